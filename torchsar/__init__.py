@@ -1,0 +1,1 @@
+"""Torch framework for synthetic aperture radar and ladar."""

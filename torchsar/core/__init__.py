@@ -1,0 +1,42 @@
+"""Axes, signals, phase, chains, estimates and random draws: what every other part stands on."""
+
+from torchsar.core.axis import Axis
+from torchsar.core.chain import Chain, Trace, Use, use
+from torchsar.core.draws import Draws
+from torchsar.core.estimate import Estimate, settle
+from torchsar.core.fft import centred_fft, centred_ifft, from_frequency, to_frequency, transform_in_blocks
+from torchsar.core.phase import cis, linear_phasor, outer_phasor, phasor_tables, real_dtype, reduced_turns, unit_phasor
+from torchsar.core.select import best_of, per_trial, take
+from torchsar.core.signal import Recording, Signal, Truth
+from torchsar.core.stage import Stage, refuse_non_finite
+
+__all__ = [
+    "Axis",
+    "Chain",
+    "Draws",
+    "Estimate",
+    "Recording",
+    "Signal",
+    "Stage",
+    "Trace",
+    "Truth",
+    "Use",
+    "best_of",
+    "centred_fft",
+    "centred_ifft",
+    "cis",
+    "from_frequency",
+    "linear_phasor",
+    "outer_phasor",
+    "per_trial",
+    "phasor_tables",
+    "real_dtype",
+    "reduced_turns",
+    "refuse_non_finite",
+    "settle",
+    "take",
+    "to_frequency",
+    "transform_in_blocks",
+    "unit_phasor",
+    "use",
+]

@@ -1,0 +1,101 @@
+"""What flows between stages: a tensor and the names of its trailing axes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchsar.core.axis import Axis
+
+
+@dataclass(frozen=True)
+class Signal:
+    """Complex samples with named trailing axes; every dim before them is a Monte Carlo trial.
+
+    data: (*trials, axes[0].n, axes[1].n, ...), slow time before fast time, range last and contiguous.
+    Raises ValueError where the trailing shape and the axes disagree.
+    """
+
+    data: Tensor
+    axes: tuple[Axis, ...]
+
+    def __post_init__(self) -> None:
+        expected = tuple(axis.n for axis in self.axes)
+        trailing = tuple(self.data.shape[self.data.ndim - len(expected) :])
+        if trailing != expected:
+            named = ", ".join(f"{axis.name}={axis.n}" for axis in self.axes)
+            raise ValueError(f"data of shape {tuple(self.data.shape)} does not end in the axes ({named}); transpose or crop it so that range is last")
+
+    @property
+    def trials(self) -> torch.Size:
+        """Shape of the leading trial dims."""
+        return self.data.shape[: self.data.ndim - len(self.axes)]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(axis.name for axis in self.axes)
+
+    def axis(self, name: str) -> Axis:
+        """The axis of that name. Raises KeyError naming the axes there are."""
+        return self.axes[self.dim(name)]
+
+    def dim(self, name: str) -> int:
+        """Position of the named axis counted from the end (negative), so that it holds for any number of trial dims."""
+        if name not in self.names:
+            raise KeyError(f"signal has the axes {self.names}, not {name!r}")
+        return self.names.index(name) - len(self.axes)
+
+    def with_data(self, data: Tensor) -> Signal:
+        """Other samples on the same axes."""
+        return replace(self, data=data)
+
+    def with_axis(self, data: Tensor, **axes: Axis) -> Signal:
+        """Other samples with some axes replaced, each named by what it replaces."""
+        for name in axes:
+            self.dim(name)
+        return Signal(data, tuple(axes.get(axis.name, axis) for axis in self.axes))
+
+    def crop(self, **bounds: tuple[int, int]) -> Signal:
+        """Samples first..last-1 of the named axes: `signal.crop(range=(0, 1480))`."""
+        signal = self
+        for name, (first, last) in bounds.items():
+            axis = signal.axis(name)
+            if not 0 <= first < last <= axis.n:
+                raise ValueError(f"crop of axis {name!r} to {first}:{last} does not fit its {axis.n} samples")
+            data = signal.data.narrow(signal.dim(name), first, last - first)
+            signal = signal.with_axis(data, **{name: axis.part(first, last)})
+        return signal
+
+    def to(self, *args: Any, **kwargs: Any) -> Signal:
+        """As Tensor.to, for the samples."""
+        return self.with_data(self.data.to(*args, **kwargs))
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What an instrument hands over: samples, what it knows about itself, and recorded side data.
+
+    signal: raw samples with true axes. radar: a frozen description (carrier, waveform, nominal path).
+    aux: named tensors that were recorded beside the samples, such as `line_number` (..., pulse) or `agc_db` (..., pulse).
+    """
+
+    signal: Signal
+    radar: Any
+    aux: Mapping[str, Tensor] = field(default_factory=dict)
+
+    def to(self, *args: Any, **kwargs: Any) -> Recording:
+        """Samples and side data moved; only the samples change dtype."""
+        signal = self.signal.to(*args, **kwargs)
+        return replace(self, signal=signal, aux={name: value.to(signal.data.device) for name, value in self.aux.items()})
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What the world knows and no processor may see: named per-trial tensors, and the undamaged recording where there is one."""
+
+    values: Mapping[str, Tensor]
+    clean: Recording | None = None

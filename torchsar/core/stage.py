@@ -1,0 +1,55 @@
+"""The base of every stage: a thin nn.Module that knows axis names and refuses what it cannot work on."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchsar.core.signal import Signal
+
+
+class Stage(nn.Module):
+    """`stage(signal, **values)` returns a Signal, an Estimate (the signal is left alone), or both as a pair.
+
+    Subclasses say in `works_on` which trailing axes they need and in `provides` which values their Estimate carries; keyword
+    parameters of `forward` that are not the signal are values that a Chain can connect. Constants are buffers, tunables are
+    nn.Parameters. Samples that are not finite or not complex are refused here, once, for every stage.
+    """
+
+    works_on: tuple[str, ...] = ("pulse", "range")
+    provides: tuple[str, ...] = ()
+
+    def __call__(self, signal: Signal, *args: Any, **values: Any) -> Any:
+        name = type(self).__name__
+        if not isinstance(signal, Signal):
+            raise TypeError(f"{name} works on a Signal with the axes {self.works_on}, got {type(signal).__name__}; wrap the tensor: Signal(data, radar.axes(lines, samples))")
+        if signal.names != self.works_on:
+            raise ValueError(f"{name} works on the axes {self.works_on}, got {signal.names}")
+        if not signal.data.is_complex():
+            raise TypeError(f"{name} works on complex samples, got {signal.data.dtype}; form the analytic signal first")
+        refuse_non_finite(signal.data, name)
+        return super().__call__(signal, *args, **values)
+
+    def hold(self, name: str, value: Tensor | float) -> None:
+        """Register a value of this stage: an nn.Parameter stays one (tunable), anything else becomes a float64 buffer (constant)."""
+        if isinstance(value, nn.Parameter):
+            self.register_parameter(name, value)
+        else:
+            self.register_buffer(name, torch.as_tensor(value, dtype=torch.float64))
+
+
+def refuse_non_finite(x: Tensor, what: str) -> None:
+    """Raise ValueError, with the count and the first place, where x holds NaN or Inf. Costs one sum over clean data."""
+    try:
+        total = torch.view_as_real(x.detach()).sum() if x.is_complex() else x.detach().sum()
+        if bool(torch.isfinite(total)):
+            return
+        bad = ~torch.isfinite(x.detach())
+        count = int(bad.sum())
+    except RuntimeError:  # inside vmap a value cannot be looked at
+        return
+    if count:
+        first = tuple(int(i) for i in bad.nonzero()[0])
+        raise ValueError(f"{what}: {count} of {x.numel()} samples are NaN or Inf, the first at index {first}; mark such lines as missing or repair the reader")

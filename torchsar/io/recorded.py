@@ -1,0 +1,81 @@
+"""Recorded stripmap data from `.npz` files, and a user's own arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchsar.core import Recording, Signal, refuse_non_finite
+from torchsar.radar import LIGHT_M_S, LinearFM, StripmapRadar
+
+_REQUIRED = ("iq", "fs_hz", "prf_hz", "f0_hz", "chirp_rate_hz_s", "pulse_s", "slant_range_cell1_m", "v_eff_m_s")
+_LINE_AUX = ("agc_db", "line_number")
+
+
+def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording:
+    """Read a raw stripmap recording from a numpy archive without pickles.
+
+    Schema: `iq` integer or float (line, sample, 2) or complex (line, sample); numbers `fs_hz`, `prf_hz`, `f0_hz`,
+    `chirp_rate_hz_s` (negative: down-chirp), `pulse_s`, `slant_range_cell1_m` (slant range of cell 1, leading edge of the echo),
+    `v_eff_m_s` (nominal effective velocity); optional `first_line`, `first_cell` (1-based position of the block, default 1), `c_m_s`,
+    `agc_db` (line,) receiver attenuation, undone here, `line_number` (line,), and `pilot` (sample,) a recorded pilot tone.
+    A Doppler ambiguity in the file is ignored: the processor finds it.
+
+    Returns a Recording with the axes (pulse, range). Raises FileNotFoundError, or ValueError naming the file and the key.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"data.file: {path} does not exist; give the path of a raw stripmap .npz file")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except (ValueError, OSError) as error:
+        raise ValueError(f"{path} is not a numpy archive without pickles ({error})") from None
+    missing = [key for key in _REQUIRED if key not in arrays]
+    if missing:
+        raise ValueError(f"{path} lacks {missing}; a raw stripmap archive holds {list(_REQUIRED)} (this one: {sorted(arrays)})")
+    rate, duration = float(arrays["chirp_rate_hz_s"]), float(arrays["pulse_s"])
+    fs, c = float(arrays["fs_hz"]), float(arrays.get("c_m_s", LIGHT_M_S))
+    radar = StripmapRadar(
+        carrier_hz=float(arrays["f0_hz"]),
+        pulse=LinearFM(abs(rate) * duration, duration, 1 if rate > 0 else -1),
+        sampling_hz=fs,
+        prf_hz=float(arrays["prf_hz"]),
+        velocity_m_s=float(arrays["v_eff_m_s"]),
+        near_range_m=float(arrays["slant_range_cell1_m"]) + (int(arrays.get("first_cell", 1)) - 1) * c / (2 * fs),
+        wave_speed_m_s=c,
+    )
+    aux = {name: torch.from_numpy(np.asarray(arrays[name])) for name in (*_LINE_AUX, "pilot") if name in arrays}
+    return recording_from_arrays(_complex(arrays["iq"], path), radar, dtype=dtype, what=str(path), **aux)
+
+
+def recording_from_arrays(data: np.ndarray | Tensor, radar: StripmapRadar, *, dtype: torch.dtype = torch.complex64, start_s: float = 0.0, what: str = "data", **aux: np.ndarray | Tensor) -> Recording:
+    """A Recording from a user's own complex raw matrix (..., line, sample), range last, and side data by name.
+
+    `agc_db` (..., line) is undone here: each line is multiplied by 10**(agc_db/20). `line_number` (..., line) must have one number a
+    line. Raises ValueError where shapes disagree or samples are not finite.
+    """
+    x = torch.as_tensor(data)
+    if not x.is_complex() or x.ndim < 2:
+        raise ValueError(f"{what}: expected complex samples (..., line, sample), got {x.dtype} of shape {tuple(x.shape)}")
+    refuse_non_finite(x, what)
+    side: Mapping[str, Tensor] = {name: torch.as_tensor(value) for name, value in aux.items()}
+    for name in _LINE_AUX:
+        if name in side and side[name].shape[-1] != x.shape[-2]:
+            raise ValueError(f"{what}: {name} has {side[name].shape[-1]} entries for {x.shape[-2]} lines")
+    x = x.to(dtype)
+    if "agc_db" in side:
+        x = x * (10 ** (side["agc_db"].to(torch.float64) / 20)).to(x.real.dtype)[..., None]
+    return Recording(Signal(x, radar.raw_axes(x.shape[-2], x.shape[-1], start_s)), radar, side)
+
+
+def _complex(iq: np.ndarray, path: Path) -> np.ndarray:
+    if np.iscomplexobj(iq) and iq.ndim == 2:
+        return iq
+    if iq.ndim == 3 and iq.shape[-1] == 2:
+        return iq[..., 0].astype(np.float32) + 1j * iq[..., 1].astype(np.float32)
+    raise ValueError(f"{path}: iq must be complex (line, sample) or (line, sample, 2), got {iq.dtype} of shape {iq.shape}")

@@ -1,0 +1,59 @@
+"""Sharpness and similarity of whole images."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Signal
+
+_OF = {"intensity": 2, "amplitude": 1}
+
+
+def _tensor(image: Tensor | Signal) -> Tensor:
+    return image.data if isinstance(image, Signal) else image
+
+
+def _power(image: Tensor) -> Tensor:
+    """|image|^2 over its detached peak, per trial, so that neither 1e-25 nor 1e19 under- or overflows. All-zero stays zero."""
+    peak = torch.amax(image.detach().abs(), (-2, -1), keepdim=True)
+    unit = image / torch.where(peak > 0, peak, 1)
+    return unit.real.square() + unit.imag.square() if unit.is_complex() else unit.square()
+
+
+def entropy(image: Tensor | Signal) -> Tensor:
+    """Image entropy in nats, -sum p ln p with p = |I|^2 / sum |I|^2. (..., azimuth, range) -> (...,).
+
+    Invariant to scale; 0 for an all-zero image; ln(number of pixels) for a flat one. Differentiable, also where pixels are zero.
+    """
+    power = _power(_tensor(image))
+    tiny = torch.finfo(power.dtype).tiny
+    p = power / power.sum((-2, -1), keepdim=True).clamp_min(tiny)
+    return -(p * torch.log(p.clamp_min(tiny))).sum((-2, -1))
+
+
+def contrast(image: Tensor | Signal, of: str = "intensity") -> Tensor:
+    """Standard deviation over mean of the intensity |I|^2 (or the amplitude |I|). (..., azimuth, range) -> (...,). 0 for an all-zero image."""
+    if of not in _OF:
+        raise ValueError(f"contrast of {of!r} is not defined; choose 'intensity' or 'amplitude'")
+    power = _power(_tensor(image))
+    x = power if of == "intensity" else torch.sqrt(power.clamp_min(torch.finfo(power.dtype).tiny))
+    mean = x.mean((-2, -1))
+    spread = (x - mean[..., None, None]).square().mean((-2, -1))
+    return torch.sqrt(spread.clamp_min(torch.finfo(power.dtype).tiny)) / torch.where(mean > 0, mean, 1)
+
+
+def correlation(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
+    """rho = |<I, I0>| / (|I| |I0|) of two complex images, (...,) in 0..1. Blind to a common gain and phase."""
+    a, b = _tensor(image), _tensor(reference)
+    product = (a * b.conj()).sum((-2, -1)).abs()
+    norms = torch.linalg.vector_norm(a, dim=(-2, -1)) * torch.linalg.vector_norm(b, dim=(-2, -1))
+    return product / torch.where(norms > 0, norms, 1)
+
+
+def error_db(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
+    """10 lg of |I - I0|^2 / |I0|^2 in dB, (...,). Sees gain and phase; use `correlation` where those are free."""
+    a, b = _tensor(image), _tensor(reference)
+    norm = torch.linalg.vector_norm(b, dim=(-2, -1))
+    ratio = torch.linalg.vector_norm(a - b, dim=(-2, -1)) / torch.where(norm > 0, norm, 1)
+    return 20 * torch.log10(ratio.clamp_min(torch.finfo(ratio.dtype).tiny))

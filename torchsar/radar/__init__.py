@@ -1,0 +1,6 @@
+"""What an instrument knows about itself."""
+
+from torchsar.radar.stripmap import LIGHT_M_S, StripmapRadar
+from torchsar.radar.waveform import LinearFM
+
+__all__ = ["LIGHT_M_S", "LinearFM", "StripmapRadar"]
