@@ -29,6 +29,10 @@ class Draws:
         """The same source for other trials."""
         return replace(self, trials=trials)
 
+    def part(self, name: str) -> Draws:
+        """An independent source for a named part of the world, so that two patches of one kind differ."""
+        return replace(self, case=f"{self.case}/{name}")
+
     def _generators(self, purpose: str) -> list[np.random.Generator]:
         def generator(trial: int) -> np.random.Generator:
             address = repr((self.seed, purpose, self.case, trial)).encode()

@@ -1,1 +1,5 @@
+"""Radar and scene to recordings: echoes, noise and receiver damage."""
 
+from torchsar.echo.stripmap import Damage, apply_damages, simulate, stripmap_echo
+
+__all__ = ["Damage", "apply_damages", "simulate", "stripmap_echo"]

@@ -1,0 +1,105 @@
+"""Scatterers and the scenes that are made of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Draws
+
+
+@dataclass(frozen=True)
+class Scatterers:
+    """Point scatterers where the beam centre meets them, relative to the middle of the recorded frame.
+
+    azimuth_m, range_m: float64 (..., target); amplitude: complex128 (..., target). Leading dims are trials. May require gradients.
+    """
+
+    azimuth_m: Tensor
+    range_m: Tensor
+    amplitude: Tensor
+
+    def __post_init__(self) -> None:
+        shapes = {tuple(x.shape) for x in (self.azimuth_m, self.range_m, self.amplitude)}
+        if self.azimuth_m.dtype != torch.float64 or self.range_m.dtype != torch.float64 or not self.amplitude.is_complex():
+            raise TypeError(f"scatterers need float64 positions and complex amplitudes, got {self.azimuth_m.dtype}, {self.range_m.dtype}, {self.amplitude.dtype}")
+        if len({s[-1] for s in shapes}) != 1:
+            raise ValueError(f"scatterers need as many ranges and amplitudes as azimuths, got shapes {sorted(shapes)}")
+
+
+class Scene(Protocol):
+    """Anything that turns random draws into scatterers."""
+
+    def scatterers(self, draws: Draws) -> Scatterers: ...
+
+
+@dataclass(frozen=True)
+class Points:
+    """Explicit points. azimuth_m, range_m, amplitude: one entry a target; random_phase gives each trial its own phases."""
+
+    azimuth_m: Sequence[float]
+    range_m: Sequence[float]
+    amplitude: Sequence[float] | None = None
+    random_phase: bool = False
+
+    def scatterers(self, draws: Draws) -> Scatterers:
+        x, r = (torch.tensor(list(v), dtype=torch.float64) for v in (self.azimuth_m, self.range_m))
+        level = torch.ones_like(x) if self.amplitude is None else torch.tensor(list(self.amplitude), dtype=torch.float64)
+        turns = draws.uniform("scene.points.phase", x.shape) if self.random_phase else torch.zeros_like(x)
+        return Scatterers(x.expand(turns.shape), r.expand(turns.shape), torch.polar(level.expand(turns.shape), 2 * math.pi * turns))
+
+
+@dataclass(frozen=True)
+class RandomPoints:
+    """count points at random places of a rectangle about (azimuth_m, range_m), levels spread evenly over spread_db, random phases."""
+
+    count: int
+    azimuth_extent_m: float
+    range_extent_m: float
+    azimuth_m: float = 0.0
+    range_m: float = 0.0
+    spread_db: float = 0.0
+
+    def scatterers(self, draws: Draws) -> Scatterers:
+        x = self.azimuth_m + self.azimuth_extent_m * (draws.uniform("scene.random.azimuth", (self.count,)) - 0.5)
+        r = self.range_m + self.range_extent_m * (draws.uniform("scene.random.range", (self.count,)) - 0.5)
+        level = 10 ** (-self.spread_db * draws.uniform("scene.random.level", (self.count,)) / 20)
+        return Scatterers(x, r, torch.polar(level, 2 * math.pi * draws.uniform("scene.random.phase", (self.count,))))
+
+
+@dataclass(frozen=True)
+class Speckle:
+    """A rectangle of fully developed speckle: count circular Gaussian scatterers at random places, mean power level_db together.
+
+    Give at least about three scatterers per resolution cell for the statistics of clutter.
+    """
+
+    count: int
+    azimuth_extent_m: float
+    range_extent_m: float
+    azimuth_m: float = 0.0
+    range_m: float = 0.0
+    level_db: float = 0.0
+
+    def scatterers(self, draws: Draws) -> Scatterers:
+        x = self.azimuth_m + self.azimuth_extent_m * (draws.uniform("scene.speckle.azimuth", (self.count,)) - 0.5)
+        r = self.range_m + self.range_extent_m * (draws.uniform("scene.speckle.range", (self.count,)) - 0.5)
+        scale = 10 ** (self.level_db / 20) / math.sqrt(self.count)
+        return Scatterers(x, r, scale * draws.normal("scene.speckle.amplitude", (self.count,), torch.complex128))
+
+
+@dataclass(frozen=True)
+class Together:
+    """Several scenes at once; each draws its own random numbers, addressed by its name."""
+
+    parts: dict[str, Scene]
+
+    def scatterers(self, draws: Draws) -> Scatterers:
+        all_parts = [scene.scatterers(draws.part(name)) for name, scene in self.parts.items()]
+        return Scatterers(*(torch.cat([getattr(p, field) for p in all_parts], -1) for field in ("azimuth_m", "range_m", "amplitude")))
+
