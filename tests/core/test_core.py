@@ -1,0 +1,118 @@
+"""Axes, signals, transforms, phase, draws."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from torchsar.core import Axis, Draws, Recording, Signal, best_of, from_frequency, linear_phasor, reduced_turns, take, to_frequency, transform_in_blocks, unit_phasor
+
+
+def test_frequency_axis_and_data_move_together():
+    axis = Axis("pulse", 60, 3.0, 0.01, "s")
+    tone_hz = 7 / 0.6
+    x = torch.polar(torch.ones(60, dtype=torch.float64), 2 * math.pi * tone_hz * axis.values())
+    signal = Signal(x, (axis,))
+    spectrum = to_frequency(signal, "pulse")
+    assert spectrum.names == ("doppler",) and spectrum.axis("doppler").unit == "Hz"
+    peak = int(spectrum.data.abs().argmax())
+    assert float(spectrum.axis("doppler").values()[peak]) == pytest.approx(tone_hz)
+    back = from_frequency(spectrum, "doppler")
+    assert back.axes == signal.axes
+    torch.testing.assert_close(back.data, signal.data)
+
+
+def test_signal_refuses_a_shape_that_does_not_end_in_its_axes():
+    with pytest.raises(ValueError, match=r"pulse=4, range=5"):
+        Signal(torch.zeros(5, 4), (Axis("pulse", 4, 0, 1, "s"), Axis("range", 5, 0, 1, "m")))
+
+
+def test_crop_moves_the_axis():
+    signal = Signal(torch.arange(12.0).reshape(3, 4), (Axis("pulse", 3, 0, 1, "s"), Axis("range", 4, 100, 2, "m")))
+    part = signal.crop(range=(1, 3))
+    assert part.axis("range") == Axis("range", 2, 102, 2, "m")
+    assert part.data.tolist() == [[1, 2], [5, 6], [9, 10]]
+    with pytest.raises(ValueError, match="does not fit"):
+        signal.crop(range=(1, 9))
+
+
+def test_recording_moves_only_the_samples_dtype():
+    recording = Recording(Signal(torch.zeros(2, 3, dtype=torch.complex64), (Axis("pulse", 2, 0, 1, "s"), Axis("range", 3, 0, 1, "m"))), None, {"line_number": torch.arange(2)})
+    moved = recording.to(torch.complex128)
+    assert moved.signal.data.dtype == torch.complex128 and moved.aux["line_number"].dtype == torch.int64
+
+
+def test_phase_of_a_long_range_is_exact():
+    # 700 km at 3.2 GHz is 1.5e7 turns; an exact rational number of turns tells whether float64 was kept
+    turns = torch.tensor([15_000_000.25, -15_000_000.25, 123_456_789.5], dtype=torch.float64)
+    expected = torch.tensor([1j, -1j, -1], dtype=torch.complex64)
+    torch.testing.assert_close(unit_phasor(turns, torch.complex64), expected, atol=1e-6, rtol=0)
+
+
+def test_phase_refuses_single_precision_and_huge_turns():
+    with pytest.raises(TypeError, match="float64 turns"):
+        unit_phasor(torch.zeros(3), torch.complex64)
+    with pytest.raises(ValueError, match="reference range"):
+        reduced_turns(torch.tensor([5e11], dtype=torch.float64))
+    with pytest.raises(ValueError, match="reference range"):
+        reduced_turns(torch.tensor([float("nan")], dtype=torch.float64))
+
+
+def test_linear_phasor_equals_the_phasor_of_every_element():
+    turns = torch.tensor([0.123456789, -7.3, 1e4 + 1 / 3], dtype=torch.float64)
+    index = -37.5 + torch.arange(101, dtype=torch.float64)
+    torch.testing.assert_close(linear_phasor(turns, -37.5, 101, torch.complex128), unit_phasor(turns[:, None] * index, torch.complex128), atol=1e-9, rtol=0)
+
+
+def test_linear_phasor_is_differentiable():
+    turns = torch.tensor([0.3, 0.7], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda t: linear_phasor(t, -2, 5, torch.complex128), (turns,))
+
+
+@pytest.mark.parametrize("dim", [-1, -2])
+def test_transform_in_blocks_equals_the_plain_one(dim):
+    x = torch.randn(3, 50, 70, dtype=torch.complex128)
+    expected = torch.fft.fft(x, dim=dim)
+    torch.testing.assert_close(transform_in_blocks(x.clone(), dim, block_bytes=5000), expected)
+    torch.testing.assert_close(transform_in_blocks(expected.clone(), dim, inverse=True, block_bytes=5000), x)
+
+
+class TestDraws:
+    def test_chunks_and_order_do_not_matter(self):
+        whole = Draws(7, trials=range(6)).normal("noise", (4, 5), torch.complex64)
+        parts = torch.cat([Draws(7, trials=t).normal("noise", (4, 5), torch.complex64) for t in ([0, 1], [2], [3, 4, 5])])
+        assert torch.equal(whole, parts)
+        assert torch.equal(Draws(7, trials=[5, 0]).normal("noise", (4, 5), torch.complex64), whole[[5, 0]])
+
+    def test_another_draw_in_between_changes_nothing(self):
+        a, b = Draws(7), Draws(7)
+        b.uniform("something else", (1000,))
+        assert torch.equal(a.normal("noise", (9,)), b.normal("noise", (9,)))
+
+    @pytest.mark.parametrize("other", [Draws(8), Draws(7, case="snr=3"), Draws(7).part("sea"), Draws(7, trials=[1])])
+    def test_every_part_of_the_address_counts(self, other):
+        assert not torch.equal(Draws(7).normal("noise", (9,)), other.normal("noise", (9,)).reshape(-1))
+
+    def test_precisions_see_the_same_noise(self):
+        double = Draws(7).normal("noise", (99,), torch.complex128)
+        assert torch.equal(double.to(torch.complex64), Draws(7).normal("noise", (99,), torch.complex64))
+
+    def test_moments(self):
+        x = Draws(3).normal("noise", (200_000,), torch.complex128)
+        assert float(x.abs().square().mean()) == pytest.approx(1, abs=0.02)
+        assert abs(complex((x * x).mean())) < 0.02
+
+    def test_subset_has_no_repetition(self):
+        picked = Draws(1, trials=range(3)).subset("lost", 50, 20)
+        assert picked.shape == (3, 20) and all(len(set(row.tolist())) == 20 for row in picked)
+
+
+def test_take_and_best_of_choose_per_trial():
+    costs = torch.tensor([[3.0, 1.0], [2.0, 5.0], [4.0, 1.5]])
+    values = torch.tensor([[10.0, 11.0], [20.0, 21.0], [30.0, 31.0]])
+    best, margin = best_of(costs, values)
+    assert best.tolist() == [20.0, 11.0] and margin.tolist() == [1.0, 0.5]
+    x = torch.arange(24.0).reshape(2, 3, 4)
+    assert take(x, torch.tensor([2, 0]), dim=1).tolist() == [[8, 9, 10, 11], [12, 13, 14, 15]]
