@@ -28,7 +28,8 @@ def entropy(image: Tensor | Signal) -> Tensor:
     """
     power = _power(_tensor(image))
     tiny = torch.finfo(power.dtype).tiny
-    p = power / power.sum((-2, -1), keepdim=True).clamp_min(tiny)
+    total = power.sum((-2, -1), keepdim=True)
+    p = power / torch.where(total > 0, total, 1)
     return -(p * torch.log(p.clamp_min(tiny))).sum((-2, -1))
 
 

@@ -1,0 +1,38 @@
+# make run: the embedded experiment. make test: the tests. Both set up $(VENV) first.
+# An environment that already has torch keeps it: make run VENV=/path/to/venv
+VENV   ?= .venv
+PYTHON ?= python3
+TORCH  ?= torch==2.13.0
+CONFIG ?= stripmap_damaged
+OUT    ?= out/$(notdir $(basename $(CONFIG)))
+ARGS   ?=
+
+PY    := $(VENV)/bin/python
+STAMP := $(VENV)/.torchsar-installed
+
+.PHONY: run test lint install clean
+
+run: install
+	$(VENV)/bin/torchsar run $(CONFIG) $(ARGS) --out $(OUT)
+
+test: install
+	$(PY) -m pytest tests $(ARGS)
+
+lint: install
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/pyright --pythonpath $(PY)
+
+install: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt Makefile
+	@test -x $(PY) || $(PYTHON) -c 'import sys; sys.exit("torchsar needs Python 3.11 or newer, $(PYTHON) is " + sys.version.split()[0] + "; try make PYTHON=python3.11" if sys.version_info < (3, 11) else 0)'
+	@test -x $(PY) || $(PYTHON) -m venv $(VENV)
+	@if $(PY) -c 'import torch' 2>/dev/null; then \
+		echo 'keeping the torch of $(VENV)'; $(PY) -m pip install -e '.[dev]'; \
+	else \
+		$(PY) -m pip install -c constraints.txt '$(TORCH)' && $(PY) -m pip install -c constraints.txt -e '.[dev]'; \
+	fi
+	@touch $(STAMP)
+
+clean:
+	rm -rf out build dist .venv

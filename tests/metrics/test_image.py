@@ -1,0 +1,89 @@
+"""Figures of merit with known answers."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from torchsar.core import Axis, Signal
+from torchsar.metrics import contrast, correlation, entropy, error_db, impulse_response
+
+
+def test_entropy_known_answers():
+    flat = torch.ones(4, 8, dtype=torch.complex128)
+    assert float(entropy(flat)) == pytest.approx(math.log(32))
+    point = torch.zeros(4, 8, dtype=torch.complex128)
+    point[1, 2] = 3j
+    assert float(entropy(point)) == pytest.approx(0, abs=1e-12)
+    assert float(entropy(torch.zeros(4, 8, dtype=torch.complex64))) == 0
+
+
+@pytest.mark.parametrize("scale", [1e-25, 1.0, 1e19])
+@pytest.mark.parametrize("metric", [entropy, contrast])
+def test_extreme_levels_change_nothing_even_in_single_precision(metric, scale):
+    image = torch.randn(3, 16, 16, dtype=torch.complex64, generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(metric(image * scale), metric(image), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("metric", [entropy, contrast])
+def test_gradients_pass_where_pixels_are_zero(metric):
+    image = torch.randn(2, 3, 4, dtype=torch.complex128, generator=torch.Generator().manual_seed(1))
+    assert torch.autograd.gradcheck(metric, (image.requires_grad_(),))
+    zero = torch.zeros(2, 3, 4, dtype=torch.complex64, requires_grad=True)
+    metric(zero).sum().backward()
+    assert torch.isfinite(torch.view_as_real(zero.grad)).all()
+
+
+def test_contrast_of_speckle_is_one_in_intensity():
+    image = torch.randn(400, 400, dtype=torch.complex128, generator=torch.Generator().manual_seed(2))
+    assert float(contrast(image)) == pytest.approx(1, abs=0.02)
+    assert float(contrast(image, of="amplitude")) == pytest.approx(math.sqrt(4 / math.pi - 1), abs=0.01)
+    with pytest.raises(ValueError, match="'intensity' or 'amplitude'"):
+        contrast(image, of="power")
+
+
+def test_correlation_is_blind_to_gain_and_phase_and_error_is_not():
+    a = torch.randn(2, 8, 8, dtype=torch.complex128, generator=torch.Generator().manual_seed(3))
+    torch.testing.assert_close(correlation(a * (2 + 1j), a), torch.ones(2, dtype=torch.float64))
+    torch.testing.assert_close(error_db(1.1 * a, a), torch.full((2,), -20.0, dtype=torch.float64))
+
+
+def sinc_image(offset_a, offset_r, oversampling=1.0, centre_turns=0.0, shape=(300, 280)):
+    a = torch.arange(shape[0], dtype=torch.float64)[:, None] - offset_a
+    r = torch.arange(shape[1], dtype=torch.float64) - offset_r
+    image = torch.sinc(a / oversampling) * torch.sinc(r / oversampling)
+    image = image * torch.polar(torch.ones_like(image), 2 * math.pi * centre_turns * a + 0.7)
+    axes = (Axis("azimuth", shape[0], -10.0, 0.5, "m"), Axis("range", shape[1], 1000.0, 0.25, "m"))
+    return Signal(image, axes)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.13, 0.5, -0.37])
+@pytest.mark.parametrize(("oversampling", "centre"), [(1.0, 0.0), (1.0, 0.41), (1.8, -0.2), (4.0, 0.3)])
+def test_sinc_is_measured_as_a_sinc(offset, oversampling, centre):
+    image = sinc_image(150 + offset, 140 - offset, oversampling, centre)
+    m = impulse_response(image, (65.0, 1035.0))
+    assert float(m["irw_azimuth_m"]) == pytest.approx(0.8859 * oversampling * 0.5, rel=0.01)
+    assert float(m["irw_range_m"]) == pytest.approx(0.8859 * oversampling * 0.25, rel=0.01)
+    for axis in ("azimuth", "range"):
+        assert float(m[f"pslr_{axis}_db"]) == pytest.approx(-13.26, abs=0.06)
+        assert float(m[f"islr_{axis}_db"]) == pytest.approx(-10.17, abs=0.1)
+    assert float(m["position_azimuth_m"]) == pytest.approx(-10 + 0.5 * (150 + offset), abs=0.5 * 0.01)
+    assert float(m["position_range_m"]) == pytest.approx(1000 + 0.25 * (140 - offset), abs=0.25 * 0.01)
+    assert math.remainder(float(torch.angle(m["peak"])) - 0.7, 2 * math.pi) == pytest.approx(0, abs=0.02)
+
+
+def test_targets_and_trials_are_measured_side_by_side():
+    images = torch.stack([sinc_image(150, 140).data, sinc_image(150.4, 139.8).data * 1000])
+    signal = Signal(images, sinc_image(1, 1).axes)
+    m = impulse_response(signal, (torch.tensor([65.0, 65.0]), torch.tensor([1035.0, 1035.0])))
+    assert m["irw_azimuth_m"].shape == (2,)
+    several = impulse_response(signal, (torch.tensor([[65.0, 66.0], [65.0, 64.0]]), torch.tensor([1035.0, 1035.0])))
+    assert several["irw_azimuth_m"].shape == (2, 2)
+    torch.testing.assert_close(several["position_azimuth_m"][:, 1], m["position_azimuth_m"])
+
+
+def test_places_outside_the_image_are_refused():
+    with pytest.raises(ValueError, match="outside the azimuth axis"):
+        impulse_response(sinc_image(150, 140), (500.0, 1035.0))
