@@ -1,1 +1,1 @@
-
+"""Experiments from a config: run, judge, store and report. Needs the extra `study`."""

@@ -1,0 +1,153 @@
+"""Classes that a config may name, with their keys read from their signatures."""
+
+from __future__ import annotations
+
+import inspect
+import types
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from pydantic import BaseModel, ConfigDict, ValidationError, create_model
+
+from torchsar.study.errors import ConfigError, did_you_mean
+
+_SCALARS = (float, int, str, bool, type(None))
+
+
+class Strict(BaseModel):
+    """Base of all sections: unknown keys, wrong types and infinities are refused."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+
+def _plain(hint: Any) -> Any | None:
+    """The part of a type that YAML can hold, None where there is nothing. Tensors become numbers or lists of numbers."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if hint in _SCALARS or origin is typing.Literal:
+        return hint
+    if hint is torch.Tensor:
+        return list[float]
+    if origin in (typing.Union, types.UnionType):
+        kept = [plain for plain in map(_plain, args) if plain is not None]
+        return typing.Union[tuple(kept)] if any(k is not type(None) for k in kept) else None  # noqa: UP007, built at run time
+    if origin in (list, tuple, Sequence) and args:
+        item = _plain(args[0])
+        return None if item is None else list[item]
+    if origin in (dict, Mapping) and args and args[0] is str:
+        item = _plain(args[1])
+        return None if item is None else dict[str, item]
+    return None
+
+
+class Catalogue:
+    """Names to classes or factories. `what` and `key` make the messages: Catalogue("stage", "stage", {...})."""
+
+    def __init__(self, what: str, key: str, entries: Mapping[str, Callable[..., Any]], given: Sequence[str] = ()) -> None:
+        self.what, self.key, self.entries, self.given = what, key, dict(entries), frozenset(given)
+        self._models: dict[str, type[BaseModel]] = {}
+
+    def model(self, name: str) -> type[BaseModel]:
+        """The keys of one entry and their types, as a pydantic model."""
+        if name not in self._models:
+            self._models[name] = create_model(name, __base__=Strict, **self._fields(name))
+        return self._models[name]
+
+    def _fields(self, name: str) -> dict[str, Any]:
+        target = self.entries[name]
+        function = target.__init__ if inspect.isclass(target) else target
+        hints = typing.get_type_hints(function)
+        fields: dict[str, Any] = {}
+        for parameter in inspect.signature(target).parameters.values():
+            if parameter.name in self.given or parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
+                continue
+            plain = _plain(hints.get(parameter.name, Any))
+            required = parameter.default is inspect.Parameter.empty
+            if plain is None and required:
+                raise TypeError(f"{self.what} {name!r}: its parameter {parameter.name!r} of type {hints.get(parameter.name)} cannot be written in a config; register a factory instead")
+            if plain is not None:
+                default = ... if required else list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
+                fields[parameter.name] = (plain, default)
+        return fields
+
+    def check(self, entry: Any, where: str, file: str) -> tuple[str, dict[str, Any]]:
+        """Name and complete keys of an entry {key: name, ...}. Raises ConfigError naming file, key and what is accepted."""
+        if not isinstance(entry, dict):
+            raise ConfigError(f"{file}: {where} must be a mapping with the key {self.key!r}, got {entry!r}")
+        if self.key not in entry:
+            raise ConfigError(f"{file}: {where} lacks the key {self.key!r}{did_you_mean('', self.entries)}")
+        name = entry[self.key]
+        if not isinstance(name, str) or name not in self.entries:
+            raise ConfigError(f"{file}: {where}.{self.key} names an unknown {self.what} {name!r}{did_you_mean(str(name), self.entries)}")
+        try:
+            parameters = self.model(name).model_validate({k: v for k, v in entry.items() if k != self.key})
+        except ValidationError as error:
+            raise ConfigError(sentence(error, self.model(name), file, where)) from None
+        return name, parameters.model_dump()
+
+    def make(self, entry: Any, where: str, file: str, **given: Any) -> Any:
+        """The object that an entry describes; `given` are the values that do not come from the config."""
+        name, parameters = self.check(entry, where, file)
+        target = self.entries[name]
+        accepted = inspect.signature(target).parameters
+        try:
+            return target(**{k: v for k, v in given.items() if k in accepted}, **_tensors(target, parameters))
+        except (ValueError, TypeError) as error:
+            raise ConfigError(f"{file}: {where}: {' '.join(str(error).split())}") from None
+
+
+def _tensors(target: Callable[..., Any], parameters: dict[str, Any]) -> dict[str, Any]:
+    """Lists become float64 tensors where the signature asks for a tensor and for no sequence."""
+    hints = typing.get_type_hints(target.__init__ if inspect.isclass(target) else target)
+    takes_tensor = {name for name, hint in hints.items() if torch.Tensor in (hint, *typing.get_args(hint)) and not any(typing.get_origin(a) in (list, tuple, Sequence) for a in typing.get_args(hint))}
+    return {k: torch.tensor(v, dtype=torch.float64) if isinstance(v, list) and k in takes_tensor else v for k, v in parameters.items()}
+
+
+def sentence(error: ValidationError, model: type[BaseModel], file: str, where: str = "") -> str:
+    """One sentence from the most telling of pydantic's errors: an unknown key first, then a missing one, then a wrong value."""
+    rank = {"extra_forbidden": 0, "missing": 1}
+    worst = min(error.errors(), key=lambda e: rank.get(e["type"], 2))
+    path = [str(part) for part in worst["loc"]]
+    names, section = _descend(model, path)
+    key = ".".join(([where] if where else []) + names)
+    if worst["type"] == "extra_forbidden":
+        return f"{file}: key {key!r} is not known{did_you_mean(path[-1], section.model_fields if section else ())}"
+    if worst["type"] == "missing":
+        return f"{file}: key {key!r} is missing"
+    text = worst["msg"].removeprefix("Value error, ").removeprefix("Input ")
+    shown = repr(worst["input"])
+    return f"{file}: key {key!r} has the value {shown if len(shown) < 80 else shown[:77] + '...'}; it {text}" if text.startswith("should") else f"{file}: key {key!r}: {text}"
+
+
+def _descend(model: type[BaseModel], path: list[str]) -> tuple[list[str], type[BaseModel] | None]:
+    """The real keys of a pydantic location (union tags dropped), and the section that holds the last of them."""
+    names: list[str] = []
+    section: type[BaseModel] | None = model
+    for i, part in enumerate(path):
+        if section is not None and part in section.model_fields:
+            names.append(part)
+            hint = section.model_fields[part].annotation
+            nested = _sections(hint)
+            if i < len(path) - 1:
+                section = nested[0] if len(nested) == 1 and not _is_mapping(hint) else section if not nested else None
+                inside = nested[0] if len(nested) == 1 else None
+                if section is None and inside is not None and i + 2 < len(path):
+                    rest, last = _descend(inside, path[i + 2 :])
+                    return [*names, path[i + 1], *rest], last
+                if section is None:
+                    return [*names, path[i + 1]], inside
+        elif i == len(path) - 1 or part.isdigit():
+            if not (section is None and part in ("int", "float", "str", "bool")) and not part.startswith(("list[", "function", "constrained")) and part not in ("float", "int", "str", "bool", "none"):
+                names.append(part)
+    return names, section
+
+
+def _sections(hint: Any) -> list[type[BaseModel]]:
+    if inspect.isclass(hint) and issubclass(hint, BaseModel):
+        return [hint]
+    return [section for arg in typing.get_args(hint) for section in _sections(arg)]
+
+
+def _is_mapping(hint: Any) -> bool:
+    return typing.get_origin(hint) in (dict, Mapping) or any(_is_mapping(arg) for arg in typing.get_args(hint))

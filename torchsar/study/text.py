@@ -1,0 +1,119 @@
+"""YAML in and out, and overrides from the command line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from torchsar.study.errors import ConfigError, did_you_mean
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe YAML that reads 1e-6 as a number (YAML 1.2), only true/false as booleans, and refuses a key given twice."""
+
+
+_Loader.yaml_implicit_resolvers = {first: [(tag, rule) for tag, rule in rules if not tag.endswith((":float", ":bool"))] for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()}
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(?:(?:[0-9][0-9_]*\.[0-9_]*|\.[0-9][0-9_]*)(?:[eE][-+]?[0-9]+)?|[0-9][0-9_]*[eE][-+]?[0-9]+|\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"),
+    list("-+0123456789."),
+)
+_Loader.add_implicit_resolver("tag:yaml.org,2002:bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF"))
+
+
+def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[str, Any]:
+    seen: dict[str, Any] = {}
+    for key_node, value_node in node.value:
+        key = loader.construct_object(key_node, deep=True)
+        key = key if isinstance(key, str) else str(key)
+        if key in seen:
+            raise yaml.constructor.ConstructorError(None, None, f"the key {key!r} is given twice", key_node.start_mark)
+        seen[key] = loader.construct_object(value_node, deep=True)
+    return seen
+
+
+_Loader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Mappings in their own order, lists of numbers on one line."""
+
+
+_Dumper.add_representer(list, lambda dumper, items: dumper.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=all(not isinstance(i, (dict, list)) for i in items)))
+_Dumper.add_representer(tuple, lambda dumper, items: dumper.represent_list(list(items)))
+
+
+def parse(text: str, what: str) -> Any:
+    """A YAML document. Raises ConfigError naming `what` and the line."""
+    try:
+        return yaml.load(text, Loader=_Loader)  # noqa: S506, a SafeLoader
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        place = f", line {mark.line + 1}" if mark else ""
+        raise ConfigError(f"{what}{place}: not readable as YAML: {error.problem}") from None
+    except (yaml.YAMLError, ValueError) as error:
+        raise ConfigError(f"{what}: not readable as YAML: {' '.join(str(error).split())}") from None
+
+
+def dump(tree: Mapping[str, Any]) -> str:
+    """The YAML text of a tree of plain values."""
+    return yaml.dump(tree, Dumper=_Dumper, sort_keys=False, width=160, allow_unicode=True)
+
+
+def config_folders() -> list[Path]:
+    """Where configs are found by name: inside an installed package, or beside the package in a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    return [folder for folder in (package / "configs", package.parent / "configs") if folder.is_dir()]
+
+
+def packaged_configs() -> dict[str, Path]:
+    """Names of the configs that come with torchsar, and their files."""
+    return {path.stem: path for folder in reversed(config_folders()) for path in sorted(folder.glob("*.yaml"))}
+
+
+def find_config(name: str) -> Path:
+    """A file by its path, else a packaged config by its name, 'stripmap_damaged' or 'configs/stripmap_damaged.yaml'."""
+    path = Path(name)
+    if path.is_file():
+        return path
+    packaged = packaged_configs()
+    if path.parent in (Path("."), Path("configs")) and path.suffix in ("", ".yaml") and path.stem in packaged:
+        return packaged[path.stem]
+    if path.is_dir():
+        raise ConfigError(f"{name} is a folder, not a config file")
+    raise ConfigError(f"there is no config file {name!r} and no packaged config of that name{did_you_mean(path.stem, packaged)}")
+
+
+def read_tree(path: Path) -> dict[str, Any]:
+    """The mapping in a config file."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read as text ({error})") from None
+    tree = parse(text, str(path))
+    if not isinstance(tree, dict):
+        raise ConfigError(f"{path}: a config is a mapping of sections, got {type(tree).__name__}")
+    return tree
+
+
+def override(tree: dict[str, Any], assignments: Sequence[str]) -> dict[str, Any]:
+    """The tree with key=value assignments applied, the keys as dotted paths and the values as YAML."""
+    for assignment in assignments:
+        key, equals, value = assignment.partition("=")
+        if not equals or not key.strip(". "):
+            raise ConfigError(f"command line: {assignment!r} is not an override; write key=value with a dotted key, such as world.noise.snr_db=10")
+        tree = _assigned(tree, key.strip().split("."), parse(value, f"command line, {key}"), key)
+    return tree
+
+
+def _assigned(tree: Any, path: list[str], value: Any, key: str) -> dict[str, Any]:
+    if tree is None:
+        tree = {}
+    if not isinstance(tree, dict):
+        raise ConfigError(f"command line: {key} cannot be set, because the part before {'.'.join(path)!r} holds the value {tree!r}, not a section")
+    head, rest = path[0], path[1:]
+    return {**tree, head: _assigned(tree.get(head), rest, value, key) if rest else value}
