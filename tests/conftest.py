@@ -14,7 +14,8 @@ SHARED = Path(os.environ.get("TORCHSAR_DATA", Path(__file__).resolve().parents[2
 
 @pytest.fixture(autouse=True, scope="session")
 def _two_threads() -> None:
-    torch.set_num_threads(min(2, os.cpu_count() or 1))
+    if "OMP_NUM_THREADS" not in os.environ:
+        torch.set_num_threads(min(2, os.cpu_count() or 1))
 
 
 @pytest.fixture

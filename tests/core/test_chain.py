@@ -74,7 +74,7 @@ def test_chain_moves_and_shows_its_state():
     assert chain.to("cpu") is chain
     other = Chain(focus=OmegaK(small_radar(), velocity_m_s=nn.Parameter(torch.tensor(1.0, dtype=torch.float64))))
     other.load_state_dict(chain.state_dict())
-    assert float(other.stages["focus"].velocity_m_s) == 120.0
+    assert float(other.stages["focus"].velocity_m_s.detach()) == 120.0
 
 
 def test_trace_keeps_time_bytes_and_every_intermediate():

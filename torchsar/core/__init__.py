@@ -2,13 +2,14 @@
 
 from torchsar.core.axis import Axis
 from torchsar.core.chain import Chain, Trace, Use, use
+from torchsar.core.check import refuse_non_finite
 from torchsar.core.draws import Draws
 from torchsar.core.estimate import Estimate, settle
-from torchsar.core.fft import centred_fft, centred_ifft, from_frequency, to_frequency, transform_in_blocks
+from torchsar.core.fft import block_bytes_of, centred_fft, centred_ifft, from_frequency, to_frequency, transform_in_blocks
 from torchsar.core.phase import cis, linear_phasor, outer_phasor, phasor_tables, real_dtype, reduced_turns, unit_phasor
 from torchsar.core.select import best_of, per_trial, take
 from torchsar.core.signal import Recording, Signal, Truth
-from torchsar.core.stage import Stage, refuse_non_finite
+from torchsar.core.stage import Stage
 
 __all__ = [
     "Axis",
@@ -22,6 +23,7 @@ __all__ = [
     "Truth",
     "Use",
     "best_of",
+    "block_bytes_of",
     "centred_fft",
     "centred_ifft",
     "cis",

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core.axis import Axis
+from torchsar.core.check import refuse_non_finite
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,27 @@ class Recording:
     signal: Signal
     radar: Any
     aux: Mapping[str, Tensor] = field(default_factory=dict)
+
+    @classmethod
+    def from_arrays(cls, data: Any, radar: Any, *, dtype: torch.dtype = torch.complex64, start_s: float = 0.0, what: str = "data", **aux: Any) -> Recording:
+        """A recording from a user's own complex raw matrix (..., line, sample), range last, and side data by name.
+
+        radar: an instrument description with `raw_axes`, such as StripmapRadar. `agc_db` (..., line), receiver attenuation, is undone here:
+        each line is multiplied by 10**(agc_db/20). `line_number` (..., line) has one number a line. Raises ValueError where shapes
+        disagree or samples are not complex and finite.
+        """
+        x = torch.as_tensor(data)
+        if not x.is_complex() or x.ndim < 2:
+            raise ValueError(f"{what}: expected complex samples (..., line, sample), got {x.dtype} of shape {tuple(x.shape)}")
+        refuse_non_finite(x, what)
+        side = {name: torch.as_tensor(value) for name, value in aux.items()}
+        for name in ("agc_db", "line_number"):
+            if name in side and side[name].shape[-1] != x.shape[-2]:
+                raise ValueError(f"{what}: {name} has {side[name].shape[-1]} entries for {x.shape[-2]} lines; give one per line")
+        x = x.to(dtype)
+        if "agc_db" in side:
+            x = x * (10 ** (side["agc_db"].to(torch.float64) / 20)).to(x.real.dtype)[..., None]
+        return cls(Signal(x, radar.raw_axes(x.shape[-2], x.shape[-1], start_s)), radar, side)
 
     def to(self, *args: Any, **kwargs: Any) -> Recording:
         """Samples and side data moved; only the samples change dtype."""

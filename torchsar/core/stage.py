@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torchsar.core.check import refuse_non_finite
 from torchsar.core.signal import Signal
 
 
@@ -38,18 +39,3 @@ class Stage(nn.Module):
             self.register_parameter(name, value)
         else:
             self.register_buffer(name, torch.as_tensor(value, dtype=torch.float64))
-
-
-def refuse_non_finite(x: Tensor, what: str) -> None:
-    """Raise ValueError, with the count and the first place, where x holds NaN or Inf. Costs one sum over clean data."""
-    try:
-        total = torch.view_as_real(x.detach()).sum() if x.is_complex() else x.detach().sum()
-        if bool(torch.isfinite(total)):
-            return
-        bad = ~torch.isfinite(x.detach())
-        count = int(bad.sum())
-    except RuntimeError:  # inside vmap a value cannot be looked at
-        return
-    if count:
-        first = tuple(int(i) for i in bad.nonzero()[0])
-        raise ValueError(f"{what}: {count} of {x.numel()} samples are NaN or Inf, the first at index {first}; mark such lines as missing or repair the reader")

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Signal, Stage, cis, linear_phasor, outer_phasor, per_trial, phasor_tables, real_dtype, reduced_turns, transform_in_blocks
+from torchsar.core import Axis, Signal, Stage, block_bytes_of, cis, linear_phasor, outer_phasor, per_trial, phasor_tables, real_dtype, reduced_turns, transform_in_blocks
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
 
@@ -156,15 +156,17 @@ def omega_k(
     return through_doppler(raw, focus_rows, differentiable=geometry.requires_grad or raw.requires_grad)
 
 
-def through_doppler(raw: Tensor, focus_rows: Callable[[Tensor, slice], Tensor], differentiable: bool, block_bytes: int = 1 << 20) -> Tensor:
+def through_doppler(raw: Tensor, focus_rows: Callable[[Tensor, slice], Tensor], differentiable: bool, block_bytes: int | None = None) -> Tensor:
     """Two-dimensional FFT, `focus_rows` on the rows of the spectrum, inverse azimuth FFT. raw, result: (..., pulse, range).
 
     focus_rows takes rows (..., d, range frequency) and their slice of the Doppler axis, and returns (..., d, range). Where gradients
-    are wanted all rows go at once; otherwise blocks of rows are worked on inside one copy of the data.
+    are wanted all rows go at once; otherwise blocks of rows are worked on inside one copy of the data, which is all the memory it takes.
     """
     if differentiable and torch.is_grad_enabled():
         return torch.fft.ifft(focus_rows(torch.fft.fft2(raw), slice(None)), dim=-2)
-    work = transform_in_blocks(transform_in_blocks(raw.clone(), -1), -2)
+    work = transform_in_blocks(raw, -1, out=torch.empty_like(raw, memory_format=torch.contiguous_format))
+    transform_in_blocks(work, -2)
+    block_bytes = block_bytes_of(raw.device) // 2 if block_bytes is None else block_bytes
     height = max(1, block_bytes // max(1, work[..., 0, :].numel() * work.element_size()))
     for first in range(0, work.shape[-2], height):
         part = slice(first, min(first + height, work.shape[-2]))

@@ -1,5 +1,5 @@
 """Recorded data in, images out."""
 
-from torchsar.io.recorded import read_stripmap, recording_from_arrays
+from torchsar.io.recorded import read_stripmap
 
-__all__ = ["read_stripmap", "recording_from_arrays"]
+__all__ = ["read_stripmap"]

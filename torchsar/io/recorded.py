@@ -1,19 +1,17 @@
-"""Recorded stripmap data from `.npz` files, and a user's own arrays."""
+"""Recorded stripmap data from `.npz` files; a user's own arrays become a Recording by `Recording.from_arrays`."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from torchsar.core import Recording, Signal, refuse_non_finite
+from torchsar.core import Recording
 from torchsar.radar import LIGHT_M_S, LinearFM, StripmapRadar
 
 _REQUIRED = ("iq", "fs_hz", "prf_hz", "f0_hz", "chirp_rate_hz_s", "pulse_s", "slant_range_cell1_m", "v_eff_m_s")
-_LINE_AUX = ("agc_db", "line_number")
+_AUX = ("agc_db", "line_number", "pilot")
 
 
 def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording:
@@ -49,28 +47,8 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Rec
         near_range_m=float(arrays["slant_range_cell1_m"]) + (int(arrays.get("first_cell", 1)) - 1) * c / (2 * fs),
         wave_speed_m_s=c,
     )
-    aux = {name: torch.from_numpy(np.asarray(arrays[name])) for name in (*_LINE_AUX, "pilot") if name in arrays}
-    return recording_from_arrays(_complex(arrays["iq"], path), radar, dtype=dtype, what=str(path), **aux)
-
-
-def recording_from_arrays(data: np.ndarray | Tensor, radar: StripmapRadar, *, dtype: torch.dtype = torch.complex64, start_s: float = 0.0, what: str = "data", **aux: np.ndarray | Tensor) -> Recording:
-    """A Recording from a user's own complex raw matrix (..., line, sample), range last, and side data by name.
-
-    `agc_db` (..., line) is undone here: each line is multiplied by 10**(agc_db/20). `line_number` (..., line) must have one number a
-    line. Raises ValueError where shapes disagree or samples are not finite.
-    """
-    x = torch.as_tensor(data)
-    if not x.is_complex() or x.ndim < 2:
-        raise ValueError(f"{what}: expected complex samples (..., line, sample), got {x.dtype} of shape {tuple(x.shape)}")
-    refuse_non_finite(x, what)
-    side: Mapping[str, Tensor] = {name: torch.as_tensor(value) for name, value in aux.items()}
-    for name in _LINE_AUX:
-        if name in side and side[name].shape[-1] != x.shape[-2]:
-            raise ValueError(f"{what}: {name} has {side[name].shape[-1]} entries for {x.shape[-2]} lines")
-    x = x.to(dtype)
-    if "agc_db" in side:
-        x = x * (10 ** (side["agc_db"].to(torch.float64) / 20)).to(x.real.dtype)[..., None]
-    return Recording(Signal(x, radar.raw_axes(x.shape[-2], x.shape[-1], start_s)), radar, side)
+    aux = {name: torch.from_numpy(np.asarray(arrays[name])) for name in _AUX if name in arrays}
+    return Recording.from_arrays(_complex(arrays["iq"], path), radar, dtype=dtype, what=str(path), **aux)
 
 
 def _complex(iq: np.ndarray, path: Path) -> np.ndarray:

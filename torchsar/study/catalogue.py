@@ -121,33 +121,21 @@ def sentence(error: ValidationError, model: type[BaseModel], file: str, where: s
 
 
 def _descend(model: type[BaseModel], path: list[str]) -> tuple[list[str], type[BaseModel] | None]:
-    """The real keys of a pydantic location (union tags dropped), and the section that holds the last of them."""
+    """The real keys of a pydantic location (union tags dropped), and the section in which the last of them was looked up."""
     names: list[str] = []
-    section: type[BaseModel] | None = model
-    for i, part in enumerate(path):
-        if section is not None and part in section.model_fields:
+    section, hint = None, model
+    for part in path:
+        hint = _without_none(hint)
+        if inspect.isclass(hint) and issubclass(hint, BaseModel):
             names.append(part)
-            hint = section.model_fields[part].annotation
-            nested = _sections(hint)
-            if i < len(path) - 1:
-                section = nested[0] if len(nested) == 1 and not _is_mapping(hint) else section if not nested else None
-                inside = nested[0] if len(nested) == 1 else None
-                if section is None and inside is not None and i + 2 < len(path):
-                    rest, last = _descend(inside, path[i + 2 :])
-                    return [*names, path[i + 1], *rest], last
-                if section is None:
-                    return [*names, path[i + 1]], inside
-        elif i == len(path) - 1 or part.isdigit():
-            if not (section is None and part in ("int", "float", "str", "bool")) and not part.startswith(("list[", "function", "constrained")) and part not in ("float", "int", "str", "bool", "none"):
-                names.append(part)
+            section, hint = hint, hint.model_fields[part].annotation if part in hint.model_fields else None
+        elif typing.get_origin(hint) in (dict, list):
+            names.append(part)
+            hint = typing.get_args(hint)[-1]
     return names, section
 
 
-def _sections(hint: Any) -> list[type[BaseModel]]:
-    if inspect.isclass(hint) and issubclass(hint, BaseModel):
-        return [hint]
-    return [section for arg in typing.get_args(hint) for section in _sections(arg)]
-
-
-def _is_mapping(hint: Any) -> bool:
-    return typing.get_origin(hint) in (dict, Mapping) or any(_is_mapping(arg) for arg in typing.get_args(hint))
+def _without_none(hint: Any) -> Any:
+    """X for X | None; unions of several types stay, since their members are scalars here."""
+    arms = [arm for arm in typing.get_args(hint) if arm is not type(None)] if typing.get_origin(hint) in (typing.Union, types.UnionType) else []
+    return arms[0] if len(arms) == 1 else hint

@@ -1,0 +1,102 @@
+"""Levels, geometries and sizes at the edge of what numbers can hold."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from tests.helpers import kondor_radar, small_radar, small_recording
+from torchsar.core import Draws, Signal
+from torchsar.echo import simulate
+from torchsar.focus import OmegaK, RangeCompress, StoredOmegaK
+from torchsar.metrics import entropy, error_db, impulse_response
+from torchsar.radar import LinearFM, StripmapRadar
+from torchsar.scene import AlwaysLit, Points, StripmapWorld
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-20, 1e15, 1e30])
+def test_levels_pass_linearly_in_single_precision(scale):
+    recording, _ = small_recording()
+    stage = OmegaK(small_radar(), "flat")
+    image = stage(recording.signal).data
+    scaled = stage(recording.signal.with_data(recording.signal.data * scale)).data
+    torch.testing.assert_close(scaled / scale, image, rtol=1e-3, atol=1e-4 * float(image.abs().max()))
+    torch.testing.assert_close(entropy(scaled), entropy(image), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("near_range_m", "velocity_m_s", "prf_hz"),
+    [
+        (10.0, 1.0, 100.0),  # a rail in a laboratory
+        (4e3, 120.0, 400.0),  # a light aircraft
+        (700e3, 7000.0, 4000.0),  # low orbit
+        (4e7, 3000.0, 400.0),  # geosynchronous height
+    ],
+)
+def test_ranges_from_a_laboratory_to_geosynchronous_height(near_range_m, velocity_m_s, prf_hz):
+    radar = small_radar(near_range_m=near_range_m, velocity_m_s=velocity_m_s, prf_hz=prf_hz)
+    world = StripmapWorld(Points([0.0], [0.0]), AlwaysLit())
+    double, truth = simulate(radar, world, 96, 96, Draws(0), dtype=torch.complex128)
+    single, _ = simulate(radar, world, 96, 96, Draws(0))
+    focus = OmegaK(radar, "flat")
+    image = focus(double.signal)
+    assert float(error_db(focus(single.signal), image)) < -60
+    azimuth, range_m = radar.image_position(truth.values["zero_doppler_s"], truth.values["closest_range_m"], 0.0, velocity_m_s)
+    found = impulse_response(image, (azimuth, range_m))
+    assert float((found["position_range_m"] - range_m).abs()) < 0.05 * radar.range_step_m
+    assert float((found["position_azimuth_m"] - azimuth).abs()) < 0.05 * velocity_m_s / prf_hz
+
+
+@pytest.mark.parametrize("squint_deg", [-60.0, -20.0, 5.0, 45.0])
+def test_large_squints(squint_deg):
+    radar = small_radar(prf_hz=800.0, pointing_doppler_hz=None)
+    sin = torch.sin(torch.deg2rad(torch.tensor(squint_deg, dtype=torch.float64)))
+    doppler = float(2 * radar.velocity_m_s * sin / radar.wavelength_m)
+    recording, truth = simulate(radar, StripmapWorld(Points([0.0], [0.0]), AlwaysLit(), doppler_hz=doppler), 128, 160, Draws(0), dtype=torch.complex128)
+    image = OmegaK(radar, "flat", doppler_hz=doppler)(recording.signal)
+    azimuth, range_m = radar.image_position(truth.values["zero_doppler_s"], truth.values["closest_range_m"], doppler, radar.velocity_m_s)
+    found = impulse_response(image, (azimuth, range_m))
+    assert float((found["position_range_m"] - range_m).abs()) < 0.1 * radar.range_step_m
+    assert float((found["position_azimuth_m"] - azimuth).abs()) < 0.1 * radar.velocity_m_s / radar.prf_hz
+    assert float(found["irw_range_m"]) == pytest.approx(radar.range_resolution_m, rel=0.05)
+
+
+@pytest.mark.parametrize("shape", [(1, 40), (2, 27), (31, 26), (7, 101)])
+def test_odd_and_tiny_matrices(shape):
+    radar = small_radar()
+    x = torch.randn(*shape, dtype=torch.complex128)
+    signal = Signal(x, radar.raw_axes(*shape))
+    image = OmegaK(radar)(signal).data
+    assert image.shape == x.shape and torch.isfinite(torch.view_as_real(image)).all()
+    torch.testing.assert_close(StoredOmegaK(OmegaK(radar), signal.axes, torch.complex128)(signal).data, image)
+
+
+def test_lines_shorter_than_the_pulse_are_refused():
+    radar = small_radar()
+    signal = Signal(torch.zeros(4, 10, dtype=torch.complex64), radar.raw_axes(4, 10))
+    with pytest.raises(ValueError, match="a line of 10 samples does not hold the pulse of 25"):
+        RangeCompress(radar)(signal)
+
+
+def test_focusing_is_unitary_up_to_the_range_filter():
+    # energy in the pulse band is kept, whatever the geometry: nothing grows, nothing vanishes
+    radar = kondor_radar(pulse=LinearFM(250e6, 0.2e-6))
+    x = torch.randn(64, 128, dtype=torch.complex128)
+    image = OmegaK(radar, None)(Signal(x, radar.raw_axes(64, 128))).data
+    torch.testing.assert_close(image.abs().square().sum(), x.abs().square().sum())
+
+
+def test_nonsense_instruments_are_refused():
+    with pytest.raises(ValueError, match=r"radar\.prf_hz must be a positive number, got nan"):
+        small_radar(prf_hz=float("nan"))
+    with pytest.raises(ValueError, match="exceeds the complex sampling rate"):
+        StripmapRadar(3e9, LinearFM(100e6, 1e-6), 50e6, 100.0, 100.0, 1000.0)
+    with pytest.raises(ValueError, match="direction"):
+        LinearFM(1e6, 1e-6, 0)
+
+
+def test_zero_image_has_finite_impulse_figures():
+    radar = small_radar()
+    zero = Signal(torch.zeros(64, 64, dtype=torch.complex64), radar.image_axes(radar.raw_axes(64, 64)))
+    found = impulse_response(zero, (5.0, 4050.0))
+    assert all(torch.isfinite(torch.view_as_real(v) if v.is_complex() else v).all() for v in found.values())

@@ -1,0 +1,85 @@
+"""Reading recordings, and clear refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from tests.helpers import small_radar
+from torchsar.core import Recording
+from torchsar.io import read_stripmap
+
+
+def archive(tmp_path, **changes):
+    rng = np.random.default_rng(0)
+    values = {
+        "iq": rng.integers(-7, 8, (6, 80, 2)).astype(np.int8),
+        "fs_hz": 50e6,
+        "prf_hz": 400.0,
+        "f0_hz": 5.3e9,
+        "chirp_rate_hz_s": -0.72e12,
+        "pulse_s": 1e-6,
+        "slant_range_cell1_m": 9000.0,
+        "first_cell": 11,
+        "v_eff_m_s": 7000.0,
+        "agc_db": np.array([0, 20, 0, 0, 0, 0], np.uint8),
+        "c_m_s": 2.9979e8,
+        "doppler_ambiguity": -6,
+    }
+    values.update(changes)
+    path = tmp_path / "raw.npz"
+    np.savez(path, **{k: v for k, v in values.items() if v is not None})
+    return path, values
+
+
+def test_axes_chirp_and_gain_come_from_the_file(tmp_path):
+    path, values = archive(tmp_path)
+    recording = read_stripmap(path)
+    assert recording.signal.names == ("pulse", "range") and recording.signal.data.dtype == torch.complex64
+    assert recording.signal.axis("range").start == pytest.approx(9000 + 10 * 2.9979e8 / 100e6)
+    assert recording.radar.pulse.direction == -1 and recording.radar.pulse.bandwidth_hz == pytest.approx(0.72e6)
+    assert recording.radar.pointing_doppler_hz is None  # the ambiguity in the file is not believed
+    sample = values["iq"][1, 3]
+    assert complex(recording.signal.data[1, 3]) == pytest.approx(10 * complex(sample[0], sample[1]))
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"prf_hz": None}, r"lacks \['prf_hz'\]"),
+        ({"iq": np.zeros((4, 5))}, r"iq must be complex \(line, sample\) or \(line, sample, 2\)"),
+        ({"agc_db": np.zeros(3)}, "agc_db has 3 entries for 6 lines"),
+        ({"iq": np.full((6, 80, 2), np.nan, np.float32)}, "480 of 480 samples are NaN or Inf"),
+        ({"prf_hz": -1.0}, "prf_hz must be a positive number"),
+        ({"iq": np.array([None], dtype=object)}, "not a numpy archive without pickles"),
+    ],
+)
+def test_bad_files_are_refused_with_one_sentence(tmp_path, changes, match):
+    path, _ = archive(tmp_path, **changes)
+    with pytest.raises(ValueError, match=match):
+        read_stripmap(path)
+
+
+def test_missing_and_foreign_files(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"absent\.npz does not exist"):
+        read_stripmap(tmp_path / "absent.npz")
+    (tmp_path / "text.npz").write_text("not an archive")
+    with pytest.raises(ValueError, match="text.npz is not a numpy archive"):
+        read_stripmap(tmp_path / "text.npz")
+
+
+def test_own_arrays_in_batches():
+    data = torch.randn(3, 6, 80, dtype=torch.complex128)
+    recording = Recording.from_arrays(data, small_radar(), dtype=torch.complex128, agc_db=torch.zeros(3, 6), line_number=torch.arange(6).expand(3, 6))
+    assert recording.signal.trials == (3,)
+    assert torch.equal(recording.signal.data, data)
+    with pytest.raises(ValueError, match="expected complex samples"):
+        Recording.from_arrays(data.real, small_radar())
+
+
+def test_recorded_blocks_read(recorded):
+    recording = read_stripmap(recorded("radarsat1_english_bay.npz"))
+    assert recording.signal.data.shape == (1424, 2848)
+    assert recording.radar.pulse.direction == -1
+    assert recording.radar.pulse_samples == 1349

@@ -1,0 +1,123 @@
+"""A small group of range lines cut out of a recording, focused by itself, quickly and as often as an estimator likes.
+
+The group may lie elsewhere in every trial, so its reference range is a per-trial tensor. Focusing is the bulk + refocus omega-K of the
+chain (`torchsar.focus.omega_k`) referred to the middle of the group, in the frame of the Doppler centroid.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchsar.focus.omega_k import FrameGeometry, FrequencyBasis, bulk_filter, refocus, refocus_turns_per_sample
+from torchsar.focus.reference import range_compress
+from torchsar.radar import StripmapRadar
+
+
+def aperture_s(radar: StripmapRadar, n_range: int) -> float:
+    """Time a target stays in the recorded band: the nominal dwell, or the time to sweep one PRF where none is known."""
+    middle = radar.near_range_m + n_range / 2 * radar.range_step_m
+    return radar.prf_hz / float(radar.azimuth_rate_hz_s(middle)) if radar.integration_s is None else radar.integration_s
+
+
+def central_lines(raw: Tensor, most: int) -> Tensor:
+    """At most `most` lines about the middle of the record, (..., pulse, range)."""
+    first = max(0, (raw.shape[-2] - most) // 2)
+    return raw[..., first : first + most, :]
+
+
+def full_columns(n_range: int, pulse_samples: int) -> int:
+    """Columns of a compressed line that hold the whole pulse; all of them where the line is hardly longer than the pulse."""
+    return n_range - pulse_samples if n_range > pulse_samples + 64 else n_range
+
+
+def compress(raw: Tensor, radar: StripmapRadar, spectrum: Tensor | None) -> Tensor:
+    """Range-compressed lines, only the fully compressed columns. spectrum: range reference, None for compressed data."""
+    if spectrum is None:
+        return raw
+    return range_compress(raw, spectrum)[..., : full_columns(raw.shape[-1], radar.pulse_samples)]
+
+
+@dataclass(frozen=True)
+class RangeGroup:
+    """Compressed lines (..., pulse, width) whose column 0 is column `start` (...,) of the recording."""
+
+    data: Tensor
+    start: Tensor
+    radar: StripmapRadar
+
+    @property
+    def middle_m(self) -> Tensor:
+        """Slant range of column width // 2, (...,) float64."""
+        return self.radar.near_range_m + (self.start + self.data.shape[-1] // 2).to(torch.float64) * self.radar.range_step_m
+
+    def spectrum(self) -> Tensor:
+        """Two-dimensional FFT, computed once for many focusings."""
+        return torch.fft.fft2(self.data)
+
+
+def pick_group(lines: Tensor, radar: StripmapRadar, width: int) -> RangeGroup:
+    """The group of `width` columns with the most signal above the background, nearest to mid-swath where several are alike.
+
+    A column counts with its energy over the median column, at most threefold, so that one ship cannot outweigh a hundred good columns.
+    """
+    count = lines.shape[-1]
+    width = min(width, count)
+    energy = (lines.detach().real.square() + lines.detach().imag.square()).sum(-2).to(torch.float64)
+    floor = energy.median(-1, keepdim=True).values
+    excess = (energy / torch.where(floor > 0, floor, 1) - 1).clamp(0, 3)
+    sums = torch.nn.functional.pad(excess.cumsum(-1), (1, 0))
+    signal = sums[..., width:] - sums[..., : count - width + 1]
+    place = torch.arange(count - width + 1, dtype=torch.float64, device=lines.device)
+    nearness = 1 - (2 * place / max(1, count - width) - 1).square()
+    start = (signal / width + 0.3 * nearness).argmax(-1)
+    columns = start[..., None] + torch.arange(width, device=lines.device)
+    return RangeGroup(lines.gather(-1, columns[..., None, :].expand(*lines.shape[:-1], width)), start, radar)
+
+
+def group_rows(spectrum: Tensor, group: RangeGroup, doppler_hz: Tensor, velocity_m_s: Tensor | float) -> tuple[Tensor, Tensor]:
+    """Range-Doppler rows of the focused group, (..., pulse, width) in FFT order, and their absolute Doppler (..., pulse)."""
+    at = FrameGeometry.of(group.radar, spectrum, doppler_hz, velocity_m_s, doppler_hz)
+    middle = group.middle_m[..., None, None]
+    rows = spectrum * bulk_filter(FrequencyBasis(group.radar, spectrum.shape[-1], spectrum.device), at, middle, None, spectrum.dtype)
+    return refocus(torch.fft.ifft(rows), refocus_turns_per_sample(at), spectrum.shape[-1] // 2), at.doppler_hz
+
+
+def focus_group(spectrum: Tensor, group: RangeGroup, doppler_hz: Tensor, velocity_m_s: Tensor | float) -> Tensor:
+    """Image of the group, (..., azimuth, width). Differentiable in the velocity."""
+    return torch.fft.ifft(group_rows(spectrum, group, doppler_hz, velocity_m_s)[0], dim=-2)
+
+
+def inside_columns(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) -> Tensor:
+    """1 for the columns whose targets stay inside the group for the whole aperture, else 0, (..., width); at least the middle half."""
+    width = group.data.shape[-1]
+    half_walk = 0.25 * group.radar.wavelength_m * doppler_hz.abs() * dwell_s / group.radar.range_step_m
+    reach = (width / 2 - half_walk - 2).clamp_min(width / 4)
+    place = torch.arange(width, dtype=torch.float64, device=group.data.device) - (width - 1) / 2
+    return (place.abs() <= reach[..., None]).to(torch.float64)
+
+
+def column_entropy(image: Tensor) -> Tensor:
+    """Entropy of each range line by itself, (..., azimuth, range) -> (..., range), nats. A bright line counts no more than any other.
+
+    Differentiable; 0 for an empty line.
+    """
+    power = image.real.square() + image.imag.square()
+    total = power.sum(-2, keepdim=True)
+    tiny = torch.finfo(power.dtype).tiny
+    p = power / total.clamp_min(tiny * 1e3)
+    return -(p * torch.log(p.clamp_min(tiny))).sum(-2).to(torch.float64)
+
+
+def student_log_likelihood(t: Tensor, degrees: int) -> Tensor:
+    """Logarithm of Student's density at t without its constant: how well a deviation of t predicted ones is explained, outliers included."""
+    return -0.5 * (degrees + 1) * torch.log1p(t.square() / degrees)
+
+
+def jackknife_std(left_out: Tensor) -> Tensor:
+    """Standard deviation from leave-one-out values, (..., block) -> (...,)."""
+    n = left_out.shape[-1]
+    return math.sqrt((n - 1) / n) * torch.linalg.vector_norm(left_out - left_out.mean(-1, keepdim=True), dim=-1)

@@ -1,0 +1,86 @@
+"""Minimising a function of one number per trial, all trials at once, each with its own end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from torchsar.core import take
+
+Cost = Callable[[Tensor], Tensor]
+
+
+def grid_minimum(cost: Cost, centre: Tensor, reach: float, count: int) -> tuple[Tensor, Tensor]:
+    """The best of `count` equally spaced points of centre +- reach, per trial. cost: (...,) -> (...,). Returns it and all costs (..., count)."""
+    if count < 3:
+        raise ValueError(f"a grid search needs at least 3 points, got {count}")
+    offsets = torch.linspace(-reach, reach, count, dtype=centre.dtype, device=centre.device)
+    with torch.no_grad():
+        costs = torch.stack([cost(centre + offset) for offset in offsets], -1)
+    return centre + take(offsets.expand(costs.shape), costs.argmin(-1)), costs
+
+
+def parabola_minimum(cost: Cost, start: Tensor, step: float, tolerance: float, rounds: int = 12) -> tuple[Tensor, Tensor]:
+    """Successive parabolas about the best point so far; the step shrinks to a quarter when the vertex lies inside it.
+
+    start, result: (...,). step: first half-width, tolerance: a trial stops when its step is below it. Returns the minimiser and the
+    second derivative there. Needs no gradient, two evaluations a round.
+    """
+    with torch.no_grad():
+        x, half, best = start, torch.full_like(start, step), cost(start)
+        curvature = torch.zeros_like(start)
+        active = torch.ones_like(start, dtype=torch.bool)
+        for _ in range(rounds):
+            low, high = cost(x - half), cost(x + half)
+            bend = low - 2 * best + high
+            vertex = torch.where(bend > 0, 0.5 * (low - high) / torch.where(bend > 0, bend, 1), torch.sign(low - high)).clamp(-1, 1)
+            curvature = torch.where(active & (bend > 0), bend / half.square(), curvature)
+            moved = torch.where(active, x + vertex * half, x)
+            value = cost(moved)
+            inside = vertex.abs() < 0.99
+            x, best = torch.where(active, moved, x), torch.where(active, value, best)
+            half = torch.where(active & inside, half / 4, half)
+            active = active & (half > tolerance)
+            if not bool(active.any()):
+                break
+    return x, curvature
+
+
+def gradient_minimum(cost: Cost, start: Tensor, step: float, tolerance: float, rounds: int = 12) -> tuple[Tensor, Tensor]:
+    """Root of the derivative by secants kept inside a bracket start +- step, with autograd; a trial stops when its bracket or move is below tolerance.
+
+    start, result: (...,). Returns the minimiser and the second derivative from the last two slopes. cost must be differentiable. Where
+    the slopes at the ends do not bracket a minimum the trial walks downhill by its step.
+    """
+    left, right = start - step, start + step
+    slope_left, slope_right = _slope(cost, left), _slope(cost, right)
+    x, last, slope_last = start, left, slope_left
+    curvature = torch.zeros_like(start)
+    active = torch.ones_like(start, dtype=torch.bool)
+    for _ in range(rounds):
+        slope = _slope(cost, x)
+        move = x - last
+        curvature = torch.where(active & (move != 0), (slope - slope_last) / torch.where(move != 0, move, 1), curvature)
+        left, slope_left = torch.where(slope < 0, x, left), torch.where(slope < 0, slope, slope_left)
+        right, slope_right = torch.where(slope < 0, right, x), torch.where(slope < 0, slope_right, slope)
+        newton = x - slope / torch.where(curvature > 0, curvature, 1)
+        usable = (curvature > 0) & (newton > left) & (newton < right)
+        next_x = torch.where(usable, newton, 0.5 * (left + right))
+        # no sign change at the ends: the minimum lies outside, shift the bracket
+        next_x = torch.where(slope_right < 0, right + step, torch.where(slope_left > 0, left - step, next_x))
+        left, right = torch.minimum(left, next_x), torch.maximum(right, next_x)
+        last, slope_last = torch.where(active, x, last), torch.where(active, slope, slope_last)
+        moved = torch.where(active, next_x, x)
+        active = active & ((moved - x).abs() > tolerance)
+        x = moved
+        if not bool(active.any()):
+            break
+    return x, curvature.clamp_min(0)
+
+
+def _slope(cost: Cost, x: Tensor) -> Tensor:
+    with torch.enable_grad():
+        x = x.detach().requires_grad_(True)
+        return torch.autograd.grad(cost(x).sum(), x)[0]

@@ -1,0 +1,192 @@
+"""The sections of a config, read and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError, model_validator
+
+from torchsar.study.catalogue import Strict, sentence
+from torchsar.study.errors import ConfigError, did_you_mean
+from torchsar.study.text import dump, find_config, override, read_tree
+
+RESERVED = ("truth", "estimate")
+
+
+class Pulse(Strict):
+    """Linear frequency-modulated pulse."""
+
+    bandwidth_hz: float = Field(gt=0)
+    duration_s: float = Field(gt=0)
+    direction: Literal[1, -1] = 1
+
+
+class Radar(Strict):
+    """What the instrument knows about itself; see torchsar.radar.StripmapRadar."""
+
+    carrier_hz: float = Field(gt=0)
+    pulse: Pulse
+    sampling_hz: float = Field(gt=0)
+    prf_hz: float = Field(gt=0)
+    velocity_m_s: float = Field(gt=0)
+    near_range_m: float = Field(gt=0)
+    pointing_doppler_hz: float | None = None
+    integration_s: float | None = Field(default=None, gt=0)
+
+
+class Noise(Strict):
+    """Receiver noise."""
+
+    snr_db: float | None = None
+
+
+class World(Strict):
+    """What is true and no processor may see. scene, beam, path and damages name entries of the catalogues (`torchsar list`)."""
+
+    lines: int = Field(gt=1)
+    samples: int = Field(gt=1)
+    scene: dict[str, dict[str, Any]] = Field(min_length=1)
+    beam: dict[str, Any] = {"kind": "always_lit"}
+    path: dict[str, Any] = {"kind": "hyperbola"}
+    velocity_m_s: float | None = Field(default=None, gt=0)
+    doppler_hz: float | None = None
+    noise: Noise = Noise()
+    damages: dict[str, dict[str, Any]] = {}
+
+
+class Data(Strict):
+    """Recorded data instead of a simulated world; damages are put into the recording."""
+
+    file: str | None = None
+    damages: dict[str, dict[str, Any]] = {}
+
+
+class Rerun(Strict):
+    """A part of another method's chain, run again on what entered it, with values held fixed."""
+
+    method: str
+    start: str
+    given: dict[str, float]
+
+
+class Method(Strict):
+    """One chain: a title for the report, the input (damaged, or the undamaged `clean`), and either stages by name or a rerun."""
+
+    title: str = ""
+    input: Literal["damaged", "clean"] = "damaged"
+    stages: dict[str, dict[str, Any]] | None = None
+    rerun: Rerun | None = None
+
+    @model_validator(mode="after")
+    def _one_of(self) -> Method:
+        if (self.stages is None) == (self.rerun is None):
+            raise ValueError("a method has either 'stages' (at least one) or 'rerun'")
+        if self.stages is not None and not self.stages:
+            raise ValueError("'stages' must name at least one stage")
+        return self
+
+
+class Margin(Strict):
+    """Lines and samples at the edges of the image that the metrics leave out."""
+
+    first_lines: int = Field(default=0, ge=0)
+    last_lines: int = Field(default=0, ge=0)
+    first_samples: int = Field(default=0, ge=0)
+    last_samples: int = Field(default=0, ge=0)
+
+
+class Metrics(Strict):
+    """How images are judged. margin: None leaves out lines without a full aperture and samples without a full pulse."""
+
+    margin: Margin | None = None
+    reference: str | None = None
+    sidelobe_nulls: int = Field(default=10, ge=1)
+    found_within_m: float = Field(default=10.0, gt=0)
+    found_above_db: float = -6.0
+    published: dict[str, float | str] = {}
+
+
+class Trade(Strict):
+    """What `torchsar trade` compares: focusers, precisions, jitter correctors."""
+
+    focusers: list[str] = ["range_doppler", "omega_k", "omega_k_stolt"]
+    precisions: list[Literal["complex64", "complex128"]] = ["complex64", "complex128"]
+    repeats: int = Field(default=3, ge=1)
+
+
+class Config(Strict):
+    """A whole experiment."""
+
+    title: str
+    seed: int = Field(default=1, ge=0)
+    precision: Literal["complex64", "complex128"] = "complex64"
+    radar: Radar | None = None
+    world: World | None = None
+    data: Data = Data()
+    processor: dict[str, Method] = Field(min_length=1)
+    metrics: Metrics = Metrics()
+    trade: Trade = Trade()
+
+    @model_validator(mode="after")
+    def _whole(self) -> Config:
+        if "recommended" not in self.processor:
+            raise ValueError("processor needs a method called 'recommended'")
+        for name in RESERVED:
+            if name in self.processor:
+                raise ValueError(f"processor.{name}: this name is taken by a group of the results; choose another")
+        if self.metrics.reference is not None and self.metrics.reference not in self.processor:
+            raise ValueError(f"metrics.reference names the method {self.metrics.reference!r}; there is {', '.join(self.processor)}")
+        return self
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A checked config, the file it came from and what the command line changed."""
+
+    config: Config
+    file: str
+    name: str
+
+    def text(self, tree: dict[str, Any] | None = None) -> str:
+        """The resolved config as YAML."""
+        return dump(self.config.model_dump() if tree is None else tree)
+
+
+def load(name: str, assignments: Sequence[str] = ()) -> Loaded:
+    """Read, override and check a config. Raises ConfigError: file, key, value, and what is accepted."""
+    path = find_config(name)
+    tree = override(read_tree(path), assignments)
+    file = str(path) + (f" with {' '.join(assignments)}" if assignments else "")
+    try:
+        config = Config.model_validate(tree)
+    except ValidationError as error:
+        raise ConfigError(sentence(error, Config, file)) from None
+    _check_source(config, file)
+    return Loaded(config, file, path.stem)
+
+
+def _check_source(config: Config, file: str) -> None:
+    if config.data.file is not None:
+        if not Path(config.data.file).is_file():
+            raise ConfigError(f"{file}: data.file: {config.data.file} does not exist; give the path of a raw stripmap .npz file")
+    elif config.world is None and config.radar is None:
+        raise ConfigError(f"{file}: data.file is not set; add data.file=PATH with the path of a raw stripmap .npz file")
+    elif config.world is None or config.radar is None:
+        missing = "world" if config.world is None else "radar"
+        raise ConfigError(f"{file}: section {missing!r} is missing; a simulation needs both 'radar' and 'world', recorded data needs data.file")
+
+
+def check_methods(config: Config, file: str) -> None:
+    """Reruns name an earlier method with stages, and a stage of it."""
+    earlier: dict[str, Method] = {}
+    for name, method in config.processor.items():
+        if method.rerun is not None:
+            of = earlier.get(method.rerun.method)
+            if of is None or of.stages is None:
+                raise ConfigError(f"{file}: processor.{name}.rerun.method names {method.rerun.method!r}, which is no earlier method with stages{did_you_mean(method.rerun.method, earlier)}")
+            if method.rerun.start not in of.stages:
+                raise ConfigError(f"{file}: processor.{name}.rerun.start names {method.rerun.start!r}, which is no stage of {method.rerun.method!r}{did_you_mean(method.rerun.start, of.stages)}")
+        earlier[name] = method

@@ -1,0 +1,92 @@
+"""Result folders that appear whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+import zarr
+from torch import Tensor
+
+from torchsar.core import Signal
+from torchsar.study.errors import ConfigError
+
+_PARTIAL = ".torchsar-partial"
+_RESULT = "config.yaml"
+
+
+@contextmanager
+def fresh_folder(out: Path) -> Iterator[Path]:
+    """A folder OUT.tmp to write into; it becomes OUT when the block ends well and is removed when it does not.
+
+    An earlier result at OUT is replaced only then. Anything else at OUT is refused with a ConfigError, before any work is done.
+    """
+    if out.exists() and not (out.is_dir() and ((out / _RESULT).is_file() or not any(out.iterdir()))):
+        raise ConfigError(f"--out {out} exists and is not a result of torchsar; choose another folder")
+    partial, old = out.with_name(out.name + ".tmp"), out.with_name(out.name + ".old")
+    if partial.exists() and not (partial / _PARTIAL).exists():
+        raise ConfigError(f"--out {out}: {partial} is in the way and was not left by torchsar; remove it or choose another folder")
+    try:
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        (partial / _PARTIAL).touch()
+    except OSError as error:
+        raise ConfigError(f"--out {out} cannot be written: {error.strerror}") from None
+    try:
+        yield partial
+        (partial / _PARTIAL).unlink()
+        if out.exists():
+            shutil.rmtree(old, ignore_errors=True)
+            out.rename(old)
+        partial.rename(out)
+        shutil.rmtree(old, ignore_errors=True)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def write_json(path: Path, tree: Mapping[str, Any]) -> None:
+    """Numbers that are not finite become null, so that every reader accepts the file."""
+    path.write_text(json.dumps(_finite(tree), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _finite(x: Any) -> Any:
+    if isinstance(x, Mapping):
+        return {str(k): _finite(v) for k, v in x.items()}
+    if isinstance(x, (list, tuple)):
+        return [_finite(v) for v in x]
+    if isinstance(x, Tensor):
+        return _finite(x.tolist())
+    return None if isinstance(x, float) and not math.isfinite(x) else x
+
+
+def write_arrays(path: Path, images: Mapping[str, Signal], truth: Mapping[str, Tensor], estimates: Mapping[str, Mapping[str, Tensor]]) -> None:
+    """arrays.zarr (version 3): one group per method with `image` and its axes; `truth`; `estimate/METHOD/STAGE.VALUE`."""
+    root = zarr.open_group(str(path), mode="w", zarr_format=3)
+    for name, signal in images.items():
+        group = root.create_group(name)
+        for axis in signal.axes:
+            _put(group, axis.name, axis.values(), (axis.name,), unit=axis.unit)
+        _put(group, "image", signal.data, tuple(axis.name for axis in signal.axes), unit="1")
+    if truth:
+        group = root.create_group("truth")
+        for name, value in truth.items():
+            _put(group, name, value)
+    if any(estimates.values()):
+        group = root.create_group("estimate")
+        for method, values in estimates.items():
+            inner = group.create_group(method)
+            for name, value in values.items():
+                _put(inner, name, value)
+
+
+def _put(group: zarr.Group, name: str, value: Tensor, dims: tuple[str, ...] | None = None, **attributes: str) -> None:
+    data = torch.as_tensor(value).detach().cpu().resolve_conj().numpy()
+    chunks = tuple(min(n, 1024) for n in data.shape)
+    array = group.create_array(name, shape=data.shape, dtype=data.dtype, chunks=chunks or "auto", dimension_names=dims, attributes=attributes)
+    array[...] = data

@@ -1,0 +1,41 @@
+"""Every name that a config may use: stages, scenes, beams, paths and damages.
+
+A user's own stage joins through the entry point group `torchsar.stages` (name = "package.module:Class"); a config has no other way to run code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from importlib.metadata import entry_points
+from typing import Any
+
+from torchsar.focus import OmegaK, RangeCompress
+from torchsar.scene import AlwaysLit, Antenna, Dwell, Hyperbola, Parabola, Points, RandomPoints, Speckle
+from torchsar.study.catalogue import Catalogue
+
+SCENES = Catalogue("scene", "kind", {"points": Points, "random_points": RandomPoints, "speckle": Speckle})
+BEAMS = Catalogue("beam", "kind", {"always_lit": AlwaysLit, "dwell": Dwell, "antenna": Antenna})
+PATHS = Catalogue("path", "kind", {"hyperbola": Hyperbola, "parabola": Parabola})
+DAMAGES = Catalogue("damage", "kind", {})
+
+REPAIR: dict[str, Callable[..., Any]] = {}
+COMPENSATE: dict[str, Callable[..., Any]] = {}
+FOCUS: dict[str, Callable[..., Any]] = {"range_compress": RangeCompress, "omega_k": OmegaK}
+GROUPS = {"repair": REPAIR, "compensate": COMPENSATE, "focus": FOCUS}
+
+
+@cache
+def stages() -> Catalogue:
+    """All stages, the user's own among them. A name taken twice is refused."""
+    entries = {name: target for group in GROUPS.values() for name, target in group.items()}
+    for point in entry_points(group="torchsar.stages"):
+        if point.name in entries:
+            raise ValueError(f"the entry point {point.value!r} takes the stage name {point.name!r}, which is in use; rename it")
+        entries[point.name] = point.load()
+    return Catalogue("stage", "stage", entries, given=("radar",))
+
+
+def group_of(name: str) -> str:
+    """repair, compensate, focus, or `own` for a user's stage."""
+    return next((group for group, members in GROUPS.items() if name in members), "own")
