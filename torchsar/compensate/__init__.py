@@ -1,1 +1,1 @@
-
+"""Estimators of motion and phase errors, and their correctors."""

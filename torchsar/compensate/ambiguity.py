@@ -22,10 +22,10 @@ from torchsar.compensate.group import (
     aperture_s,
     central_lines,
     column_entropy,
+    column_weights,
     compress,
     focus_group,
     group_rows,
-    inside_columns,
     jackknife_std,
     pick_group,
     student_log_likelihood,
@@ -118,12 +118,12 @@ def _phase_slope(products: Tensor, frequency_hz: Tensor) -> Tensor:
 
 def entropy_scores(group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turns: Tensor, dwell_s: float) -> Tensor:
     """Negative mean entropy of the range lines of a group focused with every candidate, (..., block, candidate); blocks of columns."""
-    spectrum = group.spectrum()
+    spectrum, weight = group.spectrum(), column_weights(group, doppler_hz, dwell_s)
     scores = []
     for k in turns.tolist():
         centroid = doppler_hz + k * group.radar.prf_hz
-        columns = column_entropy(focus_group(spectrum, group, centroid, velocity_m_s))
-        scores.append(torch.stack([-part.mean(-1) for part in columns.tensor_split(_BLOCKS, -1)], -1))
+        columns = column_entropy(focus_group(spectrum, group, centroid, velocity_m_s)) * weight
+        scores.append(torch.stack([-part.sum(-1) for part in columns.tensor_split(_BLOCKS, -1)], -1))
     return torch.stack(scores, -1)
 
 

@@ -59,21 +59,27 @@ class RangeGroup:
         return torch.fft.fft2(self.data)
 
 
-def pick_group(lines: Tensor, radar: StripmapRadar, width: int) -> RangeGroup:
-    """The group of `width` columns with the most signal above the background, nearest to mid-swath where several are alike.
+def column_signal(lines: Tensor) -> Tensor:
+    """Energy of each column above the background, in backgrounds, limited to 10: (..., pulse, range) -> (..., range) float64, never quite 0.
 
-    A column counts with its energy over the median column, at most threefold, so that one ship cannot outweigh a hundred good columns.
+    The background is the column at the lowest tenth; what four deviations of noise could be does not count. The limit keeps one ship
+    from outweighing a hundred good columns.
     """
+    energy = (lines.detach().real.square() + lines.detach().imag.square()).sum(-2).to(torch.float64)
+    floor = energy.kthvalue(max(1, energy.shape[-1] // 10), dim=-1, keepdim=True).values
+    excess = energy / torch.where(floor > 0, floor, 1) - 1 - 4 / math.sqrt(lines.shape[-2])
+    return excess.clamp(1e-3, 10)
+
+
+def pick_group(lines: Tensor, radar: StripmapRadar, width: int) -> RangeGroup:
+    """The group of `width` columns with the most signal above the background, nearer to mid-swath where several are alike."""
     count = lines.shape[-1]
     width = min(width, count)
-    energy = (lines.detach().real.square() + lines.detach().imag.square()).sum(-2).to(torch.float64)
-    floor = energy.median(-1, keepdim=True).values
-    excess = (energy / torch.where(floor > 0, floor, 1) - 1).clamp(0, 3)
-    sums = torch.nn.functional.pad(excess.cumsum(-1), (1, 0))
+    sums = torch.nn.functional.pad(column_signal(lines).cumsum(-1), (1, 0))
     signal = sums[..., width:] - sums[..., : count - width + 1]
     place = torch.arange(count - width + 1, dtype=torch.float64, device=lines.device)
-    nearness = 1 - (2 * place / max(1, count - width) - 1).square()
-    start = (signal / width + 0.3 * nearness).argmax(-1)
+    off = (2 * place / max(1, count - width) - 1).square()
+    start = (signal * (1 - 0.3 * off)).argmax(-1)
     columns = start[..., None] + torch.arange(width, device=lines.device)
     return RangeGroup(lines.gather(-1, columns[..., None, :].expand(*lines.shape[:-1], width)), start, radar)
 
@@ -91,13 +97,15 @@ def focus_group(spectrum: Tensor, group: RangeGroup, doppler_hz: Tensor, velocit
     return torch.fft.ifft(group_rows(spectrum, group, doppler_hz, velocity_m_s)[0], dim=-2)
 
 
-def inside_columns(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) -> Tensor:
-    """1 for the columns whose targets stay inside the group for the whole aperture, else 0, (..., width); at least the middle half."""
+def column_weights(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) -> Tensor:
+    """Weights of the range lines of a group in an objective, (..., width) with sum 1: their signal (`column_signal`), 0 where targets
+    would walk out of the group within the aperture; the middle half always counts."""
     width = group.data.shape[-1]
     half_walk = 0.25 * group.radar.wavelength_m * doppler_hz.abs() * dwell_s / group.radar.range_step_m
     reach = (width / 2 - half_walk - 2).clamp_min(width / 4)
     place = torch.arange(width, dtype=torch.float64, device=group.data.device) - (width - 1) / 2
-    return (place.abs() <= reach[..., None]).to(torch.float64)
+    weight = column_signal(group.data) * (place.abs() <= reach[..., None])
+    return weight / weight.sum(-1, keepdim=True)
 
 
 def column_entropy(image: Tensor) -> Tensor:

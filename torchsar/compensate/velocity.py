@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.doppler import unit_peak
-from torchsar.compensate.group import RangeGroup, aperture_s, central_lines, column_entropy, compress, focus_group, inside_columns, pick_group
+from torchsar.compensate.group import RangeGroup, aperture_s, central_lines, column_entropy, column_weights, compress, focus_group, pick_group
 from torchsar.core import Estimate, Signal, Stage, settle
 from torchsar.optim.scalar import gradient_minimum, grid_minimum, parabola_minimum
 from torchsar.radar import StripmapRadar
@@ -36,8 +36,7 @@ def velocity_objective(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) ->
     Differentiable in the velocity. Columns whose targets walk out of the group do not count.
     """
     spectrum = group.spectrum()
-    weight = inside_columns(group, doppler_hz, dwell_s)
-    weight = weight / weight.sum(-1, keepdim=True)
+    weight = column_weights(group, doppler_hz, dwell_s)
 
     def columns(velocity_m_s: Tensor) -> Tensor:
         return column_entropy(focus_group(spectrum, group, doppler_hz, velocity_m_s)) * weight

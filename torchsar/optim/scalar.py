@@ -25,8 +25,8 @@ def grid_minimum(cost: Cost, centre: Tensor, reach: float, count: int) -> tuple[
 def parabola_minimum(cost: Cost, start: Tensor, step: float, tolerance: float, rounds: int = 12) -> tuple[Tensor, Tensor]:
     """Successive parabolas about the best point so far; the step shrinks to a quarter when the vertex lies inside it.
 
-    start, result: (...,). step: first half-width, tolerance: a trial stops when its step is below it. Returns the minimiser and the
-    second derivative there. Needs no gradient, two evaluations a round.
+    start, result: (...,). step: first half-width, tolerance: a trial stops when its step is below it. Stays within start +- 2 steps. Returns the
+    minimiser and the second derivative there. Needs no gradient, two evaluations a round.
     """
     with torch.no_grad():
         x, half, best = start, torch.full_like(start, step), cost(start)
@@ -37,7 +37,7 @@ def parabola_minimum(cost: Cost, start: Tensor, step: float, tolerance: float, r
             bend = low - 2 * best + high
             vertex = torch.where(bend > 0, 0.5 * (low - high) / torch.where(bend > 0, bend, 1), torch.sign(low - high)).clamp(-1, 1)
             curvature = torch.where(active & (bend > 0), bend / half.square(), curvature)
-            moved = torch.where(active, x + vertex * half, x)
+            moved = torch.where(active, torch.clamp(x + vertex * half, start - 2 * step, start + 2 * step), x)
             value = cost(moved)
             inside = vertex.abs() < 0.99
             x, best = torch.where(active, moved, x), torch.where(active, value, best)
@@ -52,7 +52,7 @@ def gradient_minimum(cost: Cost, start: Tensor, step: float, tolerance: float, r
     """Root of the derivative by secants kept inside a bracket start +- step, with autograd; a trial stops when its bracket or move is below tolerance.
 
     start, result: (...,). Returns the minimiser and the second derivative from the last two slopes. cost must be differentiable. Where
-    the slopes at the ends do not bracket a minimum the trial walks downhill by its step.
+    the slopes at the ends do not bracket a minimum the trial walks downhill, at most one more step.
     """
     left, right = start - step, start + step
     slope_left, slope_right = _slope(cost, left), _slope(cost, right)
@@ -70,6 +70,7 @@ def gradient_minimum(cost: Cost, start: Tensor, step: float, tolerance: float, r
         next_x = torch.where(usable, newton, 0.5 * (left + right))
         # no sign change at the ends: the minimum lies outside, shift the bracket
         next_x = torch.where(slope_right < 0, right + step, torch.where(slope_left > 0, left - step, next_x))
+        next_x = torch.clamp(next_x, start - 2 * step, start + 2 * step)
         left, right = torch.minimum(left, next_x), torch.maximum(right, next_x)
         last, slope_last = torch.where(active, x, last), torch.where(active, slope, slope_last)
         moved = torch.where(active, next_x, x)

@@ -92,16 +92,21 @@ class Catalogue:
         target = self.entries[name]
         accepted = inspect.signature(target).parameters
         try:
-            return target(**{k: v for k, v in given.items() if k in accepted}, **_tensors(target, parameters))
+            return target(**{k: v for k, v in given.items() if k in accepted}, **_converted(target, parameters))
         except (ValueError, TypeError) as error:
             raise ConfigError(f"{file}: {where}: {' '.join(str(error).split())}") from None
 
 
-def _tensors(target: Callable[..., Any], parameters: dict[str, Any]) -> dict[str, Any]:
-    """Lists become float64 tensors where the signature asks for a tensor and for no sequence."""
+def _converted(target: Callable[..., Any], parameters: dict[str, Any]) -> dict[str, Any]:
+    """Lists become tuples, or float64 tensors where the signature asks for a tensor and for no sequence."""
     hints = typing.get_type_hints(target.__init__ if inspect.isclass(target) else target)
-    takes_tensor = {name for name, hint in hints.items() if torch.Tensor in (hint, *typing.get_args(hint)) and not any(typing.get_origin(a) in (list, tuple, Sequence) for a in typing.get_args(hint))}
-    return {k: torch.tensor(v, dtype=torch.float64) if isinstance(v, list) and k in takes_tensor else v for k, v in parameters.items()}
+
+    def convert(value: Any, hint: Any) -> Any:
+        arms = (hint, *typing.get_args(hint)) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
+        sequence = any(typing.get_origin(arm) in (list, tuple, Sequence) for arm in arms)
+        return torch.tensor(value, dtype=torch.float64) if torch.Tensor in arms and not sequence else tuple(value)
+
+    return {k: convert(v, hints.get(k)) if isinstance(v, list) else v for k, v in parameters.items()}
 
 
 def sentence(error: ValidationError, model: type[BaseModel], file: str, where: str = "") -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchsar import plot
 from torchsar.core import Signal, Truth
-from torchsar.metrics.impulse import impulse_cuts
+from torchsar.study.cuts import impulse_cuts
 from torchsar.radar import StripmapRadar
 from torchsar.study.build import Case
 from torchsar.study.config import Config
@@ -192,12 +192,12 @@ def _repair_stages(scene: Scene) -> Iterator[tuple[str, Signal, Signal]]:
             yield name, before, after
 
 
-def range_spectrum(signal: Signal) -> tuple[Tensor, Tensor]:
-    """Range frequency (MHz) and mean power spectrum of all lines."""
+def range_spectrum(signal: Signal) -> Tensor:
+    """Power spectrum summed over all lines, centred, (range,)."""
     power = torch.zeros(signal.axes[-1].n, dtype=torch.float64)
     for block in signal.data.split(256):
         power += torch.fft.fft(block).abs().square().sum(0).double().cpu()
-    return torch.fft.fftshift(power), power
+    return torch.fft.fftshift(power)
 
 
 def _frequency_mhz(scene: Scene, n: int) -> np.ndarray:
@@ -205,8 +205,7 @@ def _frequency_mhz(scene: Scene, n: int) -> np.ndarray:
 
 
 def _mean_spectrum_db(signal: Signal, reference: float | None = None) -> tuple[np.ndarray, float]:
-    shifted, _ = range_spectrum(signal)
-    power = plot.array(shifted)
+    power = plot.array(range_spectrum(signal))
     top = reference or float(power.max()) or 1.0
     return 10 * np.log10(np.maximum(power / top, 1e-12)), top
 
@@ -277,6 +276,3 @@ def _velocity(scene: Scene) -> Drawn:
             value = float(estimate.value["velocity_m_s"])
             caption = "Entropy of a small group of range lines over effective velocity; the dashed line is the refined minimum."
             yield f"{name}_entropy", "Effective velocity by minimum entropy", caption, plot.curves({"entropy": (grid, cost)}, "effective velocity (m/s)", "entropy (nats)", f"{value:.2f} m/s", {"estimate": value})
-
-
-Maker = Callable[[Scene], Drawn]

@@ -1,0 +1,97 @@
+"""The command `torchsar`."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+EXIT_BAD_INPUT = 2
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    top = argparse.ArgumentParser(prog="torchsar", description="Synthetic aperture radar experiments from a config.")
+    top.add_argument("--threads", type=int, metavar="N", help="threads of torch (default: all cores)")
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, text in (
+        ("run", "run an experiment and write its images, figures and report"),
+        ("requires", "what the scene of a config requires of its models"),
+        ("trade", "speed against accuracy of the alternatives, beside the exact yardstick"),
+    ):
+        one = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        one.add_argument("config", help="a YAML file, or the name of a packaged config (see `torchsar list`)")
+        one.add_argument("overrides", nargs="*", metavar="key=value", help="overrides with dotted keys, such as world.noise.snr_db=10")
+        one.add_argument("--out", type=Path, metavar="DIR", help="result folder" + (" (default: out/<config name>)" if name == "run" else ""))
+    commands.add_parser("list", help="experiments, stages and data keys")
+    return top
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command. Returns 0, or 2 after one sentence on stderr for bad input, or 130 when interrupted."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    options = parser().parse_args(given)
+    try:
+        from torchsar.study.errors import ConfigError
+    except ImportError as error:
+        return _fail(f"{error}; install the extra: pip install 'torchsar-lab[study]'")
+    try:
+        _log_to_stderr()
+        return _dispatch(options, "torchsar " + shlex.join(given))
+    except ImportError as error:
+        return _fail(f"{error.name or error} is not installed; install the extra: pip install 'torchsar-lab[study]'")
+    except ConfigError as error:
+        return _fail(str(error))
+    except KeyboardInterrupt:
+        print("torchsar: interrupted, nothing was written", file=sys.stderr)
+        return 130
+
+
+def _dispatch(options: argparse.Namespace, command: str) -> int:
+    from torchsar.study.config import load
+
+    if options.threads:
+        import torch
+
+        torch.set_num_threads(options.threads)
+    if options.command == "list":
+        from torchsar.study.listing import listing
+
+        print(listing())
+        return 0
+    loaded = load(options.config, options.overrides)
+    if options.command == "run":
+        from torchsar.study.run import run
+
+        print(run(loaded, options.out or Path("out") / loaded.name, command))
+    elif options.command == "requires":
+        from torchsar.study.requires import requires
+
+        print(requires(loaded, options.out))
+    else:
+        from torchsar.study.trade import trade
+
+        print(trade(loaded, options.out))
+    return 0
+
+
+def _fail(sentence: str) -> int:
+    print(f"torchsar: {' '.join(sentence.split())}", file=sys.stderr)
+    return EXIT_BAD_INPUT
+
+
+def _log_to_stderr() -> None:
+    log = logging.getLogger("torchsar")
+    if not log.handlers:
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("torchsar: %(message)s"))
+        log.addHandler(handler)
+    log.setLevel(os.environ.get("TORCHSAR_LOG", "INFO").upper())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,68 @@
+"""`torchsar run`: one experiment, from config to report."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Chain
+from torchsar.study.build import Case, build_case, build_radar, resolved
+from torchsar.study.config import Loaded
+from torchsar.study.figures import Scene, draw_all
+from torchsar.study.folder import fresh_folder, write_arrays, write_json
+from torchsar.study.judge import metrics_tree, window
+from torchsar.study.methods import Result, build_chains, run_methods
+from torchsar.study.report import write_report
+
+log = logging.getLogger("torchsar")
+
+
+def run(loaded: Loaded, out: Path, command: str = "torchsar run") -> Path:
+    """Run every method of the config and write config.yaml, metrics.json, arrays.zarr, figures/ and report.html into OUT.
+
+    OUT appears whole or not at all. Returns the path of the report. Raises ConfigError for whatever the user can put right.
+    """
+    began = time.perf_counter()
+    with fresh_folder(out) as folder:
+        case, chains = prepare(loaded)
+        results = run_methods(loaded, case, chains)
+        metrics = metrics_tree(loaded.config, case, results)
+        config_text = loaded.text(resolved(loaded))
+        (folder / "config.yaml").write_text(config_text, encoding="utf-8")
+        write_json(folder / "metrics.json", metrics)
+        log.info("writing arrays")
+        write_arrays(folder / "arrays.zarr", {name: r.image for name, r in results.items()}, _truth_arrays(case), _estimate_arrays(results))
+        log.info("drawing")
+        scene = Scene(loaded.config, case, results, window(results["recommended"].image, case.recording.radar, loaded.config.metrics.margin))
+        pictures = draw_all(scene, folder / "figures")
+        write_report(folder / "report.html", loaded.config.title, metrics, pictures, folder / "figures", config_text, command)
+    log.info("finished in %.0f s", time.perf_counter() - began)
+    return out / "report.html"
+
+
+def prepare(loaded: Loaded) -> tuple[Case, dict[str, Chain]]:
+    """The case and all chains. Of a simulation the chains are checked first, since the echoes take long."""
+    if loaded.config.data.file is None:
+        build_chains(loaded, build_radar(loaded))
+        log.info("simulating %s", loaded.name)
+    else:
+        log.info("reading %s", loaded.config.data.file)
+    began = time.perf_counter()
+    case = build_case(loaded)
+    lines, samples = case.recording.signal.data.shape[-2:]
+    log.info("%d lines of %d samples: %.1f s", lines, samples, time.perf_counter() - began)
+    return case, build_chains(loaded, case.recording.radar)
+
+
+def _truth_arrays(case: Case) -> dict[str, Tensor]:
+    return {} if case.truth is None else {name: torch.as_tensor(value) for name, value in case.truth.values.items()}
+
+
+def _estimate_arrays(results: Mapping[str, Result]) -> dict[str, dict[str, Tensor]]:
+    """Values of all estimates by method, `stage.value`; those of methods without any are left out."""
+    return {name: {f"{stage}.{key}": value for stage, e in r.estimates.items() for key, value in e.value.items()} for name, r in results.items() if r.estimates}
