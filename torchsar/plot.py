@@ -82,8 +82,8 @@ def _show(axes: Axes, signal: Signal, dynamic_range_db: float, title: str, refer
     top = reference if reference is not None else float(np.percentile(amplitude, percentile)) or float(amplitude.max(initial=1.0))
     origin = (0.0, signal.axes[1].start if signal.axes[1].start > 1e4 else 0.0)
     shown = axes.imshow(decibel(amplitude, top), cmap="gray", vmin=-dynamic_range_db, vmax=0, origin="lower", aspect="auto", extent=_extent(view, origin), interpolation="nearest")
-    offset = f" - {origin[1]:,.0f} m" if origin[1] else ""
-    axes.set(xlabel=f"{signal.axes[1].name} {'(m)' if not offset else offset + ' (m)'}".replace("  ", " "), ylabel=f"{signal.axes[0].name} ({signal.axes[0].unit})", title=title)
+    beyond = f" beyond {origin[1]:,.0f} m" if origin[1] else ""
+    axes.set(xlabel=f"{signal.axes[1].name}{beyond} ({signal.axes[1].unit})", ylabel=f"{signal.axes[0].name} ({signal.axes[0].unit})", title=title)
     axes.grid(False)
     return shown
 

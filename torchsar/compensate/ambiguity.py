@@ -20,12 +20,11 @@ from torchsar.compensate.doppler import phase_increment, unit_peak, wrap_hz
 from torchsar.compensate.group import (
     RangeGroup,
     aperture_s,
+    beam_spectrum,
     central_lines,
     column_entropy,
     column_weights,
     compress,
-    focus_group,
-    group_rows,
     jackknife_std,
     pick_group,
     student_log_likelihood,
@@ -61,11 +60,9 @@ def look_scores(group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turn
     The group is focused with the baseband Doppler (...,) as if it were absolute; a true centroid k PRFs away displaces look l + 1
     against look l by dr. Blocks are ranges of image lines. Intensities are limited to 20 times the mean, so that one ship cannot rule.
     """
-    rows, doppler = group_rows(group.spectrum(), group, doppler_hz, velocity_m_s)
+    rows = beam_spectrum(group, doppler_hz).rows(doppler_hz, velocity_m_s)
     height = rows.shape[-2] // looks
-    order = doppler.argsort(-1)[..., : height * looks]
-    rows = rows.gather(-2, order[..., None].expand(*rows.shape[:-2], height * looks, rows.shape[-1]))
-    image = torch.fft.ifft(rows.unflatten(-2, (looks, height)), dim=-2)
+    image = torch.fft.ifft(rows[..., : height * looks, :].unflatten(-2, (looks, height)), dim=-2)
     intensity = image.real.square() + image.imag.square()
     mean = intensity.mean((-3, -2, -1), keepdim=True)
     intensity = (intensity / torch.where(mean > 0, mean, 1)).clamp_max(20)
@@ -118,11 +115,11 @@ def _phase_slope(products: Tensor, frequency_hz: Tensor) -> Tensor:
 
 def entropy_scores(group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turns: Tensor, dwell_s: float) -> Tensor:
     """Negative mean entropy of the range lines of a group focused with every candidate, (..., block, candidate); blocks of columns."""
-    spectrum, weight = group.spectrum(), column_weights(group, doppler_hz, dwell_s)
+    spectrum, weight = beam_spectrum(group, doppler_hz), column_weights(group.data, group.radar, doppler_hz, dwell_s)
     scores = []
     for k in turns.tolist():
-        centroid = doppler_hz + k * group.radar.prf_hz
-        columns = column_entropy(focus_group(spectrum, group, centroid, velocity_m_s)) * weight
+        shift = k * group.radar.prf_hz
+        columns = column_entropy(spectrum.moved(shift).image(doppler_hz + shift, velocity_m_s)) * weight
         scores.append(torch.stack([-part.sum(-1) for part in columns.tensor_split(_BLOCKS, -1)], -1))
     return torch.stack(scores, -1)
 

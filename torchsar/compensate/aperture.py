@@ -13,8 +13,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchsar.compensate.doppler import increment_std_rad, lag_products, unit_peak, wrap_hz
-from torchsar.compensate.group import RangeGroup, compress, focus_group, full_columns
+from torchsar.compensate.doppler import lag_products, unit_peak, wrap_hz
+from torchsar.compensate.group import RangeGroup, compress, full_columns, full_spectrum
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
 
@@ -46,8 +46,9 @@ def _refined(raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwell: int, 
     parts = [_tiles(block, radar_part, doppler_hz, reference) for block, radar_part in _chunks(raw, radar, reference)]
     products = torch.cat([p for p, _, _ in parts], -1)
     rate = torch.cat([r.expand(p.shape[-1]) for p, _, r in parts])
-    weight = torch.cat([_above_noise(p, q) for p, q, _ in parts], -1)
-    products = products * weight
+    power = torch.cat([q for _, q, _ in parts], -1)
+    weight = _above_noise(products, power)
+    products, noise = products * weight, weight.square() * _noise_variance(power)
     tile = raw.shape[-2] / products.shape[-2]
     line = (torch.arange(products.shape[-2], dtype=torch.float64, device=raw.device) + 0.5) * tile
     total, scale = doppler_hz, radar.prf_hz / (2 * math.pi)
@@ -62,7 +63,7 @@ def _refined(raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwell: int, 
         delta = wrap_hz(scale * phase - total, radar.prf_hz)
         enough = chosen.sum((-2, -1)).abs() > 0
         total = torch.where(enough, total + delta, total)
-        std = torch.where(enough, scale * increment_std_rad(chosen, phase), math.inf)
+        std = torch.where(enough, scale * _std_rad(chosen, (noise * whole).sum((-2, -1)), phase), math.inf)
     return total, std
 
 
@@ -80,12 +81,30 @@ def _tiles(raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, reference: str
     spectrum = None if reference is None else REFERENCES[reference](radar.pulse, raw.shape[-1], radar.sampling_hz, raw.device)
     lines = compress(raw, radar, spectrum)
     group = RangeGroup(lines, torch.zeros(lines.shape[:-2], device=raw.device), radar)
-    image = focus_group(group.spectrum(), group, doppler_hz, radar.velocity_m_s)
+    image = full_spectrum(group, doppler_hz).image(doppler_hz, radar.velocity_m_s)
     tiles = (max(1, image.shape[-2] // _TILE_LINES), max(1, image.shape[-1] // _TILE_COLUMNS))
     products, power = lag_products(image, tiles)
     scale = image.abs().amax((-2, -1)).to(torch.float64).square()[..., None, None]  # lag_products is scale free, chunks must stay comparable
     rate = radar.azimuth_rate_hz_s(radar.near_range_m + image.shape[-1] / 2 * radar.range_step_m).to(raw.device)
     return products * scale, power * scale, rate[None]
+
+
+def _noise_variance(power: Tensor) -> Tensor:
+    """Variance of the imaginary part of a tile's product by noise, against noise and against signal; the noise is the tile at the lowest tenth."""
+    flat = power.flatten(-2)
+    floor = flat.kthvalue(max(1, flat.shape[-1] // 10), dim=-1).values[..., None, None]
+    return floor * (0.5 * floor + power) / (_TILE_LINES * _TILE_COLUMNS)
+
+
+def _std_rad(products: Tensor, noise: Tensor, phase_rad: Tensor) -> Tensor:
+    """Deviation of the common phase from the scatter over columns of tiles in four parts of the strip, and from noise.
+
+    The parts are much longer than a point's response, whose tiles differ in Doppler when the nominal velocity is off.
+    """
+    parts = torch.stack([part.sum(-2) for part in products.tensor_split(4, -2)], -2).flatten(-2)
+    turned = parts * torch.polar(torch.ones_like(phase_rad), -phase_rad)[..., None]
+    total = turned.real.sum(-1)
+    return torch.sqrt(turned.imag.square().sum(-1) + noise) / torch.where(total > 0, total, 1e-300)
 
 
 def _above_noise(products: Tensor, power: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ chain (`torchsar.focus.omega_k`) referred to the middle of the group, in the fra
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -54,9 +54,50 @@ class RangeGroup:
         """Slant range of column width // 2, (...,) float64."""
         return self.radar.near_range_m + (self.start + self.data.shape[-1] // 2).to(torch.float64) * self.radar.range_step_m
 
-    def spectrum(self) -> Tensor:
-        """Two-dimensional FFT, computed once for many focusings."""
-        return torch.fft.fft2(self.data)
+
+@dataclass(frozen=True)
+class BeamSpectrum:
+    """Two-dimensional spectrum of a group, or those of its rows that are wanted: data (..., d, width), doppler_hz (..., d)."""
+
+    group: RangeGroup
+    data: Tensor
+    doppler_hz: Tensor
+
+    def moved(self, by_hz: Tensor | float) -> BeamSpectrum:
+        """The same samples read as lying by_hz higher in absolute Doppler."""
+        return replace(self, doppler_hz=self.doppler_hz + by_hz)
+
+    def rows(self, frame_hz: Tensor, velocity_m_s: Tensor | float) -> Tensor:
+        """Range-Doppler rows of the focused group, (..., d, width)."""
+        radar, n = self.group.radar, self.data.shape[-1]
+        at = FrameGeometry(radar, self.doppler_hz, torch.as_tensor(velocity_m_s, dtype=torch.float64, device=self.data.device), frame_hz)
+        middle = self.group.middle_m[..., None, None]
+        rows = self.data * bulk_filter(FrequencyBasis(radar, n, self.data.device), at, middle, None, self.data.dtype)
+        return refocus(torch.fft.ifft(rows), refocus_turns_per_sample(at), n // 2)
+
+    def image(self, frame_hz: Tensor, velocity_m_s: Tensor | float) -> Tensor:
+        """Image of the group, (..., azimuth, width), sampled as coarsely as the band allows. Differentiable in the velocity."""
+        return torch.fft.ifft(self.rows(frame_hz, velocity_m_s), dim=-2)
+
+
+def full_spectrum(group: RangeGroup, doppler_hz: Tensor) -> BeamSpectrum:
+    """All rows in FFT order, unwrapped about the centroid (...,): images of it keep the phase from line to line."""
+    return BeamSpectrum(group, torch.fft.fft2(group.data), group.radar.doppler_hz(group.data.shape[-2], doppler_hz, group.data.device))
+
+
+def beam_spectrum(group: RangeGroup, doppler_hz: Tensor, margin: float = 1.2) -> BeamSpectrum:
+    """Rows of a group about the centroid (...,) in rising Doppler: `margin` times the band of the beam's dwell, all where no dwell is known.
+
+    Outside that band there is only noise, whose phase under the azimuth filter changes fastest with velocity: it would make objectives rough.
+    """
+    radar, n, full = group.radar, group.data.shape[-2], full_spectrum(group, doppler_hz)
+    order = full.doppler_hz.argsort(-1)
+    if radar.integration_s is not None:
+        share = margin * radar.integration_s * float(radar.azimuth_rate_hz_s(radar.near_range_m)) / radar.prf_hz
+        keep = min(n, 32 * math.ceil(max(64.0, share * n) / 32))
+        order = order[..., (n - keep) // 2 : (n - keep) // 2 + keep]
+    rows = order[..., None].expand(*order.shape, full.data.shape[-1])
+    return BeamSpectrum(group, full.data.gather(-2, rows), full.doppler_hz.gather(-1, order))
 
 
 def column_signal(lines: Tensor) -> Tensor:
@@ -84,27 +125,14 @@ def pick_group(lines: Tensor, radar: StripmapRadar, width: int) -> RangeGroup:
     return RangeGroup(lines.gather(-1, columns[..., None, :].expand(*lines.shape[:-1], width)), start, radar)
 
 
-def group_rows(spectrum: Tensor, group: RangeGroup, doppler_hz: Tensor, velocity_m_s: Tensor | float) -> tuple[Tensor, Tensor]:
-    """Range-Doppler rows of the focused group, (..., pulse, width) in FFT order, and their absolute Doppler (..., pulse)."""
-    at = FrameGeometry.of(group.radar, spectrum, doppler_hz, velocity_m_s, doppler_hz)
-    middle = group.middle_m[..., None, None]
-    rows = spectrum * bulk_filter(FrequencyBasis(group.radar, spectrum.shape[-1], spectrum.device), at, middle, None, spectrum.dtype)
-    return refocus(torch.fft.ifft(rows), refocus_turns_per_sample(at), spectrum.shape[-1] // 2), at.doppler_hz
-
-
-def focus_group(spectrum: Tensor, group: RangeGroup, doppler_hz: Tensor, velocity_m_s: Tensor | float) -> Tensor:
-    """Image of the group, (..., azimuth, width). Differentiable in the velocity."""
-    return torch.fft.ifft(group_rows(spectrum, group, doppler_hz, velocity_m_s)[0], dim=-2)
-
-
-def column_weights(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) -> Tensor:
+def column_weights(columns: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwell_s: float) -> Tensor:
     """Weights of the range lines of a group in an objective, (..., width) with sum 1: their signal (`column_signal`), 0 where targets
-    would walk out of the group within the aperture; the middle half always counts."""
-    width = group.data.shape[-1]
-    half_walk = 0.25 * group.radar.wavelength_m * doppler_hz.abs() * dwell_s / group.radar.range_step_m
+    would walk out of the group within the aperture; the middle half always counts. columns: (..., n, width), lines or an image."""
+    width = columns.shape[-1]
+    half_walk = 0.25 * radar.wavelength_m * doppler_hz.abs() * dwell_s / radar.range_step_m
     reach = (width / 2 - half_walk - 2).clamp_min(width / 4)
-    place = torch.arange(width, dtype=torch.float64, device=group.data.device) - (width - 1) / 2
-    weight = column_signal(group.data) * (place.abs() <= reach[..., None])
+    place = torch.arange(width, dtype=torch.float64, device=columns.device) - (width - 1) / 2
+    weight = column_signal(columns) * (place.abs() <= reach[..., None])
     return weight / weight.sum(-1, keepdim=True)
 
 

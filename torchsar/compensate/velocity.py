@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.doppler import unit_peak
-from torchsar.compensate.group import RangeGroup, aperture_s, central_lines, column_entropy, column_weights, compress, focus_group, pick_group
+from torchsar.compensate.group import RangeGroup, aperture_s, beam_spectrum, central_lines, column_entropy, column_weights, compress, pick_group
 from torchsar.core import Estimate, Signal, Stage, settle
 from torchsar.optim.scalar import gradient_minimum, grid_minimum, parabola_minimum
 from torchsar.radar import StripmapRadar
@@ -33,13 +33,16 @@ class Focuser(Protocol):
 def velocity_objective(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) -> Callable[[Tensor], Tensor]:
     """Function velocity (...,) -> per-column entropies (..., width) times the column weights, whose sum over the last dim is the objective.
 
-    Differentiable in the velocity. Columns whose targets walk out of the group do not count.
+    Differentiable in the velocity. Columns whose targets walk out of the group do not count; the others with their signal above the
+    background in the image of the nominal velocity, where migration is already undone.
     """
-    spectrum = group.spectrum()
-    weight = column_weights(group, doppler_hz, dwell_s)
+    radar = group.radar
+    spectrum = beam_spectrum(group, doppler_hz)
+    with torch.no_grad():
+        weight = column_weights(spectrum.image(doppler_hz, radar.velocity_m_s), radar, doppler_hz, dwell_s)
 
     def columns(velocity_m_s: Tensor) -> Tensor:
-        return column_entropy(focus_group(spectrum, group, doppler_hz, velocity_m_s)) * weight
+        return column_entropy(spectrum.image(doppler_hz, velocity_m_s)) * weight
 
     return columns
 

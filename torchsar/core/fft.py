@@ -54,11 +54,24 @@ def transform_in_blocks(x: Tensor, dim: int, inverse: bool = False, out: Tensor 
     return out
 
 
+def spectrum_in_blocks(x: Tensor) -> Tensor:
+    """fft2 of x (..., pulse, range) into a new array, by whole trials where they fit the cache, else pass by pass; not differentiable."""
+    out = torch.empty_like(x, memory_format=torch.contiguous_format)
+    if x.shape[-2] * x.shape[-1] * x.element_size() > 4 * block_bytes_of(x.device):
+        return transform_in_blocks(transform_in_blocks(x, -1, out=out), -2)
+    for one, target in zip(x.reshape(-1, *x.shape[-2:]), out.view(-1, *x.shape[-2:]), strict=True):
+        target.copy_(torch.fft.fft2(one))
+    return out
+
+
 def _blocks(x: Tensor, dim: int, block_bytes: int) -> Iterator[tuple[slice, ...]]:
-    """Slices of (row, n) for a transform along -1, of (trial, n, column) for one along -2: whole trials where several fit, else columns."""
+    """Slices of (row, n) for a transform along -1, of (trial, n, column) for one along -2: trials where they fit, else their columns.
+
+    Trials go one by one unless they are tiny: a strided transform of several makes torch copy them first.
+    """
     item = x[0].numel() * x.element_size()
     if dim == -1 or item <= block_bytes:
-        height = max(1, block_bytes // item)
+        height = max(1, (block_bytes if dim == -1 else block_bytes // 16) // item)
         yield from ((slice(first, first + height),) for first in range(0, x.shape[0], height))
         return
     width = max(16, block_bytes // (x.shape[-2] * x.element_size()))

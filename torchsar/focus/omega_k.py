@@ -16,9 +16,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Signal, Stage, block_bytes_of, cis, linear_phasor, outer_phasor, per_trial, phasor_tables, real_dtype, reduced_turns, transform_in_blocks
+from torchsar.core import Axis, Signal, Stage, block_bytes_of, cis, linear_phasor, outer_phasor, per_trial, phasor_tables, real_dtype, reduced_turns, spectrum_in_blocks, transform_in_blocks
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
+
+
+# phase that the stationary-phase spectrum of a receding-frequency azimuth signal carries beside its exponent, taken back by the bulk filter
+STATIONARY_TURNS = 1 / 8
 
 
 def wavenumber(radar: StripmapRadar, frequency_hz: Tensor, doppler_hz: Tensor, velocity_m_s: Tensor | float, frame_hz: Tensor | float) -> Tensor:
@@ -80,6 +84,20 @@ class FrameGeometry:
         return wavenumber(self.radar, frequency_hz, self.doppler_hz, self.velocity_m_s, self.frame_hz)
 
 
+def residual_frequency(at: FrameGeometry, offset_hz: Tensor) -> Tensor:
+    """What bulk + refocus leave of the wavenumber mapping: f(G(0) + h) - h in Hz, float64 (..., d, h), for image frequencies h about G(0).
+
+    f(G) is the inverse of wavenumber(): the raw range frequency that an image frequency is made of.
+    """
+    velocity, frame = (per_trial(value, 2, at.doppler_hz) for value in (at.velocity_m_s, at.frame_hz))
+    f0, c = at.radar.carrier_hz, at.radar.wave_speed_m_s
+    x = c * at.doppler_hz[..., None] / (2 * velocity)
+    sin = c * frame / (2 * velocity * f0)
+    # G(0) = cos root(0) + sin x, so that root(h) = root(0) + h / cos
+    root = torch.sqrt(((f0 - x) * (f0 + x)).clamp_min(0)) + offset_hz / torch.sqrt(1 - sin.square())
+    return torch.sqrt(x.square() + root.square()) - f0 - offset_hz
+
+
 class FrequencyBasis:
     """Chebyshev polynomials over the range band: a smooth phase per Doppler row becomes a few float64 numbers and one matrix product.
 
@@ -97,6 +115,10 @@ class FrequencyBasis:
         u = (radar.range_frequency_hz(n, device) / (radar.sampling_hz / 2)).clamp(-1, 1)
         self._polynomials = torch.cos(torch.acos(u) * order[:, None])
 
+    def evaluate(self, values_at_nodes: Tensor, dtype: torch.dtype) -> Tensor:
+        """A smooth real function on the FFT grid in `dtype`, from its float64 values at the nodes, (..., row, node) -> (..., row, n)."""
+        return (values_at_nodes @ self._to_coefficients).to(dtype) @ self._polynomials.to(dtype)
+
     def phasor(self, turns_at_nodes: Tensor, dtype: torch.dtype) -> Tensor:
         """exp(2j pi turns) on the FFT grid from float64 turns at the nodes, (..., row, node) -> (..., row, n)."""
         coefficients = turns_at_nodes @ self._to_coefficients
@@ -106,11 +128,12 @@ class FrequencyBasis:
 
 
 def bulk_filter(basis: FrequencyBasis, at: FrameGeometry, range_m: float, reference: Tensor | None, dtype: torch.dtype) -> Tensor:
-    """Conjugate two-dimensional spectrum of a target at range_m, (..., d, n): phase 2 pi (2 R / c) (G - f0 - f), zero at the frame Doppler.
+    """Conjugate two-dimensional spectrum of a target at range_m, (..., d, n): phase 2 pi [(2 R / c) (G - f0 - f) + 1/8], 1/8 turn at the frame Doppler.
 
+    A focused target then has the phase -4 pi R / lambda of its echo at the crossing of the beam centre, as backprojection has.
     The range reference (n,) is multiplied in where there is one.
     """
-    turns = (2 * range_m / at.radar.wave_speed_m_s) * (at.mapped(basis.nodes_hz) - basis.nodes_hz)
+    turns = (2 * range_m / at.radar.wave_speed_m_s) * (at.mapped(basis.nodes_hz) - basis.nodes_hz) + STATIONARY_TURNS
     h = basis.phasor(turns, dtype)
     return h if reference is None else h * reference.to(dtype)
 
@@ -164,8 +187,7 @@ def through_doppler(raw: Tensor, focus_rows: Callable[[Tensor, slice], Tensor], 
     """
     if differentiable and torch.is_grad_enabled():
         return torch.fft.ifft(focus_rows(torch.fft.fft2(raw), slice(None)), dim=-2)
-    work = transform_in_blocks(raw, -1, out=torch.empty_like(raw, memory_format=torch.contiguous_format))
-    transform_in_blocks(work, -2)
+    work = spectrum_in_blocks(raw)
     block_bytes = block_bytes_of(raw.device) // 2 if block_bytes is None else block_bytes
     height = max(1, block_bytes // max(1, work[..., 0, :].numel() * work.element_size()))
     for first in range(0, work.shape[-2], height):

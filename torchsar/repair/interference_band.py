@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchsar.repair.interference_detect import LEVEL_SHARE, THRESHOLD, Level, line_spectra
-from torchsar.repair.interference_tone import anything, block_sums
+from torchsar.repair.interference_tone import anything, block_sums, window_sums
 
 STRETCH_LINES = 32
 
@@ -32,18 +32,23 @@ def lasts_the_line(lines: Tensor, cell: Tensor) -> Tensor:
 
 
 def find_band(lines: Tensor, level: Level, threshold: float = THRESHOLD) -> tuple[Tensor, Tensor]:
-    """Lines with an interferer that lasts, and its strongest cell (n-point FFT). lines: (..., pulse, range); both (..., pulse)."""
+    """Lines with an interferer that lasts, and its strongest cell (n-point FFT). lines: (..., pulse, range); both (..., pulse).
+
+    The verdict that it lasts is the majority's among the strong lines nearby: of a noise-like interferer one line may look intermittent.
+    """
     peak, cell = level.excess(line_spectra(lines.detach())).max(-1)
     strong = peak > threshold
     if not anything(strong):
         return strong, cell
-    return strong & lasts_the_line(lines.detach(), cell), cell
+    near = window_sums(STRETCH_LINES // 2)
+    votes = near((strong & lasts_the_line(lines.detach(), cell)).to(torch.float64))
+    return strong & (votes > 0.5 * near(strong.to(torch.float64))), cell
 
 
-def subtract_band(lines: Tensor, touched: Tensor, cell: Tensor, level: Level) -> Tensor:
+def subtract_band(lines: Tensor, touched: Tensor, level: Level) -> Tensor:
     """Lines (..., pulse, range) without the interferer near the strongest cell of each stretch of lines.
 
-    touched, cell: (..., pulse), from find_band. Untouched lines pass unchanged. Differentiable in lines (the spectrum of the
+    touched: (..., pulse), from find_band. Untouched lines pass unchanged. Differentiable in lines (the spectrum of the
     interferer is held).
     """
     n_pulse = lines.shape[-2]
@@ -90,11 +95,12 @@ def _process(x: Tensor, first: Tensor, ratio: Tensor) -> Tensor:
     n, m = x.shape[-1], ratio.shape[-1]
     index = (first[..., None] + torch.arange(m, device=x.device)) % (2 * n)
     index = index[..., None, :].expand(*x.shape[:-1], m)
-    root = torch.sqrt(ratio)
-    seen = torch.fft.fft(x, 2 * n, norm="ortho").gather(-1, index) * root[..., None, :]
+    # the solve is small and its condition is the interferer's power over the clutter's: always in double precision
+    root, wide = torch.sqrt(ratio.to(torch.float64)), torch.complex128
+    seen = torch.fft.fft(x, 2 * n, norm="ortho").gather(-1, index).to(wide) * root[..., None, :]
     lag = torch.arange(m, device=x.device)
-    overlap = torch.fft.ifft(pad(torch.ones(n, dtype=x.dtype, device=x.device), (0, n)))[(lag[None, :] - lag[:, None]) % (2 * n)]
-    system = root[..., :, None] * overlap * root[..., None, :] + torch.eye(m, dtype=x.dtype, device=x.device)
+    overlap = torch.fft.ifft(pad(torch.ones(n, dtype=wide, device=x.device), (0, n)))[(lag[None, :] - lag[:, None]) % (2 * n)]
+    system = root[..., :, None] * overlap * root[..., None, :] + torch.eye(m, dtype=wide, device=x.device)
     solved = torch.cholesky_solve(seen.mT, torch.linalg.cholesky(system)).mT * root[..., None, :]
-    spectrum = torch.zeros(*x.shape[:-1], 2 * n, dtype=x.dtype, device=x.device).scatter(-1, index, solved)
+    spectrum = torch.zeros(*x.shape[:-1], 2 * n, dtype=x.dtype, device=x.device).scatter(-1, index, solved.to(x.dtype))
     return torch.fft.ifft(spectrum, norm="ortho")[..., :n]

@@ -40,6 +40,10 @@ class Tone:
         t = torch.arange(n, dtype=torch.float64, device=self.frequency.device) - (n - 1) / 2
         return unit_phasor((self.frequency[..., None] + self.rate[..., None] * (t / 2)) * t, dtype)
 
+    def cell(self, n: int) -> Tensor:
+        """Nearest cell of an n-point FFT, int64 (..., pulse)."""
+        return torch.round(self.frequency * n).to(torch.int64) % n
+
     def waveform(self, lines: Tensor) -> Tensor:
         """The tone as it is in these lines (least squares amplitude), zero where it is not present. Differentiable in lines."""
         unit = self.phasor(lines.shape[-1], lines.dtype)
@@ -111,7 +115,7 @@ def fit_tone(lines: Tensor, cell: Tensor, present: Tensor, level: Level) -> Tone
     tone = replace(tone, frequency=tone.frequency + offset / n, rate=sweep / (n * n))
     for inner in (_STEPS, 3, 1):
         tone, blocks = _refine(lines, tone, inner)
-    density = level.at(torch.round(tone.frequency * n).to(torch.int64))
+    density = level.at(tone.cell(n))
     energy = blocks.sum(-1).abs().square() / n
     noise = torch.sqrt(density / (2 * energy.clamp_min(torch.finfo(energy.dtype).tiny))).to(torch.float64)
     return replace(tone, present=present & is_steady(blocks, energy, density), noise_rad=noise)
@@ -139,27 +143,28 @@ def is_steady(blocks: Tensor, energy: Tensor, density: Tensor) -> Tensor:
     n_blocks = blocks.shape[-1]
     coherent = blocks.sum(-1).abs().square() / (n_blocks * blocks.abs().square().sum(-1).clamp_min(torch.finfo(density.dtype).tiny))
     z = energy / density.clamp_min(torch.finfo(density.dtype).tiny)
-    return coherent > 0.25 * z / (z + n_blocks)
+    return coherent > 0.35 * z / (z + n_blocks)
 
 
-def pooled(tone: Tone, n: int) -> Tone:
+def pooled(tone: Tone, n: int, position: Tensor) -> Tone:
     """Frequency and rate smoothed over neighbouring lines as far as the data agree with a smooth drift.
 
     Local straight lines over windows that grow threefold; a line keeps the widest window whose residuals are no larger than the
-    predicted noise. A tone that jumps from line to line keeps its own values.
+    predicted noise. A tone that jumps from line to line keeps its own values. position: line numbers, float64 (..., pulse).
     """
-    first, second = (tone.noise_rad * math.sqrt(3) / (math.pi * n), tone.noise_rad * 6 * math.sqrt(5) / (math.pi * n * n))
-    return replace(tone, frequency=_smooth_track(tone.frequency, first, tone.present), rate=_smooth_track(tone.rate, second, tone.present))
+    frequency = smooth_track(tone.frequency, _to_frequency(tone.noise_rad, n), tone.present, position)
+    return replace(tone, frequency=frequency, rate=smooth_track(tone.rate, _to_rate(tone.noise_rad, n), tone.present, position))
 
 
-def _smooth_track(value: Tensor, std: Tensor, present: Tensor) -> Tensor:
-    """value, std, present: (..., pulse)."""
+def smooth_track(value: Tensor, std: Tensor, present: Tensor, position: Tensor) -> Tensor:
+    """Local straight-line fits wherever they agree with the predicted std, the values themselves elsewhere. All (..., pulse) float64."""
     weight = torch.where(present, 1 / std.square().clamp_min(1e-60), 0.0)
     weight = weight / weight.amax(-1, keepdim=True).clamp_min(1e-300)
+    unit = position / position.amax(-1, keepdim=True).clamp_min(1)
     chosen, half = value, 2
     while half < value.shape[-1]:
-        box = _box(half)
-        line, support = _local_line(value, weight, box)
+        box = window_sums(half)
+        line, support = _local_line(value, weight, unit, box)
         misfit = torch.where(present, (value - line) / std.clamp_min(1e-30), 0.0).square()
         count = box(present.to(value.dtype))
         spread = box(misfit) / (count - 2).clamp_min(1)
@@ -169,7 +174,7 @@ def _smooth_track(value: Tensor, std: Tensor, present: Tensor) -> Tensor:
     return chosen
 
 
-def _box(half: int) -> Callable[[Tensor], Tensor]:
+def window_sums(half: int) -> Callable[[Tensor], Tensor]:
     """Sums over lines i - half .. i + half, cut at the ends."""
 
     def sums(x: Tensor) -> Tensor:
@@ -179,36 +184,55 @@ def _box(half: int) -> Callable[[Tensor], Tensor]:
     return sums
 
 
-def _local_line(value: Tensor, weight: Tensor, box: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
-    """Weighted straight-line fit in a sliding window, at the window's centre; also where it is determined."""
-    i = torch.arange(value.shape[-1], dtype=value.dtype, device=value.device)
+def _local_line(value: Tensor, weight: Tensor, i: Tensor, box: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+    """Weighted straight-line fit over position i in a sliding window, at each position; also where it is determined."""
     anchor = (weight * value).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp_min(1e-300)
     y = torch.where(weight > 0, value - anchor, 0.0)
     s0, s1, s2, sy, s1y = (box(part) for part in (weight, weight * i, weight * i * i, weight * y, weight * i * y))
     determinant = s0 * s2 - s1 * s1
-    support = determinant > 1e-6 * s0 * s0
+    support = determinant > 1e-12 * s0 * s2.clamp_min(1e-300)
     slope = torch.where(support, (s0 * s1y - s1 * sy) / torch.where(support, determinant, 1), 0.0)
     mean = sy / torch.where(support, s0, 1)
     return anchor + mean + slope * (i - s1 / torch.where(support, s0, 1)), support
 
 
-def find_tones(lines: Tensor, level: Level, most: int = 4, threshold: float = THRESHOLD) -> list[Tone]:
-    """Up to `most` tones a line, strongest first, each found on what the earlier ones leave. lines: (..., pulse, range)."""
+def find_tones(lines: Tensor, level: Level, position: Tensor | None = None, most: int = 4, threshold: float = THRESHOLD) -> list[Tone]:
+    """Up to `most` tones a line, strongest first, each found on what the earlier ones leave. lines: (..., pulse, range).
+
+    position: line numbers (..., pulse) where the lines are a selection. Lines where the tones do not account for the energy about
+    them keep none: what is there is not a tone.
+    """
     rest, tones = lines.detach(), []
     blocked = torch.zeros(lines.shape, dtype=torch.bool, device=lines.device)
     for _ in range(most):
-        excess = level.excess(line_spectra(rest)).masked_fill(blocked, 0)
-        peak, cell = excess.max(-1)
-        if not anything(peak > threshold):
+        peak, cell = level.excess(line_spectra(rest)).masked_fill(blocked, 0).max(-1)
+        strong = peak > threshold
+        if not anything(strong):
             break
-        tone = fit_tone(rest, cell, peak > threshold, level)
+        tone = fit_tone(rest, cell, strong, level)
         rest = rest - tone.waveform(rest)
-        blocked = blocked | _around(cell, lines.shape[-1]) & ((peak > threshold) & ~tone.present)[..., None]
+        blocked = blocked | around(tone.cell(lines.shape[-1]), lines.shape[-1]) & (strong & ~tone.present)[..., None]
         tones.append(tone)
-    return refit(lines.detach(), tones, level) if tones else tones
+    if position is None:
+        position = torch.arange(lines.shape[-2], device=lines.device).expand(lines.shape[:-1])
+    return refit(lines.detach(), explaining(lines.detach(), rest, tones, level), position.to(torch.float64))
 
 
-def refit(lines: Tensor, tones: list[Tone], level: Level, rounds: int = 2) -> list[Tone]:
+def explaining(lines: Tensor, rest: Tensor, tones: list[Tone], level: Level) -> list[Tone]:
+    """The tones that account for nearly all energy about them, what clutter would leave apart; the others are marked absent."""
+    if not tones:
+        return tones
+    n = lines.shape[-1]
+    before, after = (level.excess(line_spectra(x)) for x in (lines, rest))
+    kept = []
+    for tone in tones:
+        near = around(tone.cell(n), n)
+        left = (after * near).sum(-1) < 0.1 * (before * near).sum(-1) + 2 * near.sum(-1)
+        kept.append(replace(tone, present=tone.present & left))
+    return [tone for tone in kept if anything(tone.present)]
+
+
+def refit(lines: Tensor, tones: list[Tone], position: Tensor, rounds: int = 2) -> list[Tone]:
     """Each tone fitted again with the others taken out, then pooled over lines."""
     n, tones = lines.shape[-1], list(tones)
     for _ in range(rounds if len(tones) > 1 else 0):
@@ -217,7 +241,7 @@ def refit(lines: Tensor, tones: list[Tone], level: Level, rounds: int = 2) -> li
             alone = lines - sum(wave for j, wave in enumerate(waves) if j != k)
             tones[k] = replace(_refine(alone, tone, 2)[0], present=tone.present)
             waves[k] = tones[k].waveform(alone)
-    return [pooled(tone, n) for tone in tones]
+    return [pooled(tone, n, position) for tone in tones]
 
 
 def subtract_each(lines: Tensor, tones: list[Tone], rounds: int = 3) -> list[Tensor]:
@@ -236,7 +260,7 @@ def subtract_tones(lines: Tensor, tones: list[Tone]) -> Tensor:
     return lines
 
 
-def _around(cell: Tensor, n: int) -> Tensor:
+def around(cell: Tensor, n: int) -> Tensor:
     """Cells within n / 32 of one cell a line, circular, (..., pulse) -> (..., pulse, n) bool."""
     distance = (torch.arange(n, device=cell.device) - cell[..., None]) % n
     return (distance <= n // 32) | (distance >= n - n // 32)

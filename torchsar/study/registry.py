@@ -10,17 +10,33 @@ from functools import cache
 from importlib.metadata import entry_points
 from typing import Any
 
+from torchsar.compensate.ambiguity import DopplerCentroid
+from torchsar.compensate.doppler import EnergyCentre, PhaseIncrement, RangeDependentCentroid
+from torchsar.echo.jitter import PeriodicJitter
 from torchsar.focus import OmegaK, RangeCompress
+from torchsar.repair.jitter_pilot import PilotJitter
 from torchsar.scene import AlwaysLit, Antenna, Dwell, Hyperbola, Parabola, Points, RandomPoints, Speckle
+from torchsar.study import factories
 from torchsar.study.catalogue import Catalogue
 
 SCENES = Catalogue("scene", "kind", {"points": Points, "random_points": RandomPoints, "speckle": Speckle})
 BEAMS = Catalogue("beam", "kind", {"always_lit": AlwaysLit, "dwell": Dwell, "antenna": Antenna})
 PATHS = Catalogue("path", "kind", {"hyperbola": Hyperbola, "parabola": Parabola})
-DAMAGES = Catalogue("damage", "kind", {})
+DAMAGES = Catalogue("damage", "kind", {"periodic_jitter": PeriodicJitter})
 
-REPAIR: dict[str, Callable[..., Any]] = {}
-COMPENSATE: dict[str, Callable[..., Any]] = {}
+REPAIR: dict[str, Callable[..., Any]] = {
+    "jitter_pilot": PilotJitter,
+    "jitter_lagrange": factories.jitter_lagrange,
+    "jitter_band_limited": factories.jitter_band_limited,
+    "jitter_exact": factories.jitter_exact,
+}
+COMPENSATE: dict[str, Callable[..., Any]] = {
+    "phase_increment": PhaseIncrement,
+    "energy_centre": EnergyCentre,
+    "range_dependent_centroid": RangeDependentCentroid,
+    "doppler_centroid": DopplerCentroid,
+    "effective_velocity": factories.effective_velocity,
+}
 FOCUS: dict[str, Callable[..., Any]] = {"range_compress": RangeCompress, "omega_k": OmegaK}
 GROUPS = {"repair": REPAIR, "compensate": COMPENSATE, "focus": FOCUS}
 
