@@ -34,7 +34,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command. Returns 0, or 2 after one sentence on stderr for bad input, or 130 when interrupted."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    options = parser().parse_args(given)
+    options = _parse(given)
     try:
         from torchsar.study.errors import ConfigError
     except ImportError as error:
@@ -49,6 +49,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("torchsar: interrupted, nothing was written", file=sys.stderr)
         return 130
+
+
+def _parse(given: Sequence[str]) -> argparse.Namespace:
+    """Overrides may stand before and after options; anything else that is left over is refused by argparse."""
+    top = parser()
+    options, rest = top.parse_known_args(given)
+    if rest and (not hasattr(options, "overrides") or any(word.startswith("-") for word in rest)):
+        top.error(f"unrecognized arguments: {' '.join(rest)}")
+    if rest:
+        options.overrides = [*options.overrides, *rest]
+    return options
 
 
 def _dispatch(options: argparse.Namespace, command: str) -> int:

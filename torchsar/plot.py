@@ -13,7 +13,8 @@ from torch import Tensor
 from torchsar.core import Axis, Signal
 
 try:
-    import matplotlib
+    from cycler import cycler
+    from matplotlib import rc_context
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 except ImportError as error:
@@ -21,7 +22,7 @@ except ImportError as error:
 
 INK, ACCENT, SECOND, THIRD, FAINT = "#1f2933", "#0b6e99", "#d1495b", "#e09f3e", "#9aa5b1"
 COLOURS = (ACCENT, SECOND, THIRD, "#4f7942", "#6a4c93", FAINT)
-_STYLE = {
+_STYLE: Any = {
     "font.size": 9,
     "axes.titlesize": 10,
     "axes.titleweight": "bold",
@@ -38,12 +39,12 @@ _STYLE = {
     "legend.fontsize": 8,
     "lines.linewidth": 1.2,
     "figure.facecolor": "white",
-    "axes.prop_cycle": matplotlib.cycler(color=COLOURS),
+    "axes.prop_cycle": cycler(color=COLOURS),
 }
 
 
 def _panels(rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, list[Axes]]:
-    with matplotlib.rc_context(_STYLE):
+    with rc_context(_STYLE):
         figure = Figure(figsize=size, layout="constrained")
         panels = figure.subplots(rows, columns, squeeze=False, **options)
     return figure, list(panels.flat)
@@ -69,14 +70,14 @@ def quicklook(signal: Signal, largest: int = 900) -> Signal:
     return Signal(data, tuple(axes))
 
 
-def _extent(signal: Signal, origin: Sequence[float]) -> list[float]:
+def _extent(signal: Signal, origin: Sequence[float]) -> tuple[float, float, float, float]:
     vertical, horizontal = signal.axes
     v, h = vertical.start - origin[0], horizontal.start - origin[1]
-    return [h - horizontal.step / 2, h + (horizontal.n - 0.5) * horizontal.step, v - vertical.step / 2, v + (vertical.n - 0.5) * vertical.step]
+    return h - horizontal.step / 2, h + (horizontal.n - 0.5) * horizontal.step, v - vertical.step / 2, v + (vertical.n - 0.5) * vertical.step
 
 
-def _show(axes: Axes, signal: Signal, dynamic_range_db: float, title: str, reference: float | None = None, percentile: float = 99.9) -> Any:
-    """Draw one image; the scale tops out at a high percentile so that one bright ship does not hide the land."""
+def _show(axes: Axes, signal: Signal, dynamic_range_db: float, title: str, reference: float | None = None, percentile: float = 100.0) -> Any:
+    """Draw one image into existing axes."""
     view = quicklook(signal)
     amplitude = view.data.cpu().numpy()
     top = reference if reference is not None else float(np.percentile(amplitude, percentile)) or float(amplitude.max(initial=1.0))
@@ -88,21 +89,24 @@ def _show(axes: Axes, signal: Signal, dynamic_range_db: float, title: str, refer
     return shown
 
 
-def image(signal: Signal, dynamic_range_db: float = 50.0, title: str = "") -> Figure:
-    """An image or a raw matrix in dB, range horizontal, azimuth vertical, axes in their units. The first trial of a batch."""
+def image(signal: Signal, dynamic_range_db: float = 50.0, title: str = "", percentile: float = 99.9) -> Figure:
+    """An image or a raw matrix in dB, range horizontal, azimuth vertical, axes in their units. The first trial of a batch.
+
+    0 dB is a high percentile of the amplitude, so that one bright ship does not hide the land; 100, the peak, suits scenes of points.
+    """
     figure, (axes,) = _panels(1, 1, (7.2, 6.2))
-    shown = _show(axes, _first(signal), dynamic_range_db, title)
-    figure.colorbar(shown, ax=axes, label="amplitude (dB below the 99.9th percentile)", shrink=0.8)
+    shown = _show(axes, _first(signal), dynamic_range_db, title, percentile=percentile)
+    figure.colorbar(shown, ax=axes, label="amplitude (dB below the peak)" if percentile == 100 else f"amplitude (dB below the {percentile:g}th percentile)", shrink=0.8)
     return figure
 
 
-def images(signals: Mapping[str, Signal], dynamic_range_db: float = 50.0, columns: int = 2, shared_scale: bool = True) -> Figure:
-    """Several images side by side, on one scale taken from the first of them unless told otherwise."""
+def images(signals: Mapping[str, Signal], dynamic_range_db: float = 50.0, columns: int = 2, percentile: float = 99.9) -> Figure:
+    """Several images side by side on one scale, taken from the first of them; arguments as `image`."""
     rows = math.ceil(len(signals) / columns)
     figure, panels = _panels(rows, min(columns, len(signals)), (4.6 * min(columns, len(signals)), 3.9 * rows))
     first = quicklook(_first(next(iter(signals.values())))).data.cpu().numpy()
-    top = float(np.percentile(first, 99.9)) if shared_scale else None
-    shown = None
+    top = float(np.percentile(first, percentile)) or None
+    shown: Any = None
     for axes, (title, signal) in zip(panels, signals.items(), strict=False):
         shown = _show(axes, _first(signal), dynamic_range_db, title, top)
     for axes in panels[len(signals) :]:

@@ -21,9 +21,9 @@ from torchsar.compensate.group import (
     RangeGroup,
     aperture_s,
     beam_spectrum,
+    block_entropy,
+    block_weights,
     central_lines,
-    column_entropy,
-    column_weights,
     compress,
     jackknife_std,
     pick_group,
@@ -43,15 +43,22 @@ def candidate_turns(reach: int, device: torch.device | None = None) -> Tensor:
     return torch.arange(-reach, reach + 1, dtype=torch.float64, device=device)
 
 
-def _evidence(scores: Tensor) -> Tensor:
-    """Log-likelihood of each candidate from scores of independent blocks (..., block, candidate): how surely it is worse than the best one."""
-    total = scores.mean(-2)
-    best = total.argmax(-1)
+def _evidence(scores: Tensor, weight: Tensor | None = None) -> Tensor:
+    """Log-likelihood of each candidate (..., candidate): how surely it is worse than the best one, from scores of blocks (..., block, candidate).
+
+    weight: (..., block) with sum 1, equal by default. Student's t of the mean deficit; its degrees of freedom follow from how many blocks
+    carry weight, and a tenth of the deficit itself counts as uncertainty, so that no single kind of evidence becomes certainty.
+    """
+    if weight is None:
+        weight = torch.full(scores.shape[:-1], 1 / scores.shape[-2], dtype=scores.dtype, device=scores.device)
+    best = (scores * weight[..., None]).sum(-2).argmax(-1)
     deficit = take(scores, best[..., None].expand(scores.shape[:-1]))[..., None] - scores
-    mean, spread = deficit.mean(-2), deficit.std(-2)
-    n = scores.shape[-2]
-    floor = 1e-9 * scores.abs().amax((-2, -1))[..., None] + 1e-300
-    return student_log_likelihood(mean / (spread / math.sqrt(n) + floor), n - 1)
+    mean = (deficit * weight[..., None]).sum(-2)
+    blocks = 1 / weight.square().sum(-1, keepdim=True)
+    gain = blocks / (blocks - 1).clamp_min(0.5)
+    variance = gain * (weight[..., None] * (deficit - mean[..., None, :])).square().sum(-2) + 0.01 * mean.square()
+    tiny = 1e-24 * scores.square().amax((-2, -1))[..., None] + 1e-300
+    return student_log_likelihood(mean / torch.sqrt(variance + tiny), (blocks - 1).clamp_min(0.5))
 
 
 def look_scores(group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turns: Tensor, looks: int = 16) -> Tensor:
@@ -113,15 +120,14 @@ def _phase_slope(products: Tensor, frequency_hz: Tensor) -> Tensor:
     return (offset * turned.imag).sum(-1) / (offset.square() * weight).sum(-1)
 
 
-def entropy_scores(group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turns: Tensor, dwell_s: float) -> Tensor:
-    """Negative mean entropy of the range lines of a group focused with every candidate, (..., block, candidate); blocks of columns."""
-    spectrum, weight = beam_spectrum(group, doppler_hz), column_weights(group.data, group.radar, doppler_hz, dwell_s)
+def entropy_scores(group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turns: Tensor, dwell_s: float) -> tuple[Tensor, Tensor]:
+    """Negative entropies of the range blocks of a group focused with every candidate, (..., block, candidate), and the blocks' weights."""
+    spectrum, weight = beam_spectrum(group, doppler_hz), block_weights(group.data, group.radar, doppler_hz, dwell_s)
     scores = []
     for k in turns.tolist():
         shift = k * group.radar.prf_hz
-        columns = column_entropy(spectrum.moved(shift).image(doppler_hz + shift, velocity_m_s)) * weight
-        scores.append(torch.stack([-part.sum(-1) for part in columns.tensor_split(_BLOCKS, -1)], -1))
-    return torch.stack(scores, -1)
+        scores.append(-block_entropy(spectrum.moved(shift).image(doppler_hz + shift, velocity_m_s)))
+    return torch.stack(scores, -1), weight
 
 
 def ambiguity_evidence(raw: Tensor, radar: StripmapRadar, doppler_baseband_hz: Tensor, reference: Tensor | None, reach: int = 12) -> dict[str, Tensor]:
@@ -134,14 +140,14 @@ def ambiguity_evidence(raw: Tensor, radar: StripmapRadar, doppler_baseband_hz: T
     dwell = aperture_s(radar, raw.shape[-1])
     lines = compress(unit_peak(central_lines(raw, max(1024, round(4 * dwell * radar.prf_hz)))), radar, reference)
     wide = pick_group(lines, radar, 4096)
-    narrow = pick_group(lines, radar, 256)
+    narrow = pick_group(lines, radar, 512)
     value, std = line_doppler(lines, radar)
     base = doppler_baseband_hz
     miss = (base[..., None] + turns * radar.prf_hz - value[..., None]) / std.clamp_min(1e-3 * radar.prf_hz)[..., None]
     return {
         "looks": _evidence(look_scores(wide, base, radar.velocity_m_s, turns)),
         "lines": student_log_likelihood(miss, _BLOCKS - 1),
-        "entropy": _evidence(entropy_scores(narrow, base, radar.velocity_m_s, turns, dwell)),
+        "entropy": _evidence(*entropy_scores(narrow, base, radar.velocity_m_s, turns, dwell)),
         "line_doppler_hz": value,
         "line_doppler_std_hz": std,
     }

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -73,7 +74,7 @@ def _chunks(raw: Tensor, radar: StripmapRadar, reference: str | None) -> list[tu
     columns = raw.shape[-1] - extra
     count = max(1, round(columns / _CHUNK_COLUMNS))
     edges = [round(i * columns / count) for i in range(count + 1)]
-    return [(raw[..., a : b + extra], replace(radar, near_range_m=radar.near_range_m + a * radar.range_step_m)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    return [(raw[..., a : b + extra], replace(radar, near_range_m=radar.near_range_m + a * radar.range_step_m)) for a, b in pairwise(edges)]
 
 
 def _tiles(raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, reference: str | None) -> tuple[Tensor, Tensor, Tensor]:

@@ -16,6 +16,8 @@ from torchsar.focus.omega_k import FrameGeometry, FrequencyBasis, bulk_filter, r
 from torchsar.focus.reference import range_compress
 from torchsar.radar import StripmapRadar
 
+BLOCK_COLUMNS = 32
+
 
 def aperture_s(radar: StripmapRadar, n_range: int) -> float:
     """Time a target stays in the recorded band: the nominal dwell, or the time to sweep one PRF where none is known."""
@@ -125,30 +127,41 @@ def pick_group(lines: Tensor, radar: StripmapRadar, width: int) -> RangeGroup:
     return RangeGroup(lines.gather(-1, columns[..., None, :].expand(*lines.shape[:-1], width)), start, radar)
 
 
-def column_weights(columns: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwell_s: float) -> Tensor:
-    """Weights of the range lines of a group in an objective, (..., width) with sum 1: their signal (`column_signal`), 0 where targets
-    would walk out of the group within the aperture; the middle half always counts. columns: (..., n, width), lines or an image."""
+def block_weights(columns: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwell_s: float) -> Tensor:
+    """Weights of the range blocks of a group in an objective, (..., block) with sum 1: their signal (`column_signal`).
+
+    Columns whose targets would walk out of the group within the aperture do not count; those of the middle half always do.
+    columns: (..., n, width), lines or an image.
+    """
     width = columns.shape[-1]
     half_walk = 0.25 * radar.wavelength_m * doppler_hz.abs() * dwell_s / radar.range_step_m
     reach = (width / 2 - half_walk - 2).clamp_min(width / 4)
     place = torch.arange(width, dtype=torch.float64, device=columns.device) - (width - 1) / 2
     weight = column_signal(columns) * (place.abs() <= reach[..., None])
+    weight = torch.stack([part.sum(-1) for part in weight.tensor_split(_block_count(width), -1)], -1)
     return weight / weight.sum(-1, keepdim=True)
 
 
-def column_entropy(image: Tensor) -> Tensor:
-    """Entropy of each range line by itself, (..., azimuth, range) -> (..., range), nats. A bright line counts no more than any other.
+def _block_count(width: int) -> int:
+    return max(1, width // BLOCK_COLUMNS)
 
-    Differentiable; 0 for an empty line.
+
+def block_entropy(image: Tensor) -> Tensor:
+    """Entropy of each block of about 32 range lines by itself, (..., azimuth, range) -> (..., block), nats, float64.
+
+    A bright block counts no more than any other, so that a few ships do not rule; a block is wide enough for the range walk that a wrong
+    velocity leaves. Differentiable; 0 for an empty block.
     """
     power = image.real.square() + image.imag.square()
-    total = power.sum(-2, keepdim=True)
     tiny = torch.finfo(power.dtype).tiny
-    p = power / total.clamp_min(tiny * 1e3)
-    return -(p * torch.log(p.clamp_min(tiny))).sum(-2).to(torch.float64)
+    blocks = []
+    for part in power.tensor_split(_block_count(image.shape[-1]), -1):
+        p = part / part.sum((-2, -1), keepdim=True).clamp_min(tiny * 1e3)
+        blocks.append(-(p * torch.log(p.clamp_min(tiny))).sum((-2, -1)).to(torch.float64))
+    return torch.stack(blocks, -1)
 
 
-def student_log_likelihood(t: Tensor, degrees: int) -> Tensor:
+def student_log_likelihood(t: Tensor, degrees: Tensor | int) -> Tensor:
     """Logarithm of Student's density at t without its constant: how well a deviation of t predicted ones is explained, outliers included."""
     return -0.5 * (degrees + 1) * torch.log1p(t.square() / degrees)
 

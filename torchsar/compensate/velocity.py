@@ -1,7 +1,7 @@
 """Effective velocity by minimum entropy of a small group of range lines (brief 004, item 8; Tsvetkov 2017).
 
 Always evaluated on the original data: the group's two-dimensional spectrum is formed once and focused anew with every velocity. The
-objective is the mean entropy of the range lines, each taken by itself, so that a few very bright ships do not rule it.
+objective is the mean entropy of blocks of range lines, each taken by itself, so that a few very bright ships do not rule it.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.doppler import unit_peak
-from torchsar.compensate.group import RangeGroup, aperture_s, beam_spectrum, central_lines, column_entropy, column_weights, compress, pick_group
+from torchsar.compensate.group import RangeGroup, aperture_s, beam_spectrum, block_entropy, block_weights, central_lines, compress, pick_group
 from torchsar.core import Estimate, Signal, Stage, settle
-from torchsar.optim.scalar import gradient_minimum, grid_minimum, parabola_minimum
+from torchsar.optim.scalar import gradient_minimum, grid_minimum
 from torchsar.radar import StripmapRadar
 
 Refine = Callable[..., tuple[Tensor, Tensor]]
@@ -31,7 +31,7 @@ class Focuser(Protocol):
 
 
 def velocity_objective(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) -> Callable[[Tensor], Tensor]:
-    """Function velocity (...,) -> per-column entropies (..., width) times the column weights, whose sum over the last dim is the objective.
+    """Function velocity (...,) -> entropies of the range blocks (..., block) times their weights, whose sum over the last dim is the objective.
 
     Differentiable in the velocity. Columns whose targets walk out of the group do not count; the others with their signal above the
     background in the image of the nominal velocity, where migration is already undone.
@@ -39,12 +39,12 @@ def velocity_objective(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) ->
     radar = group.radar
     spectrum = beam_spectrum(group, doppler_hz)
     with torch.no_grad():
-        weight = column_weights(spectrum.image(doppler_hz, radar.velocity_m_s), radar, doppler_hz, dwell_s)
+        weight = block_weights(spectrum.image(doppler_hz, radar.velocity_m_s), radar, doppler_hz, dwell_s)
 
-    def columns(velocity_m_s: Tensor) -> Tensor:
-        return column_entropy(spectrum.image(doppler_hz, velocity_m_s)) * weight
+    def blocks(velocity_m_s: Tensor) -> Tensor:
+        return block_entropy(spectrum.image(doppler_hz, velocity_m_s)) * weight
 
-    return columns
+    return blocks
 
 
 def grid_step_m_s(radar: StripmapRadar, range_m: float, dwell_s: float) -> float:
@@ -58,10 +58,10 @@ def minimum_entropy_velocity(group: RangeGroup, doppler_hz: Tensor, dwell_s: flo
     refine: `parabola_minimum` or `gradient_minimum` of torchsar.optim. The deviation is how far the minima of separate parts of the
     group scatter about the common one (eight parts, by their slopes at the minimum and the common curvature).
     """
-    columns = velocity_objective(group, doppler_hz, dwell_s)
+    blocks = velocity_objective(group, doppler_hz, dwell_s)
 
     def cost(velocity: Tensor) -> Tensor:
-        return columns(velocity).sum(-1)
+        return blocks(velocity).sum(-1)
 
     step = min(grid_step_m_s(group.radar, float(group.radar.near_range_m), dwell_s), reach_m_s / 2)
     count = 2 * math.ceil(reach_m_s / step) + 1
@@ -69,12 +69,12 @@ def minimum_entropy_velocity(group: RangeGroup, doppler_hz: Tensor, dwell_s: flo
     coarse, costs = grid_minimum(cost, start, reach_m_s, count)
     value, curvature = refine(cost, coarse, 2 * reach_m_s / (count - 1), tolerance_m_s)
     value, _ = settle(value, group.radar.velocity_m_s)
-    return value, _scatter_std(columns, value, curvature, max(tolerance_m_s, step / 50)), costs
+    return value, _scatter_std(blocks, value, curvature, max(tolerance_m_s, step / 50)), costs
 
 
-def _scatter_std(columns: Callable[[Tensor], Tensor], velocity: Tensor, curvature: Tensor, half: float) -> Tensor:
+def _scatter_std(blocks: Callable[[Tensor], Tensor], velocity: Tensor, curvature: Tensor, half: float) -> Tensor:
     with torch.no_grad():
-        slopes = (columns(velocity + half) - columns(velocity - half)) / (2 * half)
+        slopes = (blocks(velocity + half) - blocks(velocity - half)) / (2 * half)
     parts = torch.stack([part.sum(-1) for part in slopes.tensor_split(8, -1)], -1)
     spread = parts.std(-1) * math.sqrt(parts.shape[-1])
     return torch.where(curvature > 0, spread / torch.where(curvature > 0, curvature, 1), 1e6).clamp_max(1e6)

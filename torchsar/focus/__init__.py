@@ -1,8 +1,47 @@
 """Range compression and image formation."""
 
+from torchsar.focus.backprojection import Backproject, DopplerBand, EveryPulse, Integration, backproject
+from torchsar.focus.detection import Detect, QuickLook, amplitude, multilook, quicklook_looks, to_db
 from torchsar.focus.nufft import Nufft, nufft_type1, nufft_type2
 from torchsar.focus.omega_k import OmegaK, StoredOmegaK, omega_k
+from torchsar.focus.range_doppler import RangeDoppler, range_doppler
 from torchsar.focus.reference import RangeCompress, flat_reference, matched_reference, range_compress
+from torchsar.focus.requirements import Requirement, recommended_form, requirements
 from torchsar.focus.stolt import OmegaKStolt, omega_k_stolt
+from torchsar.focus.strip import StripPlan, focus_strip, plan_strip, reach_lines, write_strip
 
-__all__ = ["Nufft", "OmegaK", "OmegaKStolt", "RangeCompress", "StoredOmegaK", "flat_reference", "matched_reference", "nufft_type1", "nufft_type2", "omega_k", "omega_k_stolt", "range_compress"]
+__all__ = [
+    "Backproject",
+    "Detect",
+    "DopplerBand",
+    "EveryPulse",
+    "Integration",
+    "Nufft",
+    "OmegaK",
+    "OmegaKStolt",
+    "QuickLook",
+    "RangeCompress",
+    "RangeDoppler",
+    "Requirement",
+    "StoredOmegaK",
+    "StripPlan",
+    "amplitude",
+    "backproject",
+    "flat_reference",
+    "focus_strip",
+    "matched_reference",
+    "multilook",
+    "nufft_type1",
+    "nufft_type2",
+    "omega_k",
+    "omega_k_stolt",
+    "plan_strip",
+    "quicklook_looks",
+    "range_compress",
+    "range_doppler",
+    "reach_lines",
+    "recommended_form",
+    "requirements",
+    "to_db",
+    "write_strip",
+]

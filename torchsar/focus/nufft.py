@@ -138,12 +138,16 @@ class Nufft:
         """Prepare points, float64 (..., m), any real numbers (periodic in 1); they can be used for several arrays."""
         return Points.of(self.kernel, cycles_per_sample * self.length, self.length, real_dtype(self.dtype))
 
-    def type2(self, x: Tensor, points: Points) -> Tensor:
-        """sum_j x_j exp(-2j pi p (j - n//2)). x: (..., n) -> (..., m)."""
+    def grid(self, x: Tensor) -> Tensor:
+        """The oversampled spectrum that `interpolate` takes points from. x: (..., n) -> (..., length)."""
         x = x * self.weight
         half = self.n // 2
         gap = x.new_zeros((*x.shape[:-1], self.length - self.n))
-        return interpolate(torch.fft.fft(torch.cat([x[..., half:], gap, x[..., :half]], -1)), points)
+        return torch.fft.fft(torch.cat([x[..., half:], gap, x[..., :half]], -1))
+
+    def type2(self, x: Tensor, points: Points) -> Tensor:
+        """sum_j x_j exp(-2j pi p (j - n//2)). x: (..., n) -> (..., m)."""
+        return interpolate(self.grid(x), points)
 
     def type1(self, y: Tensor, points: Points) -> Tensor:
         """sum_k y_k exp(+2j pi p_k (j - n//2)), the adjoint of type2. y: (..., m) -> (..., n)."""

@@ -127,7 +127,7 @@ class FrequencyBasis:
         return cis(2 * math.pi * (coefficients @ self._polynomials.to(coefficients.dtype)))
 
 
-def bulk_filter(basis: FrequencyBasis, at: FrameGeometry, range_m: float, reference: Tensor | None, dtype: torch.dtype) -> Tensor:
+def bulk_filter(basis: FrequencyBasis, at: FrameGeometry, range_m: Tensor | float, reference: Tensor | None, dtype: torch.dtype) -> Tensor:
     """Conjugate two-dimensional spectrum of a target at range_m, (..., d, n): phase 2 pi [(2 R / c) (G - f0 - f) + 1/8], 1/8 turn at the frame Doppler.
 
     A focused target then has the phase -4 pi R / lambda of its echo at the crossing of the beam centre, as backprojection has.
@@ -196,14 +196,14 @@ def through_doppler(raw: Tensor, focus_rows: Callable[[Tensor, slice], Tensor], 
     return transform_in_blocks(work, -2, inverse=True)
 
 
-class OmegaK(Stage):
-    """Focus by bulk + refocus omega-K; image axes (azimuth, range) in the coordinates of the frame Doppler.
+class Focuser(Stage):
+    """Base of the focusing stages: a radar, a range reference, a velocity and a Doppler; `form` is the function that does the work.
 
-    reference: "matched" or "flat" to compress the pulse in the same pass, None for range-compressed data. velocity_m_s and doppler_hz
+    Image axes (azimuth, range) are in the coordinates of the frame Doppler. reference: "matched" or "flat" to compress the pulse in the same pass, None for range-compressed data. velocity_m_s and doppler_hz
     may be given here (a number, a per-trial tensor, or an nn.Parameter to optimise) or by a chain at every call, which wins.
     """
 
-    form = staticmethod(omega_k)
+    form: Callable[..., Tensor]
 
     def __init__(
         self,
@@ -227,13 +227,19 @@ class OmegaK(Stage):
     def forward(self, signal: Signal, doppler_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Signal:
         data = type(self).form(
             signal.data,
-            self.radar,
+            replace(self.radar, near_range_m=signal.axes[-1].start),
             doppler_hz=self.doppler_hz if doppler_hz is None else doppler_hz,
             velocity_m_s=self.velocity_m_s if velocity_m_s is None else velocity_m_s,
             frame_hz=self.frame_hz,
             reference=self.spectrum(signal.data.shape[-1], signal.data.device),
         )
         return Signal(data, self.radar.image_axes(signal.axes))
+
+
+class OmegaK(Focuser):
+    """Focus by bulk + refocus omega-K; arguments as `Focuser`."""
+
+    form = staticmethod(omega_k)
 
 
 class StoredOmegaK(Stage):
@@ -245,7 +251,7 @@ class StoredOmegaK(Stage):
     def __init__(self, stage: OmegaK, axes: tuple[Axis, ...], dtype: torch.dtype = torch.complex64) -> None:
         super().__init__()
         n_pulse, n_range = axes[-2].n, axes[-1].n
-        radar, device = stage.radar, stage.velocity_m_s.device
+        radar, device = replace(stage.radar, near_range_m=axes[-1].start), stage.velocity_m_s.device
         anchor = torch.empty((n_pulse, n_range), dtype=dtype, device="meta")
         self.axes, self.radar, self.centre = axes, radar, n_range // 2
         with torch.no_grad():

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchsar.core import real_dtype
 from torchsar.focus.nufft import Nufft, Points
-from torchsar.focus.omega_k import FrameGeometry, FrequencyBasis, OmegaK, bulk_filter, refocus, refocus_turns_per_sample, residual_frequency, through_doppler
+from torchsar.focus.omega_k import Focuser, FrameGeometry, FrequencyBasis, bulk_filter, refocus, refocus_turns_per_sample, residual_frequency, through_doppler
 from torchsar.radar import StripmapRadar
 
 
@@ -61,7 +61,7 @@ def omega_k_stolt(
     return through_doppler(raw, focus_rows, differentiable=geometry.requires_grad or raw.requires_grad)
 
 
-class OmegaKStolt(OmegaK):
-    """Focus by omega-K with Stolt interpolation, exact over the whole swath; arguments, axes and coordinates as `OmegaK`."""
+class OmegaKStolt(Focuser):
+    """Focus by omega-K with Stolt interpolation, exact over the whole swath; arguments as `Focuser`."""
 
     form = staticmethod(omega_k_stolt)

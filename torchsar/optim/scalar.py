@@ -43,7 +43,7 @@ def parabola_minimum(cost: Cost, start: Tensor, step: float, tolerance: float, r
             x, best = torch.where(active, moved, x), torch.where(active, value, best)
             half = torch.where(active & inside, half / 4, half)
             active = active & (half > tolerance)
-            if not bool(active.any()):
+            if _finished(active):
                 break
     return x, curvature
 
@@ -76,9 +76,16 @@ def gradient_minimum(cost: Cost, start: Tensor, step: float, tolerance: float, r
         moved = torch.where(active, next_x, x)
         active = active & ((moved - x).abs() > tolerance)
         x = moved
-        if not bool(active.any()):
+        if _finished(active):
             break
     return x, curvature.clamp_min(0)
+
+
+def _finished(active: Tensor) -> bool:
+    try:
+        return not bool(active.any())
+    except RuntimeError:  # inside vmap a value cannot be looked at: all rounds are made
+        return False
 
 
 def _slope(cost: Cost, x: Tensor) -> Tensor:

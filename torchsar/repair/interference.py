@@ -15,8 +15,8 @@ from torch import Tensor
 
 from torchsar.core import Estimate, Signal, Stage
 from torchsar.repair.interference_band import find_band, subtract_band
-from torchsar.repair.interference_detect import THRESHOLD, Level, clean_level, line_spectra
-from torchsar.repair.interference_tone import Tone, anything, find_tones, fit_tone, subtract_tones
+from torchsar.repair.interference_detect import THRESHOLD, Level, clean_level, line_spectra, stands_out
+from torchsar.repair.interference_tone import Tone, anything, find_tones, subtract_tones
 
 _BAND_ROUNDS = 3
 
@@ -47,7 +47,7 @@ class Contamination:
 
 
 def find_contamination(raw: Tensor, threshold: float = THRESHOLD) -> Contamination:
-    """Lines and cells whose tapered range spectrum exceeds `threshold` times the robust level. raw: (..., pulse, range).
+    """Cells whose tapered range spectrum exceeds `threshold` times the robust level, and lines where that is in few places. raw: (..., pulse, range).
 
     A first look: the repairs also test that what they see lasts the whole line, since regularly spaced targets make spectral lines too.
     """
@@ -56,7 +56,7 @@ def find_contamination(raw: Tensor, threshold: float = THRESHOLD) -> Contaminati
         level = clean_level(power)
         excess = level.excess(power)
         cells = excess > threshold
-    return Contamination(level, excess, cells, cells.any(-1))
+    return Contamination(level, excess, cells, stands_out(excess, threshold))
 
 
 def notch_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
@@ -65,7 +65,7 @@ def notch_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
     Takes the clutter of those cells with it and leaves the skirts of the tone that lie below the threshold.
     """
     found = find_contamination(raw, threshold)
-    touched = found.lines & _interfered(raw.detach(), found, threshold)
+    touched = _interfered(raw.detach(), found, threshold)
     spectrum = torch.fft.fft(raw)
     with torch.no_grad():
         hit = (found.level.excess((spectrum.real.square() + spectrum.imag.square()) / raw.shape[-1]) > threshold) & touched[..., None]
@@ -76,7 +76,7 @@ def notch_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
 def drop_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
     """Give contaminated lines up: they are set to zero and marked missing, for the stage that fills lines. Differentiable in raw."""
     found = find_contamination(raw, threshold)
-    touched = found.lines & _interfered(raw.detach(), found, threshold)
+    touched = _interfered(raw.detach(), found, threshold)
     data = raw.masked_fill(touched[..., None], 0)
     return Repaired(data, touched, touched, torch.where(touched, raw.shape[-1], 0), _no_tone(touched))
 
@@ -85,7 +85,7 @@ def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones:
     """Subtract tones by maximum likelihood and what is wider as a narrowband process; give up lines that neither can save.
 
     raw: (..., pulse, range) complex. Up to `most_tones` tones a line, each with its own frequency and drift, amplitude and phase; up to
-    three bands, each narrower than 1/16 of the sampling rate. A tone costs a line of n samples 1 / n to 2 / n of the clutter's power
+    three bands, each narrower than about 1/40 of the sampling rate. A tone costs a line of n samples 1 / n to 2 / n of the clutter's power
     at that frequency; a band of width B about B n / fs cells. A line is missing where interference stronger than its clutter is left. Differentiable
     in raw, with frequencies and spectra of the interferers held. Works on the contaminated lines only; the others pass bit by bit.
     """
@@ -94,7 +94,7 @@ def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones:
         nothing = torch.zeros_like(found.lines)
         return Repaired(raw, nothing, nothing, found.cells.sum(-1), _no_tone(nothing))
     index = _selection(found.lines)
-    lines, level = _take_lines(raw, index), Level(found.level.gain.gather(-1, index), found.level.shape)
+    lines, level = _take_lines(raw, index), found.level.lines(index)
     with torch.no_grad():
         tones = find_tones(lines, level, index, most_tones, threshold)
     cleaned = subtract_tones(lines, tones)
@@ -114,22 +114,20 @@ def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones:
 
 
 def _interfered(raw: Tensor, found: Contamination, threshold: float) -> Tensor:
-    """Lines whose strongest cell comes from something that lasts the whole line, (..., pulse) bool."""
-    peak, cell = found.excess.max(-1)
-    strong = peak > threshold
-    if not anything(strong):
-        return strong
-    return fit_tone(raw, cell, strong, found.level).present | find_band(raw, found.level, threshold)[0]
+    """Lines with a tone or with something wider that lasts the whole line, (..., pulse) bool."""
+    touched = find_band(raw, found.level, threshold)[0] if anything(found.lines) else found.lines
+    for tone in find_tones(raw, found.level, most=1, threshold=threshold) if anything(found.lines & ~touched) else []:
+        touched = touched | tone.present
+    return touched
 
 
 def _selection(lines: Tensor) -> Tensor:
-    """Indices of marked lines in rising order, (..., count) int64, count the largest of any trial; others fill up trials with fewer."""
+    """Indices of marked lines in rising order, (..., count) int64, count the largest of any trial; unmarked lines fill up behind."""
     try:
         count = int(lines.sum(-1).max())
     except RuntimeError:  # inside vmap a value cannot be looked at
         count = lines.shape[-1]
-    rank = torch.argsort((~lines).to(torch.int8), dim=-1, stable=True)[..., :count]
-    return rank.sort(-1).values
+    return torch.argsort((~lines).to(torch.int8), dim=-1, stable=True)[..., :count]
 
 
 def _take_lines(raw: Tensor, index: Tensor) -> Tensor:
@@ -140,7 +138,7 @@ def _ruined(lines: Tensor, level: Level, threshold: float) -> Tensor:
     """Lines where the cells still above the threshold hold more power than the clutter of the whole line, (..., pulse) bool."""
     power = line_spectra(lines)
     left = (power * (level.excess(power) > threshold)).sum(-1)
-    return left > level.gain * level.shape.sum(-1, keepdim=True)
+    return left > level.density.sum(-1)
 
 
 def _no_tone(touched: Tensor) -> Tensor:

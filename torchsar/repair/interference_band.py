@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchsar.repair.interference_detect import LEVEL_SHARE, THRESHOLD, Level, line_spectra
+from torchsar.repair.interference_detect import LEVEL_SHARE, THRESHOLD, Level, line_spectra, stands_out
 from torchsar.repair.interference_tone import anything, block_sums, window_sums
 
 STRETCH_LINES = 32
@@ -28,7 +28,7 @@ def lasts_the_line(lines: Tensor, cell: Tensor) -> Tensor:
     turns = (cell.to(torch.float64) / n)[..., None] * torch.arange(n, dtype=torch.float64, device=lines.device)
     angle = (2 * torch.pi * (turns - torch.round(turns))).to(lines.real.dtype)
     power = block_sums(lines * torch.polar(torch.ones_like(angle), -angle)).abs().square()
-    return power.median(-1).values > 0.25 * power.mean(-1)
+    return power.median(-1).values > 0.35 * power.mean(-1)
 
 
 def find_band(lines: Tensor, level: Level, threshold: float = THRESHOLD) -> tuple[Tensor, Tensor]:
@@ -36,8 +36,8 @@ def find_band(lines: Tensor, level: Level, threshold: float = THRESHOLD) -> tupl
 
     The verdict that it lasts is the majority's among the strong lines nearby: of a noise-like interferer one line may look intermittent.
     """
-    peak, cell = level.excess(line_spectra(lines.detach())).max(-1)
-    strong = peak > threshold
+    excess = level.excess(line_spectra(lines.detach()))
+    strong, cell = stands_out(excess, threshold), excess.argmax(-1)
     if not anything(strong):
         return strong, cell
     near = window_sums(STRETCH_LINES // 2)
@@ -63,14 +63,13 @@ def subtract_band(lines: Tensor, touched: Tensor, level: Level) -> Tensor:
 
 def _mean_excess(x: Tensor, on: Tensor, level: Level) -> Tensor:
     """Spectrum over the level at half cells, mean over the touched lines of a stretch. (..., stretch, line, n) -> (..., stretch, 2 n)."""
-    gain = pad(level.gain, (0, -level.gain.shape[-1] % STRETCH_LINES)).unflatten(-1, (-1, STRETCH_LINES))
-    fine = level.shape.repeat_interleave(2, -1)[..., None, :]
-    weight = torch.where(on & (gain > 0), 1 / torch.where(gain > 0, gain, 1), 0)
+    density = pad(level.density, (0, 0, 0, -level.density.shape[-2] % STRETCH_LINES)).unflatten(-2, (-1, STRETCH_LINES))
     total = torch.zeros(*x.shape[:-2], 2 * x.shape[-1], dtype=x.real.dtype, device=x.device)
     for k in range(STRETCH_LINES):  # one line of every stretch at a time: a fraction of the memory of all at once
-        total = total + line_spectra(x[..., k, :], 2) * weight[..., k, None]
-    total = total / on.sum(-1).clamp_min(1)[..., None]
-    return torch.where(fine > 0, total / torch.where(fine > 0, fine, 1), 0)
+        fine = density[..., k, :].repeat_interleave(2, -1)
+        usable = on[..., k, None] & (fine > 0)
+        total = total + torch.where(usable, line_spectra(x[..., k, :], 2) / torch.where(usable, fine, 1), 0)
+    return total / on.sum(-1).clamp_min(1)[..., None]
 
 
 def _window(excess: Tensor, n: int) -> tuple[Tensor, Tensor]:

@@ -17,9 +17,10 @@ import torch
 from torch import Tensor
 
 from torchsar.core import unit_phasor
-from torchsar.repair.interference_detect import THRESHOLD, Level, line_spectra
+from torchsar.repair.interference_detect import THRESHOLD, Level, line_spectra, stands_out
 
-_SWEEP_CELLS = 12  # drift within a line that is searched, +- frequency cells
+_SWEEP_CELLS = 48  # drift within a line that is searched, +- frequency cells
+_OFFSET_CELLS = 12
 _STEPS = 6
 
 
@@ -73,13 +74,14 @@ def coarse_offset(blocks: Tensor, n: int) -> tuple[Tensor, Tensor]:
     """Frequency offset and rate that collect most energy of demodulated block sums, in cells (1 / n) and cells per line, (...,)."""
     count = blocks.shape[-1]
     u = torch.linspace(-0.5, 0.5, count, dtype=torch.float64, device=blocks.device)
-    offset = torch.fft.fftfreq(4 * count, 1 / (4 * count), dtype=torch.float64, device=blocks.device) / 4
-    near = offset.abs() <= _SWEEP_CELLS
+    offset = torch.fft.fftfreq(2 * count, 1 / (2 * count), dtype=torch.float64, device=blocks.device) / 2
     best = torch.full(blocks.shape[:-1], -1.0, dtype=blocks.real.dtype, device=blocks.device)
     cells, sweep = torch.zeros_like(best, dtype=torch.float64), torch.zeros_like(best, dtype=torch.float64)
-    for cells_per_line in sorted(range(-_SWEEP_CELLS, _SWEEP_CELLS + 1), key=abs):
+    for cells_per_line in sorted(range(-_SWEEP_CELLS, _SWEEP_CELLS + 1, 2), key=abs):
         chirp = unit_phasor(-0.5 * cells_per_line * u.square(), blocks.dtype)
-        value, index = (torch.fft.fft(blocks * chirp, 4 * count).abs() * near).max(-1)
+        # the strongest cell of a drifting tone may be any that it passes
+        near = offset.abs() <= _OFFSET_CELLS + abs(cells_per_line) / 2
+        value, index = (torch.fft.fft(blocks * chirp, 2 * count).abs() * near).max(-1)
         # a drift must earn its parameter
         better = value > best * (1.0 if cells_per_line == 0 else 1.02)
         best, cells = torch.where(better, value, best), torch.where(better, offset[index], cells)
@@ -168,7 +170,8 @@ def smooth_track(value: Tensor, std: Tensor, present: Tensor, position: Tensor) 
         misfit = torch.where(present, (value - line) / std.clamp_min(1e-30), 0.0).square()
         count = box(present.to(value.dtype))
         spread = box(misfit) / (count - 2).clamp_min(1)
-        agrees = present & support & (count >= 5) & (spread < 1 + 3 * torch.sqrt(2 / count.clamp_min(1))) & (misfit < 16)
+        wider = half < present.sum(-1, keepdim=True)
+        agrees = present & support & wider & (count >= 5) & (spread < 1 + 3 * torch.sqrt(2 / count.clamp_min(1))) & (misfit < 16)
         chosen = torch.where(agrees, line, chosen)
         half *= 3
     return chosen
@@ -205,8 +208,8 @@ def find_tones(lines: Tensor, level: Level, position: Tensor | None = None, most
     rest, tones = lines.detach(), []
     blocked = torch.zeros(lines.shape, dtype=torch.bool, device=lines.device)
     for _ in range(most):
-        peak, cell = level.excess(line_spectra(rest)).masked_fill(blocked, 0).max(-1)
-        strong = peak > threshold
+        excess = level.excess(line_spectra(rest)).masked_fill(blocked, 0)
+        strong, cell = stands_out(excess, threshold), excess.argmax(-1)
         if not anything(strong):
             break
         tone = fit_tone(rest, cell, strong, level)
@@ -235,11 +238,13 @@ def explaining(lines: Tensor, rest: Tensor, tones: list[Tone], level: Level) -> 
 def refit(lines: Tensor, tones: list[Tone], position: Tensor, rounds: int = 2) -> list[Tone]:
     """Each tone fitted again with the others taken out, then pooled over lines."""
     n, tones = lines.shape[-1], list(tones)
-    for _ in range(rounds if len(tones) > 1 else 0):
+    shared = torch.stack([tone.present for tone in tones]).sum(0) > 1 if tones else None
+    for _ in range(rounds if shared is not None and anything(shared) else 0):
         waves = subtract_each(lines, tones)
         for k, tone in enumerate(tones):
             alone = lines - sum(wave for j, wave in enumerate(waves) if j != k)
-            tones[k] = replace(_refine(alone, tone, 2)[0], present=tone.present)
+            again = _refine(alone, tone, 2)[0]
+            tones[k] = replace(tone, frequency=torch.where(shared, again.frequency, tone.frequency), rate=torch.where(shared, again.rate, tone.rate))
             waves[k] = tones[k].waveform(alone)
     return [pooled(tone, n, position) for tone in tones]
 

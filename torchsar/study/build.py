@@ -76,17 +76,26 @@ def point_targets(scenes: Mapping[str, Scene]) -> dict[str, int]:
     return names
 
 
+def read_recording(loaded: Loaded) -> Recording:
+    """The recording that data.file names."""
+    assert loaded.config.data.file is not None
+    try:
+        return read_stripmap(loaded.config.data.file, precision(loaded.config))
+    except (ValueError, OSError) as error:
+        raise ConfigError(f"{loaded.file}: data.file: {' '.join(str(error).split()).removeprefix('data.file: ')}") from None
+
+
 def build_case(loaded: Loaded) -> Case:
     """Simulate, or read and optionally damage a recording. Everything that the config says about it is checked first."""
     config = loaded.config
     draws = Draws(config.seed)
     if config.data.file is not None:
         damages = build_damages(config.data.damages, "data.damages", loaded.file)
+        clean = read_recording(loaded)
         try:
-            clean = read_stripmap(config.data.file, precision(config))
             recording, told = apply_damages(clean, damages, draws)
-        except (ValueError, OSError) as error:
-            raise ConfigError(f"{loaded.file}: data.file: {' '.join(str(error).split()).removeprefix('data.file: ')}") from None
+        except ValueError as error:
+            raise ConfigError(f"{loaded.file}: data.damages: {' '.join(str(error).split())}") from None
         return Case(recording, clean, Truth(told, clean) if damages else None, {})
     world, radar = build_world(loaded), build_radar(loaded)
     assert config.world is not None

@@ -134,6 +134,8 @@ class Config(Strict):
     def _whole(self) -> Config:
         if "recommended" not in self.processor:
             raise ValueError("processor needs a method called 'recommended'")
+        if self.processor["recommended"].stages is None:
+            raise ValueError("processor.recommended needs stages of its own")
         for name in RESERVED:
             if name in self.processor:
                 raise ValueError(f"processor.{name}: this name is taken by a group of the results; choose another")

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from torchsar import plot
 from torchsar.core import Signal, Truth
-from torchsar.study.cuts import impulse_cuts
 from torchsar.radar import StripmapRadar
 from torchsar.study.build import Case
 from torchsar.study.config import Config
+from torchsar.study.cuts import impulse_cuts
 from torchsar.study.judge import expected_places
 from torchsar.study.methods import Result, focus_name
 from torchsar.study.registry import group_of
@@ -46,6 +46,11 @@ class Scene:
         return self.results["recommended"]
 
     @property
+    def scale(self) -> dict[str, Any]:
+        """Scenes of known points are shown below their peak; of recordings the brightest thousandth saturates."""
+        return {"percentile": 100.0, "dynamic_range_db": 60.0} if self.case.targets else {"percentile": 99.9, "dynamic_range_db": 50.0}
+
+    @property
     def radar(self) -> StripmapRadar:
         return self.case.recording.radar
 
@@ -68,14 +73,14 @@ Drawn = Iterator[tuple[str, str, str, Any]]
 def _image(scene: Scene) -> Drawn:
     image = scene.best.image.crop(**scene.window)
     caption = "The image of the recommended method over the judged window: range to the right, azimuth upward, in metres; amplitude in dB."
-    yield "image", "Focused image", caption, plot.image(image, title=scene.best.title or "recommended")
+    yield "image", "Focused image", caption, plot.image(image, title=scene.best.title or "recommended", **scene.scale)
 
 
 def _comparison(scene: Scene) -> Drawn:
     shown = {name: result.image.crop(**scene.window) for name, result in scene.results.items() if not scene.config.processor[name].rerun}
     if len(shown) > 1:
         first = next(iter(shown))
-        yield "methods", "The same scene by every method", f"All images on one scale, that of '{first}'.", plot.images(shown)
+        yield "methods", "The same scene by every method", f"All images on one scale, that of '{first}'.", plot.images(shown, **scene.scale)
 
 
 def _cuts(scene: Scene) -> Drawn:
@@ -121,7 +126,7 @@ def _squint(scene: Scene) -> Drawn:
         if method.rerun is not None and any(key.endswith("doppler_hz") for key in method.rerun.given):
             shown = {"squint taken into account": scene.best.image.crop(**scene.window), method.title or name: scene.results[name].image.crop(**scene.window)}
             caption = "Left: focused about the estimated Doppler centroid. Right: the same data focused as if the beam looked straight to the side: displaced, smeared, with ghosts."
-            yield "squint", "With and without the squint", caption, plot.images(shown)
+            yield "squint", "With and without the squint", caption, plot.images(shown, **scene.scale)
 
 
 def _focus_input(result: Result) -> Signal | None:
@@ -275,4 +280,5 @@ def _velocity(scene: Scene) -> Drawn:
             grid, cost = (plot.array(estimate.info[key]) for key in ("grid_velocity_m_s", "grid_entropy"))
             value = float(estimate.value["velocity_m_s"])
             caption = "Entropy of a small group of range lines over effective velocity; the dashed line is the refined minimum."
-            yield f"{name}_entropy", "Effective velocity by minimum entropy", caption, plot.curves({"entropy": (grid, cost)}, "effective velocity (m/s)", "entropy (nats)", f"{value:.2f} m/s", {"estimate": value})
+            figure = plot.curves({"entropy": (grid, cost)}, "effective velocity (m/s)", "entropy (nats)", f"{value:.2f} m/s", {"estimate": value})
+            yield f"{name}_entropy", "Effective velocity by minimum entropy", caption, figure

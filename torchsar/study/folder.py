@@ -85,7 +85,7 @@ def write_arrays(path: Path, images: Mapping[str, Signal], truth: Mapping[str, T
                 _put(inner, name, value)
 
 
-def _put(group: zarr.Group, name: str, value: Tensor, dims: tuple[str, ...] | None = None, **attributes: str) -> None:
+def _put(group: zarr.Group, name: str, value: Tensor, dims: tuple[str, ...] | None = None, **attributes: Any) -> None:
     data = torch.as_tensor(value).detach().cpu().resolve_conj().numpy()
     chunks = tuple(min(n, 1024) for n in data.shape)
     array = group.create_array(name, shape=data.shape, dtype=data.dtype, chunks=chunks or "auto", dimension_names=dims, attributes=attributes)

@@ -75,10 +75,11 @@ def metrics_tree(config: Config, case: Case, results: Mapping[str, Result]) -> d
 
 
 def _image_metrics(result: Result, reference: Result | None, part: Mapping[str, tuple[int, int]]) -> dict[str, float]:
-    image = result.image.crop(**part).to(torch.complex128)  # sums over millions of pixels
+    image = result.image.crop(**part)
     out = {"entropy_nats": float(entropy(image)), "contrast": float(contrast(image))}
     if reference is not None and reference is not result:
         other = reference.image.crop(**part).to(torch.complex128)
+        image = image.to(torch.complex128)  # sums over millions of pixels
         out["image_error_db"], out["image_correlation"] = float(error_db(image, other)), float(correlation(image, other))
     return out
 

@@ -14,7 +14,7 @@ from torchsar.study.text import packaged_configs, read_tree
 def listing() -> str:
     """Experiments, stages and world objects with their keys, and the keys of data files."""
     parts = ["EXPERIMENTS (torchsar run NAME)"]
-    parts += [f"  {name:<22}{read_tree(path).get('title', '')}" for name, path in packaged_configs().items()]
+    parts += [f"  {name:<25}{read_tree(path).get('title', '')}" for name, path in packaged_configs().items()]
     for group in ("repair", "compensate", "focus", "own"):
         names = [name for name in stages().entries if group_of(name) == group]
         if names:
@@ -31,7 +31,7 @@ def _line(catalogue: Catalogue, name: str) -> str:
     for key, field in catalogue.model(name).model_fields.items():
         keys.append(key if field.is_required() else f"{key}={_short(field.default)}")
     about = (inspect.getdoc(catalogue.entries[name]) or "").split("\n")[0].replace("`", "")
-    return f"  {name:<22}{about}\n  {'':<22}  keys: {', '.join(keys) or 'none'}"
+    return f"  {name:<25}{about}\n  {'':<25}  keys: {', '.join(keys) or 'none'}"
 
 
 def _short(value: object) -> str:

@@ -6,7 +6,7 @@ import logging
 import os
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -68,8 +68,15 @@ def run_methods(loaded: Loaded, case: Case, chains: Mapping[str, Chain]) -> dict
             log.info("%s: %.1f s", name, results[name].seconds)
             for other, result in results.items():
                 if other not in keep and result.trace is not None:
-                    results[other] = Result(**{**result.__dict__, "trace": None})
+                    results[other] = replace(result, trace=None)
     return results
+
+
+def run_recommended(loaded: Loaded, case: Case) -> Result:
+    """The recommended method alone."""
+    chains = build_chains(loaded, case.recording.radar)
+    config = loaded.config.model_copy(update={"processor": {"recommended": loaded.config.processor["recommended"]}})
+    return run_methods(replace(loaded, config=config), case, chains)["recommended"]
 
 
 def _run_one(name: str, method: Method, chain: Chain, case: Case, earlier: Mapping[str, Result]) -> Result:

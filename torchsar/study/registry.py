@@ -12,8 +12,14 @@ from typing import Any
 
 from torchsar.compensate.ambiguity import DopplerCentroid
 from torchsar.compensate.doppler import EnergyCentre, PhaseIncrement, RangeDependentCentroid
+from torchsar.echo.interference import Quantiser, Tone, WideInterferer
 from torchsar.echo.jitter import PeriodicJitter
 from torchsar.focus import OmegaK, RangeCompress
+from torchsar.focus.backprojection import Backproject
+from torchsar.focus.range_doppler import RangeDoppler
+from torchsar.focus.stolt import OmegaKStolt
+from torchsar.repair.interference import DropInterference, NotchInterference, SubtractInterference
+from torchsar.repair.jitter_blind import BlindJitter
 from torchsar.repair.jitter_pilot import PilotJitter
 from torchsar.scene import AlwaysLit, Antenna, Dwell, Hyperbola, Parabola, Points, RandomPoints, Speckle
 from torchsar.study import factories
@@ -22,10 +28,14 @@ from torchsar.study.catalogue import Catalogue
 SCENES = Catalogue("scene", "kind", {"points": Points, "random_points": RandomPoints, "speckle": Speckle})
 BEAMS = Catalogue("beam", "kind", {"always_lit": AlwaysLit, "dwell": Dwell, "antenna": Antenna})
 PATHS = Catalogue("path", "kind", {"hyperbola": Hyperbola, "parabola": Parabola})
-DAMAGES = Catalogue("damage", "kind", {"periodic_jitter": PeriodicJitter})
+DAMAGES = Catalogue("damage", "kind", {"tone": Tone, "wide_interferer": WideInterferer, "quantiser": Quantiser, "periodic_jitter": PeriodicJitter})
 
 REPAIR: dict[str, Callable[..., Any]] = {
+    "interference_subtract": SubtractInterference,
+    "interference_notch": NotchInterference,
+    "interference_drop": DropInterference,
     "jitter_pilot": PilotJitter,
+    "jitter_blind": BlindJitter,
     "jitter_lagrange": factories.jitter_lagrange,
     "jitter_band_limited": factories.jitter_band_limited,
     "jitter_exact": factories.jitter_exact,
@@ -37,7 +47,13 @@ COMPENSATE: dict[str, Callable[..., Any]] = {
     "doppler_centroid": DopplerCentroid,
     "effective_velocity": factories.effective_velocity,
 }
-FOCUS: dict[str, Callable[..., Any]] = {"range_compress": RangeCompress, "omega_k": OmegaK}
+FOCUS: dict[str, Callable[..., Any]] = {
+    "range_compress": RangeCompress,
+    "omega_k": OmegaK,
+    "omega_k_stolt": OmegaKStolt,
+    "range_doppler": RangeDoppler,
+    "backproject": Backproject,
+}
 GROUPS = {"repair": REPAIR, "compensate": COMPENSATE, "focus": FOCUS}
 
 

@@ -46,7 +46,7 @@ def number(value: Any, digits: int = 4) -> str:
         return ", ".join(number(v, digits) for v in value)
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if isinstance(value, int) or float(value).is_integer() and abs(value) < 1e6:
+    if isinstance(value, int) or (float(value).is_integer() and abs(value) < 1e6):
         return f"{int(value)}"
     return f"{value:,.{digits}f}" if 1e-3 <= abs(value) < 1e7 else f"{value:.4g}"
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Chain
-from torchsar.study.build import Case, build_case, build_radar, resolved
+from torchsar.study.build import Case, build_case, build_damages, build_radar, build_world, resolved
 from torchsar.study.config import Loaded
 from torchsar.study.figures import Scene, draw_all
 from torchsar.study.folder import fresh_folder, write_arrays, write_json
@@ -45,10 +45,18 @@ def run(loaded: Loaded, out: Path, command: str = "torchsar run") -> Path:
     return out / "report.html"
 
 
+def check(loaded: Loaded) -> None:
+    """Build all that the config of a simulation names, without computing anything: echoes take long, mistakes should not."""
+    build_world(loaded)
+    assert loaded.config.world is not None
+    build_damages(loaded.config.world.damages, "world.damages", loaded.file)
+    build_chains(loaded, build_radar(loaded))
+
+
 def prepare(loaded: Loaded) -> tuple[Case, dict[str, Chain]]:
-    """The case and all chains. Of a simulation the chains are checked first, since the echoes take long."""
+    """The case and all chains."""
     if loaded.config.data.file is None:
-        build_chains(loaded, build_radar(loaded))
+        check(loaded)
         log.info("simulating %s", loaded.name)
     else:
         log.info("reading %s", loaded.config.data.file)

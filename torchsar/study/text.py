@@ -50,7 +50,7 @@ _Dumper.add_representer(tuple, lambda dumper, items: dumper.represent_list(list(
 def parse(text: str, what: str) -> Any:
     """A YAML document. Raises ConfigError naming `what` and the line."""
     try:
-        return yaml.load(text, Loader=_Loader)  # noqa: S506, a SafeLoader
+        return yaml.load(text, Loader=_Loader)  # a SafeLoader
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         place = f", line {mark.line + 1}" if mark else ""

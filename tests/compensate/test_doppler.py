@@ -1,0 +1,249 @@
+"""Doppler centroid, ambiguity and velocity: known answers and the figures of brief 004."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchsar.compensate import (
+    DopplerCentroid,
+    EffectiveVelocity,
+    EnergyCentre,
+    PhaseIncrement,
+    RangeDependentCentroid,
+    energy_centre,
+    phase_increment,
+    point_doppler,
+    velocity_objective,
+)
+from torchsar.core import Chain, Draws, Recording, Signal, use
+from torchsar.echo import simulate
+from torchsar.focus import OmegaK
+from torchsar.io import read_stripmap
+from torchsar.metrics.bounds import beam_centre_bound_hz, reference_doppler_std_hz, tone_frequency_bound_hz, velocity_bound_m_s
+from torchsar.optim import gradient_minimum, grid_minimum, parabola_minimum
+from torchsar.radar import LIGHT_M_S, LinearFM, StripmapRadar
+from torchsar.scene import Dwell, RandomPoints, StripmapWorld
+
+PRF = 1000.0
+
+
+def kondor(dwell_s: float = 0.3, squint_deg: float = 0.3) -> StripmapRadar:
+    pointing = 2 * 7000 * math.sin(math.radians(squint_deg)) / (LIGHT_M_S / 3.2e9)
+    return StripmapRadar(3.2e9, LinearFM(200e6, 2e-6), 250e6, 4000.0, 7000.0, 700e3, pointing_doppler_hz=pointing, integration_s=dwell_s)
+
+
+def strip(radar: StripmapRadar, lines: int, samples: int, points: int = 24, trials: int = 2, velocity: float = 7000.0, seed: int = 1, snr_db: float = -5.0) -> tuple[Recording, torch.Tensor]:
+    doppler = (radar.pointing_doppler_hz or 0.0) + torch.linspace(-40, 40, trials, dtype=torch.float64)
+    scene = RandomPoints(points, lines * 7000 / 4000, 150.0)
+    world = StripmapWorld(scene, beam=Dwell(radar.integration_s or 1.0), velocity_m_s=velocity, doppler_hz=doppler, snr_db=snr_db)
+    return simulate(radar, world, lines, samples, Draws(seed, trials=range(trials)))[0], doppler
+
+
+def coloured(seed: int, centre_hz: float, shape: tuple[int, int] = (2048, 1024), band_hz: float = 500.0) -> torch.Tensor:
+    """Uniform speckle with a rectangular azimuth band about centre_hz and noise 20 dB below."""
+    generator = torch.Generator().manual_seed(seed)
+    x = torch.fft.fft(torch.randn(shape, generator=generator, dtype=torch.complex64), dim=0)
+    frequency = torch.fft.fftfreq(shape[0], 1 / PRF, dtype=torch.float64)
+    offset = torch.remainder(frequency - centre_hz + PRF / 2, PRF) - PRF / 2
+    x = torch.fft.ifft(x * (offset.abs() < band_hz / 2)[:, None], dim=0)
+    return x + 0.07 * torch.randn(shape, generator=generator, dtype=torch.complex64)
+
+
+@pytest.mark.parametrize(("seed", "centre"), [(0, 120.0), (1, 490.0), (2, -377.0)])
+def test_both_estimators_within_one_hertz_on_uniform_scenes_also_where_the_band_wraps(seed: int, centre: float) -> None:
+    x = coloured(seed, centre)
+    increment, energy = phase_increment(x, PRF), energy_centre(x, PRF)
+    for estimate in (increment, energy):
+        error = float(estimate["doppler_baseband_hz"]) - centre
+        assert abs(error - PRF * round(error / PRF)) < 1.0
+        assert bool(estimate.ok)
+    assert abs(float(increment["doppler_baseband_hz"] - energy["doppler_baseband_hz"])) < 0.01
+    median = phase_increment(x, PRF, over="median")["doppler_baseband_hz"]
+    assert abs(float(median) - centre) < 3.0
+
+
+def test_plain_centre_of_mass_is_wrong_where_the_band_wraps() -> None:
+    estimate = energy_centre(coloured(1, 490.0), PRF)
+    assert abs(float(estimate.info["plain_baseband_hz"]) - 490) > 300
+
+
+def test_block_increments_are_offered_along_the_strip() -> None:
+    estimate = phase_increment(coloured(0, 120.0, (512, 256)), PRF, blocks=(8, 4))
+    assert estimate.info["block_hz"].shape == (8, 4)
+    assert (estimate.info["block_hz"] - 120).abs().max() < 60
+
+
+def test_missing_lines_do_not_bias() -> None:
+    x = coloured(3, 120.0)
+    holed = x.clone()
+    holed[torch.randperm(2048, generator=torch.Generator().manual_seed(0))[:100]] = 0
+    for estimator in (phase_increment, energy_centre):
+        assert abs(float(estimator(holed, PRF)["doppler_baseband_hz"]) - 120) < 1.0
+
+
+def test_predicted_std_covers_the_scatter_over_seeds() -> None:
+    estimates = [phase_increment(coloured(seed, 120.0, (256, 64)), PRF) for seed in range(40)]
+    errors = torch.stack([e["doppler_baseband_hz"] - 120 for e in estimates])
+    predicted = torch.stack([e.std["doppler_baseband_hz"] for e in estimates]).mean()
+    assert 0.6 < float(errors.std() / predicted) < 1.6
+
+
+def test_silent_trial_and_extreme_scales_leave_the_neighbours_alone() -> None:
+    x = torch.stack([coloured(0, 120.0, (256, 64)), torch.zeros(256, 64, dtype=torch.complex64), coloured(1, -200.0, (256, 64)) * 1e25])
+    estimate = phase_increment(x, PRF)
+    alone = phase_increment(x[0], PRF)
+    torch.testing.assert_close(estimate["doppler_baseband_hz"][0], alone["doppler_baseband_hz"])
+    assert estimate.ok.tolist() == [True, False, True]
+    assert torch.isfinite(estimate["doppler_baseband_hz"]).all()
+    assert abs(float(estimate["doppler_baseband_hz"][2]) + 200) < 10
+
+
+def test_range_dependent_centroid_follows_a_slope_past_a_bright_outlier() -> None:
+    radar = replace(kondor(), prf_hz=PRF)
+    t, u = torch.arange(512, dtype=torch.float64) / PRF, torch.linspace(-1, 1, 512, dtype=torch.float64)
+    turn = torch.polar(torch.ones(512, 512, dtype=torch.float64), 2 * math.pi * t[:, None] * 60 * u)
+    x = coloured(4, 120.0, (512, 512)) * turn.to(torch.complex64)
+    x[:, 100:104] += 30 * torch.polar(torch.ones(512), 2 * math.pi * 400 * t.float())[:, None]
+    estimate = RangeDependentCentroid(radar)(Signal(x, radar.raw_axes(512, 512)), doppler_hz=torch.tensor(120.0 - 3 * PRF, dtype=torch.float64))
+    error = estimate["doppler_range_hz"] - (120 + 60 * u - 3 * PRF)
+    assert float(error.abs().max()) < 12
+
+
+@pytest.mark.parametrize("rate", [0.0, 1494.0])
+@pytest.mark.parametrize("snr_db", [-8.0, 10.0])
+def test_point_doppler_lies_between_the_bound_and_the_papers_curve(rate: float, snr_db: float) -> None:
+    n, prf, trials = 1024, 4000.0, 300
+    generator = torch.Generator().manual_seed(5)
+    t = (torch.arange(n, dtype=torch.float64) - (n - 1) / 2) / prf
+    f = 3000 * (torch.rand(trials, generator=generator, dtype=torch.float64) - 0.5)
+    x = torch.exp(2j * math.pi * (f[:, None] * t - 0.5 * rate * t.square()))
+    x = x + 10 ** (-snr_db / 20) * torch.randn(trials, n, generator=generator, dtype=torch.complex128)
+    std = (point_doppler(x, prf, rate) - f).square().mean().sqrt()
+    q = n * 10 ** (snr_db / 10)
+    assert float(std) <= float(reference_doppler_std_hz(q, n / prf))
+    assert float(std) >= 0.7 * float(tone_frequency_bound_hz(q, n / prf))
+
+
+def test_bounds_have_the_known_values() -> None:
+    assert float(tone_frequency_bound_hz(1e4, 1.5)) == pytest.approx(0.39 / 150, rel=0.01)
+    assert float(reference_doppler_std_hz(1e4, 1.5)) == pytest.approx(1 / 150)
+    assert float(velocity_bound_m_s(1e4, 1.0, 7000.0, 0.0937, 700e3)) == pytest.approx(0.0707, rel=0.01)
+    cosine = torch.cos(torch.linspace(-math.pi / 2, math.pi / 2, 4001, dtype=torch.float64))
+    assert float(beam_centre_bound_hz(cosine, 1e4, 1494.0, 4000.0)) == pytest.approx(1494 / math.sqrt(2e4) / math.pi, rel=0.01)
+
+
+@pytest.mark.parametrize("refine", [parabola_minimum, gradient_minimum])
+def test_optimisers_find_each_trials_minimum(refine) -> None:
+    target = torch.tensor([-3.3, 0.02, 4.1], dtype=torch.float64)
+
+    def cost(x: torch.Tensor) -> torch.Tensor:
+        return torch.log1p((x - target).square()) + 0.1 * (x - target).square()
+
+    coarse, costs = grid_minimum(cost, torch.zeros(3, dtype=torch.float64), 6.0, 7)
+    assert costs.shape == (3, 7)
+    value, curvature = refine(cost, coarse, 2.0, 1e-4)
+    torch.testing.assert_close(value, target, atol=2e-3, rtol=0)
+    torch.testing.assert_close(curvature, torch.full((3,), 2.2, dtype=torch.float64), atol=0.2, rtol=0)
+
+
+@pytest.mark.parametrize(("squint", "ambiguity", "seed"), [(0.0, 0, 1), (0.3, 0, 2), (2.0, 1, 3)])
+def test_centroid_of_points_cut_by_the_ends_of_the_strip(squint: float, ambiguity: int, seed: int) -> None:
+    radar = kondor(0.3, squint)
+    recording, truth = strip(radar, 2048, 1024, seed=seed)
+    estimate = DopplerCentroid(radar)(recording.signal)
+    assert estimate.ok.all()
+    assert estimate["ambiguity"].tolist() == [ambiguity] * 2
+    assert (estimate["doppler_hz"] - truth).abs().max() < 5
+    blind = phase_increment(recording.signal.data, radar.prf_hz)["doppler_baseband_hz"]
+    assert (estimate["doppler_baseband_hz"] - truth + 4000 * ambiguity).abs().max() < (blind - truth + 4000 * ambiguity).abs().max()
+    exact = torch.rad2deg(torch.asin(radar.sin_squint(truth)))
+    assert (estimate["squint_deg"] - exact).abs().max() < 0.01
+
+
+@pytest.mark.parametrize("off", [-58.0, 58.0])
+def test_velocity_within_a_third_of_a_metre_per_second(off: float) -> None:
+    radar = kondor(0.8)
+    recording, _ = strip(radar, 4096, 900, trials=1, velocity=7000 + off)
+    chain = Chain(doppler=DopplerCentroid(radar), velocity=use(EffectiveVelocity(OmegaK(radar), refine=parabola_minimum, lines=256), doppler_hz="doppler"))
+    estimate = chain.trace(recording).estimates["velocity"]
+    assert abs(float(estimate["velocity_m_s"]) - 7000 - off) < 0.3
+    assert bool(estimate.ok)
+
+
+def test_gradient_of_the_objective_is_the_slope_and_both_refinements_agree() -> None:
+    radar = kondor()
+    recording, truth = strip(radar, 1536, 800)
+    raw = recording.signal.data.to(torch.complex128)
+    stage = EffectiveVelocity(OmegaK(radar), lines=128)
+    group, dwell = stage.group(raw)
+    blocks = velocity_objective(group, truth, dwell)
+    v = torch.full((2,), 7020.0, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(blocks(v).sum(), v)
+    with torch.no_grad():
+        numeric = (blocks(v + 0.01) - blocks(v - 0.01)).sum(-1) / 0.02
+    torch.testing.assert_close(slope, numeric, rtol=1e-4, atol=1e-9)
+    signal = recording.signal.with_data(raw)
+    by_gradient = stage(signal, doppler_hz=truth)["velocity_m_s"]
+    by_parabola = EffectiveVelocity(OmegaK(radar), lines=128, refine=parabola_minimum)(signal, doppler_hz=truth)["velocity_m_s"]
+    torch.testing.assert_close(by_gradient, by_parabola, atol=0.05, rtol=0)
+
+
+def test_batch_equals_singles_and_a_silent_trial_is_not_ok() -> None:
+    radar = kondor()
+    recording, _ = strip(radar, 1536, 800)
+    data = torch.cat([recording.signal.data, torch.zeros_like(recording.signal.data[:1])])
+    signal = recording.signal.with_data(data)
+    doppler = DopplerCentroid(radar)(signal)
+    velocity = EffectiveVelocity(OmegaK(radar), lines=128)(signal, doppler_hz=doppler["doppler_hz"])
+    assert not bool(doppler.ok[2]) and not bool(velocity.ok[2])
+    for estimate in (doppler, velocity):
+        assert all(torch.isfinite(value).all() for value in estimate.value.values())
+    single = signal.with_data(data[1])
+    alone = DopplerCentroid(radar)(single)
+    torch.testing.assert_close(alone["doppler_hz"], doppler["doppler_hz"][1], atol=1e-2, rtol=0)
+    fast = EffectiveVelocity(OmegaK(radar), lines=128)(single, doppler_hz=alone["doppler_hz"])
+    torch.testing.assert_close(fast["velocity_m_s"], velocity["velocity_m_s"][1], atol=0.05, rtol=0)
+
+
+BLOCKS = [
+    ("radarsat1_english_bay.npz", (0, 1424), (0, 2848), 488.0),
+    ("radarsat1_english_bay.npz", (200, 1224), (300, 2200), None),
+    ("radarsat1_squamish.npz", (0, 1536), (0, 2048), 549.0),
+    ("radarsat1_squamish.npz", (400, 1424), (100, 2000), None),
+]
+
+
+@pytest.mark.parametrize(("name", "lines", "columns", "baseband"), BLOCKS)
+def test_recorded_blocks_told_nothing(recorded, name: str, lines: tuple[int, int], columns: tuple[int, int], baseband: float | None) -> None:
+    recording = read_stripmap(recorded(name))
+    radar = replace(recording.radar, near_range_m=recording.radar.near_range_m + columns[0] * recording.radar.range_step_m)
+    signal = recording.signal.crop(pulse=lines, range=columns)
+    doppler = DopplerCentroid(radar)(signal)
+    assert bool(doppler.ok)
+    assert float(doppler["ambiguity"]) == -6
+    if baseband is not None:
+        assert abs(float(doppler["doppler_baseband_hz"]) - baseband) < 5
+        assert abs(float(doppler["doppler_hz"]) - (-7050 if baseband < 500 else -6990)) < 25
+        for stage in (PhaseIncrement(radar), EnergyCentre(radar)):
+            assert abs(float(stage(signal)["doppler_baseband_hz"]) - baseband) < 5
+        plain = float(EnergyCentre(radar)(signal).info["plain_baseband_hz"])
+        assert 390 < baseband - plain < 505
+    velocity = EffectiveVelocity(OmegaK(radar))(signal, doppler_hz=doppler["doppler_hz"])
+    assert abs(float(velocity["velocity_m_s"]) - 7066) < 3
+    assert bool(velocity.ok)
+
+
+def test_misuse_is_refused_in_one_sentence() -> None:
+    radar = kondor()
+    with pytest.raises(ValueError, match="mean"):
+        PhaseIncrement(radar, over="mode")
+    with pytest.raises(ValueError, match="flat"):
+        DopplerCentroid(radar, reference="none")
+    with pytest.raises(ValueError, match="reach"):
+        EffectiveVelocity(OmegaK(radar), reach_m_s=-1)
+    with pytest.raises(ValueError, match="blocks"):
+        phase_increment(torch.ones(4, 8, dtype=torch.complex64), PRF, blocks=(8, 8))

@@ -1,0 +1,105 @@
+"""The command line, as a user meets it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.study.tiny import write_tiny
+from torchsar.cli import main
+
+
+def spoken(capsys: pytest.CaptureFixture[str]) -> list[str]:
+    return [line for line in capsys.readouterr().err.splitlines() if line.strip()]
+
+
+def test_list_names_experiments_stages_and_data_keys(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list"]) == 0
+    text = capsys.readouterr().out
+    for name in ("stripmap_damaged", "radarsat1", "omega_k", "doppler_centroid", "points", "dwell", "chirp_rate_hz_s"):
+        assert name in text
+
+
+def test_run_prints_where_the_report_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "result"
+    assert main(["run", str(write_tiny(tmp_path)), "world.noise.snr_db=30", "seed=5", "--out", str(out)]) == 0
+    assert capsys.readouterr().out.strip() == str(out / "report.html")
+    assert "snr_db: 30" in (out / "config.yaml").read_text()
+    assert "seed: 5" in (out / "config.yaml").read_text()
+
+
+@pytest.mark.parametrize("extra", [["--out", "{out}", "seed=5"], ["seed=5", "--out", "{out}"]])
+def test_options_may_stand_before_or_after_overrides(tmp_path: Path, extra: list[str]) -> None:
+    out = tmp_path / "result"
+    assert main(["run", str(write_tiny(tmp_path)), *(e.format(out=out) for e in extra)]) == 0
+    assert "seed: 5" in (out / "config.yaml").read_text()
+
+
+@pytest.mark.parametrize("command", ["run", "requires", "trade"])
+def test_a_mistake_is_one_sentence_and_status_two(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "result"
+    assert main([command, str(write_tiny(tmp_path)), "radar.prf=3", "--out", str(out)]) == 2
+    lines = spoken(capsys)
+    assert len(lines) == 1 and lines[0].startswith("torchsar: ") and "radar.prf" in lines[0] and "prf_hz" in lines[0]
+    assert [path.name for path in tmp_path.iterdir()] == ["tiny.yaml"]
+
+
+def recording(path: Path, **changes: object) -> Path:
+    rng = np.random.default_rng(1)
+    arrays: dict = {
+        "iq": rng.normal(size=(96, 160, 2)).astype(np.float32),
+        "fs_hz": 50e6,
+        "prf_hz": 400.0,
+        "f0_hz": 3.2e9,
+        "chirp_rate_hz_s": 80e12,
+        "pulse_s": 0.5e-6,
+        "slant_range_cell1_m": 4000.0,
+        "v_eff_m_s": 120.0,
+    }
+    np.savez(path, **{key: value for key, value in {**arrays, **changes}.items() if value is not None})
+    return path
+
+
+FOCUS = {"recommended": {"stages": {"focus": {"stage": "omega_k"}}}}
+
+
+def test_own_recording_runs(tmp_path: Path) -> None:
+    config = write_tiny(tmp_path, world=None, radar=None, metrics=None, processor=FOCUS)
+    assert main(["run", str(config), f"data.file={recording(tmp_path / 'raw.npz')}", "--out", str(tmp_path / "result")]) == 0
+    assert "entropy_nats" in json.loads((tmp_path / "result" / "metrics.json").read_text())["methods"]["recommended"]["metrics"]
+
+
+@pytest.mark.parametrize(
+    "changes, expected",
+    [
+        ({"prf_hz": None}, ["raw.npz", "prf_hz"]),
+        ({"iq": np.full((96, 160, 2), np.nan, np.float32)}, ["raw.npz", "NaN"]),
+        ({"iq": np.zeros((96, 160), np.float32)}, ["raw.npz", "iq"]),
+        ({"agc_db": np.zeros(5)}, ["agc_db", "96 lines"]),
+    ],
+)
+def test_bad_recordings_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict, expected: list[str]) -> None:
+    config = write_tiny(tmp_path, world=None, radar=None, metrics=None, processor=FOCUS)
+    file = recording(tmp_path / "raw.npz", **changes)
+    assert main(["run", str(config), f"data.file={file}", "--out", str(tmp_path / "result")]) == 2
+    last = spoken(capsys)[-1]
+    for part in ("data.file", *expected):
+        assert part in last
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["raw.npz", "tiny.yaml"]
+
+
+def test_a_file_that_is_no_archive_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "raw.npz").write_text("not an archive")
+    config = write_tiny(tmp_path, world=None, radar=None, metrics=None, processor=FOCUS)
+    assert main(["run", str(config), f"data.file={tmp_path / 'raw.npz'}", "--out", str(tmp_path / "result")]) == 2
+    assert "raw.npz" in spoken(capsys)[-1]
+
+
+def test_the_command_is_installed() -> None:
+    done = subprocess.run([sys.executable, "-m", "torchsar.cli", "run", "nowhere"], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2 and "nowhere" in done.stderr and "Traceback" not in done.stderr

@@ -1,0 +1,187 @@
+"""Backprojection of stripmap data: slow, exact, the yardstick of every faster focuser."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Signal, per_trial, real_dtype, unit_phasor
+from torchsar.focus.nufft import Nufft, Points, interpolate
+from torchsar.focus.omega_k import Focuser, FrameGeometry
+from torchsar.radar import StripmapRadar
+
+
+class Aperture(Protocol):
+    """Which pulses form a pixel: (slow time since the beam centre crossed it, its Doppler relative to the centroid) -> weight."""
+
+    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class EveryPulse:
+    """All recorded pulses."""
+
+    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
+        return torch.ones_like(since_s)
+
+
+@dataclass(frozen=True)
+class Integration:
+    """The pulses within integration_s about the crossing of the beam centre."""
+
+    integration_s: float
+
+    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
+        return (since_s.abs() <= self.integration_s / 2).to(since_s.dtype)
+
+
+@dataclass(frozen=True)
+class DopplerBand:
+    """The pulses in which the pixel's Doppler is within width_hz about the centroid; with the PRF, what a Doppler processor uses."""
+
+    width_hz: float
+
+    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
+        return (doppler_offset_hz.abs() <= self.width_hz / 2).to(since_s.dtype)
+
+
+def backproject(
+    raw: Tensor,
+    radar: StripmapRadar,
+    azimuth_m: Tensor,
+    range_m: Tensor,
+    *,
+    doppler_hz: Tensor | float,
+    velocity_m_s: Tensor | float | None = None,
+    frame_hz: Tensor | float | None = None,
+    reference: Tensor | None = None,
+    aperture: Aperture | None = None,
+    start_s: float = 0.0,
+    eps: float = 1e-10,
+    block_bytes: int = 1 << 23,
+) -> Tensor:
+    """Coherent sum over pulses of the compressed echo at each pixel's own range. raw: (..., pulse, range) -> (..., *pixels), complex.
+
+    azimuth_m, range_m: float64 pixel coordinates that broadcast to `pixels`, in the image coordinates of `omega_k`: x = nominal velocity *
+    slow time of crossing, and the slant range at crossing, in the frame Doppler. start_s: slow time of the first pulse. The range
+    history is the exact hyperbola, formed as a difference to the pixel's range at crossing; the echo between samples comes from its
+    range spectrum by a non-uniform FFT of relative error eps. A target has the phase -4 pi R / lambda and the sum of its pulses as
+    amplitude. Echoes outside the record count as zero. Costs pulses x pixels x 50 operations: for patches. Differentiable in raw, velocity,
+    frame and pixel positions.
+    """
+    at = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz)
+    x, r = torch.broadcast_tensors(*(torch.as_tensor(v, dtype=torch.float64, device=raw.device) for v in (azimuth_m, range_m)))
+    shape, x, r = x.shape, x.reshape(-1), r.reshape(-1)
+    sight = _Sight(radar, at.velocity_m_s, at.frame_hz, per_trial(doppler_hz, 2, x), aperture or EveryPulse())
+    echo = _EchoBetweenSamples(raw, reference, radar, eps)
+    pulse_s = start_s + torch.arange(raw.shape[-2], dtype=torch.float64, device=raw.device) / radar.prf_hz
+    trials = max(1, raw[..., 0, 0].numel())
+    # each of the about 20 working arrays of a block takes 16 bytes a pulse and pixel
+    pixels_at_once = min(max(1, x.numel()), 4096)
+    height = max(1, min(raw.shape[-2], block_bytes // (16 * trials * max(pixels_at_once, 2 * raw.shape[-1]))))
+    sums = [torch.zeros((*raw.shape[:-2], min(pixels_at_once, x.numel() - p.start)), dtype=raw.dtype, device=raw.device) for p in _slices(x.numel(), pixels_at_once)]
+    for pulses in _slices(raw.shape[-2], height):
+        grid = echo.grid(pulses)
+        for i, pixels in enumerate(_slices(x.numel(), pixels_at_once)):
+            difference, weight = sight(pulse_s[pulses, None], x[pixels], r[pixels])
+            sums[i] = sums[i] + echo.at(grid, r[pixels], difference, weight).sum(-2)
+    return torch.cat(sums, -1).reshape(*raw.shape[:-2], *shape)
+
+
+def _slices(n: int, step: int) -> Iterator[slice]:
+    yield from (slice(first, min(first + step, n)) for first in range(0, n, step))
+
+
+@dataclass(frozen=True)
+class _Sight:
+    """The way a pixel is seen from the path: range relative to the crossing, and the weight of the aperture."""
+
+    radar: StripmapRadar
+    velocity_m_s: Tensor
+    frame_hz: Tensor
+    centroid_hz: Tensor
+    aperture: Aperture
+
+    def __call__(self, pulse_s: Tensor, azimuth_m: Tensor, range_m: Tensor) -> tuple[Tensor, Tensor]:
+        """pulse_s: (pulse, 1); pixels (pixel,). Returns r(t) - R in metres and the weight, float64 (..., pulse, pixel)."""
+        velocity, frame = (per_trial(v, 2, pulse_s) for v in (self.velocity_m_s, self.frame_hz))
+        sin = self.radar.wavelength_m * frame / (2 * velocity)
+        since = pulse_s - azimuth_m / self.radar.velocity_m_s
+        way = velocity * since
+        excess = way * (way - 2 * range_m * sin)
+        slant = torch.sqrt(range_m.square() + excess)
+        doppler = 2 * velocity * (range_m * sin - way) / (slant * self.radar.wavelength_m)
+        return excess / (slant + range_m), self.aperture.weight(*torch.broadcast_tensors(since, doppler - self.centroid_hz))
+
+
+class _EchoBetweenSamples:
+    """Range-compressed pulses at any range, demodulated by the carrier phase of the range difference."""
+
+    def __init__(self, raw: Tensor, reference: Tensor | None, radar: StripmapRadar, eps: float) -> None:
+        self.raw, self.reference, self.radar = raw, reference, radar
+        self.n = raw.shape[-1]
+        self.plan = Nufft(self.n, eps, raw.dtype, raw.device)
+
+    def grid(self, pulses: slice) -> Tensor:
+        spectrum = torch.fft.fft(self.raw[..., pulses, :])
+        if self.reference is not None:
+            spectrum = spectrum * self.reference.to(spectrum.dtype)
+        return self.plan.grid(torch.fft.fftshift(spectrum, dim=-1)) / self.n
+
+    def at(self, grid: Tensor, range_m: Tensor, difference_m: Tensor, weight: Tensor) -> Tensor:
+        """Weighted echo of each pulse and pixel, (..., pulse, pixel)."""
+        cell = ((range_m - self.radar.near_range_m) + difference_m) / self.radar.range_step_m
+        weight = weight * ((cell >= 0) & (cell <= self.n - 1))
+        # exp(+2j pi k q / n) asks for points of the other sign
+        points = Points.of(self.plan.kernel, -cell * (self.plan.length / self.n), self.plan.length, real_dtype(grid.dtype))
+        carrier = unit_phasor(2 * self.radar.carrier_hz / self.radar.wave_speed_m_s * difference_m, grid.dtype)
+        return interpolate(grid, points) * carrier * weight.to(real_dtype(grid.dtype))
+
+
+class Backproject(Focuser):
+    """Focus a patch by backprojection: lines and cells (first, last) of the raw matrix, all by default, sampled `oversampling` times finer.
+
+    Other arguments as `Focuser`. The exact reference for the faster focusers, on the same image axes.
+    """
+
+    form = staticmethod(backproject)
+
+    def __init__(
+        self,
+        radar: StripmapRadar,
+        reference: str | None = "matched",
+        velocity_m_s: Tensor | float | None = None,
+        doppler_hz: Tensor | float | None = None,
+        frame_hz: float | None = None,
+        lines: tuple[int, int] | None = None,
+        cells: tuple[int, int] | None = None,
+        oversampling: int = 1,
+        aperture: Aperture | None = None,
+        eps: float = 1e-10,
+    ) -> None:
+        super().__init__(radar, reference, velocity_m_s, doppler_hz, frame_hz)
+        self.lines, self.cells, self.oversampling, self.aperture, self.eps = lines, cells, oversampling, aperture, eps
+
+    def forward(self, signal: Signal, doppler_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Signal:
+        azimuth, range_ = self.radar.image_axes(signal.axes)
+        azimuth, range_ = (
+            axis.part(*(bounds or (0, axis.n))).resampled(self.oversampling) for axis, bounds in ((azimuth, self.lines), (range_, self.cells))
+        )
+        data = backproject(
+            signal.data,
+            replace(self.radar, near_range_m=signal.axes[-1].start),
+            azimuth.values(signal.data.device)[:, None],
+            range_.values(signal.data.device),
+            doppler_hz=self.doppler_hz if doppler_hz is None else doppler_hz,
+            velocity_m_s=self.velocity_m_s if velocity_m_s is None else velocity_m_s,
+            frame_hz=self.frame_hz,
+            reference=self.spectrum(signal.data.shape[-1], signal.data.device),
+            aperture=self.aperture,
+            start_s=signal.axes[-2].start,
+            eps=self.eps,
+        )
+        return Signal(data, (azimuth, range_))

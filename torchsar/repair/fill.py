@@ -1,0 +1,163 @@
+"""Lines that are missing: zeros, linear interpolation, the azimuth spectrum, or a model of the scene (brief 004, item 2).
+
+All four keep the received lines bit for bit and replace only the missing ones, whatever those hold. Errors of the image: zero fill errs by the
+share of missing lines; the azimuth spectrum (a stationary model) gains little where azimuth oversampling is low; only a model of
+the scene, which knows where the image is dark, gains much. Source: brief 004, item 2; Tsvetkov 2017.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Signal, Stage, per_trial, real_dtype, unit_phasor
+from torchsar.focus.reference import REFERENCES
+from torchsar.radar import StripmapRadar
+from torchsar.repair.sparse import conjugate_fill, sparse_fill, unit_level
+
+
+def _mask(lines: Tensor, missing: Tensor) -> Tensor:
+    """missing as a bool mask that broadcasts against the lines, (..., pulse, 1). Raises ValueError where it does not fit."""
+    if missing.shape[-1:] != lines.shape[-2:-1]:
+        raise ValueError(f"mask of missing lines of shape {tuple(missing.shape)} does not fit {lines.shape[-2]} lines; give one entry per line, as LineIntegrity does")
+    return missing.bool()[..., None]
+
+
+def zero_fill(lines: Tensor, missing: Tensor) -> Tensor:
+    """Missing lines set to zero: the baseline. lines: (..., pulse, range); missing: bool (..., pulse)."""
+    return torch.where(_mask(lines, missing), 0, lines)
+
+
+def linear_fill(lines: Tensor, missing: Tensor, doppler_turns: Tensor | float = 0.0) -> Tensor:
+    """Straight line between the nearest received lines, about a Doppler centroid of doppler_turns cycles per line, (...,).
+
+    Before the first and behind the last received line that line is held. Worse than zeros where adjacent lines correlate less than 0.25
+    about the centroid, and inside gaps of several lines of data with low azimuth oversampling.
+    """
+    mask, n = _mask(lines, missing), lines.shape[-2]
+    row = torch.arange(n, device=lines.device)
+    received = ~missing.bool().expand(lines.shape[:-1])
+    before = torch.where(received, row, -1).cummax(-1).values
+    after = torch.where(received, row, n).flip(-1).cummin(-1).values.flip(-1)
+    share = torch.where(before < 0, 1.0, torch.where(after >= n, 0.0, (row - before) / (after - before).clamp_min(1)))
+    turns = per_trial(doppler_turns, 1, lines)
+
+    def turned(index: Tensor, weight: Tensor) -> Tensor:
+        index = index.clamp(0, n - 1)
+        factor = unit_phasor(turns * (row - index), lines.dtype) * weight.to(real_dtype(lines.dtype))
+        return zero_fill(lines, missing).gather(-2, index[..., None].expand(lines.shape)) * factor[..., None]
+
+    return torch.where(mask, turned(before, 1 - share) + turned(after, share), lines)
+
+
+def azimuth_spectrum(lines: Tensor, received: Tensor, lags: int = 24) -> Tensor:
+    """Azimuth power spectrum from lag products of the received lines, averaged over range, unit mean, (..., pulse) in FFT order.
+
+    lines: zero where not received; received: bool (..., pulse). Smoothed over about 2 / lags of the PRF; may be slightly negative.
+    """
+    n = lines.shape[-2]
+    lags = min(lags, max(1, n // 4))
+    products = torch.fft.ifft(torch.fft.fft(lines, 2 * n, dim=-2).abs().square().sum(-1))
+    pairs = torch.fft.ifft(torch.fft.fft(received.to(lines.real.dtype), 2 * n).abs().square()).real
+    lag = torch.arange(lags + 1, device=lines.device)
+    taper = 0.5 + 0.5 * torch.cos(torch.pi * lag / (lags + 1))
+    mean = products[..., : lags + 1] / pairs[..., : lags + 1].clamp_min(0.5) * taper.to(pairs.dtype)
+    spectrum = 2 * torch.fft.fft(mean, n).real - mean[..., :1].real
+    return spectrum / spectrum.mean(-1, keepdim=True).clamp_min(torch.finfo(spectrum.dtype).tiny)
+
+
+def band_limited_fill(lines: Tensor, missing: Tensor, rounds: int = 2, steps: int = 12) -> Tensor:
+    """Least squares over the azimuth band: the missing lines that fit the azimuth spectrum of the received ones best (Wiener).
+
+    The spectrum, with the Doppler centroid in it, is estimated here from the received lines, then once more from the filled ones. Minimises
+    sum |D(f)|^2 / S(f) over the missing lines by conjugate gradients. lines: (..., pulse, range); missing: bool (..., pulse).
+    """
+    mask = _mask(lines, missing)
+    filled, level = unit_level(zero_fill(lines, missing))
+    spectrum = azimuth_spectrum(filled.detach(), ~missing.bool().expand(lines.shape[:-1])).clamp_min(0.05)
+    for _ in range(rounds):
+        weight = (1 / spectrum)[..., None]
+        filled = conjugate_fill(lambda x, w=weight: torch.fft.ifft(torch.fft.fft(x, dim=-2) * w, dim=-2), filled, mask, steps)
+        spectrum = azimuth_spectrum(filled.detach(), torch.ones_like(mask[..., 0]).expand(lines.shape[:-1]), 96).clamp_min(2e-3)
+    return torch.where(mask, filled * level, lines)
+
+
+class ZeroFill(Stage):
+    """Missing lines set to zero. forward(signal, missing): missing is a bool mask (..., pulse)."""
+
+    def forward(self, signal: Signal, missing: Tensor) -> Signal:
+        return signal.with_data(zero_fill(signal.data, missing))
+
+
+class LinearFill(Stage):
+    """Linear interpolation over missing lines about the Doppler centroid; see linear_fill.
+
+    doppler_hz: by default the radar's nominal pointing, else 0; a chain may connect an estimate, which wins. Only its fraction of the
+    PRF matters.
+    """
+
+    def __init__(self, radar: StripmapRadar, doppler_hz: Tensor | float | None = None) -> None:
+        super().__init__()
+        self.hold("doppler_hz", (radar.pointing_doppler_hz or 0.0) if doppler_hz is None else doppler_hz)
+
+    def forward(self, signal: Signal, missing: Tensor, doppler_hz: Tensor | None = None) -> Signal:
+        doppler = self.doppler_hz if doppler_hz is None else doppler_hz
+        return signal.with_data(linear_fill(signal.data, missing, doppler * signal.axis("pulse").step))
+
+
+class BandLimitedFill(Stage):
+    """Least squares over the azimuth band; see band_limited_fill. Needs no Doppler: the spectrum that it estimates holds the centroid."""
+
+    def __init__(self, rounds: int = 2, steps: int = 12) -> None:
+        super().__init__()
+        if rounds < 1 or steps < 1:
+            raise ValueError(f"band-limited fill needs at least one round of one step, got rounds={rounds}, steps={steps}")
+        self.rounds, self.steps = rounds, steps
+
+    def forward(self, signal: Signal, missing: Tensor) -> Signal:
+        return signal.with_data(band_limited_fill(signal.data, missing, self.rounds, self.steps))
+
+
+class SparseFill(Stage):
+    """Missing lines from a model of the focused scene; see sparse_fill. Begins from the band-limited fill.
+
+    reference: "matched" for raw lines, None for range-compressed ones. doppler_hz and velocity_m_s as in OmegaK: given here, or by a chain
+    at every call, which wins. The Doppler must be absolute (ambiguity resolved) where range migration exceeds a cell.
+    """
+
+    def __init__(
+        self,
+        radar: StripmapRadar,
+        reference: str | None = "matched",
+        velocity_m_s: Tensor | float | None = None,
+        doppler_hz: Tensor | float | None = None,
+        looks: int = 4,
+        rounds: int = 3,
+        steps: int = 4,
+    ) -> None:
+        super().__init__()
+        if reference is not None and reference not in REFERENCES:
+            raise ValueError(f"range reference {reference!r} is unknown; choose one of {sorted(REFERENCES)}, or None for compressed lines")
+        if min(looks, rounds, steps) < 1:
+            raise ValueError(f"sparse fill needs at least one look, round and step, got looks={looks}, rounds={rounds}, steps={steps}")
+        self.radar, self.reference = radar, reference
+        self.looks, self.rounds, self.steps = looks, rounds, steps
+        self.hold("velocity_m_s", radar.velocity_m_s if velocity_m_s is None else velocity_m_s)
+        self.hold("doppler_hz", (radar.pointing_doppler_hz or 0.0) if doppler_hz is None else doppler_hz)
+
+    def forward(self, signal: Signal, missing: Tensor, doppler_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Signal:
+        lines, radar = signal.data, self.radar
+        reference = None if self.reference is None else REFERENCES[self.reference](radar.pulse, lines.shape[-1], radar.sampling_hz, lines.device)
+        filled = sparse_fill(
+            lines,
+            missing,
+            radar,
+            doppler_hz=self.doppler_hz if doppler_hz is None else doppler_hz,
+            velocity_m_s=self.velocity_m_s if velocity_m_s is None else velocity_m_s,
+            reference=reference,
+            start=band_limited_fill(lines, missing),
+            looks=self.looks,
+            rounds=self.rounds,
+            steps=self.steps,
+        )
+        return signal.with_data(filled)
