@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -43,11 +44,20 @@ _STYLE: Any = {
 }
 
 
-def _panels(rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, list[Axes]]:
-    with rc_context(_STYLE):
-        figure = Figure(figsize=size, layout="constrained")
-        panels = figure.subplots(rows, columns, squeeze=False, **options)
-    return figure, list(panels.flat)
+def _styled(draw: Callable[..., Figure]) -> Callable[..., Figure]:
+    """Draw in the house style without touching the user's."""
+
+    @functools.wraps(draw)
+    def styled(*args: Any, **options: Any) -> Figure:
+        with rc_context(_STYLE):
+            return draw(*args, **options)
+
+    return styled
+
+
+def _panels(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
 
 
 def decibel(x: Tensor | np.ndarray, reference: float | None = None) -> np.ndarray:
@@ -89,6 +99,7 @@ def _show(axes: Axes, signal: Signal, dynamic_range_db: float, title: str, refer
     return shown
 
 
+@_styled
 def image(signal: Signal, dynamic_range_db: float = 50.0, title: str = "", percentile: float = 99.9) -> Figure:
     """An image or a raw matrix in dB, range horizontal, azimuth vertical, axes in their units. The first trial of a batch.
 
@@ -100,6 +111,7 @@ def image(signal: Signal, dynamic_range_db: float = 50.0, title: str = "", perce
     return figure
 
 
+@_styled
 def images(signals: Mapping[str, Signal], dynamic_range_db: float = 50.0, columns: int = 2, percentile: float = 99.9) -> Figure:
     """Several images side by side on one scale, taken from the first of them; arguments as `image`."""
     rows = math.ceil(len(signals) / columns)
@@ -119,6 +131,7 @@ def _first(signal: Signal) -> Signal:
     return signal.with_data(signal.data.flatten(0, -3)[0]) if signal.trials else signal
 
 
+@_styled
 def curves(series: Mapping[str, tuple[np.ndarray, np.ndarray]], xlabel: str, ylabel: str, title: str = "", marks: Mapping[str, float] | None = None, ylim: tuple[float, float] | None = None) -> Figure:
     """Lines by name in one panel; marks: vertical lines by name."""
     figure, (axes,) = _panels(1, 1, (7.2, 3.2))
@@ -126,6 +139,7 @@ def curves(series: Mapping[str, tuple[np.ndarray, np.ndarray]], xlabel: str, yla
     return figure
 
 
+@_styled
 def panels(parts: Sequence[Mapping[str, Any]], columns: int = 2) -> Figure:
     """Several curve panels; each part holds the arguments of `curves`."""
     rows = math.ceil(len(parts) / columns)
@@ -145,11 +159,10 @@ def draw_curves(
     title: str = "",
     marks: Mapping[str, float] | None = None,
     ylim: tuple[float, float] | None = None,
-    points: bool = False,
 ) -> None:
-    """Draw lines (or points) by name into existing axes."""
+    """Draw lines by name into existing axes; the first is the widest, so that others which lie on it are seen."""
     for i, (name, (x, y)) in enumerate(series.items()):
-        axes.plot(x, y, "." if points else "-", label=name, color=COLOURS[i % len(COLOURS)], markersize=4, alpha=0.9, zorder=3 - 0.1 * i)
+        axes.plot(x, y, label=name, color=COLOURS[i % len(COLOURS)], linewidth=max(0.9, 2.0 - 0.45 * i) if len(series) > 1 else 1.2)
     for i, (name, place) in enumerate((marks or {}).items()):
         axes.axvline(place, color=COLOURS[(len(series) + i) % len(COLOURS)], linestyle="--", linewidth=1, label=name)
     axes.set(xlabel=xlabel, ylabel=ylabel, title=title)
@@ -159,6 +172,7 @@ def draw_curves(
         axes.legend(loc="best")
 
 
+@_styled
 def trade(names: Sequence[str], seconds: Sequence[float], error_db: Sequence[float], ylabel: str, title: str) -> Figure:
     """Time against accuracy: one labelled point an alternative, faster to the left, better at the bottom."""
     figure, (axes,) = _panels(1, 1, (7.2, 4.2))

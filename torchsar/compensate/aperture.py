@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.doppler import lag_products, unit_peak, wrap_hz
-from torchsar.compensate.group import RangeGroup, compress, full_columns, full_spectrum
+from torchsar.compensate.group import RangeGroup, compress, full_columns, full_spectrum, stays_inside
+from torchsar.core import settle
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
 
@@ -26,7 +27,7 @@ _GUARD = 0.02
 def complete_aperture_centroid(raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, std_hz: Tensor, reference: str | None, rounds: int = 2) -> tuple[Tensor, Tensor]:
     """Refine an absolute centroid (...,) with predicted deviation std_hz (...,) by complete apertures; returns both anew.
 
-    raw: (..., pulse, range). A trial keeps what it had where the new deviation would not be smaller. Everything stays as it is
+    raw: (..., pulse, range). A trial keeps what it had where the new deviation is more than twice the old one. Everything stays as it is
     where the beam's dwell is not known (`radar.integration_s`) or the record is hardly longer.
     """
     if radar.integration_s is None:
@@ -37,7 +38,7 @@ def complete_aperture_centroid(raw: Tensor, radar: StripmapRadar, doppler_hz: Te
     raw, value, std = unit_peak(raw), doppler_hz, std_hz
     for _ in range(rounds):
         found, found_std = _refined(raw, radar, value, dwell, reference)
-        better = found_std < std_hz
+        better = found_std < 2 * std_hz  # the deviation of the first estimate does not know of the cut apertures
         value, std = torch.where(better, found, doppler_hz), torch.where(better, found_std, std_hz)
     return value, std
 
@@ -57,15 +58,24 @@ def _refined(raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwell: int, 
     for _ in range(8):
         # a frame off by d shows a target d / rate late
         shift = (total - doppler_hz)[..., None, None] / rate * radar.prf_hz
-        crossing = line[:, None] - shift
-        whole = (crossing >= dwell / 2) & (crossing <= raw.shape[-2] - dwell / 2)
+        whole = _whole(line[:, None] - shift, raw.shape[-2], dwell)
         chosen = products * whole
         phase = torch.angle(chosen.sum((-2, -1)))
         delta = wrap_hz(scale * phase - total, radar.prf_hz)
         enough = chosen.sum((-2, -1)).abs() > 0
         total = torch.where(enough, total + delta, total)
-        std = torch.where(enough, scale * _std_rad(chosen, (noise * whole).sum((-2, -1)), phase), math.inf)
+        std = torch.where(enough, scale * _std_rad(chosen, (noise * whole.square()).sum((-2, -1)), phase), math.inf)
     return total, std
+
+
+def _whole(crossing: Tensor, lines: int, dwell: int) -> Tensor:
+    """Weight of image lines by the line at which the beam crosses them: 1 where the dwell lies inside the record, 0 where not.
+
+    It falls off over a tenth of a dwell: a sharp end would cut responses that a wrong nominal velocity smears, and each part of such a
+    response has another Doppler.
+    """
+    margin = torch.minimum(crossing - dwell / 2, lines - dwell / 2 - crossing)
+    return (margin / min(0.1 * dwell, (lines - dwell) / 4)).clamp(0, 1)
 
 
 def _chunks(raw: Tensor, radar: StripmapRadar, reference: str | None) -> list[tuple[Tensor, StripmapRadar]]:
@@ -84,6 +94,7 @@ def _tiles(raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, reference: str
     group = RangeGroup(lines, torch.zeros(lines.shape[:-2], device=raw.device), radar)
     image = full_spectrum(group, doppler_hz).image(doppler_hz, radar.velocity_m_s)
     tiles = (max(1, image.shape[-2] // _TILE_LINES), max(1, image.shape[-1] // _TILE_COLUMNS))
+    image = image * stays_inside(image.shape[-1], radar, doppler_hz, radar.integration_s or 0.0)[..., None, :].to(image.real.dtype)
     products, power = lag_products(image, tiles)
     scale = image.abs().amax((-2, -1)).to(torch.float64).square()[..., None, None]  # lag_products is scale free, chunks must stay comparable
     rate = radar.azimuth_rate_hz_s(radar.near_range_m + image.shape[-1] / 2 * radar.range_step_m).to(raw.device)
@@ -93,7 +104,8 @@ def _tiles(raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, reference: str
 def _noise_variance(power: Tensor) -> Tensor:
     """Variance of the imaginary part of a tile's product by noise, against noise and against signal; the noise is the tile at the lowest tenth."""
     flat = power.flatten(-2)
-    floor = flat.kthvalue(max(1, flat.shape[-1] // 10), dim=-1).values[..., None, None]
+    floor = torch.where(flat > 0, flat, torch.inf).kthvalue(max(1, flat.shape[-1] // 10), dim=-1).values
+    floor = settle(floor, 0.0)[0][..., None, None]
     return floor * (0.5 * floor + power) / (_TILE_LINES * _TILE_COLUMNS)
 
 

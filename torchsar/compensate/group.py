@@ -127,6 +127,18 @@ def pick_group(lines: Tensor, radar: StripmapRadar, width: int) -> RangeGroup:
     return RangeGroup(lines.gather(-1, columns[..., None, :].expand(*lines.shape[:-1], width)), start, radar)
 
 
+def stays_inside(width: int, radar: StripmapRadar, doppler_hz: Tensor, dwell_s: float) -> Tensor:
+    """1 for the columns of a group of `width` whose targets stay in it while they migrate for dwell_s, else 0, (..., width) float64.
+
+    doppler_hz: absolute centroid (...,). The middle half always counts.
+    """
+    curvature_m = (radar.velocity_m_s * dwell_s / 2) ** 2 / (2 * radar.near_range_m)
+    half_walk = (0.25 * radar.wavelength_m * doppler_hz.abs() * dwell_s + curvature_m) / radar.range_step_m
+    reach = (width / 2 - half_walk - 2).clamp_min(width / 4)
+    place = torch.arange(width, dtype=torch.float64, device=doppler_hz.device) - (width - 1) / 2
+    return (place.abs() <= reach[..., None]).to(torch.float64)
+
+
 def block_weights(columns: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwell_s: float) -> Tensor:
     """Weights of the range blocks of a group in an objective, (..., block) with sum 1: their signal (`column_signal`).
 
@@ -134,10 +146,7 @@ def block_weights(columns: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwe
     columns: (..., n, width), lines or an image.
     """
     width = columns.shape[-1]
-    half_walk = 0.25 * radar.wavelength_m * doppler_hz.abs() * dwell_s / radar.range_step_m
-    reach = (width / 2 - half_walk - 2).clamp_min(width / 4)
-    place = torch.arange(width, dtype=torch.float64, device=columns.device) - (width - 1) / 2
-    weight = column_signal(columns) * (place.abs() <= reach[..., None])
+    weight = column_signal(columns) * stays_inside(width, radar, doppler_hz, dwell_s)
     weight = torch.stack([part.sum(-1) for part in weight.tensor_split(_block_count(width), -1)], -1)
     return weight / weight.sum(-1, keepdim=True)
 

@@ -10,6 +10,7 @@ the squint. A frame of 0 Hz gives the classical zero-Doppler image. Source: brie
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -42,14 +43,34 @@ def wavenumber(radar: StripmapRadar, frequency_hz: Tensor, doppler_hz: Tensor, v
     return cos * (root - at_frame) + sin * (x - f0 * sin)
 
 
+BAND_EDGE = 0.1  # of the band, the width of its raised-cosine edges
+
+
+def band_weight(radar: StripmapRadar, offset_hz: Tensor, band_hz: float) -> Tensor:
+    """Weight of Doppler offsets from the centroid in a processed band: 1 inside, 1/2 at +-band_hz / 2, raised-cosine edges of a tenth of the band.
+
+    Raises ValueError where band_hz is no positive number; warns where band and edges do not fit the PRF, which folds azimuth.
+    """
+    if not (math.isfinite(band_hz) and band_hz > 0):
+        raise ValueError(f"the processed Doppler band must be a positive number of Hz, got {band_hz}")
+    if band_hz * (1 + BAND_EDGE) > radar.prf_hz * (1 + 1e-9):
+        warnings.warn(f"PRF {radar.prf_hz:g} Hz is below the processed band of {band_hz:g} Hz and its edges, {band_hz * (1 + BAND_EDGE):g} Hz: azimuth is cut at the PRF; process at most {radar.prf_hz / (1 + BAND_EDGE):.6g} Hz", stacklevel=2)
+    beyond = (offset_hz.abs() - band_hz / 2) / (BAND_EDGE * band_hz)
+    return 0.5 - 0.5 * torch.sin(math.pi * beyond.clamp(-0.5, 0.5))
+
+
 @dataclass(frozen=True)
 class FrameGeometry:
-    """The rows of an azimuth spectrum: radar, absolute Doppler (..., d), and velocity and frame Doppler (...,), all float64."""
+    """The rows of an azimuth spectrum: radar, absolute Doppler (..., d), and velocity and frame Doppler (...,), all float64.
+
+    weight: (..., d) of a processed Doppler band, None for the whole PRF.
+    """
 
     radar: StripmapRadar
     doppler_hz: Tensor
     velocity_m_s: Tensor
     frame_hz: Tensor
+    weight: Tensor | None = None
 
     @staticmethod
     def of(
@@ -59,6 +80,7 @@ class FrameGeometry:
         velocity_m_s: Tensor | float | None,
         frame_hz: Tensor | float | None,
         device: torch.device | None = None,
+        band_hz: float | None = None,
     ) -> FrameGeometry:
         """Geometry of all rows of raw (..., pulse, range). Raises ValueError where the Doppler asks for a squint beyond 90 degrees."""
         device = raw.device if device is None else device
@@ -69,11 +91,16 @@ class FrameGeometry:
         for name, value in (("doppler_hz", centroid), ("velocity_m_s", velocity)):
             if value.ndim and value.shape != raw.shape[:-2]:
                 raise ValueError(f"{name} of shape {tuple(value.shape)} does not match the trial dims {tuple(raw.shape[:-2])} of the data; give one number per trial")
-        return FrameGeometry(radar, radar.doppler_hz(raw.shape[-2], centroid, device), velocity, frame)
+        doppler = radar.doppler_hz(raw.shape[-2], centroid, device)
+        return FrameGeometry(radar, doppler, velocity, frame, None if band_hz is None else band_weight(radar, doppler - centroid[..., None], band_hz))
 
     def rows(self, part: slice) -> FrameGeometry:
         """The same for some of the rows."""
-        return replace(self, doppler_hz=self.doppler_hz[..., part])
+        return replace(self, doppler_hz=self.doppler_hz[..., part], weight=None if self.weight is None else self.weight[..., part])
+
+    def weighted(self, lines: Tensor) -> Tensor:
+        """lines (..., d, n) times the weight of their row, where there is one."""
+        return lines if self.weight is None else lines * self.weight.to(real_dtype(lines.dtype))[..., None]
 
     @property
     def requires_grad(self) -> bool:
@@ -157,16 +184,17 @@ def omega_k(
     velocity_m_s: Tensor | float | None = None,
     frame_hz: Tensor | float | None = None,
     reference: Tensor | None = None,
+    band_hz: float | None = None,
 ) -> Tensor:
     """Bulk + refocus omega-K (the form of Tsvetkov 2017, steps 1 to 5). raw, result: (..., pulse, range) complex.
 
     doppler_hz: absolute Doppler centroid, about which the azimuth spectrum is unwrapped; frame_hz: frame of the image coordinates, by
     default the radar's nominal pointing, else the centroid. Both and velocity_m_s may differ per trial, (...,). reference: range reference
-    spectrum (range,), None for range-compressed data. Neglects the change of migration over the swath (`focus.requirements` says
+    spectrum (range,), None for range-compressed data. band_hz: processed Doppler bandwidth about the centroid, None for the whole PRF. Neglects the change of migration over the swath (`focus.requirements` says
     how much that is); `omega_k_stolt` does not. Differentiable in raw, velocity and frame; without gradients it works by blocks in one
     copy of the data.
     """
-    geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz)
+    geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz, band_hz=band_hz)
     n, centre = raw.shape[-1], raw.shape[-1] // 2
     basis = FrequencyBasis(radar, n, raw.device)
     range_m = radar.near_range_m + centre * radar.range_step_m
@@ -174,7 +202,7 @@ def omega_k(
     def focus_rows(rows: Tensor, part: slice) -> Tensor:
         at = geometry.rows(part)
         rows = rows * bulk_filter(basis, at, range_m, reference, raw.dtype)
-        return refocus(torch.fft.ifft(rows), refocus_turns_per_sample(at), centre)
+        return at.weighted(refocus(torch.fft.ifft(rows), refocus_turns_per_sample(at), centre))
 
     return through_doppler(raw, focus_rows, differentiable=geometry.requires_grad or raw.requires_grad)
 
@@ -200,7 +228,7 @@ class Focuser(Stage):
     """Base of the focusing stages: a radar, a range reference, a velocity and a Doppler; `form` is the function that does the work.
 
     Image axes (azimuth, range) are in the coordinates of the frame Doppler. reference: "matched" or "flat" to compress the pulse in the same pass, None for range-compressed data. velocity_m_s and doppler_hz
-    may be given here (a number, a per-trial tensor, or an nn.Parameter to optimise) or by a chain at every call, which wins.
+    may be given here (a number, a per-trial tensor, or an nn.Parameter to optimise) or by a chain at every call, which wins. band_hz: processed Doppler bandwidth, None for the whole PRF.
     """
 
     form: Callable[..., Tensor]
@@ -212,11 +240,12 @@ class Focuser(Stage):
         velocity_m_s: Tensor | float | None = None,
         doppler_hz: Tensor | float | None = None,
         frame_hz: float | None = None,
+        band_hz: float | None = None,
     ) -> None:
         super().__init__()
         if reference is not None and reference not in REFERENCES:
             raise ValueError(f"range reference {reference!r} is unknown; choose one of {sorted(REFERENCES)}, or None for compressed data")
-        self.radar, self.reference, self.frame_hz = radar, reference, frame_hz
+        self.radar, self.reference, self.frame_hz, self.band_hz = radar, reference, frame_hz, band_hz
         self.hold("velocity_m_s", radar.velocity_m_s if velocity_m_s is None else velocity_m_s)
         self.hold("doppler_hz", (radar.pointing_doppler_hz or 0.0) if doppler_hz is None else doppler_hz)
 
@@ -232,6 +261,7 @@ class Focuser(Stage):
             velocity_m_s=self.velocity_m_s if velocity_m_s is None else velocity_m_s,
             frame_hz=self.frame_hz,
             reference=self.spectrum(signal.data.shape[-1], signal.data.device),
+            band_hz=self.band_hz,
         )
         return Signal(data, self.radar.image_axes(signal.axes))
 
@@ -255,9 +285,9 @@ class StoredOmegaK(Stage):
         anchor = torch.empty((n_pulse, n_range), dtype=dtype, device="meta")
         self.axes, self.radar, self.centre = axes, radar, n_range // 2
         with torch.no_grad():
-            at = FrameGeometry.of(radar, anchor, stage.doppler_hz, stage.velocity_m_s, stage.frame_hz, device)
+            at = FrameGeometry.of(radar, anchor, stage.doppler_hz, stage.velocity_m_s, stage.frame_hz, device, stage.band_hz)
             range_m = radar.near_range_m + self.centre * radar.range_step_m
-            self.register_buffer("filter", bulk_filter(FrequencyBasis(radar, n_range, device), at, range_m, stage.spectrum(n_range, device), dtype))
+            self.register_buffer("filter", at.weighted(bulk_filter(FrequencyBasis(radar, n_range, device), at, range_m, stage.spectrum(n_range, device), dtype)))
             fine, coarse = phasor_tables(refocus_turns_per_sample(at), -self.centre, n_range, dtype)
             self.register_buffer("fine", fine)
             self.register_buffer("coarse", coarse)

@@ -30,6 +30,7 @@ def range_doppler(
     velocity_m_s: Tensor | float | None = None,
     frame_hz: Tensor | float | None = None,
     reference: Tensor | None = None,
+    band_hz: float | None = None,
     eps: float = 1e-4,
 ) -> Tensor:
     """Range-Doppler algorithm: azimuth FFT, migration taken out by interpolation, hyperbolic azimuth phase per range, inverse FFT.
@@ -38,7 +39,7 @@ def range_doppler(
     azimuth phase; neglects the coupling of range and azimuth beyond the carrier (no secondary range compression), which broadens wide
     bands, long apertures and squinted beams: `focus.requirements` says by how much. eps: relative error of the interpolation.
     """
-    geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz)
+    geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz, band_hz=band_hz)
     n, centre, real = raw.shape[-1], raw.shape[-1] // 2, real_dtype(raw.dtype)
     plan = Nufft(n, eps, raw.dtype, raw.device)
     per_sample = plan.length / n
@@ -56,7 +57,7 @@ def range_doppler(
         turns = refocus_turns_per_sample(at)
         constant = unit_phasor(turns * centre_cells + STATIONARY_TURNS, raw.dtype) / n
         lines = plan.type2(torch.fft.fftshift(spectrum, dim=-1), points)
-        return lines * linear_phasor(turns, -centre, n, raw.dtype) * constant[..., None]
+        return at.weighted(lines * linear_phasor(turns, -centre, n, raw.dtype) * constant[..., None])
 
     return through_doppler(raw, focus_rows, differentiable=geometry.requires_grad or raw.requires_grad)
 

@@ -39,6 +39,7 @@ def omega_k_stolt(
     velocity_m_s: Tensor | float | None = None,
     frame_hz: Tensor | float | None = None,
     reference: Tensor | None = None,
+    band_hz: float | None = None,
     eps: float = 1e-4,
 ) -> Tensor:
     """Omega-K with Stolt interpolation (brief 004, item 7 ii). raw, result: (..., pulse, range) complex.
@@ -47,7 +48,7 @@ def omega_k_stolt(
     at every range. eps: relative error of the interpolation (the image errs by less; 1e-12 for complex128 references). About twice
     the time of `omega_k`. Differentiable in raw, velocity and frame.
     """
-    geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz)
+    geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz, band_hz=band_hz)
     n, centre = raw.shape[-1], raw.shape[-1] // 2
     basis = FrequencyBasis(radar, n, raw.device)
     mapping = StoltMap(basis, radar, n, eps, raw.dtype, raw.device)
@@ -56,7 +57,7 @@ def omega_k_stolt(
     def focus_rows(rows: Tensor, part: slice) -> Tensor:
         at = geometry.rows(part)
         lines = torch.fft.ifft(rows * bulk_filter(basis, at, range_m, reference, raw.dtype))
-        return refocus(mapping(lines, at), refocus_turns_per_sample(at), centre)
+        return at.weighted(refocus(mapping(lines, at), refocus_turns_per_sample(at), centre))
 
     return through_doppler(raw, focus_rows, differentiable=geometry.requires_grad or raw.requires_grad)
 

@@ -1,8 +1,9 @@
 """Focusing of strips longer than memory, by overlapping azimuth blocks of known size.
 
-A focused line is a convolution of raw lines with the azimuth filter, which occupies PRF / (Doppler rate) seconds and has tails beyond,
-because its spectrum has a kink where the PRF band wraps. Blocks therefore overlap by that length and by a guard that holds the energy
-of the cut tails below a tolerance; apart from those tails the blocks give what one transform of the whole strip gives.
+A focused line is a convolution of raw lines with the azimuth filter, which occupies (processed band) / (Doppler rate) seconds and has
+tails beyond. Blocks overlap by that length and by a guard that holds the energy of the cut tails below a tolerance; apart from those
+tails the blocks give what one transform of the whole strip gives. Focusers with a processed band (`band_hz`) have short tails; those
+that use the whole PRF have long ones, because their filter jumps where the band wraps.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from torchsar.core import Axis, Signal
 from torchsar.focus.nufft import smooth_length
+from torchsar.focus.omega_k import BAND_EDGE
 from torchsar.radar import StripmapRadar
 
 ARRAYS = 3  # of block size at once: raw block, its image, and the previous image in the hands of the caller
@@ -50,38 +52,39 @@ class StripPlan:
         return [(slice(start, start + self.height), slice(first, last)) for start, first, last in zip(starts, cuts[:-1], cuts[1:], strict=True)]
 
 
-def filter_tail(aperture_lines: float, guard_lines: float) -> float:
-    """Energy of an azimuth filter of that length beyond guard_lines from its two ends, relative to all of it.
+def filter_tail(guard_lines: float) -> float:
+    """Energy of a whole-PRF azimuth filter beyond guard_lines from the ends of its aperture, relative to all of it.
 
-    The kink of the spectrum at the wrap of the PRF band gives |h| = N / (2 pi g (g + N)) at g lines beyond an aperture of N; its integral.
+    The filter's phase jumps by any amount where the PRF band wraps; a jump of two gives |h| = 1 / (pi g), half of it on average.
     """
-    n, g = aperture_lines, max(guard_lines, 1.0)
-    return max(0.0, (1 / g + 1 / (g + n) - 2 / n * math.log1p(n / g))) / (2 * math.pi**2)
+    return 1 / (math.pi**2 * guard_lines)
 
 
 def reach_lines(
     radar: StripmapRadar,
     axes: tuple[Axis, ...],
     doppler_hz: tuple[float, float],
+    *,
     frame_hz: float | None = None,
-    integration_s: float | None = None,
+    band_hz: float | None = None,
     tolerance_db: float = -60.0,
 ) -> tuple[int, int]:
     """First and last raw line, relative to an image line, that the image line is made of.
 
     doppler_hz: lowest and highest absolute centroid of the strip; frame_hz: frame of the image coordinates, the centroid itself where
-    None. integration_s: time that a target is seen (by default the radar's own); where its Doppler leaves a fifth of the PRF band empty, only
-    noise and side lobes, taken as -20 dB, reach the tails of the filter and the guard is short.
+    None. band_hz: the processed Doppler band of the focuser; its soft edges make the filter compact, the overlap shortest and the
+    tolerance sure. Without one the aperture is that of the whole PRF, and the guard keeps tails below the tolerance for data whose ends
+    of the PRF band are 30 dB down (a beam narrower than the PRF, little noise): data that fill the band agree to about -45 dB.
     """
     far, near = axes[-1].stop, axes[-1].start
-    seen = radar.integration_s if integration_s is None else integration_s
     cos2 = 1 - max(float(radar.sin_squint(f)) ** 2 for f in doppler_hz)
     rate = float(radar.azimuth_rate_hz_s(far)) * cos2**1.5
-    aperture = radar.prf_hz**2 / rate
-    density = 0.01 if seen is not None and rate * seen < 0.8 * radar.prf_hz else 1.0
-    guard = 8.0
-    while density * filter_tail(aperture, guard) > 10 ** (tolerance_db / 10):
-        guard *= 1.1
+    if band_hz is None:
+        aperture, guard = radar.prf_hz**2 / rate, 1e-3 * filter_tail(1.0) / 10 ** (tolerance_db / 10)
+    else:
+        # tails of a raised-cosine edge of width w fall as (w tau)^-5 in energy: 3e-5 (w tau)^-5
+        periods = (3e-5 / 10 ** (tolerance_db / 10)) ** 0.2
+        aperture, guard = band_hz * (1 + BAND_EDGE) * radar.prf_hz / rate, (2 + periods) * radar.prf_hz / (BAND_EDGE * band_hz)
     shifts = [_frame_shift_s(radar, f, f if frame_hz is None else frame_hz, r) * radar.prf_hz for f in doppler_hz for r in (near, far)]
     half = aperture / 2 + guard
     return math.floor(min(shifts) - half), math.ceil(max(shifts) + half)

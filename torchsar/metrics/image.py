@@ -44,17 +44,31 @@ def contrast(image: Tensor | Signal, of: str = "intensity") -> Tensor:
     return torch.sqrt(spread.clamp_min(torch.finfo(power.dtype).tiny)) / torch.where(mean > 0, mean, 1)
 
 
+def _norm(x: Tensor) -> Tensor:
+    """Root of the energy of each image, summed in float64: a million float32 terms would lose the fourth digit."""
+    return (x.real.square() + x.imag.square()).sum((-2, -1), dtype=torch.float64).sqrt()
+
+
+def _over_peak(image: Tensor | Signal) -> Tensor:
+    """A complex image over its detached peak, so that its squares neither under- nor overflow. All-zero stays zero."""
+    x = _tensor(image)
+    peak = x.detach().abs().amax((-2, -1), keepdim=True)
+    return x / torch.where(peak > 0, peak, 1)
+
+
 def correlation(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
-    """rho = |<I, I0>| / (|I| |I0|) of two complex images, (...,) in 0..1. Blind to a common gain and phase."""
-    a, b = _tensor(image), _tensor(reference)
-    product = (a * b.conj()).sum((-2, -1)).abs()
-    norms = torch.linalg.vector_norm(a, dim=(-2, -1)) * torch.linalg.vector_norm(b, dim=(-2, -1))
+    """rho = |<I, I0>| / (|I| |I0|) of two complex images, (...,) float64 in 0..1. Blind to a common gain and phase; 0 where one is all zero."""
+    a, b = _over_peak(image), _over_peak(reference)
+    product = (a * b.conj()).sum((-2, -1), dtype=torch.complex128).abs()
+    norms = _norm(a) * _norm(b)
     return product / torch.where(norms > 0, norms, 1)
 
 
 def error_db(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
-    """10 lg of |I - I0|^2 / |I0|^2 in dB, (...,). Sees gain and phase; use `correlation` where those are free."""
+    """10 lg of |I - I0|^2 / |I0|^2 in dB, (...,) float64. Sees gain and phase; use `correlation` where those are free."""
     a, b = _tensor(image), _tensor(reference)
-    norm = torch.linalg.vector_norm(b, dim=(-2, -1))
-    ratio = torch.linalg.vector_norm(a - b, dim=(-2, -1)) / torch.where(norm > 0, norm, 1)
+    peak = b.detach().abs().amax((-2, -1), keepdim=True)
+    scale = torch.where(peak > 0, peak, 1)
+    norm = _norm(b / scale)
+    ratio = _norm((a - b) / scale) / torch.where(norm > 0, norm, 1)
     return 20 * torch.log10(ratio.clamp_min(torch.finfo(ratio.dtype).tiny))

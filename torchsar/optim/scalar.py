@@ -90,5 +90,4 @@ def _finished(active: Tensor) -> bool:
 
 def _slope(cost: Cost, x: Tensor) -> Tensor:
     with torch.enable_grad():
-        x = x.detach().requires_grad_(True)
-        return torch.autograd.grad(cost(x).sum(), x)[0]
+        return torch.func.grad(lambda value: cost(value).sum())(x.detach())

@@ -53,11 +53,12 @@ def linear_fill(lines: Tensor, missing: Tensor, doppler_turns: Tensor | float = 
 def azimuth_spectrum(lines: Tensor, received: Tensor, lags: int = 24) -> Tensor:
     """Azimuth power spectrum from lag products of the received lines, averaged over range, unit mean, (..., pulse) in FFT order.
 
-    lines: zero where not received; received: bool (..., pulse). Smoothed over about 2 / lags of the PRF; may be slightly negative.
+    lines: (..., range, pulse), azimuth last, zero where not received; received: bool (..., pulse). Smoothed over about 2 / lags of the
+    PRF; may be slightly negative.
     """
-    n = lines.shape[-2]
+    n = lines.shape[-1]
     lags = min(lags, max(1, n // 4))
-    products = torch.fft.ifft(torch.fft.fft(lines, 2 * n, dim=-2).abs().square().sum(-1))
+    products = torch.fft.ifft(torch.fft.fft(lines, 2 * n).abs().square().sum(-2))
     pairs = torch.fft.ifft(torch.fft.fft(received.to(lines.real.dtype), 2 * n).abs().square()).real
     lag = torch.arange(lags + 1, device=lines.device)
     taper = 0.5 + 0.5 * torch.cos(torch.pi * lag / (lags + 1))
@@ -72,14 +73,15 @@ def band_limited_fill(lines: Tensor, missing: Tensor, rounds: int = 2, steps: in
     The spectrum, with the Doppler centroid in it, is estimated here from the received lines, then once more from the filled ones. Minimises
     sum |D(f)|^2 / S(f) over the missing lines by conjugate gradients. lines: (..., pulse, range); missing: bool (..., pulse).
     """
-    mask = _mask(lines, missing)
-    filled, level = unit_level(zero_fill(lines, missing))
-    spectrum = azimuth_spectrum(filled.detach(), ~missing.bool().expand(lines.shape[:-1])).clamp_min(0.05)
+    # azimuth last: its FFTs then run along contiguous samples
+    mask = _mask(lines, missing).mT
+    filled, level = unit_level(zero_fill(lines, missing).mT.contiguous())
+    spectrum = azimuth_spectrum(filled.detach(), ~mask.expand(filled.shape)[..., 0, :]).clamp_min(0.05)
     for _ in range(rounds):
-        weight = (1 / spectrum)[..., None]
-        filled = conjugate_fill(lambda x, w=weight: torch.fft.ifft(torch.fft.fft(x, dim=-2) * w, dim=-2), filled, mask, steps)
-        spectrum = azimuth_spectrum(filled.detach(), torch.ones_like(mask[..., 0]).expand(lines.shape[:-1]), 96).clamp_min(2e-3)
-    return torch.where(mask, filled * level, lines)
+        weight = (1 / spectrum)[..., None, :]
+        filled = conjugate_fill(lambda x, w=weight: torch.fft.ifft(torch.fft.fft(x) * w), filled, mask, steps)
+        spectrum = azimuth_spectrum(filled.detach(), torch.ones_like(filled[..., 0, :], dtype=torch.bool), 96).clamp_min(2e-3)
+    return torch.where(mask, filled * level, 0).mT + zero_fill(lines, missing)
 
 
 class ZeroFill(Stage):

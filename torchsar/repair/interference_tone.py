@@ -205,41 +205,48 @@ def find_tones(lines: Tensor, level: Level, position: Tensor | None = None, most
     position: line numbers (..., pulse) where the lines are a selection. Lines where the tones do not account for the energy about
     them keep none: what is there is not a tone.
     """
-    rest, tones = lines.detach(), []
+    rest, tones, n = lines.detach(), [], lines.shape[-1]
     blocked = torch.zeros(lines.shape, dtype=torch.bool, device=lines.device)
+    excess = level.excess(line_spectra(rest))
     for _ in range(most):
-        excess = level.excess(line_spectra(rest)).masked_fill(blocked, 0)
-        strong, cell = stands_out(excess, threshold), excess.argmax(-1)
+        open_ = excess.masked_fill(blocked, 0)
+        strong = stands_out(open_, threshold)
         if not anything(strong):
             break
-        tone = fit_tone(rest, cell, strong, level)
-        rest = rest - tone.waveform(rest)
-        blocked = blocked | around(tone.cell(lines.shape[-1]), lines.shape[-1]) & (strong & ~tone.present)[..., None]
-        tones.append(tone)
-    if position is None:
-        position = torch.arange(lines.shape[-2], device=lines.device).expand(lines.shape[:-1])
-    return refit(lines.detach(), explaining(lines.detach(), rest, tones, level), position.to(torch.float64))
+        tone = fit_tone(rest, open_.argmax(-1), strong, level)
+        without = rest - tone.waveform(rest)
+        after, near = level.excess(line_spectra(without)), around(tone.cell(n), n)
+        # a tone that leaves most of the energy about it is part of something wider
+        useful = tone.present & accounts_for(excess, after, near, 0.7)
+        rest, excess = torch.where(useful[..., None], without, rest), torch.where(useful[..., None], after, excess)
+        blocked = blocked | near & (strong & ~useful)[..., None]
+        tones.append(replace(tone, present=useful))
+    at = torch.arange(lines.shape[-2], device=lines.device).expand(lines.shape[:-1]) if position is None else position
+    return refit(lines.detach(), explaining(lines.detach(), rest, tones, level), at.to(torch.float64))
+
+
+def accounts_for(before: Tensor, after: Tensor, near: Tensor, share: float) -> Tensor:
+    """Whether at most a share of the energy in the cells `near` is left, clutter (1 a cell) apart. (..., pulse, range) -> (..., pulse) bool."""
+    return (after * near).sum(-1) < share * (before * near).sum(-1) + 2 * near.sum(-1)
 
 
 def explaining(lines: Tensor, rest: Tensor, tones: list[Tone], level: Level) -> list[Tone]:
-    """The tones that account for nearly all energy about them, what clutter would leave apart; the others are marked absent."""
+    """The tones that together account for nearly all energy about them; the others are marked absent."""
     if not tones:
         return tones
     n = lines.shape[-1]
     before, after = (level.excess(line_spectra(x)) for x in (lines, rest))
-    kept = []
-    for tone in tones:
-        near = around(tone.cell(n), n)
-        left = (after * near).sum(-1) < 0.1 * (before * near).sum(-1) + 2 * near.sum(-1)
-        kept.append(replace(tone, present=tone.present & left))
+    kept = [replace(tone, present=tone.present & accounts_for(before, after, around(tone.cell(n), n), 0.1)) for tone in tones]
     return [tone for tone in kept if anything(tone.present)]
 
 
 def refit(lines: Tensor, tones: list[Tone], position: Tensor, rounds: int = 2) -> list[Tone]:
     """Each tone fitted again with the others taken out, then pooled over lines."""
     n, tones = lines.shape[-1], list(tones)
-    shared = torch.stack([tone.present for tone in tones]).sum(0) > 1 if tones else None
-    for _ in range(rounds if shared is not None and anything(shared) else 0):
+    if not tones:
+        return tones
+    shared = torch.stack([tone.present for tone in tones]).sum(0) > 1
+    for _ in range(rounds if anything(shared) else 0):
         waves = subtract_each(lines, tones)
         for k, tone in enumerate(tones):
             alone = lines - sum(wave for j, wave in enumerate(waves) if j != k)

@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv1d, pad
 
-from torchsar.core import per_trial
 from torchsar.focus.defocus import InvertibleOmegaK, all_pass
 from torchsar.radar import StripmapRadar
 
@@ -57,8 +56,8 @@ def conjugate_fill(quadratic: Callable[[Tensor], Tensor], lines: Tensor, mask: T
 
 
 def smooth(power: Tensor, azimuth: float, range_: float) -> Tensor:
-    """Local mean of (..., azimuth, range) with Gaussian weights of these standard deviations; circular in azimuth, edges held in range."""
-    return _smooth_last(_smooth_last(power, range_, "replicate").mT, azimuth, "circular").mT
+    """Local mean of (..., range, azimuth) with Gaussian weights of these standard deviations; circular in azimuth, edges held in range."""
+    return _smooth_last(_smooth_last(power, azimuth, "circular").mT, range_, "replicate").mT
 
 
 def _smooth_last(x: Tensor, sigma: float, edges: str) -> Tensor:
@@ -82,37 +81,40 @@ def look_windows(n: int, looks: int, doppler_turns: Tensor) -> Tensor:
 
 
 class SubLooks:
-    """The precision (inverse covariance) of lines under the scene model. windows: (look, ..., n) amplitude weights over Doppler."""
+    """The precision (inverse covariance) of lines under the scene model. windows: (look, ..., n) amplitude weights over Doppler.
+
+    Powers and weights of sub-looks are held with azimuth last, (look, ..., range, pulse), where azimuth FFTs take half the time.
+    """
 
     def __init__(self, operator: InvertibleOmegaK, windows: Tensor) -> None:
         self.operator = operator
-        self.windows = windows[..., None]
+        self.windows = windows[..., None, :]
         self.share = windows.square().mean(-1)[..., None, None]
 
     def power(self, lines: Tensor, unexplained: Tensor) -> Tensor:
-        """v: local power of each sub-look, (look, ..., pulse, range), geometric mean of its own and what the whole image says of it.
+        """v: local power of each sub-look, the geometric mean of its own and of what the whole image says of it.
 
-        unexplained: power that errors of the filled lines may have in every pixel, broadcast against (..., pulse, range).
+        unexplained: power that errors of the filled lines may have in every pixel, broadcast against (..., range, pulse).
         """
-        spectra = self.operator.to_doppler(lines)
-        whole = power_of(torch.fft.ifft(spectra, dim=-2))
+        spectra = self.operator.to_doppler(lines).mT.contiguous()
+        whole = power_of(torch.fft.ifft(spectra))
         mean = whole.mean((-2, -1), keepdim=True)
         local = smooth(whole, 1.0, 1.0) / torch.where(mean > 0, mean, 1)
         floor = torch.maximum(unexplained, 1e-9 * mean + torch.finfo(mean.dtype).tiny)
         result = []
         for window, share in zip(self.windows.to(mean.dtype), self.share.to(mean.dtype), strict=True):
-            own = power_of(torch.fft.ifft(spectra * window, dim=-2)) / share
+            own = power_of(torch.fft.ifft(spectra * window)) / share
             expected = own.mean((-2, -1), keepdim=True) * local
             result.append(torch.sqrt(smooth(own, max(1.0, 0.8 * len(self.share)), 1.0) * expected) + floor)
         return torch.stack(result)
 
     def precision(self, lines: Tensor, weight: Tensor) -> Tensor:
-        """Lines -> gradient of sum weight |sub-look|^2. weight: (look, ..., pulse, range)."""
-        spectra = self.operator.to_doppler(lines)
+        """Lines -> gradient of sum weight |sub-look|^2."""
+        spectra = self.operator.to_doppler(lines).mT.contiguous()
         total = torch.zeros_like(spectra)
         for window, w in zip(self.windows.to(weight.dtype), weight, strict=True):
-            total = total + window * torch.fft.fft(w * torch.fft.ifft(spectra * window, dim=-2), dim=-2)
-        return self.operator.from_doppler(total)
+            total = total + window * torch.fft.fft(w * torch.fft.ifft(spectra * window))
+        return self.operator.from_doppler(total.mT)
 
 
 def sparse_fill(
@@ -149,5 +151,5 @@ def sparse_fill(
         power = model.power(x.detach(), unexplained)
         weight = power.mean((0, -2, -1), keepdim=True) / power
         x = conjugate_fill(lambda y, w=weight: model.precision(y, w), x, mask, steps)
-        unexplained = lost * (1 / (1 / power).mean((0, -2), keepdim=True))[0]
+        unexplained = lost * (1 / (1 / power).mean((0, -1), keepdim=True))[0]
     return torch.where(mask, x * level, lines)

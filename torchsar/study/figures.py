@@ -15,6 +15,7 @@ from torch import Tensor
 from torchsar import plot
 from torchsar.core import Signal, Truth
 from torchsar.radar import StripmapRadar
+from torchsar.repair.response import band_grid
 from torchsar.study.build import Case
 from torchsar.study.config import Config
 from torchsar.study.cuts import impulse_cuts
@@ -60,8 +61,8 @@ def draw_all(scene: Scene, folder: Path) -> list[Picture]:
     folder.mkdir()
     pictures = []
     for make in (_image, _comparison, _cuts, _squint, _doppler_spectrum, _increments, _repairs, _contaminated_line, _response, _velocity):
-        for number, (name, title, caption, figure) in enumerate(make(scene)):
-            file = f"{len(pictures) + 1:02d}_{name}{f'_{number + 1}' if number else ''}.png"
+        for name, title, caption, figure in make(scene):
+            file = f"{len(pictures) + 1:02d}_{name}.png"
             plot.save(figure, folder / file)
             pictures.append(Picture(file, title, caption))
     return pictures
@@ -179,6 +180,7 @@ def _increments(scene: Scene) -> Drawn:
     series: dict[str, tuple[np.ndarray, np.ndarray]] = {"blocks of lines": (plot.array(time_s), doppler)}
     if "doppler_hz" in scene.best.used:
         base = scene.best.used["doppler_hz"] - prf * round(scene.best.used["doppler_hz"] / prf)
+        doppler -= prf * np.round((doppler - base) / prf)
         series["estimate"] = (plot.array(time_s), np.full(len(doppler), base))
     caption = "Mean phase increment between adjacent lines, in Hz (PRF times increment over 2 pi), for blocks of lines along the strip. The scene makes it fluctuate; the estimate averages it."
     yield "phase_increments", "Phase increments along the strip", caption, plot.curves(series, "slow time (s)", "increment (Hz)")
@@ -215,9 +217,11 @@ def _mean_spectrum_db(signal: Signal, reference: float | None = None) -> tuple[n
     return 10 * np.log10(np.maximum(power / top, 1e-12)), top
 
 
-def _line_power_db(signal: Signal) -> np.ndarray:
+def _line_power_db(signal: Signal, like: Signal) -> np.ndarray:
+    """Mean power of the lines over the median line of `like`, dB."""
     power = plot.array(signal.data.abs().square().mean(-1).double())
-    return 10 * np.log10(np.maximum(power / (np.median(power[power > 0]) if (power > 0).any() else 1.0), 1e-6))
+    whole = plot.array(like.data.abs().square().mean(-1).double())
+    return 10 * np.log10(np.maximum(power / (np.median(whole[whole > 0]) if (whole > 0).any() else 1.0), 1e-4))
 
 
 def _repairs(scene: Scene) -> Drawn:
@@ -225,7 +229,7 @@ def _repairs(scene: Scene) -> Drawn:
     for name, before, after in _repair_stages(scene):
         old, top = _mean_spectrum_db(before)
         new, _ = _mean_spectrum_db(after, top)
-        lines = {"before": (np.arange(before.axes[0].n), _line_power_db(before)), "after": (np.arange(after.axes[0].n), _line_power_db(after))}
+        lines = {"before": (np.arange(before.axes[0].n), _line_power_db(before, before)), "after": (np.arange(after.axes[0].n), _line_power_db(after, before))}
         spectra = {"before": (_frequency_mhz(scene, len(old)), old), "after": (_frequency_mhz(scene, len(new)), new)}
         stage = (scene.config.processor["recommended"].stages or {})[name]["stage"]
         parts = [
@@ -252,18 +256,35 @@ def _contaminated_line(scene: Scene) -> Drawn:
 
 def _response(scene: Scene) -> Drawn:
     """Estimated phase and amplitude response of the channel over range frequency, beside the truth where it is known."""
-    n = scene.case.recording.signal.axes[-1].n
-    for name, estimate in scene.best.estimates.items():
-        curves = {key: value for key, value in estimate.value.items() if value.ndim == 1 and value.shape[0] == n and key in ("phase_rad", "gain_db", "amplitude")}
-        parts = []
-        for key, value in curves.items():
-            series = {"estimate": (_frequency_mhz(scene, n), plot.array(torch.fft.fftshift(value)))}
-            true = _true_curve(scene.case.truth, key, n)
-            if true is not None:
-                series["truth"] = (_frequency_mhz(scene, n), plot.array(torch.fft.fftshift(true)))
-            parts.append({"series": {k: _within(x, y, scene.radar.pulse.bandwidth_hz / 2e6) for k, (x, y) in series.items()}, "xlabel": "range frequency (MHz)", "ylabel": key, "title": key})
-        if parts:
-            yield f"response_{name}", "Response of the channel", f"Estimate of stage '{name}' over the pulse band.", plot.panels(parts)
+    band_mhz = plot.array(band_grid()) * scene.radar.pulse.bandwidth_hz / 2e6
+    parts = []
+    for estimate in scene.best.estimates.values():
+        for key, label in (("phase_rad", "phase (rad)"), ("amplitude", "amplitude")):
+            if key in estimate.value and estimate.value[key].shape == band_mhz.shape:
+                series = {"estimate": (band_mhz, plot.array(estimate.value[key]))}
+                true = _true_curve(scene.case.truth, key, len(band_mhz))
+                if true is not None:
+                    series["truth"] = (band_mhz, plot.array(true))
+                parts.append({"series": series, "xlabel": "range frequency (MHz)", "ylabel": label, "title": label})
+    if parts:
+        yield "response", "Response of the whole channel", "Phase and amplitude over the band of the pulse, as found from bright places of the image.", plot.panels(parts)
+    yield from _image_repairs(scene)
+
+
+def _image_repairs(scene: Scene) -> Drawn:
+    """Range cut through the strongest target before and after a repair of the image."""
+    place, trace = _strongest(scene), scene.best.trace
+    stages = scene.config.processor["recommended"].stages or {}
+    for name, entry in stages.items():
+        if place is None or trace is None or group_of(entry["stage"]) != "repair" or trace.outputs[name].names != ("azimuth", "range"):
+            continue
+        before, after = trace.inputs[name], trace.outputs[name]
+        if torch.equal(before.data, after.data):
+            continue
+        cuts = {label: impulse_cuts(image, place[1:])["range"] for label, image in (("before", before), ("after", after))}
+        series = {label: (plot.array(offset), plot.decibel(level)) for label, (offset, level) in cuts.items()}
+        caption = f"Stage '{name}' ({entry['stage']}): range cut through {place[0]} before and after."
+        yield f"repair_{name}", f"Repair: {name}", caption, plot.curves(series, "range from the peak (m)", "dB", ylim=(-50, 3))
 
 
 def _true_curve(truth: Truth | None, key: str, n: int) -> Tensor | None:

@@ -12,15 +12,19 @@ from typing import Any
 
 from torchsar.compensate.ambiguity import DopplerCentroid
 from torchsar.compensate.doppler import EnergyCentre, PhaseIncrement, RangeDependentCentroid
+from torchsar.echo.channels import ChannelImbalance
 from torchsar.echo.interference import Quantiser, Tone, WideInterferer
 from torchsar.echo.jitter import PeriodicJitter
+from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedLines
 from torchsar.focus import OmegaK, RangeCompress
 from torchsar.focus.backprojection import Backproject
 from torchsar.focus.range_doppler import RangeDoppler
 from torchsar.focus.stolt import OmegaKStolt
+from torchsar.repair.fill import BandLimitedFill, LinearFill, SparseFill, ZeroFill
 from torchsar.repair.interference import DropInterference, NotchInterference, SubtractInterference
 from torchsar.repair.jitter_blind import BlindJitter
 from torchsar.repair.jitter_pilot import PilotJitter
+from torchsar.repair.lines import LineIntegrity
 from torchsar.scene import AlwaysLit, Antenna, Dwell, Hyperbola, Parabola, Points, RandomPoints, Speckle
 from torchsar.study import factories
 from torchsar.study.catalogue import Catalogue
@@ -28,9 +32,28 @@ from torchsar.study.catalogue import Catalogue
 SCENES = Catalogue("scene", "kind", {"points": Points, "random_points": RandomPoints, "speckle": Speckle})
 BEAMS = Catalogue("beam", "kind", {"always_lit": AlwaysLit, "dwell": Dwell, "antenna": Antenna})
 PATHS = Catalogue("path", "kind", {"hyperbola": Hyperbola, "parabola": Parabola})
-DAMAGES = Catalogue("damage", "kind", {"tone": Tone, "wide_interferer": WideInterferer, "quantiser": Quantiser, "periodic_jitter": PeriodicJitter})
+DAMAGES = Catalogue(
+    "damage",
+    "kind",
+    {
+        "channel_imbalance": ChannelImbalance,
+        "tone": Tone,
+        "wide_interferer": WideInterferer,
+        "quantiser": Quantiser,
+        "periodic_jitter": PeriodicJitter,
+        "lost_lines": LostLines,
+        "lost_gaps": LostGaps,
+        "repeated_lines": RepeatedLines,
+        "corrupted_numbers": CorruptedNumbers,
+    },
+)
 
 REPAIR: dict[str, Callable[..., Any]] = {
+    "line_integrity": LineIntegrity,
+    "zero_fill": ZeroFill,
+    "linear_fill": LinearFill,
+    "band_limited_fill": BandLimitedFill,
+    "sparse_fill": SparseFill,
     "interference_subtract": SubtractInterference,
     "interference_notch": NotchInterference,
     "interference_drop": DropInterference,
