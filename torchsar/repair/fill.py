@@ -67,7 +67,7 @@ def azimuth_spectrum(lines: Tensor, received: Tensor, lags: int = 24) -> Tensor:
     return spectrum / spectrum.mean(-1, keepdim=True).clamp_min(torch.finfo(spectrum.dtype).tiny)
 
 
-def band_limited_fill(lines: Tensor, missing: Tensor, rounds: int = 2, steps: int = 12) -> Tensor:
+def band_limited_fill(lines: Tensor, missing: Tensor, rounds: int = 2, steps: int = 8) -> Tensor:
     """Least squares over the azimuth band: the missing lines that fit the azimuth spectrum of the received ones best (Wiener).
 
     The spectrum, with the Doppler centroid in it, is estimated here from the received lines, then once more from the filled ones. Minimises
@@ -81,7 +81,7 @@ def band_limited_fill(lines: Tensor, missing: Tensor, rounds: int = 2, steps: in
         weight = (1 / spectrum)[..., None, :]
         filled = conjugate_fill(lambda x, w=weight: torch.fft.ifft(torch.fft.fft(x) * w), filled, mask, steps)
         spectrum = azimuth_spectrum(filled.detach(), torch.ones_like(filled[..., 0, :], dtype=torch.bool), 96).clamp_min(2e-3)
-    return torch.where(mask, filled * level, 0).mT + zero_fill(lines, missing)
+    return torch.where(mask.mT, (filled * level).mT, lines)
 
 
 class ZeroFill(Stage):
@@ -110,7 +110,7 @@ class LinearFill(Stage):
 class BandLimitedFill(Stage):
     """Least squares over the azimuth band; see band_limited_fill. Needs no Doppler: the spectrum that it estimates holds the centroid."""
 
-    def __init__(self, rounds: int = 2, steps: int = 12) -> None:
+    def __init__(self, rounds: int = 2, steps: int = 8) -> None:
         super().__init__()
         if rounds < 1 or steps < 1:
             raise ValueError(f"band-limited fill needs at least one round of one step, got rounds={rounds}, steps={steps}")
@@ -134,7 +134,7 @@ class SparseFill(Stage):
         velocity_m_s: Tensor | float | None = None,
         doppler_hz: Tensor | float | None = None,
         looks: int = 4,
-        rounds: int = 3,
+        rounds: int = 2,
         steps: int = 4,
     ) -> None:
         super().__init__()

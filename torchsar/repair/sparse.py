@@ -127,7 +127,7 @@ def sparse_fill(
     reference: Tensor | None = None,
     start: Tensor | None = None,
     looks: int = 4,
-    rounds: int = 3,
+    rounds: int = 2,
     steps: int = 4,
 ) -> Tensor:
     """Missing lines that make the focused image most probable under a model of locally varying power. lines: (..., pulse, range).

@@ -1,0 +1,83 @@
+"""Damage to the sequence of lines: what is lost is really gone, and the truth says where."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from tests.helpers import small_radar
+from torchsar.core import Draws, Recording, Signal
+from torchsar.echo import apply_damages
+from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedLines
+
+N = 200
+
+
+def recording(trials: int | None = 3) -> Recording:
+    """Line i holds i + 1 in every sample, and so does its AGC."""
+    shape = (N, 4) if trials is None else (trials, N, 4)
+    lines = (torch.arange(N) + 1.0).to(torch.complex64)[:, None].expand(shape).contiguous()
+    return Recording(Signal(lines, small_radar().raw_axes(N, 4)), small_radar(), {"agc": torch.arange(N) + 1.0, "pilot": torch.ones(N)})
+
+
+@pytest.mark.parametrize("damage, count", [(LostLines(count=7), 7), (LostLines(fraction=0.2), 40), (LostGaps(3, 8), 24)])
+def test_lost_lines_close_up_and_the_end_is_padded(damage, count: int) -> None:
+    out, told = apply_damages(recording(), {"lost": damage}, Draws(1, trials=range(3)))
+    number, lost = out.aux["line_number"], told["lost.lost"]
+    assert (lost.sum(-1) == count).all() and not lost[:, 0].any()
+    for trial in range(3):
+        kept = (~lost[trial]).nonzero()[:, 0]
+        assert torch.equal(number[trial, : N - count], kept)
+        assert (number[trial, N - count :] == -1).all() and (out.signal.data[trial, N - count :] == 0).all()
+        assert torch.equal(out.signal.data[trial, : N - count, 0].real, kept + 1.0)
+        assert torch.equal(out.aux["agc"][trial, : N - count], kept + 1.0)
+    assert torch.equal(out.aux["pilot"], torch.ones(N))
+    assert torch.equal(told["lost.lost_number"], lost.nonzero()[:, 1].reshape(3, -1))
+    assert not torch.equal(lost[0], lost[1])
+
+
+def test_gaps_have_their_length_and_stay_apart() -> None:
+    for seed in range(5):
+        _, told = apply_damages(recording(None), {"gap": LostGaps(5, 8)}, Draws(seed))
+        edges = torch.diff(told["gap.lost"].int(), prepend=torch.zeros(1, dtype=torch.int32), append=torch.zeros(1, dtype=torch.int32))
+        begins, ends = (edges == 1).nonzero()[:, 0], (edges == -1).nonzero()[:, 0]
+        assert (ends - begins).tolist() == [8] * 5
+
+
+def test_repeated_lines_come_twice() -> None:
+    out, told = apply_damages(recording(), {"again": RepeatedLines(6)}, Draws(2, trials=range(3)))
+    number = out.aux["line_number"]
+    assert torch.equal(told["again.repeated"][:, 1:], number[:, 1:] == number[:, :-1])
+    assert ((number[:, 1:] - number[:, :-1]) >= 0).all()
+    assert torch.equal(out.signal.data[..., 0].real, number + 1.0)
+
+
+@pytest.mark.parametrize("bits", [None, 3])
+def test_corrupted_numbers_leave_samples_alone(bits: int | None) -> None:
+    source = recording()
+    out, told = apply_damages(source, {"number": CorruptedNumbers(9, bits)}, Draws(3, trials=range(3)))
+    wrong = out.aux["line_number"] != told["number.true_number"]
+    assert torch.equal(wrong, told["number.corrupted"]) and (wrong.sum(-1) == 9).all()
+    assert torch.equal(out.signal.data, source.signal.data)
+
+
+def test_damage_depends_on_its_address_alone() -> None:
+    together, _ = apply_damages(recording(3), {"lost": LostLines(count=7)}, Draws(4, trials=range(3)))
+    alone, _ = apply_damages(recording(1), {"lost": LostLines(count=7)}, Draws(4, trials=[2]))
+    assert torch.equal(together.aux["line_number"][2], alone.aux["line_number"][0])
+
+
+@pytest.mark.parametrize(
+    "build, message",
+    [
+        (lambda: LostLines(), "a count or a fraction"),
+        (lambda: LostLines(fraction=1.5), "fraction in 0..1"),
+        (lambda: LostGaps(2, 0), "length >= 1"),
+        (lambda: LostLines(count=N)(recording(None), Draws(0)), "leave nothing of a recording of 200 lines"),
+        (lambda: LostGaps(30, 8)(recording(None), Draws(0)), "do not fit a recording of 200 lines"),
+        (lambda: LostLines(count=3)(recording(None), Draws(0, trials=range(2))), "draw one unbatched trial"),
+    ],
+)
+def test_mistakes_are_named(build, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        build()

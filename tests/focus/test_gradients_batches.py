@@ -1,0 +1,95 @@
+"""Gradients and batches of every focuser, at a tiny size in complex128."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchsar.focus import DopplerBand, Integration, OmegaK, backproject, omega_k, omega_k_stolt, range_doppler
+from torchsar.radar import LinearFM, StripmapRadar
+
+RADAR = StripmapRadar(3.2e9, LinearFM(40e6, 0.2e-6), 50e6, 400.0, 120.0, 2000.0)
+FORMS = [omega_k, omega_k_stolt, range_doppler]
+
+
+def rows(form):
+    def run(raw, velocity, frame):
+        return form(raw, RADAR, doppler_hz=8.0, velocity_m_s=velocity, frame_hz=frame)
+
+    return run
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_gradcheck_in_raw_velocity_and_frame(form):
+    torch.manual_seed(0)
+    raw = torch.randn(2, 6, 8, dtype=torch.complex128, requires_grad=True)
+    velocity, frame = torch.tensor([118.0, 121.0], dtype=torch.float64, requires_grad=True), torch.tensor([5.0, -7.0], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(rows(form), (raw, velocity, frame), atol=1e-4)
+
+
+def test_gradcheck_of_backprojection_in_all_that_varies():
+    torch.manual_seed(0)
+    raw = torch.randn(5, 8, dtype=torch.complex128, requires_grad=True)
+    x, r = (torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in ([0.5, 0.9], [2008.0, 2011.0]))
+    velocity = torch.tensor(119.0, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda raw, x, r, v: backproject(raw, RADAR, x, r, doppler_hz=8.0, velocity_m_s=v), (raw, x, r, velocity), atol=1e-4)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("shape", [(48, 60), (33, 47)])
+def test_a_batch_with_different_values_equals_its_singles(form, shape):
+    raw = torch.randn(3, *shape, dtype=torch.complex128)
+    doppler, velocity = torch.tensor([0.0, 130.0, -900.0], dtype=torch.float64), torch.tensor([120.0, 90.0, 125.0], dtype=torch.float64)
+    batch = form(raw, RADAR, doppler_hz=doppler, velocity_m_s=velocity)
+    singles = [form(raw[i], RADAR, doppler_hz=doppler[i], velocity_m_s=velocity[i]) for i in range(3)]
+    torch.testing.assert_close(batch, torch.stack(singles), rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_blocks_equal_the_plain_path(form):
+    raw = torch.randn(700, 600, dtype=torch.complex128)
+    plain = form(raw.clone().requires_grad_(), RADAR, doppler_hz=40.0, band_hz=200.0).detach()
+    torch.testing.assert_close(form(raw, RADAR, doppler_hz=40.0, band_hz=200.0), plain, rtol=1e-10, atol=1e-10)
+
+
+def test_backprojected_batch_equals_singles_and_blocks_do_not_matter():
+    raw = torch.randn(2, 40, 64, dtype=torch.complex128)
+    x, r = torch.linspace(3, 9, 5, dtype=torch.float64)[:, None], 2000 + torch.linspace(20, 120, 7, dtype=torch.float64)
+    velocity = torch.tensor([120.0, 100.0], dtype=torch.float64)
+    kw = {"doppler_hz": 3.0, "aperture": Integration(0.05)}
+    batch = backproject(raw, RADAR, x, r, velocity_m_s=velocity, **kw)
+    assert batch.shape == (2, 5, 7)
+    for i in range(2):
+        torch.testing.assert_close(batch[i], backproject(raw[i], RADAR, x, r, velocity_m_s=velocity[i], block_bytes=1, **kw))
+
+
+def test_apertures_limit_the_pulses():
+    raw = torch.ones(40, 64, dtype=torch.complex128)
+    x, r = torch.tensor(6.0, dtype=torch.float64), torch.tensor(2060.0, dtype=torch.float64)
+    some = backproject(raw, RADAR, x, r, doppler_hz=0.0, aperture=Integration(10 / 400))
+    mask = ((torch.arange(40) / 400 - 6.0 / 120).abs() <= 5 / 400)[:, None]
+    torch.testing.assert_close(some, backproject(raw * mask, RADAR, x, r, doppler_hz=0.0))
+    assert abs(backproject(raw, RADAR, x, r, doppler_hz=300.0, aperture=DopplerBand(50.0))) == 0
+
+
+def test_a_processed_band_removes_what_lies_outside_and_warns_beyond_the_prf():
+    n = 256
+    tone = torch.exp(2j * torch.pi * 90 / 400 * torch.arange(n, dtype=torch.float64))[:, None].expand(n, 32).contiguous()
+    kept, removed = (omega_k(tone, RADAR, doppler_hz=centre, frame_hz=0.0, band_hz=100.0).abs().mean() for centre in (90.0, 0.0))
+    assert removed < 0.02 * kept
+    with pytest.warns(UserWarning, match=r"PRF 400 Hz .* 450"):
+        omega_k(tone, RADAR, doppler_hz=0.0, band_hz=450.0)
+    with pytest.raises(ValueError, match="band"):
+        omega_k(tone, RADAR, doppler_hz=0.0, band_hz=-1.0)
+
+
+def test_a_cropped_signal_keeps_its_ranges():
+    from torchsar.core import Signal
+
+    raw = Signal(torch.zeros(64, 128, dtype=torch.complex128), RADAR.raw_axes(64, 128))
+    raw.data[32, 90] = 1
+    stage = OmegaK(RADAR, None)
+    whole, part = stage(raw), stage(raw.crop(range=(40, 128)))
+    peak = int(part.data.abs().sum(-2).argmax())
+    assert part.axes[-1].start == pytest.approx(whole.axes[-1].start + 40 * RADAR.range_step_m)
+    torch.testing.assert_close(part.data[:, peak].abs(), whole.data[:, peak + 40].abs(), rtol=0, atol=2e-3)
