@@ -1,24 +1,29 @@
 """Range compression and image formation."""
 
 from torchsar.focus.backprojection import Backproject, DopplerBand, EveryPulse, Integration, backproject
+from torchsar.focus.coordinates import ClosestRange, PaddedLines, closest_range
+from torchsar.focus.defocus import InvertibleOmegaK, defocus_omega_k
 from torchsar.focus.detection import Detect, QuickLook, amplitude, multilook, quicklook_looks, to_db
 from torchsar.focus.nufft import Nufft, nufft_type1, nufft_type2
 from torchsar.focus.omega_k import OmegaK, StoredOmegaK, omega_k
 from torchsar.focus.range_doppler import RangeDoppler, range_doppler
-from torchsar.focus.reference import RangeCompress, flat_reference, matched_reference, range_compress
+from torchsar.focus.reference import RangeCompress, flat_reference, matched_reference, phase_reference, range_compress
 from torchsar.focus.requirements import Requirement, recommended_form, requirements
 from torchsar.focus.stolt import OmegaKStolt, omega_k_stolt
 from torchsar.focus.strip import StripPlan, focus_strip, plan_strip, reach_lines, write_strip
 
 __all__ = [
     "Backproject",
+    "ClosestRange",
     "Detect",
     "DopplerBand",
     "EveryPulse",
     "Integration",
+    "InvertibleOmegaK",
     "Nufft",
     "OmegaK",
     "OmegaKStolt",
+    "PaddedLines",
     "QuickLook",
     "RangeCompress",
     "RangeDoppler",
@@ -27,6 +32,8 @@ __all__ = [
     "StripPlan",
     "amplitude",
     "backproject",
+    "closest_range",
+    "defocus_omega_k",
     "flat_reference",
     "focus_strip",
     "matched_reference",
@@ -35,6 +42,7 @@ __all__ = [
     "nufft_type2",
     "omega_k",
     "omega_k_stolt",
+    "phase_reference",
     "plan_strip",
     "quicklook_looks",
     "range_compress",

@@ -89,7 +89,7 @@ def backproject(
         for i, pixels in enumerate(_slices(x.numel(), pixels_at_once)):
             difference, weight = sight(pulse_s[pulses, None], x[pixels], r[pixels])
             sums[i] = sums[i] + echo.at(grid, r[pixels], difference, weight).sum(-2)
-    return torch.cat(sums, -1).reshape(*raw.shape[:-2], *shape)
+    return torch.cat(sums, -1).reshape((*raw.shape[:-2], *shape))
 
 
 def _slices(n: int, step: int) -> Iterator[slice]:

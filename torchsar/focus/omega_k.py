@@ -216,7 +216,7 @@ def through_doppler(raw: Tensor, focus_rows: Callable[[Tensor, slice], Tensor], 
     if differentiable and torch.is_grad_enabled():
         return torch.fft.ifft(focus_rows(torch.fft.fft2(raw), slice(None)), dim=-2)
     work = spectrum_in_blocks(raw)
-    block_bytes = block_bytes_of(raw.device) // 2 if block_bytes is None else block_bytes
+    block_bytes = block_bytes_of(raw.device) if block_bytes is None else block_bytes
     height = max(1, block_bytes // max(1, work[..., 0, :].numel() * work.element_size()))
     for first in range(0, work.shape[-2], height):
         part = slice(first, min(first + height, work.shape[-2]))

@@ -31,7 +31,7 @@ def range_doppler(
     frame_hz: Tensor | float | None = None,
     reference: Tensor | None = None,
     band_hz: float | None = None,
-    eps: float = 1e-4,
+    eps: float = 2e-4,
 ) -> Tensor:
     """Range-Doppler algorithm: azimuth FFT, migration taken out by interpolation, hyperbolic azimuth phase per range, inverse FFT.
 

@@ -59,13 +59,17 @@ def window_entropy(spectra: Tensor, phase_rad: Tensor, weight: Tensor) -> tuple[
     """Weighted mean entropy of the windows after removing a phase, and its gradient to the phase of each frequency.
 
     spectra: (trial, point, n) complex128, unit energy each (or zero); phase_rad: (trial, n); weight: (trial, point). Returns (trial,),
-    (trial, n). The removal is unitary, so p = |y|^2 sums to one and dH/dy* = -(ln p + 1) y.
+    (trial, n). Responses are sampled twice as finely as the image, so that it matters less where a point lies between samples. The
+    removal is unitary, so p = |y|^2 sums to one and dH/dy* = -(ln p + 1) y.
     """
+    n = spectra.shape[-1]
     turned = spectra * cis(-phase_rad)[:, None]
-    y = torch.fft.ifft(turned, norm="ortho")
+    zeros = torch.zeros_like(turned)
+    y = torch.fft.ifft(torch.cat([turned[..., : n // 2], zeros, turned[..., n // 2 :]], -1), norm="ortho")
     p = y.real.square() + y.imag.square()
     log = torch.log(p.clamp_min(1e-30))
     slope = torch.fft.fft(-log * y, norm="ortho")
+    slope = torch.cat([slope[..., : n // 2], slope[..., -(n - n // 2) :]], -1)
     weight = (weight / weight.sum(-1, keepdim=True).clamp_min(1e-300))[..., None]
     return -(weight * p * log).sum((-2, -1)), 2 * (weight * (slope.conj() * turned).imag).sum(-2)
 
@@ -157,7 +161,7 @@ def estimate_response_sharpest(
     first, second = sharpest_coefficients(halves, weights, band, orders[-1:]).chunk(2)
     total = total + (first + second) / 2
     std = torch.linalg.vector_norm(first - second, dim=-1) / 2
-    return _phase_estimate(total @ basis, std, image.shape[:-2])
+    return _phase_estimate(total @ basis, torch.where((weights.sum(-1) > 0).reshape(2, -1).all(0), std, torch.inf), image.shape[:-2])
 
 
 def _phase_estimate(phase_rad: Tensor, std: Tensor, trials: torch.Size) -> Estimate:

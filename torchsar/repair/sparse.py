@@ -21,6 +21,7 @@ from torchsar.focus.defocus import InvertibleOmegaK, all_pass
 from torchsar.radar import StripmapRadar
 
 
+FLOOR=2e-3
 def unit_level(lines: Tensor) -> tuple[Tensor, Tensor]:
     """Lines over their largest sample, per trial, and that level (..., 1, 1): neither 1e-25 nor 1e19 may under- or overflow when squared."""
     level = lines.detach().abs().amax((-2, -1), keepdim=True)
@@ -53,6 +54,23 @@ def conjugate_fill(quadratic: Callable[[Tensor], Tensor], lines: Tensor, mask: T
         before, left = left, dot(residual, residual)
         direction = residual + over(left, before) * direction
     return lines
+
+
+def azimuth_spectrum(lines: Tensor, received: Tensor, lags: int = 24) -> Tensor:
+    """Azimuth power spectrum from lag products of the received lines, averaged over range, unit mean, (..., pulse) in FFT order.
+
+    lines: (..., range, pulse), azimuth last, zero where not received; received: bool (..., pulse). Smoothed over about 2 / lags of the
+    PRF; may be slightly negative.
+    """
+    n = lines.shape[-1]
+    lags = min(lags, max(1, n // 4))
+    products = torch.fft.ifft(torch.fft.fft(lines, 2 * n).abs().square().sum(-2))
+    pairs = torch.fft.ifft(torch.fft.fft(received.to(lines.real.dtype), 2 * n).abs().square()).real
+    lag = torch.arange(lags + 1, device=lines.device)
+    taper = 0.5 + 0.5 * torch.cos(torch.pi * lag / (lags + 1))
+    mean = products[..., : lags + 1] / pairs[..., : lags + 1].clamp_min(0.5) * taper.to(pairs.dtype)
+    spectrum = 2 * torch.fft.fft(mean, n).real - mean[..., :1].real
+    return spectrum / spectrum.mean(-1, keepdim=True).clamp_min(torch.finfo(spectrum.dtype).tiny)
 
 
 def smooth(power: Tensor, azimuth: float, range_: float) -> Tensor:
@@ -144,7 +162,8 @@ def sparse_fill(
     flat = None if reference is None else all_pass(reference)
     operator = InvertibleOmegaK(radar, x, doppler_hz=doppler_hz, velocity_m_s=velocity_m_s, reference=flat)
     turns = torch.as_tensor(doppler_hz, dtype=torch.float64, device=x.device) / radar.prf_hz
-    model = SubLooks(operator, look_windows(x.shape[-2], looks, turns))
+    spectrum = azimuth_spectrum(x.detach().mT, torch.ones_like(mask[..., 0]), 96).clamp_min(FLOOR).double()
+    model = SubLooks(operator, look_windows(x.shape[-2], looks, turns) / spectrum.sqrt())
     lost = mask.to(x.real.dtype).mean((-2, -1), keepdim=True)
     unexplained = 0.5 * lost * power_of(x.detach()).mean((-2, -1), keepdim=True)
     for _ in range(rounds):

@@ -1,17 +1,21 @@
-"""Stages whose constructors take other objects, as functions of plain keys."""
+"""Stages and damages whose constructors take other objects or functions, from plain keys."""
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import torch
 from torch import Tensor
 
 from torchsar.compensate.velocity import EffectiveVelocity
+from torchsar.core import Estimate, Signal, Stage
+from torchsar.echo.response import ChannelResponse
 from torchsar.focus import OmegaK
 from torchsar.optim.scalar import gradient_minimum, parabola_minimum
 from torchsar.radar import StripmapRadar
 from torchsar.repair.jitter import BandLimited, CorrectJitter, Exact, Lagrange
+from torchsar.repair.response_phase import EstimateResponse, estimate_response_points, estimate_response_sharpest
 
 _REFINE = {"gradient": gradient_minimum, "parabola": parabola_minimum}
 
@@ -45,3 +49,45 @@ def jitter_exact(offset_samples: list[float] | None = None) -> CorrectJitter:
 
 def _tensor(values: list[float] | None) -> Tensor | None:
     return None if values is None else torch.tensor(values, dtype=torch.float64)
+
+
+def channel_response(
+    quadratic_rad: float = 0.0,
+    cubic_rad: float = 0.0,
+    ripple_rad: float = 0.0,
+    ripple_cycles: float = 3.0,
+    slope_db: float = 0.0,
+    amplitude_ripple_db: float = 0.0,
+) -> ChannelResponse:
+    """Damage: phase quadratic u^2 + cubic u^3 + ripple sin(2 pi cycles u / 2) and gain slope u / 2 + ripple cos(2 pi cycles u / 2) over the band, u = -1..1."""
+
+    def phase(u: Tensor) -> Tensor:
+        return quadratic_rad * u.square() + cubic_rad * u**3 + ripple_rad * torch.sin(math.pi * ripple_cycles * u)
+
+    def amplitude(u: Tensor) -> Tensor:
+        return 10 ** ((slope_db * u / 2 + amplitude_ripple_db * torch.cos(math.pi * ripple_cycles * u)) / 20)
+
+    return ChannelResponse(phase, amplitude)
+
+
+_RESPONSE = {"sharpest": estimate_response_sharpest, "points": estimate_response_points}
+
+
+class FlatBandResponse(Stage):
+    """EstimateResponse for images made with the `flat` reference: a clean one fills the pulse band evenly, so the amplitude is found as well."""
+
+    works_on = EstimateResponse.works_on
+    provides = EstimateResponse.provides
+
+    def __init__(self, radar: StripmapRadar, method: Literal["sharpest", "points"] = "sharpest") -> None:
+        super().__init__()
+        self.radar, self.method = radar, _RESPONSE[method]
+
+    def forward(self, signal: Signal) -> Estimate:
+        even = torch.ones(signal.data.shape[-1], dtype=torch.float64, device=signal.data.device)
+        return EstimateResponse(self.radar, self.method, even)(signal)
+
+
+def estimate_response(radar: StripmapRadar, method: Literal["sharpest", "points"] = "sharpest") -> EstimateResponse:
+    """Phase response of the channel from bright places of the focused image; the amplitude is left alone."""
+    return EstimateResponse(radar, _RESPONSE[method])

@@ -66,7 +66,8 @@ def metrics_tree(config: Config, case: Case, results: Mapping[str, Result]) -> d
         targets = _targets(config, case, result, radar, peaks)
         methods[name] = {
             "title": result.title,
-            "metrics": {**_image_metrics(result, reference, part), **_geometry(result, radar), **_over_targets(targets), "seconds": result.seconds},
+            "metrics": {**_image_metrics(result, reference, part), **_geometry(result, radar), **_over_targets(targets), "seconds": sum(result.seconds.values())},
+            "seconds_by_stage": dict(result.seconds),
             "estimates": estimate_table(result.estimates),
             "targets": targets,
         }

@@ -30,7 +30,7 @@ class Result:
     chain: Chain
     image: Signal
     estimates: Mapping[str, Estimate]
-    seconds: float
+    seconds: Mapping[str, float]
     bytes: int
     used: Mapping[str, float]
     trace: Trace | None
@@ -65,7 +65,7 @@ def run_methods(loaded: Loaded, case: Case, chains: Mapping[str, Chain]) -> dict
                     raise
                 text = error.args[0] if isinstance(error, KeyError) and error.args else error
                 raise ConfigError(f"{loaded.file}: processor.{name}: {' '.join(str(text).split())}") from None
-            log.info("%s: %.1f s", name, results[name].seconds)
+            log.info("%s: %.1f s", name, sum(results[name].seconds.values()))
             for other, result in results.items():
                 if other not in keep and result.trace is not None:
                     results[other] = replace(result, trace=None)
@@ -87,13 +87,13 @@ def _run_one(name: str, method: Method, chain: Chain, case: Case, earlier: Mappi
         given = {key: torch.tensor(value, dtype=torch.float64) for key, value in method.rerun.given.items()}
         image = chain.rerun(source, method.rerun.start, given=given)
         used = _used(chain, {**source.values, **given}, case.recording.radar)
-        return Result(name, method.title, chain, image, {}, time.perf_counter() - began, _bytes(image), used, None)
+        return Result(name, method.title, chain, image, {}, {"rerun": time.perf_counter() - began}, _bytes(image), used, None)
     trace = chain.trace(case.clean if method.input == "clean" else case.recording)
     image = trace.signal
     if image.names != ("azimuth", "range") or image.trials:
         raise ValueError(f"the last stage gives the axes {image.names}, not an image ('azimuth', 'range'); end the chain with a focusing stage")
     used = _used(chain, trace.values, case.recording.radar)
-    return Result(name, method.title, chain, image, trace.estimates, sum(trace.seconds.values()), max(trace.bytes.values()), used, trace)
+    return Result(name, method.title, chain, image, trace.estimates, dict(trace.seconds), max(trace.bytes.values()), used, trace)
 
 
 def _bytes(signal: Signal) -> int:

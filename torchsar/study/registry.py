@@ -20,11 +20,13 @@ from torchsar.focus import OmegaK, RangeCompress
 from torchsar.focus.backprojection import Backproject
 from torchsar.focus.range_doppler import RangeDoppler
 from torchsar.focus.stolt import OmegaKStolt
+from torchsar.repair.channels import CorrectImbalance, EstimateImbalance
 from torchsar.repair.fill import BandLimitedFill, LinearFill, SparseFill, ZeroFill
 from torchsar.repair.interference import DropInterference, NotchInterference, SubtractInterference
 from torchsar.repair.jitter_blind import BlindJitter
 from torchsar.repair.jitter_pilot import PilotJitter
 from torchsar.repair.lines import LineIntegrity
+from torchsar.repair.response import CorrectResponse
 from torchsar.scene import AlwaysLit, Antenna, Dwell, Hyperbola, Parabola, Points, RandomPoints, Speckle
 from torchsar.study import factories
 from torchsar.study.catalogue import Catalogue
@@ -37,6 +39,7 @@ DAMAGES = Catalogue(
     "kind",
     {
         "channel_imbalance": ChannelImbalance,
+        "channel_response": factories.channel_response,
         "tone": Tone,
         "wide_interferer": WideInterferer,
         "quantiser": Quantiser,
@@ -62,6 +65,11 @@ REPAIR: dict[str, Callable[..., Any]] = {
     "jitter_lagrange": factories.jitter_lagrange,
     "jitter_band_limited": factories.jitter_band_limited,
     "jitter_exact": factories.jitter_exact,
+    "imbalance": EstimateImbalance,
+    "imbalance_correct": CorrectImbalance,
+    "response": factories.estimate_response,
+    "response_flat_band": factories.FlatBandResponse,
+    "response_correct": CorrectResponse,
 }
 COMPENSATE: dict[str, Callable[..., Any]] = {
     "phase_increment": PhaseIncrement,

@@ -1,0 +1,52 @@
+"""Closest-approach coordinates and padded records."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from tests.helpers import small_radar
+from torchsar.core import Draws
+from torchsar.echo import simulate
+from torchsar.focus import ClosestRange, OmegaK, PaddedLines, closest_range
+from torchsar.metrics import impulse_response
+from torchsar.scene import AlwaysLit, Dwell, Points, StripmapWorld
+
+
+@pytest.mark.parametrize("doppler_hz", [-400.0, 150.0])
+def test_a_point_appears_at_its_closest_range(doppler_hz):
+    radar = small_radar(prf_hz=800.0, pointing_doppler_hz=None)
+    world = StripmapWorld(Points([0.0, 2.0], [40.0, 95.0]), Dwell(0.5), doppler_hz=doppler_hz)
+    recording, truth = simulate(radar, world, 600, 256, Draws(0), dtype=torch.complex128)
+    image = ClosestRange(radar)(OmegaK(radar, "flat")(recording.signal, doppler_hz=torch.tensor(doppler_hz)), doppler_hz=torch.tensor(doppler_hz))
+    azimuth, slant = radar.image_position(truth.values["zero_doppler_s"], truth.values["closest_range_m"], doppler_hz, radar.velocity_m_s)
+    closest = truth.values["closest_range_m"]
+    assert float((slant - closest).abs().min()) > 2 * radar.range_step_m  # there is something to correct
+    found = impulse_response(image, (azimuth, closest))
+    torch.testing.assert_close(found["position_range_m"], closest, atol=0.05 * radar.range_step_m, rtol=0)
+    torch.testing.assert_close(found["position_azimuth_m"], azimuth, atol=0.15, rtol=0)  # a twentieth of a cell
+    torch.testing.assert_close(found["pslr_range_db"], torch.full((2,), -13.26, dtype=torch.float64), atol=0.15, rtol=0)
+
+
+def test_without_squint_nothing_moves():
+    radar = small_radar()
+    image = torch.randn(4, 64, dtype=torch.complex128)
+    torch.testing.assert_close(closest_range(image, radar, 0.0, eps=1e-12), image, atol=1e-9, rtol=0)
+
+
+def test_the_centroid_is_asked_for_where_the_pointing_is_unknown():
+    radar = small_radar(pointing_doppler_hz=None)
+    recording, _ = simulate(radar, StripmapWorld(Points([0.0], [0.0])), 8, 64, Draws(0))
+    with pytest.raises(ValueError, match="needs the doppler_hz"):
+        ClosestRange(radar)(OmegaK(radar)(recording.signal))
+
+
+def test_padding_keeps_cut_apertures_from_wrapping():
+    radar = small_radar()
+    # lit all the time and far beyond the end of the record: unpadded, its echo folds back into the image
+    world = StripmapWorld(Points([25.0], [0.0]), AlwaysLit())
+    recording, _ = simulate(radar, world, 128, 96, Draws(0), dtype=torch.complex128)
+    plain, padded = OmegaK(radar, "flat")(recording.signal), PaddedLines(OmegaK(radar, "flat"))(recording.signal)
+    assert padded.axes == plain.axes
+    early = slice(0, 40)
+    assert float(padded.data[early].abs().square().sum()) < 0.2 * float(plain.data[early].abs().square().sum())
