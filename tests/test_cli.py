@@ -103,3 +103,39 @@ def test_a_file_that_is_no_archive_is_named(tmp_path: Path, capsys: pytest.Captu
 def test_the_command_is_installed() -> None:
     done = subprocess.run([sys.executable, "-m", "torchsar.cli", "run", "nowhere"], capture_output=True, text=True, timeout=120)
     assert done.returncode == 2 and "nowhere" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_requires_prints_the_table_and_writes_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "needs"
+    assert main(["requires", str(write_tiny(tmp_path)), "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    assert "squint ignored" in text and "omega_k" in text and text.strip().endswith(str(out))
+    table = json.loads((out / "requires.json").read_text())
+    assert {"effect", "phase_rad", "verdict"} <= set(table["requirements"][0])
+
+
+def test_requires_follows_the_scene(tmp_path: Path) -> None:
+    def squint_phase(doppler_hz: float) -> float:
+        assert main(["requires", str(write_tiny(tmp_path)), f"world.doppler_hz={doppler_hz}", "--out", str(tmp_path / "needs")]) == 0
+        rows = json.loads((tmp_path / "needs" / "requires.json").read_text())["requirements"]
+        return next(row["phase_rad"] for row in rows if row["effect"] == "squint ignored")
+
+    assert squint_phase(100.0) == pytest.approx(2 * squint_phase(50.0), rel=0.05)
+
+
+def test_trade_starts_with_the_yardstick(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "trade"
+    beam = "world.beam.dwell_s=1.0"
+    assert main(["trade", str(write_tiny(tmp_path)), beam, "world.lines=640", "world.samples=256", "trade.repeats=1", "--out", str(out)]) == 0
+    table = json.loads((out / "trade.json").read_text())
+    assert table["focusing"][0]["name"].startswith("backprojection") and table["jitter"][0]["name"] == "uncorrected"
+    errors = {row["name"]: row["error_db"] for row in table["focusing"] + table["jitter"]}
+    assert errors["omega_k_stolt, complex128"] < -20
+    assert errors["exact"] < errors["Lagrange, 12 points"] < errors["Lagrange, 4 points"] < errors["uncorrected"]
+    assert {path.name for path in (out / "figures").iterdir()} == {"trade_focusing.png", "trade_jitter.png"}
+    assert "backprojection" in capsys.readouterr().out
+
+
+def test_trade_refuses_what_it_cannot_compare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["trade", str(write_tiny(tmp_path)), "trade.focusers=[omega]"]) == 2
+    assert "did you mean 'omega_k'" in spoken(capsys)[-1]

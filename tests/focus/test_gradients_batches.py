@@ -69,7 +69,7 @@ def test_apertures_limit_the_pulses():
     some = backproject(raw, RADAR, x, r, doppler_hz=0.0, aperture=Integration(11 / 400))
     mask = ((torch.arange(40) / 400 - 6.0 / 120).abs() <= 5.5 / 400)[:, None]
     torch.testing.assert_close(some, backproject(raw * mask, RADAR, x, r, doppler_hz=0.0))
-    assert abs(backproject(raw, RADAR, x, r, doppler_hz=300.0, aperture=DopplerBand(50.0))) == 0
+    assert abs(backproject(raw, RADAR, x, r, doppler_hz=300.0, frame_hz=0.0, aperture=DopplerBand(50.0))) == 0
 
 
 def test_a_processed_band_removes_what_lies_outside_and_warns_beyond_the_prf():

@@ -130,7 +130,8 @@ def test_requirements_of_the_brief():
     rows = {row.effect: row for row in requirements(radar, radar.raw_axes(4096, 16678))}
     bulk = rows["bulk + refocus (omega_k)"]
     assert bulk.ok and bulk.range_cells * radar.range_step_m == pytest.approx(0.14, abs=0.005)
-    walk = [row for row in requirements(radar, radar.raw_axes(4096, 16678), 2 * 7000 * math.sin(math.radians(0.3)) / radar.wavelength_m) if row.effect == "squint ignored"][0]
+    doppler = 2 * 7000 * math.sin(math.radians(0.3)) / radar.wavelength_m
+    walk = next(row for row in requirements(radar, radar.raw_axes(4096, 16678), doppler) if row.effect == "squint ignored")
     assert 80 < walk.range_cells < 95 and not walk.ok
     near = StripmapRadar(3.2e9, LinearFM(200e6, 5e-6), 250e6, 400.0, 150.0, 7e3, pointing_doppler_hz=0.0, integration_s=3.0)
     assert requirements(near, near.raw_axes(4096, 2048))[0].verdict == "use omega_k_stolt"

@@ -21,7 +21,6 @@ from torchsar.core import Axis, Signal, Stage, block_bytes_of, cis, linear_phaso
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
 
-
 # phase that the stationary-phase spectrum of a receding-frequency azimuth signal carries beside its exponent, taken back by the bulk filter
 STATIONARY_TURNS = 1 / 8
 
@@ -54,7 +53,11 @@ def band_weight(radar: StripmapRadar, offset_hz: Tensor, band_hz: float) -> Tens
     if not (math.isfinite(band_hz) and band_hz > 0):
         raise ValueError(f"the processed Doppler band must be a positive number of Hz, got {band_hz}")
     if band_hz * (1 + BAND_EDGE) > radar.prf_hz * (1 + 1e-9):
-        warnings.warn(f"PRF {radar.prf_hz:g} Hz is below the processed band of {band_hz:g} Hz and its edges, {band_hz * (1 + BAND_EDGE):g} Hz: azimuth is cut at the PRF; process at most {radar.prf_hz / (1 + BAND_EDGE):.6g} Hz", stacklevel=2)
+        warnings.warn(
+            f"PRF {radar.prf_hz:g} Hz is below the processed band of {band_hz:g} Hz and its edges, {band_hz * (1 + BAND_EDGE):g} Hz: "
+            f"azimuth is cut at the PRF; process at most {radar.prf_hz / (1 + BAND_EDGE):.6g} Hz",
+            stacklevel=2,
+        )
     beyond = (offset_hz.abs() - band_hz / 2) / (BAND_EDGE * band_hz)
     return 0.5 - 0.5 * torch.sin(math.pi * beyond.clamp(-0.5, 0.5))
 
@@ -190,9 +193,10 @@ def omega_k(
 
     doppler_hz: absolute Doppler centroid, about which the azimuth spectrum is unwrapped; frame_hz: frame of the image coordinates, by
     default the radar's nominal pointing, else the centroid. Both and velocity_m_s may differ per trial, (...,). reference: range reference
-    spectrum (range,), None for range-compressed data. band_hz: processed Doppler bandwidth about the centroid, None for the whole PRF. Neglects the change of migration over the swath (`focus.requirements` says
-    how much that is); `omega_k_stolt` does not. Differentiable in raw, velocity and frame; without gradients it works by blocks in one
-    copy of the data.
+    spectrum (range,), None for range-compressed data. band_hz: processed Doppler bandwidth about the centroid, None for the whole PRF.
+    Neglects the change of migration over the swath (`focus.requirements` says how much that is); `omega_k_stolt` does not. A focused
+    target has the phase -4 pi R / lambda. Differentiable in raw, velocity and frame; without gradients it works by blocks in one copy
+    of the data.
     """
     geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz, band_hz=band_hz)
     n, centre = raw.shape[-1], raw.shape[-1] // 2
@@ -227,8 +231,9 @@ def through_doppler(raw: Tensor, focus_rows: Callable[[Tensor, slice], Tensor], 
 class Focuser(Stage):
     """Base of the focusing stages: a radar, a range reference, a velocity and a Doppler; `form` is the function that does the work.
 
-    Image axes (azimuth, range) are in the coordinates of the frame Doppler. reference: "matched" or "flat" to compress the pulse in the same pass, None for range-compressed data. velocity_m_s and doppler_hz
-    may be given here (a number, a per-trial tensor, or an nn.Parameter to optimise) or by a chain at every call, which wins. band_hz: processed Doppler bandwidth, None for the whole PRF.
+    Image axes (azimuth, range) are in the coordinates of the frame Doppler. reference: a name of REFERENCES to compress the pulse in the
+    same pass, None for range-compressed data. velocity_m_s and doppler_hz may be given here (a number, a per-trial tensor, or an
+    nn.Parameter to optimise) or by a chain at every call, which wins. band_hz: processed Doppler bandwidth, None for the whole PRF.
     """
 
     form: Callable[..., Tensor]

@@ -52,7 +52,11 @@ class Aperture:
         wanted = radar.prf_hz / rate if integration_s is None else integration_s
         band = min(rate * wanted, radar.prf_hz)
         if rate * wanted > 1.001 * radar.prf_hz:
-            warnings.warn(f"PRF {radar.prf_hz:g} Hz is below the Doppler band {rate * wanted:.6g} Hz of a {wanted:g} s aperture: its ends alias in azimuth; shorten the aperture to {radar.prf_hz / rate:.3g} s", stacklevel=3)
+            warnings.warn(
+                f"PRF {radar.prf_hz:g} Hz is below the Doppler band {rate * wanted:.6g} Hz of a {wanted:g} s aperture: "
+                f"its ends alias in azimuth; shorten the aperture to {radar.prf_hz / rate:.3g} s",
+                stacklevel=3,
+            )
         doppler = doppler_hz + band * torch.linspace(-0.5, 0.5, samples, dtype=torch.float64)
         frequency = radar.pulse.bandwidth_hz * torch.linspace(-0.5, 0.5, samples, dtype=torch.float64)
         velocity, frame = (torch.tensor(v, dtype=torch.float64) for v in (velocity_m_s, frame_hz))
@@ -106,6 +110,7 @@ def requirements(
     seen = Aperture.of(radar, middle, doppler, velocity, frame, radar.integration_s if integration_s is None else integration_s)
     bulk, rda = (float(x.abs().max()) for x in (seen.bulk_residual_rad(half), seen.coupling_rad(far)))
     path, cells = _parabola_rad(seen, near), radar.range_step_m
+    band_turns = radar.pulse.bandwidth_hz / radar.wave_speed_m_s
     walk = abs(float(radar.sin_squint(doppler, velocity))) * velocity * seen.integration_s
     back_turns = 2 * radar.carrier_hz / radar.wave_speed_m_s
     defocus = 2 * math.pi * back_turns * velocity * velocity_error_m_s * (seen.integration_s / 2) ** 2 / near
@@ -120,7 +125,7 @@ def requirements(
         row("bulk + refocus (omega_k)", "change of migration over the swath", bulk, float(seen.slope.abs().max()) * half / cells, "use omega_k_stolt"),
         row("range-Doppler", "coupling of range and azimuth (no secondary range compression)", rda, math.nan, "use omega_k"),
         row("parabolic range history", "third and higher orders of the hyperbola", path, math.nan, "keep the hyperbola"),
-        row("squint ignored", "range walk of the beam centre over the aperture", 2 * math.pi * radar.pulse.bandwidth_hz * walk / radar.wave_speed_m_s, walk / cells, "focus about the Doppler centroid"),
+        row("squint ignored", "range walk of the beam centre over the aperture", 2 * math.pi * band_turns * walk, walk / cells, "focus about the Doppler centroid"),
         row(f"velocity wrong by {velocity_error_m_s:g} m/s", "quadratic phase over the aperture", defocus, math.nan, "estimate the effective velocity"),
         row("stop and go", "change of Doppler inside the pulse over the aperture (the cells: a constant shift)", inside, displaced, "model the motion inside the pulse"),
         row("range in float32", "rounding of absolute ranges", single, single / (2 * math.pi * back_turns) / cells, "form phases in float64 turns (always done here)"),

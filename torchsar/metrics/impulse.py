@@ -35,9 +35,7 @@ def impulse_response(signal: Signal, at_m: tuple[Tensor | float, Tensor | float]
     reach = [_reach(search_m, axis.step) for axis in signal.axes]
     data = signal.data.to(torch.complex128)
     rows, cols = _brightest(data, centre, reach)
-    patch = _patch(data, rows, cols, _PATCH, _PATCH)
-    tone_a, tone_r = _centre_turns(patch, -2), _centre_turns(patch, -1)
-    da, dr = _fine_peak(patch, tone_a, tone_r)
+    rows, cols, tone_a, tone_r, da, dr = _climb(data, rows, cols)
     azimuth = _slice_through(_patch(data, rows, cols, min(_SLICE, signal.axes[0].n), _PATCH), tone_r, dr, -1)
     range_ = _slice_through(_patch(data, rows, cols, _PATCH, min(_SLICE, signal.axes[1].n)), tone_a, da, -2)
     out: dict[str, Tensor] = {}
@@ -76,6 +74,20 @@ def _brightest(data: Tensor, centre: list[Tensor], reach: list[int]) -> tuple[Te
     height, width = 2 * reach[0] + 1, 2 * reach[1] + 1
     best = _patch(data, centre[0], centre[1], height, width).abs().flatten(-2).argmax(-1)
     return centre[0] + best // width - reach[0], centre[1] + best % width - reach[1]
+
+
+def _climb(data: Tensor, rows: Tensor, cols: Tensor, rounds: int = 4) -> tuple[Tensor, ...]:
+    """From the strongest sample to the interpolated maximum: (row, column, spectral centres in turns per sample, offsets in samples).
+
+    A skewed response that is sampled finely in one axis and coarsely in the other has its maximum more than a sample away from its strongest sample.
+    """
+    for _ in range(rounds):
+        patch = _patch(data, rows, cols, _PATCH, _PATCH)
+        tone_a, tone_r = _centre_turns(patch, -2), _centre_turns(patch, -1)
+        da, dr = _fine_peak(patch, tone_a, tone_r)
+        step_a, step_r = da.round().long(), dr.round().long()
+        rows, cols = rows + step_a, cols + step_r
+    return rows, cols, tone_a, tone_r, da - step_a, dr - step_r
 
 
 def _centre_turns(patch: Tensor, dim: int) -> Tensor:

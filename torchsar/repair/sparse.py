@@ -104,9 +104,12 @@ class SubLooks:
     Powers and weights of sub-looks are held with azimuth last, (look, ..., range, pulse), where azimuth FFTs take half the time.
     """
 
-    def __init__(self, operator: InvertibleOmegaK, windows: Tensor) -> None:
+    def __init__(self, operator: InvertibleOmegaK, windows: Tensor, spectrum: Tensor) -> None:
         self.operator = operator
-        self.windows = windows[..., None, :]
+        power = windows.square()
+        level = (power * spectrum).mean(-1, keepdim=True) / power.mean(-1, keepdim=True)
+        fine = spectrum / (power * level).sum(0)
+        self.windows = (windows / fine.sqrt())[..., None, :]
         self.share = windows.square().mean(-1)[..., None, None]
 
     def power(self, lines: Tensor, unexplained: Tensor) -> Tensor:
@@ -163,7 +166,7 @@ def sparse_fill(
     operator = InvertibleOmegaK(radar, x, doppler_hz=doppler_hz, velocity_m_s=velocity_m_s, reference=flat)
     turns = torch.as_tensor(doppler_hz, dtype=torch.float64, device=x.device) / radar.prf_hz
     spectrum = azimuth_spectrum(x.detach().mT, torch.ones_like(mask[..., 0]), 96).clamp_min(FLOOR).double()
-    model = SubLooks(operator, look_windows(x.shape[-2], looks, turns) / spectrum.sqrt())
+    model = SubLooks(operator, look_windows(x.shape[-2], looks, turns), spectrum)
     lost = mask.to(x.real.dtype).mean((-2, -1), keepdim=True)
     unexplained = 0.5 * lost * power_of(x.detach()).mean((-2, -1), keepdim=True)
     for _ in range(rounds):

@@ -15,6 +15,7 @@ from torchsar.focus import OmegaK
 from torchsar.optim.scalar import gradient_minimum, parabola_minimum
 from torchsar.radar import StripmapRadar
 from torchsar.repair.jitter import BandLimited, CorrectJitter, Exact, Lagrange
+from torchsar.repair.response import band_grid
 from torchsar.repair.response_phase import EstimateResponse, estimate_response_points, estimate_response_sharpest
 
 _REFINE = {"gradient": gradient_minimum, "parabola": parabola_minimum}
@@ -59,10 +60,18 @@ def channel_response(
     slope_db: float = 0.0,
     amplitude_ripple_db: float = 0.0,
 ) -> ChannelResponse:
-    """Damage: phase quadratic u^2 + cubic u^3 + ripple sin(2 pi cycles u / 2) and gain slope u / 2 + ripple cos(2 pi cycles u / 2) over the band, u = -1..1."""
+    """Damage: phase quadratic u^2 + cubic u^3 + ripple sin(pi cycles u), and gain slope u / 2 + ripple cos(pi cycles u) in dB, u = -1..1 over the band.
+
+    The phase is taken without its constant and linear parts: these are a phase and a shift of the whole scene, which nothing can tell from the scene's own.
+    """
+
+    def curve(u: Tensor) -> Tensor:
+        return quadratic_rad * u.square() + cubic_rad * u**3 + ripple_rad * torch.sin(math.pi * ripple_cycles * u)
 
     def phase(u: Tensor) -> Tensor:
-        return quadratic_rad * u.square() + cubic_rad * u**3 + ripple_rad * torch.sin(math.pi * ripple_cycles * u)
+        grid = band_grid(u.device)
+        whole = curve(grid)
+        return curve(u) - whole.mean() - u * ((whole * grid).sum() / grid.square().sum())
 
     def amplitude(u: Tensor) -> Tensor:
         return 10 ** ((slope_db * u / 2 + amplitude_ripple_db * torch.cos(math.pi * ripple_cycles * u)) / 20)
