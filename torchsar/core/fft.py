@@ -46,9 +46,9 @@ def transform_in_blocks(x: Tensor, dim: int, inverse: bool = False, out: Tensor 
     """
     out = x if out is None else out
     transform = torch.fft.ifft if inverse else torch.fft.fft
-    source, target = (y.reshape(-1, *y.shape[-2:]) if dim == -2 else y.reshape(-1, y.shape[-1]) for y in (x, out))
-    if target.data_ptr() != out.data_ptr():
+    if not out.is_contiguous():
         raise ValueError(f"transform_in_blocks writes into a contiguous array, got strides {out.stride()} for the shape {tuple(out.shape)}")
+    source, target = (y.reshape(-1, *y.shape[-2:]) if dim == -2 else y.reshape(-1, y.shape[-1]) for y in (x, out))
     for part in _blocks(source, dim, block_bytes_of(x.device) if block_bytes is None else block_bytes):
         target[part] = transform(source[part].contiguous(), dim=dim)
     return out

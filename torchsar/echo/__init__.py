@@ -1,6 +1,27 @@
 """Radar and scene to recordings: echoes, noise and receiver damage."""
 
+from torchsar.echo.channels import ChannelImbalance
+from torchsar.echo.interference import Quantiser, Tone, WideInterferer
+from torchsar.echo.jitter import PeriodicJitter
+from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedLines
 from torchsar.echo.pairs import SimulatedPairs
+from torchsar.echo.response import ChannelResponse
 from torchsar.echo.stripmap import Damage, apply_damages, simulate, stripmap_echo
 
-__all__ = ["Damage", "SimulatedPairs", "apply_damages", "simulate", "stripmap_echo"]
+__all__ = [
+    "ChannelImbalance",
+    "ChannelResponse",
+    "CorruptedNumbers",
+    "Damage",
+    "LostGaps",
+    "LostLines",
+    "PeriodicJitter",
+    "Quantiser",
+    "RepeatedLines",
+    "SimulatedPairs",
+    "Tone",
+    "WideInterferer",
+    "apply_damages",
+    "simulate",
+    "stripmap_echo",
+]

@@ -160,5 +160,6 @@ def _focus_block(
 def write_strip(blocks: Iterator[tuple[slice, Signal]], target: Any) -> None:
     """Write every block into target[..., lines, :] (a tensor, numpy array or memmap, zarr array) as it is made."""
     for lines, image in blocks:
-        target[..., lines, :] = image.data if isinstance(target, Tensor) else image.data.cpu().numpy()
+        samples: Any = image.data if isinstance(target, Tensor) else image.data.cpu().numpy()
+        target[..., lines, :] = samples
         del image

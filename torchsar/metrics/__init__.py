@@ -1,7 +1,17 @@
-"""Figures of merit."""
+"""Figures of merit, and the bounds that estimators are judged by."""
 
+from torchsar.metrics.bounds import beam_centre_bound_hz, reference_doppler_std_hz, tone_frequency_bound_hz, velocity_bound_m_s
 from torchsar.metrics.image import contrast, correlation, entropy, error_db
-
 from torchsar.metrics.impulse import impulse_response
 
-__all__ = ["contrast", "correlation", "entropy", "error_db", "impulse_response"]
+__all__ = [
+    "beam_centre_bound_hz",
+    "contrast",
+    "correlation",
+    "entropy",
+    "error_db",
+    "impulse_response",
+    "reference_doppler_std_hz",
+    "tone_frequency_bound_hz",
+    "velocity_bound_m_s",
+]

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchsar.compensate.velocity import EffectiveVelocity
 from torchsar.core import Estimate, Signal, Stage
 from torchsar.echo.response import ChannelResponse
-from torchsar.focus import OmegaK
+from torchsar.focus import OmegaK, PaddedLines
 from torchsar.optim.scalar import gradient_minimum, parabola_minimum
 from torchsar.radar import StripmapRadar
 from torchsar.repair.jitter import BandLimited, CorrectJitter, Exact, Lagrange
@@ -23,7 +23,7 @@ _REFINE = {"gradient": gradient_minimum, "parabola": parabola_minimum}
 
 def effective_velocity(
     radar: StripmapRadar,
-    reference: Literal["matched", "flat"] | None = "matched",
+    reference: Literal["matched", "flat", "phase"] | None = "matched",
     reach_m_s: float = 80.0,
     lines: int = 512,
     refine: Literal["gradient", "parabola"] = "gradient",
@@ -31,6 +31,17 @@ def effective_velocity(
 ) -> EffectiveVelocity:
     """Minimum-entropy velocity of range lines that are compressed with `reference` (None: compressed already)."""
     return EffectiveVelocity(OmegaK(radar, reference), reach_m_s, lines, _REFINE[refine], tolerance_m_s)
+
+
+def omega_k_padded(
+    radar: StripmapRadar,
+    reference: Literal["matched", "flat", "phase"] | None = "matched",
+    velocity_m_s: float | None = None,
+    doppler_hz: float | None = None,
+    lines: int | None = None,
+) -> PaddedLines:
+    """omega_k with empty lines behind the record, one aperture by default, so that cut apertures do not wrap round."""
+    return PaddedLines(OmegaK(radar, reference, velocity_m_s, doppler_hz), lines)
 
 
 def jitter_lagrange(points: int = 4, offset_samples: list[float] | None = None) -> CorrectJitter:

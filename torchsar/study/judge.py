@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Estimate, Signal, Truth
+from torchsar.focus import ClosestRange
 from torchsar.metrics import contrast, correlation, entropy, error_db, impulse_response
 from torchsar.radar import StripmapRadar
 from torchsar.study.build import Case
@@ -105,6 +106,8 @@ def expected_places(case: Case, result: Result, radar: StripmapRadar) -> tuple[l
     values = case.truth.values
     index = torch.tensor(list(case.targets.values()))
     azimuth, slant = radar.image_position(values["zero_doppler_s"][index], values["closest_range_m"][index], result.used["frame_hz"], values["velocity_m_s"])
+    if any(isinstance(stage, ClosestRange) for stage in result.chain.stages.values()):
+        slant = values["closest_range_m"][index]
     inside = [a.start <= float(x) <= a.stop and r.start <= float(y) <= r.stop for (a, r), x, y in zip([result.image.axes] * len(index), azimuth, slant)]
     keep = torch.tensor(inside)
     return [name for name, k in zip(case.targets, inside) if k], azimuth[keep], slant[keep]

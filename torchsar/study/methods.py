@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from tqdm import tqdm
 
 from torchsar.core import Chain, Estimate, Signal, Trace
@@ -102,14 +102,19 @@ def _bytes(signal: Signal) -> int:
 
 def focus_name(chain: Chain) -> str:
     """The stage that makes the image: the last one with a Doppler of its own, else the last."""
-    focusing = [name for name, stage in chain.stages.items() if hasattr(stage, "frame_hz")]
+    focusing = [name for name, stage in chain.stages.items() if hasattr(focuser_of(stage), "frame_hz")]
     return focusing[-1] if focusing else list(chain.stages)[-1]
+
+
+def focuser_of(stage: nn.Module) -> nn.Module:
+    """The stage itself, or the focuser that it wraps."""
+    return getattr(stage, "focuser", stage)
 
 
 def _used(chain: Chain, values: Mapping[str, Tensor], radar: StripmapRadar) -> dict[str, float]:
     """Doppler, velocity and frame that the focusing stage worked with, connected or its own."""
     name = focus_name(chain)
-    stage, connected = chain.stages[name], chain.uses[name]
+    stage, connected = focuser_of(chain.stages[name]), chain.uses[name]
     used: dict[str, float] = {}
     for key in ("doppler_hz", "velocity_m_s"):
         value = values[connected[key]] if key in connected else getattr(stage, key, None)

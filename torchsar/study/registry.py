@@ -16,10 +16,7 @@ from torchsar.echo.channels import ChannelImbalance
 from torchsar.echo.interference import Quantiser, Tone, WideInterferer
 from torchsar.echo.jitter import PeriodicJitter
 from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedLines
-from torchsar.focus import OmegaK, RangeCompress
-from torchsar.focus.backprojection import Backproject
-from torchsar.focus.range_doppler import RangeDoppler
-from torchsar.focus.stolt import OmegaKStolt
+from torchsar.focus import Backproject, ClosestRange, OmegaK, OmegaKStolt, RangeCompress, RangeDoppler
 from torchsar.repair.channels import CorrectImbalance, EstimateImbalance
 from torchsar.repair.fill import BandLimitedFill, LinearFill, SparseFill, ZeroFill
 from torchsar.repair.interference import DropInterference, NotchInterference, SubtractInterference
@@ -81,9 +78,11 @@ COMPENSATE: dict[str, Callable[..., Any]] = {
 FOCUS: dict[str, Callable[..., Any]] = {
     "range_compress": RangeCompress,
     "omega_k": OmegaK,
+    "omega_k_padded": factories.omega_k_padded,
     "omega_k_stolt": OmegaKStolt,
     "range_doppler": RangeDoppler,
     "backproject": Backproject,
+    "closest_range": ClosestRange,
 }
 GROUPS = {"repair": REPAIR, "compensate": COMPENSATE, "focus": FOCUS}
 

@@ -17,7 +17,8 @@ from torch import Tensor
 from torchsar import plot
 from torchsar.core import Recording, Signal
 from torchsar.echo.jitter import sample_unevenly
-from torchsar.focus.backprojection import Backproject
+from torchsar.focus import Backproject
+from torchsar.focus.omega_k import Focuser
 from torchsar.metrics import error_db
 from torchsar.repair.jitter import BandLimited, Exact, Lagrange
 from torchsar.study.build import build_case, resolved
@@ -62,9 +63,9 @@ def trade(loaded: Loaded, out: Path | None) -> str:
 
     With `out`: config.yaml, trade.json, trade.txt and figures/ in that folder.
     """
-    wrong = [name for name in loaded.config.trade.focusers if name not in FOCUS or name in ("range_compress", "backproject")]
+    accepted = [name for name, stage in FOCUS.items() if isinstance(stage, type) and issubclass(stage, Focuser) and stage is not Backproject]
+    wrong = [name for name in loaded.config.trade.focusers if name not in accepted]
     if wrong:
-        accepted = [name for name in FOCUS if name not in ("range_compress", "backproject")]
         raise ConfigError(f"{loaded.file}: trade.focusers names {wrong[0]!r}, which is no focuser to compare{did_you_mean(wrong[0], accepted)}")
     if out is None:
         return _text(*_tables(loaded))
