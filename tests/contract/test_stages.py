@@ -10,8 +10,26 @@ import torch
 from torch import Tensor
 
 from tests.helpers import small_radar, small_recording
-from torchsar.core import Estimate, Signal, Stage
-from torchsar.focus import OmegaK, RangeCompress
+from torchsar.compensate import DopplerCentroid, EffectiveVelocity, EnergyCentre, PhaseIncrement, RangeDependentCentroid
+from torchsar.core import Estimate, Signal, Stage, real_dtype
+from torchsar.focus import Backproject, ClosestRange, Detect, OmegaK, OmegaKStolt, PaddedLines, RangeCompress, RangeDoppler
+from torchsar.repair import (
+    BandLimitedFill,
+    BlindJitter,
+    CorrectImbalance,
+    CorrectJitter,
+    CorrectResponse,
+    DropInterference,
+    EstimateImbalance,
+    EstimateResponse,
+    LinearFill,
+    LineIntegrity,
+    NotchInterference,
+    PilotJitter,
+    SparseFill,
+    SubtractInterference,
+    ZeroFill,
+)
 
 RADAR = small_radar()
 
@@ -26,6 +44,9 @@ class Case:
     differentiable: bool = True
     vmap: bool = True
     tolerance: float = 1e-9
+    image: bool = False
+    keeps_complex: bool = True
+    n_range: int = 64
 
 
 def _geometry(signal: Signal) -> dict[str, Tensor]:
@@ -34,10 +55,68 @@ def _geometry(signal: Signal) -> dict[str, Tensor]:
     return {"doppler_hz": 5.0 * at - 3.0, "velocity_m_s": 120.0 + at}
 
 
+def _missing(signal: Signal) -> dict[str, Tensor]:
+    lines = torch.arange(signal.axes[0].n)
+    return {"missing": torch.stack([(lines % 11) == 3 + i for i in range(signal.trials.numel())]).reshape(*signal.trials, -1)}
+
+
+def _numbers(signal: Signal) -> dict[str, Tensor]:
+    lines = torch.arange(signal.axes[0].n)
+    return {"line_number": (lines + 100 + (lines > 20)).expand(*signal.trials, -1).contiguous()}
+
+
+def _offsets(signal: Signal) -> dict[str, Tensor]:
+    base = torch.tensor([0.05, -0.03, 0.02, -0.04], dtype=torch.float64)
+    return {"offset_samples": base * (1 + 0.1 * torch.arange(signal.trials.numel(), dtype=torch.float64).reshape(*signal.trials, 1))}
+
+
+def _pilot(signal: Signal) -> dict[str, Tensor]:
+    n = torch.arange(512, dtype=torch.float64)
+    offsets = 0.05 * torch.sin(2 * torch.pi * (n % 4) / 4)
+    tone = torch.polar(torch.ones_like(n), 2 * torch.pi * 0.1371 * (n + offsets))
+    return {"pilot": tone.to(signal.data.dtype).expand(*signal.trials, -1).contiguous()}
+
+
+def _imbalance(signal: Signal) -> dict[str, Tensor]:
+    one = torch.ones(*signal.trials, 1, dtype=torch.float64)
+    return {"gain": torch.cat([one, 1.2 * one], -1), "phase_rad": torch.cat([0 * one, 0.5 * one], -1)}
+
+
+def _response(signal: Signal) -> dict[str, Tensor]:
+    u = torch.linspace(-1, 1, 129, dtype=torch.float64)
+    return {"phase_rad": (0.5 * u**3).expand(*signal.trials, -1).contiguous()}
+
+
 CASES = [
     Case("range_compress", lambda: RangeCompress(RADAR)),
     Case("omega_k", lambda: OmegaK(RADAR), _geometry),
     Case("omega_k_flat", lambda: OmegaK(RADAR, "flat"), _geometry),
+    Case("omega_k_stolt", lambda: OmegaKStolt(RADAR), _geometry),
+    Case("range_doppler", lambda: RangeDoppler(RADAR), _geometry),
+    Case("backproject", lambda: Backproject(RADAR), _geometry),
+    Case("padded", lambda: PaddedLines(OmegaK(RADAR), 16), _geometry),
+    Case("closest_range", lambda: ClosestRange(RADAR), _geometry, image=True),
+    Case("detect", lambda: Detect(), image=True, keeps_complex=False),
+    Case("phase_increment", lambda: PhaseIncrement(RADAR, (2, 2))),
+    Case("energy_centre", lambda: EnergyCentre(RADAR, (2, 2))),
+    Case("range_dependent_centroid", lambda: RangeDependentCentroid(RADAR, 1, (2, 4)), differentiable=False),
+    Case("doppler_centroid", lambda: DopplerCentroid(RADAR), differentiable=False, vmap=False),
+    Case("effective_velocity", lambda: EffectiveVelocity(OmegaK(RADAR), 5.0), lambda s: {"doppler_hz": _geometry(s)["doppler_hz"]}, differentiable=False, vmap=False, tolerance=1e-6),
+    Case("line_integrity", lambda: LineIntegrity(), _numbers, differentiable=False, vmap=False),
+    Case("zero_fill", lambda: ZeroFill(), _missing, vmap=False),
+    Case("linear_fill", lambda: LinearFill(RADAR), lambda s: {**_missing(s), "doppler_hz": _geometry(s)["doppler_hz"]}, vmap=False),
+    Case("band_limited_fill", lambda: BandLimitedFill(), _missing, differentiable=False, vmap=False),
+    Case("sparse_fill", lambda: SparseFill(RADAR), lambda s: {**_missing(s), **_geometry(s)}, differentiable=False, vmap=False),
+    Case("subtract_interference", lambda: SubtractInterference(), differentiable=False, vmap=False),
+    Case("notch_interference", lambda: NotchInterference(), differentiable=False, vmap=False),
+    Case("drop_interference", lambda: DropInterference(), differentiable=False, vmap=False),
+    Case("correct_jitter", lambda: CorrectJitter(), _offsets, vmap=False),
+    Case("pilot_jitter", lambda: PilotJitter(), _pilot, differentiable=False, vmap=False),
+    Case("blind_jitter", lambda: BlindJitter(max_period=4), differentiable=False, vmap=False, n_range=128),
+    Case("estimate_imbalance", lambda: EstimateImbalance(), vmap=False),
+    Case("correct_imbalance", lambda: CorrectImbalance(), _imbalance),
+    Case("estimate_response", lambda: EstimateResponse(RADAR), differentiable=False, vmap=False, image=True, tolerance=1e-6, n_range=300),
+    Case("correct_response", lambda: CorrectResponse(RADAR), _response, image=True),
 ]
 IDS = [case.name for case in CASES]
 
@@ -63,6 +142,11 @@ def raw(trials: int | None, dtype: torch.dtype = torch.complex128, n_pulse: int 
     return recording.signal
 
 
+def entering(case: Case, signal: Signal) -> Signal:
+    """What the stage works on: the raw signal, or an image of it."""
+    return Signal(signal.data, RADAR.image_axes(signal.axes)) if case.image else signal
+
+
 def single(values: dict[str, Tensor], i: int) -> dict[str, Tensor]:
     return {name: value[i] for name, value in values.items()}
 
@@ -70,7 +154,7 @@ def single(values: dict[str, Tensor], i: int) -> dict[str, Tensor]:
 @pytest.mark.parametrize("trials", [1, 3])
 @pytest.mark.parametrize("case", CASES, ids=IDS)
 def test_batch_equals_singles(case: Case, trials: int) -> None:
-    stage, signal = case.build(), raw(trials)
+    stage, signal = case.build(), entering(case, raw(trials, n_range=case.n_range))
     values = case.values(signal)
     together = results(stage(signal, **values))
     for i in range(trials):
@@ -83,16 +167,16 @@ def test_batch_equals_singles(case: Case, trials: int) -> None:
 @pytest.mark.parametrize("dtype", [torch.complex64, torch.complex128])
 @pytest.mark.parametrize("case", CASES, ids=IDS)
 def test_dtype_and_device_are_kept(case: Case, dtype: torch.dtype) -> None:
-    signal = raw(2, dtype)
+    signal = entering(case, raw(2, dtype, n_range=case.n_range))
     out = results(case.build()(signal, **case.values(signal)))
     if "data" in out:
-        assert out["data"].dtype == dtype and out["data"].device == signal.data.device
+        assert out["data"].dtype == (dtype if case.keeps_complex else real_dtype(dtype)) and out["data"].device == signal.data.device
     assert all(torch.isfinite(value).all() for value in out.values())
 
 
 @pytest.mark.parametrize("case", [c for c in CASES if c.differentiable], ids=[c.name for c in CASES if c.differentiable])
 def test_gradients(case: Case) -> None:
-    stage, signal = case.build(), raw(2, n_pulse=6, n_range=32)
+    stage, signal = case.build(), entering(case, raw(2, n_pulse=6, n_range=32))
     values = case.values(signal)
     floating = {name: value.requires_grad_() for name, value in values.items() if value.is_floating_point()}
 
@@ -106,7 +190,7 @@ def test_gradients(case: Case) -> None:
 
 @pytest.mark.parametrize("case", [c for c in CASES if c.vmap], ids=[c.name for c in CASES if c.vmap])
 def test_vmap_equals_batch(case: Case) -> None:
-    stage, signal = case.build(), raw(3)
+    stage, signal = case.build(), entering(case, raw(3, n_range=case.n_range))
     values = case.values(signal)
     names = list(values)
 
@@ -122,7 +206,7 @@ def test_vmap_equals_batch(case: Case) -> None:
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 @pytest.mark.parametrize("case", CASES, ids=IDS)
 def test_non_finite_input_is_refused(case: Case, bad: float) -> None:
-    stage, signal = case.build(), raw(2)
+    stage, signal = case.build(), entering(case, raw(2, n_range=case.n_range))
     data = signal.data.clone()
     data[1, 3, 5] = bad
     with pytest.raises(ValueError, match=r"1 of \d+ samples are NaN or Inf, the first at index \(1, 3, 5\)"):
@@ -131,7 +215,7 @@ def test_non_finite_input_is_refused(case: Case, bad: float) -> None:
 
 @pytest.mark.parametrize("case", CASES, ids=IDS)
 def test_state_moves_and_input_is_left_alone(case: Case) -> None:
-    stage, signal = case.build(), raw(2)
+    stage, signal = case.build(), entering(case, raw(2, n_range=case.n_range))
     before = signal.data.clone()
     stage.load_state_dict(stage.state_dict())
     stage.to("cpu")(signal, **case.values(signal))
@@ -140,7 +224,7 @@ def test_state_moves_and_input_is_left_alone(case: Case) -> None:
 
 @pytest.mark.parametrize("case", CASES, ids=IDS)
 def test_all_zero_trial_stays_finite(case: Case) -> None:
-    stage, signal = case.build(), raw(2)
+    stage, signal = case.build(), entering(case, raw(2, n_range=case.n_range))
     data = signal.data.clone()
     data[0] = 0
     out = results(stage(signal.with_data(data), **case.values(signal)))

@@ -37,9 +37,9 @@ _BLOCKS = 8
 
 
 def candidate_turns(reach: int, device: torch.device | None = None) -> Tensor:
-    """-reach..reach, float64."""
-    if reach < 1:
-        raise ValueError(f"the ambiguity search needs a reach of at least one PRF, got {reach}")
+    """-reach..reach, float64; 0 alone where no other squint is possible."""
+    if reach < 0:
+        raise ValueError(f"the ambiguity search needs a reach of 0 or more PRFs, got {reach}")
     return torch.arange(-reach, reach + 1, dtype=torch.float64, device=device)
 
 
@@ -153,6 +153,11 @@ def ambiguity_evidence(raw: Tensor, radar: StripmapRadar, doppler_baseband_hz: T
     }
 
 
+def possible_reach(radar: StripmapRadar, reach: int) -> int:
+    """At most `reach` PRFs, and no further than squints of about 70 degrees: 0.94 * 2 v / lambda."""
+    return max(0, min(reach, math.floor(1.88 * radar.velocity_m_s / (radar.wavelength_m * radar.prf_hz) - 0.5)))
+
+
 class DopplerCentroid(Stage):
     """The recommended estimator: absolute Doppler centroid, its ambiguity and the squint angle; leaves the signal alone.
 
@@ -169,8 +174,9 @@ class DopplerCentroid(Stage):
         super().__init__()
         if reference is not None and reference not in REFERENCES:
             raise ValueError(f"range reference {reference!r} is unknown; choose one of {sorted(REFERENCES)}, or None for compressed data")
-        candidate_turns(reach)
-        self.radar, self.reference, self.reach, self.blocks = radar, reference, reach, blocks
+        if reach < 1:
+            raise ValueError(f"the ambiguity search needs a reach of at least one PRF, got {reach}")
+        self.radar, self.reference, self.reach, self.blocks = radar, reference, possible_reach(radar, reach), blocks
 
     def spectrum(self, n: int, device: torch.device | str | None = None) -> Tensor | None:
         """Range reference for lines of n samples, None for compressed data."""

@@ -237,6 +237,8 @@ class Focuser(Stage):
     """
 
     form: Callable[..., Tensor]
+    velocity_m_s: Tensor
+    doppler_hz: Tensor
 
     def __init__(
         self,
@@ -282,6 +284,10 @@ class StoredOmegaK(Stage):
 
     Holds one complex number per sample of the raw matrix. Built by `StoredOmegaK(stage, axes, dtype)`.
     """
+
+    filter: Tensor
+    fine: Tensor
+    coarse: Tensor
 
     def __init__(self, stage: OmegaK, axes: tuple[Axis, ...], dtype: torch.dtype = torch.complex64) -> None:
         super().__init__()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -17,6 +18,8 @@ from torchsar.study.build import Case
 from torchsar.study.config import Config, Margin
 from torchsar.study.methods import Result
 
+log = logging.getLogger("torchsar")
+
 DEFINITIONS: dict[str, Any] = {
     "snr": "mean signal power per lit raw sample over noise variance, dB",
     "entropy": "-sum p ln p, p = |I|^2 / sum |I|^2 over the window, nats",
@@ -31,6 +34,7 @@ DEFINITIONS: dict[str, Any] = {
     "doppler_centroid_hz": "absolute Doppler of the beam centre, positive when closing",
     "doppler_baseband_hz": "the centroid modulo the pulse repetition frequency, within half of it of zero",
     "squint_deg": "asin(wavelength * doppler / (2 * velocity)), positive when the beam looks ahead",
+    "published": "figures of the source and its corrected brief, or the theory of a rectangular band; text and numbers of the config's metrics.published",
     "seconds": "wall time of the whole chain of the method",
 }
 
@@ -48,7 +52,10 @@ def window(image: Signal, radar: StripmapRadar, margin: Margin | None) -> dict[s
 
 
 def _bounds(n: int, first: int, last: int) -> tuple[int, int]:
-    return (first, n - last) if n - last - first >= 32 else (0, n)
+    if n - last - first >= 32:
+        return first, n - last
+    log.warning("a margin of %d and %d leaves nothing of %d lines or samples: that axis is judged whole", first, last, n)
+    return 0, n
 
 
 def _aperture_lines(image: Signal, radar: StripmapRadar) -> int:
@@ -72,7 +79,7 @@ def metrics_tree(config: Config, case: Case, results: Mapping[str, Result]) -> d
             "estimates": estimate_table(result.estimates),
             "targets": targets,
         }
-    definitions = {**DEFINITIONS, "islr_extent_nulls": config.metrics.sidelobe_nulls, "window": {axis: list(bounds) for axis, bounds in part.items()}, "reference": config.metrics.reference}
+    definitions = {**DEFINITIONS, "islr_extent_nulls": config.metrics.sidelobe_nulls, "window": part, "reference": config.metrics.reference}
     return {"methods": methods, "published": config.metrics.published, "truth": truth_table(case.truth), "definitions": definitions}
 
 

@@ -15,7 +15,7 @@ from torchsar.study.build import Case, build_case, build_damages, build_radar, b
 from torchsar.study.config import Loaded
 from torchsar.study.figures import Scene, draw_all
 from torchsar.study.folder import fresh_folder, write_arrays, write_json
-from torchsar.study.judge import metrics_tree, window
+from torchsar.study.judge import metrics_tree
 from torchsar.study.methods import Result, build_chains, run_methods
 from torchsar.study.report import write_report
 
@@ -38,7 +38,7 @@ def run(loaded: Loaded, out: Path, command: str = "torchsar run") -> Path:
         wrote = time.perf_counter()
         write_arrays(folder / "arrays.zarr", {name: r.image for name, r in results.items()}, _truth_arrays(case), _estimate_arrays(results))
         log.info("arrays: %.1f s", time.perf_counter() - wrote)
-        scene = Scene(loaded.config, case, results, window(results["recommended"].image, case.recording.radar, loaded.config.metrics.margin))
+        scene = Scene(loaded.config, case, results, metrics["definitions"]["window"])
         pictures = draw_all(scene, folder / "figures")
         write_report(folder / "report.html", loaded.config.title, metrics, pictures, folder / "figures", config_text, command)
     log.info("finished in %.0f s", time.perf_counter() - began)
