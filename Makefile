@@ -6,6 +6,11 @@ TORCH  ?= torch==2.13.0
 CONFIG ?= stripmap_damaged
 OUT    ?= out/$(notdir $(basename $(CONFIG)))
 ARGS   ?=
+TESTS  ?= tests
+
+# On a machine that others use too, threads that spin while they wait starve those that work.
+OMP_WAIT_POLICY ?= PASSIVE
+export OMP_WAIT_POLICY
 
 PY    := $(VENV)/bin/python
 STAMP := $(VENV)/.torchsar-installed
@@ -16,7 +21,7 @@ run: install
 	$(VENV)/bin/torchsar run $(CONFIG) $(ARGS) --out $(OUT)
 
 test: install
-	$(PY) -m pytest tests $(ARGS)
+	$(PY) -m pytest $(TESTS) $(ARGS)
 
 lint: install
 	$(VENV)/bin/ruff check .

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchsar.core import Signal, Stage, per_trial, real_dtype, unit_phasor
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
-from torchsar.repair.sparse import azimuth_spectrum, conjugate_fill, sparse_fill, unit_level
+from torchsar.repair.sparse import conjugate_fill, sparse_fill, unit_level
 
 
 def _mask(lines: Tensor, missing: Tensor) -> Tensor:
@@ -21,6 +21,14 @@ def _mask(lines: Tensor, missing: Tensor) -> Tensor:
     if missing.shape[-1:] != lines.shape[-2:-1]:
         raise ValueError(f"mask of missing lines of shape {tuple(missing.shape)} does not fit {lines.shape[-2]} lines; give one entry per line, as LineIntegrity does")
     return missing.bool()[..., None]
+
+
+def _nothing_missing(missing: Tensor) -> bool:
+    """Whether all the work can be saved; inside vmap a value cannot be looked at, and the work leaves the lines alone anyway."""
+    try:
+        return not bool(missing.any())
+    except RuntimeError:
+        return False
 
 
 def zero_fill(lines: Tensor, missing: Tensor) -> Tensor:
@@ -48,6 +56,23 @@ def linear_fill(lines: Tensor, missing: Tensor, doppler_turns: Tensor | float = 
         return zero_fill(lines, missing).gather(-2, index[..., None].expand(lines.shape)) * factor[..., None]
 
     return torch.where(mask, turned(before, 1 - share) + turned(after, share), lines)
+
+
+def azimuth_spectrum(lines: Tensor, received: Tensor, lags: int = 24) -> Tensor:
+    """Azimuth power spectrum from lag products of the received lines, averaged over range, unit mean, (..., pulse) in FFT order.
+
+    lines: (..., range, pulse), azimuth last, zero where not received; received: bool (..., pulse). Smoothed over about 2 / lags of the
+    PRF; may be slightly negative.
+    """
+    n = lines.shape[-1]
+    lags = min(lags, max(1, n // 4))
+    products = torch.fft.ifft(torch.fft.fft(lines, 2 * n).abs().square().sum(-2))
+    pairs = torch.fft.ifft(torch.fft.fft(received.to(lines.real.dtype), 2 * n).abs().square()).real
+    lag = torch.arange(lags + 1, device=lines.device)
+    taper = 0.5 + 0.5 * torch.cos(torch.pi * lag / (lags + 1))
+    mean = products[..., : lags + 1] / pairs[..., : lags + 1].clamp_min(0.5) * taper.to(pairs.dtype)
+    spectrum = 2 * torch.fft.fft(mean, n).real - mean[..., :1].real
+    return spectrum / spectrum.mean(-1, keepdim=True).clamp_min(torch.finfo(spectrum.dtype).tiny)
 
 
 def band_limited_fill(lines: Tensor, missing: Tensor, rounds: int = 2, steps: int = 8) -> Tensor:
@@ -100,6 +125,8 @@ class BandLimitedFill(Stage):
         self.rounds, self.steps = rounds, steps
 
     def forward(self, signal: Signal, missing: Tensor) -> Signal:
+        if _nothing_missing(missing):
+            return signal
         return signal.with_data(band_limited_fill(signal.data, missing, self.rounds, self.steps))
 
 
@@ -132,6 +159,8 @@ class SparseFill(Stage):
 
     def forward(self, signal: Signal, missing: Tensor, doppler_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Signal:
         lines, radar = signal.data, self.radar
+        if _nothing_missing(missing):
+            return signal
         reference = None if self.reference is None else REFERENCES[self.reference](radar.pulse, lines.shape[-1], radar.sampling_hz, lines.device)
         filled = sparse_fill(
             lines,

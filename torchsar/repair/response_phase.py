@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchsar.core import Estimate, Signal, Stage, cis
 from torchsar.radar import StripmapRadar
-from torchsar.repair.response import GRID, band_axis, band_grid, band_power, correct_response, estimate_amplitude_response, legendre, without_line
+from torchsar.repair.response import GRID, band_axis, band_grid, band_power, correct_response, estimate_amplitude_response, legendre
 
 ORDERS = (2, 4, 8, 16, 40)
 
@@ -47,11 +47,11 @@ def window_weights(windows: Tensor, image: Tensor, floor: float = 20.0, full: fl
     """Trust in each window by its peak power s over the background of the image, s / (s + full), and 0 below floor. (..., point).
 
     The background is the mean power that Gaussian speckle of the image's median power would have; of a million of its pixels none
-    exceeds the floor by chance.
+    exceeds the floor by chance. It is taken at least 50 dB below the brightest peak: weaker maxima are its side lobes.
     """
     background = image.abs().flatten(-2).median(-1).values.square().to(torch.float64) / math.log(2)
     peak = windows.abs().amax(-1).square().to(torch.float64)
-    s = peak / background[..., None].clamp_min(1e-12 * peak.amax(-1, keepdim=True)).clamp_min(1e-300)
+    s = peak / torch.maximum(background[..., None], 1e-5 * peak.amax(-1, keepdim=True)).clamp_min(1e-300)
     return torch.where(s > floor, s / (s + full), 0)
 
 
@@ -137,12 +137,12 @@ def sharpest_coefficients(windows: Tensor, weight: Tensor, band: float, orders: 
 
 
 def estimate_response_sharpest(
-    image: Tensor, band: float, points: int = 800, width: int = 128, orders: tuple[int, ...] = ORDERS, passes: int = 3, valid: int | None = None
+    image: Tensor, band: float, points: int = 800, width: int = 256, orders: tuple[int, ...] = ORDERS, passes: int = 3, valid: int | None = None
 ) -> Estimate:
     """Phase response by least entropy of the range windows about bright points. image: (..., azimuth, range), range spectrum centred.
 
-    band: pulse bandwidth over sampling rate; width: window in samples, several times the spread of the response; valid: number of fully
-    compressed columns. After each pass the image is corrected and the points are chosen anew; the last pass fits two halves of
+    band: pulse bandwidth over sampling rate; width: window in samples, many times the spread of the response (shortened to half the
+    valid columns where these are few); valid: number of fully compressed columns. After each pass the image is corrected and the points are chosen anew; the last pass fits two halves of
     the points apart: their mean is the estimate, their difference its std.
     Gives `phase_rad` (..., GRID), see `repair.response` for the conventions, `amplitude` ones. quality falls with the difference of the
     halves, 1 / (1 + std^2). Not ok, with zero phase: no bright places (halves that differ by more than 0.25 rad rms).
@@ -153,7 +153,7 @@ def estimate_response_sharpest(
     total = torch.zeros((rows.shape[0], basis.shape[0]), dtype=torch.float64, device=image.device)
     for i in range(passes):
         sharper = correct_response(rows, total @ basis, None, band) if i else rows
-        windows = brightest_windows(sharper, points, width)
+        windows = brightest_windows(sharper, points, min(width, sharper.shape[-1] // 4 * 2))
         weight = window_weights(windows, sharper)
         if i < passes - 1:
             total = total + sharpest_coefficients(windows, weight, band, orders if i == 0 else orders[-1:])
@@ -176,7 +176,7 @@ def point_average_phase(windows: Tensor, band: float, rounds: int = 4) -> Tensor
     """Coherent average of the spectra of single points, each less its own constant and linear phase. (..., point, n) -> phase (..., GRID).
 
     Spectra are first centred by the phase increment between their frequencies, then aligned again in constant and slope to the average
-    of all. The phase of the average is the running sum of its increments. The outermost bins are held at the value of the last one inside.
+    of all. The phase of the average is the running sum of its increments, carried to the grid by a fit of Legendre polynomials.
     """
     n = windows.shape[-1]
     u = torch.fft.fftshift(band_axis(n, band, windows.device))
@@ -190,26 +190,23 @@ def point_average_phase(windows: Tensor, band: float, rounds: int = 4) -> Tensor
         seen = seen * cis(-slope * place)
         spectra = spectra * cis(-slope * place) * cis(-torch.angle(seen.sum(-1, keepdim=True)))
         average = spectra.mean(-2, keepdim=True)
-    steps = torch.angle(average[..., 0, 1:] * average[..., 0, :-1].conj())
+    average = average[..., 0, :]
+    steps = torch.angle(average[..., 1:] * average[..., :-1].conj())
     phase = torch.nn.functional.pad(torch.cumsum(steps, -1), (1, 0))
-    return without_line(_interpolate(phase, u[inside], band_grid(windows.device)))
+    order = min(ORDERS[-1], inside.numel() // 2)
+    basis = legendre(u[inside], order).mT
+    coefficients = torch.linalg.lstsq(basis.expand(*phase.shape[:-1], *basis.shape), phase[..., None]).solution[..., 2:, 0]
+    return coefficients @ legendre(band_grid(windows.device), order)[2:]
 
 
-def _interpolate(values: Tensor, at: Tensor, wanted: Tensor) -> Tensor:
-    """Linear interpolation of values (..., n) given at rising places (n,), held outside them."""
-    high = torch.searchsorted(at, wanted).clamp(1, at.numel() - 1)
-    part = ((wanted - at[high - 1]) / (at[high] - at[high - 1])).clamp(0, 1)
-    return values[..., high - 1] * (1 - part) + values[..., high] * part
-
-
-def estimate_response_points(image: Tensor, band: float, points: int = 50, width: int = 64, valid: int | None = None) -> Estimate:
+def estimate_response_points(image: Tensor, band: float, points: int = 50, width: int = 128, valid: int | None = None) -> Estimate:
     """Phase response by the average of isolated bright points: the baseline. Arguments and result as estimate_response_sharpest.
 
-    Fails where the brightest places are not single points and where the response spreads them over much of the window.
+    Takes one line for each point. Fails where the brightest places are not single points and where the response spreads them over much of the window.
     """
     used = image.detach()[..., :valid] if valid else image.detach()
     rows = used.reshape(-1, *used.shape[-2:])
-    windows = brightest_windows(rows, points, width, apart=width // 2)
+    windows = brightest_windows(rows, points, min(width, rows.shape[-1] // 4 * 2), apart=width // 4)
     first, second = (point_average_phase(part, band) for part in (windows[:, 0::2], windows[:, 1::2]))
     std = (first - second).square().mean(-1).sqrt() / 2
     return _phase_estimate(point_average_phase(windows, band), std, image.shape[:-2])

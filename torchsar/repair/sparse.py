@@ -21,7 +21,6 @@ from torchsar.focus.defocus import InvertibleOmegaK, all_pass
 from torchsar.radar import StripmapRadar
 
 
-FLOOR=2e-3
 def unit_level(lines: Tensor) -> tuple[Tensor, Tensor]:
     """Lines over their largest sample, per trial, and that level (..., 1, 1): neither 1e-25 nor 1e19 may under- or overflow when squared."""
     level = lines.detach().abs().amax((-2, -1), keepdim=True)
@@ -56,23 +55,6 @@ def conjugate_fill(quadratic: Callable[[Tensor], Tensor], lines: Tensor, mask: T
     return lines
 
 
-def azimuth_spectrum(lines: Tensor, received: Tensor, lags: int = 24) -> Tensor:
-    """Azimuth power spectrum from lag products of the received lines, averaged over range, unit mean, (..., pulse) in FFT order.
-
-    lines: (..., range, pulse), azimuth last, zero where not received; received: bool (..., pulse). Smoothed over about 2 / lags of the
-    PRF; may be slightly negative.
-    """
-    n = lines.shape[-1]
-    lags = min(lags, max(1, n // 4))
-    products = torch.fft.ifft(torch.fft.fft(lines, 2 * n).abs().square().sum(-2))
-    pairs = torch.fft.ifft(torch.fft.fft(received.to(lines.real.dtype), 2 * n).abs().square()).real
-    lag = torch.arange(lags + 1, device=lines.device)
-    taper = 0.5 + 0.5 * torch.cos(torch.pi * lag / (lags + 1))
-    mean = products[..., : lags + 1] / pairs[..., : lags + 1].clamp_min(0.5) * taper.to(pairs.dtype)
-    spectrum = 2 * torch.fft.fft(mean, n).real - mean[..., :1].real
-    return spectrum / spectrum.mean(-1, keepdim=True).clamp_min(torch.finfo(spectrum.dtype).tiny)
-
-
 def smooth(power: Tensor, azimuth: float, range_: float) -> Tensor:
     """Local mean of (..., range, azimuth) with Gaussian weights of these standard deviations; circular in azimuth, edges held in range."""
     return _smooth_last(_smooth_last(power, azimuth, "circular").mT, range_, "replicate").mT
@@ -104,12 +86,9 @@ class SubLooks:
     Powers and weights of sub-looks are held with azimuth last, (look, ..., range, pulse), where azimuth FFTs take half the time.
     """
 
-    def __init__(self, operator: InvertibleOmegaK, windows: Tensor, spectrum: Tensor) -> None:
+    def __init__(self, operator: InvertibleOmegaK, windows: Tensor) -> None:
         self.operator = operator
-        power = windows.square()
-        level = (power * spectrum).mean(-1, keepdim=True) / power.mean(-1, keepdim=True)
-        fine = spectrum / (power * level).sum(0)
-        self.windows = (windows / fine.sqrt())[..., None, :]
+        self.windows = windows[..., None, :]
         self.share = windows.square().mean(-1)[..., None, None]
 
     def power(self, lines: Tensor, unexplained: Tensor) -> Tensor:
@@ -165,8 +144,7 @@ def sparse_fill(
     flat = None if reference is None else all_pass(reference)
     operator = InvertibleOmegaK(radar, x, doppler_hz=doppler_hz, velocity_m_s=velocity_m_s, reference=flat)
     turns = torch.as_tensor(doppler_hz, dtype=torch.float64, device=x.device) / radar.prf_hz
-    spectrum = azimuth_spectrum(x.detach().mT, torch.ones_like(mask[..., 0]), 96).clamp_min(FLOOR).double()
-    model = SubLooks(operator, look_windows(x.shape[-2], looks, turns), spectrum)
+    model = SubLooks(operator, look_windows(x.shape[-2], looks, turns))
     lost = mask.to(x.real.dtype).mean((-2, -1), keepdim=True)
     unexplained = 0.5 * lost * power_of(x.detach()).mean((-2, -1), keepdim=True)
     for _ in range(rounds):
