@@ -34,8 +34,8 @@ def from_frequency(signal: Signal, name: str) -> Signal:
 
 
 def block_bytes_of(device: torch.device) -> int:
-    """Size of the blocks that large arrays are worked on in: what stays in the cache of a CPU core, much more on an accelerator."""
-    return 1 << 20 if device.type == "cpu" else 1 << 28
+    """Size of the blocks that large arrays are worked on in: what stays in the caches of the CPU cores at work, much more on an accelerator."""
+    return torch.get_num_threads() << 20 if device.type == "cpu" else 1 << 28
 
 
 def transform_in_blocks(x: Tensor, dim: int, inverse: bool = False, out: Tensor | None = None, block_bytes: int | None = None) -> Tensor:

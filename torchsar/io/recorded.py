@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -47,7 +48,7 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Rec
         near_range_m=float(arrays["slant_range_cell1_m"]) + (int(arrays.get("first_cell", 1)) - 1) * c / (2 * fs),
         wave_speed_m_s=c,
     )
-    aux = {name: torch.from_numpy(np.asarray(arrays[name])) for name in _AUX if name in arrays}
+    aux: dict[str, Any] = {name: torch.from_numpy(np.asarray(arrays[name])) for name in _AUX if name in arrays}
     return Recording.from_arrays(_complex(arrays["iq"], path), radar, dtype=dtype, what=str(path), **aux)
 
 

@@ -76,18 +76,22 @@ def _brightest(data: Tensor, centre: list[Tensor], reach: list[int]) -> tuple[Te
     return centre[0] + best // width - reach[0], centre[1] + best % width - reach[1]
 
 
-def _climb(data: Tensor, rows: Tensor, cols: Tensor, rounds: int = 4) -> tuple[Tensor, ...]:
+def _climb(data: Tensor, rows: Tensor, cols: Tensor, rounds: int = 3) -> tuple[Tensor, ...]:
     """From the strongest sample to the interpolated maximum: (row, column, spectral centres in turns per sample, offsets in samples).
 
     A skewed response that is sampled finely in one axis and coarsely in the other has its maximum more than a sample away from its strongest sample.
     """
     for _ in range(rounds):
-        patch = _patch(data, rows, cols, _PATCH, _PATCH)
-        tone_a, tone_r = _centre_turns(patch, -2), _centre_turns(patch, -1)
-        da, dr = _fine_peak(patch, tone_a, tone_r)
-        step_a, step_r = da.round().long(), dr.round().long()
-        rows, cols = rows + step_a, cols + step_r
-    return rows, cols, tone_a, tone_r, da - step_a, dr - step_r
+        tone_a, tone_r, da, dr = _refined(data, rows, cols)
+        rows, cols = rows + da.round().long(), cols + dr.round().long()
+    return rows, cols, *_refined(data, rows, cols)
+
+
+def _refined(data: Tensor, rows: Tensor, cols: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Spectral centres in turns per sample, and offsets of the interpolated maximum from (row, column) in samples."""
+    patch = _patch(data, rows, cols, _PATCH, _PATCH)
+    tone_a, tone_r = _centre_turns(patch, -2), _centre_turns(patch, -1)
+    return tone_a, tone_r, *_fine_peak(patch, tone_a, tone_r)
 
 
 def _centre_turns(patch: Tensor, dim: int) -> Tensor:

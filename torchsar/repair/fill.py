@@ -106,6 +106,8 @@ class LinearFill(Stage):
     PRF matters.
     """
 
+    doppler_hz: Tensor
+
     def __init__(self, radar: StripmapRadar, doppler_hz: Tensor | float | None = None) -> None:
         super().__init__()
         self.hold("doppler_hz", (radar.pointing_doppler_hz or 0.0) if doppler_hz is None else doppler_hz)
@@ -136,6 +138,9 @@ class SparseFill(Stage):
     reference: "matched" for raw lines, None for range-compressed ones. doppler_hz and velocity_m_s as in OmegaK: given here, or by a chain
     at every call, which wins. The Doppler must be absolute (ambiguity resolved) where range migration exceeds a cell.
     """
+
+    doppler_hz: Tensor
+    velocity_m_s: Tensor
 
     def __init__(
         self,

@@ -156,7 +156,8 @@ def _strongest(tones: list[Tone], index: Tensor) -> Tensor:
 class _InterferenceRepair(Stage):
     """Common part of the three stages: a repaired signal, and how much of it was touched.
 
-    Estimate: value `missing` (..., pulse) bool, lines given up; info `lines_touched`, `cells_touched` (...,) counts, `touched` (..., pulse),
+    Estimate: value `missing` (..., pulse) bool, lines given up, joined with those that were missing before where a chain connects
+    them (`missing`), so that one fill serves both; info `lines_touched`, `cells_touched` (...,) counts, `touched` (..., pulse),
     `tone_cycles_per_sample` (..., pulse); quality is the share of lines kept, ok False where fewer than half are.
     """
 
@@ -169,16 +170,17 @@ class _InterferenceRepair(Stage):
             raise ValueError(f"threshold {threshold} is not above the mean level of clutter (1); choose 20 to 50, by default {THRESHOLD:g}")
         self.threshold = float(threshold)
 
-    def forward(self, signal: Signal) -> tuple[Signal, Estimate]:
+    def forward(self, signal: Signal, missing: Tensor | None = None) -> tuple[Signal, Estimate]:
         result = type(self).repair(signal.data, self.threshold)
         quality = 1 - result.missing.to(torch.float64).mean(-1)
+        given_up = result.missing if missing is None else result.missing | missing.bool()
         info = {
             "lines_touched": result.touched.sum(-1),
             "cells_touched": result.cells.sum(-1),
             "touched": result.touched,
             "tone_cycles_per_sample": result.tone_cycles,
         }
-        return signal.with_data(result.data), Estimate({"missing": result.missing}, quality, quality >= 0.5, info=info)
+        return signal.with_data(result.data), Estimate({"missing": given_up}, quality, quality >= 0.5, info=info)
 
 
 class SubtractInterference(_InterferenceRepair):

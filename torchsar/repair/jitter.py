@@ -34,7 +34,8 @@ def refuse_crossing(offset_samples: Tensor) -> None:
         return
     if not worst >= MIN_GAP:
         shown = [round(x, 3) for x in offsets.reshape(-1, offsets.shape[-1])[0].tolist()]
-        raise ValueError(f"jitter offsets must be finite and keep neighbouring sample instants at least {MIN_GAP} sample apart, got a gap of {worst:.3g} (offsets {shown} ...); check their sign and unit (samples)")
+        gap = f"at least {MIN_GAP} sample apart, got a gap of {worst:.3g} (offsets {shown} ...)"
+        raise ValueError(f"jitter offsets must be finite and keep neighbouring sample instants {gap}; check their sign and unit (samples)")
 
 
 def sample_offsets(offset_samples: Tensor, n: int) -> Tensor:
@@ -224,6 +225,8 @@ class CorrectJitter(Stage):
     Connect both values: `use(CorrectJitter(), offset_samples="pilot", period="pilot")`. method: `Exact()`, `BandLimited(8, 0.8)`,
     `Lagrange(8)`, or any function of (samples, offsets (..., M)).
     """
+
+    offset_samples: Tensor
 
     def __init__(self, offset_samples: Tensor | None = None, method: Callable[[Tensor, Tensor], Tensor] | None = None) -> None:
         super().__init__()

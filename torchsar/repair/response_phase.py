@@ -160,14 +160,20 @@ def estimate_response_sharpest(
     halves, weights = (torch.cat([x[:, 0::2], x[:, 1::2]]) for x in (windows, weight))
     first, second = sharpest_coefficients(halves, weights, band, orders[-1:]).chunk(2)
     total = total + (first + second) / 2
-    std = torch.linalg.vector_norm(first - second, dim=-1) / 2
-    return _phase_estimate(total @ basis, torch.where((weights.sum(-1) > 0).reshape(2, -1).all(0), std, torch.inf), image.shape[:-2])
+    std = torch.where((weights.sum(-1) > 0).reshape(2, -1).all(0), torch.linalg.vector_norm(first - second, dim=-1) / 2, torch.inf)
+    return _phase_estimate(_significant(total, std) @ basis, std, image.shape[:-2])
+
+
+def _significant(c: Tensor, std: Tensor, times: float = 4.0) -> Tensor:
+    """Coefficients (trial, p) less what chance makes of them: c max(0, 1 - (times * deviation / c)^2), deviation = std / sqrt(p)."""
+    limit = times * std[:, None] / math.sqrt(c.shape[-1])
+    return c * (1 - (limit / c.abs().clamp_min(1e-300)).square()).clamp_min(0)
 
 
 def _phase_estimate(phase_rad: Tensor, std: Tensor, trials: torch.Size) -> Estimate:
     ok = torch.isfinite(std) & (std < 0.125) & torch.isfinite(phase_rad).all(-1)
     phase_rad = torch.where(ok[:, None], phase_rad, 0).reshape(*trials, GRID)
-    std = torch.nan_to_num(std, nan=math.pi)[:, None].expand(-1, GRID).reshape(*trials, GRID)
+    std = torch.where(torch.isfinite(std), std, math.pi)[:, None].expand(-1, GRID).reshape(*trials, GRID)
     quality = torch.where(ok.reshape(trials), 1 / (1 + std[..., 0].square()), 0)
     return Estimate({"phase_rad": phase_rad, "amplitude": torch.ones_like(phase_rad)}, quality, ok.reshape(trials), {"phase_rad": std})
 
@@ -193,9 +199,9 @@ def point_average_phase(windows: Tensor, band: float, rounds: int = 4) -> Tensor
     average = average[..., 0, :]
     steps = torch.angle(average[..., 1:] * average[..., :-1].conj())
     phase = torch.nn.functional.pad(torch.cumsum(steps, -1), (1, 0))
-    order = min(ORDERS[-1], inside.numel() // 2)
-    basis = legendre(u[inside], order).mT
-    coefficients = torch.linalg.lstsq(basis.expand(*phase.shape[:-1], *basis.shape), phase[..., None]).solution[..., 2:, 0]
+    order = min(ORDERS[-1], inside.numel() // 3)
+    weight = average.abs()[..., None]
+    coefficients = torch.linalg.lstsq(weight * legendre(u[inside], order).mT, weight * phase[..., None]).solution[..., 2:, 0]
     return coefficients @ legendre(band_grid(windows.device), order)[2:]
 
 
@@ -222,6 +228,8 @@ class EstimateResponse(Stage):
 
     works_on = ("azimuth", "range")
     provides = ("phase_rad", "amplitude")
+
+    expected_power: Tensor | None
 
     def __init__(self, radar: StripmapRadar, method: Callable[..., Estimate] = estimate_response_sharpest, expected_power: Tensor | None = None) -> None:
         super().__init__()
