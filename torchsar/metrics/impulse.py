@@ -82,7 +82,7 @@ def _climb(data: Tensor, rows: Tensor, cols: Tensor, rounds: int = 3) -> tuple[T
     A skewed response that is sampled finely in one axis and coarsely in the other has its maximum more than a sample away from its strongest sample.
     """
     for _ in range(rounds):
-        tone_a, tone_r, da, dr = _refined(data, rows, cols)
+        _, _, da, dr = _refined(data, rows, cols)
         rows, cols = rows + da.round().long(), cols + dr.round().long()
     return rows, cols, *_refined(data, rows, cols)
 
