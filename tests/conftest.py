@@ -18,7 +18,7 @@ def _two_threads() -> None:
         torch.set_num_threads(min(2, os.cpu_count() or 1))
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def recorded() -> Callable[[str], Path]:
     """Path of a recorded data set by file name; skips where the recordings are not at hand."""
 

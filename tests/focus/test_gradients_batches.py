@@ -93,3 +93,21 @@ def test_a_cropped_signal_keeps_its_ranges():
     peak = int(part.data.abs().sum(-2).argmax())
     assert part.axes[-1].start == pytest.approx(whole.axes[-1].start + 40 * RADAR.range_step_m)
     torch.testing.assert_close(part.data[:, peak].abs(), whole.data[:, peak + 40].abs(), rtol=0, atol=2e-3)
+
+
+def test_threads_share_the_blocks_and_change_nothing():
+    raw = torch.randn(900, 600, dtype=torch.complex64)
+    velocity = torch.nn.Parameter(torch.tensor(119.0, dtype=torch.float64))
+    before, images = torch.get_num_threads(), []
+    try:
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            with torch.no_grad():
+                images.append(omega_k_stolt(raw, RADAR, doppler_hz=3.0, velocity_m_s=velocity))
+            assert torch.get_num_threads() == count
+            with torch.inference_mode():
+                omega_k(raw, RADAR, doppler_hz=3.0)
+    finally:
+        torch.set_num_threads(before)
+    assert not images[1].requires_grad
+    torch.testing.assert_close(*images, rtol=1e-4, atol=1e-4)

@@ -116,15 +116,15 @@ def test_defocus_inverts_and_is_the_adjoint(doppler: float) -> None:
     torch.testing.assert_close((operator.focus(x).conj() * y).sum(), (x.conj() * operator.defocus(y)).sum())
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_model_of_the_scene_beats_the_rest(seed: int) -> None:
-    radar, clean, signal, missing = scene(seed, LostLines(fraction=0.01))
+@pytest.mark.parametrize("seed, snr_db, reach", [(1, None, -30.9), (1, 20.0, -30.0), (2, 20.0, -30.0), (3, 20.0, -30.0)])
+def test_a_model_of_the_scene_beats_the_rest(seed: int, snr_db: float | None, reach: float) -> None:
+    """Brief 004: 1 % of the lines lost, errors -20.0 (zeros), -20.3 (linear), -21.8 (band-limited), -30.9 dB (model of the scene)."""
+    radar, clean, signal, missing = scene(seed, LostLines(fraction=0.01), snr_db=snr_db)
     focus = OmegaK(radar)
     truth = focus(clean.signal)
-    error = {name: float(error_db(focus(stage(signal, missing)), truth)) for name, stage in {**STAGES, "linear": LinearFill(radar), "sparse": SparseFill(radar)}.items()}
-    assert error["zero"] < -19 and error["linear"] < error["zero"]
-    assert error["band"] < error["zero"] - 4 and error["sparse"] < error["band"]
-    assert error["sparse"] < -30.9, f"brief 004 reached -30.9 dB with 1 % of the lines lost, got {error}"
+    zero, linear, band, sparse = (float(error_db(focus(stage(signal, missing)), truth)) for stage in (ZeroFill(), LinearFill(radar), BandLimitedFill(), SparseFill(radar)))
+    assert abs(zero + 20) < 3 and linear < zero - 0.3 and band < zero - 1
+    assert sparse < min(band - 3, reach), f"zeros {zero:.1f}, linear {linear:.1f}, band-limited {band:.1f}, model {sparse:.1f} dB"
 
 
 def test_gaps_in_simulation() -> None:
@@ -132,7 +132,7 @@ def test_gaps_in_simulation() -> None:
     focus = OmegaK(radar)
     truth = focus(clean.signal)
     zero, sparse = (float(error_db(focus(stage(signal, missing)), truth)) for stage in (ZeroFill(), SparseFill(radar)))
-    assert sparse < zero - 6
+    assert sparse < zero - 10
 
 
 def test_geometry_need_not_be_exact() -> None:
