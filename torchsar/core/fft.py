@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -34,23 +36,61 @@ def from_frequency(signal: Signal, name: str) -> Signal:
 
 
 def block_bytes_of(device: torch.device) -> int:
-    """Size of the blocks that large arrays are worked on in: what stays in the caches of the CPU cores at work, much more on an accelerator."""
-    return torch.get_num_threads() << 20 if device.type == "cpu" else 1 << 28
+    """Size of the blocks that large arrays are worked on in: what stays in the cache of a CPU core, much more on an accelerator."""
+    return 1 << 20 if device.type == "cpu" else 1 << 28
+
+
+def over_blocks(work: Callable[[Any], None], parts: Iterable[Any], like: Tensor) -> None:
+    """Call work on every part of an array, in as many threads as torch uses; not differentiable. like: the array.
+
+    Each thread works on blocks of its own with one-threaded operations: nothing waits for a slower thread at every operation, which on a
+    busy machine costs several times the work itself. Few blocks, accelerators and torch.func transforms go one after another.
+    """
+    parts, threads = list(parts), torch.get_num_threads()
+    if threads == 1 or len(parts) < 2 * threads or like.device.type != "cpu" or not _has_storage(like):
+        for part in parts:
+            work(part)
+        return
+    inference = torch.is_inference_mode_enabled()
+
+    def one(part: Any) -> None:
+        # modes and thread counts belong to a thread
+        torch.set_num_threads(1)
+        with torch.inference_mode(inference), torch.no_grad():
+            work(part)
+
+    try:
+        with ThreadPoolExecutor(threads) as pool:
+            for _ in pool.map(one, parts):
+                pass
+    finally:
+        torch.set_num_threads(threads)  # the mathematics library counts threads for the whole process
+
+
+def _has_storage(x: Tensor) -> bool:
+    """False inside torch.func transforms, whose state does not pass to other threads."""
+    try:
+        return x.data_ptr() != 0
+    except RuntimeError:
+        return False
 
 
 def transform_in_blocks(x: Tensor, dim: int, inverse: bool = False, out: Tensor | None = None, block_bytes: int | None = None) -> Tensor:
-    """FFT of x along -1 or -2 into `out` (x itself by default; contiguous), by blocks that stay in the cache; not differentiable.
+    """FFT of x along -1 or -2 into `out` (x itself by default), by blocks that stay in the cache; not differentiable.
 
     A pass along -2 gathers a few columns into the cache, transforms them there and puts them back: two to four times as fast as one
-    call on the large array, and needs no second array.
+    call on the large array, and needs no second array (unless `out` is not contiguous).
     """
     out = x if out is None else out
     transform = torch.fft.ifft if inverse else torch.fft.fft
     if not out.is_contiguous():
-        raise ValueError(f"transform_in_blocks writes into a contiguous array, got strides {out.stride()} for the shape {tuple(out.shape)}")
+        return out.copy_(transform(x, dim=dim))
     source, target = (y.reshape(-1, *y.shape[-2:]) if dim == -2 else y.reshape(-1, y.shape[-1]) for y in (x, out))
-    for part in _blocks(source, dim, block_bytes_of(x.device) if block_bytes is None else block_bytes):
+
+    def work(part: tuple[slice, ...]) -> None:
         target[part] = transform(source[part].contiguous(), dim=dim)
+
+    over_blocks(work, _blocks(source, dim, block_bytes_of(x.device) if block_bytes is None else block_bytes), out)
     return out
 
 
@@ -59,8 +99,12 @@ def spectrum_in_blocks(x: Tensor) -> Tensor:
     out = torch.empty_like(x, memory_format=torch.contiguous_format)
     if x.shape[-2] * x.shape[-1] * x.element_size() > 4 * block_bytes_of(x.device):
         return transform_in_blocks(transform_in_blocks(x, -1, out=out), -2)
-    for one, target in zip(x.reshape(-1, *x.shape[-2:]), out.view(-1, *x.shape[-2:]), strict=True):
-        target.copy_(torch.fft.fft2(one))
+    source, target = x.reshape(-1, *x.shape[-2:]), out.view(-1, *x.shape[-2:])
+
+    def work(trial: int) -> None:
+        target[trial] = torch.fft.fft2(source[trial])
+
+    over_blocks(work, range(source.shape[0]), out)
     return out
 
 

@@ -17,7 +17,22 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Signal, Stage, block_bytes_of, cis, linear_phasor, outer_phasor, per_trial, phasor_tables, real_dtype, reduced_turns, spectrum_in_blocks, transform_in_blocks
+from torchsar.core import (
+    Axis,
+    Signal,
+    Stage,
+    block_bytes_of,
+    cis,
+    linear_phasor,
+    outer_phasor,
+    over_blocks,
+    per_trial,
+    phasor_tables,
+    real_dtype,
+    reduced_turns,
+    spectrum_in_blocks,
+    transform_in_blocks,
+)
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
 
@@ -222,9 +237,11 @@ def through_doppler(raw: Tensor, focus_rows: Callable[[Tensor, slice], Tensor], 
     work = spectrum_in_blocks(raw)
     block_bytes = block_bytes_of(raw.device) if block_bytes is None else block_bytes
     height = max(1, block_bytes // max(1, work[..., 0, :].numel() * work.element_size()))
-    for first in range(0, work.shape[-2], height):
-        part = slice(first, min(first + height, work.shape[-2]))
+
+    def focus(part: slice) -> None:
         work[..., part, :] = focus_rows(work[..., part, :], part)
+
+    over_blocks(focus, (slice(first, first + height) for first in range(0, work.shape[-2], height)), work)
     return transform_in_blocks(work, -2, inverse=True)
 
 

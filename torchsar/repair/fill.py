@@ -133,7 +133,7 @@ class BandLimitedFill(Stage):
 
 
 class SparseFill(Stage):
-    """Missing lines from a model of the focused scene; see sparse_fill. Begins from the band-limited fill.
+    """Missing lines from a model of the focused scene; see sparse_fill.
 
     reference: "matched" for raw lines, None for range-compressed ones. doppler_hz and velocity_m_s as in OmegaK: given here, or by a chain
     at every call, which wins. The Doppler must be absolute (ambiguity resolved) where range migration exceeds a cell.
@@ -174,7 +174,6 @@ class SparseFill(Stage):
             doppler_hz=self.doppler_hz if doppler_hz is None else doppler_hz,
             velocity_m_s=self.velocity_m_s if velocity_m_s is None else velocity_m_s,
             reference=reference,
-            start=band_limited_fill(lines, missing),
             looks=self.looks,
             rounds=self.rounds,
             steps=self.steps,

@@ -14,33 +14,29 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, cis
+from torchsar.core import Estimate, Signal, Stage, cis, linear_phasor
 from torchsar.radar import StripmapRadar
 from torchsar.repair.response import GRID, band_axis, band_grid, band_power, correct_response, estimate_amplitude_response, legendre
 
 ORDERS = (2, 4, 8, 16, 40)
 
 
-def brightest_windows(image: Tensor, points: int, width: int, apart: int = 8, valid: int | None = None) -> Tensor:
-    """Range windows about the brightest local maxima of each trial, (..., azimuth, range) -> (..., points, width).
+def brightest_windows(image: Tensor, points: int, width: int, apart: int = 8) -> Tensor:
+    """Range windows about the brightest local maxima of each trial, (trial, azimuth, range) -> (trial, points, width).
 
-    Maxima are at least `apart` samples from any brighter one in their own and the next lines. Columns from `valid` on, where echoes are
-    not fully compressed, and those closer than half a window to the ends are not taken. With fewer maxima than points the rest is zero.
+    Maxima are at least `apart` samples from any brighter one in their own and the next lines; those closer than half a window to the
+    ends of a line are not taken. Where there are fewer maxima than points, the other windows are zero.
     """
-    size = image[..., :valid].abs()
-    half = width // 2
-    if size.shape[-1] < 2 * width:
-        raise ValueError(f"windows of {width} samples need at least {2 * width} valid range samples, got {size.shape[-1]}; choose shorter windows")
-    size = torch.nn.functional.pad(size[..., half:-half], (half, half)).flatten(0, -3) if image.ndim > 2 else torch.nn.functional.pad(size[..., half:-half], (half, half))[None]
+    n, half = image.shape[-1], width // 2
+    if width < 16 or n < 2 * width:
+        raise ValueError(f"windows of {width} samples (at least 16) need at least {max(32, 2 * width)} valid range samples, got {n}; give longer lines")
+    size = torch.nn.functional.pad(image.abs()[..., half:-half], (half, half))
     highest = torch.nn.functional.max_pool2d(size[:, None], (3, 2 * apart + 1), 1, (1, apart))[:, 0]
     peaks = torch.where((size == highest) & (size > 0), size, 0).flatten(-2)
     level, index = peaks.topk(min(points, peaks.shape[-1]), -1)
-    line, column = index // size.shape[-1], index % size.shape[-1]
-    flat = line * image.shape[-1] + column
-    place = flat[..., None] + torch.arange(-half, width - half, device=image.device)
-    rows = image.reshape(size.shape[0], -1)
-    windows = torch.gather(rows, -1, place.clamp(0, rows.shape[-1] - 1).flatten(-2)).unflatten(-1, place.shape[-2:])
-    return (windows * (level > 0)[..., None]).reshape(*image.shape[:-2], *windows.shape[-2:])
+    place = index[..., None] + torch.arange(-half, width - half, device=image.device)
+    windows = torch.gather(image.flatten(-2), -1, place.clamp(0, peaks.shape[-1] - 1).flatten(-2)).unflatten(-1, place.shape[-2:])
+    return windows * (level > 0)[..., None]
 
 
 def window_weights(windows: Tensor, image: Tensor, floor: float = 20.0, full: float = 100.0) -> Tensor:
@@ -178,44 +174,60 @@ def _phase_estimate(phase_rad: Tensor, std: Tensor, trials: torch.Size) -> Estim
     return Estimate({"phase_rad": phase_rad, "amplitude": torch.ones_like(phase_rad)}, quality, ok.reshape(trials), {"phase_rad": std})
 
 
-def point_average_phase(windows: Tensor, band: float, rounds: int = 4) -> Tensor:
-    """Coherent average of the spectra of single points, each less its own constant and linear phase. (..., point, n) -> phase (..., GRID).
+def point_average_coefficients(windows: Tensor, weight: Tensor, band: float, order: int = 24, rounds: int = 6) -> Tensor:
+    """Coherent average of the spectra of single points, each less its own constant and linear phase. (trial, point, n) -> (trial, p).
 
-    Spectra are first centred by the phase increment between their frequencies, then aligned again in constant and slope to the average
-    of all. The phase of the average is the running sum of its increments, carried to the grid by a fit of Legendre polynomials.
+    Starts from the spectrum of the brightest point, aligns every other one to it in slope (the peak of their correlation) and constant,
+    and repeats with the average. The phase of the average is the running sum of its increments, fitted with Legendre polynomials.
     """
     n = windows.shape[-1]
     u = torch.fft.fftshift(band_axis(n, band, windows.device))
     inside = (u.abs() <= 1).nonzero()[:, 0]
-    spectra = torch.fft.fftshift(torch.fft.fft(windows.to(torch.complex128)), dim=-1)[..., inside]
-    place = torch.arange(inside.numel(), dtype=torch.float64, device=windows.device) - (inside.numel() - 1) / 2
-    average = torch.ones_like(spectra[..., :1, :])
+    away = (torch.arange(n, device=windows.device) - n // 2).abs() / n
+    taper = torch.cos(math.pi / 2 * ((away - 0.3) / 0.2).clamp(0, 1)).square()
+    spectra = torch.fft.fftshift(torch.fft.fft((windows * taper).to(torch.complex128)), dim=-1)[..., inside]
+    norm = torch.linalg.vector_norm(spectra, dim=-1, keepdim=True)
+    spectra = spectra / torch.where(norm > 0, norm, 1) * weight[..., None]
+    average = spectra[..., :1, :]
     for _ in range(rounds):
-        seen = spectra * average.conj()
-        slope = torch.angle((seen[..., 1:] * seen[..., :-1].conj()).sum(-1, keepdim=True))
-        seen = seen * cis(-slope * place)
-        spectra = spectra * cis(-slope * place) * cis(-torch.angle(seen.sum(-1, keepdim=True)))
+        spectra = _align(spectra, average)
         average = spectra.mean(-2, keepdim=True)
     average = average[..., 0, :]
     steps = torch.angle(average[..., 1:] * average[..., :-1].conj())
     phase = torch.nn.functional.pad(torch.cumsum(steps, -1), (1, 0))
-    order = min(ORDERS[-1], inside.numel() // 3)
-    weight = average.abs()[..., None]
-    coefficients = torch.linalg.lstsq(weight * legendre(u[inside], order).mT, weight * phase[..., None]).solution[..., 2:, 0]
-    return coefficients @ legendre(band_grid(windows.device), order)[2:]
+    sure = (average.abs() + 1e-12)[..., None]
+    return torch.linalg.lstsq(sure * legendre(u[inside], order).mT, sure * phase[..., None]).solution[..., 2:, 0]
 
 
-def estimate_response_points(image: Tensor, band: float, points: int = 50, width: int = 128, valid: int | None = None) -> Estimate:
+def _align(spectra: Tensor, reference: Tensor) -> Tensor:
+    """Spectra (..., point, n) turned by the linear and constant phase that bring them closest to reference (..., 1, n)."""
+    n = 8 * spectra.shape[-1]
+    correlation = torch.fft.fft(spectra * reference.conj(), n)
+    index = correlation.abs().argmax(-1, keepdim=True)
+    slope = (index - n * (2 * index >= n)).to(torch.float64) / n
+    turned = torch.gather(correlation, -1, index)
+    return spectra * linear_phasor(-slope[..., 0], 0, spectra.shape[-1], spectra.dtype) * cis(-torch.angle(turned))
+
+
+def estimate_response_points(image: Tensor, band: float, points: int = 200, width: int = 128, order: int = 24, passes: int = 3, valid: int | None = None) -> Estimate:
     """Phase response by the average of isolated bright points: the baseline. Arguments and result as estimate_response_sharpest.
 
-    Takes one line for each point. Fails where the brightest places are not single points and where the response spreads them over much of the window.
+    Takes one line for each point, so that noise tells more than there. Fails where the brightest places are not single points and where
+    the response spreads them over much of the window.
     """
     used = image.detach()[..., :valid] if valid else image.detach()
     rows = used.reshape(-1, *used.shape[-2:])
-    windows = brightest_windows(rows, points, min(width, rows.shape[-1] // 4 * 2), apart=width // 4)
-    first, second = (point_average_phase(part, band) for part in (windows[:, 0::2], windows[:, 1::2]))
-    std = (first - second).square().mean(-1).sqrt() / 2
-    return _phase_estimate(point_average_phase(windows, band), std, image.shape[:-2])
+    width = min(width, rows.shape[-1] // 4 * 2)
+    basis = legendre(band_grid(image.device), order)[2:]
+    total = torch.zeros((rows.shape[0], basis.shape[0]), dtype=torch.float64, device=image.device)
+    for i in range(passes):
+        sharper = correct_response(rows, total @ basis, None, band) if i else rows
+        windows = brightest_windows(sharper, points, width, apart=width // 2)
+        weight = (window_weights(windows, sharper) > 0).to(torch.float64)
+        total = total + point_average_coefficients(windows, weight, band, order)
+    first, second = (point_average_coefficients(windows[:, part], weight[:, part], band, order) for part in (slice(0, None, 2), slice(1, None, 2)))
+    std = torch.where((weight.sum(-1) > 1), torch.linalg.vector_norm(first - second, dim=-1) / 2, torch.inf)
+    return _phase_estimate(total @ basis, std, image.shape[:-2])
 
 
 class EstimateResponse(Stage):
