@@ -185,7 +185,7 @@ def point_average_coefficients(windows: Tensor, weight: Tensor, band: float, ord
     inside = (u.abs() <= 1).nonzero()[:, 0]
     away = (torch.arange(n, device=windows.device) - n // 2).abs() / n
     taper = torch.cos(math.pi / 2 * ((away - 0.3) / 0.2).clamp(0, 1)).square()
-    spectra = torch.fft.fftshift(torch.fft.fft((windows * taper).to(torch.complex128)), dim=-1)[..., inside]
+    spectra = torch.fft.fftshift(torch.fft.fft(torch.fft.ifftshift((windows * taper).to(torch.complex128), dim=-1)), dim=-1)[..., inside]
     norm = torch.linalg.vector_norm(spectra, dim=-1, keepdim=True)
     spectra = spectra / torch.where(norm > 0, norm, 1) * weight[..., None]
     average = spectra[..., :1, :]
