@@ -34,6 +34,7 @@ from torchsar.repair import (
 )
 
 RADAR = small_radar()
+FEW_POINTS = partial(estimate_response_sharpest, points=40, orders=(4, 8), passes=2)
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,7 @@ CASES = [
     Case("blind_jitter", lambda: BlindJitter(max_period=4), differentiable=False, vmap=False, n_range=128),
     Case("estimate_imbalance", lambda: EstimateImbalance()),
     Case("correct_imbalance", lambda: CorrectImbalance(), _imbalance),
-    Case("estimate_response", lambda: EstimateResponse(RADAR, partial(estimate_response_sharpest, points=40, orders=(4, 8), passes=2)), differentiable=False, vmap=False, image=True, tolerance=1e-6, n_range=300),
+    Case("estimate_response", lambda: EstimateResponse(RADAR, FEW_POINTS), differentiable=False, vmap=False, image=True, tolerance=1e-6, n_range=300),
     Case("correct_response", lambda: CorrectResponse(RADAR), _response, image=True),
 ]
 IDS = [case.name for case in CASES]
