@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import logging
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -81,6 +83,7 @@ def test_own_recording_runs(tmp_path: Path) -> None:
         ({"iq": np.full((96, 160, 2), np.nan, np.float32)}, ["raw.npz", "NaN"]),
         ({"iq": np.zeros((96, 160), np.float32)}, ["raw.npz", "iq"]),
         ({"agc_db": np.zeros(5)}, ["agc_db", "96 lines"]),
+        ({"line_number": np.zeros((2, 96), int)}, ["raw.npz", "line_number", "(2, 96)"]),
     ],
 )
 def test_bad_recordings_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict, expected: list[str]) -> None:
@@ -91,6 +94,52 @@ def test_bad_recordings_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[
     for part in ("data.file", *expected):
         assert part in last
     assert sorted(path.name for path in tmp_path.iterdir()) == ["raw.npz", "tiny.yaml"]
+
+
+@pytest.mark.parametrize(
+    "changes, expected",
+    [
+        ({"iq": np.concatenate([np.ones((90, 160, 2), np.float32), np.zeros((6, 160, 2), np.float32)])}, ["raw.npz", "6 of 96 lines hold only zeros", "line 90"]),
+        ({"pilot": np.zeros(4096, np.complex64)}, ["recommended", "'pilot' found nothing to trust"]),
+    ],
+)
+def test_doubtful_recordings_are_named_in_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict, expected: list[str]) -> None:
+    stages = {**({"pilot": {"stage": "jitter_pilot", "uses": {"pilot": "aux.pilot"}}} if "pilot" in changes else {}), **FOCUS["recommended"]["stages"]}
+    config = write_tiny(tmp_path, world=None, radar=None, metrics=None, processor={"recommended": {"stages": stages}})
+    logging.getLogger("torchsar").handlers.clear()  # one of an earlier test writes to that test's stderr
+    assert main(["run", str(config), f"data.file={recording(tmp_path / 'raw.npz', **changes)}", "--out", str(tmp_path / "result")]) == 0
+    said = [line for line in spoken(capsys) if "warning: " in line]
+    assert len(said) == 1 and all(part in said[0] for part in expected)
+
+
+def test_aliasing_is_named_with_both_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    logging.getLogger("torchsar").handlers.clear()
+    assert main(["run", str(write_tiny(tmp_path)), "radar.prf_hz=10.0", "--out", str(tmp_path / "result")]) == 0
+    assert "warning: PRF 10 Hz is below the Doppler band 14.67" in capsys.readouterr().err
+
+
+def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
+    config = write_tiny(tmp_path)
+    command = [sys.executable, "-m", "torchsar.cli", "run", str(config), "world.lines=60000", "world.samples=1024", "--out", str(tmp_path / "result")]
+    running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    assert running.stderr is not None and "simulating" in running.stderr.readline()
+    running.send_signal(signal.SIGINT)
+    _, said = running.communicate(timeout=60)
+    assert running.returncode == 130 and said.strip() == "torchsar: interrupted, nothing was written"
+    assert [path.name for path in tmp_path.iterdir()] == ["tiny.yaml"]
+
+
+@pytest.mark.parametrize("word", ["0", "-3", "many"])
+def test_threads_are_a_number_above_zero(word: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["--threads", word, "list"])
+    assert f"{word!r} is not a whole number above 0" in capsys.readouterr().err
+
+
+def test_a_level_that_the_log_does_not_know(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("TORCHSAR_LOG", "loud")
+    assert main(["list"]) == 2
+    assert "TORCHSAR_LOG=LOUD" in spoken(capsys)[-1]
 
 
 def test_a_file_that_is_no_archive_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

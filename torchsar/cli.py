@@ -7,6 +7,7 @@ import logging
 import os
 import shlex
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,7 +17,7 @@ EXIT_BAD_INPUT = 2
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     top = argparse.ArgumentParser(prog="torchsar", description="Synthetic aperture radar experiments from a config.")
-    top.add_argument("--threads", type=int, metavar="N", help="threads of torch (default: all cores)")
+    top.add_argument("--threads", type=_positive, metavar="N", help="threads of torch (default: all cores)")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, text in (
         ("run", "run an experiment and write its images, figures and report"),
@@ -31,6 +32,12 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
+def _positive(text: str) -> int:
+    if not (text.isdecimal() and int(text) > 0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
+    return int(text)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command. Returns 0, or 2 after one sentence on stderr for bad input, or 130 when interrupted."""
     given = list(sys.argv[1:] if arguments is None else arguments)
@@ -41,7 +48,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(f"{error}; install the extra: pip install 'torchsar-lab[study]'")
     try:
         _log_to_stderr()
-        return _dispatch(options, "torchsar " + shlex.join(given))
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            return _dispatch(options, "torchsar " + shlex.join(given))
     except ImportError as error:
         return _fail(f"{error.name or error} is not installed; install the extra: pip install 'torchsar-lab[study]'")
     except ConfigError as error:
@@ -65,7 +74,7 @@ def _parse(given: Sequence[str]) -> argparse.Namespace:
 def _dispatch(options: argparse.Namespace, command: str) -> int:
     from torchsar.study.config import load
 
-    if options.threads:
+    if options.threads is not None:
         import torch
 
         torch.set_num_threads(options.threads)
@@ -96,12 +105,22 @@ def _fail(sentence: str) -> int:
 
 
 def _log_to_stderr() -> None:
+    from torchsar.study.errors import ConfigError
+
     log = logging.getLogger("torchsar")
     if not log.handlers:
         handler = logging.StreamHandler()
         handler.setFormatter(logging.Formatter("torchsar: %(message)s"))
         log.addHandler(handler)
-    log.setLevel(os.environ.get("TORCHSAR_LOG", "INFO").upper())
+    level = os.environ.get("TORCHSAR_LOG", "INFO").upper()
+    if level not in logging.getLevelNamesMapping():
+        raise ConfigError(f"TORCHSAR_LOG={level} is no level of the log; choose DEBUG, INFO, WARNING or ERROR")
+    log.setLevel(level)
+
+
+def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    """A Python warning as one line of the log, without the place in the code."""
+    logging.getLogger("torchsar").warning("warning: %s", " ".join(str(message).split()))
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from torchsar.core import Axis, Chain, Draws, Estimate, Signal, Stage, use
 from torchsar.echo import simulate
 from torchsar.focus import OmegaK
 from torchsar.metrics import entropy
+from torchsar.repair import LineIntegrity
 from torchsar.scene import AlwaysLit, Points, StripmapWorld
 
 
@@ -143,3 +144,22 @@ def test_gradients_flow_from_entropy_to_velocity_and_positions():
 def test_axis_of_one_sample_step():
     with pytest.raises(ValueError, match="positive step"):
         Axis("range", 3, 0.0, 0.0, "m")
+
+
+@pytest.mark.parametrize(
+    ("stages", "error", "match"),
+    [
+        ({"a": OmegaK}, TypeError, "'a' must be a torch.nn.Module.* got the class OmegaK, not an instance"),
+        ({"a": 3}, TypeError, "'a' must be a torch.nn.Module.* got int"),
+        ({"forward": GivenVelocity()}, ValueError, "cannot be called 'forward'"),
+        ({"lines": LineIntegrity()}, ValueError, r"'lines' \(LineIntegrity\) needs the value 'line_number'.*no earlier values.*aux.NAME"),
+    ],
+)
+def test_members_that_are_no_stages_are_refused_at_construction(stages, error, match):
+    with pytest.raises(error, match=match):
+        Chain(**stages)
+
+
+def test_a_constant_is_no_connection():
+    with pytest.raises(TypeError, match="doppler_hz=3.0: `use` connects values by name"):
+        use(OmegaK(small_radar()), doppler_hz=3.0)

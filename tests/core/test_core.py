@@ -24,6 +24,11 @@ def test_frequency_axis_and_data_move_together():
     torch.testing.assert_close(back.data, signal.data)
 
 
+def test_signal_refuses_what_is_no_tensor():
+    with pytest.raises(TypeError, match="holds a torch.Tensor, got list"):
+        Signal([1j, 2j], (Axis("range", 2, 0.0, 1.0, "m"),))
+
+
 def test_signal_refuses_a_shape_that_does_not_end_in_its_axes():
     with pytest.raises(ValueError, match=r"pulse=4, range=5"):
         Signal(torch.zeros(5, 4), (Axis("pulse", 4, 0, 1, "s"), Axis("range", 5, 0, 1, "m")))

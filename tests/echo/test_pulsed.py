@@ -99,3 +99,27 @@ def test_pairs_are_the_same_in_any_batch_size():
     assert [r.signal.data.shape[0] for r, _ in by_two] == [2, 2, 1] and len(SimulatedPairs(small_radar(), world, 12, 60, 4, 5, 2)) == 3
     one_by_one = torch.cat([r.signal.data for r, _ in SimulatedPairs(small_radar(), world, 12, 60, seed=4, count=5)])
     torch.testing.assert_close(torch.cat([r.signal.data for r, _ in by_two]), one_by_one, rtol=1e-4, atol=1e-6)
+
+
+def test_what_no_radar_can_record_is_refused():
+    def refused(match, scene=None, n_range=128, **world):
+        with pytest.raises(ValueError, match=match):
+            simulate(small_radar(), StripmapWorld(scene or Points([0.0], [0.0]), **world), 8, n_range, Draws(0))
+
+    refused("no scatterer", Points([], []))
+    refused("behind the radar, at a range of -8", Points([0.0], [-5000.0]))
+    refused("squint beyond 90 degrees", doppler_hz=3000.0)
+    refused("line of 20 samples does not hold the pulse of 25", n_range=20)
+
+
+def test_worlds_that_make_no_sense_are_refused_at_construction():
+    with pytest.raises(ValueError, match=r"as many ranges.*\[2, 1\]"):
+        Points([0.0, 1.0], [0.0])
+    with pytest.raises(ValueError, match="count=0"):
+        Speckle(0, 1.0, 1.0)
+    with pytest.raises(ValueError, match="extents"):
+        RandomPoints(3, -1.0, 1.0)
+    with pytest.raises(ValueError, match="dwell_s must be a positive"):
+        Dwell(0.0)
+    with pytest.raises(ValueError, match="length_m must be a positive"):
+        Antenna(-2.0)

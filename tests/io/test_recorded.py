@@ -51,8 +51,19 @@ def test_axes_chirp_and_gain_come_from_the_file(tmp_path):
         ({"iq": np.zeros((4, 5))}, r"iq must be complex \(line, sample\) or \(line, sample, 2\)"),
         ({"agc_db": np.zeros(3)}, "agc_db has 3 entries for 6 lines"),
         ({"iq": np.full((6, 80, 2), np.nan, np.float32)}, "480 of 480 samples are NaN or Inf"),
-        ({"prf_hz": -1.0}, "prf_hz must be a positive number"),
+        ({"prf_hz": -1.0}, "raw.npz: prf_hz must be one positive number, got -1.0"),
         ({"iq": np.array([None], dtype=object)}, "not a numpy archive without pickles"),
+        ({"iq": np.zeros((6, 80, 2), bool)}, "iq must be complex .* got bool"),
+        ({"fs_hz": 0.0}, "raw.npz: fs_hz must be one positive number, got 0.0"),
+        ({"fs_hz": np.array([50e6])}, r"fs_hz must be one positive number, got float64 of shape \(1,\)"),
+        ({"f0_hz": "high"}, "f0_hz must be one positive number, got 'high'"),
+        ({"chirp_rate_hz_s": np.nan}, "chirp_rate_hz_s must be one number other than zero, got nan"),
+        ({"c_m_s": np.inf}, "c_m_s must be one positive number, got inf"),
+        ({"first_cell": 1.7}, "first_cell must be one whole number, got 1.7"),
+        ({"agc_db": np.float64(3)}, "agc_db has 1 entries for 6 lines"),
+        ({"agc_db": np.array(["loud"] * 6)}, "raw.npz: agc_db: expected numbers in an array or a tensor, got <U4"),
+        ({"agc_db": np.full(6, np.nan)}, "agc_db must be finite and within"),
+        ({"line_number": np.zeros((2, 6), int)}, r"line_number is torch.int64 of shape \(2, 6\)"),
     ],
 )
 def test_bad_files_are_refused_with_one_sentence(tmp_path, changes, match):
@@ -76,6 +87,20 @@ def test_own_arrays_in_batches():
     assert torch.equal(recording.signal.data, data)
     with pytest.raises(ValueError, match="expected complex samples"):
         Recording.from_arrays(data.real, small_radar())
+
+
+def test_own_arrays_that_are_none():
+    with pytest.raises(ValueError, match="data: expected numbers"):
+        Recording.from_arrays(None, small_radar())
+    with pytest.raises(ValueError, match="dtype must be complex64 or complex128, got torch.float32"):
+        Recording.from_arrays(torch.ones(6, 80, dtype=torch.complex64), small_radar(), dtype=torch.float32)
+
+
+def test_lines_of_zeros_are_named():
+    data = torch.ones(6, 80, dtype=torch.complex64)
+    data[3:5] = 0
+    with pytest.warns(UserWarning, match="data: 2 of 6 lines hold only zeros, the first is line 3"):
+        Recording.from_arrays(data, small_radar())
 
 
 def test_recorded_blocks_read(recorded):

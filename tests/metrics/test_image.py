@@ -87,3 +87,31 @@ def test_targets_and_trials_are_measured_side_by_side():
 def test_places_outside_the_image_are_refused():
     with pytest.raises(ValueError, match="outside the azimuth axis"):
         impulse_response(sinc_image(150, 140), (500.0, 1035.0))
+
+
+def test_what_is_no_image_is_refused():
+    flat = torch.ones(8, dtype=torch.complex64)
+    with pytest.raises(ValueError, match=r"at least one pixel, got the shape \(8,\)"):
+        entropy(flat)
+    with pytest.raises(ValueError, match=r"at least one pixel, got the shape \(0, 8\)"):
+        contrast(flat.expand(0, 8))
+    with pytest.raises(TypeError, match="got ndarray"):
+        entropy(flat.expand(4, 8).numpy())
+    with pytest.raises(ValueError, match=r"one size can be compared.*\(4, 8\).*\(2, 8\)"):
+        error_db(flat.expand(4, 8), flat.expand(2, 8))
+    with pytest.raises(ValueError, match="complex images.*torch.float32"):
+        correlation(flat.expand(4, 8).real, flat.expand(4, 8))
+
+
+def test_what_has_no_impulse_response_is_refused():
+    image = sinc_image(150, 140)
+    with pytest.raises(ValueError, match="Signal with two axes, got Tensor"):
+        impulse_response(image.data, (65.0, 1035.0))
+    with pytest.raises(ValueError, match="one coordinate for each of the axes .* got 1"):
+        impulse_response(image, (65.0,))
+    with pytest.raises(ValueError, match="sidelobe_nulls of 1 or more and search_m above 0, got 0"):
+        impulse_response(image, (65.0, 1035.0), sidelobe_nulls=0)
+    with pytest.raises(ValueError, match="outside the azimuth axis"):
+        impulse_response(image, (math.nan, 1035.0))
+    with pytest.raises(ValueError, match="NaN or Inf"):
+        impulse_response(image.with_data(image.data * math.nan), (65.0, 1035.0))

@@ -10,14 +10,14 @@ from tests.study.tiny import TINY, write_tiny
 from torchsar.study.build import build_chain, build_radar, resolved
 from torchsar.study.config import load
 from torchsar.study.errors import ConfigError
-from torchsar.study.run import check
+from torchsar.study.run import check, prepare
 from torchsar.study.text import dump, override, packaged_configs, parse
 
 
 def refused(tmp_path: Path, *assignments: str, **changes: object) -> str:
     with pytest.raises(ConfigError) as error:
         loaded = load(str(write_tiny(tmp_path, **changes)), assignments)
-        check(loaded)
+        prepare(loaded)
     text = str(error.value)
     assert "\n" not in text
     return text
@@ -108,9 +108,25 @@ def test_unknown_config_names_what_there_is() -> None:
         (["seed=-1"], ["'seed' has the value -1"]),
         (["seed=1.5"], ["'seed' has the value 1.5", "integer"]),
         (["precision=float32"], ["precision", "'complex64' or 'complex128'"]),
-        (["data.file=/nowhere/raw.npz"], ["data.file", "/nowhere/raw.npz does not exist"]),
+        (["data.file=/nowhere/raw.npz"], ["data.file", "'/nowhere/raw.npz' does not exist"]),
         (["nonsense"], ["'nonsense' is not an override"]),
         (["=3"], ["is not an override"]),
+        ([".seed=3"], ["'.seed=3' is not an override"]),
+        (["world=3"], ["'world' has the value 3", "mapping of keys"]),
+        (["world.scene={}"], ["'world.scene' has the value {}", "not an empty one"]),
+        (["data.file=/tmp"], ["data.file", "'/tmp' is no file"]),
+        (["world.lines=1000000000000"], ["world", "1000000000000 lines of 128 samples", "GB"]),
+        (["world.scene.points.azimuth_m=[1.0, 2.0, 3.0]"], ["world.scene.points", "as many ranges", "[3, 2]"]),
+        (["world.scene.points.range_m=[-5000.0, 0.0]"], ["world", "behind the radar"]),
+        (["world.scene.field.count=0"], ["world.scene.field", "count=0"]),
+        (["world.scene.field.azimuth_extent_m=-1.0"], ["world.scene.field", "-1.0"]),
+        (["world.scene.field.level_db=9999.0"], ["world.scene.field", "level_db", "9999"]),
+        (["world.beam.dwell_s=-1.0"], ["world.beam", "dwell_s", "-1.0"]),
+        (["world.doppler_hz=3000.0"], ["world", "Doppler", "squint beyond 90 degrees"]),
+        (["radar.pulse.duration_s=1.0"], ["world", "a line of 128 samples does not hold the pulse of 50000000"]),
+        (["world.damages={x: {kind: periodic_jitter, offset_samples: []}}"], ["world.damages.x", "at least one offset"]),
+        (["processor.recommended.stages.keys.stage=omega_k"], ["processor.recommended", "cannot be called 'keys'"]),
+        (["processor.recommended.stages.lines.stage=line_integrity"], ["processor.recommended", "'lines'", "needs the value 'line_number'", "aux.NAME"]),
         (["seed=[1"], ["command line, seed", "not readable as YAML"]),
     ],
 )

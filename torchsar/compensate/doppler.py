@@ -13,7 +13,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, settle
+from torchsar.core import Estimate, Signal, Stage, legendre, settle
 from torchsar.radar import StripmapRadar
 
 OVER = ("mean", "median")
@@ -189,14 +189,6 @@ def _weighted_fit(basis: Tensor, y: Tensor, weight: Tensor) -> tuple[Tensor, Ten
     eye = torch.eye(basis.shape[-1], dtype=basis.dtype, device=basis.device)
     coefficients = torch.linalg.solve(normal + ridge[..., None, None] * eye, (weighted * y[..., None]).sum(-2))
     return coefficients, y - coefficients @ basis.mT
-
-
-def legendre(u: Tensor, order: int) -> Tensor:
-    """Legendre polynomials 0..order of u, (..., order + 1)."""
-    terms = [torch.ones_like(u), u]
-    for k in range(1, order):
-        terms.append(((2 * k + 1) * u * terms[k] - k * terms[k - 1]) / (k + 1))
-    return torch.stack(terms[: order + 1], -1)
 
 
 def block_centres(count: int, device: torch.device | None = None) -> Tensor:

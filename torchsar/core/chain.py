@@ -28,6 +28,9 @@ def use(stage: nn.Module, **names: str) -> Use:
 
     "doppler" alone is short for "doppler.doppler_hz", the value called like the parameter; "aux.NAME" is recorded side data.
     """
+    for parameter, source in names.items():
+        if not isinstance(source, str):
+            raise TypeError(f"{parameter}={source!r}: `use` connects values by name, such as {parameter}='doppler'; a constant belongs to the constructor of the stage")
     return Use(stage, {parameter: source if "." in source else f"{source}.{parameter}" for parameter, source in names.items()})
 
 
@@ -70,19 +73,27 @@ class Chain(nn.Module):
         super().__init__()
         if not stages:
             raise ValueError("a chain needs at least one stage: Chain(compress=RangeCompress(radar), focus=OmegaK(radar))")
-        self.stages = nn.ModuleDict({name: item.stage if isinstance(item, Use) else item for name, item in stages.items()})
+        members = {name: item.stage if isinstance(item, Use) else item for name, item in stages.items()}
+        for name, stage in members.items():
+            _refuse_foreign(name, stage)
+        self.stages = nn.ModuleDict(members)
         self.uses = {name: item.names if isinstance(item, Use) else {} for name, item in stages.items()}
         self._check()
 
     def _check(self) -> None:
         offered: set[str] = set()
         for name, stage in self.stages.items():
-            accepted = [p.name for p in inspect.signature(stage.forward).parameters.values()][1:]
+            parameters = list(inspect.signature(stage.forward).parameters.values())[1:]
+            accepted = [p.name for p in parameters]
             for parameter, source in self.uses[name].items():
                 if parameter not in accepted:
                     raise ValueError(f"stage {name!r} ({type(stage).__name__}) has no value {parameter!r} to connect; it accepts {accepted or 'none'}")
                 if not source.startswith("aux.") and source not in offered:
                     raise ValueError(f"stage {name!r} uses {source!r}, which no earlier stage provides; there is {sorted(offered) or 'nothing yet'}, and 'aux.NAME' for recorded side data")
+            for p in parameters:
+                if p.default is p.empty and p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY) and p.name not in self.uses[name]:
+                    there = f"one of {sorted(offered)}" if offered else "a value of an earlier stage"
+                    raise ValueError(f"stage {name!r} ({type(stage).__name__}) needs the value {p.name!r}; connect it (`use`) with {there}, or with 'aux.NAME' for recorded side data")
             offered |= {f"{name}.{key}" for key in getattr(stage, "provides", ())}
 
     def forward(self, x: Recording | Signal, given: Mapping[str, Tensor] | None = None) -> Signal:
@@ -140,6 +151,15 @@ class Chain(nn.Module):
             if log is not None:
                 log.estimates[name] = estimate
         return out
+
+
+def _refuse_foreign(name: str, stage: object) -> None:
+    """A member of a chain is a module, under a name that nn.ModuleDict does not need for itself."""
+    if not isinstance(stage, nn.Module):
+        got = f"the class {stage.__name__}, not an instance of it" if isinstance(stage, type) else type(stage).__name__
+        raise TypeError(f"stage {name!r} must be a torch.nn.Module, such as a Stage, got {got}")
+    if hasattr(nn.ModuleDict(), name) or "." in name:
+        raise ValueError(f"a stage cannot be called {name!r}, which torch.nn.ModuleDict has for itself; choose another name")
 
 
 def _split(x: Recording | Signal) -> tuple[Signal, dict[str, Tensor]]:

@@ -37,6 +37,10 @@ class PeriodicJitter:
     pilot_samples: int = 4096
     pilot_snr_db: float | None = 60.0
 
+    def __post_init__(self) -> None:
+        if not len(self.offset_samples) or self.pilot_samples < 0:
+            raise ValueError(f"jitter needs at least one offset and pilot_samples of 0 or more, got offsets {self.offset_samples} and {self.pilot_samples} samples")
+
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         data = recording.signal.data
         offsets = torch.as_tensor(self.offset_samples, dtype=torch.float64, device=data.device)

@@ -147,13 +147,17 @@ def simulate(
 
     Noise follows `world.snr_db`: mean signal power per lit raw sample over noise variance. damages: applied in order, by name. The
     truth holds target positions (zero-Doppler time, closest range), velocity, beam Doppler, noise deviation, what each damage says
-    under "<damage>.<name>", and the undamaged recording with the same noise as `clean`.
+    under "<damage>.<name>", and the undamaged recording with the same noise as `clean`. Raises ValueError for what no radar
+    can record: a squint beyond 90 degrees, targets behind it, a pulse longer than a line.
     """
     velocity = radar.velocity_m_s if world.velocity_m_s is None else world.velocity_m_s
     doppler = _true_doppler(world, radar)
     scatterers = world.scene.scatterers(draws)
     scatterers = Scatterers(*(x.to(device) for x in (scatterers.azimuth_m, scatterers.range_m, scatterers.amplitude)))
+    _refuse_impossible(scatterers, radar, n_range, radar.sin_squint(doppler, velocity))
     placed = place(scatterers, radar, n_pulse, n_range, doppler, velocity)
+    if bool((placed.closest_m <= 0).any()):
+        raise ValueError(f"a target lies behind the radar, at a range of {float(placed.closest_m.min()):.4g} m; range_m counts from the middle of the recorded frame")
     echo = stripmap_echo(placed, world, radar, n_pulse, n_range, dtype)
     std = torch.zeros((), dtype=torch.float64, device=device)
     if world.snr_db is not None:
@@ -171,6 +175,16 @@ def simulate(
     }
     recording, told = apply_damages(clean, damages or {}, draws)
     return recording, Truth({**values, **told}, clean)
+
+
+def _refuse_impossible(scatterers: Scatterers, radar: StripmapRadar, n_range: int, sin_squint: Tensor) -> None:
+    if not scatterers.azimuth_m.shape[-1]:
+        raise ValueError("the scene holds no scatterer; give it at least one")
+    if not bool((sin_squint.abs() < 1).all()):
+        worst = float(sin_squint.abs().max())
+        raise ValueError(f"the Doppler of the beam asks for a squint beyond 90 degrees (sine {worst:.4g}); it must stay below 2 * velocity / wavelength in magnitude")
+    if radar.pulse_samples > n_range:
+        raise ValueError(f"a line of {n_range} samples does not hold the pulse of {radar.pulse_samples}; record longer lines or shorten the pulse")
 
 
 def apply_damages(recording: Recording, damages: Mapping[str, Damage], draws: Draws) -> tuple[Recording, dict[str, Tensor]]:

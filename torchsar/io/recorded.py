@@ -37,24 +37,53 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Rec
     missing = [key for key in _REQUIRED if key not in arrays]
     if missing:
         raise ValueError(f"{path} lacks {missing}; a raw stripmap archive holds {list(_REQUIRED)} (this one: {sorted(arrays)})")
-    rate, duration = float(arrays["chirp_rate_hz_s"]), float(arrays["pulse_s"])
-    fs, c = float(arrays["fs_hz"]), float(arrays.get("c_m_s", LIGHT_M_S))
-    radar = StripmapRadar(
-        carrier_hz=float(arrays["f0_hz"]),
+    number = {key: _number(arrays, key, path) for key in _REQUIRED[1:]}
+    c = _number(arrays, "c_m_s", path) if "c_m_s" in arrays else LIGHT_M_S
+    try:
+        radar = _radar(number, c, _first_cell(arrays, path))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    aux: dict[str, Any] = {name: arrays[name] for name in _AUX if name in arrays}
+    return Recording.from_arrays(_complex(arrays["iq"], path), radar, dtype=dtype, what=str(path), **aux)
+
+
+def _radar(number: dict[str, float], c: float, first_cell: int) -> StripmapRadar:
+    rate, duration, fs = number["chirp_rate_hz_s"], number["pulse_s"], number["fs_hz"]
+    return StripmapRadar(
+        carrier_hz=number["f0_hz"],
         pulse=LinearFM(abs(rate) * duration, duration, 1 if rate > 0 else -1),
         sampling_hz=fs,
-        prf_hz=float(arrays["prf_hz"]),
-        velocity_m_s=float(arrays["v_eff_m_s"]),
-        near_range_m=float(arrays["slant_range_cell1_m"]) + (int(arrays.get("first_cell", 1)) - 1) * c / (2 * fs),
+        prf_hz=number["prf_hz"],
+        velocity_m_s=number["v_eff_m_s"],
+        near_range_m=number["slant_range_cell1_m"] + (first_cell - 1) * c / (2 * fs),
         wave_speed_m_s=c,
     )
-    aux: dict[str, Any] = {name: torch.from_numpy(np.asarray(arrays[name])) for name in _AUX if name in arrays}
-    return Recording.from_arrays(_complex(arrays["iq"], path), radar, dtype=dtype, what=str(path), **aux)
+
+
+def _number(arrays: dict[str, np.ndarray], key: str, path: Path) -> float:
+    """A finite number; positive too, but for the chirp rate, whose sign is the direction."""
+    value = np.asarray(arrays[key])
+    signed = key == "chirp_rate_hz_s"
+    plain = value.ndim == 0 and value.dtype.kind in "iuf"
+    if not (plain and np.isfinite(value) and (value != 0 if signed else value > 0)):
+        raise ValueError(f"{path}: {key} must be one {'number other than zero' if signed else 'positive number'}, got {_shown(value)}")
+    return float(value)
+
+
+def _first_cell(arrays: dict[str, np.ndarray], path: Path) -> int:
+    value = np.asarray(arrays.get("first_cell", 1))
+    if value.ndim or value.dtype.kind not in "iuf" or value != np.round(value):
+        raise ValueError(f"{path}: first_cell must be one whole number, got {_shown(value)}")
+    return int(value)
+
+
+def _shown(value: np.ndarray) -> str:
+    return repr(value.item()) if value.ndim == 0 else f"{value.dtype} of shape {value.shape}"
 
 
 def _complex(iq: np.ndarray, path: Path) -> np.ndarray:
     if np.iscomplexobj(iq) and iq.ndim == 2:
         return iq
-    if iq.ndim == 3 and iq.shape[-1] == 2:
+    if iq.ndim == 3 and iq.shape[-1] == 2 and iq.dtype.kind in "iuf":
         return iq[..., 0].astype(np.float32) + 1j * iq[..., 1].astype(np.float32)
     raise ValueError(f"{path}: iq must be complex (line, sample) or (line, sample, 2), got {iq.dtype} of shape {iq.shape}")

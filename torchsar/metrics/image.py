@@ -11,7 +11,20 @@ _OF = {"intensity": 2, "amplitude": 1}
 
 
 def _tensor(image: Tensor | Signal) -> Tensor:
-    return image.data if isinstance(image, Signal) else image
+    """The samples (..., azimuth, range). Raises TypeError or ValueError for what is no image."""
+    x = image.data if isinstance(image, Signal) else image
+    if not isinstance(x, Tensor) or x.dtype == torch.bool:
+        raise TypeError(f"an image is a Signal or a tensor of numbers, got {x.dtype if isinstance(x, Tensor) else type(x).__name__}")
+    if x.ndim < 2 or not x.shape[-2] * x.shape[-1]:
+        raise ValueError(f"an image has the dims (..., azimuth, range) and at least one pixel, got the shape {tuple(x.shape)}")
+    return x
+
+
+def _pair(image: Tensor | Signal, reference: Tensor | Signal) -> tuple[Tensor, Tensor]:
+    a, b = _tensor(image), _tensor(reference)
+    if not (a.is_complex() and b.is_complex()) or a.shape[-2:] != b.shape[-2:]:
+        raise ValueError(f"complex images of one size can be compared, got {a.dtype} of shape {tuple(a.shape)} and {b.dtype} of shape {tuple(b.shape)}")
+    return a, b
 
 
 def _power(image: Tensor) -> Tensor:
@@ -49,16 +62,15 @@ def _norm(x: Tensor) -> Tensor:
     return (x.real.square() + x.imag.square()).sum((-2, -1), dtype=torch.float64).sqrt()
 
 
-def _over_peak(image: Tensor | Signal) -> Tensor:
+def _over_peak(x: Tensor) -> Tensor:
     """A complex image over its detached peak, so that its squares neither under- nor overflow. All-zero stays zero."""
-    x = _tensor(image)
     peak = x.detach().abs().amax((-2, -1), keepdim=True)
     return x / torch.where(peak > 0, peak, 1)
 
 
 def correlation(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
     """rho = |<I, I0>| / (|I| |I0|) of two complex images, (...,) float64 in 0..1. Blind to a common gain and phase; 0 where one is all zero."""
-    a, b = _over_peak(image), _over_peak(reference)
+    a, b = (_over_peak(x) for x in _pair(image, reference))
     product = (a * b.conj()).sum((-2, -1), dtype=torch.complex128).abs()
     norms = _norm(a) * _norm(b)
     return product / torch.where(norms > 0, norms, 1)
@@ -66,7 +78,7 @@ def correlation(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
 
 def error_db(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
     """10 lg of |I - I0|^2 / |I0|^2 in dB, (...,) float64. Sees gain and phase; use `correlation` where those are free."""
-    a, b = _tensor(image), _tensor(reference)
+    a, b = _pair(image, reference)
     peak = b.detach().abs().amax((-2, -1), keepdim=True)
     scale = torch.where(peak > 0, peak, 1)
     norm = _norm(b / scale)

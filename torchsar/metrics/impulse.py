@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal, cis
+from torchsar.core import Signal, cis, refuse_non_finite
 
 _PATCH = 64
 _SLICE = 512
@@ -25,8 +25,13 @@ def impulse_response(signal: Signal, at_m: tuple[Tensor | float, Tensor | float]
     Slices are band-limited about their own spectral centre and zero-padded by two before interpolation, so that full-band images and
     squinted spectra are read correctly. Raises ValueError for an image without two axes or a place outside of it.
     """
-    if len(signal.axes) != 2:
-        raise ValueError(f"impulse_response works on an image with two axes, got {signal.names}")
+    if not isinstance(signal, Signal) or len(signal.axes) != 2:
+        raise ValueError(f"impulse_response works on a Signal with two axes, got {signal.names if isinstance(signal, Signal) else type(signal).__name__}")
+    if len(at_m) != 2:
+        raise ValueError(f"at_m holds one coordinate for each of the axes {signal.names}, got {len(at_m)}")
+    if sidelobe_nulls < 1 or (search_m is not None and not search_m > 0):
+        raise ValueError(f"impulse_response needs sidelobe_nulls of 1 or more and search_m above 0, got {sidelobe_nulls} and {search_m}")
+    refuse_non_finite(signal.data, "impulse_response")
     per_target = any(torch.as_tensor(a).ndim > len(signal.trials) for a in at_m)
     places = torch.broadcast_tensors(*(torch.as_tensor(a, dtype=torch.float64, device=signal.data.device) for a in at_m))
     places = [p if per_target else p[..., None] for p in places]
@@ -49,7 +54,7 @@ def impulse_response(signal: Signal, at_m: tuple[Tensor | float, Tensor | float]
 
 
 def _nearest(index: Tensor, n: int, name: str) -> Tensor:
-    if bool(((index < -0.5) | (index > n - 0.5)).any()):
+    if not bool(((index >= -0.5) & (index <= n - 0.5)).all()):
         raise ValueError(f"a place given to impulse_response lies outside the {name} axis (sample {float(index.min()):.1f} to {float(index.max()):.1f} of {n})")
     return index.round().long().clamp(0, n - 1)
 

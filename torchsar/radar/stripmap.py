@@ -38,6 +38,10 @@ class StripmapRadar:
         for name in ("carrier_hz", "sampling_hz", "prf_hz", "velocity_m_s", "near_range_m", "wave_speed_m_s"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ValueError(f"radar.{name} must be a positive number, got {getattr(self, name)}")
+        if self.pointing_doppler_hz is not None and not math.isfinite(self.pointing_doppler_hz):
+            raise ValueError(f"radar.pointing_doppler_hz must be a finite number or None, got {self.pointing_doppler_hz}")
+        if self.integration_s is not None and not self.integration_s > 0:
+            raise ValueError(f"radar.integration_s must be a positive number or None, got {self.integration_s}")
         if self.pulse.bandwidth_hz > self.sampling_hz:
             raise ValueError(f"pulse bandwidth {self.pulse.bandwidth_hz:g} Hz exceeds the complex sampling rate {self.sampling_hz:g} Hz; sample at least as fast as the bandwidth")
 

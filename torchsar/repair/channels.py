@@ -54,6 +54,7 @@ def estimate_imbalance(x: Tensor, channels: int = 2, doppler_cycles: Tensor | fl
     """
     if channels < 2 or x.shape[-2] < 2 * channels + 1:
         raise ValueError(f"channel imbalance needs 2 or more channels and at least {2 * max(channels, 2) + 1} lines, got {channels} channels and {x.shape[-2]} lines")
+    x = x / x.detach().abs().amax((-2, -1), keepdim=True).clamp_min(torch.finfo(real_dtype(x.dtype)).tiny)
     lag, log_power = lag_products(x, channels)
     angle = torch.angle(lag)
     turns = torch.arange(channels, dtype=torch.float64, device=x.device) / channels

@@ -141,6 +141,6 @@ class PilotJitter(Stage):
         self.max_period, self.period, self.origin = max_period, period, origin
 
     def forward(self, signal: Signal, pilot: Tensor) -> Estimate:
-        if pilot.ndim > 1 and pilot.shape[:-1] != signal.trials:
+        if not pilot.ndim or (pilot.ndim > 1 and pilot.shape[:-1] != signal.trials):
             raise ValueError(f"pilot record of shape {tuple(pilot.shape)} does not match the trial dims {tuple(signal.trials)}; give (n,) or (*trials, n)")
         return estimate_jitter_pilot(pilot.expand(*signal.trials, pilot.shape[-1]), self.max_period, self.period, self.origin)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal, Stage, cis, real_dtype
+from torchsar.core import Signal, Stage, cis, legendre, real_dtype
 from torchsar.radar import StripmapRadar
 
 GRID = 1025
@@ -29,18 +29,15 @@ def band_axis(n: int, band: float, device: torch.device | str | None = None) -> 
     return torch.fft.fftfreq(n, dtype=torch.float64, device=device) / (band / 2)
 
 
-def legendre(u: Tensor, order: int) -> Tensor:
+def unit_legendre(u: Tensor, order: int) -> Tensor:
     """Legendre polynomials of degree 0..order, scaled to unit mean square over -1..1, (order + 1, *u.shape) float64."""
-    terms = [torch.ones_like(u), u]
-    for k in range(1, order):
-        terms.append(((2 * k + 1) * u * terms[k] - k * terms[k - 1]) / (k + 1))
-    degree = torch.arange(order + 1, dtype=torch.float64, device=u.device).reshape(-1, *(1,) * u.ndim)
-    return torch.stack(terms[: order + 1]) * torch.sqrt(2 * degree + 1)
+    degree = torch.arange(order + 1, dtype=torch.float64, device=u.device)
+    return (legendre(u, order) * torch.sqrt(2 * degree + 1)).movedim(-1, 0)
 
 
 def without_line(phase_rad: Tensor) -> Tensor:
     """A phase on the grid less its constant and linear parts of least squares over the band. (..., GRID) -> (..., GRID)."""
-    line = legendre(band_grid(phase_rad.device), 1)
+    line = unit_legendre(band_grid(phase_rad.device), 1)
     line = line / torch.linalg.vector_norm(line, dim=-1, keepdim=True)
     return phase_rad - (phase_rad @ line.mT) @ line
 
@@ -89,8 +86,8 @@ def estimate_amplitude_response(power: Tensor, expected: Tensor, band: float, or
     ratio = _binned(power.to(torch.float64), band, bins) / wanted
     level = ratio.mean(-1, keepdim=True)
     half_log = 0.5 * torch.log((ratio / level.clamp_min(1e-300)).clamp_min(1e-6))
-    coefficients = torch.linalg.lstsq(legendre(u, order).mT, half_log[..., None]).solution[..., 1:, 0]
-    fitted = torch.exp(coefficients @ legendre(band_grid(power.device), order)[1:])
+    coefficients = torch.linalg.lstsq(unit_legendre(u, order).mT, half_log[..., None]).solution[..., 1:, 0]
+    fitted = torch.exp(coefficients @ unit_legendre(band_grid(power.device), order)[1:])
     return torch.where(level > 0, fitted, 1)
 
 

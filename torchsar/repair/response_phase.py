@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchsar.core import Estimate, Signal, Stage, cis, linear_phasor
 from torchsar.radar import StripmapRadar
-from torchsar.repair.response import GRID, band_axis, band_grid, band_power, correct_response, estimate_amplitude_response, legendre
+from torchsar.repair.response import GRID, band_axis, band_grid, band_power, correct_response, estimate_amplitude_response, unit_legendre
 
 ORDERS = (2, 4, 8, 16, 40)
 
@@ -119,7 +119,7 @@ def sharpest_coefficients(windows: Tensor, weight: Tensor, band: float, orders: 
     spectra = torch.fft.fft(windows.to(torch.complex128), norm="ortho")
     energy = torch.linalg.vector_norm(spectra, dim=-1, keepdim=True)
     spectra = spectra / torch.where(energy > 0, energy, 1)
-    basis = legendre(band_axis(n, band, windows.device).clamp(-1, 1), orders[-1])[2:]
+    basis = unit_legendre(band_axis(n, band, windows.device).clamp(-1, 1), orders[-1])[2:]
     c = torch.zeros((windows.shape[0], 0), dtype=torch.float64, device=windows.device)
     for order in orders:
         part = basis[: order - 1]
@@ -138,14 +138,15 @@ def estimate_response_sharpest(
     """Phase response by least entropy of the range windows about bright points. image: (..., azimuth, range), range spectrum centred.
 
     band: pulse bandwidth over sampling rate; width: window in samples, many times the spread of the response (shortened to half the
-    valid columns where these are few); valid: number of fully compressed columns. After each pass the image is corrected and the points are chosen anew; the last pass fits two halves of
-    the points apart: their mean is the estimate, their difference its std.
+    valid columns where these are few); valid: number of fully compressed columns. After each pass, the first on a quarter of the
+    points, the image is corrected and the points are chosen anew. The last pass fits two halves of the points apart: their mean is the
+    estimate, less what chance makes of it, their difference its std.
     Gives `phase_rad` (..., GRID), see `repair.response` for the conventions, `amplitude` ones. quality falls with the difference of the
     halves, 1 / (1 + std^2). Not ok, with zero phase: no bright places (halves that differ by more than 0.25 rad rms).
     """
     used = image.detach()[..., :valid] if valid else image.detach()
     rows = used.reshape(-1, *used.shape[-2:])
-    basis = legendre(band_grid(image.device), orders[-1])[2:]
+    basis = unit_legendre(band_grid(image.device), orders[-1])[2:]
     total = torch.zeros((rows.shape[0], basis.shape[0]), dtype=torch.float64, device=image.device)
     for i in range(passes):
         sharper = correct_response(rows, total @ basis, None, band) if i else rows
@@ -196,7 +197,7 @@ def point_average_coefficients(windows: Tensor, weight: Tensor, band: float, ord
     steps = torch.angle(average[..., 1:] * average[..., :-1].conj())
     phase = torch.nn.functional.pad(torch.cumsum(steps, -1), (1, 0))
     sure = (average.abs() + 1e-12)[..., None]
-    return torch.linalg.lstsq(sure * legendre(u[inside], order).mT, sure * phase[..., None]).solution[..., 2:, 0]
+    return torch.linalg.lstsq(sure * unit_legendre(u[inside], order).mT, sure * phase[..., None]).solution[..., 2:, 0]
 
 
 def _align(spectra: Tensor, reference: Tensor) -> Tensor:
@@ -218,7 +219,7 @@ def estimate_response_points(image: Tensor, band: float, points: int = 200, widt
     used = image.detach()[..., :valid] if valid else image.detach()
     rows = used.reshape(-1, *used.shape[-2:])
     width = min(width, rows.shape[-1] // 4 * 2)
-    basis = legendre(band_grid(image.device), order)[2:]
+    basis = unit_legendre(band_grid(image.device), order)[2:]
     total = torch.zeros((rows.shape[0], basis.shape[0]), dtype=torch.float64, device=image.device)
     for i in range(passes):
         sharper = correct_response(rows, total @ basis, None, band) if i else rows

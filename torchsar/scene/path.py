@@ -71,6 +71,10 @@ class Dwell:
 
     dwell_s: float
 
+    def __post_init__(self) -> None:
+        if not self.dwell_s > 0:
+            raise ValueError(f"dwell_s must be a positive number of seconds, got {self.dwell_s}")
+
     def weight(self, since_s: Tensor, doppler_offset_hz: Tensor, velocity_m_s: Tensor) -> Tensor:
         return (since_s.abs() <= self.dwell_s / 2).to(since_s.dtype)
 
@@ -80,6 +84,10 @@ class Antenna:
     """Uniform aperture of length_m: two-way gain sinc^2(length * (Doppler offset) / (2 v)), side lobes included."""
 
     length_m: float
+
+    def __post_init__(self) -> None:
+        if not self.length_m > 0:
+            raise ValueError(f"length_m must be a positive number of metres, got {self.length_m}")
 
     def weight(self, since_s: Tensor, doppler_offset_hz: Tensor, velocity_m_s: Tensor) -> Tensor:
         return torch.sinc(self.length_m * doppler_offset_hz / (2 * velocity_m_s)).square()

@@ -32,6 +32,11 @@ class Scatterers:
             raise ValueError(f"scatterers need as many ranges and amplitudes as azimuths, got shapes {sorted(shapes)}")
 
 
+def _refuse_empty(count: int, *extents_m: float) -> None:
+    if count < 1 or not all(math.isfinite(e) and e >= 0 for e in extents_m):
+        raise ValueError(f"a random scene needs at least one scatterer and extents of 0 m or more, got count={count} and extents {extents_m}")
+
+
 class Scene(Protocol):
     """Anything that turns random draws into scatterers."""
 
@@ -46,6 +51,11 @@ class Points:
     range_m: Sequence[float]
     amplitude: Sequence[float] | None = None
     random_phase: bool = False
+
+    def __post_init__(self) -> None:
+        counts = [len(values) for values in (self.azimuth_m, self.range_m, self.amplitude) if values is not None]
+        if len(set(counts)) != 1:
+            raise ValueError(f"points need as many ranges (and amplitudes, where given) as azimuths, got {counts}")
 
     def scatterers(self, draws: Draws) -> Scatterers:
         x, r = (torch.tensor(list(v), dtype=torch.float64) for v in (self.azimuth_m, self.range_m))
@@ -64,6 +74,9 @@ class RandomPoints:
     azimuth_m: float = 0.0
     range_m: float = 0.0
     spread_db: float = 0.0
+
+    def __post_init__(self) -> None:
+        _refuse_empty(self.count, self.azimuth_extent_m, self.range_extent_m)
 
     def scatterers(self, draws: Draws) -> Scatterers:
         x = self.azimuth_m + self.azimuth_extent_m * (draws.uniform("scene.random.azimuth", (self.count,)) - 0.5)
@@ -86,6 +99,11 @@ class Speckle:
     range_m: float = 0.0
     level_db: float = 0.0
 
+    def __post_init__(self) -> None:
+        _refuse_empty(self.count, self.azimuth_extent_m, self.range_extent_m)
+        if not abs(self.level_db) <= 300:
+            raise ValueError(f"level_db must lie within +-300 dB, got {self.level_db}")
+
     def scatterers(self, draws: Draws) -> Scatterers:
         x = self.azimuth_m + self.azimuth_extent_m * (draws.uniform("scene.speckle.azimuth", (self.count,)) - 0.5)
         r = self.range_m + self.range_extent_m * (draws.uniform("scene.speckle.range", (self.count,)) - 0.5)
@@ -102,4 +120,3 @@ class Together:
     def scatterers(self, draws: Draws) -> Scatterers:
         all_parts = [scene.scatterers(draws.part(name)) for name, scene in self.parts.items()]
         return Scatterers(*(torch.cat([getattr(p, field) for p in all_parts], -1) for field in ("azimuth_m", "range_m", "amplitude")))
-

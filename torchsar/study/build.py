@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -99,6 +100,7 @@ def build_case(loaded: Loaded) -> Case:
         return Case(recording, clean, Truth(told, clean) if damages else None, {})
     world, radar = build_world(loaded), build_radar(loaded)
     assert config.world is not None
+    _refuse_oversize(config.world.lines, config.world.samples, loaded.file)
     damages = build_damages(config.world.damages, "world.damages", loaded.file)
     try:
         recording, truth = simulate(radar, world, config.world.lines, config.world.samples, draws, damages, precision(config))
@@ -107,6 +109,18 @@ def build_case(loaded: Loaded) -> Case:
     assert truth.clean is not None and isinstance(world.scene, Together)
     clean, _ = apply_damages(truth.clean, {}, draws)
     return Case(recording, clean, truth, point_targets(world.scene.parts))
+
+
+def _refuse_oversize(lines: int, samples: int, file: str) -> None:
+    """A raw matrix larger than the memory of the machine is a slip of the pen."""
+    try:
+        memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):  # not told on every system
+        return
+    if 8 * lines * samples > memory:
+        raise ConfigError(
+            f"{file}: world: {lines} lines of {samples} samples take {8 * lines * samples / 1e9:.3g} GB, and this machine has {memory / 1e9:.3g} GB; make world.lines or world.samples smaller"
+        )
 
 
 def build_chain(method: Method, where: str, file: str, radar: StripmapRadar) -> Chain:

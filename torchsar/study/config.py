@@ -172,8 +172,9 @@ def load(name: str, assignments: Sequence[str] = ()) -> Loaded:
 
 def _check_source(config: Config, file: str) -> None:
     if config.data.file is not None:
-        if not Path(config.data.file).is_file():
-            raise ConfigError(f"{file}: data.file: {config.data.file} does not exist; give the path of a raw stripmap .npz file")
+        path = Path(config.data.file)
+        if not path.is_file():
+            raise ConfigError(f"{file}: data.file: {config.data.file!r} {'is no file' if path.exists() else 'does not exist'}; give the path of a raw stripmap .npz file")
     elif config.world is None and config.radar is None:
         raise ConfigError(f"{file}: data.file is not set; add data.file=PATH with the path of a raw stripmap .npz file")
     elif config.world is None or config.radar is None:

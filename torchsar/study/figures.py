@@ -154,7 +154,7 @@ def _doppler_spectrum(scene: Scene) -> Drawn:
     frequency, power = azimuth_spectrum(signal)
     prf, centroid = scene.radar.prf_hz, scene.best.used["doppler_hz"]
     baseband = centroid - prf * round(centroid / prf)
-    series = {"mean over range": (plot.array(frequency), 10 * np.log10(plot.array(power)))}
+    series = {"mean over range": (plot.array(frequency), 10 * np.log10(np.maximum(plot.array(power), np.finfo(np.float32).tiny)))}
     title = f"centroid {centroid:.1f} Hz = {baseband:.1f} Hz {'-' if centroid < baseband else '+'} {abs(round(centroid / prf))} PRF"
     caption = "Azimuth power spectrum of the data that is focused, averaged over range. The dashed line is the Doppler centroid inside one PRF; the ambiguity is found from range migration."
     yield "doppler_spectrum", "Doppler spectrum", caption, plot.curves(series, "baseband Doppler (Hz)", "power (dB)", title, {"centroid": baseband})

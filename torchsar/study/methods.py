@@ -60,16 +60,24 @@ def run_methods(loaded: Loaded, case: Case, chains: Mapping[str, Chain]) -> dict
             try:
                 with torch.no_grad(), _announced(chains[name], name, bar):
                     results[name] = _run_one(name, method, chains[name], case, results)
-            except (ValueError, TypeError, KeyError) as error:
+            except (ValueError, TypeError, KeyError, RuntimeError) as error:  # RuntimeError: what torch itself refuses, too little memory among it
                 if os.environ.get("TORCHSAR_DEBUG"):
                     raise
                 text = error.args[0] if isinstance(error, KeyError) and error.args else error
                 raise ConfigError(f"{loaded.file}: processor.{name}: {' '.join(str(text).split())}") from None
             log.info("%s: %.1f s", name, sum(results[name].seconds.values()))
+            _warn_of_doubt(results[name])
             for other, result in results.items():
                 if other not in keep and result.trace is not None:
                     results[other] = replace(result, trace=None)
     return results
+
+
+def _warn_of_doubt(result: Result) -> None:
+    """Name the estimators that do not stand for their values, such as those of an empty pilot record."""
+    for stage, estimate in result.estimates.items():
+        if not bool(estimate.ok.all()):
+            log.warning("warning: %s: stage %r found nothing to trust in the data; its values %s are a fallback", result.name, stage, ", ".join(estimate.value))
 
 
 def run_recommended(loaded: Loaded, case: Case) -> Result:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Chain
+from torchsar.focus.requirements import requirements
 from torchsar.study.build import Case, build_case, build_damages, build_radar, build_world, resolved
 from torchsar.study.config import Loaded
 from torchsar.study.figures import Scene, draw_all
@@ -62,9 +63,19 @@ def prepare(loaded: Loaded) -> tuple[Case, dict[str, Chain]]:
         log.info("reading %s", loaded.config.data.file)
     began = time.perf_counter()
     case = build_case(loaded)
+    if loaded.config.data.file is None:
+        _warn_of_aliasing(loaded, case)
     lines, samples = case.recording.signal.data.shape[-2:]
     log.info("%d lines of %d samples: %.1f s", lines, samples, time.perf_counter() - began)
     return case, build_chains(loaded, case.recording.radar)
+
+
+def _warn_of_aliasing(loaded: Loaded, case: Case) -> None:
+    """A Doppler band of the nominal aperture beyond the PRF is named with both figures, by `requirements`."""
+    world, radar = loaded.config.world, case.recording.radar
+    assert world is not None
+    if radar.integration_s is not None:
+        requirements(radar, case.recording.signal.axes, world.doppler_hz, world.velocity_m_s)
 
 
 def _truth_arrays(case: Case) -> dict[str, Tensor]:

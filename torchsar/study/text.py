@@ -104,7 +104,7 @@ def override(tree: dict[str, Any], assignments: Sequence[str]) -> dict[str, Any]
     """The tree with key=value assignments applied, the keys as dotted paths and the values as YAML."""
     for assignment in assignments:
         key, equals, value = assignment.partition("=")
-        if not equals or not key.strip(". "):
+        if not equals or not all(part.strip() for part in key.split(".")):
             raise ConfigError(f"command line: {assignment!r} is not an override; write key=value with a dotted key, such as world.noise.snr_db=10")
         tree = _assigned(tree, key.strip().split("."), parse(value, f"command line, {key}"), key)
     return tree

@@ -1,0 +1,80 @@
+"""Imbalance of channels that record the lines in turn."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from torchsar.core import Chain, Draws, Recording, use
+from torchsar.echo.channels import ChannelImbalance
+from torchsar.io import read_stripmap
+from torchsar.metrics import correlation
+from torchsar.repair.channels import CorrectImbalance, EstimateImbalance, correct_imbalance, estimate_imbalance
+
+DEGREE = math.pi / 180
+
+
+def scene(lines=256, n=512, seed=0, centre=0.3, trials=2):
+    """Speckle whose Doppler spectrum is a raised cosine about `centre` cycles per line."""
+    white = torch.randn(trials, lines, n, dtype=torch.complex128, generator=torch.Generator().manual_seed(seed))
+    f = torch.fft.fftfreq(lines, dtype=torch.float64)[:, None]
+    return torch.fft.ifft(torch.fft.fft(white, dim=-2) * (1 + torch.cos(2 * math.pi * (f - centre))), dim=-2)
+
+
+def unbalanced(x, gain, degrees):
+    factor = torch.polar(torch.tensor(gain, dtype=torch.float64), torch.tensor(degrees, dtype=torch.float64) * DEGREE)
+    return x * factor[torch.arange(x.shape[-2]) % len(gain), None].to(x.dtype)
+
+
+@pytest.mark.parametrize("gain, degrees", [((1, 1.2), (0, 60)), ((1, 0.7), (0, -85)), ((1, 1.2, 0.9), (0, 30, -25)), ((1, 1, 1.1, 0.8), (0, 20, -15, 30))])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_imbalance_within_its_predicted_error(gain, degrees, seed):
+    x = scene(seed=seed)
+    estimate = estimate_imbalance(unbalanced(x, gain, degrees), len(gain))
+    assert bool(estimate.ok.all())
+    assert bool(((estimate["gain"] - torch.tensor(gain)).abs() <= 5 * estimate.std["gain"] + 1e-12).all())
+    assert bool(((estimate["phase_rad"] / DEGREE - torch.tensor(degrees)).abs() <= 5 * estimate.std["phase_rad"] / DEGREE + 1e-9).all())
+    assert float(estimate.std["phase_rad"].max()) < 0.5 * DEGREE and float(estimate.std["gain"].max()) < 0.01
+
+
+def test_the_doppler_settles_phases_beyond_ninety_degrees():
+    y = unbalanced(scene(centre=0.3), (1, 1.0), (0, 130))
+    blind, told = estimate_imbalance(y), estimate_imbalance(y, doppler_cycles=torch.tensor([0.3, 0.33]))
+    assert bool(((blind["phase_rad"][:, 1] / DEGREE + 50).abs() < 1).all())
+    assert bool(((told["phase_rad"][:, 1] / DEGREE - 130).abs() < 1).all())
+
+
+def test_silent_trials_and_scale_do_not_matter():
+    y = unbalanced(scene(trials=3), (1, 1.2), (0, 60)).to(torch.complex64) * torch.tensor([1e-22, 1.0, 0.0])[:, None, None]
+    estimate = estimate_imbalance(y)
+    assert estimate.ok.tolist() == [True, True, False]
+    assert estimate["gain"][2].tolist() == [1, 1] and estimate["phase_rad"][2].tolist() == [0, 0]
+    assert bool(((estimate["gain"][:2, 1] - 1.2).abs() < 0.02).all())
+
+
+def test_correction_is_the_inverse_and_differentiable():
+    x = scene(8, 4)
+    gain, phase = torch.tensor([1.0, 1.2], dtype=torch.float64), torch.tensor([0.0, 60 * DEGREE], dtype=torch.float64)
+    torch.testing.assert_close(correct_imbalance(unbalanced(x, (1, 1.2), (0, 60)), gain, phase), x)
+    assert torch.autograd.gradcheck(lambda g, p: torch.view_as_real(correct_imbalance(x, g, p)), (gain.requires_grad_(), phase.requires_grad_()))
+
+
+def test_too_few_lines_are_refused():
+    with pytest.raises(ValueError, match="at least 5 lines"):
+        estimate_imbalance(torch.zeros(4, 8, dtype=torch.complex64))
+
+
+@pytest.mark.parametrize("name, hz", [("radarsat1_english_bay.npz", 488.0), ("radarsat1_squamish.npz", 549.0)])
+def test_even_and_odd_lines_of_recorded_data(recorded, name, hz):
+    clean = read_stripmap(recorded(name))
+    damaged, _ = ChannelImbalance((1, 1.2), (0, 60 * DEGREE))(clean, Draws(0))
+    chain = Chain(imbalance=EstimateImbalance(), equalise=use(CorrectImbalance(), gain="imbalance", phase_rad="imbalance"))
+    trace = chain.trace(damaged)
+    assert isinstance(damaged, Recording)
+    assert abs(float(trace.values["imbalance.gain"][1]) - 1.2) < 0.0036
+    assert abs(float(trace.values["imbalance.phase_rad"][1]) / DEGREE - 60) < 0.2
+    assert float(correlation(trace.signal.data.to(torch.complex128), clean.signal.data.to(torch.complex128))) > 0.99999
+    told = EstimateImbalance()(damaged.signal, doppler_hz=torch.tensor(hz, dtype=torch.float64))
+    torch.testing.assert_close(told["phase_rad"], trace.values["imbalance.phase_rad"])

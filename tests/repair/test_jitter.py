@@ -1,0 +1,166 @@
+"""Converter jitter: correction at each accuracy, offsets from a pilot and from clutter."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from torchsar.core import Chain, Draws, use
+from torchsar.echo.jitter import PeriodicJitter, sample_unevenly
+from torchsar.io import read_stripmap
+from torchsar.metrics import correlation, error_db
+from torchsar.repair.jitter import BandLimited, CorrectJitter, Exact, Lagrange, correct_jitter, correct_jitter_band_limited, correct_jitter_exact, correct_jitter_lagrange
+from torchsar.repair.jitter_blind import detect_jitter_period, estimate_jitter_blind
+from torchsar.repair.jitter_pilot import PilotJitter, estimate_jitter_pilot
+
+OFFSETS = torch.tensor([0.0, 0.18, -0.12, 0.07], dtype=torch.float64)
+
+
+def clutter(lines, n, band=0.77, seed=0, dtype=torch.complex128):
+    white = torch.randn(lines, n, dtype=torch.complex128, generator=torch.Generator().manual_seed(seed))
+    return torch.fft.ifft(torch.fft.fft(white) * (torch.fft.fftfreq(n).abs() < band / 2)).to(dtype)
+
+
+def offsets(period, rms=0.1, seed=0):
+    e = torch.randn(period, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    e = e - e.mean()
+    return e * rms / e.square().mean().sqrt()
+
+
+def test_accuracies_of_the_brief():
+    x = clutter(8, 2048)
+    y = sample_unevenly(x, OFFSETS)
+    assert abs(float(error_db(y, x)) + 16) < 0.5
+    assert float(error_db(correct_jitter_lagrange(y, OFFSETS, 4), x)) < -23.5
+    assert float(error_db(correct_jitter_lagrange(y, OFFSETS, 8), x)) < -27
+    assert float(error_db(correct_jitter_band_limited(y, OFFSETS, 8, 0.8), x)) < -42
+    assert float(error_db(correct_jitter_exact(y, OFFSETS), x)) < -250
+
+
+@pytest.mark.parametrize("n, period, seed", [(1024, 8, 0), (1022, 4, 1), (1021, 7, 2), (1000, 16, 3), (63, 4, 4)])
+def test_exact_for_any_line_length(n, period, seed):
+    x, e = clutter(3, n, 0.95, seed), offsets(period, 0.12, seed)
+    y = sample_unevenly(x, e)
+    assert float(error_db(correct_jitter_exact(y, e), x)) < -147
+    single = correct_jitter_exact(y.to(torch.complex64), e)
+    assert single.dtype == torch.complex64 and float(error_db(single, x)) < -90
+
+
+@pytest.mark.parametrize("method", [Exact(), Lagrange(4), Lagrange(7), BandLimited(8, 0.8)])
+def test_batch_equals_singles_with_offsets_per_trial(method):
+    x = clutter(6, 128).reshape(3, 2, 128)
+    e = torch.stack([offsets(4, 0.1, s) for s in range(3)])
+    torch.testing.assert_close(method(x, e), torch.stack([method(x[i], e[i]) for i in range(3)]))
+
+
+def test_periods_that_differ_between_trials_and_clean_ones_untouched():
+    x = clutter(6, 128).reshape(3, 2, 128)
+    e = torch.zeros(3, 4, dtype=torch.float64)
+    e[0], e[1, :2] = OFFSETS, torch.tensor([0.1, -0.1])
+    y = torch.stack([sample_unevenly(x[0], e[0]), sample_unevenly(x[1], e[1, :2]), x[2]])
+    out = correct_jitter(y, e, torch.tensor([4, 2, 3]))
+    assert bool((error_db(out[:2], x[:2]) < -147).all()) and torch.equal(out[2], x[2])
+
+
+def test_zero_offsets_pass_through():
+    x = clutter(2, 100)
+    assert torch.equal(correct_jitter_lagrange(x, torch.zeros(4), 8), x)
+    assert float(error_db(correct_jitter_exact(x, torch.zeros(4)), x)) < -250
+
+
+def test_exact_correction_is_differentiable():
+    y, e = clutter(1, 24).requires_grad_(), (0.5 * OFFSETS).clone().requires_grad_()
+    assert torch.autograd.gradcheck(lambda y, e: torch.view_as_real(correct_jitter_exact(y, e)), (y, e))
+
+
+@pytest.mark.parametrize("bad", [[0.0, -1.0], [0.6, -0.5], [0.0, math.nan]])
+@pytest.mark.parametrize("method", [Exact(), Lagrange(8), BandLimited(8)])
+def test_coinciding_instants_are_refused(bad, method):
+    with pytest.raises(ValueError, match="instants"):
+        method(clutter(1, 64), torch.tensor(bad, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("snr_db, cycles, period", [(60.0, 0.2137, 4), (30.0, -0.37, 4), (40.0, 0.11, 13)])
+def test_pilot_reaches_the_predicted_error(snr_db, cycles, period):
+    true = OFFSETS if period == 4 else offsets(period)
+    damage = PeriodicJitter(true, pilot_cycles=cycles, pilot_snr_db=snr_db, pilot_samples=2000)
+    pilot = damage.pilot(true, Draws(3, trials=range(60)), torch.zeros(1, dtype=torch.complex64))
+    for origin, expected in (("mean", true - true.mean()), ("first", true - true[0])):
+        estimate = estimate_jitter_pilot(pilot, origin=origin)
+        assert bool(estimate.ok.all()) and bool((estimate["period"] == period).all())
+        error = (estimate["offset_samples"][:, :period] - expected).square().mean().sqrt()
+        predicted = estimate.std["offset_samples"][:, :period].square().mean().sqrt()
+        assert 0.85 < float(error / predicted) < 1.15
+
+
+def test_clean_pilot_changes_nothing():
+    pilot = PeriodicJitter((0.0,)).pilot(torch.zeros(1, dtype=torch.float64), Draws(0, trials=range(200)), torch.zeros(1, dtype=torch.complex64))
+    estimate = estimate_jitter_pilot(pilot + 0.03 * Draws(1, trials=range(200)).normal("more", (4096,), torch.complex64))
+    assert bool(estimate.ok.all()) and float(estimate["offset_samples"].abs().max()) == 0
+
+
+def test_bad_pilots():
+    good = PeriodicJitter(OFFSETS).pilot(OFFSETS, Draws(0, trials=range(5)), torch.zeros(1, dtype=torch.complex128))
+    bad = good.clone()
+    bad[1], bad[2, 7], bad[3] = 0, math.nan, torch.randn(4096, dtype=torch.complex128, generator=torch.Generator().manual_seed(0))
+    estimate = estimate_jitter_pilot(bad)
+    assert estimate.ok.tolist() == [True, False, False, False, True]
+    assert bool(torch.isfinite(estimate["offset_samples"]).all()) and float(estimate["offset_samples"][1:4].abs().max()) == 0
+    torch.testing.assert_close(estimate["offset_samples"][[0, 4]], estimate_jitter_pilot(good[[0, 4]])["offset_samples"])
+    with pytest.raises(ValueError, match="at least 64 samples"):
+        estimate_jitter_pilot(good[:, :0])
+    with pytest.raises(TypeError, match="complex"):
+        estimate_jitter_pilot(good.real)
+
+
+def test_chain_from_pilot_to_correction(small_jittered):
+    recording, clean = small_jittered
+    chain = Chain(pilot=use(PilotJitter(origin="first"), pilot="aux.pilot"), jitter=use(CorrectJitter(), offset_samples="pilot", period="pilot"))
+    repaired = chain(recording)
+    assert float(error_db(recording.signal, clean).max()) > -20
+    assert float(error_db(repaired, clean).max()) < -75
+
+
+@pytest.fixture
+def small_jittered():
+    from tests.helpers import small_recording
+
+    recording, truth = small_recording(trials=2, damages={"jitter": PeriodicJitter(OFFSETS)})
+    return recording, truth.clean.signal
+
+
+@pytest.mark.parametrize("period, seed", [(4, 0), (8, 1), (5, 2)])
+def test_blind_offsets_of_simulated_clutter(period, seed):
+    true = offsets(period, 0.1, seed)
+    x = clutter(128, 1024, 0.85, seed, torch.complex64)
+    y = torch.stack([sample_unevenly(x, true), x])
+    estimate = estimate_jitter_blind(y)
+    assert estimate["period"].tolist() == [period, 1] and bool(estimate.ok.all())
+    error = (estimate["offset_samples"][0, :period] - true).square().mean().sqrt()
+    assert float(error) < 0.003
+    assert float(estimate["offset_samples"][1].abs().max()) == 0
+
+
+def test_blind_keeps_a_silent_trial_apart():
+    x = clutter(64, 512, seed=3)
+    y = torch.stack([sample_unevenly(x, OFFSETS), torch.zeros_like(x)])
+    estimate = estimate_jitter_blind(y)
+    assert estimate.ok.tolist() == [True, False] and float(estimate["offset_samples"][1].abs().max()) == 0
+    torch.testing.assert_close(estimate["offset_samples"][0], estimate_jitter_blind(y[:1])["offset_samples"][0])
+
+
+@pytest.mark.parametrize("name, seed", [("radarsat1_english_bay.npz", 0), ("radarsat1_squamish.npz", 1)])
+def test_blind_on_recorded_data(recorded, name, seed):
+    """The bar is 0.003 sample; the recordings hold a pattern of their own of about 0.0012 sample, of period 8."""
+    x = read_stripmap(recorded(name)).signal.data[:1024]
+    true = offsets(8, 0.1, seed)
+    y = sample_unevenly(x, true)
+    assert int(detect_jitter_period(x)) == 1
+    estimate = estimate_jitter_blind(y)
+    assert int(estimate["period"]) == 8
+    assert float((estimate["offset_samples"][:8] - true).square().mean().sqrt()) < 0.003
+    repaired = correct_jitter(y, estimate["offset_samples"], estimate["period"])
+    assert float(correlation(y.to(torch.complex128), x.to(torch.complex128))) < 0.99
+    assert float(correlation(repaired.to(torch.complex128), x.to(torch.complex128))) > 0.9999
