@@ -138,8 +138,8 @@ def estimate_response_sharpest(
     """Phase response by least entropy of the range windows about bright points. image: (..., azimuth, range), range spectrum centred.
 
     band: pulse bandwidth over sampling rate; width: window in samples, many times the spread of the response (shortened to half the
-    valid columns where these are few); valid: number of fully compressed columns. After each pass, the first on a quarter of the
-    points, the image is corrected and the points are chosen anew. The last pass fits two halves of the points apart: their mean is the
+    valid columns where these are few); valid: number of fully compressed columns. After each pass the image is corrected and the
+    points are chosen anew. The last pass fits two halves of the points apart: their mean is the
     estimate, less what chance makes of it, their difference its std.
     Gives `phase_rad` (..., GRID), see `repair.response` for the conventions, `amplitude` ones. quality falls with the difference of the
     halves, 1 / (1 + std^2). Not ok, with zero phase: no bright places (halves that differ by more than 0.25 rad rms).
