@@ -152,7 +152,7 @@ def test_axis_of_one_sample_step():
         ({"a": OmegaK}, TypeError, "'a' must be a torch.nn.Module.* got the class OmegaK, not an instance"),
         ({"a": 3}, TypeError, "'a' must be a torch.nn.Module.* got int"),
         ({"forward": GivenVelocity()}, ValueError, "cannot be called 'forward'"),
-        ({"lines": LineIntegrity()}, ValueError, r"'lines' \(LineIntegrity\) needs the value 'line_number'.*no earlier values.*aux.NAME"),
+        ({"lines": LineIntegrity()}, ValueError, r"'lines' \(LineIntegrity\) needs the value 'line_number'.*a value of an earlier stage.*aux.NAME"),
     ],
 )
 def test_members_that_are_no_stages_are_refused_at_construction(stages, error, match):
