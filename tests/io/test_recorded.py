@@ -59,6 +59,7 @@ def test_axes_chirp_and_gain_come_from_the_file(tmp_path):
         ({"f0_hz": "high"}, "f0_hz must be one positive number, got 'high'"),
         ({"chirp_rate_hz_s": np.nan}, "chirp_rate_hz_s must be one number other than zero, got nan"),
         ({"c_m_s": np.inf}, "c_m_s must be one positive number, got inf"),
+        ({"iq": np.zeros((0, 80, 2), np.int8)}, r"raw.npz: expected complex samples .* at least one, got .* \(0, 80\)"),
         ({"first_cell": 1.7}, "first_cell must be one whole number, got 1.7"),
         ({"agc_db": np.float64(3)}, "agc_db has 1 entries for 6 lines"),
         ({"agc_db": np.array(["loud"] * 6)}, "raw.npz: agc_db: expected numbers in an array or a tensor, got <U4"),

@@ -104,8 +104,8 @@ class Recording:
         if not dtype.is_complex:
             raise ValueError(f"{what}: dtype must be complex64 or complex128, got {dtype}")
         x = _as_tensor(data, what)
-        if not x.is_complex() or x.ndim < 2:
-            raise ValueError(f"{what}: expected complex samples (..., line, sample), got {x.dtype} of shape {tuple(x.shape)}")
+        if not x.is_complex() or x.ndim < 2 or not x.numel():
+            raise ValueError(f"{what}: expected complex samples (..., line, sample), at least one, got {x.dtype} of shape {tuple(x.shape)}")
         refuse_non_finite(x, what)
         _warn_of_silence(x, what)
         side = {name: _as_tensor(value, f"{what}: {name}") for name, value in aux.items()}

@@ -39,8 +39,9 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Rec
         raise ValueError(f"{path} lacks {missing}; a raw stripmap archive holds {list(_REQUIRED)} (this one: {sorted(arrays)})")
     number = {key: _number(arrays, key, path) for key in _REQUIRED[1:]}
     c = _number(arrays, "c_m_s", path) if "c_m_s" in arrays else LIGHT_M_S
+    first_cell = _first_cell(arrays, path)
     try:
-        radar = _radar(number, c, _first_cell(arrays, path))
+        radar = _radar(number, c, first_cell)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     aux: dict[str, Any] = {name: arrays[name] for name in _AUX if name in arrays}
