@@ -109,6 +109,7 @@ class FrameGeometry:
         for name, value in (("doppler_hz", centroid), ("velocity_m_s", velocity)):
             if value.ndim and value.shape != raw.shape[:-2]:
                 raise ValueError(f"{name} of shape {tuple(value.shape)} does not match the trial dims {tuple(raw.shape[:-2])} of the data; give one number per trial")
+        _refuse_impossible(radar, velocity, centroid, frame)
         doppler = radar.doppler_hz(raw.shape[-2], centroid, device)
         return FrameGeometry(radar, doppler, velocity, frame, None if band_hz is None else band_weight(radar, doppler - centroid[..., None], band_hz))
 
@@ -127,6 +128,19 @@ class FrameGeometry:
     def mapped(self, frequency_hz: Tensor) -> Tensor:
         """wavenumber() of these rows, (..., d, f)."""
         return wavenumber(self.radar, frequency_hz, self.doppler_hz, self.velocity_m_s, self.frame_hz)
+
+
+def _refuse_impossible(radar: StripmapRadar, velocity_m_s: Tensor, *doppler_hz: Tensor) -> None:
+    """Raise ValueError for velocities that are not positive and for Dopplers that no squint gives."""
+    try:
+        slowest = float(velocity_m_s.detach().min())
+        largest = max(float(radar.sin_squint(value.detach(), velocity_m_s.detach()).abs().max()) for value in doppler_hz)
+    except RuntimeError:  # inside vmap a value cannot be looked at
+        return
+    if not 0 < slowest < math.inf:
+        raise ValueError(f"velocity_m_s must be positive and finite in every trial, got {slowest:g}")
+    if not largest < 1:
+        raise ValueError(f"a Doppler asks for a squint of sine {largest:.4g}; doppler_hz and frame_hz must stay below 2 * velocity / wavelength in magnitude")
 
 
 def residual_frequency(at: FrameGeometry, offset_hz: Tensor) -> Tensor:
