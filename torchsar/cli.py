@@ -21,13 +21,19 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, text in (
         ("run", "run an experiment and write its images, figures and report"),
+        ("sweep", "run the Monte Carlo sweep of a config: many trials of every point of its grid"),
         ("requires", "what the scene of a config requires of its models"),
         ("trade", "speed against accuracy of the alternatives, beside the exact yardstick"),
     ):
         one = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         one.add_argument("config", help="a YAML file, or the name of a packaged config (see `torchsar list`)")
         one.add_argument("overrides", nargs="*", metavar="key=value", help="overrides with dotted keys, such as world.noise.snr_db=10")
-        one.add_argument("--out", type=Path, metavar="DIR", help="result folder" + (" (default: out/<config name>)" if name == "run" else ""))
+        one.add_argument("--out", type=Path, metavar="DIR", help="result folder" + (" (default: out/<config name>)" if name in ("run", "sweep") else ""))
+    sweep = commands.choices["sweep"]
+    sweep.add_argument("--resume", action="store_true", help="go on with the sweep in the folder; on an empty folder it simply starts")
+    sweep.add_argument("--workers", type=_positive, metavar="N", help="compute in N processes of this machine (extra `cluster`)")
+    sweep.add_argument("--cluster", metavar="ADDRESS", help="compute on the workers of a running dask scheduler, such as tcp://host:8786")
+    sweep.add_argument("--device", default="cpu", metavar="NAME", help="cpu (default), cuda, cuda:1, ...")
     commands.add_parser("list", help="experiments, stages and data keys")
     return top
 
@@ -55,8 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(f"{error.name or error} is not installed; install the extra: pip install 'torchsar-lab[study]'")
     except ConfigError as error:
         return _fail(str(error))
-    except KeyboardInterrupt:
-        print("torchsar: interrupted, nothing was written", file=sys.stderr)
+    except KeyboardInterrupt as stopped:
+        print(f"torchsar: interrupted, {stopped if stopped.args else 'nothing was written'}", file=sys.stderr)
         return 130
 
 
@@ -88,6 +94,10 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
         from torchsar.study.run import run
 
         print(run(loaded, options.out or Path("out") / loaded.name, command))
+    elif options.command == "sweep":
+        from torchsar.study.sweeping import sweep_config
+
+        print(sweep_config(loaded, options.out or Path("out") / loaded.name, options.resume, options.workers, options.cluster, options.device, command))
     elif options.command == "requires":
         from torchsar.study.requires import requires
 

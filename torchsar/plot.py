@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -17,12 +18,15 @@ try:
     from cycler import cycler
     from matplotlib import rc_context
     from matplotlib.axes import Axes
+    from matplotlib.colors import LogNorm, Normalize
     from matplotlib.figure import Figure
+    from matplotlib.ticker import FuncFormatter, LogFormatterSciNotation, LogLocator, NullFormatter
 except ImportError as error:
     raise ImportError("torchsar.plot needs matplotlib: pip install 'torchsar-lab[study]'") from error
 
 INK, ACCENT, SECOND, THIRD, FAINT = "#1f2933", "#0b6e99", "#d1495b", "#e09f3e", "#9aa5b1"
 COLOURS = (ACCENT, SECOND, THIRD, "#4f7942", "#6a4c93", FAINT)
+MARKERS, DASHES = "osD^vPX", ("--", ":", "-.")
 _STYLE: Any = {
     "font.size": 9,
     "axes.titlesize": 10,
@@ -55,9 +59,9 @@ def _styled(draw: Callable[..., Figure]) -> Callable[..., Figure]:
     return styled
 
 
-def _panels(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, list[Axes]]:
+def _panels(rows: int, columns: int, size: tuple[float, float], sharey: bool = False) -> tuple[Figure, list[Axes]]:
     figure = Figure(figsize=size, layout="constrained")
-    return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
+    return figure, list(figure.subplots(rows, columns, squeeze=False, sharey=sharey).flat)
 
 
 def decibel(x: Tensor | np.ndarray, reference: float | None = None) -> np.ndarray:
@@ -182,6 +186,143 @@ def trade(names: Sequence[str], seconds: Sequence[float], error_db: Sequence[flo
     axes.set(xscale="log", xlabel="time (s)", ylabel=ylabel, title=title)
     axes.margins(0.18)
     return figure
+
+
+@_styled
+def error_curves(parts: Sequence[Mapping[str, Any]], xlabel: str, ylabel: str, log_x: bool = False, log_y: bool = False, ylim: tuple[float, float] | None = None) -> Figure:
+    """Figures of algorithms with their intervals, over numbers (lines with bands) or words (dots with bars), in panels with one y axis.
+
+    Each part holds `title`; `x`, an array or a sequence of words; `series`, name -> (values (x,), interval (x, 2)); and `bounds`,
+    name -> values (x,), drawn dark and dashed. What is not finite, or not positive on a logarithmic axis, is left out.
+    """
+    figure, axes = _grid(len(parts), (7.2, 3.6), 3.0)
+    for one, part in zip(axes, parts, strict=False):
+        draw = _draw_dots if any(isinstance(x, str) for x in part["x"]) else _draw_bands
+        draw(one, part["x"], part["series"], part["bounds"], log_y)
+        if not any(np.isfinite(_drawable(y, log_y)).any() for y, _ in part["series"].values()):
+            one.text(0.5, 0.5, "no value to show", transform=one.transAxes, ha="center", va="center", color=FAINT)
+    for one in axes[: len(parts)]:
+        _scale_axes(one, np.asarray(parts[0]["x"]), log_x, log_y, ylim)
+    _name_axes(axes, [part["title"] for part in parts], xlabel, ylabel)
+    _legend_below(figure, axes)
+    return figure
+
+
+def _columns(count: int) -> int:
+    """Rows of up to three panels; four stand two by two."""
+    return count if count < 4 else 2 if count == 4 else 3
+
+
+def _grid(count: int, single: tuple[float, float], height: float) -> tuple[Figure, list[Axes]]:
+    """Axes for so many panels; those beyond the count are hidden."""
+    rows = math.ceil(count / _columns(count))
+    figure, axes = _panels(rows, _columns(count), single if count == 1 else (9.6, height * rows + 0.5), sharey=True)
+    for one in axes[count:]:
+        one.set_visible(False)
+    return figure, axes
+
+
+def _name_axes(axes: Sequence[Axes], titles: Sequence[str], xlabel: str, ylabel: str) -> None:
+    """Titles broken to the width of their panels; labels only where nothing stands below or to the left."""
+    columns = _columns(len(titles))
+    for i, title in enumerate(titles):
+        axes[i].set_title(textwrap.fill(title, {1: 84, 2: 46}.get(columns, 30)))
+        axes[i].set_xlabel(xlabel if i + columns >= len(titles) else "")
+        axes[i].set_ylabel(textwrap.fill(ylabel, 38) if i % columns == 0 else "")
+
+
+def _drawable(y: Any, log: bool) -> np.ndarray:
+    """Float64 with NaN for what the axis cannot show."""
+    y = np.asarray(y, dtype=np.float64)
+    return np.where(np.isfinite(y) & ((y > 0) | (not log)), y, np.nan)
+
+
+def _draw_bands(axes: Axes, x: np.ndarray, series: Mapping[str, tuple[np.ndarray, np.ndarray]], bounds: Mapping[str, np.ndarray], log: bool) -> None:
+    for i, (name, (y, interval)) in enumerate(series.items()):
+        low, high = np.moveaxis(_drawable(interval, log), -1, 0)
+        colour, line = COLOURS[i % len(COLOURS)], "-" if i < len(COLOURS) else (0, (6, 2))
+        axes.fill_between(x, low, high, color=colour, alpha=0.18 if len(series) < 5 else 0.1, linewidth=0)
+        axes.plot(x, _drawable(y, log), color=colour, linestyle=line, marker=MARKERS[i % len(MARKERS)], markersize=3.5, label=name)
+    for i, (name, y) in enumerate(bounds.items()):
+        axes.plot(x, _drawable(y, log), color=INK, linestyle=DASHES[i % len(DASHES)], linewidth=1.1, label=name)
+
+
+def _draw_dots(axes: Axes, x: Sequence[str], series: Mapping[str, tuple[np.ndarray, np.ndarray]], bounds: Mapping[str, np.ndarray], log: bool) -> None:
+    step = min(0.16, 0.6 / len(series))
+    for i, (name, (y, interval)) in enumerate(series.items()):
+        place = np.arange(len(x)) + (i - (len(series) - 1) / 2) * step
+        low, high = np.moveaxis(_drawable(interval, log), -1, 0)
+        axes.vlines(place, low, high, color=COLOURS[i % len(COLOURS)], linewidth=1.6, alpha=0.6)
+        axes.plot(place, _drawable(y, log), color=COLOURS[i % len(COLOURS)], marker=MARKERS[i % len(MARKERS)], markersize=5, linestyle="none", label=name)
+    for i, (name, y) in enumerate(bounds.items()):
+        axes.hlines(_drawable(y, log), np.arange(len(x)) - 0.4, np.arange(len(x)) + 0.4, color=INK, linestyle=DASHES[i % len(DASHES)], linewidth=1.1, label=name)
+    axes.set_xticks(np.arange(len(x)), x)
+    axes.set_xlim(-0.6, len(x) - 0.4)
+    axes.grid(False, axis="x")
+
+
+def _scale_axes(axes: Axes, x: np.ndarray, log_x: bool, log_y: bool, ylim: tuple[float, float] | None) -> None:
+    if x.dtype.kind != "U":
+        axes.set_xscale("log" if log_x else "linear")
+        place = np.log(x) if log_x else x
+        if len(x) <= 8 and np.diff(place).min(initial=np.inf) > 0.08 * np.ptp(place):
+            axes.set_xticks(x, [f"{value:g}" for value in x])
+            axes.xaxis.set_minor_formatter(NullFormatter())
+    if log_y:
+        axes.set_yscale("log")
+        low, high = axes.get_ylim()
+        if high < 1000 * low:
+            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high > 10 * low else (1, 1.5, 2, 3, 4, 5, 6, 8)))
+            plain = low >= 1e-3 and high < 1e5
+            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}") if plain else LogFormatterSciNotation(minor_thresholds=(math.inf, math.inf)))
+            axes.yaxis.set_minor_formatter(NullFormatter())
+    if ylim is not None:
+        axes.set_ylim(*ylim)
+
+
+def _legend_below(figure: Figure, axes: Sequence[Axes]) -> None:
+    """One legend for all panels, under them, where more than one thing is drawn."""
+    found = {label: handle for one in axes for handle, label in zip(*one.get_legend_handles_labels(), strict=True)}
+    if len(found) > 1:
+        fitting = int(12 * figure.get_figwidth() / (6 + max(map(len, found))))
+        figure.legend(list(found.values()), list(found), loc="outside lower center", ncols=max(1, min(fitting, len(found))))
+
+
+@_styled
+def heat_map(parts: Sequence[Mapping[str, Any]], xlabel: str, ylabel: str, label: str, log: bool = False, limits: tuple[float, float] | None = None) -> Figure:
+    """Cells over two parameters, one panel a part, all on one colour scale; few enough cells carry their numbers.
+
+    Each part holds `title`, `x`, `y` and `z` (y, x). limits: ends of the colour scale, by default those of what is drawn. What is not
+    finite, or not positive on a logarithmic scale, stays white.
+    """
+    shown = [_drawable(part["z"], log) for part in parts]
+    norm = _norm(np.stack(shown) if limits is None else np.asarray(limits), log)
+    figure, axes = _grid(len(parts), (7.2, 4.2), 2.9)
+    mesh: Any = None
+    for one, part, z in zip(axes, parts, shown, strict=False):
+        mesh = one.imshow(z, norm=norm, cmap="viridis", origin="lower", aspect="auto", interpolation="nearest")
+        _label_cells(one, part, z, norm)
+    figure.colorbar(mesh, ax=axes, label=label, shrink=0.9)
+    _name_axes(axes, [part["title"] for part in parts], xlabel, ylabel)
+    return figure
+
+
+def _norm(z: np.ndarray, log: bool) -> Normalize:
+    known = z[np.isfinite(z)]
+    low, high = (float(known.min()), float(known.max())) if known.size else (1.0, 1.0)
+    return (LogNorm if log else Normalize)(low, high if high > low else low + (abs(low) or 1.0) * 0.01)
+
+
+def _label_cells(axes: Axes, part: Mapping[str, Any], z: np.ndarray, norm: Normalize) -> None:
+    """Ticks at the values of the parameters (every so many of them), and the numbers of up to 48 cells."""
+    for axis, values in ((axes.xaxis, part["x"]), (axes.yaxis, part["y"])):
+        step = math.ceil(len(values) / 8)
+        axis.set_ticks(np.arange(0, len(values), step), [f"{value:g}" for value in values[::step]])
+    axes.grid(False)
+    if z.size <= 48:
+        for (row, column), value in np.ndenumerate(z):
+            if np.isfinite(value):
+                axes.text(column, row, f"{value:.2g}" if abs(value) < 100 else f"{value:.0f}", ha="center", va="center", fontsize=7, color=INK if norm(value) > 0.6 else "white")
 
 
 def save(figure: Figure, path: Any, dpi: int = 110) -> None:

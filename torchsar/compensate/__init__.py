@@ -13,6 +13,7 @@ from torchsar.compensate.doppler import (
     plain_energy_centre,
     point_doppler,
 )
+from torchsar.compensate.point import PointDoppler, doppler_at, peak_time_s
 from torchsar.compensate.velocity import EffectiveVelocity, minimum_entropy_velocity, velocity_objective
 
 __all__ = [
@@ -20,14 +21,17 @@ __all__ = [
     "EffectiveVelocity",
     "EnergyCentre",
     "PhaseIncrement",
+    "PointDoppler",
     "RangeDependentCentroid",
     "ambiguity_evidence",
     "complete_aperture_centroid",
+    "doppler_at",
     "energy_centre",
     "fit_over_range",
     "lag_products",
     "line_doppler",
     "minimum_entropy_velocity",
+    "peak_time_s",
     "phase_increment",
     "plain_energy_centre",
     "point_doppler",

@@ -16,14 +16,19 @@ class Draws:
     """A source whose every draw depends on its address alone, never on what was drawn before, on chunking or on the device.
 
     seed: of the whole study. case: any text or number that names a parameter point (a hash of its parameters, so that a
-    growing grid moves no seed). trials: indices of the trials of this chunk, which become the leading dim; None draws one
-    unbatched trial, equal to trial 0. Draws are made in float64 on the host and then cast, so that complex64 and
-    complex128, CPU and GPU see the same noise.
+    growing grid moves no seed), or a tuple of them, one per trial, where a batch holds several points. trials: indices of the
+    trials of this chunk, which become the leading dim; None draws one unbatched trial, equal to trial 0. Draws are made in
+    float64 on the host and then cast, so that complex64 and complex128, CPU and GPU see the same noise.
+    Raises ValueError where cases and trials disagree in number.
     """
 
     seed: int
-    case: str | int = 0
+    case: str | int | tuple[str | int, ...] = 0
     trials: Sequence[int] | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.case, tuple) and (self.trials is None or len(self.case) != len(self.trials)):
+            raise ValueError(f"draws for {len(self.case)} cases need as many trials, got {None if self.trials is None else len(self.trials)}; name one case for all of them or one for each")
 
     def for_trials(self, trials: Sequence[int]) -> Draws:
         """The same source for other trials."""
@@ -31,14 +36,15 @@ class Draws:
 
     def part(self, name: str) -> Draws:
         """An independent source for a named part of the world, so that two patches of one kind differ."""
-        return replace(self, case=f"{self.case}/{name}")
+        return replace(self, case=tuple(f"{case}/{name}" for case in self.case) if isinstance(self.case, tuple) else f"{self.case}/{name}")
 
     def _generators(self, purpose: str) -> list[np.random.Generator]:
-        def generator(trial: int) -> np.random.Generator:
-            address = repr((self.seed, purpose, self.case, trial)).encode()
+        def generator(case: str | int, trial: int) -> np.random.Generator:
+            address = repr((self.seed, purpose, case, trial)).encode()
             return np.random.Generator(np.random.Philox(key=int.from_bytes(hashlib.blake2b(address, digest_size=16).digest(), "big")))
 
-        return [generator(trial) for trial in (self.trials if self.trials is not None else [0])]
+        trials = self.trials if self.trials is not None else [0]
+        return [generator(*address) for address in zip(self.case if isinstance(self.case, tuple) else [self.case] * len(trials), trials, strict=True)]
 
     def _stack(self, arrays: list[np.ndarray], dtype: torch.dtype, device: torch.device | str | None) -> Tensor:
         x = torch.from_numpy(np.stack(arrays))

@@ -6,7 +6,7 @@ from torchsar.echo.jitter import PeriodicJitter
 from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedLines
 from torchsar.echo.pairs import SimulatedPairs
 from torchsar.echo.response import ChannelResponse
-from torchsar.echo.stripmap import Damage, apply_damages, simulate, stripmap_echo
+from torchsar.echo.stripmap import Damage, apply_damages, simulate, stripmap_echo, target_energy
 
 __all__ = [
     "ChannelImbalance",
@@ -24,4 +24,5 @@ __all__ = [
     "apply_damages",
     "simulate",
     "stripmap_echo",
+    "target_energy",
 ]

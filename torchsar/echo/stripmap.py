@@ -70,12 +70,9 @@ def _block_spectrum(placed: Placed, world: StripmapWorld, radar: StripmapRadar, 
     doppler = per_trial(_true_doppler(world, radar), 2, pulse_s)
     total = torch.zeros((*placed.closest_m.shape[:-1], pulse_s.numel(), n_fft), dtype=dtype, device=pulse_s.device)
     for targets in _target_blocks(placed, pulse_s.numel(), n_fft):
-        crossing, zero, closest = (x[..., None, targets] for x in (placed.crossing_s, placed.zero_doppler_s, placed.closest_m))
-        since = pulse_s[:, None] - zero
-        offset = 2 * velocity.square() * -since / (radar.wavelength_m * torch.sqrt(closest.square() + (velocity * since).square())) - doppler
-        weight = world.beam.weight(pulse_s[:, None] - crossing, offset, velocity)
+        since, closest, weight = _seen(placed, targets, world, radar, pulse_s, doppler, velocity)
         lit = _lit(weight)
-        since, closest, weight = (x[..., lit] for x in torch.broadcast_tensors(since, closest, weight))
+        since, closest, weight = (x[..., lit] for x in (since, closest, weight))
         if not since.shape[-1]:
             continue
         range_m = world.path.range_m(since, closest, velocity)
@@ -84,6 +81,14 @@ def _block_spectrum(placed: Placed, world: StripmapWorld, radar: StripmapRadar, 
         amplitude = placed.amplitude[..., None, targets][..., lit] * torch.where(inside, weight, 0)
         total = total + echo_spectrum(delay, 2 * radar.carrier_hz / radar.wave_speed_m_s * range_m, amplitude, n_fft, radar.sampling_hz / n_fft, dtype)
     return total
+
+
+def _seen(placed: Placed, targets: slice, world: StripmapWorld, radar: StripmapRadar, pulse_s: Tensor, doppler_hz: Tensor, velocity_m_s: Tensor) -> list[Tensor]:
+    """Time since closest approach, closest range and gain of the beam for targets at pulses, (..., pulse, target) each."""
+    crossing, zero, closest = (x[..., None, targets] for x in (placed.crossing_s, placed.zero_doppler_s, placed.closest_m))
+    since = pulse_s[:, None] - zero
+    offset = 2 * velocity_m_s.square() * -since / (radar.wavelength_m * torch.sqrt(closest.square() + (velocity_m_s * since).square())) - doppler_hz
+    return torch.broadcast_tensors(since, closest, world.beam.weight(pulse_s[:, None] - crossing, offset, velocity_m_s))
 
 
 def _true_doppler(world: StripmapWorld, radar: StripmapRadar) -> Tensor | float:
@@ -126,6 +131,20 @@ def _target_blocks(placed: Placed, height: int, n_fft: int) -> Iterator[slice]:
         yield slice(first, min(first + width, placed.closest_m.shape[-1]))
 
 
+def target_energy(truth: Truth, world: StripmapWorld, radar: StripmapRadar, n_pulse: int) -> Tensor:
+    """Energy of each target's raw echo in squared sample amplitudes, (..., target), over the lines of the record that see it.
+
+    Over the noise variance (`noise_std` squared) it is q, the peak signal-to-noise ratio after two-dimensional compression.
+    """
+    values = truth.values
+    crossing = values["crossing_s"]
+    placed = Placed(crossing, values["zero_doppler_s"], values["closest_range_m"], values["amplitude"])
+    pulse_s = torch.arange(n_pulse, dtype=torch.float64, device=crossing.device) / radar.prf_hz
+    velocity, doppler = (per_trial(values[name], 2, pulse_s) for name in ("velocity_m_s", "doppler_hz"))
+    weight = _seen(placed, slice(None), world, radar, pulse_s, doppler, velocity)[2]
+    return radar.pulse.duration_s * radar.sampling_hz * values["amplitude"].abs().square() * weight.square().sum(-2)
+
+
 def lit_power(echo: Tensor) -> Tensor:
     """Mean power of the lit raw samples, (...,): those above 1e-4 of the strongest sample's power in their trial."""
     power = echo.real.square() + echo.imag.square()
@@ -164,8 +183,11 @@ def simulate(
         std = torch.sqrt(lit_power(echo.detach()).double() / 10 ** (per_trial(world.snr_db, 0, echo) / 10))
         noise = draws.normal("noise", (n_pulse, n_range), dtype, device)
         echo = echo + noise * std.to(echo.real.dtype)[..., None, None]
+    trials = () if draws.trials is None else (len(draws.trials),)
+    echo = echo.expand(*torch.broadcast_shapes(echo.shape[:-2], trials), -1, -1)  # nothing may differ between trials
     clean = Recording(Signal(echo, radar.raw_axes(n_pulse, n_range)), radar)
     values = {
+        "crossing_s": placed.crossing_s,
         "zero_doppler_s": placed.zero_doppler_s,
         "closest_range_m": placed.closest_m,
         "amplitude": placed.amplitude,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from torchsar.core import Chain, Draws, Recording, Truth, use
 from torchsar.echo import apply_damages, simulate
@@ -47,18 +48,25 @@ def build_radar(loaded: Loaded) -> StripmapRadar:
 
 
 def build_world(loaded: Loaded) -> StripmapWorld:
-    """The world of a simulation."""
+    """The world of a simulation. A squint becomes the Doppler of the true velocity."""
     world = loaded.config.world
     assert world is not None
+    doppler = world.doppler_hz if world.squint_deg is None else float(squint_doppler_hz(build_radar(loaded), world.squint_deg, world.velocity_m_s))
     scenes = {name: SCENES.make(entry, f"world.scene.{name}", loaded.file) for name, entry in world.scene.items()}
     return StripmapWorld(
         scene=Together(scenes),
         beam=BEAMS.make(world.beam, "world.beam", loaded.file),
         path=PATHS.make(world.path, "world.path", loaded.file),
         velocity_m_s=world.velocity_m_s,
-        doppler_hz=world.doppler_hz,
+        doppler_hz=doppler,
         snr_db=world.noise.snr_db,
     )
+
+
+def squint_doppler_hz(radar: StripmapRadar, squint_deg: Tensor | float, velocity_m_s: Tensor | float | None) -> Tensor:
+    """Doppler of the beam centre at a squint, 2 v sin(squint) / lambda; the velocity is the true one, by default the nominal."""
+    velocity = radar.velocity_m_s if velocity_m_s is None else velocity_m_s
+    return 2 * velocity * torch.sin(torch.deg2rad(torch.as_tensor(squint_deg, dtype=torch.float64))) / radar.wavelength_m
 
 
 def build_damages(entries: Mapping[str, dict[str, Any]], where: str, file: str) -> dict[str, Any]:

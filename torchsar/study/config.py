@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -53,8 +53,15 @@ class World(Strict):
     path: dict[str, Any] = {"kind": "hyperbola"}
     velocity_m_s: float | None = Field(default=None, gt=0)
     doppler_hz: float | None = None
+    squint_deg: float | None = Field(default=None, gt=-90, lt=90)
     noise: Noise = Noise()
     damages: dict[str, dict[str, Any]] = {}
+
+    @model_validator(mode="after")
+    def _one_direction(self) -> World:
+        if self.doppler_hz is not None and self.squint_deg is not None:
+            raise ValueError("doppler_hz and squint_deg both say where the beam looks; give one of them")
+        return self
 
 
 class Data(Strict):
@@ -117,6 +124,45 @@ class Trade(Strict):
     repeats: int = Field(default=3, ge=1)
 
 
+class EarlyStop(Strict):
+    """Ends a point once half of the 95 % interval of a statistic is below `relative` times the statistic."""
+
+    metric: str
+    relative: float = Field(gt=0, lt=1)
+    statistic: Literal["rmse", "mean", "median"] = "rmse"
+
+
+class Save(Strict):
+    """Trials whose images (and the outputs of the named stages) are kept in the store."""
+
+    trials: list[int] = []
+    taps: list[str] = []
+
+
+class Sweep(Strict):
+    """A Monte Carlo sweep: settings, and every other key is a key of the config with the values it takes.
+
+    grid: dotted key -> list of values, or mapping of labels to values. trials: per point, or the limit where points end early. chunk: trials
+    a batch, chosen by bytes where it is not given. success: metric -> limit of its magnitude below which a trial counts as a success.
+    """
+
+    grid: dict[str, Any] = {}
+    trials: int = Field(default=200, ge=1)
+    chunk: int | None = Field(default=None, ge=1)
+    stop: EarlyStop | None = None
+    success: dict[str, float] = {}
+    save: Save = Save()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _keys_into_grid(cls, given: Any) -> Any:
+        if not isinstance(given, dict):
+            return given
+        loose = {key: value for key, value in given.items() if key not in cls.model_fields}
+        known = {key: value for key, value in given.items() if key in cls.model_fields}
+        return {**known, "grid": {**(known.get("grid") or {}), **loose}} if loose else known
+
+
 class Config(Strict):
     """A whole experiment."""
 
@@ -129,6 +175,7 @@ class Config(Strict):
     processor: dict[str, Method] = Field(min_length=1)
     metrics: Metrics = Metrics()
     trade: Trade = Trade()
+    sweep: Sweep = Sweep()
 
     @model_validator(mode="after")
     def _whole(self) -> Config:
@@ -152,22 +199,41 @@ class Loaded:
     file: str
     name: str
 
+    def changed(self, values: Mapping[str, Any]) -> Loaded:
+        """The same config with other values at dotted keys. Raises ConfigError where a key leads nowhere or a value is not accepted."""
+        tree = self.config.model_dump()
+        for key, value in values.items():
+            tree = _placed(tree, key.split("."), value, f"{self.file}: sweep: the key {key!r}")
+        return replace(self, config=_checked(tree, f"{self.file}: sweep"))
+
     def text(self, tree: dict[str, Any] | None = None) -> str:
         """The resolved config as YAML."""
         return dump(self.config.model_dump() if tree is None else tree)
 
 
+def _placed(tree: Any, path: list[str], value: Any, what: str) -> dict[str, Any]:
+    """The tree with one value changed; all but the last part of the path must be there."""
+    head, rest = path[0], path[1:]
+    if not isinstance(tree, dict) or (rest and head not in tree):
+        raise ConfigError(f"{what} leads nowhere at {head!r}{did_you_mean(head, tree if isinstance(tree, dict) else ())}")
+    return {**tree, head: _placed(tree[head], rest, value, what) if rest else value}
+
+
 def load(name: str, assignments: Sequence[str] = ()) -> Loaded:
     """Read, override and check a config. Raises ConfigError: file, key, value, and what is accepted."""
     path = find_config(name)
-    tree = override(read_tree(path), assignments)
+    tree = override(read_tree(path), assignments, literal=("sweep", tuple(Sweep.model_fields)))
     file = str(path) + (f" with {' '.join(assignments)}" if assignments else "")
+    return Loaded(_checked(tree, file), file, path.stem)
+
+
+def _checked(tree: Any, file: str) -> Config:
     try:
         config = Config.model_validate(tree)
     except ValidationError as error:
         raise ConfigError(sentence(error, Config, file)) from None
     _check_source(config, file)
-    return Loaded(config, file, path.stem)
+    return config
 
 
 def _check_source(config: Config, file: str) -> None:

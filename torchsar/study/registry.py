@@ -12,6 +12,7 @@ from typing import Any
 
 from torchsar.compensate.ambiguity import DopplerCentroid
 from torchsar.compensate.doppler import EnergyCentre, PhaseIncrement, RangeDependentCentroid
+from torchsar.compensate.point import PointDoppler
 from torchsar.echo.channels import ChannelImbalance
 from torchsar.echo.interference import Quantiser, Tone, WideInterferer
 from torchsar.echo.jitter import PeriodicJitter
@@ -73,6 +74,7 @@ COMPENSATE: dict[str, Callable[..., Any]] = {
     "energy_centre": EnergyCentre,
     "range_dependent_centroid": RangeDependentCentroid,
     "doppler_centroid": DopplerCentroid,
+    "point_doppler": PointDoppler,
     "effective_velocity": factories.effective_velocity,
 }
 FOCUS: dict[str, Callable[..., Any]] = {

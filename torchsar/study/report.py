@@ -73,20 +73,24 @@ def installed_version() -> str:
         return "not installed"
 
 
-def write_report(path: Path, title: str, metrics: Mapping[str, Any], pictures: Sequence[Picture], figures: Path, config_text: str, command: str) -> None:
-    """Write the report; it asks for nothing from outside."""
+def write_page(path: Path, template: str, pictures: Sequence[Picture], figures: Path, **fields: Any) -> None:
+    """Write one HTML file with its pictures inside, which asks for nothing from outside.
+
+    template: a file beside this module that extends base.html.j2. figures: the folder of the pictures. fields: what the template shows;
+    the base itself shows `title`, `command`, `definitions` (name -> text) and `config` (text).
+    """
     environment = jinja2.Environment(loader=jinja2.PackageLoader("torchsar.study", "."), autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters["number"] = number
-    columns, rows = figure_table(metrics)
-    text = environment.get_template("report.html.j2").render(
-        title=title,
-        metrics=metrics,
-        best=metrics["methods"]["recommended"],
-        columns=columns,
-        rows=rows,
+    text = environment.get_template(template).render(
         pictures=[{"title": p.title, "caption": p.caption, "source": _embedded(figures / p.file)} for p in pictures],
-        config=config_text,
-        command=command,
         made=f"torchsar-lab {installed_version()}, torch {torch.__version__}, {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+        **fields,
     )
     path.write_text(text, encoding="utf-8")
+
+
+def write_report(path: Path, title: str, metrics: Mapping[str, Any], pictures: Sequence[Picture], figures: Path, config_text: str, command: str) -> None:
+    """Write the report of one run; it asks for nothing from outside."""
+    columns, rows = figure_table(metrics)
+    fields = {"metrics": metrics, "best": metrics["methods"]["recommended"], "columns": columns, "rows": rows}
+    write_page(path, "report.html.j2", pictures, figures, title=title, command=command, definitions=metrics["definitions"], config=config_text, **fields)

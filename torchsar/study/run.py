@@ -75,7 +75,7 @@ def _warn_of_aliasing(loaded: Loaded, case: Case) -> None:
     world, radar = loaded.config.world, case.recording.radar
     assert world is not None
     if radar.integration_s is not None:
-        requirements(radar, case.recording.signal.axes, world.doppler_hz, world.velocity_m_s)
+        requirements(radar, case.recording.signal.axes, build_world(loaded).doppler_hz, world.velocity_m_s)
 
 
 def _truth_arrays(case: Case) -> dict[str, Tensor]:

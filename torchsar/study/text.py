@@ -71,8 +71,8 @@ def config_folders() -> list[Path]:
 
 
 def packaged_configs() -> dict[str, Path]:
-    """Names of the configs that come with torchsar, and their files."""
-    return {path.stem: path for folder in reversed(config_folders()) for path in sorted(folder.glob("*.yaml"))}
+    """Names of the configs that come with torchsar, and their files; those of sweeps lie in a folder of their own."""
+    return {path.stem: path for folder in reversed(config_folders()) for path in (*sorted(folder.glob("*.yaml")), *sorted(folder.glob("sweeps/*.yaml")))}
 
 
 def find_config(name: str) -> Path:
@@ -81,7 +81,7 @@ def find_config(name: str) -> Path:
     if path.is_file():
         return path
     packaged = packaged_configs()
-    if path.parent in (Path("."), Path("configs")) and path.suffix in ("", ".yaml") and path.stem in packaged:
+    if path.parent in (Path("."), Path("configs"), Path("sweeps"), Path("configs/sweeps")) and path.suffix in ("", ".yaml") and path.stem in packaged:
         return packaged[path.stem]
     if path.is_dir():
         raise ConfigError(f"{name} is a folder, not a config file")
@@ -100,13 +100,20 @@ def read_tree(path: Path) -> dict[str, Any]:
     return tree
 
 
-def override(tree: dict[str, Any], assignments: Sequence[str]) -> dict[str, Any]:
-    """The tree with key=value assignments applied, the keys as dotted paths and the values as YAML."""
+def override(tree: dict[str, Any], assignments: Sequence[str], literal: tuple[str, Sequence[str]] = ("", ())) -> dict[str, Any]:
+    """The tree with key=value assignments applied, the keys as dotted paths and the values as YAML.
+
+    literal: a section whose keys are dotted themselves, and those of its keys that are not: `sweep.world.noise.snr_db=[0, 10]` sets the
+    key "world.noise.snr_db" of `sweep`.
+    """
     for assignment in assignments:
         key, equals, value = assignment.partition("=")
         if not equals or not all(part.strip() for part in key.split(".")):
             raise ConfigError(f"command line: {assignment!r} is not an override; write key=value with a dotted key, such as world.noise.snr_db=10")
-        tree = _assigned(tree, key.strip().split("."), parse(value, f"command line, {key}"), key)
+        path = key.strip().split(".")
+        if path[0] == literal[0] and len(path) > 2 and path[1] not in literal[1]:
+            path = [path[0], ".".join(path[1:])]
+        tree = _assigned(tree, path, parse(value, f"command line, {key}"), key)
     return tree
 
 

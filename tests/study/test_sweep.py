@@ -1,0 +1,326 @@
+"""Sweeps of any trial function: addresses, chunks, memory, resuming, early ends."""
+
+from __future__ import annotations
+
+import logging
+import resource
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import zarr
+
+from tests.study import toy
+from torchsar.core import Draws
+from torchsar.study.errors import ConfigError
+from torchsar.study.montecarlo import Record, Stop, read_sweep, sweep
+from torchsar.study.montecarlo.chunks import CACHE_BYTES, cut, probed_bytes, rows_by_bytes
+from torchsar.study.montecarlo.grid import address, make_grid
+from torchsar.study.montecarlo.stopping import looks
+from torchsar.study.montecarlo.work import Work
+
+
+def same(a: Record, b: Record, rtol: float = 0.0) -> None:
+    assert a.labels == b.labels and a.algorithms == b.algorithms
+    np.testing.assert_array_equal(a.done, b.done)
+    np.testing.assert_array_equal(a.ok, b.ok)
+    for name in a.metrics:
+        np.testing.assert_allclose(a.metrics[name], b.metrics[name], rtol=rtol, atol=rtol)
+
+
+@pytest.fixture(scope="module")
+def reference() -> Record:
+    return toy.run(chunk=7)
+
+
+def test_a_batch_may_hold_several_cases_each_with_its_own_numbers() -> None:
+    both = Draws(3, ("a", "b", "a"), [0, 4, 9]).part("noise")
+    for row, (case, trial) in enumerate((("a", 0), ("b", 4), ("a", 9))):
+        assert torch.equal(both.normal("x", (5,))[row], Draws(3, case, [trial]).part("noise").normal("x", (5,))[0])
+    with pytest.raises(ValueError, match="2 cases need as many trials, got 3"):
+        Draws(3, ("a", "b"), [0, 1, 2])
+
+
+def test_addresses_stay_when_the_grid_grows_or_is_reordered() -> None:
+    small = make_grid({"a": [1.0, 2.0], "b": {"x": {"k": 1}, "y": {"k": 2}}})
+    large = make_grid({"b": {"y": {"k": 2}, "z": {"k": 3}, "x": {"k": 1}}, "a": [0, 2, 1]})
+    known = {tuple(sorted(large.labels_at(p).items())): p.address for p in large.points()}
+    assert all(known[tuple(sorted(small.labels_at(p).items()))] == p.address for p in small.points())
+    assert len(set(known.values())) == 9
+    assert address({"a": 20}) == address({"a": 20.0}) != address({"b": 20})
+
+
+@pytest.mark.parametrize(
+    "grid, batched, said",
+    [
+        ({"a": []}, [], "a has no values"),
+        ({"a": [1, 1.0]}, [], "holds 1.0 twice"),
+        ({"a": "word"}, [], "must be a list of values"),
+        ({"a": [1, "b"]}, [], "mixes numbers and words"),
+        ({"a": [{"k": 1}]}, [], "write {label: value"),
+        ({"trial": [1]}, [], "names a dimension"),
+        ({"a": ["x"]}, ["a"], "finite numbers"),
+        ({"a": [float("nan")]}, [], "a holds the value nan"),
+        ({"a": [1]}, ["b"], "batched names 'b'"),
+    ],
+)
+def test_bad_grids_are_refused_by_name(grid: dict, batched: list, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        make_grid(grid, batched)
+
+
+def test_results_are_labelled_and_whole(reference: Record) -> None:
+    assert reference.dims == ("algorithm", "snr_db", "law", "trial")
+    assert reference.metrics["level_error_m"].shape == (2, 3, 2, 40) and reference.done.all()
+    assert np.isnan(reference.metrics["first_m"][0]).all() and np.isfinite(reference.metrics["first_m"][1]).all()
+    assert reference.ok[1].all()  # without a verdict of its own
+    rmse = np.sqrt((reference.metrics["level_error_m"][0, :, 0] ** 2).mean(-1))
+    np.testing.assert_allclose(rmse, reference.bounds["level_error_m"]["Cramer-Rao bound"][:, 0, 0], rtol=0.4)
+
+
+def test_the_numbers_are_those_of_each_trial_alone(reference: Record) -> None:
+    point = address({"snr_db": 10.0, "law": "tilted"})
+    alone = toy.trial({"snr_db": torch.tensor([10.0], dtype=torch.float64), "law": "tilted"}, Draws(5, (point,), [33]))
+    np.testing.assert_allclose(reference.metrics["level_error_m"][0, 1, 1, 33], float(alone["average"]["level_error_m"][0]), rtol=1e-5)
+    assert reference.metrics["first_m"][1, 1, 1, 33] == float(alone["transformed"]["first_m"][0])
+
+
+@pytest.mark.parametrize("chunk", [1, 7, None, 1000])
+def test_chunks_change_no_draw_and_no_verdict(reference: Record, chunk: int | None) -> None:
+    other = toy.run(chunk=chunk)
+    np.testing.assert_array_equal(other.metrics["first_m"], reference.metrics["first_m"])
+    same(other, reference, 1e-5 if chunk != 7 else 0.0)
+
+
+def test_automatic_chunks_follow_the_bytes_of_the_largest_tensor() -> None:
+    def trial(parameters, draws):
+        x = draws.normal("x", (1024,), torch.complex64)
+        return {"m": torch.fft.fft(torch.cat([x, x], -1)).abs().sum(-1)}
+
+    work = Work(trial, tuple(make_grid({}).cases()), {}, (), 1)
+    bytes_per_trial = probed_bytes(work, 0)
+    assert bytes_per_trial in (16 * 1024, 32 * 1024)  # the doubled complex64 row, or the float64 draws
+    assert rows_by_bytes(bytes_per_trial, "cpu") == CACHE_BYTES // bytes_per_trial
+    assert rows_by_bytes(10 * CACHE_BYTES, "cpu") == 1
+    trial.bytes_per_trial = lambda fixed: 12345
+    assert probed_bytes(work, 0) == 12345
+
+
+def test_chunks_are_equal_pieces_in_one_order() -> None:
+    case = make_grid({"a": [1.0, 2.0, 3.0]}, ["a"]).cases()[0]
+    chunks = list(cut(0, case, {0, 2}, 10, 15, 4))
+    assert [len(c) for c in chunks] == [3, 4, 3]
+    assert [(p, t) for c in chunks for p, t in zip(c.points, c.trials)] == [(p, t) for p in (0, 2) for t in range(10, 15)]
+
+
+@pytest.mark.parametrize("error", [torch.OutOfMemoryError("full"), MemoryError("full"), RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 10 bytes")])
+def test_too_large_a_batch_is_halved_and_the_sweep_goes_on(reference: Record, error: Exception, caplog: pytest.LogCaptureFixture) -> None:
+    sizes = []
+
+    def greedy(parameters, draws):
+        sizes.append(len(draws.trials))
+        if len(draws.trials) > 4:
+            raise error
+        return toy.trial(parameters, draws)
+
+    with caplog.at_level(logging.WARNING, "torchsar"):
+        same(toy.run(trial=greedy, chunk=20), reference, 1e-5)
+    assert sum(size > 4 for size in sizes) <= 6  # one chunk of each case teaches the rest
+    assert "20 trials at once do not fit into memory; going on with" in caplog.text
+
+
+def test_a_single_trial_that_does_not_fit_is_a_sentence() -> None:
+    def greedy(parameters, draws):
+        raise MemoryError
+
+    with pytest.raises(ConfigError, match="a single trial does not fit into the memory of cpu"):
+        toy.run(trial=greedy, chunk=5)
+
+
+@pytest.mark.parametrize(
+    "result, said",
+    [
+        (lambda rows: {"m": torch.zeros(rows + 1)}, r"trial.m must hold one real number for each of the 5 trials"),
+        (lambda rows: {"m": torch.zeros(rows, dtype=torch.complex64)}, "real number"),
+        (lambda rows: {"ok": torch.zeros(rows)}, "ok must be bool"),
+        (lambda rows: {"m": torch.zeros(rows), "a": {"m": torch.zeros(rows)}}, "not both"),
+        (lambda rows: 1 / 0, "ZeroDivisionError: division by zero"),
+    ],
+)
+def test_what_a_trial_does_wrong_is_named_with_its_place(result, said: str) -> None:
+    with pytest.raises(ConfigError, match=said) as caught:
+        sweep(lambda parameters, draws: result(len(draws.trials)), {"law": ["flat"]}, trials=5, chunk=5)
+    assert "in trials 0 to 4 of law=flat" in str(caught.value)
+    assert caught.value.__cause__ is not None
+
+
+def test_foreign_algorithms_in_the_middle_are_refused() -> None:
+    with pytest.raises(ConfigError, match="algorithm 'b', those before it of a"):
+        sweep(lambda p, d: {p["law"]: {"m": torch.zeros(len(d.trials))}}, {"law": ["a", "b"]}, trials=2)
+
+
+def test_the_store_holds_the_record_and_says_where_it_comes_from(reference: Record, tmp_path: Path) -> None:
+    toy.run(tmp_path / "s", chunk=7, config={"scene": "toy"})
+    held = read_sweep(tmp_path / "s")
+    same(held, reference)
+    np.testing.assert_array_equal(held.bounds["level_error_m"]["Cramer-Rao bound"], reference.bounds["level_error_m"]["Cramer-Rao bound"])
+    assert held.about["seed"] == 5 and held.about["identity"]["config"] == {"scene": "toy"} and len(held.about["hash"]) == 24
+    session = held.about["sessions"][0]
+    assert session["trials"] == 240 and session["versions"]["torch"] == torch.__version__ and session["device"] == "cpu" and session["seconds"] > 0
+    root = zarr.open_group(str(tmp_path / "s" / "results.zarr"), mode="r")
+    assert root.metadata.zarr_format == 3 and root["level_error_m"].metadata.dimension_names == ("algorithm", "snr_db", "law", "trial")
+    assert list(root["law"][:]) == ["flat", "tilted"] and list(root["snr_db"][:]) == [0, 10, 20]
+
+
+def test_xarray_reads_it(tmp_path: Path) -> None:
+    xarray = pytest.importorskip("xarray", reason="the extra xarray is not installed")
+    record = toy.run(tmp_path / "s", chunk=7)
+    data = record.to_xarray()
+    direct = xarray.open_zarr(str(tmp_path / "s" / "results.zarr"), consolidated=False)
+    for one in (data, direct):
+        picked = one["level_error_m"].sel(algorithm="transformed", snr_db=10.0, law="tilted")
+        np.testing.assert_array_equal(picked.values, record.metrics["level_error_m"][1, 1, 1])
+
+
+def test_a_finished_sweep_is_not_overwritten_and_resuming_computes_nothing(tmp_path: Path) -> None:
+    toy.run(tmp_path / "s")
+    with pytest.raises(ConfigError, match="holds a sweep already; add --resume"):
+        toy.run(tmp_path / "s")
+
+    def never(parameters, draws):
+        raise AssertionError("nothing is missing")
+
+    never.__qualname__ = "trial"
+    assert toy.run(tmp_path / "s", trial=never, resume=True).done.all()
+
+
+def test_resuming_an_empty_folder_starts(tmp_path: Path) -> None:
+    (tmp_path / "s").mkdir()
+    assert toy.run(tmp_path / "s", resume=True, trials=3).done.all()
+
+
+def test_foreign_folders_are_never_touched(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "precious.txt").write_text("x")
+    (tmp_path / "mine2" / "results.zarr").mkdir(parents=True)
+    (tmp_path / "file").write_text("x")
+    for name in ("mine", "mine2", "file"):
+        for resume in (False, True):
+            with pytest.raises(ConfigError, match="not the folder of a sweep|already|no results|not left by|cannot be written"):
+                toy.run(tmp_path / name, resume=resume)
+    assert (tmp_path / "mine" / "precious.txt").read_text() == "x"
+
+
+def test_trials_and_values_can_be_added(tmp_path: Path) -> None:
+    toy.run(tmp_path / "s", trials=20, grid={"snr_db": [0.0, 20.0], "law": ["flat"]}, chunk=7)
+    seen: list[tuple[str, int]] = []
+
+    def noting(parameters, draws):
+        seen.extend(zip(draws.case, draws.trials))
+        return toy.trial(parameters, draws)
+
+    noting.__qualname__ = "trial"
+    grown = toy.run(tmp_path / "s", trial=noting, resume=True, chunk=7)
+    same(grown, toy.run(chunk=7), 1e-5)
+    assert len(seen) == len(set(seen)) == 240 - 40
+    assert read_sweep(tmp_path / "s").labels["snr_db"] == (0.0, 20.0, 10.0)  # what was there stays where it was
+    part = toy.run(tmp_path / "s", resume=True, grid={"snr_db": [20.0], "law": ["flat"]}, trials=20)
+    assert part.labels == {"snr_db": (20.0,), "law": ("flat",)}
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        ({"seed": 6}, "seed was 5 and is 6"),
+        ({"config": {"world": {"lines": 65}}}, "config.world.lines was 64 and is 65"),
+        ({"grid": {"snr_db": [0.0]}}, "holds a sweep over snr_db, law, not over snr_db"),
+        ({"grid": {"snr_db": [0.0], "law": {"flat": "tilted"}}}, "where law 'flat' is"),
+    ],
+)
+def test_resuming_another_sweep_is_refused_with_what_differs(tmp_path: Path, change: dict, said: str) -> None:
+    config = {"config": {"world": {"lines": 64}}}
+    toy.run(tmp_path / "s", trials=2, **config)
+    with pytest.raises(ConfigError, match=said):
+        toy.run(tmp_path / "s", trials=2, resume=True, **{**config, **change})
+
+
+def test_two_writers_are_refused(tmp_path: Path) -> None:
+    def second(parameters, draws):
+        with pytest.raises(ConfigError, match="another sweep is writing"):
+            toy.run(tmp_path / "s", resume=True)
+        return toy.trial(parameters, draws)
+
+    toy.run(tmp_path / "s", trial=second, trials=2)
+
+
+def test_arrays_of_chosen_trials_are_kept(tmp_path: Path) -> None:
+    toy.run(tmp_path / "s", trials=6, save=[1, 4], chunk=4)
+    saved = zarr.open_group(str(tmp_path / "s" / "results.zarr"), mode="r")["saved"]
+    point = saved[address({"snr_db": 0.0, "law": "flat"})]
+    assert set(point.group_keys()) == {"1", "4"} and len(list(saved.group_keys())) == 6
+    expected = toy.trial({"snr_db": torch.zeros(1, dtype=torch.float64), "law": "flat"}, Draws(5, (address({"snr_db": 0.0, "law": "flat"}),), [4]))
+    np.testing.assert_allclose(point["4/average.samples"][:], expected["saved"]["average"]["samples"][0].numpy(), rtol=1e-6)
+    assert point["4"].attrs["parameters"] == {"snr_db": 0.0, "law": "flat"} and point["4"].attrs["trial"] == 4
+
+
+@pytest.mark.parametrize("bad", [{"trials": 0}, {"chunk": 0}, {"seed": -1}, {"trials": 2.5}, {"device": "abacus"}])
+def test_impossible_settings_are_refused(bad: dict) -> None:
+    with pytest.raises(ConfigError, match=next(iter(bad)) if "device" not in bad else "abacus"):
+        toy.run(**bad)
+
+
+def test_points_end_early_by_the_trials_in_order_alone() -> None:
+    assert looks(200, None) == [200] and looks(401, Stop("m", 0.1)) == [50, 100, 200, 400, 401] and looks(30, Stop("m", 0.1)) == [30]
+    stop = Stop("level_error_m", 0.12, "rmse")
+    runs = [toy.run(stop=stop, trials=500, chunk=chunk) for chunk in (7, 64)]
+    counts = runs[0].done.sum(-1)
+    np.testing.assert_array_equal(counts, runs[1].done.sum(-1))
+    assert set(counts.flat) <= {50, 100, 200, 400, 500} and counts.min() < 500
+    assert toy.run(stop=Stop("level_error_m", 0.9), trials=500).done.sum(-1).max() == 50
+    with pytest.raises(ConfigError, match=r"stop.metric names 'level_error'.*did you mean 'level_error_m'"):
+        toy.run(stop=Stop("level_error", 0.1), trials=500)
+
+
+def test_a_stopped_point_is_extended_when_more_is_asked(tmp_path: Path) -> None:
+    loose, tight = Stop("level_error_m", 0.5), Stop("level_error_m", 0.12)
+    assert toy.run(tmp_path / "s", stop=loose, trials=200).done.sum(-1).max() == 50
+    again = toy.run(tmp_path / "s", stop=tight, trials=200, resume=True)
+    np.testing.assert_array_equal(again.done.sum(-1), toy.run(stop=tight, trials=200).done.sum(-1))
+
+
+def test_memory_stays_flat_over_ten_thousand_trials(tmp_path: Path) -> None:
+    held = []
+
+    def trial(parameters, draws):
+        x = torch.zeros(len(draws.trials), 1 << 14)
+        held.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+        return {"m_m": x.sum(-1)}
+
+    sweep(trial, {"a": [1.0, 2.0]}, trials=5_000, chunk=50, out=tmp_path / "s")
+    assert len(held) == 200 and held[-1] - held[20] < 6_000  # KiB; what a chunk holds, 3 MB, must not pile up to 600 MB
+
+
+def test_the_machinery_costs_less_than_five_percent(tmp_path: Path) -> None:
+    x = torch.randn(64, 1024, dtype=torch.complex64)
+
+    def trial(parameters, draws):
+        began = time.perf_counter()
+        while time.perf_counter() - began < 0.05:
+            torch.fft.fft(x)
+        return {f"metric{i}_m": torch.zeros(len(draws.trials)) for i in range(8)}
+
+    def bare() -> float:
+        began = time.perf_counter()
+        for _ in range(100):
+            trial({"a": 1.0}, Draws(1, trials=range(8)))
+        return time.perf_counter() - began
+
+    shares = []
+    for attempt in range(3):  # others use this machine too
+        record = sweep(trial, {"a": [1.0, 2.0]}, trials=400, chunk=8, out=tmp_path / f"s{attempt}")
+        shares.append(record.about["sessions"][0]["seconds"] / bare() - 1)
+        if shares[-1] < 0.05:
+            return
+    pytest.fail(f"overheads {shares}")

@@ -1,0 +1,149 @@
+"""Sweeps that are killed, interrupted, or computed by several processes."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.study import toy
+from tests.study.tiny import write_tiny
+from torchsar.study.errors import ConfigError
+from torchsar.study.montecarlo import Record, read_sweep
+from torchsar.study.montecarlo.engines import engine
+
+ROOT = Path(__file__).resolve().parents[2]
+needs_dask = pytest.mark.skipif(pytest.importorskip("importlib.util").find_spec("distributed") is None, reason="dask.distributed (extra cluster) is not installed")
+
+
+def start(out: Path, *options: str) -> subprocess.Popen:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen([sys.executable, "-m", "tests.study.toy", str(out), *options], cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def rows(log: Path) -> list[tuple[str, str]]:
+    """Rows that the log says were computed: (address, trial)."""
+    return [tuple(line.split()[1:]) for line in log.read_text().splitlines() if line.count(" ") == 2] if log.exists() else []
+
+
+def marked(out: Path) -> np.ndarray | None:
+    try:
+        return read_sweep(out).done
+    except ConfigError:
+        return None
+
+
+def bitwise(a: Record, b: Record) -> None:
+    assert a.done.all() and b.done.all()
+    np.testing.assert_array_equal(a.ok, b.ok)
+    for name in a.metrics:
+        np.testing.assert_array_equal(a.metrics[name], b.metrics[name])
+    for metric, named in a.bounds.items():
+        for name in named:
+            np.testing.assert_array_equal(named[name], b.bounds[metric][name])
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Record:
+    """The toy sweep in one process with one thread."""
+    out = tmp_path_factory.mktemp("alone") / "s"
+    done = start(out)
+    _, said = done.communicate(timeout=120)
+    assert done.returncode == 0, said[-2000:]
+    return read_sweep(out)
+
+
+def test_a_program_killed_at_random_moments_loses_nothing_and_repeats_nothing(alone: Record, tmp_path: Path) -> None:
+    out, log, moments = tmp_path / "s", tmp_path / "log", random.Random(7)
+    kills = 0
+    while kills < 6:
+        before = marked(out)
+        known = len(rows(log))
+        running = start(out, "--slow", "0.05", "--log", str(log))
+        deadline = time.monotonic() + 60
+        while len(rows(log)) == known and running.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+        time.sleep(moments.uniform(0.0, 0.35))
+        running.send_signal(signal.SIGKILL)
+        running.communicate()
+        after = marked(out)
+        if after is None:
+            continue
+        kills += 1
+        if before is not None:
+            assert not (before & ~after).any()  # nothing that was marked is lost
+            assert not set(rows(log)[known:]) & computed_before  # nothing that was marked is computed again
+        record = read_sweep(out)
+        for algorithm in range(len(record.algorithms)):
+            assert np.isfinite(record.metrics["level_error_m"][algorithm][after]).all()  # no torn chunk
+        computed_before = addresses(after)
+    finished = start(out, "--log", str(log))
+    assert finished.wait(timeout=120) == 0
+    assert not set(rows(log)[len(rows(log)) - int((~after).sum()) :]) & computed_before
+    bitwise(read_sweep(out), alone)
+
+
+def addresses(done: np.ndarray) -> set[tuple[str, str]]:
+    """Rows that are marked, as the log names them."""
+    from torchsar.study.montecarlo.grid import make_grid
+
+    points = make_grid(toy.GRID, ["snr_db"]).points()
+    return {(p.address, str(trial)) for p in points for trial in np.flatnonzero(done[p.index])}
+
+
+@needs_dask
+@pytest.mark.slow
+def test_two_workers_give_the_same_bits_and_survive_the_death_of_workers(alone: Record, tmp_path: Path) -> None:
+    out, log = tmp_path / "s", tmp_path / "log"
+    running = start(out, "--workers", "2", "--slow", "0.3", "--log", str(log))
+    killed: set[int] = set()
+    deadline = time.monotonic() + 120
+    while running.poll() is None and len(killed) < 3 and time.monotonic() < deadline:
+        fresh = [int(line.split()[0]) for line in log.read_text().splitlines() if line.count(" ") == 2] if log.exists() else []
+        victims = [pid for pid in dict.fromkeys(fresh[-14:]) if pid not in killed]
+        if victims and len(fresh) > 30 * (len(killed) + 1):
+            os.kill(victims[-1], signal.SIGKILL)
+            killed.add(victims[-1])
+        time.sleep(0.05)
+    _, said = running.communicate(timeout=120)
+    assert running.returncode == 0, said[-2000:]
+    assert len(killed) == 3
+    bitwise(read_sweep(out), alone)
+    assert len({line.split()[0] for line in log.read_text().splitlines()}) >= 4  # both workers, and those that replaced the dead
+    assert max(Counter(rows(log)).values()) <= 1 + len(killed)
+
+
+@needs_dask
+def test_a_scheduler_that_does_not_answer_is_named() -> None:
+    with pytest.raises(ConfigError, match="--cluster nowhere://x does not answer"), engine(cluster="nowhere://x"):
+        pytest.fail("must not begin")
+    with pytest.raises(ConfigError, match="give one of them"), engine(workers=2, cluster="tcp://localhost:1"):
+        pytest.fail("must not begin")
+
+
+def test_an_interrupted_sweep_says_how_to_go_on_and_does(tmp_path: Path) -> None:
+    config, out = write_tiny(tmp_path, sweep={"world.noise.snr_db": [0.0, 10.0], "trials": 4000, "chunk": 4}), tmp_path / "result"
+    command = [sys.executable, "-m", "torchsar.cli", "sweep", str(config), "--out", str(out)]
+    for stop in (signal.SIGINT, signal.SIGTERM):
+        running = subprocess.Popen([*command, "--resume"], stderr=subprocess.PIPE, text=True, cwd=ROOT)
+        assert running.stderr is not None
+        while "chunk" not in (line := running.stderr.readline()) and line:
+            pass
+        running.send_signal(stop)
+        _, said = running.communicate(timeout=60)
+        assert running.returncode == 130, said
+        assert "interrupted" in said and "trials are recorded in" in said and said.strip().endswith("go on with --resume")
+        assert "Traceback" not in said and not (out / "report.html").exists()
+    held = int(read_sweep(out).done.sum())
+    assert held >= 8
+    done = subprocess.run([*command, "--resume", f"sweep.trials={held // 2 + 2}"], capture_output=True, text=True, cwd=ROOT, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert (out / "report.html").exists()

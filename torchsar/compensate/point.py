@@ -1,0 +1,92 @@
+"""Doppler of the beam from the place of one point in a focused image (Tsvetkov 2017, text after Fig. 5).
+
+A point whose crossing of the beam centre is known, such as a corner reflector, tells the Doppler at that time by where it lies along azimuth:
+an image holds it at the time when its Doppler is that of the image's frame. The place of a peak is known to 0.39 / (T sqrt(q)) in Doppler,
+the Cramer-Rao bound of a tone, which no estimator of the beam's envelope can reach through one point.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.doppler import point_doppler, wrap_hz
+from torchsar.core import Estimate, Signal, Stage, settle
+from torchsar.metrics.bounds import tone_frequency_bound_hz
+from torchsar.metrics.impulse import impulse_response
+from torchsar.radar import StripmapRadar
+
+
+def doppler_at(radar: StripmapRadar, azimuth_m: Tensor, slant_m: Tensor, frame_hz: Tensor | float, velocity_m_s: Tensor | float, crossing_s: Tensor | float) -> Tensor:
+    """Doppler at the slow time crossing_s of a point that an image of frame frame_hz holds at (azimuth_m, slant_m), Hz, positive when closing.
+
+    All arguments broadcast. Exact for a straight path; the inverse of StripmapRadar.image_position.
+    """
+    sin = radar.sin_squint(frame_hz, velocity_m_s)
+    closest = slant_m * torch.sqrt(1 - sin.square())
+    zero_doppler_s = azimuth_m / radar.velocity_m_s + sin * slant_m / velocity_m_s
+    ahead = velocity_m_s * (zero_doppler_s - crossing_s)
+    return 2 * velocity_m_s / radar.wavelength_m * ahead / torch.sqrt(closest.square() + ahead.square())
+
+
+def peak_time_s(image: Tensor, prf_hz: float, sample: Tensor, band_hz: Tensor | float, centre_hz: Tensor | float) -> Tensor:
+    """Slow time, counted from the first line, of the strongest peak of one range position; maximum likelihood within a Doppler band.
+
+    image: (..., azimuth, range); sample: range position (...,), fractional; band_hz: width of the point's spectrum about centre_hz (...,), which
+    counts as the spectrum of the image does, modulo the PRF. An image passes noise of the whole PRF; only that in the point's band belongs to it.
+    """
+    n = image.shape[-2]
+    weights = torch.sinc(torch.arange(image.shape[-1], dtype=torch.float64, device=image.device) - sample[..., None])
+    spectrum = torch.fft.fft((image * weights[..., None, :].to(image.real.dtype)).sum(-1).to(torch.complex128))
+    count = max(2, min(n, round(float(band_hz) * n / prf_hz)))
+    first = torch.round(torch.as_tensor(centre_hz, dtype=torch.float64, device=image.device) * n / prf_hz - (count - 1) / 2).long()
+    bins = torch.remainder(first[..., None] + torch.arange(count, device=image.device), n)
+    inside = spectrum.gather(-1, bins.expand(*spectrum.shape[:-1], count))
+    return torch.remainder(-point_doppler(inside, n / prf_hz), n / prf_hz)
+
+
+class PointDoppler(Stage):
+    """`doppler_hz` of the beam from the brightest point of an image, which the beam centre crosses at crossing_s (default: the middle line).
+
+    frame_hz, velocity_m_s: those of the image; by default the radar's pointing and its nominal velocity. std: the bound of a tone at the
+    measured peak signal-to-noise ratio. ok where the peak stands 16 times above the mean power of the image's pixels or more. Raises ValueError
+    where neither the radar nor a connected value says what the frame is.
+    """
+
+    works_on = ("azimuth", "range")
+    provides = ("doppler_hz", "doppler_baseband_hz")
+
+    def __init__(self, radar: StripmapRadar, crossing_s: float | None = None) -> None:
+        super().__init__()
+        self.radar, self.crossing_s = radar, crossing_s
+
+    @torch.no_grad()
+    def forward(self, signal: Signal, frame_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Estimate:
+        radar, image, (azimuth, slant) = self.radar, signal.data, signal.axes
+        frame = radar.pointing_doppler_hz if frame_hz is None else frame_hz
+        if frame is None:
+            raise ValueError("PointDoppler needs the frame of the image: set radar.pointing_doppler_hz, or connect frame_hz with the Doppler that the image was focused with")
+        power = image.real.square() + image.imag.square()
+        line, sample = torch.unravel_index(power.flatten(-2).argmax(-1), power.shape[-2:])
+        found = impulse_response(signal, (azimuth.start + azimuth.step * line.double(), slant.start + slant.step * sample.double()), search_m=azimuth.step)
+        velocity = radar.velocity_m_s if velocity_m_s is None else velocity_m_s
+        dwell = radar.integration_s or radar.prf_hz / float(radar.azimuth_rate_hz_s(slant.start))
+        crossing = (azimuth.n // 2) / radar.prf_hz if self.crossing_s is None else self.crossing_s - azimuth.start / radar.velocity_m_s
+        position = found["position_range_m"]
+        band = dwell * float(radar.azimuth_rate_hz_s(slant.start))
+        value = doppler_at(radar, found["position_azimuth_m"] - azimuth.start, position, frame, velocity, crossing)
+        for _ in range(2):
+            at_s = peak_time_s(image, radar.prf_hz, slant.index_of(position), band, value)
+            value = doppler_at(radar, at_s * radar.velocity_m_s, position, frame, velocity, crossing)
+        value, finite = settle(value, 0.0)
+        floor = power.flatten(-2).median(-1).values.double() / 0.6931  # of an exponential law
+        q = found["peak"].abs().square() / torch.where(floor > 0, floor, 1)
+        std = tone_frequency_bound_hz(q.clamp_min(1e-12), dwell)
+        mean = power.mean((-2, -1)).double()
+        return Estimate(
+            {"doppler_hz": value, "doppler_baseband_hz": wrap_hz(value, radar.prf_hz)},
+            1 - 1 / (1 + q),
+            finite & (found["peak"].abs().square() > 16 * mean) & (mean > 0),
+            {"doppler_hz": std, "doppler_baseband_hz": std},
+            {"peak_to_noise": q},
+        )

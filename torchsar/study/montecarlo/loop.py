@@ -1,0 +1,229 @@
+"""The sweep itself: points and trials in, a record out; it knows no physics."""
+
+from __future__ import annotations
+
+import logging
+import platform
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchsar.study.errors import ConfigError, did_you_mean
+from torchsar.study.montecarlo.chunks import cut, probed_bytes, rows_by_bytes
+from torchsar.study.montecarlo.engines import Engine, Task, engine
+from torchsar.study.montecarlo.grid import Grid, make_grid
+from torchsar.study.montecarlo.progress import Progress
+from torchsar.study.montecarlo.record import Record
+from torchsar.study.montecarlo.stopping import Stop, looks
+from torchsar.study.montecarlo.store import Store, empty, read_sweep
+from torchsar.study.montecarlo.work import Chunk, Outcome, Trial, Work
+from torchsar.study.report import installed_version
+
+log = logging.getLogger("torchsar")
+
+
+class Interrupted(KeyboardInterrupt):
+    """Stopped by the user; what had been computed is recorded."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a sweep is to compute, apart from where. chunk: rows a batch, None to choose by bytes; save: trials whose arrays are kept.
+
+    needs: metrics that something after the sweep asks for, by where that is said; the first batch must give them.
+    """
+
+    grid: Grid
+    trials: int = 200
+    seed: int = 1
+    chunk: int | None = None
+    stop: Stop | None = None
+    save: frozenset[int] = frozenset()
+    device: str = "cpu"
+    needs: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, value, least in (("trials", self.trials, 1), ("chunk", self.chunk, 1), ("seed", self.seed, 0)):
+            if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < least):
+                raise ConfigError(f"sweep: {name} must be a whole number of at least {least}, got {value!r}")
+        try:
+            torch.empty(0, device=self.device)
+        except (RuntimeError, AssertionError) as error:
+            raise ConfigError(f"sweep: the device {self.device!r} cannot be used here: {str(error).splitlines()[0]}") from None
+
+
+def sweep(
+    trial: Trial,
+    grid: Mapping[str, Sequence[Any] | Mapping[str, Any]],
+    *,
+    trials: int = 200,
+    seed: int = 1,
+    batched: Sequence[str] = (),
+    out: Path | str | None = None,
+    resume: bool = False,
+    chunk: int | None = None,
+    workers: int | None = None,
+    cluster: str | None = None,
+    stop: Stop | None = None,
+    save: Iterable[int] = (),
+    device: str = "cpu",
+    config: Mapping[str, Any] | None = None,
+) -> Record:
+    """Run `trial(parameters, draws)` over a grid of parameters, many trials at once, and return the labelled results.
+
+    trial: gets the parameters of a batch by name, and `Draws` whose trials are the rows of that batch; returns {metric: (rows,) tensor},
+    or {algorithm: {metric: tensor}} to compare algorithms on the same noise. `ok` (bool) is an algorithm's own verdict. Two further keys:
+    "bounds" {metric: {name: (rows,) tensor}}, and "saved" {algorithm: {name: (rows, ...) tensor}}, kept for the trials in `save`.
+    grid: {name: values}, or {name: {label: value}} for values that are no numbers or words. batched: names whose values come as one float64
+    tensor (rows,); any other value comes as it is, one case after the other.
+    trials: per point; more trials on a finished sweep extend it. stop: ends a point early. chunk: rows a batch (default: by bytes).
+    out: folder for results.zarr; None keeps the results in memory only. resume: go on with what is there. workers, cluster: processes of
+    this machine, or the address of a dask scheduler. config: whatever else the results depend on; resuming with another one is refused.
+
+    Random numbers depend on (seed, purpose, parameters, trial) alone. Raises ConfigError for bad input, Interrupted after Ctrl-C.
+    """
+    plan = Plan(make_grid(grid, batched), trials, seed, chunk, stop, frozenset(save), device)
+    identity = {"seed": seed, "trial": getattr(trial, "__qualname__", type(trial).__qualname__), "config": dict(config or {})}
+    store = None if out is None else open_store(Path(out), plan, identity, resume)
+    return run_plan(plan, trial, store, engine(workers, cluster)).select(plan.grid.labels)
+
+
+def open_store(out: Path, plan: Plan, identity: Mapping[str, Any], resume: bool) -> Store:
+    """results.zarr in the folder: a new one, or with `resume` the one that is there. Raises ConfigError where that would lose results.
+
+    A sweep that ended before its first mark holds nothing to lose and is begun anew.
+    """
+    path = out / "results.zarr"
+    if path.exists() and resume:
+        return Store.resume(path, plan.grid, plan.trials, identity)
+    if path.exists() and read_sweep(path).done.any():
+        raise ConfigError(f"{out} holds a sweep already; add --resume (resume=True) to go on with it, or choose another folder")
+    if not path.exists() and out.exists() and (not out.is_dir() or any(p for p in out.iterdir() if not p.name.startswith(".results.zarr"))):
+        raise ConfigError(f"{out} exists and is not the folder of a sweep; choose another one")
+    return Store.create(path, plan.grid, plan.trials, identity)
+
+
+def run_plan(plan: Plan, trial: Trial, store: Store | None, engine: AbstractContextManager[Engine], title: str = "sweep") -> Record:
+    """Compute what is missing and return the whole record, which may hold more labels than the plan's grid after a resume."""
+    record = empty(plan.grid.labels, plan.trials) if store is None else store.record
+    cases = tuple(plan.grid.cases())
+    work = Work(trial, cases, {p.name: p.values for p in plan.grid.parameters if p.batched}, plan.grid.names, plan.seed, plan.device, plan.save)
+    run = _Run(plan, work, record, store)
+    try:
+        with engine as chosen:
+            run.all_levels(chosen, title)
+    except KeyboardInterrupt:
+        raise Interrupted(f"{int(record.done.sum())} trials are recorded") from None
+    finally:
+        if store is not None:
+            store.close()
+    return record
+
+
+class _Run:
+    """The state of one session: which points go on, how many rows fit, what is recorded."""
+
+    def __init__(self, plan: Plan, work: Work, record: Record, store: Store | None) -> None:
+        self.plan, self.work, self.record, self.store = plan, work, record, store
+        self.places = [[record.place(plan.grid.labels_at(p)) for p in case.points] for case in work.cases]
+        self.active = [set(range(len(case.points))) for case in work.cases]
+        self.fits: dict[int, int] = {}
+        self.rows: dict[int, int] = {}
+        self.settled_at: dict[tuple[int, int], int] = {}
+
+    def all_levels(self, engine: Engine, title: str) -> None:
+        levels = sorted({*looks(self.plan.trials, self.plan.stop), *(n for n in self.record.about.get("finished", []) if n < self.plan.trials)})
+        progress, began, first = Progress(title, self._expected(levels[-1]), self._recorded(levels[-1])), time.perf_counter(), 0
+        session = self._session(engine)
+        try:
+            for last in levels:
+                for chunk, outcome in engine.results(self.work, self._tasks(first, last)):
+                    self._enter(chunk, outcome)
+                    progress.advance(len(chunk), outcome.seconds)
+                self._finished(last)
+                if last in looks(self.plan.trials, self.plan.stop)[:-1]:
+                    self._drop_settled(last)
+                    progress.expect(self._expected(levels[-1]))
+                first = last
+        finally:
+            progress.close()
+            self._note({**session, "seconds": time.perf_counter() - began, "trials": progress.done - progress.began_with, "chunk_rows": {str(k): v for k, v in self.rows.items()}})
+
+    def _expected(self, trials: int) -> int:
+        """Trials that the sweep will hold if no further point ends early."""
+        return sum(self.settled_at.get((case, p), trials) for case, places in enumerate(self.places) for p in range(len(places)))
+
+    def _finished(self, trials: int) -> None:
+        """Remember that all points got this far: batches never reach across, so that an extension of a sweep runs the same ones however often it is resumed."""
+        finished = sorted({*self.record.about.get("finished", []), trials})
+        self._about(finished=finished)
+
+    def _recorded(self, trials: int) -> int:
+        return sum(int(self.record.done[(*place, slice(0, trials))].sum()) for places in self.places for place in places)
+
+    def _tasks(self, first: int, last: int) -> Iterator[Task]:
+        """Chunks of one level without the rows that are done."""
+        for number, case in enumerate(self.work.cases):
+            missing = any(not self.record.done[(*self.places[number][p], slice(first, last))].all() for p in self.active[number])
+            if not missing:
+                continue
+            self.rows[number] = self.plan.chunk or self.rows.get(number) or rows_by_bytes(probed_bytes(self.work, number), self.plan.device)
+            for whole in cut(number, case, self.active[number], first, last, self.rows[number]):
+                keep = [i for i, (p, t) in enumerate(zip(whole.points, whole.trials)) if not self.record.done[(*self.places[number][p], t)]]
+                if keep:
+                    yield Chunk(number, tuple(whole.points[i] for i in keep), tuple(whole.trials[i] for i in keep)), self.fits.get(number)
+
+    def _enter(self, chunk: Chunk, outcome: Outcome) -> None:
+        places = [self.places[chunk.case][p] for p in chunk.points]
+        if not self.record.algorithms:
+            self._refuse_missing(outcome)
+        self.record.add(places, chunk.trials, outcome.values, outcome.bounds)
+        if outcome.fits is not None and outcome.fits < self.fits.get(chunk.case, len(chunk)):
+            log.warning("warning: %d trials at once do not fit into memory; going on with %d", len(chunk), outcome.fits)
+            self.fits[chunk.case] = outcome.fits
+        if self.store is not None:
+            points = self.work.cases[chunk.case].points
+            for row, arrays in outcome.saved.items():
+                self.store.save(self.plan.grid.labels_at(points[chunk.points[row]]), chunk.trials[row], arrays)
+            self.store.entered(places, chunk.trials)
+
+    def _refuse_missing(self, outcome: Outcome) -> None:
+        given = {metric for metrics in outcome.values.values() for metric in metrics}
+        for where, metric in {**self.plan.needs, **({"stop.metric": self.plan.stop.metric} if self.plan.stop else {})}.items():
+            if metric not in given:
+                raise ConfigError(f"{where} names {metric!r}, which no trial gives{did_you_mean(metric, given)}")
+
+    def _drop_settled(self, trials: int) -> None:
+        assert self.plan.stop is not None
+        for case, (places, active) in enumerate(zip(self.places, self.active)):
+            ended = {p for p in active if self.plan.stop.reached(self.record, places[p], trials, self.plan.seed)}
+            self.settled_at.update({(case, p): trials for p in ended})
+            active -= ended
+
+    def _session(self, engine: Engine) -> dict[str, Any]:
+        gpu = {"gpu": torch.cuda.get_device_name(self.plan.device)} if torch.device(self.plan.device).type == "cuda" else {}
+        return {
+            "began": datetime.now(UTC).isoformat(timespec="seconds"),
+            "device": self.plan.device,
+            **gpu,
+            "workers": engine.workers,
+            "threads": getattr(engine, "threads", None) or torch.get_num_threads(),
+            "machine": platform.machine(),
+            "versions": {"torchsar-lab": installed_version(), "torch": torch.__version__, "numpy": np.__version__, "python": platform.python_version()},
+        }
+
+    def _note(self, session: Mapping[str, Any]) -> None:
+        """What this session was, beside those before it."""
+        self._about(seed=self.plan.seed, sessions=[*self.record.about.get("sessions", []), session])
+
+    def _about(self, **attributes: Any) -> None:
+        self.record.about = {**self.record.about, **attributes}
+        if self.store is not None:
+            self.store.note(**attributes)

@@ -1,0 +1,100 @@
+"""`torchsar sweep`: a Monte Carlo sweep, from config to report."""
+
+from __future__ import annotations
+
+import logging
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from torchsar.study.build import resolved
+from torchsar.study.config import Loaded
+from torchsar.study.folder import write_json
+from torchsar.study.judge import DEFINITIONS
+from torchsar.study.montecarlo.engines import engine
+from torchsar.study.montecarlo.grid import Grid
+from torchsar.study.montecarlo.loop import Interrupted, Plan, open_store, run_plan
+from torchsar.study.montecarlo.pictures import draw_sweep
+from torchsar.study.montecarlo.record import Record
+from torchsar.study.montecarlo.report import write_sweep_report
+from torchsar.study.montecarlo.stopping import Stop
+from torchsar.study.montecarlo.summary import summary_tree
+from torchsar.study.trials import BATCHED, StripmapTrials, sweep_grid
+
+log = logging.getLogger("torchsar")
+_NOT_IDENTITY = ("sweep", "trade", "title", "seed")
+
+
+def sweep_config(loaded: Loaded, out: Path, resume: bool = False, workers: int | None = None, cluster: str | None = None, device: str = "cpu", command: str = "torchsar sweep") -> Path:
+    """Run the sweep of a config and write results.zarr, config.yaml, summary.json, figures/ and report.html into OUT; returns the report's path.
+
+    results.zarr grows while it runs and is never replaced; the other files appear at the end. Raises ConfigError for what the user can put right,
+    Interrupted after Ctrl-C with a sentence that says how to go on.
+    """
+    settings = loaded.config.sweep
+    grid = sweep_grid(loaded)
+    stop = None if settings.stop is None else Stop(settings.stop.metric, settings.stop.relative, settings.stop.statistic)
+    needs = {f"{loaded.file}: sweep.success.{metric}": metric for metric in settings.success}
+    plan = Plan(grid, settings.trials, loaded.config.seed, settings.chunk, stop, frozenset(settings.save.trials), device, needs)
+    store = open_store(out, plan, identity(loaded), resume)
+    config_text = loaded.text(resolved(loaded))
+    about = {"title": loaded.config.title, "config": config_text, "dtype": loaded.config.precision}
+    store.note(**about)
+    _announce(grid, settings.trials)
+    try:
+        with _terminated_like_interrupted():
+            record = run_plan(plan, StripmapTrials(loaded, device), store, engine(workers, cluster), loaded.name)
+    except Interrupted as stopped:
+        raise Interrupted(f"{stopped} in {out}; go on with --resume") from None
+    record.about = {**record.about, **about}
+    return report(record.select(grid.labels), loaded, out, config_text, command)
+
+
+def identity(loaded: Loaded) -> dict[str, Any]:
+    """What the results depend on besides the grid: the resolved config without what only says how much is computed or shown."""
+    tree = resolved(loaded)
+    return {"seed": loaded.config.seed, "config": {key: value for key, value in tree.items() if key not in _NOT_IDENTITY}}
+
+
+def report(record: Record, loaded: Loaded, out: Path, config_text: str, command: str) -> Path:
+    """summary.json, figures/ and report.html of a record; each file is replaced whole, the report last."""
+    summary = summary_tree(record, loaded.config.sweep.success, {"snr": DEFINITIONS["snr"]})
+    figures = out / "figures"
+    figures.mkdir(exist_ok=True)
+    for old in figures.glob("*.png"):
+        old.unlink()
+    pictures = draw_sweep(summary, figures)
+    (out / "config.yaml").write_text(config_text, encoding="utf-8")
+    write_json(out / "summary.json.tmp", summary)
+    (out / "summary.json.tmp").replace(out / "summary.json")
+    write_sweep_report(out / "report.html.tmp", summary, pictures, figures, config_text, command)
+    return (out / "report.html.tmp").replace(out / "report.html")
+
+
+def _announce(grid: Grid, trials: int) -> None:
+    together = [f"{p.name} ({len(p.labels)})" for p in grid.parameters if p.batched]
+    apart = [f"{p.name} ({len(p.labels)})" for p in grid.parameters if not p.batched]
+    log.info("%d points of %d trials; per-trial tensors, which share batches: %s; cases of their own: %s", len(grid.points()), trials, ", ".join(together) or "none", ", ".join(apart) or "none")
+    if apart:
+        log.debug("per-trial tensors can be: %s", ", ".join(BATCHED))
+
+
+@contextmanager
+def _terminated_like_interrupted() -> Iterator[None]:
+    """A batch system ends jobs with SIGTERM: record what there is, as after Ctrl-C."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    try:
+        earlier = signal.signal(signal.SIGTERM, stop)
+    except ValueError:  # not in the main thread
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, earlier)
