@@ -27,6 +27,7 @@ from torchsar.study.montecarlo.work import Chunk, Outcome, Trial, Work
 from torchsar.study.report import installed_version
 
 log = logging.getLogger("torchsar")
+_WAITING = 256
 
 
 class Interrupted(KeyboardInterrupt):
@@ -120,8 +121,10 @@ def run_plan(plan: Plan, trial: Trial, store: Store | None, engine: AbstractCont
         with engine as chosen:
             run.all_levels(chosen, title)
     except KeyboardInterrupt:
+        run.settle()
         raise Interrupted(f"{int(record.done.sum())} trials are recorded") from None
     finally:
+        run.settle()
         if store is not None:
             store.close()
     return record
@@ -136,6 +139,7 @@ class _Run:
         self.active = [set(range(len(case.points))) for case in work.cases]
         self.fits: dict[int, int] = {}
         self.rows: dict[int, int] = {}
+        self.waiting: list[tuple[Chunk, Outcome]] = []
         self.settled_at: dict[tuple[int, int], int] = {}
 
     def all_levels(self, engine: Engine, title: str) -> None:
@@ -147,6 +151,7 @@ class _Run:
                 for chunk, outcome in engine.results(self.work, self._tasks(first, last)):
                     self._enter(chunk, outcome)
                     progress.advance(len(chunk), outcome.seconds)
+                self.settle()
                 self._finished(last)
                 if last in looks(self.plan.trials, self.plan.stop)[:-1]:
                     self._drop_settled(last)
@@ -181,18 +186,29 @@ class _Run:
                     yield Chunk(number, tuple(whole.points[i] for i in keep), tuple(whole.trials[i] for i in keep)), self.fits.get(number)
 
     def _enter(self, chunk: Chunk, outcome: Outcome) -> None:
-        places = [self.places[chunk.case][p] for p in chunk.points]
-        if not self.record.algorithms:
+        """Take in a chunk; it waits with others until writing them together is cheap."""
+        if not self.record.algorithms and not self.waiting:
             self._refuse_missing(outcome)
-        self.record.add(places, chunk.trials, outcome.values, outcome.bounds)
         if outcome.fits is not None and outcome.fits < self.fits.get(chunk.case, len(chunk)):
             log.warning("warning: %d trials at once do not fit into memory; going on with %d", len(chunk), outcome.fits)
             self.fits[chunk.case] = outcome.fits
+        self.waiting.append((chunk, outcome))
+        if len(self.waiting) >= _WAITING or (self.store is not None and self.store.due):
+            self.settle()
+
+    def settle(self) -> None:
+        """Enter what waits into the record and the store."""
+        while self.waiting:
+            chunk, outcome = self.waiting.pop(0)
+            places = [self.places[chunk.case][p] for p in chunk.points]
+            self.record.add(places, chunk.trials, outcome.values, outcome.bounds)
+            if self.store is not None:
+                self.store.entered(places, chunk.trials)
+                points = self.work.cases[chunk.case].points
+                for row, arrays in outcome.saved.items():
+                    self.store.save(self.plan.grid.labels_at(points[chunk.points[row]]), chunk.trials[row], arrays)
         if self.store is not None:
-            points = self.work.cases[chunk.case].points
-            for row, arrays in outcome.saved.items():
-                self.store.save(self.plan.grid.labels_at(points[chunk.points[row]]), chunk.trials[row], arrays)
-            self.store.entered(places, chunk.trials)
+            self.store.flush()
 
     def _refuse_missing(self, outcome: Outcome) -> None:
         given = {metric for metrics in outcome.values.values() for metric in metrics}

@@ -35,6 +35,8 @@ class Progress:
         now = time.perf_counter()
         quiet = now - self._said < _QUIET_S and self.done < self.total
         level = logging.DEBUG if quiet else logging.INFO
+        if not log.isEnabledFor(level):
+            return
         log.log(level, "chunk %d, %d trials in %.2f s: %d of %d, %.3g trials/s, %s left", self.chunks, trials, seconds, self.done, self.total, self.rate, _clock(self.left_s))
         self._said = self._said if quiet else now
 

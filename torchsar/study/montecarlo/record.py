@@ -49,24 +49,35 @@ class Record:
         """Index of a point, from its labels by parameter."""
         return tuple(known.index(labels[name]) for name, known in self.labels.items())
 
-    def add(self, places: Sequence[tuple[int, ...]], trials: Sequence[int], values: Mapping[str, Mapping[str, np.ndarray]], bounds: Mapping[str, Mapping[str, np.ndarray]]) -> None:
+    def add(self, places: Sequence[tuple[int, ...]], trials: Sequence[int], values: Mapping[str, Mapping[str, Sequence[float]]], bounds: Mapping[str, Mapping[str, Sequence[float]]]) -> None:
         """Enter rows: values by algorithm and metric, bounds by metric and name, each (rows,). An algorithm without `ok` stands for all it gives."""
         if not self.algorithms:
             self.algorithms, self.ok = tuple(values), np.zeros((len(values), *self.done.shape), bool)
         foreign = [a for a in values if a not in self.algorithms]
         if foreign:
             raise ConfigError(f"a trial gave results of the algorithm {foreign[0]!r}, those before it of {', '.join(self.algorithms)}; return the same algorithms in every trial")
-        where = tuple(np.array(column) for column in zip(*((*place, trial) for place, trial in zip(places, trials))))
+        rows = np.ravel_multi_index(tuple(zip(*((*place, trial) for place, trial in zip(places, trials)))), self.done.shape)
         for algorithm, metrics in values.items():
-            row = (self.algorithms.index(algorithm), *where)
-            self.ok[row] = metrics[OK] > 0 if OK in metrics else True
+            number = self.algorithms.index(algorithm)
+            self.ok[number].reshape(-1)[rows] = metrics.get(OK, True)
             for metric, found in metrics.items():
                 if metric != OK:
-                    self.metrics.setdefault(metric, self.blank())[row] = found
+                    self._metric(metric)[number].reshape(-1)[rows] = found
         for metric, named in bounds.items():
             for name, found in named.items():
-                self.bounds.setdefault(metric, {}).setdefault(name, self.blank(False))[where] = found
-        self.done[where] = True
+                self._bound(metric, name).reshape(-1)[rows] = found
+        self.done.reshape(-1)[rows] = True
+
+    def _metric(self, name: str) -> np.ndarray:
+        if name not in self.metrics:
+            self.metrics[name] = self.blank()
+        return self.metrics[name]
+
+    def _bound(self, metric: str, name: str) -> np.ndarray:
+        named = self.bounds.setdefault(metric, {})
+        if name not in named:
+            named[name] = self.blank(False)
+        return named[name]
 
     def grown(self, labels: Labels, trials: int) -> Record:
         """The same results where there is room for more: labels begin with those of this record."""

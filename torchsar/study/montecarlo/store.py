@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import time
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ except ImportError:  # not on every system; there, two writers at once are the u
 
 FORMAT = 1
 _CHUNK_NUMBERS = 1 << 16
-_SHARE_FOR_WRITING = 0.01
+_SHARE_FOR_WRITING = 0.005
 _DONE, _SAVED = "done", "saved"
 
 
@@ -88,13 +88,16 @@ class Store:
 
     # writing -----------------------------------------------------------------------------------------------------
 
-    def entered(self, places: Iterable[tuple[int, ...]], trials: Iterable[int]) -> None:
-        """Rows have entered the record. They are written once that costs less than a hundredth of the time since the last writing."""
+    @property
+    def due(self) -> bool:
+        """Whether writing costs less than half a percent of the time since the last writing."""
+        return time.perf_counter() - self._last > self._cost / _SHARE_FOR_WRITING
+
+    def entered(self, places: Iterable[tuple[int, ...]], trials: Sequence[int]) -> None:
+        """Rows have entered the record, to be written by the next `flush`."""
         self._dirty.update(places)
-        first, last = min(trials := list(trials)), max(trials) + 1
+        first, last = min(trials), max(trials) + 1
         self._window = (first, last) if self._window is None else (min(first, self._window[0]), max(last, self._window[1]))
-        if time.perf_counter() - self._last > self._cost / _SHARE_FOR_WRITING:
-            self.flush()
 
     def save(self, labels: Mapping[str, float | str], trial: int, arrays: Mapping[str, np.ndarray]) -> None:
         """Keep arrays of one trial, to be written before it is marked done."""

@@ -51,8 +51,8 @@ class Outcome:
     fits: the largest batch that the memory was found to hold, None where nothing was too large.
     """
 
-    values: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
-    bounds: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
+    values: dict[str, dict[str, list[float]]] = field(default_factory=dict)
+    bounds: dict[str, dict[str, list[float]]] = field(default_factory=dict)
     saved: dict[int, dict[str, np.ndarray]] = field(default_factory=dict)
     seconds: float = 0.0
     fits: int | None = None
@@ -140,17 +140,17 @@ def _name(trial: Trial) -> str:
 
 
 def _array(value: Tensor) -> np.ndarray:
-    return value.detach().cpu().resolve_conj().numpy() if isinstance(value, Tensor) else np.asarray(value)
+    return value.numpy(force=True) if isinstance(value, Tensor) else np.asarray(value)
 
 
-def _rows(value: Any, rows: int, what: str) -> np.ndarray:
-    """One number per row as float64; verdicts (ok, or any bool) become 0 and 1."""
-    x = _array(value)
-    if np.iscomplexobj(x) or x.shape not in ((rows,), ()):
-        raise ValueError(f"{what} must hold one real number for each of the {rows} trials, got {x.dtype} of shape {x.shape}")
-    if what.endswith(f".{OK}") and x.dtype != bool:
+def _rows(value: Any, rows: int, what: str) -> list[float]:
+    """One number per row; a list, since that is the cheapest way out of torch."""
+    x = value if isinstance(value, Tensor) else torch.as_tensor(value)
+    if x.is_complex() or x.shape not in ((rows,), ()):
+        raise ValueError(f"{what} must hold one real number for each of the {rows} trials, got {x.dtype} of shape {tuple(x.shape)}")
+    if what.endswith(f".{OK}") and x.dtype != torch.bool:
         raise ValueError(f"{what} must be bool, got {x.dtype}")
-    return x.astype(np.float64) if x.shape else np.full(rows, x, np.float64)
+    return x.tolist() if x.ndim else [x.item()] * rows
 
 
 def _joined(parts: list[tuple[Chunk, Outcome]]) -> Outcome:
@@ -159,8 +159,8 @@ def _joined(parts: list[tuple[Chunk, Outcome]]) -> Outcome:
         return parts[0][1]
     first = parts[0][1]
     whole = Outcome(
-        {a: {m: np.concatenate([o.values[a][m] for _, o in parts]) for m in metrics} for a, metrics in first.values.items()},
-        {m: {b: np.concatenate([o.bounds[m][b] for _, o in parts]) for b in named} for m, named in first.bounds.items()},
+        {a: {m: [x for _, o in parts for x in o.values[a][m]] for m in metrics} for a, metrics in first.values.items()},
+        {m: {b: [x for _, o in parts for x in o.bounds[m][b]] for b in named} for m, named in first.bounds.items()},
     )
     start = 0
     for chunk, outcome in parts:
