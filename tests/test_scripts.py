@@ -23,13 +23,35 @@ def test_first_image_is_the_script_of_the_readme_and_runs(tmp_path: Path) -> Non
 def test_the_config_of_the_readme_is_accepted(tmp_path: Path) -> None:
     from torchsar.study.config import load
     from torchsar.study.run import check
+    from torchsar.study.trials import sweep_grid
 
-    blocks = re.findall(r"```yaml\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
-    assert blocks
-    for block in blocks:
-        path = tmp_path / "readme.yaml"
-        path.write_text(block, encoding="utf-8")
-        check(load(str(path)))
+    whole, swept = readme_blocks("yaml")
+    path = tmp_path / "readme.yaml"
+    path.write_text(whole, encoding="utf-8")
+    check(load(str(path)))
+    path.write_text(whole + swept, encoding="utf-8")
+    assert sweep_grid(load(str(path))).shape == (3, 2, 2)
+
+
+def readme_blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+
+
+def test_the_sweep_of_the_readme_runs(tmp_path: Path) -> None:
+    script = next(block for block in readme_blocks("python") if "def trial(" in block)
+    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr[-1000:]
+    assert (tmp_path / "out" / "mean" / "results.zarr").is_dir()
+    rmse = [float(x) for x in re.findall(r"\d\.\d+(?:e-\d+)?", done.stdout)]
+    assert rmse[0] < 0.15 and rmse[3] > rmse[0]  # the median of Gaussian noise is worse than the mean
+
+
+def test_the_benchmark_of_sweeps_runs(tmp_path: Path) -> None:
+    command = [sys.executable, str(ROOT / "scripts" / "sweep_speed.py"), "--trials", "4", "--rounds", "1", "processor.recommended.stages.velocity.lines=16", "world.lines=384"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-1000:]
+    for name in ("one by one", "one batch", "automatic ", "automatic, 2 workers"):
+        assert re.search(rf"^{name} +\d+ +\d+\.\d+", done.stdout, re.MULTILINE), done.stdout
 
 
 def test_readme_points_at_files_that_exist() -> None:

@@ -17,7 +17,7 @@ EXIT_BAD_INPUT = 2
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     top = argparse.ArgumentParser(prog="torchsar", description="Synthetic aperture radar experiments from a config.")
-    top.add_argument("--threads", type=_positive, metavar="N", help="threads of torch (default: all cores)")
+    top.add_argument("--threads", type=_positive, metavar="N", help="threads of torch (default: all cores; of a sweep, one in each process)")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, text in (
         ("run", "run an experiment and write its images, figures and report"),
@@ -97,7 +97,7 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
     elif options.command == "sweep":
         from torchsar.study.sweeping import sweep_config
 
-        print(sweep_config(loaded, options.out or Path("out") / loaded.name, options.resume, options.workers, options.cluster, options.device, command))
+        print(sweep_config(loaded, options.out or Path("out") / loaded.name, options.resume, options.workers, options.cluster, options.threads or 1, options.device, command))
     elif options.command == "requires":
         from torchsar.study.requires import requires
 

@@ -242,7 +242,7 @@ def _draw_bands(axes: Axes, x: np.ndarray, series: Mapping[str, tuple[np.ndarray
         low, high = np.moveaxis(_drawable(interval, log), -1, 0)
         colour, line = COLOURS[i % len(COLOURS)], "-" if i < len(COLOURS) else (0, (6, 2))
         axes.fill_between(x, low, high, color=colour, alpha=0.18 if len(series) < 5 else 0.1, linewidth=0)
-        axes.plot(x, _drawable(y, log), color=colour, linestyle=line, marker=MARKERS[i % len(MARKERS)], markersize=3.5, label=name)
+        axes.plot(x, _drawable(y, log), color=colour, linestyle=line, marker=MARKERS[i % len(MARKERS)], markersize=3.5, label=name if np.isfinite(_drawable(y, log)).any() else "_")
     for i, (name, y) in enumerate(bounds.items()):
         axes.plot(x, _drawable(y, log), color=INK, linestyle=DASHES[i % len(DASHES)], linewidth=1.1, label=name)
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from tests.helpers import small_radar, small_recording
-from torchsar.compensate import DopplerCentroid, EffectiveVelocity, EnergyCentre, PhaseIncrement, RangeDependentCentroid
+from torchsar.compensate import DopplerCentroid, EffectiveVelocity, EnergyCentre, PhaseIncrement, PointDoppler, RangeDependentCentroid
 from torchsar.core import Estimate, Signal, Stage, real_dtype
 from torchsar.focus import Backproject, ClosestRange, Detect, OmegaK, OmegaKStolt, PaddedLines, RangeCompress, RangeDoppler
 from torchsar.repair import (
@@ -105,6 +105,7 @@ CASES = [
     Case("range_dependent_centroid", lambda: RangeDependentCentroid(RADAR, 1, (2, 4)), differentiable=False),
     Case("doppler_centroid", lambda: DopplerCentroid(RADAR), differentiable=False, vmap=False),
     Case("effective_velocity", lambda: EffectiveVelocity(OmegaK(RADAR), 5.0), lambda s: {"doppler_hz": _geometry(s)["doppler_hz"]}, differentiable=False, vmap=False, tolerance=1e-6),
+    Case("point_doppler", lambda: PointDoppler(RADAR), differentiable=False, vmap=False, image=True, tolerance=1e-6),
     Case("line_integrity", lambda: LineIntegrity(), _numbers, differentiable=False, vmap=False),
     Case("zero_fill", lambda: ZeroFill(), _missing),
     Case("linear_fill", lambda: LinearFill(RADAR), lambda s: {**_missing(s), "doppler_hz": _geometry(s)["doppler_hz"]}),

@@ -63,7 +63,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Record:
 
 def test_a_program_killed_at_random_moments_loses_nothing_and_repeats_nothing(alone: Record, tmp_path: Path) -> None:
     out, log, moments = tmp_path / "s", tmp_path / "log", random.Random(7)
-    kills = 0
+    kills, computed_before = 0, set()
     while kills < 6:
         before = marked(out)
         known = len(rows(log))

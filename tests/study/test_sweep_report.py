@@ -52,7 +52,7 @@ def summary(record: Record, tmp_path_factory: pytest.TempPathFactory) -> dict[st
 @pytest.fixture(scope="module")
 def drawn(summary: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Picture]]:
     folder = tmp_path_factory.mktemp("sweep") / "figures"
-    return folder, draw_sweep(summary, folder)
+    return folder, draw_sweep(summary, folder, ["doppler_error_hz", "entropy_nats"])
 
 
 @pytest.fixture(scope="module")
@@ -143,6 +143,11 @@ def test_every_sweep_has_its_pictures(labels: dict[str, tuple[float | str, ...]]
     check_pictures(draw_sweep(summary_tree(record, {"doppler_error_hz": 4.0}, {}), tmp_path / "figures"), tmp_path / "figures", expected)
 
 
+def test_errors_are_drawn_unless_something_else_is_asked_for(summary: dict[str, Any], tmp_path: Path) -> None:
+    files = [p.file for p in draw_sweep(summary, tmp_path / "a")]
+    assert any("doppler_error_hz" in name for name in files) and not any("entropy" in name for name in files)
+
+
 def test_panels_are_thinned_and_the_caption_says_so() -> None:
     cube = read_summary(summary_tree(synthetic(MANY, trials=2), {}, {}))
     panels, note = panels_beside(cube, {"snr_db", "gain"})
@@ -161,7 +166,7 @@ def test_curves_run_along_sorted_numbers(summary: dict[str, Any]) -> None:
     np.testing.assert_array_equal(along[1], [chosen[-10.0], chosen[5.0], chosen[20.0]])
 
 
-LABELS = {"doppler_error_hz": "doppler error (Hz)", "world.noise.snr_db": "SNR (dB)", "v_m_s": "v (m/s)", "yaw_rad_s": "yaw (rad/s)", "beam": "beam", "seconds": "seconds"}
+LABELS = {"doppler_error_hz": "Doppler error (Hz)", "world.noise.snr_db": "SNR (dB)", "v_m_s": "v (m/s)", "yaw_rad_s": "yaw (rad/s)", "beam": "beam", "seconds": "seconds"}
 
 
 @pytest.mark.parametrize("name, label", LABELS.items(), ids=LABELS)

@@ -29,7 +29,7 @@ from torchsar.compensate.group import (
     pick_group,
     student_log_likelihood,
 )
-from torchsar.core import Estimate, Signal, Stage, settle, take
+from torchsar.core import Estimate, Signal, Stage, fft_lines, settle, take
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
 
@@ -69,7 +69,7 @@ def look_scores(group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turn
     """
     rows = beam_spectrum(group, doppler_hz).rows(doppler_hz, velocity_m_s)
     height = rows.shape[-2] // looks
-    image = torch.fft.ifft(rows[..., : height * looks, :].unflatten(-2, (looks, height)), dim=-2)
+    image = fft_lines(rows[..., : height * looks, :].unflatten(-2, (looks, height)), inverse=True)
     intensity = image.real.square() + image.imag.square()
     mean = intensity.mean((-3, -2, -1), keepdim=True)
     intensity = (intensity / torch.where(mean > 0, mean, 1)).clamp_max(20)

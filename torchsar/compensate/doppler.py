@@ -13,7 +13,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage, legendre, settle
+from torchsar.core import Estimate, Signal, Stage, fft_lines, legendre, settle
 from torchsar.radar import StripmapRadar
 
 OVER = ("mean", "median")
@@ -73,7 +73,7 @@ def block_spectra(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> Tensor:
     n = 2 * (max(last - first for first, last in segments) // 2 + 1)
     spectra = []
     for first, last in segments:
-        part = torch.fft.fft(x[..., first : last + 1, :], n, dim=-2)
+        part = fft_lines(x[..., first : last + 1, :], n=n)
         power = (part.real.square() + part.imag.square()).to(torch.float64)
         spectra.append(_sums(power, columns).mT)
     return torch.stack(spectra, -3)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchsar.core import fft_lines
 from torchsar.focus.omega_k import FrameGeometry, FrequencyBasis, bulk_filter, refocus, refocus_turns_per_sample
 from torchsar.focus.reference import range_compress
 from torchsar.radar import StripmapRadar
@@ -79,7 +80,7 @@ class BeamSpectrum:
 
     def image(self, frame_hz: Tensor, velocity_m_s: Tensor | float) -> Tensor:
         """Image of the group, (..., azimuth, width), sampled as coarsely as the band allows. Differentiable in the velocity."""
-        return torch.fft.ifft(self.rows(frame_hz, velocity_m_s), dim=-2)
+        return fft_lines(self.rows(frame_hz, velocity_m_s), inverse=True)
 
 
 def full_spectrum(group: RangeGroup, doppler_hz: Tensor) -> BeamSpectrum:

@@ -7,11 +7,13 @@ the Cramer-Rao bound of a tone, which no estimator of the beam's envelope can re
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from torchsar.compensate.doppler import point_doppler, wrap_hz
-from torchsar.core import Estimate, Signal, Stage, settle
+from torchsar.core import Estimate, Signal, Stage, cis, settle
 from torchsar.metrics.bounds import tone_frequency_bound_hz
 from torchsar.metrics.impulse import impulse_response
 from torchsar.radar import StripmapRadar
@@ -29,28 +31,31 @@ def doppler_at(radar: StripmapRadar, azimuth_m: Tensor, slant_m: Tensor, frame_h
     return 2 * velocity_m_s / radar.wavelength_m * ahead / torch.sqrt(closest.square() + ahead.square())
 
 
-def peak_time_s(image: Tensor, prf_hz: float, sample: Tensor, band_hz: Tensor | float, centre_hz: Tensor | float) -> Tensor:
-    """Slow time, counted from the first line, of the strongest peak of one range position; maximum likelihood within a Doppler band.
+def peak_time_s(image: Tensor, prf_hz: float, sample: Tensor, rate_hz_s: Tensor | float, dwell_s: float, doppler_hz: Tensor, start_s: Tensor) -> Tensor:
+    """Refine the slow time start_s (...,), counted from the first line, of a peak at one range position; maximum likelihood.
 
-    image: (..., azimuth, range); sample: range position (...,), fractional; band_hz: width of the point's spectrum about centre_hz (...,), which
-    counts as the spectrum of the image does, modulo the PRF. An image passes noise of the whole PRF; only that in the point's band belongs to it.
+    image: (..., azimuth, range); sample: range position (...,), fractional. The column is spread out again to the azimuth history of the point
+    about its Doppler doppler_hz (...,), of which only the dwell is kept: an image passes the noise of all lines and of the whole PRF.
+    rate_hz_s: magnitude of the Doppler rate.
     """
     n = image.shape[-2]
     weights = torch.sinc(torch.arange(image.shape[-1], dtype=torch.float64, device=image.device) - sample[..., None])
     spectrum = torch.fft.fft((image * weights[..., None, :].to(image.real.dtype)).sum(-1).to(torch.complex128))
-    count = max(2, min(n, round(float(band_hz) * n / prf_hz)))
-    first = torch.round(torch.as_tensor(centre_hz, dtype=torch.float64, device=image.device) * n / prf_hz - (count - 1) / 2).long()
-    bins = torch.remainder(first[..., None] + torch.arange(count, device=image.device), n)
-    inside = spectrum.gather(-1, bins.expand(*spectrum.shape[:-1], count))
-    return torch.remainder(-point_doppler(inside, n / prf_hz), n / prf_hz)
+    offset = wrap_hz(torch.fft.fftfreq(n, 1 / prf_hz, dtype=torch.float64, device=image.device) - doppler_hz[..., None], prf_hz)
+    rate = torch.as_tensor(rate_hz_s, dtype=torch.float64, device=image.device)[..., None]
+    history = torch.fft.ifft(spectrum * cis(math.pi * offset.square() / rate))
+    lines = torch.round(start_s[..., None] * prf_hz) - n // 2 + torch.arange(n, dtype=torch.float64, device=image.device)  # the peak in the middle
+    since = lines / prf_hz - start_s[..., None]
+    tone = history.gather(-1, torch.remainder(lines, n).long()) * cis(math.pi * torch.remainder(rate * since.square(), 2)) * (since.abs() <= dwell_s / 2)
+    return start_s + (point_doppler(tone, prf_hz, centre_hz=doppler_hz) - doppler_hz) / rate[..., 0]
 
 
 class PointDoppler(Stage):
     """`doppler_hz` of the beam from the brightest point of an image, which the beam centre crosses at crossing_s (default: the middle line).
 
     frame_hz, velocity_m_s: those of the image; by default the radar's pointing and its nominal velocity. std: the bound of a tone at the
-    measured peak signal-to-noise ratio. ok where the peak stands 16 times above the mean power of the image's pixels or more. Raises ValueError
-    where neither the radar nor a connected value says what the frame is.
+    measured q (info). ok where the peak is higher than noise alone would have it once in 10,000 images. Raises ValueError where neither the
+    radar nor a connected value says what the frame is.
     """
 
     works_on = ("azimuth", "range")
@@ -70,23 +75,23 @@ class PointDoppler(Stage):
         line, sample = torch.unravel_index(power.flatten(-2).argmax(-1), power.shape[-2:])
         found = impulse_response(signal, (azimuth.start + azimuth.step * line.double(), slant.start + slant.step * sample.double()), search_m=azimuth.step)
         velocity = radar.velocity_m_s if velocity_m_s is None else velocity_m_s
+        position, rate = found["position_range_m"], radar.azimuth_rate_hz_s(found["position_range_m"], velocity)
         dwell = radar.integration_s or radar.prf_hz / float(radar.azimuth_rate_hz_s(slant.start))
         crossing = (azimuth.n // 2) / radar.prf_hz if self.crossing_s is None else self.crossing_s - azimuth.start / radar.velocity_m_s
-        position = found["position_range_m"]
-        band = dwell * float(radar.azimuth_rate_hz_s(slant.start))
-        value = doppler_at(radar, found["position_azimuth_m"] - azimuth.start, position, frame, velocity, crossing)
-        for _ in range(2):
-            at_s = peak_time_s(image, radar.prf_hz, slant.index_of(position), band, value)
+        at_s = (found["position_azimuth_m"] - azimuth.start) / radar.velocity_m_s
+        value = doppler_at(radar, at_s * radar.velocity_m_s, position, frame, velocity, crossing)
+        for _ in range(4):
+            at_s = peak_time_s(image, radar.prf_hz, slant.index_of(position), rate, dwell, value, at_s)
             value = doppler_at(radar, at_s * radar.velocity_m_s, position, frame, velocity, crossing)
         value, finite = settle(value, 0.0)
-        floor = power.flatten(-2).median(-1).values.double() / 0.6931  # of an exponential law
-        q = found["peak"].abs().square() / torch.where(floor > 0, floor, 1)
+        floor = power.flatten(-2).median(-1).values.double() / math.log(2)  # the mean of an exponential law
+        peak_to_noise = found["peak"].abs().square() / torch.where(floor > 0, floor, 1)
+        q = peak_to_noise * (radar.prf_hz / (rate * dwell)).clamp_min(1)  # the image holds the noise of the whole PRF
         std = tone_frequency_bound_hz(q.clamp_min(1e-12), dwell)
-        mean = power.mean((-2, -1)).double()
         return Estimate(
             {"doppler_hz": value, "doppler_baseband_hz": wrap_hz(value, radar.prf_hz)},
             1 - 1 / (1 + q),
-            finite & (found["peak"].abs().square() > 16 * mean) & (mean > 0),
+            finite & (floor > 0) & (peak_to_noise > math.log(azimuth.n * slant.n) + 10),
             {"doppler_hz": std, "doppler_baseband_hz": std},
-            {"peak_to_noise": q},
+            {"q": q},
         )

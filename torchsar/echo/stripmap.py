@@ -69,9 +69,10 @@ def _block_spectrum(placed: Placed, world: StripmapWorld, radar: StripmapRadar, 
     velocity = per_trial(radar.velocity_m_s if world.velocity_m_s is None else world.velocity_m_s, 2, pulse_s)
     doppler = per_trial(_true_doppler(world, radar), 2, pulse_s)
     total = torch.zeros((*placed.closest_m.shape[:-1], pulse_s.numel(), n_fft), dtype=dtype, device=pulse_s.device)
-    for targets in _target_blocks(placed, pulse_s.numel(), n_fft):
+    blocks = list(_target_blocks(placed, pulse_s.numel(), n_fft))
+    for targets in blocks:
         since, closest, weight = _seen(placed, targets, world, radar, pulse_s, doppler, velocity)
-        lit = _lit(weight)
+        lit = slice(None) if len(blocks) == 1 else _lit(weight)  # few targets all count, so that a trial's sum does not depend on its neighbours
         since, closest, weight = (x[..., lit] for x in (since, closest, weight))
         if not since.shape[-1]:
             continue
@@ -118,15 +119,14 @@ def _smooth(n: int) -> bool:
 
 
 def _pulse_blocks(placed: Placed, n_pulse: int, n_fft: int) -> Iterator[slice]:
-    trials = math.prod(placed.closest_m.shape[:-1])
-    height = max(1, min(64, _TABLE_BYTES // (8 * trials * n_fft)))
+    """Blocks of pulses, whatever the number of trials: sums then round alike in batches of any size."""
+    height = max(1, min(64, _TABLE_BYTES // (8 * n_fft)))
     for first in range(0, n_pulse, height):
         yield slice(first, min(first + height, n_pulse))
 
 
 def _target_blocks(placed: Placed, height: int, n_fft: int) -> Iterator[slice]:
-    trials = math.prod(placed.closest_m.shape[:-1])
-    width = max(16, _TABLE_BYTES // (8 * trials * height * 3 * math.isqrt(n_fft)))
+    width = max(16, _TABLE_BYTES // (8 * height * 3 * math.isqrt(n_fft)))
     for first in range(0, placed.closest_m.shape[-1], width):
         yield slice(first, min(first + width, placed.closest_m.shape[-1]))
 

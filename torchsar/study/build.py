@@ -47,18 +47,24 @@ def build_radar(loaded: Loaded) -> StripmapRadar:
         raise ConfigError(f"{loaded.file}: radar: {error}") from None
 
 
-def build_world(loaded: Loaded) -> StripmapWorld:
-    """The world of a simulation. A squint becomes the Doppler of the true velocity."""
+def true_doppler_hz(loaded: Loaded) -> float | None:
+    """Doppler of the beam centre, from world.doppler_hz or from the squint at the true velocity."""
     world = loaded.config.world
     assert world is not None
-    doppler = world.doppler_hz if world.squint_deg is None else float(squint_doppler_hz(build_radar(loaded), world.squint_deg, world.velocity_m_s))
+    return world.doppler_hz if world.squint_deg is None else float(squint_doppler_hz(build_radar(loaded), world.squint_deg, world.velocity_m_s))
+
+
+def build_world(loaded: Loaded) -> StripmapWorld:
+    """The world of a simulation."""
+    world = loaded.config.world
+    assert world is not None
     scenes = {name: SCENES.make(entry, f"world.scene.{name}", loaded.file) for name, entry in world.scene.items()}
     return StripmapWorld(
         scene=Together(scenes),
         beam=BEAMS.make(world.beam, "world.beam", loaded.file),
         path=PATHS.make(world.path, "world.path", loaded.file),
         velocity_m_s=world.velocity_m_s,
-        doppler_hz=doppler,
+        doppler_hz=true_doppler_hz(loaded),
         snr_db=world.noise.snr_db,
     )
 

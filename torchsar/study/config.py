@@ -144,6 +144,7 @@ class Sweep(Strict):
 
     grid: dotted key -> list of values, or mapping of labels to values. trials: per point, or the limit where points end early. chunk: trials
     a batch, chosen by bytes where it is not given. success: metric -> limit of its magnitude below which a trial counts as a success.
+    show: metrics to draw, by default all errors. save: trials whose images are kept.
     """
 
     grid: dict[str, Any] = {}
@@ -151,6 +152,7 @@ class Sweep(Strict):
     chunk: int | None = Field(default=None, ge=1)
     stop: EarlyStop | None = None
     success: dict[str, float] = {}
+    show: list[str] = []
     save: Save = Save()
 
     @model_validator(mode="before")

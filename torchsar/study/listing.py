@@ -13,8 +13,10 @@ from torchsar.study.text import packaged_configs, read_tree
 
 def listing() -> str:
     """Experiments, stages and world objects with their keys, and the keys of data files."""
-    parts = ["EXPERIMENTS (torchsar run NAME)"]
-    parts += [f"  {name:<25}{read_tree(path).get('title', '')}" for name, path in packaged_configs().items()]
+    parts = ["EXPERIMENTS (torchsar run NAME; those marked [sweep] are for torchsar sweep NAME)"]
+    for name, path in packaged_configs().items():
+        tree = read_tree(path)
+        parts.append(f"  {name:<25}{tree.get('title', '')}{' [sweep]' if 'sweep' in tree else ''}")
     for group in ("repair", "compensate", "focus", "own"):
         names = [name for name in stages().entries if group_of(name) == group]
         if names:

@@ -99,7 +99,7 @@ def _run_one(name: str, method: Method, chain: Chain, case: Case, earlier: Mappi
     trace = chain.trace(case.clean if method.input == "clean" else case.recording)
     image = trace.signal
     if image.names != ("azimuth", "range") or image.trials:
-        raise ValueError(f"the last stage gives the axes {image.names}, not an image ('azimuth', 'range'); end the chain with a focusing stage")
+        raise ValueError(f"the last stage gives the axes {image.names}, not an image ('azimuth', 'range'); end the chain with a focusing stage (a sweep needs none)")
     used = _used(chain, trace.values, case.recording.radar)
     return Result(name, method.title, chain, image, trace.estimates, dict(trace.seconds), max(trace.bytes.values()), used, trace)
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchsar.focus.requirements import Requirement, recommended_form, requirements
-from torchsar.study.build import build_case, build_radar, build_world, resolved
+from torchsar.study.build import build_case, build_radar, resolved, true_doppler_hz
 from torchsar.study.config import Loaded
 from torchsar.study.folder import fresh_folder, write_json
 from torchsar.study.methods import run_recommended
@@ -44,7 +44,7 @@ def _rows(loaded: Loaded) -> tuple[Sequence[Requirement], list[str]]:
         check(loaded)
         assert world is not None
         radar = build_radar(loaded)
-        axes, doppler, velocity = radar.raw_axes(world.lines, world.samples), build_world(loaded).doppler_hz, world.velocity_m_s
+        axes, doppler, velocity = radar.raw_axes(world.lines, world.samples), true_doppler_hz(loaded), world.velocity_m_s
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         rows = requirements(radar, axes, doppler, velocity)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchsar.core import Chain
 from torchsar.focus.requirements import requirements
-from torchsar.study.build import Case, build_case, build_damages, build_radar, build_world, resolved
+from torchsar.study.build import Case, build_case, build_damages, build_radar, build_world, resolved, true_doppler_hz
 from torchsar.study.config import Loaded
 from torchsar.study.figures import Scene, draw_all
 from torchsar.study.folder import fresh_folder, write_arrays, write_json
@@ -75,7 +75,7 @@ def _warn_of_aliasing(loaded: Loaded, case: Case) -> None:
     world, radar = loaded.config.world, case.recording.radar
     assert world is not None
     if radar.integration_s is not None:
-        requirements(radar, case.recording.signal.axes, build_world(loaded).doppler_hz, world.velocity_m_s)
+        requirements(radar, case.recording.signal.axes, true_doppler_hz(loaded), world.velocity_m_s)
 
 
 def _truth_arrays(case: Case) -> dict[str, Tensor]:

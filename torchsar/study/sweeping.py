@@ -28,7 +28,16 @@ log = logging.getLogger("torchsar")
 _NOT_IDENTITY = ("sweep", "trade", "title", "seed")
 
 
-def sweep_config(loaded: Loaded, out: Path, resume: bool = False, workers: int | None = None, cluster: str | None = None, device: str = "cpu", command: str = "torchsar sweep") -> Path:
+def sweep_config(
+    loaded: Loaded,
+    out: Path,
+    resume: bool = False,
+    workers: int | None = None,
+    cluster: str | None = None,
+    threads: int = 1,
+    device: str = "cpu",
+    command: str = "torchsar sweep",
+) -> Path:
     """Run the sweep of a config and write results.zarr, config.yaml, summary.json, figures/ and report.html into OUT; returns the report's path.
 
     results.zarr grows while it runs and is never replaced; the other files appear at the end. Raises ConfigError for what the user can put right,
@@ -37,8 +46,8 @@ def sweep_config(loaded: Loaded, out: Path, resume: bool = False, workers: int |
     settings = loaded.config.sweep
     grid = sweep_grid(loaded)
     stop = None if settings.stop is None else Stop(settings.stop.metric, settings.stop.relative, settings.stop.statistic)
-    needs = {f"{loaded.file}: sweep.success.{metric}": metric for metric in settings.success}
-    plan = Plan(grid, settings.trials, loaded.config.seed, settings.chunk, stop, frozenset(settings.save.trials), device, needs)
+    needs = [(f"{loaded.file}: sweep.success", metric) for metric in settings.success] + [(f"{loaded.file}: sweep.show", metric) for metric in settings.show]
+    plan = Plan(grid, settings.trials, loaded.config.seed, settings.chunk, stop, frozenset(settings.save.trials), device, tuple(needs))
     store = open_store(out, plan, identity(loaded), resume)
     config_text = loaded.text(resolved(loaded))
     about = {"title": loaded.config.title, "config": config_text, "dtype": loaded.config.precision}
@@ -46,7 +55,7 @@ def sweep_config(loaded: Loaded, out: Path, resume: bool = False, workers: int |
     _announce(grid, settings.trials)
     try:
         with _terminated_like_interrupted():
-            record = run_plan(plan, StripmapTrials(loaded, device), store, engine(workers, cluster), loaded.name)
+            record = run_plan(plan, StripmapTrials(loaded, device), store, engine(workers, cluster, threads), loaded.name)
     except Interrupted as stopped:
         raise Interrupted(f"{stopped} in {out}; go on with --resume") from None
     record.about = {**record.about, **about}
@@ -66,7 +75,7 @@ def report(record: Record, loaded: Loaded, out: Path, config_text: str, command:
     figures.mkdir(exist_ok=True)
     for old in figures.glob("*.png"):
         old.unlink()
-    pictures = draw_sweep(summary, figures)
+    pictures = draw_sweep(summary, figures, loaded.config.sweep.show)
     (out / "config.yaml").write_text(config_text, encoding="utf-8")
     write_json(out / "summary.json.tmp", summary)
     (out / "summary.json.tmp").replace(out / "summary.json")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import torch
@@ -12,41 +13,53 @@ import torch
 from torchsar.study.errors import ConfigError
 from torchsar.study.montecarlo.work import Chunk, Outcome, Work
 
+log = logging.getLogger("torchsar")
 Task = tuple[Chunk, int | None]
 _QUEUE = 4
-_RETRIES = 20
+_DEATHS = 10
 
 
 class Engine(Protocol):
-    """Computes chunks in any order; `workers` is for the record."""
+    """Computes chunks in any order; how many processes and threads in each are for the record."""
 
-    workers: int
+    @property
+    def workers(self) -> int: ...
+
+    @property
+    def threads(self) -> int: ...
 
     def results(self, work: Work, tasks: Iterable[Task]) -> Iterator[tuple[Chunk, Outcome]]: ...
 
 
 @dataclass(frozen=True)
 class InProcess:
-    """One chunk after the other, with the threads of torch."""
+    """One chunk after the other in this process."""
 
+    threads: int = 1
     workers: int = 1
 
     def results(self, work: Work, tasks: Iterable[Task]) -> Iterator[tuple[Chunk, Outcome]]:
-        for chunk, fits in tasks:
-            yield chunk, work.compute(chunk, fits)
+        before = torch.get_num_threads()
+        torch.set_num_threads(self.threads)
+        try:
+            for chunk, fits in tasks:
+                yield chunk, work.compute(chunk, fits)
+        finally:
+            torch.set_num_threads(before)
 
 
 def _compute(chunk: Chunk, fits: int | None) -> Outcome:
     """Runs in a worker, with the work that its plugin holds."""
     from distributed import get_worker
 
-    return get_worker().plugins[_PLUGIN].work.compute(chunk, fits)
+    carrier: Any = get_worker().plugins[_PLUGIN]
+    return carrier.work.compute(chunk, fits)
 
 
 _PLUGIN = "torchsar-work"
 
 
-def _plugin(work: Work, threads: int | None) -> Any:
+def _plugin(work: Work, threads: int) -> Any:
     """Gives every worker, a restarted one too, the work, its torch threads, and the GPU of its number."""
     from distributed import WorkerPlugin
 
@@ -54,7 +67,7 @@ def _plugin(work: Work, threads: int | None) -> Any:
         name = _PLUGIN
 
         def setup(self, worker: Any) -> None:
-            torch.set_num_threads(threads or max(1, worker.state.nthreads))
+            torch.set_num_threads(threads)
             self.work = _on_own_gpu(work, worker.name)
 
     return Carrier()
@@ -62,8 +75,6 @@ def _plugin(work: Work, threads: int | None) -> Any:
 
 def _on_own_gpu(work: Work, worker: Any) -> Work:
     """The GPU whose number is the worker's, where there are several and none was named."""
-    from dataclasses import replace
-
     count = torch.cuda.device_count() if work.device == "cuda" else 0
     return replace(work, device=f"cuda:{int(worker) % count}") if count > 1 and str(worker).isdecimal() else work
 
@@ -74,41 +85,55 @@ class Distributed:
 
     client: Any
     workers: int
-    threads: int | None = None
+    threads: int = 1
 
     def results(self, work: Work, tasks: Iterable[Task]) -> Iterator[tuple[Chunk, Outcome]]:
-        from distributed import as_completed
+        from distributed import KilledWorker, as_completed
 
         self.client.register_plugin(_plugin(work, self.threads), name=_PLUGIN)
-        source, waiting = iter(tasks), {}
-        done = as_completed(raise_errors=False)
+        source, waiting, done = iter(tasks), {}, as_completed()
 
-        def submit() -> None:
-            task = next(source, None)
+        def submit(task: Task | None) -> None:
             if task is not None:
-                future = self.client.submit(_compute, *task, pure=False, retries=_RETRIES)
-                waiting[future.key] = task[0]
+                future = self.client.submit(_compute, *task, pure=False)
+                waiting[future] = task[0]
                 done.add(future)
 
         try:
             for _ in range(_QUEUE * max(1, self.workers)):
-                submit()
+                submit(next(source, None))
             for future in done:
-                chunk = waiting.pop(future.key)
-                yield chunk, future.result()
-                submit()
+                chunk = waiting.pop(future)
+                try:
+                    outcome = future.result()
+                except KilledWorker:
+                    for half in _after_deaths(chunk):
+                        submit((half, len(half)))
+                    continue
+                yield chunk, outcome
+                submit(next(source, None))
         finally:
-            self.client.cancel(list(done.futures), force=True)
+            self.client.cancel(list(waiting), force=True)
+
+
+def _after_deaths(chunk: Chunk) -> Iterator[Chunk]:
+    """Halves of a chunk whose workers died one after the other: the system kills a process that takes too much memory, without an error."""
+    if len(chunk) == 1:
+        raise ConfigError(f"every worker that ran trial {chunk.trials[0]} died, most likely for want of memory; use fewer workers, or make the scene smaller")
+    log.warning("warning: the workers that ran %d trials at once died, most likely for want of memory; trying halves", len(chunk))
+    yield from chunk.pieces(-(-len(chunk) // 2))
 
 
 @contextmanager
-def engine(workers: int | None = None, cluster: str | None = None) -> Iterator[Engine]:
-    """In this process by default; `workers` local processes that share the cores; or the workers of a running scheduler at `cluster`.
+def engine(workers: int | None = None, cluster: str | None = None, threads: int = 1) -> Iterator[Engine]:
+    """In this process by default; `workers` local processes; or the workers of a running scheduler at `cluster`.
 
+    threads: of torch in each process. One is the default: batches that fit the cache gain nothing from more (two took 1.4 times as long on two
+    cores), and results then do not depend on the number of cores.
     Raises ConfigError where dask.distributed is missing or the address does not answer.
     """
     if workers is None and cluster is None:
-        yield InProcess()
+        yield InProcess(threads)
         return
     if workers is not None and cluster is not None:
         raise ConfigError("--workers starts processes on this machine and --cluster uses running ones; give one of them")
@@ -116,14 +141,23 @@ def engine(workers: int | None = None, cluster: str | None = None) -> Iterator[E
         import distributed
     except ImportError:
         raise ConfigError("several processes need dask.distributed; install the extra: pip install 'torchsar-lab[cluster]'") from None
-    with _local(distributed, workers) if workers is not None else _remote(distributed, str(cluster)) as chosen:
+    with _local(distributed, workers, threads) if workers is not None else _remote(distributed, str(cluster), threads) as chosen:
         yield chosen
 
 
+def _settings(threads: int) -> dict[str, Any]:
+    """Of local workers. dask lets malloc hand memory back at once, which doubled the time of these chains: every operation faulted its pages in anew."""
+    kept = dict.fromkeys(("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_"), 256 << 20)
+    environment = {**dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads), **kept}
+    return {"distributed.nanny.pre-spawn-environ": environment, "distributed.scheduler.allowed-failures": _DEATHS}
+
+
 @contextmanager
-def _local(distributed: Any, workers: int) -> Iterator[Engine]:
-    threads = max(1, torch.get_num_threads() // workers)
+def _local(distributed: Any, workers: int, threads: int) -> Iterator[Engine]:
+    from dask import config
+
     with (
+        config.set(_settings(threads)),
         distributed.LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=40, memory_limit=0) as local,
         distributed.Client(local) as client,
     ):
@@ -131,11 +165,11 @@ def _local(distributed: Any, workers: int) -> Iterator[Engine]:
 
 
 @contextmanager
-def _remote(distributed: Any, address: str) -> Iterator[Engine]:
+def _remote(distributed: Any, address: str, threads: int) -> Iterator[Engine]:
     try:
         client = distributed.Client(address, timeout=20)
     except (OSError, ValueError) as error:
         raise ConfigError(f"--cluster {address} does not answer ({' '.join(str(error).split())}); start a scheduler there, or leave --cluster out") from None
     with client:
         client.wait_for_workers(1, timeout=600)
-        yield Distributed(client, len(client.scheduler_info()["workers"]))
+        yield Distributed(client, len(client.scheduler_info()["workers"]), threads)

@@ -7,7 +7,7 @@ import platform
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ class Interrupted(KeyboardInterrupt):
 class Plan:
     """What a sweep is to compute, apart from where. chunk: rows a batch, None to choose by bytes; save: trials whose arrays are kept.
 
-    needs: metrics that something after the sweep asks for, by where that is said; the first batch must give them.
+    needs: (where it is said, metric) of what something after the sweep asks for; the first batch must give it.
     """
 
     grid: Grid
@@ -48,7 +48,7 @@ class Plan:
     stop: Stop | None = None
     save: frozenset[int] = frozenset()
     device: str = "cpu"
-    needs: Mapping[str, str] = field(default_factory=dict)
+    needs: tuple[tuple[str, str], ...] = ()
 
     def __post_init__(self) -> None:
         for name, value, least in (("trials", self.trials, 1), ("chunk", self.chunk, 1), ("seed", self.seed, 0)):
@@ -72,6 +72,7 @@ def sweep(
     chunk: int | None = None,
     workers: int | None = None,
     cluster: str | None = None,
+    threads: int = 1,
     stop: Stop | None = None,
     save: Iterable[int] = (),
     device: str = "cpu",
@@ -86,14 +87,14 @@ def sweep(
     tensor (rows,); any other value comes as it is, one case after the other.
     trials: per point; more trials on a finished sweep extend it. stop: ends a point early. chunk: rows a batch (default: by bytes).
     out: folder for results.zarr; None keeps the results in memory only. resume: go on with what is there. workers, cluster: processes of
-    this machine, or the address of a dask scheduler. config: whatever else the results depend on; resuming with another one is refused.
+    this machine, or the address of a dask scheduler; threads: of torch in each process. config: whatever else the results depend on; resuming with another one is refused.
 
     Random numbers depend on (seed, purpose, parameters, trial) alone. Raises ConfigError for bad input, Interrupted after Ctrl-C.
     """
     plan = Plan(make_grid(grid, batched), trials, seed, chunk, stop, frozenset(save), device)
     identity = {"seed": seed, "trial": getattr(trial, "__qualname__", type(trial).__qualname__), "config": dict(config or {})}
     store = None if out is None else open_store(Path(out), plan, identity, resume)
-    return run_plan(plan, trial, store, engine(workers, cluster)).select(plan.grid.labels)
+    return run_plan(plan, trial, store, engine(workers, cluster, threads)).select(plan.grid.labels)
 
 
 def open_store(out: Path, plan: Plan, identity: Mapping[str, Any], resume: bool) -> Store:
@@ -212,7 +213,8 @@ class _Run:
 
     def _refuse_missing(self, outcome: Outcome) -> None:
         given = {metric for metrics in outcome.values.values() for metric in metrics}
-        for where, metric in {**self.plan.needs, **({"stop.metric": self.plan.stop.metric} if self.plan.stop else {})}.items():
+        stop = (("stop.metric", self.plan.stop.metric),) if self.plan.stop else ()
+        for where, metric in (*self.plan.needs, *stop):
             if metric not in given:
                 raise ConfigError(f"{where} names {metric!r}, which no trial gives{did_you_mean(metric, given)}")
 
@@ -230,7 +232,7 @@ class _Run:
             "device": self.plan.device,
             **gpu,
             "workers": engine.workers,
-            "threads": getattr(engine, "threads", None) or torch.get_num_threads(),
+            "threads": engine.threads,
             "machine": platform.machine(),
             "versions": {"torchsar-lab": installed_version(), "torch": torch.__version__, "numpy": np.__version__, "python": platform.python_version()},
         }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from torchsar.study.montecarlo.statistics import LEVEL
 
 PANELS = 6
 _UNITS = {"_rad_s": "rad/s", "_m_s2": "m/s²", "_m_s": "m/s", "_hz": "Hz", "_db": "dB", "_nats": "nats", "_rad": "rad", "_deg": "deg", "_m": "m", "_s": "s"}
-_ACRONYMS = {word.lower(): word for word in ("SNR", "PRF", "RMS", "IRW", "PSLR", "ISLR", "RCS", "SIR", "CNR", "ADC")}
+_ACRONYMS = {word.lower(): word for word in ("Doppler", "SNR", "PRF", "RMS", "IRW", "PSLR", "ISLR", "RCS", "SIR", "CNR", "ADC")}
 
 
 def name_and_unit(name: str) -> tuple[str, str]:
@@ -129,20 +129,25 @@ def _index(labels: Mapping[str, list[float | str]], parameters: Mapping[str, flo
 Drawn = Iterator[tuple[str, str, str, Any]]
 
 
-def draw_sweep(summary: Mapping[str, Any], folder: Path) -> list[Picture]:
-    """Every picture that this sweep has the material for, as PNG files in the folder (made if need be), in the order of reading."""
+def draw_sweep(summary: Mapping[str, Any], folder: Path, show: Sequence[str] = ()) -> list[Picture]:
+    """The pictures of a sweep as PNG files in the folder (made if need be), in the order of reading.
+
+    show: the metrics to draw, in this order; by default the errors, and where nothing is called an error everything that was measured.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     cube, pictures = read_summary(summary), []
-    for name, title, caption, figure in _all(cube):
+    wanted = show or [metric for metric in cube.figures if "error" in metric] or list(cube.figures)
+    for name, title, caption, figure in _all(cube, wanted):
         file = f"{len(pictures) + 1:02d}_{re.sub(r'[^A-Za-z0-9_.-]+', '_', name)}.png"
         plot.save(figure, folder / file)
         pictures.append(Picture(file, title[:1].upper() + title[1:], caption))
     return pictures
 
 
-def _all(cube: Cube) -> Drawn:
+def _all(cube: Cube, wanted: Sequence[str]) -> Drawn:
     """Of each metric its curves, its success and its heat maps; last what the algorithms trust."""
-    for metric, fields in cube.figures.items():
+    for metric in wanted:
+        fields = cube.figures[metric]
         quantity = main_quantity(metric)
         yield from _curves(cube, quantity)
         if "success_share" in fields:

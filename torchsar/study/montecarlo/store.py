@@ -41,7 +41,7 @@ class Store:
 
     def __init__(self, root: zarr.Group, lock: Any, record: Record) -> None:
         self.root, self._lock, self.record = root, lock, record
-        self._marks: dict[str, list[list[int]]] = dict(root[_DONE].attrs.asdict())
+        self._marks = attributes(root[_DONE])
         self._dirty: set[tuple[int, ...]] = set()
         self._window: tuple[int, int] | None = None
         self._arrays: dict[str, zarr.Array] = {}
@@ -61,30 +61,30 @@ class Store:
         """The store that is there, with room for new labels and trials. Raises ConfigError where it belongs to another config."""
         lock = _locked(path)
         root = _opened(path, "r+")
-        held = root.attrs.asdict()
+        held = attributes(root)
         refuse_another(path, held["identity"], _plain(identity), held["values"], _values(grid))
         record = _loaded(root)
         labels = {name: (*known, *(label for label in grid.labels[name] if label not in known)) for name, known in record.labels.items()}
         return cls(root, lock, record.grown(labels, max(trials, record.trials)))._begun(grid, identity)
 
     def _begun(self, grid: Grid, identity: Mapping[str, Any]) -> Store:
-        values = {name: {**self.root.attrs.get("values", {}).get(name, {}), **named} for name, named in _values(grid).items()}
+        values = {name: {**attributes(self.root).get("values", {}).get(name, {}), **named} for name, named in _values(grid).items()}
         self.root.update_attributes({"format": FORMAT, "identity": _plain(identity), "hash": hash_of(identity), "values": values})
         self.record.about = _about(self.root)
         self._describe()
         for name, labels in self.record.labels.items():
             self._put(name, np.array(labels), (name,))
         self._put("trial", np.arange(self.record.trials), ("trial",))
-        for name, (data, dims, attributes) in self._variables().items() if self.record.algorithms else ():
-            self._array(name, data, dims, attributes)
+        for name, (data, dims, about) in self._variables().items() if self.record.algorithms else ():
+            self._array(name, data, dims, about)
         return self
 
     def _describe(self) -> None:
         self.root.update_attributes({"labels": {k: list(v) for k, v in self.record.labels.items()}, "trials": self.record.trials, "algorithms": list(self.record.algorithms)})
 
-    def note(self, **attributes: Any) -> None:
+    def note(self, **about: Any) -> None:
         """Root attributes: what the run was."""
-        self.root.update_attributes(_plain_values(attributes))
+        self.root.update_attributes(_plain_values(about))
 
     # writing -----------------------------------------------------------------------------------------------------
 
@@ -111,11 +111,11 @@ class Store:
         if list(self.record.algorithms) != self.root.attrs.get("algorithms"):
             self._describe()
             self._put("algorithm", np.array(self.record.algorithms), ("algorithm",))
-        for name, (data, dims, attributes) in self._variables().items():
-            self._write(name, data, dims, attributes, *self._window)
+        for name, (data, dims, about) in self._variables().items():
+            self._write(name, data, dims, about, *self._window)
         self._write_saved()
         self._marks.update({",".join(map(str, place)): _spans(self.record.done[place]) for place in self._dirty})
-        self.root[_DONE].attrs.put(self._marks)
+        self.root[_DONE].update_attributes(self._marks)
         self._dirty, self._window = set(), None
         self._last = time.perf_counter()
         self._cost = self._last - began
@@ -126,35 +126,35 @@ class Store:
         if self._lock is not None:
             self._lock.close()
 
-    def _variables(self) -> dict[str, tuple[np.ndarray, tuple[str, ...], dict[str, str]]]:
+    def _variables(self) -> dict[str, tuple[np.ndarray, tuple[str, ...], dict[str, Any]]]:
         record = self.record
         found = {OK: (record.ok, record.dims, {"kind": OK}), **{name: (x, record.dims, {"kind": "metric"}) for name, x in record.metrics.items()}}
         for metric, named in record.bounds.items():
             found.update({bound_name(metric, name): (x, record.dims[1:], {"kind": "bound", "bound_of": metric, "bound": name}) for name, x in named.items()})
         return found
 
-    def _write(self, name: str, data: np.ndarray, dims: tuple[str, ...], attributes: dict[str, str], first: int, last: int) -> None:
+    def _write(self, name: str, data: np.ndarray, dims: tuple[str, ...], about: dict[str, Any], first: int, last: int) -> None:
         """The trials first..last-1 of all points, widened to whole chunks of the array, so that nothing is read back."""
-        array = self._array(name, data, dims, attributes)
+        array = self._array(name, data, dims, about)
         step = array.chunks[-1]
         window = (..., slice(first // step * step, min(-(-last // step) * step, data.shape[-1])))
         array[window] = data[window]
 
-    def _array(self, name: str, data: np.ndarray, dims: tuple[str, ...], attributes: dict[str, str]) -> zarr.Array:
+    def _array(self, name: str, data: np.ndarray, dims: tuple[str, ...], about: dict[str, Any]) -> zarr.Array:
         """The array of that name, made or grown as needed, and remembered: looking it up costs as much as writing it."""
         if name not in self._arrays:
-            self._arrays[name] = self._opened_array(name, data, dims, attributes)
+            self._arrays[name] = self._opened_array(name, data, dims, about)
         if self._arrays[name].shape != data.shape:
             self._arrays[name].resize(data.shape)
         return self._arrays[name]
 
-    def _opened_array(self, name: str, data: np.ndarray, dims: tuple[str, ...], attributes: dict[str, str]) -> zarr.Array:
+    def _opened_array(self, name: str, data: np.ndarray, dims: tuple[str, ...], about: dict[str, Any]) -> zarr.Array:
         if name in self.root:
             return self.root[name]  # pyright: ignore[reportReturnType]
         leading = tuple(max(1, min(n, 64)) for n in data.shape[:-1])
         chunk = max(1, min(data.shape[-1], 1024, _CHUNK_NUMBERS // max(1, int(np.prod(leading)))))
         fill = False if data.dtype == bool else np.nan
-        return self.root.create_array(name, shape=data.shape, dtype=data.dtype, chunks=(*leading, chunk), dimension_names=dims, attributes=attributes, fill_value=fill, compressors=None)
+        return self.root.create_array(name, shape=data.shape, dtype=data.dtype, chunks=(*leading, chunk), dimension_names=dims, attributes=about, fill_value=fill, compressors=None)
 
     def _put(self, name: str, values: np.ndarray, dims: tuple[str, ...]) -> None:
         """A coordinate, whole."""
@@ -166,9 +166,9 @@ class Store:
             array[...] = values
 
     def _write_saved(self) -> None:
-        for path, attributes, arrays in self._pending:
+        for path, about, arrays in self._pending:
             group = self.root.require_group(f"{_SAVED}/{path}")
-            group.attrs.put(_plain_values(attributes))
+            group.attrs.put(_plain_values(about))
             for name, data in arrays.items():
                 group.create_array(name, data=data, overwrite=True)
         self._pending = []
@@ -186,6 +186,11 @@ def read_sweep(path: Path | str) -> Record:
     return _loaded(_opened(path / "results.zarr" if (path / "results.zarr").exists() else path, "r"))
 
 
+def attributes(node: Any) -> dict[str, Any]:
+    """Attributes of a group or an array, as a plain tree."""
+    return node.attrs.asdict()
+
+
 def _opened(path: Path, mode: Any) -> zarr.Group:
     try:
         root = zarr.open_group(str(path), mode=mode)
@@ -198,9 +203,9 @@ def _opened(path: Path, mode: Any) -> zarr.Group:
 
 def _loaded(root: zarr.Group) -> Record:
     """Everything on disk, without what is not marked done."""
-    held = root.attrs.asdict()
+    held = attributes(root)
     record = empty({name: tuple(labels) for name, labels in held["labels"].items()}, held["trials"])
-    for index, spans in root[_DONE].attrs.asdict().items():
+    for index, spans in attributes(root[_DONE]).items():
         for first, last in spans:
             record.done[(*map(int, filter(None, index.split(","))), slice(first, last))] = True
     record.algorithms = tuple(held["algorithms"])
@@ -219,7 +224,7 @@ def _loaded(root: zarr.Group) -> Record:
 
 
 def _about(root: zarr.Group) -> dict[str, Any]:
-    return {key: value for key, value in root.attrs.items() if key not in ("labels", "values", "trials", "algorithms", "format")}
+    return {key: value for key, value in attributes(root).items() if key not in ("labels", "values", "trials", "algorithms", "format")}
 
 
 def _restore(target: np.ndarray, array: zarr.Array, done: np.ndarray) -> None:

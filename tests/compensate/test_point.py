@@ -1,0 +1,61 @@
+"""The beam's Doppler from the place of one point in the image."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from torchsar.compensate import PointDoppler, doppler_at
+from torchsar.core import Draws, Signal
+from torchsar.echo import simulate, target_energy
+from torchsar.focus import OmegaK
+from torchsar.metrics.bounds import reference_doppler_std_hz, tone_frequency_bound_hz
+from torchsar.radar import LinearFM, StripmapRadar
+from torchsar.scene import Dwell, Points, StripmapWorld
+
+RADAR = StripmapRadar(3.2e9, LinearFM(50e6, 1e-6), 62.5e6, 1000.0, 7000.0, 700e3, pointing_doppler_hz=652.0, integration_s=0.3)
+
+
+def observed(snr_db: float, doppler_hz: float, trials: int = 60, seed: int = 1):
+    world = StripmapWorld(Points([0.0], [0.0], random_phase=True), Dwell(0.3), doppler_hz=doppler_hz, snr_db=snr_db)
+    recording, truth = simulate(RADAR, world, 512, 192, Draws(seed, case=f"{snr_db}/{doppler_hz}", trials=range(trials)))
+    q = float((target_energy(truth, world, RADAR, 512).sum(-1) / truth.values["noise_std"].square()).mean())
+    return PointDoppler(RADAR)(OmegaK(RADAR)(recording.signal)), q
+
+
+@pytest.mark.parametrize("snr_db, doppler_hz", [(-20.0, 391.0), (-10.0, 652.0), (0.0, 913.0)])
+def test_it_stands_on_the_bound_of_a_tone_and_below_the_papers_curve(snr_db: float, doppler_hz: float) -> None:
+    found, q = observed(snr_db, doppler_hz)
+    rmse = float((found["doppler_hz"] - doppler_hz).square().mean().sqrt())
+    bound = float(tone_frequency_bound_hz(q, 0.3))
+    assert 0.7 * bound <= rmse <= 1.35 * bound
+    assert rmse <= float(reference_doppler_std_hz(q, 0.3))
+    assert bool(found.ok.all()) and float(found.std["doppler_hz"].median()) == pytest.approx(bound, rel=0.35)
+
+
+def test_noise_alone_is_not_trusted() -> None:
+    noise = Draws(4, trials=range(20)).normal("n", (512, 192), torch.complex64)
+    found = PointDoppler(RADAR)(Signal(noise, RADAR.image_axes(RADAR.raw_axes(512, 192))))
+    assert int(found.ok.sum()) == 0
+    silent = PointDoppler(RADAR)(Signal(torch.zeros(2, 64, 64, dtype=torch.complex64), RADAR.image_axes(RADAR.raw_axes(64, 64))))
+    assert not bool(silent.ok.any()) and bool(torch.isfinite(silent["doppler_hz"]).all())
+
+
+def test_doppler_at_inverts_the_place_in_the_image() -> None:
+    zero_s, closest_m, velocity = 0.7, 701e3, 7003.0
+    for crossing_s in (-0.4, 0.2, 0.6):
+        ahead = velocity * (zero_s - crossing_s)
+        doppler = 2 * velocity / RADAR.wavelength_m * ahead / math.hypot(closest_m, ahead)
+        for frame_hz in (0.0, 652.0, -900.0):
+            place = RADAR.image_position(torch.tensor(zero_s, dtype=torch.float64), torch.tensor(closest_m, dtype=torch.float64), frame_hz, velocity)
+            assert float(doppler_at(RADAR, *place, frame_hz, velocity, crossing_s)) == pytest.approx(doppler, abs=1e-7)
+
+
+def test_a_frame_is_needed() -> None:
+    from dataclasses import replace
+
+    radar = replace(RADAR, pointing_doppler_hz=None)
+    with pytest.raises(ValueError, match="needs the frame of the image"):
+        PointDoppler(radar)(Signal(torch.ones(64, 64, dtype=torch.complex64), radar.image_axes(radar.raw_axes(64, 64))))

@@ -1,0 +1,160 @@
+"""Sweeps of a config: what is checked before anything runs, and what lies in the folder."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.study.tiny import TINY, write_tiny
+from torchsar.cli import main
+from torchsar.study.config import load
+from torchsar.study.errors import ConfigError
+from torchsar.study.montecarlo import Record, read_sweep
+from torchsar.study.montecarlo.engines import InProcess
+from torchsar.study.montecarlo.loop import Plan, run_plan
+from torchsar.study.trials import StripmapTrials, error_name, sweep_grid
+
+SWEEP = {"world.noise.snr_db": [0.0, 20.0], "world.doppler_hz": [-20.0, 30.0], "trials": 6}
+SMALL = ["sweep.world.noise.snr_db=[-10.0, 10.0]", "sweep.world.squint_deg=[0.25]"]
+
+
+def record_of(loaded, chunk: int | None, trials: int) -> Record:
+    from contextlib import nullcontext
+
+    return run_plan(Plan(sweep_grid(loaded), trials, loaded.config.seed, chunk), StripmapTrials(loaded), None, nullcontext(InProcess()))
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sweep")
+    config = write_tiny(folder, sweep={**SWEEP, "success": {"doppler_baseband_error_hz": 10.0}, "save": {"trials": [1], "taps": ["doppler"]}})
+    assert main(["sweep", str(config), "--resume", "--out", str(folder / "result")]) == 0
+    return folder / "result"
+
+
+def test_the_folder_holds_what_is_promised(out: Path) -> None:
+    assert {p.name for p in out.iterdir() if not p.name.startswith(".")} == {"results.zarr", "config.yaml", "summary.json", "figures", "report.html"}
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["parameters"] == {"world.noise.snr_db": [0, 20], "world.doppler_hz": [-20, 30]}
+    asked = {"algorithm": "recommended", "metric": "doppler_baseband_error_hz", "parameters": {"world.noise.snr_db": 20.0, "world.doppler_hz": 30.0}}
+    point = next(p for p in summary["points"] if asked.items() <= p.items())
+    assert {"n", "mean", "median", "rmse", "interval", "ok_share", "success_share"} <= set(point) and point["n"] == 6
+    values = read_sweep(out).metrics["doppler_baseband_error_hz"][1, 1, 1]
+    assert point["rmse"] == pytest.approx(float(np.sqrt(np.mean(values**2))))
+    assert point["interval"][0] <= point["rmse"] <= point["interval"][1]
+
+
+def test_the_config_left_behind_runs_again(out: Path) -> None:
+    again = load(str(out / "config.yaml"))
+    assert again.config.sweep.grid == {k: v for k, v in SWEEP.items() if "." in k} and again.config.sweep.trials == 6
+
+
+def test_images_of_chosen_trials_are_kept(out: Path) -> None:
+    import zarr
+
+    saved = zarr.open_group(str(out / "results.zarr"), mode="r")["saved"]
+    groups = [saved[name]["1"] for name in saved.group_keys()]
+    assert len(groups) == 4 and all(g["recommended.last"].shape == (192, 128) and g["recommended.doppler"].shape == (192, 128) for g in groups)
+
+
+def test_a_batched_key_gives_what_a_config_of_that_value_gives() -> None:
+    tiny = load_tree({**TINY, "sweep": SWEEP})
+    swept = record_of(tiny, 5, 3)
+    alone = record_of(tiny.changed({"sweep": {"grid": {"world.noise.snr_db": [20.0], "world.doppler_hz": [30.0]}}}), 1, 3)
+    np.testing.assert_allclose(swept.metrics["doppler_baseband_hz"][1, 1, 1], alone.metrics["doppler_baseband_hz"][1, 0, 0], rtol=1e-5)
+
+
+def test_keys_of_any_kind_make_cases() -> None:
+    found = record_of(load_tree({**TINY, "sweep": {"world.beam.dwell_s": [0.1, 0.2], "precision": ["complex64", "complex128"]}}), None, 2)
+    assert found.labels == {"world.beam.dwell_s": (0.1, 0.2), "precision": ("complex64", "complex128")} and found.done.all()
+    entropy = found.metrics["entropy_nats"]
+    assert (np.abs(entropy[:, 0] - entropy[:, 1]) > 0.01).any()
+
+
+def load_tree(tree: dict):
+    from torchsar.study.config import Config, Loaded
+
+    return Loaded(Config.model_validate(tree), "tiny.yaml", "tiny")
+
+
+def test_the_log_says_what_is_batched(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    config = write_tiny(tmp_path, sweep={"world.noise.snr_db": [0.0], "world.beam.dwell_s": [0.1, 0.2], "trials": 1})
+    with caplog.at_level(logging.INFO, "torchsar"):
+        assert main(["sweep", str(config), "--out", str(tmp_path / "result")]) == 0
+    assert "per-trial tensors, which share batches: world.noise.snr_db (1); cases of their own: world.beam.dwell_s (2)" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "sweep, said",
+    [
+        ({"world.noise.snr": [1.0]}, "world.noise.snr"),
+        ({"world.nose.snr_db": [1.0]}, "did you mean 'noise'"),
+        ({"world.noise.snr_db": ["loud"]}, "finite numbers"),
+        ({"world.velocity_m_s": [-3.0]}, "velocity_m_s"),
+        ({"world.noise.snr_db": []}, "has no values"),
+        ({"world.noise.snr_db": 3.0}, "must be a list of values"),
+        ({"processor.recommended.stages.focus.reference": ["matcht"]}, "matcht"),
+        ({"processor.recommended.stages.fokus.reference": ["flat"]}, "did you mean 'focus'"),
+        ({"trails": 5}, "did you mean 'trials'"),
+        ({"trials": 0}, "sweep.trials"),
+        ({"seed": [1, 2]}, "cannot be swept"),
+        ({"data.file": ["x"]}, "cannot be swept"),
+        ({"world.doppler_hz": [1.0], "world.squint_deg": [1.0]}, "both say where the beam looks"),
+        ({"trials": 2, "success": {"dopler_hz": 1.0}}, "did you mean 'doppler"),
+        ({"trials": 2, "show": ["entropy"]}, "did you mean 'entropy_nats'"),
+        ({"trials": 2, "save": {"trials": [0], "taps": ["fokus"]}}, "did you mean 'focus'"),
+        ({"trials": 2, "stop": {"metric": "entropi_nats", "relative": 0.1}}, "did you mean 'entropy_nats'"),
+        ({"world.scene": [{"kind": "points"}]}, "write {label: value"),
+    ],
+)
+def test_mistakes_are_one_sentence(sweep: dict, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = write_tiny(tmp_path, sweep=sweep)
+    assert main(["sweep", str(config), "--out", str(tmp_path / "result")]) == 2
+    last = [line for line in capsys.readouterr().err.splitlines() if line.strip()][-1]
+    assert last.startswith("torchsar: ") and said in last
+    assert not (tmp_path / "result" / "report.html").exists()
+
+
+def test_a_recording_cannot_be_swept(tmp_path: Path) -> None:
+    loaded = load_tree({**TINY, "sweep": SWEEP})
+    with pytest.raises(ConfigError, match="a sweep simulates its trials"):
+        sweep_grid(load_tree({**{k: v for k, v in TINY.items() if k not in ("world", "radar")}, "data": {"file": str(tmp_path)}, "sweep": SWEEP}))
+    assert sweep_grid(loaded).shape == (2, 2)
+
+
+def test_squint_is_the_doppler_of_the_true_velocity() -> None:
+    tree = {**TINY, "world": {**TINY["world"], "squint_deg": 0.6, "velocity_m_s": 121.0}, "sweep": {"trials": 1}}
+    found = record_of(load_tree(tree), 1, 1)
+    expected = 2 * 121.0 * np.sin(np.deg2rad(0.6)) / (299792458.0 / 3.2e9)
+    name = "doppler_baseband"
+    truth = found.metrics[f"{name}_hz"][1, 0] - found.metrics[f"{name}_error_hz"][1, 0]
+    assert truth == pytest.approx(expected, abs=1e-9)
+
+
+def test_names_of_errors() -> None:
+    assert [error_name(n) for n in ("doppler_hz", "velocity_m_s", "gain")] == ["doppler_error_hz", "velocity_error_m_s", "gain_error"]
+
+
+@pytest.mark.parametrize("precision, tolerance", [("complex64", 1e-5), ("complex128", 1e-12)])
+def test_chunks_change_the_stripmap_chain_only_by_rounding(precision: str, tolerance: float) -> None:
+    """Relative to the estimate itself: an error is the small difference of two large numbers."""
+    loaded = load("stripmap_doppler", [*SMALL, f"precision={precision}"])
+    records = {chunk: record_of(loaded, chunk, 3) for chunk in (1, 7, None)}
+    for other in (records[1], records[None]):
+        np.testing.assert_array_equal(other.ok, records[7].ok)
+        for name in ("doppler_hz", "doppler_baseband_hz", "velocity_m_s"):
+            np.testing.assert_allclose(other.metrics[name], records[7].metrics[name], rtol=tolerance)
+
+
+def test_the_point_estimator_of_the_stripmap_sweep_stands_on_its_bound() -> None:
+    loaded = load("stripmap_doppler", [*SMALL, "sweep.world.scene={point: {target: {kind: points, azimuth_m: [0.0], range_m: [0.0], random_phase: true}}}"])
+    record = record_of(loaded, None, 30)
+    row = record.algorithms.index("point")
+    rmse = np.sqrt((record.metrics["doppler_error_hz"][row, 0, 0] ** 2).mean(-1))
+    bound = record.bounds["doppler_error_hz"]["Cramer-Rao bound of a point of known place"][0, 0, :, 0]
+    assert ((0.7 * bound < rmse) & (rmse < 1.45 * bound)).all()
+    assert (rmse < record.bounds["doppler_error_hz"]["1/(T sqrt q), Tsvetkov 2017"][0, 0, :, 0]).all()
