@@ -43,7 +43,7 @@ def main() -> None:
     parser.add_argument("overrides", nargs="*")
     parser.add_argument("--trials", type=int, default=96)
     parser.add_argument("--rounds", type=int, default=3)
-    options = parser.parse_args()
+    options = parser.parse_intermixed_args()
     torch.set_num_threads(1)
     loaded = load(options.config, options.overrides)
     grid = first_point(sweep_grid(loaded))

@@ -47,7 +47,7 @@ def test_the_sweep_of_the_readme_runs(tmp_path: Path) -> None:
 
 
 def test_the_benchmark_of_sweeps_runs(tmp_path: Path) -> None:
-    command = [sys.executable, str(ROOT / "scripts" / "sweep_speed.py"), "--trials", "4", "--rounds", "1", "processor.recommended.stages.velocity.lines=16", "world.lines=384"]
+    command = [sys.executable, str(ROOT / "scripts" / "sweep_speed.py"), "stripmap_doppler", "--trials", "4", "--rounds", "1", "processor.recommended.stages.velocity.lines=16", "world.lines=384"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-1000:]
     for name in ("one by one", "one batch", "automatic ", "automatic, 2 workers"):

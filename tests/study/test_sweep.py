@@ -15,7 +15,7 @@ import zarr
 from tests.study import toy
 from torchsar.core import Draws
 from torchsar.study.errors import ConfigError
-from torchsar.study.montecarlo import Record, Stop, read_sweep, sweep
+from torchsar.study.montecarlo import Record, Stop, differences, read_sweep, sweep
 from torchsar.study.montecarlo.chunks import CACHE_BYTES, cut, probed_bytes, rows_by_bytes
 from torchsar.study.montecarlo.grid import address, make_grid
 from torchsar.study.montecarlo.stopping import looks
@@ -324,3 +324,21 @@ def test_the_machinery_costs_less_than_five_percent(tmp_path: Path) -> None:
         if shares[-1] < 0.05:
             return
     pytest.fail(f"overheads {shares}")
+
+
+def test_trials_that_came_out_otherwise_are_named(reference: Record) -> None:
+    import copy
+
+    other = copy.deepcopy(reference)
+    other.metrics["level_error_m"][1, 2, 0, 17] += 0.5
+    other.metrics["first_m"][1, 0, 0, 3] *= 1 + 1e-7
+    other.ok[0, 1, 1, 5] ^= True
+    found = differences(reference, other, 1e-5)
+    assert [(d.metric, d.algorithm, d.parameters, d.trial) for d in found] == [
+        ("level_error_m", "transformed", {"snr_db": 20.0, "law": "flat"}, 17),
+        ("ok", "average", {"snr_db": 10.0, "law": "tilted"}, 5),
+    ]
+    assert found[0].values[1] - found[0].values[0] == pytest.approx(0.5)
+    assert differences(reference, reference, 0.0) == []
+    with pytest.raises(ConfigError, match="different sweeps"):
+        differences(reference, reference.select({"snr_db": (0.0,), "law": ("flat",)}), 0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import random
 import signal
@@ -17,7 +18,7 @@ import pytest
 from tests.study import toy
 from tests.study.tiny import write_tiny
 from torchsar.study.errors import ConfigError
-from torchsar.study.montecarlo import Record, read_sweep
+from torchsar.study.montecarlo import Record, engines, read_sweep
 from torchsar.study.montecarlo.engines import engine
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -147,3 +148,33 @@ def test_an_interrupted_sweep_says_how_to_go_on_and_does(tmp_path: Path) -> None
     done = subprocess.run([*command, "--resume", f"sweep.trials={held // 2 + 2}"], capture_output=True, text=True, cwd=ROOT, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
     assert (out / "report.html").exists()
+
+
+def deadly(parameters: dict, draws) -> dict:
+    """The toy trial, in a process that the system kills where a batch is too large."""
+    if len(draws.trials) > 4:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return toy.trial(parameters, draws)
+
+
+@needs_dask
+def test_a_batch_that_kills_its_workers_is_halved(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    monkeypatch.setattr(engines, "_DEATHS", 0)
+    with caplog.at_level(logging.WARNING, "torchsar"):
+        record = toy.run(trial=deadly, workers=1, trials=6, grid={"snr_db": [0.0], "law": ["flat"]}, chunk=6)
+    assert "the workers that ran 6 trials at once died" in caplog.text
+    np.testing.assert_allclose(record.metrics["level_error_m"], toy.run(trials=6, grid={"snr_db": [0.0], "law": ["flat"]}).metrics["level_error_m"], rtol=1e-5, atol=1e-6)
+
+
+@needs_dask
+def test_a_running_scheduler_serves_and_a_failing_trial_is_named(alone: Record) -> None:
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=40) as cluster:
+        bitwise(toy.run(cluster=cluster.scheduler_address, chunk=7), alone)
+        with pytest.raises(ConfigError, match="failed in trials 0 to 1 of law=flat: KeyError: 'nothing'"):
+            toy.run(trial=failing, cluster=cluster.scheduler_address, chunk=2, trials=2)
+
+
+def failing(parameters: dict, draws) -> dict:
+    return {"m": parameters["nothing"]}

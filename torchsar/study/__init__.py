@@ -8,9 +8,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from torchsar.study.montecarlo import Interrupted, Record, Stop, read_sweep, sweep
+    from torchsar.study.montecarlo import Difference, Interrupted, Record, Stop, differences, read_sweep, sweep
 
-__all__ = ["Interrupted", "Record", "Stop", "read_sweep", "sweep"]
+__all__ = ["Difference", "Interrupted", "Record", "Stop", "differences", "read_sweep", "sweep"]
 
 
 def __getattr__(name: str) -> Any:

@@ -158,7 +158,7 @@ def _local(distributed: Any, workers: int, threads: int) -> Iterator[Engine]:
 
     with (
         config.set(_settings(threads)),
-        distributed.LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=40, memory_limit=0) as local,
+        distributed.LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=40, memory_limit=0) as local,
         distributed.Client(local) as client,
     ):
         yield Distributed(client, workers, threads)

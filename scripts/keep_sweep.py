@@ -1,0 +1,44 @@
+"""Keep what a finished sweep claims: RMSE, intervals, bounds and shares of its drawn metrics, as a small file that tests check.
+
+    python scripts/keep_sweep.py out/stripmap_doppler docs/sweeps/stripmap_doppler.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+KEPT = ("algorithm", "parameters", "metric", "n", "median", "rmse", "interval", "ok_share", "success_share")
+
+
+def rounded(x: Any) -> Any:
+    """Five digits are more than any interval here is worth."""
+    if isinstance(x, list):
+        return [rounded(v) for v in x]
+    return float(f"{x:.5g}") if isinstance(x, float) else x
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("file", type=Path)
+    options = parser.parse_args()
+    summary = json.loads((options.folder / "summary.json").read_text(encoding="utf-8"))
+    session = summary["about"]["sessions"][-1]
+    wanted = {point["metric"] for point in summary["points"] if "error" in point["metric"]}
+    kept = {
+        "title": summary["title"],
+        "made_with": {"seed": summary["about"]["seed"], "hash": summary["about"]["hash"], "versions": session["versions"], "trials": summary["trials"]},
+        "points": [{key: rounded(point[key]) for key in KEPT if key in point} for point in summary["points"] if point["metric"] in wanted and point["n"]],
+        "bounds": [rounded_bound for rounded_bound in ({**bound, "rms": rounded(bound["rms"])} for bound in summary["bounds"]) if rounded_bound["rms"] is not None],
+    }
+    lines = [f'"{key}": {json.dumps(value)}' for key, value in kept.items() if not isinstance(value, list)]
+    lines += [f'"{key}": [\n' + ",\n".join(json.dumps(row) for row in value) + "\n]" for key, value in kept.items() if isinstance(value, list)]
+    options.file.parent.mkdir(parents=True, exist_ok=True)
+    options.file.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
