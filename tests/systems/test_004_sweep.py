@@ -1,0 +1,55 @@
+"""What the recorded sweep of system 004 claims (200 trials a point); the reduced version runs in tests/study/test_sweep_config.py."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+RECORDED = json.loads((Path(__file__).resolve().parents[2] / "docs" / "sweeps" / "stripmap_doppler.json").read_text(encoding="utf-8"))
+BOUND, CURVE = "Cramer-Rao bound of a point of known place", "1/(T sqrt q), Tsvetkov 2017"
+SNRS, SQUINTS = (-20.0, -10.0, 0.0, 10.0, 20.0), (0.15, 0.25, 0.35)
+
+
+def place(scene: str, squint_deg: float, snr_db: float) -> dict:
+    return {"world.scene": scene, "world.squint_deg": squint_deg, "world.noise.snr_db": snr_db}
+
+
+def point(algorithm: str, metric: str, at: dict) -> dict:
+    return next(p for p in RECORDED["points"] if (p["algorithm"], p["metric"], p["parameters"]) == (algorithm, metric, at))
+
+
+def bound(metric: str, name: str, at: dict) -> float:
+    return next(b["rms"] for b in RECORDED["bounds"] if (b["metric"], b["bound"], b["parameters"]) == (metric, name, at))
+
+
+def test_every_point_has_its_trials() -> None:
+    assert len({json.dumps(p["parameters"]) for p in RECORDED["points"]}) == 30
+    assert all(p["n"] == 200 and p["interval"][0] <= p["rmse"] <= p["interval"][1] for p in RECORDED["points"])
+
+
+@pytest.mark.parametrize("squint_deg", SQUINTS)
+@pytest.mark.parametrize("snr_db", SNRS)
+def test_a_point_of_known_place_lies_between_its_bound_and_the_papers_curve(squint_deg: float, snr_db: float) -> None:
+    """Its velocity is found with the nominal pointing of 0.25 deg; where the squint is another, a velocity error of some m/s shows above 0 dB as 0.003 Hz."""
+    at = place("point", squint_deg, snr_db)
+    rmse = point("point", "doppler_error_hz", at)["rmse"]
+    assert rmse >= 0.85 * bound("doppler_error_hz", BOUND, at)
+    if squint_deg == 0.25 or snr_db <= 0:
+        assert rmse <= 1.25 * bound("doppler_error_hz", BOUND, at)
+        assert rmse <= 0.5 * bound("doppler_error_hz", CURVE, at)
+    assert rmse <= bound("doppler_error_hz", CURVE, at) or rmse < 0.004
+
+
+@pytest.mark.parametrize("scene", ["point", "speckle"])
+@pytest.mark.parametrize("squint_deg", SQUINTS)
+def test_complete_apertures_beat_the_plain_increment_in_noise(scene: str, squint_deg: float) -> None:
+    at = place(scene, squint_deg, -10.0)
+    assert point("recommended", "doppler_baseband_error_hz", at)["rmse"] < 0.7 * point("phase_increment", "doppler_baseband_error_hz", at)["rmse"]
+
+
+@pytest.mark.parametrize("squint_deg", SQUINTS)
+def test_squint_is_found_to_a_hundredth_of_a_degree_once_there_is_signal(squint_deg: float) -> None:
+    for scene, snr_db in (("speckle", 10.0), ("speckle", 20.0), ("point", 20.0)):
+        assert point("recommended", "doppler_error_hz", place(scene, squint_deg, snr_db))["success_share"] >= 0.95
