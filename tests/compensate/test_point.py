@@ -59,3 +59,17 @@ def test_a_frame_is_needed() -> None:
     radar = replace(RADAR, pointing_doppler_hz=None)
     with pytest.raises(ValueError, match="needs the frame of the image"):
         PointDoppler(radar)(Signal(torch.ones(64, 64, dtype=torch.complex64), radar.image_axes(radar.raw_axes(64, 64))))
+
+
+@pytest.mark.parametrize("at_m, inside", [(40.0, True), (140.0, True), (-145.0, True), (165.0, False)])
+def test_an_aperture_that_the_record_cuts_is_measured_by_what_is_left_of_it(at_m: float, inside: bool) -> None:
+    """An airborne radar, 307 m of track, 120 m of aperture; the image holds the point at 140 m beyond its end, circularly."""
+    radar = StripmapRadar(9.6e9, LinearFM(60e6, 1.5e-6), 75e6, 400.0, 120.0, 5000.0, pointing_doppler_hz=0.0, integration_s=1.0)
+    world = StripmapWorld(Points([at_m], [0.0], random_phase=True), Dwell(1.0), doppler_hz=math.copysign(37.0, at_m), snr_db=-10.0)
+    recording, truth = simulate(radar, world, 1024, 192, Draws(2, case=f"{at_m}", trials=range(30)))
+    found = PointDoppler(radar, crossing_s=float(truth.values["crossing_s"].flatten()[0]))(OmegaK(radar)(recording.signal))
+    q = float((target_energy(truth, world, radar, 1024).sum(-1) / truth.values["noise_std"].square()).mean())
+    bound = float(tone_frequency_bound_hz(q, min(1.0, 0.5 + 1.28 - abs(at_m) / 120)))
+    rmse = float((found["doppler_hz"] - world.doppler_hz).square().mean().sqrt())
+    assert bool((found.ok == inside).all()) and 0.6 * bound <= rmse <= 1.4 * bound
+    assert float(found.std["doppler_hz"].median()) == pytest.approx(bound, rel=0.15)

@@ -31,12 +31,12 @@ def doppler_at(radar: StripmapRadar, azimuth_m: Tensor, slant_m: Tensor, frame_h
     return 2 * velocity_m_s / radar.wavelength_m * ahead / torch.sqrt(closest.square() + ahead.square())
 
 
-def peak_time_s(image: Tensor, prf_hz: float, sample: Tensor, rate_hz_s: Tensor | float, dwell_s: float, doppler_hz: Tensor, start_s: Tensor) -> Tensor:
+def peak_time_s(image: Tensor, prf_hz: float, sample: Tensor, rate_hz_s: Tensor | float, seen_s: tuple[float, float], doppler_hz: Tensor, start_s: Tensor) -> Tensor:
     """Refine the slow time start_s (...,), counted from the first line, of a peak at one range position; maximum likelihood.
 
     image: (..., azimuth, range); sample: range position (...,), fractional. The column is spread out again to the azimuth history of the point
-    about its Doppler doppler_hz (...,), of which only the dwell is kept: an image passes the noise of all lines and of the whole PRF.
-    rate_hz_s: magnitude of the Doppler rate.
+    about its Doppler doppler_hz (...,), of which only seen_s is kept: an image passes the noise of all lines and of the whole PRF.
+    rate_hz_s: magnitude of the Doppler rate; seen_s: when the record saw the point, from and to, counted from the beam's crossing.
     """
     n = image.shape[-2]
     weights = torch.sinc(torch.arange(image.shape[-1], dtype=torch.float64, device=image.device) - sample[..., None])
@@ -46,16 +46,18 @@ def peak_time_s(image: Tensor, prf_hz: float, sample: Tensor, rate_hz_s: Tensor 
     history = torch.fft.ifft(spectrum * cis(math.pi * offset.square() / rate))
     lines = torch.round(start_s[..., None] * prf_hz) - n // 2 + torch.arange(n, dtype=torch.float64, device=image.device)  # the peak in the middle
     since = lines / prf_hz - start_s[..., None]
-    tone = history.gather(-1, torch.remainder(lines, n).long()) * cis(math.pi * torch.remainder(rate * since.square(), 2)) * (since.abs() <= dwell_s / 2)
+    tone = history.gather(-1, torch.remainder(lines, n).long()) * cis(math.pi * torch.remainder(rate * since.square(), 2)) * (since >= seen_s[0]) * (since <= seen_s[1])
     return start_s + (point_doppler(tone, prf_hz, centre_hz=doppler_hz) - doppler_hz) / rate[..., 0]
 
 
 class PointDoppler(Stage):
     """`doppler_hz` of the beam from the brightest point of an image, which the beam centre crosses at crossing_s (default: the middle line).
 
-    frame_hz, velocity_m_s: those of the image; by default the radar's pointing and its nominal velocity. std: the bound of a tone at the
-    measured q (info). ok where the peak is higher than noise alone would have it once in 10,000 images. Raises ValueError where neither the
-    radar nor a connected value says what the frame is.
+    frame_hz, velocity_m_s: those of the image; by default the radar's pointing and its nominal velocity. The band of the beam must lie within
+    half a PRF of the frame (focusing folds what does not), and its Doppler within half the length of the image, rate * n / (2 PRF).
+    std: the bound of a tone at the measured q (info), for the part of the dwell that the record saw; it holds where radar.integration_s is the
+    true dwell. ok where the crossing lies within the record and the peak is higher than noise
+    alone would have it once in 10,000 images. Raises ValueError where neither the radar nor a connected value says what the frame is.
     """
 
     works_on = ("azimuth", "range")
@@ -75,23 +77,27 @@ class PointDoppler(Stage):
         line, sample = torch.unravel_index(power.flatten(-2).argmax(-1), power.shape[-2:])
         found = impulse_response(signal, (azimuth.start + azimuth.step * line.double(), slant.start + slant.step * sample.double()), search_m=azimuth.step)
         velocity = radar.velocity_m_s if velocity_m_s is None else velocity_m_s
-        position, rate = found["position_range_m"], radar.azimuth_rate_hz_s(found["position_range_m"], velocity)
+        position, cos = found["position_range_m"], torch.sqrt(1 - radar.sin_squint(frame, velocity).square())
+        rate = radar.azimuth_rate_hz_s(position, velocity) * cos.square()  # of a point at this slant range in the direction of the frame
+        crossing, record = (azimuth.n // 2) / radar.prf_hz if self.crossing_s is None else self.crossing_s - azimuth.start / radar.velocity_m_s, azimuth.n / radar.prf_hz
         dwell = radar.integration_s or radar.prf_hz / float(radar.azimuth_rate_hz_s(slant.start))
-        crossing = (azimuth.n // 2) / radar.prf_hz if self.crossing_s is None else self.crossing_s - azimuth.start / radar.velocity_m_s
+        seen = max(-dwell / 2, -crossing), min(dwell / 2, record - crossing)
         at_s = (found["position_azimuth_m"] - azimuth.start) / radar.velocity_m_s
+        at_s = crossing + wrap_hz(at_s - crossing, record)  # an image is circular: the peak may lie beyond its end
         value = doppler_at(radar, at_s * radar.velocity_m_s, position, frame, velocity, crossing)
         for _ in range(4):
-            at_s = peak_time_s(image, radar.prf_hz, slant.index_of(position), rate, dwell, value, at_s)
+            at_s = peak_time_s(image, radar.prf_hz, slant.index_of(position), rate, seen, value, at_s)
             value = doppler_at(radar, at_s * radar.velocity_m_s, position, frame, velocity, crossing)
         value, finite = settle(value, 0.0)
         floor = power.flatten(-2).median(-1).values.double() / math.log(2)  # the mean of an exponential law
         peak_to_noise = found["peak"].abs().square() / torch.where(floor > 0, floor, 1)
-        q = peak_to_noise * (radar.prf_hz / (rate * dwell)).clamp_min(1)  # the image holds the noise of the whole PRF
-        std = tone_frequency_bound_hz(q.clamp_min(1e-12), dwell)
+        visible = max(seen[1] - seen[0], 1 / radar.prf_hz)
+        q = peak_to_noise * (radar.prf_hz / (rate * visible)).clamp_min(1)  # the image holds the noise of the whole PRF
+        std = tone_frequency_bound_hz(q.clamp_min(1e-12), visible)
         return Estimate(
             {"doppler_hz": value, "doppler_baseband_hz": wrap_hz(value, radar.prf_hz)},
             1 - 1 / (1 + q),
-            finite & (floor > 0) & (peak_to_noise > math.log(azimuth.n * slant.n) + 10),
+            finite & (floor > 0) & (0 <= crossing <= record) & (peak_to_noise > math.log(azimuth.n * slant.n) + 10),
             {"doppler_hz": std, "doppler_baseband_hz": std},
             {"q": q},
         )

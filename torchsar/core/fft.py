@@ -45,6 +45,10 @@ class _ContiguousGradient(torch.autograd.Function):
         pass
 
     @staticmethod
+    def jvp(ctx: Any, tangent: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return tangent.view_as(tangent)
+
+    @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         return gradient.contiguous()
 
@@ -114,10 +118,13 @@ def transform_in_blocks(x: Tensor, dim: int, inverse: bool = False, out: Tensor 
         return out.copy_(transform(x, dim=dim))
     source, target = (y.reshape(-1, *y.shape[-2:]) if dim == -2 else y.reshape(-1, y.shape[-1]) for y in (x, out))
 
-    def work(part: tuple[slice, ...]) -> None:
-        target[part] = fft_lines(source[part], inverse) if dim == -2 else transform(source[part].contiguous())
+    block_bytes = block_bytes_of(x.device) if block_bytes is None else block_bytes
+    several = dim == -2 and block_bytes // 16 // (source[0].numel() * source.element_size()) > 1  # small trials share blocks, the last may hold one
 
-    over_blocks(work, _blocks(source, dim, block_bytes_of(x.device) if block_bytes is None else block_bytes), out)
+    def work(part: tuple[slice, ...]) -> None:
+        target[part] = fft_lines(source[part], inverse) if several else transform(source[part].contiguous(), dim=dim)
+
+    over_blocks(work, _blocks(source, dim, block_bytes), out)
     return out
 
 

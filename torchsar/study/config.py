@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -151,7 +151,7 @@ class Sweep(Strict):
     trials: int = Field(default=200, ge=1)
     chunk: int | None = Field(default=None, ge=1)
     stop: EarlyStop | None = None
-    success: dict[str, float] = {}
+    success: dict[str, Annotated[float, Field(ge=0)]] = {}
     show: list[str] = []
     save: Save = Save()
 
@@ -204,7 +204,7 @@ class Loaded:
     def changed(self, values: Mapping[str, Any]) -> Loaded:
         """The same config with other values at dotted keys. Raises ConfigError where a key leads nowhere or a value is not accepted."""
         tree = self.config.model_dump()
-        for key, value in values.items():
+        for key, value in sorted(values.items(), key=lambda item: item[0].count(".")):  # a part of a section after the section itself
             tree = _placed(tree, key.split("."), value, f"{self.file}: sweep: the key {key!r}")
         return replace(self, config=_checked(tree, f"{self.file}: sweep"))
 

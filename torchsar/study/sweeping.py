@@ -12,6 +12,7 @@ from typing import Any
 
 from torchsar.study.build import resolved
 from torchsar.study.config import Loaded
+from torchsar.study.errors import ConfigError
 from torchsar.study.folder import write_json
 from torchsar.study.judge import DEFINITIONS
 from torchsar.study.montecarlo.engines import engine
@@ -56,10 +57,14 @@ def sweep_config(
     try:
         with _terminated_like_interrupted():
             record = run_plan(plan, StripmapTrials(loaded, device), store, engine(workers, cluster, threads), loaded.name)
+            record.about = {**record.about, **about}
+            return report(record.select(grid.labels), loaded, out, config_text, command)
     except Interrupted as stopped:
         raise Interrupted(f"{stopped} in {out}; go on with --resume") from None
-    record.about = {**record.about, **about}
-    return report(record.select(grid.labels), loaded, out, config_text, command)
+    except KeyboardInterrupt:  # a second Ctrl-C, or one while the report was made
+        raise Interrupted(f"what is marked done is in {out}; go on with --resume") from None
+    except OSError as error:
+        raise ConfigError(f"{out}: the report cannot be written ({error.strerror or error}); the trials are recorded, make it with --resume") from error
 
 
 def identity(loaded: Loaded) -> dict[str, Any]:
@@ -70,7 +75,7 @@ def identity(loaded: Loaded) -> dict[str, Any]:
 
 def report(record: Record, loaded: Loaded, out: Path, config_text: str, command: str) -> Path:
     """summary.json, figures/ and report.html of a record; each file is replaced whole, the report last."""
-    summary = summary_tree(record, loaded.config.sweep.success, {"snr": DEFINITIONS["snr"]})
+    summary = summary_tree(record, loaded.config.sweep.success, {"snr": DEFINITIONS["snr"], **{f"method {name}": method.title for name, method in loaded.config.processor.items() if method.title}})
     figures = out / "figures"
     figures.mkdir(exist_ok=True)
     for old in figures.glob("*.png"):

@@ -67,6 +67,9 @@ def sweep_grid(loaded: Loaded) -> Grid:
     given = loaded.config.sweep.grid
     if loaded.config.world is None or loaded.config.data.file is not None:
         raise ConfigError(f"{loaded.file}: a sweep simulates its trials; give the sections 'radar' and 'world' and no data.file")
+    taken = [name for name in loaded.config.processor if name in (BOUNDS, SAVED)]
+    if taken:
+        raise ConfigError(f"{loaded.file}: processor.{taken[0]}: in a sweep this name is taken by a part of the results; choose another")
     for key in given:
         _refuse_fixed(key, loaded)
     grid = make_grid(given, [key for key in given if key in BATCHED], f"{loaded.file}: sweep")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import multiprocessing
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -17,6 +18,7 @@ log = logging.getLogger("torchsar")
 Task = tuple[Chunk, int | None]
 _QUEUE = 4
 _DEATHS = 10
+_UNGUARDED = "a script that starts workers is read again by each of them; put its call of sweep(...) below the line: if __name__ == '__main__':"
 
 
 class Engine(Protocol):
@@ -67,6 +69,7 @@ def _plugin(work: Work, threads: int) -> Any:
         name = _PLUGIN
 
         def setup(self, worker: Any) -> None:
+            logging.getLogger("distributed.worker").setLevel(logging.CRITICAL)  # a failed trial reaches the user once, as its own sentence
             torch.set_num_threads(threads)
             self.work = _on_own_gpu(work, worker.name)
 
@@ -90,6 +93,7 @@ class Distributed:
     def results(self, work: Work, tasks: Iterable[Task]) -> Iterator[tuple[Chunk, Outcome]]:
         from distributed import KilledWorker, as_completed
 
+        _refuse_unsendable(work)
         self.client.register_plugin(_plugin(work, self.threads), name=_PLUGIN)
         source, waiting, done = iter(tasks), {}, as_completed()
 
@@ -116,6 +120,25 @@ class Distributed:
             self.client.cancel(list(waiting), force=True)
 
 
+def _refuse_unsendable(work: Work) -> None:
+    """Asked before dask does, which would print the whole way down to what cannot be sent."""
+    import cloudpickle
+
+    try:
+        cloudpickle.dumps(work)
+    except Exception as error:  # objects raise what they like when they are pickled
+        raise ConfigError(f"the trial function and its grid cannot be sent to other processes ({' '.join(str(error).split())}); make such objects inside the function") from error
+
+
+def refuse_unguarded() -> None:
+    """A worker process that is just starting reads the user's script again; workers of its own are the mark of a script without the usual guard.
+
+    SystemExit ends it with a sentence and without a traceback; the process that started it then says that its workers did not come.
+    """
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise SystemExit(_UNGUARDED)
+
+
 def _after_deaths(chunk: Chunk) -> Iterator[Chunk]:
     """Halves of a chunk whose workers died one after the other: the system kills a process that takes too much memory, without an error."""
     if len(chunk) == 1:
@@ -132,6 +155,9 @@ def engine(workers: int | None = None, cluster: str | None = None, threads: int 
     cores), and results then do not depend on the number of cores.
     Raises ConfigError where dask.distributed is missing or the address does not answer.
     """
+    for name, value in (("workers", workers), ("threads", threads)):
+        if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
+            raise ConfigError(f"sweep: {name} must be a whole number of at least 1, got {value!r}")
     if workers is None and cluster is None:
         yield InProcess(threads)
         return
@@ -158,10 +184,17 @@ def _local(distributed: Any, workers: int, threads: int) -> Iterator[Engine]:
 
     with (
         config.set(_settings(threads)),
-        distributed.LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=40, memory_limit=0) as local,
+        _cluster(distributed, workers) as local,
         distributed.Client(local) as client,
     ):
         yield Distributed(client, workers, threads)
+
+
+def _cluster(distributed: Any, workers: int) -> Any:
+    try:
+        return distributed.LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=50, memory_limit=0)
+    except RuntimeError as error:
+        raise ConfigError(f"the worker processes did not start ({' '.join(str(error).split())}); {_UNGUARDED}") from None
 
 
 @contextmanager

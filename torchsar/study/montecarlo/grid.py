@@ -5,14 +5,15 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from torchsar.study.errors import ConfigError
 
-RESERVED = ("algorithm", "trial", "method")
+RESERVED = ("algorithm", "trial", "method", "ok", "done", "saved")
+_LONGEST = 200  # bytes: file systems end at 255, and bounds and figures add words
 
 
 @dataclass(frozen=True)
@@ -97,9 +98,11 @@ def _plain(x: Any) -> Any:
         return [_plain(v) for v in x]
     if isinstance(x, bool) or x is None or isinstance(x, str):
         return x
+    if isinstance(x, int) and abs(x) > 2**53:  # beyond this, a float would make neighbours alike
+        return x
     if isinstance(x, (int, float)):
-        return float(x)
-    return repr(x)
+        return float(x) + 0.0  # the sum makes -0.0 and 0.0, which are equal, alike
+    return _plain(x.tolist()) if hasattr(x, "tolist") else repr(x)
 
 
 def make_grid(values: Mapping[str, Sequence[Any] | Mapping[str, Any]], batched: Sequence[str] = (), where: str = "grid") -> Grid:
@@ -108,21 +111,50 @@ def make_grid(values: Mapping[str, Sequence[Any] | Mapping[str, Any]], batched: 
     batched: names whose values reach the trial as per-row tensors. Raises ConfigError for a parameter without values, a value given
     twice, a reserved name, or a batched parameter that is no number.
     """
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{where} must be a mapping of names to lists of values, got {values!r}")
+    if isinstance(batched, str):
+        raise ConfigError(f"{where}: batched must be a list of names, got {batched!r}; write [{batched!r}]")
     unknown = [name for name in batched if name not in values]
     if unknown:
         raise ConfigError(f"{where}: batched names {unknown[0]!r}, which is no parameter of the grid ({', '.join(values) or 'it has none'})")
     return Grid(tuple(_parameter(name, given, name in batched, f"{where}: {name}") for name, given in values.items()))
 
 
-def _parameter(name: str, given: Any, batched: bool, where: str) -> Parameter:
-    if name in RESERVED:
-        raise ConfigError(f"{where}: a parameter cannot be called {name!r}, which names a dimension of the results; choose another name")
-    if isinstance(given, (str, bytes)) or (not isinstance(given, (Mapping, Sequence)) and not hasattr(given, "tolist")):
+def check_name(name: Any, taken: Sequence[str], where: str, kind: str) -> None:
+    """Raise ConfigError for a name under which the store could not keep an array: each is a folder of its own."""
+    if name in taken:
+        raise ConfigError(f"{where}: a {kind} cannot be called {name!r}, which names a dimension or a part of the results; choose another name")
+    if not isinstance(name, str) or not name or "/" in name or "\0" in name or name in (".", "..", "zarr.json") or name.startswith("__"):
+        raise ConfigError(f"{where}: a {kind} cannot be called {name!r}; its name is a word without '/' that does not begin with '__'")
+    if len(name.encode()) > _LONGEST:
+        raise ConfigError(f"{where}: the name of the {kind} {name[:40]!r}... has {len(name.encode())} bytes; use {_LONGEST} at most")
+
+
+def _pairs(given: Any, where: str) -> list[tuple[float | str, Any]]:
+    """Labels and values, numpy's and torch's numbers as Python's own."""
+    if not isinstance(given, Mapping) and hasattr(given, "tolist"):
+        given = given.tolist()
+    if isinstance(given, (str, bytes)) or not isinstance(given, (Mapping, Sequence)):
         raise ConfigError(f"{where} must be a list of values or a mapping of labels to values, got {given!r}")
-    pairs = list(given.items()) if isinstance(given, Mapping) else [(_label(v, where), v) for v in (given if isinstance(given, Sequence) else given.tolist())]
+    if isinstance(given, Mapping):
+        return [(_label(label, where), _bare(value)) for label, value in given.items()]
+    return [(_label(_bare(value), where), _bare(value)) for value in given]
+
+
+def _bare(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") and getattr(value, "ndim", 1) == 0 else value
+
+
+def _parameter(name: str, given: Any, batched: bool, where: str) -> Parameter:
+    check_name(name, RESERVED, where, "parameter")
+    pairs = _pairs(given, where)
     if not pairs:
         raise ConfigError(f"{where} has no values; give at least one")
     labels, values = tuple(label for label, _ in pairs), tuple(value for _, value in pairs)
+    nameless = next((value for value in values if " at 0x" in canonical(value)), None)
+    if nameless is not None:
+        raise ConfigError(f"{where} holds {nameless!r}, whose text is another in every process, and random numbers follow it; give numbers, words, lists, mappings or dataclasses")
     for known in (labels, tuple(map(canonical, values))):
         twice = next((label for i, label in enumerate(known) if label in known[:i]), None)
         if twice is not None:
@@ -135,14 +167,14 @@ def _parameter(name: str, given: Any, batched: bool, where: str) -> Parameter:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
 def _label(value: Any, where: str) -> float | str:
     if isinstance(value, str):
         return value
     if _is_number(value):
-        return float(value)
+        return float(value) + 0.0
     if isinstance(value, bool) or value is None:
         return {True: "true", False: "false", None: "null"}[value]
     if isinstance(value, (list, tuple)):

@@ -17,12 +17,12 @@ import torch
 
 from torchsar.study.errors import ConfigError, did_you_mean
 from torchsar.study.montecarlo.chunks import cut, probed_bytes, rows_by_bytes
-from torchsar.study.montecarlo.engines import Engine, Task, engine
+from torchsar.study.montecarlo.engines import Engine, Task, engine, refuse_unguarded
 from torchsar.study.montecarlo.grid import Grid, make_grid
 from torchsar.study.montecarlo.progress import Progress
-from torchsar.study.montecarlo.record import Record
+from torchsar.study.montecarlo.record import OK, Record
 from torchsar.study.montecarlo.stopping import Stop, looks
-from torchsar.study.montecarlo.store import Store, empty, read_sweep
+from torchsar.study.montecarlo.store import Store, cut_off, empty, read_sweep
 from torchsar.study.montecarlo.work import Chunk, Outcome, Trial, Work
 from torchsar.study.report import installed_version
 
@@ -54,9 +54,12 @@ class Plan:
         for name, value, least in (("trials", self.trials, 1), ("chunk", self.chunk, 1), ("seed", self.seed, 0)):
             if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < least):
                 raise ConfigError(f"sweep: {name} must be a whole number of at least {least}, got {value!r}")
+        absent = next((t for t in self.save if isinstance(t, bool) or not isinstance(t, int) or not 0 <= t < self.trials), None)
+        if absent is not None:
+            raise ConfigError(f"sweep: save names trial {absent!r}, and a point has the trials 0 to {self.trials - 1}; name some of these")
         try:
-            torch.empty(0, device=self.device)
-        except (RuntimeError, AssertionError) as error:
+            torch.empty(0, device=torch.device(self.device))
+        except (RuntimeError, AssertionError, TypeError) as error:
             raise ConfigError(f"sweep: the device {self.device!r} cannot be used here: {str(error).splitlines()[0]}") from None
 
 
@@ -91,10 +94,26 @@ def sweep(
 
     Random numbers depend on (seed, purpose, parameters, trial) alone. Raises ConfigError for bad input, Interrupted after Ctrl-C.
     """
+    if workers is not None:
+        refuse_unguarded()
+    _refuse_types(trial, stop, save, config, out)
     plan = Plan(make_grid(grid, batched), trials, seed, chunk, stop, frozenset(save), device)
     identity = {"seed": seed, "trial": getattr(trial, "__qualname__", type(trial).__qualname__), "config": dict(config or {})}
     store = None if out is None else open_store(Path(out), plan, identity, resume)
     return run_plan(plan, trial, store, engine(workers, cluster, threads)).select(plan.grid.labels)
+
+
+def _refuse_types(trial: Any, stop: Any, save: Any, config: Any, out: Any) -> None:
+    if not callable(trial):
+        raise ConfigError(f"sweep: the trial must be a function of (parameters, draws), got {trial!r}")
+    if stop is not None and not isinstance(stop, Stop):
+        raise ConfigError(f"sweep: stop must be a Stop, such as Stop('error_m', 0.05), got {stop!r}")
+    if not isinstance(save, Iterable):
+        raise ConfigError(f"sweep: save must list the numbers of trials, got {save!r}")
+    if out is None and set(save):
+        raise ConfigError("sweep: save keeps arrays in the folder of the sweep; give out as well")
+    if config is not None and not isinstance(config, Mapping):
+        raise ConfigError(f"sweep: config must be a mapping of whatever else the results depend on, got {config!r}")
 
 
 def open_store(out: Path, plan: Plan, identity: Mapping[str, Any], resume: bool) -> Store:
@@ -103,9 +122,10 @@ def open_store(out: Path, plan: Plan, identity: Mapping[str, Any], resume: bool)
     A sweep that ended before its first mark holds nothing to lose and is begun anew.
     """
     path = out / "results.zarr"
-    if path.exists() and resume:
+    there = path.exists() and not cut_off(path)
+    if there and resume:
         return Store.resume(path, plan.grid, plan.trials, identity)
-    if path.exists() and read_sweep(path).done.any():
+    if there and read_sweep(path).done.any():
         raise ConfigError(f"{out} holds a sweep already; add --resume (resume=True) to go on with it, or choose another folder")
     if not path.exists() and out.exists() and (not out.is_dir() or any(p for p in out.iterdir() if not p.name.startswith(".results.zarr"))):
         raise ConfigError(f"{out} exists and is not the folder of a sweep; choose another one")
@@ -125,9 +145,11 @@ def run_plan(plan: Plan, trial: Trial, store: Store | None, engine: AbstractCont
         run.settle()
         raise Interrupted(f"{int(record.done.sum())} trials are recorded") from None
     finally:
-        run.settle()
-        if store is not None:
-            store.close()
+        try:
+            run.settle()
+        finally:
+            if store is not None:
+                store.close()
     return record
 
 
@@ -144,6 +166,8 @@ class _Run:
         self.settled_at: dict[tuple[int, int], int] = {}
 
     def all_levels(self, engine: Engine, title: str) -> None:
+        if self.record.algorithms:
+            self._refuse_missing(self.record.metrics)
         levels = sorted({*looks(self.plan.trials, self.plan.stop), *(n for n in self.record.about.get("finished", []) if n < self.plan.trials)})
         progress, began, first = Progress(title, self._expected(levels[-1]), self._recorded(levels[-1])), time.perf_counter(), 0
         session = self._session(engine)
@@ -189,7 +213,7 @@ class _Run:
     def _enter(self, chunk: Chunk, outcome: Outcome) -> None:
         """Take in a chunk; it waits with others until writing them together is cheap."""
         if not self.record.algorithms and not self.waiting:
-            self._refuse_missing(outcome)
+            self._refuse_missing({metric for metrics in outcome.values.values() for metric in metrics if metric != OK})
         if outcome.fits is not None and outcome.fits < self.fits.get(chunk.case, len(chunk)):
             log.warning("warning: %d trials at once do not fit into memory; going on with %d", len(chunk), outcome.fits)
             self.fits[chunk.case] = outcome.fits
@@ -198,21 +222,24 @@ class _Run:
             self.settle()
 
     def settle(self) -> None:
-        """Enter what waits into the record and the store."""
+        """Enter what waits into the record and the store.
+
+        The store is told first: a second Ctrl-C in between may then leave rows that are announced and not done, never the reverse.
+        """
         while self.waiting:
             chunk, outcome = self.waiting.pop(0)
             places = [self.places[chunk.case][p] for p in chunk.points]
-            self.record.add(places, chunk.trials, outcome.values, outcome.bounds)
             if self.store is not None:
                 self.store.entered(places, chunk.trials)
                 points = self.work.cases[chunk.case].points
                 for row, arrays in outcome.saved.items():
                     self.store.save(self.plan.grid.labels_at(points[chunk.points[row]]), chunk.trials[row], arrays)
+            self.record.add(places, chunk.trials, outcome.values, outcome.bounds)
         if self.store is not None:
             self.store.flush()
 
-    def _refuse_missing(self, outcome: Outcome) -> None:
-        given = {metric for metrics in outcome.values.values() for metric in metrics}
+    def _refuse_missing(self, given: Iterable[str]) -> None:
+        """given: the metrics that trials give."""
         stop = (("stop.metric", self.plan.stop.metric),) if self.plan.stop else ()
         for where, metric in (*self.plan.needs, *stop):
             if metric not in given:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchsar.study.errors import ConfigError
+from torchsar.study.montecarlo.grid import RESERVED, check_name
 
 OK = "ok"
 Labels = dict[str, tuple[float | str, ...]]
@@ -53,9 +54,10 @@ class Record:
         """Enter rows: values by algorithm and metric, bounds by metric and name, each (rows,). An algorithm without `ok` stands for all it gives."""
         if not self.algorithms:
             self.algorithms, self.ok = tuple(values), np.zeros((len(values), *self.done.shape), bool)
-        foreign = [a for a in values if a not in self.algorithms]
-        if foreign:
-            raise ConfigError(f"a trial gave results of the algorithm {foreign[0]!r}, those before it of {', '.join(self.algorithms)}; return the same algorithms in every trial")
+        if set(values) != set(self.algorithms):
+            foreign = next((a for a in values if a not in self.algorithms), None)
+            gave = f"results of the algorithm {foreign!r}" if foreign is not None else f"results of {', '.join(values)} alone"
+            raise ConfigError(f"a trial gave {gave}, those before it of {', '.join(self.algorithms)}; return the same algorithms in every trial")
         rows = np.ravel_multi_index(tuple(zip(*((*place, trial) for place, trial in zip(places, trials)))), self.done.shape)
         for algorithm, metrics in values.items():
             number = self.algorithms.index(algorithm)
@@ -70,14 +72,21 @@ class Record:
 
     def _metric(self, name: str) -> np.ndarray:
         if name not in self.metrics:
+            self._refuse_name(name, "metric")
             self.metrics[name] = self.blank()
         return self.metrics[name]
 
     def _bound(self, metric: str, name: str) -> np.ndarray:
         named = self.bounds.setdefault(metric, {})
         if name not in named:
+            self._refuse_name(bound_name(metric, name), "bound")
             named[name] = self.blank(False)
         return named[name]
+
+    def _refuse_name(self, name: Any, kind: str) -> None:
+        """A new array may not stand in the place of another one."""
+        bounds = [bound_name(metric, bound) for metric, named in self.bounds.items() for bound in named]
+        check_name(name, (*RESERVED, *self.labels, *self.metrics, *bounds), "the trial function", kind)
 
     def grown(self, labels: Labels, trials: int) -> Record:
         """The same results where there is room for more: labels begin with those of this record."""

@@ -21,7 +21,9 @@ def statistics(values: np.ndarray, seed: int, level: float = LEVEL) -> dict[str,
     What is not finite takes no part, and n says how many are left. rmse is the root mean square about zero (the metrics are errors);
     std has n - 1 below it. mean_interval and rmse_interval, (..., 2), are percentiles of a bootstrap; median_interval lies between two
     order statistics and holds the median of any distribution with at least the given probability. The bootstrap is too narrow for few
-    trials: of Gaussian errors, at 95 %, it holds the rmse in 81 % of cases for n = 10, 92 % for 50, 95 % for 200. Fewer than two have no
+    trials: of Gaussian errors, at 95 %, it holds the rmse in 81 % of cases for n = 10, 92 % for 50, 95 % for 200. Rare outliers that
+    few trials have not met are not foreseen: it holds the rmse of log-normal errors in 69 % (n = 50) and 80 % (200), with one error in a hundred
+    100 times as large in 28 % and 62 %, while the median keeps 95 % or more and the mean 89 % or more. Fewer than two have no
     interval, and fewer than log2(2 / (1 - level)) (six at 95 %) none for the median: NaN.
     The bootstrap draws from (seed, number of trials) alone: a point's interval is the same, to rounding, whatever stands beside it.
     """

@@ -16,15 +16,21 @@ FIRST_LOOK = 50
 
 @dataclass(frozen=True)
 class Stop:
-    """A point ends when half of the 95 % interval of a statistic is below `relative` times the statistic, for every algorithm that has the metric."""
+    """A point ends when half of the 95 % interval of a statistic is below `relative` times the statistic, for every algorithm that has the metric.
+
+    An rmse that rare outliers make up is settled before they come: with one error in a hundred 100 times as large and relative = 0.19, four
+    points of ten end at 50 trials and never saw one. Below a threshold SNR take the median, or a smaller relative (0.1 sees 100 trials or more).
+    """
 
     metric: str
     relative: float
     statistic: Literal["rmse", "mean", "median"] = "rmse"
 
     def __post_init__(self) -> None:
-        if not 0 < self.relative < 1:
-            raise ConfigError(f"stop.relative must lie between 0 and 1, got {self.relative}")
+        if self.statistic not in ("rmse", "mean", "median"):
+            raise ConfigError(f"stop.statistic must be rmse, mean or median, got {self.statistic!r}")
+        if not isinstance(self.relative, (int, float)) or not 0 < self.relative < 1:
+            raise ConfigError(f"stop.relative must lie between 0 and 1, got {self.relative!r}")
 
     def reached(self, record: Record, place: tuple[int, ...], trials: int, seed: int) -> bool:
         """Whether the first `trials` trials of a point say enough."""

@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 import time
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -51,10 +52,11 @@ class Store:
     @classmethod
     def create(cls, path: Path, grid: Grid, trials: int, identity: Mapping[str, Any]) -> Store:
         """A new store. Raises ConfigError where the folder cannot be written."""
-        lock = _locked(path)
-        root = zarr.open_group(str(path), mode="w", zarr_format=3)
-        root.create_group(_DONE)
-        return cls(root, lock, empty(grid.labels, trials))._begun(grid, identity)
+        record, lock = empty(grid.labels, trials), _locked(path)
+        with _writing(path):
+            root = zarr.open_group(str(path), mode="w", zarr_format=3)
+            root.create_group(_DONE)
+            return cls(root, lock, record)._begun(grid, identity)
 
     @classmethod
     def resume(cls, path: Path, grid: Grid, trials: int, identity: Mapping[str, Any]) -> Store:
@@ -63,9 +65,10 @@ class Store:
         root = _opened(path, "r+")
         held = attributes(root)
         refuse_another(path, held["identity"], _plain(identity), held["values"], _values(grid))
-        record = _loaded(root)
+        record = _loaded(root, path)
         labels = {name: (*known, *(label for label in grid.labels[name] if label not in known)) for name, known in record.labels.items()}
-        return cls(root, lock, record.grown(labels, max(trials, record.trials)))._begun(grid, identity)
+        with _writing(path):
+            return cls(root, lock, record.grown(labels, max(trials, record.trials)))._begun(grid, identity)
 
     def _begun(self, grid: Grid, identity: Mapping[str, Any]) -> Store:
         values = {name: {**attributes(self.root).get("values", {}).get(name, {}), **named} for name, named in _values(grid).items()}
@@ -84,7 +87,13 @@ class Store:
 
     def note(self, **about: Any) -> None:
         """Root attributes: what the run was."""
-        self.root.update_attributes(_plain_values(about))
+        with _writing(self.path):
+            self.root.update_attributes(_plain_values(about))
+
+    @property
+    def path(self) -> Path:
+        """Where it lies."""
+        return Path(str(self.root.store_path).removeprefix("file://"))
 
     # writing -----------------------------------------------------------------------------------------------------
 
@@ -107,12 +116,20 @@ class Store:
         """Write what has entered the record, then mark it done, in one file."""
         if self._window is None:
             return
+        with _writing(self.path):
+            self._flush(*self._window)
+
+    def _flush(self, first: int, last: int) -> None:
+        """The trials first..last-1. The list of arrays comes after them and before the marks: whoever reads knows what must be there."""
         began = time.perf_counter()
         if list(self.record.algorithms) != self.root.attrs.get("algorithms"):
             self._describe()
             self._put("algorithm", np.array(self.record.algorithms), ("algorithm",))
-        for name, (data, dims, about) in self._variables().items():
-            self._write(name, data, dims, about, *self._window)
+        variables = self._variables()
+        for name, (data, dims, about) in variables.items():
+            self._write(name, data, dims, about, first, last)
+        if list(variables) != self.root.attrs.get("arrays"):
+            self.root.update_attributes({"arrays": list(variables)})
         self._write_saved()
         self._marks.update({",".join(map(str, place)): _spans(self.record.done[place]) for place in self._dirty})
         self.root[_DONE].update_attributes(self._marks)
@@ -122,8 +139,9 @@ class Store:
 
     def close(self) -> None:
         """Write the rest and let others write."""
-        self.flush()
-        if self._lock is not None:
+        try:
+            self.flush()
+        finally:
             self._lock.close()
 
     def _variables(self) -> dict[str, tuple[np.ndarray, tuple[str, ...], dict[str, Any]]]:
@@ -175,20 +193,35 @@ class Store:
 
 
 def empty(labels: Labels, trials: int) -> Record:
-    """A record in which nothing has run."""
+    """A record in which nothing has run. Raises ConfigError where it does not fit into memory."""
     shape = (*map(len, labels.values()), trials)
-    return Record((), dict(labels), np.zeros(shape, bool), np.zeros((0, *shape), bool))
+    try:
+        return Record((), dict(labels), np.zeros(shape, bool), np.zeros((0, *shape), bool))
+    except (MemoryError, ValueError):
+        raise ConfigError(f"sweep: the results of {' x '.join(map(str, shape))} trials do not fit into memory; ask for fewer trials or points") from None
 
 
 def read_sweep(path: Path | str) -> Record:
     """The record in a results.zarr, or in the folder of a sweep, finished or not. Raises ConfigError where there is none."""
-    path = Path(path)
-    return _loaded(_opened(path / "results.zarr" if (path / "results.zarr").exists() else path, "r"))
+    path = Path(path) / "results.zarr" if (Path(path) / "results.zarr").exists() else Path(path)
+    return _loaded(_opened(path, "r"), path)
 
 
 def attributes(node: Any) -> dict[str, Any]:
     """Attributes of a group or an array, as a plain tree."""
     return node.attrs.asdict()
+
+
+def cut_off(path: Path) -> bool:
+    """Whether a sweep of ours was killed while it made this store, before there was anything in it."""
+    made = {p.name for p in path.iterdir() if not p.name.endswith(".partial")} if path.is_dir() else {""}
+    if not _lock_of(path).exists() or not made <= {"zarr.json", _DONE}:
+        return False
+    return "zarr.json" not in made or "labels" not in json.loads((path / "zarr.json").read_text(encoding="utf-8")).get("attributes", {})
+
+
+def _lock_of(path: Path) -> Path:
+    return path.with_name(f".{path.name}.lock")
 
 
 def _opened(path: Path, mode: Any) -> zarr.Group:
@@ -197,12 +230,31 @@ def _opened(path: Path, mode: Any) -> zarr.Group:
     except (FileNotFoundError, ValueError, OSError):
         raise ConfigError(f"{path} holds no results of a sweep; choose another folder") from None
     if root.attrs.get("format") != FORMAT or not {"labels", "identity"} <= set(root.attrs):
-        raise ConfigError(f"{path} was not left by a sweep of this version of torchsar, or was cut off before its first mark; remove it or choose another folder")
+        raise ConfigError(f"{path} was not left by a sweep of this version of torchsar; remove it or choose another folder")
     return root
 
 
-def _loaded(root: zarr.Group) -> Record:
-    """Everything on disk, without what is not marked done."""
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """What the system says of a file that cannot be written, as one sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be written ({error.strerror or error}); what is marked done there is safe, go on with --resume once it can be") from error
+
+
+def _loaded(root: zarr.Group, path: Path) -> Record:
+    """Everything on disk, without what is not marked done. Raises ConfigError where files are missing or spoilt."""
+    try:
+        missing = [name for name in (_DONE, *attributes(root).get("arrays", [])) if name not in root]
+        if not missing:
+            return _read(root)
+    except (KeyError, ValueError, IndexError, TypeError, OSError) as error:
+        raise ConfigError(f"{path} is damaged ({type(error).__name__}: {' '.join(str(error).split())}); restore it, or begin anew in another folder") from error
+    raise ConfigError(f"{path} is damaged: {missing[0]!r} is missing; restore it, or begin anew in another folder")
+
+
+def _read(root: zarr.Group) -> Record:
     held = attributes(root)
     record = empty({name: tuple(labels) for name, labels in held["labels"].items()}, held["trials"])
     for index, spans in attributes(root[_DONE]).items():
@@ -210,7 +262,11 @@ def _loaded(root: zarr.Group) -> Record:
             record.done[(*map(int, filter(None, index.split(","))), slice(first, last))] = True
     record.algorithms = tuple(held["algorithms"])
     record.ok = np.zeros((len(record.algorithms), *record.done.shape), bool)
-    for name, array in root.arrays():
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Object at")  # a process that was killed while it wrote leaves half a file beside the old one
+        arrays = list(root.arrays())
+    place = {name: i for i, name in enumerate(held.get("arrays", []))}  # a folder lists its files in any order
+    for name, array in sorted(arrays, key=lambda pair: place.get(pair[0], -1)):
         kind = array.attrs.get("kind")
         if kind == OK:
             _restore(record.ok, array, record.done)
@@ -224,7 +280,7 @@ def _loaded(root: zarr.Group) -> Record:
 
 
 def _about(root: zarr.Group) -> dict[str, Any]:
-    return {key: value for key, value in attributes(root).items() if key not in ("labels", "values", "trials", "algorithms", "format")}
+    return {key: value for key, value in attributes(root).items() if key not in ("labels", "values", "trials", "algorithms", "arrays", "format")}
 
 
 def _restore(target: np.ndarray, array: zarr.Array, done: np.ndarray) -> None:
@@ -287,7 +343,7 @@ def _locked(path: Path) -> Any:
     """An open file that this process alone holds; it is let go of when the process ends, however it ends."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        file = path.with_name(f".{path.name}.lock").open("w")
+        file = _lock_of(path).open("w")
     except OSError as error:
         raise ConfigError(f"{path.parent} cannot be written: {error.strerror}") from None
     if fcntl is not None:

@@ -20,7 +20,7 @@ _DEFINITIONS = {
     "median_interval": f"two order statistics that enclose the median of any distribution with a probability of at least {LEVEL:.0%}; none for fewer than six trials",
     "ok_share": f"share of the trials done that the algorithm itself trusts, with its exact {LEVEL:.0%} interval (Clopper-Pearson)",
 }
-_SUCCESS = f"share of the trials done that the algorithm trusts and whose metric is within success_limit of zero, with its exact {LEVEL:.0%} interval (Clopper-Pearson)"
+_SUCCESS = f"share of trials done that the algorithm trusts, with the metric within success_limit of zero, none where it never gives the metric, with its exact {LEVEL:.0%} interval (Clopper-Pearson)"
 _BOUND = "root mean square over the trials done of the bound of each trial, beside which an rmse stands"
 
 
@@ -48,7 +48,7 @@ def summary_tree(record: Record, success: Mapping[str, float], definitions: Mapp
 def _points(record: Record, success: Mapping[str, float]) -> list[Tree]:
     """Entries in the order of algorithm, place and metric."""
     seed = int(record.about["seed"])
-    ok = _shares(record, record.ok, "ok")
+    ok = _shares(record.ok, record.done[None], "ok")
     fields = {name: _statistics(values, seed) | ok | _success(record, values, success.get(name)) for name, values in record.metrics.items()}
     done = record.done.sum(-1)
     entries = []
@@ -71,16 +71,18 @@ def _statistics(values: np.ndarray, seed: int) -> dict[str, np.ndarray]:
     return {"interval" if name == "rmse_interval" else name: array for name, array in found.items()}
 
 
-def _shares(record: Record, hits: np.ndarray, name: str) -> dict[str, np.ndarray]:
-    value, interval = share(hits, record.done[None])
+def _shares(hits: np.ndarray, of: np.ndarray, name: str) -> dict[str, np.ndarray]:
+    value, interval = share(hits, of)
     return {f"{name}_share": value, f"{name}_interval": interval}
 
 
 def _success(record: Record, values: np.ndarray, limit: float | None) -> dict[str, np.ndarray]:
     if limit is None:
         return {}
-    within = record.ok & (np.abs(np.where(np.isfinite(values), values, np.inf)) <= limit)
-    return {"success_limit": np.full(values.shape[:-1], float(limit)), **_shares(record, within, "success")}
+    here = np.isfinite(values)
+    within = record.ok & (np.abs(np.where(here, values, np.inf)) <= limit)
+    gives = here.any(tuple(range(1, here.ndim)), keepdims=True)  # an algorithm that never has the metric neither succeeds nor fails
+    return {"success_limit": np.full(values.shape[:-1], float(limit)), **_shares(within, record.done[None] & gives, "success")}
 
 
 def _bounds(record: Record) -> Iterator[Tree]:

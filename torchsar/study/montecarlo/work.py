@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -120,17 +121,25 @@ class Work:
         return Draws(self.seed, tuple(points[p].address for p in chunk.points), list(chunk.trials))
 
     def _once(self, chunk: Chunk) -> Outcome:
-        found = dict(self.trial(self.parameters(chunk), self.draws(chunk)))
+        given = self.trial(self.parameters(chunk), self.draws(chunk))
+        if not isinstance(given, Mapping):
+            raise ValueError(f"a trial function returns {{metric: tensor}} or {{algorithm: {{metric: tensor}}}}, got {type(given).__name__}")
+        found = dict(given)
         bounds, saved = found.pop(BOUNDS, {}), found.pop(SAVED, {})
         nested = {name: value for name, value in found.items() if isinstance(value, Mapping)}
         if nested and len(nested) != len(found):
             raise ValueError(f"a trial function returns tensors by metric, or a mapping of metrics by algorithm, not both; got {list(found)}")
+        if not (any(nested.values()) if nested else found):
+            raise ValueError("a trial function gives at least one metric, and this one gave none")
+        for name, tree in ((BOUNDS, bounds), (SAVED, saved)):
+            if not isinstance(tree, Mapping) or not all(isinstance(named, Mapping) for named in tree.values()):
+                raise ValueError(f"{name!r} must be a mapping of mappings, {'{metric: {name: tensor}}' if name == BOUNDS else '{algorithm: {name: tensor}}'}")
         outcome = Outcome()
         for algorithm, metrics in (nested or {_name(self.trial): found}).items():
             outcome.values[algorithm] = {metric: _rows(value, len(chunk), f"{algorithm}.{metric}") for metric, value in metrics.items()}
         outcome.bounds = {metric: {name: _rows(v, len(chunk), f"bounds.{metric}.{name}") for name, v in named.items()} for metric, named in bounds.items()}
         for row in (i for i, trial in enumerate(chunk.trials) if trial in self.save):
-            outcome.saved[row] = {f"{algorithm}.{name}": _array(value[row]) for algorithm, named in saved.items() for name, value in named.items()}
+            outcome.saved[row] = {f"{algorithm}.{name}": _array(value, row, len(chunk), f"{SAVED}.{algorithm}.{name}") for algorithm, named in saved.items() for name, value in named.items()}
         return outcome
 
 
@@ -139,13 +148,20 @@ def _name(trial: Trial) -> str:
     return name if name.isidentifier() else "trial"
 
 
-def _array(value: Tensor) -> np.ndarray:
-    return value.numpy(force=True) if isinstance(value, Tensor) else np.asarray(value)
+def _array(value: Any, row: int, rows: int, what: str) -> np.ndarray:
+    """One trial's part of what is to be kept."""
+    if not hasattr(value, "__len__") or len(value) != rows:
+        raise ValueError(f"{what} must hold one array for each of the {rows} trials, got {tuple(getattr(value, 'shape', ())) or type(value).__name__}")
+    one = value[row]
+    return one.to(torch.float32 if one.dtype == torch.bfloat16 else one.dtype).numpy(force=True) if isinstance(one, Tensor) else np.asarray(one)
 
 
 def _rows(value: Any, rows: int, what: str) -> list[float]:
     """One number per row; a list, since that is the cheapest way out of torch."""
-    x = value if isinstance(value, Tensor) else torch.as_tensor(value)
+    try:
+        x = value if isinstance(value, Tensor) else torch.as_tensor(value)
+    except (TypeError, RuntimeError, ValueError):
+        raise ValueError(f"{what} must hold one real number for each of the {rows} trials, got {type(value).__name__}") from None
     if x.is_complex() or x.shape not in ((rows,), ()):
         raise ValueError(f"{what} must hold one real number for each of the {rows} trials, got {x.dtype} of shape {tuple(x.shape)}")
     if what.endswith(f".{OK}") and x.dtype != torch.bool:
@@ -157,16 +173,25 @@ def _joined(parts: list[tuple[Chunk, Outcome]]) -> Outcome:
     """The outcomes of pieces as one, in order."""
     if len(parts) == 1:
         return parts[0][1]
-    first = parts[0][1]
-    whole = Outcome(
-        {a: {m: [x for _, o in parts for x in o.values[a][m]] for m in metrics} for a, metrics in first.values.items()},
-        {m: {b: [x for _, o in parts for x in o.bounds[m][b]] for b in named} for m, named in first.bounds.items()},
-    )
+    if any(set(o.values) != set(parts[0][1].values) for _, o in parts):
+        raise TrialError(f"trials gave results of {' and then of '.join(dict.fromkeys(', '.join(o.values) for _, o in parts))}; return the same algorithms in every trial")
+    whole = Outcome(_columns([(o.values, len(c)) for c, o in parts]), _columns([(o.bounds, len(c)) for c, o in parts]))
     start = 0
     for chunk, outcome in parts:
         whole.saved.update({start + row: arrays for row, arrays in outcome.saved.items()})
         start += len(chunk)
     return whole
+
+
+def _columns(parts: list[tuple[dict[str, dict[str, list[float]]], int]]) -> dict[str, dict[str, list[float]]]:
+    """The numbers of pieces and how many rows each has, one after the other; a name that only some of them give is NaN in the others."""
+    names = {outer: dict.fromkeys(inner for tree, _ in parts for inner in tree.get(outer, {})) for outer in dict.fromkeys(o for tree, _ in parts for o in tree)}
+
+    def column(outer: str, inner: str) -> list[float]:
+        missing = True if inner == OK else math.nan
+        return [x for tree, rows in parts for x in tree.get(outer, {}).get(inner, [missing] * rows)]
+
+    return {outer: {inner: column(outer, inner) for inner in inners} for outer, inners in names.items()}
 
 
 def _out_of_memory(error: Exception) -> bool:
