@@ -135,6 +135,13 @@ def test_squint_is_the_doppler_of_the_true_velocity() -> None:
     assert truth == pytest.approx(expected, abs=1e-9)
 
 
+@pytest.mark.parametrize("key", ["sweep.world.noise.snr_db", "sweep.grid.world.noise.snr_db"])
+def test_the_command_line_reaches_the_grid_and_its_settings(key: str, tmp_path: Path) -> None:
+    loaded = load(str(write_tiny(tmp_path, sweep=SWEEP)), [f"{key}=[3.0]", "sweep.trials=9", "sweep.save.trials=[2]"])
+    assert loaded.config.sweep.grid["world.noise.snr_db"] == [3.0] and loaded.config.sweep.grid["world.doppler_hz"] == [-20.0, 30.0]
+    assert loaded.config.sweep.trials == 9 and loaded.config.sweep.save.trials == [2]
+
+
 def test_names_of_errors() -> None:
     assert [error_name(n) for n in ("doppler_hz", "velocity_m_s", "gain")] == ["doppler_error_hz", "velocity_error_m_s", "gain_error"]
 

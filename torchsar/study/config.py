@@ -224,7 +224,7 @@ def _placed(tree: Any, path: list[str], value: Any, what: str) -> dict[str, Any]
 def load(name: str, assignments: Sequence[str] = ()) -> Loaded:
     """Read, override and check a config. Raises ConfigError: file, key, value, and what is accepted."""
     path = find_config(name)
-    tree = override(read_tree(path), assignments, literal=("sweep", tuple(Sweep.model_fields)))
+    tree = override(read_tree(path), assignments, literal=("sweep", "grid", [name for name in Sweep.model_fields if name != "grid"]))
     file = str(path) + (f" with {' '.join(assignments)}" if assignments else "")
     return Loaded(_checked(tree, file), file, path.stem)
 

@@ -100,19 +100,19 @@ def read_tree(path: Path) -> dict[str, Any]:
     return tree
 
 
-def override(tree: dict[str, Any], assignments: Sequence[str], literal: tuple[str, Sequence[str]] = ("", ())) -> dict[str, Any]:
+def override(tree: dict[str, Any], assignments: Sequence[str], literal: tuple[str, str, Sequence[str]] = ("", "", ())) -> dict[str, Any]:
     """The tree with key=value assignments applied, the keys as dotted paths and the values as YAML.
 
-    literal: a section whose keys are dotted themselves, and those of its keys that are not: `sweep.world.noise.snr_db=[0, 10]` sets the
-    key "world.noise.snr_db" of `sweep`.
+    literal: a section whose keys are dotted themselves, the mapping in it that may hold them too, and those of its keys that are not
+    dotted: `sweep.world.noise.snr_db=[0, 10]` and `sweep.grid.world.noise.snr_db=[0, 10]` set the key "world.noise.snr_db".
     """
     for assignment in assignments:
         key, equals, value = assignment.partition("=")
         if not equals or not all(part.strip() for part in key.split(".")):
             raise ConfigError(f"command line: {assignment!r} is not an override; write key=value with a dotted key, such as world.noise.snr_db=10")
         path = key.strip().split(".")
-        if path[0] == literal[0] and len(path) > 2 and path[1] not in literal[1]:
-            path = [path[0], ".".join(path[1:])]
+        if path[0] == literal[0] and len(path) > 2 and path[1] not in literal[2]:
+            path = [path[0], ".".join(path[1:]).removeprefix(f"{literal[1]}.")]
         tree = _assigned(tree, path, parse(value, f"command line, {key}"), key)
     return tree
 
