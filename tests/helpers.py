@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import signal
+
 from torchsar.core import Draws, Recording, Truth
 from torchsar.echo import simulate
 from torchsar.radar import LinearFM, StripmapRadar
 from torchsar.scene import AlwaysLit, Dwell, Points, StripmapWorld
+
+
+def mind_interrupts() -> None:
+    """For the child of a Popen: tests that were started in the background ignore Ctrl-C, and their children would, too."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def small_radar(**changes: object) -> StripmapRadar:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.helpers import mind_interrupts
 from tests.study.tiny import write_tiny
 from torchsar.cli import main
 
@@ -121,7 +122,7 @@ def test_aliasing_is_named_with_both_figures(tmp_path: Path, capsys: pytest.Capt
 def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
     config = write_tiny(tmp_path)
     command = [sys.executable, "-m", "torchsar.cli", "run", str(config), "world.lines=60000", "world.samples=1024", "--out", str(tmp_path / "result")]
-    running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=mind_interrupts)
     assert running.stderr is not None and "simulating" in running.stderr.readline()
     running.send_signal(signal.SIGINT)
     _, said = running.communicate(timeout=60)

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.helpers import mind_interrupts
 from tests.study import toy
 from tests.study.tiny import write_tiny
 from torchsar.study.errors import ConfigError
@@ -134,7 +135,7 @@ def test_an_interrupted_sweep_says_how_to_go_on_and_does(tmp_path: Path) -> None
     config, out = write_tiny(tmp_path, sweep={"world.noise.snr_db": [0.0, 10.0], "trials": 4000, "chunk": 4}), tmp_path / "result"
     command = [sys.executable, "-m", "torchsar.cli", "sweep", str(config), "--out", str(out)]
     for stop in (signal.SIGINT, signal.SIGTERM):
-        running = subprocess.Popen([*command, "--resume"], stderr=subprocess.PIPE, text=True, cwd=ROOT)
+        running = subprocess.Popen([*command, "--resume"], stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=mind_interrupts)
         assert running.stderr is not None
         while "chunk" not in (line := running.stderr.readline()) and line:
             pass
