@@ -179,3 +179,18 @@ def test_a_running_scheduler_serves_and_a_failing_trial_is_named(alone: Record) 
 
 def failing(parameters: dict, draws) -> dict:
     return {"m": parameters["nothing"]}
+
+
+@needs_dask
+def test_ctrl_c_with_workers_is_one_sentence(tmp_path: Path) -> None:
+    config, out = write_tiny(tmp_path, sweep={"world.noise.snr_db": [0.0, 10.0], "trials": 4000, "chunk": 4}), tmp_path / "result"
+    command = [sys.executable, "-m", "torchsar.cli", "sweep", str(config), "--workers", "2", "--out", str(out)]
+    running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=mind_interrupts, start_new_session=True)
+    assert running.stderr is not None
+    while "chunk" not in (line := running.stderr.readline()) and line:
+        pass
+    time.sleep(1)
+    os.killpg(running.pid, signal.SIGINT)  # as a terminal does, to all of them
+    _, said = running.communicate(timeout=60)
+    assert running.returncode == 130 and "Traceback" not in said
+    assert said.strip().endswith("go on with --resume") and read_sweep(out).done.any()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
+import signal
+import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -61,8 +63,11 @@ def _compute(chunk: Chunk, fits: int | None) -> Outcome:
 _PLUGIN = "torchsar-work"
 
 
-def _plugin(work: Work, threads: int) -> Any:
-    """Gives every worker, a restarted one too, the work, its torch threads, and the GPU of its number."""
+def _plugin(work: Work, threads: int, own: bool) -> Any:
+    """Gives every worker, a restarted one too, the work, its torch threads, and the GPU of its number.
+
+    own: workers that this program started leave Ctrl-C, which reaches all of them, to it.
+    """
     from distributed import WorkerPlugin
 
     class Carrier(WorkerPlugin):
@@ -71,6 +76,8 @@ def _plugin(work: Work, threads: int) -> Any:
         def setup(self, worker: Any) -> None:
             logging.getLogger("distributed.worker").setLevel(logging.CRITICAL)  # a failed trial reaches the user once, as its own sentence
             torch.set_num_threads(threads)
+            if own and threading.current_thread() is threading.main_thread():
+                signal.signal(signal.SIGINT, signal.SIG_IGN)
             self.work = _on_own_gpu(work, worker.name)
 
     return Carrier()
@@ -89,12 +96,13 @@ class Distributed:
     client: Any
     workers: int
     threads: int = 1
+    own: bool = False
 
     def results(self, work: Work, tasks: Iterable[Task]) -> Iterator[tuple[Chunk, Outcome]]:
         from distributed import KilledWorker, as_completed
 
         _refuse_unsendable(work)
-        self.client.register_plugin(_plugin(work, self.threads), name=_PLUGIN)
+        self.client.register_plugin(_plugin(work, self.threads, self.own), name=_PLUGIN)
         source, waiting, done = iter(tasks), {}, as_completed()
 
         def submit(task: Task | None) -> None:
@@ -187,7 +195,7 @@ def _local(distributed: Any, workers: int, threads: int) -> Iterator[Engine]:
         _cluster(distributed, workers) as local,
         distributed.Client(local) as client,
     ):
-        yield Distributed(client, workers, threads)
+        yield Distributed(client, workers, threads, own=True)
 
 
 def _cluster(distributed: Any, workers: int) -> Any:
