@@ -23,7 +23,7 @@ BLOCK_COLUMNS = 32
 def aperture_s(radar: StripmapRadar, n_range: int) -> float:
     """Time a target stays in the recorded band: the nominal dwell, or the time to sweep one PRF where none is known."""
     middle = radar.near_range_m + n_range / 2 * radar.range_step_m
-    return radar.prf_hz / float(radar.azimuth_rate_hz_s(middle)) if radar.integration_s is None else radar.integration_s
+    return radar.aperture_s(middle)
 
 
 def central_lines(raw: Tensor, most: int) -> Tensor:

@@ -51,7 +51,9 @@ def peak_time_s(image: Tensor, prf_hz: float, sample: Tensor, rate_hz_s: Tensor 
 
 
 class PointDoppler(Stage):
-    """`doppler_hz` of the beam from the brightest point of an image, which the beam centre crosses at crossing_s (default: the middle line).
+    """`doppler_hz` (...,) of the beam from the brightest point of an image (..., azimuth, range), which the beam centre crosses at crossing_s.
+
+    Tsvetkov 2017, text after Fig. 5. crossing_s: slow time, the middle line by default.
 
     frame_hz, velocity_m_s: those of the image; by default the radar's pointing and its nominal velocity. The band of the beam must lie within
     half a PRF of the frame (focusing folds what does not), and its Doppler within half the length of the image, rate * n / (2 PRF).
@@ -80,7 +82,7 @@ class PointDoppler(Stage):
         position, cos = found["position_range_m"], torch.sqrt(1 - radar.sin_squint(frame, velocity).square())
         rate = radar.azimuth_rate_hz_s(position, velocity) * cos.square()  # of a point at this slant range in the direction of the frame
         crossing, record = (azimuth.n // 2) / radar.prf_hz if self.crossing_s is None else self.crossing_s - azimuth.start / radar.velocity_m_s, azimuth.n / radar.prf_hz
-        dwell = radar.integration_s or radar.prf_hz / float(radar.azimuth_rate_hz_s(slant.start))
+        dwell = radar.aperture_s(slant.start)
         seen = max(-dwell / 2, -crossing), min(dwell / 2, record - crossing)
         at_s = (found["position_azimuth_m"] - azimuth.start) / radar.velocity_m_s
         at_s = crossing + wrap_hz(at_s - crossing, record)  # an image is circular: the peak may lie beyond its end

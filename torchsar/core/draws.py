@@ -11,6 +11,11 @@ import torch
 from torch import Tensor
 
 
+def generator_at(*address: str | int) -> np.random.Generator:
+    """The source of random numbers that lives at this address."""
+    return np.random.Generator(np.random.Philox(key=int.from_bytes(hashlib.blake2b(repr(address).encode(), digest_size=16).digest(), "big")))
+
+
 @dataclass(frozen=True)
 class Draws:
     """A source whose every draw depends on its address alone, never on what was drawn before, on chunking or on the device.
@@ -39,12 +44,9 @@ class Draws:
         return replace(self, case=tuple(f"{case}/{name}" for case in self.case) if isinstance(self.case, tuple) else f"{self.case}/{name}")
 
     def _generators(self, purpose: str) -> list[np.random.Generator]:
-        def generator(case: str | int, trial: int) -> np.random.Generator:
-            address = repr((self.seed, purpose, case, trial)).encode()
-            return np.random.Generator(np.random.Philox(key=int.from_bytes(hashlib.blake2b(address, digest_size=16).digest(), "big")))
-
         trials = self.trials if self.trials is not None else [0]
-        return [generator(*address) for address in zip(self.case if isinstance(self.case, tuple) else [self.case] * len(trials), trials, strict=True)]
+        cases = self.case if isinstance(self.case, tuple) else [self.case] * len(trials)
+        return [generator_at(self.seed, purpose, case, trial) for case, trial in zip(cases, trials, strict=True)]
 
     def _stack(self, arrays: list[np.ndarray], dtype: torch.dtype, device: torch.device | str | None) -> Tensor:
         x = torch.from_numpy(np.stack(arrays))

@@ -91,10 +91,13 @@ class StripmapRadar:
         velocity = torch.as_tensor(self.velocity_m_s if velocity_m_s is None else velocity_m_s, dtype=torch.float64)
         return 2 * velocity.square() / (self.wavelength_m * torch.as_tensor(range_m, dtype=torch.float64))
 
+    def aperture_s(self, range_m: float) -> float:
+        """Time of one synthetic aperture at this range: the nominal dwell, or the time to sweep one PRF where none is known."""
+        return self.prf_hz / float(self.azimuth_rate_hz_s(range_m)) if self.integration_s is None else self.integration_s
+
     def aperture_lines(self, range_m: float) -> int:
-        """Lines of one synthetic aperture at this range: the nominal dwell, or the time to sweep one PRF where none is known."""
-        seconds = self.prf_hz / float(self.azimuth_rate_hz_s(range_m)) if self.integration_s is None else self.integration_s
-        return math.ceil(seconds * self.prf_hz)
+        """Lines of one synthetic aperture at this range."""
+        return math.ceil(self.aperture_s(range_m) * self.prf_hz)
 
     def image_position(self, zero_doppler_s: Tensor, closest_range_m: Tensor, frame_doppler_hz: Tensor | float, velocity_m_s: Tensor | float) -> tuple[Tensor, Tensor]:
         """Where a target appears in an image of frame Doppler f: (azimuth_m, range_m).

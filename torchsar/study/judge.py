@@ -46,7 +46,7 @@ def window(image: Signal, radar: StripmapRadar, margin: Margin | None) -> dict[s
     """
     lines, samples = (axis.n for axis in image.axes)
     if margin is None:
-        edge = min(_aperture_lines(image, radar) // 2, lines // 4)
+        edge = min(radar.aperture_lines(image.axes[1].start) // 2, lines // 4)
         margin = Margin(first_lines=edge, last_lines=edge, last_samples=radar.pulse_samples)
     return {"azimuth": _bounds(lines, margin.first_lines, margin.last_lines), "range": _bounds(samples, margin.first_samples, margin.last_samples)}
 
@@ -56,12 +56,6 @@ def _bounds(n: int, first: int, last: int) -> tuple[int, int]:
         return first, n - last
     log.warning("a margin of %d and %d leaves nothing of %d lines or samples: that axis is judged whole", first, last, n)
     return 0, n
-
-
-def _aperture_lines(image: Signal, radar: StripmapRadar) -> int:
-    """Pulses of one aperture: the nominal integration, else the time in which the Doppler sweeps the PRF band."""
-    seconds = radar.integration_s or radar.prf_hz / float(radar.azimuth_rate_hz_s(image.axes[1].start))
-    return math.ceil(seconds * radar.prf_hz)
 
 
 def metrics_tree(config: Config, case: Case, results: Mapping[str, Result]) -> dict[str, Any]:

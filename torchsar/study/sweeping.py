@@ -23,7 +23,7 @@ from torchsar.study.montecarlo.record import Record
 from torchsar.study.montecarlo.report import write_sweep_report
 from torchsar.study.montecarlo.stopping import Stop
 from torchsar.study.montecarlo.summary import summary_tree
-from torchsar.study.trials import BATCHED, StripmapTrials, sweep_grid
+from torchsar.study.trials import StripmapTrials, sweep_grid
 
 log = logging.getLogger("torchsar")
 _NOT_IDENTITY = ("sweep", "trade", "title", "seed")
@@ -46,7 +46,7 @@ def sweep_config(
     """
     settings = loaded.config.sweep
     grid = sweep_grid(loaded)
-    stop = None if settings.stop is None else Stop(settings.stop.metric, settings.stop.relative, settings.stop.statistic)
+    stop = None if settings.stop is None else Stop(**settings.stop.model_dump())
     needs = [(f"{loaded.file}: sweep.success", metric) for metric in settings.success] + [(f"{loaded.file}: sweep.show", metric) for metric in settings.show]
     plan = Plan(grid, settings.trials, loaded.config.seed, settings.chunk, stop, frozenset(settings.save.trials), device, tuple(needs))
     store = open_store(out, plan, identity(loaded), resume)
@@ -74,7 +74,7 @@ def identity(loaded: Loaded) -> dict[str, Any]:
 
 
 def report(record: Record, loaded: Loaded, out: Path, config_text: str, command: str) -> Path:
-    """summary.json, figures/ and report.html of a record; each file is replaced whole, the report last."""
+    """summary.json, figures/, config.yaml and report.html of a record. The summary and the report, which is last, are replaced whole."""
     summary = summary_tree(record, loaded.config.sweep.success, {"snr": DEFINITIONS["snr"], **{f"method {name}": method.title for name, method in loaded.config.processor.items() if method.title}})
     figures = out / "figures"
     figures.mkdir(exist_ok=True)
@@ -92,8 +92,6 @@ def _announce(grid: Grid, trials: int) -> None:
     together = [f"{p.name} ({len(p.labels)})" for p in grid.parameters if p.batched]
     apart = [f"{p.name} ({len(p.labels)})" for p in grid.parameters if not p.batched]
     log.info("%d points of %d trials; per-trial tensors, which share batches: %s; cases of their own: %s", len(grid.points()), trials, ", ".join(together) or "none", ", ".join(apart) or "none")
-    if apart:
-        log.debug("per-trial tensors can be: %s", ", ".join(BATCHED))
 
 
 @contextmanager

@@ -203,11 +203,11 @@ def _bounds(bench: Bench, truth: Truth, lines: int) -> dict[str, dict[str, Tenso
     if not all(isinstance(scene, (Points, RandomPoints)) for scene in parts) or not bool((std > 0).all()):
         return {}
     q = target_energy(truth, world, radar, lines).sum(-1) / std.square()
-    middle_m = float(radar.near_range_m)
-    seconds = radar.integration_s or radar.prf_hz / float(radar.azimuth_rate_hz_s(middle_m))
+    range_m = truth.values["closest_range_m"].mean(-1)
+    seconds = radar.aperture_s(float(range_m.mean()))
     velocity = truth.values["velocity_m_s"].to(q)
     doppler = {"Cramer-Rao bound of a point of known place": tone_frequency_bound_hz(q, seconds), "1/(T sqrt q), Tsvetkov 2017": reference_doppler_std_hz(q, seconds)}
-    bound = velocity_bound_m_s(q, seconds, velocity, radar.wavelength_m, middle_m)
+    bound = velocity_bound_m_s(q, seconds, velocity, radar.wavelength_m, range_m)
     return {"doppler_error_hz": doppler, "doppler_baseband_error_hz": doppler, "velocity_error_m_s": {"Cramer-Rao bound": bound}}
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Iterator
 
 import numpy as np
+
+from torchsar.core.draws import generator_at
 
 LEVEL = 0.95
 RESAMPLES = 1000
@@ -162,17 +163,12 @@ def _weights(seed: int, trials: int) -> Iterator[tuple[slice, np.ndarray]]:
     resample's draws fall into each slice, then where in it. Addressed by (seed, trials, slice) alone.
     """
     slices = list(_blocks(trials, _COLUMNS))
-    counts = _generator(seed, trials, -1).multinomial(trials, [(s.stop - s.start) / trials for s in slices], RESAMPLES)
+    counts = generator_at(seed, "bootstrap", trials, -1).multinomial(trials, [(s.stop - s.start) / trials for s in slices], RESAMPLES)
     for i, s in enumerate(slices):
         width = s.stop - s.start
-        place = _generator(seed, trials, i).integers(0, width, counts[:, i].sum())
+        place = generator_at(seed, "bootstrap", trials, i).integers(0, width, counts[:, i].sum())
         place += np.repeat(np.arange(RESAMPLES) * width, counts[:, i])
         yield s, np.bincount(place, minlength=RESAMPLES * width).reshape(RESAMPLES, width).astype(np.float64)
-
-
-def _generator(seed: int, trials: int, part: int) -> np.random.Generator:
-    address = repr((seed, "bootstrap", trials, part)).encode()
-    return np.random.Generator(np.random.Philox(key=int.from_bytes(hashlib.blake2b(address, digest_size=16).digest(), "big")))
 
 
 def _powers(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
