@@ -13,7 +13,7 @@ import torchsar
 
 PACKAGE = Path(torchsar.__file__).parent
 PROCESSING = ("repair", "compensate", "focus", "metrics", "optim")
-CORE = [path for folder in ("core", "radar", "scene", "echo", "io", *PROCESSING) for path in sorted((PACKAGE / folder).glob("*.py"))]
+CORE = [path for folder in ("core", "radar", "scene", "echo", "io", *PROCESSING) for path in sorted((PACKAGE / folder).rglob("*.py"))]
 
 _ONLY_TORCH_AND_NUMPY = """
 import sys
@@ -60,7 +60,7 @@ def test_core_and_stages_name_only_torch_and_numpy() -> None:
 
 @pytest.mark.parametrize("package", PROCESSING)
 def test_processing_never_sees_the_world(package: str) -> None:
-    for path in sorted((PACKAGE / package).glob("*.py")):
+    for path in sorted((PACKAGE / package).rglob("*.py")):
         for name in _imports(path):
             assert not name.startswith(("torchsar.scene", "torchsar.echo", "torchsar.study")), f"{path.name} imports {name}"
             assert not name.endswith(".Truth"), f"{path.name} imports {name}"
@@ -70,7 +70,7 @@ def test_processing_never_sees_the_world(package: str) -> None:
 def test_imports_go_downward() -> None:
     may = {"core": {"core"}, "radar": {"core", "radar"}, "scene": {"core", "radar", "scene"}, "echo": {"core", "radar", "scene", "echo"}}
     for package, allowed in may.items():
-        for path in sorted((PACKAGE / package).glob("*.py")):
+        for path in sorted((PACKAGE / package).rglob("*.py")):
             used = {name.split(".")[1] for name in _imports(path) if name.startswith("torchsar.")}
             assert used <= allowed, f"{path} imports {used - allowed}"
 

@@ -7,6 +7,7 @@ from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedL
 from torchsar.echo.pairs import SimulatedPairs
 from torchsar.echo.response import ChannelResponse
 from torchsar.echo.stripmap import Damage, apply_damages, simulate, stripmap_echo, target_energy
+from torchsar.echo.turntable import LostPulses, dechirped_echo, simulate_turntable, turntable_echo
 
 __all__ = [
     "ChannelImbalance",
@@ -15,6 +16,7 @@ __all__ = [
     "Damage",
     "LostGaps",
     "LostLines",
+    "LostPulses",
     "PeriodicJitter",
     "Quantiser",
     "RepeatedLines",
@@ -22,7 +24,10 @@ __all__ = [
     "Tone",
     "WideInterferer",
     "apply_damages",
+    "dechirped_echo",
     "simulate",
+    "simulate_turntable",
     "stripmap_echo",
     "target_energy",
+    "turntable_echo",
 ]

@@ -2,40 +2,54 @@
 
 from torchsar.focus.backprojection import Backproject, DopplerBand, EveryPulse, Integration, backproject
 from torchsar.focus.coordinates import ClosestRange, PaddedLines, closest_range
+from torchsar.focus.dechirped import AzimuthTransform, CompressDechirped, azimuth_transform, compress_dechirped
 from torchsar.focus.defocus import InvertibleOmegaK, defocus_omega_k
 from torchsar.focus.detection import Detect, QuickLook, amplitude, multilook, quicklook_looks, to_db
+from torchsar.focus.inverse_requirements import inverse_requirements
 from torchsar.focus.nufft import Nufft, nufft_type1, nufft_type2
 from torchsar.focus.omega_k import OmegaK, StoredOmegaK, omega_k
+from torchsar.focus.polar import PolarFormat, PolarOperator
 from torchsar.focus.range_doppler import RangeDoppler, range_doppler
 from torchsar.focus.reference import RangeCompress, flat_reference, matched_reference, phase_reference, range_compress
 from torchsar.focus.requirements import Requirement, recommended_form, requirements
+from torchsar.focus.spotlight import GroundGrid, SpotlightBackprojection, backproject_spotlight
 from torchsar.focus.stolt import OmegaKStolt, omega_k_stolt
 from torchsar.focus.strip import StripPlan, focus_strip, plan_strip, reach_lines, write_strip
 
 __all__ = [
+    "AzimuthTransform",
     "Backproject",
     "ClosestRange",
+    "CompressDechirped",
     "Detect",
     "DopplerBand",
     "EveryPulse",
+    "GroundGrid",
     "Integration",
     "InvertibleOmegaK",
     "Nufft",
     "OmegaK",
     "OmegaKStolt",
     "PaddedLines",
+    "PolarFormat",
+    "PolarOperator",
     "QuickLook",
     "RangeCompress",
     "RangeDoppler",
     "Requirement",
+    "SpotlightBackprojection",
     "StoredOmegaK",
     "StripPlan",
     "amplitude",
+    "azimuth_transform",
     "backproject",
+    "backproject_spotlight",
     "closest_range",
+    "compress_dechirped",
     "defocus_omega_k",
     "flat_reference",
     "focus_strip",
+    "inverse_requirements",
     "matched_reference",
     "multilook",
     "nufft_type1",

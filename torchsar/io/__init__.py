@@ -1,5 +1,6 @@
 """Recorded data in, images out."""
 
+from torchsar.io.inverse import read_inverse
 from torchsar.io.recorded import read_stripmap
 
-__all__ = ["read_stripmap"]
+__all__ = ["read_inverse", "read_stripmap"]

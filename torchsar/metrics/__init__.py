@@ -3,6 +3,7 @@
 from torchsar.metrics.bounds import beam_centre_bound_hz, reference_doppler_std_hz, tone_frequency_bound_hz, velocity_bound_m_s
 from torchsar.metrics.image import contrast, correlation, entropy, error_db
 from torchsar.metrics.impulse import impulse_response
+from torchsar.metrics.phase import phase_rmse, residual_phase, strehl
 
 __all__ = [
     "beam_centre_bound_hz",
@@ -11,7 +12,10 @@ __all__ = [
     "entropy",
     "error_db",
     "impulse_response",
+    "phase_rmse",
     "reference_doppler_std_hz",
+    "residual_phase",
+    "strehl",
     "tone_frequency_bound_hz",
     "velocity_bound_m_s",
 ]
