@@ -44,6 +44,81 @@ def test_contrast_of_speckle_is_one_in_intensity():
         contrast(image, of="power")
 
 
+FORMS = [(metric, of) for metric in (entropy, contrast) for of in ("intensity", "amplitude")]
+FORM_IDS = [f"{metric.__name__}_{of}" for metric, of in FORMS]
+
+
+def direct(metric, of: str, levels: torch.Tensor) -> float:
+    """The figure from a plain list of amplitudes, pixel by pixel."""
+    x = [float(a) ** {"intensity": 2, "amplitude": 1}[of] for a in levels]
+    if metric is entropy:
+        return -sum(v / sum(x) * math.log(v / sum(x)) for v in x if v)
+    mean = sum(x) / len(x)
+    return math.sqrt(sum((v - mean) ** 2 for v in x) / len(x)) / mean
+
+
+@pytest.mark.parametrize(("metric", "of"), FORMS, ids=FORM_IDS)
+def test_figures_of_regions_are_those_of_their_pixels(metric, of):
+    image = torch.randn(3, 5, 6, dtype=torch.complex128, generator=torch.Generator().manual_seed(4)) * torch.tensor([1.0, 1e3, 1e-9])[:, None, None]
+    image[0, 1, 2] = 0
+    times = torch.randint(0, 4, (3, 5, 6), generator=torch.Generator().manual_seed(5))
+    for i in range(3):
+        assert float(metric(image, of)[i]) == pytest.approx(direct(metric, of, image[i].abs().flatten()), rel=1e-12)
+        assert float(metric(image, of=of, mask=times > 1)[i]) == pytest.approx(direct(metric, of, image[i].abs()[times[i] > 1]), rel=1e-12)
+        counted = image[i].abs().flatten().repeat_interleave(times[i].flatten())
+        assert float(metric(image, of, mask=times)[i]) == pytest.approx(direct(metric, of, counted), rel=1e-12)
+    torch.testing.assert_close(metric(image, of, mask=torch.ones(6, dtype=torch.bool)), metric(image, of))
+
+
+@pytest.mark.parametrize("scale", [1e-25, 1e19])
+@pytest.mark.parametrize(("metric", "of"), FORMS, ids=FORM_IDS)
+def test_extreme_levels_change_no_form(metric, of, scale):
+    image = torch.randn(3, 16, 16, dtype=torch.complex64, generator=torch.Generator().manual_seed(1))
+    mask = torch.rand(16, 16, generator=torch.Generator().manual_seed(2)).mul(2).floor()
+    torch.testing.assert_close(metric(image * scale, of), metric(image, of), rtol=1e-5, atol=1e-5)
+    beside = torch.where(mask > 0, image * 1e-25, 1e19)  # what does not count is 440 dB louder
+    torch.testing.assert_close(metric(beside, of, mask=mask), metric(image, of, mask=mask), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize(("metric", "of"), FORMS, ids=FORM_IDS)
+def test_gradients_of_regions_and_at_zeros(metric, of):
+    image = torch.randn(2, 3, 4, dtype=torch.complex128, generator=torch.Generator().manual_seed(1)).requires_grad_()
+    mask = torch.tensor([1.0, 0.0, 2.5, 0.3], dtype=torch.float64)
+    for given in (None, mask, mask > 0.4):
+        assert torch.autograd.gradcheck(lambda x, m=given: metric(x, of, mask=m), (image,))
+    holes = torch.where(torch.rand(2, 3, 4, generator=torch.Generator().manual_seed(3)) > 0.5, image.detach(), 0)
+    for x in (holes, torch.zeros(2, 3, 4, dtype=torch.complex64), torch.ones(2, 3, 4, dtype=torch.complex64)):
+        (gradient,) = torch.autograd.grad(metric(x.requires_grad_(), of, mask=mask).sum(), x)
+        assert torch.isfinite(torch.view_as_real(gradient)).all() and (gradient[..., 1] == 0).all()
+
+
+@pytest.mark.parametrize(("metric", "of"), FORMS, ids=FORM_IDS)
+def test_nothing_that_counts_gives_nothing(metric, of):
+    image = torch.randn(2, 3, 4, dtype=torch.complex64)
+    assert torch.equal(metric(torch.zeros_like(image), of), torch.zeros(2))
+    mask = torch.ones(2, 1, 1)
+    mask[0] = 0
+    found = metric(image, of, mask=mask)
+    assert float(found[0]) == 0
+    torch.testing.assert_close(found[1], metric(image[1], of))
+    torch.testing.assert_close(torch.vmap(lambda x, m: metric(x, of, mask=m))(image, mask), found)
+
+
+@pytest.mark.parametrize("metric", [entropy, contrast])
+def test_masks_that_do_not_fit_are_refused(metric):
+    image = torch.ones(2, 3, 4)
+    with pytest.raises(ValueError, match=r"mask of shape \(4, 3\) does not broadcast to the image \(2, 3, 4\)"):
+        metric(image, mask=torch.ones(4, 3))
+    with pytest.raises(ValueError, match="weights of 0 or more, got -1 to 1"):
+        metric(image, mask=torch.tensor([1.0, -1.0, 1.0, 1.0]))
+    with pytest.raises(ValueError, match="finite weights"):
+        metric(image, mask=torch.tensor([1.0, math.nan, 1.0, 1.0]))
+    with pytest.raises(TypeError, match="real weights or of bool, got torch.complex64"):
+        metric(image, mask=torch.ones(4, dtype=torch.complex64))
+    with pytest.raises(ValueError, match="'intensity' or 'amplitude'"):
+        metric(image, of="power")
+
+
 def test_correlation_is_blind_to_gain_and_phase_and_error_is_not():
     a = torch.randn(2, 8, 8, dtype=torch.complex128, generator=torch.Generator().manual_seed(3))
     torch.testing.assert_close(correlation(a * (2 + 1j), a), torch.ones(2, dtype=torch.float64))

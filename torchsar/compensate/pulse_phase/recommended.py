@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
+import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import prepare, starting_phase
+from torchsar.compensate.pulse_phase.data import prepare, rotate, starting_phase
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging, Through
 from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, fixed_point, in_turn
 from torchsar.compensate.pulse_phase.verdict import Found, estimated
 from torchsar.core import Estimate
+from torchsar.metrics import entropy
 
 _FLOOR = 2.5
 _RELAXATION = 1.8
+_SLOPES = 48
 
 
 def autofocus(
@@ -30,19 +36,60 @@ def autofocus(
     Adjacent pulses (`sca`), then the entropy fixed point with one low floor until a trial stands still (at most `search` iterations: hard cases
     of low SNR use them), then at most `polish` iterations against a Wiener estimate of the scene on an image of twice as many cells, which lowers the floor
     that the entropy leaves by half and more. start: (..., pulse) rad, by default that of `sca`, with which the result is equivariant: any phase
-    per pulse is removed, whatever its size. imaging: the image formation to sharpen, see `entropy_fixed_point`. std: from even against odd range
-    cells, close to the true error on targets of points. ok is False for noise, for images no sharper than noise can be made, and for one row alone.
-    Raises TypeError or ValueError for samples that are not finite and complex, or a start of another shape.
+    per pulse is removed, whatever its size.
+
+    imaging: an image formation in which scatterers keep still where they migrate through range cells here, see `entropy_fixed_point`. It tells
+    the slope of the phase over pulses as well, since an image in a wrong place migrates wrongly: after the steps above, 48 slopes over one turn a pulse are
+    tried, the best refined, and both kinds of iterations run through `imaging`. Its image must cover the whole unambiguous cross range.
+
+    std: from even against odd range cells, close to the true error on targets of points. ok is False for noise, for images no sharper than
+    noise can be made, and for one row alone. Differentiable without `imaging`. Raises TypeError or ValueError for samples that are not finite and complex, or a start of another shape.
     """
     pulses = prepare(data, "autofocus")
     if search < 0 or polish < 0:
         raise ValueError(f"autofocus needs numbers of iterations of 0 or more, got search={search} and polish={polish}")
-    coarse, fine = (AlongPulses(), AlongPulses(2)) if imaging is None else (Through(imaging), Through(imaging))
-    runs = [Run(LogAbove(_FLOOR), coarse, search, _RELAXATION, search_tolerance_rad), Run(Wiener(), fine, polish, 1.0, tolerance_rad)]
     again = Run(Wiener(), AlongPulses(2), 6, 1.0, tolerance_rad)
 
+    def runs(coarse: Imaging, fine: Imaging) -> list[Run]:
+        return [Run(LogAbove(_FLOOR), coarse, search, _RELAXATION, search_tolerance_rad), Run(Wiener(), fine, polish, 1.0, tolerance_rad)]
+
     def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> Found:
-        phase, taken = in_turn(rows, pair_phase(rows, present) if begin is None else begin, runs)
+        phase, taken = in_turn(rows, pair_phase(rows, present) if begin is None else begin, runs(AlongPulses(), AlongPulses(2)))
+        if imaging is not None:
+            through = Through(imaging)
+            phase, more = _Placed(through, runs(through, through))(rows, phase)
+            taken = taken + more
         return phase, taken, lambda some, _, at: fixed_point(some, at, again)[0]
 
     return estimated(pulses, starting_phase(start, pulses, "autofocus"), find, at_rest=True)
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """Slope and phase through an image formation in which scatterers do not migrate: the slope over a turn, the phase, the slope again, the phase."""
+
+    through: Through
+    runs: list[Run]
+
+    def __call__(self, rows: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
+        step = 2 * math.pi / _SLOPES
+        phase = self._best_slope(rows, phase, step, _SLOPES)
+        total = torch.zeros_like(phase[:, 0], dtype=torch.int64)
+        for _ in range(2):
+            phase = self._best_slope(rows, phase, step / 8, 17)
+            phase, taken = in_turn(rows, phase, self.runs)
+            total = total + taken
+        return self._best_slope(rows, phase, step / 8, 17), total
+
+    @torch.no_grad()
+    def _best_slope(self, rows: Tensor, phase: Tensor, step_rad: float, count: int) -> Tensor:
+        """The phase with the one of `count` slopes (rad per pulse) about its own that gives the least entropy, per trial."""
+        n = rows.shape[-1]
+        ramp = torch.arange(n, dtype=phase.dtype, device=phase.device) - (n - 1) / 2
+        best, least = phase, torch.full_like(phase[:, 0], torch.inf)
+        for index in range(count):
+            candidate = phase + (index - count // 2) * step_rad * ramp
+            cost = entropy(self.through.image(rotate(rows, candidate)))
+            better = cost < least
+            best, least = torch.where(better[:, None], candidate, best), torch.where(better, cost, least)
+        return best

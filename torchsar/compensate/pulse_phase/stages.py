@@ -52,7 +52,8 @@ class Pga(Stage):
 
     def __init__(self, kernel: Kernel = "lumv", windows: Literal["shrinking", "measured"] | list[float] = "shrinking", iterations: int = 20, patience: int = 6) -> None:
         super().__init__()
-        self.kernel, self.windows, self.iterations, self.patience = kernel, windows_of(windows), iterations, patience
+        self.kernel: Kernel = kernel
+        self.windows, self.iterations, self.patience = windows_of(windows), iterations, patience
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
         return pga(signal.data, kernel=self.kernel, start=start, windows=self.windows, iterations=self.iterations, patience=self.patience)
