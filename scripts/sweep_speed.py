@@ -22,7 +22,8 @@ from torchsar.study.montecarlo.chunks import rows_by_bytes
 from torchsar.study.montecarlo.engines import Engine, InProcess, engine
 from torchsar.study.montecarlo.grid import Grid
 from torchsar.study.montecarlo.loop import Plan, run_plan
-from torchsar.study.trials import StripmapTrials, sweep_grid
+from torchsar.study.stripmap.trials import StripmapTrials
+from torchsar.study.sweeping import sweep_grid
 
 
 def first_point(grid: Grid) -> Grid:

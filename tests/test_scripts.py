@@ -22,8 +22,8 @@ def test_first_image_is_the_script_of_the_readme_and_runs(tmp_path: Path) -> Non
 
 def test_the_config_of_the_readme_is_accepted(tmp_path: Path) -> None:
     from torchsar.study.config import load
-    from torchsar.study.run import check
-    from torchsar.study.trials import sweep_grid
+    from torchsar.study.stripmap.run import check
+    from torchsar.study.sweeping import sweep_grid
 
     whole, swept = readme_blocks("yaml")
     path = tmp_path / "readme.yaml"

@@ -89,23 +89,19 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
 
         print(listing())
         return 0
+    from torchsar.study.systems import system_of
+
     loaded = load(options.config, options.overrides)
     if options.command == "run":
-        from torchsar.study.run import run
-
-        print(run(loaded, options.out or Path("out") / loaded.name, command))
+        print(system_of(loaded).run(loaded, options.out or Path("out") / loaded.name, command))
     elif options.command == "sweep":
         from torchsar.study.sweeping import sweep_config
 
         print(sweep_config(loaded, options.out or Path("out") / loaded.name, options.resume, options.workers, options.cluster, options.threads or 1, options.device, command))
     elif options.command == "requires":
-        from torchsar.study.requires import requires
-
-        print(requires(loaded, options.out))
+        print(system_of(loaded).requires(loaded, options.out))
     else:
-        from torchsar.study.trade import trade
-
-        print(trade(loaded, options.out))
+        print(system_of(loaded).trade(loaded, options.out))
     return 0
 
 

@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 
 from tests.study.tiny import TINY, write_tiny
-from torchsar.study.build import build_chain, build_radar, resolved
+from torchsar.study.build import build_chain, resolved
 from torchsar.study.config import load
 from torchsar.study.errors import ConfigError
-from torchsar.study.run import check, prepare
+from torchsar.study.stripmap.build import build_radar
+from torchsar.study.stripmap.run import check, prepare
 from torchsar.study.text import dump, override, packaged_configs, parse
 
 
@@ -146,6 +147,6 @@ def test_missing_sections_are_named(tmp_path: Path) -> None:
 
 def test_chain_of_a_method_is_built_as_written(tmp_path: Path) -> None:
     loaded = load(str(write_tiny(tmp_path)))
-    chain = build_chain(loaded.config.processor["recommended"], "processor.recommended", loaded.file, build_radar(loaded))
+    chain = build_chain(loaded.config.processor["recommended"], "processor.recommended", loaded.file, radar=build_radar(loaded))
     assert list(chain.stages) == ["doppler", "focus"]
     assert chain.uses["focus"] == {"doppler_hz": "doppler.doppler_baseband_hz"}

@@ -14,7 +14,7 @@ from tests.study.tiny import write_tiny
 from torchsar.study.config import load
 from torchsar.study.errors import ConfigError
 from torchsar.study.folder import fresh_folder
-from torchsar.study.run import run
+from torchsar.study.stripmap.run import run
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,8 @@ from torchsar.study.errors import ConfigError
 from torchsar.study.montecarlo import Record, differences, read_sweep
 from torchsar.study.montecarlo.engines import InProcess
 from torchsar.study.montecarlo.loop import Plan, run_plan
-from torchsar.study.trials import StripmapTrials, error_name, sweep_grid
+from torchsar.study.stripmap.trials import StripmapTrials, error_name
+from torchsar.study.sweeping import sweep_grid
 
 SWEEP = {"world.noise.snr_db": [0.0, 20.0], "world.doppler_hz": [-20.0, 30.0], "trials": 6}
 SMALL = ["sweep.world.noise.snr_db=[-10.0, 10.0]", "sweep.world.squint_deg=[0.25]"]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from torchsar.study.config import load
-from torchsar.study.run import run
+from torchsar.study.stripmap.run import run
 
 
 def metrics(out: Path) -> dict:

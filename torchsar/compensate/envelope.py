@@ -1,11 +1,12 @@
 """Alignment of the envelopes of pulses in range, ahead of any estimate of their phases (brief 002, section 9).
 
-A shift counts towards greater range, against what the pulses have in common, in cells of the circular range window. It is to be removed:
-`shift_range(data, -shift_cells)`. Envelopes are powers |s|^2 on a grid of half cells, where they are band-limited, so that shifts by any
-fraction are exact, and each is divided by its own mean: neither the phase nor the gain of a pulse can change its shift.
+A shift is the place of a pulse against what the pulses have in common, in cells, towards greater range and circular in the window. It is to be
+removed: `shift_range(data, -shift_cells)`. Envelopes are powers |s|^2 on a grid of half cells, where they are band-limited and shifts by any
+fraction exact, each over its own mean: neither the phase nor the gain of a pulse can change its shift.
 
-Cells of a target of many scatterers are speckle: their power in a pulse is exponential about the mean T of all pulses, noise included. The
-likelihood of a shift is then the correlation of |s|^2 with -1 / T, and not with T or |s|: it is what makes low SNR possible here.
+A range cell of many scatterers is speckle: its power in a pulse is exponential about the mean T of all pulses, noise included. The log-likelihood of a
+shift is then the correlation of |s|^2 with -1 / T, not with T or with |s|. On the aircraft of brief 002 this halves the jitter of single pulses and
+lets a polynomial be found at -10 dB.
 """
 
 from __future__ import annotations
@@ -18,22 +19,29 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from torchsar.compensate.pulse_phase.recommended import autofocus
 from torchsar.compensate.pulse_phase.stages import correct_pulse_phase
-from torchsar.core import Estimate, Signal, Stage, block_bytes_of, legendre, linear_phasor, per_trial, real_dtype, refuse_non_finite, take
+from torchsar.core import Estimate, Signal, Stage, block_bytes_of, fft_lines, legendre, linear_phasor, real_dtype, refuse_non_finite
+from torchsar.metrics.image import entropy
 from torchsar.optim.descent import lbfgs
 
 Match = Literal["likelihood", "amplitude"]
+
+GOOD_CELLS = 0.5  # deviation of a shift beyond which an alignment is not ok
 _FINE = 2  # samples a cell: |s|^2 has twice the band of s
-_FLOOR = 1e-2  # of the mean power, least power of a cell that the likelihood believes
-_BLOCKS = 16
-_LEAST_RISE = 8.0
+_FLOOR = 1e-2  # of the mean power: what the likelihood takes an empty cell to hold
+_REACH_CELLS = 8.0
+_TUKEY = 4.685
+_LEAST_CELLS = 1e-3
+_TUNINGS = 5
+_STANDS_OUT = 6.0  # of the mean power of a periodogram, beyond the log of the number of its cells: one false tone in 400 trials
 
 
 def shift_range(data: Tensor, shift_cells: Tensor | float) -> Tensor:
     """Every pulse moved by its shift towards greater range, circularly. data: (..., pulse, range) complex; shift_cells: (..., pulse), (pulse,) or a number.
 
-    A linear phase about the centre of fast time (the middle of the band), so that the phase of an echo does not turn with its place. Unitary:
-    shift_range(., -s) undoes shift_range(., s) exactly. Differentiable in both. Raises ValueError for any other shape of the shifts.
+    A linear phase about the centre of fast time, the middle of the band: the phase of an echo does not turn with its place. Unitary, and
+    shift_range(., -s) undoes shift_range(., s). Differentiable in both. Raises ValueError for shifts of another shape.
     """
     n = data.shape[-1]
     shift = torch.as_tensor(shift_cells, dtype=torch.float64, device=data.device)
@@ -41,3 +49,383 @@ def shift_range(data: Tensor, shift_cells: Tensor | float) -> Tensor:
         raise ValueError(f"one shift per pulse is needed, (..., {data.shape[-2]}), got {tuple(shift.shape)}")
     phasor = torch.fft.ifftshift(linear_phasor(-shift / n, -(n // 2), n, data.dtype), dim=-1)
     return torch.fft.ifft(torch.fft.fft(data) * phasor)
+
+
+def align_running(data: Tensor, *, memory_pulses: float = 10.0) -> Estimate:
+    """Shift of each pulse against an exponentially running mean of the aligned ones before it, with value["shift_cells"] (..., pulse).
+
+    data: (..., pulse, range) complex, range-compressed. Correlates |s|, peak by a parabola through samples half a cell apart. memory_pulses: how far the mean
+    reaches back. Follows any motion of less than half a window from pulse to pulse, but the mean drifts: for a start. See `align_envelopes`, also for
+    std, ok and errors.
+    """
+    if not memory_pulses >= 1:
+        raise ValueError(f"align_running: memory_pulses is {memory_pulses}; choose 1 or more")
+    return _estimated(data, "align_running", lambda pulses: running_shifts(pulses, 1 / memory_pulses))
+
+
+def align_mean(data: Tensor, *, first: Literal["running", "none"] = "running", match: Match = "likelihood", iterations: int = 4) -> Estimate:
+    """Shift of each pulse by itself against the mean envelope of all, iterated, with value["shift_cells"] (..., pulse).
+
+    data: (..., pulse, range) complex. first: where to begin, the running mean or the data as they are. match: "likelihood" correlates |s|^2 with -1 / T, "amplitude"
+    |s| with its mean. On a perfect recording of the aircraft the shifts have 0.03 cell (likelihood) or 0.07 cell rms of speckle jitter. For motion that has no
+    smooth course; otherwise `align_envelopes`, also for std, ok and errors.
+    """
+    if first not in ("running", "none") or match not in ("likelihood", "amplitude") or iterations < 1:
+        raise ValueError(f"align_mean: first is {first!r} ('running' or 'none'), match {match!r} ('likelihood' or 'amplitude'), iterations {iterations} (1 or more)")
+
+    def find(pulses: Envelopes) -> Tensor:
+        start = running_shifts(pulses, 0.1) if first == "running" else torch.zeros_like(pulses.present, dtype=torch.float64)
+        return single_shifts(pulses, start, match, iterations)
+
+    return _estimated(data, "align_mean", find)
+
+
+def align_envelopes(data: Tensor, *, degree: int | None = 2, tones: int = 0, passes: int = 6, blocks: int = 16) -> Estimate:
+    """The recommended alignment, with value["shift_cells"] (..., pulse) to be removed: a smooth course of shifts of mean zero.
+
+    data: (..., pulse, range) complex, range-compressed, of any phases. The mean drift from pulses 1, 2, 4, ... apart, then `passes` rounds: the mean envelope, the likelihood
+    of the shift of each of `blocks` runs of pulses against it, and a polynomial of `degree` through these, robust against runs that went wrong. tones: number of
+    sinusoids (vibration) that are then looked for in the shifts of single pulses, and kept where they stand out. degree None: shifts of single
+    pulses, not smoothed, begun at a parabola.
+
+    Shifts may pass the ends of the window any number of times. A pulse of zeros takes the place that the course gives it. std: half of the rms
+    difference between what the lower and the upper half of the band say, each found from nothing; ok: it is below half a cell. quality: 1 / (1 + (2 std)^2).
+    Raises TypeError or ValueError for samples that are not finite and complex, or settings that make no sense.
+    """
+    if not ((degree is None or degree >= 0) and tones >= 0 and passes >= 1 and blocks >= 1) or (degree is None and tones):
+        raise ValueError(f"align_envelopes: degree is {degree} (0 or more; None without tones), tones {tones} (0 or more), passes {passes} and blocks {blocks} (1 or more)")
+
+    def find(pulses: Envelopes) -> Tensor:
+        smooth = smooth_shifts(pulses, 2 if degree is None else degree, passes, blocks)
+        if degree is None:
+            return single_shifts(pulses, smooth, "likelihood", 3)
+        return with_tones(pulses, smooth, tones, degree) if tones else smooth
+
+    return _estimated(data, "align_envelopes", find)
+
+
+def refine_alignment(data: Tensor, shift_cells: Tensor, *, degree: int = 2, rounds: int = 2, steps: int = 15) -> Estimate:
+    """Image-based refinement: the polynomial that, added to shifts (..., pulse), gives the image of least entropy, with value["shift_cells"].
+
+    data: (..., pulse, range) complex. In each round `autofocus` finds the phases at the present shifts; then the coefficients of degrees 1..degree are varied with these
+    phases held (torchsar.optim.lbfgs, each trial by itself, at most `steps` steps). A round that does not lower the entropy is not taken. Needs
+    phases that can be found, that is shifts within about a cell. ok: that of the last autofocus. quality: its quality. Errors as `align_envelopes`.
+    """
+    flat, _ = _checked(data, "refine_alignment")
+    if degree < 1 or rounds < 1:
+        raise ValueError(f"refine_alignment: degree is {degree} and rounds {rounds}; choose 1 or more of both")
+    flat, shift = flat.detach(), shift_cells.detach().to(torch.float64).expand(data.shape[:-1]).reshape(flat.shape[:-1])
+    basis = legendre(_unit_time(flat.shape[-2], flat.device), degree)[:, 1:]
+    phase = autofocus(shift_range(flat, -shift))
+    least = entropy(_focused(flat, shift, phase["phase_rad"]))
+    for _ in range(rounds):
+        held = phase["phase_rad"]
+        found = lbfgs(lambda c: entropy(_focused(flat, shift + (basis @ c[..., None])[..., 0], held)).double(), shift.new_zeros(len(flat), degree), steps=steps, first_step=0.05)  # noqa: B023
+        shift = shift + (basis @ found.x[..., None])[..., 0]
+        phase = autofocus(shift_range(flat, -shift), start=held)
+        least = entropy(_focused(flat, shift, phase["phase_rad"]))
+    shape = data.shape[:-2]
+    return Estimate({"shift_cells": shift.reshape(data.shape[:-1])}, phase.quality.reshape(shape), phase.ok.reshape(shape), info={"entropy_nats": least.reshape(shape)})
+
+
+def _focused(data: Tensor, shift: Tensor, phase_rad: Tensor) -> Tensor:
+    return fft_lines(correct_pulse_phase(shift_range(data, -shift), phase_rad))
+
+
+def drift_cells(shift_cells: Tensor) -> Tensor:
+    """Mean drift of shifts (..., pulse), cells a pulse (...,): the slope of the line through them by least squares; 0 for a single pulse."""
+    n = shift_cells.shape[-1]
+    k = torch.arange(n, dtype=shift_cells.dtype, device=shift_cells.device) - (n - 1) / 2
+    return (shift_cells * k).sum(-1) / k.square().sum().clamp_min(1)
+
+
+@dataclass(frozen=True)
+class Envelopes:
+    """Powers of pulses as half spectra (trial, pulse, frequency), frequency i being i / n cycles a cell; zero where not present (trial, pulse). n: cells."""
+
+    spectra: Tensor
+    present: Tensor
+    n: int
+
+    @property
+    def count(self) -> Tensor:
+        """Pulses that are there, (trial, 1, 1), at least 1."""
+        return self.present.sum(-1)[:, None, None].clamp_min(1)
+
+    @staticmethod
+    def of(lines: Tensor) -> Envelopes:
+        """Envelopes of pulses (trial, pulse, range): |s|^2 on half cells over its mean in each pulse."""
+        n = lines.shape[-1]
+        present = (lines != 0).any(-1)
+        real, imag = lines.real.abs().amax(-1, keepdim=True), lines.imag.abs().amax(-1, keepdim=True)
+        peak = torch.maximum(real, imag)
+        power = _half_cells(lines / torch.where(peak > 0, peak, 1)).abs().square()
+        mean = power.mean(-1, keepdim=True)
+        return Envelopes(torch.fft.rfft(power / torch.where(mean > 0, mean, 1)), present, n)
+
+    def moved(self, shift: Tensor) -> Tensor:
+        """Spectra with shifts (trial, pulse) in cells taken out."""
+        return self.spectra * linear_phasor(shift / self.n, 0, self.spectra.shape[-1], self.spectra.dtype)
+
+    def amplitudes(self) -> Envelopes:
+        """The same of |s|."""
+        return Envelopes(torch.fft.rfft(self.on_grid(self.spectra).clamp_min(0).sqrt()), self.present, self.n)
+
+    def on_grid(self, spectra: Tensor) -> Tensor:
+        """Samples half a cell apart of half spectra."""
+        return torch.fft.irfft(spectra, _FINE * self.n)
+
+    def likelihood(self, mean: Tensor) -> Tensor:
+        """Spectrum of -1 / T for that of the mean envelope T: correlated with the power of a pulse, the log-likelihood of its shift."""
+        return torch.fft.rfft(-1 / self.on_grid(mean).clamp_min(_FLOOR))
+
+    def peak(self, spectra: Tensor, reach_cells: float | None = None) -> Tensor:
+        """Place in cells, -n/2..n/2, of the maximum of a correlation given by its half spectrum (..., frequency): a parabola through three samples half a cell apart."""
+        samples = self.on_grid(spectra)
+        length = samples.shape[-1]
+        if reach_cells is not None:
+            cell = torch.arange(length, device=samples.device)
+            samples = torch.where(torch.minimum(cell, length - cell) <= reach_cells * _FINE, samples, -torch.inf)
+        at = samples.argmax(-1, keepdim=True)
+        left, top, right = (samples.gather(-1, (at + step) % length).to(torch.float64) for step in (-1, 0, 1))
+        bend = left - 2 * top + right
+        part = torch.where(bend < 0, 0.5 * (left - right) / torch.where(bend < 0, bend, -1), 0)
+        place = (at + torch.where(torch.isfinite(part), part, 0)).squeeze(-1)
+        return torch.where(place > length / 2, place - length, place) / _FINE
+
+
+def _half_cells(lines: Tensor) -> Tensor:
+    """Band-limited interpolation to half cells; the whole spectrum of n samples stays, from -n // 2 on."""
+    n = lines.shape[-1]
+    spectrum = torch.fft.fftshift(torch.fft.fft(lines), dim=-1)
+    before = n - n // 2
+    padded = torch.nn.functional.pad(spectrum, (before, n - before))
+    return torch.fft.ifft(torch.fft.ifftshift(padded, dim=-1)) * _FINE
+
+
+def running_shifts(pulses: Envelopes, gain: float) -> Tensor:
+    """Shifts against a mean that each pulse enters with `gain`, (trial, pulse) float64, continued over the ends of the window from pulse to pulse."""
+    amplitude = pulses.amplitudes()
+    mean, shift, shifts = torch.zeros_like(amplitude.spectra[:, 0]), amplitude.spectra.new_zeros((), dtype=torch.float64).expand(len(pulses.present)), []
+    for k in range(pulses.present.shape[-1]):
+        there, pulse = pulses.present[:, k], amplitude.spectra[:, k]
+        found = amplitude.peak(pulse * mean.conj())
+        shift = torch.where(there, shift + _wrapped(found - shift, pulses.n), shift)
+        moved = pulse * linear_phasor(shift / pulses.n, 0, pulse.shape[-1], pulse.dtype)
+        empty = (mean == 0).all(-1)
+        mean = torch.where(there[:, None], torch.where(empty[:, None], moved, (1 - gain) * mean + gain * moved), mean)
+        shifts.append(shift)
+    return _centred(torch.stack(shifts, -1), pulses.present)
+
+
+def single_shifts(pulses: Envelopes, start: Tensor, match: Match, iterations: int) -> Tensor:
+    """Shifts of pulses by themselves against the mean envelope, within half a window of the start, (trial, pulse) float64."""
+    used = pulses.amplitudes() if match == "amplitude" else pulses
+    shift = start
+    for _ in range(iterations):
+        mean = used.moved(shift).sum(-2, keepdim=True) / used.count
+        against = mean if match == "amplitude" else used.likelihood(mean)
+        found = used.peak(used.moved(start) * against.conj())
+        shift = _centred(start + torch.where(used.present, found, 0), used.present)
+    return shift
+
+
+def smooth_shifts(pulses: Envelopes, degree: int, passes: int, blocks: int) -> Tensor:
+    """Polynomial course of the shifts, (trial, pulse) float64 of mean zero."""
+    k = pulses.present.shape[-1]
+    basis = legendre(_unit_time(k, pulses.present.device), degree)
+    runs = _runs(k, max(blocks, degree + 1), pulses.present)
+    shift = mean_drift(pulses)[:, None] * (torch.arange(k, dtype=torch.float64, device=basis.device) - (k - 1) / 2)
+    count = runs.sum(-1)
+    middle = (runs @ basis) / count.clamp_min(1)[..., None]
+    for _ in range(passes):
+        moved = pulses.moved(shift)
+        against = pulses.likelihood(moved.sum(-2, keepdim=True) / pulses.count)
+        found = pulses.peak((runs.to(moved.dtype) @ moved) * against.conj())
+        shift = shift + (basis @ robust_fit(found, middle, count)[..., None]).squeeze(-1)
+        shift = shift - shift.mean(-1, keepdim=True)
+    return shift
+
+
+def mean_drift(pulses: Envelopes) -> Tensor:
+    """Cells a pulse, (trial,) float64, modulo the window: the correlation of |s| with pulses 1, 2, 4, ... later, each sum finer than the one before."""
+    amplitude, k = pulses.amplitudes(), pulses.present.shape[-1]
+    drift, apart = torch.zeros(len(pulses.present), dtype=torch.float64, device=pulses.present.device), 1
+    while apart <= max(1, k // 4) and apart < k:
+        product = (amplitude.spectra[:, apart:] * amplitude.spectra[:, :-apart].conj()).sum(-2)
+        there = product * linear_phasor(drift * apart / pulses.n, 0, product.shape[-1], product.dtype)
+        drift = drift + amplitude.peak(there, None if apart == 1 else _REACH_CELLS) / apart
+        apart *= 2
+    return drift
+
+
+def robust_fit(values: Tensor, basis: Tensor, weight: Tensor, iterations: int = 12) -> Tensor:
+    """Coefficients (trial, term) of basis (trial, m, term) through values (trial, m), by reweighted least squares: absolute deviations, then Tukey's biweight.
+
+    weight: (trial, m), zero for values that do not count. The scale of the biweight is the median deviation of each trial.
+    """
+    now, coefficients = weight, torch.zeros_like(basis[:, 0])
+    for turn in range(iterations):
+        coefficients = weighted_fit(values, basis, now)
+        off = (values - (basis @ coefficients[..., None]).squeeze(-1)).abs()
+        if turn < iterations // 2:
+            now = weight / off.clamp_min(0.1)
+        else:
+            scale = 1.4826 * torch.where(weight > 0, off, torch.nan).nanmedian(-1, keepdim=True).values.nan_to_num() + _LEAST_CELLS
+            now = weight * (1 - (off / (_TUKEY * scale)).square()).clamp_min(0).square()
+    return coefficients
+
+
+def weighted_fit(values: Tensor, basis: Tensor, weight: Tensor) -> Tensor:
+    """Least squares, (trial, term); directions that nothing determines get zero. Shapes as `robust_fit`."""
+    share = weight / weight.sum(-1, keepdim=True).clamp_min(torch.finfo(weight.dtype).tiny)
+    normal = (basis.mT * share[:, None]) @ basis
+    eye = torch.eye(basis.shape[-1], dtype=basis.dtype, device=basis.device)
+    return torch.linalg.solve(normal + 1e-9 * eye, (basis.mT * share[:, None]) @ values[..., None]).squeeze(-1)
+
+
+def with_tones(pulses: Envelopes, smooth: Tensor, tones: int, degree: int) -> Tensor:
+    """The course with up to `tones` sinusoids added one by one, each only in trials where it stands out of the jitter of single pulses, (trial, pulse)."""
+    k = pulses.present.shape[-1]
+    time = torch.arange(k, dtype=torch.float64, device=smooth.device)
+    weight = pulses.present.to(torch.float64)
+    terms = legendre(_unit_time(k, smooth.device), degree)
+    course = smooth
+    for _ in range(tones):
+        rest = _left(pulses, course)
+        frequency, stands_out = strongest_tone(rest, pulses.present)
+        wave, base = torch.zeros_like(frequency)[:, None].expand(-1, 2), course
+        for _ in range(_TUNINGS):
+            cos, sin = (part(2 * math.pi * frequency[:, None] * time) for part in (torch.cos, torch.sin))
+            bend = (wave[:, 1:] * cos - wave[:, :1] * sin) * (2 * math.pi * (time - time.mean()))
+            step = robust_fit(_left(pulses, course), torch.cat([terms.expand(len(rest), -1, -1), torch.stack([cos, sin, bend], -1)], -1), weight)
+            step = torch.where(stands_out[:, None], step, 0)
+            wave, frequency = wave + step[:, -3:-1], frequency + step[:, -1].clamp(-0.5 / k, 0.5 / k)
+            base = base + (terms @ step[:, :-3, None]).squeeze(-1)
+            angle = 2 * math.pi * frequency[:, None] * time
+            course = base + wave[:, :1] * torch.cos(angle) + wave[:, 1:] * torch.sin(angle)
+    return _centred(course, torch.ones_like(pulses.present))
+
+
+def _left(pulses: Envelopes, course: Tensor) -> Tensor:
+    """What single pulses are off a course, (trial, pulse)."""
+    return single_shifts(pulses, course, "likelihood", 1) - course
+
+
+def strongest_tone(rest: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
+    """Frequency (cycles a pulse) of the strongest sinusoid in residual shifts (trial, pulse), and whether noise would hardly hold it; both (trial,)."""
+    k = rest.shape[-1]
+    limit = 3 * rest.abs().median(-1, keepdim=True).values
+    power = torch.fft.rfft(torch.where(present, rest.clamp(-limit, limit), 0), 8 * k).abs().square()
+    power[:, :8] = 0  # less than a period is the polynomial's
+    top, at = power.max(-1)
+    mean = power.mean(-1)
+    return at / (8 * k), top > (math.log(k) + _STANDS_OUT) * mean
+
+
+def _estimated(data: Tensor, name: str, find: Callable[[Envelopes], Tensor]) -> Estimate:
+    """Shifts of the whole band and, to judge them, of its lower and upper half, whose speckle and noise are independent."""
+    flat, present = _checked(data, name)
+    height = max(1, 8 * block_bytes_of(flat.device) // max(1, flat[0].numel() * flat.element_size())) if len(flat) else 1
+    with torch.no_grad():
+        parts = [_judged(flat[first : first + height].detach(), find) for first in range(0, len(flat), height)]
+    shift, std = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
+    learnable = present.sum(-1) >= 2
+    shift, std = torch.where(learnable[:, None], shift, 0), torch.where(learnable, std, data.shape[-1] / math.sqrt(12))
+    quality = 1 / (1 + (std / GOOD_CELLS).square())
+    shape = data.shape[:-2]
+    wide = std[:, None].expand_as(shift).reshape(data.shape[:-1])
+    return Estimate(
+        value={"shift_cells": shift.reshape(data.shape[:-1])},
+        std={"shift_cells": wide},
+        quality=quality.reshape(shape),
+        ok=(learnable & (std < GOOD_CELLS)).reshape(shape),
+        info={"present": present.reshape(data.shape[:-1])},
+    )
+
+
+def _judged(lines: Tensor, find: Callable[[Envelopes], Tensor]) -> tuple[Tensor, Tensor]:
+    """Shifts (trial, pulse) and their deviation (trial,) in cells."""
+    envelopes = Envelopes.of(lines)
+    shift, n = find(envelopes), lines.shape[-1]
+    if n < 4:
+        return shift, shift.new_full(shift.shape[:1], n / math.sqrt(12))
+    lower, upper = (find(Envelopes.of(half)) * (n / half.shape[-1]) for half in _band_halves(lines))
+    off = _about_circular_mean(lower - upper, envelopes.present, n)
+    return shift, (off.square().sum(-1) / envelopes.present.sum(-1).clamp_min(1)).sqrt() / 2
+
+
+def _band_halves(lines: Tensor) -> tuple[Tensor, Tensor]:
+    """Pulses compressed from the two halves of the band alone, (trial, pulse, n // 2), cells twice as wide."""
+    half = lines.shape[-1] // 2
+    spectrum = torch.fft.fftshift(torch.fft.fft(lines), dim=-1)
+    return torch.fft.ifft(spectrum[..., :half].contiguous()), torch.fft.ifft(spectrum[..., -half:].contiguous())
+
+
+def _about_circular_mean(shift: Tensor, present: Tensor, n: int) -> Tensor:
+    """Shifts (trial, pulse) less their mean on the circle of n cells, in -n/2..n/2; zero where not present."""
+    turn = torch.where(present, torch.polar(torch.ones_like(shift), 2 * math.pi / n * shift), 0)
+    return torch.where(present, _wrapped(shift - torch.angle(turn.sum(-1, keepdim=True)) * (n / (2 * math.pi)), n), 0)
+
+
+def _centred(shift: Tensor, present: Tensor) -> Tensor:
+    """Shifts (trial, pulse) less their mean over the pulses that are there."""
+    return shift - (shift * present).sum(-1, keepdim=True) / present.sum(-1, keepdim=True).clamp_min(1)
+
+
+def _wrapped(cells: Tensor, n: int) -> Tensor:
+    """Modulo the window, in -n/2..n/2."""
+    return cells - n * torch.round(cells / n)
+
+
+def _unit_time(n: int, device: torch.device) -> Tensor:
+    """Pulses on -1..1."""
+    return (2 * torch.arange(n, dtype=torch.float64, device=device) - (n - 1)) / max(1, n - 1)
+
+
+def _runs(n: int, blocks: int, present: Tensor) -> Tensor:
+    """Which pulses that are there belong to which of at most `blocks` runs of equal length, (trial, run, pulse) of 0 and 1, float64."""
+    length = -(-n // blocks)
+    run = torch.arange(n, device=present.device) // length
+    member = run == torch.arange(-(-n // length), device=present.device)[:, None]
+    return (member & present[:, None]).to(torch.float64)
+
+
+def _checked(data: Tensor, name: str) -> tuple[Tensor, Tensor]:
+    """Data (trial, pulse, range) and present (trial, pulse). Raises TypeError or ValueError naming the function."""
+    if not isinstance(data, Tensor) or not data.is_complex():
+        raise TypeError(f"{name} works on complex range-compressed samples (..., pulse, range), got {data.dtype if isinstance(data, Tensor) else type(data).__name__}")
+    real_dtype(data.dtype)
+    if data.ndim < 2 or not data.shape[-2] * data.shape[-1]:
+        raise ValueError(f"{name} works on samples (..., pulse, range) with at least one pulse and one range cell, got the shape {tuple(data.shape)}")
+    refuse_non_finite(data, name)
+    flat = data.reshape(-1, *data.shape[-2:])
+    return flat, (flat.detach() != 0).any(-1)
+
+
+class AlignEnvelopes(Stage):
+    """`align_envelopes`, with shift_m (..., pulse) towards greater range, to be removed by `ShiftRange`, and the range rate velocity_m_s (...,).
+
+    velocity_m_s: that of the residual drift (receding positive), added to the one that the pulses were compressed with where such a value is connected: what
+    `focus.CompressDechirped` should be given. Drift is known modulo a window per pulse.
+    """
+
+    provides = ("shift_m", "velocity_m_s")
+
+    def __init__(self, degree: int | None = 2, tones: int = 0, passes: int = 6, blocks: int = 16) -> None:
+        super().__init__()
+        self.degree, self.tones, self.passes, self.blocks = degree, tones, passes, blocks
+
+    def forward(self, signal: Signal, velocity_m_s: Tensor | None = None) -> Estimate:
+        found = align_envelopes(signal.data, degree=self.degree, tones=self.tones, passes=self.passes, blocks=self.blocks)
+        cell_m, per_s = signal.axis("range").step, 1 / signal.axis("pulse").step
+        velocity = drift_cells(found["shift_cells"]) * (cell_m * per_s)
+        value = {"shift_m": found["shift_cells"] * cell_m, "velocity_m_s": velocity if velocity_m_s is None else velocity + velocity_m_s}
+        return Estimate(value, found.quality, found.ok, {"shift_m": found.std["shift_cells"] * cell_m}, found.info)
+
+
+class ShiftRange(Stage):
+    """Moves every pulse back by shift_m (..., pulse), a value of `AlignEnvelopes`: see `shift_range`. Differentiable in both."""
+
+    def forward(self, signal: Signal, shift_m: Tensor) -> Signal:
+        return signal.with_data(shift_range(signal.data, -shift_m / signal.axis("range").step))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -16,52 +16,10 @@ from torchsar.study.text import dump, find_config, override, read_tree
 RESERVED = ("truth", "estimate")
 
 
-class Pulse(Strict):
-    """Linear frequency-modulated pulse."""
-
-    bandwidth_hz: float = Field(gt=0)
-    duration_s: float = Field(gt=0)
-    direction: Literal[1, -1] = 1
-
-
-class Radar(Strict):
-    """What the instrument knows about itself; see torchsar.radar.StripmapRadar."""
-
-    carrier_hz: float = Field(gt=0)
-    pulse: Pulse
-    sampling_hz: float = Field(gt=0)
-    prf_hz: float = Field(gt=0)
-    velocity_m_s: float = Field(gt=0)
-    near_range_m: float = Field(gt=0)
-    pointing_doppler_hz: float | None = None
-    integration_s: float | None = Field(default=None, gt=0)
-
-
 class Noise(Strict):
     """Receiver noise."""
 
     snr_db: float | None = None
-
-
-class World(Strict):
-    """What is true and no processor may see. scene, beam, path and damages name entries of the catalogues (`torchsar list`)."""
-
-    lines: int = Field(gt=1)
-    samples: int = Field(gt=1)
-    scene: dict[str, dict[str, Any]] = Field(min_length=1)
-    beam: dict[str, Any] = {"kind": "always_lit"}
-    path: dict[str, Any] = {"kind": "hyperbola"}
-    velocity_m_s: float | None = Field(default=None, gt=0)
-    doppler_hz: float | None = None
-    squint_deg: float | None = Field(default=None, gt=-90, lt=90)
-    noise: Noise = Noise()
-    damages: dict[str, dict[str, Any]] = {}
-
-    @model_validator(mode="after")
-    def _one_direction(self) -> World:
-        if self.doppler_hz is not None and self.squint_deg is not None:
-            raise ValueError("doppler_hz and squint_deg both say where the beam looks; give one of them")
-        return self
 
 
 class Data(Strict):
@@ -94,34 +52,6 @@ class Method(Strict):
         if self.stages is not None and not self.stages:
             raise ValueError("'stages' must name at least one stage")
         return self
-
-
-class Margin(Strict):
-    """Lines and samples at the edges of the image that the metrics leave out."""
-
-    first_lines: int = Field(default=0, ge=0)
-    last_lines: int = Field(default=0, ge=0)
-    first_samples: int = Field(default=0, ge=0)
-    last_samples: int = Field(default=0, ge=0)
-
-
-class Metrics(Strict):
-    """How images are judged. margin: None leaves out lines without a full aperture and samples without a full pulse."""
-
-    margin: Margin | None = None
-    reference: str | None = None
-    sidelobe_nulls: int = Field(default=10, ge=1)
-    found_within_m: float = Field(default=10.0, gt=0)
-    found_above_db: float = -6.0
-    published: dict[str, float | str] = {}
-
-
-class Trade(Strict):
-    """What `torchsar trade` compares: focusers, precisions, jitter correctors."""
-
-    focusers: list[str] = ["range_doppler", "omega_k", "omega_k_stolt"]
-    precisions: list[Literal["complex64", "complex128"]] = ["complex64", "complex128"]
-    repeats: int = Field(default=3, ge=1)
 
 
 class EarlyStop(Strict):
@@ -166,17 +96,20 @@ class Sweep(Strict):
 
 
 class Config(Strict):
-    """A whole experiment."""
+    """A whole experiment; a system gives the sections radar, world, metrics and trade their keys."""
 
+    recording: ClassVar[str] = "recorded"
+
+    system: str = "stripmap"
     title: str
     seed: int = Field(default=1, ge=0)
     precision: Literal["complex64", "complex128"] = "complex64"
-    radar: Radar | None = None
-    world: World | None = None
+    radar: Any = None
+    world: Any = None
     data: Data = Data()
     processor: dict[str, Method] = Field(min_length=1)
-    metrics: Metrics = Metrics()
-    trade: Trade = Trade()
+    metrics: Any = None
+    trade: Any = None
     sweep: Sweep = Sweep()
 
     @model_validator(mode="after")
@@ -188,7 +121,7 @@ class Config(Strict):
         for name in RESERVED:
             if name in self.processor:
                 raise ValueError(f"processor.{name}: this name is taken by a group of the results; choose another")
-        if self.metrics.reference is not None and self.metrics.reference not in self.processor:
+        if self.metrics is not None and self.metrics.reference is not None and self.metrics.reference not in self.processor:
             raise ValueError(f"metrics.reference names the method {self.metrics.reference!r}; there is {', '.join(self.processor)}")
         return self
 
@@ -230,10 +163,13 @@ def load(name: str, assignments: Sequence[str] = ()) -> Loaded:
 
 
 def _checked(tree: Any, file: str) -> Config:
+    from torchsar.study.systems import system_named  # the systems build on this module
+
+    kind = system_named(tree.get("system", "stripmap") if isinstance(tree, dict) else "stripmap", file).config
     try:
-        config = Config.model_validate(tree)
+        config = kind.model_validate(tree)
     except ValidationError as error:
-        raise ConfigError(sentence(error, Config, file)) from None
+        raise ConfigError(sentence(error, kind, file)) from None
     _check_source(config, file)
     return config
 
@@ -242,7 +178,7 @@ def _check_source(config: Config, file: str) -> None:
     if config.data.file is not None:
         path = Path(config.data.file)
         if not path.is_file():
-            raise ConfigError(f"{file}: data.file: {config.data.file!r} {'is no file' if path.exists() else 'does not exist'}; give the path of a raw stripmap .npz file")
+            raise ConfigError(f"{file}: data.file: {config.data.file!r} {'is no file' if path.exists() else 'does not exist'}; give the path of a {config.recording} .npz file")
     elif config.world is None and config.radar is None:
         raise ConfigError(f"{file}: data.file is not set; add data.file=PATH with the path of a raw stripmap .npz file")
     elif config.world is None or config.radar is None:

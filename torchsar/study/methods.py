@@ -7,6 +7,7 @@ import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -36,13 +37,13 @@ class Result:
     trace: Trace | None
 
 
-def build_chains(loaded: Loaded, radar: StripmapRadar) -> dict[str, Chain]:
-    """All chains, before anything is computed, so that a mistake in the last method costs no waiting."""
+def build_chains(loaded: Loaded, **given: Any) -> dict[str, Chain]:
+    """All chains, before anything is computed, so that a mistake in the last method costs no waiting. given: what stages take from the recording, such as radar."""
     check_methods(loaded.config, loaded.file)
     chains: dict[str, Chain] = {}
     for name, method in loaded.config.processor.items():
         if method.stages is not None:
-            chains[name] = build_chain(method, f"processor.{name}", loaded.file, radar)
+            chains[name] = build_chain(method, f"processor.{name}", loaded.file, **given)
         elif method.rerun is not None:
             chains[name] = chains[method.rerun.method]
             check_given(chains[name], method, f"processor.{name}", loaded.file)
@@ -82,7 +83,7 @@ def _warn_of_doubt(result: Result) -> None:
 
 def run_recommended(loaded: Loaded, case: Case) -> Result:
     """The recommended method alone."""
-    chains = build_chains(loaded, case.recording.radar)
+    chains = build_chains(loaded, radar=case.recording.radar)
     config = loaded.config.model_copy(update={"processor": {"recommended": loaded.config.processor["recommended"]}})
     return run_methods(replace(loaded, config=config), case, chains)["recommended"]
 

@@ -12,7 +12,7 @@ from typing import Any
 import jinja2
 import torch
 
-from torchsar.study.figures import Picture
+from torchsar.study.pictures import Picture
 
 _LABELS = {
     "targets_found": ("targets found", "", 0),

@@ -4,29 +4,30 @@ from __future__ import annotations
 
 import logging
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 from torchsar.study.build import resolved
-from torchsar.study.config import Loaded
-from torchsar.study.errors import ConfigError
+from torchsar.study.config import Config, Loaded, Sweep
+from torchsar.study.errors import ConfigError, did_you_mean
 from torchsar.study.folder import write_json
-from torchsar.study.judge import DEFINITIONS
 from torchsar.study.montecarlo.engines import engine
-from torchsar.study.montecarlo.grid import Grid
+from torchsar.study.montecarlo.grid import Grid, make_grid
 from torchsar.study.montecarlo.loop import Interrupted, Plan, open_store, run_plan
 from torchsar.study.montecarlo.pictures import draw_sweep
 from torchsar.study.montecarlo.record import Record
 from torchsar.study.montecarlo.report import write_sweep_report
 from torchsar.study.montecarlo.stopping import Stop
 from torchsar.study.montecarlo.summary import summary_tree
-from torchsar.study.trials import StripmapTrials, sweep_grid
+from torchsar.study.montecarlo.work import BOUNDS, SAVED
+from torchsar.study.systems import Trials, system_of
 
 log = logging.getLogger("torchsar")
 _NOT_IDENTITY = ("sweep", "trade", "title", "seed")
+_FIXED = ("sweep", "seed", "data", "title", "trade", "system")
 
 
 def sweep_config(
@@ -56,7 +57,7 @@ def sweep_config(
     _announce(grid, settings.trials)
     try:
         with _terminated_like_interrupted():
-            record = run_plan(plan, StripmapTrials(loaded, device), store, engine(workers, cluster, threads), loaded.name)
+            record = run_plan(plan, system_of(loaded).trials(loaded, device), store, engine(workers, cluster, threads), loaded.name)
             record.about = {**record.about, **about}
             return report(record.select(grid.labels), loaded, out, config_text, command)
     except Interrupted as stopped:
@@ -67,6 +68,40 @@ def sweep_config(
         raise ConfigError(f"{out}: the report cannot be written ({error.strerror or error}); the trials are recorded, make it with --resume") from error
 
 
+def sweep_grid(loaded: Loaded) -> Grid:
+    """The grid of a config's sweep, every key and value checked and every case built once. Raises ConfigError."""
+    given, trials = loaded.config.sweep.grid, system_of(loaded).trials(loaded)
+    if loaded.config.world is None or loaded.config.data.file is not None:
+        raise ConfigError(f"{loaded.file}: a sweep simulates its trials; give the sections 'radar' and 'world' and no data.file")
+    taken = [name for name in loaded.config.processor if name in (BOUNDS, SAVED)]
+    if taken:
+        raise ConfigError(f"{loaded.file}: processor.{taken[0]}: in a sweep this name is taken by a part of the results; choose another")
+    for key in given:
+        _refuse_fixed(key, loaded)
+    grid = make_grid(given, [key for key in given if key in trials.batched], f"{loaded.file}: sweep")
+    for parameter in grid.parameters:
+        for value in parameter.values:
+            loaded.changed({parameter.name: value})
+    trials.check(given)
+    for case in grid.cases():
+        _refuse_missing_taps(trials, case.fixed, loaded)
+    return grid
+
+
+def _refuse_fixed(key: str, loaded: Loaded) -> None:
+    if key.split(".")[0] in _FIXED:
+        raise ConfigError(f"{loaded.file}: sweep: the key {key!r} cannot be swept")
+    if "." not in key and key not in Config.model_fields:
+        raise ConfigError(f"{loaded.file}: sweep.{key} is neither a setting of the sweep nor a key of the config{did_you_mean(key, (*Sweep.model_fields, *Config.model_fields))}")
+
+
+def _refuse_missing_taps(trials: Trials, fixed: Mapping[str, Any], loaded: Loaded) -> None:
+    there = trials.stages(fixed)
+    for tap in loaded.config.sweep.save.taps:
+        if tap not in there:
+            raise ConfigError(f"{loaded.file}: sweep.save.taps names {tap!r}, which is no stage of a method{did_you_mean(tap, there)}")
+
+
 def identity(loaded: Loaded) -> dict[str, Any]:
     """What the results depend on besides the grid: the resolved config without what only says how much is computed or shown."""
     tree = resolved(loaded)
@@ -75,7 +110,8 @@ def identity(loaded: Loaded) -> dict[str, Any]:
 
 def report(record: Record, loaded: Loaded, out: Path, config_text: str, command: str) -> Path:
     """summary.json, figures/, config.yaml and report.html of a record. The summary and the report, which is last, are replaced whole."""
-    summary = summary_tree(record, loaded.config.sweep.success, {"snr": DEFINITIONS["snr"], **{f"method {name}": method.title for name, method in loaded.config.processor.items() if method.title}})
+    titles = {f"method {name}": method.title for name, method in loaded.config.processor.items() if method.title}
+    summary = summary_tree(record, loaded.config.sweep.success, {"snr": system_of(loaded).definitions["snr"], **titles})
     figures = out / "figures"
     figures.mkdir(exist_ok=True)
     for old in figures.glob("*.png"):

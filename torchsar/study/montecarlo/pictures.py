@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from torchsar import plot
-from torchsar.study.figures import Picture
 from torchsar.study.montecarlo.statistics import LEVEL
+from torchsar.study.pictures import Picture
 
 PANELS = 6
 _UNITS = {"_rad_s": "rad/s", "_m_s2": "m/s²", "_m_s": "m/s", "_hz": "Hz", "_db": "dB", "_nats": "nats", "_rad": "rad", "_deg": "deg", "_m": "m", "_s": "s"}

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchsar.study.figures import Picture
 from torchsar.study.montecarlo.pictures import axis_label
+from torchsar.study.pictures import Picture
 from torchsar.study.report import write_page
 
 MISSING = "–"

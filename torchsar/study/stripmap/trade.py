@@ -21,12 +21,13 @@ from torchsar.focus import Backproject
 from torchsar.focus.omega_k import Focuser
 from torchsar.metrics import error_db
 from torchsar.repair.jitter import BandLimited, Exact, Lagrange
-from torchsar.study.build import build_case, resolved
+from torchsar.study.build import resolved
 from torchsar.study.config import Loaded
 from torchsar.study.errors import ConfigError, did_you_mean
 from torchsar.study.folder import fresh_folder, write_json
 from torchsar.study.methods import run_recommended
 from torchsar.study.registry import FOCUS
+from torchsar.study.stripmap.build import build_case
 
 log = logging.getLogger("torchsar")
 _HALF = 16

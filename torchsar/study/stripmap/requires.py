@@ -8,11 +8,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchsar.focus.requirements import Requirement, recommended_form, requirements
-from torchsar.study.build import build_case, build_radar, resolved, true_doppler_hz
+from torchsar.study.build import resolved
 from torchsar.study.config import Loaded
 from torchsar.study.folder import fresh_folder, write_json
 from torchsar.study.methods import run_recommended
-from torchsar.study.run import check
+from torchsar.study.stripmap.build import build_case, build_radar, true_doppler_hz
+from torchsar.study.stripmap.run import check
 
 
 def requires(loaded: Loaded, out: Path | None) -> str:

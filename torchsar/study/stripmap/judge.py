@@ -15,8 +15,9 @@ from torchsar.focus import ClosestRange
 from torchsar.metrics import contrast, correlation, entropy, error_db, impulse_response
 from torchsar.radar import StripmapRadar
 from torchsar.study.build import Case
-from torchsar.study.config import Config, Margin
+from torchsar.study.config import Config
 from torchsar.study.methods import Result
+from torchsar.study.stripmap.sections import Margin
 
 log = logging.getLogger("torchsar")
 

@@ -17,14 +17,14 @@ from torchsar.metrics import contrast, correlation, entropy, error_db
 from torchsar.metrics.bounds import reference_doppler_std_hz, tone_frequency_bound_hz, velocity_bound_m_s
 from torchsar.radar import StripmapRadar
 from torchsar.scene import Points, RandomPoints, StripmapWorld, Together
-from torchsar.study.build import build_damages, build_radar, build_world, precision, squint_doppler_hz
-from torchsar.study.config import Config, Loaded, Sweep
-from torchsar.study.errors import ConfigError, did_you_mean
-from torchsar.study.judge import window
+from torchsar.study.build import build_damages, precision
+from torchsar.study.config import Config, Loaded
+from torchsar.study.errors import ConfigError
 from torchsar.study.methods import build_chains
-from torchsar.study.montecarlo.grid import Grid, make_grid
 from torchsar.study.montecarlo.record import OK
 from torchsar.study.montecarlo.work import BOUNDS, SAVED
+from torchsar.study.stripmap.build import build_radar, build_world, squint_doppler_hz
+from torchsar.study.stripmap.judge import window
 
 _UNIT = re.compile(r"_(hz|m_s|m|s|rad|deg|db)$")
 _PEAK_BYTES = 2  # the largest tensor of these chains is about twice the raw matrix
@@ -59,45 +59,6 @@ def _snr(bench: Bench, value: Tensor) -> StripmapWorld:
 
 # Keys that are per-trial tensors of the world, in the order in which they are set: a squint needs the velocity.
 BATCHED = {"world.velocity_m_s": _velocity, "world.doppler_hz": _doppler, "world.squint_deg": _squint, "world.noise.snr_db": _snr}
-_FIXED = ("sweep", "seed", "data", "title", "trade")
-
-
-def sweep_grid(loaded: Loaded) -> Grid:
-    """The grid of a config's sweep, every key and value checked and every case built once. Raises ConfigError."""
-    given = loaded.config.sweep.grid
-    if loaded.config.world is None or loaded.config.data.file is not None:
-        raise ConfigError(f"{loaded.file}: a sweep simulates its trials; give the sections 'radar' and 'world' and no data.file")
-    taken = [name for name in loaded.config.processor if name in (BOUNDS, SAVED)]
-    if taken:
-        raise ConfigError(f"{loaded.file}: processor.{taken[0]}: in a sweep this name is taken by a part of the results; choose another")
-    for key in given:
-        _refuse_fixed(key, loaded)
-    grid = make_grid(given, [key for key in given if key in BATCHED], f"{loaded.file}: sweep")
-    for parameter in grid.parameters:
-        for value in parameter.values:
-            loaded.changed({parameter.name: value})
-    if "world.doppler_hz" in given and "world.squint_deg" in given:
-        raise ConfigError(f"{loaded.file}: sweep: world.doppler_hz and world.squint_deg both say where the beam looks; sweep one of them")
-    trials = StripmapTrials(loaded)
-    for case in grid.cases():
-        _refuse_missing_taps(trials.bench(case.fixed), loaded)
-    return grid
-
-
-def _refuse_fixed(key: str, loaded: Loaded) -> None:
-    if key.split(".")[0] in _FIXED:
-        raise ConfigError(f"{loaded.file}: sweep: the key {key!r} cannot be swept")
-    if "." not in key and key not in Config.model_fields:
-        raise ConfigError(f"{loaded.file}: sweep.{key} is neither a setting of the sweep nor a key of the config{did_you_mean(key, (*Sweep.model_fields, *Config.model_fields))}")
-
-
-def _refuse_missing_taps(bench: Bench, loaded: Loaded) -> None:
-    there = {stage for chain in bench.chains.values() for stage in chain.stages}
-    for tap in loaded.config.sweep.save.taps:
-        if tap not in there:
-            raise ConfigError(f"{loaded.file}: sweep.save.taps names {tap!r}, which is no stage of a method{did_you_mean(tap, there)}")
-
-
 class StripmapTrials:
     """`trial(parameters, draws)` of a config: {method: {metric: (rows,)}}, bounds, and images of the trials to keep.
 
@@ -106,12 +67,23 @@ class StripmapTrials:
     `ok` where all estimators of the method are. Built chains are kept in the process and do not travel to workers.
     """
 
+    batched = tuple(BATCHED)
+
     def __init__(self, loaded: Loaded, device: str = "cpu") -> None:
         self.loaded, self.device = loaded, device
         self._benches: dict[str, Bench] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         return {"loaded": self.loaded, "device": self.device, "_benches": {}}
+
+    def check(self, grid: Mapping[str, Any]) -> None:
+        """Refuse a grid that contradicts itself. Raises ConfigError."""
+        if "world.doppler_hz" in grid and "world.squint_deg" in grid:
+            raise ConfigError(f"{self.loaded.file}: sweep: world.doppler_hz and world.squint_deg both say where the beam looks; sweep one of them")
+
+    def stages(self, fixed: Mapping[str, Any]) -> set[str]:
+        """Names of all stages of this case, whose chains are built."""
+        return {stage for chain in self.bench(fixed).chains.values() for stage in chain.stages}
 
     def bench(self, fixed: Mapping[str, Any]) -> Bench:
         """The built case of these fixed parameters."""
@@ -121,7 +93,7 @@ class StripmapTrials:
             radar, world = build_radar(loaded), loaded.config.world
             assert world is not None
             damages = build_damages(world.damages, "world.damages", loaded.file)
-            chains = {name: chain.to(self.device) for name, chain in build_chains(loaded, radar).items()}
+            chains = {name: chain.to(self.device) for name, chain in build_chains(loaded, radar=radar).items()}
             self._benches[key] = Bench(loaded.config, radar, build_world(loaded), damages, chains)
         return self._benches[key]
 

@@ -12,13 +12,14 @@ from torch import Tensor
 
 from torchsar.core import Chain
 from torchsar.focus.requirements import requirements
-from torchsar.study.build import Case, build_case, build_damages, build_radar, build_world, resolved, true_doppler_hz
+from torchsar.study.build import Case, build_damages, resolved
 from torchsar.study.config import Loaded
-from torchsar.study.figures import Scene, draw_all
 from torchsar.study.folder import fresh_folder, write_arrays, write_json
-from torchsar.study.judge import metrics_tree
 from torchsar.study.methods import Result, build_chains, run_methods
 from torchsar.study.report import write_report
+from torchsar.study.stripmap.build import build_case, build_radar, build_world, true_doppler_hz
+from torchsar.study.stripmap.figures import Scene, draw
+from torchsar.study.stripmap.judge import metrics_tree
 
 log = logging.getLogger("torchsar")
 
@@ -40,7 +41,7 @@ def run(loaded: Loaded, out: Path, command: str = "torchsar run") -> Path:
         write_arrays(folder / "arrays.zarr", {name: r.image for name, r in results.items()}, _truth_arrays(case), _estimate_arrays(results))
         log.info("arrays: %.1f s", time.perf_counter() - wrote)
         scene = Scene(loaded.config, case, results, metrics["definitions"]["window"])
-        pictures = draw_all(scene, folder / "figures")
+        pictures = draw(scene, folder / "figures")
         write_report(folder / "report.html", loaded.config.title, metrics, pictures, folder / "figures", config_text, command)
     log.info("finished in %.0f s", time.perf_counter() - began)
     return out / "report.html"
@@ -51,7 +52,7 @@ def check(loaded: Loaded) -> None:
     build_world(loaded)
     assert loaded.config.world is not None
     build_damages(loaded.config.world.damages, "world.damages", loaded.file)
-    build_chains(loaded, build_radar(loaded))
+    build_chains(loaded, radar=build_radar(loaded))
 
 
 def prepare(loaded: Loaded) -> tuple[Case, dict[str, Chain]]:
@@ -67,7 +68,7 @@ def prepare(loaded: Loaded) -> tuple[Case, dict[str, Chain]]:
         _warn_of_aliasing(loaded, case)
     lines, samples = case.recording.signal.data.shape[-2:]
     log.info("%d lines of %d samples: %.1f s", lines, samples, time.perf_counter() - began)
-    return case, build_chains(loaded, case.recording.radar)
+    return case, build_chains(loaded, radar=case.recording.radar)
 
 
 def _warn_of_aliasing(loaded: Loaded, case: Case) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,19 +19,11 @@ from torchsar.radar import StripmapRadar
 from torchsar.repair.response import band_grid
 from torchsar.study.build import Case
 from torchsar.study.config import Config
-from torchsar.study.cuts import impulse_cuts
-from torchsar.study.judge import expected_places
 from torchsar.study.methods import Result, focus_name
+from torchsar.study.pictures import Drawn, Picture, draw_all
 from torchsar.study.registry import group_of
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A figure file and what a reader should see in it."""
-
-    file: str
-    title: str
-    caption: str
+from torchsar.study.stripmap.cuts import impulse_cuts
+from torchsar.study.stripmap.judge import expected_places
 
 
 @dataclass(frozen=True)
@@ -56,19 +49,10 @@ class Scene:
         return self.case.recording.radar
 
 
-def draw_all(scene: Scene, folder: Path) -> list[Picture]:
+def draw(scene: Scene, folder: Path) -> list[Picture]:
     """Every picture that this run has the material for, as PNG files in the folder, in the order of reading."""
-    folder.mkdir()
-    pictures = []
-    for make in (_image, _comparison, _cuts, _squint, _doppler_spectrum, _increments, _repairs, _contaminated_line, _response, _velocity):
-        for name, title, caption, figure in make(scene):
-            file = f"{len(pictures) + 1:02d}_{name}.png"
-            plot.save(figure, folder / file)
-            pictures.append(Picture(file, title, caption))
-    return pictures
-
-
-Drawn = Iterator[tuple[str, str, str, Any]]
+    makers = (_image, _comparison, _cuts, _squint, _doppler_spectrum, _increments, _repairs, _contaminated_line, _response, _velocity)
+    return draw_all([partial(make, scene) for make in makers], folder)
 
 
 def _image(scene: Scene) -> Drawn:

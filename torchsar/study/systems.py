@@ -1,0 +1,72 @@
+"""The systems that a config may choose by its key `system`, and what each brings: sections, experiments, trials, tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Protocol
+
+from torchsar.core import Draws
+from torchsar.study.config import Config, Loaded
+from torchsar.study.errors import ConfigError, did_you_mean
+
+
+class Trials(Protocol):
+    """One batch of Monte Carlo trials of a config, as `torchsar.study.sweep` takes it, and what is asked of it before."""
+
+    @property
+    def batched(self) -> Collection[str]: ...
+
+    def __call__(self, parameters: Mapping[str, Any], draws: Draws) -> dict[str, Any]: ...
+
+    def bytes_per_trial(self, fixed: Mapping[str, Any]) -> int: ...
+
+    def check(self, grid: Mapping[str, Any]) -> None: ...
+
+    def stages(self, fixed: Mapping[str, Any]) -> set[str]: ...
+
+
+@dataclass(frozen=True)
+class System:
+    """What a system brings.
+
+    config: its sections. check(loaded): builds all that the config of a simulation names. run(loaded, out, command), requires(loaded, out) and
+    trade(loaded, out): the commands. trials(loaded, device): its Monte Carlo. definitions: of the figures, by name.
+    """
+
+    config: type[Config]
+    check: Callable[[Loaded], None]
+    run: Callable[[Loaded, Path, str], Path]
+    requires: Callable[[Loaded, Path | None], str]
+    trade: Callable[[Loaded, Path | None], str]
+    trials: Callable[..., Trials]
+    definitions: Mapping[str, Any]
+
+
+@cache
+def systems() -> dict[str, System]:
+    """All systems by name."""
+    from torchsar.study.stripmap import run as stripmap_run
+    from torchsar.study.stripmap.judge import DEFINITIONS as STRIPMAP
+    from torchsar.study.stripmap.requires import requires as stripmap_requires
+    from torchsar.study.stripmap.sections import StripmapConfig
+    from torchsar.study.stripmap.trade import trade as stripmap_trade
+    from torchsar.study.stripmap.trials import StripmapTrials
+
+    return {
+        "stripmap": System(StripmapConfig, stripmap_run.check, stripmap_run.run, stripmap_requires, stripmap_trade, StripmapTrials, STRIPMAP),
+    }
+
+
+def system_named(name: Any, file: str) -> System:
+    """The system of that name. Raises ConfigError naming those there are."""
+    if not isinstance(name, str) or name not in systems():
+        raise ConfigError(f"{file}: key 'system' has the value {name!r}; it should be one of {', '.join(systems())}{did_you_mean(str(name), systems())}")
+    return systems()[name]
+
+
+def system_of(loaded: Loaded) -> System:
+    """The system of a checked config."""
+    return systems()[loaded.config.system]
