@@ -54,6 +54,17 @@ def test_the_benchmark_of_sweeps_runs(tmp_path: Path) -> None:
         assert re.search(rf"^{name} +\d+ +\d+\.\d+", done.stdout, re.MULTILINE), done.stdout
 
 
+def test_autofocus_is_composed(tmp_path: Path) -> None:
+    command = [sys.executable, str(ROOT / "scripts" / "compose_autofocus.py"), "--trials", "2", "--candidates", "2", "--pulses", "64"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr[-1000:]
+    rows = {line[:32].strip(): [float(x) for x in line[32:].split()] for line in done.stdout.splitlines() if re.search(r"\d\.\d{3}$", line)}
+    assert all(len(row) == 6 for row in rows.values()) and len(rows) == 6
+    middle = {name: sorted(row)[2] for name, row in rows.items()}
+    assert middle["polynomial, region"] < 0.5 * middle["autofocus, a free phase"] < 0.1 < middle["polynomial, whole image"]
+    assert (tmp_path / "compose_autofocus.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_readme_points_at_files_that_exist() -> None:
     for target in re.findall(r"\]\(([^)#]+)\)", (ROOT / "README.md").read_text(encoding="utf-8")):
         assert target.startswith("http") or (ROOT / target).exists(), target

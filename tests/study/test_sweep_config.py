@@ -77,9 +77,10 @@ def test_keys_of_any_kind_make_cases() -> None:
 
 
 def load_tree(tree: dict):
-    from torchsar.study.config import Config, Loaded
+    from torchsar.study.config import Loaded
+    from torchsar.study.stripmap.sections import StripmapConfig
 
-    return Loaded(Config.model_validate(tree), "tiny.yaml", "tiny")
+    return Loaded(StripmapConfig.model_validate(tree), "tiny.yaml", "tiny")
 
 
 def test_the_log_says_what_is_batched(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -30,9 +30,10 @@ Match = Literal["likelihood", "amplitude"]
 GOOD_CELLS = 0.5  # deviation of a shift beyond which an alignment is not ok
 _FINE = 2  # samples a cell: |s|^2 has twice the band of s
 _FLOOR = 1e-2  # of the mean power: what the likelihood takes an empty cell to hold
-_REACH_CELLS = 8.0
+_COARSE = 16  # cycles in the window, the finest features that drift is looked for in
 _TUKEY = 4.685
 _LEAST_CELLS = 1e-3
+_LEAST_TONE_CELLS = 0.05  # smaller ones cost less than they would add
 _TUNINGS = 5
 _STANDS_OUT = 6.0  # of the mean power of a periodogram, beyond the log of the number of its cells: one false tone in 400 trials
 
@@ -179,13 +180,10 @@ class Envelopes:
         """Spectrum of -1 / T for that of the mean envelope T: correlated with the power of a pulse, the log-likelihood of its shift."""
         return torch.fft.rfft(-1 / self.on_grid(mean).clamp_min(_FLOOR))
 
-    def peak(self, spectra: Tensor, reach_cells: float | None = None) -> Tensor:
+    def peak(self, spectra: Tensor) -> Tensor:
         """Place in cells, -n/2..n/2, of the maximum of a correlation given by its half spectrum (..., frequency): a parabola through three samples half a cell apart."""
-        samples = self.on_grid(spectra)
+        samples = self.on_grid(torch.cat([torch.zeros_like(spectra[..., :1]), spectra[..., 1:]], -1))  # its mean says nothing, and costs digits
         length = samples.shape[-1]
-        if reach_cells is not None:
-            cell = torch.arange(length, device=samples.device)
-            samples = torch.where(torch.minimum(cell, length - cell) <= reach_cells * _FINE, samples, -torch.inf)
         at = samples.argmax(-1, keepdim=True)
         left, top, right = (samples.gather(-1, (at + step) % length).to(torch.float64) for step in (-1, 0, 1))
         bend = left - 2 * top + right
@@ -248,15 +246,19 @@ def smooth_shifts(pulses: Envelopes, degree: int, passes: int, blocks: int) -> T
 
 
 def mean_drift(pulses: Envelopes) -> Tensor:
-    """Cells a pulse, (trial,) float64, modulo the window: the correlation of |s| with pulses 1, 2, 4, ... later, each sum finer than the one before."""
-    amplitude, k = pulses.amplitudes(), pulses.present.shape[-1]
-    drift, apart = torch.zeros(len(pulses.present), dtype=torch.float64, device=pulses.present.device), 1
-    while apart <= max(1, k // 4) and apart < k:
-        product = (amplitude.spectra[:, apart:] * amplitude.spectra[:, :-apart].conj()).sum(-2)
-        there = product * linear_phasor(drift * apart / pulses.n, 0, product.shape[-1], product.dtype)
-        drift = drift + amplitude.peak(there, None if apart == 1 else _REACH_CELLS) / apart
-        apart *= 2
-    return drift
+    """Cells a pulse, (trial,) float64, modulo the window: the line along which the coarse features of all envelopes together add up best.
+
+    sum_f |sum_k P_k(f) exp(2j pi f v k / n)|^2 over the lowest frequencies f and all v at once, from one zero-padded transform along pulses.
+    """
+    k, last = pulses.present.shape[-1], min(_COARSE, pulses.n - 1)
+    if last < 1:
+        return torch.zeros(len(pulses.present), dtype=torch.float64, device=pulses.present.device)
+    length = 2 * last * k
+    power = torch.fft.ifft(pulses.spectra[..., 1 : last + 1].mT, length).abs().square()
+    lines = torch.arange(length, device=power.device)
+    total = torch.stack([power[:, f - 1, (f * lines) % length] for f in range(1, last + 1)]).sum(0)
+    cycles = total.argmax(-1).to(torch.float64) / length
+    return pulses.n * (cycles - torch.round(cycles))
 
 
 def robust_fit(values: Tensor, basis: Tensor, weight: Tensor, iterations: int = 12) -> Tensor:
@@ -284,27 +286,47 @@ def weighted_fit(values: Tensor, basis: Tensor, weight: Tensor) -> Tensor:
     return torch.linalg.solve(normal + 1e-9 * eye, (basis.mT * share[:, None]) @ values[..., None]).squeeze(-1)
 
 
+@dataclass(frozen=True)
+class _Tone:
+    """One sinusoid per trial: frequency (trial,) in cycles a pulse, cosine and sine parts (trial, 2) in cells."""
+
+    frequency: Tensor
+    parts: Tensor
+
+    def waves(self, time: Tensor) -> Tensor:
+        """Cosine and sine, (trial, pulse, 2)."""
+        angle = 2 * math.pi * self.frequency[:, None] * time
+        return torch.stack([torch.cos(angle), torch.sin(angle)], -1)
+
+    def columns(self, time: Tensor) -> Tensor:
+        """Derivatives of the sinusoid after its two parts and its frequency, (trial, pulse, 3)."""
+        waves = self.waves(time)
+        turned = (self.parts[:, None, 1] * waves[..., 0] - self.parts[:, None, 0] * waves[..., 1]) * (2 * math.pi * (time - time.mean()))
+        return torch.cat([waves, turned[..., None]], -1)
+
+
 def with_tones(pulses: Envelopes, smooth: Tensor, tones: int, degree: int) -> Tensor:
     """The course with up to `tones` sinusoids added one by one, each only in trials where it stands out of the jitter of single pulses, (trial, pulse)."""
-    k = pulses.present.shape[-1]
-    time = torch.arange(k, dtype=torch.float64, device=smooth.device)
-    weight = pulses.present.to(torch.float64)
-    terms = legendre(_unit_time(k, smooth.device), degree)
     course = smooth
     for _ in range(tones):
-        rest = _left(pulses, course)
-        frequency, stands_out = strongest_tone(rest, pulses.present)
-        wave, base = torch.zeros_like(frequency)[:, None].expand(-1, 2), course
-        for _ in range(_TUNINGS):
-            cos, sin = (part(2 * math.pi * frequency[:, None] * time) for part in (torch.cos, torch.sin))
-            bend = (wave[:, 1:] * cos - wave[:, :1] * sin) * (2 * math.pi * (time - time.mean()))
-            step = robust_fit(_left(pulses, course), torch.cat([terms.expand(len(rest), -1, -1), torch.stack([cos, sin, bend], -1)], -1), weight)
-            step = torch.where(stands_out[:, None], step, 0)
-            wave, frequency = wave + step[:, -3:-1], frequency + step[:, -1].clamp(-0.5 / k, 0.5 / k)
-            base = base + (terms @ step[:, :-3, None]).squeeze(-1)
-            angle = 2 * math.pi * frequency[:, None] * time
-            course = base + wave[:, :1] * torch.cos(angle) + wave[:, 1:] * torch.sin(angle)
-    return _centred(course, torch.ones_like(pulses.present))
+        course = _with_tone(pulses, course, degree)
+    return course
+
+
+def _with_tone(pulses: Envelopes, course: Tensor, degree: int) -> Tensor:
+    """The course with one more sinusoid, tuned together with the polynomial by Gauss-Newton steps through the shifts of single pulses."""
+    k = course.shape[-1]
+    time, weight = torch.arange(k, dtype=torch.float64, device=course.device), pulses.present.to(torch.float64)
+    terms = legendre(_unit_time(k, course.device), degree).expand(len(course), -1, -1)
+    frequency, stands_out = strongest_tone(_left(pulses, course), pulses.present)
+    tone, base, now = _Tone(frequency, torch.zeros_like(terms[:, 0, :1]).expand(-1, 2)), course, course
+    for _ in range(_TUNINGS):
+        step = robust_fit(_left(pulses, now), torch.cat([terms, tone.columns(time)], -1), weight)
+        tone = _Tone(tone.frequency + step[:, -1].clamp(-0.5 / k, 0.5 / k), tone.parts + step[:, -3:-1])
+        base = base + (terms @ step[:, :-3, None]).squeeze(-1)
+        now = base + (tone.waves(time) @ tone.parts[..., None]).squeeze(-1)
+    kept = stands_out & (tone.parts.square().sum(-1).sqrt() > _LEAST_TONE_CELLS)
+    return _centred(torch.where(kept[:, None], now, course), torch.ones_like(pulses.present))
 
 
 def _left(pulses: Envelopes, course: Tensor) -> Tensor:
@@ -319,8 +341,7 @@ def strongest_tone(rest: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
     power = torch.fft.rfft(torch.where(present, rest.clamp(-limit, limit), 0), 8 * k).abs().square()
     power[:, :8] = 0  # less than a period is the polynomial's
     top, at = power.max(-1)
-    mean = power.mean(-1)
-    return at / (8 * k), top > (math.log(k) + _STANDS_OUT) * mean
+    return at / (8 * k), top > (math.log(k) + _STANDS_OUT) * power.mean(-1)
 
 
 def _estimated(data: Tensor, name: str, find: Callable[[Envelopes], Tensor]) -> Estimate:
@@ -355,11 +376,11 @@ def _judged(lines: Tensor, find: Callable[[Envelopes], Tensor]) -> tuple[Tensor,
     return shift, (off.square().sum(-1) / envelopes.present.sum(-1).clamp_min(1)).sqrt() / 2
 
 
-def _band_halves(lines: Tensor) -> tuple[Tensor, Tensor]:
-    """Pulses compressed from the two halves of the band alone, (trial, pulse, n // 2), cells twice as wide."""
+def _band_halves(lines: Tensor) -> list[Tensor]:
+    """Pulses compressed from the two halves of the band alone, each about its own middle, (trial, pulse, n // 2), cells twice as wide."""
     half = lines.shape[-1] // 2
     spectrum = torch.fft.fftshift(torch.fft.fft(lines), dim=-1)
-    return torch.fft.ifft(spectrum[..., :half].contiguous()), torch.fft.ifft(spectrum[..., -half:].contiguous())
+    return [torch.fft.ifft(torch.fft.ifftshift(part, dim=-1)) for part in (spectrum[..., :half], spectrum[..., -half:])]
 
 
 def _about_circular_mean(shift: Tensor, present: Tensor, n: int) -> Tensor:

@@ -5,6 +5,7 @@ from torchsar.echo.interference import Quantiser, Tone, WideInterferer
 from torchsar.echo.jitter import PeriodicJitter
 from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedLines
 from torchsar.echo.pairs import SimulatedPairs
+from torchsar.echo.pulse_phase import PhaseSinusoid, PhaseWalk, WhitePhase
 from torchsar.echo.response import ChannelResponse
 from torchsar.echo.stripmap import Damage, apply_damages, simulate, stripmap_echo, target_energy
 from torchsar.echo.turntable import LostPulses, dechirped_echo, simulate_turntable, turntable_echo
@@ -18,10 +19,13 @@ __all__ = [
     "LostLines",
     "LostPulses",
     "PeriodicJitter",
+    "PhaseSinusoid",
+    "PhaseWalk",
     "Quantiser",
     "RepeatedLines",
     "SimulatedPairs",
     "Tone",
+    "WhitePhase",
     "WideInterferer",
     "apply_damages",
     "dechirped_echo",

@@ -15,6 +15,7 @@ from torchsar.focus.requirements import Requirement, recommended_form, requireme
 from torchsar.focus.spotlight import GroundGrid, SpotlightBackprojection, backproject_spotlight
 from torchsar.focus.stolt import OmegaKStolt, omega_k_stolt
 from torchsar.focus.strip import StripPlan, focus_strip, plan_strip, reach_lines, write_strip
+from torchsar.focus.target import TargetImage
 
 __all__ = [
     "AzimuthTransform",
@@ -40,6 +41,7 @@ __all__ = [
     "SpotlightBackprojection",
     "StoredOmegaK",
     "StripPlan",
+    "TargetImage",
     "amplitude",
     "azimuth_transform",
     "backproject",

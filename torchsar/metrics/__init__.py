@@ -1,6 +1,13 @@
 """Figures of merit, and the bounds that estimators are judged by."""
 
-from torchsar.metrics.bounds import beam_centre_bound_hz, reference_doppler_std_hz, tone_frequency_bound_hz, velocity_bound_m_s
+from torchsar.metrics.bounds import (
+    beam_centre_bound_hz,
+    pulse_phase_bound_of_scene_rad,
+    pulse_phase_bound_rad,
+    reference_doppler_std_hz,
+    tone_frequency_bound_hz,
+    velocity_bound_m_s,
+)
 from torchsar.metrics.image import contrast, correlation, entropy, error_db
 from torchsar.metrics.impulse import impulse_response
 from torchsar.metrics.phase import phase_rmse, residual_phase, strehl
@@ -13,6 +20,8 @@ __all__ = [
     "error_db",
     "impulse_response",
     "phase_rmse",
+    "pulse_phase_bound_of_scene_rad",
+    "pulse_phase_bound_rad",
     "reference_doppler_std_hz",
     "residual_phase",
     "strehl",

@@ -53,3 +53,30 @@ def velocity_bound_m_s(q: Value, dwell_s: Value, velocity_m_s: Value, wavelength
     """
     curvature = math.sqrt(180) / (_double(dwell_s).square() * torch.sqrt(2 * _double(q)))
     return curvature * wavelength_m * range_m / (4 * math.pi * _double(velocity_m_s))
+
+
+def pulse_phase_bound_rad(snr: Value, n_range: int) -> Tensor:
+    """Bound of the phase of one pulse where the scene is known: 1 / sqrt(2 N SNR), SNR the mean power of all samples over the noise variance."""
+    return 1 / torch.sqrt(2 * n_range * _double(snr))
+
+
+def pulse_phase_bound_of_scene_rad(azimuth: Tensor, range_: Tensor, amplitude: Tensor, noise_std: Value) -> Tensor:
+    """Bound of the rms phase error per pulse where the places of the scatterers are known and their complex amplitudes are not, (...,).
+
+    Samples s[k, n] = exp(j psi_k) sum_m azimuth[k, m] range_[m, n] amplitude[m] plus circular noise of variance noise_std^2. azimuth:
+    (..., pulse, target), range_: (..., target, range), amplitude: (..., target), complex128. The constant and the linear term of psi, which
+    no data tell from a turn and a shift of the scene, are left out. Amplitudes that the data cannot tell apart count as one.
+    """
+    echo = (azimuth * amplitude[..., None, :]) @ range_
+    gram = (azimuth.mH @ azimuth) * (range_ @ range_.mH).mT
+    cross = azimuth.conj() * (echo @ range_.mH)  # A^H of the derivative by each phase, (..., pulse, target), but for a factor j
+    scale = gram.diagonal(dim1=-2, dim2=-1).real.mean(-1)[..., None, None]
+    ridge = 1e-9 * scale * torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
+    explained = (cross.conj() @ torch.linalg.solve(gram + ridge, cross.mT)).real
+    known = echo.abs().square().sum(-1)
+    information = 2 * (torch.diag_embed(known) - explained) / _double(noise_std).square()[..., None, None]
+    n = echo.shape[-2]
+    k = torch.arange(n, dtype=torch.float64, device=echo.device)
+    free = torch.linalg.qr(torch.stack([torch.ones_like(k), k - k.mean()], -1), mode="complete").Q[:, 2:]
+    variance = torch.linalg.inv(free.mT @ information @ free)
+    return torch.sqrt(variance.diagonal(dim1=-2, dim2=-1).sum(-1) / n)

@@ -8,15 +8,17 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from torchsar.compensate.pulse_phase.stages import Autofocus
 from torchsar.compensate.velocity import EffectiveVelocity
 from torchsar.core import Estimate, Signal, Stage
 from torchsar.echo.response import ChannelResponse
-from torchsar.focus import OmegaK, PaddedLines
+from torchsar.focus import OmegaK, PaddedLines, TargetImage
 from torchsar.optim.scalar import gradient_minimum, parabola_minimum
-from torchsar.radar import StripmapRadar
+from torchsar.radar import FarField, InverseRadar, Spotlight, StripmapRadar
 from torchsar.repair.jitter import BandLimited, CorrectJitter, Exact, Lagrange
 from torchsar.repair.response import band_grid
 from torchsar.repair.response_phase import EstimateResponse, estimate_response_points, estimate_response_sharpest
+from torchsar.scene import Dechirped, Polynomial, Sinusoid
 
 _REFINE = {"gradient": gradient_minimum, "parabola": parabola_minimum}
 
@@ -111,3 +113,26 @@ class FlatBandResponse(Stage):
 def estimate_response(radar: StripmapRadar, method: Literal["sharpest", "points"] = "sharpest") -> EstimateResponse:
     """Phase response of the channel from bright places of the focused image; the amplitude is left alone."""
     return EstimateResponse(radar, _RESPONSE[method])
+
+
+def vibration(name: str, unit: Literal["mm", "um"]) -> Sinusoid:
+    """Sinusoidal vibration by its published name amplitude_frequency_phase (1_100_90), the amplitude in `unit`."""
+    return Sinusoid.named(name, unit=unit)
+
+
+def dechirped(track_m: list[float] | None = None) -> Dechirped:
+    """Dechirped pulses with the motion inside them; track_m: velocity, half the acceleration, ... that the range window follows."""
+    return Dechirped((Polynomial(track_m),) if track_m else ())
+
+
+class AutofocusOfImage(Autofocus):
+    """`autofocus`, through polar format where the recording tells where the antenna was."""
+
+    def __init__(self, radar: InverseRadar, geometry: FarField | Spotlight | None = None, search: int = 120, polish: int = 20) -> None:
+        super().__init__(search, polish)
+        self.target = None if geometry is None else TargetImage(radar, geometry)
+
+    def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
+        if self.target is not None:
+            self.imaging = self.target.operator(signal.data)
+        return super().forward(signal, start)

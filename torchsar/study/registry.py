@@ -13,11 +13,14 @@ from typing import Any
 from torchsar.compensate.ambiguity import DopplerCentroid
 from torchsar.compensate.doppler import EnergyCentre, PhaseIncrement, RangeDependentCentroid
 from torchsar.compensate.point import PointDoppler
+from torchsar.compensate.pulse_phase.stages import CorrectPulsePhase, EntropyFixedPoint, Pga, PgaSca, Sca
 from torchsar.echo.channels import ChannelImbalance
 from torchsar.echo.interference import Quantiser, Tone, WideInterferer
 from torchsar.echo.jitter import PeriodicJitter
 from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedLines
-from torchsar.focus import Backproject, ClosestRange, OmegaK, OmegaKStolt, RangeCompress, RangeDoppler
+from torchsar.echo.pulse_phase import PhaseSinusoid, PhaseWalk, WhitePhase
+from torchsar.echo.turntable import LostPulses
+from torchsar.focus import AzimuthTransform, Backproject, ClosestRange, CompressDechirped, OmegaK, OmegaKStolt, RangeCompress, RangeDoppler, TargetImage
 from torchsar.repair.channels import CorrectImbalance, EstimateImbalance
 from torchsar.repair.fill import BandLimitedFill, LinearFill, SparseFill, ZeroFill
 from torchsar.repair.interference import DropInterference, NotchInterference, SubtractInterference
@@ -25,13 +28,32 @@ from torchsar.repair.jitter_blind import BlindJitter
 from torchsar.repair.jitter_pilot import PilotJitter
 from torchsar.repair.lines import LineIntegrity
 from torchsar.repair.response import CorrectResponse
-from torchsar.scene import AlwaysLit, Antenna, Dwell, Hyperbola, Parabola, Points, RandomPoints, Speckle
+from torchsar.scene import (
+    Aircraft,
+    AlwaysLit,
+    Antenna,
+    Dwell,
+    Hyperbola,
+    Parabola,
+    PhaseOnly,
+    Points,
+    Polynomial,
+    RandomPoints,
+    Sinusoid,
+    Speckle,
+    SpreadRows,
+    StartPhase,
+    UniformStartPhase,
+)
 from torchsar.study import factories
 from torchsar.study.catalogue import Catalogue
 
-SCENES = Catalogue("scene", "kind", {"points": Points, "random_points": RandomPoints, "speckle": Speckle})
+SCENES = Catalogue("scene", "kind", {"points": Points, "random_points": RandomPoints, "speckle": Speckle, "aircraft": Aircraft, "spread_rows": SpreadRows})
 BEAMS = Catalogue("beam", "kind", {"always_lit": AlwaysLit, "dwell": Dwell, "antenna": Antenna})
 PATHS = Catalogue("path", "kind", {"hyperbola": Hyperbola, "parabola": Parabola})
+MOTIONS = Catalogue("motion", "kind", {"vibration": factories.vibration, "sinusoid": Sinusoid, "polynomial": Polynomial})
+START_PHASES = Catalogue("start phase", "kind", {"normal": StartPhase, "uniform": UniformStartPhase})
+FIDELITIES = Catalogue("fidelity", "kind", {"phase_only": PhaseOnly, "dechirped": factories.dechirped})
 DAMAGES = Catalogue(
     "damage",
     "kind",
@@ -46,6 +68,10 @@ DAMAGES = Catalogue(
         "lost_gaps": LostGaps,
         "repeated_lines": RepeatedLines,
         "corrupted_numbers": CorruptedNumbers,
+        "lost_pulses": LostPulses,
+        "white_phase": WhitePhase,
+        "phase_walk": PhaseWalk,
+        "phase_sinusoid": PhaseSinusoid,
     },
 )
 
@@ -76,6 +102,12 @@ COMPENSATE: dict[str, Callable[..., Any]] = {
     "doppler_centroid": DopplerCentroid,
     "point_doppler": PointDoppler,
     "effective_velocity": factories.effective_velocity,
+    "sca": Sca,
+    "pga": Pga,
+    "pga_sca": PgaSca,
+    "entropy_fixed_point": EntropyFixedPoint,
+    "autofocus": factories.AutofocusOfImage,
+    "pulse_phase_correct": CorrectPulsePhase,
 }
 FOCUS: dict[str, Callable[..., Any]] = {
     "range_compress": RangeCompress,
@@ -85,6 +117,9 @@ FOCUS: dict[str, Callable[..., Any]] = {
     "range_doppler": RangeDoppler,
     "backproject": Backproject,
     "closest_range": ClosestRange,
+    "compress_dechirped": CompressDechirped,
+    "azimuth_transform": AzimuthTransform,
+    "target_image": TargetImage,
 }
 GROUPS = {"repair": REPAIR, "compensate": COMPENSATE, "focus": FOCUS}
 
@@ -97,7 +132,7 @@ def stages() -> Catalogue:
         if point.name in entries:
             raise ValueError(f"the entry point {point.value!r} takes the stage name {point.name!r}, which is in use; rename it")
         entries[point.name] = point.load()
-    return Catalogue("stage", "stage", entries, given=("radar",))
+    return Catalogue("stage", "stage", entries, given=("radar", "geometry"))
 
 
 def group_of(name: str) -> str:

@@ -48,6 +48,12 @@ class System:
 @cache
 def systems() -> dict[str, System]:
     """All systems by name."""
+    from torchsar.study.isal import run as isal_run
+    from torchsar.study.isal.judge import DEFINITIONS as ISAL
+    from torchsar.study.isal.requires import requires as isal_requires
+    from torchsar.study.isal.sections import IsalConfig
+    from torchsar.study.isal.trade import trade as isal_trade
+    from torchsar.study.isal.trials import IsalTrials
     from torchsar.study.stripmap import run as stripmap_run
     from torchsar.study.stripmap.judge import DEFINITIONS as STRIPMAP
     from torchsar.study.stripmap.requires import requires as stripmap_requires
@@ -56,6 +62,7 @@ def systems() -> dict[str, System]:
     from torchsar.study.stripmap.trials import StripmapTrials
 
     return {
+        "isal": System(IsalConfig, isal_run.check, isal_run.run, isal_requires, isal_trade, IsalTrials, ISAL),
         "stripmap": System(StripmapConfig, stripmap_run.check, stripmap_run.run, stripmap_requires, stripmap_trade, StripmapTrials, STRIPMAP),
     }
 

@@ -105,7 +105,11 @@ class _Free:
     def phase(self, x: Tensor) -> Tensor:
         return x
 
-    coordinates = pulled = phase
+    def coordinates(self, phase_rad: Tensor) -> Tensor:
+        return phase_rad
+
+    def pulled(self, gradient: Tensor) -> Tensor:
+        return gradient
 
 
 @dataclass(frozen=True)
@@ -130,7 +134,7 @@ class _Spanned:
 def _space_of(basis: Tensor | None, pulses: Pulses) -> _Space:
     if basis is None:
         return _Free()
-    if basis.is_complex() or basis.ndim < 2 or basis.shape[-1] != pulses.n or not 1 <= basis.shape[-2] <= pulses.n:
+    if _tensor(basis, "basis").is_complex() or basis.ndim < 2 or basis.shape[-1] != pulses.n or not 1 <= basis.shape[-2] <= pulses.n:
         raise ValueError(f"sharpest_phase: basis needs real functions (coefficient, pulse) over {pulses.n} pulses, got {basis.dtype} of shape {tuple(basis.shape)}")
     wide = _by_trial(basis.to(device=pulses.rows.device, dtype=torch.float64), pulses, "basis")
     if not torch.isfinite(wide).all() or bool((torch.linalg.matrix_rank(wide) < wide.shape[-2]).any()):
@@ -138,9 +142,15 @@ def _space_of(basis: Tensor | None, pulses: Pulses) -> _Space:
     return _Spanned((torch.linalg.qr(wide.mT).Q.mT * math.sqrt(pulses.n)).to(pulses.rows.real.dtype).contiguous())
 
 
+def _tensor(x: Tensor, what: str) -> Tensor:
+    if not isinstance(x, Tensor):
+        raise TypeError(f"sharpest_phase: {what} must be a tensor, got {type(x).__name__}; torch.as_tensor makes one")
+    return x
+
+
 def _by_trial(x: Tensor, pulses: Pulses, what: str) -> Tensor:
-    """x (a, b) as it is; (..., a, b) as (trial, a, b)."""
-    if x.ndim == 2:
+    """x (..., a, b) as (trial, a, b); with two dims or less as it is."""
+    if x.ndim < 3:
         return x
     try:
         return x.expand(*pulses.trials, *x.shape[-2:]).reshape(-1, *x.shape[-2:])
@@ -174,11 +184,11 @@ def _cost_of(objective: Objective, mask: Tensor | None, imaging: Imaging | None,
     operator = _Centred() if imaging is None else Through(imaging)
     if not isinstance(objective, str):
         return lambda rows, _: _Derived(rows, operator, objective)
-    weights = None if mask is None else _by_trial(mask.to(pulses.rows.device), pulses, "mask")
+    weights = None if mask is None else _by_trial(_tensor(mask, "mask").to(pulses.rows.device), pulses, "mask")
     figure = _COSTS[objective]
 
     def of_trials(rows: Tensor, which: Tensor) -> _Figure:
-        return _Derived(rows, operator, partial(figure, mask=weights if weights is None or weights.ndim == 2 else weights[which]))
+        return _Derived(rows, operator, partial(figure, mask=weights if weights is None or weights.ndim < 3 else weights[which]))
 
     return of_trials
 

@@ -1,0 +1,88 @@
+"""The pictures of a run: images of every case, and what is left of the phase errors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchsar import plot
+from torchsar.core import Signal
+from torchsar.metrics import residual_phase
+from torchsar.study.pictures import Drawn, Picture, draw_all
+
+_COMPARED = {
+    "entropy_above_ideal_nats": "entropy above the ideal image (nats)",
+    "agreement_rad": "influence of the injected phases (rad)",
+    "residual_phase_rms_rad": "residual phase (rad rms)",
+}
+
+
+@dataclass(frozen=True)
+class CaseResult:
+    """One case: metrics by method (trial,), and of the first trial images, and phases estimated and true (pulse,)."""
+
+    metrics: Mapping[str, Mapping[str, Tensor]]
+    images: Mapping[str, Signal]
+    phases: Mapping[str, Tensor]
+    true_rad: Tensor
+
+
+def draw(results: Mapping[str, CaseResult], folder: Path) -> list[Picture]:
+    """Every picture of a run, as PNG files in the folder, in the order of reading."""
+    return draw_all([partial(_entropies, results), *(partial(make, case, result) for case, result in results.items() for make in (_images, _phases))], folder)
+
+
+def _entropies(results: Mapping[str, CaseResult]) -> Drawn:
+    """Entropy above the ideal image (or above the method's own result without injected phases) by method and case."""
+    for key, label in _COMPARED.items():
+        methods = [name for name in next(iter(results.values())).metrics if any(key in result.metrics[name] for result in results.values())]
+        if not methods:
+            continue
+        x = list(results)
+        means = {name: np.array([_mean(result.metrics[name], key) for result in results.values()]) for name in methods}
+        parts = [{"title": "", "x": x, "series": {name: (y, np.stack([y, y], -1)) for name, y in means.items()}, "bounds": {}}]
+        yield key, label.split(" (")[0].capitalize(), f"Mean over trials of the {label}, by case and method.", plot.error_curves(parts, "case", label)
+
+
+def _mean(metrics: Mapping[str, Tensor], key: str) -> float:
+    return float(metrics[key].mean()) if key in metrics else float("nan")
+
+
+def _images(case: str, result: CaseResult) -> Drawn:
+    title = "Images by every method" if case == "all" else f"Images by every method: {case}"
+    reference = "ideal" if "ideal" in result.images else next(iter(result.images))
+    shown = {reference: result.images[reference], **{name: image for name, image in result.images.items() if name != reference}}
+    caption = f"The first trial; all images on one scale, that of '{reference}', in dB. They are shifted along cross range by what no data can tell."
+    yield f"images_{_word(case)}", title, caption, plot.images({name: _centred(image) for name, image in shown.items()}, dynamic_range_db=35.0, columns=3)
+
+
+def _phases(case: str, result: CaseResult) -> Drawn:
+    pulses = np.arange(result.true_rad.numel())
+    inside = torch.remainder(result.true_rad + torch.pi, 2 * torch.pi) - torch.pi
+    left = {name: (pulses, plot.array(residual_phase(phase, result.true_rad))) for name, phase in result.phases.items() if name not in ("none", "ideal")}
+    if not left:
+        return
+    parts = [
+        {"series": {"true": (pulses, plot.array(inside))}, "xlabel": "pulse", "ylabel": "rad", "title": "phase error put in, modulo a turn"},
+        {"series": left, "xlabel": "pulse", "ylabel": "rad", "title": "what each method leaves of it"},
+    ]
+    title = "Phase errors" if case == "all" else f"Phase errors: {case}"
+    yield f"phases_{_word(case)}", title, "Constant and linear terms are removed on the circle: they only turn and shift the image.", plot.panels(parts)
+
+
+def _centred(image: Signal) -> Signal:
+    """The image rolled along cross range so that the centre of its energy lies in the middle."""
+    n = image.axes[0].n
+    power = image.data.abs().square().sum(-1).double()
+    turn = torch.polar(power, 2 * torch.pi * torch.arange(n, dtype=torch.float64) / n).sum()
+    return image.with_data(image.data.roll(n // 2 - round(float(torch.angle(turn)) / (2 * torch.pi) * n), 0))
+
+
+def _word(case: str) -> str:
+    return "".join(c if c.isalnum() else "_" for c in case)

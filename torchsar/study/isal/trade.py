@@ -1,0 +1,185 @@
+"""`torchsar trade` for turning targets: time against phase error of methods, iterations, precisions and echo models."""
+
+from __future__ import annotations
+
+import logging
+import platform
+import statistics
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchsar import plot
+from torchsar.compensate import autofocus, correct_pulse_phase
+from torchsar.core import Draws, Recording, Signal, Truth
+from torchsar.echo import simulate_turntable
+from torchsar.focus import CompressDechirped, azimuth_transform
+from torchsar.metrics import entropy, phase_rmse
+from torchsar.radar import InverseRadar
+from torchsar.scene import Dechirped, PhaseOnly, TurntableWorld
+from torchsar.study.build import build_damages, resolved
+from torchsar.study.config import Loaded
+from torchsar.study.errors import ConfigError
+from torchsar.study.folder import fresh_folder, write_json
+from torchsar.study.isal.build import build_radar, build_world, cases_of, check
+from torchsar.study.isal.judge import estimated_phase
+from torchsar.study.methods import build_chains
+
+log = logging.getLogger("torchsar")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One alternative: median seconds a trial over the repeats, their spread, rms phase error (rad) and entropy above the ideal image (nats), means over trials."""
+
+    name: str
+    seconds: float
+    spread_s: float
+    error_rad: float
+    entropy_above_ideal_nats: float
+
+
+def trade(loaded: Loaded, out: Path | None) -> str:
+    """Tables of methods, of iterations of `autofocus`, of precisions, and of the echo models, on the last case of a config; returns them as text.
+
+    With `out`: config.yaml, trade.json, trade.txt and figures/ in that folder. Raises ConfigError for recordings, whose phases are not known.
+    """
+    if loaded.config.data.file is not None or loaded.config.world is None:
+        raise ConfigError(f"{loaded.file}: trade compares with true phases, which a recording does not tell; take a config that simulates")
+    check(loaded)
+    name, case = list(cases_of(loaded).items())[-1]
+    if out is None:
+        return _text(name, _tables(case))
+    with fresh_folder(out) as folder:
+        tables = _tables(case)
+        text = _text(name, tables)
+        (folder / "config.yaml").write_text(loaded.text(resolved(loaded)), encoding="utf-8")
+        (folder / "trade.txt").write_text(text + "\n", encoding="utf-8")
+        machine = {"machine": platform.processor() or platform.machine(), "torch": torch.__version__, "threads": torch.get_num_threads(), "seed": loaded.config.seed}
+        write_json(folder / "trade.json", {**{key: [asdict(row) for row in rows] for key, rows in tables.items()}, "made_on": machine})
+        (folder / "figures").mkdir()
+        for key in ("methods", "iterations", "precision"):
+            rows = tables[key]
+            figure = plot.trade([r.name for r in rows], [r.seconds for r in rows], [r.error_rad for r in rows], "residual phase (rad rms)", key)
+            plot.save(figure, folder / "figures" / f"trade_{key}.png")
+    return f"{text}\n{out}"
+
+
+@dataclass(frozen=True)
+class _Trials:
+    """Simulated trials: their recording and truth, and the radar."""
+
+    radar: InverseRadar
+    recording: Recording
+    truth: Truth
+
+    @property
+    def data(self) -> Tensor:
+        return self.recording.signal.data
+
+    def row(self, name: str, data: Tensor, work: Callable[[Tensor], Tensor], repeats: int) -> Row:
+        """The alternative `work`: data to phases."""
+        phase, times = _timed(lambda: work(data), repeats)
+        assert self.truth.clean is not None
+        error = phase_rmse(phase, self.truth.values["phase_rad"])
+        gained = entropy(azimuth_transform(correct_pulse_phase(data, phase))) - entropy(azimuth_transform(self.truth.clean.signal.data.to(data.dtype)))
+        count = max(1, error.numel())
+        log.info("%s: %.1f ms, %.3f rad", name, 1e3 * statistics.median(times) / count, float(error.mean()))
+        return Row(name, statistics.median(times) / count, (max(times) - min(times)) / count, float(error.mean()), float(gained.mean()))
+
+
+@torch.no_grad()
+def _tables(loaded: Loaded) -> dict[str, list[Row]]:
+    config = loaded.config
+    made = _simulate(loaded, build_world(loaded), torch.complex64)
+    phase_only = replace(build_world(loaded), fidelity=PhaseOnly())
+    if isinstance(build_world(loaded).fidelity, Dechirped):
+        made = _simulate(loaded, phase_only, torch.complex64)
+    tables = {"methods": list(_methods(loaded, made)), "iterations": list(_iterations(loaded, made)), "precision": list(_precisions(loaded, phase_only))}
+    if config.radar.pulse_s is not None:
+        tables["echo"] = list(_echoes(loaded))
+    return tables
+
+
+def _simulate(loaded: Loaded, world: TurntableWorld, dtype: torch.dtype, count: int | None = None) -> _Trials:
+    size, radar = loaded.config.world, build_radar(loaded)
+    damages = build_damages(size.damages, "world.damages", loaded.file)
+    recording, truth = simulate_turntable(radar, world, size.pulses, size.samples, Draws(loaded.config.seed, "trade", range(count or loaded.config.trade.trials)), damages, dtype)
+    return _Trials(radar, recording, truth)
+
+
+def _methods(loaded: Loaded, made: _Trials) -> Iterator[Row]:
+    """Every method of the processor that estimates phases."""
+    for name, chain in build_chains(loaded, radar=made.radar).items():
+        if loaded.config.processor[name].input == "clean":
+            continue
+
+        def work(data: Tensor, chain: Any = chain) -> Tensor:
+            return estimated_phase(chain.trace(made.recording.signal.with_data(data)), made.truth.values["phase_rad"])
+
+        yield made.row(name, made.data, work, loaded.config.trade.repeats)
+
+
+def _iterations(loaded: Loaded, made: _Trials) -> Iterator[Row]:
+    """The recommended method with fewer iterations."""
+    settings = loaded.config.trade
+    deepest = max(settings.search)
+    for search in settings.search:
+        yield made.row(f"search {search}, polish 0", made.data, lambda x, s=search: autofocus(x, search=s, polish=0)["phase_rad"], settings.repeats)
+    for polish in settings.polish:
+        yield made.row(f"search {deepest}, polish {polish}", made.data, lambda x, p=polish: autofocus(x, search=deepest, polish=p)["phase_rad"], settings.repeats)
+
+
+def _precisions(loaded: Loaded, world: TurntableWorld) -> Iterator[Row]:
+    made = _simulate(loaded, world, torch.complex128)
+    for name in loaded.config.trade.precisions:
+        yield made.row(name, made.data.to(getattr(torch, name)), lambda x: autofocus(x)["phase_rad"], loaded.config.trade.repeats)
+
+
+def _echoes(loaded: Loaded) -> Iterator[Row]:
+    """Phase-only echo against dechirped pulses with the motion inside them, after the recommended autofocus: seconds are those of one echo."""
+    for name, fidelity in (("phase_only", PhaseOnly()), ("dechirped", Dechirped())):
+        world = replace(build_world(loaded), fidelity=fidelity)
+        made, times = _timed(lambda world=world: _simulate(loaded, world, torch.complex64, 2), 1)
+        signal: Signal = made.recording.signal
+        if isinstance(fidelity, Dechirped):
+            stage = CompressDechirped(made.radar)
+            signal = stage(signal)
+            clean = replace(made.truth, clean=replace(made.recording, signal=stage(made.truth.clean.signal))) if made.truth.clean is not None else made.truth
+            made = replace(made, truth=clean)
+        row = made.row(name, signal.data, lambda x: autofocus(x)["phase_rad"], 1)
+        yield replace(row, seconds=times[0] / 2, spread_s=0.0)
+
+
+def _timed(work: Callable[[], Any], repeats: int) -> tuple[Any, list[float]]:
+    times, result = [], None
+    for _ in range(repeats):
+        began = time.perf_counter()
+        result = work()
+        times.append(time.perf_counter() - began)
+    return result, times
+
+
+_TITLES = {
+    "methods": "METHODS of the processor",
+    "iterations": "ITERATIONS of the recommended method",
+    "precision": "PRECISION of the recommended method",
+    "echo": "ECHO MODELS: time of one echo, and what the recommended method makes of it without alignment of envelopes",
+}
+
+
+def _text(case: str, tables: dict[str, list[Row]]) -> str:
+    parts = [f"case {case!r}" if case else "one case"]
+    for key, rows in tables.items():
+        parts += ["", _TITLES[key], f"{'alternative':<30}{'ms a trial':>12}{'spread':>9}{'error (rad rms)':>17}{'entropy above ideal':>21}"]
+        parts += _lines(rows)
+    return "\n".join(parts)
+
+
+def _lines(rows: Sequence[Row]) -> list[str]:
+    return [f"{r.name:<30}{1e3 * r.seconds:>12.2f}{1e3 * r.spread_s:>9.2f}{r.error_rad:>17.4f}{r.entropy_above_ideal_nats:>21.3f}" for r in rows]

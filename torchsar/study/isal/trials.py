@@ -1,0 +1,190 @@
+"""One batch of trials of a turning target: simulate, run every method, compare with the truth."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Chain, Draws, Recording, Signal, Trace, Truth
+from torchsar.echo import Damage, simulate_turntable
+from torchsar.metrics.bounds import pulse_phase_bound_of_scene_rad, pulse_phase_bound_rad
+from torchsar.radar import InverseRadar
+from torchsar.scene import PhaseOnly, TurntableWorld
+from torchsar.study.build import build_damages, precision
+from torchsar.study.config import Config, Loaded
+from torchsar.study.errors import ConfigError
+from torchsar.study.isal.build import build_radar, build_world
+from torchsar.study.isal.judge import image_metrics, phase_metrics
+from torchsar.study.methods import build_chains
+from torchsar.study.montecarlo.work import BOUNDS, SAVED
+
+_SNR = "world.noise.snr_db"
+_MOST_SCATTERERS = 1200
+_PEAK_BYTES = 8
+
+
+@dataclass(frozen=True)
+class Bench:
+    """All that one case needs, built once in a process."""
+
+    config: Config
+    radar: InverseRadar
+    world: TurntableWorld
+    damages: Mapping[str, Damage]
+    chains: Mapping[str, Chain]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What one batch of trials gave: the recording, the truth, and the trace and the seconds per trial of every method."""
+
+    recording: Recording
+    truth: Truth
+    traces: Mapping[str, Trace]
+    seconds: Mapping[str, float]
+
+    @property
+    def phase_rad(self) -> Tensor:
+        """The whole phase error of every pulse, (..., pulse)."""
+        values = self.truth.values
+        return values["phase_rad"] + sum(value for name, value in values.items() if name.endswith(".phase_rad"))
+
+    @property
+    def present(self) -> Tensor | None:
+        """Pulses that were received, (..., pulse), None where all were."""
+        lost = [value for name, value in self.truth.values.items() if name.endswith(".present")]
+        return torch.stack(lost).all(0) if lost else None
+
+
+class IsalTrials:
+    """`trial(parameters, draws)` of a config: {method: {metric: (rows,)}}, bounds of the residual phase, and images of the trials to keep.
+
+    Metrics of a method: `residual_phase_rms_rad`, `strehl`, the predicted `residual_phase_std_rad`, `entropy_nats`, `contrast`, and
+    `entropy_above_ideal_nats` where metrics.reference names a method of undamaged input; `seconds` per trial; `ok`.
+    """
+
+    batched = (_SNR,)
+
+    def __init__(self, loaded: Loaded, device: str = "cpu") -> None:
+        self.loaded, self.device = loaded, device
+        self._benches: dict[str, Bench] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"loaded": self.loaded, "device": self.device, "_benches": {}}
+
+    def check(self, grid: Mapping[str, Any]) -> None:
+        """Refuse a grid over what a sweep does not use. Raises ConfigError."""
+        for key in grid:
+            if key.split(".")[0] == "cases" or key == "world.trials":
+                raise ConfigError(f"{self.loaded.file}: sweep: the key {key!r} belongs to runs and cannot be swept")
+
+    def stages(self, fixed: Mapping[str, Any]) -> set[str]:
+        """Names of all stages of this case, whose chains are built."""
+        return {stage for chain in self.bench(fixed).chains.values() for stage in chain.stages}
+
+    def bench(self, fixed: Mapping[str, Any]) -> Bench:
+        """The built case of these fixed parameters."""
+        key = repr(fixed)
+        if key not in self._benches:
+            loaded = self.loaded.changed(fixed)
+            radar = build_radar(loaded)
+            chains = {name: chain.to(self.device) for name, chain in build_chains(loaded, radar=radar).items()}
+            damages = build_damages(loaded.config.world.damages, "world.damages", loaded.file)
+            self._benches[key] = Bench(loaded.config, radar, build_world(loaded), damages, chains)
+        return self._benches[key]
+
+    def bytes_per_trial(self, fixed: Mapping[str, Any]) -> int:
+        """Of the largest tensors that a trial needs, from the axes: data, image, and what an iteration makes of them."""
+        config = self.bench(fixed).config
+        return _PEAK_BYTES * config.world.pulses * config.world.samples * precision(config).itemsize
+
+    @torch.no_grad()
+    def __call__(self, parameters: Mapping[str, Any], draws: Draws) -> dict[str, Any]:
+        bench = self.bench({k: v for k, v in parameters.items() if k != _SNR})
+        if _SNR in parameters:
+            bench = replace(bench, world=replace(bench.world, snr_db=parameters[_SNR]))
+        batch = run_batch(bench, draws, self.device)
+        found: dict[str, Any] = judged(bench.config, batch)
+        return {**found, BOUNDS: _bounds(bench, batch), SAVED: _saved(bench, batch)}
+
+
+def run_batch(bench: Bench, draws: Draws, device: str = "cpu") -> Batch:
+    """Simulate the trials of the draws and run every method on them."""
+    size = bench.config.world
+    recording, truth = simulate_turntable(bench.radar, bench.world, size.pulses, size.samples, draws, bench.damages, precision(bench.config), device)
+    assert truth.clean is not None
+    traces, seconds = {}, {}
+    count = max(1, recording.signal.trials.numel())
+    for name, method in bench.config.processor.items():
+        began = time.perf_counter()
+        if method.rerun is not None:
+            raise ConfigError(f"processor.{name}.rerun: methods of this system have stages of their own")
+        traces[name] = bench.chains[name].trace(truth.clean if method.input == "clean" else recording)
+        seconds[name] = (time.perf_counter() - began) / count
+    return Batch(recording, truth, traces, seconds)
+
+
+def judged(config: Config, batch: Batch) -> dict[str, dict[str, Tensor]]:
+    """Metrics of every method, (trial,) each."""
+    reference = config.metrics.reference
+    ideal = None if reference is None else batch.traces[reference].signal
+    found = {}
+    for name, trace in batch.traces.items():
+        clean = config.processor[name].input == "clean"
+        truth = torch.zeros_like(batch.phase_rad) if clean else batch.phase_rad
+        metrics = phase_metrics(trace, truth, batch.present)
+        if trace.signal.names == ("azimuth", "range"):
+            metrics.update(image_metrics(trace.signal, None if name == reference else ideal))
+        metrics["seconds"] = torch.full(truth.shape[:-1], batch.seconds[name], dtype=torch.float64)
+        found[name] = metrics
+    return found
+
+
+def _bounds(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
+    """Of the residual phase: scene known; amplitudes unknown, from the first scene of the batch (it scales with the noise, scenes differ by a percent)."""
+    values = batch.truth.values
+    std = values["noise_std"]
+    if not bool((std > 0).all()):
+        return {}
+    assert batch.truth.clean is not None
+    data = batch.truth.clean.signal.data
+    power = (torch.view_as_real(data).double().square().sum(-1).mean((-2, -1)) - std.square()).clamp_min(1e-300)
+    known = pulse_phase_bound_rad(power / std.square(), data.shape[-1])
+    bounds = {"scene known": known}
+    x, y, amplitude = (values[name].reshape(-1, values[name].shape[-1])[0] for name in ("cross_range_m", "range_m", "amplitude"))
+    if isinstance(bench.world.fidelity, PhaseOnly) and x.numel() <= _MOST_SCATTERERS and data.shape[-2] > 2:
+        matrices = _scene_matrices(bench, x, y, data.shape[-2], data.shape[-1])
+        first = pulse_phase_bound_of_scene_rad(*matrices, amplitude, std.reshape(-1)[0])
+        bounds["amplitudes unknown (Cramer-Rao)"] = known * (first / known.reshape(-1)[0])
+    return {"residual_phase_rms_rad": bounds}
+
+
+def _scene_matrices(bench: Bench, x: Tensor, y: Tensor, n_pulse: int, n_range: int) -> tuple[Tensor, Tensor]:
+    """Azimuth phasors (pulse, target) and range responses (target, range) of scatterers at the level of phases."""
+    rate = bench.radar.rotation_rad_s if bench.world.rotation_rad_s is None else bench.world.rotation_rad_s
+    theta = float(rate or 0.0) * (torch.arange(n_pulse, dtype=torch.float64) - n_pulse // 2) / bench.radar.prf_hz
+    ways = x * torch.sin(theta)[:, None] + y * (torch.cos(theta)[:, None] - 1)
+    azimuth = torch.polar(torch.ones_like(ways), -4 * math.pi / bench.radar.wavelength_m * ways)
+    cells = torch.arange(n_range, dtype=torch.float64) - n_range // 2
+    shifts, back = -2 * math.pi / n_range * (y / bench.radar.range_step_m)[:, None] * cells, 2 * math.pi / n_range * cells[:, None] * cells
+    return azimuth, torch.polar(torch.ones_like(shifts), shifts) @ torch.polar(torch.ones_like(back), back) / n_range
+
+
+def _saved(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
+    """The last signal of every method, and the outputs of the stages that `sweep.save.taps` names."""
+    save = bench.config.sweep.save
+    if not save.trials:
+        return {}
+    return {name: {"last": trace.signal.data, **{stage: trace.outputs[stage].data for stage in save.taps if stage in trace.outputs}} for name, trace in batch.traces.items()}
+
+
+def image_of(trace: Trace, trial: int = 0) -> Signal:
+    """The last signal of one trial."""
+    signal = trace.signal
+    return signal if not signal.trials else signal.with_data(signal.data.reshape(-1, *signal.data.shape[-2:])[trial])
