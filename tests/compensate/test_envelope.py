@@ -90,19 +90,21 @@ def test_correlations_equal_direct_sums() -> None:
     fine = torch.stack([shift_range(x, 0.0), shift_range(x, -0.5)], -1).flatten(-2).abs().square()
     power = fine / fine.mean(-1, keepdim=True)
     torch.testing.assert_close(pulses.on_grid(pulses.spectra), power, atol=1e-12, rtol=0)
-    mean = power.mean(-2)
-    got = pulses.on_grid(pulses.spectra * pulses.likelihood(pulses.spectra.mean(-2, keepdim=True)).conj())
-    direct = torch.stack([-(power.roll(-lag, -1) / mean.clamp_min(0.01)[:, None]).sum(-1) for lag in range(24)], -1)
+    # quarter cells: the likelihood of every shift, sum over cells of -|s|^2 / T
+    finer = torch.stack([shift_range(x, -part / 4) for part in range(4)], -1).flatten(-2).abs().square()
+    finer = finer / finer.mean(-1, keepdim=True)
+    direct = torch.stack([-(finer.roll(-lag, -1) / finer.mean(-2).clamp_min(0.01)[:, None]).mean(-1) * 24 for lag in range(48)], -1)
+    got = pulses.on_grid(pulses.spectra * pulses.likelihood(pulses.spectra.mean(-2, keepdim=True)).conj(), 4)
     torch.testing.assert_close(got, direct, atol=1e-10 * float(direct.abs().max()), rtol=0)
 
 
 def test_parabola_finds_the_peak_between_samples() -> None:
-    """Of a smooth envelope to 0.005 cell, wherever it lies."""
+    """Of a smooth envelope to 0.001 cell, wherever it lies."""
     place = torch.linspace(-31.9, 31.9, 301, dtype=torch.float64)
     lines = torch.exp(-(((torch.arange(64) - 32) / 2.0) ** 2)).to(DOUBLE).expand(1, 301, -1)
     pulses = Envelopes.of(shift_range(lines, place))
     found = pulses.peak(pulses.spectra * Envelopes.of(lines).spectra[:, :1].conj())
-    assert float((found - place).abs().max()) < 5e-3
+    assert float((found - place).abs().max()) < 1e-3
 
 
 @pytest.mark.parametrize("method", SINGLE.values(), ids=list(SINGLE))
@@ -110,7 +112,7 @@ def test_recovers_shifts_of_a_rigid_profile(method) -> None:
     x = rigid()
     true = 1.5 * unit_time(60) + 0.4 * circular(2, 60, seed=2).real
     error = off(method(shift_range(x, true))["shift_cells"], true, 64)
-    assert float(error.abs().max()) < 0.05 and float(rms(error).max()) < 0.02
+    assert float(error.abs().max()) < 0.03 and float(rms(error).max()) < 0.01
 
 
 @pytest.mark.parametrize("method", METHODS.values(), ids=list(METHODS))
@@ -174,12 +176,12 @@ def test_vibration_is_a_tone() -> None:
 
 
 def test_low_signal_is_admitted() -> None:
-    """Single pulses fail at -5 dB and say so; the course is found there and fails at -15 dB."""
-    x, _ = aircraft(-5.0, 2, 400)
+    """Single pulses fail at -5 dB and say so; the course is found there and fails at -25 dB."""
+    x, _ = aircraft(-5.0, 2, 300)
     for method in SINGLE.values():
         found = method(x)
-        assert float(rms(off(found["shift_cells"], torch.zeros(2, 400))).max()) > 1 and not found.ok.any()
-    far, _ = aircraft(-15.0, 4, 400)
+        assert float(rms(off(found["shift_cells"], torch.zeros(2, 300))).max()) > 1 and not found.ok.any()
+    far, _ = aircraft(-25.0, 3, 400)
     assert not align_envelopes(far).ok.any()
 
 
@@ -256,7 +258,7 @@ def test_refinement_by_the_image_finds_a_bent_course() -> None:
 
 
 def test_stages_follow_a_target_that_is_tracked_badly() -> None:
-    """Compressed with 100 m/s, flying 100.3 m/s and vibrating: the chain removes the drift and gives the velocity back."""
+    """Compressed with 100 m/s, flying 100.3 m/s and vibrating: the chain removes the drift and gives the velocity back, with that of the coupling."""
     world = TurntableWorld(Aircraft(), motion=[Polynomial([100.3, 0.1]), Sinusoid(2e-6, 100.0)], start_phase=[UniformStartPhase()], snr_db=5.0, fidelity=Dechirped([Polynomial([100.0])]))
     recording, truth = simulate_turntable(LADAR, world, 200, 256, Draws(2, trials=range(2)), dtype=DOUBLE)
     used = torch.full((2,), 100.0, dtype=torch.float64)
@@ -267,7 +269,8 @@ def test_stages_follow_a_target_that_is_tracked_badly() -> None:
     )
     trace = chain.trace(recording, given={"aux.velocity_m_s": used})
     assert trace.estimates["align"].ok.all()
-    torch.testing.assert_close(trace.values["align.velocity_m_s"], torch.full((2,), 100.3 + 0.1 * 0.1, dtype=torch.float64), atol=0.003, rtol=0)
+    coupled = 2 * 0.1 * LADAR.carrier_hz / LADAR.chirp_rate_hz_s
+    torch.testing.assert_close(trace.values["align.velocity_m_s"], torch.full((2,), 100.3 + 0.1 * 0.1 + coupled, dtype=torch.float64), atol=0.005, rtol=0)
     drift_m = truth.values["displacement_m"] - 100 * torch.arange(200) / 2000
     residual = trace.values["align.shift_m"] - drift_m
     # what is left is the coupling of range and Doppler: acceleration and vibration times f0 / gamma

@@ -22,19 +22,21 @@ Found = tuple[Tensor, Tensor, Again]
 Find = Callable[[Tensor, Tensor, Tensor | None], Found]
 
 
-def sharpness_beyond_speckle(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Entropy (nats) that an image (..., range, Doppler) lacks against speckle of the same row energies, and its effective number of rows.
+def sharpness_beyond_speckle(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Entropy (nats) that an image (..., range, Doppler) lacks against speckle of the same row energies, (...,).
 
-    An image whose rows are circular noise has 0 before any phase is fitted to it. Both (...,).
+    An image whose rows are circular noise has 0 before any phase is fitted to it. Also returns over how many rows its energy is spread, and over
+    how many rows the sharpness is (1 where one bright row makes all of it).
     """
-    power = image.real.square() + image.imag.square()
-    row = power.sum(-1, dtype=torch.float64)
+    real, imag = image.real.contiguous(), image.imag.contiguous()
+    power = (real * real + imag * imag).to(torch.float64)
+    row = power.sum(-1)
     share = row / _or_one(row.sum(-1, keepdim=True))
-    power = power / _or_one(power.sum((-2, -1), keepdim=True))
-    tiny = torch.finfo(power.dtype).tiny
-    entropy = -(power * torch.log(power.clamp_min(tiny))).sum((-2, -1), dtype=torch.float64)
-    speckle = -(share * torch.log(share.clamp_min(1e-300))).sum(-1) + math.log(image.shape[-1]) - SPECKLE_NATS
-    return speckle - entropy, 1 / _or_one(share.square().sum(-1))
+    within = power / _or_one(row[..., None])
+    entropy = -(within * torch.log(within.clamp_min(1e-300))).sum(-1)
+    lack = share * torch.where(row > 0, math.log(image.shape[-1]) - SPECKLE_NATS - entropy, 0)
+    sharp = lack.sum(-1)
+    return sharp, 1 / _or_one(share.square().sum(-1)), sharp.square() / _or_one(lack.square().sum(-1))
 
 
 def sharpness_of_noise(rows: Tensor) -> Tensor:
@@ -50,7 +52,7 @@ def estimated(pulses: Pulses, start: Tensor | None, find: Find, at_rest: bool = 
     """Find a phase and judge it, by blocks of trials that stay in the cache (all at once where gradients are wanted).
 
     find(rows, present, start): phase (trial, pulse), iterations taken (trial,), and `again`: what a method finds from some of the rows beginning with
-    a phase. It is run on the even and on the odd range cells, whose noise is independent: half of the difference of both, and how far
+    a phase. It is run on two halves of the rows, dealt out by their energy, whose noise is independent: half of the difference of both, and how far
     it moves away on all rows (nothing where the phase is at_rest under it), make the predicted deviation. ok: the image is 1.5 times sharper
     than noise can be made, more than one row carries it, and the deviation promises a Strehl ratio of 0.8. quality: that ratio, times the share
     of the sharpness that noise does not explain. A pulse without samples has no phase of its own and is marked in info["present"].
@@ -71,26 +73,26 @@ def estimated(pulses: Pulses, start: Tensor | None, find: Find, at_rest: bool = 
 
 
 def _judged(rows: Tensor, present: Tensor, start: Tensor | None, find: Find, at_rest: bool) -> tuple[Tensor, ...]:
-    """Phase, iterations, sharpness, effective rows, deviation of every trial."""
+    """Phase, iterations, sharpness, rows of the energy and of the sharpness, deviation of every trial."""
     phase, taken, again = find(rows, present, start)
     with torch.no_grad():
-        sharp, effective = sharpness_beyond_speckle(torch.fft.fft(rotate(rows, phase), norm="ortho"))
+        sharp, effective, telling = sharpness_beyond_speckle(torch.fft.fft(rotate(rows, phase), norm="ortho"))
         deviation = _disagreement(rows, present, phase, again)
         if not at_rest:
             deviation = torch.hypot(deviation, phase_rmse(again(rows, present, phase), phase, present))
-    return phase, taken, sharp, effective, deviation
+    return phase, taken, sharp, effective, telling, deviation
 
 
 def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
-    phase, taken, sharp, effective, deviation = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
+    phase, taken, sharp, effective, telling, deviation = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
     present, shape = pulses.present, pulses.trials
     noise = sharpness_of_noise(effective.clamp_min(1))
     learnable = present.sum(-1) >= 3
     promised = torch.exp(-deviation.square())
     quality = torch.where(learnable, promised * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1)), 0)
-    ok = learnable & (sharp > _MARGIN * noise) & (effective > _LEAST_ROWS) & (promised > LEAST_STREHL)
+    ok = learnable & (sharp > _MARGIN * noise) & (telling > _LEAST_ROWS) & (promised > LEAST_STREHL)
     phase = torch.where(learnable[:, None], phase, 0)
-    info = {"iterations": taken, "sharpness_nats": sharp, "noise_sharpness_nats": noise, "effective_rows": effective}
+    info = {"iterations": taken, "sharpness_nats": sharp, "noise_sharpness_nats": noise, "effective_rows": effective, "telling_rows": telling}
     std = deviation[:, None].expand(-1, pulses.n).to(phase.dtype)
     return Estimate(
         value={"phase_rad": phase.reshape(*shape, pulses.n)},
@@ -102,11 +104,13 @@ def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
 
 
 def _disagreement(rows: Tensor, present: Tensor, phase: Tensor, again: Again) -> Tensor:
-    """Half of the rms difference (rad) between the phases from even and from odd range cells, (trial,); pi / sqrt(3) where there is but one cell."""
+    """Half of the rms difference (rad) between the phases from two halves of the rows, (trial,); pi / sqrt(3) where there is but one."""
     if rows.shape[-2] < 2 or rows.shape[-1] < 3:
         return torch.full(rows.shape[:1], math.pi / math.sqrt(3), dtype=torch.float64, device=rows.device)
-    even, odd = (again(half.contiguous(), present, phase) for half in (rows[:, 0::2], rows[:, 1::2]))
-    return phase_rmse(even, odd, present) / 2
+    order = (rows.real.square() + rows.imag.square()).sum(-1).argsort(-1, descending=True)
+    halves = (order[:, part::2].sort(-1).values for part in (0, 1))
+    one, other = (again(rows.gather(1, half[..., None].expand(-1, -1, rows.shape[-1])), present, phase) for half in halves)
+    return phase_rmse(one, other, present) / 2
 
 
 def _or_one(x: Tensor) -> Tensor:
