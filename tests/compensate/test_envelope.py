@@ -155,14 +155,14 @@ def test_perfect_data_are_not_harmed() -> None:
     assert 0 < cost(align_mean) < 0.04 < cost(SINGLE["mean of |s|"])
 
 
-@pytest.mark.parametrize("snr_db", [None, 0.0, -5.0])
+@pytest.mark.parametrize("snr_db", [None, 0.0, -10.0])
 def test_a_course_over_several_windows_is_found(snr_db: float | None) -> None:
     x, _ = aircraft(snr_db, 3, 400)
     u = unit_time(400)
     true = torch.stack([0 * u, 50 * u + 20 * u**2, 340 * u - 60 * u**2])
     found = align_envelopes(shift_range(x, true))
     error = rms(off(found["shift_cells"], true))
-    assert found.ok.all() and float(error.max()) < 0.05
+    assert found.ok.all() and float(error.max()) < 0.1
     assert bool((error < 3 * found.std["shift_cells"][:, 0] + 0.02).all())
     torch.testing.assert_close(drift_cells(found["shift_cells"]), drift_cells(true), atol=1e-3, rtol=0)
 
@@ -227,7 +227,7 @@ def test_bad_input_is_refused(method) -> None:
     "call",
     [
         partial(align_running, memory_pulses=0.5),
-        partial(align_mean, match="power"),
+        partial(align_mean, match="power"),  # pyright: ignore[reportArgumentType]
         partial(align_mean, iterations=0),
         partial(align_envelopes, degree=-1),
         partial(align_envelopes, degree=None, tones=1),

@@ -62,7 +62,7 @@ def align_running(data: Tensor, *, memory_pulses: float = 10.0) -> Estimate:
     """
     if not memory_pulses >= 1:
         raise ValueError(f"align_running: memory_pulses is {memory_pulses}; choose 1 or more")
-    return _estimated(data, "align_running", lambda pulses: running_shifts(pulses, 1 / memory_pulses))
+    return _estimated(data, "align_running", lambda pulses: (running_shifts(pulses, 1 / memory_pulses), None))
 
 
 def align_mean(data: Tensor, *, first: Literal["running", "none"] = "running", match: Match = "likelihood", iterations: int = 4) -> Estimate:
@@ -75,9 +75,9 @@ def align_mean(data: Tensor, *, first: Literal["running", "none"] = "running", m
     if first not in ("running", "none") or match not in ("likelihood", "amplitude") or iterations < 1:
         raise ValueError(f"align_mean: first is {first!r} ('running' or 'none'), match {match!r} ('likelihood' or 'amplitude'), iterations {iterations} (1 or more)")
 
-    def find(pulses: Envelopes) -> Tensor:
+    def find(pulses: Envelopes) -> Course:
         start = running_shifts(pulses, 0.1) if first == "running" else torch.zeros_like(pulses.present, dtype=torch.float64)
-        return single_shifts(pulses, start, match, iterations)
+        return single_shifts(pulses, start, match, iterations), None
 
     return _estimated(data, "align_mean", find)
 
@@ -86,24 +86,25 @@ def align_envelopes(data: Tensor, *, degree: int | None = 2, tones: int = 0, pas
     """The recommended alignment, with value["shift_cells"] (..., pulse) to be removed: a smooth course of shifts of mean zero.
 
     data: (..., pulse, range) complex, range-compressed, of any phases. The line along which the coarse envelopes add up best, then `passes` rounds: the mean
-    envelope, the likelihood of the shift of each of `blocks` runs of pulses against it, and a polynomial of `degree` through these, robust against
-    runs that went wrong. tones: number of sinusoids (vibration) that are then looked for in the shifts of single pulses, and kept where they
+    envelope, the likelihood of the shift of each of `blocks` runs of pulses against that of the others, and a polynomial of `degree` through these, robust
+    against runs that went wrong. tones: number of sinusoids (vibration) that are then looked for in the shifts of single pulses, and kept where they
     stand out; they need periods of two pulses or more, and shifts of single pulses, that is about -5 dB. degree None: shifts of single pulses, not
     smoothed, begun at a parabola.
 
-    On the aircraft of brief 002 (400 pulses) the course is found to 0.02 cell at 0 dB and 0.05 cell at -10 dB, and costs perfect data less than 0.002 nats. Shifts may
-    pass the ends of the window any number of times, but not curve away from a line by half a window. A pulse of zeros takes the place that the course gives it. std: half of the rms
-    difference between what the lower and the upper half of the band say, each found from nothing; ok: it is below half a cell. quality: 1 / (1 + (2 std)^2).
+    On the aircraft of brief 002 (400 pulses) the course is found to 0.02 cell down to -8 dB and to 0.05 cell at -12.5 dB, and costs perfect data less than 0.002 nats.
+    Shifts may pass the ends of the window any number of times, but not curve away from a line by half a window. A pulse of zeros takes the
+    place that the course gives it. std: half of the rms difference between what the lower and the upper half of the band say, each found from nothing, or the
+    deviation of the course by the scatter of its runs where that is more; ok: it is below half a cell. quality: 1 / (1 + (2 std)^2). Not differentiable.
     Raises TypeError or ValueError for samples that are not finite and complex, or settings that make no sense.
     """
     if not ((degree is None or degree >= 0) and tones >= 0 and passes >= 1 and blocks >= 1) or (degree is None and tones):
         raise ValueError(f"align_envelopes: degree is {degree} (0 or more; None without tones), tones {tones} (0 or more), passes {passes} and blocks {blocks} (1 or more)")
 
-    def find(pulses: Envelopes) -> Tensor:
-        smooth = smooth_shifts(pulses, 2 if degree is None else degree, passes, blocks)
+    def find(pulses: Envelopes) -> Course:
+        smooth, deviation = smooth_shifts(pulses, 2 if degree is None else degree, passes, blocks)
         if degree is None:
-            return single_shifts(pulses, smooth, "likelihood", 3)
-        return with_tones(pulses, smooth, tones, degree) if tones else smooth
+            return single_shifts(pulses, smooth, "likelihood", 3), None
+        return with_tones(pulses, smooth, tones, degree), deviation
 
     return _estimated(data, "align_envelopes", find)
 
@@ -113,7 +114,8 @@ def refine_alignment(data: Tensor, shift_cells: Tensor, *, degree: int = 2, roun
 
     data: (..., pulse, range) complex. In each round `autofocus` finds the phases at the present shifts; then the coefficients of degrees 1..degree are varied with these
     phases held (torchsar.optim.lbfgs, each trial by itself, at most `steps` steps). A round that does not lower the entropy is not taken. Needs
-    phases that can be found, that is shifts within about a cell. ok: that of the last autofocus. quality: its quality. Errors as `align_envelopes`.
+    phases that can be found, that is shifts within about a cell. On shifts of `align_envelopes` it changes the
+    entropy by less than 0.005. ok and quality: those of the last autofocus. Errors as `align_envelopes`.
     """
     flat, _ = _checked(data, "refine_alignment")
     if degree < 1 or rounds < 1:
@@ -125,9 +127,10 @@ def refine_alignment(data: Tensor, shift_cells: Tensor, *, degree: int = 2, roun
     for _ in range(rounds):
         held = phase["phase_rad"]
         found = lbfgs(lambda c: entropy(_focused(flat, shift + (basis @ c[..., None])[..., 0], held)).double(), shift.new_zeros(len(flat), degree), steps=steps, first_step=0.05)  # noqa: B023
-        shift = shift + (basis @ found.x[..., None])[..., 0]
-        phase = autofocus(shift_range(flat, -shift), start=held)
-        least = entropy(_focused(flat, shift, phase["phase_rad"]))
+        moved = shift + (basis @ found.x[..., None])[..., 0]
+        phase = autofocus(shift_range(flat, -moved), start=held)
+        reached = entropy(_focused(flat, moved, phase["phase_rad"]))
+        shift, least = torch.where((reached < least)[:, None], moved, shift), torch.minimum(reached, least)
     shape = data.shape[:-2]
     return Estimate({"shift_cells": shift.reshape(data.shape[:-1])}, phase.quality.reshape(shape), phase.ok.reshape(shape), info={"entropy_nats": least.reshape(shape)})
 
@@ -196,6 +199,9 @@ class Envelopes:
         return torch.where(place > length / 2, place - length, place) / _QUARTER
 
 
+Course = tuple[Tensor, Tensor | None]  # shifts (trial, pulse), and their deviation (trial,) where the method has one of its own
+
+
 def _half_cells(lines: Tensor) -> Tensor:
     """Band-limited interpolation to half cells; the whole spectrum of n samples stays, from -n // 2 on."""
     n = lines.shape[-1]
@@ -232,21 +238,24 @@ def single_shifts(pulses: Envelopes, start: Tensor, match: Match, iterations: in
     return shift
 
 
-def smooth_shifts(pulses: Envelopes, degree: int, passes: int, blocks: int) -> Tensor:
-    """Polynomial course of the shifts, (trial, pulse) float64 of mean zero."""
+def smooth_shifts(pulses: Envelopes, degree: int, passes: int, blocks: int) -> tuple[Tensor, Tensor]:
+    """Polynomial course of the shifts, (trial, pulse) float64 of mean zero, and its deviation by the scatter of the runs about it, (trial,)."""
     k = pulses.present.shape[-1]
     basis = legendre(_unit_time(k, pulses.present.device), degree)
     runs = _runs(k, max(blocks, degree + 1), pulses.present)
     shift = mean_drift(pulses)[:, None] * (torch.arange(k, dtype=torch.float64, device=basis.device) - (k - 1) / 2)
-    count = runs.sum(-1)
+    count, step, found = runs.sum(-1), torch.zeros_like(runs[:, :1, 0]), torch.zeros_like(runs[..., 0])
     middle = (runs @ basis) / count.clamp_min(1)[..., None]
     for _ in range(passes):
-        moved = pulses.moved(shift)
-        against = pulses.likelihood(moved.sum(-2, keepdim=True) / pulses.count)
-        found = pulses.peak((runs.to(moved.dtype) @ moved) * against.conj())
-        shift = shift + (basis @ robust_fit(found, middle, count)[..., None]).squeeze(-1)
+        sums = runs.to(pulses.spectra.dtype) @ pulses.moved(shift)
+        # a run is held against the others alone: its own noise would hold it where it is
+        others = (sums.sum(-2, keepdim=True) - sums) / (count.sum(-1, keepdim=True) - count).clamp_min(1)[..., None]
+        found = pulses.peak(sums * pulses.likelihood(others).conj())
+        step = robust_fit(found, middle, count)
+        shift = shift + (basis @ step[..., None]).squeeze(-1)
         shift = shift - shift.mean(-1, keepdim=True)
-    return shift
+    off = (found - (middle @ step[..., None]).squeeze(-1)).abs()
+    return shift, _middling(off, count > 0).squeeze(-1) * ((degree + 1) / (count > 0).sum(-1).clamp_min(1)).sqrt()
 
 
 def mean_drift(pulses: Envelopes) -> Tensor:
@@ -277,9 +286,14 @@ def robust_fit(values: Tensor, basis: Tensor, weight: Tensor, iterations: int = 
         if turn < iterations // 2:
             now = weight / off.clamp_min(0.1)
         else:
-            scale = 1.4826 * torch.where(weight > 0, off, torch.nan).nanmedian(-1, keepdim=True).values.nan_to_num() + _LEAST_CELLS
+            scale = _middling(off, weight > 0) + _LEAST_CELLS
             now = weight * (1 - (off / (_TUKEY * scale)).square()).clamp_min(0).square()
     return coefficients
+
+
+def _middling(off: Tensor, counts: Tensor) -> Tensor:
+    """Deviation of normal errors with the median of these sizes (trial, m), (trial, 1)."""
+    return 1.4826 * torch.where(counts, off, torch.nan).nanmedian(-1, keepdim=True).values.nan_to_num()
 
 
 def weighted_fit(values: Tensor, basis: Tensor, weight: Tensor) -> Tensor:
@@ -355,7 +369,7 @@ def strongest_tone(rest: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
     return at / (8 * k), top > (math.log(k) + _STANDS_OUT) * power.mean(-1)
 
 
-def _estimated(data: Tensor, name: str, find: Callable[[Envelopes], Tensor]) -> Estimate:
+def _estimated(data: Tensor, name: str, find: Callable[[Envelopes], Course]) -> Estimate:
     """Shifts of the whole band and, to judge them, of its lower and upper half, whose speckle and noise are independent."""
     flat, present = _checked(data, name)
     height = max(1, 8 * block_bytes_of(flat.device) // max(1, flat[0].numel() * flat.element_size())) if len(flat) else 1
@@ -376,15 +390,16 @@ def _estimated(data: Tensor, name: str, find: Callable[[Envelopes], Tensor]) -> 
     )
 
 
-def _judged(lines: Tensor, find: Callable[[Envelopes], Tensor]) -> tuple[Tensor, Tensor]:
-    """Shifts (trial, pulse) and their deviation (trial,) in cells."""
-    envelopes = Envelopes.of(lines)
-    shift, n = find(envelopes), lines.shape[-1]
+def _judged(lines: Tensor, find: Callable[[Envelopes], Course]) -> tuple[Tensor, Tensor]:
+    """Shifts (trial, pulse) and their deviation (trial,) in cells: what the halves disagree by, or what the method says itself where that is more."""
+    envelopes, n = Envelopes.of(lines), lines.shape[-1]
+    shift, deviation = find(envelopes)
     if n < 4:
         return shift, shift.new_full(shift.shape[:1], n / math.sqrt(12))
-    lower, upper = (find(Envelopes.of(half)) * (n / half.shape[-1]) for half in _band_halves(lines))
+    lower, upper = (find(Envelopes.of(half))[0] * (n / half.shape[-1]) for half in _band_halves(lines))
     off = _about_circular_mean(lower - upper, envelopes.present, n)
-    return shift, (off.square().sum(-1) / envelopes.present.sum(-1).clamp_min(1)).sqrt() / 2
+    disagreement = (off.square().sum(-1) / envelopes.present.sum(-1).clamp_min(1)).sqrt() / 2
+    return shift, disagreement if deviation is None else torch.maximum(disagreement, deviation)
 
 
 def _band_halves(lines: Tensor) -> list[Tensor]:

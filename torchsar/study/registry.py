@@ -12,8 +12,9 @@ from typing import Any
 
 from torchsar.compensate.ambiguity import DopplerCentroid
 from torchsar.compensate.doppler import EnergyCentre, PhaseIncrement, RangeDependentCentroid
+from torchsar.compensate.envelope import AlignEnvelopes, ShiftRange
 from torchsar.compensate.point import PointDoppler
-from torchsar.compensate.pulse_phase.stages import CorrectPulsePhase, EntropyFixedPoint, Pga, PgaSca, Sca
+from torchsar.compensate.pulse_phase.stages import CorrectPulsePhase, EntropyFixedPoint, Pga, PgaSca, Sca, SharpestPhase
 from torchsar.echo.channels import ChannelImbalance
 from torchsar.echo.interference import Quantiser, Tone, WideInterferer
 from torchsar.echo.jitter import PeriodicJitter
@@ -102,10 +103,13 @@ COMPENSATE: dict[str, Callable[..., Any]] = {
     "doppler_centroid": DopplerCentroid,
     "point_doppler": PointDoppler,
     "effective_velocity": factories.effective_velocity,
+    "align_envelopes": AlignEnvelopes,
+    "shift_range": ShiftRange,
     "sca": Sca,
     "pga": Pga,
     "pga_sca": PgaSca,
     "entropy_fixed_point": EntropyFixedPoint,
+    "sharpest_phase": SharpestPhase,
     "autofocus": factories.AutofocusOfImage,
     "pulse_phase_correct": CorrectPulsePhase,
 }

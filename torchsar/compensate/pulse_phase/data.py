@@ -50,7 +50,7 @@ def prepare(data: Tensor, name: str) -> Pulses:
 
 
 def starting_phase(start: Tensor | None, pulses: Pulses, name: str) -> Tensor | None:
-    """A start of the caller, (..., pulse) or (pulse,), as (trial, pulse) in the working precision."""
+    """A start of the caller, (..., pulse) or (pulse,), as (trial, pulse) in the working precision, less whole turns, which many turns would need more than it holds."""
     if start is None:
         return None
     want = (*pulses.trials, pulses.n)
@@ -60,7 +60,7 @@ def starting_phase(start: Tensor | None, pulses: Pulses, name: str) -> Tensor | 
         wide = start.expand(want)
     except RuntimeError:
         raise ValueError(f"{name}: start has the shape {tuple(start.shape)}; one phase per pulse is {want}") from None
-    return wide.reshape(-1, pulses.n).to(dtype=pulses.rows.real.dtype, device=pulses.rows.device)
+    return on_the_circle(wide.reshape(-1, pulses.n).to(torch.float64)).to(dtype=pulses.rows.real.dtype, device=pulses.rows.device)
 
 
 def rotate(rows: Tensor, phase_rad: Tensor) -> Tensor:

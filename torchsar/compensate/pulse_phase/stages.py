@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Literal
 
+import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import rotate
+from torchsar.compensate.pulse_phase.data import on_the_circle, rotate
+from torchsar.compensate.pulse_phase.descent import sharpest_phase
 from torchsar.compensate.pulse_phase.gradient import Kernel, Listed, Measured, Shrinking, Windows, pga, pga_sca
 from torchsar.compensate.pulse_phase.imaging import Imaging
 from torchsar.compensate.pulse_phase.pairs import sca
@@ -16,10 +18,13 @@ from torchsar.core import Estimate, Signal, Stage, real_dtype
 
 
 def correct_pulse_phase(data: Tensor, phase_rad: Tensor) -> Tensor:
-    """data * exp(-j phase). data: (..., pulse, range) complex; phase_rad: (..., pulse) or (pulse,). Differentiable in both (Ruan et al. 2013, text after Eq. 6)."""
+    """data * exp(-j phase). data: (..., pulse, range) complex; phase_rad: (..., pulse) or (pulse,), whole turns of which are dropped in float64.
+
+    Differentiable in both (Ruan et al. 2013, text after Eq. 6). Raises ValueError where there is not one phase a pulse.
+    """
     if phase_rad.shape[-1:] != data.shape[-2:-1]:
         raise ValueError(f"one phase per pulse is needed, (..., {data.shape[-2]}), got {tuple(phase_rad.shape)}")
-    return rotate(data.mT, phase_rad.to(real_dtype(data.dtype))).mT
+    return rotate(data.mT, on_the_circle(phase_rad.to(torch.float64)).to(real_dtype(data.dtype))).mT
 
 
 class CorrectPulsePhase(Stage):
@@ -95,3 +100,18 @@ class Autofocus(Stage):
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
         return autofocus(signal.data, start=start, search=self.search, polish=self.polish, imaging=self.imaging)
+
+
+class SharpestPhase(Stage):
+    """`sharpest_phase`: the phases of least power or amplitude entropy, or of most contrast, by descent from SCA or the value `start`."""
+
+    provides = ("phase_rad",)
+
+    def __init__(self, objective: Literal["power_entropy", "amplitude_entropy", "contrast"] = "power_entropy", method: Literal["lbfgs", "adam"] = "lbfgs", steps: int = 100) -> None:
+        super().__init__()
+        self.objective: Literal["power_entropy", "amplitude_entropy", "contrast"] = objective
+        self.method: Literal["lbfgs", "adam"] = method
+        self.steps = steps
+
+    def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
+        return sharpest_phase(signal.data, objective=self.objective, method=self.method, steps=self.steps, start=start)

@@ -58,6 +58,8 @@ def estimated(pulses: Pulses, start: Tensor | None, find: Find, at_rest: bool = 
     of the sharpness that noise does not explain. A pulse without samples has no phase of its own and is marked in info["present"].
     """
     rows, present = pulses.rows, pulses.present
+    if not len(rows) or pulses.n < 3:
+        return _gathered(pulses, [_nothing(rows)])
     if len(rows) == 1 or (rows.requires_grad and torch.is_grad_enabled()):
         return _gathered(pulses, [_judged(rows, present, start, find, at_rest)])
     height = max(1, block_bytes_of(rows.device) // (rows[0].numel() * rows.element_size()))
@@ -83,6 +85,12 @@ def _judged(rows: Tensor, present: Tensor, start: Tensor | None, find: Find, at_
     return phase, taken, sharp, effective, telling, deviation
 
 
+def _nothing(rows: Tensor) -> tuple[Tensor, ...]:
+    """What `_judged` would return where no phase can be found: too few pulses, or no trials."""
+    zero = torch.zeros(len(rows), dtype=torch.float64, device=rows.device)
+    return rows[:, 0].real * 0, zero.long(), zero, zero, zero, zero + math.pi / math.sqrt(3)
+
+
 def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
     phase, taken, sharp, effective, telling, deviation = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
     present, shape = pulses.present, pulses.trials
@@ -105,7 +113,7 @@ def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
 
 def _disagreement(rows: Tensor, present: Tensor, phase: Tensor, again: Again) -> Tensor:
     """Half of the rms difference (rad) between the phases from two halves of the rows, (trial,); pi / sqrt(3) where there is but one."""
-    if rows.shape[-2] < 2 or rows.shape[-1] < 3:
+    if rows.shape[-2] < 2:
         return torch.full(rows.shape[:1], math.pi / math.sqrt(3), dtype=torch.float64, device=rows.device)
     order = (rows.real.square() + rows.imag.square()).sum(-1).argsort(-1, descending=True)
     halves = (order[:, part::2].sort(-1).values for part in (0, 1))

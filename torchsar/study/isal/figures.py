@@ -16,6 +16,7 @@ from torchsar.core import Signal
 from torchsar.metrics import residual_phase
 from torchsar.study.pictures import Drawn, Picture, draw_all
 
+_NEAR_RAD = 0.3
 _COMPARED = {
     "entropy_above_ideal_nats": "entropy above the ideal image (nats)",
     "agreement_rad": "influence of the injected phases (rad)",
@@ -65,15 +66,14 @@ def _images(case: str, result: CaseResult) -> Drawn:
 def _phases(case: str, result: CaseResult) -> Drawn:
     pulses = np.arange(result.true_rad.numel())
     inside = torch.remainder(result.true_rad + torch.pi, 2 * torch.pi) - torch.pi
-    left = {name: (pulses, plot.array(residual_phase(phase, result.true_rad))) for name, phase in result.phases.items() if name not in ("none", "ideal")}
-    if not left:
-        return
-    parts = [
-        {"series": {"true": (pulses, plot.array(inside))}, "xlabel": "pulse", "ylabel": "rad", "title": "phase error put in, modulo a turn"},
-        {"series": left, "xlabel": "pulse", "ylabel": "rad", "title": "what each method leaves of it"},
-    ]
+    left = {name: residual_phase(phase, result.true_rad) for name, phase in result.phases.items() if name not in ("none", "ideal")}
+    parts = [{"series": {"true": (pulses, plot.array(inside))}, "xlabel": "pulse", "ylabel": "rad", "title": "phase error put in, modulo a turn"}]
+    for title, near in (("what the best methods leave of it", True), ("what the others leave", False)):
+        series = {name: (pulses, plot.array(phase)) for name, phase in left.items() if (float(phase.square().mean().sqrt()) < _NEAR_RAD) == near}
+        if series:
+            parts.append({"series": series, "xlabel": "pulse", "ylabel": "rad", "title": title})
     title = "Phase errors" if case == "all" else f"Phase errors: {case}"
-    yield f"phases_{_word(case)}", title, "Constant and linear terms are removed on the circle: they only turn and shift the image.", plot.panels(parts)
+    yield f"phases_{_word(case)}", title, "Constant and linear terms are removed on the circle: they only turn and shift the image.", plot.panels(parts, columns=1)
 
 
 def _centred(image: Signal) -> Signal:

@@ -1,0 +1,50 @@
+"""Range-compressed pulses of point targets with phases of their own, made by plain formulas."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate import autofocus, entropy_fixed_point, pga, pga_sca, sca
+from torchsar.core import Draws, Estimate, unit_phasor
+
+DOUBLE = torch.complex128
+METHODS: dict[str, Callable[[Tensor], Estimate]] = {"sca": sca, "pga": pga, "pga_sca": pga_sca, "entropy_fixed_point": entropy_fixed_point, "autofocus": autofocus}
+EQUIVARIANT = ("sca", "pga_sca", "entropy_fixed_point", "autofocus")
+
+
+def still(trials: int, n_pulse: int = 128, n_range: int = 64, per_row: int = 3, width: float = 0.5, seed: int = 3) -> Tensor:
+    """Points at random places in every range cell, no phase error, (trial, pulse, range) complex128. width: share of the Doppler band they fill."""
+    draws = Draws(seed, trials=range(trials))
+    shape = (n_range, per_row)
+    cycles = width * draws.uniform("cycles", shape, -0.5, 0.5)
+    amplitude = draws.normal("amplitude", shape, DOUBLE)
+    k = torch.arange(n_pulse, dtype=torch.float64)
+    return (amplitude[..., None] * unit_phasor(cycles[..., None] * k, DOUBLE)).sum(-2).mT.contiguous()
+
+
+def noisy(x: Tensor, snr_db: float, seed: int = 4) -> Tensor:
+    """Circular noise; SNR: mean power of all samples over the noise variance."""
+    noise = Draws(seed, trials=range(len(x))).normal("noise", tuple(x.shape[1:]), DOUBLE)
+    return x + noise * (x.abs().square().mean((-2, -1), keepdim=True) * 10 ** (-snr_db / 10)).sqrt()
+
+
+def white(trials: int, n_pulse: int = 128, seed: int = 5) -> Tensor:
+    """Uniform phases of every pulse, (trial, pulse)."""
+    return Draws(seed, trials=range(trials)).uniform("white", (n_pulse,), 0.0, 2 * math.pi)
+
+
+def turned(x: Tensor, phase_rad: Tensor) -> Tensor:
+    return x * unit_phasor(phase_rad / (2 * math.pi), DOUBLE)[..., None].to(x.dtype)
+
+
+def doppler_image(x: Tensor, phase_rad: Tensor) -> Tensor:
+    """Image of the pulses less their phases, (..., Doppler, range)."""
+    return torch.fft.fft(turned(x, -phase_rad), dim=-2, norm="ortho")
+
+
+def noise(trials: int, n_pulse: int, n_range: int, dtype: torch.dtype = torch.complex64, seed: int = 6) -> Tensor:
+    return Draws(seed, trials=range(trials)).normal("alone", (n_pulse, n_range), dtype)

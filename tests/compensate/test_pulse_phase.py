@@ -1,0 +1,334 @@
+"""The autofocus family against direct evaluation, and the properties it has exactly."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tests.compensate.scenes import DOUBLE, EQUIVARIANT, METHODS, doppler_image, noisy, still, turned, white
+from torchsar.compensate import Autofocus, CorrectPulsePhase, EntropyFixedPoint, Listed, Measured, Pga, PgaSca, Sca, Shrinking, autofocus, correct_pulse_phase, entropy_fixed_point, pga, pga_sca, sca
+from torchsar.compensate.pulse_phase.data import prepare, without_line
+from torchsar.compensate.pulse_phase.imaging import AlongPulses
+from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, fixed_point
+from torchsar.core import Chain, Signal, use
+from torchsar.metrics import entropy, phase_rmse, residual_phase
+from torchsar.radar import InverseRadar
+
+RADAR = InverseRadar(2e14, 150e9, 2000.0, 0.005)
+
+
+def constant_apart(a: Tensor, b: Tensor) -> float:
+    """Largest difference (rad, on the circle) of phases once their common constant is gone."""
+    turn = torch.exp(1j * (a - b))
+    return float(torch.angle(turn / turn[..., :1]).abs().max())
+
+
+# properties of section 5
+
+
+@pytest.mark.parametrize("name", EQUIVARIANT)
+def test_the_size_of_the_error_is_of_no_account(name):
+    x = noisy(still(2), 10.0)
+    a = 1e4 * torch.randn(2, 128, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    plain, moved = METHODS[name](x)["phase_rad"], METHODS[name](turned(x, a))["phase_rad"]
+    assert constant_apart(moved, plain + a) < 1e-10
+    assert float((entropy(doppler_image(turned(x, a), moved)) - entropy(doppler_image(x, plain))).abs().max()) < 1e-12
+
+
+def test_pga_and_a_start_at_zero_are_not_equivariant():
+    x, a = still(1), white(1)
+    for method in (pga, lambda data: entropy_fixed_point(data, start=torch.zeros(128))):
+        assert constant_apart(method(turned(x, a))["phase_rad"], method(x)["phase_rad"] + a) > 0.1
+
+
+@pytest.mark.parametrize("name", EQUIVARIANT)
+def test_constant_and_linear_phases_cannot_be_seen(name):
+    """A constant changes nothing; a line of whole cells moves the image, and the estimate follows it."""
+    x = noisy(still(1), 20.0)
+    line = 1.3 + 2 * math.pi * 7 / 128 * torch.arange(128, dtype=torch.float64)
+    plain, moved = METHODS[name](x), METHODS[name](turned(x, line[None]))
+    assert phase_rmse(moved["phase_rad"], plain["phase_rad"]) < 1e-10
+    torch.testing.assert_close(moved.quality, plain.quality, atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("name", ["pga_sca", "entropy_fixed_point", "autofocus"])
+def test_white_phases_are_found(name):
+    x, a = still(3), white(3)
+    found = METHODS[name](turned(x, a))
+    error = phase_rmse(found["phase_rad"], a)
+    assert found.ok.all() and bool((error < 0.15).all()) and bool((error < 2 * found.std["phase_rad"][:, 0]).all())
+    assert bool((found.quality > 0.8).all()) and found["phase_rad"].dtype == torch.float64
+
+
+def test_methods_rank_as_measured():
+    """SCA leaves much, PGA from it less, the entropy less, the Wiener estimate least; PGA from zero does not find white phases."""
+    x, a = noisy(still(4, per_row=5), 20.0), white(4)
+    error = {name: float(phase_rmse(method(turned(x, a))["phase_rad"], a).median()) for name, method in METHODS.items()}
+    assert error["autofocus"] < error["entropy_fixed_point"] < error["pga_sca"] < 0.6 * error["sca"] and error["pga"] > 0.8
+
+
+# SCA
+
+
+def test_sca_equals_the_sum_of_its_steps():
+    x = noisy(still(1, 24, 10), 5.0)[0]
+    psi = [0.0]
+    for k in range(1, 24):
+        g = sum(complex(x[k - 1, n]) * complex(x[k, n]).conjugate() for n in range(10))
+        psi.append(psi[-1] - np.angle(g))
+    torch.testing.assert_close(sca(x)["phase_rad"], torch.tensor(psi, dtype=torch.float64), atol=1e-12, rtol=0)
+
+
+def test_sca_bridges_lost_pulses_by_the_product_of_their_neighbours():
+    x = noisy(still(1, 12, 10), 5.0)[0]
+    lost = [0, 4, 5, 11]
+    x[lost] = 0
+    kept = [k for k in range(12) if k not in lost]
+    psi = torch.zeros(12, dtype=torch.float64)
+    for before, k in zip(kept, kept[1:]):
+        psi[k] = psi[before] + torch.angle((x[k] * x[before].conj()).sum())
+    found = sca(x)
+    torch.testing.assert_close(found["phase_rad"][kept], psi[kept], atol=1e-12, rtol=0)
+    assert found["phase_rad"][4] == found["phase_rad"][3] and found.info["present"].tolist() == [k in kept for k in range(12)]
+
+
+# PGA
+
+
+def _line_free(p: np.ndarray) -> np.ndarray:
+    k = np.arange(len(p))
+    return p - np.polyval(np.polyfit(k, p, 1), k)
+
+
+def slow_pga_step(x: np.ndarray, psi: np.ndarray, width: float, kernel: str) -> np.ndarray:
+    """One iteration of PGA on pulses (pulse, range), padded with as many zeros, row by row."""
+    n_pulse, n_range = x.shape
+    pulses = np.zeros((n_pulse, n_range), complex)
+    for n in range(n_range):
+        image = np.fft.fft(np.concatenate([x[:, n] * np.exp(-1j * psi), np.zeros(n_pulse)]))
+        peak, windowed = int(np.argmax(np.abs(image))), np.zeros(2 * n_pulse, complex)
+        for offset in range(-int(width), int(width) + 1):
+            windowed[offset % (2 * n_pulse)] = image[(peak + offset) % (2 * n_pulse)]
+        pulses[:, n] = np.fft.ifft(windowed)[:n_pulse]
+    step = [0.0]
+    for k in range(1, n_pulse):
+        g, before = pulses[k], pulses[k - 1]
+        if kernel == "ml":
+            step.append(np.angle(np.sum(g * np.conj(before))))
+        else:
+            step.append(np.sum(np.imag(np.conj(before) * (g - before))) / np.sum(np.abs(before) ** 2))
+    return psi + _line_free(np.cumsum(step))
+
+
+def padded_entropy(x: np.ndarray, psi: np.ndarray) -> float:
+    p = np.abs(np.fft.fft(x * np.exp(-1j * psi)[:, None], 2 * len(psi), axis=0)) ** 2
+    p = p / p.sum()
+    return float(-(p * np.log(p)).sum())
+
+
+def smooth(n_pulse: int) -> Tensor:
+    t = torch.linspace(-1, 1, n_pulse, dtype=torch.float64)
+    return 6 * t**2 + 5 * t**3
+
+
+@pytest.mark.parametrize("kernel", ["lumv", "ml"])
+@pytest.mark.parametrize("n_pulse", [48, 45])
+def test_pga_equals_its_slow_form(kernel, n_pulse):
+    x = turned(noisy(still(1, n_pulse, 12, per_row=1), 20.0), smooth(n_pulse)[None])[0]
+    psi, history = np.zeros(n_pulse), []
+    for iteration in range(4):
+        psi = slow_pga_step(x.numpy(), psi, max(5.0, 0.5 * n_pulse * 0.8**iteration), kernel)
+        history.append(psi)
+    sharpest = int(np.argmin([padded_entropy(x.numpy(), p) for p in history]))
+    for iterations in (1, 4):
+        found = pga(x, kernel=kernel, iterations=iterations)
+        best = min(sharpest, iterations - 1) if iterations == 4 else 0
+        torch.testing.assert_close(found["phase_rad"], torch.from_numpy(history[best]), atol=1e-9, rtol=0)
+        assert int(found.info["iterations"]) == best + 1
+
+
+def test_pga_sca_is_pga_with_its_kernel_from_sca():
+    x = turned(noisy(still(2), 10.0), white(2))
+    torch.testing.assert_close(pga_sca(x)["phase_rad"], pga(x, kernel="ml", start=sca(x)["phase_rad"])["phase_rad"], atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("kernel", ["eigenvector", "synchronised"])
+def test_coherent_kernels_find_the_first_eigenvector(kernel):
+    """One point a row: every row, its peak at zero Doppler, is the same vector of phases times a number; both kernels must say that vector."""
+    a = smooth(64)
+    x = noisy(turned(still(1, 64, 32, per_row=1), a[None]), 30.0)
+    assert float(phase_rmse(pga(x, kernel=kernel, windows=Measured())["phase_rad"][0], a)) < 0.02
+
+
+@pytest.mark.parametrize("kernel", ["lumv", "ml", "synchronised", "eigenvector"])
+@pytest.mark.parametrize("windows", [Shrinking(), Measured(), Listed((96.0, 64.0, 32.0, 16.0, 8.0))])
+def test_every_kernel_and_window_removes_a_smooth_error(kernel, windows):
+    a = 2 * smooth(128)
+    found = pga(turned(noisy(still(1), 20.0), a[None]), kernel=kernel, windows=windows)
+    assert float(phase_rmse(found["phase_rad"][0], a)) < 0.2 < 1.5 < float(phase_rmse(torch.zeros(128), a))
+
+
+def test_windows():
+    flat = torch.zeros(2, 64)
+    flat[:, 0], flat[0, 1], flat[0, -3], flat[1, 40] = 1.0, 0.5, 0.2, 0.05
+    assert Measured().width(0, 64, lambda: flat).tolist() == [1.5 * 7, 5.0]
+    assert [float(Shrinking().width(i, 100, lambda: flat)) for i in (0, 1, 30)] == [50.0, 40.0, 5.0]
+    assert [float(Listed((9.0, 4.0)).width(i, 100, lambda: flat)) for i in (0, 1, 2)] == [9.0, 4.0, 4.0]
+
+
+def test_a_constant_and_a_line_are_taken_from_pulses_that_are_there():
+    present = torch.ones(2, 20, dtype=torch.bool)
+    present[1, 3:9] = False
+    p = torch.where(present, 4.0 - 0.3 * torch.arange(20, dtype=torch.float64), 99.0)
+    assert float((without_line(p, present) * present).abs().max()) < 1e-12
+
+
+# entropy
+
+
+def slow_entropy_fixed_point(x: np.ndarray, psi: np.ndarray) -> np.ndarray:
+    """Section 7 of brief 002, cell by cell: x (pulse, range)."""
+    n_pulse, n_range = x.shape
+    for floor in [5.0] * 12 + [2.0] * 12:
+        f = np.stack([np.fft.fft(x[:, n] * np.exp(-1j * psi)) for n in range(n_range)])
+        p = np.abs(f) ** 2 / np.mean(np.abs(f) ** 2)
+        q = np.stack([np.fft.ifft(np.log(np.maximum(p[n], floor) / floor) * f[n]) for n in range(n_range)])
+        step = np.zeros(n_pulse)
+        for k in range(n_pulse):
+            step[k] = np.angle(sum(x[k, n] * np.exp(-1j * psi[k]) * np.conj(q[n, k]) for n in range(n_range)))
+        psi = psi + 1.8 * step
+    return psi
+
+
+@pytest.mark.parametrize("start", [None, "zero"])
+def test_entropy_fixed_point_equals_its_slow_form(start):
+    x = turned(noisy(still(2, 32, 9), 20.0), white(2, 32))
+    found = entropy_fixed_point(x, tolerance_rad=0.0, start=None if start is None else torch.zeros(32))
+    for i in range(2):
+        begin = sca(x[i])["phase_rad"].numpy() if start is None else np.zeros(32)
+        slow = torch.from_numpy(slow_entropy_fixed_point(x[i].numpy(), begin))
+        assert float(residual_phase(found["phase_rad"][i], slow).abs().max()) < 1e-8
+    assert found.info["iterations"].tolist() == [24, 24]
+
+
+def _one_step(x: Tensor, psi: Tensor, weights) -> Tensor:
+    return fixed_point(x.mT.contiguous(), psi, Run(weights, AlongPulses(), 1, 1.0, 0.0))[0] - psi
+
+
+@pytest.mark.parametrize("floor", [1e-9, 2.0])
+def test_the_step_points_down_the_entropy(floor):
+    """gradient = -(2 / mean power) |S| sin(step), with S the sum over range that the step is the angle of. floor 1e-9: the entropy itself."""
+    x, psi = noisy(still(1, 40, 12), 10.0), white(1, 40).requires_grad_()
+    f = doppler_image(x, psi)
+    p = f.abs().square() / f.abs().square().mean()
+    cost = torch.where(p > floor, -(p * torch.log(p / floor) - p + floor), 0).sum()
+    (gradient,) = torch.autograd.grad(cost, psi)
+    if floor < 1e-6:
+        (exact,) = torch.autograd.grad(entropy(doppler_image(x, psi)).sum(), psi)
+        torch.testing.assert_close(exact * x[0].numel(), gradient, atol=1e-6, rtol=1e-6)
+    with torch.no_grad():
+        q = torch.fft.ifft(torch.log((p / floor).clamp_min(1)) * f, dim=-2, norm="ortho")
+        size = (turned(x, -psi) * q.conj()).sum(-1).abs()
+        step = _one_step(x, psi, LogAbove(floor))
+        torch.testing.assert_close(-2 / f.abs().square().mean() * size * torch.sin(step), gradient, atol=1e-9, rtol=1e-7)
+
+
+def test_weights_of_the_wrong_sign_blur():
+    """ln p of powers that add up to one is negative, and the iteration then seeks the most entropy."""
+    x = still(1, 64, 32)
+    psi = 0.3 * white(1, 64)
+    cells = x[0].numel()
+    start = float(entropy(doppler_image(x, psi)))
+    blurred = fixed_point(x.mT.contiguous(), psi, Run(lambda p: torch.log((p / cells).clamp_min(1e-300)), AlongPulses(), 12, 1.0, 0.0))[0]
+    sharpened = fixed_point(x.mT.contiguous(), psi, Run(LogAbove(2.0), AlongPulses(), 12, 1.0, 0.0))[0]
+    assert float(entropy(doppler_image(x, sharpened))) < start - 0.3 and float(entropy(doppler_image(x, blurred))) > start + 0.3
+
+
+def test_entropy_falls_with_every_step_above_its_floor():
+    x = turned(still(1), white(1))
+    psi = sca(x)["phase_rad"]
+    costs = []
+    for _ in range(6):
+        f = doppler_image(x, psi)
+        p = f.abs().square() / f.abs().square().mean()
+        costs.append(float(torch.where(p > 2.0, -(p * torch.log(p / 2.0) - p + 2.0), 0).sum()))
+        psi = psi + _one_step(x, psi, LogAbove(2.0))
+    assert all(after < before for before, after in zip(costs, costs[1:]))
+
+
+def test_wiener_weights():
+    power = torch.rand(2, 5, 7, dtype=torch.float64) * 10
+    expected = torch.empty_like(power)
+    for t in range(2):
+        for n in range(5):
+            for d in range(7):
+                local = (power[t, n - 1, d] + 2 * power[t, n, d] + power[t, (n + 1) % 5, d]) / 4
+                expected[t, n, d] = (local / (local + 2.0)) ** 2
+    torch.testing.assert_close(Wiener()(power), expected - expected.mean(-1, keepdim=True), atol=1e-14, rtol=0)
+
+
+@pytest.mark.parametrize("oversampling", [1, 2, 3])
+def test_transform_along_pulses_and_its_adjoint(oversampling):
+    x, y = torch.randn(2, 3, 10, dtype=DOUBLE), torch.randn(2, 3, 10 * oversampling, dtype=DOUBLE)
+    a = AlongPulses(oversampling)
+    torch.testing.assert_close((a.image(x) * y.conj()).sum(), (x * a.adjoint(y).conj()).sum(), atol=1e-12, rtol=0)
+
+
+def test_steps_taken_are_counted_and_a_quiet_trial_rests():
+    x = still(2)
+    x = torch.stack([x[0], turned(x, white(2))[1]])
+    found = autofocus(x, search=60, polish=0, start=torch.stack([autofocus(x)["phase_rad"][0], torch.zeros(128, dtype=torch.float64)]))
+    assert int(found.info["iterations"][0]) < int(found.info["iterations"][1]) <= 60
+
+
+# corrector and stages
+
+
+def test_corrector_takes_out_the_phase_and_drops_whole_turns_in_float64():
+    x, a = still(2), white(2)
+    torch.testing.assert_close(correct_pulse_phase(turned(x, a), a), x, atol=1e-12, rtol=0)
+    turns = 2 * math.pi * torch.round(1e8 * torch.rand(128, dtype=torch.float64))  # a displacement of metres, 1.6e8 rad
+    torch.testing.assert_close(correct_pulse_phase(x.to(torch.complex64), a + turns), turned(x, -a).to(torch.complex64), atol=1e-5, rtol=0)
+    torch.testing.assert_close(entropy_fixed_point(x.to(torch.complex64), start=a + turns)["phase_rad"], entropy_fixed_point(x.to(torch.complex64), start=a)["phase_rad"], atol=7, rtol=0)
+    with pytest.raises(ValueError, match=r"\(..., 128\), got \(127,\)"):
+        correct_pulse_phase(x, a[0, :127])
+
+
+@pytest.mark.parametrize("stage", [Sca, PgaSca, EntropyFixedPoint, Autofocus])
+def test_an_estimator_and_the_corrector_make_a_chain(stage):
+    x = turned(still(2), white(2))
+    chain = Chain(find=stage(), correct=use(CorrectPulsePhase(), phase_rad="find.phase_rad"))
+    found = METHODS[{Sca: "sca", PgaSca: "pga_sca", EntropyFixedPoint: "entropy_fixed_point", Autofocus: "autofocus"}[stage]](x)
+    torch.testing.assert_close(chain(Signal(x, RADAR.raw_axes(128, 64))).data, correct_pulse_phase(x, found["phase_rad"]), atol=1e-12, rtol=0)
+
+
+def test_a_start_connects_to_pga():
+    x = turned(still(1), white(1))
+    chain = Chain(first=Sca(), second=use(Pga(kernel="ml"), start="first.phase_rad"))
+    torch.testing.assert_close(chain.trace(Signal(x, RADAR.raw_axes(128, 64))).values["second.phase_rad"], pga_sca(x)["phase_rad"], atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "call, message",
+    [
+        (lambda x: pga(x, kernel="mean"), "kernel 'mean' is not known"),
+        (lambda x: pga(x, iterations=0), "at least one iteration"),
+        (lambda x: pga_sca(x, patience=0), "patience of 1 or more"),
+        (lambda x: Shrinking(factor=1.2), "factor in 0..1"),
+        (lambda x: Listed(()), "widths of 1 cell or more"),
+        (lambda x: entropy_fixed_point(x, floors=((0.0, 3),)), "floors above 0"),
+        (lambda x: entropy_fixed_point(x, relaxation=2.0), "relaxation in 0..2"),
+        (lambda x: EntropyFixedPoint(floors=[5.0], iterations=[3, 4]), "a number of iterations for each floor"),
+        (lambda x: autofocus(x, search=-1), "search=-1"),
+        (lambda x: autofocus(x, start=torch.zeros(5)), r"one phase per pulse is \(1, 16\)"),
+        (lambda x: pga(x, start=torch.full((16,), torch.nan)), "finite real phases"),
+        (lambda x: sca(x[0, 0]), "at least one pulse and one range cell"),
+    ],
+)
+def test_mistakes_get_one_clear_sentence(call, message):
+    with pytest.raises(ValueError, match=message):
+        call(still(1, 16, 4))
