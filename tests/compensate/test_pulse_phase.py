@@ -12,6 +12,7 @@ from torch import Tensor
 from tests.compensate.scenes import DOUBLE, EQUIVARIANT, METHODS, doppler_image, noisy, still, turned, white
 from torchsar.compensate import Autofocus, CorrectPulsePhase, EntropyFixedPoint, Listed, Measured, Pga, PgaSca, Sca, Shrinking, autofocus, correct_pulse_phase, entropy_fixed_point, pga, pga_sca, sca
 from torchsar.compensate.pulse_phase.data import prepare, without_line
+from torchsar.compensate.pulse_phase.gradient import _centred, _solver, _view, _windowed
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, fixed_point
 from torchsar.core import Chain, Signal, use
@@ -156,12 +157,26 @@ def test_pga_sca_is_pga_with_its_kernel_from_sca():
     torch.testing.assert_close(pga_sca(x)["phase_rad"], pga(x, kernel="ml", start=sca(x)["phase_rad"])["phase_rad"], atol=1e-9, rtol=0)
 
 
+def test_patience_waits_for_the_window():
+    """Wide windows over clutter blur the image for many iterations; narrow ones then sharpen it. No patience may end the search before."""
+    a = 0.1 * smooth(256)
+    x = noisy(still(1, 256, 200, per_row=1, width=0.9), -13.0)
+    hasty, patient = (pga(turned(x, a[None]), patience=p) for p in (1, 20))
+    torch.testing.assert_close(hasty["phase_rad"], patient["phase_rad"], atol=1e-9, rtol=0)
+    assert int(hasty.info["iterations"]) > 6 and float(phase_rmse(hasty["phase_rad"][0], a)) < 0.5 * float(phase_rmse(torch.zeros(256), a))
+
+
 @pytest.mark.parametrize("kernel", ["eigenvector", "synchronised"])
 def test_coherent_kernels_find_the_first_eigenvector(kernel):
-    """One point a row: every row, its peak at zero Doppler, is the same vector of phases times a number; both kernels must say that vector."""
+    """One point a row: every row, its peak at zero Doppler, is nearly the same vector of phases times a number; both kernels must say that vector."""
     a = smooth(64)
     x = noisy(turned(still(1, 64, 32, per_row=1), a[None]), 30.0)
-    assert float(phase_rmse(pga(x, kernel=kernel, windows=Measured())["phase_rad"][0], a)) < 0.02
+    assert float(phase_rmse(pga(x, kernel=kernel)["phase_rad"][0], a)) < 0.03
+    view, everywhere = _view(x.mT.contiguous(), a[None]), torch.ones(1, 64, dtype=torch.bool)
+    g = torch.fft.ifft(_windowed(view, torch.tensor([4])), norm="ortho")[..., :64]
+    rows = _centred(g, view, everywhere)[0]
+    first = torch.from_numpy(np.linalg.eigh((rows.mT @ rows.conj()).numpy())[1][:, -1])
+    assert constant_apart(_solver(kernel)(g, view, everywhere)[0], torch.angle(first)) < 0.01
 
 
 @pytest.mark.parametrize("kernel", ["lumv", "ml", "synchronised", "eigenvector"])
@@ -169,7 +184,7 @@ def test_coherent_kernels_find_the_first_eigenvector(kernel):
 def test_every_kernel_and_window_removes_a_smooth_error(kernel, windows):
     a = 2 * smooth(128)
     found = pga(turned(noisy(still(1), 20.0), a[None]), kernel=kernel, windows=windows)
-    assert float(phase_rmse(found["phase_rad"][0], a)) < 0.2 < 1.5 < float(phase_rmse(torch.zeros(128), a))
+    assert float(phase_rmse(found["phase_rad"][0], a)) < 0.2 < 1.0 < float(phase_rmse(torch.zeros(128), a))
 
 
 def test_windows():
@@ -243,7 +258,7 @@ def test_weights_of_the_wrong_sign_blur():
     psi = 0.3 * white(1, 64)
     cells = x[0].numel()
     start = float(entropy(doppler_image(x, psi)))
-    blurred = fixed_point(x.mT.contiguous(), psi, Run(lambda p: torch.log((p / cells).clamp_min(1e-300)), AlongPulses(), 12, 1.0, 0.0))[0]
+    blurred = fixed_point(x.mT.contiguous(), psi, Run(lambda p, mean: torch.log((p / (cells * mean)).clamp_min(1e-300)), AlongPulses(), 12, 1.0, 0.0))[0]
     sharpened = fixed_point(x.mT.contiguous(), psi, Run(LogAbove(2.0), AlongPulses(), 12, 1.0, 0.0))[0]
     assert float(entropy(doppler_image(x, sharpened))) < start - 0.3 and float(entropy(doppler_image(x, blurred))) > start + 0.3
 
@@ -262,13 +277,14 @@ def test_entropy_falls_with_every_step_above_its_floor():
 
 def test_wiener_weights():
     power = torch.rand(2, 5, 7, dtype=torch.float64) * 10
+    mean = power.mean((-2, -1), keepdim=True)
     expected = torch.empty_like(power)
     for t in range(2):
         for n in range(5):
             for d in range(7):
                 local = (power[t, n - 1, d] + 2 * power[t, n, d] + power[t, (n + 1) % 5, d]) / 4
-                expected[t, n, d] = (local / (local + 2.0)) ** 2
-    torch.testing.assert_close(Wiener()(power), expected - expected.mean(-1, keepdim=True), atol=1e-14, rtol=0)
+                expected[t, n, d] = (local / (local + 2.0 * mean[t, 0, 0])) ** 2
+    torch.testing.assert_close(Wiener()(power, mean), expected - expected.mean(-1, keepdim=True), atol=1e-14, rtol=0)
 
 
 @pytest.mark.parametrize("oversampling", [1, 2, 3])
@@ -293,7 +309,8 @@ def test_corrector_takes_out_the_phase_and_drops_whole_turns_in_float64():
     torch.testing.assert_close(correct_pulse_phase(turned(x, a), a), x, atol=1e-12, rtol=0)
     turns = 2 * math.pi * torch.round(1e8 * torch.rand(128, dtype=torch.float64))  # a displacement of metres, 1.6e8 rad
     torch.testing.assert_close(correct_pulse_phase(x.to(torch.complex64), a + turns), turned(x, -a).to(torch.complex64), atol=1e-5, rtol=0)
-    torch.testing.assert_close(entropy_fixed_point(x.to(torch.complex64), start=a + turns)["phase_rad"], entropy_fixed_point(x.to(torch.complex64), start=a)["phase_rad"], atol=7, rtol=0)
+    one, other = (entropy_fixed_point(x.to(torch.complex64), start=start)["phase_rad"] for start in (a, a + turns))
+    assert float(residual_phase(one, other).abs().max()) < 1e-4
     with pytest.raises(ValueError, match=r"\(..., 128\), got \(127,\)"):
         correct_pulse_phase(x, a[0, :127])
 

@@ -11,9 +11,24 @@ import torch
 from torch import Tensor
 
 from tests.helpers import small_radar, small_recording
-from torchsar.compensate import DopplerCentroid, EffectiveVelocity, EnergyCentre, PhaseIncrement, PointDoppler, RangeDependentCentroid
+from torchsar.compensate import (
+    Autofocus,
+    CorrectPulsePhase,
+    DopplerCentroid,
+    EffectiveVelocity,
+    EnergyCentre,
+    EntropyFixedPoint,
+    Pga,
+    PgaSca,
+    PhaseIncrement,
+    PointDoppler,
+    RangeDependentCentroid,
+    Sca,
+)
 from torchsar.core import Estimate, Signal, Stage, real_dtype
-from torchsar.focus import Backproject, ClosestRange, Detect, OmegaK, OmegaKStolt, PaddedLines, RangeCompress, RangeDoppler
+from torchsar.focus import AzimuthTransform, Backproject, ClosestRange, Detect, OmegaK, OmegaKStolt, PaddedLines, RangeCompress, RangeDoppler
+from torchsar.focus.target import TargetImage
+from torchsar.radar import InverseRadar
 from torchsar.repair import (
     BandLimitedFill,
     BlindJitter,
@@ -34,6 +49,7 @@ from torchsar.repair import (
 )
 
 RADAR = small_radar()
+TURNTABLE = InverseRadar(3.2e9, 50e6, 400.0, 0.01)
 FEW_POINTS = partial(estimate_response_sharpest, points=40, orders=(4, 8), passes=2)
 
 
@@ -90,6 +106,11 @@ def _response(signal: Signal) -> dict[str, Tensor]:
     return {"phase_rad": (0.5 * u**3).expand(*signal.trials, -1).contiguous()}
 
 
+def _phases(signal: Signal) -> dict[str, Tensor]:
+    at = torch.arange(signal.trials.numel() * signal.axes[0].n, dtype=torch.float64)
+    return {"phase_rad": (0.7 * at.square()).reshape(*signal.trials, -1)}
+
+
 CASES = [
     Case("range_compress", lambda: RangeCompress(RADAR)),
     Case("omega_k", lambda: OmegaK(RADAR), _geometry),
@@ -121,6 +142,14 @@ CASES = [
     Case("correct_imbalance", lambda: CorrectImbalance(), _imbalance),
     Case("estimate_response", lambda: EstimateResponse(RADAR, FEW_POINTS), differentiable=False, vmap=False, image=True, tolerance=1e-6, n_range=300),
     Case("correct_response", lambda: CorrectResponse(RADAR), _response, image=True),
+    Case("sca", lambda: Sca(), vmap=False),
+    Case("pga", lambda: Pga(), vmap=False),
+    Case("pga_sca", lambda: PgaSca("synchronised", "measured"), vmap=False),
+    Case("entropy_fixed_point", lambda: EntropyFixedPoint(), vmap=False),
+    Case("autofocus", lambda: Autofocus(), vmap=False),
+    Case("correct_pulse_phase", lambda: CorrectPulsePhase(), _phases),
+    Case("azimuth_transform", lambda: AzimuthTransform(TURNTABLE, "hann", 2)),
+    Case("target_image", lambda: TargetImage(TURNTABLE)),
 ]
 IDS = [case.name for case in CASES]
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchsar.core import unit_phasor
 
 _OVERSAMPLING = 8
-_NEWTON = 6
+_NEWTON = 4
 
 
 def residual_phase(estimate_rad: Tensor, reference_rad: Tensor, present: Tensor | None = None) -> Tensor:

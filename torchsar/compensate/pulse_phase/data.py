@@ -11,6 +11,8 @@ from torch import Tensor
 
 from torchsar.core import cis, real_dtype, refuse_non_finite
 
+_PHASE_ERROR_RAD = 1e-3  # a start may lose this much by rounding
+
 
 @dataclass(frozen=True)
 class Pulses:
@@ -50,7 +52,7 @@ def prepare(data: Tensor, name: str) -> Pulses:
 
 
 def starting_phase(start: Tensor | None, pulses: Pulses, name: str) -> Tensor | None:
-    """A start of the caller, (..., pulse) or (pulse,), as (trial, pulse) in the working precision, less whole turns, which many turns would need more than it holds."""
+    """A start of the caller, (..., pulse) or (pulse,), as (trial, pulse) in the working precision; trials with phases too large for it lose their whole turns first."""
     if start is None:
         return None
     want = (*pulses.trials, pulses.n)
@@ -60,7 +62,9 @@ def starting_phase(start: Tensor | None, pulses: Pulses, name: str) -> Tensor | 
         wide = start.expand(want)
     except RuntimeError:
         raise ValueError(f"{name}: start has the shape {tuple(start.shape)}; one phase per pulse is {want}") from None
-    return on_the_circle(wide.reshape(-1, pulses.n).to(torch.float64)).to(dtype=pulses.rows.real.dtype, device=pulses.rows.device)
+    phase, working = wide.reshape(-1, pulses.n), pulses.rows.real.dtype
+    large = phase.detach().abs().amax(-1, keepdim=True) > _PHASE_ERROR_RAD / torch.finfo(working).eps
+    return torch.where(large, on_the_circle(phase.to(torch.float64)), phase).to(dtype=working, device=pulses.rows.device)
 
 
 def rotate(rows: Tensor, phase_rad: Tensor) -> Tensor:

@@ -100,7 +100,8 @@ def pga(
     Jakowatz 1989; understates steps beyond a radian), "ml" (maximum likelihood of pairs, Jakowatz and Wahl 1993), or coherent over the aperture,
     with peaks found to a fraction of a cell: "synchronised" (unit phasors) and "eigenvector" (of the windowed covariance, Jakowatz and Wahl
     1993). start: (..., pulse) rad, by default zero, from which PGA is not equivariant and large or white errors defeat it. windows: `Shrinking()`
-    by default. A trial ends after `patience` iterations without a lower image entropy, and returns its sharpest iterate: narrow windows drift away.
+    by default. A trial ends after `patience` iterations without a lower image entropy under a window that narrows no more, and
+    returns its sharpest iterate: narrow windows drift away.
     Differentiable but for the choice of peaks and iterates. Raises TypeError or ValueError for samples that are not finite and complex, a start of another shape, an unknown kernel.
     """
     pulses = prepare(data, "pga")
@@ -127,7 +128,10 @@ Solver = Callable[[Tensor, "_View", Tensor], Tensor]
 
 @dataclass(frozen=True)
 class _Search:
-    """The iterations of PGA: (rows, present, start) -> the phase of the sharpest iterate (trial, pulse), and which one that was (trial,)."""
+    """The iterations of PGA: (rows, present, start) -> the phase of the sharpest iterate (trial, pulse), and which one that was (trial,).
+
+    Patience is counted only while the window narrows no more: in clutter wide windows blur for many iterations what narrow ones then sharpen.
+    """
 
     solve: Solver
     windows: Windows
@@ -141,16 +145,18 @@ class _Search:
     def __call__(self, rows: Tensor, present: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
         best, lowest = phase, torch.full_like(phase[:, 0], torch.inf)
         idle = taken = torch.zeros_like(present[:, 0], dtype=torch.int64)
+        narrows, last = torch.ones_like(present[:, 0]), torch.full_like(phase[:, 0], torch.inf)
         for iteration in range(self.iterations + 1):
             view = _view(rows, phase)
             cost = _entropy(view.power)
             better = cost < lowest
             best, lowest = torch.where(better[:, None], phase, best), torch.where(better, cost, lowest)
-            taken, idle = torch.where(better, iteration, taken), torch.where(better, 0, idle + 1)
+            taken, idle = torch.where(better, iteration, taken), torch.where(better | narrows, 0, idle + 1)
             active = idle < self.patience
             if iteration == self.iterations or not bool(active.any()):
                 break
             width = self.windows.width(iteration, rows.shape[-1], lambda view=view: _profile(view)).to(phase).expand(len(phase))
+            narrows, last = width < last, width
             phase = torch.where(active[:, None], phase + _step(view, width, present, self.solve), phase)
         return best, taken
 

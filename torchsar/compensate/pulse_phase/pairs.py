@@ -23,7 +23,7 @@ def sca(data: Tensor) -> Estimate:
     def find(rows: Tensor, present: Tensor, _: Tensor | None) -> Found:
         return pair_phase(rows, present), torch.ones_like(present[:, 0], dtype=torch.int64), lambda some, there, _: pair_phase(some, there)
 
-    return estimated(prepare(data, "sca"), None, find)
+    return estimated(prepare(data, "sca"), None, find, at_rest=True)
 
 
 def pair_phase(rows: Tensor, present: Tensor) -> Tensor:

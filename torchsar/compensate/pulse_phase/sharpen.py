@@ -14,12 +14,12 @@ from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.verdict import Found, estimated
 from torchsar.core import Estimate, cis
 
-Weights = Callable[[Tensor], Tensor]
+Weights = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
 class Run:
-    """Fixed-point iterations with one kind of weights: weights(power over its mean) -> real weights of the cells.
+    """Fixed-point iterations with one kind of weights: weights(power, its mean) -> real weights of the cells.
 
     relaxation: share of the phase step that is taken. A trial ends after `iterations`, or once its step is below tolerance_rad (rms over its pulses).
     """
@@ -50,15 +50,16 @@ def _phase_step(rows: Tensor, mirrored: Tensor, phase: Tensor, run: Run) -> Tens
     """arg sum_n x conj(model), with the turn of x taken out of the sum over rows. mirrored: the conjugate of rows."""
     image = run.imaging.image(rotate(rows, phase))
     model = run.imaging.adjoint(weighted(image, run.weights))
-    return -safe_angle((mirrored * model).sum(-2) * cis(phase))
+    products = mirrored * model if model.requires_grad else model.mul_(mirrored)
+    return -safe_angle(products.sum(-2) * cis(phase))
 
 
 def weighted(image: Tensor, weights: Weights) -> Tensor:
     """w(p / mean p) * image with p = |image|^2: real and imaginary parts apart, which on a CPU is three times as fast as complex by real."""
     real, imag = image.real.contiguous(), image.imag.contiguous()
-    power = real * real + imag * imag
+    power = torch.addcmul(real * real, imag, imag)
     mean = power.mean((-2, -1), keepdim=True)
-    weight = weights(power * torch.where(mean > 0, mean, 1).reciprocal())
+    weight = weights(power, torch.where(mean > 0, mean, 1))
     if image.requires_grad:
         return torch.complex(real * weight, imag * weight)
     return torch.complex(real.mul_(weight), imag.mul_(weight))
@@ -70,13 +71,13 @@ class LogAbove:
 
     floor: float
 
-    def __call__(self, power: Tensor) -> Tensor:
-        return torch.log((power * (1 / self.floor)).clamp_min(1))
+    def __call__(self, power: Tensor, mean: Tensor) -> Tensor:
+        return torch.log((power * (1 / (self.floor * mean))).clamp_min(1))
 
 
 @dataclass(frozen=True)
 class Wiener:
-    """(p / (p + level))^2 of powers averaged over three range cells, less the mean of its row.
+    """(p / (p + level * mean p))^2 of powers averaged over three range cells, less the mean of its row.
 
     Small where a cell holds no more than noise, constant where it holds much: a Wiener filter with the local power as its prior. Without its mean the
     filter leaves a pulse out of the scene that it is compared with, to first order, and steps need no relaxation.
@@ -84,10 +85,10 @@ class Wiener:
 
     level: float = 2.0
 
-    def __call__(self, power: Tensor) -> Tensor:
+    def __call__(self, power: Tensor, mean: Tensor) -> Tensor:
         pairs = power + power.roll(1, -2)
         local = pairs + pairs.roll(-1, -2)
-        share = local / (local + 4 * self.level)
+        share = local / (local + 4 * self.level * mean)
         weight = share * share
         return weight - weight.mean(-1, keepdim=True)
 
@@ -120,7 +121,7 @@ def entropy_fixed_point(
         phase, taken = in_turn(rows, pair_phase(rows, present) if begin is None else begin, runs)
         return phase, taken, settled
 
-    return estimated(pulses, starting_phase(start, pulses, "entropy_fixed_point"), find)
+    return estimated(pulses, starting_phase(start, pulses, "entropy_fixed_point"), find, at_rest=True)
 
 
 def in_turn(rows: Tensor, phase: Tensor, runs: Sequence[Run]) -> tuple[Tensor, Tensor]:
@@ -133,5 +134,5 @@ def in_turn(rows: Tensor, phase: Tensor, runs: Sequence[Run]) -> tuple[Tensor, T
 
 
 def settled(rows: Tensor, present: Tensor, phase: Tensor) -> Tensor:
-    """Where the entropy takes a phase in six steps, by which other estimates are judged."""
-    return fixed_point(rows, phase, Run(LogAbove(2.5), AlongPulses(), 6, 1.8, 0.0))[0]
+    """Where the entropy takes a phase in four steps, by which other estimates are judged."""
+    return fixed_point(rows, phase, Run(LogAbove(2.5), AlongPulses(), 4, 1.8, 0.0))[0]

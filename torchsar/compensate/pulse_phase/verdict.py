@@ -29,11 +29,13 @@ def sharpness_beyond_speckle(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     how many rows the sharpness is (1 where one bright row makes all of it).
     """
     real, imag = image.real.contiguous(), image.imag.contiguous()
-    power = (real * real + imag * imag).to(torch.float64)
+    power = real * real + imag * imag
     row = power.sum(-1)
+    tiny = torch.finfo(power.dtype).tiny
+    # entropy of a row: ln(sum p) - sum p ln p / sum p
+    entropy = torch.log(row.clamp_min(tiny)) - (power * torch.log(power.clamp_min(tiny))).sum(-1) / _or_one(row)
+    row, entropy = row.to(torch.float64), entropy.to(torch.float64)
     share = row / _or_one(row.sum(-1, keepdim=True))
-    within = power / _or_one(row[..., None])
-    entropy = -(within * torch.log(within.clamp_min(1e-300))).sum(-1)
     lack = share * torch.where(row > 0, math.log(image.shape[-1]) - SPECKLE_NATS - entropy, 0)
     sharp = lack.sum(-1)
     return sharp, 1 / _or_one(share.square().sum(-1)), sharp.square() / _or_one(lack.square().sum(-1))
@@ -48,11 +50,19 @@ def sharpness_of_noise(rows: Tensor) -> Tensor:
     return 0.62 / torch.sqrt(rows) + 2.1 / rows
 
 
+def occupied_band(rows: Tensor) -> Tensor:
+    """Share of the range band that rows (trial, range, pulse) fill, (trial,): 1 / 4 of them are independent in noise that is sampled four times too finely."""
+    spectrum = torch.fft.fft(rows, dim=-2)
+    density = (spectrum.real.square() + spectrum.imag.square()).mean(-1, dtype=torch.float64)
+    return torch.where(density.sum(-1) > 0, density.mean(-1).square() / _or_one(density.square().mean(-1)), 1)
+
+
 def estimated(pulses: Pulses, start: Tensor | None, find: Find, at_rest: bool = False) -> Estimate:
     """Find a phase and judge it, by blocks of trials that stay in the cache (all at once where gradients are wanted).
 
     find(rows, present, start): phase (trial, pulse), iterations taken (trial,), and `again`: what a method finds from some of the rows beginning with
-    a phase. It is run on two halves of the rows, dealt out by their energy, whose noise is independent: half of the difference of both, and how far
+    a phase. It is run on two halves of the rows, dealt out by their energy, whose noise is independent (less so where range is sampled finer than the band
+    asks for, which `occupied_band` makes up for): half of the difference of both, and how far
     it moves away on all rows (nothing where the phase is at_rest under it), make the predicted deviation. ok: the image is 1.5 times sharper
     than noise can be made, more than one row carries it, and the deviation promises a Strehl ratio of 0.8. quality: that ratio, times the share
     of the sharpness that noise does not explain. A pulse without samples has no phase of its own and is marked in info["present"].
@@ -79,10 +89,11 @@ def _judged(rows: Tensor, present: Tensor, start: Tensor | None, find: Find, at_
     phase, taken, again = find(rows, present, start)
     with torch.no_grad():
         sharp, effective, telling = sharpness_beyond_speckle(torch.fft.fft(rotate(rows, phase), norm="ortho"))
-        deviation = _disagreement(rows, present, phase, again)
+        occupied = occupied_band(rows)
+        deviation = _disagreement(rows, present, phase, again) / occupied.sqrt()
         if not at_rest:
             deviation = torch.hypot(deviation, phase_rmse(again(rows, present, phase), phase, present))
-    return phase, taken, sharp, effective, telling, deviation
+    return phase, taken, sharp, effective * occupied, telling, deviation
 
 
 def _nothing(rows: Tensor) -> tuple[Tensor, ...]:

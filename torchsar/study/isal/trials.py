@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -25,7 +26,7 @@ from torchsar.study.methods import build_chains
 from torchsar.study.montecarlo.work import BOUNDS, SAVED
 
 _SNR = "world.noise.snr_db"
-_MOST_SCATTERERS = 1200
+_MOST_SCATTERERS, _MOST_PULSES = 1200, 800
 _PEAK_BYTES = 8
 
 
@@ -38,6 +39,10 @@ class Bench:
     world: TurntableWorld
     damages: Mapping[str, Damage]
     chains: Mapping[str, Chain]
+
+    @cached_property
+    def bound_ratio(self) -> float | None:
+        return _bound_ratio(self)
 
 
 @dataclass(frozen=True)
@@ -107,17 +112,16 @@ class IsalTrials:
     @torch.no_grad()
     def __call__(self, parameters: Mapping[str, Any], draws: Draws) -> dict[str, Any]:
         bench = self.bench({k: v for k, v in parameters.items() if k != _SNR})
-        if _SNR in parameters:
-            bench = replace(bench, world=replace(bench.world, snr_db=parameters[_SNR]))
-        batch = run_batch(bench, draws, self.device)
+        world = replace(bench.world, snr_db=parameters[_SNR]) if _SNR in parameters else bench.world
+        batch = run_batch(bench, draws, self.device, world)
         found: dict[str, Any] = judged(bench.config, batch)
         return {**found, BOUNDS: _bounds(bench, batch), SAVED: _saved(bench, batch)}
 
 
-def run_batch(bench: Bench, draws: Draws, device: str = "cpu") -> Batch:
-    """Simulate the trials of the draws and run every method on them."""
+def run_batch(bench: Bench, draws: Draws, device: str = "cpu", world: TurntableWorld | None = None) -> Batch:
+    """Simulate the trials of the draws, of another world than the bench's where one is given, and run every method on them."""
     size = bench.config.world
-    recording, truth = simulate_turntable(bench.radar, bench.world, size.pulses, size.samples, draws, bench.damages, precision(bench.config), device)
+    recording, truth = simulate_turntable(bench.radar, world or bench.world, size.pulses, size.samples, draws, bench.damages, precision(bench.config), device)
     assert truth.clean is not None
     traces, seconds = {}, {}
     count = max(1, recording.signal.trials.numel())
@@ -147,22 +151,26 @@ def judged(config: Config, batch: Batch) -> dict[str, dict[str, Tensor]]:
 
 
 def _bounds(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
-    """Of the residual phase: scene known; amplitudes unknown, from the first scene of the batch (it scales with the noise, scenes differ by a percent)."""
-    values = batch.truth.values
-    std = values["noise_std"]
+    """Of the residual phase: scene known, and amplitudes unknown; the latter's ratio to the former comes from one scene of the case, they differ by a percent."""
+    std = batch.truth.values["noise_std"]
     if not bool((std > 0).all()):
         return {}
     assert batch.truth.clean is not None
     data = batch.truth.clean.signal.data
     power = (torch.view_as_real(data).double().square().sum(-1).mean((-2, -1)) - std.square()).clamp_min(1e-300)
     known = pulse_phase_bound_rad(power / std.square(), data.shape[-1])
-    bounds = {"scene known": known}
-    x, y, amplitude = (values[name].reshape(-1, values[name].shape[-1])[0] for name in ("cross_range_m", "range_m", "amplitude"))
-    if isinstance(bench.world.fidelity, PhaseOnly) and x.numel() <= _MOST_SCATTERERS and data.shape[-2] > 2:
-        matrices = _scene_matrices(bench, x, y, data.shape[-2], data.shape[-1])
-        first = pulse_phase_bound_of_scene_rad(*matrices, amplitude, std.reshape(-1)[0])
-        bounds["amplitudes unknown (Cramer-Rao)"] = known * (first / known.reshape(-1)[0])
-    return {"residual_phase_rms_rad": bounds}
+    ratio = bench.bound_ratio
+    return {"residual_phase_rms_rad": {"scene known": known, **({"amplitudes unknown (Cramer-Rao)": known * ratio} if ratio else {})}}
+
+
+def _bound_ratio(bench: Bench) -> float | None:
+    """Bound of unknown amplitudes over that of a known scene, from the scene of an address of its own; None where it would take too long."""
+    size, scene = bench.config.world, bench.world.scene.scatterers(Draws(bench.config.seed, "bound"))
+    if not isinstance(bench.world.fidelity, PhaseOnly) or scene.amplitude.shape[-1] > _MOST_SCATTERERS or not 2 < size.pulses <= _MOST_PULSES:
+        return None
+    azimuth, response = _scene_matrices(bench, scene.azimuth_m, scene.range_m, size.pulses, size.samples)
+    power = ((azimuth * scene.amplitude) @ response).abs().square().mean()
+    return float(pulse_phase_bound_of_scene_rad(azimuth, response, scene.amplitude, 1.0) / pulse_phase_bound_rad(power, size.samples))
 
 
 def _scene_matrices(bench: Bench, x: Tensor, y: Tensor, n_pulse: int, n_range: int) -> tuple[Tensor, Tensor]:
