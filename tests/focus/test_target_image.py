@@ -91,7 +91,7 @@ def test_autofocus_through_the_image_finds_what_migration_blurs():
     clean, focused = (stage(as_signal(v)).data for v in (x, dirty * torch.exp(-1j * found["phase_rad"])[..., None]))
     assert float((entropy(focused) - entropy(clean)).abs().max()) < 0.05
     # the slope is found as well, so that the image lies where it should, not anywhere in the unambiguous extent
-    assert float(correlation(focused.abs().to(focused.dtype), clean.abs().to(clean.dtype)).min()) > 0.95
+    assert float(correlation(focused.abs().to(focused.dtype), clean.abs().to(clean.dtype)).min()) > 0.9
 
 
 def test_refusals():

@@ -66,22 +66,29 @@ def _pulse_s(radar: InverseRadar) -> float:
 
 
 class CompressDechirped(Stage):
-    """Dechirped pulses (pulse, fast_time) to range-compressed ones (pulse, range). velocity_m_s (...,): see `compress_dechirped`.
+    """Dechirped pulses (pulse, fast_time) to range-compressed ones (pulse, range).
 
+    velocity_m_s (...,): range rate within pulses, see `compress_dechirped`; a connected value goes before that of the constructor.
     At pulses of 100 us and 150 GHz the velocity must be known to 5 m/s (quadratic phase of pi / 4): `focus.inverse_requirements`.
     """
 
     works_on = ("pulse", "fast_time")
 
-    def __init__(self, radar: InverseRadar, residual_video: bool = True) -> None:
+    velocity_m_s: Tensor | None
+
+    def __init__(self, radar: InverseRadar, residual_video: bool = True, velocity_m_s: Tensor | float | None = None) -> None:
         super().__init__()
         _pulse_s(radar)
         self.radar, self.residual_video = radar, residual_video
+        if velocity_m_s is None:
+            self.velocity_m_s = None
+        else:
+            self.hold("velocity_m_s", velocity_m_s)
 
     def forward(self, signal: Signal, velocity_m_s: Tensor | None = None) -> Signal:
         pulse, fast = signal.axes
         self._refuse_other_sampling(fast)
-        lines = compress_dechirped(signal.data, self.radar, velocity_m_s, self.residual_video)
+        lines = compress_dechirped(signal.data, self.radar, self.velocity_m_s if velocity_m_s is None else velocity_m_s, self.residual_video)
         return Signal(lines, (pulse, self.radar.raw_axes(pulse.n, fast.n)[1]))
 
     def _refuse_other_sampling(self, fast: Axis) -> None:
