@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tests.compensate.scenes import DOUBLE, EQUIVARIANT, METHODS, doppler_image, noisy, still, turned, white
 from torchsar.compensate import Autofocus, CorrectPulsePhase, EntropyFixedPoint, Listed, Measured, Pga, PgaSca, Sca, Shrinking, autofocus, correct_pulse_phase, entropy_fixed_point, pga, pga_sca, sca
-from torchsar.compensate.pulse_phase.data import prepare, without_line
+from torchsar.compensate.pulse_phase.data import without_line
 from torchsar.compensate.pulse_phase.gradient import _centred, _solver, _view, _windowed
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, fixed_point

@@ -11,7 +11,8 @@ from torchsar.study.build import build_chain, resolved
 from torchsar.study.config import load
 from torchsar.study.errors import ConfigError
 from torchsar.study.stripmap.build import build_radar
-from torchsar.study.stripmap.run import check, prepare
+from torchsar.study.stripmap.run import prepare
+from torchsar.study.systems import system_of
 from torchsar.study.text import dump, override, packaged_configs, parse
 
 
@@ -59,7 +60,7 @@ def test_packaged_configs_are_complete(name: str) -> None:
         loaded = load(spelled, [f"data.file={__file__}"])  # any file: only its presence is checked here
         assert "recommended" in loaded.config.processor
     if loaded.config.radar is not None:
-        check(loaded)
+        system_of(loaded).check(loaded)
         assert parse(dump(resolved(loaded)), name)["seed"] == loaded.config.seed
 
 
