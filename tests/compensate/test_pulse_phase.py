@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -90,7 +91,7 @@ def test_sca_bridges_lost_pulses_by_the_product_of_their_neighbours():
     x[lost] = 0
     kept = [k for k in range(12) if k not in lost]
     psi = torch.zeros(12, dtype=torch.float64)
-    for before, k in zip(kept, kept[1:]):
+    for before, k in pairwise(kept):
         psi[k] = psi[before] + torch.angle((x[k] * x[before].conj()).sum())
     found = sca(x)
     torch.testing.assert_close(found["phase_rad"][kept], psi[kept], atol=1e-12, rtol=0)
@@ -272,7 +273,7 @@ def test_entropy_falls_with_every_step_above_its_floor():
         p = f.abs().square() / f.abs().square().mean()
         costs.append(float(torch.where(p > 2.0, -(p * torch.log(p / 2.0) - p + 2.0), 0).sum()))
         psi = psi + _one_step(x, psi, LogAbove(2.0))
-    assert all(after < before for before, after in zip(costs, costs[1:]))
+    assert all(after < before for before, after in pairwise(costs))
 
 
 def test_wiener_weights():

@@ -100,7 +100,7 @@ def test_too_few_pulses_give_zero_and_a_warning(name, n_pulse):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_one_row_warns_and_is_never_believed(name):
-    x, a = scene(4, 30.0, n_range=1)
+    x, _ = scene(4, 30.0, n_range=1)
     with pytest.warns(UserWarning, match="one range cell cannot tell"):
         found = METHODS[name](x)
     assert torch.isfinite(found["phase_rad"]).all() and not found.ok.any()
@@ -165,7 +165,7 @@ def test_sca_bridges_where_the_scene_is_coherent_over_the_gap():
 
 
 def test_pulses_of_one_trial_may_be_lost_in_another_place():
-    x, a = scene(3, 10.0)
+    x, _ = scene(3, 10.0)
     x[0, 10:14], x[2, ::5] = 0, 0
     together = autofocus(x)
     for i in range(3):
@@ -275,7 +275,7 @@ def test_threads_change_nothing(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_many_tiny_trials(name):
-    x, a = scene(500, 20.0, n_pulse=12, n_range=6)
+    x, _ = scene(500, 20.0, n_pulse=12, n_range=6)
     x = x.repeat(4, 1, 1).to(torch.complex64)
     found = METHODS[name](x)
     assert torch.isfinite(found["phase_rad"]).all()
@@ -287,7 +287,12 @@ def test_many_tiny_trials(name):
 
 @pytest.mark.parametrize(
     "find",
-    [sca, lambda x: entropy_fixed_point(x, floors=((3.0, 3),), tolerance_rad=0.0), lambda x: pga(x, kernel="ml", iterations=2), lambda x: autofocus(x, search=3, polish=2, search_tolerance_rad=0.0, tolerance_rad=0.0)],
+    [
+        sca,
+        lambda x: entropy_fixed_point(x, floors=((3.0, 3),), tolerance_rad=0.0),
+        lambda x: pga(x, kernel="ml", iterations=2),
+        lambda x: autofocus(x, search=3, polish=2, search_tolerance_rad=0.0, tolerance_rad=0.0),
+    ],
     ids=["sca", "entropy_fixed_point", "pga", "autofocus"],
 )
 def test_gradients(find):

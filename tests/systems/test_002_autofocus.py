@@ -67,7 +67,7 @@ def test_ideal_entropy():
     assert float(image_entropy(truth.clean.signal.data).mean()) == pytest.approx(7.16, abs=0.15)
 
 
-@pytest.mark.parametrize("row, polluted", zip(TABLE_1, [1.26, 1.85, 2.87, 2.88]))
+@pytest.mark.parametrize("row, polluted", list(zip(TABLE_1, [1.26, 1.85, 2.87, 2.88], strict=True)))
 def test_polluted_entropies_are_those_of_the_brief(table_1, row, polluted):
     assert float(table_1[row]["polluted"].mean()) == pytest.approx(polluted, abs=0.2)
 
@@ -129,18 +129,29 @@ def judged(method, scene, snr_db: float, trials: int = 4) -> tuple[Tensor, Tenso
     return phase_rmse(found["phase_rad"], truth.values["phase_rad"]), found.ok
 
 
-@pytest.mark.parametrize("scene", [SpreadRows(64, 128, 0.5, EXTENT_M, RADAR.range_step_m), Speckle(4000, 0.8 * EXTENT_M, 0.2)], ids=["128 a row", "80 percent wide"])
-def test_dense_targets_defeat_pga_sca_and_not_autofocus(scene):
-    error, ok = judged(pga_sca, scene, 10.0)
-    assert float(error.median()) > SUCCESS_RAD and int(ok.sum()) <= 1
+def test_dense_rows_defeat_pga_sca_and_not_autofocus():
+    """128 equal scatterers a row."""
+    scene = SpreadRows(64, 128, 0.5, EXTENT_M, RADAR.range_step_m)
+    assert float(judged(pga_sca, scene, 10.0)[0].median()) > 0.4
     error, ok = judged(autofocus, scene, 10.0)
-    assert float(error.max()) < 0.15 and ok.all()
+    assert float(error.max()) < 0.1 and ok.all()
 
 
-def test_a_target_that_fills_the_band_defeats_everything_and_nobody_claims_it():
-    for method in METHODS.values():
-        error, ok = judged(method, Speckle(4000, EXTENT_M, 0.2), 10.0)
-        assert float(error.min()) > SUCCESS_RAD and not ok.any()
+def test_a_target_that_fills_the_band_defeats_pairs_and_pga_and_not_autofocus():
+    """4000 scatterers over the whole unambiguous cross range: adjacent pulses have nothing in common, so that there is nothing to start from."""
+    scene = Speckle(4000, EXTENT_M, 0.2)
+    for method in (sca, pga_sca):
+        error, ok = judged(method, scene, 10.0)
+        assert float(error.min()) > 2 * SUCCESS_RAD and not ok.any()
+    error, ok = judged(autofocus, scene, 10.0)
+    assert float(error.max()) < 0.05 and ok.all()
+
+
+def test_wide_targets_leave_pga_sca_behind():
+    """20000 scatterers over 80 percent of the cross range."""
+    scene = Speckle(20000, 0.8 * EXTENT_M, 0.2)
+    error, ok = judged(autofocus, scene, 10.0, 2)
+    assert float(error.max()) < 0.08 and ok.all() and float(judged(pga_sca, scene, 10.0, 2)[0].min()) > 2 * float(error.max())
 
 
 @pytest.mark.parametrize("count, per_row", [(4, 1), (16, 1), (4, 4), (16, 4)])
@@ -201,7 +212,6 @@ def injected(n: int, kind: str, seed: int) -> Tensor:
 def best_iterate(x: Tensor, true: Tensor, start: Tensor, kernel: str) -> float:
     """Least phase error of 20 iterations of the rule that the brief states, on padded pulses, without any stop."""
     psi, least, n = start.double(), math.inf, len(x)
-    present = torch.ones(1, n, dtype=torch.bool)
     k = torch.arange(n, dtype=torch.float64) - (n - 1) / 2
     for iteration in range(21):
         least = min(least, float(phase_rmse(psi, true)))
@@ -215,25 +225,25 @@ def best_iterate(x: Tensor, true: Tensor, start: Tensor, kernel: str) -> float:
         step = torch.cat([torch.zeros(1, dtype=torch.float64), step.double().cumsum(-1)])
         step = step - step.mean() - (step * k).sum() / k.square().sum() * k
         psi = psi + step
-    assert present.all()
     return least
 
 
 STRIPS = {
-    "1024, patches, smooth": (1024, dict(points=480, clutter=0.5, decades=(0.5, 1.5), patches=True), "smooth", "zero"),
-    "512, even speckle, few points, a slow walk": (512, dict(points=64, clutter=0.0, decades=(0.5, 1.5), patches=False), "walk", "zero"),
-    "512, clutter over weak points, a slow walk": (512, dict(points=240, clutter=1.0, decades=(0.5, 1.5), patches=True), "walk", "zero"),
-    "512, strong points in clutter, white": (512, dict(points=240, clutter=1.0, decades=(1.8, 2.4), patches=True), "white", "sca"),
+    "1024, patches, smooth": (lambda: strip(1024, 1, 480, 0.5, (0.5, 1.5), True), "smooth", "zero"),
+    "512, even speckle, few points, a slow walk": (lambda: strip(512, 1, 64, 0.0, (0.5, 1.5), False), "walk", "zero"),
+    "512, clutter over weak points, a slow walk": (lambda: strip(512, 1, 240, 1.0, (0.5, 1.5), True), "walk", "zero"),
+    "512, strong points in clutter, white": (lambda: strip(512, 1, 240, 1.0, (1.8, 2.4), True), "white", "sca"),
 }
 
 
 @pytest.mark.parametrize("name", STRIPS)
 def test_pga_ends_near_its_best_iterate(name):
-    n, scene, kind, start = STRIPS[name]
-    true = injected(n, kind, 1)
-    x = strip(n, 1, **scene) * torch.exp(1j * true)[:, None].to(torch.complex64)
+    scene, kind, start = STRIPS[name]
+    x = scene()
+    true = injected(len(x), kind, 1)
+    x = x * torch.exp(1j * true)[:, None].to(torch.complex64)
     found = pga(x) if start == "zero" else pga_sca(x)
-    begin = torch.zeros(n) if start == "zero" else sca(x)["phase_rad"]
+    begin = torch.zeros(len(x)) if start == "zero" else sca(x)["phase_rad"]
     error, best = float(phase_rmse(found["phase_rad"], true)), best_iterate(x, true, begin, "lumv" if start == "zero" else "ml")
     assert error < 1.1 * best + 1e-4 and best < 0.5 * float(phase_rmse(begin, true))
 
