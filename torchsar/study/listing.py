@@ -5,10 +5,20 @@ from __future__ import annotations
 import inspect
 import textwrap
 
-from torchsar.io import recorded
+from torchsar.io import inverse, recorded
 from torchsar.study.catalogue import Catalogue
-from torchsar.study.registry import BEAMS, DAMAGES, PATHS, SCENES, group_of, stages
+from torchsar.study.registry import BEAMS, DAMAGES, FIDELITIES, MOTIONS, PATHS, SCENES, START_PHASES, group_of, stages
 from torchsar.study.text import packaged_configs, read_tree
+
+_WORLD = {
+    "SCENES": SCENES,
+    "BEAMS (stripmap)": BEAMS,
+    "PATHS (stripmap)": PATHS,
+    "MOTIONS (isal)": MOTIONS,
+    "START PHASES (isal)": START_PHASES,
+    "FIDELITIES (isal)": FIDELITIES,
+    "DAMAGES": DAMAGES,
+}
 
 
 def listing() -> str:
@@ -21,11 +31,14 @@ def listing() -> str:
         names = [name for name in stages().entries if group_of(name) == group]
         if names:
             parts += ["", f"STAGES, {group}"] + [_line(stages(), name) for name in names]
-    for title, catalogue in (("SCENES", SCENES), ("BEAMS", BEAMS), ("PATHS", PATHS), ("DAMAGES", DAMAGES)):
+    for title, catalogue in _WORLD.items():
         if catalogue.entries:
             parts += ["", title] + [_line(catalogue, name) for name in catalogue.entries]
-    schema = inspect.cleandoc(recorded.read_stripmap.__doc__ or "").split("\n\n")[1]
-    return "\n".join([*parts, "", "DATA (data.file=PATH, a numpy archive)", textwrap.indent(schema, "  ")])
+    parts += ["", "DATA (data.file=PATH, a numpy archive)"]
+    for system, reader in (("stripmap", recorded.read_stripmap), ("isal", inverse.read_inverse)):
+        schema = inspect.cleandoc(reader.__doc__ or "").split("\n\n")[1]
+        parts += [f"  system {system}", textwrap.indent(schema, "    ")]
+    return "\n".join(parts)
 
 
 def _line(catalogue: Catalogue, name: str) -> str:
