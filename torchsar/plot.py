@@ -144,6 +144,15 @@ def curves(series: Mapping[str, tuple[np.ndarray, np.ndarray]], xlabel: str, yla
 
 
 @_styled
+def places(x: np.ndarray, y: np.ndarray, size: np.ndarray, xlabel: str, ylabel: str, title: str = "") -> Figure:
+    """Points of a scene by their places, on one scale for both axes; size: the area of each point, relative to the largest."""
+    figure, (axes,) = _panels(1, 1, (5.4, 5.0))
+    axes.scatter(x, y, s=14 * size / max(float(size.max()), 1e-300), color=COLOURS[0], linewidths=0)
+    axes.set(xlabel=xlabel, ylabel=ylabel, title=title, aspect="equal")
+    return figure
+
+
+@_styled
 def panels(parts: Sequence[Mapping[str, Any]], columns: int = 2) -> Figure:
     """Several curve panels; each part holds the arguments of `curves`."""
     rows = math.ceil(len(parts) / columns)

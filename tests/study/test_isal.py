@@ -69,7 +69,7 @@ def test_a_run_compares_methods_over_cases_and_scenes(tmp_path: Path) -> None:
     assert methods["recommended"]["metrics"]["strehl"] > 0.95 > methods["none"]["metrics"]["strehl"]
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "noisy, published" in page  # 8.0 - 7.0 beside ours
-    assert len(list((tmp_path / "out" / "figures").glob("*.png"))) == 6
+    assert len(list((tmp_path / "out" / "figures").glob("*.png"))) == 7
     again = run(str(tmp_path / "out" / "config.yaml"), tmp_path / "again")  # what was resolved can be run again
     assert again["methods"]["recommended"]["cases"]["noisy"]["entropy_nats"] == methods["recommended"]["cases"]["noisy"]["entropy_nats"]
 

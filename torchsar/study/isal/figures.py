@@ -26,17 +26,26 @@ _COMPARED = {
 
 @dataclass(frozen=True)
 class CaseResult:
-    """One case: metrics by method (trial,), and of the first trial images, and phases estimated and true (pulse,)."""
+    """One case: metrics by method (trial,), and of the first trial images, phases estimated and true (pulse,),
+    and the target: range and cross range (m) and amplitude of its scatterers, where it was simulated."""
 
     metrics: Mapping[str, Mapping[str, Tensor]]
     images: Mapping[str, Signal]
     phases: Mapping[str, Tensor]
     true_rad: Tensor
+    target: tuple[Tensor, Tensor, Tensor] | None = None
 
 
 def draw(results: Mapping[str, CaseResult], folder: Path) -> list[Picture]:
     """Every picture of a run, as PNG files in the folder, in the order of reading."""
-    return draw_all([partial(_entropies, results), *(partial(make, case, result) for case, result in results.items() for make in (_images, _phases))], folder)
+    by_case = [partial(make, case, result) for case, result in results.items() for make in (_images, _phases)]
+    return draw_all([partial(_target, next(iter(results.values()))), partial(_entropies, results), *by_case], folder)
+
+
+def _target(result: CaseResult) -> Drawn:
+    if result.target is not None:
+        along, across, amplitude = (plot.array(v) for v in result.target)
+        yield "target", "Target", "Scatterers of the first scene; the area of a point is its power.", plot.places(along, across, np.abs(amplitude) ** 2, "range (m)", "cross range (m)")
 
 
 def _entropies(results: Mapping[str, CaseResult]) -> Drawn:
@@ -73,7 +82,7 @@ def _phases(case: str, result: CaseResult) -> Drawn:
         if series:
             parts.append({"series": series, "xlabel": "pulse", "ylabel": "rad", "title": title})
     title = "Phase errors" if case == "all" else f"Phase errors: {case}"
-    yield f"phases_{_word(case)}", title, "Constant and linear terms are removed on the circle: they only turn and shift the image.", plot.panels(parts, columns=1)
+    yield f"phases_{_word(case)}", title, "Constant and linear terms are removed on the circle: they only turn and shift the image.", plot.panels(parts, columns=3)
 
 
 def _centred(image: Signal) -> Signal:

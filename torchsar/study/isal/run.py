@@ -72,7 +72,8 @@ def _simulated(loaded: Loaded, name: str) -> CaseResult:
         if first is None:
             true = batch.phase_rad[0]
             phases = {method: estimated_phase(trace, batch.phase_rad)[0] for method, trace in batch.traces.items()}
-            first = {method: image_of(trace) for method, trace in batch.traces.items()}, phases, true
+            along, across, amplitude = (batch.truth.values[name].reshape(-1, batch.truth.values[name].shape[-1])[0] for name in ("range_m", "cross_range_m", "amplitude"))
+            first = {method: image_of(trace) for method, trace in batch.traces.items()}, phases, true, (along, across, amplitude)
     assert first is not None
     _warn_of_doubt(bench, name, parts)
     metrics = {method: {key: torch.cat([part[method][key].reshape(-1) for part in parts]) for key in parts[0][method]} for method in parts[0]}
