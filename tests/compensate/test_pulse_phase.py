@@ -333,7 +333,7 @@ def test_a_start_connects_to_pga():
 @pytest.mark.parametrize(
     "call, message",
     [
-        (lambda x: pga(x, kernel="mean"), "kernel 'mean' is not known"),
+        (lambda x: pga(x, kernel="mean"), "kernel 'mean' is not known"),  # pyright: ignore[reportArgumentType]
         (lambda x: pga(x, iterations=0), "at least one iteration"),
         (lambda x: pga_sca(x, patience=0), "patience of 1 or more"),
         (lambda x: Shrinking(factor=1.2), "factor in 0..1"),

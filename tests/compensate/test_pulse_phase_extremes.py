@@ -57,7 +57,7 @@ def test_non_finite_samples_are_refused_with_their_place(name, bad):
 def test_what_is_not_complex_is_refused(name):
     for bad in (torch.ones(8, 4), torch.ones(8, 4, dtype=torch.int64), [[1j, 2.0]]):
         with pytest.raises(TypeError, match="complex"):
-            METHODS[name](bad)
+            METHODS[name](bad)  # pyright: ignore[reportArgumentType]
 
 
 # nothing in it

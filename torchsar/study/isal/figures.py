@@ -68,8 +68,8 @@ def _images(case: str, result: CaseResult) -> Drawn:
     title = "Images by every method" if case == "all" else f"Images by every method: {case}"
     reference = "ideal" if "ideal" in result.images else next(iter(result.images))
     shown = {reference: result.images[reference], **{name: image for name, image in result.images.items() if name != reference}}
-    caption = f"The first trial; all images on one scale, that of '{reference}', in dB. They are shifted along cross range by what no data can tell."
-    yield f"images_{_word(case)}", title, caption, plot.images({name: _centred(image) for name, image in shown.items()}, dynamic_range_db=35.0, columns=3)
+    caption = f"The first trial; all images on one scale, that of '{reference}', in dB. They are rolled along cross range to where that one lies, which is a matter of the phase's slope."
+    yield f"images_{_word(case)}", title, caption, plot.images({name: _placed_as(image, shown[reference]) for name, image in shown.items()}, dynamic_range_db=35.0, columns=3)
 
 
 def _phases(case: str, result: CaseResult) -> Drawn:
@@ -85,12 +85,17 @@ def _phases(case: str, result: CaseResult) -> Drawn:
     yield f"phases_{_word(case)}", title, "Constant and linear terms are removed on the circle: they only turn and shift the image.", plot.panels(parts, columns=3)
 
 
-def _centred(image: Signal) -> Signal:
-    """The image rolled along cross range so that the centre of its energy lies in the middle."""
+def _placed_as(image: Signal, reference: Signal) -> Signal:
+    """The image rolled along cross range so that the centre of its energy lies where that of the reference does."""
+    n = image.axes[0].n
+    return image.with_data(image.data.roll(round((_centre(reference) - _centre(image)) * n), 0))
+
+
+def _centre(image: Signal) -> float:
+    """Circular centre of the energy along cross range, in parts of the image's height."""
     n = image.axes[0].n
     power = image.data.abs().square().sum(-1).double()
-    turn = torch.polar(power, 2 * torch.pi * torch.arange(n, dtype=torch.float64) / n).sum()
-    return image.with_data(image.data.roll(n // 2 - round(float(torch.angle(turn)) / (2 * torch.pi) * n), 0))
+    return float(torch.angle(torch.polar(power, 2 * torch.pi * torch.arange(n, dtype=torch.float64) / n).sum())) / (2 * torch.pi)
 
 
 def _word(case: str) -> str:
