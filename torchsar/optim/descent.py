@@ -54,7 +54,7 @@ def lbfgs(
     value_tolerance. The result is detached. Trials are leading dims; it cannot be put inside vmap.
 
     steps: at most, per trial. history: pairs kept, those without positive curvature are dropped. gradient_tolerance: a trial has converged when its gradient norm is
-    at most this fraction of that at the start. value_tolerance: or when a step lowers the cost by at most this fraction of it. first_step: length
+    at most this fraction of that at the start. value_tolerance: or when a step lowers the cost by at most this fraction of it (at least four units of rounding). first_step: length
     of the first trial step in the units of x. search: evaluations of one line search at most; a search that finds nothing drops the history once, then ends the trial.
     A step into non-finite cost or gradient counts as too long; a trial whose search ends at such a wall is not ok.
 
@@ -250,7 +250,9 @@ def _move(state: _State, ended: Tensor, wall: Tensor, scaled: _Scaled, rules: _R
     search = state.search
     moved = ended & (search.low.step > 0)
     x, cost, gradient = _where(moved, _along(state, search.low.step), state.x), _where(moved, search.cost, state.cost), _where(moved, search.gradient, state.gradient)
-    lowered = state.cost - cost <= rules.value_tolerance * torch.maximum(cost.abs(), state.cost.abs())
+    # below a few units of rounding a search only chases noise
+    tolerance = max(rules.value_tolerance, 4 * torch.finfo(cost.dtype).eps) if rules.value_tolerance else 0.0
+    lowered = state.cost - cost <= tolerance * torch.maximum(cost.abs(), state.cost.abs())
     converged = moved & ((lowered & ~wall) | (_norm(gradient) <= rules.gradient_tolerance * scaled.norm))
     steps = state.steps + moved
     stuck = ended & ~moved & (state.pairs.inverse == 0).all(0)

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from torchsar.core import Chain, Recording, Truth, use
+from torchsar.radar import InverseRadar, StripmapRadar
 from torchsar.study.catalogue import Catalogue
 from torchsar.study.config import Config, Loaded, Method
 from torchsar.study.errors import ConfigError, did_you_mean
@@ -33,8 +34,8 @@ def precision(config: Config) -> torch.dtype:
     return {"complex64": torch.complex64, "complex128": torch.complex128}[config.precision]
 
 
-def build_damages(entries: Mapping[str, dict[str, Any]], where: str, file: str) -> dict[str, Any]:
-    return {name: DAMAGES.make(entry, f"{where}.{name}", file) for name, entry in entries.items()}
+def build_damages(entries: Mapping[str, dict[str, Any]], where: str, file: str, catalogue: Catalogue = DAMAGES) -> dict[str, Any]:
+    return {name: catalogue.make(entry, f"{where}.{name}", file) for name, entry in entries.items()}
 
 
 def build_chain(method: Method, where: str, file: str, **given: Any) -> Chain:
@@ -48,12 +49,22 @@ def build_chain(method: Method, where: str, file: str, **given: Any) -> Chain:
         uses = entry.get("uses", {}) if isinstance(entry, dict) else {}
         if not (isinstance(uses, dict) and all(isinstance(v, str) for v in uses.values())):
             raise ConfigError(f"{file}: {place}.uses must map values of the stage to 'stage.value', got {uses!r}")
-        stage = stages().make({k: v for k, v in entry.items() if k != "uses"} if isinstance(entry, dict) else entry, place, file, **given)
+        try:
+            stage = stages().make({k: v for k, v in entry.items() if k != "uses"} if isinstance(entry, dict) else entry, place, file, **given)
+        except AttributeError as error:
+            raise ConfigError(f"{file}: {place}: {foreign(error)}") from None
         built[name] = use(stage, **uses)
     try:
         return Chain(**built)
     except (ValueError, TypeError) as error:
         raise ConfigError(f"{file}: {where}: {' '.join(str(error).split())}") from None
+
+
+def foreign(error: AttributeError) -> str:
+    """The sentence for a stage that asks its radar for what only another system's has. Any other AttributeError is a fault of the program and goes on."""
+    if not isinstance(error.obj, (StripmapRadar, InverseRadar)):
+        raise error
+    return f"this stage needs radar.{error.name}, which a radar of this system does not have; it is a stage of another system"
 
 
 def check_given(chain: Chain, method: Method, where: str, file: str) -> None:

@@ -134,12 +134,12 @@ class Loaded:
     file: str
     name: str
 
-    def changed(self, values: Mapping[str, Any]) -> Loaded:
-        """The same config with other values at dotted keys. Raises ConfigError where a key leads nowhere or a value is not accepted."""
+    def changed(self, values: Mapping[str, Any], where: str = "sweep") -> Loaded:
+        """The same config with other values at dotted keys, which stand at `where`. Raises ConfigError where a key leads nowhere or a value is not accepted."""
         tree = self.config.model_dump()
         for key, value in sorted(values.items(), key=lambda item: item[0].count(".")):  # a part of a section after the section itself
-            tree = _placed(tree, key.split("."), value, f"{self.file}: sweep: the key {key!r}")
-        return replace(self, config=_checked(tree, f"{self.file}: sweep"))
+            tree = _placed(tree, key.split("."), value, f"{self.file}: {where}: the key {key!r}")
+        return replace(self, config=_checked(tree, f"{self.file}: {where}"))
 
     def text(self, tree: dict[str, Any] | None = None) -> str:
         """The resolved config as YAML."""
@@ -180,7 +180,7 @@ def _check_source(config: Config, file: str) -> None:
         if not path.is_file():
             raise ConfigError(f"{file}: data.file: {config.data.file!r} {'is no file' if path.exists() else 'does not exist'}; give the path of a {config.recording} .npz file")
     elif config.world is None and config.radar is None:
-        raise ConfigError(f"{file}: data.file is not set; add data.file=PATH with the path of a raw stripmap .npz file")
+        raise ConfigError(f"{file}: data.file is not set; add data.file=PATH with the path of a {config.recording} .npz file")
     elif config.world is None or config.radar is None:
         missing = "world" if config.world is None else "radar"
         raise ConfigError(f"{file}: section {missing!r} is missing; a simulation needs both 'radar' and 'world', recorded data needs data.file")

@@ -7,6 +7,7 @@ import textwrap
 
 from torchsar.io import inverse, recorded
 from torchsar.study.catalogue import Catalogue
+from torchsar.study.isal.sections import TARGET_DAMAGES
 from torchsar.study.registry import BEAMS, DAMAGES, FIDELITIES, MOTIONS, PATHS, SCENES, START_PHASES, group_of, stages
 from torchsar.study.text import packaged_configs, read_tree
 
@@ -17,7 +18,8 @@ _WORLD = {
     "MOTIONS (isal)": MOTIONS,
     "START PHASES (isal)": START_PHASES,
     "FIDELITIES (isal)": FIDELITIES,
-    "DAMAGES": DAMAGES,
+    "DAMAGES (stripmap)": DAMAGES,
+    "DAMAGES (isal)": TARGET_DAMAGES,
 }
 
 

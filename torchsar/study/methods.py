@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from torchsar.core import Chain, Estimate, Signal, Trace
 from torchsar.radar import StripmapRadar
-from torchsar.study.build import Case, build_chain, check_given
+from torchsar.study.build import Case, build_chain, check_given, foreign
 from torchsar.study.config import Loaded, Method, check_methods
 from torchsar.study.errors import ConfigError
 
@@ -61,6 +61,8 @@ def run_methods(loaded: Loaded, case: Case, chains: Mapping[str, Chain]) -> dict
             try:
                 with torch.no_grad(), _announced(chains[name], name, bar):
                     results[name] = _run_one(name, method, chains[name], case, results)
+            except AttributeError as error:
+                raise ConfigError(f"{loaded.file}: processor.{name}: {foreign(error)}") from None
             except (ValueError, TypeError, KeyError, RuntimeError) as error:  # RuntimeError: what torch itself refuses, too little memory among it
                 if os.environ.get("TORCHSAR_DEBUG"):
                     raise

@@ -16,8 +16,8 @@ def sca(data: Tensor) -> Estimate:
     data: (..., pulse, range) complex, range-compressed and aligned; the compensated data are data * exp(-j phase_rad)[..., None]. Exactly
     equivariant: on data * exp(j a) the estimate is larger by a, up to a constant, whatever a is, so that the severity of the error is of no
     account. Its own error comes from the scene (about 1.2 rad for a target of many scatterers a row) and from noise. A pulse of zeros is bridged
-    by the product of its neighbours and keeps the phase of the one before. Differentiable. ok is False for noise. std: from even against odd
-    range cells. Raises TypeError or ValueError for what are no finite complex samples.
+    by the product of its neighbours and keeps the phase of the one before. Differentiable. ok is False for noise. std: from two halves
+    of the rows. Raises TypeError or ValueError for what are no finite complex samples.
     """
 
     def find(rows: Tensor, present: Tensor, _: Tensor | None) -> Found:

@@ -42,7 +42,7 @@ def autofocus(
     the slope of the phase over pulses as well, since an image in a wrong place migrates wrongly: after the steps above, 48 slopes over one turn a pulse are
     tried, the best refined, and both kinds of iterations run through `imaging`. Its image must cover the whole unambiguous cross range.
 
-    std: from even against odd range cells, close to the true error on targets of points. ok is False for noise, for images no sharper than
+    std: from two halves of the rows, close to the true error on targets of points. ok is False for noise, for images no sharper than
     noise can be made, and for one row alone. Differentiable without `imaging`. Raises TypeError or ValueError for samples that are not finite and complex, or a start of another shape.
     """
     pulses = prepare(data, "autofocus")
@@ -79,7 +79,7 @@ class _Placed:
             phase = self._best_slope(rows, phase, step / 8, 17)
             phase, taken = in_turn(rows, phase, self.runs)
             total = total + taken
-        return self._best_slope(rows, phase, step / 8, 17), total
+        return self._best_slope(rows, self._best_slope(rows, phase, step / 8, 17), step / 64, 17), total
 
     @torch.no_grad()
     def _best_slope(self, rows: Tensor, phase: Tensor, step_rad: float, count: int) -> Tensor:

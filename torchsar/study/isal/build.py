@@ -10,12 +10,13 @@ from torchsar.io import read_inverse
 from torchsar.radar import InverseRadar, geometry_of
 from torchsar.scene import Together, TurntableWorld
 from torchsar.study.build import build_damages, precision, refuse_oversize
-from torchsar.study.config import Loaded
+from torchsar.study.config import RESERVED, Loaded
 from torchsar.study.errors import ConfigError
-from torchsar.study.isal.sections import IsalConfig
+from torchsar.study.isal.sections import TARGET_DAMAGES, IsalConfig
 from torchsar.study.methods import build_chains
 from torchsar.study.registry import FIDELITIES, MOTIONS, SCENES, START_PHASES
 
+_OF_ALL_CASES = ("system", "title", "cases", "metrics", "trade", "sweep")
 _GEOMETRY = ("frequency_hz", "angle_rad", "position_m", "reference_m")
 
 
@@ -46,16 +47,53 @@ def cases_of(loaded: Loaded) -> dict[str, Loaded]:
     assert isinstance(loaded.config, IsalConfig)
     cases = loaded.config.cases
     for name, values in cases.items():
-        if not values:
-            raise ConfigError(f"{loaded.file}: cases.{name} changes nothing; give it dotted keys with values, such as world.noise.snr_db: 10.0")
-    return {name: loaded.changed(values) for name, values in cases.items()} or {"": loaded}
+        _refuse_case(name, values, loaded)
+    words = {word_of(name): name for name in cases}
+    for name in cases:
+        if words[word_of(name)] != name:
+            raise ConfigError(f"{loaded.file}: cases {name!r} and {words[word_of(name)]!r} would share their figures; name them apart by letters or digits")
+    changed = {name: loaded.changed(values, f"cases.{name}") for name, values in cases.items()}
+    for name, case in changed.items():
+        if list(case.config.processor) != list(loaded.config.processor):
+            raise ConfigError(f"{loaded.file}: cases.{name} changes which methods there are; every method runs on every case, so a case may change only keys of their stages")
+    return changed or {"": loaded}
+
+
+def word_of(case: str) -> str:
+    """The name of a case as a part of names of files."""
+    return "".join(c if c.isalnum() else "_" for c in case)
+
+
+def _refuse_case(name: str, values: Mapping[str, Any], loaded: Loaded) -> None:
+    """A case has a name that results can go by, and changes what a case may change."""
+    if not word_of(name).strip("_") or name.startswith("__") or "/" in name or name in (*RESERVED, "all"):
+        raise ConfigError(f"{loaded.file}: a case cannot be called {name!r}; its name has letters or digits and no '/', and is none of {', '.join((*RESERVED, 'all'))}")
+    if not values:
+        raise ConfigError(f"{loaded.file}: cases.{name} changes nothing; give it dotted keys with values, such as world.noise.snr_db: 10.0")
+    recorded = loaded.config.data.file is not None
+    for key in values:
+        root = key.split(".")[0]
+        if root in _OF_ALL_CASES or key == "world.trials" or root == ("world" if recorded else "data"):
+            where = "is not used by a run on recorded data" if recorded and root == "world" else "is not used by a simulation" if root == "data" else "holds for all cases"
+            raise ConfigError(f"{loaded.file}: cases.{name}: the key {key!r} {where}; a case may change radar, world, data, processor, seed and precision")
+
+
+def check_judged(loaded: Loaded) -> None:
+    """Methods have stages of their own, and the reference is one of undamaged input."""
+    for name, method in loaded.config.processor.items():
+        if method.rerun is not None:
+            raise ConfigError(f"{loaded.file}: processor.{name}.rerun: system isal runs no part of a chain again; give the method 'stages' of its own")
+    reference = loaded.config.metrics.reference
+    if reference is not None and loaded.config.processor[reference].input != "clean":
+        raise ConfigError(f"{loaded.file}: metrics.reference names {reference!r}, whose image is not the ideal one; name a method with 'input: clean'")
 
 
 def check(loaded: Loaded) -> None:
     """Build all that a simulation names, without computing anything."""
     for case in cases_of(loaded).values():
         build_world(case)
-        build_damages(case.config.world.damages, "world.damages", case.file)
+        check_judged(case)
+        build_damages(case.config.world.damages, "world.damages", case.file, TARGET_DAMAGES)
         build_chains(case, radar=build_radar(case))
 
 

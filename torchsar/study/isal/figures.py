@@ -14,6 +14,7 @@ from torch import Tensor
 from torchsar import plot
 from torchsar.core import Signal
 from torchsar.metrics import residual_phase
+from torchsar.study.isal.build import word_of
 from torchsar.study.pictures import Drawn, Picture, draw_all
 
 _NEAR_RAD = 0.3
@@ -69,7 +70,7 @@ def _images(case: str, result: CaseResult) -> Drawn:
     reference = "ideal" if "ideal" in result.images else next(iter(result.images))
     shown = {reference: result.images[reference], **{name: image for name, image in result.images.items() if name != reference}}
     caption = f"The first trial; all images on one scale, that of '{reference}', in dB. They are rolled along cross range to where that one lies, which is a matter of the phase's slope."
-    yield f"images_{_word(case)}", title, caption, plot.images({name: _placed_as(image, shown[reference]) for name, image in shown.items()}, dynamic_range_db=35.0, columns=3)
+    yield f"images_{word_of(case)}", title, caption, plot.images({name: _placed_as(image, shown[reference]) for name, image in shown.items()}, dynamic_range_db=35.0, columns=3)
 
 
 def _phases(case: str, result: CaseResult) -> Drawn:
@@ -82,7 +83,7 @@ def _phases(case: str, result: CaseResult) -> Drawn:
         if series:
             parts.append({"series": series, "xlabel": "pulse", "ylabel": "rad", "title": title})
     title = "Phase errors" if case == "all" else f"Phase errors: {case}"
-    yield f"phases_{_word(case)}", title, "Constant and linear terms are removed on the circle: they only turn and shift the image.", plot.panels(parts, columns=3)
+    yield f"phases_{word_of(case)}", title, "Constant and linear terms are removed on the circle: they only turn and shift the image.", plot.panels(parts, columns=3)
 
 
 def _placed_as(image: Signal, reference: Signal) -> Signal:
@@ -94,9 +95,5 @@ def _placed_as(image: Signal, reference: Signal) -> Signal:
 def _centre(image: Signal) -> float:
     """Circular centre of the energy along cross range, in parts of the image's height."""
     n = image.axes[0].n
-    power = image.data.abs().square().sum(-1).double()
+    power = image.data.abs().double().square().sum(-1)
     return float(torch.angle(torch.polar(power, 2 * torch.pi * torch.arange(n, dtype=torch.float64) / n).sum())) / (2 * torch.pi)
-
-
-def _word(case: str) -> str:
-    return "".join(c if c.isalnum() else "_" for c in case)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,18 +12,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Signal
+from torchsar.core import Draws, Signal, Trace
 from torchsar.echo import apply_damages
 from torchsar.metrics import phase_rmse
 from torchsar.study.build import build_damages, resolved
 from torchsar.study.config import Loaded, check_methods
 from torchsar.study.errors import ConfigError
 from torchsar.study.folder import fresh_folder, write_arrays, write_json
-from torchsar.study.isal.build import cases_of, check, read_recording, recorded_chains
+from torchsar.study.isal.build import cases_of, check, check_judged, read_recording, recorded_chains
 from torchsar.study.isal.figures import CaseResult, draw
 from torchsar.study.isal.judge import DEFINITIONS, estimated_phase, image_metrics, phase_metrics, summary
 from torchsar.study.isal.report import write_report
-from torchsar.study.isal.trials import Bench, IsalTrials, image_of, judged, run_batch
+from torchsar.study.isal.sections import TARGET_DAMAGES
+from torchsar.study.isal.trials import IMAGE, Bench, IsalTrials, image_of, judged, not_an_image, run_batch, traced
 from torchsar.study.montecarlo.record import OK
 
 log = logging.getLogger("torchsar")
@@ -37,7 +39,9 @@ def run(loaded: Loaded, out: Path, command: str = "torchsar run") -> Path:
     with fresh_folder(out) as folder:
         check_methods(loaded.config, loaded.file)
         recorded = loaded.config.data.file is not None
-        if not recorded:
+        if recorded:
+            check_judged(loaded)
+        else:
             check(loaded)
         results: dict[str, CaseResult] = {}
         for name, case in cases_of(loaded).items():
@@ -45,9 +49,8 @@ def run(loaded: Loaded, out: Path, command: str = "torchsar run") -> Path:
             try:
                 results[name or "all"] = _recorded(case) if recorded else _simulated(case, name)
             except (ValueError, TypeError, KeyError, RuntimeError) as error:
-                if isinstance(error, ConfigError):
-                    raise
-                raise ConfigError(f"{loaded.file}: {f'cases.{name}: ' if name else ''}{' '.join(str(error).split())}") from error
+                text, place = " ".join(str(error).split()), f"{loaded.file}: {f'cases.{name}: ' if name else ''}"
+                raise ConfigError(text if text.startswith(loaded.file) else f"{place}{text}") from error
             log.info("%s: %.1f s", name or loaded.name, time.perf_counter() - started)
         metrics = metrics_tree(loaded, results)
         config_text = loaded.text(resolved(loaded))
@@ -68,16 +71,26 @@ def _simulated(loaded: Loaded, name: str) -> CaseResult:
     parts, first = [], None
     for begin in range(0, trials, height):
         batch = run_batch(bench, Draws(loaded.config.seed, "run", range(begin, min(begin + height, trials))))
-        parts.append(judged(bench.config, batch))
+        for method, trace in batch.traces.items():
+            _refuse_no_image(method, trace)
+        parts.append(judged(bench, batch))
         if first is None:
             true = batch.phase_rad[0]
-            phases = {method: estimated_phase(trace, batch.phase_rad)[0] for method, trace in batch.traces.items()}
+            phases = {method: estimated_phase(bench.chains[method], trace, batch.phase_rad)[0] for method, trace in batch.traces.items()}
             along, across, amplitude = (batch.truth.values[name].reshape(-1, batch.truth.values[name].shape[-1])[0] for name in ("range_m", "cross_range_m", "amplitude"))
             first = {method: image_of(trace) for method, trace in batch.traces.items()}, phases, true, (along, across, amplitude)
     assert first is not None
     _warn_of_doubt(bench, name, parts)
     metrics = {method: {key: torch.cat([part[method][key].reshape(-1) for part in parts]) for key in parts[0][method]} for method in parts[0]}
     return CaseResult(metrics, *first)
+
+
+def _refuse_no_image(name: str, trace: Trace) -> None:
+    if trace.signal.names != IMAGE:
+        raise ConfigError(f"processor.{name}, {not_an_image(trace.signal)} (a sweep needs none)")
+    for axis in trace.signal.axes:
+        if not math.isfinite(axis.step * axis.n):
+            raise ConfigError(f"processor.{name}: the image has cells of {axis.step:g} {axis.unit} along {axis.name}; check the carrier, the pulse rate and the rotation of the radar")
 
 
 def _warn_of_doubt(bench: Bench, name: str, parts: list[dict[str, dict[str, Tensor]]]) -> None:
@@ -90,7 +103,7 @@ def _warn_of_doubt(bench: Bench, name: str, parts: list[dict[str, dict[str, Tens
 def _recorded(loaded: Loaded) -> CaseResult:
     """One case of a recording: every method on the recording as it is, and with the injected phases."""
     clean = read_recording(loaded)
-    damages = build_damages(loaded.config.data.damages, "data.damages", loaded.file)
+    damages = build_damages(loaded.config.data.damages, "data.damages", loaded.file, TARGET_DAMAGES)
     dirty, told = apply_damages(clean, damages, Draws(loaded.config.seed))
     if not [name for name in told if name.endswith(".phase_rad")]:
         told = {**told, "none.phase_rad": torch.zeros(clean.signal.data.shape[-2], dtype=torch.float64)}
@@ -101,15 +114,17 @@ def _recorded(loaded: Loaded) -> CaseResult:
     images, phases = {}, {}
     for name, method in loaded.config.processor.items():
         began = time.perf_counter()
-        of_clean = chains[name].trace(clean)
+        chain = chains[name]
+        of_clean = traced(chain, clean, name)
         seconds = time.perf_counter() - began
-        trace = of_clean if method.input == "clean" else chains[name].trace(dirty)
+        trace = of_clean if method.input == "clean" else traced(chain, dirty, name)
+        _refuse_no_image(name, trace)
         injected = torch.zeros_like(true) if method.input == "clean" else true
-        row = {**phase_metrics(trace, injected, present), **image_metrics(trace.signal, None)}
+        row = {**phase_metrics(chain, trace, injected, present), **image_metrics(trace.signal, None)}
         row["entropy_above_clean_nats"] = row["entropy_nats"] - image_metrics(of_clean.signal, None)["entropy_nats"]
-        row["agreement_rad"] = phase_rmse(estimated_phase(trace, true) - injected, estimated_phase(of_clean, true), present)
+        row["agreement_rad"] = phase_rmse(estimated_phase(chain, trace, true) - injected, estimated_phase(chain, of_clean, true), present)
         row["seconds"] = torch.tensor(seconds, dtype=torch.float64)
-        metrics[name], images[name], phases[name] = row, trace.signal, estimated_phase(trace, true)
+        metrics[name], images[name], phases[name] = row, trace.signal, estimated_phase(chain, trace, true)
     return CaseResult(metrics, images, phases, true)
 
 
@@ -124,7 +139,7 @@ def metrics_tree(loaded: Loaded, results: Mapping[str, CaseResult]) -> dict[str,
         metrics = {key: sum(row[key] for row in rows.values() if key in row) / sum(key in row for row in rows.values()) for key in keys}
         methods[name] = {"title": method.title, "metrics": metrics, "estimates": {}, "targets": {}, "cases": rows}
     published = {"ideal_entropy_nats": config.metrics.published_ideal, "entropy_nats": config.metrics.published}
-    return {"methods": methods, "published": published, "truth": {}, "definitions": DEFINITIONS, "trials": 1 if config.world is None else config.world.trials}
+    return {"methods": methods, "published": published, "truth": {}, "definitions": DEFINITIONS, "trials": 1 if config.data.file is not None else config.world.trials}
 
 
 def _key(case: str, name: str) -> str:

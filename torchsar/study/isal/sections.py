@@ -11,6 +11,10 @@ from torchsar.study.config import Config, Noise
 from torchsar.study.registry import DAMAGES, FIDELITIES, MOTIONS, SCENES, START_PHASES
 
 
+_DAMAGES = ("lost_pulses", "white_phase", "phase_walk", "phase_sinusoid", "quantiser")
+TARGET_DAMAGES = Catalogue("damage of a turning target", "kind", {name: DAMAGES.entries[name] for name in _DAMAGES})
+
+
 class Radar(Strict):
     """What the instrument knows about itself; see torchsar.radar.InverseRadar."""
 
@@ -29,7 +33,7 @@ class World(Strict):
     """
 
     single: ClassVar[dict[str, Catalogue]] = {"fidelity": FIDELITIES}
-    named: ClassVar[dict[str, Catalogue]] = {"scene": SCENES, "motion": MOTIONS, "start_phase": START_PHASES, "damages": DAMAGES}
+    named: ClassVar[dict[str, Catalogue]] = {"scene": SCENES, "motion": MOTIONS, "start_phase": START_PHASES, "damages": TARGET_DAMAGES}
 
     pulses: int = Field(gt=0)
     samples: int = Field(gt=0)

@@ -28,6 +28,7 @@ from torchsar.study.errors import ConfigError
 from torchsar.study.folder import fresh_folder, write_json
 from torchsar.study.isal.build import build_radar, build_world, cases_of, check
 from torchsar.study.isal.judge import estimated_phase
+from torchsar.study.isal.sections import TARGET_DAMAGES
 from torchsar.study.methods import build_chains
 
 log = logging.getLogger("torchsar")
@@ -108,7 +109,7 @@ def _tables(loaded: Loaded) -> dict[str, list[Row]]:
 
 def _simulate(loaded: Loaded, world: TurntableWorld, dtype: torch.dtype, count: int | None = None) -> _Trials:
     size, radar = loaded.config.world, build_radar(loaded)
-    damages = build_damages(size.damages, "world.damages", loaded.file)
+    damages = build_damages(size.damages, "world.damages", loaded.file, TARGET_DAMAGES)
     recording, truth = simulate_turntable(radar, world, size.pulses, size.samples, Draws(loaded.config.seed, "trade", range(count or loaded.config.trade.trials)), damages, dtype)
     return _Trials(radar, recording, truth)
 
@@ -120,7 +121,7 @@ def _methods(loaded: Loaded, made: _Trials) -> Iterator[Row]:
             continue
 
         def work(data: Tensor, chain: Any = chain) -> Tensor:
-            return estimated_phase(chain.trace(made.recording.signal.with_data(data)), made.truth.values["phase_rad"])
+            return estimated_phase(chain, chain.trace(made.recording.signal.with_data(data)), made.truth.values["phase_rad"])
 
         yield made.row(name, made.data, work, loaded.config.trade.repeats)
 

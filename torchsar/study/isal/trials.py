@@ -17,14 +17,16 @@ from torchsar.echo import Damage, simulate_turntable
 from torchsar.metrics.bounds import pulse_phase_bound_of_scene_rad, pulse_phase_bound_rad
 from torchsar.radar import InverseRadar
 from torchsar.scene import PhaseOnly, TurntableWorld
-from torchsar.study.build import build_damages, precision
+from torchsar.study.build import build_damages, foreign, precision
 from torchsar.study.config import Config, Loaded
 from torchsar.study.errors import ConfigError
-from torchsar.study.isal.build import build_radar, build_world
+from torchsar.study.isal.build import build_radar, build_world, check_judged
 from torchsar.study.isal.judge import image_metrics, phase_metrics
+from torchsar.study.isal.sections import TARGET_DAMAGES
 from torchsar.study.methods import build_chains
 from torchsar.study.montecarlo.work import BOUNDS, SAVED
 
+IMAGE = ("azimuth", "range")
 _SNR = "world.noise.snr_db"
 _MOST_SCATTERERS, _MOST_PULSES = 1200, 800
 _PEAK_BYTES = 8
@@ -85,6 +87,8 @@ class IsalTrials:
 
     def check(self, grid: Mapping[str, Any]) -> None:
         """Refuse a grid over what a sweep does not use. Raises ConfigError."""
+        if self.loaded.config.cases:
+            raise ConfigError(f"{self.loaded.file}: cases belong to runs; sweep over the keys that they change, such as world.start_phase, and add cases={{}} to leave them out")
         for key in grid:
             if key.split(".")[0] == "cases" or key == "world.trials":
                 raise ConfigError(f"{self.loaded.file}: sweep: the key {key!r} belongs to runs and cannot be swept")
@@ -98,9 +102,10 @@ class IsalTrials:
         key = repr(fixed)
         if key not in self._benches:
             loaded = self.loaded.changed(fixed)
+            check_judged(loaded)
             radar = build_radar(loaded)
             chains = {name: chain.to(self.device) for name, chain in build_chains(loaded, radar=radar).items()}
-            damages = build_damages(loaded.config.world.damages, "world.damages", loaded.file)
+            damages = build_damages(loaded.config.world.damages, "world.damages", loaded.file, TARGET_DAMAGES)
             self._benches[key] = Bench(loaded.config, radar, build_world(loaded), damages, chains)
         return self._benches[key]
 
@@ -114,8 +119,23 @@ class IsalTrials:
         bench = self.bench({k: v for k, v in parameters.items() if k != _SNR})
         world = replace(bench.world, snr_db=parameters[_SNR]) if _SNR in parameters else bench.world
         batch = run_batch(bench, draws, self.device, world)
-        found: dict[str, Any] = judged(bench.config, batch)
+        found: dict[str, Any] = judged(bench, batch)
         return {**found, BOUNDS: _bounds(bench, batch), SAVED: _saved(bench, batch)}
+
+
+def traced(chain: Chain, recording: Recording, name: str) -> Trace:
+    """The trace of a method, whose name goes before whatever its stages refuse."""
+    try:
+        return chain.trace(recording)
+    except AttributeError as error:
+        raise ConfigError(f"processor.{name}: {foreign(error)}") from error
+    except (ValueError, TypeError, KeyError) as error:
+        text = error.args[0] if isinstance(error, KeyError) and error.args else error
+        raise ConfigError(f"processor.{name}: {text}") from error
+
+
+def not_an_image(signal: Signal) -> str:
+    return f"whose last stage gives the axes {signal.names}, not an image {IMAGE}; end its chain with azimuth_transform or target_image"
 
 
 def run_batch(bench: Bench, draws: Draws, device: str = "cpu", world: TurntableWorld | None = None) -> Batch:
@@ -127,23 +147,23 @@ def run_batch(bench: Bench, draws: Draws, device: str = "cpu", world: TurntableW
     count = max(1, recording.signal.trials.numel())
     for name, method in bench.config.processor.items():
         began = time.perf_counter()
-        if method.rerun is not None:
-            raise ConfigError(f"processor.{name}.rerun: methods of this system have stages of their own")
-        traces[name] = bench.chains[name].trace(truth.clean if method.input == "clean" else recording)
+        traces[name] = traced(bench.chains[name], truth.clean if method.input == "clean" else recording, name)
         seconds[name] = (time.perf_counter() - began) / count
     return Batch(recording, truth, traces, seconds)
 
 
-def judged(config: Config, batch: Batch) -> dict[str, dict[str, Tensor]]:
+def judged(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
     """Metrics of every method, (trial,) each."""
-    reference = config.metrics.reference
+    config, reference = bench.config, bench.config.metrics.reference
     ideal = None if reference is None else batch.traces[reference].signal
+    if ideal is not None and ideal.names != IMAGE:
+        raise ConfigError(f"metrics.reference names {reference!r}, {not_an_image(ideal)}")
     found = {}
     for name, trace in batch.traces.items():
         clean = config.processor[name].input == "clean"
         truth = torch.zeros_like(batch.phase_rad) if clean else batch.phase_rad
-        metrics = phase_metrics(trace, truth, batch.present)
-        if trace.signal.names == ("azimuth", "range"):
+        metrics = phase_metrics(bench.chains[name], trace, truth, batch.present)
+        if trace.signal.names == IMAGE:
             metrics.update(image_metrics(trace.signal, None if name == reference else ideal))
         metrics["seconds"] = torch.full(truth.shape[:-1], batch.seconds[name], dtype=torch.float64)
         found[name] = metrics
