@@ -43,12 +43,13 @@ def shift_range(data: Tensor, shift_cells: Tensor | float) -> Tensor:
     """Every pulse moved by its shift towards greater range, circularly. data: (..., pulse, range) complex; shift_cells: (..., pulse), (pulse,) or a number.
 
     A linear phase about the centre of fast time, the middle of the band: the phase of an echo does not turn with its place. Unitary, and
-    shift_range(., -s) undoes shift_range(., s). Differentiable in both. Raises ValueError for shifts of another shape.
+    shift_range(., -s) undoes shift_range(., s). Differentiable in both. Raises ValueError for shifts of another shape or not finite.
     """
     n = data.shape[-1]
     shift = torch.as_tensor(shift_cells, dtype=torch.float64, device=data.device)
     if shift.ndim and shift.shape[-1] != data.shape[-2]:
         raise ValueError(f"one shift per pulse is needed, (..., {data.shape[-2]}), got {tuple(shift.shape)}")
+    refuse_non_finite(shift, "shift_range: shift_cells")
     phasor = torch.fft.ifftshift(linear_phasor(-shift / n, -(n // 2), n, data.dtype), dim=-1)
     return torch.fft.ifft(torch.fft.fft(data) * phasor)
 
@@ -97,8 +98,9 @@ def align_envelopes(data: Tensor, *, degree: int | None = 2, tones: int = 0, pas
     deviation of the course by the scatter of its runs where that is more; ok: it is below half a cell. quality: 1 / (1 + (2 std)^2). Not differentiable.
     Raises TypeError or ValueError for samples that are not finite and complex, or settings that make no sense.
     """
-    if not ((degree is None or degree >= 0) and tones >= 0 and passes >= 1 and blocks >= 1) or (degree is None and tones):
-        raise ValueError(f"align_envelopes: degree is {degree} (0 or more; None without tones), tones {tones} (0 or more), passes {passes} and blocks {blocks} (1 or more)")
+    whole = all(isinstance(value, int) for value in (degree or 0, tones, passes, blocks))
+    if not (whole and (degree is None or degree >= 0) and tones >= 0 and passes >= 1 and blocks >= 1) or (degree is None and tones):
+        raise ValueError(f"align_envelopes: degree is {degree!r} (0 or more; None without tones), tones {tones!r} (0 or more), passes {passes!r} and blocks {blocks!r} (1 or more); whole numbers")
 
     def find(pulses: Envelopes) -> Course:
         smooth, deviation = smooth_shifts(pulses, 2 if degree is None else degree, passes, blocks)
@@ -375,6 +377,7 @@ def _estimated(data: Tensor, name: str, find: Callable[[Envelopes], Course]) -> 
     height = max(1, 8 * block_bytes_of(flat.device) // max(1, flat[0].numel() * flat.element_size())) if len(flat) else 1
     with torch.no_grad():
         parts = [_judged(flat[first : first + height].detach(), find) for first in range(0, len(flat), height)]
+    parts = parts or [(torch.zeros_like(present, dtype=torch.float64), torch.zeros(0, dtype=torch.float64, device=flat.device))]  # no trials
     shift, std = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
     learnable = present.sum(-1) >= 2
     shift, std = torch.where(learnable[:, None], shift, 0), torch.where(learnable, std, data.shape[-1] / math.sqrt(12))

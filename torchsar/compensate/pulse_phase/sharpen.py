@@ -67,9 +67,9 @@ def weighted(image: Tensor, weights: Weights) -> Tensor:
 
 @dataclass(frozen=True)
 class LogAbove:
-    """ln(max(p, floor) / floor): the gradient of the entropy for cells above the floor (times the mean power), nothing below it."""
+    """ln(max(p, floor) / floor): the gradient of the entropy for cells above the floor (times the mean power; a number or (trial, 1, 1)), nothing below it."""
 
-    floor: float
+    floor: float | Tensor
 
     def __call__(self, power: Tensor, mean: Tensor) -> Tensor:
         return torch.log((power * (1 / (self.floor * mean))).clamp_min(1))
