@@ -232,6 +232,7 @@ def test_bad_input_is_refused(method) -> None:
         partial(align_envelopes, degree=-1),
         partial(align_envelopes, degree=None, tones=1),
         partial(align_envelopes, blocks=0),
+        partial(align_envelopes, degree=2.5),  # pyright: ignore[reportArgumentType]
         lambda x: refine_alignment(x, torch.zeros(5), degree=0),
     ],
 )
@@ -288,3 +289,14 @@ def test_stages_count_in_metres() -> None:
     torch.testing.assert_close(found.std["shift_m"], cells.std["shift_cells"] * 0.5)
     torch.testing.assert_close(found["velocity_m_s"], drift_cells(cells["shift_cells"]) * 0.5 * 2000)
     torch.testing.assert_close(ShiftRange()(signal, shift_m=found["shift_m"]).data, shift_range(x, -cells["shift_cells"]))
+
+
+@pytest.mark.parametrize("settings", [{}, {"tones": 2}, {"degree": None}])
+def test_no_trials_give_no_shifts(settings: dict) -> None:
+    found = align_envelopes(torch.zeros(0, 5, 16, dtype=torch.complex64), **settings)
+    assert found["shift_cells"].shape == (0, 5) and found.ok.shape == (0,)
+
+
+def test_a_shift_that_is_no_number_is_refused() -> None:
+    with pytest.raises(ValueError, match="shift_range: .*NaN"):
+        shift_range(torch.ones(3, 8, dtype=torch.complex64), torch.tensor([0.0, math.nan, 0.0]))

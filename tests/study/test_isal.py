@@ -11,6 +11,9 @@ import pytest
 import yaml
 
 from torchsar.cli import main
+from torchsar.focus import TargetImage
+from torchsar.io import read_inverse
+from torchsar.radar import geometry_of
 from torchsar.study.config import load
 from torchsar.study.errors import ConfigError
 from torchsar.study.isal.trials import IsalTrials
@@ -201,3 +204,124 @@ def test_a_recording_cannot_be_swept_or_traded(tmp_path: Path) -> None:
     for command in (system_of(loaded).requires, system_of(loaded).trade):
         with pytest.raises(ConfigError, match="recording"):
             command(loaded, None)
+
+
+CORRECT = {"stage": "pulse_phase_correct", "uses": {"phase_rad": "phase"}}
+IMAGE = {"stage": "azimuth_transform"}
+
+
+def test_all_corrections_of_a_chain_are_judged_together(tmp_path: Path) -> None:
+    again = {"phase": {"stage": "sca"}, "correct": CORRECT, "rest": {"stage": "autofocus"}, "remove": {"stage": "pulse_phase_correct", "uses": {"phase_rad": "rest"}}, "image": IMAGE}
+    started = {"first": {"stage": "sca"}, "phase": {"stage": "pga", "kernel": "ml", "uses": {"start": "first.phase_rad"}}, "correct": CORRECT, "image": IMAGE}
+    processor = {**TINY["processor"], "again": {"stages": again}, "started": {"stages": started}}
+    methods = run(write(tmp_path, processor=processor, precision="complex128"), tmp_path / "out")["methods"]
+    error = {name: method["metrics"].get("residual_phase_rms_rad") for name, method in methods.items()}
+    assert error["again"] == pytest.approx(error["recommended"], abs=1e-6)  # the second estimator alone says little of the phase put in
+    assert error["started"] < error["sca"]  # a phase that was only a start is not counted twice
+
+
+def test_names_of_cases_may_hold_a_slash(tmp_path: Path) -> None:
+    config = write(tmp_path, cases={"0.1 m/s": {"seed": 4}}, processor={name: TINY["processor"][name] for name in ("ideal", "recommended")})
+    run(config, tmp_path / "out")
+    assert (tmp_path / "out" / "arrays.zarr" / "0.1 m_s" / "recommended").is_dir()
+
+
+def test_noise_near_the_end_of_float32_leaves_a_report(tmp_path: Path) -> None:
+    run(write(tmp_path), tmp_path / "out", "world.noise.snr_db=-400")
+
+
+def _method(**stages: dict) -> dict:
+    return {"processor": {**TINY["processor"], "odd": {"stages": stages}}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"cases": {"odd": {"world.noise.snr_db": "loud"}}}, "cases.odd: key 'world.noise.snr_db'"),
+        ({"cases": {"odd": {"metrics.reference": "sca"}}}, "cases.odd: the key 'metrics.reference' holds for all cases"),
+        ({"cases": {"odd": {"world.trials": 2}}}, "the key 'world.trials' holds for all cases"),
+        ({"cases": {"odd": {"data.file": __file__}}}, "is not used by a simulation"),
+        ({"cases": {"odd": {"processor.more": {"stages": {"image": IMAGE}}}}}, "cases.odd changes which methods there are"),
+        ({"cases": {"../": {"seed": 2}}}, "a case cannot be called '../'"),
+        ({"cases": {"all": {"seed": 2}}}, "a case cannot be called 'all'"),
+        ({"cases": {"a b": {"seed": 2}, "a_b": {"seed": 3}}}, "would share their figures"),
+        ({"metrics": {"reference": "sca"}}, "name a method with 'input: clean'"),
+        (_method(phase={"stage": "sca"}), "processor.odd, whose last stage gives the axes ('pulse', 'range'), not an image"),
+        (_method(doppler={"stage": "doppler_centroid"}, image=IMAGE), "needs radar.velocity_m_s, which a radar of this system does not have"),
+        (_method(compress={"stage": "range_compress"}, image=IMAGE), "processor.odd: this stage needs radar.pulse"),
+        (_method(compress={"stage": "compress_dechirped"}, image=IMAGE), "processor.odd: CompressDechirped works on the axes"),
+        ({"processor": {**TINY["processor"], "odd": {"rerun": {"method": "sca", "start": "image", "given": {}}}}}, "target.yaml: processor.odd.rerun: system isal runs no part of a chain again"),
+        ({"world": {**TINY["world"], "damages": {"hum": {"kind": "tone", "over_signal_db": 9.0, "frequency_hz": 1e6}}}}, "unknown damage of a turning target 'tone'"),
+        ({"world": {**TINY["world"], "damages": {"lost": {"kind": "lost_lines", "count": 3}}}}, "did you mean 'lost_pulses'"),
+        ({"radar": {**TINY["radar"], "carrier_hz": 1e-300}}, "check the carrier"),
+    ],
+)
+def test_what_would_mislead_is_refused(tmp_path: Path, changes: dict, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", write(tmp_path, **changes), "--out", str(tmp_path / "out")]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["processor.again={rerun: {method: sca, start: image, given: {}}}"], "system isal runs no part of a chain again"),
+        (["cases={white: {data.damages: {hum: {kind: tone, over_signal_db: 9, frequency_hz: 1e6}}}}"], "unknown damage of a turning target"),
+        (["cases={white: {seed: 2}}", "processor.sca={stages: {phase: {stage: sca}}}"], "not an image"),
+    ],
+)
+def test_what_would_mislead_is_refused_of_recordings(tmp_path: Path, overrides: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "autofocus_recorded", f"data.file={yak_like(tmp_path)}", *overrides, "--out", str(tmp_path / "out")]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_recording_that_is_not_named_is_asked_for_by_its_kind() -> None:
+    with pytest.raises(ConfigError, match="range profile or phase history"):
+        load("autofocus_recorded")
+
+
+def test_a_sweep_has_no_cases(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = write(tmp_path, cases={"quiet": {"world.noise.snr_db": 30.0}}, sweep={"world.noise.snr_db": [10.0], "trials": 1})
+    assert main(["sweep", config, "--out", str(tmp_path / "sweep")]) == 2
+    assert "cases belong to runs" in capsys.readouterr().err
+
+
+def test_a_stage_of_turning_targets_is_refused_by_a_stripmap() -> None:
+    processor = "processor={recommended: {stages: {image: {stage: compress_dechirped}}}}"
+    with pytest.raises(ConfigError, match=r"needs radar\.pulse_s"):
+        loaded = load("stripmap_damaged", [processor, "metrics={}"])
+        system_of(loaded).check(loaded)
+
+
+def test_an_image_of_other_profiles_leaves_no_operator_behind(tmp_path: Path) -> None:
+    recording = read_inverse(turntable_like(tmp_path))
+    stage = TargetImage(recording.radar, geometry_of(recording.aux["frequency_hz"], angle_rad=recording.aux["angle_rad"]))
+    with pytest.raises(ValueError, match="crop both alike"):
+        stage(recording.signal.crop(range=(0, 20)))
+    fresh = TargetImage(recording.radar, geometry_of(recording.aux["frequency_hz"], angle_rad=recording.aux["angle_rad"]))
+    assert stage(recording.signal).axes == fresh(recording.signal).axes
+
+
+def test_trade_knows_the_phases_of_damages(tmp_path: Path) -> None:
+    damages = {"phase": {"kind": "white_phase"}, "lost": {"kind": "lost_pulses", "count": 6}}
+    config = write(tmp_path, world={**TINY["world"], "damages": damages}, trade={"trials": 2, "repeats": 1, "search": [0], "polish": [0]})
+    assert main(["trade", config, "--out", str(tmp_path / "trade")]) == 0
+    rows = json.loads((tmp_path / "trade" / "trade.json").read_text(encoding="utf-8"))["methods"]
+    assert next(row["error_rad"] for row in rows if row["name"] == "recommended") < 0.2
+
+
+@pytest.mark.parametrize(
+    ("command", "config", "overrides", "said"),
+    [
+        ("trade", None, ["trade.search=[]"], "trade.search"),
+        ("trade", None, ["trade.search=[-1]"], "trade.search"),
+        ("trade", None, ["processor.sca={stages: {phase: {stage: pga, iterations: 0}}}"], "processor.sca: pga needs at least one iteration"),
+        ("trade", "isal_motion", [], "begins with dechirped ones"),
+        ("requires", None, ["radar.rotation_rad_s=null"], "depends on its rotation"),
+    ],
+)
+def test_trade_and_requires_refuse_in_a_sentence(tmp_path: Path, command: str, config: str | None, overrides: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, config or write(tmp_path), *overrides, "--out", str(tmp_path / "out")]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -33,11 +33,19 @@ class TargetImage(Stage):
         """The polar operator for profiles (..., pulse, range), kept for the next of the same kind; None where images are transforms along pulses."""
         if self.waves is None:
             return None
+        self._refuse_other_pulses(profiles)
         kept = self._operator
         if kept is None or kept.dtype != profiles.dtype or kept.geometry.direction.device != profiles.device:
             waves = self.waves.to(profiles.device)
             kept = self._operator = PolarOperator(waves, *self._axes(waves, profiles), window=self.window, dtype=profiles.dtype)
         return kept
+
+    def _refuse_other_pulses(self, profiles: Tensor) -> None:
+        """Before an operator is kept for them."""
+        assert self.waves is not None
+        want = self.waves.direction.shape[0], self.waves.frequency_hz.shape[0]
+        if profiles.shape[-2:] != want:
+            raise ValueError(f"profiles of shape {tuple(profiles.shape)} do not end in the (pulse, frequency) = {want} of the geometry; crop both alike")
 
     def _axes(self, waves: FarField, profiles: Tensor) -> tuple[Axis, Axis]:
         n_pulse, n_range = profiles.shape[-2:]

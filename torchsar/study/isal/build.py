@@ -66,16 +66,16 @@ def word_of(case: str) -> str:
 
 def _refuse_case(name: str, values: Mapping[str, Any], loaded: Loaded) -> None:
     """A case has a name that results can go by, and changes what a case may change."""
-    if not word_of(name).strip("_") or name.startswith("__") or "/" in name or name in (*RESERVED, "all"):
-        raise ConfigError(f"{loaded.file}: a case cannot be called {name!r}; its name has letters or digits and no '/', and is none of {', '.join((*RESERVED, 'all'))}")
+    if not word_of(name).strip("_") or name.startswith("__") or name in (*RESERVED, "all"):
+        raise ConfigError(f"{loaded.file}: a case cannot be called {name!r}; its name has letters or digits, does not begin with '__', and is none of {', '.join((*RESERVED, 'all'))}")
     if not values:
         raise ConfigError(f"{loaded.file}: cases.{name} changes nothing; give it dotted keys with values, such as world.noise.snr_db: 10.0")
-    recorded = loaded.config.data.file is not None
     for key in values:
         root = key.split(".")[0]
-        if root in _OF_ALL_CASES or key == "world.trials" or root == ("world" if recorded else "data"):
-            where = "is not used by a run on recorded data" if recorded and root == "world" else "is not used by a simulation" if root == "data" else "holds for all cases"
-            raise ConfigError(f"{loaded.file}: cases.{name}: the key {key!r} {where}; a case may change radar, world, data, processor, seed and precision")
+        if root in _OF_ALL_CASES or key == "world.trials":
+            raise ConfigError(f"{loaded.file}: cases.{name}: the key {key!r} holds for all cases; a case may change radar, world, data, processor, seed and precision")
+        if root == "data" and loaded.config.data.file is None:
+            raise ConfigError(f"{loaded.file}: cases.{name}: the key {key!r} is not used by a simulation, whose damages are keys of the world; set data.file to work on a recording")
 
 
 def check_judged(loaded: Loaded) -> None:
@@ -110,5 +110,3 @@ def recorded_chains(loaded: Loaded, recording: Recording) -> dict[str, Chain]:
     """The chains for a recording, whose geometry shapes the images where it is told."""
     known: Mapping[str, Any] = {name: recording.aux[name] for name in _GEOMETRY if name in recording.aux}
     return build_chains(loaded, radar=recording.radar, geometry=geometry_of(**known) if known else None)
-
-

@@ -52,7 +52,7 @@ def _target(result: CaseResult) -> Drawn:
 def _entropies(results: Mapping[str, CaseResult]) -> Drawn:
     """Entropy above the ideal image (or above the method's own result without injected phases) by method and case."""
     for key, label in _COMPARED.items():
-        methods = [name for name in next(iter(results.values())).metrics if any(key in result.metrics[name] for result in results.values())]
+        methods = [name for name in next(iter(results.values())).metrics if name != "ideal" and any(key in result.metrics[name] for result in results.values())]
         if not methods:
             continue
         x = list(results)

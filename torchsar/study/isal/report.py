@@ -27,7 +27,7 @@ def _cell(row: Mapping[str, float], key: str, digits: int) -> str:
     if key not in row:
         return "–"
     spread = row.get(f"{key}_sd")
-    return number(row[key], digits) if spread is None or key == "seconds" else f"{number(row[key], digits)} ± {number(spread, digits)}"
+    return number(row[key], digits) if spread is None or key == "seconds" else f"{number(row[key], digits)} ± {spread:.{digits}f}"
 
 
 def tables(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -52,6 +52,8 @@ def _rows(loaded: Loaded) -> Sequence[Requirement]:
     rate = None if world.rotation_rad_s is None else float(torch.as_tensor(world.rotation_rad_s).abs().max())
     vibrations = [(float(part.amplitude_m), float(part.frequency_hz)) for part in world.motion if hasattr(part, "amplitude_m") and hasattr(part, "frequency_hz")]  # pyright: ignore[reportAttributeAccessIssue]
     steady = not vibrations
+    if radar.rotation_rad_s is None and rate is None:
+        raise ConfigError(f"{loaded.file}: neither radar.rotation_rad_s nor world.rotation_rad_s is set; what a turning target requires depends on its rotation")
     return inverse_requirements(radar, size.pulses, size.samples, max(across, 1e-9), max(along, 1e-9), speed if steady else 0.0, acceleration if steady else 0.0, vibrations, rate)
 
 

@@ -143,7 +143,8 @@ def metrics_tree(loaded: Loaded, results: Mapping[str, CaseResult]) -> dict[str,
 
 
 def _key(case: str, name: str) -> str:
-    return name if case == "all" else f"{case}/{name}"
+    """Path in the store; a '/' in the name of a case makes no group."""
+    return name if case == "all" else f"{case.replace('/', '_')}/{name}"
 
 
 def _images(results: Mapping[str, CaseResult]) -> dict[str, Signal]:
@@ -160,4 +161,3 @@ def _estimates(results: Mapping[str, CaseResult]) -> dict[str, dict[str, Tensor]
         for name, phase in result.phases.items():
             found.setdefault(name, {})[_key(case, "phase_rad")] = phase
     return found
-

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
 from torchsar.study.catalogue import Catalogue, Strict
 from torchsar.study.config import Config, Noise
 from torchsar.study.registry import DAMAGES, FIDELITIES, MOTIONS, SCENES, START_PHASES
-
 
 _DAMAGES = ("lost_pulses", "white_phase", "phase_walk", "phase_sinusoid", "quantiser")
 TARGET_DAMAGES = Catalogue("damage of a turning target", "kind", {name: DAMAGES.entries[name] for name in _DAMAGES})
@@ -62,8 +61,8 @@ class Trade(Strict):
     """What `torchsar trade` compares: methods of the processor, iterations of the recommended one, precisions; over so many trials, repeated."""
 
     precisions: list[Literal["complex64", "complex128"]] = ["complex64", "complex128"]
-    search: list[int] = [0, 10, 30, 120]
-    polish: list[int] = [0, 5, 10, 20]
+    search: list[Annotated[int, Field(ge=0)]] = Field(default=[0, 10, 30, 120], min_length=1)
+    polish: list[Annotated[int, Field(ge=0)]] = Field(default=[0, 5, 10, 20], min_length=1)
     trials: int = Field(default=8, ge=1)
     repeats: int = Field(default=3, ge=1)
 

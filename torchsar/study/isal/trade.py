@@ -29,6 +29,7 @@ from torchsar.study.folder import fresh_folder, write_json
 from torchsar.study.isal.build import build_radar, build_world, cases_of, check
 from torchsar.study.isal.judge import estimated_phase
 from torchsar.study.isal.sections import TARGET_DAMAGES
+from torchsar.study.isal.trials import received, traced, whole_phase
 from torchsar.study.methods import build_chains
 
 log = logging.getLogger("torchsar")
@@ -54,6 +55,7 @@ def trade(loaded: Loaded, out: Path | None) -> str:
         raise ConfigError(f"{loaded.file}: trade compares with true phases, which a recording does not tell; take a config that simulates")
     check(loaded)
     name, case = list(cases_of(loaded).items())[-1]
+    _refuse_dechirped(case)
     if out is None:
         return _text(name, _tables(case))
     with fresh_folder(out) as folder:
@@ -69,6 +71,16 @@ def trade(loaded: Loaded, out: Path | None) -> str:
             figure = plot.trade([r.name for r in rows], [r.seconds for r in rows], [r.error_rad for r in rows], "residual phase (rad rms)", key)
             plot.save(figure, folder / "figures" / f"trade_{key}.png")
     return f"{text}\n{out}"
+
+
+def _refuse_dechirped(loaded: Loaded) -> None:
+    """Methods are compared on range-compressed pulses, whose true phases are known."""
+    for name, chain in build_chains(loaded, radar=build_radar(loaded)).items():
+        first, stage = next(iter(chain.stages.items()))
+        if "fast_time" in getattr(stage, "works_on", ()):
+            raise ConfigError(
+                f"{loaded.file}: trade compares methods on range-compressed pulses, and processor.{name}.stages.{first} begins with dechirped ones; take one without it, such as isal_table1"
+            )
 
 
 @dataclass(frozen=True)
@@ -87,15 +99,23 @@ class _Trials:
         """The alternative `work`: data to phases."""
         phase, times = _timed(lambda: work(data), repeats)
         assert self.truth.clean is not None
-        error = phase_rmse(phase, self.truth.values["phase_rad"])
+        error = phase_rmse(phase, whole_phase(self.truth), received(self.truth))
         gained = entropy(azimuth_transform(correct_pulse_phase(data, phase))) - entropy(azimuth_transform(self.truth.clean.signal.data.to(data.dtype)))
         count = max(1, error.numel())
         log.info("%s: %.1f ms, %.3f rad", name, 1e3 * statistics.median(times) / count, float(error.mean()))
         return Row(name, statistics.median(times) / count, (max(times) - min(times)) / count, float(error.mean()), float(gained.mean()))
 
 
-@torch.no_grad()
 def _tables(loaded: Loaded) -> dict[str, list[Row]]:
+    """Raises ConfigError for what simulation or methods refuse."""
+    try:
+        return _made_tables(loaded)
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise ConfigError(f"{loaded.file}: {' '.join(str(error).split())}") from error
+
+
+@torch.no_grad()
+def _made_tables(loaded: Loaded) -> dict[str, list[Row]]:
     config = loaded.config
     made = _simulate(loaded, build_world(loaded), torch.complex64)
     phase_only = replace(build_world(loaded), fidelity=PhaseOnly())
@@ -120,8 +140,8 @@ def _methods(loaded: Loaded, made: _Trials) -> Iterator[Row]:
         if loaded.config.processor[name].input == "clean":
             continue
 
-        def work(data: Tensor, chain: Any = chain) -> Tensor:
-            return estimated_phase(chain, chain.trace(made.recording.signal.with_data(data)), made.truth.values["phase_rad"])
+        def work(data: Tensor, chain: Any = chain, name: str = name) -> Tensor:
+            return estimated_phase(chain, traced(chain, replace(made.recording, signal=made.recording.signal.with_data(data)), name), whole_phase(made.truth))
 
         yield made.row(name, made.data, work, loaded.config.trade.repeats)
 

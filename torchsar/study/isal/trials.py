@@ -22,7 +22,7 @@ from torchsar.study.config import Config, Loaded
 from torchsar.study.errors import ConfigError
 from torchsar.study.isal.build import build_radar, build_world, check_judged
 from torchsar.study.isal.judge import image_metrics, phase_metrics
-from torchsar.study.isal.sections import TARGET_DAMAGES
+from torchsar.study.isal.sections import TARGET_DAMAGES, IsalConfig
 from torchsar.study.methods import build_chains
 from torchsar.study.montecarlo.work import BOUNDS, SAVED
 
@@ -59,14 +59,23 @@ class Batch:
     @property
     def phase_rad(self) -> Tensor:
         """The whole phase error of every pulse, (..., pulse)."""
-        values = self.truth.values
-        return values["phase_rad"] + sum(value for name, value in values.items() if name.endswith(".phase_rad"))
+        return whole_phase(self.truth)
 
     @property
     def present(self) -> Tensor | None:
         """Pulses that were received, (..., pulse), None where all were."""
-        lost = [value for name, value in self.truth.values.items() if name.endswith(".present")]
-        return torch.stack(lost).all(0) if lost else None
+        return received(self.truth)
+
+
+def whole_phase(truth: Truth) -> Tensor:
+    """The phase error of every pulse with those of the damages, (..., pulse)."""
+    return truth.values["phase_rad"] + sum(value for name, value in truth.values.items() if name.endswith(".phase_rad"))
+
+
+def received(truth: Truth) -> Tensor | None:
+    """Pulses that no damage lost, (..., pulse), None where all were received."""
+    lost = [value for name, value in truth.values.items() if name.endswith(".present")]
+    return torch.stack(lost).all(0) if lost else None
 
 
 class IsalTrials:
@@ -87,6 +96,7 @@ class IsalTrials:
 
     def check(self, grid: Mapping[str, Any]) -> None:
         """Refuse a grid over what a sweep does not use. Raises ConfigError."""
+        assert isinstance(self.loaded.config, IsalConfig)
         if self.loaded.config.cases:
             raise ConfigError(f"{self.loaded.file}: cases belong to runs; sweep over the keys that they change, such as world.start_phase, and add cases={{}} to leave them out")
         for key in grid:
