@@ -334,7 +334,7 @@ def test_a_start_connects_to_pga():
     "call, message",
     [
         (lambda x: pga(x, kernel="mean"), "kernel 'mean' is not known"),  # pyright: ignore[reportArgumentType]
-        (lambda x: pga(x, iterations=0), "at least one iteration"),
+        (lambda x: pga(x, iterations=0), "iterations must be a whole number of 1 or more"),
         (lambda x: pga_sca(x, patience=0), "patience of 1 or more"),
         (lambda x: Shrinking(factor=1.2), "factor in 0..1"),
         (lambda x: Listed(()), "widths of 1 cell or more"),

@@ -55,9 +55,11 @@ def starting_phase(start: Tensor | None, pulses: Pulses, name: str) -> Tensor | 
     """A start of the caller, (..., pulse) or (pulse,), as (trial, pulse) in the working precision; trials with phases too large for it lose their whole turns first."""
     if start is None:
         return None
+    if not isinstance(start, Tensor):
+        raise TypeError(f"{name}: start must be a tensor of phases (rad), got {type(start).__name__}; torch.as_tensor makes one")
     want = (*pulses.trials, pulses.n)
     if start.is_complex() or not start.is_floating_point() or not torch.isfinite(start).all():
-        raise ValueError(f"{name}: start must hold finite real phases (rad), got {start.dtype}")
+        raise ValueError(f"{name}: start must hold finite real phases (rad), got {start.dtype}{'' if start.is_complex() or not start.is_floating_point() else ' with NaN or Inf'}")
     try:
         wide = start.expand(want)
     except RuntimeError:
@@ -65,6 +67,13 @@ def starting_phase(start: Tensor | None, pulses: Pulses, name: str) -> Tensor | 
     phase, working = wide.reshape(-1, pulses.n), pulses.rows.real.dtype
     large = phase.detach().abs().amax(-1, keepdim=True) > _PHASE_ERROR_RAD / torch.finfo(working).eps
     return torch.where(large, on_the_circle(phase.to(torch.float64)), phase).to(dtype=working, device=pulses.rows.device)
+
+
+def refuse_odd_counts(name: str, least: int, **counts: int) -> None:
+    """Numbers of iterations are whole and at least `least`. Raises ValueError naming the one that is not."""
+    for what, count in counts.items():
+        if isinstance(count, bool) or not isinstance(count, int) or count < least:
+            raise ValueError(f"{name}: {what} must be a whole number of {least} or more, got {count!r}")
 
 
 def rotate(rows: Tensor, phase_rad: Tensor) -> Tensor:

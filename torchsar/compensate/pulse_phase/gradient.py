@@ -15,7 +15,7 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import prepare, rotate, safe_angle, starting_phase, without_line
+from torchsar.compensate.pulse_phase.data import prepare, refuse_odd_counts, rotate, safe_angle, starting_phase, without_line
 from torchsar.compensate.pulse_phase.pairs import pair_phase, pair_products, running_sum
 from torchsar.compensate.pulse_phase.sharpen import settled
 from torchsar.compensate.pulse_phase.verdict import Found, estimated
@@ -139,8 +139,9 @@ class _Search:
     patience: int
 
     def __post_init__(self) -> None:
-        if self.iterations < 1 or self.patience < 1:
-            raise ValueError(f"pga needs at least one iteration and a patience of 1 or more, got {self.iterations} and {self.patience}")
+        refuse_odd_counts("pga", 1, iterations=self.iterations, patience=self.patience)
+        if not hasattr(self.windows, "width"):
+            raise TypeError(f"pga: windows must be a schedule such as Shrinking(), Measured() or Listed((99.0, 33.0, 11.0)), got {self.windows!r}")
 
     def __call__(self, rows: Tensor, present: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
         best, lowest = phase, torch.full_like(phase[:, 0], torch.inf)

@@ -37,6 +37,8 @@ class Through:
     """Any linear image formation of (..., pulse, range) profiles, such as `torchsar.focus.PolarOperator`, given as an object with image and adjoint."""
 
     def __init__(self, operator: Imaging) -> None:
+        if not (hasattr(operator, "image") and hasattr(operator, "adjoint")):
+            raise TypeError(f"imaging must have `image` and `adjoint`, as torchsar.focus.PolarOperator, got {type(operator).__name__}")
         self.operator = operator
 
     def image(self, rows: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import prepare, rotate, starting_phase
+from torchsar.compensate.pulse_phase.data import prepare, refuse_odd_counts, rotate, starting_phase
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging, Through
 from torchsar.compensate.pulse_phase.pairs import pair_phase
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, fixed_point, in_turn
@@ -47,8 +47,7 @@ def autofocus(
     noise can be made, and for one row alone. Differentiable without `imaging`. Raises TypeError or ValueError for samples that are not finite and complex, or a start of another shape.
     """
     pulses = prepare(data, "autofocus")
-    if search < 0 or polish < 0:
-        raise ValueError(f"autofocus needs numbers of iterations of 0 or more, got search={search} and polish={polish}")
+    refuse_odd_counts("autofocus", 0, search=search, polish=polish)
     again = Run(Wiener(), AlongPulses(2), 6, 1.0, tolerance_rad)
 
     def runs(coarse: Imaging, fine: Imaging) -> list[Run]:

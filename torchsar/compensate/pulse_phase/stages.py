@@ -14,7 +14,7 @@ from torchsar.compensate.pulse_phase.imaging import Imaging
 from torchsar.compensate.pulse_phase.pairs import sca
 from torchsar.compensate.pulse_phase.recommended import autofocus
 from torchsar.compensate.pulse_phase.sharpen import entropy_fixed_point
-from torchsar.core import Estimate, Signal, Stage, real_dtype
+from torchsar.core import Estimate, Signal, Stage, real_dtype, refuse_non_finite
 
 
 def correct_pulse_phase(data: Tensor, phase_rad: Tensor) -> Tensor:
@@ -22,8 +22,10 @@ def correct_pulse_phase(data: Tensor, phase_rad: Tensor) -> Tensor:
 
     Differentiable in both (Ruan et al. 2013, text after Eq. 6). Raises ValueError where there is not one phase a pulse.
     """
-    if phase_rad.shape[-1:] != data.shape[-2:-1]:
-        raise ValueError(f"one phase per pulse is needed, (..., {data.shape[-2]}), got {tuple(phase_rad.shape)}")
+    if not isinstance(phase_rad, Tensor) or phase_rad.shape[-1:] != data.shape[-2:-1]:
+        got = tuple(phase_rad.shape) if isinstance(phase_rad, Tensor) else type(phase_rad).__name__
+        raise ValueError(f"correct_pulse_phase needs a tensor of one phase per pulse, (..., {data.shape[-2]}), got {got}")
+    refuse_non_finite(phase_rad, "correct_pulse_phase")
     return rotate(data.mT, on_the_circle(phase_rad.to(torch.float64)).to(real_dtype(data.dtype))).mT
 
 

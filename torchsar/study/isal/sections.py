@@ -62,7 +62,7 @@ class Trade(Strict):
 
     precisions: list[Literal["complex64", "complex128"]] = ["complex64", "complex128"]
     search: list[Annotated[int, Field(ge=0)]] = Field(default=[0, 10, 30, 120], min_length=1)
-    polish: list[Annotated[int, Field(ge=0)]] = Field(default=[0, 5, 10, 20], min_length=1)
+    polish: list[Annotated[int, Field(ge=0)]] = Field(default=[5, 10, 20], min_length=1)
     trials: int = Field(default=8, ge=1)
     repeats: int = Field(default=3, ge=1)
 

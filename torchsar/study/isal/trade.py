@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import platform
 import statistics
 import time
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from torchsar import plot
 from torchsar.compensate import autofocus, correct_pulse_phase
-from torchsar.core import Draws, Recording, Signal, Truth
+from torchsar.core import Chain, Draws, Recording, Truth
 from torchsar.echo import simulate_turntable
 from torchsar.focus import CompressDechirped, azimuth_transform
 from torchsar.metrics import entropy, phase_rmse
@@ -55,7 +56,6 @@ def trade(loaded: Loaded, out: Path | None) -> str:
         raise ConfigError(f"{loaded.file}: trade compares with true phases, which a recording does not tell; take a config that simulates")
     check(loaded)
     name, case = list(cases_of(loaded).items())[-1]
-    _refuse_dechirped(case)
     if out is None:
         return _text(name, _tables(case))
     with fresh_folder(out) as folder:
@@ -73,16 +73,6 @@ def trade(loaded: Loaded, out: Path | None) -> str:
     return f"{text}\n{out}"
 
 
-def _refuse_dechirped(loaded: Loaded) -> None:
-    """Methods are compared on range-compressed pulses, whose true phases are known."""
-    for name, chain in build_chains(loaded, radar=build_radar(loaded)).items():
-        first, stage = next(iter(chain.stages.items()))
-        if "fast_time" in getattr(stage, "works_on", ()):
-            raise ConfigError(
-                f"{loaded.file}: trade compares methods on range-compressed pulses, and processor.{name}.stages.{first} begins with dechirped ones; take one without it, such as isal_table1"
-            )
-
-
 @dataclass(frozen=True)
 class _Trials:
     """Simulated trials: their recording and truth, and the radar."""
@@ -94,6 +84,12 @@ class _Trials:
     @property
     def data(self) -> Tensor:
         return self.recording.signal.data
+
+    def compressed(self) -> _Trials:
+        """Dechirped pulses after range compression, the clean ones likewise."""
+        stage = CompressDechirped(self.radar)
+        clean = None if self.truth.clean is None else replace(self.truth.clean, signal=stage(self.truth.clean.signal))
+        return _Trials(self.radar, replace(self.recording, signal=stage(self.recording.signal)), replace(self.truth, clean=clean))
 
     def row(self, name: str, data: Tensor, work: Callable[[Tensor], Tensor], repeats: int) -> Row:
         """The alternative `work`: data to phases."""
@@ -116,13 +112,12 @@ def _tables(loaded: Loaded) -> dict[str, list[Row]]:
 
 @torch.no_grad()
 def _made_tables(loaded: Loaded) -> dict[str, list[Row]]:
-    config = loaded.config
-    made = _simulate(loaded, build_world(loaded), torch.complex64)
-    phase_only = replace(build_world(loaded), fidelity=PhaseOnly())
-    if isinstance(build_world(loaded).fidelity, Dechirped):
-        made = _simulate(loaded, phase_only, torch.complex64)
-    tables = {"methods": list(_methods(loaded, made)), "iterations": list(_iterations(loaded, made)), "precision": list(_precisions(loaded, phase_only))}
-    if config.radar.pulse_s is not None:
+    world = build_world(loaded)
+    still = replace(world, fidelity=PhaseOnly())
+    made = _simulate(loaded, world, torch.complex64)
+    flat = made if isinstance(world.fidelity, PhaseOnly) else _simulate(loaded, still, torch.complex64)
+    tables = {"methods": list(_methods(loaded, made)), "iterations": list(_iterations(loaded, flat)), "precision": list(_precisions(loaded, still))}
+    if loaded.config.radar.pulse_s is not None:
         tables["echo"] = list(_echoes(loaded))
     return tables
 
@@ -135,15 +130,24 @@ def _simulate(loaded: Loaded, world: TurntableWorld, dtype: torch.dtype, count: 
 
 
 def _methods(loaded: Loaded, made: _Trials) -> Iterator[Row]:
-    """Every method of the processor that estimates phases."""
-    for name, chain in build_chains(loaded, radar=made.radar).items():
-        if loaded.config.processor[name].input == "clean":
-            continue
+    """Every method of the processor that works on the recording as it is, beside the image of those that see the clean one."""
+    chains = build_chains(loaded, radar=made.radar)
+    assert made.truth.clean is not None
+    clean = [name for name in chains if loaded.config.processor[name].input == "clean"]
+    ideal = entropy(traced(chains[clean[0]], made.truth.clean, clean[0]).signal) if clean else torch.tensor(math.nan)
+    for name, chain in chains.items():
+        if name not in clean:
+            yield _method_row(name, chain, made, ideal, loaded.config.trade.repeats)
 
-        def work(data: Tensor, chain: Any = chain, name: str = name) -> Tensor:
-            return estimated_phase(chain, traced(chain, replace(made.recording, signal=made.recording.signal.with_data(data)), name), whole_phase(made.truth))
 
-        yield made.row(name, made.data, work, loaded.config.trade.repeats)
+def _method_row(name: str, chain: Chain, made: _Trials, ideal: Tensor, repeats: int) -> Row:
+    trace, times = _timed(lambda: traced(chain, made.recording, name), repeats)
+    truth = whole_phase(made.truth)
+    error = phase_rmse(estimated_phase(chain, trace, truth), truth, received(made.truth))
+    gained = entropy(trace.signal) - ideal if trace.signal.names == ("azimuth", "range") else torch.tensor(math.nan)
+    count = max(1, error.numel())
+    log.info("%s: %.1f ms, %.3f rad", name, 1e3 * statistics.median(times) / count, float(error.mean()))
+    return Row(name, statistics.median(times) / count, (max(times) - min(times)) / count, float(error.mean()), float(gained.mean()))
 
 
 def _iterations(loaded: Loaded, made: _Trials) -> Iterator[Row]:
@@ -163,18 +167,21 @@ def _precisions(loaded: Loaded, world: TurntableWorld) -> Iterator[Row]:
 
 
 def _echoes(loaded: Loaded) -> Iterator[Row]:
-    """Phase-only echo against dechirped pulses with the motion inside them, after the recommended autofocus: seconds are those of one echo."""
-    for name, fidelity in (("phase_only", PhaseOnly()), ("dechirped", Dechirped())):
-        world = replace(build_world(loaded), fidelity=fidelity)
-        made, times = _timed(lambda world=world: _simulate(loaded, world, torch.complex64, 2), 1)
-        signal: Signal = made.recording.signal
-        if isinstance(fidelity, Dechirped):
-            stage = CompressDechirped(made.radar)
-            signal = stage(signal)
-            clean = replace(made.truth, clean=replace(made.recording, signal=stage(made.truth.clean.signal))) if made.truth.clean is not None else made.truth
-            made = replace(made, truth=clean)
-        row = made.row(name, signal.data, lambda x: autofocus(x)["phase_rad"], 1)
-        yield replace(row, seconds=times[0] / 2, spread_s=0.0)
+    """Phases alone against dechirped pulses with the motion inside them: seconds of one echo, and what can be made of it.
+
+    Of a dechirped config that is the recommended method's; else `autofocus` of the compressed pulses, without alignment of envelopes.
+    """
+    world = build_world(loaded)
+    for name in ("phase_only", "dechirped"):
+        own = isinstance(world.fidelity, Dechirped)
+        fidelity = PhaseOnly() if name == "phase_only" else world.fidelity if own else Dechirped()
+        made, times = _timed(lambda fidelity=fidelity: _simulate(loaded, replace(world, fidelity=fidelity), torch.complex64, 2), 1)
+        if name == "dechirped" and own:
+            row = next(r for r in _methods(loaded, made) if r.name == "recommended")
+        else:
+            made = made if name == "phase_only" else made.compressed()
+            row = made.row(name, made.data, lambda x: autofocus(x)["phase_rad"], 1)
+        yield replace(row, name=name, seconds=times[0] / 2, spread_s=0.0)
 
 
 def _timed(work: Callable[[], Any], repeats: int) -> tuple[Any, list[float]]:
@@ -190,7 +197,7 @@ _TITLES = {
     "methods": "METHODS of the processor",
     "iterations": "ITERATIONS of the recommended method",
     "precision": "PRECISION of the recommended method",
-    "echo": "ECHO MODELS: time of one echo, and what the recommended method makes of it without alignment of envelopes",
+    "echo": "ECHO MODELS: time of one echo, and what the recommended method makes of it",
 }
 
 
