@@ -17,6 +17,7 @@ from torchsar.echo import Damage, simulate_turntable
 from torchsar.metrics.bounds import pulse_phase_bound_of_scene_rad, pulse_phase_bound_rad
 from torchsar.radar import InverseRadar
 from torchsar.scene import PhaseOnly, TurntableWorld
+from torchsar.study.benches import Benches
 from torchsar.study.build import build_damages, foreign, precision
 from torchsar.study.config import Config, Loaded
 from torchsar.study.errors import ConfigError
@@ -78,7 +79,7 @@ def received(truth: Truth) -> Tensor | None:
     return torch.stack(lost).all(0) if lost else None
 
 
-class IsalTrials:
+class IsalTrials(Benches[Bench]):
     """`trial(parameters, draws)` of a config: {method: {metric: (rows,)}}, bounds of the residual phase, and images of the trials to keep.
 
     Metrics of a method: `residual_phase_rms_rad`, `strehl`, the predicted `residual_phase_std_rad`, `entropy_nats`, `contrast`, and
@@ -86,13 +87,6 @@ class IsalTrials:
     """
 
     batched = (_SNR,)
-
-    def __init__(self, loaded: Loaded, device: str = "cpu") -> None:
-        self.loaded, self.device = loaded, device
-        self._benches: dict[str, Bench] = {}
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {"loaded": self.loaded, "device": self.device, "_benches": {}}
 
     def check(self, grid: Mapping[str, Any]) -> None:
         """Refuse a grid over what a sweep does not use. Raises ConfigError."""
@@ -103,21 +97,12 @@ class IsalTrials:
             if key.split(".")[0] == "cases" or key == "world.trials":
                 raise ConfigError(f"{self.loaded.file}: sweep: the key {key!r} belongs to runs and cannot be swept")
 
-    def stages(self, fixed: Mapping[str, Any]) -> set[str]:
-        """Names of all stages of this case, whose chains are built."""
-        return {stage for chain in self.bench(fixed).chains.values() for stage in chain.stages}
-
-    def bench(self, fixed: Mapping[str, Any]) -> Bench:
-        """The built case of these fixed parameters."""
-        key = repr(fixed)
-        if key not in self._benches:
-            loaded = self.loaded.changed(fixed)
-            check_judged(loaded)
-            radar = build_radar(loaded)
-            chains = {name: chain.to(self.device) for name, chain in build_chains(loaded, radar=radar).items()}
-            damages = build_damages(loaded.config.world.damages, "world.damages", loaded.file, TARGET_DAMAGES)
-            self._benches[key] = Bench(loaded.config, radar, build_world(loaded), damages, chains)
-        return self._benches[key]
+    def build(self, loaded: Loaded) -> Bench:
+        check_judged(loaded)
+        radar = build_radar(loaded)
+        chains = {name: chain.to(self.device) for name, chain in build_chains(loaded, radar=radar).items()}
+        damages = build_damages(loaded.config.world.damages, "world.damages", loaded.file, TARGET_DAMAGES)
+        return Bench(loaded.config, radar, build_world(loaded), damages, chains)
 
     def bytes_per_trial(self, fixed: Mapping[str, Any]) -> int:
         """Of the largest tensors that a trial needs, from the axes: data, image, and what an iteration makes of them."""

@@ -17,6 +17,7 @@ from torchsar.metrics import contrast, correlation, entropy, error_db
 from torchsar.metrics.bounds import reference_doppler_std_hz, tone_frequency_bound_hz, velocity_bound_m_s
 from torchsar.radar import StripmapRadar
 from torchsar.scene import Points, RandomPoints, StripmapWorld, Together
+from torchsar.study.benches import Benches
 from torchsar.study.build import build_damages, precision
 from torchsar.study.config import Config, Loaded
 from torchsar.study.errors import ConfigError
@@ -59,7 +60,9 @@ def _snr(bench: Bench, value: Tensor) -> StripmapWorld:
 
 # Keys that are per-trial tensors of the world, in the order in which they are set: a squint needs the velocity.
 BATCHED = {"world.velocity_m_s": _velocity, "world.doppler_hz": _doppler, "world.squint_deg": _squint, "world.noise.snr_db": _snr}
-class StripmapTrials:
+
+
+class StripmapTrials(Benches[Bench]):
     """`trial(parameters, draws)` of a config: {method: {metric: (rows,)}}, bounds, and images of the trials to keep.
 
     Metrics of a method: every scalar estimate under its name (`doppler_hz`); its error against the truth (`doppler_error_hz`, and
@@ -69,33 +72,17 @@ class StripmapTrials:
 
     batched = tuple(BATCHED)
 
-    def __init__(self, loaded: Loaded, device: str = "cpu") -> None:
-        self.loaded, self.device = loaded, device
-        self._benches: dict[str, Bench] = {}
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {"loaded": self.loaded, "device": self.device, "_benches": {}}
-
     def check(self, grid: Mapping[str, Any]) -> None:
         """Refuse a grid that contradicts itself. Raises ConfigError."""
         if "world.doppler_hz" in grid and "world.squint_deg" in grid:
             raise ConfigError(f"{self.loaded.file}: sweep: world.doppler_hz and world.squint_deg both say where the beam looks; sweep one of them")
 
-    def stages(self, fixed: Mapping[str, Any]) -> set[str]:
-        """Names of all stages of this case, whose chains are built."""
-        return {stage for chain in self.bench(fixed).chains.values() for stage in chain.stages}
-
-    def bench(self, fixed: Mapping[str, Any]) -> Bench:
-        """The built case of these fixed parameters."""
-        key = repr(fixed)
-        if key not in self._benches:
-            loaded = self.loaded.changed(fixed)
-            radar, world = build_radar(loaded), loaded.config.world
-            assert world is not None
-            damages = build_damages(world.damages, "world.damages", loaded.file)
-            chains = {name: chain.to(self.device) for name, chain in build_chains(loaded, radar=radar).items()}
-            self._benches[key] = Bench(loaded.config, radar, build_world(loaded), damages, chains)
-        return self._benches[key]
+    def build(self, loaded: Loaded) -> Bench:
+        radar, world = build_radar(loaded), loaded.config.world
+        assert world is not None
+        damages = build_damages(world.damages, "world.damages", loaded.file)
+        chains = {name: chain.to(self.device) for name, chain in build_chains(loaded, radar=radar).items()}
+        return Bench(loaded.config, radar, build_world(loaded), damages, chains)
 
     def bytes_per_trial(self, fixed: Mapping[str, Any]) -> int:
         """Of the largest tensor that a trial needs, from the axes."""
