@@ -335,13 +335,13 @@ def test_a_start_connects_to_pga():
     [
         (lambda x: pga(x, kernel="mean"), "kernel 'mean' is not known"),  # pyright: ignore[reportArgumentType]
         (lambda x: pga(x, iterations=0), "iterations must be a whole number of 1 or more"),
-        (lambda x: pga_sca(x, patience=0), "patience of 1 or more"),
+        (lambda x: pga_sca(x, patience=0), "patience must be a whole number of 1 or more"),
         (lambda x: Shrinking(factor=1.2), "factor in 0..1"),
         (lambda x: Listed(()), "widths of 1 cell or more"),
         (lambda x: entropy_fixed_point(x, floors=((0.0, 3),)), "floors above 0"),
         (lambda x: entropy_fixed_point(x, relaxation=2.0), "relaxation in 0..2"),
         (lambda x: EntropyFixedPoint(floors=[5.0], iterations=[3, 4]), "a number of iterations for each floor"),
-        (lambda x: autofocus(x, search=-1), "search=-1"),
+        (lambda x: autofocus(x, search=-1), "search must be a whole number of 0 or more"),
         (lambda x: autofocus(x, start=torch.zeros(5)), r"one phase per pulse is \(1, 16\)"),
         (lambda x: pga(x, start=torch.full((16,), torch.nan)), "finite real phases"),
         (lambda x: sca(x[0, 0]), "at least one pulse and one range cell"),

@@ -19,9 +19,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from torchsar.compensate.pulse_phase.data import checked
 from torchsar.compensate.pulse_phase.recommended import autofocus
 from torchsar.compensate.pulse_phase.stages import correct_pulse_phase
-from torchsar.core import Estimate, Signal, Stage, block_bytes_of, fft_lines, legendre, linear_phasor, real_dtype, refuse_non_finite
+from torchsar.core import Estimate, Signal, Stage, block_bytes_of, fft_lines, legendre, linear_phasor, refuse_non_finite
 from torchsar.metrics.image import entropy
 from torchsar.optim.descent import lbfgs
 
@@ -119,7 +120,7 @@ def refine_alignment(data: Tensor, shift_cells: Tensor, *, degree: int = 2, roun
     phases that can be found, that is shifts within about a cell. On shifts of `align_envelopes` it changes the
     entropy by less than 0.005. ok and quality: those of the last autofocus. Errors as `align_envelopes`.
     """
-    flat, _ = _checked(data, "refine_alignment")
+    flat, _ = checked(data, "refine_alignment")
     if degree < 1 or rounds < 1:
         raise ValueError(f"refine_alignment: degree is {degree} and rounds {rounds}; choose 1 or more of both")
     flat, shift = flat.detach(), shift_cells.detach().to(torch.float64).expand(data.shape[:-1]).reshape(flat.shape[:-1])
@@ -373,7 +374,7 @@ def strongest_tone(rest: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
 
 def _estimated(data: Tensor, name: str, find: Callable[[Envelopes], Course]) -> Estimate:
     """Shifts of the whole band and, to judge them, of its lower and upper half, whose speckle and noise are independent."""
-    flat, present = _checked(data, name)
+    flat, present = checked(data, name)
     height = max(1, 8 * block_bytes_of(flat.device) // max(1, flat[0].numel() * flat.element_size())) if len(flat) else 1
     with torch.no_grad():
         parts = [_judged(flat[first : first + height].detach(), find) for first in range(0, len(flat), height)]
@@ -439,18 +440,6 @@ def _runs(n: int, blocks: int, present: Tensor) -> Tensor:
     run = torch.arange(n, device=present.device) // length
     member = run == torch.arange(-(-n // length), device=present.device)[:, None]
     return (member & present[:, None]).to(torch.float64)
-
-
-def _checked(data: Tensor, name: str) -> tuple[Tensor, Tensor]:
-    """Data (trial, pulse, range) and present (trial, pulse). Raises TypeError or ValueError naming the function."""
-    if not isinstance(data, Tensor) or not data.is_complex():
-        raise TypeError(f"{name} works on complex range-compressed samples (..., pulse, range), got {data.dtype if isinstance(data, Tensor) else type(data).__name__}")
-    real_dtype(data.dtype)
-    if data.ndim < 2 or not data.shape[-2] * data.shape[-1]:
-        raise ValueError(f"{name} works on samples (..., pulse, range) with at least one pulse and one range cell, got the shape {tuple(data.shape)}")
-    refuse_non_finite(data, name)
-    flat = data.reshape(-1, *data.shape[-2:])
-    return flat, (flat.detach() != 0).any(-1)
 
 
 class AlignEnvelopes(Stage):

@@ -31,23 +31,31 @@ class Pulses:
         return self.rows.shape[-1]
 
 
-def prepare(data: Tensor, name: str) -> Pulses:
-    """Check and lay out data (..., pulse, range). Raises TypeError or ValueError naming the estimator; warns where nothing can be learnt."""
+def checked(data: Tensor, name: str) -> tuple[Tensor, Tensor]:
+    """Range-compressed data (..., pulse, range) as (trial, pulse, range), and which pulses hold samples, (trial, pulse).
+
+    Raises TypeError or ValueError naming the function for what are no finite complex samples.
+    """
     if not isinstance(data, Tensor) or not data.is_complex():
         raise TypeError(f"{name} works on complex range-compressed samples (..., pulse, range), got {data.dtype if isinstance(data, Tensor) else type(data).__name__}")
     real_dtype(data.dtype)
     if data.ndim < 2 or not data.shape[-2] * data.shape[-1]:
         raise ValueError(f"{name} works on samples (..., pulse, range) with at least one pulse and one range cell, got the shape {tuple(data.shape)}")
     refuse_non_finite(data, name)
+    flat = data.reshape(-1, *data.shape[-2:])
+    return flat, (flat.detach() != 0).any(-1)
+
+
+def prepare(data: Tensor, name: str) -> Pulses:
+    """Check and lay out data (..., pulse, range). Raises TypeError or ValueError naming the estimator; warns where nothing can be learnt."""
+    flat, present = checked(data, name)
     n_pulse, n_range = data.shape[-2:]
     if n_pulse < 3:
         warnings.warn(f"{name}: {n_pulse} pulse(s) carry no phase error that can be told from a shift; the estimate is zero and not ok", stacklevel=3)
     elif n_range == 1:
         warnings.warn(f"{name}: one range cell cannot tell phase errors from the scene; the estimate flattens it and is not ok", stacklevel=3)
-    flat = data.reshape(-1, n_pulse, n_range)
     largest = torch.maximum(flat.detach().real.abs(), flat.detach().imag.abs()).amax((-2, -1), keepdim=True)  # |z| itself may overflow
     scale = torch.where(largest > 0, largest, 1)
-    present = (flat.detach() != 0).any(-1)
     return Pulses((flat / scale).mT.contiguous(), present, data.shape[:-2])
 
 
