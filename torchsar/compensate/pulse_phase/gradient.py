@@ -128,7 +128,7 @@ Solver = Callable[[Tensor, "_View", Tensor], Tensor]
 
 @dataclass(frozen=True)
 class _Search:
-    """The iterations of PGA: (rows, present, start) -> the phase of the sharpest iterate (trial, pulse), and which one that was (trial,).
+    """The iterations of PGA: (rows, present, start) -> the phase of the sharpest iterate (trial, pulse), and how many were made (trial,).
 
     Patience is counted only while the window narrows no more: in clutter wide windows blur for many iterations what narrow ones then sharpen.
     """
@@ -145,21 +145,22 @@ class _Search:
 
     def __call__(self, rows: Tensor, present: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
         best, lowest = phase, torch.full_like(phase[:, 0], torch.inf)
-        idle = taken = torch.zeros_like(present[:, 0], dtype=torch.int64)
+        idle = made = torch.zeros_like(present[:, 0], dtype=torch.int64)
         narrows, last = torch.ones_like(present[:, 0]), torch.full_like(phase[:, 0], torch.inf)
         for iteration in range(self.iterations + 1):
             view = _view(rows, phase)
             cost = _entropy(view.power)
             better = cost < lowest
             best, lowest = torch.where(better[:, None], phase, best), torch.where(better, cost, lowest)
-            taken, idle = torch.where(better, iteration, taken), torch.where(better | narrows, 0, idle + 1)
+            idle = torch.where(better | narrows, 0, idle + 1)
             active = idle < self.patience
             if iteration == self.iterations or not bool(active.any()):
                 break
             width = self.windows.width(iteration, rows.shape[-1], lambda view=view: _profile(view)).to(phase).expand(len(phase))
             narrows, last = width < last, width
             phase = torch.where(active[:, None], phase + _step(view, width, present, self.solve), phase)
-        return best, taken
+            made = made + active
+        return best, made
 
 
 @dataclass(frozen=True)
@@ -174,8 +175,8 @@ class _View:
 def _view(rows: Tensor, phase: Tensor) -> _View:
     image = torch.fft.fft(rotate(rows, phase), _PADDING * rows.shape[-1], norm="ortho")
     real, imag = (part.contiguous() for part in (image.detach().real, image.detach().imag))
-    power = real * real + imag * imag
-    return _View(image, power, power.argmax(-1))
+    power = torch.addcmul(real * real, imag, imag)
+    return _View(image, power, power.max(-1).indices)
 
 
 def _step(view: _View, width: Tensor, present: Tensor, solve: Solver) -> Tensor:

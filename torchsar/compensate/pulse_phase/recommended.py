@@ -11,7 +11,7 @@ from torch import Tensor
 from torchsar.compensate.pulse_phase.data import prepare, refuse_odd_counts, rotate, starting_phase
 from torchsar.compensate.pulse_phase.imaging import AlongPulses, Imaging, Through
 from torchsar.compensate.pulse_phase.pairs import pair_phase
-from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, fixed_point, in_turn
+from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, fixed_point, in_turn, settled
 from torchsar.compensate.pulse_phase.verdict import Found, estimated
 from torchsar.core import Estimate
 from torchsar.metrics import entropy
@@ -60,7 +60,7 @@ def autofocus(
             through = Through(imaging)
             phase, more = _Placed(through, runs(through, through))(rows, phase)
             taken = taken + more
-        return phase, taken, lambda some, _, at: fixed_point(some, at, again)[0]
+        return phase, taken, (lambda some, _, at: fixed_point(some, at, again)[0]) if polish else settled
 
     return estimated(pulses, starting_phase(start, pulses, "autofocus"), find, at_rest=True)
 
