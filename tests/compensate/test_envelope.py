@@ -9,7 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchsar.compensate.envelope import AlignEnvelopes, Envelopes, ShiftRange, align_envelopes, align_mean, align_running, drift_cells, refine_alignment, robust_fit, shift_range
+from torchsar.compensate.envelope import AlignEnvelopes, ShiftRange, align_envelopes, align_mean, align_running, drift_cells, refine_alignment, shift_range
+from torchsar.compensate.envelope_fit import Envelopes, robust_fit
 from torchsar.compensate.pulse_phase.stages import correct_pulse_phase
 from torchsar.core import Axis, Chain, Draws, Signal, use
 from torchsar.echo import simulate_turntable
