@@ -123,6 +123,8 @@ def sentence(error: ValidationError, model: type[BaseModel], file: str, where: s
     text = worst["msg"].removeprefix("Value error, ").removeprefix("Input ")
     if worst["type"] in ("dict_type", "model_type", "too_short"):
         text = "should be a mapping of keys, and not an empty one" if worst["type"] == "too_short" else "should be a mapping of keys"
+    if not key:  # what a whole config contradicts, not one key of it
+        return f"{file}: {text}"
     shown = repr(worst["input"])
     return f"{file}: key {key!r} has the value {shown if len(shown) < 80 else shown[:77] + '...'}; it {text}" if text.startswith("should") else f"{file}: key {key!r}: {text}"
 
