@@ -59,11 +59,14 @@ class Quantity:
         return self.words + name_and_unit(self.metric)[0] if not self.field.endswith("share") else self.words
 
 
-def main_quantity(metric: str) -> Quantity:
-    """RMSE on a logarithmic axis for errors about zero; the median of everything else, errors that are ratios in dB among them."""
+def main_quantity(metric: str, bounded: bool = False) -> Quantity:
+    """RMSE on a logarithmic axis for errors about zero; the median of everything else, errors that are ratios in dB among them.
+
+    bounded: whether the metric has bounds, which make a logarithmic axis of their own right.
+    """
     if "error" in metric and not metric.endswith("_db"):
         return Quantity(metric, "rmse", "interval", "RMSE of ", log=True)
-    return Quantity(metric, "median", "median_interval", "median of ")
+    return Quantity(metric, "median", "median_interval", "median of ", log=bounded)
 
 
 @dataclass(frozen=True)
@@ -148,7 +151,7 @@ def _all(cube: Cube, wanted: Sequence[str]) -> Drawn:
     """Of each metric its curves, its success and its heat maps; last what the algorithms trust."""
     for metric in wanted:
         fields = cube.figures[metric]
-        quantity = main_quantity(metric)
+        quantity = main_quantity(metric, bool(cube.bounds.get(metric)))
         yield from _curves(cube, quantity)
         if "success_share" in fields:
             limit = np.nanmax(fields["success_limit"])
@@ -191,7 +194,7 @@ def _part(cube: Cube, quantity: Quantity, panel: Panel, over: str) -> dict[str, 
     """Every algorithm along one parameter."""
     fields = cube.figures[quantity.metric]
     y, interval = (cube.cut(fields[name], panel, over) for name in (quantity.field, quantity.interval))
-    bounds = cube.bounds.get(quantity.metric, {}) if quantity.field == "rmse" else {}
+    bounds = cube.bounds.get(quantity.metric, {}) if quantity.log else {}
     labels = [cube.labels[over][i] for i in cube.order(over)]
     return {
         "title": panel.title,
@@ -205,7 +208,7 @@ def _part_over_algorithms(cube: Cube, quantity: Quantity, panel: Panel, over: st
     """The algorithms side by side, for a sweep of one place."""
     place = (slice(None), *(panel.index[name] for name in cube.labels))
     y, interval = (cube.figures[quantity.metric][name][place] for name in (quantity.field, quantity.interval))
-    bounds = cube.bounds.get(quantity.metric, {}) if quantity.field == "rmse" else {}
+    bounds = cube.bounds.get(quantity.metric, {}) if quantity.log else {}
     return {"title": "", "x": cube.algorithms, "series": {quantity.title: (y, interval)}, "bounds": {name: np.full(len(y), values[place[1:]]) for name, values in bounds.items()}}
 
 
@@ -263,7 +266,7 @@ def _caption(cube: Cube, quantity: Quantity) -> str:
         return f"Share of {trials}, with exact {LEVEL:.0%} intervals.{success}"
     below = "" if quantity.field == "median" else " Lower is better."
     bounds = " Dark lines are bounds: a curve that lies on one cannot be improved without bias, and where it departs from it the algorithm has its threshold."
-    has_bounds = quantity.field == "rmse" and bool(cube.bounds.get(quantity.metric))
+    has_bounds = quantity.log and bool(cube.bounds.get(quantity.metric))
     some_zero = quantity.log and _has_positive(cube, quantity) and bool((cube.figures[quantity.metric][quantity.field] == 0).any())
     zeros = " Zeros have no place on the logarithmic axis." if some_zero else ""
     return f"{quantity.title[:1].upper() + quantity.title[1:]} over {trials}, trusted or not, with {LEVEL:.0%} intervals.{below}{zeros}{bounds if has_bounds else ''}"
