@@ -27,6 +27,7 @@ except ImportError as error:
 INK, ACCENT, SECOND, THIRD, FAINT = "#1f2933", "#0b6e99", "#d1495b", "#e09f3e", "#9aa5b1"
 COLOURS = (ACCENT, SECOND, THIRD, "#4f7942", "#6a4c93", FAINT)
 MARKERS, DASHES = "osD^vPX", ("--", ":", "-.")
+_WORDS_FIT = 90  # letters of words beside each other under one panel
 _STYLE: Any = {
     "font.size": 9,
     "axes.titlesize": 10,
@@ -265,7 +266,7 @@ def _draw_dots(axes: Axes, x: Sequence[str], series: Mapping[str, tuple[np.ndarr
         axes.plot(place, _drawable(y, log), color=COLOURS[i % len(COLOURS)], marker=MARKERS[i % len(MARKERS)], markersize=5, linestyle="none", label=name)
     for i, (name, y) in enumerate(bounds.items()):
         axes.hlines(_drawable(y, log), np.arange(len(x)) - 0.4, np.arange(len(x)) + 0.4, color=INK, linestyle=DASHES[i % len(DASHES)], linewidth=1.1, label=name)
-    axes.set_xticks(np.arange(len(x)), x)
+    axes.set_xticks(np.arange(len(x)), x, **({"rotation": 40, "ha": "right"} if sum(len(word) + 2 for word in x) > _WORDS_FIT else {}))
     axes.set_xlim(-0.6, len(x) - 0.4)
     axes.grid(False, axis="x")
 
