@@ -10,6 +10,7 @@ from torchsar.core.phase import cis, linear_phasor, outer_phasor, phasor_tables,
 from torchsar.core.polynomials import legendre
 from torchsar.core.select import best_of, per_trial, take
 from torchsar.core.signal import Recording, Signal, Truth
+from torchsar.core.spline import UniformSpline
 from torchsar.core.stage import Stage
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "Stage",
     "Trace",
     "Truth",
+    "UniformSpline",
     "Use",
     "best_of",
     "block_bytes_of",

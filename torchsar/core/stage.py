@@ -16,11 +16,13 @@ class Stage(nn.Module):
 
     Subclasses say in `works_on` which trailing axes they need and in `provides` which values their Estimate carries; keyword
     parameters of `forward` that are not the signal are values that a Chain can connect. Constants are buffers, tunables are
-    nn.Parameters. Samples that are not finite or not complex are refused here, once, for every stage.
+    nn.Parameters. Samples that are not finite or not complex are refused here, once, for every stage; one that separates the record of a
+    one-channel detector says `takes_real`.
     """
 
     works_on: tuple[str, ...] = ("pulse", "range")
     provides: tuple[str, ...] = ()
+    takes_real: bool = False
 
     def __call__(self, signal: Signal, *args: Any, **values: Any) -> Any:
         name = type(self).__name__
@@ -28,7 +30,7 @@ class Stage(nn.Module):
             raise TypeError(f"{name} works on a Signal with the axes {self.works_on}, got {type(signal).__name__}; wrap the tensor: Signal(data, radar.axes(lines, samples))")
         if signal.names != self.works_on:
             raise ValueError(f"{name} works on the axes {self.works_on}, got {signal.names}")
-        if not signal.data.is_complex():
+        if not (signal.data.is_complex() or (self.takes_real and signal.data.is_floating_point())):
             raise TypeError(f"{name} works on complex samples, got {signal.data.dtype}; form the analytic signal first")
         refuse_non_finite(signal.data, name)
         return super().__call__(signal, *args, **values)

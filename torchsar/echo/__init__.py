@@ -3,11 +3,14 @@
 from torchsar.echo.channels import ChannelImbalance
 from torchsar.echo.interference import Quantiser, Tone, WideInterferer
 from torchsar.echo.jitter import PeriodicJitter
+from torchsar.echo.ladar import ladar_echo, simulate_ladar
+from torchsar.echo.ladar_record import ladar_record, simulate_ladar_record
 from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedLines
 from torchsar.echo.pairs import SimulatedPairs
 from torchsar.echo.pulse_phase import PhaseSinusoid, PhaseWalk, WhitePhase
 from torchsar.echo.response import ChannelResponse
 from torchsar.echo.stripmap import Damage, apply_damages, simulate, stripmap_echo, target_energy
+from torchsar.echo.sweep_error import PolynomialSweepError, SinusoidSweepError, calibration_channel
 from torchsar.echo.turntable import LostPulses, dechirped_echo, simulate_turntable, turntable_echo
 
 __all__ = [
@@ -21,15 +24,22 @@ __all__ = [
     "PeriodicJitter",
     "PhaseSinusoid",
     "PhaseWalk",
+    "PolynomialSweepError",
     "Quantiser",
     "RepeatedLines",
     "SimulatedPairs",
+    "SinusoidSweepError",
     "Tone",
     "WhitePhase",
     "WideInterferer",
     "apply_damages",
+    "calibration_channel",
     "dechirped_echo",
+    "ladar_echo",
+    "ladar_record",
     "simulate",
+    "simulate_ladar",
+    "simulate_ladar_record",
     "simulate_turntable",
     "stripmap_echo",
     "target_energy",

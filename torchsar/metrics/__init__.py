@@ -10,6 +10,13 @@ from torchsar.metrics.bounds import (
 )
 from torchsar.metrics.image import contrast, correlation, entropy, error_db
 from torchsar.metrics.impulse import impulse_response
+from torchsar.metrics.ladar_bounds import (
+    integrated_range_detrended_bound_m,
+    range_per_sweep_bound_m,
+    velocity_free_offset_bound_m_s,
+    velocity_known_offset_bound_m_s,
+    velocity_segmented_bound_m_s,
+)
 from torchsar.metrics.phase import phase_rmse, residual_phase, strehl
 
 __all__ = [
@@ -19,12 +26,17 @@ __all__ = [
     "entropy",
     "error_db",
     "impulse_response",
+    "integrated_range_detrended_bound_m",
     "phase_rmse",
     "pulse_phase_bound_of_scene_rad",
     "pulse_phase_bound_rad",
+    "range_per_sweep_bound_m",
     "reference_doppler_std_hz",
     "residual_phase",
     "strehl",
     "tone_frequency_bound_hz",
     "velocity_bound_m_s",
+    "velocity_free_offset_bound_m_s",
+    "velocity_known_offset_bound_m_s",
+    "velocity_segmented_bound_m_s",
 ]

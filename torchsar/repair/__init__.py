@@ -1,4 +1,4 @@
-"""Repairs of raw data: lost lines, interference, converter jitter, channel imbalance, channel response."""
+"""Repairs of raw data: lost lines, interference, converter jitter, channel imbalance, channel response, triangular sweeps."""
 
 from torchsar.repair.channels import CorrectImbalance, EstimateImbalance, correct_imbalance, estimate_imbalance
 from torchsar.repair.fill import BandLimitedFill, LinearFill, SparseFill, ZeroFill, band_limited_fill, linear_fill, zero_fill
@@ -10,11 +10,17 @@ from torchsar.repair.lines import LineIntegrity, line_integrity, place_lines
 from torchsar.repair.response import CorrectResponse, correct_response, estimate_amplitude_response
 from torchsar.repair.response_phase import EstimateResponse, estimate_response_points, estimate_response_sharpest
 from torchsar.repair.sparse import sparse_fill
+from torchsar.repair.triangle import BlankTurningPoints, CircularShift, SplitSweeps, blank_turning_points, circular_shift, split_record
+from torchsar.repair.triangle_calibrate import CalibrateSweeps, calibrate_sweeps
+from torchsar.repair.trigger import find_trigger
 
 __all__ = [
     "BandLimited",
     "BandLimitedFill",
+    "BlankTurningPoints",
     "BlindJitter",
+    "CalibrateSweeps",
+    "CircularShift",
     "CorrectImbalance",
     "CorrectJitter",
     "CorrectResponse",
@@ -28,9 +34,13 @@ __all__ = [
     "NotchInterference",
     "PilotJitter",
     "SparseFill",
+    "SplitSweeps",
     "SubtractInterference",
     "ZeroFill",
     "band_limited_fill",
+    "blank_turning_points",
+    "calibrate_sweeps",
+    "circular_shift",
     "correct_imbalance",
     "correct_jitter",
     "correct_jitter_band_limited",
@@ -45,11 +55,13 @@ __all__ = [
     "estimate_response_points",
     "estimate_response_sharpest",
     "find_contamination",
+    "find_trigger",
     "line_integrity",
     "linear_fill",
     "notch_interference",
     "place_lines",
     "sparse_fill",
+    "split_record",
     "subtract_interference",
     "zero_fill",
 ]

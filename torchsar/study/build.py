@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from torchsar.core import Chain, Recording, Truth, use
-from torchsar.radar import InverseRadar, StripmapRadar
+from torchsar.radar import InverseRadar, StripmapRadar, TriangularLadar
 from torchsar.study.catalogue import Catalogue
 from torchsar.study.config import Config, Loaded, Method
 from torchsar.study.errors import ConfigError, did_you_mean
@@ -62,7 +62,7 @@ def build_chain(method: Method, where: str, file: str, **given: Any) -> Chain:
 
 def foreign(error: AttributeError) -> str:
     """The sentence for a stage that asks its radar for what only another system's has. Any other AttributeError is a fault of the program and goes on."""
-    if not isinstance(error.obj, (StripmapRadar, InverseRadar)):
+    if not isinstance(error.obj, (StripmapRadar, InverseRadar, TriangularLadar)):
         raise error
     return f"this stage needs radar.{error.name}, which a radar of this system does not have; it is a stage of another system"
 
@@ -83,7 +83,8 @@ def resolved(loaded: Loaded) -> dict[str, Any]:
     if tree["world"] is not None:
         world = tree["world"]
         for section, catalogue in loaded.config.world.single.items():
-            world[section] = _full(catalogue, world[section], f"world.{section}", file)
+            if world[section] is not None:
+                world[section] = _full(catalogue, world[section], f"world.{section}", file)
         for section, catalogue in loaded.config.world.named.items():
             world[section] = {k: _full(catalogue, v, f"world.{section}.{k}", file) for k, v in world[section].items()}
     tree["data"]["damages"] = {k: _full(DAMAGES, v, f"data.damages.{k}", file) for k, v in tree["data"]["damages"].items()}

@@ -18,7 +18,7 @@ from torchsar.radar import FarField, InverseRadar, Spotlight, StripmapRadar
 from torchsar.repair.jitter import BandLimited, CorrectJitter, Exact, Lagrange
 from torchsar.repair.response import band_grid
 from torchsar.repair.response_phase import EstimateResponse, estimate_response_points, estimate_response_sharpest
-from torchsar.scene import Dechirped, Polynomial, Sinusoid
+from torchsar.scene import Dechirped, MeasuredTrack, Polynomial, Sinusoid
 
 _REFINE = {"gradient": gradient_minimum, "parabola": parabola_minimum}
 
@@ -118,6 +118,16 @@ def estimate_response(radar: StripmapRadar, method: Literal["sharpest", "points"
 def vibration(name: str, unit: Literal["mm", "um"]) -> Sinusoid:
     """Sinusoidal vibration by its published name amplitude_frequency_phase (1_100_90), the amplitude in `unit`."""
     return Sinusoid.named(name, unit=unit)
+
+
+def drift(velocity_m_s: Tensor | float = 0.0, acceleration_m_s2: Tensor | float = 0.0) -> Polynomial:
+    """Constant velocity and acceleration along the line of sight, d = v t + a t^2 / 2."""
+    return Polynomial((velocity_m_s, acceleration_m_s2 / 2))
+
+
+def measured_track(file: str) -> MeasuredTrack:
+    """A displacement (m) over time (s) from a file of two columns, text, .csv, .npy or .npz."""
+    return MeasuredTrack.from_file(file)
 
 
 def dechirped(track_m: list[float] | None = None) -> Dechirped:

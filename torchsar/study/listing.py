@@ -8,7 +8,23 @@ import textwrap
 from torchsar.io import inverse, recorded
 from torchsar.study.catalogue import Catalogue
 from torchsar.study.isal.sections import TARGET_DAMAGES
-from torchsar.study.registry import BEAMS, DAMAGES, FIDELITIES, MOTIONS, PATHS, SCENES, START_PHASES, group_of, stages
+from torchsar.study.registry import (
+    BEAMS,
+    CALIBRATIONS,
+    DAMAGES,
+    FIDELITIES,
+    LOG_AMPLITUDES,
+    MOTIONS,
+    PATHS,
+    RADIAL_MOTIONS,
+    SCENES,
+    START_PHASES,
+    SWEEP_ERRORS,
+    SWEEP_FIDELITIES,
+    group_of,
+    stages,
+)
+from torchsar.study.sal.sections import LADAR_DAMAGES
 from torchsar.study.text import packaged_configs, read_tree
 
 _WORLD = {
@@ -18,8 +34,14 @@ _WORLD = {
     "MOTIONS (isal)": MOTIONS,
     "START PHASES (isal)": START_PHASES,
     "FIDELITIES (isal)": FIDELITIES,
+    "MOTIONS (sal)": RADIAL_MOTIONS,
+    "LOG-AMPLITUDES (sal)": LOG_AMPLITUDES,
+    "FIDELITIES (sal)": SWEEP_FIDELITIES,
+    "SWEEP ERRORS (sal)": SWEEP_ERRORS,
+    "CALIBRATIONS (sal)": CALIBRATIONS,
     "DAMAGES (stripmap)": DAMAGES,
     "DAMAGES (isal)": TARGET_DAMAGES,
+    "DAMAGES (sal)": LADAR_DAMAGES,
 }
 
 

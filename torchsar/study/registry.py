@@ -15,13 +15,16 @@ from torchsar.compensate.doppler import EnergyCentre, PhaseIncrement, RangeDepen
 from torchsar.compensate.envelope import AlignEnvelopes, ShiftRange
 from torchsar.compensate.point import PointDoppler
 from torchsar.compensate.pulse_phase.stages import CorrectPulsePhase, EntropyFixedPoint, Pga, PgaSca, Sca, SharpestPhase
+from torchsar.compensate.radial import CompensateMotion, MirrorProduct, MlPeak, PhasePolish, SegmentedInterference, SpectrumCorrelation
 from torchsar.echo.channels import ChannelImbalance
 from torchsar.echo.interference import Quantiser, Tone, WideInterferer
 from torchsar.echo.jitter import PeriodicJitter
 from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedLines
 from torchsar.echo.pulse_phase import PhaseSinusoid, PhaseWalk, WhitePhase
+from torchsar.echo.sweep_error import PolynomialSweepError, SinusoidSweepError
 from torchsar.echo.turntable import LostPulses
 from torchsar.focus import AzimuthTransform, Backproject, ClosestRange, CompressDechirped, OmegaK, OmegaKStolt, RangeCompress, RangeDoppler, TargetImage
+from torchsar.focus.triangular import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
 from torchsar.repair.channels import CorrectImbalance, EstimateImbalance
 from torchsar.repair.fill import BandLimitedFill, LinearFill, SparseFill, ZeroFill
 from torchsar.repair.interference import DropInterference, NotchInterference, SubtractInterference
@@ -29,32 +32,82 @@ from torchsar.repair.jitter_blind import BlindJitter
 from torchsar.repair.jitter_pilot import PilotJitter
 from torchsar.repair.lines import LineIntegrity
 from torchsar.repair.response import CorrectResponse
+from torchsar.repair.triangle import BlankTurningPoints, CircularShift, SplitSweeps
+from torchsar.repair.triangle_calibrate import CalibrateSweeps
 from torchsar.scene import (
     Aircraft,
     AlwaysLit,
     Antenna,
+    CalibrationFibre,
     Dwell,
+    EverySample,
     Hyperbola,
+    LetterE,
+    LinearInSweep,
+    LogAmplitude,
+    OnePerPeriod,
+    OnePerSweep,
     Parabola,
+    PathFluctuation,
     PhaseOnly,
     Points,
     Polynomial,
+    QuadraticInSweep,
     RandomPoints,
+    RetroAndBrokenLine,
     Sinusoid,
     Speckle,
     SpreadRows,
     StartPhase,
     UniformStartPhase,
+    VibrationSpectrum,
 )
 from torchsar.study import factories
 from torchsar.study.catalogue import Catalogue
 
-SCENES = Catalogue("scene", "kind", {"points": Points, "random_points": RandomPoints, "speckle": Speckle, "aircraft": Aircraft, "spread_rows": SpreadRows})
+SCENES = Catalogue(
+    "scene",
+    "kind",
+    {
+        "points": Points,
+        "random_points": RandomPoints,
+        "speckle": Speckle,
+        "aircraft": Aircraft,
+        "spread_rows": SpreadRows,
+        "letter_e": LetterE,
+        "retro_and_broken_line": RetroAndBrokenLine,
+    },
+)
 BEAMS = Catalogue("beam", "kind", {"always_lit": AlwaysLit, "dwell": Dwell, "antenna": Antenna})
 PATHS = Catalogue("path", "kind", {"hyperbola": Hyperbola, "parabola": Parabola})
 MOTIONS = Catalogue("motion", "kind", {"vibration": factories.vibration, "sinusoid": Sinusoid, "polynomial": Polynomial})
+RADIAL_MOTIONS = Catalogue(
+    "motion of the line of sight",
+    "kind",
+    {
+        **MOTIONS.entries,
+        "drift": factories.drift,
+        "path_fluctuation": PathFluctuation,
+        "vibration_spectrum": VibrationSpectrum,
+        "measured_track": factories.measured_track,
+    },
+)
 START_PHASES = Catalogue("start phase", "kind", {"normal": StartPhase, "uniform": UniformStartPhase})
 FIDELITIES = Catalogue("fidelity", "kind", {"phase_only": PhaseOnly, "dechirped": factories.dechirped})
+SWEEP_FIDELITIES = Catalogue(
+    "fidelity of a sweep",
+    "kind",
+    {
+        "linear_in_sweep": LinearInSweep,
+        "quadratic_in_sweep": QuadraticInSweep,
+        "every_sample": EverySample,
+        "one_per_sweep": OnePerSweep,
+        "one_per_period": OnePerPeriod,
+    },
+)
+LOG_AMPLITUDES = Catalogue("log-amplitude", "kind", {"scintillation": LogAmplitude})
+SWEEP_ERRORS = Catalogue("sweep error", "kind", {"polynomial": PolynomialSweepError, "sinusoid": SinusoidSweepError})
+CALIBRATIONS = Catalogue("calibration", "kind", {"fibre": CalibrationFibre})
 DAMAGES = Catalogue(
     "damage",
     "kind",
@@ -95,6 +148,10 @@ REPAIR: dict[str, Callable[..., Any]] = {
     "response": factories.estimate_response,
     "response_flat_band": factories.FlatBandResponse,
     "response_correct": CorrectResponse,
+    "split_sweeps": SplitSweeps,
+    "circular_shift": CircularShift,
+    "blank_turning_points": BlankTurningPoints,
+    "calibrate_sweeps": CalibrateSweeps,
 }
 COMPENSATE: dict[str, Callable[..., Any]] = {
     "phase_increment": PhaseIncrement,
@@ -112,6 +169,12 @@ COMPENSATE: dict[str, Callable[..., Any]] = {
     "sharpest_phase": SharpestPhase,
     "autofocus": factories.AutofocusOfImage,
     "pulse_phase_correct": CorrectPulsePhase,
+    "segmented_interference": SegmentedInterference,
+    "mirror_product": MirrorProduct,
+    "ml_peak": MlPeak,
+    "spectrum_correlation": SpectrumCorrelation,
+    "compensate_motion": CompensateMotion,
+    "phase_polish": PhasePolish,
 }
 FOCUS: dict[str, Callable[..., Any]] = {
     "range_compress": RangeCompress,
@@ -124,6 +187,9 @@ FOCUS: dict[str, Callable[..., Any]] = {
     "compress_dechirped": CompressDechirped,
     "azimuth_transform": AzimuthTransform,
     "target_image": TargetImage,
+    "compress_sweeps": CompressSweeps,
+    "deramp_azimuth": DerampAzimuth,
+    "azimuth_matched_filter": AzimuthMatchedFilter,
 }
 GROUPS = {"repair": REPAIR, "compensate": COMPENSATE, "focus": FOCUS}
 

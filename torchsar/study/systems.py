@@ -54,6 +54,12 @@ def systems() -> dict[str, System]:
     from torchsar.study.isal.sections import IsalConfig
     from torchsar.study.isal.trade import trade as isal_trade
     from torchsar.study.isal.trials import IsalTrials
+    from torchsar.study.sal import run as sal_run
+    from torchsar.study.sal.judge import DEFINITIONS as SAL
+    from torchsar.study.sal.requires import requires as sal_requires
+    from torchsar.study.sal.sections import SalConfig
+    from torchsar.study.sal.trade import trade as sal_trade
+    from torchsar.study.sal.trials import SalTrials
     from torchsar.study.stripmap import run as stripmap_run
     from torchsar.study.stripmap.judge import DEFINITIONS as STRIPMAP
     from torchsar.study.stripmap.requires import requires as stripmap_requires
@@ -63,6 +69,7 @@ def systems() -> dict[str, System]:
 
     return {
         "isal": System(IsalConfig, isal_run.check, isal_run.run, isal_requires, isal_trade, IsalTrials, ISAL),
+        "sal": System(SalConfig, sal_run.check, sal_run.run, sal_requires, sal_trade, SalTrials, SAL),
         "stripmap": System(StripmapConfig, stripmap_run.check, stripmap_run.run, stripmap_requires, stripmap_trade, StripmapTrials, STRIPMAP),
     }
 

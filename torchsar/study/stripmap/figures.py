@@ -19,10 +19,10 @@ from torchsar.radar import StripmapRadar
 from torchsar.repair.response import band_grid
 from torchsar.study.build import Case
 from torchsar.study.config import Config
+from torchsar.study.cuts import impulse_cuts
 from torchsar.study.methods import Result, focus_name
 from torchsar.study.pictures import Drawn, Picture, draw_all
 from torchsar.study.registry import group_of
-from torchsar.study.stripmap.cuts import impulse_cuts
 from torchsar.study.stripmap.judge import expected_places
 
 

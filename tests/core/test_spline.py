@@ -1,0 +1,64 @@
+"""Splines on a uniform grid against scipy, and what they promise beyond it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import CubicSpline
+
+from torchsar.core import UniformSpline
+
+START, STEP = 0.3, 0.7
+
+
+def knots(n: int) -> np.ndarray:
+    return START + STEP * np.arange(n)
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 5, 6, 7, 20, 33, 66, 200])
+def test_equals_scipy(n: int) -> None:
+    values = np.random.default_rng(n).standard_normal((2, 3, n))
+    t = np.linspace(START - 0.5, knots(n)[-1] + 0.5, 143).reshape(11, 13)
+    spline, expected = UniformSpline(torch.tensor(values), START, STEP), CubicSpline(knots(n), values, axis=-1)
+    pairs = [(spline.at, expected), (spline.slope, expected.derivative()), (spline.integral, expected.antiderivative())]
+    for found, known in pairs:
+        torch.testing.assert_close(found(torch.tensor(t)), torch.tensor(known(t)), atol=2e-12, rtol=1e-12)
+
+
+def test_pieces_are_scipys() -> None:
+    values = np.random.default_rng(0).standard_normal((2, 40))
+    expected = CubicSpline(knots(40), values, axis=-1).c[::-1]
+    torch.testing.assert_close(UniformSpline(torch.tensor(values), START, STEP).pieces(), torch.tensor(np.moveaxis(expected, 0, -1).swapaxes(0, 1).copy()), atol=1e-12, rtol=1e-12)
+
+
+def test_cubics_are_reproduced_and_integrals_begin_at_start() -> None:
+    t = torch.linspace(-1.0, 9.0, 57, dtype=torch.float64)
+    at = torch.arange(12, dtype=torch.float64) * 0.5 + 2.0
+    spline = UniformSpline(at**3 - 2 * at, 2.0, 0.5)
+    torch.testing.assert_close(spline.at(t), t**3 - 2 * t, atol=1e-9, rtol=0)
+    torch.testing.assert_close(spline.slope(t), 3 * t**2 - 2, atol=1e-9, rtol=0)
+    assert float(spline.integral(torch.tensor(2.0, dtype=torch.float64)).abs()) < 1e-14
+
+
+def test_batch_equals_singles_and_trials_do_not_mix() -> None:
+    values = torch.randn(3, 30, dtype=torch.float64) * torch.tensor([1.0, 1e6, 1e-6], dtype=torch.float64)[:, None]
+    t = torch.linspace(0, 29, 50, dtype=torch.float64)
+    together = UniformSpline(values, 0.0, 1.0).integral(t)
+    torch.testing.assert_close(together, torch.stack([UniformSpline(v, 0.0, 1.0).integral(t) for v in values]), rtol=1e-12, atol=1e-16)
+
+
+@pytest.mark.parametrize("n", [2, 3, 5, 9])
+def test_gradients(n: int) -> None:
+    values = torch.randn(2, n, dtype=torch.float64, requires_grad=True)
+    t = (torch.rand(4, dtype=torch.float64) * (n - 1)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda v, x: tuple(getattr(UniformSpline(v, 0.0, 1.0), name)(x) for name in ("at", "slope", "integral")), (values, t))
+
+
+def test_bad_input_is_refused() -> None:
+    with pytest.raises(TypeError, match="float64 values, got torch.float32"):
+        UniformSpline(torch.zeros(4), 0.0, 1.0)
+    with pytest.raises(ValueError, match="at least two values"):
+        UniformSpline(torch.zeros(3, 1, dtype=torch.float64), 0.0, 1.0)
+    with pytest.raises(ValueError, match="positive step"):
+        UniformSpline(torch.zeros(4, dtype=torch.float64), 0.0, 0.0)

@@ -1,0 +1,158 @@
+"""Targets, random motions and worlds of the ladar."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import CubicSpline
+
+from torchsar.core import Draws
+from torchsar.scene import (
+    CalibrationFibre,
+    LadarWorld,
+    LetterE,
+    LinearInSweep,
+    LogAmplitude,
+    MeasuredTrack,
+    PathFluctuation,
+    Points,
+    Polynomial,
+    RetroAndBrokenLine,
+    Sinusoid,
+    VibrationSpectrum,
+    drawn_motion,
+)
+
+
+def test_the_letter() -> None:
+    """Brief 000, section 8 B: 62 points, spine 5 cm, arms 1 cm, at spine points 0, 8, 16."""
+    s = LetterE().scatterers(Draws(1, trials=range(3)))
+    assert s.range_m.shape == s.azimuth_m.shape == (62,) and s.amplitude.shape == (3, 62)
+    places = {(round(float(x), 3), round(float(r), 3)) for x, r in zip(s.azimuth_m, s.range_m, strict=True)}
+    assert len(places) == 62 and {(-0.075, -0.4), (-0.075, 0.4), (0.075, 0.0), (-0.065, 0.4), (-0.075, 0.35)} <= places
+    assert (-0.065, -0.35) not in places
+    torch.testing.assert_close(s.amplitude.abs(), torch.ones(3, 62, dtype=torch.float64))
+    assert not torch.equal(s.amplitude[0], s.amplitude[1])
+    assert torch.equal(LetterE(random_phase=False).scatterers(Draws(1)).amplitude, torch.ones(62, dtype=torch.complex128))
+
+
+def test_the_ground_target() -> None:
+    """Brief 000, section 8 C: retro 25 dB, nine points 18 dB below it, 0.25 to 0.55 m beyond."""
+    s = RetroAndBrokenLine().scatterers(Draws(1, trials=range(2)))
+    level = 20 * torch.log10(s.amplitude.abs())
+    assert s.range_m.shape == (10,) and float(s.range_m[0]) == 10.5
+    torch.testing.assert_close(level, torch.tensor([25.0] + 9 * [7.0], dtype=torch.float64).expand(2, -1))
+    beyond = s.range_m[1:] - s.range_m[0]
+    assert float(beyond.min()) == pytest.approx(0.25) and float(beyond.max()) == pytest.approx(0.55)
+    gaps = torch.diff(beyond)
+    assert int((gaps > 1.5 * gaps.min()).sum()) == 2
+
+
+@pytest.mark.parametrize("kind, slope", [(PathFluctuation, -8 / 3), (VibrationSpectrum, -8 / 3), (LogAmplitude, -5 / 3)])
+def test_spectra_follow_their_power_law(kind, slope: float) -> None:
+    tones = kind(2e-6, lowest_hz=10.0, highest_hz=1000.0, slope=slope, count=50).drawn(Draws(1, trials=range(4)), 1.0)
+    power = (tones.cosine.square() + tones.sine.square()) / 2
+    torch.testing.assert_close(power.sum(-1), torch.full((4,), 4e-12, dtype=torch.float64), rtol=1e-12, atol=0)
+    edges = 10.0 * 100.0 ** (torch.arange(51, dtype=torch.float64) / 50)
+    density = (power / torch.diff(edges))[0]
+    fitted = np.polyfit(np.log(tones.frequency_hz.numpy()), np.log(density.numpy()), 1)[0]
+    assert fitted == pytest.approx(slope, abs=1e-9)
+    assert bool((tones.frequency_hz > edges[:-1]).all()) and bool((tones.frequency_hz < edges[1:]).all())
+
+
+def test_defaults_follow_the_recording_and_rms_the_trial() -> None:
+    tones = PathFluctuation(torch.tensor([1.0, 3.0], dtype=torch.float64)).drawn(Draws(0, trials=range(2)), 0.5)
+    assert 2.0 < float(tones.frequency_hz[0]) < 2.3 and 1800 < float(tones.frequency_hz[-1]) < 2000
+    power = (tones.cosine.square() + tones.sine.square()).sum(-1) / 2
+    torch.testing.assert_close(power, torch.tensor([1.0, 9.0], dtype=torch.float64))
+    short = LogAmplitude(0.1).drawn(Draws(0), 1e-4)
+    assert 9e4 < float(short.frequency_hz[-1]) < 1e5
+
+
+def test_tones_are_sums_of_sinusoids_at_any_times() -> None:
+    tones = PathFluctuation(1.0, 20.0, 500.0, count=7).drawn(Draws(2, trials=range(2)), 1.0)
+    time = torch.rand(3, 7001, dtype=torch.float64)
+    expected = sum(
+        (c[:, None, None] * torch.cos(2 * math.pi * f * time) + s[:, None, None] * torch.sin(2 * math.pi * f * time) for f, c, s in zip(tones.frequency_hz, tones.cosine.T, tones.sine.T, strict=True)),
+        torch.zeros(2, 3, 7001, dtype=torch.float64),
+    )
+    torch.testing.assert_close(tones.displacement_m(time), expected, atol=1e-11, rtol=0)
+    assert tones.value(torch.tensor(0.3, dtype=torch.float64)).shape == (2,)
+
+
+def test_random_motions_have_addresses() -> None:
+    motion = [PathFluctuation(1e-6), Polynomial([0.3]), PathFluctuation(1e-6)]
+    time = torch.linspace(0, 0.01, 5, dtype=torch.float64)
+    together = drawn_motion(motion, Draws(1, trials=[3, 5]), 0.01)
+    alone = drawn_motion(motion, Draws(1, trials=[5]), 0.01)
+    torch.testing.assert_close(together[0].displacement_m(time)[1], alone[0].displacement_m(time)[0], atol=1e-18, rtol=1e-9)
+    assert together[1] is motion[1] and not torch.equal(together[0].displacement_m(time), together[2].displacement_m(time))
+
+
+def written(folder: Path, suffix: str, time: np.ndarray, track: np.ndarray) -> Path:
+    path = folder / f"track{suffix}"
+    if suffix == ".npy":
+        np.save(path, np.stack([time, track], -1))
+    elif suffix == ".npz":
+        np.savez(path, time_s=time, displacement_m=track)
+    elif suffix == ".csv":
+        path.write_text("time,displacement\n" + "\n".join(f"{t:.17g},{d:.17g}" for t, d in zip(time, track, strict=True)))
+    else:
+        np.savetxt(path, np.stack([time, track], -1), fmt="%.17g", header="time displacement")
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".txt", ".csv", ".npy", ".npz"])
+def test_measured_tracks_from_files(tmp_path: Path, suffix: str) -> None:
+    time = np.arange(50) * 1e-4
+    track = 1e-5 * np.sin(2 * np.pi * 300 * time)
+    found = MeasuredTrack.from_file(written(tmp_path, suffix, time, track))
+    at = np.linspace(0, time[-1], 77).reshape(7, 11)
+    np.testing.assert_allclose(found.displacement_m(torch.tensor(at)).numpy(), CubicSpline(time, track)(at), atol=1e-17)
+
+
+def test_measured_tracks_refuse_what_they_cannot_be(tmp_path: Path) -> None:
+    (tmp_path / "three.csv").write_text("1,2,3\n4,5,6\n")
+    (tmp_path / "words.txt").write_text("no numbers\nat all\n")
+    written(tmp_path, ".npy", np.array([0.0, 1.0, 3.0]), np.zeros(3))
+    for name, message in (
+        ("three.csv", r"three.csv: expected two columns.*\(2, 3\)"),
+        ("words.txt", "words.txt: expected two columns"),
+        ("track.npy", "track.npy: times.*rise evenly"),
+        ("none.csv", "none.csv: no such file"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            MeasuredTrack.from_file(tmp_path / name)
+    track = MeasuredTrack(torch.arange(4, dtype=torch.float64), torch.zeros(2, 4, dtype=torch.float64))
+    assert track.displacement_m(torch.zeros(3, 5, dtype=torch.float64)).shape == (2, 3, 5)
+    with pytest.raises(ValueError, match="reaches from -1 to 4 s, asked for 2 to 9 s"):
+        track.displacement_m(torch.tensor([2.0, 9.0], dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    "build, message",
+    [
+        (lambda: LadarWorld(Points([0.0], [0.0]), gate_m=(2.0, 1.0)), "gate_m must be"),
+        (lambda: LadarWorld(Points([0.0], [0.0]), snr_db=math.nan), "snr_db must be a finite number"),
+        (lambda: LadarWorld(Points([0.0], [0.0]), log_amplitude=LogAmplitude(-0.1)), "rms of a log-amplitude"),
+        (lambda: LinearInSweep(("curvature",)), "effects that may be left out are residual_video, hyperbola, flight"),  # type: ignore[arg-type]
+        (lambda: LinearInSweep("flight"), "give a tuple of them"),  # type: ignore[arg-type]
+        (lambda: CalibrationFibre(0.0), "longer than 0 s"),
+        (lambda: PathFluctuation(1e-6, 100.0, 10.0), "0 < lowest_hz <= highest_hz"),
+        (lambda: VibrationSpectrum(1e-6, 1.0, 10.0, count=0), "count of sinusoids"),
+        (lambda: PathFluctuation(1e-6, highest_hz=1.0).drawn(Draws(0), 0.1), "has no band; give lowest_hz"),
+        (lambda: RetroAndBrokenLine(range_m=math.inf), "range_m of a retro-reflector"),
+    ],
+)
+def test_bad_worlds_are_refused(build, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        build()
+
+
+def test_a_fidelity_must_be_one() -> None:
+    with pytest.raises(TypeError, match="fidelity must be LinearInSweep"):
+        LadarWorld(Points([0.0], [0.0]), fidelity=Sinusoid(1.0, 1.0))  # type: ignore[arg-type]

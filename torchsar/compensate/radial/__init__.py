@@ -1,0 +1,33 @@
+"""Radial motion of a triangular-FMCW ladar: velocities at turning points from up and down sweeps, and what takes the motion out (system 000)."""
+
+from torchsar.compensate.radial.bands import Bands, bands_of
+from torchsar.compensate.radial.compensate import compensate_motion
+from torchsar.compensate.radial.correlation import spectrum_correlation
+from torchsar.compensate.radial.mirror import mirror_product
+from torchsar.compensate.radial.peak import ml_peak
+from torchsar.compensate.radial.polish import phase_polish
+from torchsar.compensate.radial.segmented import segmented_interference
+from torchsar.compensate.radial.stages import CompensateMotion, MirrorProduct, MlPeak, PhasePolish, SegmentedInterference, SpectrumCorrelation
+from torchsar.compensate.radial.trajectory import geometric_velocity_m_s, integrated_range, sweep_middles, sweep_motion, turning_points
+
+__all__ = [
+    "Bands",
+    "CompensateMotion",
+    "MirrorProduct",
+    "MlPeak",
+    "PhasePolish",
+    "SegmentedInterference",
+    "SpectrumCorrelation",
+    "bands_of",
+    "compensate_motion",
+    "geometric_velocity_m_s",
+    "integrated_range",
+    "mirror_product",
+    "ml_peak",
+    "phase_polish",
+    "segmented_interference",
+    "spectrum_correlation",
+    "sweep_middles",
+    "sweep_motion",
+    "turning_points",
+]

@@ -1,0 +1,210 @@
+"""Up sweeps and mirrored down sweeps of a window of ranges, on few samples and with the bulk of the Doppler shift taken out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchsar.core import cis, real_dtype, refuse_non_finite
+from torchsar.radar import TriangularLadar
+
+_BLOCK = 8
+# likeness of envelopes that noise alone does not reach, and share of the usual energy below which a period shows no echo
+_ALIKE, _FAINT = 0.35, 0.3
+
+
+@dataclass(frozen=True)
+class Bands:
+    """Both sweeps of every period as the window of ranges makes them, without the Doppler shift of a whole number of bins.
+
+    up, down: (..., pulse, m) samples over the sweep at `time_s` (m,), symmetric about its middle. up is up(u) exp(-2j pi s u / T) and down is the
+    MIRRORED sweep down(-u) exp(+2j pi s u / T), in the sign of the paper ("lo_conj_echo"), each filtered to the lines of the window. Both then have
+    the beat of the range plus and minus what is left of the Doppler shift, within about a bin of it, and the residual video phase is
+    removed unless it was to be kept. shift: (..., pulse) int64, s. lit: (..., pulse) bool, False where no echo is
+    seen and the shift is that of the neighbours. lines: number of kept bins; first: beat of the first of them in bins of 1 / T; noise_lines: how
+    many unfiltered lines let as much noise through.
+    """
+
+    up: Tensor
+    down: Tensor
+    time_s: Tensor
+    shift: Tensor
+    lit: Tensor
+    lines: int
+    first: int
+    noise_lines: float
+    radar: TriangularLadar
+
+    @property
+    def shift_m_s(self) -> Tensor:
+        """Radial velocity of the shift that was taken out, (..., pulse) float64."""
+        return self.shift.to(torch.float64) * self.radar.ambiguous_velocity_m_s
+
+    def product(self) -> Tensor:
+        """up conj(down), (..., pulse, m): equal optical frequencies meet, see `mirror_product`."""
+        return self.up * self.down.conj()
+
+    @property
+    def inner(self) -> slice:
+        """Samples without the 1/32 at each end, where filters ring (brief 000, section 5b)."""
+        drop = round(self.time_s.shape[-1] / 32)
+        return slice(drop, self.time_s.shape[-1] - drop)
+
+
+def canonical(sweeps: Tensor, radar: TriangularLadar) -> Tensor:
+    """The sweeps in the sign of the paper: a scatterer beyond the reference has a positive beat in the up sweep."""
+    return sweeps.conj() if radar.dechirp_sign == "echo_conj_lo" else sweeps
+
+
+def refuse_other_sweeps(sweeps: Tensor, radar: TriangularLadar, what: str) -> None:
+    """Raise TypeError or ValueError unless sweeps is finite and complex (..., 2, pulse, N) with the N of the radar."""
+    n = radar.sweep_samples
+    if not (isinstance(sweeps, Tensor) and sweeps.is_complex()):
+        raise TypeError(f"{what} works on complex sweeps (..., 2, pulse, {n}), got {getattr(sweeps, 'dtype', type(sweeps).__name__)}; split the record of a real detector first")
+    if sweeps.ndim < 3 or sweeps.shape[-3] != 2 or sweeps.shape[-1] != n or sweeps.shape[-2] < 1:
+        raise ValueError(f"{what} works on sweeps (..., 2, pulse, {n}), up before down, got shape {tuple(sweeps.shape)}")
+    refuse_non_finite(sweeps, what)
+
+
+def window_lines(radar: TriangularLadar, window_m: tuple[float, float] | None) -> tuple[int, int]:
+    """First beat bin and number of bins of a window of relative ranges; the whole band for None. Raises ValueError for a window that is none."""
+    n = radar.sweep_samples
+    if window_m is None:
+        return -(n // 2), n
+    low, high = (float(edge) for edge in window_m)
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise ValueError(f"window_m must be two relative ranges (low, high) in metres with low < high, got {tuple(window_m)}")
+    first, last = round(low / radar.range_step_m), round(high / radar.range_step_m)
+    limit = n // 2
+    if first < -limit or last >= limit:
+        raise ValueError(f"window_m {tuple(window_m)} reaches beyond the beat band of +-{limit * radar.range_step_m:.4g} m; make it smaller")
+    if last - first + 1 < 4:
+        raise ValueError(f"window_m {tuple(window_m)} holds {last - first + 1} range cells of {radar.range_step_m:.3g} m; make it 4 cells or wider")
+    return first, last - first + 1
+
+
+def inside(radar: TriangularLadar, window_m: tuple[float, float] | None, bins: int, per_line: float, device: torch.device) -> Tensor:
+    """Mask (bins,) of a transform's bins, `per_line` of them a range cell and zero frequency first, that lie in a window of relative ranges."""
+    first, lines = window_lines(radar, window_m)
+    at = torch.arange(bins, device=device)
+    at = torch.where(at >= bins // 2, at - bins, at) / per_line
+    return (at >= first - 0.5) & (at <= first + lines - 0.5)
+
+
+def bulk_shift(power: Tensor) -> tuple[Tensor, Tensor]:
+    """Doppler shift of every period in whole bins, and whether an echo is there to tell it. power: (..., 2, pulse, N) -> (..., pulse) int64 and bool.
+
+    power[..., r, k, :] is |FFT|^2 with zero frequency first, the down sweep mirrored already. Envelopes of 8 periods are added before they are
+    correlated; the lag that makes up and down envelopes meet is 2 fd (brief 000, section 5.4). Lags beyond half the band, which a circular correlation
+    would wrap, are told apart. Periods in which the envelopes do not resemble each other take the shift of their neighbours.
+    """
+    n, pulses = power.shape[-1], power.shape[-2]
+    block = min(_BLOCK, pulses)
+    blocks = torch.stack([part.mean(-2) for part in torch.fft.fftshift(power, dim=-1).split(block, -2)], -2)
+    blocks = blocks - blocks.mean(-1, keepdim=True)
+    level = blocks.square().sum(-1).clamp_min(torch.finfo(blocks.dtype).tiny).sqrt()
+    blocks = blocks / level[..., None]
+    spectrum = torch.fft.rfft(blocks, 2 * n)
+    met = torch.fft.irfft(spectrum[..., 0, :, :] * spectrum[..., 1, :, :].conj(), 2 * n)
+    likeness, lag = met.max(-1)
+    lag = torch.where(lag >= n, lag - 2 * n, lag).to(torch.float64)
+    alike = likeness > _ALIKE
+    lag = filled(_median_of_three(filled(lag, alike)), alike)
+    at = (torch.arange(pulses, dtype=torch.float64, device=power.device) - (block - 1) / 2) / block
+    return torch.round(_interpolated(lag, at) / 2).to(torch.int64), alike.repeat_interleave(block, -1)[..., :pulses]
+
+
+def filled(values: Tensor, known: Tensor) -> Tensor:
+    """values (..., n) with those that are not known interpolated between their known neighbours, held at the ends; as they are where none is known."""
+    n = values.shape[-1]
+    index = torch.arange(n, device=values.device).expand(values.shape)
+    known = torch.where(known.any(-1, keepdim=True), known, True)
+    before = torch.where(known, index, -1).cummax(-1).values
+    after = torch.where(known, index, n).flip(-1).cummin(-1).values.flip(-1)
+    low, high = torch.where(before < 0, after, before), torch.where(after >= n, before, after)
+    share = (index - low).to(values.dtype) / (high - low).clamp_min(1).to(values.dtype)
+    return torch.where(known, values, values.gather(-1, low) * (1 - share) + values.gather(-1, high) * share)
+
+
+def _median_of_three(x: Tensor) -> Tensor:
+    """Median of every entry along the last dim and its two neighbours; the ends as they are."""
+    if x.shape[-1] < 3:
+        return x
+    inner = torch.stack([x[..., :-2], x[..., 1:-1], x[..., 2:]]).median(0).values
+    return torch.cat([x[..., :1], inner, x[..., -1:]], -1)
+
+
+def _interpolated(values: Tensor, at: Tensor) -> Tensor:
+    """Linear interpolation of values (..., n) at fractional indices (m,), held at the ends."""
+    at = at.clamp(0, values.shape[-1] - 1)
+    low = at.floor().long().clamp_max(max(values.shape[-1] - 2, 0))
+    high = (low + 1).clamp_max(values.shape[-1] - 1)
+    share = at - low
+    return values[..., low] * (1 - share) + values[..., high] * share
+
+
+def bands_of(sweeps: Tensor, radar: TriangularLadar, window_m: tuple[float, float] | None = None, taper: float = 1.0, oversampling: int = 1, video: bool = False) -> Bands:
+    """Bands of a window of relative ranges (m), the whole band for None. sweeps: (..., 2, pulse, N) as recorded. Differentiable but for the shift.
+
+    taper: share of the window that its raised-cosine edges take; 0 cuts sharply, which leaves ringing at the ends of the sweep (the error floor
+    of a mirror product at high SNR), 1 makes them meet in the middle. oversampling: samples a line, rounded up to a power of two; products need 2. video: keep the residual
+    video phase, which single scatterers do not mind, and whose filter rings at the ends of the sweep.
+    """
+    first, lines = window_lines(radar, window_m)
+    n = radar.sweep_samples
+    data = canonical(sweeps, radar)
+    spectrum = torch.fft.fft(torch.stack([data[..., 0, :, :], data[..., 1, :, :].flip(-1)], -3))
+    shift, alike = bulk_shift(_smooth_power(spectrum.detach()))
+    m = 2 ** max(3, math.ceil(math.log2(oversampling * lines)))
+    line = torch.arange(lines, device=sweeps.device)
+    sides = torch.stack([shift, -shift], -2)
+    bins = (first + line + sides[..., None]) % n
+    kept = spectrum.gather(-1, bins)
+    shape = _raised_cosine(line.to(torch.float64), lines, taper if window_m is not None else 0.0)
+    filters = torch.stack([shape.to(kept.dtype) * _line_phase(first, lines, m, 0 if video else sign, radar, kept) for sign in (1, -1)])
+    turned = cis((math.pi * (first + sides).to(torch.float64) * ((n - 1) / n) % (2 * math.pi)).to(real_dtype(kept.dtype)))
+    series = torch.fft.ifft(kept * filters[:, None, :] * turned[..., None], m) * (m / n)
+    beat = _beat_of_first(first, m, sweeps)
+    series = series * beat.to(series.dtype)
+    time_s = (torch.arange(m, dtype=torch.float64, device=sweeps.device) - (m - 1) / 2) * (radar.sweep_s / m)
+    up, down = series[..., 0, :, :], series[..., 1, :, :]
+    return Bands(up, down, time_s, shift, alike & ~_faint(up, down, alike), lines, first, float(shape.square().sum()), radar)
+
+
+def _faint(up: Tensor, down: Tensor, alike: Tensor) -> Tensor:
+    """Periods with much less energy in the window than the others, (..., pulse) bool: no scatterer is lit in them."""
+    energy = sum((x.detach().real.square() + x.detach().imag.square()).sum(-1) for x in (up, down))
+    usual = torch.where(alike, energy, torch.nan).nanmedian(-1, keepdim=True).values
+    return energy < _FAINT * usual
+
+
+def _smooth_power(spectrum: Tensor) -> Tensor:
+    """Power spectra of Hann-windowed sweeps: on the bins of a rectangular one, a peak between two of them loses more than half."""
+    windowed = spectrum - (spectrum.roll(1, -1) + spectrum.roll(-1, -1)) / 2
+    return windowed.real.square() + windowed.imag.square()
+
+
+def _line_phase(first: int, lines: int, m: int, sign: int, radar: TriangularLadar, like: Tensor) -> Tensor:
+    """Per line: removal of the residual video phase, and the half-sample offset between the grids of n and of m samples."""
+    j = torch.arange(lines, dtype=torch.float64, device=like.device)
+    beat_hz = (first + j) / radar.sweep_s
+    video = sign * math.pi * beat_hz.square() / radar.chirp_rate_hz_s
+    offset = math.pi * j * (1 / m - 1 / radar.sweep_samples)
+    return torch.exp(1j * ((video + offset) % (2 * math.pi))).to(like.dtype)
+
+
+def _raised_cosine(j: Tensor, lines: int, taper: float) -> Tensor:
+    """Window over lines 0..lines-1 whose edges of `taper` times half the window fall as a cosine."""
+    if not taper:
+        return torch.ones_like(j)
+    distance = (j - (lines - 1) / 2).abs() / ((lines + 1) / 2)
+    return torch.where(distance > 1 - taper, 0.5 * (1 + torch.cos(math.pi * (distance - 1 + taper) / taper)), 1.0)
+
+
+def _beat_of_first(first: int, m: int, like: Tensor) -> Tensor:
+    """exp(2j pi first u / T) on the grid of m samples: lines count from zero beat again."""
+    index = torch.arange(m, dtype=torch.float64, device=like.device) - (m - 1) / 2
+    return torch.exp(2j * math.pi * ((first * index / m) % 1))

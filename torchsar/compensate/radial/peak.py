@@ -1,0 +1,69 @@
+"""Radial velocity from the beat frequencies of the strongest scatterer."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.radial.bands import Bands, bands_of, inside, refuse_other_sweeps, window_lines
+from torchsar.compensate.radial.verdict import velocity_estimate
+from torchsar.core import Axis, Estimate, cis
+from torchsar.radar import TriangularLadar
+
+_PAD, _NEWTON, _REACH = 2, 3, 2.0
+
+
+def ml_peak(sweeps: Tensor, radar: TriangularLadar, pulse: Axis, *, window_m: tuple[float, float] | None = None, azimuth_m: Tensor | float = 0.0) -> Estimate:
+    """Radial velocity at the turning points from periodogram peaks, value["velocity_m_s"] (..., pulse) (brief 000, section 5b).
+
+    fd = (f'up - f'mirrored down) / 2 with each peak refined by Newton steps: for one scatterer the maximum-likelihood estimate with unknown offsets.
+    sweeps: (..., 2, pulse, N). window_m: relative ranges (low, high) m to look for it, None for the whole band; nothing is filtered. The peak is sought
+    within two range cells of that of the whole record. azimuth_m: x of the scatterer. Differentiable around the detached peaks. Raises TypeError or ValueError for
+    other sweeps or a window that is none.
+    """
+    refuse_other_sweeps(sweeps, radar, "ml_peak")
+    window_lines(radar, window_m)
+    bands = bands_of(sweeps, radar, video=True)
+    up, down = peak_frequencies(bands, window_m)
+    return velocity_estimate(from_beats(up, down, bands), bands, pulse, factor=3.0, azimuth_m=azimuth_m)
+
+
+def from_beats(up_hz: Tensor, down_hz: Tensor, bands: Bands) -> Tensor:
+    """Velocity (..., pulse) from the beats of up and mirrored down sweeps. The range changes between their middles: factor 1 + B / (2 fc), erratum 8."""
+    radar = bands.radar
+    doppler = bands.shift.to(torch.float64) / radar.sweep_s + (up_hz - down_hz) / 2
+    return radar.wavelength_m / 2 * doppler * (1 + radar.bandwidth_hz / (2 * radar.carrier_hz))
+
+
+def peak_frequencies(bands: Bands, window_m: tuple[float, float] | None) -> tuple[Tensor, Tensor]:
+    """Beat frequencies (Hz) of the strongest scatterer in the up and the mirrored down sweeps, (..., pulse) float64 each."""
+    both = torch.stack([bands.up, bands.down], -3)
+    m = both.shape[-1]
+    spectrum = torch.fft.fft(both.detach(), _PAD * m)
+    power = spectrum.real.square() + spectrum.imag.square()
+    sought = inside(bands.radar, window_m, _PAD * m, _PAD, both.device)
+    centre = torch.where(sought, power.mean((-3, -2), keepdim=True), -1).argmax(-1, keepdim=True)
+    away = (torch.arange(_PAD * m, device=both.device) - centre + _PAD * m // 2) % (_PAD * m) - _PAD * m // 2
+    best = torch.where(away.abs() <= round(_REACH * _PAD), power, -1).argmax(-1)
+    best = torch.where(best >= _PAD * m // 2, best - _PAD * m, best)
+    frequency = best.to(torch.float64) / (_PAD * bands.radar.sweep_s)
+    frequency = _climbed(both, frequency, bands.time_s)
+    return frequency[..., 0, :], frequency[..., 1, :]
+
+
+def _climbed(x: Tensor, frequency_hz: Tensor, time_s: Tensor) -> Tensor:
+    """Frequencies of greatest |sum x exp(-2j pi f u)| next to those given, (..., pulse), by Newton steps. x: (..., pulse, m)."""
+    w = 2 * math.pi * time_s
+    for _ in range(_NEWTON):
+        turned = x * cis((-(frequency_hz[..., None] * w)).to(x.real.dtype))
+        weight = w.to(x.real.dtype)
+        s0, s1, s2 = turned.sum(-1), (turned * weight).sum(-1), (turned * weight * weight).sum(-1)
+        gradient = 2 * (s0.conj() * s1).imag
+        bend = 2 * (s1.real.square() + s1.imag.square() - (s0.conj() * s2).real)
+        concave = bend < 0
+        frequency_hz = frequency_hz + torch.where(concave, -gradient / torch.where(concave, bend, -1), 0).to(torch.float64)
+    return frequency_hz
+
+

@@ -1,0 +1,172 @@
+"""Radial velocity by segmented interference: the method of the paper."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.radial.bands import Bands, bands_of, inside, refuse_other_sweeps, window_lines
+from torchsar.compensate.radial.correlation import envelope_lag
+from torchsar.compensate.radial.peak import from_beats
+from torchsar.compensate.radial.verdict import GRADIENT_SNR_DB, LEAST_SNR_DB, velocity_estimate
+from torchsar.core import Axis, Estimate
+from torchsar.radar import TriangularLadar
+
+Bins = Literal["peak", "sum"]
+Unwrap = Literal["gradient", "per_pulse"]
+
+
+def segmented_interference(
+    sweeps: Tensor,
+    radar: TriangularLadar,
+    pulse: Axis,
+    *,
+    bins: Bins = "peak",
+    unwrap: Unwrap = "gradient",
+    scatterers: int = 1,
+    padding: int = 4,
+    hann: bool = False,
+    window_m: tuple[float, float] | None = None,
+    azimuth_m: Tensor | float = 0.0,
+) -> Estimate:
+    """Radial velocity at the turning points, value["velocity_m_s"] (..., pulse), from the phase between half sweeps (paper, Eqs. 14 to 20, corrected).
+
+    sweeps: (..., 2, pulse, N). phi = arg{U1 conj(D1) conj(U2 conj(D2))} of centre-referenced spectra of the halves, the down sweep conjugated before its
+    transform, is -2 pi T fd (brief 000, errata 6 to 8). bins: "peak" reads it where up and down have their own peaks, for each of so many
+    `scatterers` apart by c / B or more, and adds their azimuth GRADIENTS with weights from contrast (Eqs. 18, 19); "sum" adds the complex
+    products of all bins, for dense scenes. padding: zero-padding of the halves; hann: a Hann window over each half, where other scatterers are in the window.
+
+    unwrap: "gradient" as in the paper, the integer of the first period from the envelopes and wrapped differences from there on, which slips
+    where the velocity changes by lambda / (4 T) a period or the SNR after compression is below 14 dB; "per_pulse" takes every integer from the envelopes.
+    info: phase_rad (..., pulse), integer (..., pulse), slips (...,), the periods where gradient and envelopes disagree by a turn, dispersion (...,) and weights (..., scatterers).
+
+    Differentiable around the detached peaks and integers. Raises TypeError or ValueError for other sweeps, options or windows.
+    """
+    refuse_other_sweeps(sweeps, radar, "segmented_interference")
+    if bins not in ("peak", "sum") or unwrap not in ("gradient", "per_pulse"):
+        raise ValueError(f"bins must be 'peak' or 'sum' and unwrap 'gradient' or 'per_pulse', got {bins!r} and {unwrap!r}")
+    if not (isinstance(scatterers, int) and scatterers >= 1 and isinstance(padding, int) and 1 <= padding <= 16):
+        raise ValueError(f"scatterers must be 1 or more and padding 1..16, both whole numbers, got {scatterers} and {padding}")
+    window_lines(radar, window_m)
+    bands = bands_of(sweeps, radar, video=bins == "peak")
+    spectra = _halves(bands, padding, hann)
+    sought = inside(radar, window_m, spectra[0].shape[-1], padding / 2, sweeps.device)
+    phases, weights = _summed(spectra, sought) if bins == "sum" else _at_peaks(spectra, sought, padding, scatterers)
+    coarse = envelope_lag(bands_of(sweeps, radar, window_m, taper=0.0), 4) / 2
+    phase, integer, slips = _unwrapped(phases, weights, coarse, bands, unwrap)
+    doppler = (integer - phase / (2 * math.pi)) / radar.sweep_s
+    need = GRADIENT_SNR_DB if unwrap == "gradient" else LEAST_SNR_DB
+    info = {"phase_rad": phase, "integer": integer + bands.shift, "slips": slips, "weights": weights, "dispersion": _dispersion(bands)}
+    return velocity_estimate(from_beats(doppler, -doppler, bands), bands, pulse, factor=4.0, azimuth_m=azimuth_m, need_db=need, **info)
+
+
+def _halves(bands: Bands, padding: int, hann: bool) -> tuple[Tensor, ...]:
+    """Spectra of the first and second halves of up and mirrored down sweeps, each (..., pulse, bin), phases referenced alike."""
+    h = bands.time_s.shape[-1] // 2
+    window = torch.hann_window(h, periodic=False, dtype=bands.up.real.dtype, device=bands.up.device) if hann else None
+    parts = [x[..., half] for x in (bands.up, bands.down) for half in (slice(0, h), slice(h, 2 * h))]
+    up1, up2, down1, down2 = (torch.fft.fft(x if window is None else x * window, padding * h) for x in parts)
+    # halves of the conjugated down sweep are the conjugate halves of the mirrored one in the other order
+    return up1, up2, down2, down1
+
+
+def _power(*parts: Tensor) -> Tensor:
+    total = torch.zeros_like(parts[0].real)
+    for x in parts:
+        total = total + x.real.square() + x.imag.square()
+    return total
+
+
+def _summed(halves: tuple[Tensor, ...], sought: Tensor) -> tuple[Tensor, Tensor]:
+    """Phase (..., 1, pulse) between the products of up and down spectra, each summed over the bins sought, of the two halves, and its weight (..., 1).
+
+    Summed before the halves meet: each product is the power spectrum of the scene times one phasor, whatever the scene.
+    """
+    up1, up2, down1, down2 = (x[..., sought] for x in halves)
+    product = (up1 * down2.conj()).sum(-1) * (up2 * down1.conj()).sum(-1).conj()
+    phase = torch.angle(product).to(torch.float64)[..., None, :]
+    return phase, torch.ones_like(phase[..., 0])
+
+
+def _at_peaks(halves: tuple[Tensor, ...], sought: Tensor, padding: int, scatterers: int) -> tuple[Tensor, Tensor]:
+    """Phases (..., scatterer, pulse) at the own peaks of up and down spectra, and the weights (..., scatterer) of Eq. (18)."""
+    up1, up2, down1, down2 = halves
+    up, down = _power(up1, up2), _power(down1, down2)
+    places = _strongest(torch.where(sought, (up + down).detach().mean(-2), -1), scatterers, padding)
+    reach = max(1, padding)
+    phases, weights = [], []
+    for place in places.unbind(-1):
+        at_up, at_down = (_own_peak(power.detach(), place, reach) for power in (up, down))
+        turn = _picked(up1 * up2.conj(), at_up) * _picked(down1 * down2.conj(), at_down)
+        phases.append(torch.angle(turn).to(torch.float64))
+        weights.append(_contrast_about((up + down).detach().sqrt(), place, reach))
+    weight = torch.stack(weights, -1).to(torch.float64)
+    return torch.stack(phases, -2), weight / weight.sum(-1, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
+
+
+def _strongest(profile: Tensor, count: int, apart: int) -> Tensor:
+    """Bins (..., count) of the greatest values of a circular profile (..., n), `apart` bins or more from each other."""
+    n = profile.shape[-1]
+    left, found = profile.clone(), []
+    index = torch.arange(n, device=profile.device)
+    for _ in range(count):
+        best = left.argmax(-1, keepdim=True)
+        found.append(best)
+        away = ((index - best + n // 2) % n - n // 2).abs()
+        left = torch.where(away < 2 * apart, torch.full_like(left, -1.0), left)
+    return torch.cat(found, -1)
+
+
+def _own_peak(power: Tensor, place: Tensor, reach: int) -> Tensor:
+    """Bin (..., pulse) of the greatest power (..., pulse, n) within `reach` bins of a place (...,)."""
+    n = power.shape[-1]
+    near = (place[..., None] + torch.arange(-reach, reach + 1, device=power.device)) % n
+    near = near[..., None, :].expand(*power.shape[:-1], -1)
+    best = power.gather(-1, near).argmax(-1, keepdim=True)
+    return near.gather(-1, best)[..., 0]
+
+
+def _picked(x: Tensor, index: Tensor) -> Tensor:
+    return x.gather(-1, index[..., None])[..., 0]
+
+
+def _contrast_about(amplitude: Tensor, place: Tensor, reach: int) -> Tensor:
+    """Standard deviation over mean of the amplitudes (..., pulse, n) in a window about a place (...,): Eq. (18) made scale invariant (erratum 10)."""
+    n = amplitude.shape[-1]
+    near = (place[..., None] + torch.arange(-4 * reach, 4 * reach + 1, device=amplitude.device)) % n
+    part = amplitude.gather(-1, near[..., None, :].expand(*amplitude.shape[:-1], -1))
+    mean = part.mean((-2, -1))
+    spread = (part - mean[..., None, None]).square().mean((-2, -1)).sqrt()
+    return torch.where(mean > 0, spread / torch.where(mean > 0, mean, 1), 0)
+
+
+def _unwrapped(phases: Tensor, weights: Tensor, coarse: Tensor, bands: Bands, unwrap: Unwrap) -> tuple[Tensor, Tensor, Tensor]:
+    """One phase and its integer a period, (..., pulse) each, and the count of disagreements (...,). coarse: fd T of the envelopes beyond the shift."""
+    turn = 2 * math.pi
+    integer = torch.round(coarse[..., None, :] + phases.detach() / turn)
+    own = ((phases - turn * integer) * weights[..., None]).sum(-2)  # phase less whole turns, weighted: fd T = -own / 2 pi
+    step = (_wrapped(phases.diff(dim=-1)) * weights[..., None]).sum(-2)
+    beyond = own - turn * bands.shift.to(torch.float64)  # with the shift, which the gradient does not see
+    both = bands.lit[..., 1:] & bands.lit[..., :-1]
+    step = torch.where(both, step, beyond.diff(dim=-1))
+    gradient = torch.cat([torch.zeros_like(step[..., :1]), step.cumsum(-1)], -1)
+    first = bands.lit.to(torch.int8).argmax(-1, keepdim=True)
+    gradient = gradient + (beyond - gradient).gather(-1, first)
+    slips = ((torch.round((gradient - beyond).detach() / turn).diff(dim=-1) != 0) & both).sum(-1).to(torch.float64)
+    chosen = gradient + turn * bands.shift.to(torch.float64) if unwrap == "gradient" else own
+    whole = -torch.round(chosen.detach() / turn)
+    return chosen + turn * whole, whole, slips
+
+
+def _wrapped(x: Tensor) -> Tensor:
+    return x - 2 * math.pi * torch.round(x.detach() / (2 * math.pi))
+
+
+def _dispersion(bands: Bands) -> Tensor:
+    """Standard deviation over mean, over periods, of the amplitude in the window: how unsteady the echo is, (...,)."""
+    level = bands.up.detach().abs().mean(-1).to(torch.float64)
+    mean = level.mean(-1)
+    return torch.where(mean > 0, level.std(-1, correction=0) / torch.where(mean > 0, mean, 1), 0)

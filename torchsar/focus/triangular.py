@@ -1,0 +1,148 @@
+"""From dechirped triangular sweeps to a focused image: range compression, azimuth deramp, azimuth matched filter."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Axis, Signal, Stage, unit_phasor
+from torchsar.radar import TriangularLadar
+
+Ramp = Literal["up", "down"]
+_EPOCH = {"up": 0.25, "down": 0.75}
+
+
+def video_filter(frequency_hz: Tensor, radar: TriangularLadar, ramp: Ramp = "up") -> Tensor:
+    """exp(+j pi f^2 / K) for beats of the up sweep, its conjugate for the down sweep, complex128: takes out the residual video phase (paper, Eq. 5, erratum 2)."""
+    turns = frequency_hz.square() / (2 * radar.chirp_rate_hz_s)
+    return unit_phasor(turns if ramp == "up" else -turns, torch.complex128)
+
+
+def compress_sweeps(sweeps: Tensor, radar: TriangularLadar, ramp: Ramp = "up", video: bool = True) -> Tensor:
+    """Range profiles (..., pulse, N) of the up or the down sweeps, relative range rising from -(N // 2) cells.
+
+    sweeps: (..., 2, pulse, N) in the radar's dechirp sign; the result is in the sign of the paper, phase +4 pi RD / lambda. A scatterer of amplitude a has
+    a peak a. video: take out the residual video phase, -pi K dtau^2 of the up sweep; after motion compensation, not before (brief 000, section 3).
+    Spectra refer to the middle of the sweep. Differentiable. Raises ValueError for sweeps of another shape.
+    """
+    n = radar.sweep_samples
+    if not sweeps.is_complex() or sweeps.ndim < 3 or sweeps.shape[-3] != 2 or sweeps.shape[-1] != n:
+        raise ValueError(f"compress_sweeps works on complex sweeps (..., 2, pulse, {n}), got {sweeps.dtype} of shape {tuple(sweeps.shape)}")
+    if ramp not in _EPOCH:
+        raise ValueError(f"ramp must be 'up' or 'down', got {ramp!r}")
+    data = sweeps[..., 0, :, :] if ramp == "up" else sweeps[..., 1, :, :].flip(-1)
+    if radar.dechirp_sign == "echo_conj_lo":
+        data = data.conj()
+    line = torch.arange(n, dtype=torch.float64, device=sweeps.device) - n // 2
+    factor = unit_phasor(line * (n - 1) / (2 * n), torch.complex128) / n
+    if video:
+        factor = factor * video_filter(line / radar.sweep_s, radar, ramp)
+    return torch.fft.fftshift(torch.fft.fft(data), dim=-1) * factor.to(sweeps.dtype)
+
+
+def profile_axes(pulse: Axis, radar: TriangularLadar, ramp: Ramp = "up") -> tuple[Axis, Axis]:
+    """Axes of range profiles: slow time of the middles of the sweeps (s), relative range (m)."""
+    n = radar.sweep_samples
+    middle = Axis("pulse", pulse.n, pulse.start + _EPOCH[ramp] * radar.period_s, pulse.step, "s")
+    return middle, Axis("range", n, -(n // 2) * radar.range_step_m, radar.range_step_m, "m")
+
+
+def azimuth_turns(pulse: Axis, range_: Axis, radar: TriangularLadar, device: torch.device | str | None = None) -> Tensor:
+    """Turns 2 (sqrt(R^2 + (V t)^2) - R) / lambda of a scatterer at azimuth zero, (pulse, range) float64, R = reference + relative range."""
+    across = (radar.speed_m_s * pulse.values(device))[:, None].square()
+    r = radar.reference_range_m + range_.values(device)
+    if bool((r <= 0).any()):
+        raise ValueError(f"the range axis reaches {float(r.min()):.4g} m from the ladar; crop it to ranges in front of the ladar")
+    return 2 / radar.wavelength_m * across / (torch.sqrt(r.square() + across) + r)
+
+
+def deramp_azimuth(data: Tensor, radar: TriangularLadar, pulse: Axis, range_: Axis) -> Tensor:
+    """Profiles (..., pulse, range) without the azimuth phase of a scatterer at azimuth zero; one at x keeps a tone of -2 V x / (lambda R) Hz.
+
+    pulse: slow time of the samples (middles of the sweeps), zero abeam. What estimators of a phase per pulse need. Differentiable.
+    """
+    return data * unit_phasor(-azimuth_turns(pulse, range_, radar, data.device), data.dtype)
+
+
+def azimuth_matched_filter(data: Tensor, radar: TriangularLadar, pulse: Axis, range_: Axis, beam_rad: float | None = None) -> Tensor:
+    """Image (..., azimuth, range) of deramped profiles (..., pulse, range): sum over the aperture of s(t) exp(-j 2 pi (V t - x)^2 / (lambda R)) at x = V t.
+
+    beam_rad: azimuth angle of the aperture, beam_rad * R long about every x, by default the radar's, and the whole record where that is None. A
+    scatterer that is lit all over its aperture keeps its amplitude. Exact phases of every range cell; no wrap-around. Differentiable.
+    Raises ValueError for a target that stands still.
+    """
+    if not radar.speed_m_s > 0:
+        raise ValueError("radar.speed_m_s is 0; a target that does not move across the line of sight has no azimuth image")
+    n = data.shape[-2]
+    half = _half_aperture(radar, pulse, range_, beam_rad)
+    turns = azimuth_turns(pulse, range_, radar, data.device)
+    lag = torch.arange(-(n - 1), n, device=data.device)
+    across = (radar.speed_m_s * pulse.step * lag.to(torch.float64))[:, None].square()
+    r = radar.reference_range_m + range_.values(data.device)
+    inside = lag[:, None].abs() <= half
+    filter_ = unit_phasor(-2 / radar.wavelength_m * across / (torch.sqrt(r.square() + across) + r), data.dtype) * inside
+    length = 2 ** math.ceil(math.log2(2 * n - 1 + n - 1))
+    spectrum = torch.fft.fft(data * unit_phasor(turns, data.dtype), length, dim=-2) * torch.fft.fft(filter_, length, dim=-2)
+    image = torch.fft.ifft(spectrum, dim=-2)[..., n - 1 : 2 * n - 1, :]
+    return image / torch.minimum(2 * half + 1, torch.full_like(half, n)).to(data.real.dtype)
+
+
+def _half_aperture(radar: TriangularLadar, pulse: Axis, range_: Axis, beam_rad: float | None) -> Tensor:
+    """Pulses to either side of the middle of the aperture, (range,) int64."""
+    beam = radar.beam_rad if beam_rad is None else beam_rad
+    r = radar.reference_range_m + range_.values()
+    if beam is None:
+        return torch.full((range_.n,), pulse.n, dtype=torch.int64)
+    if not beam > 0:
+        raise ValueError(f"beam_rad must be a positive angle or None, got {beam}")
+    return torch.floor(beam * r / (2 * radar.speed_m_s * pulse.step)).to(torch.int64).clamp_min(0)
+
+
+class CompressSweeps(Stage):
+    """`compress_sweeps` of one ramp; window_m: keep only these relative ranges (low, high)."""
+
+    works_on = ("ramp", "pulse", "fast_time")
+
+    def __init__(self, radar: TriangularLadar, ramp: Ramp = "up", video: bool = True, window_m: tuple[float, float] | list[float] | None = None) -> None:
+        super().__init__()
+        if ramp not in _EPOCH:
+            raise ValueError(f"ramp must be 'up' or 'down', got {ramp!r}")
+        self.radar, self.ramp, self.video, self.window_m = radar, ramp, video, window_m
+
+    def forward(self, signal: Signal) -> Signal:
+        axes = profile_axes(signal.axis("pulse"), self.radar, self.ramp)
+        out = Signal(compress_sweeps(signal.data, self.radar, self.ramp, self.video), axes)
+        if self.window_m is None:
+            return out
+        low, high = (round(float(axes[1].index_of(edge))) for edge in self.window_m)
+        if not 0 <= low < high < axes[1].n:
+            raise ValueError(f"window_m {tuple(self.window_m)} does not lie in the relative ranges {axes[1].start:.4g}..{axes[1].stop:.4g} m")
+        return out.crop(range=(low, high + 1))
+
+
+class DerampAzimuth(Stage):
+    """`deramp_azimuth`."""
+
+    def __init__(self, radar: TriangularLadar) -> None:
+        super().__init__()
+        self.radar = radar
+
+    def forward(self, signal: Signal) -> Signal:
+        return signal.with_data(deramp_azimuth(signal.data, self.radar, *signal.axes))
+
+
+class AzimuthMatchedFilter(Stage):
+    """`azimuth_matched_filter`: deramped profiles in, an image (azimuth, range) in metres out."""
+
+    def __init__(self, radar: TriangularLadar, beam_rad: float | None = None) -> None:
+        super().__init__()
+        self.radar, self.beam_rad = radar, beam_rad
+
+    def forward(self, signal: Signal) -> Signal:
+        pulse, range_ = signal.axes
+        image = azimuth_matched_filter(signal.data, self.radar, pulse, range_, self.beam_rad)
+        v = self.radar.speed_m_s
+        return Signal(image, (Axis("azimuth", pulse.n, v * pulse.start, v * pulse.step, "m"), range_))

@@ -1,0 +1,122 @@
+"""`torchsar run` for triangular-sweep ladars: every case, simulated over trials, by every method."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Draws, Signal
+from torchsar.study.build import resolved
+from torchsar.study.cases import cases_of, key_of, methods_tree
+from torchsar.study.config import Loaded, check_methods
+from torchsar.study.errors import ConfigError
+from torchsar.study.folder import fresh_folder, write_arrays, write_json
+from torchsar.study.montecarlo.record import OK
+from torchsar.study.sal.build import check
+from torchsar.study.sal.figures import CaseResult, draw
+from torchsar.study.sal.judge import DEFINITIONS
+from torchsar.study.sal.report import write_report
+from torchsar.study.sal.requires import heed_limits
+from torchsar.study.sal.trials import ENDING, Batch, SalTrials, run_batch
+from torchsar.study.tracing import refuse_no_image, summary
+
+__all__ = ["check", "run"]
+log = logging.getLogger("torchsar")
+_BATCH_BYTES = 256 << 20
+
+
+def run(loaded: Loaded, out: Path, command: str = "torchsar run") -> Path:
+    """Run every method on every case and write config.yaml, metrics.json, arrays.zarr, figures/ and report.html into OUT.
+
+    OUT appears whole or not at all. Returns the path of the report. Raises ConfigError for whatever the user can put right, limits that the
+    scene exceeds among it.
+    """
+    began = time.perf_counter()
+    with fresh_folder(out) as folder:
+        check_methods(loaded.config, loaded.file)
+        check(loaded)
+        cases = cases_of(loaded)
+        for name, case in cases.items():
+            heed_limits(case, name)
+        results = {name or "all": _case(case, name) for name, case in cases.items()}
+        metrics = metrics_tree(loaded, results)
+        config_text = loaded.text(resolved(loaded))
+        (folder / "config.yaml").write_text(config_text, encoding="utf-8")
+        write_json(folder / "metrics.json", metrics)
+        write_arrays(folder / "arrays.zarr", _images(results), _truths(results), _estimates(results))
+        pictures = draw(results, folder / "figures")
+        write_report(folder / "report.html", loaded.config.title, metrics, pictures, folder / "figures", config_text, command)
+    log.info("finished in %.0f s", time.perf_counter() - began)
+    return out / "report.html"
+
+
+def _case(loaded: Loaded, name: str) -> CaseResult:
+    """One case; what simulation or methods refuse is a ConfigError that names it."""
+    started = time.perf_counter()
+    try:
+        result = _simulated(loaded, name)
+    except (ValueError, TypeError, KeyError, RuntimeError) as error:
+        text, place = " ".join(str(error).split()), f"{loaded.file}: {f'cases.{name}: ' if name else ''}"
+        raise ConfigError(text if text.startswith(loaded.file) else f"{place}{text}") from error
+    log.info("%s: %.1f s", name or loaded.name, time.perf_counter() - started)
+    return result
+
+
+@torch.no_grad()
+def _simulated(loaded: Loaded, name: str) -> CaseResult:
+    """All trials of one case, a few at a time; scenes and noise of a case depend on the seed and on nothing else."""
+    trials, count = SalTrials(loaded), loaded.config.world.trials
+    bench = trials.bench({})
+    height = max(1, min(count, _BATCH_BYTES // trials.bytes_per_trial({})))
+    parts: list[Batch] = []
+    for begin in range(0, count, height):
+        batch = run_batch(bench, Draws(loaded.config.seed, "run", range(begin, min(begin + height, count))))
+        for method, outcome in batch.outcomes.items():
+            refuse_no_image(method, outcome.last, ENDING)
+        parts.append(batch if not parts else batch.without_signals())
+    result = CaseResult.of(bench, parts)
+    _warn_of_doubt(name, result.metrics, count)
+    return result
+
+
+def _warn_of_doubt(name: str, metrics: Mapping[str, Mapping[str, Tensor]], count: int) -> None:
+    verdicts = metrics["recommended"].get(OK)
+    doubted = 0 if verdicts is None else int((~verdicts).sum())
+    if doubted:
+        log.warning("warning: %srecommended does not trust its estimate in %d of %d trials", f"{name}: " if name else "", doubted, count)
+
+
+def metrics_tree(loaded: Loaded, results: Mapping[str, CaseResult]) -> dict[str, Any]:
+    """The content of metrics.json: by method, means over all cases as `metrics`, every case under `cases`, and responses of point targets by `case/target`."""
+    methods = methods_tree(loaded, {case: summary(result.metrics) for case, result in results.items()})
+    for name, method in methods.items():
+        for case, result in results.items():
+            rows = summary(result.targets[name])
+            method["targets"].update({target if case == "all" else f"{case}/{target}": row for target, row in rows.items()})
+    settings = loaded.config.metrics
+    definitions = {**DEFINITIONS, "islr_extent_nulls": settings.sidelobe_nulls, "reference": settings.reference, "target": settings.target}
+    return {"methods": methods, "published": settings.published, "truth": {}, "definitions": definitions, "trials": loaded.config.world.trials}
+
+
+def _images(results: Mapping[str, CaseResult]) -> dict[str, Signal]:
+    return {key_of(case, name): image for case, result in results.items() for name, image in result.images.items()}
+
+
+def _truths(results: Mapping[str, CaseResult]) -> dict[str, Tensor]:
+    return {key_of(case, name): value for case, result in results.items() for name, value in result.truth.items()}
+
+
+def _estimates(results: Mapping[str, CaseResult]) -> dict[str, dict[str, Tensor]]:
+    """Velocities and range errors of the first trial, by method."""
+    found: dict[str, dict[str, Tensor]] = {}
+    for case, result in results.items():
+        for name, course in result.courses.items():
+            values = {"range_error_m": course.error_m, **({} if course.velocity_m_s is None else {"velocity_m_s": course.velocity_m_s})}
+            found.setdefault(name, {}).update({key_of(case, key): value for key, value in values.items()})
+    return found

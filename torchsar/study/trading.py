@@ -1,0 +1,49 @@
+"""What the tables of `torchsar trade` have in common: timing, and the folder that they are written into."""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from matplotlib.figure import Figure
+
+from torchsar import plot
+from torchsar.study.build import resolved
+from torchsar.study.config import Loaded
+from torchsar.study.folder import fresh_folder, write_json
+
+Result = TypeVar("Result")
+
+
+def timed(work: Callable[[], Result], repeats: int) -> tuple[Result, list[float]]:
+    """The last result of `work`, and the seconds of every repeat."""
+    times = []
+    for _ in range(repeats - 1):
+        began = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - began)
+    began = time.perf_counter()
+    result = work()
+    return result, [*times, time.perf_counter() - began]
+
+
+def written(loaded: Loaded, out: Path | None, tables: Callable[[], Mapping[str, Sequence[Any]]], text: Callable[[Mapping[str, Sequence[Any]]], str], figures: Callable[[Mapping[str, Sequence[Any]]], Mapping[str, Figure]]) -> str:
+    """The text of the tables; with `out` also config.yaml, trade.json, trade.txt and figures/trade_NAME.png in that folder. Rows are dataclasses."""
+    if out is None:
+        return text(tables())
+    with fresh_folder(out) as folder:
+        found = tables()
+        said = text(found)
+        (folder / "config.yaml").write_text(loaded.text(resolved(loaded)), encoding="utf-8")
+        (folder / "trade.txt").write_text(said + "\n", encoding="utf-8")
+        machine = {"machine": platform.processor() or platform.machine(), "torch": torch.__version__, "threads": torch.get_num_threads(), "seed": loaded.config.seed}
+        write_json(folder / "trade.json", {**{key: [asdict(row) for row in rows] for key, rows in found.items()}, "made_on": machine})
+        (folder / "figures").mkdir()
+        for name, figure in figures(found).items():
+            plot.save(figure, folder / "figures" / f"trade_{name}.png")
+    return f"{said}\n{out}"
