@@ -18,6 +18,7 @@ from torchsar.study.config import Loaded
 from torchsar.study.folder import fresh_folder, write_json
 
 Result = TypeVar("Result")
+Tables = Mapping[str, Sequence[Any]]
 
 
 def timed(work: Callable[[], Result], repeats: int) -> tuple[Result, list[float]]:
@@ -32,7 +33,13 @@ def timed(work: Callable[[], Result], repeats: int) -> tuple[Result, list[float]
     return result, [*times, time.perf_counter() - began]
 
 
-def written(loaded: Loaded, out: Path | None, tables: Callable[[], Mapping[str, Sequence[Any]]], text: Callable[[Mapping[str, Sequence[Any]]], str], figures: Callable[[Mapping[str, Sequence[Any]]], Mapping[str, Figure]]) -> str:
+def written(
+    loaded: Loaded,
+    out: Path | None,
+    tables: Callable[[], Mapping[str, Sequence[Any]]],
+    text: Callable[[Mapping[str, Sequence[Any]]], str],
+    figures: Callable[[Mapping[str, Sequence[Any]]], Mapping[str, Figure]],
+) -> str:
     """The text of the tables; with `out` also config.yaml, trade.json, trade.txt and figures/trade_NAME.png in that folder. Rows are dataclasses."""
     if out is None:
         return text(tables())

@@ -97,13 +97,15 @@ def inside(radar: TriangularLadar, window_m: tuple[float, float] | None, bins: i
 def bulk_shift(power: Tensor) -> tuple[Tensor, Tensor]:
     """Doppler shift of every period in whole bins, and whether an echo is there to tell it. power: (..., 2, pulse, N) -> (..., pulse) int64 and bool.
 
-    power[..., r, k, :] is |FFT|^2 with zero frequency first, the down sweep mirrored already. Envelopes of 8 periods are added before they are
+    power[..., r, k, :] is |FFT|^2 with zero frequency first, the down sweep as recorded. Envelopes of 8 periods are added before they are
     correlated; the lag that makes up and down envelopes meet is 2 fd (brief 000, section 5.4). Lags beyond half the band, which a circular correlation
     would wrap, are told apart. Periods in which the envelopes do not resemble each other take the shift of their neighbours.
     """
     n, pulses = power.shape[-1], power.shape[-2]
     block = min(_BLOCK, pulses)
-    blocks = torch.stack([part.mean(-2) for part in torch.fft.fftshift(power, dim=-1).split(block, -2)], -2)
+    blocks = torch.stack([part.mean(-2) for part in power.split(block, -2)], -2)
+    blocks = torch.stack([blocks[..., 0, :, :], blocks[..., 1, :, :].roll(-1, -1).flip(-1)], -3)
+    blocks = torch.fft.fftshift(blocks, dim=-1)
     blocks = blocks - blocks.mean(-1, keepdim=True)
     level = blocks.square().sum(-1).clamp_min(torch.finfo(blocks.dtype).tiny).sqrt()
     blocks = blocks / level[..., None]
@@ -156,16 +158,17 @@ def bands_of(sweeps: Tensor, radar: TriangularLadar, window_m: tuple[float, floa
     first, lines = window_lines(radar, window_m)
     n = radar.sweep_samples
     data = canonical(sweeps, radar)
-    spectrum = torch.fft.fft(torch.stack([data[..., 0, :, :], data[..., 1, :, :].flip(-1)], -3))
+    spectrum = torch.fft.fft(data)
     shift, alike = bulk_shift(_smooth_power(spectrum.detach()))
     m = 2 ** max(3, math.ceil(math.log2(oversampling * lines)))
     line = torch.arange(lines, device=sweeps.device)
     sides = torch.stack([shift, -shift], -2)
-    bins = (first + line + sides[..., None]) % n
-    kept = spectrum.gather(-1, bins)
+    mirror = torch.tensor([1, -1], device=sweeps.device)[:, None, None]  # a mirrored sweep has the mirrored spectrum
+    kept = spectrum.gather(-1, mirror * (first + line + sides[..., None]) % n)
     shape = _raised_cosine(line.to(torch.float64), lines, taper if window_m is not None else 0.0)
-    filters = torch.stack([shape.to(kept.dtype) * _line_phase(first, lines, m, 0 if video else sign, radar, kept) for sign in (1, -1)])
-    turned = cis((math.pi * (first + sides).to(torch.float64) * ((n - 1) / n) % (2 * math.pi)).to(real_dtype(kept.dtype)))
+    filters = torch.stack([shape.to(kept.dtype) * _line_phase(first, lines, m, sign, not video, radar, kept) for sign in (1, -1)])
+    middle = mirror[..., 0] * (first + sides).to(torch.float64)  # phases refer to the middle of the sweep
+    turned = cis((math.pi * middle * ((n - 1) / n) % (2 * math.pi)).to(real_dtype(kept.dtype)))
     series = torch.fft.ifft(kept * filters[:, None, :] * turned[..., None], m) * (m / n)
     beat = _beat_of_first(first, m, sweeps)
     series = series * beat.to(series.dtype)
@@ -183,16 +186,20 @@ def _faint(up: Tensor, down: Tensor, alike: Tensor) -> Tensor:
 
 def _smooth_power(spectrum: Tensor) -> Tensor:
     """Power spectra of Hann-windowed sweeps: on the bins of a rectangular one, a peak between two of them loses more than half."""
-    windowed = spectrum - (spectrum.roll(1, -1) + spectrum.roll(-1, -1)) / 2
-    return windowed.real.square() + windowed.imag.square()
+    windowed = spectrum.clone()
+    windowed[..., 1:].sub_(spectrum[..., :-1], alpha=0.5)
+    windowed[..., :-1].sub_(spectrum[..., 1:], alpha=0.5)
+    windowed[..., 0].sub_(spectrum[..., -1], alpha=0.5)
+    windowed[..., -1].sub_(spectrum[..., 0], alpha=0.5)
+    return torch.addcmul(windowed.real.square(), windowed.imag, windowed.imag)
 
 
-def _line_phase(first: int, lines: int, m: int, sign: int, radar: TriangularLadar, like: Tensor) -> Tensor:
-    """Per line: removal of the residual video phase, and the half-sample offset between the grids of n and of m samples."""
+def _line_phase(first: int, lines: int, m: int, sign: int, remove_video: bool, radar: TriangularLadar, like: Tensor) -> Tensor:
+    """Per line of the up (sign 1) or mirrored down sweep (-1): removal of the residual video phase, and the half-sample offset between the grids of n and of m samples."""
     j = torch.arange(lines, dtype=torch.float64, device=like.device)
     beat_hz = (first + j) / radar.sweep_s
-    video = sign * math.pi * beat_hz.square() / radar.chirp_rate_hz_s
-    offset = math.pi * j * (1 / m - 1 / radar.sweep_samples)
+    video = sign * remove_video * math.pi * beat_hz.square() / radar.chirp_rate_hz_s
+    offset = math.pi * j * (1 / m - sign / radar.sweep_samples)
     return torch.exp(1j * ((video + offset) % (2 * math.pi))).to(like.dtype)
 
 

@@ -54,7 +54,7 @@ def mirror_velocity(bands: Bands, intercept: Intercept) -> tuple[Tensor, dict[st
     z = bands.product()[..., inner]
     z = z / z.detach().abs().mean(-1, keepdim=True).clamp_min(torch.finfo(z.real.dtype).tiny)
     z = z * _of_shift(bands, u, z)
-    free = _slope(z, u, bands)
+    free = _slope(z, u, bands, 1 if intercept == "known" else _NEWTON)
     if intercept == "free":
         return bands.shift_m_s + free, {}
     if intercept == "known":
@@ -78,10 +78,10 @@ def _weights(u: Tensor, bands: Bands) -> Tensor:
 
 
 def _turned(z: Tensor, u: Tensor, v: Tensor, bands: Bands) -> Tensor:
-    return z * cis(-(v[..., None] * _weights(u, bands)).to(z.real.dtype))
+    return z * cis(-v[..., None].to(z.real.dtype) * _weights(u, bands).to(z.real.dtype))
 
 
-def _slope(z: Tensor, u: Tensor, bands: Bands) -> Tensor:
+def _slope(z: Tensor, u: Tensor, bands: Bands, steps: int) -> Tensor:
     """The velocity of greatest |sum z exp(-j w v)|, (..., pulse): the peak of a padded transform, then Newton steps."""
     n, per = z.shape[-1], 4 * bands.radar.carrier_hz / bands.radar.wave_speed_m_s
     spectrum = torch.fft.fft(z.detach(), _PAD * n)
@@ -91,8 +91,8 @@ def _slope(z: Tensor, u: Tensor, bands: Bands) -> Tensor:
     best = best + _parabola(power, best)
     v = best.to(torch.float64) / (_PAD * n * float(u[1] - u[0]) * per)
     w = (2 * math.pi * per * u).to(z.real.dtype)
-    for _ in range(_NEWTON):
-        turned = z * cis(-(v[..., None] * w.to(torch.float64)).to(z.real.dtype))
+    for _ in range(steps):
+        turned = z * cis(-v[..., None].to(w.dtype) * w)
         s0, s1, s2 = turned.sum(-1), (turned * w).sum(-1), (turned * w * w).sum(-1)
         gradient = 2 * (s0.conj() * s1).imag
         bend = 2 * (s1.real.square() + s1.imag.square() - (s0.conj() * s2).real)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -12,11 +13,12 @@ from torchsar.compensate.radial.bands import Bands, bands_of, inside, refuse_oth
 from torchsar.compensate.radial.correlation import envelope_lag
 from torchsar.compensate.radial.peak import from_beats
 from torchsar.compensate.radial.verdict import GRADIENT_SNR_DB, LEAST_SNR_DB, velocity_estimate
-from torchsar.core import Axis, Estimate
+from torchsar.core import Axis, Estimate, cis
 from torchsar.radar import TriangularLadar
 
 Bins = Literal["peak", "sum"]
 Unwrap = Literal["gradient", "per_pulse"]
+_SUM_UPSAMPLING = 20
 
 
 def segmented_interference(
@@ -52,10 +54,10 @@ def segmented_interference(
         raise ValueError(f"scatterers must be 1 or more and padding 1..16, both whole numbers, got {scatterers} and {padding}")
     window_lines(radar, window_m)
     bands = bands_of(sweeps, radar, video=bins == "peak")
-    spectra = _halves(bands, padding, hann)
+    coarse = envelope_lag(bands_of(sweeps, radar, window_m, taper=0.0), _SUM_UPSAMPLING if bins == "sum" else 4) / 2
+    spectra = _halves(_shifted(bands, coarse) if bins == "sum" else bands, padding, hann)
     sought = inside(radar, window_m, spectra[0].shape[-1], padding / 2, sweeps.device)
-    phases, weights = _summed(spectra, sought) if bins == "sum" else _at_peaks(spectra, sought, padding, scatterers)
-    coarse = envelope_lag(bands_of(sweeps, radar, window_m, taper=0.0), 4) / 2
+    phases, weights = _summed(spectra, sought, coarse) if bins == "sum" else _at_peaks(spectra, sought, padding, scatterers)
     phase, integer, slips = _unwrapped(phases, weights, coarse, bands, unwrap)
     doppler = (integer - phase / (2 * math.pi)) / radar.sweep_s
     need = GRADIENT_SNR_DB if unwrap == "gradient" else LEAST_SNR_DB
@@ -80,14 +82,22 @@ def _power(*parts: Tensor) -> Tensor:
     return total
 
 
-def _summed(halves: tuple[Tensor, ...], sought: Tensor) -> tuple[Tensor, Tensor]:
+def _shifted(bands: Bands, shift: Tensor) -> Bands:
+    """The bands with a further Doppler shift in bins, (..., pulse), taken out."""
+    angle = 2 * math.pi * shift[..., None] * (bands.time_s / bands.radar.sweep_s)
+    turn = cis(angle.to(bands.up.real.dtype))
+    return replace(bands, up=bands.up * turn.conj(), down=bands.down * turn)
+
+
+def _summed(halves: tuple[Tensor, ...], sought: Tensor, coarse: Tensor) -> tuple[Tensor, Tensor]:
     """Phase (..., 1, pulse) between the products of up and down spectra, each summed over the bins sought, of the two halves, and its weight (..., 1).
 
-    Summed before the halves meet: each product is the power spectrum of the scene times one phasor, whatever the scene.
+    Summed before the halves meet: each product is the power spectrum of the scene times one phasor, whatever the scene, once the Doppler shift
+    `coarse` (bins) is out; that of a dense scene would else decide where in its half the phase is read. The phase is given back what was taken out.
     """
     up1, up2, down1, down2 = (x[..., sought] for x in halves)
     product = (up1 * down2.conj()).sum(-1) * (up2 * down1.conj()).sum(-1).conj()
-    phase = torch.angle(product).to(torch.float64)[..., None, :]
+    phase = (torch.angle(product).to(torch.float64) - 2 * math.pi * coarse)[..., None, :]
     return phase, torch.ones_like(phase[..., 0])
 
 

@@ -11,18 +11,19 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.radial import integrated_range, sweep_middles
-from torchsar.core import Axis, Chain, Signal, Trace, Truth
+from torchsar.core import Axis, Chain, Signal, Trace, Truth, unit_phasor
 from torchsar.metrics import contrast, entropy, impulse_response
 from torchsar.radar import TriangularLadar
 
 SWEEPS = ("ramp", "pulse", "fast_time")
+_LEADING = 10 ** (-10 / 20)
 DEFINITIONS: dict[str, Any] = {
     "snr": "per sample before any compression, of a scatterer of amplitude 1 against the variance of the complex noise, dB",
-    "velocity_rmse_m_s": "rms over periods of the estimated minus the true radial velocity of the motion at the turning points, receding positive",
+    "velocity_rmse_m_s": "rms over periods with a lit scatterer (within 10 dB of the strongest) of the estimated minus the true radial velocity of the motion at the turning points, receding positive",
     "range_error": "estimated minus true motion at the middles of the up sweeps: integral of the velocity that was compensated plus lambda / (4 pi) times the phases that "
     "were taken out of pulses, known modulo a turn and unwrapped along pulses against the truth",
-    "range_error_max_m": "largest distance of the range error from its value at the first pulse",
-    "range_error_detrended_rms_m": "rms of the range error without constant and slope, which only turn and shift the image",
+    "range_error_max_m": "largest distance of the range error from its value at the first lit pulse, over lit pulses",
+    "range_error_detrended_rms_m": "rms over lit pulses of the range error without constant and slope, which only turn and shift the image",
     "residual_phase_rms_rad": "4 pi / lambda times range_error_detrended_rms_m",
     "entropy_nats": "-sum p ln p, p = |I|^2 / sum |I|^2 over the whole image, nats",
     "entropy_above_ideal_nats": "entropy less that of the same scene and noise without motion",
@@ -40,42 +41,64 @@ DEFINITIONS: dict[str, Any] = {
 @dataclass(frozen=True)
 class Course:
     """What a method says of the motion. velocity_m_s: (..., pulse) at the turning points, None where it estimates none; pulse: starts of the periods;
-    error_m: (..., pulse) range error at the middles of the up sweeps; coarse_m: the same without the phases taken out of pulses."""
+    error_m: (..., pulse) range error at the middles of the up sweeps; coarse_m: the same without the phases taken out of pulses; lit: bool (..., pulse)."""
 
     pulse: Axis
     velocity_m_s: Tensor | None
     velocity_error_m_s: Tensor | None
     error_m: Tensor
     coarse_m: Tensor
+    lit: Tensor
 
     @property
     def detrended_m(self) -> Tensor:
-        """Range error without constant and slope, (..., pulse)."""
-        return self.error_m - _line(self.error_m)
+        """Range error without constant and slope, (..., pulse), zero where nothing is lit."""
+        mean, slope, k = self._line(self.error_m)
+        return torch.where(self.lit, self.error_m - mean[..., None] - slope[..., None] * k, 0)
 
     @property
     def slope_m_s(self) -> Tensor:
         """Slope of the range error over slow time, (...,)."""
-        return _slope(self.error_m) / self.pulse.step
+        return self._line(self.error_m)[1] / self.pulse.step
 
     @property
     def coarse_slope_m_s(self) -> Tensor:
         """Slope of what velocities alone leave, (...,): phases of pulses move no envelope."""
-        return _slope(self.coarse_m) / self.pulse.step
+        return self._line(self.coarse_m)[1] / self.pulse.step
+
+    @property
+    def largest_m(self) -> Tensor:
+        """Largest distance of the range error from its first lit value, (...,)."""
+        first = self.error_m.gather(-1, self.lit.to(torch.int8).argmax(-1, keepdim=True).expand(*self.error_m.shape[:-1], 1))
+        return torch.where(self.lit, (self.error_m - first).abs(), 0).amax(-1)
+
+    def rms(self, x: Tensor) -> Tensor:
+        """Root mean square over the lit pulses of x (..., pulse)."""
+        return (torch.where(self.lit, x.square(), 0).sum(-1) / self._count).sqrt()
+
+    @property
+    def _count(self) -> Tensor:
+        return self.lit.sum(-1).clamp_min(1)
+
+    def _line(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Least-squares line through the lit pulses: mean, slope per pulse, and the pulses counted from the middle of the lit ones."""
+        k = torch.arange(x.shape[-1], dtype=torch.float64, device=x.device).expand(self.lit.shape)
+        k = k - (torch.where(self.lit, k, 0).sum(-1) / self._count)[..., None]
+        mean = torch.where(self.lit, x, 0).sum(-1) / self._count
+        slope = torch.where(self.lit, x * k, 0).sum(-1) / torch.where(self.lit, k.square(), 0).sum(-1).clamp_min(1)
+        return mean, slope, k
 
 
-def _centred(n: int, like: Tensor) -> Tensor:
-    return torch.arange(n, dtype=torch.float64, device=like.device) - (n - 1) / 2
+def leading(level: Tensor) -> Tensor:
+    """Scatterers within 10 dB of the strongest, bool; those far below it do not lead an estimator. level: (..., target) amplitudes."""
+    return (level >= _LEADING * level.amax(-1, keepdim=True)) & (level > 0)
 
 
-def _slope(x: Tensor) -> Tensor:
-    """Least-squares slope per sample along the last dim."""
-    k = _centred(x.shape[-1], x)
-    return (x * k).sum(-1) / k.square().sum().clamp_min(1)
-
-
-def _line(x: Tensor) -> Tensor:
-    return x.mean(-1, keepdim=True) + _slope(x)[..., None] * _centred(x.shape[-1], x)
+def lit_periods(radar: TriangularLadar, pulse: Axis, azimuth_m: Tensor, range_m: Tensor) -> Tensor:
+    """Whether the beam lights any of the scatterers (..., target) at the turning points, bool (..., pulse)."""
+    across = radar.speed_m_s * (pulse.values(azimuth_m.device) + radar.period_s / 2)[:, None] - azimuth_m[..., None, :]
+    half = math.inf if radar.beam_rad is None else radar.beam_rad / 2
+    return (across.abs() <= half * (radar.reference_range_m + range_m)[..., None, :]).any(-1)
 
 
 def _unwrapped(phase: Tensor) -> Tensor:
@@ -98,7 +121,14 @@ def course_of(chain: Chain, trace: Trace, truth: Truth, radar: TriangularLadar, 
     if phase is not None:
         per_m = 4 * math.pi / radar.wavelength_m
         error = _unwrapped(coarse * per_m + phase) / per_m
-    return Course(pulse, velocity, None if velocity is None else velocity - true, error, coarse)
+    return Course(pulse, velocity, None if velocity is None else velocity - true, error, coarse, _lit(truth, radar, pulse).expand(error.shape))
+
+
+def _lit(truth: Truth, radar: TriangularLadar, pulse: Axis) -> Tensor:
+    """Periods in which a leading scatterer is lit: velocity is undefined in others, (..., pulse)."""
+    shines = leading(truth.values["amplitude"].abs())
+    azimuth = torch.where(shines, truth.values["azimuth_m"], math.inf)  # never in the beam
+    return lit_periods(radar, pulse, azimuth, truth.values["range_m"].expand(azimuth.shape))
 
 
 def _sweeps_axis(trace: Trace) -> Axis:
@@ -126,15 +156,15 @@ def _summed(chain: Chain, trace: Trace, name: str, used_only: bool = False) -> T
 
 def motion_metrics(course: Course, radar: TriangularLadar) -> dict[str, Tensor]:
     """Figures of the motion, (...,) each."""
-    detrended = course.detrended_m.square().mean(-1).sqrt()
+    detrended = course.rms(course.detrended_m)
     found = {
-        "range_error_max_m": (course.error_m - course.error_m[..., :1]).abs().amax(-1),
+        "range_error_max_m": course.largest_m,
         "range_error_detrended_rms_m": detrended,
         "residual_phase_rms_rad": 4 * math.pi / radar.wavelength_m * detrended,
     }
     if course.velocity_error_m_s is None:
         return found
-    return {"velocity_rmse_m_s": course.velocity_error_m_s.square().mean(-1).sqrt(), **found}
+    return {"velocity_rmse_m_s": course.rms(course.velocity_error_m_s), **found}
 
 
 def image_metrics(image: Signal) -> dict[str, Tensor]:
@@ -147,15 +177,26 @@ def target_metrics(image: Signal, places: Mapping[str, tuple[Tensor, Tensor]], c
 
     What is left of the motion moves a target: echo phases 4 pi DR / lambda with the slope -e' of DR shift azimuth by -e' R / V, beats by 2 e' / lambda.
     """
-    found = {}
+    found, finer = {}, finer_in_range(image)
     for name, (azimuth, range_) in places.items():
         along = azimuth + course.slope_m_s * (radar.reference_range_m + range_) / max(radar.speed_m_s, 1e-30)
         beyond = range_ - course.coarse_slope_m_s * radar.carrier_hz / radar.chirp_rate_hz_s
         if all(_inside(place, axis) for place, axis in zip((azimuth, range_), image.axes)):
             at = tuple(place.clamp(axis.start, axis.stop) for place, axis in zip((along, beyond), image.axes))
-            figures = impulse_response(image, (at[0], at[1]), sidelobe_nulls=nulls, search_m=search_m)
+            figures = impulse_response(finer, (at[0], at[1]), sidelobe_nulls=nulls, search_m=search_m)
             found[name] = {key: value for key, value in figures.items() if key != "peak"}
     return found
+
+
+def finer_in_range(image: Signal) -> Signal:
+    """The image on half the range step: full-band profiles have no guard band, which slices need (brief 000, section 8 A). Exact for uncropped profiles."""
+    azimuth, range_ = image.axes
+    n, data = range_.n, image.data.to(torch.complex128)
+    cell = torch.arange(2 * n, dtype=torch.float64, device=data.device)
+    half = (n - 1) / (2 * n)  # the middle of the sweep, in turns a cell
+    sweeps = torch.fft.ifft(data * unit_phasor(-half * cell[:n], torch.complex128))
+    fine = torch.fft.fft(sweeps, 2 * n) * unit_phasor(half / 2 * cell, torch.complex128)
+    return Signal(fine, (azimuth, Axis("range", 2 * n, range_.start, range_.step / 2, range_.unit)))
 
 
 def _inside(place: Tensor, axis: Axis) -> bool:

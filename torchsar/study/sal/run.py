@@ -18,7 +18,7 @@ from torchsar.study.config import Loaded, check_methods
 from torchsar.study.errors import ConfigError
 from torchsar.study.folder import fresh_folder, write_arrays, write_json
 from torchsar.study.montecarlo.record import OK
-from torchsar.study.sal.build import check
+from torchsar.study.sal.build import check, refuse_recordings
 from torchsar.study.sal.figures import CaseResult, draw
 from torchsar.study.sal.judge import DEFINITIONS
 from torchsar.study.sal.report import write_report
@@ -40,6 +40,7 @@ def run(loaded: Loaded, out: Path, command: str = "torchsar run") -> Path:
     began = time.perf_counter()
     with fresh_folder(out) as folder:
         check_methods(loaded.config, loaded.file)
+        refuse_recordings(loaded)
         check(loaded)
         cases = cases_of(loaded)
         for name, case in cases.items():

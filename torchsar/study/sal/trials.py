@@ -47,7 +47,7 @@ class Outcome:
     metrics: dict[str, Tensor]
     targets: dict[str, dict[str, Tensor]]
     course: Course
-    last: Signal
+    last: Signal | None
     profiles: Signal | None
     kept: dict[str, Tensor]
 
@@ -62,6 +62,10 @@ class Batch:
     @property
     def metrics(self) -> dict[str, dict[str, Tensor]]:
         return {name: outcome.metrics for name, outcome in self.outcomes.items()}
+
+    def without_signals(self) -> Batch:
+        """The figures alone, which is what later batches of a run are kept for."""
+        return replace(self, outcomes={name: replace(outcome, last=None, profiles=None) for name, outcome in self.outcomes.items()})
 
 
 class SalTrials(Benches[Bench]):

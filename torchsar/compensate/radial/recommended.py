@@ -1,0 +1,82 @@
+"""The recommended estimate of the radial motion: velocities by the mirror product, then the phase of every pulse against the scene."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.radial.bands import Bands, bands_of, refuse_other_sweeps
+from torchsar.compensate.radial.compensate import carrier_turns, polynomial_phasor
+from torchsar.compensate.radial.mirror import Intercept, mirror_velocity
+from torchsar.compensate.radial.polish import phase_polish
+from torchsar.compensate.radial.trajectory import integrated_range, sweep_middles, sweep_motion
+from torchsar.compensate.radial.verdict import velocity_estimate
+from torchsar.core import Axis, Estimate, unit_phasor
+from torchsar.core.spline import UniformSpline
+from torchsar.radar import TriangularLadar
+
+
+def radial_motion(
+    sweeps: Tensor,
+    radar: TriangularLadar,
+    pulse: Axis,
+    *,
+    window_m: tuple[float, float] | None = None,
+    intercept: Intercept = "known",
+    taper: float = 1.0,
+    azimuth_m: Tensor | float = 0.0,
+    iterations: int = 30,
+    tolerance_rad: float = 0.02,
+) -> Estimate:
+    """The recommended estimate: value["velocity_m_s"] at the turning points and value["phase_rad"] at the middles of the up sweeps, (..., pulse) each.
+
+    sweeps: (..., 2, pulse, N). `mirror_product` gives the velocities; their integral takes the motion out of the range cells of window_m (None: the
+    whole band), deramped in azimuth; `phase_polish` finds what is left in each pulse, so that the error of the range does not
+    grow with the length of the record. All on the few lines of the window: a window that holds the scene and little else costs less and
+    stands more noise. The phase is to be removed after `compensate_motion` by the velocities; `range_error` adds both up. intercept, taper, azimuth_m: see
+    `mirror_product`; iterations, tolerance_rad: see `phase_polish`.
+
+    std: of both. ok: both can be trusted. quality: that of the velocities. Differentiable around the detached peak search. Raises TypeError or ValueError for other sweeps or windows.
+    """
+    refuse_other_sweeps(sweeps, radar, "radial_motion")
+    bands = bands_of(sweeps, radar, window_m, taper, oversampling=2)
+    velocity, info = mirror_velocity(bands, intercept)
+    coarse = velocity_estimate(velocity, bands, pulse, factor=3.0 if intercept == "free" else 0.75, azimuth_m=azimuth_m, squared=True, **info)
+    fine = phase_polish(deramped_lines(bands, coarse["velocity_m_s"], pulse), iterations=iterations, tolerance_rad=tolerance_rad)
+    return Estimate(
+        {**coarse.value, **fine.value},
+        quality=coarse.quality,
+        ok=coarse.ok & fine.ok,
+        std={**coarse.std, **fine.std},
+        info={**coarse.info, **fine.info},
+    )
+
+
+def deramped_lines(bands: Bands, velocity_m_s: Tensor, pulse: Axis) -> Tensor:
+    """Range cells of the window (..., pulse, line) of the up sweeps, the motion and the azimuth phase of a scatterer at azimuth zero taken out."""
+    radar, m = bands.radar, bands.time_s.shape[-1]
+    turns = carrier_turns(sweep_motion(velocity_m_s, radar, pulse), radar)[..., 0, :, :]
+    left = torch.cat([turns[..., :1], turns[..., 1:2] - (bands.shift.to(torch.float64) / radar.sweep_s)[..., None], turns[..., 2:]], -1)
+    still = bands.up * polynomial_phasor(-left, radar.sweep_s / m, m, bands.up.dtype)
+    lines = torch.arange(bands.first, bands.first + bands.lines, device=still.device)
+    cells = torch.fft.fft(still)[..., lines % m] / m
+    across = (radar.speed_m_s * sweep_middles(radar, pulse, still.device)[0])[:, None].square()
+    r = radar.reference_range_m + radar.range_step_m * lines.to(torch.float64)
+    return cells * unit_phasor(-2 / radar.wavelength_m * across / (torch.sqrt(r.square() + across) + r), cells.dtype)
+
+
+def range_error(estimate: Estimate, radar: TriangularLadar, pulse: Axis, at_s: Tensor) -> Tensor:
+    """Range error (m) at slow times at_s, any shape, of any estimate of the radial motion: (..., *at_s.shape) float64.
+
+    The integral of its velocities, zero at the first turning point, and lambda / (4 pi) times its phases of pulses where it has them, by cubic splines.
+    """
+    total = torch.zeros((), dtype=torch.float64, device=at_s.device)
+    if "velocity_m_s" in estimate.value:
+        total = total + integrated_range(estimate["velocity_m_s"], radar, pulse, at_s)
+    if "phase_rad" in estimate.value:
+        fine = estimate["phase_rad"].to(torch.float64) * (radar.wavelength_m / (4 * math.pi))
+        start = float(sweep_middles(radar, pulse)[0, 0])
+        total = total + (UniformSpline(fine, start, pulse.step).at(at_s) if pulse.n > 1 else fine.reshape(*fine.shape[:-1], *(1,) * at_s.ndim).expand(*fine.shape[:-1], *at_s.shape))
+    return total

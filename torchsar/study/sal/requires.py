@@ -1,0 +1,190 @@
+"""`torchsar requires` for triangular-sweep ladars: limits of their estimators, and what the scene requires of echo and compensation."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Draws
+from torchsar.focus.ladar_requirements import Limit, ladar_limits, ladar_requirements
+from torchsar.focus.requirements import Requirement
+from torchsar.radar import TriangularLadar
+from torchsar.scene import Extremes, Fidelity, LinearInSweep, QuadraticInSweep, drawn_motion
+from torchsar.scene.vibration import displacement_m
+from torchsar.study.build import resolved
+from torchsar.study.cases import cases_of
+from torchsar.study.config import Loaded
+from torchsar.study.errors import ConfigError
+from torchsar.study.folder import fresh_folder, write_json
+from torchsar.study.sal.build import Ladar, check, refuse_recordings
+from torchsar.study.sal.judge import leading, lit_periods
+
+log = logging.getLogger("torchsar")
+_TIMES_A_PERIOD = 16
+_TOLERANCE_RAD = 0.1
+# limits that stop only methods with such a stage; key: value that it has there
+_CONCERNS = {
+    "SNR after compression": ("segmented_interference", "unwrap", "gradient"),
+    "spacing of scatterers": ("segmented_interference", "bins", "peak"),
+    "speed of the mirror tone": ("", "", ""),  # estimators take the bulk of the velocity out first
+}
+
+
+def requires(loaded: Loaded, out: Path | None) -> str:
+    """Both tables of every case of a simulation as text, predicted from the config alone. With `out`: config.yaml, requires.json and requires.txt there."""
+    refuse_recordings(loaded)
+    check(loaded)
+    found = {name or loaded.name: Needs.of(case) for name, case in cases_of(loaded).items()}
+    text = "\n\n".join(_text(name, needs) for name, needs in found.items())
+    if out is None:
+        return text
+    with fresh_folder(out) as folder:
+        (folder / "config.yaml").write_text(loaded.text(resolved(loaded)), encoding="utf-8")
+        (folder / "requires.txt").write_text(text + "\n", encoding="utf-8")
+        write_json(folder / "requires.json", {name: needs.tree() for name, needs in found.items()})
+    return f"{text}\n{out}"
+
+
+def heed_limits(loaded: Loaded, case: str) -> None:
+    """Refuse a case beyond a limit that stops a method, unless the config shows the method beyond its limits on purpose; warn of the other limits.
+
+    Raises ConfigError with the limit, what it comes to and what helps.
+    """
+    where = f"cases.{case}: " if case else ""
+    for limit in Needs.of(loaded).limits:
+        stopped = _stopped(limit, loaded) if limit.verdict == "refuse" else []
+        if stopped:
+            raise ConfigError(f"{loaded.file}: {where}processor.{stopped[0]}: {limit.sentence} (or name the method in beyond_limits)")
+        if limit.verdict != "ok":
+            log.warning("warning: %s%s", where, limit.sentence)
+
+
+def _stopped(limit: Limit, loaded: Loaded) -> list[str]:
+    """Methods that a limit stops and that the config does not show beyond their limits."""
+    config = loaded.config
+    names = [name for name, method in config.processor.items() if method.input != "clean" and name not in config.beyond_limits]
+    if limit.name not in _CONCERNS:
+        return names
+    stage, key, value = _CONCERNS[limit.name]
+    return [name for name in names if any(entry["stage"] == stage and entry.get(key, value) == value for entry in (config.processor[name].stages or {}).values())]
+
+
+@dataclass(frozen=True)
+class Needs:
+    """Limits and fidelity rows of one case, and the simplest fidelity of its echo."""
+
+    limits: tuple[Limit, ...]
+    rows: tuple[Requirement, ...]
+    fidelity: str
+
+    @staticmethod
+    def of(loaded: Loaded) -> Needs:
+        """Predicted from the first trial of a run. Raises ConfigError for what the world refuses."""
+        try:
+            return _needs(Ladar.of(loaded), loaded.config.seed)
+        except ValueError as error:
+            raise ConfigError(f"{loaded.file}: {' '.join(str(error).split())}") from None
+
+    def tree(self) -> dict[str, object]:
+        limits = [{**asdict(limit), "verdict": limit.verdict} for limit in self.limits]
+        return {"limits": limits, "fidelity": self.fidelity, "requirements": [{**asdict(row), "ok": row.ok, "verdict": row.verdict} for row in self.rows]}
+
+
+def _needs(ladar: Ladar, seed: int) -> Needs:
+    draws, radar = Draws(seed, "run", [0]), ladar.radar
+    scene = ladar.world.scene.scatterers(draws)
+    azimuth, ranges, level = (v.reshape(-1, v.shape[-1])[0] for v in (scene.azimuth_m, scene.range_m, scene.amplitude.abs()))
+    inside = torch.ones_like(level, dtype=torch.bool) if ladar.world.gate_m is None else (ranges >= ladar.world.gate_m[0]) & (ranges <= ladar.world.gate_m[1])
+    inside = inside & (level > 0)
+    leads = leading(torch.where(inside, level, 0))
+    if not bool(leads.any()):
+        raise ValueError("world: no scatterer within the gate; widen gate_m")
+    moved = _motion(ladar, draws)
+    apart = torch.diff(torch.unique(ranges[leads]))
+    snr_db = None if ladar.world.snr_db is None else float(ladar.world.snr_db) + 20 * math.log10(float(level[leads].max()))
+    reach = float(ranges[inside].min()), float(ranges[inside].max())
+    limits = ladar_limits(
+        radar,
+        ladar.periods,
+        reach,
+        moved.velocity_m_s,
+        moved.acceleration_m_s2,
+        moved.jerk_m_s3,
+        snr_db,
+        float(azimuth[leads].max() - azimuth[leads].min()),
+        float(apart.min()) if len(apart) else None,
+        _lit_share(radar, ladar.periods, azimuth[leads], ranges[leads]),
+    )
+    rows = ladar_requirements(radar, ladar.periods, reach, moved.velocity_m_s, moved.acceleration_m_s2, moved.displacement_m)
+    across = radar.speed_m_s * ladar.periods * radar.pulse_step_s / 2 + float(azimuth.abs().max())
+    extremes = Extremes(reach, across, moved.velocity_m_s, moved.change_m_s, moved.acceleration_m_s2, moved.jerk_m_s3)
+    return Needs(limits, rows, simplest_fidelity(radar, extremes))
+
+
+@dataclass(frozen=True)
+class _Reach:
+    """Largest magnitudes of a motion over a recording."""
+
+    displacement_m: float
+    velocity_m_s: float
+    change_m_s: float
+    acceleration_m_s2: float
+    jerk_m_s3: float
+
+
+def _motion(ladar: Ladar, draws: Draws) -> _Reach:
+    """Differences of the displacement on a grid of sixteen times a period."""
+    span = ladar.periods * ladar.radar.pulse_step_s
+    n = max(8, ladar.periods * ladar.radar.keep_every * _TIMES_A_PERIOD)
+    step = span / n
+    moved = displacement_m(drawn_motion(ladar.world.motion, draws, span), torch.arange(n, dtype=torch.float64) * step).reshape(-1, n)[0]
+    slopes = [moved]
+    for _ in range(3):
+        slopes.append(torch.gradient(slopes[-1], spacing=step)[0][2:-2] if len(slopes) > 1 else torch.gradient(moved, spacing=step)[0])
+    velocity, acceleration, jerk = slopes[1:]
+    return _Reach(_extent(moved), *(float(x) for x in (velocity.abs().max(), velocity.max() - velocity.min(), acceleration.abs().max(), jerk.abs().max())))
+
+
+def _extent(x: Tensor) -> float:
+    return float(x.max() - x.min())
+
+
+def _lit_share(radar: TriangularLadar, periods: int, azimuth: Tensor, ranges: Tensor) -> float:
+    """Share of periods in which any leading scatterer is in the beam."""
+    return float(lit_periods(radar, radar.sweep_axes(periods)[1], azimuth, ranges).to(torch.float64).mean())
+
+
+def simplest_fidelity(radar: TriangularLadar, extremes: Extremes) -> str:
+    """The cheapest level whose own neglected phase is below 0.1 rad; those of effects left out stand in the table."""
+    ladder: tuple[tuple[str, Fidelity], ...] = (("linear_in_sweep", LinearInSweep(())), ("quadratic_in_sweep", QuadraticInSweep(())))
+    for name, level in ladder:
+        if level.neglected_phase_rad(radar, extremes)["level"] < _TOLERANCE_RAD:
+            return name
+    return "every_sample"
+
+
+def _text(name: str, needs: Needs) -> str:
+    return "\n".join([name, *_limit_lines(needs.limits), "", *_requirement_lines(needs.rows), f"the simplest echo model that this scene allows: {needs.fidelity}"])
+
+
+def _limit_lines(limits: Sequence[Limit]) -> list[str]:
+    lines = [f"{'limit':<40}{'value':>12}{'limit':>14} {'unit':<8}{'verdict':<9}what then"]
+    for row in limits:
+        then = "" if row.ok else f"{row.consequence}; {row.remedy}"
+        lines.append(f"{row.name:<40}{row.value:>12.4g}{('>= ' if row.at_least else '< ') + format(row.limit, '.4g'):>14} {row.unit:<8}{row.verdict:<9}{then}".rstrip())
+    return lines
+
+
+def _requirement_lines(rows: Sequence[Requirement]) -> list[str]:
+    wide = 2 + max(len(row.verdict) for row in rows)
+    lines = [f"{'simplification':<34}{'neglected phase':>16}{'range cells':>13}  {'verdict':<{wide}}neglects"]
+    for row in rows:
+        cells = "" if math.isnan(row.range_cells) else f"{row.range_cells:.3g}"
+        lines.append(f"{row.effect:<34}{row.phase_rad:>12.3g} rad{cells:>13}  {row.verdict:<{wide}}{row.neglects}")
+    return lines
