@@ -6,6 +6,7 @@ from torchsar.focus.dechirped import AzimuthTransform, CompressDechirped, azimut
 from torchsar.focus.defocus import InvertibleOmegaK, defocus_omega_k
 from torchsar.focus.detection import Detect, QuickLook, amplitude, multilook, quicklook_looks, to_db
 from torchsar.focus.inverse_requirements import inverse_requirements
+from torchsar.focus.ladar_requirements import Limit, ladar_limits, ladar_requirements
 from torchsar.focus.nufft import Nufft, nufft_type1, nufft_type2
 from torchsar.focus.omega_k import OmegaK, StoredOmegaK, omega_k
 from torchsar.focus.polar import PolarFormat, PolarOperator
@@ -16,18 +17,23 @@ from torchsar.focus.spotlight import GroundGrid, SpotlightBackprojection, backpr
 from torchsar.focus.stolt import OmegaKStolt, omega_k_stolt
 from torchsar.focus.strip import StripPlan, focus_strip, plan_strip, reach_lines, write_strip
 from torchsar.focus.target import TargetImage
+from torchsar.focus.triangular import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth, azimuth_matched_filter, compress_sweeps, deramp_azimuth, profile_axes
 
 __all__ = [
+    "AzimuthMatchedFilter",
     "AzimuthTransform",
     "Backproject",
     "ClosestRange",
     "CompressDechirped",
+    "CompressSweeps",
+    "DerampAzimuth",
     "Detect",
     "DopplerBand",
     "EveryPulse",
     "GroundGrid",
     "Integration",
     "InvertibleOmegaK",
+    "Limit",
     "Nufft",
     "OmegaK",
     "OmegaKStolt",
@@ -43,15 +49,20 @@ __all__ = [
     "StripPlan",
     "TargetImage",
     "amplitude",
+    "azimuth_matched_filter",
     "azimuth_transform",
     "backproject",
     "backproject_spotlight",
     "closest_range",
     "compress_dechirped",
+    "compress_sweeps",
     "defocus_omega_k",
+    "deramp_azimuth",
     "flat_reference",
     "focus_strip",
     "inverse_requirements",
+    "ladar_limits",
+    "ladar_requirements",
     "matched_reference",
     "multilook",
     "nufft_type1",
@@ -60,6 +71,7 @@ __all__ = [
     "omega_k_stolt",
     "phase_reference",
     "plan_strip",
+    "profile_axes",
     "quicklook_looks",
     "range_compress",
     "range_doppler",

@@ -110,7 +110,8 @@ class CompressSweeps(Stage):
         super().__init__()
         if ramp not in _EPOCH:
             raise ValueError(f"ramp must be 'up' or 'down', got {ramp!r}")
-        self.radar, self.ramp, self.video, self.window_m = radar, ramp, video, window_m
+        self.radar, self.video, self.window_m = radar, video, window_m
+        self.ramp: Ramp = ramp
 
     def forward(self, signal: Signal) -> Signal:
         axes = profile_axes(signal.axis("pulse"), self.radar, self.ramp)

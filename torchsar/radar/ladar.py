@@ -116,5 +116,8 @@ class TriangularLadar:
         return Axis("ramp", 2, 0.0, 1.0, ""), Axis("pulse", n_period, start, self.pulse_step_s, "s"), self.fast_time_axis()
 
     def record_axes(self, n_period: int, n_sample: int, start_s: float | None = None) -> tuple[Axis, Axis]:
-        """Axes of blocks of a continuous record, one block a recorded period: pulse (start of each block, s) and time within the block (s)."""
-        return self.sweep_axes(n_period, start_s)[1], Axis("time", n_sample, 0.0, 1 / self.sample_rate_hz, "s")
+        """Axes of blocks of a continuous record, one block a recorded period: pulse (start of each block, s) and time within the block (s).
+
+        The first sample lies half a step after the start, so that samples of separated sweeps are samples of the record where the triangle starts with the block.
+        """
+        return self.sweep_axes(n_period, start_s)[1], Axis("time", n_sample, 0.5 / self.sample_rate_hz, 1 / self.sample_rate_hz, "s")

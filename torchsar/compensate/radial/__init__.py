@@ -6,8 +6,9 @@ from torchsar.compensate.radial.correlation import spectrum_correlation
 from torchsar.compensate.radial.mirror import mirror_product
 from torchsar.compensate.radial.peak import ml_peak
 from torchsar.compensate.radial.polish import phase_polish
+from torchsar.compensate.radial.recommended import radial_motion, range_error
 from torchsar.compensate.radial.segmented import segmented_interference
-from torchsar.compensate.radial.stages import CompensateMotion, MirrorProduct, MlPeak, PhasePolish, SegmentedInterference, SpectrumCorrelation
+from torchsar.compensate.radial.stages import CompensateMotion, MirrorProduct, MlPeak, PhasePolish, RadialMotion, SegmentedInterference, SpectrumCorrelation
 from torchsar.compensate.radial.trajectory import geometric_velocity_m_s, integrated_range, sweep_middles, sweep_motion, turning_points
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "MirrorProduct",
     "MlPeak",
     "PhasePolish",
+    "RadialMotion",
     "SegmentedInterference",
     "SpectrumCorrelation",
     "bands_of",
@@ -25,6 +27,8 @@ __all__ = [
     "mirror_product",
     "ml_peak",
     "phase_polish",
+    "radial_motion",
+    "range_error",
     "segmented_interference",
     "spectrum_correlation",
     "sweep_middles",

@@ -14,9 +14,7 @@ from torchsar.radar import TriangularLadar
 _REACH = 4
 
 
-def spectrum_correlation(
-    sweeps: Tensor, radar: TriangularLadar, pulse: Axis, *, upsampling: int = 20, window_m: tuple[float, float] | None = None, azimuth_m: Tensor | float = 0.0
-) -> Estimate:
+def spectrum_correlation(sweeps: Tensor, radar: TriangularLadar, pulse: Axis, *, upsampling: int = 20, window_m: tuple[float, float] | None = None, azimuth_m: Tensor | float = 0.0) -> Estimate:
     """Radial velocity at the turning points, value["velocity_m_s"] (..., pulse), from cross-correlated range envelopes (paper, section 2.3.2; its reference [17]).
 
     The lag that aligns |S+(f)| with the mirrored |S-(-f)| is 2 fd. It is found on a grid of 1 / (upsampling T): however strong the signal, an error

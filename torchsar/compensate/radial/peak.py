@@ -65,5 +65,3 @@ def _climbed(x: Tensor, frequency_hz: Tensor, time_s: Tensor) -> Tensor:
         concave = bend < 0
         frequency_hz = frequency_hz + torch.where(concave, -gradient / torch.where(concave, bend, -1), 0).to(torch.float64)
     return frequency_hz
-
-

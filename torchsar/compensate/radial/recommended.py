@@ -10,7 +10,7 @@ from torch import Tensor
 from torchsar.compensate.radial.bands import Bands, bands_of, refuse_other_sweeps
 from torchsar.compensate.radial.compensate import carrier_turns, polynomial_phasor
 from torchsar.compensate.radial.mirror import Intercept, mirror_velocity
-from torchsar.compensate.radial.polish import phase_polish
+from torchsar.compensate.radial.polish import ENOUGH_STD_RAD, phase_polish
 from torchsar.compensate.radial.trajectory import integrated_range, sweep_middles, sweep_motion
 from torchsar.compensate.radial.verdict import velocity_estimate
 from torchsar.core import Axis, Estimate, unit_phasor
@@ -45,11 +45,12 @@ def radial_motion(
     velocity, info = mirror_velocity(bands, intercept)
     coarse = velocity_estimate(velocity, bands, pulse, factor=3.0 if intercept == "free" else 0.75, azimuth_m=azimuth_m, squared=True, **info)
     fine = phase_polish(deramped_lines(bands, coarse["velocity_m_s"], pulse), iterations=iterations, tolerance_rad=tolerance_rad)
+    std = (1 / torch.sqrt(2 * 10 ** (coarse.info["snr_db"] / 10))).clamp_max(math.pi)
     return Estimate(
         {**coarse.value, **fine.value},
         quality=coarse.quality,
-        ok=coarse.ok & fine.ok,
-        std={**coarse.std, **fine.std},
+        ok=coarse.ok & (std < ENOUGH_STD_RAD),
+        std={**coarse.std, "phase_rad": std[..., None].expand_as(fine["phase_rad"])},
         info={**coarse.info, **fine.info},
     )
 

@@ -9,6 +9,7 @@ from torchsar.compensate.radial.correlation import spectrum_correlation
 from torchsar.compensate.radial.mirror import Intercept, mirror_product
 from torchsar.compensate.radial.peak import ml_peak
 from torchsar.compensate.radial.polish import phase_polish
+from torchsar.compensate.radial.recommended import radial_motion
 from torchsar.compensate.radial.segmented import Bins, Unwrap, segmented_interference
 from torchsar.core import Estimate, Signal, Stage
 from torchsar.radar import TriangularLadar
@@ -30,6 +31,7 @@ class _OfSweeps(Stage):
 
     works_on = SWEEPS
     provides = ("velocity_m_s",)
+    azimuth_m: Tensor
 
     def __init__(self, radar: TriangularLadar, window_m: Window, azimuth_m: float) -> None:
         super().__init__()
@@ -47,6 +49,38 @@ class MirrorProduct(_OfSweeps):
 
     def forward(self, signal: Signal) -> Estimate:
         return mirror_product(signal.data, self.radar, signal.axis("pulse"), window_m=self.window_m, intercept=self.intercept, taper=self.taper, azimuth_m=self.azimuth_m)
+
+
+class RadialMotion(MirrorProduct):
+    """`radial_motion`, the recommended estimator: `velocity_m_s` for `CompensateMotion`, then `phase_rad` for `CorrectPulsePhase`."""
+
+    provides = ("velocity_m_s", "phase_rad")
+
+    def __init__(
+        self,
+        radar: TriangularLadar,
+        window_m: Window = None,
+        intercept: Intercept = "known",
+        taper: float = 1.0,
+        azimuth_m: float = 0.0,
+        iterations: int = 30,
+        tolerance_rad: float = 0.02,
+    ) -> None:
+        super().__init__(radar, window_m, intercept, taper, azimuth_m)
+        self.iterations, self.tolerance_rad = iterations, tolerance_rad
+
+    def forward(self, signal: Signal) -> Estimate:
+        return radial_motion(
+            signal.data,
+            self.radar,
+            signal.axis("pulse"),
+            window_m=self.window_m,
+            intercept=self.intercept,
+            taper=self.taper,
+            azimuth_m=self.azimuth_m,
+            iterations=self.iterations,
+            tolerance_rad=self.tolerance_rad,
+        )
 
 
 class MlPeak(_OfSweeps):

@@ -34,9 +34,7 @@ def signal_and_noise(bands: Bands, residual_m_s: Tensor) -> tuple[Tensor, Tensor
     return signal, total - signal
 
 
-def velocity_estimate(
-    velocity_m_s: Tensor, bands: Bands, pulse: Axis, *, factor: float, azimuth_m: Tensor | float, squared: bool = False, need_db: float = LEAST_SNR_DB, **info: Tensor
-) -> Estimate:
+def velocity_estimate(velocity_m_s: Tensor, bands: Bands, pulse: Axis, *, factor: float, azimuth_m: Tensor | float, squared: bool = False, need_db: float = LEAST_SNR_DB, **info: Tensor) -> Estimate:
     """The estimate of an estimator whose bound is factor * (lambda / 2)^2 / ((2 pi T)^2 g). velocity_m_s: (..., pulse), with the geometric velocity still in it.
 
     squared: the estimator multiplies the sweeps, which at low SNR costs more than the bound. quality: share of the power in the window

@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import get_args
 
 import torch
+from matplotlib.figure import Figure
 
-from torchsar.compensate.radial import mirror_product
+from torchsar import plot
+from torchsar.compensate.radial import mirror_product, segmented_interference, spectrum_correlation
 from torchsar.compensate.radial.mirror import Intercept
-from torchsar.core import Chain, Estimate, Recording, Signal, Stage, Trace, Truth
+from torchsar.core import Chain, Draws, Estimate, Recording, Signal, Stage, Trace, Truth, use
 from torchsar.metrics import error_db
 from torchsar.radar import TriangularLadar
 from torchsar.scene import EverySample, Fidelity, LinearInSweep, OnePerPeriod, OnePerSweep, QuadraticInSweep
