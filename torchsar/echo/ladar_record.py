@@ -46,7 +46,7 @@ def ladar_record(
     scatterers = Scatterers(shared(scatterers.azimuth_m), shared(scatterers.range_m), scatterers.amplitude)
     start_s = axis.values(scatterers.range_m.device)
     paths = BlockPaths.of(scatterers, radar, start_s, n_sample, motion, without)
-    ramps = _Ramps.of(radar, time.offsets(scatterers.range_m.device), trigger_s, 0.0 if "residual_video" in without else 0.5)
+    ramps = _Ramps.of(radar, time.values(scatterers.range_m.device), trigger_s, 0.0 if "residual_video" in without else 0.5)
     _refuse_record(scatterers, radar, n_period, motion, without)
     parts = []
     trials = torch.broadcast_shapes(paths.place.shape[:-2], paths.knots.shape[:-2], scatterers.amplitude.shape[:-1]).numel()
@@ -122,7 +122,7 @@ class BlockPaths:
         shrink = 1 - speed / radar.wave_speed_m_s if flight else torch.ones_like(first)
         bend = 2 * ((last - middle) - (middle - first)) / length**2
         lit = lit_by(scatterers, radar, start_s + length / 2)
-        offsets = torch.arange(n_sample, dtype=torch.float64, device=start_s.device) / radar.sample_rate_hz
+        offsets = radar.record_axes(len(start_s), n_sample)[1].values(start_s.device)
         return BlockPaths(first, (last - first) / length - bend * length, bend, knots, shrink, lit, length / count, offsets, radar.wave_speed_m_s)
 
     def part(self, first: int, last: int) -> BlockPaths:
@@ -199,8 +199,8 @@ def simulate_ladar_record(
     """A continuous record (pulse, time) of a world, one block a recorded period, and the truth about it; batched over the trials of `draws`.
 
     block_s: length of a block; by default one period where all are recorded, so that blocks join, and two periods where only every
-    keep_every-th is. trigger_s: where in the block an up sweep starts, a number or per-trial tensor (half a sample before the first sample, -0.5 / fs,
-    puts samples on the symmetric grid of separated sweeps); the recording holds it as aux `trigger_s` only if
+    keep_every-th is. trigger_s: where in the block an up sweep starts, a number or per-trial tensor (whole samples, zero
+    among them, put samples on the symmetric grid of separated sweeps); the recording holds it as aux `trigger_s` only if
     told_trigger. Samples are complex (`dtype`) or real (its real dtype) by radar.detection; real noise has half the variance, so that the analytic signal has
     the SNR of complex samples. Truth and aux are as of `simulate_ladar`, at the turning points t_k + trigger_s + period / 2, besides `trigger_s`.
     Raises ValueError for beats beyond the sampling rate or that fold, blocks that overlap or hold no sweep, a fidelity that is no record's.

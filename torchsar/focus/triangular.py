@@ -67,13 +67,16 @@ def deramp_azimuth(data: Tensor, radar: TriangularLadar, pulse: Axis, range_: Ax
     return data * unit_phasor(-azimuth_turns(pulse, range_, radar, data.device), data.dtype)
 
 
-def azimuth_matched_filter(data: Tensor, radar: TriangularLadar, pulse: Axis, range_: Axis, beam_rad: float | None = None) -> Tensor:
+def azimuth_matched_filter(data: Tensor, radar: TriangularLadar, pulse: Axis, range_: Axis, beam_rad: float | None = None, weighting: float = 0.0) -> Tensor:
     """Image (..., azimuth, range) of deramped profiles (..., pulse, range): sum over the aperture of s(t) exp(-j 2 pi (V t - x)^2 / (lambda R)) at x = V t.
 
     beam_rad: azimuth angle of the aperture, beam_rad * R long about every x, by default the radar's, and the whole record where that is None. A
-    scatterer that is lit all over its aperture keeps its amplitude. Exact phases of every range cell; no wrap-around. Differentiable.
-    Raises ValueError for a target that stands still.
+    scatterer that is lit all over its aperture keeps its amplitude. weighting: a of the weights 1 - a + a cos(2 pi y / L) over the aperture L, which
+    lower the first side lobes (0: -13.27 dB; 0.03: -13.9 dB and 1 % wider; 0.46: Hamming). Exact phases of every range cell; no wrap-around. Differentiable.
+    Raises ValueError for a target that stands still, or a weighting outside 0..0.5.
     """
+    if not 0 <= weighting <= 0.5:
+        raise ValueError(f"weighting must lie in 0..0.5, got {weighting}")
     if not radar.speed_m_s > 0:
         raise ValueError("radar.speed_m_s is 0; a target that does not move across the line of sight has no azimuth image")
     n = data.shape[-2]
@@ -82,12 +85,13 @@ def azimuth_matched_filter(data: Tensor, radar: TriangularLadar, pulse: Axis, ra
     lag = torch.arange(-(n - 1), n, device=data.device)
     across = (radar.speed_m_s * pulse.step * lag.to(torch.float64))[:, None].square()
     r = radar.reference_range_m + range_.values(data.device)
-    inside = lag[:, None].abs() <= half
-    filter_ = unit_phasor(-2 / radar.wavelength_m * across / (torch.sqrt(r.square() + across) + r), data.dtype) * inside
+    filter_ = unit_phasor(-2 / radar.wavelength_m * across / (torch.sqrt(r.square() + across) + r), data.dtype) * (lag[:, None].abs() <= half)
     length = 2 ** math.ceil(math.log2(2 * n - 1 + n - 1))
-    spectrum = torch.fft.fft(data * unit_phasor(turns, data.dtype), length, dim=-2) * torch.fft.fft(filter_, length, dim=-2)
+    lit = torch.minimum(2 * half + 1, torch.full_like(half, n))
+    weights = 1 - weighting + weighting * torch.cos(2 * math.pi * lag[:, None] / lit)
+    spectrum = torch.fft.fft(data * unit_phasor(turns, data.dtype), length, dim=-2) * torch.fft.fft(filter_ * weights.to(data.real.dtype), length, dim=-2)
     image = torch.fft.ifft(spectrum, dim=-2)[..., n - 1 : 2 * n - 1, :]
-    return image / torch.minimum(2 * half + 1, torch.full_like(half, n)).to(data.real.dtype)
+    return image / (lit * (1 - weighting)).to(data.real.dtype)
 
 
 def _half_aperture(radar: TriangularLadar, pulse: Axis, range_: Axis, beam_rad: float | None) -> Tensor:
@@ -138,12 +142,12 @@ class DerampAzimuth(Stage):
 class AzimuthMatchedFilter(Stage):
     """`azimuth_matched_filter`: deramped profiles in, an image (azimuth, range) in metres out."""
 
-    def __init__(self, radar: TriangularLadar, beam_rad: float | None = None) -> None:
+    def __init__(self, radar: TriangularLadar, beam_rad: float | None = None, weighting: float = 0.0) -> None:
         super().__init__()
-        self.radar, self.beam_rad = radar, beam_rad
+        self.radar, self.beam_rad, self.weighting = radar, beam_rad, weighting
 
     def forward(self, signal: Signal) -> Signal:
         pulse, range_ = signal.axes
-        image = azimuth_matched_filter(signal.data, self.radar, pulse, range_, self.beam_rad)
+        image = azimuth_matched_filter(signal.data, self.radar, pulse, range_, self.beam_rad, self.weighting)
         v = self.radar.speed_m_s
         return Signal(image, (Axis("azimuth", pulse.n, v * pulse.start, v * pulse.step, "m"), range_))

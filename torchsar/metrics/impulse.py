@@ -14,11 +14,19 @@ _SLICE = 512
 _FINE = 32
 
 
-def impulse_response(signal: Signal, at_m: tuple[Tensor | float, Tensor | float], sidelobe_nulls: int = 10, search_m: float | None = None) -> dict[str, Tensor]:
+def impulse_response(
+    signal: Signal,
+    at_m: tuple[Tensor | float, Tensor | float],
+    sidelobe_nulls: int = 10,
+    search_m: float | None = None,
+    centre_turns: tuple[float | None, float | None] = (None, None),
+) -> dict[str, Tensor]:
     """Measure the responses nearest to the given places of an image with two axes, the first before the second.
 
     at_m: coordinates on the two axes, each (...,) one target per trial or (..., target). The strongest sample within search_m (default
-    8 samples) is taken. sidelobe_nulls: extent of the side lobes in null spacings of a rectangular band; 10 give ISLR -10.17 dB for a sinc.
+    8 samples) is taken. centre_turns: centre of the spectrum along each axis in turns per sample, None to estimate it from the neighbourhood,
+    where other scatterers may mislead it; a full band, which leaves no gap, should be told. sidelobe_nulls: extent of the side lobes in null
+    spacings of a rectangular band; 10 give ISLR -10.17 dB for a sinc.
 
     Returns for each axis A of the image: irw_A_m (-3 dB width), pslr_A_db (strongest side lobe in the extent), islr_A_db (side-lobe over
     main-lobe energy, null to null), position_A_m; and peak, the complex interpolated peak. Shapes as at_m broadcast with the trials.
@@ -40,7 +48,7 @@ def impulse_response(signal: Signal, at_m: tuple[Tensor | float, Tensor | float]
     reach = [_reach(search_m, axis.step) for axis in signal.axes]
     data = signal.data.to(torch.complex128)
     rows, cols = _brightest(data, centre, reach)
-    rows, cols, tone_a, tone_r, da, dr = _climb(data, rows, cols)
+    rows, cols, tone_a, tone_r, da, dr = _climb(data, rows, cols, centre_turns)
     azimuth = _slice_through(_patch(data, rows, cols, min(_SLICE, signal.axes[0].n), _PATCH), tone_r, dr, -1)
     range_ = _slice_through(_patch(data, rows, cols, _PATCH, min(_SLICE, signal.axes[1].n)), tone_a, da, -2)
     out: dict[str, Tensor] = {}
@@ -81,21 +89,23 @@ def _brightest(data: Tensor, centre: list[Tensor], reach: list[int]) -> tuple[Te
     return centre[0] + best // width - reach[0], centre[1] + best % width - reach[1]
 
 
-def _climb(data: Tensor, rows: Tensor, cols: Tensor, rounds: int = 3) -> tuple[Tensor, ...]:
+def _climb(data: Tensor, rows: Tensor, cols: Tensor, centre_turns: tuple[float | None, float | None], rounds: int = 3) -> tuple[Tensor, ...]:
     """From the strongest sample to the interpolated maximum: (row, column, spectral centres in turns per sample, offsets in samples).
 
     A skewed response that is sampled finely in one axis and coarsely in the other has its maximum more than a sample away from its strongest sample.
     """
     for _ in range(rounds):
-        _, _, da, dr = _refined(data, rows, cols)
+        _, _, da, dr = _refined(data, rows, cols, centre_turns)
         rows, cols = rows + da.round().long(), cols + dr.round().long()
-    return rows, cols, *_refined(data, rows, cols)
+    return rows, cols, *_refined(data, rows, cols, centre_turns)
 
 
-def _refined(data: Tensor, rows: Tensor, cols: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _refined(data: Tensor, rows: Tensor, cols: Tensor, centre_turns: tuple[float | None, float | None]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Spectral centres in turns per sample, and offsets of the interpolated maximum from (row, column) in samples."""
     patch = _patch(data, rows, cols, _PATCH, _PATCH)
-    tone_a, tone_r = _centre_turns(patch, -2), _centre_turns(patch, -1)
+    tone_a, tone_r = (
+        _centre_turns(patch, dim) if told is None else torch.full(patch.shape[:-2], told, dtype=torch.float64, device=patch.device) for dim, told in zip((-2, -1), centre_turns, strict=True)
+    )
     return tone_a, tone_r, *_fine_peak(patch, tone_a, tone_r)
 
 

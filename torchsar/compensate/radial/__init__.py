@@ -3,30 +3,35 @@
 from torchsar.compensate.radial.bands import Bands, bands_of
 from torchsar.compensate.radial.compensate import compensate_motion
 from torchsar.compensate.radial.correlation import spectrum_correlation
+from torchsar.compensate.radial.equalise import equalise_pulses, pulse_gain
 from torchsar.compensate.radial.mirror import mirror_product
 from torchsar.compensate.radial.peak import ml_peak
 from torchsar.compensate.radial.polish import phase_polish
 from torchsar.compensate.radial.recommended import radial_motion, range_error
 from torchsar.compensate.radial.segmented import segmented_interference
-from torchsar.compensate.radial.stages import CompensateMotion, MirrorProduct, MlPeak, PhasePolish, RadialMotion, SegmentedInterference, SpectrumCorrelation
+from torchsar.compensate.radial.stages import CompensateMotion, EqualisePulses, MirrorProduct, MlPeak, PhasePolish, PulseGain, RadialMotion, SegmentedInterference, SpectrumCorrelation
 from torchsar.compensate.radial.trajectory import geometric_velocity_m_s, integrated_range, sweep_middles, sweep_motion, turning_points
 
 __all__ = [
     "Bands",
     "CompensateMotion",
+    "EqualisePulses",
     "MirrorProduct",
     "MlPeak",
     "PhasePolish",
+    "PulseGain",
     "RadialMotion",
     "SegmentedInterference",
     "SpectrumCorrelation",
     "bands_of",
     "compensate_motion",
+    "equalise_pulses",
     "geometric_velocity_m_s",
     "integrated_range",
     "mirror_product",
     "ml_peak",
     "phase_polish",
+    "pulse_gain",
     "radial_motion",
     "range_error",
     "segmented_interference",

@@ -94,16 +94,14 @@ def inside(radar: TriangularLadar, window_m: tuple[float, float] | None, bins: i
     return (at >= first - 0.5) & (at <= first + lines - 0.5)
 
 
-def bulk_shift(power: Tensor) -> tuple[Tensor, Tensor]:
-    """Doppler shift of every period in whole bins, and whether an echo is there to tell it. power: (..., 2, pulse, N) -> (..., pulse) int64 and bool.
+def bulk_shift(blocks: Tensor, pulses: int) -> tuple[Tensor, Tensor]:
+    """Doppler shift of every period in whole bins, and whether an echo is there to tell it: (..., pulse) int64 and bool.
 
-    power[..., r, k, :] is |FFT|^2 with zero frequency first, the down sweep as recorded. Envelopes of 8 periods are added before they are
-    correlated; the lag that makes up and down envelopes meet is 2 fd (brief 000, section 5.4). Lags beyond half the band, which a circular correlation
+    blocks: (..., 2, block, N) power spectra, zero frequency first, the down sweep as recorded, mean over 8 periods each (the last over what is left). The lag that
+    makes up and down envelopes meet is 2 fd (brief 000, section 5.4). Lags beyond half the band, which a circular correlation
     would wrap, are told apart. Periods in which the envelopes do not resemble each other take the shift of their neighbours.
     """
-    n, pulses = power.shape[-1], power.shape[-2]
-    block = min(_BLOCK, pulses)
-    blocks = torch.stack([part.mean(-2) for part in power.split(block, -2)], -2)
+    n, block = blocks.shape[-1], min(_BLOCK, pulses)
     blocks = torch.stack([blocks[..., 0, :, :], blocks[..., 1, :, :].roll(-1, -1).flip(-1)], -3)
     blocks = torch.fft.fftshift(blocks, dim=-1)
     blocks = blocks - blocks.mean(-1, keepdim=True)
@@ -115,7 +113,7 @@ def bulk_shift(power: Tensor) -> tuple[Tensor, Tensor]:
     lag = torch.where(lag >= n, lag - 2 * n, lag).to(torch.float64)
     alike = likeness > _ALIKE
     lag = filled(_median_of_three(filled(lag, alike)), alike)
-    at = (torch.arange(pulses, dtype=torch.float64, device=power.device) - (block - 1) / 2) / block
+    at = (torch.arange(pulses, dtype=torch.float64, device=blocks.device) - (block - 1) / 2) / block
     return torch.round(_interpolated(lag, at) / 2).to(torch.int64), alike.repeat_interleave(block, -1)[..., :pulses]
 
 
@@ -158,8 +156,8 @@ def bands_of(sweeps: Tensor, radar: TriangularLadar, window_m: tuple[float, floa
     first, lines = window_lines(radar, window_m)
     n = radar.sweep_samples
     data = canonical(sweeps, radar)
-    spectrum = torch.fft.fft(data)
-    shift, alike = bulk_shift(_smooth_power(spectrum.detach()))
+    spectrum, scale = torch.fft.fft(data), _scale(sweeps.detach())
+    shift, alike = bulk_shift(_block_power(spectrum.detach(), scale), sweeps.shape[-2])
     m = 2 ** max(3, math.ceil(math.log2(oversampling * lines)))
     line = torch.arange(lines, device=sweeps.device)
     sides = torch.stack([shift, -shift], -2)
@@ -169,7 +167,7 @@ def bands_of(sweeps: Tensor, radar: TriangularLadar, window_m: tuple[float, floa
     filters = torch.stack([shape.to(kept.dtype) * _line_phase(first, lines, m, sign, not video, radar, kept) for sign in (1, -1)])
     middle = mirror[..., 0] * (first + sides).to(torch.float64)  # phases refer to the middle of the sweep
     turned = cis((math.pi * middle * ((n - 1) / n) % (2 * math.pi)).to(real_dtype(kept.dtype)))
-    series = torch.fft.ifft(kept * filters[:, None, :] * turned[..., None], m) * (m / n)
+    series = torch.fft.ifft(kept * filters[:, None, :] * (turned * scale[..., 0])[..., None], m) * (m / n)
     beat = _beat_of_first(first, m, sweeps)
     series = series * beat.to(series.dtype)
     time_s = (torch.arange(m, dtype=torch.float64, device=sweeps.device) - (m - 1) / 2) * (radar.sweep_s / m)
@@ -184,14 +182,27 @@ def _faint(up: Tensor, down: Tensor, alike: Tensor) -> Tensor:
     return energy < _FAINT * usual
 
 
-def _smooth_power(spectrum: Tensor) -> Tensor:
-    """Power spectra of Hann-windowed sweeps: on the bins of a rectangular one, a peak between two of them loses more than half."""
-    windowed = spectrum.clone()
-    windowed[..., 1:].sub_(spectrum[..., :-1], alpha=0.5)
-    windowed[..., :-1].sub_(spectrum[..., 1:], alpha=0.5)
-    windowed[..., 0].sub_(spectrum[..., -1], alpha=0.5)
-    windowed[..., -1].sub_(spectrum[..., 0], alpha=0.5)
-    return torch.addcmul(windowed.real.square(), windowed.imag, windowed.imag)
+def _scale(sweeps: Tensor) -> Tensor:
+    """Power of two (..., 1, 1, 1) that brings samples of a trial to about one, so that their squares neither under- nor overflow. The middle of every sweep tells."""
+    middle = sweeps.shape[-1] // 2
+    level = torch.view_as_real(sweeps[..., middle - 4 : middle + 4]).abs().amax((-4, -3, -2, -1))[..., None, None, None]
+    return torch.where(level > 0, torch.exp2(-torch.round(torch.log2(torch.where(level > 0, level, 1)))), 1)
+
+
+def _block_power(spectrum: Tensor, scale: Tensor) -> Tensor:
+    """Power spectra of Hann-windowed sweeps, mean over blocks of periods: (..., 2, pulse, N) -> (..., 2, block, N).
+
+    On the bins of a rectangular window, a peak between two of them loses more than half.
+    """
+    parts = torch.view_as_real(spectrum).flatten(-2)  # real and imaginary parts in turn: the window is the same for both
+    inner = _windowed_power(parts[..., :-4], parts[..., 2:-2], parts[..., 4:], scale)
+    ends = [_windowed_power(*(parts[..., (2 * (at + k)) % parts.shape[-1] :][..., :2] for k in (-1, 0, 1)), scale) for at in (0, spectrum.shape[-1] - 1)]
+    return torch.cat([ends[0], inner, ends[1]], -1).unflatten(-1, (-1, 2)).sum(-1)
+
+
+def _windowed_power(before: Tensor, here: Tensor, after: Tensor, scale: Tensor) -> Tensor:
+    windowed = torch.sub(here, before + after, alpha=0.5).mul_(scale).square_()
+    return torch.stack([part.mean(-2) for part in windowed.split(_BLOCK, -2)], -2)
 
 
 def _line_phase(first: int, lines: int, m: int, sign: int, remove_video: bool, radar: TriangularLadar, like: Tensor) -> Tensor:

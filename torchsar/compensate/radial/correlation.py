@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.radial.bands import Bands, bands_of, refuse_other_sweeps
+from torchsar.compensate.radial.blocks import by_trials
 from torchsar.compensate.radial.peak import from_beats
 from torchsar.compensate.radial.verdict import velocity_estimate
 from torchsar.core import Axis, Estimate
@@ -25,10 +26,13 @@ def spectrum_correlation(sweeps: Tensor, radar: TriangularLadar, pulse: Axis, *,
     refuse_other_sweeps(sweeps, radar, "spectrum_correlation")
     if not (isinstance(upsampling, int) and 1 <= upsampling <= 64):
         raise ValueError(f"upsampling must be a whole number of 1..64, got {upsampling}")
-    bands = bands_of(sweeps, radar, window_m, taper=0.0)
-    lag = envelope_lag(bands, upsampling)
-    doppler = lag / (2 * radar.sweep_s)
-    return velocity_estimate(from_beats(doppler, -doppler, bands), bands, pulse, factor=3.0, azimuth_m=azimuth_m)
+
+    def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
+        bands = bands_of(sweeps, radar, window_m, taper=0.0)
+        doppler = envelope_lag(bands, upsampling) / (2 * radar.sweep_s)
+        return velocity_estimate(from_beats(doppler, -doppler, bands), bands, pulse, factor=3.0, azimuth_m=azimuth_m)
+
+    return by_trials(estimator, sweeps, azimuth_m)
 
 
 @torch.no_grad()

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
 from torchsar.compensate.radial.bands import Bands, bands_of, refuse_other_sweeps
+from torchsar.compensate.radial.blocks import by_trials
 from torchsar.compensate.radial.verdict import velocity_estimate
 from torchsar.core import Axis, Estimate, cis, take
 from torchsar.radar import TriangularLadar
@@ -40,9 +41,22 @@ def mirror_product(
     Differentiable: the peak search is detached, Newton steps refine around it. Raises TypeError or ValueError for other sweeps or a window that is none.
     """
     refuse_other_sweeps(sweeps, radar, "mirror_product")
-    if intercept not in ("known", "record", "free"):
+    refuse_other_intercept(intercept)
+
+    def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
+        return mirror_estimate(bands_of(sweeps, radar, window_m, taper, oversampling=2), pulse, intercept, azimuth_m)
+
+    return by_trials(estimator, sweeps, azimuth_m)
+
+
+def refuse_other_intercept(intercept: str) -> None:
+    """Raise ValueError for what is no kind of intercept."""
+    if intercept not in get_args(Intercept):
         raise ValueError(f"intercept must be 'known', 'record' or 'free', got {intercept!r}")
-    bands = bands_of(sweeps, radar, window_m, taper, oversampling=2)
+
+
+def mirror_estimate(bands: Bands, pulse: Axis, intercept: Intercept, azimuth_m: Tensor | float) -> Estimate:
+    """The estimate from bands of two samples a line."""
     velocity, info = mirror_velocity(bands, intercept)
     return velocity_estimate(velocity, bands, pulse, factor=3.0 if intercept == "free" else 0.75, azimuth_m=azimuth_m, squared=True, **info)
 

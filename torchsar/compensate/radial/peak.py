@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.radial.bands import Bands, bands_of, inside, refuse_other_sweeps, window_lines
+from torchsar.compensate.radial.blocks import by_trials
 from torchsar.compensate.radial.verdict import velocity_estimate
 from torchsar.core import Axis, Estimate, cis
 from torchsar.radar import TriangularLadar
@@ -25,9 +26,13 @@ def ml_peak(sweeps: Tensor, radar: TriangularLadar, pulse: Axis, *, window_m: tu
     """
     refuse_other_sweeps(sweeps, radar, "ml_peak")
     window_lines(radar, window_m)
-    bands = bands_of(sweeps, radar, video=True)
-    up, down = peak_frequencies(bands, window_m)
-    return velocity_estimate(from_beats(up, down, bands), bands, pulse, factor=3.0, azimuth_m=azimuth_m)
+
+    def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
+        bands = bands_of(sweeps, radar, video=True)
+        up, down = peak_frequencies(bands, window_m)
+        return velocity_estimate(from_beats(up, down, bands), bands, pulse, factor=3.0, azimuth_m=azimuth_m)
+
+    return by_trials(estimator, sweeps, azimuth_m)
 
 
 def from_beats(up_hz: Tensor, down_hz: Tensor, bands: Bands) -> Tensor:

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.radial.bands import Bands, bands_of, refuse_other_sweeps
+from torchsar.compensate.radial.blocks import by_trials
 from torchsar.compensate.radial.compensate import carrier_turns, polynomial_phasor
-from torchsar.compensate.radial.mirror import Intercept, mirror_velocity
+from torchsar.compensate.radial.mirror import Intercept, mirror_estimate, refuse_other_intercept
 from torchsar.compensate.radial.polish import ENOUGH_STD_RAD, phase_polish
 from torchsar.compensate.radial.trajectory import integrated_range, sweep_middles, sweep_motion
-from torchsar.compensate.radial.verdict import velocity_estimate
 from torchsar.core import Axis, Estimate, unit_phasor
 from torchsar.core.spline import UniformSpline
 from torchsar.radar import TriangularLadar
@@ -41,9 +41,17 @@ def radial_motion(
     std: of both. ok: both can be trusted. quality: that of the velocities. Differentiable around the detached peak search. Raises TypeError or ValueError for other sweeps or windows.
     """
     refuse_other_sweeps(sweeps, radar, "radial_motion")
-    bands = bands_of(sweeps, radar, window_m, taper, oversampling=2)
-    velocity, info = mirror_velocity(bands, intercept)
-    coarse = velocity_estimate(velocity, bands, pulse, factor=3.0 if intercept == "free" else 0.75, azimuth_m=azimuth_m, squared=True, **info)
+    refuse_other_intercept(intercept)
+
+    def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
+        bands = bands_of(sweeps, radar, window_m, taper, oversampling=2)
+        return polished(bands, mirror_estimate(bands, pulse, intercept, azimuth_m), pulse, iterations, tolerance_rad)
+
+    return by_trials(estimator, sweeps, azimuth_m)
+
+
+def polished(bands: Bands, coarse: Estimate, pulse: Axis, iterations: int, tolerance_rad: float) -> Estimate:
+    """An estimate of velocities and the phases that they leave in the up sweeps of the bands that they come from."""
     fine = phase_polish(deramped_lines(bands, coarse["velocity_m_s"], pulse), iterations=iterations, tolerance_rad=tolerance_rad)
     std = (1 / torch.sqrt(2 * 10 ** (coarse.info["snr_db"] / 10))).clamp_max(math.pi)
     return Estimate(

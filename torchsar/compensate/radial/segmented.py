@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.radial.bands import Bands, bands_of, inside, refuse_other_sweeps, window_lines
+from torchsar.compensate.radial.blocks import by_trials
 from torchsar.compensate.radial.correlation import envelope_lag
 from torchsar.compensate.radial.peak import from_beats
 from torchsar.compensate.radial.verdict import GRADIENT_SNR_DB, LEAST_SNR_DB, velocity_estimate
@@ -53,16 +54,20 @@ def segmented_interference(
     if not (isinstance(scatterers, int) and scatterers >= 1 and isinstance(padding, int) and 1 <= padding <= 16):
         raise ValueError(f"scatterers must be 1 or more and padding 1..16, both whole numbers, got {scatterers} and {padding}")
     window_lines(radar, window_m)
-    bands = bands_of(sweeps, radar, video=bins == "peak")
-    coarse = envelope_lag(bands_of(sweeps, radar, window_m, taper=0.0), _SUM_UPSAMPLING if bins == "sum" else 4) / 2
-    spectra = _halves(_shifted(bands, coarse) if bins == "sum" else bands, padding, hann)
-    sought = inside(radar, window_m, spectra[0].shape[-1], padding / 2, sweeps.device)
-    phases, weights = _summed(spectra, sought, coarse) if bins == "sum" else _at_peaks(spectra, sought, padding, scatterers)
-    phase, integer, slips = _unwrapped(phases, weights, coarse, bands, unwrap)
-    doppler = (integer - phase / (2 * math.pi)) / radar.sweep_s
-    need = GRADIENT_SNR_DB if unwrap == "gradient" else LEAST_SNR_DB
-    info = {"phase_rad": phase, "integer": integer + bands.shift, "slips": slips, "weights": weights, "dispersion": _dispersion(bands)}
-    return velocity_estimate(from_beats(doppler, -doppler, bands), bands, pulse, factor=4.0, azimuth_m=azimuth_m, need_db=need, **info)
+
+    def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
+        bands = bands_of(sweeps, radar, video=bins == "peak")
+        coarse = envelope_lag(bands_of(sweeps, radar, window_m, taper=0.0), _SUM_UPSAMPLING if bins == "sum" else 4) / 2
+        spectra = _halves(_shifted(bands, coarse) if bins == "sum" else bands, padding, hann)
+        sought = inside(radar, window_m, spectra[0].shape[-1], padding / 2, sweeps.device)
+        phases, weights = _summed(spectra, sought, coarse) if bins == "sum" else _at_peaks(spectra, sought, padding, scatterers)
+        phase, integer, slips = _unwrapped(phases, weights, coarse, bands, unwrap)
+        doppler = (integer - phase / (2 * math.pi)) / radar.sweep_s
+        need = GRADIENT_SNR_DB if unwrap == "gradient" else LEAST_SNR_DB
+        info = {"phase_rad": phase, "integer": integer + bands.shift, "slips": slips, "weights": weights, "dispersion": _dispersion(bands)}
+        return velocity_estimate(from_beats(doppler, -doppler, bands), bands, pulse, factor=4.0, azimuth_m=azimuth_m, need_db=need, **info)
+
+    return by_trials(estimator, sweeps, azimuth_m)
 
 
 def _halves(bands: Bands, padding: int, hann: bool) -> tuple[Tensor, ...]:
@@ -158,17 +163,22 @@ def _unwrapped(phases: Tensor, weights: Tensor, coarse: Tensor, bands: Bands, un
     turn = 2 * math.pi
     integer = torch.round(coarse[..., None, :] + phases.detach() / turn)
     own = ((phases - turn * integer) * weights[..., None]).sum(-2)  # phase less whole turns, weighted: fd T = -own / 2 pi
-    step = (_wrapped(phases.diff(dim=-1)) * weights[..., None]).sum(-2)
+    step = (_wrapped(_steps(phases)) * weights[..., None]).sum(-2)
     beyond = own - turn * bands.shift.to(torch.float64)  # with the shift, which the gradient does not see
     both = bands.lit[..., 1:] & bands.lit[..., :-1]
-    step = torch.where(both, step, beyond.diff(dim=-1))
-    gradient = torch.cat([torch.zeros_like(step[..., :1]), step.cumsum(-1)], -1)
+    step = torch.where(both, step, _steps(beyond))
+    gradient = torch.cat([torch.zeros_like(own[..., :1]), step.cumsum(-1)], -1)
     first = bands.lit.to(torch.int8).argmax(-1, keepdim=True)
     gradient = gradient + (beyond - gradient).gather(-1, first)
-    slips = ((torch.round((gradient - beyond).detach() / turn).diff(dim=-1) != 0) & both).sum(-1).to(torch.float64)
+    slips = ((_steps(torch.round((gradient - beyond).detach() / turn)) != 0) & both).sum(-1).to(torch.float64)
     chosen = gradient + turn * bands.shift.to(torch.float64) if unwrap == "gradient" else own
     whole = -torch.round(chosen.detach() / turn)
     return chosen + turn * whole, whole, slips
+
+
+def _steps(x: Tensor) -> Tensor:
+    """From each entry to the next, none for a single one."""
+    return x[..., 1:] - x[..., :-1]
 
 
 def _wrapped(x: Tensor) -> Tensor:

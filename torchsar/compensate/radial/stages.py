@@ -6,6 +6,7 @@ from torch import Tensor
 
 from torchsar.compensate.radial.compensate import compensate_motion
 from torchsar.compensate.radial.correlation import spectrum_correlation
+from torchsar.compensate.radial.equalise import equalise_pulses, pulse_gain
 from torchsar.compensate.radial.mirror import Intercept, mirror_product
 from torchsar.compensate.radial.peak import ml_peak
 from torchsar.compensate.radial.polish import phase_polish
@@ -162,3 +163,19 @@ class PhasePolish(Stage):
 
     def forward(self, signal: Signal) -> Estimate:
         return phase_polish(signal.data, iterations=self.iterations, tolerance_rad=self.tolerance_rad)
+
+
+class PulseGain(Stage):
+    """`pulse_gain`: how strong each pulse is."""
+
+    provides = ("gain",)
+
+    def forward(self, signal: Signal) -> Estimate:
+        return pulse_gain(signal.data)
+
+
+class EqualisePulses(Stage):
+    """`equalise_pulses` by a connected value `gain` (..., pulse)."""
+
+    def forward(self, signal: Signal, gain: Tensor) -> Signal:
+        return signal.with_data(equalise_pulses(signal.data, gain))

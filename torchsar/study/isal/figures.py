@@ -14,7 +14,7 @@ from torch import Tensor
 from torchsar import plot
 from torchsar.core import Signal
 from torchsar.metrics import residual_phase
-from torchsar.study.isal.build import word_of
+from torchsar.study.cases import word_of
 from torchsar.study.pictures import Drawn, Picture, draw_all
 
 _NEAR_RAD = 0.3
@@ -35,6 +35,12 @@ class CaseResult:
     phases: Mapping[str, Tensor]
     true_rad: Tensor
     target: tuple[Tensor, Tensor, Tensor] | None = None
+
+    def truths(self) -> dict[str, Tensor]:
+        return {"phase_rad": self.true_rad}
+
+    def estimates(self) -> dict[str, dict[str, Tensor]]:
+        return {name: {"phase_rad": phase} for name, phase in self.phases.items()}
 
 
 def draw(results: Mapping[str, CaseResult], folder: Path) -> list[Picture]:

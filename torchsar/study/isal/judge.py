@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -10,7 +9,7 @@ from torch import Tensor
 
 from torchsar.core import Chain, Signal, Trace
 from torchsar.metrics import contrast, entropy, phase_rmse, residual_phase, strehl
-from torchsar.study.montecarlo.record import OK
+from torchsar.study.tracing import verdict
 
 DEFINITIONS: dict[str, Any] = {
     "snr": "mean power of all range-compressed samples over noise variance, dB",
@@ -47,8 +46,7 @@ def phase_metrics(chain: Chain, trace: Trace, truth_rad: Tensor, present: Tensor
     for estimate in trace.estimates.values():
         if "phase_rad" in estimate.std:
             found["residual_phase_std_rad"] = estimate.std["phase_rad"].mean(-1)
-    verdicts = [estimate.ok.expand(truth_rad.shape[:-1]) for estimate in trace.estimates.values()]
-    return {**found, OK: torch.stack(verdicts).all(0)} if verdicts else found
+    return {**found, **verdict(trace.estimates, truth_rad.shape[:-1])}
 
 
 def strehl_over(residual: Tensor, present: Tensor | None) -> Tensor:
@@ -63,17 +61,3 @@ def image_metrics(image: Signal, ideal: Signal | None) -> dict[str, Tensor]:
     """Entropy and contrast, and the entropy above that of the ideal image."""
     found = {"entropy_nats": entropy(image), "contrast": contrast(image)}
     return found if ideal is None else {**found, "entropy_above_ideal_nats": found["entropy_nats"] - entropy(ideal)}
-
-
-def summary(values: Mapping[str, Mapping[str, Tensor]]) -> dict[str, dict[str, float]]:
-    """Mean over trials of every metric by method, with `<metric>_sd` where there are several; `<metric>` of ok is a share."""
-    out: dict[str, dict[str, float]] = {}
-    for method, metrics in values.items():
-        row: dict[str, float] = {}
-        for name, value in metrics.items():
-            x = value.to(torch.float64).reshape(-1)
-            row[name] = float(x.mean())
-            if x.numel() > 1 and name != OK:
-                row[f"{name}_sd"] = float(x.std())
-        out[method] = row
-    return out

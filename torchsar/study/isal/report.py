@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from torchsar.study.case_report import Published, write_case_report
 from torchsar.study.pictures import Picture
-from torchsar.study.report import number, write_page
 
 _SHOWN = {
     "entropy_above_ideal_nats": ("entropy above the ideal image", "nats", 3),
@@ -23,38 +23,14 @@ _SHOWN = {
 }
 
 
-def _cell(row: Mapping[str, float], key: str, digits: int) -> str:
-    if key not in row:
-        return "–"
-    spread = row.get(f"{key}_sd")
-    return number(row[key], digits) if spread is None or key == "seconds" else f"{number(row[key], digits)} ± {spread:.{digits}f}"
-
-
-def tables(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """One table a figure: rows are cases, columns methods; of the entropy also what the source published, less its ideal."""
-    methods = metrics["methods"]
-    cases = list(next(iter(methods.values()))["cases"])
-    found = []
-    for key, (label, unit, digits) in _SHOWN.items():
-        columns = [name for name, m in methods.items() if any(key in row for row in m["cases"].values())]
-        if not columns:
-            continue
-        rows = [{"case": case, "cells": [_cell(methods[name]["cases"][case], key, digits) for name in columns]} for case in cases]
-        found.append({"title": f"{label} ({unit})" if unit else label, "columns": columns, "rows": rows, "published": _published(metrics, columns, cases) if key == "entropy_above_ideal_nats" else []})
-    return found
-
-
-def _published(metrics: Mapping[str, Any], columns: Sequence[str], cases: Sequence[str]) -> list[dict[str, Any]]:
-    """Rows of the source beside ours: entropy less the entropy that it implies for the error-free image."""
+def _published(metrics: Mapping[str, Any]) -> Published:
+    """Entropies of the source less the entropy that it implies for the error-free image."""
     ideal, entropies = metrics["published"]["ideal_entropy_nats"], metrics["published"]["entropy_nats"]
     if ideal is None:
-        return []
-    return [{"case": case, "cells": [number(entropies[case][name] - ideal, 3) if name in entropies[case] else "–" for name in columns]} for case in cases if case in entropies]
+        return {}
+    return {"entropy_above_ideal_nats": {case: {name: value - ideal for name, value in row.items()} for case, row in entropies.items()}}
 
 
 def write_report(path: Path, title: str, metrics: Mapping[str, Any], pictures: Sequence[Picture], figures: Path, config_text: str, command: str) -> None:
     """Write the report of one run; it asks for nothing from outside."""
-    best = metrics["methods"]["recommended"]["metrics"]
-    facts = [(f"{number(best[key], digits)} {unit}", label) for key, (label, unit, digits) in _SHOWN.items() if key in best][:6]
-    fields = {"facts": facts, "tables": tables(metrics), "methods": metrics["methods"], "trials": metrics["trials"]}
-    write_page(path, "isal.html.j2", pictures, figures, title=title, command=command, definitions=metrics["definitions"], config=config_text, **fields)
+    write_case_report(path, "isal.html.j2", title, metrics, _SHOWN, _published(metrics), pictures, figures, config_text, command)

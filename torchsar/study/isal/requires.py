@@ -13,11 +13,11 @@ from torchsar.core import Draws
 from torchsar.focus.inverse_requirements import inverse_requirements
 from torchsar.focus.requirements import Requirement
 from torchsar.scene import displacement_m
-from torchsar.study.build import resolved
+from torchsar.study.case_run import write_requirements
+from torchsar.study.cases import cases_of
 from torchsar.study.config import Loaded
 from torchsar.study.errors import ConfigError
-from torchsar.study.folder import fresh_folder, write_json
-from torchsar.study.isal.build import build_radar, build_world, cases_of, check
+from torchsar.study.isal.build import build_radar, build_world, check
 
 _SAMPLING = ("vibration followed by pulses", "cross range unambiguous", "range unambiguous")
 
@@ -31,15 +31,13 @@ def requires(loaded: Loaded, out: Path | None) -> str:
     if loaded.config.data.file is not None or loaded.config.world is None:
         raise ConfigError(f"{loaded.file}: requires predicts what a simulation needs; of a recording neither the extents of the target nor its motion are known")
     check(loaded)
-    tables = {name or loaded.name: _rows(case) for name, case in cases_of(loaded).items()}
-    text = "\n\n".join(_text(name, rows) for name, rows in tables.items())
-    if out is None:
-        return text
-    with fresh_folder(out) as folder:
-        (folder / "config.yaml").write_text(loaded.text(resolved(loaded)), encoding="utf-8")
-        (folder / "requires.txt").write_text(text + "\n", encoding="utf-8")
-        write_json(folder / "requires.json", {name: {"fidelity": fidelity_for(rows), "requirements": [asdict(row) for row in rows]} for name, rows in tables.items()})
-    return f"{text}\n{out}"
+
+    def find() -> tuple[str, dict[str, object]]:
+        tables = {name or loaded.name: _rows(case) for name, case in cases_of(loaded).items()}
+        text = "\n\n".join(_text(name, rows) for name, rows in tables.items())
+        return text, {name: {"fidelity": fidelity_for(rows), "requirements": [asdict(row) for row in rows]} for name, rows in tables.items()}
+
+    return write_requirements(loaded, out, find)
 
 
 def _rows(loaded: Loaded) -> Sequence[Requirement]:

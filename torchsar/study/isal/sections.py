@@ -6,8 +6,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
+from torchsar.study.cases import CasedConfig
 from torchsar.study.catalogue import Catalogue, Strict
-from torchsar.study.config import Config, Noise
+from torchsar.study.config import Noise
 from torchsar.study.registry import DAMAGES, FIDELITIES, MOTIONS, SCENES, START_PHASES
 
 _DAMAGES = ("lost_pulses", "white_phase", "phase_walk", "phase_sinusoid", "quantiser")
@@ -67,14 +68,13 @@ class Trade(Strict):
     repeats: int = Field(default=3, ge=1)
 
 
-class IsalConfig(Config):
-    """An experiment with a turning target; cases: name -> dotted keys with the values that make the case."""
+class IsalConfig(CasedConfig):
+    """An experiment with a turning target."""
 
     recording: ClassVar[str] = "range profile or phase history"
 
     system: Literal["isal"] = "isal"
     radar: Radar | None = None
     world: World | None = None
-    cases: dict[str, dict[str, Any]] = {}
     metrics: Metrics = Metrics()
     trade: Trade = Trade()

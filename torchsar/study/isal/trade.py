@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import logging
 import math
-import platform
 import statistics
-import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchsar import plot
@@ -23,15 +21,17 @@ from torchsar.focus import CompressDechirped, azimuth_transform
 from torchsar.metrics import entropy, phase_rmse
 from torchsar.radar import InverseRadar
 from torchsar.scene import Dechirped, PhaseOnly, TurntableWorld
-from torchsar.study.build import build_damages, resolved
+from torchsar.study.build import build_damages
+from torchsar.study.cases import cases_of
 from torchsar.study.config import Loaded
 from torchsar.study.errors import ConfigError
-from torchsar.study.folder import fresh_folder, write_json
-from torchsar.study.isal.build import build_radar, build_world, cases_of, check
+from torchsar.study.isal.build import build_radar, build_world, check
 from torchsar.study.isal.judge import estimated_phase
 from torchsar.study.isal.sections import TARGET_DAMAGES
-from torchsar.study.isal.trials import received, traced, whole_phase
+from torchsar.study.isal.trials import received, whole_phase
 from torchsar.study.methods import build_chains
+from torchsar.study.tracing import traced
+from torchsar.study.trading import Tables, timed, written
 
 log = logging.getLogger("torchsar")
 
@@ -56,21 +56,12 @@ def trade(loaded: Loaded, out: Path | None) -> str:
         raise ConfigError(f"{loaded.file}: trade compares with true phases, which a recording does not tell; take a config that simulates")
     check(loaded)
     name, case = list(cases_of(loaded).items())[-1]
-    if out is None:
-        return _text(name, _tables(case))
-    with fresh_folder(out) as folder:
-        tables = _tables(case)
-        text = _text(name, tables)
-        (folder / "config.yaml").write_text(loaded.text(resolved(loaded)), encoding="utf-8")
-        (folder / "trade.txt").write_text(text + "\n", encoding="utf-8")
-        machine = {"machine": platform.processor() or platform.machine(), "torch": torch.__version__, "threads": torch.get_num_threads(), "seed": loaded.config.seed}
-        write_json(folder / "trade.json", {**{key: [asdict(row) for row in rows] for key, rows in tables.items()}, "made_on": machine})
-        (folder / "figures").mkdir()
-        for key in ("methods", "iterations", "precision"):
-            rows = tables[key]
-            figure = plot.trade([r.name for r in rows], [r.seconds for r in rows], [r.error_rad for r in rows], "residual phase (rad rms)", key)
-            plot.save(figure, folder / "figures" / f"trade_{key}.png")
-    return f"{text}\n{out}"
+    return written(loaded, out, lambda: _tables(case), lambda tables: _text(name, tables), _figures)
+
+
+def _figures(tables: Tables) -> dict[str, Figure]:
+    label = "residual phase (rad rms)"
+    return {key: plot.trade([r.name for r in tables[key]], [r.seconds for r in tables[key]], [r.error_rad for r in tables[key]], label, key) for key in ("methods", "iterations", "precision")}
 
 
 @dataclass(frozen=True)
@@ -93,7 +84,7 @@ class _Trials:
 
     def row(self, name: str, data: Tensor, work: Callable[[Tensor], Tensor], repeats: int) -> Row:
         """The alternative `work`: data to phases."""
-        phase, times = _timed(lambda: work(data), repeats)
+        phase, times = timed(lambda: work(data), repeats)
         assert self.truth.clean is not None
         error = phase_rmse(phase, whole_phase(self.truth), received(self.truth))
         gained = entropy(azimuth_transform(correct_pulse_phase(data, phase))) - entropy(azimuth_transform(self.truth.clean.signal.data.to(data.dtype)))
@@ -141,7 +132,7 @@ def _methods(loaded: Loaded, made: _Trials) -> Iterator[Row]:
 
 
 def _method_row(name: str, chain: Chain, made: _Trials, ideal: Tensor, repeats: int) -> Row:
-    trace, times = _timed(lambda: traced(chain, made.recording, name), repeats)
+    trace, times = timed(lambda: traced(chain, made.recording, name), repeats)
     truth = whole_phase(made.truth)
     error = phase_rmse(estimated_phase(chain, trace, truth), truth, received(made.truth))
     gained = entropy(trace.signal) - ideal if trace.signal.names == ("azimuth", "range") else torch.tensor(math.nan)
@@ -175,22 +166,13 @@ def _echoes(loaded: Loaded) -> Iterator[Row]:
     for name in ("phase_only", "dechirped"):
         own = isinstance(world.fidelity, Dechirped)
         fidelity = PhaseOnly() if name == "phase_only" else world.fidelity if own else Dechirped()
-        made, times = _timed(lambda fidelity=fidelity: _simulate(loaded, replace(world, fidelity=fidelity), torch.complex64, 2), 1)
+        made, times = timed(lambda fidelity=fidelity: _simulate(loaded, replace(world, fidelity=fidelity), torch.complex64, 2), 1)
         if name == "dechirped" and own:
             row = next(r for r in _methods(loaded, made) if r.name == "recommended")
         else:
             made = made if name == "phase_only" else made.compressed()
             row = made.row(name, made.data, lambda x: autofocus(x)["phase_rad"], 1)
         yield replace(row, name=name, seconds=times[0] / 2, spread_s=0.0)
-
-
-def _timed(work: Callable[[], Any], repeats: int) -> tuple[Any, list[float]]:
-    times, result = [], None
-    for _ in range(repeats):
-        began = time.perf_counter()
-        result = work()
-        times.append(time.perf_counter() - began)
-    return result, times
 
 
 _TITLES = {
@@ -201,7 +183,7 @@ _TITLES = {
 }
 
 
-def _text(case: str, tables: dict[str, list[Row]]) -> str:
+def _text(case: str, tables: Tables) -> str:
     parts = [f"case {case!r}" if case else "one case"]
     for key, rows in tables.items():
         parts += ["", _TITLES[key], f"{'alternative':<30}{'ms a trial':>12}{'spread':>9}{'error (rad rms)':>17}{'entropy above ideal':>21}"]

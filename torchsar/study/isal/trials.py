@@ -12,22 +12,24 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.core import Chain, Draws, Recording, Signal, Trace, Truth
+from torchsar.core import Chain, Draws, Recording, Trace, Truth
 from torchsar.echo import Damage, simulate_turntable
 from torchsar.metrics.bounds import pulse_phase_bound_of_scene_rad, pulse_phase_bound_rad
 from torchsar.radar import InverseRadar
 from torchsar.scene import PhaseOnly, TurntableWorld
 from torchsar.study.benches import Benches
-from torchsar.study.build import build_damages, foreign, precision
+from torchsar.study.build import build_damages, precision
+from torchsar.study.cases import check_judged, check_sweep
 from torchsar.study.config import Config, Loaded
 from torchsar.study.errors import ConfigError
-from torchsar.study.isal.build import build_radar, build_world, check_judged
+from torchsar.study.isal.build import build_radar, build_world
 from torchsar.study.isal.judge import image_metrics, phase_metrics
-from torchsar.study.isal.sections import TARGET_DAMAGES, IsalConfig
+from torchsar.study.isal.sections import TARGET_DAMAGES
 from torchsar.study.methods import build_chains
 from torchsar.study.montecarlo.work import BOUNDS, SAVED
+from torchsar.study.tracing import IMAGE, not_an_image, saved_of, traced
 
-IMAGE = ("azimuth", "range")
+ENDING = "azimuth_transform or target_image"
 _SNR = "world.noise.snr_db"
 _MOST_SCATTERERS, _MOST_PULSES = 1200, 800
 _PEAK_BYTES = 8
@@ -90,12 +92,7 @@ class IsalTrials(Benches[Bench]):
 
     def check(self, grid: Mapping[str, Any]) -> None:
         """Refuse a grid over what a sweep does not use. Raises ConfigError."""
-        assert isinstance(self.loaded.config, IsalConfig)
-        if self.loaded.config.cases:
-            raise ConfigError(f"{self.loaded.file}: cases belong to runs; sweep over the keys that they change, such as world.start_phase, and add cases={{}} to leave them out")
-        for key in grid:
-            if key.split(".")[0] == "cases" or key == "world.trials":
-                raise ConfigError(f"{self.loaded.file}: sweep: the key {key!r} belongs to runs and cannot be swept")
+        check_sweep(self.loaded, grid, "world.start_phase")
 
     def build(self, loaded: Loaded) -> Bench:
         check_judged(loaded)
@@ -115,22 +112,8 @@ class IsalTrials(Benches[Bench]):
         world = replace(bench.world, snr_db=parameters[_SNR]) if _SNR in parameters else bench.world
         batch = run_batch(bench, draws, self.device, world)
         found: dict[str, Any] = judged(bench, batch)
-        return {**found, BOUNDS: _bounds(bench, batch), SAVED: _saved(bench, batch)}
-
-
-def traced(chain: Chain, recording: Recording, name: str) -> Trace:
-    """The trace of a method, whose name goes before whatever its stages refuse."""
-    try:
-        return chain.trace(recording)
-    except AttributeError as error:
-        raise ConfigError(f"processor.{name}: {foreign(error)}") from error
-    except (ValueError, TypeError, KeyError) as error:
-        text = error.args[0] if isinstance(error, KeyError) and error.args else error
-        raise ConfigError(f"processor.{name}: {text}") from error
-
-
-def not_an_image(signal: Signal) -> str:
-    return f"whose last stage gives the axes {signal.names}, not an image {IMAGE}; end its chain with azimuth_transform or target_image"
+        save = bench.config.sweep.save
+        return {**found, BOUNDS: _bounds(bench, batch), SAVED: saved_of(batch.traces, save.taps) if save.trials else {}}
 
 
 def run_batch(bench: Bench, draws: Draws, device: str = "cpu", world: TurntableWorld | None = None) -> Batch:
@@ -152,7 +135,7 @@ def judged(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
     config, reference = bench.config, bench.config.metrics.reference
     ideal = None if reference is None else batch.traces[reference].signal
     if ideal is not None and ideal.names != IMAGE:
-        raise ConfigError(f"metrics.reference names {reference!r}, {not_an_image(ideal)}")
+        raise ConfigError(f"metrics.reference names {reference!r}, {not_an_image(ideal, ENDING)}")
     found = {}
     for name, trace in batch.traces.items():
         clean = config.processor[name].input == "clean"
@@ -197,17 +180,3 @@ def _scene_matrices(bench: Bench, x: Tensor, y: Tensor, n_pulse: int, n_range: i
     cells = torch.arange(n_range, dtype=torch.float64) - n_range // 2
     shifts, back = -2 * math.pi / n_range * (y / bench.radar.range_step_m)[:, None] * cells, 2 * math.pi / n_range * cells[:, None] * cells
     return azimuth, torch.polar(torch.ones_like(shifts), shifts) @ torch.polar(torch.ones_like(back), back) / n_range
-
-
-def _saved(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
-    """The last signal of every method, and the outputs of the stages that `sweep.save.taps` names."""
-    save = bench.config.sweep.save
-    if not save.trials:
-        return {}
-    return {name: {"last": trace.signal.data, **{stage: trace.outputs[stage].data for stage in save.taps if stage in trace.outputs}} for name, trace in batch.traces.items()}
-
-
-def image_of(trace: Trace, trial: int = 0) -> Signal:
-    """The last signal of one trial."""
-    signal = trace.signal
-    return signal if not signal.trials else signal.with_data(signal.data.reshape(-1, *signal.data.shape[-2:])[trial])

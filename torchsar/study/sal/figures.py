@@ -55,6 +55,14 @@ class CaseResult:
         scatterers = values["azimuth_m"], values["range_m"], values["amplitude"]
         return CaseResult(metrics, targets, images, profiles, courses, values, scatterers, bench.config.metrics.target)
 
+    def truths(self) -> Mapping[str, Tensor]:
+        return self.truth
+
+    def estimates(self) -> dict[str, dict[str, Tensor]]:
+        """Velocities and range errors by method."""
+        found = {name: {"range_error_m": course.error_m, "velocity_m_s": course.velocity_m_s} for name, course in self.courses.items()}
+        return {name: {key: value for key, value in values.items() if value is not None} for name, values in found.items()}
+
 
 def _joined(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
     return {key: torch.cat([part[key].reshape(-1) for part in parts]) for key in parts[0]}

@@ -17,11 +17,10 @@ from torchsar.focus.requirements import Requirement
 from torchsar.radar import TriangularLadar
 from torchsar.scene import Extremes, Fidelity, LinearInSweep, QuadraticInSweep, drawn_motion
 from torchsar.scene.vibration import displacement_m
-from torchsar.study.build import resolved
+from torchsar.study.case_run import write_requirements
 from torchsar.study.cases import cases_of
 from torchsar.study.config import Loaded
 from torchsar.study.errors import ConfigError
-from torchsar.study.folder import fresh_folder, write_json
 from torchsar.study.sal.build import Ladar, check, refuse_recordings
 from torchsar.study.sal.judge import leading, lit_periods
 
@@ -40,15 +39,12 @@ def requires(loaded: Loaded, out: Path | None) -> str:
     """Both tables of every case of a simulation as text, predicted from the config alone. With `out`: config.yaml, requires.json and requires.txt there."""
     refuse_recordings(loaded)
     check(loaded)
-    found = {name or loaded.name: Needs.of(case) for name, case in cases_of(loaded).items()}
-    text = "\n\n".join(_text(name, needs) for name, needs in found.items())
-    if out is None:
-        return text
-    with fresh_folder(out) as folder:
-        (folder / "config.yaml").write_text(loaded.text(resolved(loaded)), encoding="utf-8")
-        (folder / "requires.txt").write_text(text + "\n", encoding="utf-8")
-        write_json(folder / "requires.json", {name: needs.tree() for name, needs in found.items()})
-    return f"{text}\n{out}"
+
+    def find() -> tuple[str, dict[str, object]]:
+        found = {name or loaded.name: Needs.of(case) for name, case in cases_of(loaded).items()}
+        return "\n\n".join(_text(name, needs) for name, needs in found.items()), {name: needs.tree() for name, needs in found.items()}
+
+    return write_requirements(loaded, out, find)
 
 
 def heed_limits(loaded: Loaded, case: str) -> None:

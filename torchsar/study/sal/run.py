@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,12 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Signal
-from torchsar.study.build import resolved
-from torchsar.study.cases import cases_of, key_of, methods_tree
+from torchsar.core import Draws
+from torchsar.study.case_run import run_cases
+from torchsar.study.cases import cases_of, methods_tree
 from torchsar.study.config import Loaded, check_methods
-from torchsar.study.errors import ConfigError
-from torchsar.study.folder import fresh_folder, write_arrays, write_json
 from torchsar.study.montecarlo.record import OK
 from torchsar.study.sal.build import check, refuse_recordings
 from torchsar.study.sal.figures import CaseResult, draw
@@ -37,36 +34,15 @@ def run(loaded: Loaded, out: Path, command: str = "torchsar run") -> Path:
     OUT appears whole or not at all. Returns the path of the report. Raises ConfigError for whatever the user can put right, limits that the
     scene exceeds among it.
     """
-    began = time.perf_counter()
-    with fresh_folder(out) as folder:
+
+    def prepare() -> None:
         check_methods(loaded.config, loaded.file)
         refuse_recordings(loaded)
         check(loaded)
-        cases = cases_of(loaded)
-        for name, case in cases.items():
+        for name, case in cases_of(loaded).items():
             heed_limits(case, name)
-        results = {name or "all": _case(case, name) for name, case in cases.items()}
-        metrics = metrics_tree(loaded, results)
-        config_text = loaded.text(resolved(loaded))
-        (folder / "config.yaml").write_text(config_text, encoding="utf-8")
-        write_json(folder / "metrics.json", metrics)
-        write_arrays(folder / "arrays.zarr", _images(results), _truths(results), _estimates(results))
-        pictures = draw(results, folder / "figures")
-        write_report(folder / "report.html", loaded.config.title, metrics, pictures, folder / "figures", config_text, command)
-    log.info("finished in %.0f s", time.perf_counter() - began)
-    return out / "report.html"
 
-
-def _case(loaded: Loaded, name: str) -> CaseResult:
-    """One case; what simulation or methods refuse is a ConfigError that names it."""
-    started = time.perf_counter()
-    try:
-        result = _simulated(loaded, name)
-    except (ValueError, TypeError, KeyError, RuntimeError) as error:
-        text, place = " ".join(str(error).split()), f"{loaded.file}: {f'cases.{name}: ' if name else ''}"
-        raise ConfigError(text if text.startswith(loaded.file) else f"{place}{text}") from error
-    log.info("%s: %.1f s", name or loaded.name, time.perf_counter() - started)
-    return result
+    return run_cases(loaded, out, command, prepare, _simulated, metrics_tree, draw, write_report)
 
 
 @torch.no_grad()
@@ -103,21 +79,3 @@ def metrics_tree(loaded: Loaded, results: Mapping[str, CaseResult]) -> dict[str,
     settings = loaded.config.metrics
     definitions = {**DEFINITIONS, "islr_extent_nulls": settings.sidelobe_nulls, "reference": settings.reference, "target": settings.target}
     return {"methods": methods, "published": settings.published, "truth": {}, "definitions": definitions, "trials": loaded.config.world.trials}
-
-
-def _images(results: Mapping[str, CaseResult]) -> dict[str, Signal]:
-    return {key_of(case, name): image for case, result in results.items() for name, image in result.images.items()}
-
-
-def _truths(results: Mapping[str, CaseResult]) -> dict[str, Tensor]:
-    return {key_of(case, name): value for case, result in results.items() for name, value in result.truth.items()}
-
-
-def _estimates(results: Mapping[str, CaseResult]) -> dict[str, dict[str, Tensor]]:
-    """Velocities and range errors of the first trial, by method."""
-    found: dict[str, dict[str, Tensor]] = {}
-    for case, result in results.items():
-        for name, course in result.courses.items():
-            values = {"range_error_m": course.error_m, **({} if course.velocity_m_s is None else {"velocity_m_s": course.velocity_m_s})}
-            found.setdefault(name, {}).update({key_of(case, key): value for key, value in values.items()})
-    return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -215,5 +216,6 @@ def _line(r: Row) -> str:
 
 
 def _figures(tables: Tables) -> dict[str, Figure]:
-    label = "range error (nm rms, without constant and slope)"
-    return {key: plot.trade([r.name for r in rows], [r.seconds for r in rows], [1e9 * r.range_error_detrended_rms_m for r in rows], label, key) for key, rows in tables.items()}
+    label = "range error without constant and slope (dB over 1 nm rms)"
+    error_db = {key: [20 * math.log10(max(1e9 * r.range_error_detrended_rms_m, 1e-3)) for r in rows] for key, rows in tables.items()}
+    return {key: plot.trade([r.name for r in rows], [r.seconds for r in rows], error_db[key], label, key) for key, rows in tables.items()}

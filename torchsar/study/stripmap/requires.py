@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchsar.focus.requirements import Requirement, recommended_form, requirements
-from torchsar.study.build import resolved
+from torchsar.study.case_run import write_requirements
 from torchsar.study.config import Loaded
-from torchsar.study.folder import fresh_folder, write_json
 from torchsar.study.methods import run_recommended
 from torchsar.study.stripmap.build import build_case, build_radar, true_doppler_hz
 from torchsar.study.stripmap.run import check
@@ -23,15 +22,12 @@ def requires(loaded: Loaded, out: Path | None) -> str:
 
     With `out`: config.yaml, requires.json and requires.txt in that folder.
     """
-    if out is None:
-        return _text(*_rows(loaded))
-    with fresh_folder(out) as folder:
+
+    def find() -> tuple[str, dict[str, object]]:
         rows, notes = _rows(loaded)
-        text = _text(rows, notes)
-        (folder / "config.yaml").write_text(loaded.text(resolved(loaded)), encoding="utf-8")
-        (folder / "requires.txt").write_text(text + "\n", encoding="utf-8")
-        write_json(folder / "requires.json", {"focuser": recommended_form(tuple(rows)), "warnings": notes, "requirements": [_plain(row) for row in rows]})
-    return f"{text}\n{out}"
+        return _text(rows, notes), {"focuser": recommended_form(tuple(rows)), "warnings": notes, "requirements": [_plain(row) for row in rows]}
+
+    return write_requirements(loaded, out, find)
 
 
 def _rows(loaded: Loaded) -> tuple[Sequence[Requirement], list[str]]:

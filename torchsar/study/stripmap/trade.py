@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import logging
 import math
-import platform
 import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchsar import plot
@@ -21,13 +21,12 @@ from torchsar.focus import Backproject
 from torchsar.focus.omega_k import Focuser
 from torchsar.metrics import error_db
 from torchsar.repair.jitter import BandLimited, Exact, Lagrange
-from torchsar.study.build import resolved
 from torchsar.study.config import Loaded
 from torchsar.study.errors import ConfigError, did_you_mean
-from torchsar.study.folder import fresh_folder, write_json
 from torchsar.study.methods import run_recommended
 from torchsar.study.registry import FOCUS
 from torchsar.study.stripmap.build import build_case
+from torchsar.study.trading import Tables, timed, written
 
 log = logging.getLogger("torchsar")
 _HALF = 16
@@ -68,28 +67,20 @@ def trade(loaded: Loaded, out: Path | None) -> str:
     wrong = [name for name in loaded.config.trade.focusers if name not in accepted]
     if wrong:
         raise ConfigError(f"{loaded.file}: trade.focusers names {wrong[0]!r}, which is no focuser to compare{did_you_mean(wrong[0], accepted)}")
-    if out is None:
-        return _text(*_tables(loaded))
-    with fresh_folder(out) as folder:
-        focusing, jitter = _tables(loaded)
-        text = _text(focusing, jitter)
-        (folder / "config.yaml").write_text(loaded.text(resolved(loaded)), encoding="utf-8")
-        (folder / "trade.txt").write_text(text + "\n", encoding="utf-8")
-        machine = {"machine": platform.processor() or platform.machine(), "torch": torch.__version__, "threads": torch.get_num_threads(), "seed": loaded.config.seed}
-        write_json(folder / "trade.json", {"focusing": [asdict(r) for r in focusing], "jitter": [asdict(r) for r in jitter], "made_on": machine})
-        (folder / "figures").mkdir()
-        for name, rows in (("focusing", focusing), ("jitter", jitter)):
-            figure = plot.trade([r.name for r in rows], [r.seconds for r in rows], [max(r.error_db, -200.0) for r in rows], "error (dB)", name)
-            plot.save(figure, folder / "figures" / f"trade_{name}.png")
-    return f"{text}\n{out}"
+    return written(loaded, out, lambda: _tables(loaded), _text, _figures)
 
 
-def _tables(loaded: Loaded) -> tuple[list[Row], list[Row]]:
+def _figures(tables: Tables) -> dict[str, Figure]:
+    return {name: plot.trade([r.name for r in rows], [r.seconds for r in rows], [max(r.error_db, -200.0) for r in rows], "error (dB)", name) for name, rows in tables.items()}
+
+
+def _tables(loaded: Loaded) -> dict[str, list[Row]]:
     case = build_case(_noiseless(loaded))
     best = run_recommended(loaded, case)
     doppler_hz, velocity_m_s = best.used.get("doppler_hz", 0.0), best.used.get("velocity_m_s", case.recording.radar.velocity_m_s)
     with torch.no_grad():
-        return list(_focusing(loaded, case.clean, doppler_hz, velocity_m_s, _bright_places(best.image))), list(_jitter(loaded, case.clean.signal))
+        focusing = list(_focusing(loaded, case.clean, doppler_hz, velocity_m_s, _bright_places(best.image)))
+        return {"focusing": focusing, "jitter": list(_jitter(loaded, case.clean.signal))}
 
 
 def _noiseless(loaded: Loaded) -> Loaded:
@@ -124,7 +115,7 @@ def _focusing(loaded: Loaded, recording: Recording, doppler_hz: float, velocity_
         signal = recording.signal.to(getattr(torch, precision))
         for name in loaded.config.trade.focusers:
             stage = FOCUS[name](recording.radar, "matched", velocity_m_s, doppler_hz)
-            image, times = _timed(lambda stage=stage, signal=signal: stage(signal).data, loaded.config.trade.repeats)
+            image, times = timed(lambda stage=stage, signal=signal: stage(signal).data, loaded.config.trade.repeats)
             patches = _scaled(torch.stack([_patch(image, place) for place in places]).to(torch.complex128), exact)
             phase = torch.angle(patches[:, _HALF, _HALF] / exact[:, _HALF, _HALF]).abs().max()
             error = float(error_db(patches.flatten(0, 1), exact.flatten(0, 1)))
@@ -163,25 +154,16 @@ def _jitter(loaded: Loaded, signal: Signal) -> Iterator[Row]:
         "exact": Exact(),
     }
     for name, method in methods.items():
-        fixed, times = _timed(lambda method=method: method(uneven, offsets), loaded.config.trade.repeats)
+        fixed, times = timed(lambda method=method: method(uneven, offsets), loaded.config.trade.repeats)
         yield Row(name, statistics.median(times), max(times) - min(times), float(error_db(fixed, raw)))
 
 
-def _timed(work: Callable[[], Tensor], repeats: int) -> tuple[Tensor, list[float]]:
-    times = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        result = work()
-        times.append(time.perf_counter() - began)
-    return result, times
-
-
-def _text(focusing: Sequence[Row], jitter: Sequence[Row]) -> str:
+def _text(tables: Tables) -> str:
     parts = ["FOCUSING: error over patches about bright points, against backprojection, one common gain removed"]
     parts += [f"{'alternative':<46}{'time (s)':>10}{'spread':>8}{'error (dB)':>12}{'peak phase (deg)':>18}"]
-    parts += [f"{r.name:<46}{r.seconds:>10.3f}{r.spread_s:>8.3f}{_db(r.error_db):>12}{r.peak_phase_deg or 0:>18.3f}" for r in focusing]
+    parts += [f"{r.name:<46}{r.seconds:>10.3f}{r.spread_s:>8.3f}{_db(r.error_db):>12}{r.peak_phase_deg or 0:>18.3f}" for r in tables["focusing"]]
     parts += ["", f"JITTER of period 4, offsets {_OFFSETS}: error of the raw data", f"{'alternative':<46}{'time (s)':>10}{'spread':>8}{'error (dB)':>12}"]
-    parts += [f"{r.name:<46}{r.seconds:>10.3f}{r.spread_s:>8.3f}{_db(r.error_db):>12}" for r in jitter]
+    parts += [f"{r.name:<46}{r.seconds:>10.3f}{r.spread_s:>8.3f}{_db(r.error_db):>12}" for r in tables["jitter"]]
     return "\n".join(parts)
 
 
