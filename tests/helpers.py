@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import signal
 
+import torch
+
 from torchsar.core import Draws, Recording, Truth
-from torchsar.echo import simulate
-from torchsar.radar import LinearFM, StripmapRadar
-from torchsar.scene import AlwaysLit, Dwell, Points, StripmapWorld
+from torchsar.echo import simulate, simulate_ladar, simulate_ladar_record
+from torchsar.radar import LIGHT_M_S, LinearFM, StripmapRadar, TriangularLadar
+from torchsar.scene import AlwaysLit, Dwell, LadarWorld, Points, Polynomial, StripmapWorld
 
 
 def mind_interrupts() -> None:
@@ -49,3 +51,17 @@ def small_recording(n_pulse: int = 128, n_range: int = 96, trials: int | None = 
     world = StripmapWorld(scene, Dwell(dwell_s) if dwell_s else AlwaysLit(), snr_db=snr_db, velocity_m_s=kwargs.pop("velocity_m_s", None), doppler_hz=kwargs.pop("doppler_hz", None))
     draws = Draws(kwargs.pop("seed", 1), trials=None if trials is None else range(trials))
     return simulate(kwargs.pop("radar", None) or small_radar(), world, n_pulse, n_range, draws, **kwargs)
+
+
+def small_ladar(**changes: object) -> TriangularLadar:
+    """The simulated ladar of brief 000 with 32 samples a sweep: a beat band of half a metre to either side."""
+    values: dict = {"carrier_hz": LIGHT_M_S / 1.55e-6, "bandwidth_hz": 5e9, "period_s": 16e-6, "sample_rate_hz": 4e6, "speed_m_s": 60.0, "reference_range_m": 3000.0}
+    return TriangularLadar(**{**values, **changes})
+
+
+def small_ladar_recording(n_period: int = 48, trials: int | None = None, dtype: torch.dtype = torch.complex128, record: bool = False, seed: int = 1, **changes) -> tuple[Recording, Truth]:
+    """Two points seen by the small ladar, in accelerated motion: separated sweeps, or a continuous record."""
+    world = LadarWorld(Points([0.0, 0.01], [0.1, 0.25], [1.0, 0.5], random_phase=True), motion=(Polynomial([0.06, 10.0]),), snr_db=20.0)
+    draws = Draws(seed, trials=None if trials is None else range(trials))
+    simulated = simulate_ladar_record if record else simulate_ladar
+    return simulated(small_ladar(**changes), world, n_period, draws, dtype=dtype)

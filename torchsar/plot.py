@@ -132,6 +132,68 @@ def images(signals: Mapping[str, Signal], dynamic_range_db: float = 50.0, column
     return figure
 
 
+@_styled
+def contours(signals: Mapping[str, Signal], levels_db: Sequence[float] = (-30, -20, -13, -3), columns: int = 3) -> Figure:
+    """Lines of equal amplitude of images side by side, in dB of the peak of each; range horizontal, azimuth vertical. The first trial of a batch."""
+    rows = math.ceil(len(signals) / columns)
+    figure, panels = _panels(rows, min(columns, len(signals)), (3.3 * min(columns, len(signals)), 3.1 * rows))
+    for axes, (title, signal) in zip(panels, signals.items(), strict=False):
+        vertical, horizontal = signal.axes
+        drawn = axes.contour(array(horizontal.values()), array(vertical.values()), decibel(_first(signal).data), levels=list(levels_db), colors=COLOURS, linewidths=1.0)
+        axes.set(xlabel=f"{horizontal.name} ({horizontal.unit})", ylabel=f"{vertical.name} ({vertical.unit})", title=title)
+        _legend_levels(figure, drawn, levels_db, once=axes is panels[0])
+    for axes in panels[len(signals) :]:
+        axes.set_visible(False)
+    return figure
+
+
+def _legend_levels(figure: Figure, drawn: Any, levels_db: Sequence[float], once: bool) -> None:
+    if once:
+        figure.legend(drawn.legend_elements()[0], [f"{level:g} dB" for level in levels_db], loc="outside lower center", ncols=len(levels_db))
+
+
+def short_time_spectrum(samples: Tensor, rate_hz: float, width: int = 64, hop: int = 4) -> Signal:
+    """Amplitude of a line of samples over frequency (MHz) and time (us): spectra of Hann windows of `width` samples, `hop` apart.
+
+    samples: (n,) complex, frequencies from -rate / 2 on, or real, frequencies from 0 on. Time counts from the first sample, to the middle of a window;
+    beyond its ends the line is zero.
+    """
+    n = 8 * width
+    window = torch.hann_window(width, dtype=samples.real.dtype, device=samples.device)
+    pieces = torch.nn.functional.pad(samples, (width // 2, width - width // 2)).unfold(0, width, hop) * window
+    spectra = torch.fft.fftshift(torch.fft.fft(pieces, n), dim=-1) if samples.is_complex() else torch.fft.rfft(pieces, n)
+    low = -0.5e-6 * rate_hz if samples.is_complex() else 0.0
+    frequency = Axis("frequency", spectra.shape[-1], low, 1e-6 * rate_hz / n, "MHz")
+    return Signal(spectra.mT.abs(), (frequency, Axis("time", len(spectra), -0.5e6 / rate_hz, 1e6 * hop / rate_hz, "us")))
+
+
+@_styled
+def overlays(parts: Sequence[Mapping[str, Any]], columns: int = 2, dynamic_range_db: float = 40.0) -> Figure:
+    """Images, each in dB of its own peak, with lines over them.
+
+    Each part holds `title`; `signal`, with two axes; `lines`, name -> (x, y), may be empty; and may hold `ylim`.
+    """
+    rows = math.ceil(len(parts) / columns)
+    figure, panels = _panels(rows, min(columns, len(parts)), (4.6 * min(columns, len(parts)), 3.2 * rows))
+    for axes, part in zip(panels, parts, strict=False):
+        shown = _show(axes, _first(part["signal"]), dynamic_range_db, part["title"])
+        _draw_over(axes, part["lines"], part.get("ylim"))
+    for axes in panels[len(parts) :]:
+        axes.set_visible(False)
+    figure.colorbar(shown, ax=panels, label="amplitude (dB below the peak of each)", shrink=0.6)
+    return figure
+
+
+def _draw_over(axes: Axes, lines: Mapping[str, tuple[np.ndarray, np.ndarray]], ylim: tuple[float, float] | None) -> None:
+    """Dashed lines over an image, which keeps its limits."""
+    limits = axes.get_xlim(), axes.get_ylim()
+    for i, (name, (x, y)) in enumerate(lines.items()):
+        axes.plot(x, y, label=name, color=COLOURS[(i + 1) % len(COLOURS)], linestyle=DASHES[i % len(DASHES)], linewidth=1.2)
+    axes.set(xlim=limits[0], ylim=ylim or limits[1])
+    if lines:
+        axes.legend(loc="upper right", labelcolor="white")
+
+
 def _first(signal: Signal) -> Signal:
     return signal.with_data(signal.data.flatten(0, -3)[0]) if signal.trials else signal
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -10,28 +11,38 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.helpers import small_radar, small_recording
+from tests.helpers import small_ladar, small_ladar_recording, small_radar, small_recording
 from torchsar.compensate import (
     Autofocus,
+    CompensateMotion,
     CorrectPulsePhase,
     DopplerCentroid,
     EffectiveVelocity,
     EnergyCentre,
     EntropyFixedPoint,
+    MirrorProduct,
+    MlPeak,
     Pga,
     PgaSca,
     PhaseIncrement,
+    PhasePolish,
     PointDoppler,
+    RadialMotion,
     RangeDependentCentroid,
     Sca,
+    SegmentedInterference,
+    SpectrumCorrelation,
 )
 from torchsar.core import Estimate, Signal, Stage, real_dtype
-from torchsar.focus import AzimuthTransform, Backproject, ClosestRange, Detect, OmegaK, OmegaKStolt, PaddedLines, RangeCompress, RangeDoppler
+from torchsar.focus import AzimuthMatchedFilter, AzimuthTransform, Backproject, ClosestRange, CompressSweeps, DerampAzimuth, Detect, OmegaK, OmegaKStolt, PaddedLines, RangeCompress, RangeDoppler
 from torchsar.focus.target import TargetImage
 from torchsar.radar import InverseRadar
 from torchsar.repair import (
     BandLimitedFill,
+    BlankTurningPoints,
     BlindJitter,
+    CalibrateSweeps,
+    CircularShift,
     CorrectImbalance,
     CorrectJitter,
     CorrectResponse,
@@ -43,6 +54,7 @@ from torchsar.repair import (
     NotchInterference,
     PilotJitter,
     SparseFill,
+    SplitSweeps,
     SubtractInterference,
     ZeroFill,
     estimate_response_sharpest,
@@ -50,6 +62,7 @@ from torchsar.repair import (
 
 RADAR = small_radar()
 TURNTABLE = InverseRadar(3.2e9, 50e6, 400.0, 0.01)
+LADAR = small_ladar()
 FEW_POINTS = partial(estimate_response_sharpest, points=40, orders=(4, 8), passes=2)
 
 
@@ -66,6 +79,7 @@ class Case:
     image: bool = False
     keeps_complex: bool = True
     n_range: int = 64
+    ladar: str = ""
 
 
 def _geometry(signal: Signal) -> dict[str, Tensor]:
@@ -111,6 +125,19 @@ def _phases(signal: Signal) -> dict[str, Tensor]:
     return {"phase_rad": (0.7 * at.square()).reshape(*signal.trials, -1)}
 
 
+def _velocities(signal: Signal) -> dict[str, Tensor]:
+    n = signal.axis("pulse").n
+    at = torch.arange(signal.trials.numel() * n, dtype=torch.float64)
+    return {"velocity_m_s": (0.1 * torch.sin(0.3 * at)).reshape(*signal.trials, n)}
+
+
+def _calibration(signal: Signal) -> dict[str, Tensor]:
+    u = LADAR.fast_time_axis().values()
+    turns = LADAR.chirp_rate_hz_s * 1e-9 * (u + 2e-8 * torch.sin(2 * torch.pi * u / LADAR.sweep_s))
+    tone = torch.stack([turns, -turns])[:, None]
+    return {"calibration": torch.polar(torch.ones_like(tone), 2 * torch.pi * tone).to(signal.data.dtype).expand(*signal.trials, 2, 1, len(u)).contiguous()}
+
+
 CASES = [
     Case("range_compress", lambda: RangeCompress(RADAR)),
     Case("omega_k", lambda: OmegaK(RADAR), _geometry),
@@ -150,6 +177,22 @@ CASES = [
     Case("correct_pulse_phase", lambda: CorrectPulsePhase(), _phases),
     Case("azimuth_transform", lambda: AzimuthTransform(TURNTABLE, "hann", 2)),
     Case("target_image", lambda: TargetImage(TURNTABLE)),
+    Case("split_sweeps", lambda: SplitSweeps(LADAR, 3.3e-6), ladar="record"),
+    Case("circular_shift", lambda: CircularShift(LADAR, 3.3e-6), ladar="record"),
+    Case("blank_turning_points", lambda: BlankTurningPoints(LADAR, 100.0), ladar="sweeps"),
+    Case("calibrate_sweeps", lambda: CalibrateSweeps(LADAR, 1e-9), _calibration, differentiable=False, vmap=False, ladar="sweeps"),
+    Case("segmented_interference", lambda: SegmentedInterference(LADAR), ladar="sweeps"),
+    Case("segmented_sum", lambda: SegmentedInterference(LADAR, "sum", "per_pulse"), ladar="sweeps"),
+    Case("mirror_product", lambda: MirrorProduct(LADAR), ladar="sweeps"),
+    Case("mirror_product_record", lambda: MirrorProduct(LADAR, (-0.3, 0.3), "record"), ladar="sweeps"),
+    Case("ml_peak", lambda: MlPeak(LADAR), ladar="sweeps"),
+    Case("spectrum_correlation", lambda: SpectrumCorrelation(LADAR), differentiable=False, ladar="sweeps"),
+    Case("radial_motion", lambda: RadialMotion(LADAR), vmap=False, ladar="sweeps"),
+    Case("compensate_motion", lambda: CompensateMotion(LADAR), _velocities, ladar="sweeps"),
+    Case("compress_sweeps", lambda: CompressSweeps(LADAR), ladar="sweeps"),
+    Case("deramp_azimuth", lambda: DerampAzimuth(LADAR), ladar="profiles"),
+    Case("azimuth_matched_filter", lambda: AzimuthMatchedFilter(LADAR), ladar="profiles"),
+    Case("phase_polish", lambda: PhasePolish(), vmap=False, ladar="profiles"),
 ]
 IDS = [case.name for case in CASES]
 
@@ -175,8 +218,20 @@ def raw(trials: int | None, dtype: torch.dtype = torch.complex128, n_pulse: int 
     return recording.signal
 
 
+def raw_ladar(kind: str, trials: int | None, dtype: torch.dtype, n_pulse: int) -> Signal:
+    """The same of a triangular ladar: "record", "sweeps", or "profiles" of the up sweeps."""
+    signal = small_ladar_recording(n_pulse, trials=trials, dtype=dtype, record=kind == "record")[0].signal
+    signal = CompressSweeps(LADAR)(signal) if kind == "profiles" else signal
+    if trials is None:
+        return signal
+    level = torch.logspace(0, 3, trials).to(dtype)
+    return signal.with_data(signal.data * level[(slice(None),) + (None,) * len(signal.axes)])
+
+
 def entering(case: Case, signal: Signal) -> Signal:
-    """What the stage works on: the raw signal, or an image of it."""
+    """What the stage works on: the raw signal, an image of it, or as many trials and pulses of a ladar."""
+    if case.ladar:
+        return raw_ladar(case.ladar, signal.trials.numel() if signal.trials else None, signal.data.dtype, signal.axes[0].n)
     return Signal(signal.data, RADAR.image_axes(signal.axes)) if case.image else signal
 
 
@@ -217,7 +272,7 @@ def test_gradients(case: Case) -> None:
         out = results(stage(signal.with_data(data), **{**values, **dict(zip(floating, tensors, strict=True))}))
         return tuple(value for value in out.values() if value.is_floating_point() or value.is_complex())
 
-    data = signal.data / signal.data.abs().amax((-2, -1), keepdim=True)
+    data = signal.data / signal.data.abs().flatten(1).amax(1)[(slice(None),) + (None,) * (signal.data.ndim - 1)]
     assert torch.autograd.gradcheck(outputs, (data.requires_grad_(), *floating.values()), fast_mode=True, atol=1e-4, rtol=1e-3)
 
 
@@ -241,8 +296,9 @@ def test_vmap_equals_batch(case: Case) -> None:
 def test_non_finite_input_is_refused(case: Case, bad: float) -> None:
     stage, signal = case.build(), entering(case, raw(2, n_range=case.n_range))
     data = signal.data.clone()
-    data[1, 3, 5] = bad
-    with pytest.raises(ValueError, match=r"1 of \d+ samples are NaN or Inf, the first at index \(1, 3, 5\)"):
+    place = (1, *(0,) * (data.ndim - 3), 3, 5)
+    data[place] = bad
+    with pytest.raises(ValueError, match=r"1 of \d+ samples are NaN or Inf, the first at index " + re.escape(str(place))):
         stage(signal.with_data(data), **case.values(signal))
 
 

@@ -6,10 +6,12 @@ import pytest
 import torch
 
 from tests.repair.triangles import ground, record, sweeps, table1
-from torchsar.core import Chain, Recording, Signal, use
+from torchsar.core import Axis, Chain, Draws, Recording, Signal, use
+from torchsar.echo import simulate_ladar, simulate_ladar_record
 from torchsar.repair import BlankTurningPoints, CircularShift, SplitSweeps, blank_turning_points, circular_shift, split_record
 from torchsar.repair.analytic import delayed
 from torchsar.repair.triangle import canonical_ramps
+from torchsar.scene import EverySample, LadarWorld, Points, Polynomial
 
 
 def rms(x, first=12, last=2):
@@ -18,7 +20,9 @@ def rms(x, first=12, last=2):
 
 
 def signal_of(radar, x):
-    return Signal(x, radar.record_axes(*x.shape[-2:]))
+    """A record whose first samples are at the starts of the blocks."""
+    pulse, time = radar.record_axes(*x.shape[-2:])
+    return Signal(x, (pulse, Axis("time", time.n, 0.0, time.step, "s")))
 
 
 SCENE = {1.5: {"scatterers": ((1.5, 1.0),)}, 10.5: {"scatterers": ((10.5, 1.0),)}}
@@ -85,13 +89,28 @@ def test_slow_time_of_the_stage_and_its_drop_of_one_period():
     assert SplitSweeps(radar)(signal_of(radar, record(radar, 0.0, 6))).axis("pulse").n == 6
 
 
-def test_samples_at_another_place_in_the_block():
-    """An axis that starts half a sample after the block leaves nothing to delay."""
+def test_records_of_the_radar_need_no_delay():
+    """The axis of a record starts half a sample after the block: sweeps of trigger zero are its samples."""
     radar = table1()
-    pulse, time = radar.record_axes(6, 1024)
-    half = 0.5 / radar.sample_rate_hz
-    out = SplitSweeps(radar)(Signal(record(radar, 0.0, 6, first_s=half), (pulse, type(time)("time", 1024, half, time.step, "s"))))
-    assert float((out.data - sweeps(radar, 6)).abs().max()) < 1e-7 and out.axis("pulse").start == pytest.approx(pulse.start, abs=1e-15)
+    axes = radar.record_axes(6, 1024)
+    out = SplitSweeps(radar)(Signal(record(radar, 0.0, 6, first_s=axes[1].start), axes))
+    assert axes[1].start == 0.5 / radar.sample_rate_hz
+    assert float((out.data - sweeps(radar, 6)).abs().max()) < 1e-7 and out.axis("pulse").start == pytest.approx(axes[0].start, abs=1e-15)
+
+
+@pytest.mark.parametrize("trigger_s", [0.0, 3.25e-6])
+def test_a_simulated_record_splits_into_simulated_sweeps(trigger_s):
+    """Away from the transient of 0.64 samples; a trigger of whole samples drops one period and moves slow time."""
+    radar = table1()
+    world = LadarWorld(Points([0.0], [1.5]), motion=[Polynomial([0.35, 10.0])], fidelity=EverySample())
+    recorded, _ = simulate_ladar_record(radar, world, 8, Draws(1), trigger_s=trigger_s, dtype=torch.complex128)
+    separate, _ = simulate_ladar(radar, world, 8, Draws(1), dtype=torch.complex128)
+    out = SplitSweeps(radar, trigger_s)(recorded.signal)
+    if trigger_s == 0:
+        assert out.axes == separate.signal.axes
+        assert float((out.data - separate.signal.data)[..., 2:].abs().max()) < 1e-6
+    assert out.axis("pulse").n == (8 if trigger_s == 0 else 7)
+    assert out.axis("pulse").start == pytest.approx(separate.signal.axis("pulse").start + trigger_s, abs=1e-15)
 
 
 def test_recorded_trigger_in_a_chain():

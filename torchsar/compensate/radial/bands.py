@@ -14,6 +14,10 @@ from torchsar.radar import TriangularLadar
 _BLOCK = 8
 # likeness of envelopes that noise alone does not reach, and share of the usual energy below which a period shows no echo
 _ALIKE, _FAINT = 0.35, 0.3
+# likeness of the envelopes of one period that is trusted against that of its neighbours
+_SURELY_ALIKE = 0.7
+# bins: what lies further off is another scatterer, lit in one of the two sweeps only
+_FURTHEST = 14
 
 
 @dataclass(frozen=True)
@@ -21,7 +25,7 @@ class Bands:
     """Both sweeps of every period as the window of ranges makes them, without the Doppler shift of a whole number of bins.
 
     up, down: (..., pulse, m) samples over the sweep at `time_s` (m,), symmetric about its middle. up is up(u) exp(-2j pi s u / T) and down is the
-    MIRRORED sweep down(-u) exp(+2j pi s u / T), in the sign of the paper ("lo_conj_echo"), each filtered to the lines of the window. Both then have
+    MIRRORED sweep down(-u) exp(+2j pi s u / T), times a power of two of the trial that brings samples to about one, in the sign of the paper ("lo_conj_echo"), each filtered to the lines of the window. Both then have
     the beat of the range plus and minus what is left of the Doppler shift, within about a bin of it, and the residual video phase is
     removed unless it was to be kept. shift: (..., pulse) int64, s. lit: (..., pulse) bool, False where no echo is
     seen and the shift is that of the neighbours. lines: number of kept bins; first: beat of the first of them in bins of 1 / T; noise_lines: how
@@ -101,7 +105,7 @@ def bulk_shift(blocks: Tensor, pulses: int) -> tuple[Tensor, Tensor]:
     makes up and down envelopes meet is 2 fd (brief 000, section 5.4). Lags beyond half the band, which a circular correlation
     would wrap, are told apart. Periods in which the envelopes do not resemble each other take the shift of their neighbours.
     """
-    n, block = blocks.shape[-1], min(_BLOCK, pulses)
+    n = blocks.shape[-1]
     blocks = torch.stack([blocks[..., 0, :, :], blocks[..., 1, :, :].roll(-1, -1).flip(-1)], -3)
     blocks = torch.fft.fftshift(blocks, dim=-1)
     blocks = blocks - blocks.mean(-1, keepdim=True)
@@ -113,8 +117,7 @@ def bulk_shift(blocks: Tensor, pulses: int) -> tuple[Tensor, Tensor]:
     lag = torch.where(lag >= n, lag - 2 * n, lag).to(torch.float64)
     alike = likeness > _ALIKE
     lag = filled(_median_of_three(filled(lag, alike)), alike)
-    at = (torch.arange(pulses, dtype=torch.float64, device=blocks.device) - (block - 1) / 2) / block
-    return torch.round(_interpolated(lag, at) / 2).to(torch.int64), alike.repeat_interleave(block, -1)[..., :pulses]
+    return torch.round(_through_blocks(lag, pulses) / 2).to(torch.int64), alike.repeat_interleave(_BLOCK, -1)[..., :pulses]
 
 
 def filled(values: Tensor, known: Tensor) -> Tensor:
@@ -137,13 +140,16 @@ def _median_of_three(x: Tensor) -> Tensor:
     return torch.cat([x[..., :1], inner, x[..., -1:]], -1)
 
 
-def _interpolated(values: Tensor, at: Tensor) -> Tensor:
-    """Linear interpolation of values (..., n) at fractional indices (m,), held at the ends."""
-    at = at.clamp(0, values.shape[-1] - 1)
-    low = at.floor().long().clamp_max(max(values.shape[-1] - 2, 0))
-    high = (low + 1).clamp_max(values.shape[-1] - 1)
-    share = at - low
-    return values[..., low] * (1 - share) + values[..., high] * share
+def _through_blocks(values: Tensor, pulses: int) -> Tensor:
+    """Values (..., block) in the middles of blocks of periods as straight lines over the periods, (..., pulse): the first and the last line go on to the ends."""
+    if values.shape[-1] == 1:
+        return values.expand(*values.shape[:-1], pulses)
+    first = torch.arange(0, pulses, _BLOCK, dtype=torch.float64, device=values.device)
+    middle = (first + (first + _BLOCK - 1).clamp_max(pulses - 1)) / 2
+    at = torch.arange(pulses, dtype=torch.float64, device=values.device)
+    low = (torch.searchsorted(middle, at, right=True) - 1).clamp(0, values.shape[-1] - 2)
+    share = (at - middle[low]) / (middle[low + 1] - middle[low])
+    return values[..., low] * (1 - share) + values[..., low + 1] * share
 
 
 def bands_of(sweeps: Tensor, radar: TriangularLadar, window_m: tuple[float, float] | None = None, taper: float = 1.0, oversampling: int = 1, video: bool = False) -> Bands:
@@ -158,6 +164,7 @@ def bands_of(sweeps: Tensor, radar: TriangularLadar, window_m: tuple[float, floa
     data = canonical(sweeps, radar)
     spectrum, scale = torch.fft.fft(data), _scale(sweeps.detach())
     shift, alike = bulk_shift(_block_power(spectrum.detach(), scale), sweeps.shape[-2])
+    shift = _followed(spectrum.detach(), scale, shift, first, lines)
     m = 2 ** max(3, math.ceil(math.log2(oversampling * lines)))
     line = torch.arange(lines, device=sweeps.device)
     sides = torch.stack([shift, -shift], -2)
@@ -176,10 +183,10 @@ def bands_of(sweeps: Tensor, radar: TriangularLadar, window_m: tuple[float, floa
 
 
 def _faint(up: Tensor, down: Tensor, alike: Tensor) -> Tensor:
-    """Periods with much less energy in the window than the others, (..., pulse) bool: no scatterer is lit in them."""
-    energy = sum((x.detach().real.square() + x.detach().imag.square()).sum(-1) for x in (up, down))
-    usual = torch.where(alike, energy, torch.nan).nanmedian(-1, keepdim=True).values
-    return energy < _FAINT * usual
+    """Periods with a sweep of much less energy in the window than others have, (..., pulse) bool: no scatterer is lit in it."""
+    both = torch.stack([(x.detach().real.square() + x.detach().imag.square()).sum(-1) for x in (up, down)])
+    usual = torch.where(alike, both.mean(0), torch.nan).nanmedian(-1, keepdim=True).values
+    return both.amin(0) < _FAINT * usual
 
 
 def _scale(sweeps: Tensor) -> Tensor:
@@ -201,8 +208,31 @@ def _block_power(spectrum: Tensor, scale: Tensor) -> Tensor:
 
 
 def _windowed_power(before: Tensor, here: Tensor, after: Tensor, scale: Tensor) -> Tensor:
-    windowed = torch.sub(here, before + after, alpha=0.5).mul_(scale).square_()
+    windowed = torch.sub(here, before + after, alpha=0.5).mul_(scale)
+    windowed = windowed.mul_(windowed)
     return torch.stack([part.mean(-2) for part in windowed.split(_BLOCK, -2)], -2)
+
+
+def _followed(spectrum: Tensor, scale: Tensor, shift: Tensor, first: int, lines: int) -> Tensor:
+    """The shift of every period corrected by the period's own envelopes, where these resemble each other and meet two bins or more from where they should.
+
+    Eight periods together see more, one alone follows vibration of a few periods.
+    """
+    n = spectrum.shape[-1]
+    sides = torch.stack([shift, -shift], -2)
+    mirror = torch.tensor([1, -1], device=spectrum.device)[:, None, None]
+    line = torch.arange(first - 1, first + lines + 1, device=spectrum.device)
+    kept = spectrum.gather(-1, mirror * (line + sides[..., None]) % n) * scale
+    smooth = kept[..., 1:-1] - (kept[..., :-2] + kept[..., 2:]) / 2
+    power = smooth.real.square() + smooth.imag.square()
+    power = power - power.mean(-1, keepdim=True)
+    power = power / power.square().sum(-1, keepdim=True).sqrt().clamp_min(torch.finfo(power.dtype).tiny)
+    length = 2 ** math.ceil(math.log2(2 * lines))
+    transform = torch.fft.rfft(power, length)
+    likeness, lag = torch.fft.irfft(transform[..., 0, :, :] * transform[..., 1, :, :].conj(), length).max(-1)
+    lag = torch.where(lag >= length // 2, lag - length, lag)
+    further = (likeness > _SURELY_ALIKE) & (lag.abs() >= 2) & (lag.abs() <= _FURTHEST)
+    return shift + torch.where(further, torch.round(lag / 2).to(torch.int64), 0)
 
 
 def _line_phase(first: int, lines: int, m: int, sign: int, remove_video: bool, radar: TriangularLadar, like: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from torchsar.compensate.radial.trajectory import sweep_motion
 from torchsar.core import Axis, cis, linear_phasor, real_dtype, unit_phasor
 from torchsar.radar import TriangularLadar
 
-_NEGLIGIBLE_TURNS = {torch.float32: 1e-8, torch.float64: 1e-15}
+_NEGLIGIBLE_TURNS, _MANY_TURNS = {torch.float32: 1e-8, torch.float64: 1e-15}, 2.0
 
 
 def compensate_motion(sweeps: Tensor, velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis, carrier_only: bool = False) -> Tensor:
@@ -65,10 +65,20 @@ def polynomial_phasor(turns: Tensor, step_s: float, n: int, dtype: torch.dtype) 
     bend: Tensor | None = None
     for k in range(turns.shape[-1] - 1, 1, -1):
         c = turns[..., k]
-        if not turns.requires_grad and float(c.abs().max()) * edge**k <= _NEGLIGIBLE_TURNS[real]:
+        if not turns.requires_grad and _largest(c) * edge**k <= _NEGLIGIBLE_TURNS[real]:
             continue
-        term = c[..., None] * u**k if real == torch.float64 else (c * edge**k).to(real)[..., None] * (u / edge).pow(k).to(real)
+        # a bend of many turns needs float64; a small one does not
+        exact = real == torch.float64 or _largest(c) * edge**k > _MANY_TURNS
+        term = c[..., None] * u**k if exact else (c * edge**k).to(real)[..., None] * (u / edge).pow(k).to(real)
         bend = term if bend is None else bend + term
     if bend is None:
         return total
-    return total * (cis(2 * torch.pi * bend) if float(bend.detach().abs().max()) < 4 else unit_phasor(bend.to(torch.float64), dtype))
+    return total * (cis(2 * torch.pi * bend) if bend.dtype == real and _largest(bend) < 2 * _MANY_TURNS else unit_phasor(bend.to(torch.float64), dtype))
+
+
+def _largest(x: Tensor) -> float:
+    """Largest magnitude, infinite inside vmap, where a value cannot be looked at."""
+    try:
+        return float(x.detach().abs().max())
+    except RuntimeError:
+        return torch.inf

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -27,10 +29,12 @@ def spectrum_correlation(sweeps: Tensor, radar: TriangularLadar, pulse: Axis, *,
     if not (isinstance(upsampling, int) and 1 <= upsampling <= 64):
         raise ValueError(f"upsampling must be a whole number of 1..64, got {upsampling}")
 
+    floor = radar.wavelength_m / (4 * upsampling * radar.sweep_s * math.sqrt(12))
+
     def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
         bands = bands_of(sweeps, radar, window_m, taper=0.0)
         doppler = envelope_lag(bands, upsampling) / (2 * radar.sweep_s)
-        return velocity_estimate(from_beats(doppler, -doppler, bands), bands, pulse, factor=3.0, azimuth_m=azimuth_m)
+        return velocity_estimate(from_beats(doppler, -doppler, bands), bands, pulse, factor=3.0, azimuth_m=azimuth_m, floor_m_s=floor)
 
     return by_trials(estimator, sweeps, azimuth_m)
 

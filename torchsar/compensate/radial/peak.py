@@ -30,7 +30,7 @@ def ml_peak(sweeps: Tensor, radar: TriangularLadar, pulse: Axis, *, window_m: tu
     def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
         bands = bands_of(sweeps, radar, video=True)
         up, down = peak_frequencies(bands, window_m)
-        return velocity_estimate(from_beats(up, down, bands), bands, pulse, factor=3.0, azimuth_m=azimuth_m)
+        return velocity_estimate(from_beats(up, down, bands), bands, pulse, factor=3.0, azimuth_m=azimuth_m, window_m=window_m)
 
     return by_trials(estimator, sweeps, azimuth_m)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import prepare, refuse_odd_counts, rotate
+from torchsar.compensate.pulse_phase.data import prepare, refuse_odd_counts, rotate, starting_phase
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.sharpen import Run, Wiener, in_turn
 from torchsar.core import Estimate
@@ -14,12 +14,12 @@ ENOUGH_STD_RAD = 0.5
 _LEVEL, _RELAXATION = 4.0, 1.7
 
 
-def phase_polish(data: Tensor, *, iterations: int = 30, tolerance_rad: float = 0.02) -> Estimate:
+def phase_polish(data: Tensor, *, start: Tensor | None = None, iterations: int = 30, tolerance_rad: float = 0.02) -> Estimate:
     """Phase of every pulse against the scene that all of them show, with value["phase_rad"] (..., pulse) to be removed (brief 000, section 5c).
 
     data: (..., pulse, range) complex, compensated, compressed and deramped in azimuth, so that scatterers are tones; a window of range cells about the
     scatterers costs less and shows more. Integrated velocities leave a random walk of the order of a radian, whose phase steps are small: no
-    start by adjacent pulses is needed. Every iteration forms the image, weighs its cells, goes back to pulses, and takes the phase of each pulse
+    start by adjacent pulses is needed. Beyond a radian iterations may end in an image of two peaks; a start (..., pulse) rad, such as that of `pga`, prevents it. Every iteration forms the image, weighs its cells, goes back to pulses, and takes the phase of each pulse
     against that. In the first two the weight is |I|^2 over the maximum of the range cell, which settles scenes of single points at once; then
     a Wiener weight, over-relaxed, until a trial's step is below tolerance_rad rms or `iterations` are done, which dense scenes need; in the last five
     p / (p + p_max / 10) on twice as many cells, which lets scatterers be that are lit for a part of the record only. Single points reach the bound of
@@ -31,11 +31,12 @@ def phase_polish(data: Tensor, *, iterations: int = 30, tolerance_rad: float = 0
     pulses = prepare(data, "phase_polish")
     refuse_odd_counts("phase_polish", 1, iterations=iterations)
     along = AlongPulses()
-    start = torch.zeros(pulses.rows.shape[0], pulses.n, dtype=pulses.rows.real.dtype, device=data.device)
+    begin = starting_phase(start, pulses, "phase_polish")
+    begin = torch.zeros_like(pulses.rows[:, 0].real) if begin is None else begin
     settle = Run(_over_peak, along, 2, 1.0, 0.0)
     search = Run(Wiener(_LEVEL), along, iterations, _RELAXATION, tolerance_rad)
     finish = Run(_near_peak, AlongPulses(2), 5, 1.0, tolerance_rad / 4)
-    phase, taken = in_turn(pulses.rows, start, [settle, search, finish])
+    phase, taken = in_turn(pulses.rows, begin, [settle, search, finish])
     quality, std = _confidence(rotate(pulses.rows.detach(), phase.detach()))
     shape = pulses.trials
     ok = (std < ENOUGH_STD_RAD) & pulses.present.any(-1)

@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from torchsar.compensate.pulse_phase.gradient import Listed, pga
 from torchsar.compensate.radial.bands import Bands, bands_of, refuse_other_sweeps
 from torchsar.compensate.radial.blocks import by_trials
 from torchsar.compensate.radial.compensate import carrier_turns, polynomial_phasor
@@ -15,7 +16,10 @@ from torchsar.compensate.radial.polish import ENOUGH_STD_RAD, phase_polish
 from torchsar.compensate.radial.trajectory import integrated_range, sweep_middles, sweep_motion
 from torchsar.core import Axis, Estimate, unit_phasor
 from torchsar.core.spline import UniformSpline
+from torchsar.metrics.ladar_bounds import integrated_range_detrended_bound_m
 from torchsar.radar import TriangularLadar
+
+_FAR_RAD, _FEW_PERIODS, _WINDOWS = 0.4, 32, Listed((31.0, 21.0, 15.0, 9.0, 9.0, 9.0))
 
 
 def radial_motion(
@@ -52,7 +56,8 @@ def radial_motion(
 
 def polished(bands: Bands, coarse: Estimate, pulse: Axis, iterations: int, tolerance_rad: float) -> Estimate:
     """An estimate of velocities and the phases that they leave in the up sweeps of the bands that they come from."""
-    fine = phase_polish(deramped_lines(bands, coarse["velocity_m_s"], pulse), iterations=iterations, tolerance_rad=tolerance_rad)
+    cells = deramped_lines(bands, coarse["velocity_m_s"], pulse)
+    fine = phase_polish(cells, start=_start(cells, coarse, bands.radar, pulse), iterations=iterations, tolerance_rad=tolerance_rad)
     std = (1 / torch.sqrt(2 * 10 ** (coarse.info["snr_db"] / 10))).clamp_max(math.pi)
     return Estimate(
         {**coarse.value, **fine.value},
@@ -61,6 +66,16 @@ def polished(bands: Bands, coarse: Estimate, pulse: Axis, iterations: int, toler
         std={**coarse.std, "phase_rad": std[..., None].expand_as(fine["phase_rad"])},
         info={**coarse.info, **fine.info},
     )
+
+
+@torch.no_grad()
+def _start(cells: Tensor, coarse: Estimate, radar: TriangularLadar, pulse: Axis) -> Tensor | None:
+    """Phases (..., pulse) by PGA for trials whose velocities integrate to a random walk of more than half a radian (brief 000, section 7), zero for the others."""
+    drift = 4 * math.pi / radar.wavelength_m * integrated_range_detrended_bound_m(coarse.std["velocity_m_s"][..., 0], pulse.step, pulse.n)
+    far = coarse.ok & (drift > _FAR_RAD)
+    if pulse.n < _FEW_PERIODS or not bool(far.any()):
+        return None
+    return torch.where(far[..., None], pga(cells.detach(), windows=_WINDOWS, iterations=len(_WINDOWS.cells))["phase_rad"], 0)
 
 
 def deramped_lines(bands: Bands, velocity_m_s: Tensor, pulse: Axis) -> Tensor:

@@ -13,7 +13,7 @@ from torchsar.compensate.radial.bands import Bands, bands_of, inside, refuse_oth
 from torchsar.compensate.radial.blocks import by_trials
 from torchsar.compensate.radial.correlation import envelope_lag
 from torchsar.compensate.radial.peak import from_beats
-from torchsar.compensate.radial.verdict import GRADIENT_SNR_DB, LEAST_SNR_DB, velocity_estimate
+from torchsar.compensate.radial.verdict import velocity_estimate
 from torchsar.core import Axis, Estimate, cis
 from torchsar.radar import TriangularLadar
 
@@ -57,15 +57,15 @@ def segmented_interference(
 
     def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
         bands = bands_of(sweeps, radar, video=bins == "peak")
-        coarse = envelope_lag(bands_of(sweeps, radar, window_m, taper=0.0), _SUM_UPSAMPLING if bins == "sum" else 4) / 2
+        windowed = bands_of(sweeps, radar, window_m, taper=0.0)
+        coarse = envelope_lag(windowed, _SUM_UPSAMPLING if bins == "sum" else 4) / 2 + (windowed.shift - bands.shift)
         spectra = _halves(_shifted(bands, coarse) if bins == "sum" else bands, padding, hann)
         sought = inside(radar, window_m, spectra[0].shape[-1], padding / 2, sweeps.device)
         phases, weights = _summed(spectra, sought, coarse) if bins == "sum" else _at_peaks(spectra, sought, padding, scatterers)
         phase, integer, slips = _unwrapped(phases, weights, coarse, bands, unwrap)
         doppler = (integer - phase / (2 * math.pi)) / radar.sweep_s
-        need = GRADIENT_SNR_DB if unwrap == "gradient" else LEAST_SNR_DB
         info = {"phase_rad": phase, "integer": integer + bands.shift, "slips": slips, "weights": weights, "dispersion": _dispersion(bands)}
-        return velocity_estimate(from_beats(doppler, -doppler, bands), bands, pulse, factor=4.0, azimuth_m=azimuth_m, need_db=need, **info)
+        return velocity_estimate(from_beats(doppler, -doppler, bands), bands, pulse, factor=4.0, azimuth_m=azimuth_m, window_m=window_m, **info)
 
     return by_trials(estimator, sweeps, azimuth_m)
 

@@ -28,13 +28,16 @@ _COMPARED = {
 }
 
 
+Metrics = Mapping[str, Mapping[str, Tensor]]
+
+
 @dataclass(frozen=True)
 class CaseResult:
     """One case: metrics (trial,) by method, and of each point target; of the first trial images, profiles and courses by method, the truth,
     and the scatterers: azimuth and relative range (m), amplitude."""
 
-    metrics: Mapping[str, Mapping[str, Tensor]]
-    targets: Mapping[str, Mapping[str, Mapping[str, Tensor]]]
+    metrics: Metrics
+    targets: Mapping[str, Metrics]
     images: Mapping[str, Signal]
     profiles: Mapping[str, Signal]
     courses: Mapping[str, Course]
@@ -43,12 +46,11 @@ class CaseResult:
     target: str | None
 
     @staticmethod
-    def of(bench: Bench, batches: Sequence[Batch]) -> CaseResult:
-        """All trials of a case; the first batch still has its signals."""
-        first, names = batches[0], list(bench.chains)
-        metrics = {name: _joined([batch.outcomes[name].metrics for batch in batches]) for name in names}
-        targets = {name: {key: _joined([batch.outcomes[name].targets[key] for batch in batches]) for key in first.outcomes[name].targets} for name in names}
-        images = {name: image_of(outcome.last) for name, outcome in first.outcomes.items() if outcome.last is not None}
+    def of(bench: Bench, first: Batch, all_metrics: Sequence[Metrics], all_targets: Sequence[Mapping[str, Metrics]]) -> CaseResult:
+        """A case from its first batch, and the metrics and responses by method of all of them."""
+        metrics = {name: _joined([part[name] for part in all_metrics]) for name in bench.chains}
+        targets = {name: {key: _joined([part[name][key] for part in all_targets]) for key in first.outcomes[name].targets} for name in bench.chains}
+        images = {name: image_of(outcome.last) for name, outcome in first.outcomes.items()}
         profiles = {name: image_of(outcome.profiles) for name, outcome in first.outcomes.items() if outcome.profiles is not None}
         courses = {name: _first_course(outcome.course) for name, outcome in first.outcomes.items()}
         values = {name: _first_row(first.truth.values[name]) for name in ("velocity_m_s", "range_error_m", "azimuth_m", "range_m", "amplitude")}
@@ -197,7 +199,7 @@ def _by_size(title: str, unit: str, lines: Lines) -> list[dict[str, object]]:
             groups[-1].append(name)
         else:
             groups.append([name])
-    return [_panel(title, unit, {name: lines[name] for name in reversed(group)}) for group in groups]
+    return [_panel(title if len(group) > 1 else f"{title}: {group[0]}", unit, {name: lines[name] for name in reversed(group)}) for group in groups]
 
 
 def _slices(case: str, result: CaseResult) -> Drawn:

@@ -23,6 +23,7 @@ from torchsar.study.config import Loaded
 from torchsar.study.errors import ConfigError
 from torchsar.study.sal.build import Ladar, check, refuse_recordings
 from torchsar.study.sal.judge import leading, lit_periods
+from torchsar.study.sal.sections import SalConfig
 
 log = logging.getLogger("torchsar")
 _TIMES_A_PERIOD = 16
@@ -64,6 +65,7 @@ def heed_limits(loaded: Loaded, case: str) -> None:
 def _stopped(limit: Limit, loaded: Loaded) -> list[str]:
     """Methods that a limit stops and that the config does not show beyond their limits."""
     config = loaded.config
+    assert isinstance(config, SalConfig)
     names = [name for name, method in config.processor.items() if method.input != "clean" and name not in config.beyond_limits]
     if limit.name not in _CONCERNS:
         return names

@@ -20,7 +20,7 @@ from torchsar.study.sal.figures import CaseResult, draw
 from torchsar.study.sal.judge import DEFINITIONS
 from torchsar.study.sal.report import write_report
 from torchsar.study.sal.requires import heed_limits
-from torchsar.study.sal.trials import ENDING, Batch, SalTrials, run_batch
+from torchsar.study.sal.trials import ENDING, SalTrials, run_batch
 from torchsar.study.tracing import refuse_no_image, summary
 
 __all__ = ["check", "run"]
@@ -51,13 +51,16 @@ def _simulated(loaded: Loaded, name: str) -> CaseResult:
     trials, count = SalTrials(loaded), loaded.config.world.trials
     bench = trials.bench({})
     height = max(1, min(count, _BATCH_BYTES // trials.bytes_per_trial({})))
-    parts: list[Batch] = []
+    first, metrics, targets = None, [], []
     for begin in range(0, count, height):
         batch = run_batch(bench, Draws(loaded.config.seed, "run", range(begin, min(begin + height, count))))
         for method, outcome in batch.outcomes.items():
             refuse_no_image(method, outcome.last, ENDING)
-        parts.append(batch if not parts else batch.without_signals())
-    result = CaseResult.of(bench, parts)
+        first = batch if first is None else first
+        metrics.append(batch.metrics)
+        targets.append(batch.targets)
+    assert first is not None
+    result = CaseResult.of(bench, first, metrics, targets)
     _warn_of_doubt(name, result.metrics, count)
     return result
 

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchsar.compensate.radial import SpectrumCorrelation
 from torchsar.core import Chain, Draws, Recording, Signal, Trace, Truth
 from torchsar.metrics import range_per_sweep_bound_m, velocity_free_offset_bound_m_s, velocity_known_offset_bound_m_s, velocity_segmented_bound_m_s
 from torchsar.scene import Points, Together
@@ -26,7 +27,8 @@ from torchsar.study.tracing import IMAGE, not_an_image, saved_of, traced, verdic
 PROFILES = ("pulse", "range")
 ENDING = "azimuth_matched_filter"
 _SNR = "world.noise.snr_db"
-_PEAK_BYTES = 2
+# the largest tensor of these chains over a recording in double precision
+_PEAK = 1.25
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ class Outcome:
     metrics: dict[str, Tensor]
     targets: dict[str, dict[str, Tensor]]
     course: Course
-    last: Signal | None
+    last: Signal
     profiles: Signal | None
     kept: dict[str, Tensor]
 
@@ -63,9 +65,9 @@ class Batch:
     def metrics(self) -> dict[str, dict[str, Tensor]]:
         return {name: outcome.metrics for name, outcome in self.outcomes.items()}
 
-    def without_signals(self) -> Batch:
-        """The figures alone, which is what later batches of a run are kept for."""
-        return replace(self, outcomes={name: replace(outcome, last=None, profiles=None) for name, outcome in self.outcomes.items()})
+    @property
+    def targets(self) -> dict[str, dict[str, dict[str, Tensor]]]:
+        return {name: outcome.targets for name, outcome in self.outcomes.items()}
 
 
 class SalTrials(Benches[Bench]):
@@ -89,10 +91,12 @@ class SalTrials(Benches[Bench]):
         return Bench(loaded.config, ladar, chains, named_targets(ladar.world))
 
     def bytes_per_trial(self, fixed: Mapping[str, Any]) -> int:
-        """Of the largest tensor that a trial needs, from the axes: noise of both sweeps (or of the blocks of a record) in double precision."""
-        ladar = self.bench(fixed).ladar
-        blocks = 1 if ladar.record is None or ladar.radar.keep_every == 1 else 2
-        return blocks * _PEAK_BYTES * 2 * ladar.periods * ladar.radar.sweep_samples * torch.complex128.itemsize
+        """Of the largest tensor that a trial needs, from the axes: noise in double precision, or spectra that are upsampled over the whole band."""
+        bench = self.bench(fixed)
+        radar, record = bench.ladar.radar, bench.ladar.record
+        block = 2 * radar.sweep_samples if record is None else round((record.block_s or (1 if radar.keep_every == 1 else 2) * radar.period_s) * radar.sample_rate_hz)
+        finest = max((stage.upsampling / 2 for chain in bench.chains.values() for stage in chain.stages.values() if isinstance(stage, SpectrumCorrelation) and stage.window_m is None), default=0)
+        return int(max(_PEAK * block, finest * 2 * radar.sweep_samples) * bench.ladar.periods * torch.complex128.itemsize)
 
     @torch.no_grad()
     def __call__(self, parameters: Mapping[str, Any], draws: Draws) -> dict[str, Any]:
