@@ -19,21 +19,21 @@ from torch import Tensor
 
 from torchsar import plot
 from torchsar.compensate import CorrectPulsePhase
-from torchsar.compensate.radial import CompensateMotion, RadialMotion, SegmentedInterference, range_error, sweep_middles
+from torchsar.compensate.radial import CompensateMotion, RadialMotion, SegmentedInterference
 from torchsar.core import Chain, Draws, Signal, Trace, Truth, use
 from torchsar.echo import simulate_ladar, simulate_ladar_record
 from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
-from torchsar.metrics import impulse_response, phase_rmse
+from torchsar.metrics import impulse_response
 from torchsar.radar import LIGHT_M_S, TriangularLadar
 from torchsar.scene import LadarWorld, Points, Polynomial, QuadraticInSweep, Sinusoid
 from torchsar.study.cuts import impulse_cuts
-from torchsar.study.sal.judge import finer_in_range
+from torchsar.study.sal.judge import Course, course_of, finer_in_range, motion_metrics
 
 RADAR = TriangularLadar(LIGHT_M_S / 1.55e-6, bandwidth_hz=5e9, period_s=16e-6, sample_rate_hz=64e6, speed_m_s=60.0, reference_range_m=3000.0)
 BEAM_RAD = 114e-6  # an azimuth aperture of 0.342 m, for 6.0 mm
 SCENE = Points(azimuth_m=[-0.06, 0.0, 0.06], range_m=[1.0, 1.5, 2.0], amplitude=[0.7, 1.0, 0.7])
 MOTION = (Polynomial((0.35, 10.0)), Sinusoid(160e-6, 100.0, math.degrees(0.3)), Sinusoid(10e-6, 330.0, math.degrees(1.0)))  # 0.35 m/s and 20 m/s^2
-NULLS = 2  # extent of side lobes for the ISLR: -12.84 dB for a sinc, 3 give -11.54 and 10 give -10.17; the published ones do not say
+NULLS = 2  # extent of side lobes for the ISLR: -12.84 dB for a sinc, 3 give -11.54 and 10 give -10.17; the paper does not say
 PUBLISHED = {"irw_range_m": 0.030, "pslr_range_db": -13.23, "islr_range_db": -12.26, "irw_azimuth_m": 0.006, "pslr_azimuth_db": -12.49, "islr_azimuth_db": -11.98}
 
 
@@ -51,23 +51,19 @@ def methods(radar: TriangularLadar) -> dict[str, Chain]:
     }
 
 
-def instantaneous_frequencies(out: Path, draws: Draws) -> None:
+def draw_frequencies(out: Path, draws: Draws) -> None:
     """Figure 2: the triangle and its echo, and the dechirped beat at rest and in motion. 50 MHz in place of 5 GHz, so that the delay can be seen."""
-    radar = replace(RADAR, bandwidth_hz=50e6)
-    range_m, velocity_m_s = 150.0, 2.0
-    delay_s = 2 * range_m / radar.wave_speed_m_s
+    radar, range_m = replace(RADAR, bandwidth_hz=50e6), 150.0
     time_s = torch.linspace(0, 3 * radar.period_s, 1500, dtype=torch.float64)
-    us, sent, echo = 1e6 * time_s, 1e-6 * triangle_hz(time_s, radar), 1e-6 * triangle_hz(time_s - delay_s, radar)
-    lines = {"local oscillator": (plot.array(us), plot.array(sent)), "echo": (plot.array(us), plot.array(echo))}
-    plot.save(plot.curves(lines, "time (us)", "frequency (MHz)", "Triangular sweep and its echo, 1 us later"), out / "figure_02_sweep.png")
-    parts = []
-    for title, speed in (("Dechirped, at rest", 0.0), (f"Dechirped, receding at {velocity_m_s:g} m/s", velocity_m_s)):
-        world = LadarWorld(Points([0.0], [range_m]), [Polynomial((speed,))], snr_db=30.0)
-        record, _ = simulate_ladar_record(radar, world, 3, draws)
-        theory = sent - echo + 1e-6 * radar.doppler_hz(speed)
+    us, sent, echo = (plot.array(1e6 * time_s), *(1e-6 * triangle_hz(time_s - delay, radar) for delay in (0, 2 * range_m / radar.wave_speed_m_s)))
+    swept = {"local oscillator": (us, plot.array(sent)), "echo of 150 m beyond the reference": (us, plot.array(echo))}
+    parts = [{"series": swept, "xlabel": "time (us)", "ylabel": "frequency (MHz)", "title": "sweeps", "ylim": (-28.0, 40.0)}]
+    for title, speed in (("dechirped, at rest", 0.0), ("dechirped, receding at 2 m/s", 2.0)):
+        record, _ = simulate_ladar_record(radar, LadarWorld(Points([0.0], [range_m]), [Polynomial((speed,))], snr_db=30.0), 3, draws)
         spectrum = plot.short_time_spectrum(record.signal.data.flatten(), radar.sample_rate_hz)
-        parts.append({"title": title, "signal": spectrum, "lines": {"theory": (plot.array(us), plot.array(theory))}, "ylim": (-15.0, 20.0)})
-    plot.save(plot.overlays(parts), out / "figure_02.png")
+        theory = {"theory": (us, plot.array(sent - echo + 1e-6 * radar.doppler_hz(speed)))}
+        parts.append({"title": title, "signal": spectrum, "lines": theory, "ylim": (-15.0, 20.0)})
+    plot.save(plot.overlays(parts, columns=3), out / "figure_02.png")
 
 
 def triangle_hz(time_s: Tensor, radar: TriangularLadar) -> Tensor:
@@ -78,7 +74,7 @@ def triangle_hz(time_s: Tensor, radar: TriangularLadar) -> Tensor:
 def draw_images(traces: Mapping[str, Trace], out: Path) -> None:
     """Figures 5 and 7: profiles and image before and after compensation; figure 8: contours."""
     for name, file in (("uncompensated", "figure_05.png"), ("segmented", "figure_07.png")):
-        shown = {"range profiles": over_peak(near(traces[name].outputs["compress"])), f"image, {name}": over_peak(near(traces[name].signal))}
+        shown = {f"range profiles, {name}": over_peak(near(traces[name].outputs["compress"])), f"image, {name}": over_peak(near(traces[name].signal))}
         plot.save(plot.images(shown, dynamic_range_db=40, percentile=100), out / file)
     before, after = (near(finer_in_range(finer_in_range(traces[name].signal))) for name in ("uncompensated", "segmented"))
     points = {f"point at {r:g} m": around(after, x, r) for x, r in zip(SCENE.azimuth_m, SCENE.range_m, strict=True)}
@@ -104,23 +100,16 @@ def around(image: Signal, azimuth_m: float, range_m: float) -> Signal:
     return image.crop(**bounds)
 
 
-def draw_motion(traces: Mapping[str, Trace], truth: Truth, radar: TriangularLadar, out: Path) -> None:
+def draw_motion(courses: Mapping[str, Course], truth: Truth, out: Path) -> None:
     """Figure 6: velocity and range error, true and estimated, and the error of the estimate."""
-    pulse = traces["segmented"].inputs["motion"].axis("pulse")
-    ms, true = plot.array(1e3 * pulse.values()), truth.values["range_error_up_m"]
-    found = {name: errors_m(trace, radar) for name, trace in traces.items() if name != "uncompensated"}
-    velocity = {"true": truth.values["velocity_m_s"], "segmented": traces["segmented"].values["motion.velocity_m_s"]}
-    motion = {"true": 1e3 * (true - true[0]), "segmented": 1e3 * (found["segmented"] - found["segmented"][0])}
-    error = {name: 1e9 * (e - true - (e - true)[0]) for name, e in found.items()}
-    parts = [(velocity, "radial velocity (m/s)"), (motion, "range error (mm)"), (error, "estimated minus true range error (nm)")]
-    panels = [{"series": {name: (ms, plot.array(y)) for name, y in lines.items()}, "xlabel": "slow time (ms)", "ylabel": label} for lines, label in parts]
-    plot.save(plot.panels(panels, columns=3), out / "figure_06.png")
-
-
-def errors_m(trace: Trace, radar: TriangularLadar) -> Tensor:
-    """Estimated range error in the middles of the up sweeps, (pulse,)."""
-    pulse = trace.inputs["motion"].axis("pulse")
-    return range_error(trace.estimates["motion"], radar, pulse, sweep_middles(radar, pulse)[0])
+    found, true = courses["segmented"], truth.values["range_error_up_m"] - truth.values["range_error_up_m"][0]
+    velocity = {"segmented": found.velocity_m_s, "true": truth.values["velocity_m_s"]}
+    motion = {"segmented": 1e3 * (true + found.error_m - found.error_m[0]), "true": 1e3 * true}
+    error = {name: 1e9 * (courses[name].error_m - courses[name].error_m[0]) for name in ("segmented", "recommended")}
+    ms, parts = plot.array(1e3 * found.pulse.values()), []
+    for title, unit, lines in (("radial velocity", "m/s", velocity), ("range error", "mm", motion), ("estimated minus true range error", "nm", error)):
+        parts.append({"series": {name: (ms, plot.array(y)) for name, y in lines.items()}, "xlabel": "slow time (ms)", "ylabel": unit, "title": title})
+    plot.save(plot.panels(parts, columns=3), out / "figure_06.png")
 
 
 def draw_slices(image: Signal, ideal: Signal, out: Path) -> None:
@@ -133,12 +122,11 @@ def draw_slices(image: Signal, ideal: Signal, out: Path) -> None:
     plot.save(plot.panels(parts), out / "figure_09.png")
 
 
-def judge(trace: Trace, truth: Truth, radar: TriangularLadar) -> list[float]:
+def judge(image: Signal, course: Course) -> list[float]:
     """The column of a method: response of the middle point, largest range error (m), and what is left of it (rad) without constant and slope."""
-    response = impulse_response(trace.signal, (0.0, 1.5), sidelobe_nulls=NULLS, search_m=0.2, centre_turns=(None, 0.0))
-    true, found = truth.values["range_error_up_m"], errors_m(trace, radar) if "motion" in trace.estimates else torch.zeros(())
-    error, per_m = found - true, 4 * math.pi / radar.wavelength_m
-    return [*(float(response[name]) for name in PUBLISHED), float((error - error[0]).abs().max()), float(phase_rmse(per_m * found, per_m * true))]
+    response = impulse_response(image, (0.0, 1.5), sidelobe_nulls=NULLS, search_m=0.2, centre_turns=(None, 0.0))
+    left = motion_metrics(course, RADAR)
+    return [*(float(response[name]) for name in PUBLISHED), float(left["range_error_max_m"]), float(left["residual_phase_rms_rad"])]
 
 
 def show(rows: Sequence[str], columns: Mapping[str, Sequence[float]]) -> None:
@@ -160,16 +148,17 @@ def main(arguments: list[str] | None = None) -> None:
 
     radar = replace(RADAR, beam_rad=BEAM_RAD if options.stripmap else None)
     world = LadarWorld(SCENE, MOTION, snr_db=options.snr_db, fidelity=QuadraticInSweep())
-    recording, truth = simulate_ladar(radar, world, 256 if options.small else 512, Draws(options.seed))
+    n_period = 256 if options.small else 448 if options.stripmap else 512  # a strip with a point in the beam all the time
+    recording, truth = simulate_ladar(radar, world, n_period, Draws(options.seed))
     chains = methods(radar)
     traces = {name: chain.trace(recording) for name, chain in chains.items()}
-
-    rows = [*PUBLISHED, "largest range error (m)", "residual phase (rad)"]
-    show(rows, {"published": [*PUBLISHED.values(), 2e-7, math.nan], **{name: judge(trace, truth, radar) for name, trace in traces.items()}})
-    instantaneous_frequencies(options.out, Draws(options.seed))
+    courses = {name: course_of(chain, traces[name], truth, radar, clean=False) for name, chain in chains.items()}
+    columns = {"published": [*PUBLISHED.values(), 2e-7, math.nan], **{name: judge(trace.signal, courses[name]) for name, trace in traces.items()}}
+    show([*PUBLISHED, "largest range error (m)", "residual phase (rad rms)"], columns)
+    draw_frequencies(options.out, Draws(options.seed))
     draw_images(traces, options.out)
-    draw_motion(traces, truth, radar, options.out)
-    draw_slices(traces["segmented"].signal, chains["uncompensated"].trace(truth.clean).signal, options.out)
+    draw_motion(courses, truth, options.out)
+    draw_slices(traces["segmented"].signal, chains["uncompensated"](truth.clean), options.out)
 
 
 if __name__ == "__main__":

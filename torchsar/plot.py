@@ -6,7 +6,7 @@ import functools
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -117,12 +117,12 @@ def image(signal: Signal, dynamic_range_db: float = 50.0, title: str = "", perce
 
 
 @_styled
-def images(signals: Mapping[str, Signal], dynamic_range_db: float = 50.0, columns: int = 2, percentile: float = 99.9) -> Figure:
-    """Several images side by side on one scale, taken from the first of them; arguments as `image`."""
+def images(signals: Mapping[str, Signal], dynamic_range_db: float = 50.0, columns: int = 2, percentile: float = 99.9, reference: str | None = None) -> Figure:
+    """Several images side by side on one scale, taken from the first of them or from the one that `reference` names; other arguments as `image`."""
     rows = math.ceil(len(signals) / columns)
     figure, panels = _panels(rows, min(columns, len(signals)), (4.6 * min(columns, len(signals)), 3.9 * rows))
-    first = quicklook(_first(next(iter(signals.values())))).data.cpu().numpy()
-    top = float(np.percentile(first, percentile)) or None
+    scale = quicklook(_first(signals[reference or next(iter(signals))])).data.cpu().numpy()
+    top = float(np.percentile(scale, percentile)) or None
     shown: Any = None
     for axes, (title, signal) in zip(panels, signals.items(), strict=False):
         shown = _show(axes, _first(signal), dynamic_range_db, title, top)
@@ -171,16 +171,22 @@ def short_time_spectrum(samples: Tensor, rate_hz: float, width: int = 64, hop: i
 def overlays(parts: Sequence[Mapping[str, Any]], columns: int = 2, dynamic_range_db: float = 40.0) -> Figure:
     """Images, each in dB of its own peak, with lines over them.
 
-    Each part holds `title`; `signal`, with two axes; `lines`, name -> (x, y), may be empty; and may hold `ylim`.
+    Each part holds `title`; `signal`, with two axes; `lines`, name -> (x, y), may be empty; and may hold `ylim`. A part without a signal
+    holds the arguments of `curves`.
     """
     rows = math.ceil(len(parts) / columns)
-    figure, panels = _panels(rows, min(columns, len(parts)), (4.6 * min(columns, len(parts)), 3.2 * rows))
+    figure, panels = _panels(rows, min(columns, len(parts)), (4.4 * min(columns, len(parts)), 3.2 * rows))
+    shown: Any = None
     for axes, part in zip(panels, parts, strict=False):
+        if "signal" not in part:
+            draw_curves(axes, **part)
+            continue
         shown = _show(axes, _first(part["signal"]), dynamic_range_db, part["title"])
         _draw_over(axes, part["lines"], part.get("ylim"))
     for axes in panels[len(parts) :]:
         axes.set_visible(False)
-    figure.colorbar(shown, ax=panels, label="amplitude (dB below the peak of each)", shrink=0.6)
+    if shown is not None:
+        figure.colorbar(shown, ax=panels, label="amplitude (dB below the peak)", shrink=0.8)
     return figure
 
 
@@ -207,11 +213,11 @@ def curves(series: Mapping[str, tuple[np.ndarray, np.ndarray]], xlabel: str, yla
 
 
 @_styled
-def places(x: np.ndarray, y: np.ndarray, size: np.ndarray, xlabel: str, ylabel: str, title: str = "") -> Figure:
-    """Points of a scene by their places, on one scale for both axes; size: the area of each point, relative to the largest."""
+def places(x: np.ndarray, y: np.ndarray, size: np.ndarray, xlabel: str, ylabel: str, title: str = "", aspect: Literal["equal", "auto"] = "equal") -> Figure:
+    """Points of a scene by their places, on one scale for both axes where aspect is "equal"; size: the area of each point, relative to the largest."""
     figure, (axes,) = _panels(1, 1, (5.4, 5.0))
     axes.scatter(x, y, s=14 * size / max(float(size.max()), 1e-300), color=COLOURS[0], linewidths=0)
-    axes.set(xlabel=xlabel, ylabel=ylabel, title=title, aspect="equal")
+    axes.set(xlabel=xlabel, ylabel=ylabel, title=title, aspect=aspect)
     return figure
 
 

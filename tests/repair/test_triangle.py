@@ -108,7 +108,7 @@ def test_a_simulated_record_splits_into_simulated_sweeps(trigger_s):
     out = SplitSweeps(radar, trigger_s)(recorded.signal)
     if trigger_s == 0:
         assert out.axes == separate.signal.axes
-        assert float((out.data - separate.signal.data)[..., 2:].abs().max()) < 1e-6
+        assert float((out.data - separate.signal.data)[..., 2:].abs().max()) < 1e-8
     assert out.axis("pulse").n == (8 if trigger_s == 0 else 7)
     assert out.axis("pulse").start == pytest.approx(separate.signal.axis("pulse").start + trigger_s, abs=1e-15)
 

@@ -119,5 +119,5 @@ class Together:
 
     def scatterers(self, draws: Draws) -> Scatterers:
         all_parts = [scene.scatterers(draws.part(name)) for name, scene in self.parts.items()]
-        trials = torch.broadcast_shapes(*(p.azimuth_m.shape[:-1] for p in all_parts))  # points without random phases are the same in all trials
+        trials = torch.broadcast_shapes(*(p.amplitude.shape[:-1] for p in all_parts), *(p.azimuth_m.shape[:-1] for p in all_parts))  # what is not random is the same in all trials
         return Scatterers(*(torch.cat([getattr(p, field).expand(*trials, -1) for p in all_parts], -1) for field in ("azimuth_m", "range_m", "amplitude")))

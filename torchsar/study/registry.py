@@ -15,7 +15,7 @@ from torchsar.compensate.doppler import EnergyCentre, PhaseIncrement, RangeDepen
 from torchsar.compensate.envelope import AlignEnvelopes, ShiftRange
 from torchsar.compensate.point import PointDoppler
 from torchsar.compensate.pulse_phase.stages import CorrectPulsePhase, EntropyFixedPoint, Pga, PgaSca, Sca, SharpestPhase
-from torchsar.compensate.radial import CompensateMotion, MirrorProduct, MlPeak, PhasePolish, SegmentedInterference, SpectrumCorrelation
+from torchsar.compensate.radial import CompensateMotion, EqualisePulses, MirrorProduct, MlPeak, PhasePolish, PulseGain, RadialMotion, SegmentedInterference, SpectrumCorrelation
 from torchsar.echo.channels import ChannelImbalance
 from torchsar.echo.interference import Quantiser, Tone, WideInterferer
 from torchsar.echo.jitter import PeriodicJitter
@@ -171,10 +171,13 @@ COMPENSATE: dict[str, Callable[..., Any]] = {
     "pulse_phase_correct": CorrectPulsePhase,
     "segmented_interference": SegmentedInterference,
     "mirror_product": MirrorProduct,
+    "radial_motion": RadialMotion,
     "ml_peak": MlPeak,
     "spectrum_correlation": SpectrumCorrelation,
     "compensate_motion": CompensateMotion,
     "phase_polish": PhasePolish,
+    "pulse_gain": PulseGain,
+    "equalise_pulses": EqualisePulses,
 }
 FOCUS: dict[str, Callable[..., Any]] = {
     "range_compress": RangeCompress,

@@ -7,23 +7,27 @@ from torch import Tensor
 
 from torchsar.compensate.pulse_phase.data import prepare, refuse_odd_counts, rotate, starting_phase
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
-from torchsar.compensate.pulse_phase.sharpen import Run, Wiener, in_turn
+from torchsar.compensate.pulse_phase.sharpen import Run, in_turn
 from torchsar.core import Estimate
 
 ENOUGH_STD_RAD = 0.5
-_LEVEL, _RELAXATION = 4.0, 1.7
+_RELAXATION = 1.7
+# what counts as scene: this share of the power of a typical bright cell, and so many times the mean power
+_SHARE, _LEVEL = 0.02, 4.0
 
 
-def phase_polish(data: Tensor, *, start: Tensor | None = None, iterations: int = 30, tolerance_rad: float = 0.02) -> Estimate:
+def phase_polish(data: Tensor, *, start: Tensor | None = None, iterations: int = 80, tolerance_rad: float = 0.005) -> Estimate:
     """Phase of every pulse against the scene that all of them show, with value["phase_rad"] (..., pulse) to be removed (brief 000, section 5c).
 
     data: (..., pulse, range) complex, compensated, compressed and deramped in azimuth, so that scatterers are tones; a window of range cells about the
     scatterers costs less and shows more. Integrated velocities leave a random walk of the order of a radian, whose phase steps are small: no
-    start by adjacent pulses is needed. Beyond a radian iterations may end in an image of two peaks; a start (..., pulse) rad, such as that of `pga`, prevents it. Every iteration forms the image, weighs its cells, goes back to pulses, and takes the phase of each pulse
-    against that. In the first two the weight is |I|^2 over the maximum of the range cell, which settles scenes of single points at once; then
-    a Wiener weight, over-relaxed, until a trial's step is below tolerance_rad rms or `iterations` are done, which dense scenes need; in the last five
-    p / (p + p_max / 10) on twice as many cells, which lets scatterers be that are lit for a part of the record only. Single points reach the bound of
-    the phase of one sweep, where the SNR after compression exceeds about 14 dB. Constant and slope, which an image cannot tell from its own place, stay near zero.
+    start by adjacent pulses is needed. Beyond a radian iterations may end in an image of two peaks; a start
+    (..., pulse) rad, such as that of `pga`, prevents it. Every iteration forms the image, weighs its cells, goes back to pulses, and takes the phase of
+    each pulse against that. The weights are Wiener's, over-relaxed, until a trial's step is below tolerance_rad rms or `iterations` are done; a
+    cell counts as scene where it holds a fiftieth of a typical bright cell, however wide the window. One step before, with the power over the
+    maximum of the range cell, settles trials of single points at once; the last five, with p / (p + p_max / 10) on twice as many cells, let scatterers
+    be that are lit for a part of the record only. Single points reach the bound of the phase of one sweep, where the SNR after
+    compression exceeds about 14 dB. Constant and slope, which an image cannot tell from its own place, stay near zero.
 
     std: predicted from the energy of the cells above the noise. ok: it is below 0.5 rad. quality: share of the energy in cells that stand out.
     Differentiable. Raises TypeError or ValueError for samples that are not finite and complex, or counts below 1.
@@ -33,9 +37,9 @@ def phase_polish(data: Tensor, *, start: Tensor | None = None, iterations: int =
     along = AlongPulses()
     begin = starting_phase(start, pulses, "phase_polish")
     begin = torch.zeros_like(pulses.rows[:, 0].real) if begin is None else begin
-    settle = Run(_over_peak, along, 2, 1.0, 0.0)
-    search = Run(Wiener(_LEVEL), along, iterations, _RELAXATION, tolerance_rad)
-    finish = Run(_near_peak, AlongPulses(2), 5, 1.0, tolerance_rad / 4)
+    settle = Run(_single_points, along, 1, 1.0, 0.0)
+    search = Run(_scene, along, iterations, _RELAXATION, tolerance_rad)
+    finish = Run(_near_peak, AlongPulses(2), 5, 1.0, tolerance_rad / 2)
     phase, taken = in_turn(pulses.rows, begin, [settle, search, finish])
     quality, std = _confidence(rotate(pulses.rows.detach(), phase.detach()))
     shape = pulses.trials
@@ -49,10 +53,25 @@ def phase_polish(data: Tensor, *, start: Tensor | None = None, iterations: int =
     )
 
 
-def _over_peak(power: Tensor, mean: Tensor) -> Tensor:
-    """Weights of the cells: their power over that of the strongest of their range cell."""
+def _bright(power: Tensor) -> Tensor:
+    """Power of a typical bright cell: the mean over cells weighted with their own power, (trial, 1, 1)."""
+    return power.square().sum((-2, -1), keepdim=True) / power.sum((-2, -1), keepdim=True).clamp_min(torch.finfo(power.dtype).tiny)
+
+
+def _single_points(power: Tensor, mean: Tensor) -> Tensor:
+    """Power over that of the strongest cell of the range cell, in trials whose typical bright cell is the brightest but for 3 dB; elsewhere as `_scene`."""
     peak = power.amax(-1, keepdim=True)
-    return power / torch.where(peak > 0, peak, 1)
+    few = _bright(power) > 0.5 * peak.amax(-2, keepdim=True)
+    return torch.where(few, power / torch.where(peak > 0, peak, 1), _scene(power, mean))
+
+
+def _scene(power: Tensor, mean: Tensor) -> Tensor:
+    """(p / (p + level))^2 of powers averaged over three range cells, less the mean of its row: a pulse is left out of the scene that it is compared with."""
+    pairs = power + power.roll(1, -2)
+    local = (pairs + pairs.roll(-1, -2)) / 4
+    share = local / (local + torch.maximum(_LEVEL * mean, _SHARE * _bright(power))).clamp_min(torch.finfo(power.dtype).tiny)
+    weight = share.square()
+    return weight - weight.mean(-1, keepdim=True)
 
 
 def _near_peak(power: Tensor, mean: Tensor) -> Tensor:

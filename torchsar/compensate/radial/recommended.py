@@ -31,8 +31,8 @@ def radial_motion(
     intercept: Intercept = "known",
     taper: float = 1.0,
     azimuth_m: Tensor | float = 0.0,
-    iterations: int = 30,
-    tolerance_rad: float = 0.02,
+    iterations: int = 80,
+    tolerance_rad: float = 0.005,
 ) -> Estimate:
     """The recommended estimate: value["velocity_m_s"] at the turning points and value["phase_rad"] at the middles of the up sweeps, (..., pulse) each.
 

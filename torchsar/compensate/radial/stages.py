@@ -64,8 +64,8 @@ class RadialMotion(MirrorProduct):
         intercept: Intercept = "known",
         taper: float = 1.0,
         azimuth_m: float = 0.0,
-        iterations: int = 30,
-        tolerance_rad: float = 0.02,
+        iterations: int = 80,
+        tolerance_rad: float = 0.005,
     ) -> None:
         super().__init__(radar, window_m, intercept, taper, azimuth_m)
         self.iterations, self.tolerance_rad = iterations, tolerance_rad
@@ -157,7 +157,7 @@ class PhasePolish(Stage):
 
     provides = ("phase_rad",)
 
-    def __init__(self, iterations: int = 30, tolerance_rad: float = 0.02) -> None:
+    def __init__(self, iterations: int = 80, tolerance_rad: float = 0.005) -> None:
         super().__init__()
         self.iterations, self.tolerance_rad = iterations, tolerance_rad
 

@@ -35,7 +35,18 @@ def signal_and_noise(bands: Bands, residual_m_s: Tensor) -> tuple[Tensor, Tensor
     return signal, total - signal
 
 
-def velocity_estimate(velocity_m_s: Tensor, bands: Bands, pulse: Axis, *, factor: float, azimuth_m: Tensor | float, squared: bool = False, floor_m_s: float = 0.0, window_m: tuple[float, float] | None = None, **info: Tensor) -> Estimate:
+def velocity_estimate(
+    velocity_m_s: Tensor,
+    bands: Bands,
+    pulse: Axis,
+    *,
+    factor: float,
+    azimuth_m: Tensor | float,
+    squared: bool = False,
+    floor_m_s: float = 0.0,
+    window_m: tuple[float, float] | None = None,
+    **info: Tensor,
+) -> Estimate:
     """The estimate of an estimator whose bound is factor * (lambda / 2)^2 / ((2 pi T)^2 g). velocity_m_s: (..., pulse), with the geometric velocity still in it.
 
     squared: the estimator multiplies the sweeps, which at low SNR costs more than the bound. floor_m_s: deviation that the strongest signal leaves. window_m: ranges

@@ -11,7 +11,7 @@ import torch
 from torchsar.core import Draws, Recording, Truth
 from torchsar.echo import Damage, simulate_ladar, simulate_ladar_record
 from torchsar.radar import LIGHT_M_S, TriangularLadar
-from torchsar.scene import LadarWorld, Points, RetroAndBrokenLine, Scatterers, Together
+from torchsar.scene import LadarWorld, Points, RetroAndBrokenLine, Together
 from torchsar.study.build import build_damages, precision, refuse_oversize
 from torchsar.study.cases import cases_of, check_judged
 from torchsar.study.catalogue import Catalogue
@@ -41,7 +41,7 @@ def build_world(loaded: Loaded) -> LadarWorld:
     motion = [RADIAL_MOTIONS.make(entry, f"world.motion.{name}", file) for name, entry in world.motion.items()]
     try:
         return LadarWorld(
-            Parts(scenes),
+            Together(scenes),
             motion,
             _made(LOG_AMPLITUDES, world.log_amplitude, "log_amplitude", file),
             world.noise.snr_db,
@@ -52,15 +52,6 @@ def build_world(loaded: Loaded) -> LadarWorld:
         )
     except (ValueError, TypeError) as error:
         raise ConfigError(f"{file}: world: {' '.join(str(error).split())}") from None
-
-
-class Parts(Together):
-    """Several scenes at once, whose positions may be the same in all trials while their amplitudes are not."""
-
-    def scatterers(self, draws: Draws) -> Scatterers:
-        parts = [scene.scatterers(draws.part(name)) for name, scene in self.parts.items()]
-        trials = torch.broadcast_shapes(*(part.amplitude.shape[:-1] for part in parts))
-        return Scatterers(*(torch.cat([getattr(part, field).expand(*trials, -1) for part in parts], -1) for field in ("azimuth_m", "range_m", "amplitude")))
 
 
 def _made(catalogue: Catalogue, entry: dict[str, Any] | None, key: str, file: str) -> Any:

@@ -112,7 +112,7 @@ def course_of(chain: Chain, trace: Trace, truth: Truth, radar: TriangularLadar, 
     """Motion as a chain found it beside the true one; clean: it ran on the recording without motion."""
     pulse = _sweeps_axis(trace)
     velocity = _summed(chain, trace, "velocity_m_s")
-    phase = _summed(chain, trace, "phase_rad", used_only=True)
+    phase = _summed(chain, trace, "phase_rad", used_only=trace.signal.names != SWEEPS)
     up, true = (torch.zeros_like(x) if clean else x for x in (truth.values[name][..., : pulse.n] for name in ("range_error_up_m", "velocity_m_s")))
     taken = _compensated(chain, trace)
     moved = torch.zeros_like(up) if taken is None else integrated_range(taken, radar, pulse, sweep_middles(radar, pulse)[0])
@@ -183,7 +183,7 @@ def target_metrics(image: Signal, places: Mapping[str, tuple[Tensor, Tensor]], c
         beyond = range_ - course.coarse_slope_m_s * radar.carrier_hz / radar.chirp_rate_hz_s
         if all(_inside(place, axis) for place, axis in zip((azimuth, range_), image.axes)):
             at = tuple(place.clamp(axis.start, axis.stop) for place, axis in zip((along, beyond), image.axes))
-            figures = impulse_response(finer, (at[0], at[1]), sidelobe_nulls=nulls, search_m=search_m)
+            figures = impulse_response(finer, (at[0], at[1]), sidelobe_nulls=nulls, search_m=search_m, centre_turns=(None, 0.0))
             found[name] = {key: value for key, value in figures.items() if key != "peak"}
     return found
 
