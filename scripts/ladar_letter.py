@@ -37,7 +37,7 @@ def methods() -> dict[str, Chain]:
     compensate = use(CompensateMotion(RADAR), velocity_m_s="motion")
     estimators = {
         "cross-correlation": SpectrumCorrelation(RADAR, upsampling=20),
-        "segmented, at one peak": SegmentedInterference(RADAR, hann=True),  # points 5 cm apart merge in half sweeps, whose cell is 6 cm
+        "segmented, at one peak": SegmentedInterference(RADAR),  # points 5 cm apart merge in half sweeps, whose cell is 6 cm
         "segmented, summed": SegmentedInterference(RADAR, bins="sum", unwrap="per_pulse", window_m=SCENE_M),
     }
     return {

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,15 +16,17 @@ from torchsar.core import Axis, Signal
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def run(name: str, folder: Path, figures: set[int]) -> str:
+def run(name: str, folder: Path, figures: set[int], capsys: pytest.CaptureFixture[str]) -> str:
     """What a script prints with --small, after a look at its figures."""
-    command = [sys.executable, str(ROOT / "scripts" / f"{name}.py"), "--small", "--out", "figures"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr[-1000:]
+    spec = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
+    assert spec and spec.loader
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    script.main(["--small", "--out", str(folder / "figures")])
     drawn = sorted((folder / "figures").iterdir())
     assert {path.name for path in drawn} == {f"figure_{i:02}.png" for i in figures}
     assert all(path.read_bytes().startswith(b"\x89PNG") and path.stat().st_size > 5000 for path in drawn)
-    return done.stdout
+    return capsys.readouterr().out
 
 
 def rows(text: str, label: int) -> dict[str, list[float]]:
@@ -34,8 +35,8 @@ def rows(text: str, label: int) -> dict[str, list[float]]:
     return {line[:label].strip(): [float("nan") if word == "-" else float(word) for word in line[label:].split()] for line in found}
 
 
-def test_points(tmp_path: Path) -> None:
-    text = run("ladar_points", tmp_path, {2, 5, 6, 7, 8, 9})
+def test_points(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = run("ladar_points", tmp_path, {2, 5, 6, 7, 8, 9}, capsys)
     assert text.splitlines()[0].split()[-4:] == ["published", "uncompensated", "segmented", "recommended"]
     table = rows(text, 28)
     assert table["pslr_azimuth_db"][0] == -12.49
@@ -44,8 +45,8 @@ def test_points(tmp_path: Path) -> None:
         assert table["largest range error (m)"][column] < 2e-7 < table["largest range error (m)"][1]
 
 
-def test_letter(tmp_path: Path) -> None:
-    first, trap = run("ladar_letter", tmp_path, {10, 11, 12}).split("\n\n")
+def test_letter(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, trap = run("ladar_letter", tmp_path, {10, 11, 12}, capsys).split("\n\n")
     assert "published" in first.splitlines()[0]
     table = rows(first, 26)
     assert table["segmented, summed"][1] == 11.3471
@@ -56,8 +57,8 @@ def test_letter(tmp_path: Path) -> None:
     assert trapped["cross-correlation"][0] < trapped["ideal"][0] and trapped["cross-correlation"][4] > 1  # less entropy than the truth, and wrong
 
 
-def test_ground(tmp_path: Path) -> None:
-    first, second = run("ladar_ground", tmp_path, {15, 16, 17, 18, 19}).split("\n\n")
+def test_ground(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, second = run("ladar_ground", tmp_path, {15, 16, 17, 18, 19}, capsys).split("\n\n")
     assert "published" in first.splitlines()[0] and second.splitlines()[0].count("published") == 2
     table = rows(first, 26)
     assert table["segmented"][1] == 11.9251

@@ -29,7 +29,9 @@ ONE = Points([0.0], [1.5], [1.0])
 GATE = (0.9, 2.1)  # 40 cells about the one point
 
 
-def seen(radar: TriangularLadar | None = None, n: int = 32, trials: int | None = None, scene=ONE, motion=COMMON, snr_db=None, dtype=torch.complex128, fidelity=None, seed=1) -> tuple[Tensor, Axis, Truth]:
+def seen(
+    radar: TriangularLadar | None = None, n: int = 32, trials: int | None = None, scene=ONE, motion=COMMON, snr_db=None, dtype=torch.complex128, fidelity=None, seed=1
+) -> tuple[Tensor, Axis, Truth]:
     """Sweeps, pulse axis and truth of a world, with the range at every sample unless told otherwise."""
     radar = table1() if radar is None else radar
     world = LadarWorld(scene, motion=motion, snr_db=snr_db, fidelity=EverySample() if fidelity is None else fidelity)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import pytest
@@ -69,7 +70,7 @@ def test_noise_from_none_to_nothing_else(name) -> None:
         error = velocity_rms(found, truth)
         assert finite(found) and bool(found.ok.all()) == (snr_db > -15)
         errors.append(float(error.max()))
-    assert all(later > 0.8 * earlier for earlier, later in zip(errors, errors[1:], strict=False)) and errors[0] < ROUGH
+    assert all(later > 0.8 * earlier for earlier, later in itertools.pairwise(errors)) and errors[0] < ROUGH
 
 
 @pytest.mark.parametrize("name", IDS)

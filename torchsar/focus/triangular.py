@@ -88,10 +88,17 @@ def azimuth_matched_filter(data: Tensor, radar: TriangularLadar, pulse: Axis, ra
     filter_ = unit_phasor(-2 / radar.wavelength_m * across / (torch.sqrt(r.square() + across) + r), data.dtype) * (lag[:, None].abs() <= half)
     length = 2 ** math.ceil(math.log2(2 * n - 1 + n - 1))
     lit = torch.minimum(2 * half + 1, torch.full_like(half, n))
-    weights = 1 - weighting + weighting * torch.cos(2 * math.pi * lag[:, None] / lit)
-    spectrum = torch.fft.fft(data * unit_phasor(turns, data.dtype), length, dim=-2) * torch.fft.fft(filter_ * weights.to(data.real.dtype), length, dim=-2)
+    # the aperture goes with the pixel, but for that of the whole record, which stays where it is
+    weights, still = (_cosine(lag[:, None] / lit, weighting), 1.0) if int(half.max()) < n else (1.0, _cosine((lag[n - 1 :, None] - (n - 1) / 2) / n, weighting))
+    data, filter_ = (x * w.to(x.real.dtype) if isinstance(w, Tensor) else x for x, w in ((data, still), (filter_, weights)))
+    spectrum = torch.fft.fft(data * unit_phasor(turns, data.dtype), length, dim=-2) * torch.fft.fft(filter_, length, dim=-2)
     image = torch.fft.ifft(spectrum, dim=-2)[..., n - 1 : 2 * n - 1, :]
     return image / (lit * (1 - weighting)).to(data.real.dtype)
+
+
+def _cosine(share: Tensor, weighting: float) -> Tensor:
+    """1 - a + a cos(2 pi y / L) at y / L."""
+    return 1 - weighting + weighting * torch.cos(2 * math.pi * share)
 
 
 def _half_aperture(radar: TriangularLadar, pulse: Axis, range_: Axis, beam_rad: float | None) -> Tensor:

@@ -25,8 +25,8 @@ class Bands:
     """Both sweeps of every period as the window of ranges makes them, without the Doppler shift of a whole number of bins.
 
     up, down: (..., pulse, m) samples over the sweep at `time_s` (m,), symmetric about its middle. up is up(u) exp(-2j pi s u / T) and down is the
-    MIRRORED sweep down(-u) exp(+2j pi s u / T), times a power of two of the trial that brings samples to about one, in the sign of the paper ("lo_conj_echo"), each filtered to the lines of the window. Both then have
-    the beat of the range plus and minus what is left of the Doppler shift, within about a bin of it, and the residual video phase is
+    MIRRORED sweep down(-u) exp(+2j pi s u / T), in the sign of the paper ("lo_conj_echo"), each filtered to the lines of the window, times a power of two
+    of the trial that brings samples to about one. Both then have the beat of the range plus and minus what is left of the Doppler shift, within about a bin of it, and the residual video phase is
     removed unless it was to be kept. shift: (..., pulse) int64, s. lit: (..., pulse) bool, False where no echo is
     seen and the shift is that of the neighbours. lines: number of kept bins; first: beat of the first of them in bins of 1 / T; noise_lines: how
     many unfiltered lines let as much noise through.
@@ -203,7 +203,8 @@ def _block_power(spectrum: Tensor, scale: Tensor) -> Tensor:
     """
     parts = torch.view_as_real(spectrum).flatten(-2)  # real and imaginary parts in turn: the window is the same for both
     inner = _windowed_power(parts[..., :-4], parts[..., 2:-2], parts[..., 4:], scale)
-    ends = [_windowed_power(*(parts[..., (2 * (at + k)) % parts.shape[-1] :][..., :2] for k in (-1, 0, 1)), scale) for at in (0, spectrum.shape[-1] - 1)]
+    first, second, last_but_one, last = parts[..., :2], parts[..., 2:4], parts[..., -4:-2], parts[..., -2:]
+    ends = _windowed_power(last, first, second, scale), _windowed_power(last_but_one, last, first, scale)
     return torch.cat([ends[0], inner, ends[1]], -1).unflatten(-1, (-1, 2)).sum(-1)
 
 

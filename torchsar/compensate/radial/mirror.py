@@ -58,7 +58,7 @@ def refuse_other_intercept(intercept: str) -> None:
 def mirror_estimate(bands: Bands, pulse: Axis, intercept: Intercept, azimuth_m: Tensor | float) -> Estimate:
     """The estimate from bands of two samples a line."""
     velocity, info = mirror_velocity(bands, intercept)
-    return velocity_estimate(velocity, bands, pulse, factor=3.0 if intercept == "free" else 0.75, azimuth_m=azimuth_m, squared=True, **info)
+    return velocity_estimate(velocity, bands, pulse, factor=3.0 if intercept == "free" else 0.75, azimuth_m=azimuth_m, squared=True, info=info)
 
 
 def mirror_velocity(bands: Bands, intercept: Intercept) -> tuple[Tensor, dict[str, Tensor]]:

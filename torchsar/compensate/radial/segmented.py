@@ -65,7 +65,7 @@ def segmented_interference(
         phase, integer, slips = _unwrapped(phases, weights, coarse, bands, unwrap)
         doppler = (integer - phase / (2 * math.pi)) / radar.sweep_s
         info = {"phase_rad": phase, "integer": integer + bands.shift, "slips": slips, "weights": weights, "dispersion": _dispersion(bands)}
-        return velocity_estimate(from_beats(doppler, -doppler, bands), bands, pulse, factor=4.0, azimuth_m=azimuth_m, window_m=window_m, **info)
+        return velocity_estimate(from_beats(doppler, -doppler, bands), bands, pulse, factor=4.0, azimuth_m=azimuth_m, window_m=window_m, info=info)
 
     return by_trials(estimator, sweeps, azimuth_m)
 

@@ -45,14 +45,14 @@ def velocity_estimate(
     squared: bool = False,
     floor_m_s: float = 0.0,
     window_m: tuple[float, float] | None = None,
-    **info: Tensor,
+    info: dict[str, Tensor] | None = None,
 ) -> Estimate:
     """The estimate of an estimator whose bound is factor * (lambda / 2)^2 / ((2 pi T)^2 g). velocity_m_s: (..., pulse), with the geometric velocity still in it.
 
-    squared: the estimator multiplies the sweeps, which at low SNR costs more than the bound. floor_m_s: deviation that the strongest signal leaves. window_m: ranges
-    of the scene, where the bands are wider. quality: share of the power in the window
-    that both sweeps have in common. ok: the SNR after compression (info) reaches 14 dB; of squared ones 15 dB, less the loss of squaring. info["lit"] (..., pulse): False where no scatterer is lit; the velocity
-    there is not estimated but interpolated between neighbours.
+    squared: the estimator multiplies the sweeps, which at low SNR costs more than the bound. floor_m_s: deviation that the strongest signal leaves. window_m:
+    ranges of the scene, where the bands are wider. quality: share of the power in the window that both sweeps have in common. ok: the SNR after compression
+    (info) reaches 14 dB; of squared ones 15 dB, less the loss of squaring. info["lit"] (..., pulse): False where no scatterer is lit; the velocity there is
+    not estimated but interpolated between neighbours.
     """
     radar, tiny = bands.radar, torch.finfo(torch.float64).tiny
     velocity, finite = settle(filled(velocity_m_s, bands.lit), 0.0)
@@ -71,5 +71,5 @@ def velocity_estimate(
         quality=torch.where(lit, signal / (signal + noise).clamp_min(tiny), 0),
         ok=enough & finite.all(-1) & lit & bands.lit.any(-1),
         std={"velocity_m_s": std[..., None].expand_as(velocity)},
-        info={"snr_db": snr_db, "shift": bands.shift, "lit": bands.lit, **info},
+        info={"snr_db": snr_db, "shift": bands.shift, "lit": bands.lit, **(info or {})},
     )
