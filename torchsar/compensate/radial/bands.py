@@ -164,7 +164,7 @@ def bands_of(sweeps: Tensor, radar: TriangularLadar, window_m: tuple[float, floa
     data = canonical(sweeps, radar)
     spectrum, scale = torch.fft.fft(data), _scale(sweeps.detach())
     shift, alike = bulk_shift(_block_power(spectrum.detach(), scale), sweeps.shape[-2])
-    shift = _followed(spectrum.detach(), scale, shift, first, lines)
+    shift, certain = _followed(spectrum.detach(), scale, shift, first, lines)
     m = 2 ** max(3, math.ceil(math.log2(oversampling * lines)))
     line = torch.arange(lines, device=sweeps.device)
     sides = torch.stack([shift, -shift], -2)
@@ -179,7 +179,7 @@ def bands_of(sweeps: Tensor, radar: TriangularLadar, window_m: tuple[float, floa
     series = series * beat.to(series.dtype)
     time_s = (torch.arange(m, dtype=torch.float64, device=sweeps.device) - (m - 1) / 2) * (radar.sweep_s / m)
     up, down = series[..., 0, :, :], series[..., 1, :, :]
-    return Bands(up, down, time_s, shift, alike & ~_faint(up, down, alike), lines, first, float(shape.square().sum()), radar)
+    return Bands(up, down, time_s, shift, alike & (certain | ~_faint(up, down, alike)), lines, first, float(shape.square().sum()), radar)
 
 
 def _faint(up: Tensor, down: Tensor, alike: Tensor) -> Tensor:
@@ -214,8 +214,8 @@ def _windowed_power(before: Tensor, here: Tensor, after: Tensor, scale: Tensor) 
     return torch.stack([part.mean(-2) for part in windowed.split(_BLOCK, -2)], -2)
 
 
-def _followed(spectrum: Tensor, scale: Tensor, shift: Tensor, first: int, lines: int) -> Tensor:
-    """The shift of every period corrected by the period's own envelopes, where these resemble each other and meet two bins or more from where they should.
+def _followed(spectrum: Tensor, scale: Tensor, shift: Tensor, first: int, lines: int) -> tuple[Tensor, Tensor]:
+    """The shift of every period corrected by the period's own envelopes, where these resemble each other and meet two bins or more from where they should; and where they do.
 
     Eight periods together see more, one alone follows vibration of a few periods.
     """
@@ -232,8 +232,8 @@ def _followed(spectrum: Tensor, scale: Tensor, shift: Tensor, first: int, lines:
     transform = torch.fft.rfft(power, length)
     likeness, lag = torch.fft.irfft(transform[..., 0, :, :] * transform[..., 1, :, :].conj(), length).max(-1)
     lag = torch.where(lag >= length // 2, lag - length, lag)
-    further = (likeness > _SURELY_ALIKE) & (lag.abs() >= 2) & (lag.abs() <= _FURTHEST)
-    return shift + torch.where(further, torch.round(lag / 2).to(torch.int64), 0)
+    certain = (likeness > _SURELY_ALIKE) & (lag.abs() <= _FURTHEST)
+    return shift + torch.where(certain & (lag.abs() >= 2), torch.round(lag / 2).to(torch.int64), 0), certain
 
 
 def _line_phase(first: int, lines: int, m: int, sign: int, remove_video: bool, radar: TriangularLadar, like: Tensor) -> Tensor:

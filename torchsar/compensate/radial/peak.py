@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -13,7 +14,7 @@ from torchsar.compensate.radial.verdict import velocity_estimate
 from torchsar.core import Axis, Estimate, cis
 from torchsar.radar import TriangularLadar
 
-_PAD, _NEWTON, _REACH = 2, 3, 2.0
+_PAD, _NEWTON, _REACH, _DARK = 2, 3, 2.0, 0.2
 
 
 def ml_peak(sweeps: Tensor, radar: TriangularLadar, pulse: Axis, *, window_m: tuple[float, float] | None = None, azimuth_m: Tensor | float = 0.0) -> Estimate:
@@ -29,7 +30,8 @@ def ml_peak(sweeps: Tensor, radar: TriangularLadar, pulse: Axis, *, window_m: tu
 
     def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
         bands = bands_of(sweeps, radar, video=True)
-        up, down = peak_frequencies(bands, window_m)
+        up, down, lit = peak_frequencies(bands, window_m)
+        bands = replace(bands, lit=bands.lit & lit)
         return velocity_estimate(from_beats(up, down, bands), bands, pulse, factor=3.0, azimuth_m=azimuth_m, window_m=window_m)
 
     return by_trials(estimator, sweeps, azimuth_m)
@@ -42,8 +44,13 @@ def from_beats(up_hz: Tensor, down_hz: Tensor, bands: Bands) -> Tensor:
     return radar.wavelength_m / 2 * doppler * (1 + radar.bandwidth_hz / (2 * radar.carrier_hz))
 
 
-def peak_frequencies(bands: Bands, window_m: tuple[float, float] | None) -> tuple[Tensor, Tensor]:
-    """Beat frequencies (Hz) of the strongest scatterer in the up and the mirrored down sweeps, (..., pulse) float64 each."""
+def shining(up: Tensor, down: Tensor) -> Tensor:
+    """Where a scatterer is lit in both sweeps: powers (..., pulse) of a fifth of their mean or more."""
+    return torch.stack([power >= _DARK * power.mean(-1, keepdim=True) for power in (up, down)]).all(0) & (up + down > 0)
+
+
+def peak_frequencies(bands: Bands, window_m: tuple[float, float] | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Beat frequencies (Hz) of the strongest scatterer in the up and the mirrored down sweeps, (..., pulse) float64 each, and where it is lit."""
     both = torch.stack([bands.up, bands.down], -3)
     m = both.shape[-1]
     spectrum = torch.fft.fft(both.detach(), _PAD * m)
@@ -51,11 +58,11 @@ def peak_frequencies(bands: Bands, window_m: tuple[float, float] | None) -> tupl
     sought = inside(bands.radar, window_m, _PAD * m, _PAD, both.device)
     centre = torch.where(sought, power.mean((-3, -2), keepdim=True), -1).argmax(-1, keepdim=True)
     away = (torch.arange(_PAD * m, device=both.device) - centre + _PAD * m // 2) % (_PAD * m) - _PAD * m // 2
-    best = torch.where(away.abs() <= round(_REACH * _PAD), power, -1).argmax(-1)
+    peak, best = torch.where(away.abs() <= round(_REACH * _PAD), power, -1).max(-1)
     best = torch.where(best >= _PAD * m // 2, best - _PAD * m, best)
     frequency = best.to(torch.float64) / (_PAD * bands.radar.sweep_s)
     frequency = _climbed(both, frequency, bands.time_s)
-    return frequency[..., 0, :], frequency[..., 1, :]
+    return frequency[..., 0, :], frequency[..., 1, :], shining(peak[..., 0, :], peak[..., 1, :])
 
 
 def _climbed(x: Tensor, frequency_hz: Tensor, time_s: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchsar.compensate.radial.bands import Bands, bands_of, inside, refuse_other_sweeps, window_lines
 from torchsar.compensate.radial.blocks import by_trials
 from torchsar.compensate.radial.correlation import envelope_lag
-from torchsar.compensate.radial.peak import from_beats
+from torchsar.compensate.radial.peak import from_beats, shining
 from torchsar.compensate.radial.verdict import velocity_estimate
 from torchsar.core import Axis, Estimate, cis
 from torchsar.radar import TriangularLadar
@@ -44,7 +44,8 @@ def segmented_interference(
 
     unwrap: "gradient" as in the paper, the integer of the first period from the envelopes and wrapped differences from there on, which slips
     where the velocity changes by lambda / (4 T) a period or the SNR after compression is below 14 dB; "per_pulse" takes every integer from the envelopes.
-    info: phase_rad (..., pulse), integer (..., pulse), slips (...,), the periods where gradient and envelopes disagree by a turn, dispersion (...,) and weights (..., scatterers).
+    info: phase_rad (..., pulse), integer (..., pulse), slips (...,), the periods where gradient and envelopes disagree by a turn, dispersion (...,) and weights (..., scatterers), means over
+    the periods. A scatterer counts where it is lit.
 
     Differentiable around the detached peaks and integers. Raises TypeError or ValueError for other sweeps, options or windows.
     """
@@ -62,9 +63,10 @@ def segmented_interference(
         spectra = _halves(_shifted(bands, coarse) if bins == "sum" else bands, padding, hann)
         sought = inside(radar, window_m, spectra[0].shape[-1], padding / 2, sweeps.device)
         phases, weights = _summed(spectra, sought, coarse) if bins == "sum" else _at_peaks(spectra, sought, padding, scatterers)
+        bands = replace(bands, lit=bands.lit & (weights > 0).any(-2))
         phase, integer, slips = _unwrapped(phases, weights, coarse, bands, unwrap)
         doppler = (integer - phase / (2 * math.pi)) / radar.sweep_s
-        info = {"phase_rad": phase, "integer": integer + bands.shift, "slips": slips, "weights": weights, "dispersion": _dispersion(bands)}
+        info = {"phase_rad": phase, "integer": integer + bands.shift, "slips": slips, "weights": weights.mean(-1), "dispersion": _dispersion(bands)}
         return velocity_estimate(from_beats(doppler, -doppler, bands), bands, pulse, factor=4.0, azimuth_m=azimuth_m, window_m=window_m, info=info)
 
     return by_trials(estimator, sweeps, azimuth_m)
@@ -95,7 +97,7 @@ def _shifted(bands: Bands, shift: Tensor) -> Bands:
 
 
 def _summed(halves: tuple[Tensor, ...], sought: Tensor, coarse: Tensor) -> tuple[Tensor, Tensor]:
-    """Phase (..., 1, pulse) between the products of up and down spectra, each summed over the bins sought, of the two halves, and its weight (..., 1).
+    """Phase (..., 1, pulse) between the products of up and down spectra, each summed over the bins sought, of the two halves, and its weight, one everywhere.
 
     Summed before the halves meet: each product is the power spectrum of the scene times one phasor, whatever the scene, once the Doppler shift
     `coarse` (bins) is out; that of a dense scene would else decide where in its half the phase is read. The phase is given back what was taken out.
@@ -103,11 +105,11 @@ def _summed(halves: tuple[Tensor, ...], sought: Tensor, coarse: Tensor) -> tuple
     up1, up2, down1, down2 = (x[..., sought] for x in halves)
     product = (up1 * down2.conj()).sum(-1) * (up2 * down1.conj()).sum(-1).conj()
     phase = (torch.angle(product).to(torch.float64) - 2 * math.pi * coarse)[..., None, :]
-    return phase, torch.ones_like(phase[..., 0])
+    return phase, torch.ones_like(phase)
 
 
 def _at_peaks(halves: tuple[Tensor, ...], sought: Tensor, padding: int, scatterers: int) -> tuple[Tensor, Tensor]:
-    """Phases (..., scatterer, pulse) at the own peaks of up and down spectra, and the weights (..., scatterer) of Eq. (18)."""
+    """Phases at the own peaks of up and down spectra, and the weights of Eq. (18), zero in periods where a scatterer is dark, (..., scatterer, pulse) each."""
     up1, up2, down1, down2 = halves
     up, down = _power(up1, up2), _power(down1, down2)
     places = _strongest(torch.where(sought, (up + down).detach().mean(-2), -1), scatterers, padding)
@@ -117,9 +119,9 @@ def _at_peaks(halves: tuple[Tensor, ...], sought: Tensor, padding: int, scattere
         at_up, at_down = (_own_peak(power.detach(), place, reach) for power in (up, down))
         turn = _picked(up1 * up2.conj(), at_up) * _picked(down1 * down2.conj(), at_down)
         phases.append(torch.angle(turn).to(torch.float64))
-        weights.append(_contrast_about((up + down).detach().sqrt(), place, reach))
-    weight = torch.stack(weights, -1).to(torch.float64)
-    return torch.stack(phases, -2), weight / weight.sum(-1, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
+        weight = _contrast_about((up + down).detach().sqrt(), place, reach).to(torch.float64)
+        weights.append(weight[..., None] * shining(_picked(up, at_up), _picked(down, at_down)))
+    return torch.stack(phases, -2), torch.stack(weights, -2)
 
 
 def _strongest(profile: Tensor, count: int, apart: int) -> Tensor:
@@ -162,10 +164,11 @@ def _unwrapped(phases: Tensor, weights: Tensor, coarse: Tensor, bands: Bands, un
     """One phase and its integer a period, (..., pulse) each, and the count of disagreements (...,). coarse: fd T of the envelopes beyond the shift."""
     turn = 2 * math.pi
     integer = torch.round(coarse[..., None, :] + phases.detach() / turn)
-    own = ((phases - turn * integer) * weights[..., None]).sum(-2)  # phase less whole turns, weighted: fd T = -own / 2 pi
-    step = (_wrapped(_steps(phases)) * weights[..., None]).sum(-2)
+    own = _weighted(phases - turn * integer, weights)  # phase less whole turns: fd T = -own / 2 pi
+    pairs = torch.minimum(weights[..., 1:], weights[..., :-1])
+    step = _weighted(_wrapped(_steps(phases)), pairs)
     beyond = own - turn * bands.shift.to(torch.float64)  # with the shift, which the gradient does not see
-    both = bands.lit[..., 1:] & bands.lit[..., :-1]
+    both = bands.lit[..., 1:] & bands.lit[..., :-1] & (pairs > 0).any(-2)
     step = torch.where(both, step, _steps(beyond))
     gradient = torch.cat([torch.zeros_like(own[..., :1]), step.cumsum(-1)], -1)
     first = bands.lit.to(torch.int8).argmax(-1, keepdim=True)
@@ -174,6 +177,11 @@ def _unwrapped(phases: Tensor, weights: Tensor, coarse: Tensor, bands: Bands, un
     chosen = gradient + turn * bands.shift.to(torch.float64) if unwrap == "gradient" else own
     whole = -torch.round(chosen.detach() / turn)
     return chosen + turn * whole, whole, slips
+
+
+def _weighted(x: Tensor, weights: Tensor) -> Tensor:
+    """Mean over scatterers (..., scatterer, pulse) -> (..., pulse), zero where none has weight."""
+    return (x * weights).sum(-2) / weights.sum(-2).clamp_min(torch.finfo(weights.dtype).tiny)
 
 
 def _steps(x: Tensor) -> Tensor:
