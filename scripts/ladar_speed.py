@@ -87,7 +87,7 @@ def table(options: argparse.Namespace, dtype: torch.dtype) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     for name, default in (("trials", 64), ("periods", 256), ("snr", 10.0), ("window", 40), ("rounds", 5), ("threads", 1)):
         parser.add_argument(f"--{name}", type=type(default), default=default)
     options = parser.parse_args()

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
-from matplotlib.figure import Figure
 
 from torchsar import plot
 from torchsar.study.build import resolved
@@ -38,7 +37,7 @@ def written(
     out: Path | None,
     tables: Callable[[], Mapping[str, Sequence[Any]]],
     text: Callable[[Mapping[str, Sequence[Any]]], str],
-    figures: Callable[[Mapping[str, Sequence[Any]]], Mapping[str, Figure]],
+    figures: Callable[[Mapping[str, Sequence[Any]]], Mapping[str, plot.Figure]],
 ) -> str:
     """The text of the tables; with `out` also config.yaml, trade.json, trade.txt and figures/trade_NAME.png in that folder. Rows are dataclasses."""
     if out is None:

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchsar import plot
@@ -59,7 +58,7 @@ def trade(loaded: Loaded, out: Path | None) -> str:
     return written(loaded, out, lambda: _tables(case), lambda tables: _text(name, tables), _figures)
 
 
-def _figures(tables: Tables) -> dict[str, Figure]:
+def _figures(tables: Tables) -> dict[str, plot.Figure]:
     label = "residual phase (rad rms)"
     return {key: plot.trade([r.name for r in tables[key]], [r.seconds for r in tables[key]], [r.error_rad for r in tables[key]], label, key) for key in ("methods", "iterations", "precision")}
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import get_args
 
 import torch
-from matplotlib.figure import Figure
 
 from torchsar import plot
 from torchsar.compensate.radial import mirror_product, segmented_interference, spectrum_correlation
@@ -215,7 +214,7 @@ def _line(r: Row) -> str:
     return f"{r.name:<38}{1e3 * r.seconds:>12.2f}{1e3 * r.spread_s:>9.2f}{velocity:>21}{1e9 * r.range_error_detrended_rms_m:>23.3f}{echo:>12}".rstrip()
 
 
-def _figures(tables: Tables) -> dict[str, Figure]:
+def _figures(tables: Tables) -> dict[str, plot.Figure]:
     label = "range error without constant and slope (dB over 1 nm rms)"
     error_db = {key: [20 * math.log10(max(1e9 * r.range_error_detrended_rms_m, 1e-3)) for r in rows] for key, rows in tables.items()}
     return {key: plot.trade([r.name for r in rows], [r.seconds for r in rows], error_db[key], label, key) for key, rows in tables.items()}

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchsar import plot
@@ -70,7 +69,7 @@ def trade(loaded: Loaded, out: Path | None) -> str:
     return written(loaded, out, lambda: _tables(loaded), _text, _figures)
 
 
-def _figures(tables: Tables) -> dict[str, Figure]:
+def _figures(tables: Tables) -> dict[str, plot.Figure]:
     return {name: plot.trade([r.name for r in rows], [r.seconds for r in rows], [max(r.error_db, -200.0) for r in rows], "error (dB)", name) for name, rows in tables.items()}
 
 
