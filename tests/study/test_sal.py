@@ -159,8 +159,9 @@ def test_phases_of_pulses_count_modulo_a_turn_and_velocities_as_they_are() -> No
     assert float(batch.metrics["ideal"]["range_error_max_m"]) == 0
     recording, truth = bench.ladar.recorded(Draws(1, "test", [0]))
     chain = bench.chains["recommended"]
-    trace = chain.trace(recording, given={"velocity.velocity_m_s": truth.values["velocity_m_s"] + 1e-3, "phase.phase_rad": torch.zeros(1, 64, dtype=torch.float64)})
+    trace = chain.trace(recording, given={"motion.velocity_m_s": truth.values["velocity_m_s"] + 1e-3, "motion.phase_rad": torch.zeros(1, 64, dtype=torch.float64)})
     course = course_of(chain, trace, truth, bench.ladar.radar, clean=False)
+    assert course.velocity_error_m_s is not None
     assert float(course.rms(course.velocity_error_m_s)) == pytest.approx(1e-3)
     assert float(course.largest_m) == pytest.approx(63 * 16e-9, rel=1e-3) and float(course.slope_m_s) == pytest.approx(1e-3, rel=1e-3)
     assert float(course.rms(course.detrended_m)) < 1e-10
@@ -282,6 +283,13 @@ def test_a_carrier_may_be_given_as_a_wavelength(tmp_path: Path) -> None:
         ({"processor": {"recommended": {"stages": {"image": {"stage": "azimuth_transform"}}}}, "metrics": None}, "processor.recommended"),
         ({"processor": {"recommended": {"stages": {"image": {"stage": "target_image"}}}}, "metrics": None}, "processor.recommended"),
         ({"cases": {"odd": {"world.trials": 3}}}, "cases.odd: the key 'world.trials' holds for all cases"),
+        ({"radar": {key: value for key, value in TINY["radar"].items() if key != "wavelength_m"}}, "neither wavelength_m nor carrier_hz is given"),
+        ({"world": world(noise={"snr_db": 4000.0})}, "world.noise.snr_db is 4000, beyond what numbers hold"),
+        ({"world": world(gate_m=[3.0])}, "it should be a list of at least 2 entries"),
+        ({"world": world(motion={"drift": {"kind": "drift", "velocity_m_s": float("nan")}})}, "it should be a finite number"),
+        ({"world": world(scene={"points": {"kind": "points", "azimuth_m": [0.0], "range_m": [-4000.0]}})}, "lies behind the ladar"),
+        ({"world": world(scene={"points": {"kind": "points", "azimuth_m": [0.0], "range_m": [100.0]}})}, "beats of relative ranges beyond"),
+        ({"processor": {"recommended": {"stages": {"compress": {"stage": "compress_sweeps"}, "image": {"stage": "azimuth_matched_filter"}}}}, "metrics": None}, "works on profiles deramped once, here 0 times"),
     ],
 )
 def test_mistakes_are_named(tmp_path: Path, changes: dict, said: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -303,3 +311,32 @@ def test_bounds_of_a_motion_come_from_its_course(tmp_path: Path) -> None:
     needs = Needs.of(load(write(tmp_path, world=world(motion={"buzz": {"kind": "sinusoid", "frequency_hz": 5000.0, "amplitude_m": 10e-6}}))))
     bias = next(limit for limit in needs.limits if limit.name == "velocity bias by jerk")
     assert bias.value == pytest.approx(10e-6 * (2 * np.pi * 5000) ** 3 * (16e-6) ** 2 / 27, rel=0.02) and bias.verdict == "warn"
+
+
+def test_errors_of_a_world_name_the_file_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = write(tmp_path, world=world(log_amplitude={"kind": "scintillation", "rms": -1.0}))
+    assert main(["run", config, "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert said.count(config) == 1 and "world.log_amplitude: rms" in said
+
+
+def test_metrics_of_a_method_are_those_of_the_first_case(tmp_path: Path) -> None:
+    cases = {"still": {"world.motion": {}}, "moving": {"world.noise.snr_db": 20.0}}
+    metrics = run(write(tmp_path, cases=cases, world=world(periods=48)), tmp_path / "out")
+    for method in metrics["methods"].values():
+        assert method["metrics"] == {key: value for key, value in method["cases"]["still"].items() if not key.endswith("_sd")}
+    assert "first case, 'still'" in metrics["definitions"]["metrics"]
+    assert "the first case" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    "changes", [{"world": world(periods=1)}, {"radar": {**TINY["radar"], "beam_rad": 1e-9}}, {"radar": {**TINY["radar"], "keep_every": 1000000}, "world": world(periods=2, motion={})}]
+)
+def test_next_to_nothing_to_see_ends_in_a_report_or_a_sentence(tmp_path: Path, changes: dict) -> None:
+    code = main(["run", write(tmp_path, **changes), "--out", str(tmp_path / "out")])
+    assert code == 2 or "NaN" not in (tmp_path / "out" / "metrics.json").read_text(encoding="utf-8")
+
+
+def test_a_real_detector_without_a_record_is_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    run(write(tmp_path, radar={**TINY["radar"], "detection": "real"}, world=world(periods=32)), tmp_path / "out")
+    assert "separated sweeps are complex" in caplog.text

@@ -28,8 +28,11 @@ class LadarCourse:
     @staticmethod
     def of(radar: TriangularLadar, world: LadarWorld, n_period: int, draws: Draws, device: torch.device | str | None) -> LadarCourse:
         """Everything drawn. Raises ValueError for no period, or no scatterer within the gate."""
-        if n_period < 1:
-            raise ValueError(f"a recording needs at least one period, got n_period={n_period}")
+        if not isinstance(radar, TriangularLadar) or not isinstance(world, LadarWorld) or not isinstance(draws, Draws):
+            raise TypeError(f"a ladar is simulated from a TriangularLadar, a LadarWorld and Draws, got {type(radar).__name__}, {type(world).__name__} and {type(draws).__name__}")
+        if not (isinstance(n_period, int) and n_period >= 1):
+            raise ValueError(f"a recording needs at least one period, a whole number of them, got n_period={n_period}")
+        refuse_trials("snr_db", world.snr_db, draws)
         drawn = world.scene.scatterers(draws)
         s = Scatterers(*(v.to(device) for v in (drawn.azimuth_m, drawn.range_m, drawn.amplitude)))
         axis = radar.sweep_axes(n_period)[1]
@@ -86,6 +89,12 @@ def _later(value: Callable[[Tensor], Tensor], time_s: Tensor, later_s: Tensor | 
 def noise_std(snr_db: Tensor | float | None, like: Tensor) -> Tensor:
     """Deviation of the complex noise of a sample, (...,): 10^(-snr / 20)."""
     return torch.zeros((), dtype=torch.float64, device=like.device) if snr_db is None else 10 ** (-per_trial(snr_db, 0, like) / 20)
+
+
+def refuse_trials(name: str, value: Tensor | float | None, draws: Draws) -> None:
+    """Raise ValueError for a per-trial tensor of another number of trials than the draws have."""
+    if isinstance(value, Tensor) and value.ndim and draws.trials is not None and value.shape[-1] not in (1, len(draws.trials)):
+        raise ValueError(f"{name} must be a number or one for each of the {len(draws.trials)} trials of the draws, got shape {tuple(value.shape)}")
 
 
 def _gated(s: Scatterers, gate_m: tuple[float, float] | None) -> Scatterers:

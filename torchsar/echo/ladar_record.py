@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchsar.core import Draws, Recording, Truth, UniformSpline, cis, per_trial, real_dtype, reduced_turns
 from torchsar.echo.ladar import SweepLines, lit_by, refuse_beats, shared, sweep_middles_s
-from torchsar.echo.ladar_course import LadarCourse, calibration_aux, hand_over, noise_std
+from torchsar.echo.ladar_course import LadarCourse, calibration_aux, hand_over, noise_std, refuse_trials
 from torchsar.echo.stripmap import Damage
 from torchsar.echo.sweep_error import wound_turns
 from torchsar.radar import TriangularLadar
@@ -210,6 +210,9 @@ def simulate_ladar_record(
     course = LadarCourse.of(radar, world, n_period, draws, device)
     axes = radar.record_axes(n_period, _block_samples(radar, block_s))
     trigger = torch.as_tensor(trigger_s, dtype=torch.float64, device=device)
+    refuse_trials("trigger_s", trigger, draws)
+    if not bool(torch.isfinite(trigger).all()):
+        raise ValueError("trigger_s must be finite seconds, a number or one per trial, got NaN or Inf")
 
     def echo_of(motion: Sequence[Motion]) -> Tensor:
         chi = None if course.chi is None else course.log_amplitude

@@ -37,9 +37,11 @@ def split_record(record: Tensor, radar: TriangularLadar, trigger_s: Trigger = 0.
     trigger common to all trials is less than half a sample. Other blocks are cut inside, K' = K, and need trigger + period to fit.
     first_s: time of the first sample of a block, as trigger_s counts it. The first sample of a sweep lies half a sample after its start.
     nearer: with real detection, whether the scene lies nearer than the reference (RD < 0) and has negative beats in up sweeps. With real
-    detection |fd| < f+ is required. Differentiable in record and trigger_s. Raises ValueError where a period does not fit.
+    detection |fd| < f+ is required. Differentiable in record and trigger_s. Raises ValueError where a period does not fit, and for a trigger that is
+    not finite or not one per trial; TypeError for what is no record.
     """
-    trigger = torch.as_tensor(trigger_s, dtype=torch.float64, device=record.device)
+    refuse_no_record(record, "split_record")
+    trigger = _trigger_of(trigger_s, record)
     joined = is_contiguous(record.shape[-1], radar) if contiguous is None else contiguous
     lines = record.flatten(-2)[..., None, :] if joined else record
     start, fraction = start_sample(trigger - first_s, radar, joined)
@@ -47,6 +49,26 @@ def split_record(record: Tensor, radar: TriangularLadar, trigger_s: Trigger = 0.
     periods = _cut_joined(whole, start, record.shape[-2], radar) if joined else _cut_inside(whole, start, radar)
     sweeps = periods.unflatten(-1, (2, radar.sweep_samples)).movedim(-2, -3)
     return sweeps if record.is_complex() else canonical_ramps(sweeps, radar, nearer)
+
+
+def refuse_no_record(record: Tensor, what: str) -> None:
+    """Raise TypeError or ValueError unless record is floating or complex (..., pulse, time)."""
+    if not (isinstance(record, Tensor) and (record.is_complex() or record.is_floating_point())):
+        raise TypeError(f"{what} works on a real or complex record (..., pulse, time), got {getattr(record, 'dtype', type(record).__name__)}; convert the samples first")
+    if record.ndim < 2 or not record.numel():
+        raise ValueError(f"{what} works on a record (..., pulse, time) with samples in it, got shape {tuple(record.shape)}")
+
+
+def _trigger_of(trigger_s: Trigger, record: Tensor) -> Tensor:
+    """The trigger as a float64 tensor, a number or one per trial of the record."""
+    if not isinstance(trigger_s, Tensor | float | int):
+        raise TypeError(f"trigger_s must be seconds, a number or one per trial, got {trigger_s!r}")
+    trigger, trials = torch.as_tensor(trigger_s, dtype=torch.float64, device=record.device), record.shape[:-2]
+    if _any(~torch.isfinite(trigger)):
+        raise ValueError("trigger_s must be finite, got NaN or Inf; take one that find_trigger is sure of (ok), or leave that trial out")
+    if trials and trigger.shape[-len(trials) :] not in (trials, ()) and any(a != b and 1 not in (a, b) for a, b in zip(trigger.shape[::-1], trials[::-1])):
+        raise ValueError(f"trigger_s must be a number or one per trial {tuple(trials)}, got shape {tuple(trigger.shape)}")
+    return trigger
 
 
 def is_contiguous(block_samples: int, radar: TriangularLadar) -> bool:
@@ -122,8 +144,12 @@ def blank_turning_points(sweeps: Tensor, radar: TriangularLadar, farthest_m: flo
 
     farthest_m: largest relative range; its echo turns 2 RD / c after the reference: the first ceil(2 RD fs / c) samples of each sweep.
     nearest_m: least relative range; where negative its echo turns earlier: the last samples. margin: further samples at either end.
-    Raises ValueError where this leaves less than half a sweep.
+    Raises ValueError where this leaves less than half a sweep, for ranges out of order and a negative margin.
     """
+    if not isinstance(sweeps, Tensor):
+        raise TypeError(f"blank_turning_points works on a tensor of sweeps (..., 2, K, N), got {type(sweeps).__name__}")
+    if not (nearest_m <= farthest_m and margin >= 0):
+        raise ValueError(f"blanking needs nearest_m <= farthest_m (relative ranges) and a margin of 0 samples or more, got {nearest_m:g}, {farthest_m:g} and {margin}")
     first, last = (math.ceil(max(0.0, d) * 2 * radar.sample_rate_hz / radar.wave_speed_m_s - 1e-9) + margin for d in (farthest_m, -nearest_m))
     n = sweeps.shape[-1]
     if not 0 <= first + last <= n // 2:

@@ -15,7 +15,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal, Stage, unit_phasor
+from torchsar.core import Signal, Stage, refuse_non_finite, unit_phasor
 from torchsar.radar import TriangularLadar
 from torchsar.repair.jitter import band_limited_weights
 
@@ -102,13 +102,22 @@ def calibrate_sweeps(
     """
     if method not in get_args(Method):
         raise ValueError(f"method must be one of {', '.join(get_args(Method))}, got {method!r}")
-    if not calibration.is_complex() or calibration.shape[-3] != 2 or calibration.shape[-1] != sweeps.shape[-1]:
-        raise ValueError(f"the calibration channel is complex (..., 2, K or 1, {sweeps.shape[-1]}) like the sweeps, got {calibration.dtype} {tuple(calibration.shape)}")
+    _refuse_other(sweeps, "the sweeps to calibrate are", radar.sweep_samples)
+    _refuse_other(calibration, "the calibration channel is", radar.sweep_samples)
+    if calibration.shape[-2] not in (1, sweeps.shape[-2]):
+        raise ValueError(f"the calibration channel has {calibration.shape[-2]} periods; give one, or the {sweeps.shape[-2]} of the sweeps")
+    refuse_non_finite(calibration, "the calibration channel")
     error = sweep_error_s(calibration, radar, delay_s)
     if method == "phase":
         return _phase_corrected(sweeps, error, radar, range_m)
     dtau = 0.0 if range_m is None else 2 * range_m / radar.wave_speed_m_s
     return _resampled(sweeps, _instants(error, radar, dtau), points, band)
+
+
+def _refuse_other(x: Tensor, what: str, n: int) -> None:
+    """Raise ValueError unless x is complex (..., 2, K, n)."""
+    if not (x.is_complex() and x.ndim >= 3 and x.shape[-3] == 2 and x.shape[-1] == n):
+        raise ValueError(f"{what} complex (..., 2, K, {n}), up before down, got {x.dtype} {tuple(x.shape)}")
 
 
 def _phase_corrected(sweeps: Tensor, error_s: Tensor, radar: TriangularLadar, range_m: float | None) -> Tensor:

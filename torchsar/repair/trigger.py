@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, real_dtype, take, unit_phasor
+from torchsar.core import Estimate, real_dtype, refuse_non_finite, take, unit_phasor
 from torchsar.radar import TriangularLadar
 from torchsar.repair.analytic import delayed
 
@@ -62,6 +62,15 @@ class _Windows:
         return source.gather(-1, index).unflatten(-1, (j.numel(), n))
 
 
+def refuse_no_samples(record: Tensor) -> None:
+    """Raise TypeError or ValueError unless record is a finite record (..., pulse, time), real or complex."""
+    if not (isinstance(record, Tensor) and (record.is_complex() or record.is_floating_point())):
+        raise TypeError(f"find_trigger works on a real or complex record (..., pulse, time), got {getattr(record, 'dtype', type(record).__name__)}; convert the samples first")
+    if record.ndim < 2 or not record.numel():
+        raise ValueError(f"find_trigger works on a record (..., pulse, time) with samples in it, got shape {tuple(record.shape)}")
+    refuse_non_finite(record, "find_trigger")
+
+
 def find_trigger(record: Tensor, radar: TriangularLadar, contiguous: bool | None = None, nearer: bool = False) -> Estimate:
     """Start of the up sweep in the blocks of a record. record: (..., pulse, time) complex or real. Gives `trigger_s` (...,) after the
     first sample of a block, -1 sample..period - 1 sample.
@@ -71,6 +80,7 @@ def find_trigger(record: Tensor, radar: TriangularLadar, contiguous: bool | None
     (below 3: not ok), and `coarse_s`, modulo half a period. quality is the drop of concentration at turning points, 0..1. A scene on both
     sides of the reference has no sign of beat: not ok. Raises ValueError for short records.
     """
+    refuse_no_samples(record)
     n = radar.sweep_samples
     joined = (radar.keep_every == 1 and record.shape[-1] == 2 * n) if contiguous is None else contiguous
     lines = record.flatten(-2)[..., None, :] if joined else record

@@ -256,9 +256,13 @@ class LadarWorld:
     def __post_init__(self) -> None:
         if self.snr_db is not None:
             refuse_unless_finite("snr_db", self.snr_db)
-        if self.gate_m is not None and not (len(self.gate_m) == 2 and self.gate_m[0] < self.gate_m[1]):
+        if not hasattr(self.scene, "scatterers"):
+            raise TypeError(f"scene must be an object with scatterers, such as Points or LetterE, got {self.scene!r}")
+        if hasattr(self.motion, "displacement_m") or hasattr(self.motion, "drawn"):
+            raise TypeError("motion must be a list of motions; put a single one in brackets")
+        if self.gate_m is not None and not (isinstance(self.gate_m, tuple | list) and len(self.gate_m) == 2 and self.gate_m[0] < self.gate_m[1]):
             raise ValueError(f"gate_m must be (low, high) relative range in m with low < high, got {self.gate_m}")
-        if not hasattr(self.fidelity, "sweep_range_m"):
+        if isinstance(self.fidelity, type) or not hasattr(self.fidelity, "sweep_range_m"):
             raise TypeError(f"fidelity must be LinearInSweep(), QuadraticInSweep(), EverySample(), OnePerSweep() or OnePerPeriod(), got {self.fidelity!r}")
 
 

@@ -55,7 +55,7 @@ class RetroAndBrokenLine:
     def __post_init__(self) -> None:
         for name in ("range_m", "azimuth_m", "retro_db", "line_db", "line_azimuth_m"):
             refuse_unless_finite(f"{name} of a retro-reflector with a line", getattr(self, name))
-        if len(self.line_m) != 2 or not all(math.isfinite(v) for v in self.line_m):
+        if not isinstance(self.line_m, tuple | list) or len(self.line_m) != 2 or not all(math.isfinite(v) for v in self.line_m):
             raise ValueError(f"line_m must be the first and last distance of the line beyond the retro-reflector, got {self.line_m}")
 
     def scatterers(self, draws: Draws) -> Scatterers:

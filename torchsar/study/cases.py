@@ -78,12 +78,16 @@ def check_sweep(loaded: Loaded, grid: Mapping[str, Any], example: str) -> None:
             raise ConfigError(f"{loaded.file}: sweep: the key {key!r} belongs to runs and cannot be swept")
 
 
-def methods_tree(loaded: Loaded, by_case: Mapping[str, Mapping[str, Mapping[str, float]]]) -> dict[str, dict[str, Any]]:
-    """The part `methods` of metrics.json: by method, means over all cases as `metrics`, and every case under `cases`. by_case: case -> method -> metric."""
+def methods_tree(loaded: Loaded, by_case: Mapping[str, Mapping[str, Mapping[str, float]]], first_only: bool = False) -> dict[str, dict[str, Any]]:
+    """The part `methods` of metrics.json: by method, means over all cases as `metrics`, and every case under `cases`. by_case: case -> method -> metric.
+
+    first_only: `metrics` are those of the first case instead, where cases differ too much for a mean.
+    """
     methods = {}
     for name, method in loaded.config.processor.items():
         rows = {case: rows[name] for case, rows in by_case.items()}
-        keys = dict.fromkeys(key for row in rows.values() for key in row if not key.endswith("_sd"))
-        metrics = {key: sum(row[key] for row in rows.values() if key in row) / sum(key in row for row in rows.values()) for key in keys}
+        judged = list(rows.values())[:1] if first_only else list(rows.values())
+        keys = dict.fromkeys(key for row in judged for key in row if not key.endswith("_sd"))
+        metrics = {key: sum(row[key] for row in judged if key in row) / sum(key in row for row in judged) for key in keys}
         methods[name] = {"title": method.title, "metrics": metrics, "estimates": {}, "targets": {}, "cases": rows}
     return methods

@@ -111,7 +111,7 @@ def _converted(target: Callable[..., Any], parameters: dict[str, Any]) -> dict[s
 
 def sentence(error: ValidationError, model: type[BaseModel], file: str, where: str = "") -> str:
     """One sentence from the most telling of pydantic's errors: an unknown key first, then a missing one, then a wrong value."""
-    rank = {"extra_forbidden": 0, "missing": 1}
+    rank = {"extra_forbidden": 0, "missing": 1, "list_type": 3}  # a number or a list of them: what is wrong with the number tells more
     worst = min(error.errors(), key=lambda e: rank.get(e["type"], 2))
     path = [str(part) for part in worst["loc"]]
     names, section = _descend(model, path)
@@ -121,7 +121,10 @@ def sentence(error: ValidationError, model: type[BaseModel], file: str, where: s
     if worst["type"] == "missing":
         return f"{file}: key {key!r} is missing"
     text = worst["msg"].removeprefix("Value error, ").removeprefix("Input ")
-    if worst["type"] in ("dict_type", "model_type", "too_short"):
+    if worst["type"] in ("too_short", "too_long") and isinstance(worst["input"], list | tuple):
+        limits = worst.get("ctx", {})
+        text = f"should be a list of {'at least' if 'min_length' in limits else 'at most'} {limits.get('min_length', limits.get('max_length'))} entries"
+    elif worst["type"] in ("dict_type", "model_type", "too_short"):
         text = "should be a mapping of keys, and not an empty one" if worst["type"] == "too_short" else "should be a mapping of keys"
     if not key:  # what a whole config contradicts, not one key of it
         return f"{file}: {text}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -18,8 +19,12 @@ from torchsar.study.catalogue import Catalogue
 from torchsar.study.config import Loaded
 from torchsar.study.errors import ConfigError, did_you_mean
 from torchsar.study.methods import build_chains
-from torchsar.study.registry import CALIBRATIONS, LOG_AMPLITUDES, RADIAL_MOTIONS, SCENES, SWEEP_ERRORS, SWEEP_FIDELITIES
+from torchsar.study.registry import CALIBRATIONS, LOG_AMPLITUDES, RADIAL_MOTIONS, SCENES, SWEEP_ERRORS, SWEEP_FIDELITIES, group_of
 from torchsar.study.sal.sections import LADAR_DAMAGES, Record
+
+log = logging.getLogger("torchsar")
+# stages that work on deramped profiles, and cannot tell whether they are
+_OF_DERAMPED = ("azimuth_matched_filter", "phase_polish")
 
 
 def build_radar(loaded: Loaded) -> TriangularLadar:
@@ -37,6 +42,8 @@ def build_radar(loaded: Loaded) -> TriangularLadar:
 def build_world(loaded: Loaded) -> LadarWorld:
     """The world of a simulation."""
     world, file = loaded.config.world, loaded.file
+    if abs(world.noise.snr_db or 0.0) > 300:
+        raise ConfigError(f"{file}: world.noise.snr_db is {world.noise.snr_db:g}, beyond what numbers hold; give -300 to 300 dB, or null for no noise")
     scenes = {name: SCENES.make(entry, f"world.scene.{name}", file) for name, entry in world.scene.items()}
     motion = [RADIAL_MOTIONS.make(entry, f"world.motion.{name}", file) for name, entry in world.motion.items()]
     try:
@@ -50,6 +57,8 @@ def build_world(loaded: Loaded) -> LadarWorld:
             _made(SWEEP_ERRORS, world.sweep_error, "sweep_error", file),
             _made(CALIBRATIONS, world.calibration, "calibration", file),
         )
+    except ConfigError:
+        raise
     except (ValueError, TypeError) as error:
         raise ConfigError(f"{file}: world: {' '.join(str(error).split())}") from None
 
@@ -116,3 +125,18 @@ def check(loaded: Loaded) -> None:
         check_judged(case)
         check_target(case, ladar.world)
         build_chains(case, radar=ladar.radar)
+        check_deramped(case)
+        if ladar.record is None and ladar.radar.detection == "real":
+            log.warning("warning: %s: radar.detection is 'real', but separated sweeps are complex; give world.record for what a real detector records", case.file)
+
+
+def check_deramped(loaded: Loaded) -> None:
+    """Stages of deramped profiles, whose axes are those of others, follow one `deramp_azimuth`, or a stage from outside. Raises ConfigError."""
+    for name, method in loaded.config.processor.items():
+        before: list[str] = []
+        for key, entry in (method.stages or {}).items():
+            stage, times = entry["stage"], before.count("deramp_azimuth")
+            foreign = any(group_of(other) == "own" for other in before)
+            if stage in _OF_DERAMPED and times != 1 and not foreign:
+                raise ConfigError(f"{loaded.file}: processor.{name}.stages.{key}: {stage} works on profiles deramped once, here {times} times; put one deramp_azimuth between compress_sweeps and it")
+            before.append(stage)

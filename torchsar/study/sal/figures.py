@@ -103,7 +103,12 @@ def _comparison(results: Mapping[str, CaseResult]) -> Drawn:
             continue
         means = {name: np.array([_mean(result.metrics[name], key) for result in results.values()]) for name in names}
         parts = [{"title": "", "x": list(results), "series": {name: (y, np.stack([y, y], -1)) for name, y in means.items()}, "bounds": {}}]
-        yield key, label.split(" (")[0].capitalize(), f"Mean over trials of the {label}, by case and method.", plot.error_curves(parts, "case", label, log_y=key != "entropy_above_ideal_nats")
+        yield key, label.split(" (")[0].capitalize(), f"Mean over trials of the {label}, by case and method.", plot.error_curves(parts, "case", label, log_y=_on_decades(key, means))
+
+
+def _on_decades(key: str, means: Mapping[str, np.ndarray]) -> bool:
+    """Errors stand on a logarithmic axis where there are any."""
+    return key != "entropy_above_ideal_nats" and any(bool((mean > 0).any()) for mean in means.values())
 
 
 def _mean(metrics: Mapping[str, Tensor], key: str) -> float:

@@ -26,7 +26,7 @@ from torchsar.study.sal.judge import leading, lit_periods
 from torchsar.study.sal.sections import SalConfig
 
 log = logging.getLogger("torchsar")
-_TIMES_A_PERIOD = 16
+_TIMES_A_PERIOD, _MOST_TIMES = 16, 1 << 22
 _TOLERANCE_RAD = 0.1
 # limits that stop only methods with such a stage; key: value that it has there
 _CONCERNS = {
@@ -102,7 +102,8 @@ def _needs(ladar: Ladar, seed: int) -> Needs:
     inside = inside & (level > 0)
     leads = leading(torch.where(inside, level, 0))
     if not bool(leads.any()):
-        raise ValueError("world: no scatterer within the gate; widen gate_m")
+        raise ValueError("world: no scatterer of the scene has an amplitude above 0 within the gate; give it one, or widen gate_m")
+    _refuse_places(radar, float(ranges[inside].min()), float(ranges[inside].max()))
     moved = _motion(ladar, draws)
     apart = torch.diff(torch.unique(ranges[leads]))
     snr_db = None if ladar.world.snr_db is None else float(ladar.world.snr_db) + 20 * math.log10(float(level[leads].max()))
@@ -125,6 +126,17 @@ def _needs(ladar: Ladar, seed: int) -> Needs:
     return Needs(limits, rows, simplest_fidelity(radar, extremes))
 
 
+def _refuse_places(radar: TriangularLadar, near_m: float, far_m: float) -> None:
+    """Raise ValueError for scatterers that no sweep can show, even at rest."""
+    if near_m <= -radar.reference_range_m:
+        raise ValueError(
+            f"world: a scatterer at the relative range {near_m:g} m lies behind the ladar, whose reference range is {radar.reference_range_m:g} m; ranges of scatterers are relative to it"
+        )
+    reach = radar.sample_rate_hz / 2 / radar.beat_hz(1.0)
+    if max(-near_m, far_m) >= reach:
+        raise ValueError(f"world: scatterers lie from {near_m:g} to {far_m:g} m, and beats of relative ranges beyond {reach:.4g} m alias; bring the reference range nearer, or sample faster")
+
+
 @dataclass(frozen=True)
 class _Reach:
     """Largest magnitudes of a motion over a recording."""
@@ -137,9 +149,9 @@ class _Reach:
 
 
 def _motion(ladar: Ladar, draws: Draws) -> _Reach:
-    """Differences of the displacement on a grid of sixteen times a period."""
+    """Differences of the displacement on a grid of sixteen times a period, coarser in recordings of many gaps."""
     span = ladar.periods * ladar.radar.pulse_step_s
-    n = max(8, ladar.periods * ladar.radar.keep_every * _TIMES_A_PERIOD)
+    n = min(max(8, ladar.periods * ladar.radar.keep_every * _TIMES_A_PERIOD), _MOST_TIMES)
     step = span / n
     moved = displacement_m(drawn_motion(ladar.world.motion, draws, span), torch.arange(n, dtype=torch.float64) * step).reshape(-1, n)[0]
     slopes = [moved]

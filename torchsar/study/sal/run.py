@@ -73,12 +73,13 @@ def _warn_of_doubt(name: str, metrics: Mapping[str, Mapping[str, Tensor]], count
 
 
 def metrics_tree(loaded: Loaded, results: Mapping[str, CaseResult]) -> dict[str, Any]:
-    """The content of metrics.json: by method, means over all cases as `metrics`, every case under `cases`, and responses of point targets by `case/target`."""
-    methods = methods_tree(loaded, {case: summary(result.metrics) for case, result in results.items()})
+    """The content of metrics.json: by method, the first case as `metrics`, every case under `cases`, and responses of point targets by `case/target`."""
+    methods = methods_tree(loaded, {case: summary(result.metrics) for case, result in results.items()}, first_only=True)
     for name, method in methods.items():
         for case, result in results.items():
             rows = summary(result.targets[name])
             method["targets"].update({target if case == "all" else f"{case}/{target}": row for target, row in rows.items()})
     settings = loaded.config.metrics
-    definitions = {**DEFINITIONS, "islr_extent_nulls": settings.sidelobe_nulls, "reference": settings.reference, "target": settings.target}
+    shown = f"methods.NAME.metrics are the means over trials of the first case, {next(iter(results))!r}; every case stands in methods.NAME.cases, with deviations as _sd"
+    definitions = {**DEFINITIONS, "metrics": shown, "islr_extent_nulls": settings.sidelobe_nulls, "reference": settings.reference, "target": settings.target}
     return {"methods": methods, "published": settings.published, "truth": {}, "definitions": definitions, "trials": loaded.config.world.trials}

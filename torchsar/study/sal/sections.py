@@ -31,8 +31,10 @@ class Radar(Strict):
 
     @model_validator(mode="after")
     def _one_carrier(self) -> Radar:
-        if (self.wavelength_m is None) == (self.carrier_hz is None):
-            raise ValueError("wavelength_m and carrier_hz say the same; give one of them")
+        if self.wavelength_m is None and self.carrier_hz is None:
+            raise ValueError("neither wavelength_m nor carrier_hz is given; give one of them")
+        if self.wavelength_m is not None and self.carrier_hz is not None:
+            raise ValueError("wavelength_m and carrier_hz say the same; give one of them, and set the other to null")
         return self
 
 
@@ -79,7 +81,7 @@ class Metrics(Strict):
     reference: str | None = None
     target: str | None = None
     sidelobe_nulls: int = Field(default=10, ge=1)
-    search_m: float = Field(default=0.02, gt=0)
+    search_m: float = Field(default=0.02, gt=0, le=1)
     published: dict[str, dict[str, dict[str, float]]] = {}
 
 

@@ -33,6 +33,7 @@ from torchsar.study.trading import Tables, timed, written
 log = logging.getLogger("torchsar")
 _LADDER: dict[str, Fidelity] = {
     "every_sample": EverySample(),
+    "every_sample, flight time": EverySample(()),
     "quadratic_in_sweep": QuadraticInSweep(),
     "linear_in_sweep": LinearInSweep(),
     "linear_in_sweep, no residual video": LinearInSweep(("flight", "residual_video")),

@@ -20,7 +20,7 @@ from torchsar.study.config import Config, Loaded
 from torchsar.study.errors import ConfigError
 from torchsar.study.methods import build_chains
 from torchsar.study.montecarlo.work import BOUNDS, SAVED
-from torchsar.study.sal.build import Ladar, check_target, named_targets, refuse_recordings
+from torchsar.study.sal.build import Ladar, check_deramped, check_target, named_targets, refuse_recordings
 from torchsar.study.sal.judge import Course, course_of, image_metrics, motion_metrics, target_metrics
 from torchsar.study.tracing import IMAGE, not_an_image, saved_of, traced, verdict
 
@@ -88,6 +88,7 @@ class SalTrials(Benches[Bench]):
         ladar = Ladar.of(loaded)
         check_target(loaded, ladar.world)
         chains = {name: chain.to(self.device) for name, chain in build_chains(loaded, radar=ladar.radar).items()}
+        check_deramped(loaded)
         return Bench(loaded.config, ladar, chains, named_targets(ladar.world))
 
     def bytes_per_trial(self, fixed: Mapping[str, Any]) -> int:
