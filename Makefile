@@ -1,4 +1,4 @@
-# make run: the embedded experiment. make test: the tests. Both set up $(VENV) first.
+# make run: the embedded experiment. make test: the tests, in JOBS processes of one thread. Both set up $(VENV) first.
 # An environment that already has torch keeps it: make run VENV=/path/to/venv
 VENV   ?= .venv
 PYTHON ?= python3
@@ -7,6 +7,7 @@ CONFIG ?= stripmap_damaged
 OUT    ?= out/$(notdir $(basename $(CONFIG)))
 ARGS   ?=
 TESTS  ?= tests
+JOBS   ?= 2
 
 # On a machine that others use too, threads that spin while they wait starve those that work.
 OMP_WAIT_POLICY ?= PASSIVE
@@ -21,7 +22,7 @@ run: install
 	$(VENV)/bin/torchsar run $(CONFIG) $(ARGS) --out $(OUT)
 
 test: install
-	$(PY) -m pytest $(TESTS) $(ARGS)
+	OMP_NUM_THREADS=1 $(PY) -m pytest -n $(JOBS) --dist worksteal $(TESTS) $(ARGS)
 
 lint: install
 	$(VENV)/bin/ruff check .

@@ -87,7 +87,7 @@ def triangle_turns(radar: TriangularLadar, position: Tensor) -> Tensor:
 
 def direct_record(s: Scatterers, radar: TriangularLadar, n_period: int, n_sample: int, motion=(), trigger_s: float = 0.0, flight: bool = False) -> Tensor:
     """Complex beats as differences of the triangle's phase, the range at every sample."""
-    start, offset = radar.sweep_axes(n_period)[1].values(), torch.arange(n_sample, dtype=torch.float64) / radar.sample_rate_hz
+    start, offset = radar.sweep_axes(n_period)[1].values(), (torch.arange(n_sample, dtype=torch.float64) + 0.5) / radar.sample_rate_hz
     position = offset - trigger_s
     out = torch.zeros(n_period, n_sample, dtype=DOUBLE)
     for x, r, a in zip(s.azimuth_m, s.range_m, s.amplitude, strict=True):

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.echo.ladars import COMMON, DOUBLE, GROUND, THREE, Earlier, direct_record, direct_sweeps, table1, table4, triangle_turns, unit_retro
+from tests.echo.ladars import COMMON, DOUBLE, GROUND, THREE, direct_record, direct_sweeps, table1, table4, triangle_turns, unit_retro
 from torchsar.core import Draws
 from torchsar.echo import PolynomialSweepError, SinusoidSweepError, ladar_echo, ladar_record, simulate_ladar_record
 from torchsar.echo.sweep_error import wound_turns
@@ -58,12 +58,10 @@ def test_transients_last_as_long_as_the_delay() -> None:
 
 
 def test_inside_sweeps_a_record_is_the_separated_sweeps() -> None:
-    """A trigger half a sample early puts samples on the symmetric grid of sweeps; motions are then half a sample earlier."""
+    """Samples of a record whose triangle starts with the block lie on the symmetric grid of sweeps."""
     radar, s = table1(), THREE.scatterers(Draws(0))
-    half = 0.5 / radar.sample_rate_hz
-    record = ladar_record(s, radar, 9, 1024, COMMON, -half, dtype=DOUBLE).unflatten(-1, (2, 512)).movedim(-2, 0)
-    earlier = Scatterers(s.azimuth_m + radar.speed_m_s * half, s.range_m, s.amplitude)
-    expected = direct_sweeps(earlier, radar, 9, [Earlier(motion, half) for motion in COMMON])
+    record = ladar_record(s, radar, 9, 1024, COMMON, dtype=DOUBLE).unflatten(-1, (2, 512)).movedim(-2, 0)
+    expected = direct_sweeps(s, radar, 9, COMMON)
     torch.testing.assert_close(record[..., 2:], expected[..., 2:], atol=1e-5, rtol=0)
     assert float((record[..., :1] - expected[..., :1]).abs().max()) > 1e-3
 
@@ -144,16 +142,15 @@ def test_sweep_errors_go_on_through_turning_points(error) -> None:
     radar, s = table1(), Points([0.0], [1.5]).scatterers(Draws(0))
     position = torch.arange(0, 80000, 7, dtype=torch.float64) / 20000 * radar.sweep_s
     torch.testing.assert_close(wound_turns(error, radar, position), wound_directly(error, radar, position), atol=1e-9, rtol=0)
-    half = 0.5 / radar.sample_rate_hz
-    record = ladar_record(s, radar, 5, 1024, trigger_s=-half, sweep_error=error, dtype=DOUBLE).unflatten(-1, (2, 512)).movedim(-2, 0)
+    record = ladar_record(s, radar, 5, 1024, sweep_error=error, dtype=DOUBLE).unflatten(-1, (2, 512)).movedim(-2, 0)
     expected = direct_sweeps(s, radar, 5, error=error)
     torch.testing.assert_close(record[..., 2:], expected[..., 2:], atol=1e-5, rtol=0)
-    assert float((record - ladar_record(s, radar, 5, 1024, trigger_s=-half, dtype=DOUBLE).unflatten(-1, (2, 512)).movedim(-2, 0)).abs().max()) > 0.01
+    assert float((record - ladar_record(s, radar, 5, 1024, dtype=DOUBLE).unflatten(-1, (2, 512)).movedim(-2, 0)).abs().max()) > 0.01
 
 
 def test_omitted_video_phase() -> None:
     s, radar = Points([0.0], [2.0]).scatterers(Draws(0)), table1()
-    record = ladar_record(s, radar, 2, 1024, trigger_s=-0.5 / 64e6, without=("flight", "residual_video"), dtype=DOUBLE).unflatten(-1, (2, 512)).movedim(-2, 0)
+    record = ladar_record(s, radar, 2, 1024, without=("flight", "residual_video"), dtype=DOUBLE).unflatten(-1, (2, 512)).movedim(-2, 0)
     expected = ladar_echo(s, radar, 2, (), EverySample(("flight", "residual_video")), dtype=DOUBLE)
     torch.testing.assert_close(record[..., 2:], expected[..., 2:], atol=1e-5, rtol=0)
 

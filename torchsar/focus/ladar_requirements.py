@@ -41,7 +41,7 @@ class Limit:
     def sentence(self) -> str:
         """One sentence with the figures, what follows and what to do."""
         relation = "at least" if self.at_least else "below"
-        figures = f"{self.name} is {self.value:.4g} {self.unit}, and must be {relation} {self.limit:.4g} {self.unit}".replace(" ,", ",")
+        figures = f"{self.name} is {f'{self.value:.4g} {self.unit}'.strip()}, and must be {relation} {f'{self.limit:.4g} {self.unit}'.strip()}"
         return figures if self.ok else f"{figures}: {self.consequence}; {self.remedy}"
 
 
@@ -176,7 +176,8 @@ def ladar_requirements(
     travel = speed_m_s * record_s if displacement_m is None else displacement_m
     per_m, c, sweep, cell = 4 * math.pi / radar.wavelength_m, radar.wave_speed_m_s, radar.sweep_s, radar.range_step_m
     bend = per_m * acceleration_m_s2 * sweep**2 / 8 + math.pi * radar.chirp_rate_hz_s * speed_m_s * sweep**2 / c
-    video = 2 * math.pi * radar.chirp_rate_hz_s * abs((2 * far / c) ** 2 - (2 * near / c) ** 2)
+    closest, farthest = 0.0 if near * far < 0 else min(abs(near), abs(far)), max(abs(near), abs(far))
+    video = 2 * math.pi * radar.chirp_rate_hz_s * ((2 * farthest / c) ** 2 - (2 * closest / c) ** 2)
     late = acceleration_m_s2 * radar.reference_range_m / c
     band = 2 * math.pi * radar.bandwidth_hz * travel / c
     still = "form the range at every sample, or with a Doppler linear in the sweep"

@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Signal, Stage, unit_phasor
+from torchsar.core import Axis, Signal, Stage, refuse_non_finite, unit_phasor
 from torchsar.radar import TriangularLadar
 
 Ramp = Literal["up", "down"]
@@ -26,11 +26,14 @@ def compress_sweeps(sweeps: Tensor, radar: TriangularLadar, ramp: Ramp = "up", v
 
     sweeps: (..., 2, pulse, N) in the radar's dechirp sign; the result is in the sign of the paper, phase +4 pi RD / lambda. A scatterer of amplitude a has
     a peak a. video: take out the residual video phase, -pi K dtau^2 of the up sweep; after motion compensation, not before (brief 000, section 3).
-    Spectra refer to the middle of the sweep. Differentiable. Raises ValueError for sweeps of another shape.
+    Spectra refer to the middle of the sweep. Differentiable. Raises TypeError or ValueError for other sweeps.
     """
     n = radar.sweep_samples
-    if not sweeps.is_complex() or sweeps.ndim < 3 or sweeps.shape[-3] != 2 or sweeps.shape[-1] != n:
-        raise ValueError(f"compress_sweeps works on complex sweeps (..., 2, pulse, {n}), got {sweeps.dtype} of shape {tuple(sweeps.shape)}")
+    if not (isinstance(sweeps, Tensor) and sweeps.is_complex()):
+        raise TypeError(f"compress_sweeps works on complex sweeps (..., 2, pulse, {n}), got {getattr(sweeps, 'dtype', type(sweeps).__name__)}")
+    if sweeps.ndim < 3 or sweeps.shape[-3] != 2 or sweeps.shape[-2] < 1 or sweeps.shape[-1] != n:
+        raise ValueError(f"compress_sweeps works on sweeps (..., 2, pulse, {n}), up before down, got shape {tuple(sweeps.shape)}")
+    refuse_non_finite(sweeps, "compress_sweeps")
     if ramp not in _EPOCH:
         raise ValueError(f"ramp must be 'up' or 'down', got {ramp!r}")
     data = sweeps[..., 0, :, :] if ramp == "up" else sweeps[..., 1, :, :].flip(-1)
@@ -59,11 +62,22 @@ def azimuth_turns(pulse: Axis, range_: Axis, radar: TriangularLadar, device: tor
     return 2 / radar.wavelength_m * across / (torch.sqrt(r.square() + across) + r)
 
 
+def _refuse_other_profiles(data: Tensor, pulse: Axis, range_: Axis, what: str) -> None:
+    """Raise TypeError or ValueError unless data are finite, complex and shaped as their axes."""
+    if not (isinstance(data, Tensor) and data.is_complex()):
+        raise TypeError(f"{what} works on complex profiles (..., pulse, range), got {getattr(data, 'dtype', type(data).__name__)}")
+    if data.ndim < 2 or tuple(data.shape[-2:]) != (pulse.n, range_.n):
+        raise ValueError(f"{what} works on profiles (..., {pulse.n}, {range_.n}) as their axes say, got shape {tuple(data.shape)}")
+    refuse_non_finite(data, what)
+
+
 def deramp_azimuth(data: Tensor, radar: TriangularLadar, pulse: Axis, range_: Axis) -> Tensor:
     """Profiles (..., pulse, range) without the azimuth phase of a scatterer at azimuth zero; one at x keeps a tone of -2 V x / (lambda R) Hz.
 
-    pulse: slow time of the samples (middles of the sweeps), zero abeam. What estimators of a phase per pulse need. Differentiable.
+    pulse: slow time of the samples (middles of the sweeps), zero abeam. What estimators of a phase per pulse need. Differentiable. Raises TypeError or
+    ValueError for data that are not complex, not finite, or do not fit their axes.
     """
+    _refuse_other_profiles(data, pulse, range_, "deramp_azimuth")
     return data * unit_phasor(-azimuth_turns(pulse, range_, radar, data.device), data.dtype)
 
 
@@ -75,6 +89,7 @@ def azimuth_matched_filter(data: Tensor, radar: TriangularLadar, pulse: Axis, ra
     lower the first side lobes (0: -13.27 dB; 0.03: -13.9 dB and 1 % wider; 0.46: Hamming). Exact phases of every range cell; no wrap-around. Differentiable.
     Raises ValueError for a target that stands still, or a weighting outside 0..0.5.
     """
+    _refuse_other_profiles(data, pulse, range_, "azimuth_matched_filter")
     if not 0 <= weighting <= 0.5:
         raise ValueError(f"weighting must lie in 0..0.5, got {weighting}")
     if not radar.speed_m_s > 0:
@@ -129,6 +144,8 @@ class CompressSweeps(Stage):
         out = Signal(compress_sweeps(signal.data, self.radar, self.ramp, self.video), axes)
         if self.window_m is None:
             return out
+        if len(self.window_m) != 2 or not self.window_m[0] < self.window_m[1]:
+            raise ValueError(f"window_m must be two relative ranges (low, high) in metres with low < high, got {list(self.window_m)}")
         low, high = (round(float(axes[1].index_of(edge))) for edge in self.window_m)
         if not 0 <= low < high < axes[1].n:
             raise ValueError(f"window_m {tuple(self.window_m)} does not lie in the relative ranges {axes[1].start:.4g}..{axes[1].stop:.4g} m")

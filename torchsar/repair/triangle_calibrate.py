@@ -102,8 +102,8 @@ def calibrate_sweeps(
     """
     if method not in get_args(Method):
         raise ValueError(f"method must be one of {', '.join(get_args(Method))}, got {method!r}")
-    _refuse_other(sweeps, "the sweeps to calibrate are", radar.sweep_samples)
-    _refuse_other(calibration, "the calibration channel is", radar.sweep_samples)
+    _refuse_other(sweeps, "the sweeps to calibrate are", "K", radar.sweep_samples)
+    _refuse_other(calibration, "the calibration channel is", "K or 1", radar.sweep_samples)
     if calibration.shape[-2] not in (1, sweeps.shape[-2]):
         raise ValueError(f"the calibration channel has {calibration.shape[-2]} periods; give one, or the {sweeps.shape[-2]} of the sweeps")
     refuse_non_finite(calibration, "the calibration channel")
@@ -114,10 +114,10 @@ def calibrate_sweeps(
     return _resampled(sweeps, _instants(error, radar, dtau), points, band)
 
 
-def _refuse_other(x: Tensor, what: str, n: int) -> None:
-    """Raise ValueError unless x is complex (..., 2, K, n)."""
+def _refuse_other(x: Tensor, what: str, periods: str, n: int) -> None:
+    """Raise ValueError unless x is complex (..., 2, K, n); periods: what K is called."""
     if not (x.is_complex() and x.ndim >= 3 and x.shape[-3] == 2 and x.shape[-1] == n):
-        raise ValueError(f"{what} complex (..., 2, K, {n}), up before down, got {x.dtype} {tuple(x.shape)}")
+        raise ValueError(f"{what} complex (..., 2, {periods}, {n}), up before down, got {x.dtype} {tuple(x.shape)}")
 
 
 def _phase_corrected(sweeps: Tensor, error_s: Tensor, radar: TriangularLadar, range_m: float | None) -> Tensor:

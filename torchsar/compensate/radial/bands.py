@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import cis, real_dtype, refuse_non_finite
+from torchsar.core import Axis, cis, real_dtype, refuse_non_finite
 from torchsar.radar import TriangularLadar
 
 _BLOCK = 8
@@ -63,13 +63,15 @@ def canonical(sweeps: Tensor, radar: TriangularLadar) -> Tensor:
     return sweeps.conj() if radar.dechirp_sign == "echo_conj_lo" else sweeps
 
 
-def refuse_other_sweeps(sweeps: Tensor, radar: TriangularLadar, what: str) -> None:
-    """Raise TypeError or ValueError unless sweeps is finite and complex (..., 2, pulse, N) with the N of the radar."""
+def refuse_other_sweeps(sweeps: Tensor, radar: TriangularLadar, what: str, pulse: Axis | None = None) -> None:
+    """Raise TypeError or ValueError unless sweeps is finite and complex (..., 2, pulse, N) with the N of the radar, and as many periods as the axis."""
     n = radar.sweep_samples
     if not (isinstance(sweeps, Tensor) and sweeps.is_complex()):
         raise TypeError(f"{what} works on complex sweeps (..., 2, pulse, {n}), got {getattr(sweeps, 'dtype', type(sweeps).__name__)}; split the record of a real detector first")
     if sweeps.ndim < 3 or sweeps.shape[-3] != 2 or sweeps.shape[-1] != n or sweeps.shape[-2] < 1:
         raise ValueError(f"{what} works on sweeps (..., 2, pulse, {n}), up before down, got shape {tuple(sweeps.shape)}")
+    if pulse is not None and pulse.n != sweeps.shape[-2]:
+        raise ValueError(f"{what}: the axis has {pulse.n} periods, the sweeps have {sweeps.shape[-2]}; take the pulse axis of the signal")
     refuse_non_finite(sweeps, what)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, block_bytes_of, over_blocks
+from torchsar.core import Estimate, block_bytes_of, over_blocks, refuse_non_finite
 
 _BLOCKS = 16  # a block of sweeps is so many times what one operation likes best: work on few trials costs more in calls than it gains
 
@@ -20,6 +20,7 @@ def by_trials(estimator: Estimator, sweeps: Tensor, azimuth_m: Tensor | float) -
     sweeps: (..., 2, pulse, N); azimuth_m: a number or one per trial (...,).
     """
     trials, azimuth = sweeps.shape[:-3], torch.as_tensor(azimuth_m, dtype=torch.float64, device=sweeps.device)
+    _refuse_other_places(azimuth, trials)
     height = max(1, _BLOCKS * block_bytes_of(sweeps.device) // (sweeps.shape[-3:].numel() * sweeps.element_size()))
     count = trials.numel()
     if count <= height or (torch.is_grad_enabled() and (sweeps.requires_grad or azimuth.requires_grad)):
@@ -34,6 +35,13 @@ def by_trials(estimator: Estimator, sweeps: Tensor, azimuth_m: Tensor | float) -
 
     over_blocks(work, starts, sweeps)
     return _joined([parts[first] for first in starts], trials)
+
+
+def _refuse_other_places(azimuth_m: Tensor, trials: torch.Size) -> None:
+    """Raise ValueError unless there is one finite azimuth, or one a trial."""
+    if azimuth_m.ndim and azimuth_m.shape != trials:
+        raise ValueError(f"azimuth_m must be one number (m) or one a trial {tuple(trials)}, got shape {tuple(azimuth_m.shape)}")
+    refuse_non_finite(azimuth_m, "azimuth_m")
 
 
 def _joined(parts: list[Estimate], trials: torch.Size) -> Estimate:

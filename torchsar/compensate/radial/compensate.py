@@ -20,7 +20,7 @@ def compensate_motion(sweeps: Tensor, velocity_m_s: Tensor, radar: TriangularLad
     of the carrier, the motion of the envelope, and acceleration inside sweeps. carrier_only: fc in place of f(u), the form that
     the paper prints, which leaves the envelopes where motion took them. Differentiable. Raises TypeError or ValueError for other sweeps or a velocity of another shape.
     """
-    refuse_other_sweeps(sweeps, radar, "compensate_motion")
+    refuse_other_sweeps(sweeps, radar, "compensate_motion", pulse)
     refuse_other_velocity(velocity_m_s, sweeps, "compensate_motion")
     coefficients = sweep_motion(velocity_m_s, radar, pulse)
     n = sweeps.shape[-1]
@@ -32,6 +32,8 @@ def compensate_motion(sweeps: Tensor, velocity_m_s: Tensor, radar: TriangularLad
 
 def refuse_other_velocity(velocity_m_s: Tensor, sweeps: Tensor, what: str) -> None:
     """Raise ValueError unless there is one finite velocity a period."""
+    if not isinstance(velocity_m_s, Tensor) or velocity_m_s.is_complex():
+        raise TypeError(f"{what} needs a tensor of real velocities (m/s), got {getattr(velocity_m_s, 'dtype', type(velocity_m_s).__name__)}")
     if velocity_m_s.ndim < 1 or velocity_m_s.shape[-1] != sweeps.shape[-2]:
         raise ValueError(f"{what} needs one velocity a period (..., {sweeps.shape[-2]}), got shape {tuple(velocity_m_s.shape)}")
     try:

@@ -25,7 +25,7 @@ def spectrum_correlation(sweeps: Tensor, radar: TriangularLadar, pulse: Axis, *,
     N). window_m: relative ranges (low, high) m, None for the whole band. azimuth_m: x of the scene's centre. Not differentiable: its
     values lie on a grid. Raises TypeError or ValueError for other sweeps, a window that is none, or upsampling below 1.
     """
-    refuse_other_sweeps(sweeps, radar, "spectrum_correlation")
+    refuse_other_sweeps(sweeps, radar, "spectrum_correlation", pulse)
     if not (isinstance(upsampling, int) and 1 <= upsampling <= 64):
         raise ValueError(f"upsampling must be a whole number of 1..64, got {upsampling}")
 

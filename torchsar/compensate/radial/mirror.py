@@ -40,7 +40,7 @@ def mirror_product(
     std: predicted from the measured SNR with the squaring loss. info: snr_db (post-compression), shift, intercept_rad (...,) with "record".
     Differentiable: the peak search is detached, Newton steps refine around it. Raises TypeError or ValueError for other sweeps or a window that is none.
     """
-    refuse_other_sweeps(sweeps, radar, "mirror_product")
+    refuse_other_sweeps(sweeps, radar, "mirror_product", pulse)
     refuse_other_intercept(intercept)
 
     def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:

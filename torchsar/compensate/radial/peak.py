@@ -25,7 +25,7 @@ def ml_peak(sweeps: Tensor, radar: TriangularLadar, pulse: Axis, *, window_m: tu
     within two range cells of that of the whole record. azimuth_m: x of the scatterer. Differentiable around the detached peaks. Raises TypeError or ValueError for
     other sweeps or a window that is none.
     """
-    refuse_other_sweeps(sweeps, radar, "ml_peak")
+    refuse_other_sweeps(sweeps, radar, "ml_peak", pulse)
     window_lines(radar, window_m)
 
     def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:

@@ -44,7 +44,7 @@ def radial_motion(
 
     std: of both. ok: both can be trusted. quality: that of the velocities. Differentiable around the detached peak search. Raises TypeError or ValueError for other sweeps or windows.
     """
-    refuse_other_sweeps(sweeps, radar, "radial_motion")
+    refuse_other_sweeps(sweeps, radar, "radial_motion", pulse)
     refuse_other_intercept(intercept)
 
     def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:

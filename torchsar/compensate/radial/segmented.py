@@ -49,7 +49,7 @@ def segmented_interference(
 
     Differentiable around the detached peaks and integers. Raises TypeError or ValueError for other sweeps, options or windows.
     """
-    refuse_other_sweeps(sweeps, radar, "segmented_interference")
+    refuse_other_sweeps(sweeps, radar, "segmented_interference", pulse)
     if bins not in ("peak", "sum") or unwrap not in ("gradient", "per_pulse"):
         raise ValueError(f"bins must be 'peak' or 'sum' and unwrap 'gradient' or 'per_pulse', got {bins!r} and {unwrap!r}")
     if not (isinstance(scatterers, int) and scatterers >= 1 and isinstance(padding, int) and 1 <= padding <= 16):
