@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchsar.radar import LIGHT_M_S, TriangularLadar
-from torchsar.scene import Motion, Points, Polynomial, RetroAndBrokenLine, Scatterers, Sinusoid, SweepError, displacement_m
+from torchsar.scene import Points, Polynomial, RetroAndBrokenLine, Scatterers, Sinusoid, SweepError, displacement_m
 
 DOUBLE = torch.complex128
 THREE = Points([-0.06, 0.0, 0.06], [1.0, 1.5, 2.0], [0.7, 1.0, 0.7])
@@ -33,17 +32,6 @@ def table4(**changes) -> TriangularLadar:
 def unit_retro(draws) -> Scatterers:
     """Retro-reflector and broken line with a retro of amplitude 1."""
     return RetroAndBrokenLine(retro_db=0.0).scatterers(draws)
-
-
-@dataclass(frozen=True)
-class Earlier:
-    """A motion as it was `lead_s` before."""
-
-    motion: Motion
-    lead_s: float
-
-    def displacement_m(self, time_s: Tensor) -> Tensor:
-        return self.motion.displacement_m(time_s - self.lead_s)
 
 
 def unit(turns: Tensor) -> Tensor:

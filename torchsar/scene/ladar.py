@@ -104,13 +104,18 @@ class Fidelity(Protocol):
 
 
 @dataclass(frozen=True)
-class EverySample:
-    """The range at each sample: the yardstick. without: effects that are left out, of "residual_video", "hyperbola", "flight"."""
+class _Level:
+    """What every level has. without: effects that are left out, of "residual_video", "hyperbola", "flight"."""
 
     without: tuple[Effect, ...] = ("flight",)
 
     def __post_init__(self) -> None:
         _refuse_effects(self.without)
+
+
+@dataclass(frozen=True)
+class EverySample(_Level):
+    """The range at each sample: the yardstick. without: effects that are left out, of "residual_video", "hyperbola", "flight"."""
 
     def sweep_range_m(self, history: RangeHistory, middle_s: Tensor) -> Lines:
         """Range at the middles of sweeps and slope (m/s) of its chord, by which beats are judged: the echo itself asks for every sample."""
@@ -122,16 +127,11 @@ class EverySample:
 
 
 @dataclass(frozen=True)
-class QuadraticInSweep:
+class QuadraticInSweep(_Level):
     """Line of the phase of each scatterer in each sweep, and one bend of it for all scatterers: acceleration, and the band that velocity takes along.
 
     Between `LinearInSweep` and `EverySample`, at little more than the cost of lines where scatterers are many. Neglects the jerk and what bends differ.
     """
-
-    without: tuple[Effect, ...] = ("flight",)
-
-    def __post_init__(self) -> None:
-        _refuse_effects(self.without)
 
     def sweep_range_m(self, history: RangeHistory, middle_s: Tensor) -> Lines:
         """Range at the middles of sweeps, slope (m/s) of its chord, and bend (m/s^2), (*trials, *middles, target) each."""
@@ -146,16 +146,11 @@ class QuadraticInSweep:
 
 
 @dataclass(frozen=True)
-class LinearInSweep:
+class LinearInSweep(_Level):
     """Phase and frequency of each scatterer in each sweep: the range goes along a straight line in it. The default (brief 000, section 10).
 
     Neglects acceleration and the band that velocity takes along, see neglected_phase_rad; the next levels are `QuadraticInSweep` and `EverySample`.
     """
-
-    without: tuple[Effect, ...] = ("flight",)
-
-    def __post_init__(self) -> None:
-        _refuse_effects(self.without)
 
     def sweep_range_m(self, history: RangeHistory, middle_s: Tensor) -> Lines:
         """Range at the middles of sweeps and slope (m/s) of its chord, (*trials, *middles, target) each."""
@@ -170,13 +165,8 @@ class LinearInSweep:
 
 
 @dataclass(frozen=True)
-class OnePerSweep:
+class OnePerSweep(_Level):
     """Stop and go: the range stands still during each sweep. Velocity then does not exist for methods that look into sweeps; for comparisons only."""
-
-    without: tuple[Effect, ...] = ("flight",)
-
-    def __post_init__(self) -> None:
-        _refuse_effects(self.without)
 
     def sweep_range_m(self, history: RangeHistory, middle_s: Tensor) -> Lines:
         """Range at the middles of sweeps, slope zero."""
@@ -190,13 +180,8 @@ class OnePerSweep:
 
 
 @dataclass(frozen=True)
-class OnePerPeriod:
+class OnePerPeriod(_Level):
     """Stop and go from period to period: both sweeps see the range of the turning point between them. For comparisons only."""
-
-    without: tuple[Effect, ...] = ("flight",)
-
-    def __post_init__(self) -> None:
-        _refuse_effects(self.without)
 
     def sweep_range_m(self, history: RangeHistory, middle_s: Tensor) -> Lines:
         """Range at the turning points, slope zero. middle_s: (2, pulse), up sweeps first."""
