@@ -58,6 +58,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             warnings.showwarning = _show_warning
             return _dispatch(options, "torchsar " + shlex.join(given))
     except ImportError as error:
+        if (error.name or "").startswith("torchsar"):  # a fault of the program, not of the installation
+            raise
         return _fail(f"{error.name or error} is not installed; install the extra: pip install 'torchsar-lab[study]'")
     except ConfigError as error:
         return _fail(str(error))

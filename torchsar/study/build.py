@@ -100,13 +100,13 @@ def _full(catalogue: Catalogue, entry: dict[str, Any], where: str, file: str) ->
     return {catalogue.key: name, **parameters}
 
 
-def refuse_oversize(lines: int, samples: int, file: str) -> None:
-    """A raw matrix larger than the memory of the machine is a slip of the pen."""
+def refuse_oversize(lines: int, samples: int, file: str, smaller: str) -> None:
+    """A raw matrix larger than the memory of the machine is a slip of the pen. smaller: the keys to make smaller."""
     try:
         memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):  # not told on every system
         return
     if 8 * lines * samples > memory:
         raise ConfigError(
-            f"{file}: world: {lines} lines of {samples} samples take {8 * lines * samples / 1e9:.3g} GB, and this machine has {memory / 1e9:.3g} GB; make world.lines or world.samples smaller"
+            f"{file}: world: {lines} lines of {samples} samples take {8 * lines * samples / 1e9:.3g} GB, and this machine has {memory / 1e9:.3g} GB; make {smaller} smaller"
         )

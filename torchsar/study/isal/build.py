@@ -31,7 +31,7 @@ def build_radar(loaded: Loaded) -> InverseRadar:
 def build_world(loaded: Loaded) -> TurntableWorld:
     """The world of a simulation."""
     world, file = loaded.config.world, loaded.file
-    refuse_oversize(world.pulses, world.samples, file)
+    refuse_oversize(world.pulses, world.samples, file, "world.pulses or world.samples")
     scenes = {name: SCENES.make(entry, f"world.scene.{name}", file) for name, entry in world.scene.items()}
     motion = [MOTIONS.make(entry, f"world.motion.{name}", file) for name, entry in world.motion.items()]
     phases = [START_PHASES.make(entry, f"world.start_phase.{name}", file) for name, entry in world.start_phase.items()]

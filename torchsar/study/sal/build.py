@@ -81,7 +81,7 @@ class Ladar:
     @staticmethod
     def of(loaded: Loaded) -> Ladar:
         world, radar = loaded.config.world, build_radar(loaded)
-        refuse_oversize(2 * world.periods, radar.sweep_samples, loaded.file)
+        refuse_oversize(2 * world.periods, radar.sweep_samples, loaded.file, "world.periods or radar.sample_rate_hz")
         damages = build_damages(world.damages, "world.damages", loaded.file, LADAR_DAMAGES)
         return Ladar(radar, build_world(loaded), world.periods, world.record, damages, precision(loaded.config))
 

@@ -92,7 +92,7 @@ def build_case(loaded: Loaded) -> Case:
         return Case(recording, clean, Truth(told, clean) if damages else None, {})
     world, radar = build_world(loaded), build_radar(loaded)
     assert config.world is not None
-    refuse_oversize(config.world.lines, config.world.samples, loaded.file)
+    refuse_oversize(config.world.lines, config.world.samples, loaded.file, "world.lines or world.samples")
     damages = build_damages(config.world.damages, "world.damages", loaded.file)
     try:
         recording, truth = simulate(radar, world, config.world.lines, config.world.samples, draws, damages, precision(config))
