@@ -111,8 +111,14 @@ def test_window_and_refusals() -> None:
         CompressSweeps(MOVING, window_m=(0.0, 9.0))(sweeps)
     with pytest.raises(ValueError, match="ramp must be"):
         CompressSweeps(MOVING, "left")
-    with pytest.raises(ValueError, match="complex sweeps"):
+    with pytest.raises(ValueError, match="low < high"):
+        CompressSweeps(MOVING, window_m=(3.0, 0.0))(sweeps)
+    with pytest.raises(ValueError, match="up before down, got shape"):
         compress_sweeps(sweeps.data[..., :100], MOVING)
+    with pytest.raises(TypeError, match="complex sweeps"):
+        compress_sweeps(sweeps.data.real, MOVING)
+    with pytest.raises(ValueError, match="as their axes say"):
+        deramp_azimuth(out.data[..., :5], MOVING, *out.axes)
     with pytest.raises(ValueError, match="does not move across"):
         AzimuthMatchedFilter(RADAR)(out)
     with pytest.raises(ValueError, match="m from the ladar; crop it"):
