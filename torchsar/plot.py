@@ -26,7 +26,7 @@ except ImportError as error:
 
 INK, ACCENT, SECOND, THIRD, FAINT = "#1f2933", "#0b6e99", "#d1495b", "#e09f3e", "#9aa5b1"
 COLOURS = (ACCENT, SECOND, THIRD, "#4f7942", "#6a4c93", FAINT, "#8d5524", "#1aa6a6")
-MARKERS, DASHES = "osD^vPX*", ("--", ":", "-.")
+MARKERS, DASHES = "osD^vPX", ("--", ":", "-.")
 _WORDS_FIT = 90  # letters of words beside each other under one panel
 _STYLE: Any = {
     "font.size": 9,
