@@ -163,3 +163,10 @@ def test_members_that_are_no_stages_are_refused_at_construction(stages, error, m
 def test_a_constant_is_no_connection():
     with pytest.raises(TypeError, match="doppler_hz=3.0: `use` connects values by name"):
         use(OmegaK(small_radar()), doppler_hz=3.0)
+
+
+def test_a_value_that_nobody_offers_is_refused() -> None:
+    chain, (recording, _) = squinted_chain(small_radar()), small_recording()
+    for run in (chain, chain.trace):
+        with pytest.raises(KeyError, match="doppler.doppler_h'.*the chain offers the values"):
+            run(recording, given={"doppler.doppler_h": torch.tensor(0.0, dtype=torch.float64)})

@@ -99,11 +99,13 @@ class Chain(nn.Module):
     def forward(self, x: Recording | Signal, given: Mapping[str, Tensor] | None = None) -> Signal:
         """The signal after the last stage. given: values that replace what an estimator would find."""
         signal, aux = _split(x)
+        self._refuse_unknown(given, aux)
         return self._run(list(self.stages), signal, {**aux, **(given or {})}, set(given or {}), None)
 
     def trace(self, x: Recording | Signal, given: Mapping[str, Tensor] | None = None) -> Trace:
         """Run and keep every intermediate by stage name, with wall seconds and bytes of each output."""
         signal, aux = _split(x)
+        self._refuse_unknown(given, aux)
         values, log = {**aux, **(given or {})}, _Log()
         self._run(list(self.stages), signal, values, set(given or {}), log)
         return Trace(log.inputs, log.outputs, log.estimates, values, log.seconds, log.bytes)
@@ -119,6 +121,14 @@ class Chain(nn.Module):
         if unknown:
             raise KeyError(f"given {sorted(unknown)}, but the trace holds the values {sorted(trace.values)}")
         return self._run(part, trace.inputs[start], {**trace.values, **(given or {})}, set(given or {}), None)
+
+    def _refuse_unknown(self, given: Mapping[str, Tensor] | None, aux: Mapping[str, Tensor]) -> None:
+        """A value that no stage offers or uses and nothing recorded would be held for nothing."""
+        offered = {f"{name}.{key}" for name, stage in self.stages.items() for key in getattr(stage, "provides", ())} | set(aux)
+        offered |= {source for names in self.uses.values() for source in names.values()}
+        unknown = set(given or {}) - offered
+        if unknown:
+            raise KeyError(f"given {sorted(unknown)}, but the chain offers the values {sorted(offered)}")
 
     def _run(self, names: list[str], signal: Signal, values: dict[str, Tensor], held: set[str], log: _Log | None) -> Signal:
         for name in names:
