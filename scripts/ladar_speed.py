@@ -19,11 +19,10 @@ from torch import Tensor
 
 from torchsar import Draws
 from torchsar.compensate import mirror_product, ml_peak, radial_motion, range_error, segmented_interference, spectrum_correlation
-from torchsar.compensate.radial import sweep_middles
 from torchsar.core import Axis, Estimate, Truth
 from torchsar.echo import simulate_ladar
 from torchsar.metrics import velocity_free_offset_bound_m_s
-from torchsar.radar import LIGHT_M_S, TriangularLadar
+from torchsar.radar import LIGHT_M_S, TriangularLadar, sweep_middles
 from torchsar.scene import LadarWorld, Points, Polynomial, Sinusoid
 
 METHODS: dict[str, Callable[..., Estimate]] = {

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from tests.echo.ladars import COMMON, table1
-from torchsar.compensate.radial import mirror_product, ml_peak, radial_motion, range_error, segmented_interference, spectrum_correlation, sweep_middles
+from torchsar.compensate.radial import mirror_product, ml_peak, radial_motion, range_error, segmented_interference, spectrum_correlation
 from torchsar.core import Axis, Draws, Estimate, Truth
 from torchsar.echo import simulate_ladar
-from torchsar.radar import TriangularLadar
+from torchsar.radar import TriangularLadar, sweep_middles
 from torchsar.scene import EverySample, LadarWorld, Points
 
 ESTIMATORS: dict[str, Callable[..., Estimate]] = {

@@ -9,10 +9,11 @@ import torch
 
 from tests.compensate.radials import GATE, rms, seen, without_line
 from tests.echo.ladars import COMMON, direct_sweeps, table1
-from torchsar.compensate.radial import compensate_motion, integrated_range, radial_motion, range_error, sweep_middles, sweep_motion, turning_points
+from torchsar.compensate.radial import compensate_motion, integrated_range, radial_motion, range_error, sweep_motion, turning_points
 from torchsar.compensate.radial.compensate import polynomial_phasor
 from torchsar.core import Axis, Estimate
 from torchsar.focus import compress_sweeps
+from torchsar.radar import sweep_middles
 from torchsar.scene import Polynomial, Scatterers, displacement_m
 
 RADAR = table1()

@@ -11,11 +11,12 @@ from torch import Tensor
 from tests.compensate.radials import ESTIMATORS, GATE, range_rms, seen, velocity_rms
 from tests.echo.ladars import COMMON, THREE, table1
 from torchsar.compensate import correct_pulse_phase, pga
-from torchsar.compensate.radial import compensate_motion, mirror_product, phase_polish, radial_motion, range_error, segmented_interference, sweep_middles
+from torchsar.compensate.radial import compensate_motion, mirror_product, phase_polish, radial_motion, range_error, segmented_interference
 from torchsar.core import Draws, Estimate, Signal
 from torchsar.echo import simulate_ladar_record
 from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
 from torchsar.metrics import impulse_response
+from torchsar.radar import sweep_middles
 from torchsar.repair import CircularShift, SplitSweeps
 from torchsar.scene import EverySample, LadarWorld, LetterE, LinearInSweep, Points, Polynomial, QuadraticInSweep
 

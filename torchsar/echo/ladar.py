@@ -12,7 +12,7 @@ from torch import Tensor
 from torchsar.core import Draws, Recording, Truth, linear_phasor, real_dtype, unit_phasor
 from torchsar.echo.ladar_course import LadarCourse, calibration_aux, hand_over
 from torchsar.echo.stripmap import Damage
-from torchsar.radar import TriangularLadar
+from torchsar.radar import TriangularLadar, sweep_middles
 from torchsar.scene import EverySample, Fidelity, LadarWorld, LinearInSweep, Motion, RangeHistory, Scatterers, SweepError
 
 _TABLE_BYTES = 8 << 20
@@ -40,7 +40,7 @@ def ladar_echo(
     """
     s = Scatterers(shared(scatterers.azimuth_m), shared(scatterers.range_m), scatterers.amplitude)
     history = RangeHistory(s, radar, motion, radar.sweep_axes(n_period)[1].start, fidelity.without)
-    middle_s = sweep_middles_s(radar, n_period, s.range_m.device)
+    middle_s = sweep_middles(radar, radar.sweep_axes(n_period)[1], s.range_m.device)
     lit = lit_by(s, radar, middle_s)
     lines = SweepLines.of(history, fidelity, middle_s)
     refuse_beats(lines.slope, lit & (s.amplitude != 0)[..., None, None, :], radar)
@@ -49,11 +49,6 @@ def ladar_echo(
     else:
         echo = _lined(lines, s, sweep_error, lit, radar, dtype)
     return echo.conj().resolve_conj() if radar.dechirp_sign == "echo_conj_lo" else echo
-
-
-def sweep_middles_s(radar: TriangularLadar, n_period: int, device: torch.device | str | None = None) -> Tensor:
-    """Slow time in the middle of each up and down sweep, (2, pulse)."""
-    return radar.sweep_axes(n_period)[1].values(device) + radar.period_s * torch.tensor([[0.25], [0.75]], dtype=torch.float64, device=device)
 
 
 def lit_by(s: Scatterers, radar: TriangularLadar, time_s: Tensor) -> Tensor:
@@ -195,7 +190,8 @@ def simulate_ladar(
     Raises ValueError for beats beyond the sampling rate, an empty scene or gate.
     """
     course = LadarCourse.of(radar, world, n_period, draws, device)
-    axes, middle_s = radar.sweep_axes(n_period), sweep_middles_s(radar, n_period, course.scatterers.range_m.device)
+    axes = radar.sweep_axes(n_period)
+    middle_s = sweep_middles(radar, axes[1], course.scatterers.range_m.device)
 
     def echo_of(motion: Sequence[Motion]) -> Tensor:
         return ladar_echo(course.scatterers, radar, n_period, motion, world.fidelity, world.sweep_error, dtype)

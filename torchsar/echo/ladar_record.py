@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, Truth, UniformSpline, cis, per_trial, real_dtype, reduced_turns
-from torchsar.echo.ladar import SweepLines, lit_by, refuse_beats, shared, sweep_middles_s
+from torchsar.echo.ladar import SweepLines, lit_by, refuse_beats, shared
 from torchsar.echo.ladar_course import LadarCourse, calibration_aux, hand_over, noise_std, refuse_trials
 from torchsar.echo.stripmap import Damage
 from torchsar.echo.sweep_error import wound_turns
-from torchsar.radar import TriangularLadar
+from torchsar.radar import TriangularLadar, sweep_middles
 from torchsar.scene import Effect, EverySample, LadarWorld, LinearInSweep, Motion, QuadraticInSweep, RangeHistory, Scatterers, SweepError, displacement_m
 
 _BLOCK_BYTES = 4 << 20
@@ -164,7 +164,7 @@ def _level(log_amplitude: Callable[[Tensor], Tensor], start_s: Tensor, length_s:
 
 
 def _refuse_record(s: Scatterers, radar: TriangularLadar, n_period: int, motion: Sequence[Motion], without: Sequence[Effect]) -> None:
-    middle_s = sweep_middles_s(radar, n_period, s.range_m.device)
+    middle_s = sweep_middles(radar, radar.sweep_axes(n_period)[1], s.range_m.device)
     level = LinearInSweep(tuple(without))
     beat = SweepLines.of(RangeHistory(s, radar, motion, radar.sweep_axes(n_period)[1].start, without), level, middle_s).slope
     shines = lit_by(s, radar, middle_s) & (s.amplitude != 0)[..., None, None, :]
@@ -218,7 +218,7 @@ def simulate_ladar_record(
         chi = None if course.chi is None else course.log_amplitude
         return ladar_record(course.scatterers, radar, n_period, axes[1].n, motion, trigger, world.fidelity.without, world.sweep_error, chi, dtype)
 
-    values = {**course.truths(radar, world, sweep_middles_s(radar, n_period, course.scatterers.range_m.device), trigger), "trigger_s": trigger}
+    values = {**course.truths(radar, world, sweep_middles(radar, axes[0], course.scatterers.range_m.device), trigger), "trigger_s": trigger}
     clean = echo_of(())
     noise = _record_noise(world.snr_db, tuple(axis.n for axis in axes), radar, draws, dtype, clean.device)
     data = echo_of(course.motion) + noise if course.motion else clean + noise

@@ -1,7 +1,7 @@
 """What an instrument knows about itself."""
 
 from torchsar.radar.inverse import InverseRadar
-from torchsar.radar.ladar import TriangularLadar
+from torchsar.radar.ladar import TriangularLadar, sweep_middles
 from torchsar.radar.spotlight import FarField, PlaneWaveLoss, Spotlight, frequency_samples, geometry_of, plane_wave_loss, range_profiles
 from torchsar.radar.stripmap import LIGHT_M_S, StripmapRadar
 from torchsar.radar.waveform import LinearFM
@@ -19,4 +19,5 @@ __all__ = [
     "geometry_of",
     "plane_wave_loss",
     "range_profiles",
+    "sweep_middles",
 ]

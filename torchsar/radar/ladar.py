@@ -6,6 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+import torch
+from torch import Tensor
+
 from torchsar.core import Axis
 from torchsar.radar.stripmap import LIGHT_M_S
 
@@ -121,3 +124,9 @@ class TriangularLadar:
         The first sample lies half a step after the start, so that samples of separated sweeps are samples of the record where the triangle starts with the block.
         """
         return self.sweep_axes(n_period, start_s)[1], Axis("time", n_sample, 0.5 / self.sample_rate_hz, 1 / self.sample_rate_hz, "s")
+
+
+def sweep_middles(radar: TriangularLadar, pulse: Axis, device: torch.device | str | None = None) -> Tensor:
+    """Slow times (s) of the middles of the up and the down sweeps, float64 (2, pulse). pulse: starts of the periods."""
+    start = pulse.values(device)
+    return torch.stack([start + 0.25 * radar.period_s, start + 0.75 * radar.period_s])

@@ -82,7 +82,7 @@ class VibrationSpectrum:
 
 
 @dataclass(frozen=True)
-class PathFluctuation:
+class PathFluctuation(VibrationSpectrum):
     """Fluctuation of the optical path by turbulent air: coloured, f^(-8/3) as of a point receiver in Kolmogorov turbulence (one way or two is the caller's).
 
     rms_m: within the band, a number or per-trial tensor (...,). highest_hz: None for 2 kHz, or ten turns in a recording so short. The rest as for
@@ -94,13 +94,6 @@ class PathFluctuation:
     highest_hz: float | None = None
     slope: float = -8 / 3
     count: int = 64
-
-    def __post_init__(self) -> None:
-        refuse_unless_finite("rms_m of a random motion", self.rms_m, 0.0)
-        _refuse_band(self.lowest_hz, self.highest_hz, self.slope, self.count)
-
-    def drawn(self, draws: Draws, span_s: float) -> Tones:
-        return random_tones(draws, self.rms_m, *_band(self.lowest_hz, self.highest_hz, span_s), self.slope, self.count)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from torchsar.compensate.radial.polish import phase_polish
 from torchsar.compensate.radial.recommended import radial_motion, range_error
 from torchsar.compensate.radial.segmented import segmented_interference
 from torchsar.compensate.radial.stages import CompensateMotion, EqualisePulses, MirrorProduct, MlPeak, PhasePolish, PulseGain, RadialMotion, SegmentedInterference, SpectrumCorrelation
-from torchsar.compensate.radial.trajectory import geometric_velocity_m_s, integrated_range, sweep_middles, sweep_motion, turning_points
+from torchsar.compensate.radial.trajectory import geometric_velocity_m_s, integrated_range, sweep_motion, turning_points
 
 __all__ = [
     "Bands",
@@ -36,7 +36,6 @@ __all__ = [
     "range_error",
     "segmented_interference",
     "spectrum_correlation",
-    "sweep_middles",
     "sweep_motion",
     "turning_points",
 ]

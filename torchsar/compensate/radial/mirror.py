@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchsar.compensate.radial.bands import Bands, bands_of, refuse_other_sweeps
 from torchsar.compensate.radial.blocks import by_trials
+from torchsar.compensate.radial.newton import climbed, step_uphill
 from torchsar.compensate.radial.verdict import velocity_estimate
 from torchsar.core import Axis, Estimate, cis, take
 from torchsar.radar import TriangularLadar
@@ -104,14 +105,7 @@ def _slope(z: Tensor, u: Tensor, bands: Bands, steps: int) -> Tensor:
     best = torch.cat([power[..., -reach:], power[..., : reach + 1]], -1).argmax(-1) - reach
     best = best + _parabola(power, best)
     v = best.to(torch.float64) / (_PAD * n * float(u[1] - u[0]) * per)
-    w = (2 * math.pi * per * u).to(z.real.dtype)
-    for _ in range(steps):
-        turned = z * cis(-v[..., None].to(w.dtype) * w)
-        s0, s1, s2 = turned.sum(-1), (turned * w).sum(-1), (turned * w * w).sum(-1)
-        gradient = 2 * (s0.conj() * s1).imag
-        bend = 2 * (s1.real.square() + s1.imag.square() - (s0.conj() * s2).real)
-        v = v + _step(gradient, bend)
-    return v
+    return climbed(z, 2 * math.pi * per * u, v, steps)
 
 
 def _parabola(power: Tensor, best: Tensor) -> Tensor:
@@ -128,11 +122,5 @@ def _through_zero(z: Tensor, u: Tensor, v: Tensor, bands: Bands) -> Tensor:
         turned = _turned(z, u, v, bands)
         gradient = (turned.imag * w).sum(-1)
         bend = -(turned.real * w * w).sum(-1)
-        v = v + _step(gradient, bend)
+        v = v + step_uphill(gradient, bend)
     return v
-
-
-def _step(gradient: Tensor, bend: Tensor) -> Tensor:
-    """A Newton step uphill where the objective bends down, nothing elsewhere."""
-    concave = bend < 0
-    return torch.where(concave, -gradient / torch.where(concave, bend, -1), 0).to(torch.float64)

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from torchsar.compensate.radial.bands import Bands, bands_of, inside, refuse_other_sweeps, window_lines
 from torchsar.compensate.radial.blocks import by_trials
+from torchsar.compensate.radial.newton import climbed
 from torchsar.compensate.radial.verdict import velocity_estimate
-from torchsar.core import Axis, Estimate, cis
+from torchsar.core import Axis, Estimate
 from torchsar.radar import TriangularLadar
 
 _PAD, _NEWTON, _REACH, _DARK = 2, 3, 2.0, 0.2
@@ -61,19 +62,5 @@ def peak_frequencies(bands: Bands, window_m: tuple[float, float] | None) -> tupl
     peak, best = torch.where(away.abs() <= round(_REACH * _PAD), power, -1).max(-1)
     best = torch.where(best >= _PAD * m // 2, best - _PAD * m, best)
     frequency = best.to(torch.float64) / (_PAD * bands.radar.sweep_s)
-    frequency = _climbed(both, frequency, bands.time_s)
+    frequency = climbed(both, 2 * math.pi * bands.time_s, frequency, _NEWTON)
     return frequency[..., 0, :], frequency[..., 1, :], shining(peak[..., 0, :], peak[..., 1, :])
-
-
-def _climbed(x: Tensor, frequency_hz: Tensor, time_s: Tensor) -> Tensor:
-    """Frequencies of greatest |sum x exp(-2j pi f u)| next to those given, (..., pulse), by Newton steps. x: (..., pulse, m)."""
-    w = 2 * math.pi * time_s
-    for _ in range(_NEWTON):
-        turned = x * cis((-(frequency_hz[..., None] * w)).to(x.real.dtype))
-        weight = w.to(x.real.dtype)
-        s0, s1, s2 = turned.sum(-1), (turned * weight).sum(-1), (turned * weight * weight).sum(-1)
-        gradient = 2 * (s0.conj() * s1).imag
-        bend = 2 * (s1.real.square() + s1.imag.square() - (s0.conj() * s2).real)
-        concave = bend < 0
-        frequency_hz = frequency_hz + torch.where(concave, -gradient / torch.where(concave, bend, -1), 0).to(torch.float64)
-    return frequency_hz

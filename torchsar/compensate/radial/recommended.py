@@ -13,11 +13,12 @@ from torchsar.compensate.radial.blocks import by_trials
 from torchsar.compensate.radial.compensate import carrier_turns, polynomial_phasor
 from torchsar.compensate.radial.mirror import Intercept, mirror_estimate, refuse_other_intercept
 from torchsar.compensate.radial.polish import ENOUGH_STD_RAD, phase_polish
-from torchsar.compensate.radial.trajectory import integrated_range, sweep_middles, sweep_motion
-from torchsar.core import Axis, Estimate, unit_phasor
+from torchsar.compensate.radial.trajectory import integrated_range, sweep_motion
+from torchsar.core import Axis, Estimate
 from torchsar.core.spline import UniformSpline
+from torchsar.focus.triangular import deramp_azimuth, profile_axes
 from torchsar.metrics.ladar_bounds import integrated_range_detrended_bound_m
-from torchsar.radar import TriangularLadar
+from torchsar.radar import TriangularLadar, sweep_middles
 
 _FAR_RAD, _FEW_PERIODS, _WINDOWS = 0.4, 32, Listed((31.0, 21.0, 15.0, 9.0, 9.0, 9.0))
 
@@ -86,9 +87,9 @@ def deramped_lines(bands: Bands, velocity_m_s: Tensor, pulse: Axis) -> Tensor:
     still = bands.up * polynomial_phasor(-left, radar.sweep_s / m, m, bands.up.dtype)
     lines = torch.arange(bands.first, bands.first + bands.lines, device=still.device)
     cells = torch.fft.fft(still)[..., lines % m] / m
-    across = (radar.speed_m_s * sweep_middles(radar, pulse, still.device)[0])[:, None].square()
-    r = radar.reference_range_m + radar.range_step_m * lines.to(torch.float64)
-    return cells * unit_phasor(-2 / radar.wavelength_m * across / (torch.sqrt(r.square() + across) + r), cells.dtype)
+    middle, _ = profile_axes(pulse, radar)
+    range_ = Axis("range", bands.lines, bands.first * radar.range_step_m, radar.range_step_m, "m")
+    return deramp_azimuth(cells, radar, middle, range_)
 
 
 def range_error(estimate: Estimate, radar: TriangularLadar, pulse: Axis, at_s: Tensor) -> Tensor:

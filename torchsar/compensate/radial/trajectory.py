@@ -9,18 +9,12 @@ from torch import Tensor
 
 from torchsar.core import Axis, per_trial
 from torchsar.core.spline import UniformSpline
-from torchsar.radar import TriangularLadar
+from torchsar.radar import TriangularLadar, sweep_middles
 
 
 def turning_points(radar: TriangularLadar, pulse: Axis) -> Axis:
     """Slow times of the turning points, half a period after the starts of the periods."""
     return Axis("pulse", pulse.n, pulse.start + radar.period_s / 2, pulse.step, "s")
-
-
-def sweep_middles(radar: TriangularLadar, pulse: Axis, device: torch.device | str | None = None) -> Tensor:
-    """Slow times of the middles of the up and the down sweeps, float64 (2, pulse)."""
-    start = pulse.values(device)
-    return torch.stack([start + 0.25 * radar.period_s, start + 0.75 * radar.period_s])
 
 
 def geometric_velocity_m_s(radar: TriangularLadar, pulse: Axis, azimuth_m: Tensor | float = 0.0, relative_range_m: float = 0.0, device: torch.device | str | None = None) -> Tensor:

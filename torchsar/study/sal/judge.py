@@ -10,10 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.compensate.radial import integrated_range, sweep_middles
+from torchsar.compensate.radial import integrated_range
 from torchsar.core import Axis, Chain, Signal, Trace, Truth, unit_phasor
 from torchsar.metrics import contrast, entropy, impulse_response
-from torchsar.radar import TriangularLadar
+from torchsar.radar import TriangularLadar, sweep_middles
 
 SWEEPS = ("ramp", "pulse", "fast_time")
 _LEADING = 10 ** (-10 / 20)
