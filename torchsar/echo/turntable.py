@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -12,7 +13,9 @@ from torch import Tensor
 from torchsar.core import Axis, Draws, Recording, Signal, Truth, linear_phasor, per_trial, unit_phasor
 from torchsar.echo.stripmap import Damage, apply_damages
 from torchsar.radar import InverseRadar
-from torchsar.scene import Dechirped, Motion, Scatterers, TurntableWorld, displacement_m, start_phase_rad
+from torchsar.scene import Dechirped, Motion, PolynomialRotation, Scatterers, TurntableWorld, displacement_m, start_phase_rad
+
+Rotation = Tensor | float | PolynomialRotation
 
 _TABLE_BYTES = 8 << 20
 _SERIES_ERROR = 1e-12
@@ -21,29 +24,65 @@ _SERIES_TERMS = 12
 _DROPPED_RAD = 1e-6
 
 
-def rotation_angle(radar: InverseRadar, n_pulse: int, rotation_rad_s: Tensor | float, like: Tensor) -> Tensor:
-    """theta at the middle of each pulse, (*trials, pulse) float64; zero at pulse n_pulse // 2."""
-    time_s = (torch.arange(n_pulse, dtype=torch.float64, device=like.device) - n_pulse // 2) / radar.prf_hz
-    return per_trial(rotation_rad_s, 1, like) * time_s
+def rotation_angle(radar: InverseRadar, n_pulse: int, rotation: Rotation, like: Tensor) -> Tensor:
+    """theta at the middle of each pulse, (*trials, pulse) float64; zero at pulse n_pulse // 2 of an even rotation, given as its rate in rad/s, and at
+    the first pulse of a PolynomialRotation. Raises ValueError for one that turns back within the record.
+    """
+    return PulseTurn.of(rotation, radar, n_pulse, like).angle_rad
 
 
-def turntable_echo(scatterers: Scatterers, radar: InverseRadar, n_pulse: int, n_range: int, rotation_rad_s: Tensor | float, dtype: torch.dtype = torch.complex64) -> Tensor:
+@dataclass(frozen=True)
+class PulseTurn:
+    """How the target stands and turns at the middle of each pulse: angle (rad), rate (rad/s), acceleration (rad/s^2), (*trials, pulse) float64."""
+
+    angle_rad: Tensor
+    rate_rad_s: Tensor
+    acceleration_rad_s2: Tensor
+
+    @staticmethod
+    def of(rotation: Rotation, radar: InverseRadar, n_pulse: int, like: Tensor) -> PulseTurn:
+        pulse = torch.arange(n_pulse, dtype=torch.float64, device=like.device)
+        if isinstance(rotation, PolynomialRotation):
+            rotation.refuse_turning_back(n_pulse / radar.prf_hz)
+            time_s = pulse / radar.prf_hz
+            return PulseTurn(rotation.angle(time_s), rotation.rate(time_s), rotation.acceleration(time_s))
+        rate = per_trial(rotation, 1, like)
+        angle = rate * ((pulse - n_pulse // 2) / radar.prf_hz)
+        return PulseTurn(angle, rate.expand_as(angle), torch.zeros_like(angle))
+
+    def __getitem__(self, pulses: slice) -> PulseTurn:
+        return PulseTurn(self.angle_rad[..., pulses], self.rate_rad_s[..., pulses], self.acceleration_rad_s2[..., pulses])
+
+
+def turntable_echo(
+    scatterers: Scatterers,
+    radar: InverseRadar,
+    n_pulse: int,
+    n_range: int,
+    rotation_rad_s: Rotation,
+    dtype: torch.dtype = torch.complex64,
+    centre_deviation_m: Tensor | float = 0.0,
+) -> Tensor:
     """Range-compressed pulses without errors or noise, (*trials, pulse, range) of `dtype` (Ruan et al. 2013, Eqs. 1 and 9).
 
-    s[k, n] = sum_m a_m h(n - y_m / dr) exp(-4j pi / lambda (x_m sin theta_k + y_m (cos theta_k - 1))), x cross range, y range. h is the
+    s[k, n] = sum_m a_m h(n - y_m / dr) exp(-4j pi / lambda (x_m sin theta_k + (y_m + yc) (cos theta_k - 1))), x cross range, y range. h is the
     response of a rectangular band of n_range frequencies, unit peak, periodic in the window. The phase of a_m is that of the echo at theta = 0.
-    Range frequency by range frequency the sum over scatterers is a matrix product of phasors. Differentiable in positions, amplitudes, rate.
+    rotation_rad_s: a number or per-trial tensor for an even rotation, theta = 0 at pulse n_pulse // 2, or a PolynomialRotation, theta = 0 at the first pulse
+    (Remote Sens. 2025, 17, 3447, Eq. 3, with sine and cosine unabridged). centre_deviation_m: yc, a number or per-trial tensor.
+    Range frequency by range frequency the sum over scatterers is a matrix product of phasors. Differentiable in positions, amplitudes, rate, k and yc.
     """
     x, y, amplitude = _rows_of(scatterers)
+    lever = y + per_trial(centre_deviation_m, 1, y)
     theta = rotation_angle(radar, n_pulse, rotation_rad_s, x)
     spectra = linear_phasor(-y / (n_range * radar.range_step_m), -(n_range // 2), n_range, dtype) * amplitude.to(dtype)[..., None]
     parts = []
     for pulses in _pulse_blocks(n_pulse, x.shape[-1]):
         angle = theta[..., pulses, None]
-        way = x[..., None, :] * torch.sin(angle) - y[..., None, :] * (2 * torch.sin(angle / 2).square())
-        parts.append(unit_phasor(-2 / radar.wavelength_m * way, dtype) @ spectra)
-    # centred in both domains: sample n_range // 2 is range zero
-    return torch.fft.fftshift(torch.fft.ifft(torch.fft.ifftshift(torch.cat(parts, -2), dim=-1)), dim=-1)
+        way = x[..., None, :] * torch.sin(angle) - lever[..., None, :] * (2 * torch.sin(angle / 2).square())
+        lines = unit_phasor(-2 / radar.wavelength_m * way, dtype) @ spectra
+        # centred in both domains: sample n_range // 2 is range zero; block by block, while the lines are in the cache
+        parts.append(torch.fft.fftshift(torch.fft.ifft(torch.fft.ifftshift(lines, dim=-1)), dim=-1))
+    return torch.cat(parts, -2)
 
 
 @dataclass(frozen=True)
@@ -71,30 +110,34 @@ def dechirped_echo(
     radar: InverseRadar,
     n_pulse: int,
     n_fast: int,
-    rotation_rad_s: Tensor | float,
+    rotation_rad_s: Rotation,
     motion: Sequence[Motion] = (),
     track: Sequence[Motion] = (),
     dtype: torch.dtype = torch.complex64,
+    centre_deviation_m: Tensor | float = 0.0,
 ) -> Tensor:
     """Dechirped pulses without noise, (*trials, pulse, fast_time) of `dtype`, the range evaluated at every sample.
 
     Phase of a scatterer: -2 pi (f0 dtau + gamma t' dtau - gamma dtau^2 / 2), dtau = 2 (x sin theta + y cos theta + d) / c at the time t' from the middle
     of the pulse, less the constant f0 2 y / c, so that amplitudes mean the same as in `turntable_echo`; d is the motion less the track's place
-    at the middle. Within a pulse the phases of scatterers differ by lines in t' and by 1e-4 rad beyond them: lines are a matrix
-    product of short tables, the rest a power series; together they are exact to 1e-6 rad, to 1e-10 for the ladar of the paper. The receiver is
+    at the middle. rotation_rad_s and centre_deviation_m as in `turntable_echo`; a centre at -yc gives x sin theta + (y + yc) cos theta - yc in place of the
+    first two terms of dtau, and a rate that changes is followed inside the pulse by its value and slope at the middle. Within a pulse the phases of
+    scatterers differ by lines in t' and by 1e-4 rad beyond them: lines are a matrix product of short tables, the rest a power series; together
+    they are exact to 1e-6 rad, to 1e-10 for the ladar of the paper. The receiver is
     ideal: a beat frequency beyond the window's, such as the coupling v f0 / gamma, wraps round, and `focus.compress_dechirped` takes it back.
-    Differentiable. Raises ValueError where target or motion turn so far within a pulse that more than 1e-6 rad would be missed.
+    Differentiable, in omega, k and yc as well. Raises ValueError where target or motion turn so far within a pulse that more than 1e-6 rad would be missed.
     """
     x, y, amplitude = _rows_of(scatterers)
-    theta, rate = rotation_angle(radar, n_pulse, rotation_rad_s, x), per_trial(rotation_rad_s, 2, x)
+    lever = y + per_trial(centre_deviation_m, 1, y)
+    turn = PulseTurn.of(rotation_rad_s, radar, n_pulse, x)
     fast_s = fast_time_axis(radar, n_fast).values(x.device)
     half_s = _pulse_s(radar) / 2
-    _refuse_fast_turns(radar, float((x.detach().square() + y.detach().square()).max().sqrt()), float(rate.detach().abs().max()) * half_s, half_s)
+    _refuse_fast_turns(radar, float((x.detach().square() + lever.detach().square()).max().sqrt()), TurnInPulse.worst(turn, rotation_rad_s, radar, half_s), half_s)
     pulse_s = torch.arange(n_pulse, dtype=torch.float64, device=x.device) / radar.prf_hz
     parts = []
     for pulses in _pulse_blocks(n_pulse, x.shape[-1] * 2 * math.isqrt(n_fast)):
         way = PulseWay.of(motion, track, pulse_s[pulses], fast_s, half_s)
-        lines = ScattererLines.of(radar, x, y, theta[..., pulses], rate, way)
+        lines = ScattererLines.of(radar, x, y, lever, turn[pulses], way)
         total = _sum_of_lines(lines, amplitude, way.bend_m, fast_s, dtype)
         parts.append(total * unit_phasor(_common_turns(radar, way, fast_s), dtype))
     return torch.cat(parts, -2)
@@ -113,19 +156,24 @@ class ScattererLines:
     bend: Tensor
 
     @staticmethod
-    def of(radar: InverseRadar, x: Tensor, y: Tensor, theta: Tensor, rate: Tensor, way: PulseWay) -> ScattererLines:
-        """Rotation inside the pulse to the second order of rate * t': range along - along (rate t')^2 / 2 + across rate t'."""
-        x, y, theta = x[..., None, :], y[..., None, :], theta[..., None]
+    def of(radar: InverseRadar, x: Tensor, y: Tensor, lever: Tensor, turn: PulseTurn, way: PulseWay) -> ScattererLines:
+        """Rotation inside the pulse to the second order of t': range along + across (rate t' + acceleration t'^2 / 2) - towards (rate t')^2 / 2.
+
+        y, lever: ranges from the middle of the window and from the centre of rotation.
+        """
+        x, y, lever = x[..., None, :], y[..., None, :], lever[..., None, :]
+        theta, rate, acceleration = turn.angle_rad[..., None], turn.rate_rad_s[..., None], turn.acceleration_rad_s2[..., None]
         middle, speed = way.middle_m[..., None], way.speed_m_s[..., None]
         sin, drop = torch.sin(theta), 2 * torch.sin(theta / 2).square()
-        change = x * sin - y * drop
-        along, turning = change + y, rate * (x - x * drop - y * sin)
+        change = x * sin - lever * drop
+        along, towards, across = change + y, change + lever, x - x * drop - lever * sin
+        turning = rate * across
         per_m = 2 / radar.wave_speed_m_s
         chirp, video = per_m * radar.chirp_rate_hz_s, 0.5 * per_m**2 * radar.chirp_rate_hz_s
         carrier = per_m * radar.carrier_hz
         start = -carrier * change + video * along * (along + 2 * middle)
         slope = -carrier * turning - chirp * along + 2 * video * (turning * (along + middle) + along * speed)
-        curve = carrier * along * rate.square() / 2 - chirp * turning + video * turning * (turning + 2 * speed)
+        curve = carrier * towards * rate.square() / 2 - chirp * turning + video * turning * (turning + 2 * speed) - carrier * across * acceleration / 2
         return ScattererLines(start, slope, curve, 2 * video * along)
 
 
@@ -180,12 +228,34 @@ def _series_terms(phase_rad: Tensor) -> int:
     raise ValueError(f"the target turns so fast that phases bend by {worst:.3g} rad within a pulse; the dechirped model holds to 0.6 rad: shorten the pulse")
 
 
-def _refuse_fast_turns(radar: InverseRadar, radius_m: float, half_turn_rad: float, half_s: float) -> None:
-    """The rotation inside a pulse is followed to its second order (half_turn_rad from the middle to an end): what comes after must be nothing."""
-    cubic = radar.carrier_hz * half_turn_rad**3 / 6 + radar.chirp_rate_hz_s * half_s * half_turn_rad**2 / 2
-    dropped = 4 * math.pi / radar.wave_speed_m_s * radius_m * cubic
+@dataclass(frozen=True)
+class TurnInPulse:
+    """Largest angles (rad) that the target turns through in half a pulse: by its rate, by its acceleration, and by what comes after."""
+
+    by_rate: float
+    by_acceleration: float
+    beyond: float
+
+    @staticmethod
+    def worst(turn: PulseTurn, rotation: Rotation, radar: InverseRadar, half_s: float) -> TurnInPulse:
+        """Over all pulses and trials."""
+        by_rate, by_acceleration = float(turn.rate_rad_s.detach().abs().max()) * half_s, float(turn.acceleration_rad_s2.detach().abs().max()) * half_s**2 / 2
+        if not isinstance(rotation, PolynomialRotation):
+            return TurnInPulse(by_rate, by_acceleration, 0.0)
+        middle_s = torch.arange(turn.angle_rad.shape[-1], dtype=torch.float64, device=turn.angle_rad.device) / radar.prf_hz
+        beyond = [rotation.angle(middle_s + s) - turn.angle_rad - turn.rate_rad_s * s - turn.acceleration_rad_s2 * s**2 / 2 for s in (-half_s, half_s)]
+        return TurnInPulse(by_rate, by_acceleration, float(torch.stack(beyond).detach().abs().max()))
+
+
+def _refuse_fast_turns(radar: InverseRadar, radius_m: float, turn: TurnInPulse, half_s: float) -> None:
+    """The rotation inside a pulse is followed to the second order of time on the carrier and to the first on the chirp: what comes after must be nothing."""
+    whole = turn.by_rate + turn.by_acceleration + turn.beyond
+    squares = (whole**2 - turn.by_rate**2) / 2
+    on_carrier = whole**3 / 6 + squares + turn.beyond
+    on_chirp = whole**2 / 2 + turn.by_acceleration + turn.beyond
+    dropped = 4 * math.pi / radar.wave_speed_m_s * radius_m * (radar.carrier_hz * on_carrier + radar.chirp_rate_hz_s * half_s * on_chirp)
     if not dropped <= _DROPPED_RAD:
-        raise ValueError(f"the target turns by {half_turn_rad:.3g} rad in half a pulse, of which the dechirped model drops {dropped:.3g} rad of phase; shorten the pulse or slow the rotation")
+        raise ValueError(f"the target turns by {whole:.3g} rad in half a pulse, of which the dechirped model drops {dropped:.3g} rad of phase; shorten the pulse or slow the rotation")
 
 
 def fast_time_axis(radar: InverseRadar, n_fast: int) -> Axis:
@@ -256,11 +326,12 @@ def simulate_turntable(
     At fidelity PhaseOnly the recording has the axes (pulse, range), range-compressed, at Dechirped (pulse, fast_time), raw, and aux `reference_m`
     (..., pulse), how far the receiver's reference went. The truth holds `phase_rad` (..., pulse), psi = delta - 4 pi d / lambda with start phase delta
     and displacement d at the middle of the pulse, less the reference's; `displacement_m` (..., pulse), the whole of it; `noise_std` of the
-    samples; `cross_range_m`, `range_m`, `amplitude` of the scatterers; `rotation_rad_s`; what each damage says under "<damage>.<name>". `clean`
+    samples; `cross_range_m`, `range_m`, `amplitude` of the scatterers; `rotation_rad_s`; what each damage says under "<damage>.<name>". Where the world has
+    a polynomial rotation: `omega_rad_s` (...,), `warp_k` (..., order - 1), `yc_m` (...,), and `rotation_rad_s` is its mean rate over the record. `clean`
     is the recording without motion, start phases and damages, with the same noise. At PhaseOnly the undamaged recording is
     clean * exp(j psi) EXACTLY, noise included: circular Gaussian noise is as good after a turn, and tests of equivariance are exact.
     Noise follows `world.snr_db`, the same before and after range compression.
-    Raises ValueError for a target outside the range window, an empty scene, no rotation rate, or a dechirped pulse of unknown length.
+    Raises ValueError for a target outside the range window, an empty scene, no rotation rate, one that turns back, or a dechirped pulse of unknown length.
     """
     course = _Course.of(radar, world, n_pulse, n_range, draws, device)
     record = _dechirped if isinstance(world.fidelity, Dechirped) else _phase_only
@@ -274,26 +345,35 @@ def simulate_turntable(
         "cross_range_m": course.scatterers.azimuth_m,
         "range_m": course.scatterers.range_m,
         "amplitude": course.scatterers.amplitude,
-        "rotation_rad_s": torch.as_tensor(course.rate_rad_s, dtype=torch.float64),
+        **_rotation_truth(course.rotation, world.centre_deviation_m, n_pulse / radar.prf_hz, data.device, trials),
     }
     recording, told = apply_damages(Recording(Signal(data, axes), radar, {name: v.expand(*trials, -1) for name, v in aux.items()}), damages or {}, draws)
     return recording, Truth({**values, **told}, Recording(Signal(clean, axes), radar))
 
 
+def _rotation_truth(rotation: Rotation, yc_m: Tensor | float, duration_s: float, device: torch.device, trials: torch.Size) -> dict[str, Tensor]:
+    if not isinstance(rotation, PolynomialRotation):
+        return {"rotation_rad_s": torch.as_tensor(rotation, dtype=torch.float64)}
+    like = torch.zeros((), dtype=torch.float64, device=device)
+    k = rotation.warp_k(like)
+    scalars = {"rotation_rad_s": rotation.mean_rate(duration_s, like), "omega_rad_s": rotation.omega(like), "yc_m": per_trial(yc_m, 0, like)}
+    return {**{name: value.expand(trials) for name, value in scalars.items()}, "warp_k": k.expand(*trials, k.shape[-1])}
+
+
 @dataclass(frozen=True)
 class _Course:
-    """What happens to a target from pulse to pulse: (*trials, pulse) each but the scatterers and the rotation rate."""
+    """What happens to a target from pulse to pulse: (*trials, pulse) each but the scatterers and the rotation."""
 
     scatterers: Scatterers
-    rate_rad_s: Tensor | float
+    rotation: Rotation
     moved_m: Tensor
     reference_m: Tensor
     start_rad: Tensor
 
     @staticmethod
     def of(radar: InverseRadar, world: TurntableWorld, n_pulse: int, n_range: int, draws: Draws, device: torch.device | str | None) -> _Course:
-        rate = radar.rotation_rad_s if world.rotation_rad_s is None else world.rotation_rad_s
-        if rate is None:
+        rotation = _first_given(world.rotation, world.rotation_rad_s, radar.rotation_rad_s)
+        if rotation is None:
             raise ValueError("neither radar.rotation_rad_s nor world.rotation_rad_s is set; the world needs a rotation rate, 0 for none")
         if n_pulse < 1 or n_range < 1:
             raise ValueError(f"a recording needs at least one pulse of one sample, got n_pulse={n_pulse}, n_range={n_range}")
@@ -303,11 +383,15 @@ class _Course:
         moved = displacement_m(world.motion, time_s)
         followed = displacement_m(world.fidelity.track, time_s) if isinstance(world.fidelity, Dechirped) else torch.zeros_like(time_s)
         _refuse_outside(scatterers, moved - followed if isinstance(world.fidelity, Dechirped) else followed, radar, n_range)
-        return _Course(scatterers, rate, moved, followed, start_phase_rad(world.start_phase, draws, n_pulse).to(device))
+        return _Course(scatterers, rotation, moved, followed, start_phase_rad(world.start_phase, draws, n_pulse).to(device))
 
     def psi_rad(self, radar: InverseRadar) -> Tensor:
         """Total phase error of each pulse."""
         return self.start_rad - 4 * math.pi / radar.wavelength_m * (self.moved_m - self.reference_m)
+
+
+def _first_given(*choices: Rotation | None) -> Rotation | None:
+    return next((choice for choice in choices if choice is not None), None)
 
 
 _Made = tuple[Tensor, Tensor, Tensor, tuple[Axis, ...], dict[str, Tensor]]
@@ -316,7 +400,7 @@ _Made = tuple[Tensor, Tensor, Tensor, tuple[Axis, ...], dict[str, Tensor]]
 def _phase_only(radar: InverseRadar, world: TurntableWorld, course: _Course, n_range: int, draws: Draws, dtype: torch.dtype) -> _Made:
     """Clean and recorded samples, deviation of the noise, axes and side data at the level of phases."""
     n_pulse = course.moved_m.shape[-1]
-    still = turntable_echo(course.scatterers, radar, n_pulse, n_range, course.rate_rad_s, dtype)
+    still = turntable_echo(course.scatterers, radar, n_pulse, n_range, course.rotation, dtype, world.centre_deviation_m)
     noise, std = _noise(still, world.snr_db, draws)
     clean = still + noise
     return clean, _turned(clean, course.psi_rad(radar)), std, radar.raw_axes(n_pulse, n_range), {}
@@ -325,8 +409,9 @@ def _phase_only(radar: InverseRadar, world: TurntableWorld, course: _Course, n_r
 def _dechirped(radar: InverseRadar, world: TurntableWorld, course: _Course, n_fast: int, draws: Draws, dtype: torch.dtype) -> _Made:
     """The same for dechirped pulses. The noise is the receiver's and does not turn with the phases of the echo."""
     n_pulse, track = course.moved_m.shape[-1], world.fidelity.track if isinstance(world.fidelity, Dechirped) else ()
-    still = dechirped_echo(course.scatterers, radar, n_pulse, n_fast, course.rate_rad_s, dtype=dtype)
-    moving = dechirped_echo(course.scatterers, radar, n_pulse, n_fast, course.rate_rad_s, world.motion, track, dtype) if world.motion or track else still
+    turned = partial(dechirped_echo, course.scatterers, radar, n_pulse, n_fast, course.rotation, dtype=dtype, centre_deviation_m=world.centre_deviation_m)
+    still = turned()
+    moving = turned(world.motion, track) if world.motion or track else still
     noise, std = _noise(still, world.snr_db, draws)
     axes = (radar.raw_axes(n_pulse, n_fast)[0], fast_time_axis(radar, n_fast))
     return still + noise, _turned(moving, course.start_rad) + noise, std, axes, {"reference_m": course.reference_m}

@@ -1,12 +1,14 @@
 """Range compression and image formation."""
 
 from torchsar.focus.backprojection import Backproject, DopplerBand, EveryPulse, Integration, backproject
+from torchsar.focus.chirp_z import chirp_z, keystone
 from torchsar.focus.coordinates import ClosestRange, PaddedLines, closest_range
 from torchsar.focus.dechirped import AzimuthTransform, CompressDechirped, azimuth_transform, compress_dechirped
 from torchsar.focus.defocus import InvertibleOmegaK, defocus_omega_k
 from torchsar.focus.detection import Detect, QuickLook, amplitude, multilook, quicklook_looks, to_db
 from torchsar.focus.inverse_requirements import inverse_requirements
 from torchsar.focus.ladar_requirements import Limit, ladar_limits, ladar_requirements
+from torchsar.focus.matched_fourier import MatchedFourier, MatchedFourierOperator, RangePhase, cross_range_of, lines_for, matched_fourier, mean_rate, range_phase
 from torchsar.focus.nufft import Nufft, nufft_type1, nufft_type2
 from torchsar.focus.omega_k import OmegaK, StoredOmegaK, omega_k
 from torchsar.focus.polar import PolarFormat, PolarOperator
@@ -34,6 +36,8 @@ __all__ = [
     "Integration",
     "InvertibleOmegaK",
     "Limit",
+    "MatchedFourier",
+    "MatchedFourierOperator",
     "Nufft",
     "OmegaK",
     "OmegaKStolt",
@@ -43,6 +47,7 @@ __all__ = [
     "QuickLook",
     "RangeCompress",
     "RangeDoppler",
+    "RangePhase",
     "Requirement",
     "SpotlightBackprojection",
     "StoredOmegaK",
@@ -53,17 +58,23 @@ __all__ = [
     "azimuth_transform",
     "backproject",
     "backproject_spotlight",
+    "chirp_z",
     "closest_range",
     "compress_dechirped",
     "compress_sweeps",
+    "cross_range_of",
     "defocus_omega_k",
     "deramp_azimuth",
     "flat_reference",
     "focus_strip",
     "inverse_requirements",
+    "keystone",
     "ladar_limits",
     "ladar_requirements",
+    "lines_for",
+    "matched_fourier",
     "matched_reference",
+    "mean_rate",
     "multilook",
     "nufft_type1",
     "nufft_type2",
@@ -75,6 +86,7 @@ __all__ = [
     "quicklook_looks",
     "range_compress",
     "range_doppler",
+    "range_phase",
     "reach_lines",
     "recommended_form",
     "requirements",

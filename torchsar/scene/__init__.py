@@ -5,6 +5,8 @@ from torchsar.scene.fluctuation import LogAmplitude, MeasuredTrack, PathFluctuat
 from torchsar.scene.ladar import CalibrationFibre, Effect, EverySample, Extremes, Fidelity, LadarWorld, LinearInSweep, OnePerPeriod, OnePerSweep, QuadraticInSweep, RangeHistory, SweepError
 from torchsar.scene.ladar_targets import LetterE, RetroAndBrokenLine
 from torchsar.scene.path import AlwaysLit, Antenna, Beam, Dwell, Hyperbola, Parabola, Path
+from torchsar.scene.rotation import PolynomialRotation
+from torchsar.scene.satellite import Satellite
 from torchsar.scene.targets import Points, RandomPoints, Scatterers, Scene, Speckle, Together
 from torchsar.scene.turntable import Dechirped, PhaseOnly, TurntableWorld
 from torchsar.scene.vibration import Motion, Polynomial, PulsePhase, Sinusoid, StartPhase, UniformStartPhase, displacement_m, start_phase_rad
@@ -37,12 +39,14 @@ __all__ = [
     "PhaseOnly",
     "Points",
     "Polynomial",
+    "PolynomialRotation",
     "PulsePhase",
     "QuadraticInSweep",
     "RandomMotion",
     "RandomPoints",
     "RangeHistory",
     "RetroAndBrokenLine",
+    "Satellite",
     "Scatterers",
     "Scene",
     "Sinusoid",

@@ -1,0 +1,301 @@
+"""Searches for the rotation of least image entropy, on targets small enough for every method."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchsar.compensate.rotation.entropy_search import (
+    RotationDescent,
+    RotationEvolution,
+    RotationGenetic,
+    RotationNewton,
+    RotationSearch,
+    descend_rotation,
+    evolve_rotation,
+    genetic_rotation,
+    newton_rotation,
+    search_rotation,
+)
+from torchsar.compensate.rotation.image_entropy import ImageEntropy
+from torchsar.compensate.rotation.unknowns import Unknowns
+from torchsar.core import Chain, Draws, Estimate, Signal, use
+from torchsar.core.warp import shape_of, warp
+from torchsar.metrics.image import entropy
+from torchsar.radar import LIGHT_M_S, InverseRadar
+
+F64 = torch.float64
+WAVELENGTH, PRF, PULSES, BINS, CELL = 1.55e-6, 20e3, 400, 16, 0.48
+OMEGA, K = 0.02, torch.tensor([10.0, 1000.0], dtype=F64)
+TRUTH = torch.tensor([OMEGA, 10.0, 1000.0], dtype=F64)
+RANGE_M = CELL * (torch.arange(BINS, dtype=F64) - BINS // 2)
+RADAR = InverseRadar(LIGHT_M_S / WAVELENGTH, LIGHT_M_S / (2 * CELL), PRF)
+
+
+def echo(x: Tensor, y: Tensor, amplitude: Tensor, n_pulse: int, prf_hz: float, range_m: Tensor, cell_m: float, yc_m: float = 0.0, k: Tensor = K) -> Tensor:
+    """Eq. (3) of brief 003 with exact sine and cosine, (pulse, range)."""
+    angle = OMEGA * warp(torch.arange(n_pulse, dtype=F64) / prf_hz, k)
+    path = x[:, None] * torch.sin(angle) + (y + yc_m)[:, None] * (torch.cos(angle) - 1)
+    phasor = torch.exp(-4j * math.pi / WAVELENGTH * path) * amplitude[:, None]
+    return phasor.mT @ torch.sinc((range_m - y[:, None]) / cell_m).to(torch.complex128)
+
+
+def target(seed: int = 0, yc_m: float = 0.0, k: Tensor = K, snr_db: float = 20.0) -> Tensor:
+    """24 points over 0.32 m of cross range and 6 m of range, with noise, (400, 16)."""
+    source = torch.Generator().manual_seed(seed)
+    x, y, phase = (torch.rand(24, generator=source, dtype=F64) for _ in range(3))
+    data = echo(0.32 * (x - 0.5), 6.0 * (y - 0.5), torch.exp(2j * math.pi * phase), PULSES, PRF, RANGE_M, CELL, yc_m, k)
+    noise = torch.randn(PULSES, BINS, dtype=torch.complex128, generator=source)
+    return data + noise * data.abs().square().mean().sqrt() * 10 ** (-snr_db / 20)
+
+
+def figure(data: Tensor, **options) -> ImageEntropy:
+    return ImageEntropy(data, wavelength_m=WAVELENGTH, prf_hz=PRF, range_m=RANGE_M, **{"oversampling": 4.0, "taps": 8, **options})
+
+
+def signal_of(data: Tensor) -> Signal:
+    return Signal(data, RADAR.raw_axes(PULSES, BINS))
+
+
+def equal(one: Estimate, many: Estimate, i: int, tolerance: float = 1e-6) -> None:
+    for name, value in one.value.items():
+        torch.testing.assert_close(many[name][i], value, rtol=tolerance, atol=tolerance)
+    assert one.ok == many.ok[i]
+
+
+def test_the_objective_is_the_entropy_of_the_image() -> None:
+    data = target()
+    phi = warp(torch.arange(PULSES, dtype=F64) / PRF, K)
+    total = warp(torch.tensor([PULSES / PRF], dtype=F64), K)
+    flat = data * torch.exp(-2j * math.pi / WAVELENGTH * (RANGE_M + 0.7) * (OMEGA * phi[:, None]).square())
+    cells = (torch.arange(300, dtype=F64) - 150) / 2
+    image = torch.exp(2j * math.pi * cells[:, None] * phi / total) @ flat
+    found = figure(data, yc_m=0.7, oversampling=2.0, lines=300, taps=12)(TRUTH[None])
+    torch.testing.assert_close(found[0], entropy(image), atol=1e-7, rtol=0)
+    searched = figure(data, yc_m=None, oversampling=2.0, lines=300, taps=12)(torch.cat([TRUTH, torch.tensor([0.7], dtype=F64)])[None])
+    torch.testing.assert_close(searched, found, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("range_term", [True, False])
+def test_both_kinds_of_variables_mean_the_same_rotation(range_term: bool) -> None:
+    raw, shape = (figure(target(), variables=variables, range_term=range_term) for variables in ("raw", "shape"))
+    x, q = raw.start(OMEGA, K), shape.start(OMEGA, K)
+    torch.testing.assert_close(shape(q[None]), raw(x[None]), atol=1e-9, rtol=0)
+    torch.testing.assert_close(q[-2:], shape_of(K, PULSES / PRF), atol=1e-12, rtol=0)
+    torch.testing.assert_close(shape.turn(q).warp_k, K, rtol=1e-9, atol=0)
+    assert raw.unknowns.names == (("omega_rad_s",) if range_term else ()) + ("k1_per_s", "k2_per_s2")
+    assert shape.unknowns.names == (("angle_rad",) if range_term else ()) + ("q2", "q3")
+
+
+@pytest.mark.parametrize("variables", ["raw", "shape"])
+def test_gradients_against_differences(variables) -> None:
+    of = figure(target(), variables=variables, yc_m=None)
+    x = of.start(OMEGA, 1.02 * K, 0.4)
+    cost, gradient = of.with_gradient(x)
+    torch.testing.assert_close(cost, of.single(x), atol=1e-12, rtol=0)
+    unit = of.units(x)
+    step = 1e-4 * torch.diag(unit)
+    slopes = (of(x + step) - of(x - step)) / 2e-4
+    torch.testing.assert_close(gradient * unit, slopes, atol=1e-6, rtol=1e-5)
+    rows = [(of.with_gradient(x + d)[1] - of.with_gradient(x - d)[1]) * unit / 2e-4 for d in step]
+    hessian = torch.autograd.functional.hessian(lambda z: of.single(x + z * unit), torch.zeros_like(x))
+    torch.testing.assert_close(hessian, torch.stack(rows), atol=1e-4, rtol=1e-3)
+
+
+def test_impossible_candidates_cost_infinity() -> None:
+    for variables in ("raw", "shape"):
+        of = figure(target(), variables=variables)
+        good = of.start(OMEGA, K)
+        folded = torch.tensor([OMEGA, -100.0, 2000.0], dtype=F64) if variables == "raw" else torch.tensor([4e-4, 2.0, 0.0], dtype=F64)
+        costs = of(torch.stack([good, folded, torch.full_like(good, torch.nan), good]))
+        assert torch.isfinite(costs).tolist() == [True, False, False, True] and not torch.isnan(costs).any()
+        assert torch.isfinite(of.with_gradient(folded)[1]).all()
+
+
+def test_candidates_in_blocks_and_batches_equal_single_ones() -> None:
+    data = torch.stack([target(i) * 10.0**i for i in range(3)]).to(torch.complex64)
+    x = TRUTH * (1 + 0.02 * torch.randn(3, 40, 3, generator=torch.Generator().manual_seed(1), dtype=F64))
+    together = figure(data)(x)
+    for i in range(3):
+        alone = torch.cat([figure(data[i])(part[None]) for part in x[i]])
+        torch.testing.assert_close(together[i], alone, atol=2e-5, rtol=0)
+    two = figure(data[None].expand(2, 3, PULSES, BINS), yc_m=torch.tensor([[0.0], [1.0]], dtype=F64))
+    assert two(x.expand(2, 3, 40, 3)).shape == (2, 3, 40)
+    torch.testing.assert_close(two(x.expand(2, 3, 40, 3))[0], together, atol=2e-5, rtol=0)
+
+
+def test_no_compensation_is_even_rotation_without_range_phase() -> None:
+    of = figure(target())
+    still = of(torch.tensor([[0.0, 0.0, 0.0]], dtype=F64))
+    torch.testing.assert_close(of.uncompensated(), still[0], atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("variables", ["raw", "shape"])
+@pytest.mark.parametrize("factor", [0.9, 1.0, 1.1])
+def test_descents_from_any_start_end_at_one_minimum(variables, factor: float) -> None:
+    of = figure(target(), variables=variables)
+    start = of.start(factor * OMEGA, factor * K)
+    descent, newton = descend_rotation(of, start), newton_rotation(of, start)
+    best = newton_rotation(figure(target()), TRUTH, steps=40).info["entropy_nats"]
+    for found in (descent, newton):
+        assert found.ok
+        torch.testing.assert_close(found.info["entropy_nats"], best, atol=1e-5, rtol=0)
+    torch.testing.assert_close(descent["warp_k"], K, rtol=0.04, atol=0)
+    assert abs(float(descent["omega_rad_s"]) / OMEGA - 1) < 0.1
+    assert torch.equal(descent["warp_k"], torch.stack([descent["k1_per_s"], descent["k2_per_s2"]]))
+
+
+def test_plain_newton_diverges_and_says_so() -> None:
+    of = figure(target())
+    for factor in (0.9, 1.1):
+        found = newton_rotation(of, of.start(factor * OMEGA, factor * K), damped=False)
+        assert not found.ok
+        assert all(torch.isfinite(value).all() for value in found.value.values())
+        assert newton_rotation(of, of.start(factor * OMEGA, factor * K)).ok
+
+
+def test_populations_find_the_same_minimum_and_keep_their_box() -> None:
+    of = figure(target(), oversampling=2.0, taps=4, lines=600)
+    best = descend_rotation(of, of.start(OMEGA, K)).info["entropy_nats"]
+    low, high = 0.7 * TRUTH, 1.3 * TRUTH
+    for found in (genetic_rotation(of, low, high, draws=Draws(1)), evolve_rotation(of, low, high, draws=Draws(1))):
+        assert found.ok and abs(float(found.info["entropy_nats"] - best)) < 0.02
+    assert found.info["evaluations"] == 888 and found.info["best_entropy_nats"].shape == (37,)
+    outside = evolve_rotation(of, 1.1 * TRUTH, 1.3 * TRUTH, draws=Draws(1), generations=20)
+    assert not outside.ok and outside.info["on_edge"].any(), "the minimum lies outside of this box"
+
+
+def test_the_grid_is_a_landscape() -> None:
+    of = figure(target(), oversampling=2.0, taps=4)
+    axes = [[OMEGA], [9.0, 9.5, 10.0, 10.5, 11.0], [900.0, 1000.0, 1100.0]]
+    found = search_rotation(of, axes)
+    assert found.ok and found.info["evaluations"] == 15 and found.info["entropy_grid_nats"].shape == (1, 5, 3)
+    torch.testing.assert_close(found["warp_k"], K, atol=0, rtol=0)
+    edge = search_rotation(of, [[OMEGA], [5.0, 10.0], [1000.0]])
+    assert not edge.ok and edge.info["on_edge"].tolist() == [False, True, False]
+
+
+def test_the_centre_deviation_is_searched_for_jointly() -> None:
+    data = target(yc_m=1.5)
+    blind, told, joint = (descend_rotation(of, of.start(OMEGA, K)) for of in (figure(data, variables="shape", yc_m=yc) for yc in (0.0, 1.5, None)))
+    assert joint.info["entropy_nats"] < blind.info["entropy_nats"] - 5e-3
+    assert abs(float(joint["yc_m"]) - 1.5) < 0.3 and told["yc_m"] == 1.5 and blind["yc_m"] == 0
+
+
+def test_second_order_finds_the_middle_rate() -> None:
+    """SM on the three points of experiment 1: not k1 = 10 but about k1 + k2 T / 2 = 20."""
+    one = torch.tensor([0.0], dtype=F64)
+    data = echo(torch.tensor([-12.0, 0.0, 12.0], dtype=F64), torch.full((3,), 12.0, dtype=F64), torch.ones(3, dtype=torch.complex128), 20000, 1e6, one + 12.0, 1.0)
+    of = ImageEntropy(data, wavelength_m=WAVELENGTH, prf_hz=1e6, range_m=one, order=2, range_term=False)
+    coarse = search_rotation(of, [torch.linspace(0, 40, 81, dtype=F64)])
+    found = descend_rotation(of, of.start(0.0, coarse["warp_k"]))
+    assert found.ok and abs(float(found["k1_per_s"]) - 20) < 0.6
+    assert set(found.value) == {"warp_k", "k1_per_s"}
+
+
+def test_even_rotation_is_not_improved_upon() -> None:
+    still = target(k=torch.zeros(2, dtype=F64))
+    of = figure(still, range_term=False, oversampling=2.0)
+    found = descend_rotation(of, of.start(0.0, torch.zeros(2, dtype=F64)))
+    assert not found.ok and found.quality < 0.02
+    assert abs(float(found["k1_per_s"])) < 3, "24 points move the minimum by that much"
+
+
+def test_a_batch_equals_its_singles() -> None:
+    data = torch.stack([target(0), 100 * target(1), target(2, k=torch.tensor([20.0, -500.0], dtype=F64))])
+    kinds = {
+        "descent": lambda of: descend_rotation(of, of.start(OMEGA, 0.95 * K), steps=8),
+        "newton": lambda of: newton_rotation(of, of.start(OMEGA, 0.95 * K), steps=5),
+        "grid": lambda of: search_rotation(of, [[OMEGA], [9.0, 10.0, 11.0], [900.0, 1000.0, 1100.0]]),
+        "genetic": lambda of: genetic_rotation(of, 0.9 * TRUTH, 1.1 * TRUTH, draws=Draws(2), population=8, generations=4),
+        "evolution": lambda of: evolve_rotation(of, 0.9 * TRUTH, 1.1 * TRUTH, draws=Draws(2), population=8, generations=4),
+    }
+    for name, search in kinds.items():
+        together = search(figure(data, oversampling=2.0))
+        for i in range(3):
+            equal(search(figure(data[i], oversampling=2.0)), together, i, 1e-3 if name in ("descent", "newton") else 1e-9)
+
+
+def stages() -> list:
+    low, high = (0.9 * TRUTH).tolist(), (1.1 * TRUTH).tolist()
+    start = (0.95 * TRUTH).tolist()
+    return [
+        RotationSearch(RADAR, low, high, [3, 3, 3]),
+        RotationGenetic(RADAR, low, high, population=10, generations=4),
+        RotationEvolution(RADAR, low, high, population=10, generations=4),
+        RotationNewton(RADAR, start, steps=10),
+        RotationDescent(RADAR, start),
+    ]
+
+
+@pytest.mark.parametrize("stage", stages(), ids=lambda stage: type(stage).__name__)
+@pytest.mark.parametrize("dtype", [torch.complex64, torch.complex128])
+def test_stages_offer_what_they_promise(stage, dtype: torch.dtype) -> None:
+    found = stage(signal_of(torch.stack([target(0), target(1)]).to(dtype)))
+    assert set(found.value) == set(stage.provides) == {"omega_rad_s", "warp_k", "yc_m", "k1_per_s", "k2_per_s2"}
+    assert found["warp_k"].shape == (2, 2) and found["omega_rad_s"].shape == (2,)
+    assert found["warp_k"].dtype == F64 and found.ok.shape == (2,)
+    assert (found.info["entropy_nats"] < found.info["uncompensated_entropy_nats"]).all()
+    assert ((found.quality >= 0) & (found.quality <= 1)).all()
+
+
+def test_a_search_hands_its_result_to_a_descent() -> None:
+    chain = Chain(
+        coarse=RotationSearch(RADAR, [OMEGA, 8.0, 800.0], [OMEGA, 12.0, 1200.0], [1, 5, 5], oversampling=1.0),
+        fine=use(RotationDescent(RADAR, oversampling=4.0), omega_rad_s="coarse", warp_k="coarse", yc_m="coarse"),
+    )
+    trace = chain.trace(signal_of(target()))
+    coarse, fine = trace.estimates["coarse"], trace.estimates["fine"]
+    assert fine.ok and (fine["warp_k"] / K - 1).abs().max() < 0.04
+    assert not torch.equal(coarse["warp_k"], fine["warp_k"])
+
+
+def test_refusals() -> None:
+    data = target()
+    with pytest.raises(ValueError, match="at least 8 pulses"):
+        figure(data[:7])
+    with pytest.raises(TypeError, match="complex64 or complex128"):
+        figure(data.real)
+    with pytest.raises(ValueError, match="NaN or Inf"):
+        figure(data * torch.nan)
+    with pytest.raises(ValueError, match="range_m needs the 8 coordinates"):
+        figure(data[:, :8])
+    with pytest.raises(ValueError, match="nothing to search for"):
+        figure(data, order=1, range_term=False)
+    with pytest.raises(ValueError, match="range term alone"):
+        figure(data, range_term=False, yc_m=None)
+    with pytest.raises(ValueError, match="'raw' or 'shape'"):
+        figure(data, variables="polar")
+    with pytest.raises(ValueError, match="low needs the 3 values omega_rad_s, k1_per_s, k2_per_s2, got 2"):
+        genetic_rotation(figure(data), [0.01, 9.0], [0.03, 11.0], draws=Draws(1))
+    with pytest.raises(ValueError, match="needs the values of the 3 unknowns"):
+        search_rotation(figure(data), [[0.02], [10.0]])
+    with pytest.raises(ValueError, match="27000 evaluations per trial, above the limit of 1000"):
+        search_rotation(figure(data), [torch.linspace(1, 2, 30, dtype=F64)] * 3, limit=1000)
+    with pytest.raises(ValueError, match="RotationDescent needs a start"):
+        RotationDescent(RADAR)(signal_of(data))
+    with pytest.raises(ValueError, match="a start needs the 3 values omega, k1, k2"):
+        RotationNewton(RADAR, [10.0, 1000.0])
+    with pytest.raises(ValueError, match="as many values in low, high and counts"):
+        RotationSearch(RADAR, [0.0], [1.0, 2.0], [3])
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 5])
+def test_any_order(order: int) -> None:
+    unknowns = Unknowns(0.02, order, yc=True, variables="shape")
+    k = torch.tensor([10.0, 1000.0, -2e4, 1e6], dtype=F64)[: order - 1]
+    x = unknowns.at(torch.tensor(0.02, dtype=F64), k, torch.tensor(1.0, dtype=F64))
+    assert len(x) == len(unknowns.names) == order + 1
+    turn = unknowns.turn(x, torch.tensor(0.0, dtype=F64))
+    torch.testing.assert_close(turn.warp_k, k, rtol=1e-9, atol=0)
+    torch.testing.assert_close(turn.omega_rad_s, torch.tensor(0.02, dtype=F64), rtol=1e-12, atol=0)
+    assert turn.feasible and turn.yc_m == 1.0
+
+
+def test_sequences_are_vectors() -> None:
+    values: Sequence[float] = [0.02, 10.0, 1000.0]
+    assert torch.equal(Unknowns(0.02).vector(values, "start"), TRUTH)

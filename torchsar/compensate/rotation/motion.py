@@ -1,0 +1,115 @@
+"""What estimators of uneven rotation share: how the data are sampled, the motion in the form in which it enters phases, and its removal."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchsar.core import phasor_tables, outer_phasor, refuse_non_finite, unit_phasor
+from torchsar.core.warp import warp
+from torchsar.focus.matched_fourier import matched_fourier, slow_times
+
+SEARCH_TAPS = 4  # enough for estimates; images take more
+LEAST_PULSES = 8
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """Where the samples of a recording lie. first_m, step_m: range of cell 0 and of one cell, from where the processor takes the centre to be."""
+
+    wavelength_m: float
+    prf_hz: float
+    pulses: int
+    cells: int
+    first_m: float
+    step_m: float
+
+    @property
+    def duration_s(self) -> float:
+        return self.pulses / self.prf_hz
+
+    @property
+    def turns_per_square(self) -> float:
+        """Turns of phase per metre of range and rad^2: half of 2 / wavelength."""
+        return 1 / self.wavelength_m
+
+    def times(self, device: torch.device) -> Tensor:
+        return slow_times(self.pulses, self.prf_hz, device)
+
+    def range_m(self, cell: Tensor) -> Tensor:
+        return self.first_m + self.step_m * cell
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Rotation in the form in which phases are linear in it: the warp k (trial, order - 1), w = Om^2 and v = yc Om^2 (trial,), float64.
+
+    Only Om^2 and yc Om^2 show in data; both may start at zero, and may come out negative where noise is all there is.
+    """
+
+    k: Tensor
+    w: Tensor
+    v: Tensor
+
+    @property
+    def omega_rad_s(self) -> Tensor:
+        return self.w.clamp_min(torch.finfo(torch.float64).tiny).sqrt()
+
+    @property
+    def yc_m(self) -> Tensor:
+        """v / w, zero where the rate is not positive."""
+        return torch.where(self.w > 0, self.v / torch.where(self.w > 0, self.w, 1), 0)
+
+    def where(self, keep: Tensor, other: Motion) -> Motion:
+        """This motion in trials where `keep` (trial,) holds, the other elsewhere."""
+        return Motion(torch.where(keep[:, None], self.k, other.k), torch.where(keep, self.w, other.w), torch.where(keep, self.v, other.v))
+
+
+@dataclass(frozen=True)
+class Warped:
+    """The warp at some times (trial, m): phi (s), u = phi / phi(T), and du/dk_i (trial, order - 1, m)."""
+
+    phi: Tensor
+    u: Tensor
+    slopes: Tensor
+
+    @staticmethod
+    def of(k: Tensor, times_s: Tensor, duration_s: float) -> Warped:
+        """times_s: (m,) or (trial, m)."""
+        end = torch.tensor([duration_s], dtype=torch.float64, device=k.device)
+        whole, phi = warp(end, k), warp(times_s, k)
+        u = phi / whole
+        rows = [(times_s ** (i + 2) - u * duration_s ** (i + 2)) / (math.factorial(i + 2) * whole) for i in range(k.shape[-1])]
+        slopes = torch.stack(rows, -2) if rows else u.new_zeros((*u.shape[:-1], 0, u.shape[-1]))
+        return Warped(phi, u, slopes)
+
+
+def flattened(data: Tensor, name: str) -> Tensor:
+    """Range-compressed data (..., pulse, range) as (trial, pulse, range), each trial over its own largest sample.
+
+    Raises TypeError or ValueError naming the estimator for what are no finite complex samples of at least 8 pulses.
+    """
+    if not isinstance(data, Tensor) or not data.is_complex():
+        raise TypeError(f"{name} works on complex range-compressed samples (..., pulse, range), got {data.dtype if isinstance(data, Tensor) else type(data).__name__}")
+    if data.ndim < 2 or data.shape[-2] < LEAST_PULSES or data.shape[-1] < 1:
+        raise ValueError(f"{name} works on samples (..., pulse, range) of at least {LEAST_PULSES} pulses and one range cell, got the shape {tuple(data.shape)}")
+    refuse_non_finite(data, name)
+    rows = data.detach().reshape(-1, *data.shape[-2:])
+    peak = torch.maximum(rows.real.abs(), rows.imag.abs()).amax((-2, -1), keepdim=True)  # |z| itself may overflow
+    return rows / torch.where(peak > 0, peak, 1)
+
+
+def without_range_term(data: Tensor, sampling: Sampling, motion: Motion, phi: Tensor) -> Tensor:
+    """data (trial, pulse, range) times exp(-j (c4/2) (w y_n + v) phi^2). phi: (trial, pulse)."""
+    square = -sampling.turns_per_square * phi.square()
+    fine, coarse = phasor_tables(square * (motion.w[:, None] * sampling.step_m), sampling.first_m / sampling.step_m, sampling.cells, data.dtype)
+    return data * outer_phasor(fine, coarse * unit_phasor(square * motion.v[:, None], data.dtype)[..., None], sampling.cells)
+
+
+def image_of(data: Tensor, sampling: Sampling, motion: Motion, taps: int = SEARCH_TAPS, oversampling: float = 2.0) -> Tensor:
+    """Image (trial, line, range) of data (trial, pulse, range) with this motion taken out, lines of 1 / oversampling Doppler cells about zero."""
+    phi = warp(sampling.times(data.device), motion.k)
+    return matched_fourier(without_range_term(data, sampling, motion, phi), motion.k, sampling.prf_hz, oversampling=oversampling, taps=taps)

@@ -1,0 +1,327 @@
+"""Maximum likelihood of the motion and of every scatterer together: amplitude, Doppler cell and range of each, and the rotation that all share.
+
+Each round removes the model of all scatterers known so far from the data, finds further ones in the image of what is left, and takes a Gauss-Newton step of
+everything at once. The gradient is that of the exact residual, so that neighbours and side lobes leave no error at the end; only the curvature is
+simplified: amplitudes are solved together, positions each for itself. Assumes range-compressed echoes of a rectangular band, whose envelope is a sinc.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.rotation.histories import solved
+from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of
+from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
+from torchsar.core import unit_phasor
+from torchsar.core.warp import least_rate
+from torchsar.focus.matched_fourier import matched_fourier
+
+_OVERSAMPLING = 2
+_SHARE, _LINES, _CELLS = 0.5, 24, 2  # a new scatterer is at least this part of the brightest about it
+COUNT, ROUNDS = 320, 6
+_SEARCHES = {0: 0.5, 2: 0.75, 4: 1.0}  # rounds that look for further scatterers, up to which part of all; the rounds between settle what was found
+_BLOCK_BYTES = 1 << 19
+_STEP = 0.3  # cells that a scatterer moves at most in a step
+_RIDGE = 1e-3
+_NEAR_CELLS, _TABLE = 64, 16  # scatterers further apart do not couple; steps of the table per cell
+_LEAST_RATE = 0.05
+_SETTLED = 0.2  # of its deviation: steps of the motion below it end a trial
+
+
+@dataclass(frozen=True)
+class Scatterers:
+    """(trial, scatterer): complex128 amplitude (0: none), Doppler cell and range cell, float64."""
+
+    amplitude: Tensor
+    cell: Tensor
+    row: Tensor
+
+    @staticmethod
+    def none(like: Tensor) -> Scatterers:
+        empty = torch.zeros(like.shape[0], 0, dtype=torch.float64, device=like.device)
+        return Scatterers(empty.to(torch.complex128), empty, empty)
+
+    def joined(self, new: Scatterers, closed: Tensor) -> Scatterers:
+        """These and the new ones; trials that are `closed` (trial,) take none."""
+        added = torch.where(closed[:, None], 0, new.amplitude)
+        return Scatterers(torch.cat([self.amplitude, added], -1), torch.cat([self.cell, new.cell], -1), torch.cat([self.row, new.row], -1))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Where a fit has come to. covariance: of (k1, k2, ..., w, v), the free ones, per unit noise power; noise: per sample, (trial,); steps: taken, (trial,)."""
+
+    motion: Motion
+    scatterers: Scatterers
+    covariance: Tensor
+    noise: Tensor
+    steps: Tensor
+    settled: Tensor
+
+
+def fit_scatterers(data: Tensor, sampling: Sampling, start: Motion, *, free_rate: bool = True, free_centre: bool = True, count: int = COUNT, rounds: int = ROUNDS) -> Fit:
+    """Maximum likelihood from `start`, on data (trial, pulse, range); a trial ends when its motion moves by less than a fifth of its deviation.
+
+    count: scatterers at most, which grow over the first rounds; rounds: steps at most.
+    """
+    unknowns = _Unknowns(start.k.shape[-1], free_rate, free_centre)
+    present = (data != 0).any(-1)
+    trials, device = data.shape[0], data.device
+    noise = torch.full((trials,), math.inf, dtype=torch.float64, device=device)
+    covariance = torch.zeros(trials, unknowns.size, unknowns.size, dtype=torch.float64, device=device)
+    never = torch.zeros(trials, dtype=torch.bool, device=device)
+    fit = Fit(start, Scatterers.none(data), covariance, noise, never.long(), never)
+    residual, step = data, None
+    for turn in range(rounds + 1):
+        new, noise = None, fit.noise
+        if turn in _SEARCHES:
+            new, noise = _standing_out(residual, sampling, fit, math.ceil(count * _SEARCHES[turn]))
+        if step is not None:
+            fit = _advanced(fit, step.taken(), noise, sampling, search_over=turn > max(_SEARCHES))
+        if new is not None:
+            fit = replace(fit, scatterers=fit.scatterers.joined(new, fit.settled), noise=noise)
+        if turn == rounds or bool(fit.settled.all()):
+            break
+        residual, step = _Step.of(data, sampling, fit, present, unknowns)
+    return fit
+
+
+@dataclass(frozen=True)
+class _Unknowns:
+    """Which of the shared unknowns are estimated."""
+
+    order: int
+    rate: bool
+    centre: bool
+
+    @property
+    def size(self) -> int:
+        return self.order + self.rate + self.centre
+
+
+def _standing_out(residual: Tensor, sampling: Sampling, fit: Fit, bound: int) -> tuple[Scatterers, Tensor]:
+    """Scatterers that stand out of the residual, no more than make `bound` with those known, and the noise power per sample (trial,)."""
+    image = image_of(residual, sampling, fit.motion, oversampling=_OVERSAMPLING)
+    power = image.real.square() + image.imag.square()
+    noise = torch.minimum(fit.noise, noise_power(power).double())
+    count = bound - fit.scatterers.cell.shape[-1]
+    peaks = find_peaks(power, (noise * threshold(power)).to(power.dtype), count, _SHARE, _LINES, _CELLS)
+    value = torch.gather(image.flatten(1), 1, peaks.line * image.shape[2] + peaks.cell).to(torch.complex128) / math.sqrt(sampling.pulses)
+    return Scatterers(torch.where(peaks.power > 0, value, 0), (peaks.line - image.shape[1] // 2) / _OVERSAMPLING, peaks.cell.to(torch.float64)), noise
+
+
+def _envelopes(sampling: Sampling, row: Tensor) -> tuple[Tensor, Tensor]:
+    """sinc(n - row) over range cells and its derivative in row, (trial, scatterer, range) each."""
+    value, slope, _ = _sinc(torch.arange(sampling.cells, dtype=row.dtype, device=row.device) - row[..., None])
+    return value, -slope
+
+
+@dataclass(frozen=True)
+class _Step:
+    """The residual's moments against what each unknown changes, and the curvature.
+
+    moments: (trial, scatterer, base), sums over pulses of base * conj(echo) * residual at the scatterer's range, bases 1, u, du/dk..., phi^2; shift: the same of base 1
+    with the derivative of the envelope.
+    """
+
+    sampling: Sampling
+    motion: Motion
+    found: Scatterers
+    unknowns: _Unknowns
+    moments: Tensor
+    shift: Tensor
+    pairs: _Pairs
+
+    @staticmethod
+    def of(data: Tensor, sampling: Sampling, fit: Fit, present: Tensor, unknowns: _Unknowns) -> tuple[Tensor, _Step]:
+        """The residual of the data and the step from it, in one pass over blocks of pulses whose echoes stay in the cache."""
+        motion, found = fit.motion, fit.scatterers
+        warped = Warped.of(motion.k, sampling.times(data.device), sampling.duration_s)
+        square = 2 * math.pi * sampling.turns_per_square * warped.phi.square()
+        bases = torch.stack([torch.ones_like(warped.u), warped.u, *warped.slopes.unbind(1), square], 1) * present[:, None]
+        left = torch.stack([-warped.u, sampling.turns_per_square * warped.phi.square()], -1)
+        right = torch.stack([found.cell, motion.w[:, None] * sampling.range_m(found.row) + motion.v[:, None]], -2)
+        envelope, slope = _envelopes(sampling, found.row)
+        weighted, back = (found.amplitude[..., None] * envelope).to(data.dtype), envelope.to(data.dtype).mT
+        residual = torch.empty_like(data)
+        moments = data.new_zeros(data.shape[0], bases.shape[1], found.cell.shape[-1])
+        shift = data.new_zeros(envelope.shape)
+        height = max(16, _BLOCK_BYTES // (data.element_size() * max(1, found.cell.numel())))
+        for first in range(0, sampling.pulses, height):
+            part = slice(first, first + height)
+            echoes = unit_phasor(left[:, part] @ right, data.dtype)
+            rest = torch.baddbmm(data[:, part], echoes, weighted, alpha=-1) * present[:, part, None]
+            residual[:, part] = rest
+            moments += bases[:, :, part].to(data.dtype) @ ((rest @ back) * echoes.conj())
+            shift += echoes.mH @ rest
+        shifts = (shift.to(torch.complex128) * slope).sum(-1)
+        return residual, _Step(sampling, motion, found, unknowns, moments.mT.to(torch.complex128), shifts, _Pairs.find(sampling, motion, found, bases))
+
+    def taken(self) -> tuple[Motion, Scatterers, Tensor, Tensor]:
+        """Motion and scatterers after the step, the step of the shared unknowns, and their covariance per unit noise power."""
+        found = self.found
+        slopes = self._slopes()
+        local, cross, shared = self._curvature(slopes)
+        turned = found.amplitude.conj()[..., None] * self.moments
+        moved = (found.amplitude.conj() * self.shift).real
+        own = torch.cat([turned[..., 0].real, turned[..., 0].imag, -2 * math.pi * turned[..., 1].imag, moved], -1)
+        joint = _solved_symmetric(local, torch.cat([cross, own[..., None]], -1))
+        schur = shared - cross.mT @ joint[..., :-1]
+        change = solved(schur, torch.einsum("bpin,bpn->bi", slopes, turned.imag) - (cross.mT @ joint[..., -1:])[..., 0])
+        grow, turn, line, row = (joint[..., -1] - (joint[..., :-1] @ change[..., None])[..., 0]).unflatten(-1, (4, -1)).unbind(-2)
+        amplitude = found.amplitude * torch.complex(1 + grow, turn)
+        place = (found.row + row.clamp(-_STEP, _STEP)).clamp(0, self.sampling.cells - 1)
+        return self.unknowns_added(change), Scatterers(amplitude, found.cell + line.clamp(-_STEP, _STEP), place), change, _inverse(schur) / 2
+
+    def _curvature(self, slopes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Gauss-Newton curvature of growth, turn, Doppler cell and row of all scatterers (trial, 4 scatterer, 4 scatterer), theirs with the shared unknowns
+        (trial, 4 scatterer, unknown), and that of the shared ones (trial, unknown, unknown).
+        """
+        pairs, found = self.pairs, self.found
+        overlap, slope, bend = _sinc(pairs.of(found.row, 1) - pairs.of(found.row, 0))
+        flat, line, bent = pairs.products[(0, 0)], 2 * math.pi * pairs.products[(0, 1)], 4 * math.pi**2 * pairs.products[(1, 1)].real
+        a, u, s, us = flat * overlap, line * overlap, flat * slope, line * slope
+        rows = [
+            [a.real, -a.imag, u.imag, s.real],
+            [a.imag, a.real, -u.real, s.imag],
+            [-u.imag, -u.real, bent * overlap, -us.imag],
+            [-s.real, s.imag, -us.imag, -flat.real * bend],
+        ]
+        local = pairs.matrix(rows)
+        diagonal = local.diagonal(dim1=-2, dim2=-1)
+        diagonal += torch.where((found.amplitude == 0).repeat(1, 4), 1.0, _RIDGE * diagonal)
+        size = slopes.shape[-1]
+        column, row = (slopes[pairs.trial, scatterer] for scatterer in (pairs.second, pairs.first))  # (pair, unknown, base)
+        seen, bowed = (sum(pairs.products[(base, n)][:, None] * column[..., n] for n in range(2, size)) for base in (0, 1))
+        parts = [-(seen * overlap[:, None]).imag, (seen * overlap[:, None]).real, -2 * math.pi * (bowed * overlap[:, None]).real, (seen * slope[:, None]).imag]
+        cross = torch.cat([pairs.per_scatterer(part) for part in parts], 1)
+        both = sum((pairs.products[(n, m)].real * overlap)[:, None, None] * row[..., n, None] * column[:, None, :, m] for n in range(2, size) for m in range(2, size))
+        return local, cross, pairs.per_trial(both)
+
+    def unknowns_added(self, change: Tensor) -> Motion:
+        order, motion = self.unknowns.order, self.motion
+        w = motion.w + (change[:, order] if self.unknowns.rate else 0)
+        v = motion.v + change[:, -1] if self.unknowns.centre else motion.yc_m * w
+        return Motion(motion.k + change[:, :order], w, v)
+
+    def _slopes(self) -> Tensor:
+        """Coefficients of the bases in the phase per unit of each shared unknown, (trial, scatterer, unknown, base)."""
+        order, found = self.unknowns.order, self.found
+        slopes = found.cell.new_zeros(*found.cell.shape, self.unknowns.size, order + 3)
+        for i in range(order):
+            slopes[..., i, 2 + i] = -2 * math.pi * found.cell
+        if self.unknowns.rate:
+            slopes[..., order, -1] = self.sampling.range_m(found.row) + (0 if self.unknowns.centre else self.motion.yc_m[:, None])
+        if self.unknowns.centre:
+            slopes[..., -1, -1] = 1
+        return slopes
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """Scatterers close enough in Doppler to couple, each with itself among them: trial, first and second of each pair (pair,).
+
+    products: for bases n and m, conj(s_p) s_q sum over pulses of b_n b_m conj(e_p) e_q of unit echoes e, (pair,), from tables over their distance.
+    """
+
+    trial: Tensor
+    first: Tensor
+    second: Tensor
+    shape: torch.Size
+    products: Mapping[tuple[int, int], Tensor]
+
+    @staticmethod
+    def find(sampling: Sampling, motion: Motion, found: Scatterers, bases: Tensor) -> _Pairs:
+        apart = found.cell[:, :, None] - found.cell[:, None]
+        live = found.amplitude != 0
+        trial, first, second = ((apart.abs() < _NEAR_CELLS) & live[:, :, None] & live[:, None]).nonzero(as_tuple=True)
+        place = apart[trial, first, second] * _TABLE + _NEAR_CELLS * _TABLE
+        whole = place.floor().long()
+        weight = found.amplitude[trial, first].conj() * found.amplitude[trial, second]
+        index = [(n, m) for n in range(bases.shape[1]) for m in range(n, bases.shape[1])]
+        table = _product_tables(sampling, motion, bases, index)
+        low, high = table[trial, whole], table[trial, whole + 1]
+        values = ((low + (place - whole)[:, None] * (high - low)) * weight[:, None]).unbind(-1)
+        products = {pair: value for (n, m), value in zip(index, values) for pair in {(n, m), (m, n)}}
+        return _Pairs(trial, first, second, found.cell.shape, products)
+
+    def of(self, values: Tensor, side: int) -> Tensor:
+        """A value (trial, scatterer) of the first (0) or second (1) of each pair."""
+        return values[self.trial, self.second if side else self.first]
+
+    def matrix(self, blocks: list[list[Tensor]]) -> Tensor:
+        """Dense matrix of blocks of values of pairs, (trial, blocks * scatterer, blocks * scatterer)."""
+        count, n = self.shape[1], len(blocks)
+        result = blocks[0][0].new_zeros(self.shape[0], n * count, n * count)
+        for i, row in enumerate(blocks):
+            for j, values in enumerate(row):
+                result[self.trial, self.first + i * count, self.second + j * count] = values
+        return result
+
+    def per_scatterer(self, values: Tensor) -> Tensor:
+        """Sums over the second of pairs, (pair, n) -> (trial, scatterer, n)."""
+        flat = values.new_zeros(self.shape[0] * self.shape[1], values.shape[-1])
+        return flat.index_add(0, self.trial * self.shape[1] + self.first, values).unflatten(0, self.shape)
+
+    def per_trial(self, values: Tensor) -> Tensor:
+        """Sums over pairs, (pair, n, m) -> (trial, n, m)."""
+        return values.new_zeros(self.shape[0], *values.shape[1:]).index_add(0, self.trial, values)
+
+
+def _product_tables(sampling: Sampling, motion: Motion, bases: Tensor, index: list[tuple[int, int]]) -> Tensor:
+    """Sums over pulses of b_n b_m exp(2j pi c u) at steps of 1 / _TABLE cell c, (trial, step, product); present pulses alone are in the bases."""
+    first, second = (torch.tensor(side, device=bases.device) for side in zip(*index))
+    scale = bases.abs().amax(-1, keepdim=True).clamp_min(1e-300)
+    unit = bases / scale
+    products = (unit[:, first] * unit[:, second]).mT.to(torch.complex128)
+    lines = 2 * _NEAR_CELLS * _TABLE + 2
+    table = matched_fourier(products, motion.k, sampling.prf_hz, oversampling=_TABLE, lines=lines, taps=6) * math.sqrt(sampling.pulses)
+    return table[:, 1:] * (scale[:, first] * scale[:, second]).mT
+
+
+def _solved_symmetric(matrix: Tensor, right: Tensor) -> Tensor:
+    """Solution by Cholesky factors, or by elimination where rounding has left a matrix indefinite."""
+    factor, failed = torch.linalg.cholesky_ex(matrix)
+    return torch.linalg.solve(matrix, right) if bool(failed.any()) else torch.cholesky_solve(right, factor)
+
+
+def _sinc(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """sinc and its first two derivatives."""
+    small = x.abs() < 1e-3
+    away = torch.where(small, 1.0, x)
+    value, wave = torch.sinc(x), torch.cos(math.pi * away)
+    first = torch.where(small, -(math.pi**2) / 3 * x, (wave - value) / away)
+    second = torch.where(small, -(math.pi**2) / 3 * (1 - 3 * math.pi**2 / 10 * x.square()), -(math.pi**2) * value - 2 * first / away)
+    return value, first, second
+
+
+def _inverse(normal: Tensor) -> Tensor:
+    """Inverse of a normal matrix, scaled first; infinite in directions that nothing is known about."""
+    scale = normal.diagonal(dim1=-2, dim2=-1)
+    root = torch.where(scale > 0, scale, 1).rsqrt()
+    unit = torch.eye(normal.shape[-1], dtype=normal.dtype, device=normal.device)
+    return torch.linalg.inv(normal * root[:, :, None] * root[:, None] + 1e-12 * unit) * root[:, :, None] * root[:, None]
+
+
+def _advanced(fit: Fit, taken: tuple[Motion, Scatterers, Tensor, Tensor], noise: Tensor, sampling: Sampling, search_over: bool) -> Fit:
+    """The fit after a step; settled trials, and steps to a motion that turns back, stay where they are."""
+    motion, found, change, covariance = taken
+    sane = torch.isfinite(change).all(-1) & (least_rate(motion.k, sampling.duration_s) > _LEAST_RATE)
+    deviation = (covariance * noise[:, None, None]).diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
+    small = (change.abs() <= _SETTLED * deviation).all(-1)
+    active, old = ~fit.settled, fit.scatterers
+    pick = (active & sane)[:, None]
+    pairs = ((found.amplitude, old.amplitude), (found.cell, old.cell), (found.row, old.row))
+    return Fit(
+        motion=motion.where(active & sane, fit.motion),
+        scatterers=Scatterers(*(torch.where(pick, new, before) for new, before in pairs)),
+        covariance=torch.where(active[:, None, None], covariance, fit.covariance),
+        noise=torch.where(active, noise, fit.noise),
+        steps=fit.steps + active,
+        settled=fit.settled | (small & sane & search_over),
+    )
