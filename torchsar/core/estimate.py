@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -33,6 +33,19 @@ class Estimate:
         if name not in self.value:
             raise KeyError(f"estimate holds {tuple(self.value)}, not {name!r}")
         return self.value[name]
+
+    @staticmethod
+    def joined(parts: Sequence[Estimate], trials: torch.Size) -> Estimate:
+        """One estimate of all trials from those of blocks of them, whose one leading dim is the block's."""
+
+        def whole(tensors: list[Tensor]) -> Tensor:
+            return torch.cat(tensors).unflatten(0, trials) if trials else torch.cat(tensors)[0]
+
+        def named(tables: list[Mapping[str, Tensor]]) -> dict[str, Tensor]:
+            return {name: whole([table[name] for table in tables]) for name in tables[0]}
+
+        value, std, info = (named([getattr(part, table) for part in parts]) for table in ("value", "std", "info"))
+        return Estimate(value, whole([part.quality for part in parts]), whole([part.ok for part in parts]), std, info)
 
 
 def settle(value: Tensor, fallback: Tensor | float) -> tuple[Tensor, Tensor]:

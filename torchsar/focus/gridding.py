@@ -106,8 +106,8 @@ def _correlate(values: Tensor, grid: Tensor, first: Tensor, taps: int) -> Tensor
 def _spread(weights: Tensor, values: Tensor, first: Tensor, length: int) -> Tensor:
     """Every grid row gathers the values that reach it: the entries of a row follow one another in `source`, from `starts` on."""
     b, m, taps = weights.shape
-    rank, count = _ranks(first), _rows(first, 1, length).flatten()
-    below = torch.bincount(count, minlength=b * length).cumsum(0)  # how many points start at or before a row
+    rank, start = _ranks(first), _rows(first, 1, length).flatten()
+    below = torch.bincount(start, minlength=b * length).cumsum(0)  # how many points start at or before a row
     before = torch.cat([below.new_zeros(taps), below[:-taps]])
     entries = below - before
     starts = entries.cumsum(0) - entries
@@ -121,12 +121,12 @@ def _spread(weights: Tensor, values: Tensor, first: Tensor, length: int) -> Tens
 
 def _ranks(first: Tensor) -> Tensor:
     """Place of each point in the order of its trial and grid row, (b * m,)."""
-    count = torch.arange(first.numel(), device=first.device)
+    every = torch.arange(first.numel(), device=first.device)
     if not bool((first.diff(dim=-1) < 0).any()):
-        return count
+        return every
     order = first.argsort(dim=-1, stable=True)
     start = first.shape[-1] * torch.arange(first.shape[0], device=first.device)
-    return torch.empty_like(count).scatter_(0, (order + start[:, None]).flatten(), count)
+    return torch.empty_like(every).scatter_(0, (order + start[:, None]).flatten(), every)
 
 
 @dataclass(frozen=True)

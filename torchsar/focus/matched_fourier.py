@@ -87,7 +87,7 @@ def range_phase(data: Tensor, range_m: Tensor, wavelength_m: float, prf_hz: floa
 
 
 class _Transform(Protocol):
-    """Sum of pulses (..., pulse, range) at `steps` x u cycles a line into lines, and its adjoint."""
+    """Pulses (..., pulse, range) into lines (..., line, range), and the adjoint."""
 
     def forward(self, pulses: Tensor) -> Tensor: ...
 
@@ -235,6 +235,8 @@ def _metre_step(k: Tensor, duration_s: float, cross_range_m: tuple[float, int], 
 
 
 class _Gridded:
+    """By gridding, see `focus.gridding`."""
+
     def __init__(self, points: Tensor, lines: int, kernel: Kernel, dtype: torch.dtype, scale: float) -> None:
         self.plan = PulseNufft(lines, kernel, dtype, points.device, scale)
         self.points = self.plan.points(points)
@@ -252,8 +254,8 @@ class _Explicit:
     def __init__(self, points: Tensor, lines: int, dtype: torch.dtype, scale: float) -> None:
         self.points, self.lines, self.dtype, self.scale = points, lines, dtype, scale
 
-    def _blocks(self, n_pulse: int) -> list[tuple[int, int]]:
-        size = max(16, 32 * block_bytes_of(self.points.device) // (n_pulse * self.dtype.itemsize))
+    def _blocks(self) -> list[tuple[int, int]]:
+        size = max(16, 32 * block_bytes_of(self.points.device) // (self.points.numel() * self.dtype.itemsize))
         return [(at, min(size, self.lines - at)) for at in range(0, self.lines, size)]
 
     def _matrix(self, at: int, count: int) -> Tensor:
@@ -261,10 +263,10 @@ class _Explicit:
         return self.scale * linear_phasor(self.points, at - self.lines // 2, count, self.dtype)
 
     def forward(self, pulses: Tensor) -> Tensor:
-        return torch.cat([self._matrix(*block).mT @ pulses for block in self._blocks(pulses.shape[-2])], -2)
+        return torch.cat([self._matrix(*block).mT @ pulses for block in self._blocks()], -2)
 
     def adjoint(self, image: Tensor) -> Tensor:
-        parts = [self._matrix(at, count).conj() @ image[..., at : at + count, :] for at, count in self._blocks(self.points.shape[-1])]
+        parts = [self._matrix(at, count).conj() @ image[..., at : at + count, :] for at, count in self._blocks()]
         return torch.stack(parts).sum(0)
 
 
@@ -349,7 +351,7 @@ class _Finufft:
 
     def __init__(self, points: Tensor, lines: int, eps: float, scale: float) -> None:
         _library()
-        self.points, self.lines, self.eps, self.scale = points, lines, max(eps, 1e-14), scale
+        self.points, self.lines, self.eps, self.scale = points, lines, eps, scale
 
     def forward(self, pulses: Tensor) -> Tensor:
         return _Compiled.apply(*self._together(pulses), self.lines, self.eps).to(pulses.dtype) * self.scale

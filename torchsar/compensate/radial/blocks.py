@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -34,7 +34,7 @@ def by_trials(estimator: Estimator, sweeps: Tensor, azimuth_m: Tensor | float) -
         parts[first] = estimator(flat[part], places[part])
 
     over_blocks(work, starts, sweeps)
-    return _joined([parts[first] for first in starts], trials)
+    return Estimate.joined([parts[first] for first in starts], trials)
 
 
 def _refuse_other_places(azimuth_m: Tensor, trials: torch.Size) -> None:
@@ -42,21 +42,3 @@ def _refuse_other_places(azimuth_m: Tensor, trials: torch.Size) -> None:
     if azimuth_m.ndim and azimuth_m.shape != trials:
         raise ValueError(f"azimuth_m must be one number (m) or one a trial {tuple(trials)}, got shape {tuple(azimuth_m.shape)}")
     refuse_non_finite(azimuth_m, "azimuth_m")
-
-
-def _joined(parts: list[Estimate], trials: torch.Size) -> Estimate:
-    """One estimate of all trials, from those of its blocks."""
-
-    def whole(tensors: list[Tensor]) -> Tensor:
-        return torch.cat(tensors).unflatten(0, trials)
-
-    def named(tables: list[Mapping[str, Tensor]]) -> dict[str, Tensor]:
-        return {name: whole([table[name] for table in tables]) for name in tables[0]}
-
-    return Estimate(
-        named([part.value for part in parts]),
-        quality=whole([part.quality for part in parts]),
-        ok=whole([part.ok for part in parts]),
-        std=named([part.std for part in parts]),
-        info=named([part.info for part in parts]),
-    )

@@ -18,7 +18,7 @@ Vector = Sequence[float] | Tensor
 
 _EDGE = 1e-3  # of the width of a box: nearer to its edge a minimum is taken to lie outside
 _GAIN_NATS = 0.01  # by which compensation must lower the entropy at least
-_STILL = {torch.complex64: 1e-7, torch.complex128: 1e-9}  # relative changes of the entropy that are left to rounding
+_STILL = {torch.complex64: 1e-8, torch.complex128: 1e-9}  # relative changes of the entropy that are left to rounding
 _FIRST_STEP = 0.3  # in units of the unknowns, of about a radian each
 
 
@@ -61,21 +61,22 @@ def evolve_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: D
 def newton_rotation(figure: ImageEntropy, start: Tensor, *, damped: bool = True, steps: int = 20) -> Estimate:
     """The same by Newton's method from `start` (..., n), see `figure.start`: what the paper calls Gauss-Newton, of which its Table 2 shows that it depends on the start.
 
-    damped=False diverges on most targets, from the truth as well: one direction is nearly flat. Such trials are not ok and keep their last finite point. info["iterations"]: steps taken.
+    damped=False diverges on most targets, from the truth as well: one direction is nearly flat. Such trials are not ok and keep their last finite point, nor are
+    those that use up their steps. info["iterations"]: steps taken.
     """
     scaled = _Scaled(figure, _started(figure, start))
-    return _of_descent(figure, scaled, newton(scaled.single, scaled.start, damped=damped, steps=steps), trusted=True)
+    return _of_descent(figure, scaled, newton(scaled.single, scaled.start, damped=damped, steps=steps), steps, trusted=True)
 
 
 def descend_rotation(figure: ImageEntropy, start: Tensor, *, steps: int = 60, tolerance: float = 1e-4) -> Estimate:
     """The same by L-BFGS with exact gradients from `start` (..., n): the minimum next to it. Best in the variables "shape".
 
-    tolerance: of the gradient against that at the start. A figure of order 2 without range term makes this the second-order method 'SM' of the paper, whose k1 is not that of the
-    target but about k1 + k2 T / 2.
+    tolerance: of the gradient against that at the start. Not ok where the steps run out. A figure of order 2 without range term makes this the
+    second-order method 'SM' of the paper, whose k1 is not that of the target but about k1 + k2 T / 2.
     """
     scaled = _Scaled(figure, _started(figure, start))
     found = lbfgs(scaled.with_gradient, scaled.start, steps=steps, first_step=_FIRST_STEP, gradient_tolerance=tolerance, value_tolerance=_STILL[figure.dtype], with_gradient=True)
-    return _of_descent(figure, scaled, found, trusted=False)
+    return _of_descent(figure, scaled, found, steps, trusted=False)
 
 
 class _Scaled:
@@ -100,9 +101,9 @@ def _of_box(figure: ImageEntropy, found: Searched, low: Tensor, high: Tensor, **
     return _estimate(figure, found.x, found.cost, found.ok & ~edge.any(-1), {"evaluations": found.evaluations, "on_edge": edge, **info})
 
 
-def _of_descent(figure: ImageEntropy, scaled: _Scaled, found: Descent, trusted: bool) -> Estimate:
-    """trusted: whether the descent's own verdict counts; that of L-BFGS is about walls on its way, which infeasible candidates are, too."""
-    ok = found.ok if trusted else torch.isfinite(found.cost)
+def _of_descent(figure: ImageEntropy, scaled: _Scaled, found: Descent, steps: int, trusted: bool) -> Estimate:
+    """Not ok where the steps ran out. trusted: whether the descent's own verdict counts; that of L-BFGS is about walls on its way, which infeasible candidates are, too."""
+    ok = (found.ok if trusted else torch.isfinite(found.cost)) & (found.converged | (found.steps < steps))
     return _estimate(figure, found.x * scaled.unit, found.cost, ok, {"evaluations": found.evaluations, "iterations": found.steps, "converged": found.converged})
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import phasor_tables, outer_phasor, refuse_non_finite, unit_phasor
+from torchsar.core import outer_phasor, phasor_tables, unit_phasor
 from torchsar.core.warp import warp
 from torchsar.focus.matched_fourier import matched_fourier, slow_times
 
@@ -85,21 +85,6 @@ class Warped:
         rows = [(times_s ** (i + 2) - u * duration_s ** (i + 2)) / (math.factorial(i + 2) * whole) for i in range(k.shape[-1])]
         slopes = torch.stack(rows, -2) if rows else u.new_zeros((*u.shape[:-1], 0, u.shape[-1]))
         return Warped(phi, u, slopes)
-
-
-def flattened(data: Tensor, name: str) -> Tensor:
-    """Range-compressed data (..., pulse, range) as (trial, pulse, range), each trial over its own largest sample.
-
-    Raises TypeError or ValueError naming the estimator for what are no finite complex samples of at least 8 pulses.
-    """
-    if not isinstance(data, Tensor) or not data.is_complex():
-        raise TypeError(f"{name} works on complex range-compressed samples (..., pulse, range), got {data.dtype if isinstance(data, Tensor) else type(data).__name__}")
-    if data.ndim < 2 or data.shape[-2] < LEAST_PULSES or data.shape[-1] < 1:
-        raise ValueError(f"{name} works on samples (..., pulse, range) of at least {LEAST_PULSES} pulses and one range cell, got the shape {tuple(data.shape)}")
-    refuse_non_finite(data, name)
-    rows = data.detach().reshape(-1, *data.shape[-2:])
-    peak = torch.maximum(rows.real.abs(), rows.imag.abs()).amax((-2, -1), keepdim=True)  # |z| itself may overflow
-    return rows / torch.where(peak > 0, peak, 1)
 
 
 def without_range_term(data: Tensor, sampling: Sampling, motion: Motion, phi: Tensor) -> Tensor:

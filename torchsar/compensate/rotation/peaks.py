@@ -21,6 +21,10 @@ class Peaks:
     line: Tensor
     cell: Tensor
 
+    def brightest(self, count: int) -> Peaks:
+        """The first `count`."""
+        return Peaks(self.power[:, :count], self.line[:, :count], self.cell[:, :count])
+
 
 def noise_power(power: Tensor) -> Tensor:
     """Mean power of circular Gaussian noise from the median over an image (trial, line, range) that scatterers leave mostly empty. (trial,)."""
@@ -39,7 +43,6 @@ def find_peaks(power: Tensor, floor: Tensor, count: int, share: float, lines: in
     power: (trial, line, range). Strong scatterers hide weaker ones and their own side lobes; those come out once the strong ones are removed.
     """
     n_line, n_cell = power.shape[1:]
-    count = max(1, count)
     maxima = torch.where(_local_maximum(power) & (power > floor[:, None, None]), power, 0).flatten(1)
     level, index = maxima.topk(min(_CANDIDATES * count, maxima.shape[-1]), -1)
     line, cell = index // n_cell, index % n_cell

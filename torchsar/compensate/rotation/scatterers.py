@@ -23,7 +23,9 @@ from torchsar.focus.matched_fourier import matched_fourier
 
 _OVERSAMPLING = 2
 _SHARE, _LINES, _CELLS = 0.5, 24, 2  # a new scatterer is at least this part of the brightest about it
-COUNT, ROUNDS = 320, 6
+MOST, ROUNDS = 800, 5
+_FEWEST = 64
+_SAMPLES_EACH = 1000  # of the data for each scatterer, so that a fit costs as much as some twenty images
 _SEARCHES = {0: 0.5, 2: 0.75, 4: 1.0}  # rounds that look for further scatterers, up to which part of all; the rounds between settle what was found
 _BLOCK_BYTES = 1 << 19
 _STEP = 0.3  # cells that a scatterer moves at most in a step
@@ -64,11 +66,12 @@ class Fit:
     settled: Tensor
 
 
-def fit_scatterers(data: Tensor, sampling: Sampling, start: Motion, *, free_rate: bool = True, free_centre: bool = True, count: int = COUNT, rounds: int = ROUNDS) -> Fit:
+def fit_scatterers(data: Tensor, sampling: Sampling, start: Motion, *, free_rate: bool = True, free_centre: bool = True, count: int | None = None, rounds: int = ROUNDS) -> Fit:
     """Maximum likelihood from `start`, on data (trial, pulse, range); a trial ends when its motion moves by less than a fifth of its deviation.
 
-    count: scatterers at most, which grow over the first rounds; rounds: steps at most.
+    count: scatterers at most, which grow over the first rounds, by default one for every thousand samples, 64 to 800; rounds: steps at most.
     """
+    count = min(MOST, max(_FEWEST, sampling.pulses * sampling.cells // _SAMPLES_EACH)) if count is None else count
     unknowns = _Unknowns(start.k.shape[-1], free_rate, free_centre)
     present = (data != 0).any(-1)
     trials, device = data.shape[0], data.device
@@ -109,8 +112,9 @@ def _standing_out(residual: Tensor, sampling: Sampling, fit: Fit, bound: int) ->
     image = image_of(residual, sampling, fit.motion, oversampling=_OVERSAMPLING)
     power = image.real.square() + image.imag.square()
     noise = torch.minimum(fit.noise, noise_power(power).double())
-    count = bound - fit.scatterers.cell.shape[-1]
+    count = max(1, bound - fit.scatterers.cell.shape[-1])
     peaks = find_peaks(power, (noise * threshold(power)).to(power.dtype), count, _SHARE, _LINES, _CELLS)
+    peaks = peaks.brightest(max(1, int((peaks.power > 0).sum(-1).max())))
     value = torch.gather(image.flatten(1), 1, peaks.line * image.shape[2] + peaks.cell).to(torch.complex128) / math.sqrt(sampling.pulses)
     return Scatterers(torch.where(peaks.power > 0, value, 0), (peaks.line - image.shape[1] // 2) / _OVERSAMPLING, peaks.cell.to(torch.float64)), noise
 
@@ -136,6 +140,7 @@ class _Step:
     moments: Tensor
     shift: Tensor
     pairs: _Pairs
+    working: torch.dtype
 
     @staticmethod
     def of(data: Tensor, sampling: Sampling, fit: Fit, present: Tensor, unknowns: _Unknowns) -> tuple[Tensor, _Step]:
@@ -144,23 +149,25 @@ class _Step:
         warped = Warped.of(motion.k, sampling.times(data.device), sampling.duration_s)
         square = 2 * math.pi * sampling.turns_per_square * warped.phi.square()
         bases = torch.stack([torch.ones_like(warped.u), warped.u, *warped.slopes.unbind(1), square], 1) * present[:, None]
-        left = torch.stack([-warped.u, sampling.turns_per_square * warped.phi.square()], -1)
+        back_turns = torch.stack([warped.u, -sampling.turns_per_square * warped.phi.square()], -1)
         right = torch.stack([found.cell, motion.w[:, None] * sampling.range_m(found.row) + motion.v[:, None]], -2)
         envelope, slope = _envelopes(sampling, found.row)
-        weighted, back = (found.amplitude[..., None] * envelope).to(data.dtype), envelope.to(data.dtype).mT
+        weighted, back = (found.amplitude.conj()[..., None] * envelope).to(data.dtype), envelope.to(data.dtype).mT
+        real_bases = bases.to(data.real.dtype)
         residual = torch.empty_like(data)
-        moments = data.new_zeros(data.shape[0], bases.shape[1], found.cell.shape[-1])
+        moments = data.real.new_zeros(data.shape[0], bases.shape[1], 2 * found.cell.shape[-1])
         shift = data.new_zeros(envelope.shape)
         height = max(16, _BLOCK_BYTES // (data.element_size() * max(1, found.cell.numel())))
         for first in range(0, sampling.pulses, height):
             part = slice(first, first + height)
-            echoes = unit_phasor(left[:, part] @ right, data.dtype)
-            rest = torch.baddbmm(data[:, part], echoes, weighted, alpha=-1) * present[:, part, None]
+            turned_back = unit_phasor(back_turns[:, part] @ right, data.dtype)
+            rest = (data[:, part] - (turned_back @ weighted).conj()) * present[:, part, None]
             residual[:, part] = rest
-            moments += bases[:, :, part].to(data.dtype) @ ((rest @ back) * echoes.conj())
-            shift += echoes.mH @ rest
+            moments += real_bases[:, :, part] @ torch.view_as_real((rest @ back) * turned_back).flatten(-2)
+            shift += turned_back.mT @ rest
+        moments = torch.view_as_complex(moments.unflatten(-1, (-1, 2)).to(torch.float64))
         shifts = (shift.to(torch.complex128) * slope).sum(-1)
-        return residual, _Step(sampling, motion, found, unknowns, moments.mT.to(torch.complex128), shifts, _Pairs.find(sampling, motion, found, bases))
+        return residual, _Step(sampling, motion, found, unknowns, moments.mT, shifts, _Pairs.find(sampling, motion, found, bases), data.real.dtype)
 
     def taken(self) -> tuple[Motion, Scatterers, Tensor, Tensor]:
         """Motion and scatterers after the step, the step of the shared unknowns, and their covariance per unit noise power."""
@@ -170,7 +177,7 @@ class _Step:
         turned = found.amplitude.conj()[..., None] * self.moments
         moved = (found.amplitude.conj() * self.shift).real
         own = torch.cat([turned[..., 0].real, turned[..., 0].imag, -2 * math.pi * turned[..., 1].imag, moved], -1)
-        joint = _solved_symmetric(local, torch.cat([cross, own[..., None]], -1))
+        joint = _solved_symmetric(local, torch.cat([cross, own[..., None]], -1), self.working)
         schur = shared - cross.mT @ joint[..., :-1]
         change = solved(schur, torch.einsum("bpin,bpn->bi", slopes, turned.imag) - (cross.mT @ joint[..., -1:])[..., 0])
         grow, turn, line, row = (joint[..., -1] - (joint[..., :-1] @ change[..., None])[..., 0]).unflatten(-1, (4, -1)).unbind(-2)
@@ -284,10 +291,17 @@ def _product_tables(sampling: Sampling, motion: Motion, bases: Tensor, index: li
     return table[:, 1:] * (scale[:, first] * scale[:, second]).mT
 
 
-def _solved_symmetric(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solution by Cholesky factors, or by elimination where rounding has left a matrix indefinite."""
-    factor, failed = torch.linalg.cholesky_ex(matrix)
-    return torch.linalg.solve(matrix, right) if bool(failed.any()) else torch.cholesky_solve(right, factor)
+def _solved_symmetric(matrix: Tensor, right: Tensor, working: torch.dtype) -> Tensor:
+    """Solution by Cholesky factors in the working precision, or by elimination where rounding has left a matrix indefinite; scaled to a unit diagonal."""
+    scale = matrix.diagonal(dim1=-2, dim2=-1).rsqrt()[..., None]
+    unit = (matrix * scale * scale.mT).to(working)
+    height = right.abs().amax(-2, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
+    scaled = right / height * scale
+    level = scaled.abs().amax(-2, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
+    factor, failed = torch.linalg.cholesky_ex(unit)
+    values = (scaled / level).to(working)
+    found = torch.linalg.solve(unit, values) if bool(failed.any()) else torch.cholesky_solve(values, factor)
+    return found.to(torch.float64) * level * scale * height
 
 
 def _sinc(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
