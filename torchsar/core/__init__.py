@@ -1,5 +1,6 @@
 """Axes, signals, phase, chains, estimates and random draws: what every other part stands on."""
 
+from torchsar.core.alternate import Alternate, Turn
 from torchsar.core.axis import Axis
 from torchsar.core.chain import Chain, Trace, Use, use
 from torchsar.core.check import refuse_non_finite
@@ -14,6 +15,7 @@ from torchsar.core.spline import UniformSpline
 from torchsar.core.stage import Stage
 
 __all__ = [
+    "Alternate",
     "Axis",
     "Chain",
     "Draws",
@@ -23,6 +25,7 @@ __all__ = [
     "Stage",
     "Trace",
     "Truth",
+    "Turn",
     "UniformSpline",
     "Use",
     "best_of",

@@ -168,9 +168,7 @@ class Backproject(Focuser):
 
     def forward(self, signal: Signal, doppler_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Signal:
         azimuth, range_ = self.radar.image_axes(signal.axes)
-        azimuth, range_ = (
-            axis.part(*(bounds or (0, axis.n))).resampled(self.oversampling) for axis, bounds in ((azimuth, self.lines), (range_, self.cells))
-        )
+        azimuth, range_ = (axis.part(*(bounds or (0, axis.n))).resampled(self.oversampling) for axis, bounds in ((azimuth, self.lines), (range_, self.cells)))
         data = backproject(
             signal.data,
             replace(self.radar, near_range_m=signal.axes[-1].start),

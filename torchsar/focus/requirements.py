@@ -53,8 +53,7 @@ class Aperture:
         band = min(rate * wanted, radar.prf_hz)
         if rate * wanted > 1.001 * radar.prf_hz:
             warnings.warn(
-                f"PRF {radar.prf_hz:g} Hz is below the Doppler band {rate * wanted:.6g} Hz of a {wanted:g} s aperture: "
-                f"its ends alias in azimuth; shorten the aperture to {radar.prf_hz / rate:.3g} s",
+                f"PRF {radar.prf_hz:g} Hz is below the Doppler band {rate * wanted:.6g} Hz of a {wanted:g} s aperture: its ends alias in azimuth; shorten the aperture to {radar.prf_hz / rate:.3g} s",
                 stacklevel=3,
             )
         doppler = doppler_hz + band * torch.linspace(-0.5, 0.5, samples, dtype=torch.float64)

@@ -111,8 +111,7 @@ def plan_strip(shape: tuple[int, ...], reach: tuple[int, int], memory_bytes: int
     least = overlap + max(1, overlap // 8)
     if height < least:
         raise ValueError(
-            f"strip blocks of {height} lines ({memory_bytes / 1e9:.3g} GB) do not hold the overlap of {overlap} lines; "
-            f"allow at least {least * line_bytes / 1e9:.3g} GB, or a narrower processed band"
+            f"strip blocks of {height} lines ({memory_bytes / 1e9:.3g} GB) do not hold the overlap of {overlap} lines; allow at least {least * line_bytes / 1e9:.3g} GB, or a narrower processed band"
         )
     height = max((h for h in range(max(least, height // 2), height + 1) if smooth_length(h) == h), default=height)
     return StripPlan(n_lines, height, reach, height * line_bytes)

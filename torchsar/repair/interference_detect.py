@@ -68,7 +68,7 @@ def local_median(power: Tensor, width: int) -> Tensor:
     width = min(width, n)
     hop = max(1, width // 2)
     count = -(-n // hop)
-    around_the_end = torch.cat([power[..., n - hop :], power, power[..., : width]], -1)
+    around_the_end = torch.cat([power[..., n - hop :], power, power[..., :width]], -1)
     windows = around_the_end.unfold(-1, width, hop)[..., : count + 1, :].median(-1).values
     pair = torch.maximum(windows[..., :-1], windows[..., 1:])
     return pair.repeat_interleave(hop, -1)[..., :n]

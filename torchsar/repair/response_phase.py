@@ -132,9 +132,7 @@ def sharpest_coefficients(windows: Tensor, weight: Tensor, band: float, orders: 
     return c
 
 
-def estimate_response_sharpest(
-    image: Tensor, band: float, points: int = 800, width: int = 256, orders: tuple[int, ...] = ORDERS, passes: int = 3, valid: int | None = None
-) -> Estimate:
+def estimate_response_sharpest(image: Tensor, band: float, points: int = 800, width: int = 256, orders: tuple[int, ...] = ORDERS, passes: int = 3, valid: int | None = None) -> Estimate:
     """Phase response by least entropy of the range windows about bright points. image: (..., azimuth, range), range spectrum centred.
 
     band: pulse bandwidth over sampling rate; width: window in samples, many times the spread of the response (shortened to half the

@@ -107,6 +107,4 @@ def refuse_oversize(lines: int, samples: int, file: str, smaller: str) -> None:
     except (AttributeError, ValueError, OSError):  # not told on every system
         return
     if 8 * lines * samples > memory:
-        raise ConfigError(
-            f"{file}: world: {lines} lines of {samples} samples take {8 * lines * samples / 1e9:.3g} GB, and this machine has {memory / 1e9:.3g} GB; make {smaller} smaller"
-        )
+        raise ConfigError(f"{file}: world: {lines} lines of {samples} samples take {8 * lines * samples / 1e9:.3g} GB, and this machine has {memory / 1e9:.3g} GB; make {smaller} smaller")

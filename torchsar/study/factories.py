@@ -8,9 +8,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.stages import Autofocus
+from torchsar.compensate.pulse_phase.stages import Autofocus, CorrectPulsePhase
+from torchsar.compensate.rotation import RotationAutofocus, UnevenRotation
 from torchsar.compensate.velocity import EffectiveVelocity
-from torchsar.core import Estimate, Signal, Stage
+from torchsar.core import Alternate, Estimate, Signal, Stage, Turn
 from torchsar.echo.response import ChannelResponse
 from torchsar.focus import OmegaK, PaddedLines, TargetImage
 from torchsar.optim.scalar import gradient_minimum, parabola_minimum
@@ -44,6 +45,14 @@ def omega_k_padded(
 ) -> PaddedLines:
     """omega_k with empty lines behind the record, one aperture by default, so that cut apertures do not wrap round."""
     return PaddedLines(OmegaK(radar, reference, velocity_m_s, doppler_hz), lines)
+
+
+def rotation_and_phase(radar: InverseRadar, order: int = 3, yc_m: float = 0.0, rounds: int = 3, scatterers: int | None = None, search: int = 60, polish: int = 20) -> Alternate:
+    """A phase per pulse and the rotation in turn (`RotationAutofocus`, `UnevenRotation`), each on the recorded data without what the other has found.
+
+    yc_m is held: a phase that is free in every pulse takes all of the range centre deviation with it.
+    """
+    return Alternate(rounds, phase=Turn(RotationAutofocus(radar, search, polish), CorrectPulsePhase()), rotation=Turn(UnevenRotation(radar, order, yc_m, scatterers)))
 
 
 def jitter_lagrange(points: int = 4, offset_samples: list[float] | None = None) -> CorrectJitter:

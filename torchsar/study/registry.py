@@ -16,6 +16,18 @@ from torchsar.compensate.envelope import AlignEnvelopes, ShiftRange
 from torchsar.compensate.point import PointDoppler
 from torchsar.compensate.pulse_phase.stages import CorrectPulsePhase, EntropyFixedPoint, Pga, PgaSca, Sca, SharpestPhase
 from torchsar.compensate.radial import CompensateMotion, EqualisePulses, MirrorProduct, MlPeak, PhasePolish, PulseGain, RadialMotion, SegmentedInterference, SpectrumCorrelation
+from torchsar.compensate.rotation import (
+    ChirpletClean,
+    CoarseRotation,
+    PhaseFitRotation,
+    RotationAutofocus,
+    RotationDescent,
+    RotationEvolution,
+    RotationGenetic,
+    RotationNewton,
+    RotationSearch,
+    UnevenRotation,
+)
 from torchsar.echo.channels import ChannelImbalance
 from torchsar.echo.interference import Quantiser, Tone, WideInterferer
 from torchsar.echo.jitter import PeriodicJitter
@@ -24,6 +36,7 @@ from torchsar.echo.pulse_phase import PhaseSinusoid, PhaseWalk, WhitePhase
 from torchsar.echo.sweep_error import PolynomialSweepError, SinusoidSweepError
 from torchsar.echo.turntable import LostPulses
 from torchsar.focus import AzimuthTransform, Backproject, ClosestRange, CompressDechirped, OmegaK, OmegaKStolt, RangeCompress, RangeDoppler, TargetImage
+from torchsar.focus.matched_fourier import MatchedFourier, RangePhase
 from torchsar.focus.triangular import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
 from torchsar.repair.channels import CorrectImbalance, EstimateImbalance
 from torchsar.repair.fill import BandLimitedFill, LinearFill, SparseFill, ZeroFill
@@ -55,6 +68,7 @@ from torchsar.scene import (
     QuadraticInSweep,
     RandomPoints,
     RetroAndBrokenLine,
+    Satellite,
     Sinusoid,
     Speckle,
     SpreadRows,
@@ -73,6 +87,7 @@ SCENES = Catalogue(
         "random_points": RandomPoints,
         "speckle": Speckle,
         "aircraft": Aircraft,
+        "satellite": Satellite,
         "spread_rows": SpreadRows,
         "letter_e": LetterE,
         "retro_and_broken_line": RetroAndBrokenLine,
@@ -178,6 +193,16 @@ COMPENSATE: dict[str, Callable[..., Any]] = {
     "phase_polish": PhasePolish,
     "pulse_gain": PulseGain,
     "equalise_pulses": EqualisePulses,
+    "rotation": UnevenRotation,
+    "rotation_coarse": CoarseRotation,
+    "rotation_phase_fit": PhaseFitRotation,
+    "rotation_search": RotationSearch,
+    "rotation_genetic": RotationGenetic,
+    "rotation_evolution": RotationEvolution,
+    "rotation_newton": RotationNewton,
+    "rotation_descent": RotationDescent,
+    "rotation_autofocus": RotationAutofocus,
+    "rotation_and_phase": factories.rotation_and_phase,
 }
 FOCUS: dict[str, Callable[..., Any]] = {
     "range_compress": RangeCompress,
@@ -193,6 +218,9 @@ FOCUS: dict[str, Callable[..., Any]] = {
     "compress_sweeps": CompressSweeps,
     "deramp_azimuth": DerampAzimuth,
     "azimuth_matched_filter": AzimuthMatchedFilter,
+    "range_phase": RangePhase,
+    "matched_fourier": MatchedFourier,
+    "chirplet_clean": ChirpletClean,
 }
 GROUPS = {"repair": REPAIR, "compensate": COMPENSATE, "focus": FOCUS}
 

@@ -19,11 +19,11 @@ SECTIONS = 28
 _OCTAVES = 3.5
 _STEPS_PER_UNIT = 200  # of the logarithm of Doppler
 _WIDEST = 1.4  # of the logarithm of a rate over another: a factor of 4
-_GRID = 0.05  # step of the search, in logarithms of rates at the middle and the end of the aperture
-_BLUR = 0.02
+_GRID = 0.07  # step of the search, in logarithms of rates at the middle and the end of the aperture
+_BLUR = 0.03
 _KEPT = 6
 _ROUNDS = 6
-_ROWS = 24
+_ROWS = 16
 _LEAST_RATE = 0.1
 
 

@@ -12,7 +12,7 @@ from torchsar.core import outer_phasor, phasor_tables, unit_phasor
 from torchsar.core.warp import warp
 from torchsar.focus.matched_fourier import matched_fourier, slow_times
 
-SEARCH_TAPS = 4  # enough for estimates; images take more
+SEARCH_EPS = 1e-3  # of the transform: enough for estimates; images take less
 LEAST_PULSES = 8
 
 
@@ -94,7 +94,7 @@ def without_range_term(data: Tensor, sampling: Sampling, motion: Motion, phi: Te
     return data * outer_phasor(fine, coarse * unit_phasor(square * motion.v[:, None], data.dtype)[..., None], sampling.cells)
 
 
-def image_of(data: Tensor, sampling: Sampling, motion: Motion, taps: int = SEARCH_TAPS, oversampling: float = 2.0) -> Tensor:
+def image_of(data: Tensor, sampling: Sampling, motion: Motion, oversampling: float = 2.0) -> Tensor:
     """Image (trial, line, range) of data (trial, pulse, range) with this motion taken out, lines of 1 / oversampling Doppler cells about zero."""
     phi = warp(sampling.times(data.device), motion.k)
-    return matched_fourier(without_range_term(data, sampling, motion, phi), motion.k, sampling.prf_hz, oversampling=oversampling, taps=taps)
+    return matched_fourier(without_range_term(data, sampling, motion, phi), motion.k, sampling.prf_hz, oversampling=oversampling, eps=SEARCH_EPS)

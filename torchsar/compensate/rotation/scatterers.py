@@ -17,16 +17,16 @@ from torch import Tensor
 from torchsar.compensate.rotation.histories import solved
 from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of
 from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
-from torchsar.core import unit_phasor
+from torchsar.core import real_dtype, reduced_turns
 from torchsar.core.warp import least_rate
 from torchsar.focus.matched_fourier import matched_fourier
 
 _OVERSAMPLING = 2
 _SHARE, _LINES, _CELLS = 0.5, 24, 2  # a new scatterer is at least this part of the brightest about it
-MOST, ROUNDS = 800, 5
+MOST, ROUNDS = 800, 4
 _FEWEST = 64
-_SAMPLES_EACH = 1000  # of the data for each scatterer, so that a fit costs as much as some twenty images
-_SEARCHES = {0: 0.5, 2: 0.75, 4: 1.0}  # rounds that look for further scatterers, up to which part of all; the rounds between settle what was found
+_SAMPLES_EACH = 1250  # of the data for each scatterer, so that a fit costs as much as some twenty images
+_SEARCHES = {0: 0.6, 2: 1.0}  # rounds that look for further scatterers, up to which part of all; the rounds between settle what was found
 _BLOCK_BYTES = 1 << 19
 _STEP = 0.3  # cells that a scatterer moves at most in a step
 _RIDGE = 1e-3
@@ -69,7 +69,7 @@ class Fit:
 def fit_scatterers(data: Tensor, sampling: Sampling, start: Motion, *, free_rate: bool = True, free_centre: bool = True, count: int | None = None, rounds: int = ROUNDS) -> Fit:
     """Maximum likelihood from `start`, on data (trial, pulse, range); a trial ends when its motion moves by less than a fifth of its deviation.
 
-    count: scatterers at most, which grow over the first rounds, by default one for every thousand samples, 64 to 800; rounds: steps at most.
+    count: scatterers at most, which grow over the first rounds, by default one for every 1250 samples, 64 to 800; rounds: steps at most.
     """
     count = min(MOST, max(_FEWEST, sampling.pulses * sampling.cells // _SAMPLES_EACH)) if count is None else count
     unknowns = _Unknowns(start.k.shape[-1], free_rate, free_centre)
@@ -125,6 +125,18 @@ def _envelopes(sampling: Sampling, row: Tensor) -> tuple[Tensor, Tensor]:
     return value, -slope
 
 
+def _phasors(left: Tensor, right: Tensor, dtype: torch.dtype) -> Tensor:
+    """exp(2j pi left @ right), (trial, pulse, scatterer), of a short block of pulses: its first pulse in float64, the differences from it, a few turns, in the working precision.
+
+    left: float64 (trial, pulse, 2) turns per unit of right, (trial, 2, scatterer). Twice as fast as `core.unit_phasor` of every element.
+    """
+    working = real_dtype(dtype)
+    begin = reduced_turns(left[:, :1] @ right).to(working)
+    turns = torch.baddbmm(begin, (left - left[:, :1]).to(working), right.to(working))
+    angle = (turns - turns.round()) * (2 * math.pi)
+    return torch.complex(torch.cos(angle), torch.sin(angle))
+
+
 @dataclass(frozen=True)
 class _Step:
     """The residual's moments against what each unknown changes, and the curvature.
@@ -140,7 +152,6 @@ class _Step:
     moments: Tensor
     shift: Tensor
     pairs: _Pairs
-    working: torch.dtype
 
     @staticmethod
     def of(data: Tensor, sampling: Sampling, fit: Fit, present: Tensor, unknowns: _Unknowns) -> tuple[Tensor, _Step]:
@@ -160,14 +171,14 @@ class _Step:
         height = max(16, _BLOCK_BYTES // (data.element_size() * max(1, found.cell.numel())))
         for first in range(0, sampling.pulses, height):
             part = slice(first, first + height)
-            turned_back = unit_phasor(back_turns[:, part] @ right, data.dtype)
+            turned_back = _phasors(back_turns[:, part], right, data.dtype)
             rest = (data[:, part] - (turned_back @ weighted).conj()) * present[:, part, None]
             residual[:, part] = rest
             moments += real_bases[:, :, part] @ torch.view_as_real((rest @ back) * turned_back).flatten(-2)
             shift += turned_back.mT @ rest
         moments = torch.view_as_complex(moments.unflatten(-1, (-1, 2)).to(torch.float64))
         shifts = (shift.to(torch.complex128) * slope).sum(-1)
-        return residual, _Step(sampling, motion, found, unknowns, moments.mT, shifts, _Pairs.find(sampling, motion, found, bases), data.real.dtype)
+        return residual, _Step(sampling, motion, found, unknowns, moments.mT, shifts, _Pairs.find(sampling, motion, found, bases))
 
     def taken(self) -> tuple[Motion, Scatterers, Tensor, Tensor]:
         """Motion and scatterers after the step, the step of the shared unknowns, and their covariance per unit noise power."""
@@ -177,7 +188,7 @@ class _Step:
         turned = found.amplitude.conj()[..., None] * self.moments
         moved = (found.amplitude.conj() * self.shift).real
         own = torch.cat([turned[..., 0].real, turned[..., 0].imag, -2 * math.pi * turned[..., 1].imag, moved], -1)
-        joint = _solved_symmetric(local, torch.cat([cross, own[..., None]], -1), self.working)
+        joint = _solved_symmetric(local, torch.cat([cross, own[..., None]], -1))
         schur = shared - cross.mT @ joint[..., :-1]
         change = solved(schur, torch.einsum("bpin,bpn->bi", slopes, turned.imag) - (cross.mT @ joint[..., -1:])[..., 0])
         grow, turn, line, row = (joint[..., -1] - (joint[..., :-1] @ change[..., None])[..., 0]).unflatten(-1, (4, -1)).unbind(-2)
@@ -291,17 +302,10 @@ def _product_tables(sampling: Sampling, motion: Motion, bases: Tensor, index: li
     return table[:, 1:] * (scale[:, first] * scale[:, second]).mT
 
 
-def _solved_symmetric(matrix: Tensor, right: Tensor, working: torch.dtype) -> Tensor:
-    """Solution by Cholesky factors in the working precision, or by elimination where rounding has left a matrix indefinite; scaled to a unit diagonal."""
-    scale = matrix.diagonal(dim1=-2, dim2=-1).rsqrt()[..., None]
-    unit = (matrix * scale * scale.mT).to(working)
-    height = right.abs().amax(-2, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
-    scaled = right / height * scale
-    level = scaled.abs().amax(-2, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
-    factor, failed = torch.linalg.cholesky_ex(unit)
-    values = (scaled / level).to(working)
-    found = torch.linalg.solve(unit, values) if bool(failed.any()) else torch.cholesky_solve(values, factor)
-    return found.to(torch.float64) * level * scale * height
+def _solved_symmetric(matrix: Tensor, right: Tensor) -> Tensor:
+    """Solution by Cholesky factors, or by elimination where rounding has left a matrix indefinite."""
+    factor, failed = torch.linalg.cholesky_ex(matrix)
+    return torch.linalg.solve(matrix, right) if bool(failed.any()) else torch.cholesky_solve(right, factor)
 
 
 def _sinc(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -56,7 +56,6 @@ def squint_doppler_hz(radar: StripmapRadar, squint_deg: Tensor | float, velocity
     return 2 * velocity * torch.sin(torch.deg2rad(torch.as_tensor(squint_deg, dtype=torch.float64))) / radar.wavelength_m
 
 
-
 def point_targets(scenes: Mapping[str, Scene]) -> dict[str, int]:
     """Names of the point targets, `part.number`, and their places among all scatterers."""
     names: dict[str, int] = {}
