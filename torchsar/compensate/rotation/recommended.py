@@ -161,8 +161,8 @@ def _judged(rows: Tensor, sampling: Sampling, motion: Motion) -> Estimate:
     """A motion as an estimate, ok where its image has no more entropy than that of even rotation without compensation."""
     motion = Motion(*(settle(x, 0.0)[0] for x in (motion.k, motion.w, motion.v)))
     zero = torch.zeros_like(motion.w)
-    before = entropy(image_of(rows, sampling, Motion(torch.zeros_like(motion.k), zero, zero), oversampling=1.0))
-    after = entropy(image_of(rows, sampling, motion, oversampling=1.0))
+    before = entropy(image_of(rows, sampling, Motion(torch.zeros_like(motion.k), zero, zero)))
+    after = entropy(image_of(rows, sampling, motion))
     value = {"warp_k": motion.k, **{k_name(i + 1): k for i, k in enumerate(motion.k.unbind(-1))}, "omega_rad_s": motion.omega_rad_s, "yc_m": motion.yc_m}
     gained = (before - after).double()
     quality = (1 - torch.exp(-gained)).clamp(0, 1)

@@ -24,7 +24,7 @@ from torchsar.focus.matched_fourier import matched_fourier
 _OVERSAMPLING = 2
 _SHARE, _LINES, _CELLS = 0.5, 24, 2  # a new scatterer is at least this part of the brightest about it
 MOST, ROUNDS = 800, 4
-_FEWEST = 64
+_FEWEST = 128
 _SAMPLES_EACH = 1250  # of the data for each scatterer, so that a fit costs as much as some twenty images
 _SEARCHES = {0: 0.6, 2: 1.0}  # rounds that look for further scatterers, up to which part of all; the rounds between settle what was found
 _BLOCK_BYTES = 1 << 19
@@ -69,7 +69,7 @@ class Fit:
 def fit_scatterers(data: Tensor, sampling: Sampling, start: Motion, *, free_rate: bool = True, free_centre: bool = True, count: int | None = None, rounds: int = ROUNDS) -> Fit:
     """Maximum likelihood from `start`, on data (trial, pulse, range); a trial ends when its motion moves by less than a fifth of its deviation.
 
-    count: scatterers at most, which grow over the first rounds, by default one for every 1250 samples, 64 to 800; rounds: steps at most.
+    count: scatterers at most, which grow over the first rounds, by default one for every 1250 samples, 128 to 800; rounds: steps at most.
     """
     count = min(MOST, max(_FEWEST, sampling.pulses * sampling.cells // _SAMPLES_EACH)) if count is None else count
     unknowns = _Unknowns(start.k.shape[-1], free_rate, free_centre)
@@ -218,7 +218,8 @@ class _Step:
         seen, bowed = (sum(pairs.products[(base, n)][:, None] * column[..., n] for n in range(2, size)) for base in (0, 1))
         parts = [-(seen * overlap[:, None]).imag, (seen * overlap[:, None]).real, -2 * math.pi * (bowed * overlap[:, None]).real, (seen * slope[:, None]).imag]
         cross = torch.cat([pairs.per_scatterer(part) for part in parts], 1)
-        both = sum((pairs.products[(n, m)].real * overlap)[:, None, None] * row[..., n, None] * column[:, None, :, m] for n in range(2, size) for m in range(2, size))
+        shared = range(2, size)
+        both = torch.stack([(pairs.products[(n, m)].real * overlap)[:, None, None] * row[..., n, None] * column[:, None, :, m] for n in shared for m in shared]).sum(0)
         return local, cross, pairs.per_trial(both)
 
     def unknowns_added(self, change: Tensor) -> Motion:
