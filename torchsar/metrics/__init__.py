@@ -18,6 +18,7 @@ from torchsar.metrics.ladar_bounds import (
     velocity_segmented_bound_m_s,
 )
 from torchsar.metrics.phase import phase_rmse, residual_phase, strehl
+from torchsar.metrics.rotation_bounds import rotation_bounds
 
 __all__ = [
     "beam_centre_bound_hz",
@@ -33,6 +34,7 @@ __all__ = [
     "range_per_sweep_bound_m",
     "reference_doppler_std_hz",
     "residual_phase",
+    "rotation_bounds",
     "strehl",
     "tone_frequency_bound_hz",
     "velocity_bound_m_s",

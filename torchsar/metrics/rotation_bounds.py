@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import legendre, per_trial
+from torchsar.core import per_trial
 from torchsar.core.warp import warp
 
 _SINGULAR = 1e-13  # eigenvalues of a correlation matrix below it are rounding
@@ -38,13 +38,63 @@ def rotation_bounds(
     the warp phi are taken out tells about the motion, J_ij = (2 / noise_std^2) sum_p |s_p|^2 <P d_i, P d_j>, c4 = 4 pi / wavelength,
     d_Om = c4 y Om phi^2, d_ki = c4 (-x Om + y Om^2 phi) t^(i+1) / (i+1)!, d_yc = (c4 / 2) Om^2 phi^2.
     Neighbours that overlap only raise it. All scatterers at one range leave Om (and a free yc) infinite, k finite. Falls as 10^(-SNR / 20). Differentiable.
-    Raises ValueError for shapes that do not fit, and for fewer pulses than the warp has terms.
+    Raises ValueError for shapes that do not fit.
     """
-    _refuse(cross_range_m, range_m, amplitude, warp_k, n_pulse)
+    _refuse(cross_range_m, range_m, amplitude, warp_k)
     x, k = cross_range_m.to(torch.float64), warp_k.to(torch.float64)
-    omega, yc = per_trial(omega_rad_s, 1, x), per_trial(yc_m, 1, x)
-    slopes = _slopes(x, range_m.to(torch.float64) + yc, omega, k.shape[-1], 4 * math.pi / wavelength_m, free_centre)
-    weight = slopes * amplitude.abs().to(torch.float64)[..., None, :]
-    gram = (weight[..., :, None, :, None, :] * weight[..., None, :, None, :, :]).sum(-1)  # (..., unknown, unknown, base, base)
-    information = (gram * _products(k, n_pulse, prf_hz)[..., None, None, :, :]).sum((-2, -1))
-    return _named(_deviations(information), per_trial(noise_std, 0, x) / math.sqrt(2), free_centre)
+    lever = range_m.to(torch.float64) + per_trial(yc_m, 1, x)
+    slopes = _slopes(x, lever, per_trial(omega_rad_s, 1, x), k.shape[-1], free_centre) * (4 * math.pi / wavelength_m)
+    weighted = slopes * amplitude.abs().to(torch.float64)[..., None, None, :]
+    told = _products(k, n_pulse, prf_hz)[..., None, :, :] @ weighted
+    information = weighted.flatten(-2) @ told.flatten(-2).mT
+    unit = _deviations(information)
+    noise = per_trial(noise_std, 1, x) / math.sqrt(2)
+    bounds = torch.where(torch.isinf(unit), unit, unit * noise)
+    names = ["omega_rad_s", *(f"k{i}_per_s{i if i > 1 else ''}" for i in range(1, k.shape[-1] + 1)), *(["yc_m"] if free_centre else [])]
+    return dict(zip(names, bounds.unbind(-1), strict=True))
+
+
+def _refuse(cross_range_m: Tensor, range_m: Tensor, amplitude: Tensor, warp_k: Tensor) -> None:
+    counts = [x.shape[-1] if x.ndim else None for x in (cross_range_m, range_m, amplitude)]
+    if None in counts or len(set(counts)) > 1:
+        shapes = ", ".join(str(tuple(x.shape)) for x in (cross_range_m, range_m, amplitude))
+        raise ValueError(f"rotation_bounds: cross_range_m, range_m and amplitude are (..., target) of as many targets, got the shapes {shapes}")
+    if not warp_k.ndim:
+        raise ValueError("rotation_bounds: warp_k is (..., order - 1), got a tensor without dims; write torch.zeros(0) for an even rotation")
+
+
+def _slopes(x: Tensor, lever: Tensor, omega: Tensor, terms: int, free_centre: bool) -> Tensor:
+    """Coefficients of the curves of `_products` in the phase of each scatterer per unit of each unknown, less the factor c4: (..., unknown, curve, target)."""
+    zero = torch.zeros_like(x * lever * omega)
+    turned, bent, square = zero - x * omega, lever * omega.square() + zero, 2 * terms
+    rows = [{square: lever * omega + zero}]
+    rows += [{i: turned, terms + i: bent} for i in range(terms)]
+    rows += [{square: omega.square() / 2 + zero}] if free_centre else []
+    return torch.stack([torch.stack([row.get(curve, zero) for curve in range(square + 1)], -2) for row in rows], -3)
+
+
+def _products(k: Tensor, n_pulse: int, prf_hz: float) -> Tensor:
+    """Inner products over the pulses of t^(i+1) / (i+1)!, of phi times each, and of phi^2, without their parts along 1 and phi. (..., curve, curve)."""
+    time = torch.arange(n_pulse, dtype=torch.float64, device=k.device) / prf_hz
+    phi = warp(time, k)
+    powers = [(time ** (i + 2) / math.factorial(i + 2)).expand_as(phi) for i in range(k.shape[-1])]
+    curves = torch.stack([*powers, *(phi * power for power in powers), phi.square()], -2)
+    line = phi - phi.mean(-1, keepdim=True)
+    line = (line / line.square().sum(-1, keepdim=True).sqrt().clamp_min(torch.finfo(torch.float64).tiny))[..., None, :]
+    for _ in range(2):  # a second pass takes out what rounding leaves
+        curves = curves - curves.mean(-1, keepdim=True)
+        curves = curves - (curves * line).sum(-1, keepdim=True) * line
+    return curves @ curves.mT
+
+
+def _deviations(information: Tensor) -> Tensor:
+    """Square roots of the diagonal of the inverse (..., n, n) -> (..., n), infinite for unknowns that a direction without information takes part in."""
+    size = information.diagonal(dim1=-2, dim2=-1)
+    root = torch.where(size > 0, size, 1).rsqrt()
+    unit = information * root[..., :, None] * root[..., None, :]
+    value, vector = torch.linalg.eigh(unit.detach())
+    blind = vector * (value < _SINGULAR)[..., None, :]
+    blind = blind @ blind.mT
+    share = blind.diagonal(dim1=-2, dim2=-1)
+    variance = torch.linalg.inv(unit + blind).diagonal(dim1=-2, dim2=-1) - share
+    return torch.where(share > _TOUCHED, torch.inf, variance.clamp_min(0).sqrt() * root)

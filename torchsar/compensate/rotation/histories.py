@@ -8,6 +8,7 @@ from any rate: even the range term of a motion that is not known at all, w = 0, 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -39,7 +40,7 @@ def refined_by_histories(data: Tensor, sampling: Sampling, motion: Motion, *, fr
     order = motion.k.shape[-1]
     w, v = (change[:, order] if free_rate else 0), (change[:, -1] if free_centre else 0)
     found = (peaks.power > 0).sum(-1)
-    return Motion(motion.k + change[:, :order], motion.w + w, motion.v + v).where(found > 0, motion), found
+    return replace(motion, k=motion.k + change[:, :order], w=motion.w + w, v=motion.v + v).where(found > 0, motion), found
 
 
 def _histories(image: Tensor, peaks: Peaks, half_cells: int) -> tuple[Tensor, Tensor]:
@@ -60,7 +61,7 @@ def _bases(motion: Motion, sampling: Sampling, cells: Tensor, range_m: Tensor, u
     square = 2 * math.pi * sampling.turns_per_square * warped.phi.square()[:, None]
     rows = [-2 * math.pi * cells[..., None] * slope[:, None] for slope in warped.slopes.unbind(1)]
     if free_rate:
-        rows.append(range_m[..., None] * square + (0 if free_centre else motion.yc_m[:, None, None] * square))
+        rows.append((range_m + motion.centre_m[:, None])[..., None] * square)
     if free_centre:
         rows.append(square.expand(-1, cells.shape[-1], -1))
     return torch.stack(rows, -2)

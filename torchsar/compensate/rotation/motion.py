@@ -45,27 +45,41 @@ class Sampling:
 
 @dataclass(frozen=True)
 class Motion:
-    """Rotation in the form in which phases are linear in it: the warp k (trial, order - 1), w = Om^2 and v = yc Om^2 (trial,), float64.
+    """Rotation in the form in which phases are linear in it: the warp k (trial, order - 1), w = Om^2 and v (trial,), float64.
 
-    Only Om^2 and yc Om^2 show in data; both may start at zero, and may come out negative where noise is all there is.
+    The range term of a scatterer at y_n is (c4/2) (w (y_n + centre_m) + v) phi^2: centre_m (trial,) is the range centre deviation that is known, v what is found
+    beyond it. Only w and v show in data; both may start at zero, and may come out negative where noise is all there is.
     """
 
     k: Tensor
     w: Tensor
     v: Tensor
+    centre_m: Tensor
+
+    @staticmethod
+    def still(k: Tensor, centre_m: Tensor | None = None) -> Motion:
+        """A warp, and no rate yet."""
+        zero = k.new_zeros(k.shape[0])
+        return Motion(k, zero, zero, zero if centre_m is None else centre_m)
 
     @property
     def omega_rad_s(self) -> Tensor:
         return self.w.clamp_min(torch.finfo(torch.float64).tiny).sqrt()
 
     @property
+    def offset(self) -> Tensor:
+        """w yc, what the centre adds to w y_n."""
+        return self.w * self.centre_m + self.v
+
+    @property
     def yc_m(self) -> Tensor:
-        """v / w, zero where the rate is not positive."""
-        return torch.where(self.w > 0, self.v / torch.where(self.w > 0, self.w, 1), 0)
+        """The range centre deviation; the known one where the rate is not positive."""
+        return self.centre_m + torch.where(self.w > 0, self.v / torch.where(self.w > 0, self.w, 1), 0)
 
     def where(self, keep: Tensor, other: Motion) -> Motion:
         """This motion in trials where `keep` (trial,) holds, the other elsewhere."""
-        return Motion(torch.where(keep[:, None], self.k, other.k), torch.where(keep, self.w, other.w), torch.where(keep, self.v, other.v))
+        w, v = (torch.where(keep, getattr(self, name), getattr(other, name)) for name in ("w", "v"))
+        return Motion(torch.where(keep[:, None], self.k, other.k), w, v, self.centre_m)
 
 
 @dataclass(frozen=True)
@@ -88,10 +102,10 @@ class Warped:
 
 
 def without_range_term(data: Tensor, sampling: Sampling, motion: Motion, phi: Tensor) -> Tensor:
-    """data (trial, pulse, range) times exp(-j (c4/2) (w y_n + v) phi^2). phi: (trial, pulse)."""
+    """data (trial, pulse, range) times exp(-j (c4/2) (w y_n + offset) phi^2). phi: (trial, pulse)."""
     square = -sampling.turns_per_square * phi.square()
     fine, coarse = phasor_tables(square * (motion.w[:, None] * sampling.step_m), sampling.first_m / sampling.step_m, sampling.cells, data.dtype)
-    return data * outer_phasor(fine, coarse * unit_phasor(square * motion.v[:, None], data.dtype)[..., None], sampling.cells)
+    return data * outer_phasor(fine, coarse * unit_phasor(square * motion.offset[:, None], data.dtype)[..., None], sampling.cells)
 
 
 def image_of(data: Tensor, sampling: Sampling, motion: Motion, oversampling: float = 2.0) -> Tensor:

@@ -21,9 +21,11 @@ class Peaks:
     line: Tensor
     cell: Tensor
 
-    def brightest(self, count: int) -> Peaks:
-        """The first `count`."""
-        return Peaks(self.power[:, :count], self.line[:, :count], self.cell[:, :count])
+    def first(self, count: Tensor) -> Peaks:
+        """The brightest `count` (trial,) of each trial."""
+        power = torch.where(torch.arange(self.power.shape[-1], device=count.device) < count[:, None], self.power, 0)
+        width = max(1, int((power > 0).sum(-1).max()))
+        return Peaks(power[:, :width], self.line[:, :width], self.cell[:, :width])
 
 
 def noise_power(power: Tensor) -> Tensor:

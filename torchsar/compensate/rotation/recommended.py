@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -73,7 +74,6 @@ def phase_fit_rotation(
         motion = _start(rows, sampling, order, known)
         for _ in range(steps):
             motion, _ = refined_by_histories(rows, sampling, motion, free_centre=known is None, half_cells=half_cells)
-            motion = motion if known is None else Motion(motion.k, motion.w, known * motion.w)
         return _judged(rows, sampling, motion)
 
     return _over_trials("phase_fit_rotation", find, data, wavelength_m, prf_hz, range_m, yc_m)
@@ -81,11 +81,10 @@ def phase_fit_rotation(
 
 def _start(rows: Tensor, sampling: Sampling, order: int, known: Tensor | None) -> Motion:
     """The coarse warp in `order` terms, and no rate yet."""
-    zero = torch.zeros(rows.shape[0], dtype=torch.float64, device=rows.device)
-    k = coarse_warp(rows, sampling.prf_hz) if order > 1 else zero.new_zeros(rows.shape[0], 0)
+    k = coarse_warp(rows, sampling.prf_hz) if order > 1 else torch.zeros(rows.shape[0], 0, dtype=torch.float64, device=rows.device)
     if order == 2:
         k = k_of_shape(shape_of(k, sampling.duration_s)[:, :1], sampling.duration_s)
-    return Motion(torch.nn.functional.pad(k, (0, max(0, order - 3))), zero, zero)
+    return Motion.still(torch.nn.functional.pad(k, (0, max(0, order - 3))), known)
 
 
 def _over_trials(name: str, find: Part, data: Tensor, wavelength_m: float, prf_hz: float, range_m: Tensor, yc_m: Tensor | float | None) -> Estimate:
@@ -152,16 +151,16 @@ def _deviations(fit: Fit, free_centre: bool) -> dict[str, Tensor]:
     omega = ww.clamp_min(0).sqrt() / (2 * w.sqrt())
     yc = torch.zeros_like(w)
     if free_centre:
-        yc = (covariance[:, -1, -1] - 2 * motion.yc_m * covariance[:, order, -1] + motion.yc_m.square() * ww).clamp_min(0).sqrt() / w
+        found = motion.yc_m - motion.centre_m
+        yc = (covariance[:, -1, -1] - 2 * found * covariance[:, order, -1] + found.square() * ww).clamp_min(0).sqrt() / w
     named = {"warp_k": k, **{k_name(i + 1): column for i, column in enumerate(k.unbind(-1))}, "omega_rad_s": omega, "yc_m": yc}
     return {name: settle(value, torch.finfo(torch.float64).max)[0] for name, value in named.items()}
 
 
 def _judged(rows: Tensor, sampling: Sampling, motion: Motion) -> Estimate:
     """A motion as an estimate, ok where its image has no more entropy than that of even rotation without compensation."""
-    motion = Motion(*(settle(x, 0.0)[0] for x in (motion.k, motion.w, motion.v)))
-    zero = torch.zeros_like(motion.w)
-    before = entropy(image_of(rows, sampling, Motion(torch.zeros_like(motion.k), zero, zero)))
+    motion = replace(motion, k=settle(motion.k, 0.0)[0], w=settle(motion.w, 0.0)[0], v=settle(motion.v, 0.0)[0])
+    before = entropy(image_of(rows, sampling, Motion.still(torch.zeros_like(motion.k))))
     after = entropy(image_of(rows, sampling, motion))
     value = {"warp_k": motion.k, **{k_name(i + 1): k for i, k in enumerate(motion.k.unbind(-1))}, "omega_rad_s": motion.omega_rad_s, "yc_m": motion.yc_m}
     gained = (before - after).double()

@@ -1,25 +1,24 @@
 """Maximum likelihood of the motion and of every scatterer together: amplitude, Doppler cell and range of each, and the rotation that all share.
 
 Each round removes the model of all scatterers known so far from the data, finds further ones in the image of what is left, and takes a Gauss-Newton step of
-everything at once. The gradient is that of the exact residual, so that neighbours and side lobes leave no error at the end; only the curvature is
-simplified: amplitudes are solved together, positions each for itself. Assumes range-compressed echoes of a rectangular band, whose envelope is a sinc.
+everything at once: amplitudes and places of all scatterers and the motion, with the couplings of those next to each other. The gradient is that of the exact
+residual, so that neighbours and side lobes leave no error at the end. Assumes range-compressed echoes of a rectangular band, whose envelope is a sinc.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from torchsar.compensate.rotation.couplings import Pairs, sinc_slopes
 from torchsar.compensate.rotation.histories import solved
 from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of
 from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
 from torchsar.core import real_dtype, reduced_turns
 from torchsar.core.warp import least_rate
-from torchsar.focus.matched_fourier import matched_fourier
 
 _OVERSAMPLING = 2
 _SHARE, _LINES, _CELLS = 0.5, 24, 2  # a new scatterer is at least this part of the brightest about it
@@ -30,7 +29,6 @@ _SEARCHES = {0: 0.6, 2: 1.0}  # rounds that look for further scatterers, up to w
 _BLOCK_BYTES = 1 << 19
 _STEP = 0.3  # cells that a scatterer moves at most in a step
 _RIDGE = 1e-3
-_NEAR_CELLS, _TABLE = 64, 16  # scatterers further apart do not couple; steps of the table per cell
 _LEAST_RATE = 0.05
 _SETTLED = 0.2  # of its deviation: steps of the motion below it end a trial
 
@@ -108,20 +106,19 @@ class _Unknowns:
 
 
 def _standing_out(residual: Tensor, sampling: Sampling, fit: Fit, bound: int) -> tuple[Scatterers, Tensor]:
-    """Scatterers that stand out of the residual, no more than make `bound` with those known, and the noise power per sample (trial,)."""
+    """Scatterers that stand out of the residual, in no trial more than make `bound` with those that it has, and the noise power per sample (trial,)."""
     image = image_of(residual, sampling, fit.motion, oversampling=_OVERSAMPLING)
     power = image.real.square() + image.imag.square()
     noise = torch.minimum(fit.noise, noise_power(power).double())
-    count = max(1, bound - fit.scatterers.cell.shape[-1])
-    peaks = find_peaks(power, (noise * threshold(power)).to(power.dtype), count, _SHARE, _LINES, _CELLS)
-    peaks = peaks.brightest(max(1, int((peaks.power > 0).sum(-1).max())))
+    known = (fit.scatterers.amplitude != 0).sum(-1)
+    peaks = find_peaks(power, (noise * threshold(power)).to(power.dtype), bound, _SHARE, _LINES, _CELLS).first(bound - known)
     value = torch.gather(image.flatten(1), 1, peaks.line * image.shape[2] + peaks.cell).to(torch.complex128) / math.sqrt(sampling.pulses)
     return Scatterers(torch.where(peaks.power > 0, value, 0), (peaks.line - image.shape[1] // 2) / _OVERSAMPLING, peaks.cell.to(torch.float64)), noise
 
 
 def _envelopes(sampling: Sampling, row: Tensor) -> tuple[Tensor, Tensor]:
     """sinc(n - row) over range cells and its derivative in row, (trial, scatterer, range) each."""
-    value, slope, _ = _sinc(torch.arange(sampling.cells, dtype=row.dtype, device=row.device) - row[..., None])
+    value, slope, _ = sinc_slopes(torch.arange(sampling.cells, dtype=row.dtype, device=row.device) - row[..., None])
     return value, -slope
 
 
@@ -151,7 +148,7 @@ class _Step:
     unknowns: _Unknowns
     moments: Tensor
     shift: Tensor
-    pairs: _Pairs
+    pairs: Pairs
 
     @staticmethod
     def of(data: Tensor, sampling: Sampling, fit: Fit, present: Tensor, unknowns: _Unknowns) -> tuple[Tensor, _Step]:
@@ -161,7 +158,7 @@ class _Step:
         square = 2 * math.pi * sampling.turns_per_square * warped.phi.square()
         bases = torch.stack([torch.ones_like(warped.u), warped.u, *warped.slopes.unbind(1), square], 1) * present[:, None]
         back_turns = torch.stack([warped.u, -sampling.turns_per_square * warped.phi.square()], -1)
-        right = torch.stack([found.cell, motion.w[:, None] * sampling.range_m(found.row) + motion.v[:, None]], -2)
+        right = torch.stack([found.cell, motion.w[:, None] * sampling.range_m(found.row) + motion.offset[:, None]], -2)
         envelope, slope = _envelopes(sampling, found.row)
         weighted, back = (found.amplitude.conj()[..., None] * envelope).to(data.dtype), envelope.to(data.dtype).mT
         real_bases = bases.to(data.real.dtype)
@@ -178,7 +175,7 @@ class _Step:
             shift += turned_back.mT @ rest
         moments = torch.view_as_complex(moments.unflatten(-1, (-1, 2)).to(torch.float64))
         shifts = (shift.to(torch.complex128) * slope).sum(-1)
-        return residual, _Step(sampling, motion, found, unknowns, moments.mT, shifts, _Pairs.find(sampling, motion, found, bases))
+        return residual, _Step(sampling, motion, found, unknowns, moments.mT, shifts, Pairs.find(sampling, motion.k, found.amplitude, found.cell, bases))
 
     def taken(self) -> tuple[Motion, Scatterers, Tensor, Tensor]:
         """Motion and scatterers after the step, the step of the shared unknowns, and their covariance per unit noise power."""
@@ -194,14 +191,14 @@ class _Step:
         grow, turn, line, row = (joint[..., -1] - (joint[..., :-1] @ change[..., None])[..., 0]).unflatten(-1, (4, -1)).unbind(-2)
         amplitude = found.amplitude * torch.complex(1 + grow, turn)
         place = (found.row + row.clamp(-_STEP, _STEP)).clamp(0, self.sampling.cells - 1)
-        return self.unknowns_added(change), Scatterers(amplitude, found.cell + line.clamp(-_STEP, _STEP), place), change, _inverse(schur) / 2
+        return self._moved(change), Scatterers(amplitude, found.cell + line.clamp(-_STEP, _STEP), place), change, _inverse(schur) / 2
 
     def _curvature(self, slopes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Gauss-Newton curvature of growth, turn, Doppler cell and row of all scatterers (trial, 4 scatterer, 4 scatterer), theirs with the shared unknowns
         (trial, 4 scatterer, unknown), and that of the shared ones (trial, unknown, unknown).
         """
         pairs, found = self.pairs, self.found
-        overlap, slope, bend = _sinc(pairs.of(found.row, 1) - pairs.of(found.row, 0))
+        overlap, slope, bend = sinc_slopes(pairs.of(found.row, 1) - pairs.of(found.row, 0))
         flat, line, bent = pairs.products[(0, 0)], 2 * math.pi * pairs.products[(0, 1)], 4 * math.pi**2 * pairs.products[(1, 1)].real
         a, u, s, us = flat * overlap, line * overlap, flat * slope, line * slope
         rows = [
@@ -222,11 +219,11 @@ class _Step:
         both = torch.stack([(pairs.products[(n, m)].real * overlap)[:, None, None] * row[..., n, None] * column[:, None, :, m] for n in shared for m in shared]).sum(0)
         return local, cross, pairs.per_trial(both)
 
-    def unknowns_added(self, change: Tensor) -> Motion:
+    def _moved(self, change: Tensor) -> Motion:
         order, motion = self.unknowns.order, self.motion
         w = motion.w + (change[:, order] if self.unknowns.rate else 0)
-        v = motion.v + change[:, -1] if self.unknowns.centre else motion.yc_m * w
-        return Motion(motion.k + change[:, :order], w, v)
+        v = motion.v + (change[:, -1] if self.unknowns.centre else 0)
+        return replace(motion, k=motion.k + change[:, :order], w=w, v=v)
 
     def _slopes(self) -> Tensor:
         """Coefficients of the bases in the phase per unit of each shared unknown, (trial, scatterer, unknown, base)."""
@@ -235,88 +232,16 @@ class _Step:
         for i in range(order):
             slopes[..., i, 2 + i] = -2 * math.pi * found.cell
         if self.unknowns.rate:
-            slopes[..., order, -1] = self.sampling.range_m(found.row) + (0 if self.unknowns.centre else self.motion.yc_m[:, None])
+            slopes[..., order, -1] = self.sampling.range_m(found.row) + self.motion.centre_m[:, None]
         if self.unknowns.centre:
             slopes[..., -1, -1] = 1
         return slopes
-
-
-@dataclass(frozen=True)
-class _Pairs:
-    """Scatterers close enough in Doppler to couple, each with itself among them: trial, first and second of each pair (pair,).
-
-    products: for bases n and m, conj(s_p) s_q sum over pulses of b_n b_m conj(e_p) e_q of unit echoes e, (pair,), from tables over their distance.
-    """
-
-    trial: Tensor
-    first: Tensor
-    second: Tensor
-    shape: torch.Size
-    products: Mapping[tuple[int, int], Tensor]
-
-    @staticmethod
-    def find(sampling: Sampling, motion: Motion, found: Scatterers, bases: Tensor) -> _Pairs:
-        apart = found.cell[:, :, None] - found.cell[:, None]
-        live = found.amplitude != 0
-        trial, first, second = ((apart.abs() < _NEAR_CELLS) & live[:, :, None] & live[:, None]).nonzero(as_tuple=True)
-        place = apart[trial, first, second] * _TABLE + _NEAR_CELLS * _TABLE
-        whole = place.floor().long()
-        weight = found.amplitude[trial, first].conj() * found.amplitude[trial, second]
-        index = [(n, m) for n in range(bases.shape[1]) for m in range(n, bases.shape[1])]
-        table = _product_tables(sampling, motion, bases, index)
-        low, high = table[trial, whole], table[trial, whole + 1]
-        values = ((low + (place - whole)[:, None] * (high - low)) * weight[:, None]).unbind(-1)
-        products = {pair: value for (n, m), value in zip(index, values) for pair in {(n, m), (m, n)}}
-        return _Pairs(trial, first, second, found.cell.shape, products)
-
-    def of(self, values: Tensor, side: int) -> Tensor:
-        """A value (trial, scatterer) of the first (0) or second (1) of each pair."""
-        return values[self.trial, self.second if side else self.first]
-
-    def matrix(self, blocks: list[list[Tensor]]) -> Tensor:
-        """Dense matrix of blocks of values of pairs, (trial, blocks * scatterer, blocks * scatterer)."""
-        count, n = self.shape[1], len(blocks)
-        result = blocks[0][0].new_zeros(self.shape[0], n * count, n * count)
-        for i, row in enumerate(blocks):
-            for j, values in enumerate(row):
-                result[self.trial, self.first + i * count, self.second + j * count] = values
-        return result
-
-    def per_scatterer(self, values: Tensor) -> Tensor:
-        """Sums over the second of pairs, (pair, n) -> (trial, scatterer, n)."""
-        flat = values.new_zeros(self.shape[0] * self.shape[1], values.shape[-1])
-        return flat.index_add(0, self.trial * self.shape[1] + self.first, values).unflatten(0, self.shape)
-
-    def per_trial(self, values: Tensor) -> Tensor:
-        """Sums over pairs, (pair, n, m) -> (trial, n, m)."""
-        return values.new_zeros(self.shape[0], *values.shape[1:]).index_add(0, self.trial, values)
-
-
-def _product_tables(sampling: Sampling, motion: Motion, bases: Tensor, index: list[tuple[int, int]]) -> Tensor:
-    """Sums over pulses of b_n b_m exp(2j pi c u) at steps of 1 / _TABLE cell c, (trial, step, product); present pulses alone are in the bases."""
-    first, second = (torch.tensor(side, device=bases.device) for side in zip(*index))
-    scale = bases.abs().amax(-1, keepdim=True).clamp_min(1e-300)
-    unit = bases / scale
-    products = (unit[:, first] * unit[:, second]).mT.to(torch.complex128)
-    lines = 2 * _NEAR_CELLS * _TABLE + 2
-    table = matched_fourier(products, motion.k, sampling.prf_hz, oversampling=_TABLE, lines=lines, taps=6) * math.sqrt(sampling.pulses)
-    return table[:, 1:] * (scale[:, first] * scale[:, second]).mT
 
 
 def _solved_symmetric(matrix: Tensor, right: Tensor) -> Tensor:
     """Solution by Cholesky factors, or by elimination where rounding has left a matrix indefinite."""
     factor, failed = torch.linalg.cholesky_ex(matrix)
     return torch.linalg.solve(matrix, right) if bool(failed.any()) else torch.cholesky_solve(right, factor)
-
-
-def _sinc(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """sinc and its first two derivatives."""
-    small = x.abs() < 1e-3
-    away = torch.where(small, 1.0, x)
-    value, wave = torch.sinc(x), torch.cos(math.pi * away)
-    first = torch.where(small, -(math.pi**2) / 3 * x, (wave - value) / away)
-    second = torch.where(small, -(math.pi**2) / 3 * (1 - 3 * math.pi**2 / 10 * x.square()), -(math.pi**2) * value - 2 * first / away)
-    return value, first, second
 
 
 def _inverse(normal: Tensor) -> Tensor:

@@ -1,0 +1,177 @@
+"""Three points of an unevenly turning target: figures 1 to 3 of Remote Sens. 2025, 17, 3447.
+
+    python scripts/rotation_profiles.py [--out rotation_profiles] [--snr-db 20] [--small]
+
+Profiles of points at -12, 0 and 12 m of cross range, 12 m behind the centre of rotation, by what is taken out of the echo; and what a range centre deviation
+does to the estimated rate where it is ignored: of one range cell, as the paper has it, and of a whole image.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchsar import plot
+from torchsar.compensate.rotation import uneven_rotation
+from torchsar.core import Axis, Draws, Signal
+from torchsar.echo import simulate_turntable
+from torchsar.focus.matched_fourier import cross_range_of, matched_fourier, range_phase
+from torchsar.radar import LIGHT_M_S, InverseRadar
+from torchsar.scene import Points, PolynomialRotation, Satellite, TurntableWorld
+
+OMEGA_RAD_S, WARP_K = 0.02, (10.0, 1000.0)
+TRUE_K = torch.tensor(WARP_K, dtype=torch.float64)
+PLACES_M, RANGE_M = (-12.0, 0.0, 12.0), 12.0
+FINE = 16  # lines of a profile per Doppler cell
+WINDOW_M = 1.5  # of a profile to either side of its strongest part
+SECOND_K1 = 20.8  # of a fit of second order to the phase by least squares; least entropy gives 20.05, k1 + k2 T / 2 is 20
+NAMES = {"none": "no compensation", "order 2": "order 2, azimuth", "true k1": "true k1, k2 = 0", "azimuth": "order 3, azimuth", "full": "order 3, two-dimensional"}
+EXPECTED = {  # brief 003, experiment 1: peak (dB), width (mm), highest side lobe (dB) at 12 m and at 0 m
+    "none": ((-29.7, 655, 0.0), (-4.1, 6.7, -16.0)),
+    "order 2": ((-15.4, 8.3, -2.1), None),
+    "azimuth": ((-2.8, 2.16, -5.1), (-2.8, 2.16, -5.1)),
+    "full": ((0.0, 1.48, -13.25), (0.0, 1.48, -13.25)),
+}
+
+
+def instrument(cell_m: float, prf_hz: float) -> InverseRadar:
+    """A ladar at 1.55 um with range cells of this size."""
+    return InverseRadar(LIGHT_M_S / 1.55e-6, LIGHT_M_S / (2 * cell_m), prf_hz)
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Cross range (m), and amplitude over that of an ideal point."""
+
+    cross_range_m: Tensor
+    amplitude: Tensor
+
+    @staticmethod
+    def of(line: Tensor, pulse: Axis, wavelength_m: float) -> Profile:
+        """Of one range cell (line,). Whatever was compensated, the target turned by the same angle in all: the mean rate scales the line."""
+        doppler = (torch.arange(len(line), dtype=torch.float64) - len(line) // 2) / (FINE * pulse.n * pulse.step)
+        return Profile(cross_range_of(doppler, OMEGA_RAD_S, TRUE_K, wavelength_m, pulse.n * pulse.step), line.abs() / math.sqrt(pulse.n))
+
+    def near(self, place_m: float, reach_m: float) -> Profile:
+        inside = (self.cross_range_m - place_m).abs() <= reach_m
+        return Profile(self.cross_range_m[inside], self.amplitude[inside])
+
+    def figures(self) -> tuple[float, float, float]:
+        """Peak (dB), width (mm) where it has fallen by 3 dB, highest side lobe (dB)."""
+        a, peak = self.amplitude, int(self.amplitude.argmax())
+        width = float(_fall(a, peak, 1) + _fall(a, peak, -1)) * float(self.cross_range_m[1] - self.cross_range_m[0])
+        first, last = _foot(a, peak, -1), _foot(a, peak, 1)
+        rest = torch.cat([a[:first], a[last + 1 :]])
+        return 20 * math.log10(a[peak]), 1e3 * width, 20 * math.log10(rest.max() / a[peak])
+
+
+def _fall(a: Tensor, index: int, side: int) -> float:
+    """How many samples to one side of the peak the line falls by 3 dB."""
+    level, steps = float(a[index]) / math.sqrt(2), 1
+    while a[index + side * steps] > level:
+        steps += 1
+    before, here = float(a[index + side * (steps - 1)]), float(a[index + side * steps])
+    return steps - (level - here) / (before - here)
+
+
+def _foot(a: Tensor, index: int, side: int) -> int:
+    """The first minimum to one side."""
+    while 0 < index < len(a) - 1 and a[index + side] < a[index]:
+        index += side
+    return index
+
+
+def compensated(signal: Signal, radar: InverseRadar) -> dict[str, Profile]:
+    """The range cell of the points after each compensation."""
+    pulse, range_ = signal.axes
+    flat = range_phase(signal.data, range_.values(), radar.wavelength_m, radar.prf_hz, OMEGA_RAD_S, TRUE_K)
+    cell = int(range_.index_of(RANGE_M).round())
+
+    def profile(pulses: Tensor, *k: float) -> Profile:
+        image = matched_fourier(pulses[:, cell, None], torch.tensor(k, dtype=torch.float64), radar.prf_hz, oversampling=FINE)
+        return Profile.of(image[:, 0], pulse, radar.wavelength_m)
+
+    return {
+        "none": profile(signal.data),
+        "order 2": profile(signal.data, SECOND_K1),
+        "true k1": profile(signal.data, WARP_K[0]),
+        "azimuth": profile(signal.data, *WARP_K),
+        "full": profile(flat, *WARP_K),
+    }
+
+
+def table(profiles: Mapping[str, Profile]) -> None:
+    print(f"{'three points, y = 12 m':26}" + "".join(f"{f'x = {x:g} m':>27}" for x in PLACES_M) + f"{'expected, 12 m':>27}{'expected, 0 m':>27}")
+    for name, profile in profiles.items():
+        cells = [profile.near(x, 3.5 * WINDOW_M).figures() for x in PLACES_M]
+        known = EXPECTED.get(name, (None, None))
+        print(f"{NAMES[name]:26}" + "".join(f"{'-' if one is None else '{:.1f} dB {:.2f} mm {:.1f} dB'.format(*one):>27}" for one in (*cells, *known)))
+
+
+def draw_profiles(profiles: Mapping[str, Profile], names: Sequence[str], reach_m: float, path: Path) -> None:
+    """Profiles of the three points, beside each other."""
+    parts = []
+    for place in PLACES_M:
+        near = {NAMES[name]: profiles[name].near(place, reach_m) for name in names}
+        series = {name: (plot.array(p.cross_range_m), plot.decibel(p.amplitude, 1.0)) for name, p in near.items()}
+        parts.append({"series": series, "xlabel": "cross range (m)", "ylabel": "amplitude (dB of an ideal point)", "title": f"x = {place:g} m", "ylim": (-50.0, 3.0)})
+    plot.save(plot.panels(parts, columns=3), path)
+
+
+def one_cell(yc_m: Tensor, y_m: float) -> Tensor:
+    """Estimated over true rate (yc,) of one range cell whose centre deviation is ignored, Eq. (6): the range term of y_m must stand for that of y_m + yc."""
+    return torch.sqrt((1 + yc_m / y_m).clamp_min(0))
+
+
+def whole_image(yc_m: Tensor, radar: InverseRadar, n_pulse: int, n_range: int, scatterers: int, snr_db: float) -> dict[str, Tensor]:
+    """Estimated over true rate (yc,) of a satellite on both sides of the centre, one trial per deviation, with the deviation ignored and estimated."""
+    target = Satellite(scatterers, half_width_m=6.43 * radar.prf_hz / 500e3)
+    world = TurntableWorld(target, rotation=PolynomialRotation(OMEGA_RAD_S, WARP_K), centre_deviation_m=yc_m, snr_db=snr_db)
+    signal = simulate_turntable(radar, world, n_pulse, n_range, Draws(1, trials=[0] * len(yc_m)))[0].signal
+    told = {"wavelength_m": radar.wavelength_m, "prf_hz": radar.prf_hz, "range_m": signal.axis("range").values()}
+    return {name: uneven_rotation(signal.data, **told, yc_m=known)["omega_rad_s"] / OMEGA_RAD_S for name, known in (("ignored", 0.0), ("estimated", None))}
+
+
+def draw_centre(yc_m: Tensor, cell: Mapping[str, Tensor], image: Mapping[str, Tensor], path: Path) -> None:
+    """Figure 1, and the same of an image."""
+    parts = []
+    for title, ratios in (("one range cell, yc ignored", cell), ("a whole image", image)):
+        series = {name: (plot.array(yc_m), plot.array(ratio)) for name, ratio in ratios.items()}
+        parts.append({"series": series, "xlabel": "range centre deviation yc (m)", "ylabel": "estimated over true rate", "title": title})
+    plot.save(plot.panels(parts), path)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("rotation_profiles"), help="folder of the figures")
+    parser.add_argument("--snr-db", type=float, default=20.0, help="of the satellite of figure 1")
+    parser.add_argument("--small", action="store_true", help="a small satellite, few deviations")
+    options = parser.parse_args(arguments)
+    options.out.mkdir(parents=True, exist_ok=True)
+
+    radar = instrument(4.0, 1e6)
+    points = Points(azimuth_m=PLACES_M, range_m=[RANGE_M] * 3)
+    world = TurntableWorld(points, rotation=PolynomialRotation(OMEGA_RAD_S, WARP_K))
+    profiles = compensated(simulate_turntable(radar, world, 20000, 8, Draws(1))[0].signal, radar)
+    table(profiles)
+    draw_profiles(profiles, ("none", "azimuth", "full"), 0.05, options.out / "figure_02.png")
+    draw_profiles(profiles, ("none", "order 2", "full"), 0.05, options.out / "figure_03.png")
+
+    yc = torch.linspace(-3, 3, 5 if options.small else 13, dtype=torch.float64)
+    size = (instrument(0.12, 125e3), 2500, 64, 120) if options.small else (instrument(0.24, 500e3), 10000, 32, 300)
+    cell = {f"y = {y:g} m": one_cell(yc, y) for y in (3.4, 6.0, 12.0)}
+    image = whole_image(yc, *size, options.snr_db)
+    draw_centre(yc, cell, image, options.out / "figure_01.png")
+    print(f"\n{'yc (m)':26}" + "".join(f"{y:>8.2f}" for y in yc))
+    for name, ratio in ({f"{name}, one cell": r for name, r in cell.items()} | {f"image, yc {name}": r for name, r in image.items()}).items():
+        print(f"{name:26}" + "".join(f"{r:>8.3f}" for r in ratio))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,141 @@
+"""Estimators in turn: what each of them sees, what it is handed, and what an alternation promises."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from torchsar.core import Alternate, Axis, Chain, Estimate, Signal, Stage, Turn, use
+
+F64 = torch.float64
+
+
+class Mean(Stage):
+    """Estimates a constant that is added to all samples: the mean of what it sees, less a part of what `slope` makes of it."""
+
+    provides = ("mean",)
+
+    def __init__(self, ok: bool = True, quality: float = 0.5) -> None:
+        super().__init__()
+        self.ok, self.quality, self.seen = ok, quality, []
+
+    def forward(self, signal: Signal, mean: Tensor | None = None, slope: Tensor | None = None) -> Estimate:
+        self.seen.append((signal.data.clone(), mean, slope))
+        found = signal.data.real.mean((-2, -1)).to(F64)
+        return Estimate({"mean": found}, torch.full_like(found, self.quality), torch.full(found.shape, self.ok), {"mean": 0 * found + 0.1}, {"steps": 0 * found + 3})
+
+
+class Slope(Stage):
+    """Estimates a slope over pulses, by the first pulse and the last: a constant in the data would go into it."""
+
+    provides = ("slope",)
+
+    def forward(self, signal: Signal) -> Estimate:
+        pulse = torch.arange(signal.data.shape[-2], dtype=F64)
+        found = (signal.data.real.mean(-1) * pulse).sum(-1) / pulse.square().sum()
+        return Estimate({"slope": found}, torch.full_like(found, 0.9), torch.ones(found.shape, dtype=torch.bool))
+
+
+class WithoutMean(Stage):
+    def forward(self, signal: Signal, mean: Tensor) -> Signal:
+        return signal.with_data(signal.data - mean[..., None, None])
+
+
+class WithoutSlope(Stage):
+    def forward(self, signal: Signal, slope: Tensor) -> Signal:
+        return signal.with_data(signal.data - slope[..., None, None] * torch.arange(signal.data.shape[-2], dtype=F64)[:, None])
+
+
+class Needy(Stage):
+    provides = ("offer",)
+
+    def forward(self, signal: Signal, slope: Tensor) -> Estimate:
+        return Estimate({"offer": slope}, slope, slope > 0)
+
+
+def lines(mean: Tensor, slope: Tensor) -> Signal:
+    """mean + slope m in pulse m."""
+    pulse = torch.arange(6, dtype=F64)
+    data = (mean[..., None] + slope[..., None] * pulse)[..., None].expand(*mean.shape, 6, 4)
+    return Signal(data.to(torch.complex128).contiguous(), (Axis("pulse", 6, 0.0, 1.0, "s"), Axis("range", 4, 0.0, 1.0, "m")))
+
+
+MEAN, SLOPE = torch.tensor([1.0, -2.0, 5.0], dtype=F64), torch.tensor([0.5, 0.0, -3.0], dtype=F64)
+
+
+def both(rounds: int, mean: Mean | None = None) -> Alternate:
+    return Alternate(rounds, mean=Turn(mean or Mean(), WithoutMean()), slope=Turn(Slope(), WithoutSlope()))
+
+
+def test_turns_agree_on_what_neither_finds_alone() -> None:
+    """Each turn takes the other's value out of the ORIGINAL data: this is block relaxation of least squares, which converges to both."""
+    signal = lines(MEAN, SLOPE)
+    one, many = both(1)(signal), both(60)(signal)
+    assert (one["mean"] - MEAN).abs().max() > 1
+    torch.testing.assert_close(many["mean"], MEAN, atol=1e-6, rtol=0)
+    torch.testing.assert_close(many["slope"], SLOPE, atol=1e-6, rtol=0)
+
+
+def test_each_turn_sees_the_original_less_the_latest_of_the_others() -> None:
+    mean, signal = Mean(), lines(MEAN, SLOPE)
+    found = both(3, mean)(signal)
+    assert len(mean.seen) == 3
+    first, second, third = mean.seen
+    assert torch.equal(first[0], signal.data) and first[1] is None and first[2] is None
+    torch.testing.assert_close(second[0], WithoutSlope()(signal, second[2]).data, rtol=0, atol=0)
+    assert second[1] is not None and third[1] is not None and not torch.equal(second[1], third[1])
+    assert not torch.equal(third[2], found["slope"]), "the last turn of the last round comes after"
+    assert torch.equal(signal.data, lines(MEAN, SLOPE).data)
+
+
+def test_a_turn_without_a_corrector_leaves_the_data() -> None:
+    mean, signal = Mean(), lines(MEAN, SLOPE)
+    Alternate(2, mean=Turn(mean, WithoutMean()), slope=Turn(Slope()))(signal)
+    assert all(torch.equal(data, signal.data) for data, _, _ in mean.seen) and mean.seen[1][2] is not None
+
+
+def test_what_comes_back() -> None:
+    stage = both(2, Mean(ok=False, quality=0.2))
+    assert stage.provides == ("mean", "slope")
+    found = stage(lines(MEAN, SLOPE))
+    assert set(found.value) == {"mean", "slope"} and set(found.std) == {"mean"} and set(found.info) == {"mean.steps"}
+    assert found.ok.tolist() == [False] * 3 and found.quality.tolist() == [0.2] * 3
+
+
+def test_a_batch_equals_its_singles() -> None:
+    together = both(4)(lines(MEAN, SLOPE))
+    for i in range(3):
+        alone = both(4)(lines(MEAN[i], SLOPE[i]))
+        for name in alone.value:
+            assert torch.equal(together[name][i], alone[name])
+
+
+def test_in_a_chain() -> None:
+    chain = Chain(fit=both(60), out=use(WithoutMean(), mean="fit"))
+    trace = chain.trace(lines(MEAN, SLOPE))
+    torch.testing.assert_close(trace.signal.data, lines(0 * MEAN, SLOPE).data, atol=1e-5, rtol=0)
+
+
+def test_it_is_one_module() -> None:
+    stage = Alternate(1, linear=Turn(Holding(2.0)), mean=Turn(Mean(), WithoutMean()))
+    assert list(stage.state_dict()) == ["estimators.linear.gain"]
+    assert isinstance(stage.to("cpu"), nn.Module)
+
+
+class Holding(Mean):
+    def __init__(self, gain: float) -> None:
+        super().__init__()
+        self.hold("gain", gain)
+
+
+def test_refusals() -> None:
+    with pytest.raises(ValueError, match=r"two turns or more and one round or more, got \['mean'\] and rounds=3"):
+        Alternate(mean=Turn(Mean()))
+    with pytest.raises(ValueError, match="rounds=0"):
+        both(0)
+    with pytest.raises(ValueError, match=r"the turn 'needy' needs \['slope'\] in the first round, but the turns before it offer nothing"):
+        Alternate(needy=Turn(Needy()), slope=Turn(Slope()))
+    with pytest.raises(ValueError, match=r"the corrector of the turn 'slope' needs \['mean'\], which its estimator does not offer"):
+        Alternate(slope=Turn(Slope(), WithoutMean()), mean=Turn(Mean()))
+    assert Alternate(slope=Turn(Slope()), needy=Turn(Needy())).provides == ("slope", "offer")

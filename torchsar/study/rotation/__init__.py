@@ -1,0 +1,1 @@
+"""Targets that turn unevenly (system 003): `system: isal_rotation`."""
