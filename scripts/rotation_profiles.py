@@ -151,7 +151,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("rotation_profiles"), help="folder of the figures")
     parser.add_argument("--snr-db", type=float, default=20.0, help="of the satellite of figure 1")
-    parser.add_argument("--small", action="store_true", help="a small satellite, few deviations")
+    parser.add_argument("--small", action="store_true", help="a tiny satellite, few deviations")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
 
@@ -164,7 +164,7 @@ def main(arguments: list[str] | None = None) -> None:
     draw_profiles(profiles, ("none", "order 2", "full"), 0.05, options.out / "figure_03.png")
 
     yc = torch.linspace(-3, 3, 5 if options.small else 13, dtype=torch.float64)
-    size = (instrument(0.12, 125e3), 2500, 64, 120) if options.small else (instrument(0.24, 500e3), 10000, 32, 300)
+    size = (instrument(0.24, 50e3), 1000, 32, 60) if options.small else (instrument(0.24, 500e3), 10000, 32, 300)
     cell = {f"y = {y:g} m": one_cell(yc, y) for y in (3.4, 6.0, 12.0)}
     image = whole_image(yc, *size, options.snr_db)
     draw_centre(yc, cell, image, options.out / "figure_01.png")

@@ -27,7 +27,7 @@ from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
 
 ROTATION = PolynomialRotation(0.02, (10.0, 1000.0))
 TIP_M = 6.43
-TARGETS = {"full": (500e3, 10000, 128, 0.06, 600), "mid": (500e3, 10000, 32, 0.24, 300), "small": (125e3, 2500, 64, 0.12, 120)}  # pulse rate, pulses, cells, cell size, scatterers
+TARGETS = {"full": (500e3, 10000, 128, 0.06, 600), "mid": (500e3, 10000, 32, 0.24, 300), "tiny": (50e3, 1000, 32, 0.24, 60)}  # pulse rate, pulses, cells, cell size, scatterers
 WHOLE = ((-1.09, 1.09), (-3.8, 3.8))  # parts of an image: cross range in half widths of the target, range (m)
 REGIONS = {"A, tip of a panel": ((-1.03, -0.81), (-1.6, 1.6)), "B, bus and dish": ((-0.11, 0.11), (-3.6, -0.4))}
 EXPECTED = {"no compensation": (11.22, 4.5), "SM, order 2": (10.05, 9.4), "order 3, azimuth": (7.79, 25.0), "order 3, two-dimensional": (7.766, 25.3)}  # brief 003, "mid"
@@ -123,11 +123,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--target", choices=TARGETS, default="full", help="how finely the satellite is sampled; the brief's figures are of mid")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--snr-db", type=float, default=20.0, help="mean power of all samples over the variance of the noise")
-    parser.add_argument("--small", action="store_true", help="the small target, few chirplets")
+    parser.add_argument("--small", action="store_true", help="a tiny target, few chirplets")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
 
-    target = "small" if options.small else options.target
+    target = "tiny" if options.small else options.target
     prf_hz, n_pulse, n_range, cell_m, count = TARGETS[target]
     radar = InverseRadar(LIGHT_M_S / 1.55e-6, LIGHT_M_S / (2 * cell_m), prf_hz)
     satellite = Satellite(count, half_width_m=TIP_M * prf_hz / 500e3)

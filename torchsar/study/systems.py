@@ -54,6 +54,12 @@ def systems() -> dict[str, System]:
     from torchsar.study.isal.sections import IsalConfig
     from torchsar.study.isal.trade import trade as isal_trade
     from torchsar.study.isal.trials import IsalTrials
+    from torchsar.study.rotation import run as rotation_run
+    from torchsar.study.rotation.judge import DEFINITIONS as ROTATION
+    from torchsar.study.rotation.requires import requires as rotation_requires
+    from torchsar.study.rotation.sections import RotationConfig
+    from torchsar.study.rotation.trade import trade as rotation_trade
+    from torchsar.study.rotation.trials import RotationTrials
     from torchsar.study.sal import run as sal_run
     from torchsar.study.sal.judge import DEFINITIONS as SAL
     from torchsar.study.sal.requires import requires as sal_requires
@@ -69,6 +75,7 @@ def systems() -> dict[str, System]:
 
     return {
         "isal": System(IsalConfig, isal_run.check, isal_run.run, isal_requires, isal_trade, IsalTrials, ISAL),
+        "isal_rotation": System(RotationConfig, rotation_run.check, rotation_run.run, rotation_requires, rotation_trade, RotationTrials, ROTATION),
         "sal": System(SalConfig, sal_run.check, sal_run.run, sal_requires, sal_trade, SalTrials, SAL),
         "stripmap": System(StripmapConfig, stripmap_run.check, stripmap_run.run, stripmap_requires, stripmap_trade, StripmapTrials, STRIPMAP),
     }

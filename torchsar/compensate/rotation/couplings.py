@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.rotation.motion import Sampling
+from torchsar.core import linear_phasor
 from torchsar.focus.matched_fourier import matched_fourier
 
 _NEAR_CELLS, _TABLE = 64, 16  # scatterers further apart in Doppler do not couple; steps of the table per cell
@@ -78,11 +79,12 @@ def _product_tables(sampling: Sampling, k: Tensor, bases: Tensor, index: list[tu
     return table[:, 1:] * (scale[:, first] * scale[:, second]).mT
 
 
-def sinc_slopes(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """sinc and its first two derivatives."""
-    small = x.abs() < 1e-3
-    away = torch.where(small, 1.0, x)
-    value, wave = torch.sinc(x), torch.cos(math.pi * away)
-    first = torch.where(small, -(math.pi**2) / 3 * x, (wave - value) / away)
-    second = torch.where(small, -(math.pi**2) / 3 * (1 - 3 * math.pi**2 / 10 * x.square()), -(math.pi**2) * value - 2 * first / away)
-    return value, first, second
+def band_response(x: Tensor, cells: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Response of range cells to a scatterer x cells away, its band being the `cells` frequencies that FFTs make of so many samples, and its first two derivatives.
+
+    x: float64, any shape. The sinc of the signal model, periodic in the window as compressed pulses are; complex128, unit peak.
+    """
+    cycles = (torch.arange(cells, dtype=torch.float64, device=x.device) - cells // 2) / cells
+    turn = 2j * math.pi * cycles
+    moments = torch.stack([torch.ones_like(turn), turn, turn.square()], -1) / cells
+    return tuple((linear_phasor(x / cells, -(cells // 2), cells, torch.complex128) @ moments).unbind(-1))  # pyright: ignore[reportReturnType]

@@ -2,7 +2,7 @@
 
 Each round removes the model of all scatterers known so far from the data, finds further ones in the image of what is left, and takes a Gauss-Newton step of
 everything at once: amplitudes and places of all scatterers and the motion, with the couplings of those next to each other. The gradient is that of the exact
-residual, so that neighbours and side lobes leave no error at the end. Assumes range-compressed echoes of a rectangular band, whose envelope is a sinc.
+residual, so that neighbours and side lobes leave no error at the end. Assumes range-compressed echoes of a flat band that fills the cells (`band_response`).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.compensate.rotation.couplings import Pairs, sinc_slopes
+from torchsar.compensate.rotation.couplings import Pairs, band_response
 from torchsar.compensate.rotation.histories import solved
 from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of
 from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
@@ -113,12 +113,13 @@ def _standing_out(residual: Tensor, sampling: Sampling, fit: Fit, bound: int) ->
     known = (fit.scatterers.amplitude != 0).sum(-1)
     peaks = find_peaks(power, (noise * threshold(power)).to(power.dtype), bound, _SHARE, _LINES, _CELLS).first(bound - known)
     value = torch.gather(image.flatten(1), 1, peaks.line * image.shape[2] + peaks.cell).to(torch.complex128) / math.sqrt(sampling.pulses)
-    return Scatterers(torch.where(peaks.power > 0, value, 0), (peaks.line - image.shape[1] // 2) / _OVERSAMPLING, peaks.cell.to(torch.float64)), noise
+    cell, row = (peaks.line - image.shape[1] // 2) / _OVERSAMPLING, peaks.cell.to(torch.float64)
+    return Scatterers(torch.where(peaks.power > 0, value, 0), cell, row), noise
 
 
 def _envelopes(sampling: Sampling, row: Tensor) -> tuple[Tensor, Tensor]:
-    """sinc(n - row) over range cells and its derivative in row, (trial, scatterer, range) each."""
-    value, slope, _ = sinc_slopes(torch.arange(sampling.cells, dtype=row.dtype, device=row.device) - row[..., None])
+    """Responses of the range cells to scatterers at `row` and their derivatives in row, (trial, scatterer, range) complex128 each."""
+    value, slope, _ = band_response(torch.arange(sampling.cells, dtype=row.dtype, device=row.device) - row[..., None], sampling.cells)
     return value, -slope
 
 
@@ -160,7 +161,7 @@ class _Step:
         back_turns = torch.stack([warped.u, -sampling.turns_per_square * warped.phi.square()], -1)
         right = torch.stack([found.cell, motion.w[:, None] * sampling.range_m(found.row) + motion.offset[:, None]], -2)
         envelope, slope = _envelopes(sampling, found.row)
-        weighted, back = (found.amplitude.conj()[..., None] * envelope).to(data.dtype), envelope.to(data.dtype).mT
+        weighted, back = (found.amplitude[..., None] * envelope).conj().to(data.dtype).resolve_conj(), envelope.mH.to(data.dtype).resolve_conj()
         real_bases = bases.to(data.real.dtype)
         residual = torch.empty_like(data)
         moments = data.real.new_zeros(data.shape[0], bases.shape[1], 2 * found.cell.shape[-1])
@@ -174,7 +175,7 @@ class _Step:
             moments += real_bases[:, :, part] @ torch.view_as_real((rest @ back) * turned_back).flatten(-2)
             shift += turned_back.mT @ rest
         moments = torch.view_as_complex(moments.unflatten(-1, (-1, 2)).to(torch.float64))
-        shifts = (shift.to(torch.complex128) * slope).sum(-1)
+        shifts = (shift.to(torch.complex128) * slope.conj()).sum(-1)
         return residual, _Step(sampling, motion, found, unknowns, moments.mT, shifts, Pairs.find(sampling, motion.k, found.amplitude, found.cell, bases))
 
     def taken(self) -> tuple[Motion, Scatterers, Tensor, Tensor]:
@@ -198,25 +199,25 @@ class _Step:
         (trial, 4 scatterer, unknown), and that of the shared ones (trial, unknown, unknown).
         """
         pairs, found = self.pairs, self.found
-        overlap, slope, bend = sinc_slopes(pairs.of(found.row, 1) - pairs.of(found.row, 0))
-        flat, line, bent = pairs.products[(0, 0)], 2 * math.pi * pairs.products[(0, 1)], 4 * math.pi**2 * pairs.products[(1, 1)].real
-        a, u, s, us = flat * overlap, line * overlap, flat * slope, line * slope
+        overlap, slope, bend = band_response(pairs.of(found.row, 0) - pairs.of(found.row, 1), self.sampling.cells)
+        flat, line, bent = pairs.products[(0, 0)], 2 * math.pi * pairs.products[(0, 1)], 4 * math.pi**2 * pairs.products[(1, 1)]
+        a, u, s, us = flat * overlap, line * overlap, -flat * slope, -line * slope
         rows = [
             [a.real, -a.imag, u.imag, s.real],
             [a.imag, a.real, -u.real, s.imag],
-            [-u.imag, -u.real, bent * overlap, -us.imag],
-            [-s.real, s.imag, -us.imag, -flat.real * bend],
+            [-u.imag, -u.real, (bent * overlap).real, -us.imag],
+            [-s.real, s.imag, -us.imag, -(flat * bend).real],
         ]
         local = pairs.matrix(rows)
         diagonal = local.diagonal(dim1=-2, dim2=-1)
-        diagonal += torch.where((found.amplitude == 0).repeat(1, 4), 1.0, _RIDGE * diagonal)
+        diagonal += torch.where(diagonal > 0, _RIDGE * diagonal, 1.0)  # no scatterer, or one range cell that tells nothing of range
         size = slopes.shape[-1]
         column, row = (slopes[pairs.trial, scatterer] for scatterer in (pairs.second, pairs.first))  # (pair, unknown, base)
         seen, bowed = (sum(pairs.products[(base, n)][:, None] * column[..., n] for n in range(2, size)) for base in (0, 1))
-        parts = [-(seen * overlap[:, None]).imag, (seen * overlap[:, None]).real, -2 * math.pi * (bowed * overlap[:, None]).real, (seen * slope[:, None]).imag]
+        parts = [-(seen * overlap[:, None]).imag, (seen * overlap[:, None]).real, -2 * math.pi * (bowed * overlap[:, None]).real, -(seen * slope[:, None]).imag]
         cross = torch.cat([pairs.per_scatterer(part) for part in parts], 1)
         shared = range(2, size)
-        both = torch.stack([(pairs.products[(n, m)].real * overlap)[:, None, None] * row[..., n, None] * column[:, None, :, m] for n in shared for m in shared]).sum(0)
+        both = torch.stack([(pairs.products[(n, m)] * overlap).real[:, None, None] * row[..., n, None] * column[:, None, :, m] for n in shared for m in shared]).sum(0)
         return local, cross, pairs.per_trial(both)
 
     def _moved(self, change: Tensor) -> Motion:

@@ -27,7 +27,7 @@ class OneScene:
     scene: Scene
     seed: int
 
-    def scatterers(self, draws: Draws) -> Scatterers:  # noqa: ARG002, the trials do not matter
+    def scatterers(self, draws: Draws) -> Scatterers:
         return self.scene.scatterers(Draws(self.seed))
 
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
+from torchsar.compensate.rotation.unknowns import k_name
 from torchsar.core import Signal
 from torchsar.study.cases import word_of
 from torchsar.study.pictures import Drawn, Picture, draw_all
@@ -53,7 +54,7 @@ class CaseResult:
         truth, wavelength = batch.truth.values, bench.table.radar.wavelength_m
         images = {name: in_metres(image_of(o.trace.signal), wavelength, scale_rate(o.found, bench.table, batch.truth, 0)) for name, o in batch.outcomes.items()}
         cuts = {name: {target: of_trials[0] for target, of_trials in outcome.cuts.items()} for name, outcome in batch.outcomes.items()}
-        scalars = {"omega_rad_s": truth["omega_rad_s"], "yc_m": truth["yc_m"], **{_k_name(i): k for i, k in enumerate(truth["warp_k"].unbind(-1))}}
+        scalars = {"omega_rad_s": truth["omega_rad_s"], "yc_m": truth["yc_m"], **{k_name(i + 1): k for i, k in enumerate(truth["warp_k"].unbind(-1))}}
         along, across, amplitude = (truth[name].reshape(-1, truth[name].shape[-1])[0] for name in ("range_m", "cross_range_m", "amplitude"))
         found = {name: _estimates(outcome.found, outcome.metrics) for name, outcome in batch.outcomes.items()}
         return CaseResult(batch.metrics, target_figures(batch, bench.config.metrics.reference), found, scalars, images, cuts, (along, across, amplitude))
@@ -75,18 +76,12 @@ class CaseResult:
         return {name: {key: torch.tensor(entry["value"], dtype=torch.float64) for key, entry in values.items()} for name, values in self.found.items() if values}
 
 
-def _k_name(i: int) -> str:
-    from torchsar.compensate.rotation.unknowns import k_name
-
-    return k_name(i + 1)
-
-
 def _estimates(found: Turned, metrics: Mapping[str, Tensor]) -> dict[str, dict[str, Any]]:
     """The scalars that metrics.json names, each with predicted deviation and verdict, lists over trials."""
     named = {name: (value, found.std.get(name)) for name, value in (("omega_rad_s", found.omega_rad_s), ("yc_m", found.yc_m)) if value is not None}
     if found.warp_k is not None:
         std = found.std.get("warp_k")
-        named.update({_k_name(i): (k, None if std is None else std[..., i]) for i, k in enumerate(found.warp_k.unbind(-1))})
+        named.update({k_name(i + 1): (k, None if std is None else std[..., i]) for i, k in enumerate(found.warp_k.unbind(-1))})
     trials = metrics["seconds"].shape
     ok = metrics["ok"].reshape(-1).tolist() if "ok" in metrics else None
     return {name: {"value": value.expand(trials).reshape(-1).tolist(), "std": None if s is None else s.expand(trials).reshape(-1).tolist(), "ok": ok} for name, (value, s) in named.items()}

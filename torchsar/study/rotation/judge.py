@@ -29,8 +29,10 @@ DEFINITIONS: dict[str, Any] = {
     "entropy_nats": "-sum p ln p, p = |I|^2 / sum |I|^2 over the whole image, nats; it grows with the lines of an image, ln 2 nats from oversampling 1 to 2",
     "entropy_above_ideal_nats": "entropy less that of the metrics.reference image of the same scene and noise",
     "contrast": "standard deviation over mean of the intensity |I|^2",
-    "targets": "cut along cross range through the range cell of a point target: peak_db, interpolated peak within metrics.search_m of the place, relative to the reference's; irw_azimuth_m, first to last "
-    "crossing of -3 dB about it; pslr_azimuth_db, strongest response beyond the first minima of the main lobe over the peak. Metres by the method's own rate, by the true mean rate where it finds none",
+    "targets": "cut along cross range through the range cell of a point target, metres by the method's own rate, by the true mean rate where it finds none",
+    "peak_db": "interpolated peak of the cut within metrics.search_m of the true place, relative to that of the reference",
+    "irw_azimuth_m": "width between the first crossings of -3 dB beside the peak of the cut",
+    "pslr_azimuth_db": "strongest response beyond the first minima beside the peak, over the peak",
     "evaluations": "evaluations of the objective that a search reports",
     "ok": "whether the method itself trusts its estimate",
     "seconds": "wall time of the chain of the method per trial",
@@ -57,8 +59,8 @@ class Turned:
         std: dict[str, Tensor] = {}
         for name, estimate in estimates.items():
             stage = chain.stages[name]
-            told = {"omega_rad_s"} if isinstance(stage, CoarseRotation) else set()
-            told |= set() if getattr(stage, "yc_m", 0.0) is None else {"yc_m"}
+            told = set() if getattr(stage, "yc_m", 0.0) is None else {"yc_m"}
+            told |= {"omega_rad_s", "yc_m"} if isinstance(stage, CoarseRotation) else set()
             for key in estimate.value.keys() - told:
                 found[key] = estimate.value[key]
                 std.pop(key, None)
@@ -141,9 +143,8 @@ class Cut:
         """peak (amplitude), irw_azimuth_m and pslr_azimuth_db."""
         power = self.line.abs().square()
         top = int(power.argmax())
-        above = torch.nonzero(power >= _DB3 * power[top])[:, 0]
+        width = _crossing(power, top, 1) - _crossing(power, top, -1)
         step = float(self.offset_m[1] - self.offset_m[0])
-        width = _crossing(power, int(above[-1]), 1, float(power[top])) - _crossing(power, int(above[0]), -1, float(power[top]))
         low, high = _minimum(power, top, -1), _minimum(power, top, 1)
         beside = torch.cat([power[:low], power[high + 1 :]])
         ratio = float(beside.max() / power[top]) if beside.numel() and float(power[top]) > 0 else 0.0
@@ -180,13 +181,15 @@ def _finer(line: Tensor, along: Axis, first: int, last: int, x_m: float, turns: 
     return Cut((places - x_m)[kept], fine[kept])
 
 
-def _crossing(power: Tensor, at: int, way: int, top: float) -> float:
-    """Where power falls through half the top between sample `at` and its neighbour, in samples."""
-    other = at + way
-    if not 0 <= other < len(power):
-        return float(at)
-    here, there = float(power[at]), float(power[other])
-    return at + way * ((here - _DB3 * top) / (here - there) if here > there else 0.0)
+def _crossing(power: Tensor, top: int, way: int) -> float:
+    """Where power first falls through half of that at the top, to one side, in samples."""
+    side = power[top:] if way > 0 else power[: top + 1].flip(0)
+    below = torch.nonzero(side < _DB3 * side[0])[:, 0]
+    if not len(below):
+        return float(top + way * (len(side) - 1))
+    at = int(below[0])
+    here, there = float(side[at - 1]), float(side[at])
+    return top + way * (at - 1 + (here - _DB3 * float(side[0])) / (here - there))
 
 
 def _minimum(power: Tensor, top: int, way: int) -> int:

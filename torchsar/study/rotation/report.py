@@ -46,7 +46,8 @@ def entropy_traps(metrics: Mapping[str, Any]) -> list[dict[str, str]]:
         trapped = [name for name, row in rows.items() if row.get("entropy_above_ideal_nats", 0.0) < -_TRAP_NATS and abs(row.get("k1_error_percent", 0.0)) > _TRAP_PERCENT]
         if trapped:
             figures = ", ".join(f"{name} ({rows[name]['entropy_above_ideal_nats']:.3f} nats, k1 {rows[name]['k1_error_percent']:.2g} % off)" for name in trapped)
-            notes.append({"title": f"Entropy trap, case {case}", "text": f"Wrong rotations give less entropy here than the right one, on the grid of its image: {figures}. A finer grid takes this away."})
+            text = f"Wrong rotations give less entropy here than the right one, on the grid of its image: {figures}. A finer grid takes this away."
+            notes.append({"title": f"Entropy trap, case {case}", "text": text})
     return notes
 
 

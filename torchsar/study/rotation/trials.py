@@ -206,7 +206,7 @@ def error_bounds(table: Turntable, truth: Truth, free_centre: bool) -> dict[str,
         free_centre=free_centre,
     )
     percent = 100 / values["omega_rad_s"]
-    found = {"omega_error_percent": deviations["omega_rad_s"] * percent, "cross_range_scale_error_percent": deviations["omega_rad_s"] * percent}
+    found = {"omega_error_percent": deviations["omega_rad_s"] * percent}
     for i in range(1, len(true_k(table)) + 1):
         name, scale = k_metric(i, true_k(table))
         found[name] = deviations[k_name(i)] * scale

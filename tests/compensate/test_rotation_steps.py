@@ -1,0 +1,199 @@
+"""The mathematics below the estimators of uneven rotation, against automatic differentiation and plain sums."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.compensate.turning import CELL, F64, K, OMEGA, PRF, PULSES, RANGE_M, WAVELENGTH, echo, noise, points, response, target
+from torchsar.compensate.rotation.histories import refined_by_histories, solved
+from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of, without_range_term
+from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
+from torchsar.compensate.rotation.scatterers import _RIDGE, Fit, Scatterers, _Step, _Unknowns
+from torchsar.core.warp import warp
+
+SAMPLING = Sampling(WAVELENGTH, PRF, PULSES, len(RANGE_M), float(RANGE_M[0]), CELL)
+TIME = torch.arange(PULSES, dtype=F64) / PRF
+
+
+def truth(k: Tensor = K, centre_m: float = 0.0) -> Motion:
+    one = torch.ones(1, dtype=F64)
+    return Motion(k[None], OMEGA**2 * one, 0 * one, centre_m * one)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+def test_slopes_of_the_normalised_warp(order: int) -> None:
+    k = torch.tensor([[10.0, 1000.0, 2e5], [-5.0, 3000.0, 0.0]], dtype=F64)[:, : order - 1]
+    warped = Warped.of(k, TIME, SAMPLING.duration_s)
+    whole = torch.tensor([SAMPLING.duration_s], dtype=F64)
+    torch.testing.assert_close(warped.phi, warp(TIME, k))
+    torch.testing.assert_close(warped.u, warp(TIME, k) / warp(whole, k))
+    assert warped.slopes.shape == (2, order - 1, PULSES)
+    for i in range(2 if order > 1 else 0):
+        slopes = torch.autograd.functional.jacobian(lambda k: warp(TIME, k) / warp(whole, k), k[i])
+        torch.testing.assert_close(warped.slopes[i], slopes.mT, rtol=1e-9, atol=1e-15)
+
+
+def test_the_range_term_is_taken_out() -> None:
+    data, motion = target(0), Motion(K[None], *torch.tensor([[4e-4], [2e-4], [1.5]], dtype=F64))
+    phi = warp(TIME, K)
+    lever = RANGE_M + 1.5 + 0.5  # v = w / 2
+    expected = data * torch.exp(-2j * math.pi / WAVELENGTH * lever * 4e-4 * phi[:, None].square())
+    torch.testing.assert_close(without_range_term(data[None], SAMPLING, motion, phi[None])[0], expected, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(motion.yc_m, torch.tensor([2.0], dtype=F64))
+    unknown = Motion(K[None], *torch.tensor([[-1e-9], [2e-4], [1.5]], dtype=F64))
+    assert unknown.yc_m == 1.5 and 0 <= unknown.omega_rad_s < 1e-100
+
+
+def test_the_image_focuses_every_scatterer() -> None:
+    x, _, amplitude = points(0, 5)
+    y = RANGE_M[[2, 6, 11, 15, 20]]
+    image = image_of(echo(x, y, amplitude)[None], SAMPLING, truth())[0]
+    cells = 2 * x * OMEGA * float(warp(torch.tensor([SAMPLING.duration_s], dtype=F64), K)) / WAVELENGTH
+    for cell, column, level in zip(cells.tolist(), (2, 6, 11, 15, 20), amplitude.abs().tolist()):
+        peak = image[:, column].abs().argmax()
+        assert abs(float(peak - PULSES) / 2 - cell) <= 0.3
+        assert abs(float(image[peak, column].abs()) / (level * math.sqrt(PULSES)) - 1) < 0.11
+
+
+def test_noise_power_and_threshold() -> None:
+    power = torch.stack([noise(seed, 500, 40).abs().square() for seed in range(20)])
+    found = noise_power(3.0 * power)
+    torch.testing.assert_close(found, torch.full((20,), 3.0, dtype=F64), rtol=0.05, atol=0)
+    above = (power > threshold(power)).flatten(1).any(1).sum()
+    assert above <= 6, "pixels of noise exceed the threshold once in some ten images"
+    power[0, :50] += 1e6
+    assert abs(float(noise_power(3.0 * power)[0]) / 3 - 1) < 0.25, "a tenth of the image full of scatterers moves the median a little"
+
+
+def test_peaks_against_a_plain_search() -> None:
+    power = torch.stack([noise(seed, 60, 12).abs().square() for seed in range(3)])
+    floor = torch.tensor([1.0, 2.0, 1e9], dtype=F64)
+    found = find_peaks(power, floor, 400, 0.5, 3, 1)
+    for trial in range(3):
+        plain = plain_peaks(power[trial], float(floor[trial]), 0.25, 3, 1)
+        live = found.power[trial] > 0
+        assert sorted(zip(found.line[trial, live].tolist(), found.cell[trial, live].tolist())) == plain
+        assert (found.power[trial].diff() <= 0).all()
+    few = found.first(torch.tensor([2, 400, 5]))
+    assert (few.power > 0).sum(-1).tolist() == [2, int((found.power[1] > 0).sum()), 0]
+
+
+def plain_peaks(power: Tensor, floor: float, share: float, lines: int, cells: int) -> list[tuple[int, int]]:
+    found = []
+    for i in range(power.shape[0]):
+        for j in range(power.shape[1]):
+            level = power[i, j]
+            cross = [power[a, b] for a, b in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)) if 0 <= a < power.shape[0] and 0 <= b < power.shape[1]]
+            around = power[max(0, i - lines) : i + lines + 1, max(0, j - cells) : j + cells + 1].max()
+            if level > floor and all(level > other for other in cross) and level >= share * around:
+                found.append((i, j))
+    return found
+
+
+@pytest.mark.parametrize("error", [(1.0, -60.0), (-2.0, 60.0)])
+def test_histories_correct_an_error(error: tuple[float, float]) -> None:
+    """One step takes out most of an error as of the coarse warp, and finds a rate that was not known."""
+    data, motion = target(0)[None], Motion.still((K + torch.tensor(error, dtype=F64))[None])
+    offset = (motion.k[0] - K).abs()
+    once, found = refined_by_histories(data, SAMPLING, motion)
+    assert found[0] > 5 and abs(float(once.omega_rad_s) / OMEGA - 1) < 0.25
+    twice, _ = refined_by_histories(data, SAMPLING, once)
+    thrice, _ = refined_by_histories(data, SAMPLING, twice)
+    assert ((once.k[0] - K).abs() < 0.5 * offset).all() and ((thrice.k[0] - K).abs() < 0.3 * offset).all()
+
+
+def test_histories_of_nothing_leave_the_motion() -> None:
+    start = Motion.still(K[None].expand(2, -1))
+    for data in (torch.zeros(2, PULSES, 24, dtype=torch.complex128), 0 * noise(0, 2, PULSES, 24)):
+        motion, found = refined_by_histories(data, SAMPLING, start)
+        assert torch.equal(motion.k, start.k) and found.tolist() == [0, 0] and motion.w.tolist() == [0, 0]
+
+
+def test_small_equations_of_any_scale() -> None:
+    rows = torch.randn(3, 10, 4, dtype=F64, generator=torch.Generator().manual_seed(0)) * torch.tensor([1e-9, 1.0, 1e6, 1e3], dtype=F64)
+    answer = torch.tensor([1e9, 2.0, 3e-6, 0.0], dtype=F64)
+    rows[:, :, 3] = 0
+    torch.testing.assert_close(solved(rows.mT @ rows, (rows.mT @ (rows @ answer)[..., None])[..., 0]), answer.expand(3, -1), rtol=1e-6, atol=1e-9)
+
+
+CELLS, SHORT = 16, 96
+SMALL = Sampling(WAVELENGTH, SHORT / SAMPLING.duration_s, SHORT, CELLS, -3.0, 0.4)
+FEW = 6
+
+
+def few() -> tuple[Scatterers, Motion]:
+    """Six scatterers that overlap, their Doppler cells on the steps of the table of couplings."""
+    source = torch.Generator().manual_seed(3)
+    level, phase, cell, row = (torch.rand(1, FEW, dtype=F64, generator=source) for _ in range(4))
+    motion = Motion(K[None], *torch.tensor([[4e-4], [1e-4], [0.7]], dtype=F64))
+    return Scatterers(torch.polar(0.5 + level, 6 * phase), (6 * 16 * (cell - 0.5)).round() / 16, 5 + 4 * row), motion
+
+
+def model(unknown: Tensor, found: Scatterers, motion: Motion) -> Tensor:
+    """Data of scatterers whose growth, turn, Doppler cell and row, and whose k, w and v, move by `unknown`.
+
+    As a step takes it, the range term stays that of the first rows and of the first warp.
+    """
+    grow, turn, line, row = unknown[: 4 * FEW].view(4, FEW)
+    k, w, v = motion.k[0] + unknown[4 * FEW : -2], motion.w + unknown[-2], motion.offset + motion.centre_m * unknown[-2] + unknown[-1]
+    time = torch.arange(SHORT, dtype=F64) / SMALL.prf_hz
+    phi = warp(time, k)
+    u = phi / warp(torch.tensor([SMALL.duration_s], dtype=F64), k)
+    range_m = SMALL.first_m + SMALL.step_m * found.row[0]
+    turns = -(found.cell[0] + line) * u[:, None] + (w * range_m + v) * warp(time, motion.k[0])[:, None].square() / WAVELENGTH
+    amplitude = found.amplitude[0] * torch.complex(1 + grow, turn)
+    profile = response(torch.arange(CELLS, dtype=F64) - (found.row[0] + row)[:, None], CELLS)
+    return torch.view_as_real((torch.exp(2j * math.pi * turns) * amplitude) @ profile)
+
+
+def step_of(data: Tensor, present: Tensor) -> tuple[Tensor, _Step]:
+    found, motion = few()
+    none = torch.zeros(1, dtype=torch.bool)
+    fit = Fit(motion, found, torch.zeros(1, 4, 4, dtype=F64), torch.ones(1, dtype=F64), none.long(), none)
+    return _Step.of(data, SMALL, fit, present, _Unknowns(2, True, True))
+
+
+@pytest.mark.parametrize("gaps", [False, True])
+def test_gradient_and_curvature_of_a_step_are_those_of_the_model(gaps: bool) -> None:
+    found, motion = few()
+    present = torch.ones(1, SHORT, dtype=torch.bool)
+    present[:, 20:33] = not gaps
+    zero = torch.zeros(4 * FEW + 4, dtype=F64)
+    data = torch.view_as_complex(model(zero, found, motion))[None] + 0.3 * noise(7, 1, SHORT, CELLS)
+    data = data * present[..., None]
+    residual, step = step_of(data, present)
+    expected = torch.view_as_real(residual[0])
+    torch.testing.assert_close(expected, (torch.view_as_real(data[0]) - model(zero, found, motion)) * present[0, :, None, None], atol=1e-9, rtol=0)
+    jacobian = torch.func.jacfwd(lambda x: model(x, found, motion))(zero) * present[0, :, None, None, None]
+    gradient = (jacobian * expected[..., None]).sum((0, 1, 2))
+    slopes = step._slopes()
+    turned = found.amplitude.conj()[..., None] * step.moments
+    own = torch.cat([turned[..., 0].real, turned[..., 0].imag, -2 * math.pi * turned[..., 1].imag, (found.amplitude.conj() * step.shift).real], -1)
+    torch.testing.assert_close(own[0], gradient[: 4 * FEW], rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(torch.einsum("bpin,bpn->bi", slopes, turned.imag)[0], gradient[4 * FEW :], rtol=1e-6, atol=1e-9)
+    flat = jacobian.flatten(0, 2)
+    local, cross, shared = step._curvature(slopes)
+    local = local[0] - torch.diag(local[0].diagonal() * _RIDGE / (1 + _RIDGE))
+    mine = torch.cat([torch.cat([local, cross[0]], 1), torch.cat([cross[0].mT, shared[0]], 1)])
+    size = flat.square().sum(0).sqrt()
+    torch.testing.assert_close(mine / size / size[:, None], flat.mT @ flat / size / size[:, None], rtol=0, atol=2e-3)
+
+
+def test_steps_explain_all_of_clean_data() -> None:
+    found, motion = few()
+    near = torch.zeros(4 * FEW + 4, dtype=F64)
+    near[: 2 * FEW], near[2 * FEW : 3 * FEW], near[3 * FEW : 4 * FEW] = 0.03, 0.02, -0.01
+    data = torch.view_as_complex(model(near, found, motion))[None]
+    present, none = torch.ones(1, SHORT, dtype=torch.bool), torch.zeros(1, dtype=torch.bool)
+    left = []
+    for _ in range(5):
+        fit = Fit(motion, found, torch.zeros(1, 4, 4, dtype=F64), torch.ones(1, dtype=F64), none.long(), none)
+        residual, step = _Step.of(data, SMALL, fit, present, _Unknowns(2, True, True))
+        left.append(float(residual.abs().square().sum() / data.abs().square().sum()))
+        _, found, _, covariance = step.taken()
+        assert (covariance.diagonal(dim1=1, dim2=2) > 0).all()
+    assert left[0] > 1e-4 and left[-1] < 1e-3 * left[0]

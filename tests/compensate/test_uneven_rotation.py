@@ -1,0 +1,273 @@
+"""The recommended estimator of uneven rotation, its steps, and the stages about it, on targets of thirty points."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.compensate.turning import F64, K, OMEGA, OPTIONS, PRF, PULSES, RADAR, RANGE_M, WAVELENGTH, echo, noise, noise_std, points, target, targets
+from torchsar.compensate import CorrectPulsePhase
+from torchsar.compensate.rotation import (
+    CoarseRotation,
+    PhaseFitRotation,
+    RotationAutofocus,
+    UnevenRotation,
+    coarse_rotation,
+    phase_fit_rotation,
+    rotating_autofocus,
+    uneven_rotation,
+)
+from torchsar.compensate.rotation.coarse import coarse_warp
+from torchsar.core import Alternate, Chain, Estimate, Signal, Turn, use
+from torchsar.core.warp import least_rate, warp
+from torchsar.focus import RangePhase
+from torchsar.metrics import residual_phase, rotation_bounds
+
+ESTIMATORS = {"coarse": coarse_rotation, "phase_fit": phase_fit_rotation, "uneven": uneven_rotation}
+
+
+def z_scores(found: Estimate, k: Tensor, yc_m: float | None = 0.0) -> Tensor:
+    """Errors over predicted deviations, (trial, unknown)."""
+    truth = {"omega_rad_s": OMEGA, **{f"k{i + 1}_per_s{i + 1 if i else ''}": float(value) for i, value in enumerate(k)}}
+    truth |= {} if yc_m is None else {"yc_m": yc_m}
+    return torch.stack([(found[name] - value) / found.std[name] for name, value in truth.items()], -1)
+
+
+@pytest.mark.parametrize("k", [(10.0, 1000.0), (0.0, 0.0), (20.0, -500.0), (-5.0, 3000.0), (40.0, 0.0), (0.0, 5000.0)], ids=str)
+def test_any_rotation_is_found_without_a_start(k: tuple[float, float]) -> None:
+    """Far outside of any box about the truth; (0, 5000) is where the first step of the brief was wrong. What is wrong is not ok."""
+    truth = torch.tensor(k, dtype=F64)
+    found = uneven_rotation(targets(4, k=truth), **OPTIONS)
+    right = (z_scores(found, truth).abs() < 6).all(-1)
+    assert right.sum() >= 3 and not (found.ok & ~right).any()
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+def test_every_order_with_the_centre_known_or_not(order: int, known: bool) -> None:
+    truth = torch.tensor([10.0, 1000.0, 2e5], dtype=F64)[: order - 1]
+    found = uneven_rotation(target(4, k=truth, yc_m=1.5), **OPTIONS, order=order, yc_m=1.5 if known else None)
+    assert found.ok and found["warp_k"].shape == (order - 1,)
+    assert z_scores(found, truth, None if known else 1.5).abs().max() < 5
+    assert found["yc_m"] == 1.5 if known else found.std["yc_m"] < 0.1
+
+
+def test_a_known_centre_per_trial() -> None:
+    data = torch.stack([target(4, yc_m=yc) for yc in (-2.0, 0.0, 1.5)])
+    centre = torch.tensor([-2.0, 0.0, 1.5], dtype=F64)
+    for name, estimator in ESTIMATORS.items():
+        found = estimator(data, **OPTIONS, yc_m=centre)
+        assert torch.equal(found["yc_m"], centre)
+        assert name == "coarse" or (found["omega_rad_s"] / OMEGA - 1).abs().max() < 0.05
+    wrong = uneven_rotation(data, **OPTIONS, yc_m=0.0)
+    assert (wrong["omega_rad_s"] / OMEGA - 1).abs().tolist()[0] > 0.02, "a centre that is not there biases the rate"
+
+
+@pytest.mark.parametrize("snr_db", [0.0, 20.0])
+def test_deviations_are_predicted_and_at_the_bound(snr_db: float) -> None:
+    data = torch.stack([target(0, snr_db, draw=draw) for draw in range(10)])
+    found = uneven_rotation(data, **OPTIONS)
+    x, y, amplitude = points(0)
+    std = noise_std(echo(x, y, amplitude), snr_db)
+    bound = rotation_bounds(x, y, amplitude, std, OMEGA, K, wavelength_m=WAVELENGTH, prf_hz=PRF, n_pulse=PULSES)
+    assert found.ok.all()
+    for name, least in bound.items():
+        assert 0.9 * least < found.std[name].median() < 1.4 * least, name
+    rms = z_scores(found, K).square().mean(0).sqrt()
+    assert (rms > 0.5).all() and (rms < 1.5).all()
+
+
+def test_each_step_comes_closer() -> None:
+    data = targets(4)
+    errors = {name: (estimator(data, **OPTIONS)["warp_k"] / K - 1).abs().median(0).values for name, estimator in ESTIMATORS.items()}
+    assert (errors["coarse"] < torch.tensor([0.5, 0.1], dtype=F64)).all() and (errors["coarse"] > errors["phase_fit"]).all()
+    assert (errors["uneven"] < 2e-3).all() and (errors["phase_fit"] > errors["uneven"]).all()
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_a_batch_equals_its_singles(name: str) -> None:
+    """With neighbours that are louder, empty, noise alone, or settle at another step."""
+    data = torch.stack([target(0), 1e4 * target(1, -5.0), torch.zeros(PULSES, 24), noise(0, PULSES, 24), 1e-4 * target(2, 40.0)]).to(torch.complex128)
+    together = ESTIMATORS[name](data, **OPTIONS)
+    for i in (0, 1, 2, 4):
+        alone = ESTIMATORS[name](data[i], **OPTIONS)
+        for key, value in alone.value.items():
+            torch.testing.assert_close(together[key][i], value, rtol=1e-6, atol=1e-9)
+        for key, value in alone.std.items():
+            torch.testing.assert_close(together.std[key][i], value, rtol=1e-4, atol=1e-9)
+        assert alone.ok == together.ok[i] and torch.allclose(alone.quality, together.quality[i], atol=1e-6)
+    assert together.ok.tolist() == [True, name != "uneven" or bool(together.ok[1]), bool(together.ok[2]), bool(together.ok[3]), True]
+    grid = ESTIMATORS[name](data[:4].view(2, 2, PULSES, 24), **OPTIONS)
+    assert grid["warp_k"].shape == (2, 2, 2) and torch.equal(grid["warp_k"].flatten(0, 1), ESTIMATORS[name](data[:4], **OPTIONS)["warp_k"])
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_single_precision_is_enough(name: str) -> None:
+    data = targets(2)
+    double, single = ESTIMATORS[name](data, **OPTIONS), ESTIMATORS[name](data.to(torch.complex64), **OPTIONS)
+    torch.testing.assert_close(single["warp_k"], double["warp_k"], rtol=1e-4, atol=0)
+    assert all(value.dtype == F64 for value in single.value.values())
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-20, 1e20, 1e300])
+def test_the_scale_of_the_data_does_not_matter(scale: float) -> None:
+    data = target(0)
+    found, scaled = uneven_rotation(data, **OPTIONS), uneven_rotation(scale * data, **OPTIONS)
+    torch.testing.assert_close(scaled["warp_k"], found["warp_k"], rtol=1e-6, atol=0)
+    torch.testing.assert_close(scaled.std["omega_rad_s"], found.std["omega_rad_s"], rtol=1e-4, atol=0)
+    if 1e-30 < scale < 1e30:
+        small = uneven_rotation((scale * data).to(torch.complex64), **OPTIONS)
+        torch.testing.assert_close(small["warp_k"], found["warp_k"], rtol=1e-4, atol=0)
+
+
+def test_where_the_range_axis_begins() -> None:
+    """An axis that is shifted as a whole is a centre deviation; one that is cropped is none."""
+    data = target(4)
+    usual = uneven_rotation(data, **OPTIONS)
+    shifted = uneven_rotation(data, **{**OPTIONS, "range_m": RANGE_M + 700.0})
+    torch.testing.assert_close(shifted["yc_m"], usual["yc_m"] - 700.0, rtol=0, atol=1e-3)
+    torch.testing.assert_close(shifted["omega_rad_s"], usual["omega_rad_s"], rtol=1e-4, atol=0)
+    cropped = uneven_rotation(data[:, 5:], **{**OPTIONS, "range_m": RANGE_M[5:]})
+    assert cropped.ok and (cropped["omega_rad_s"] / OMEGA - 1).abs() < 0.05 and (cropped["warp_k"] / K - 1).abs().max() < 0.01 and cropped["yc_m"].abs() < 0.1
+    backwards = uneven_rotation(data.flip(1), **{**OPTIONS, "range_m": RANGE_M.flip(0)})
+    assert z_scores(backwards, K).abs().max() < 5
+
+
+def test_odd_and_missing_pulses() -> None:
+    for data in (target(4, n_pulse=801), with_gaps(target(4), 0.1), with_gaps(target(4), 0.5)):
+        found = uneven_rotation(data, **OPTIONS)
+        assert found.ok and z_scores(found, K).abs().max() < 6
+
+
+def with_gaps(data: Tensor, share: float) -> Tensor:
+    """Without a share of its pulses, at random places."""
+    missing = torch.rand(len(data), generator=torch.Generator().manual_seed(5)) < share
+    return torch.where(missing[:, None], 0, data)
+
+
+def degenerate() -> dict[str, Tensor]:
+    x, y, amplitude = points(0, 1)
+    one = echo(x, y, amplitude)
+    row = echo(points(0)[0], torch.zeros(30, dtype=F64), points(0)[2])
+    return {
+        "noise": noise(1, PULSES, 24),
+        "empty": torch.zeros(PULSES, 24, dtype=torch.complex128),
+        "constant": torch.ones(PULSES, 24, dtype=torch.complex128),
+        "one point": one + 0.1 * noise(2, PULSES, 24),
+        "one range cell": row + 0.1 * noise(3, PULSES, 24),
+        "one sample": torch.zeros(PULSES, 24, dtype=torch.complex128).index_put((torch.tensor(7), torch.tensor(7)), torch.tensor(1.0 + 0j, dtype=torch.complex128)),
+        "8 pulses": target(0)[:8],
+    }
+
+
+@pytest.mark.parametrize("kind", degenerate())
+def test_what_cannot_be_known_is_not_ok_but_finite(kind: str) -> None:
+    data = degenerate()[kind]
+    for estimator in ESTIMATORS.values():
+        found = estimator(data, **OPTIONS)
+        assert all(torch.isfinite(value).all() for value in (*found.value.values(), found.quality)), kind
+        assert not any(value.isnan().any() for value in (*found.std.values(), *found.info.values()))
+        assert 0 <= found.quality <= 1 and found["omega_rad_s"] >= 0
+    assert not uneven_rotation(data, **OPTIONS).ok
+
+
+def test_one_range_cell_tells_the_warp_but_not_the_rate() -> None:
+    found = uneven_rotation(degenerate()["one range cell"], **OPTIONS)
+    assert found.info["focused"] and not found.ok
+    assert ((found["warp_k"] - K) / found.std["warp_k"]).abs().max() < 6
+
+
+def test_the_same_again() -> None:
+    data = targets(2, snr_db=0.0).to(torch.complex64)
+    once, again = uneven_rotation(data, **OPTIONS), uneven_rotation(data.clone(), **OPTIONS)
+    assert all(torch.equal(value, again[name]) for name, value in once.value.items())
+
+
+def test_the_coarse_warp_turns_on_and_on() -> None:
+    """Whatever the data: a warp that turns back has no image."""
+    data = torch.cat([noise(0, 4, PULSES, 24), torch.zeros(1, PULSES, 24), torch.ones(1, PULSES, 24)])
+    k = coarse_warp(data, PRF)
+    assert torch.isfinite(k).all() and (least_rate(k, PULSES / PRF) > 0).all()
+    assert coarse_warp(data[:, :8], PRF).shape == (6, 2) and torch.isfinite(coarse_warp(data[:, :9, :1], PRF)).all()
+
+
+def test_the_coarse_warp_does_not_see_the_rate_or_the_scale_of_the_pulse_rate() -> None:
+    data = target(0)
+    k = coarse_warp(data[None], PRF)
+    torch.testing.assert_close(coarse_warp(data[None], 10 * PRF), k * torch.tensor([10.0, 100.0], dtype=F64), rtol=1e-9, atol=0)
+    torch.testing.assert_close(coarse_warp(data[None].conj().resolve_conj(), PRF), k, rtol=1e-6, atol=0)
+
+
+def signal_of(data: Tensor) -> Signal:
+    return Signal(data, RADAR.raw_axes(*data.shape[-2:], start_s=3.0))
+
+
+@pytest.mark.parametrize("stage", [UnevenRotation(RADAR), CoarseRotation(RADAR), PhaseFitRotation(RADAR), UnevenRotation(RADAR, 4), UnevenRotation(RADAR, yc_m=0.5)], ids=lambda s: type(s).__name__)
+def test_stages_offer_what_they_promise(stage) -> None:
+    found = stage(signal_of(targets(2).to(torch.complex64)))
+    assert set(found.value) == set(stage.provides)
+    assert found["warp_k"].shape == (2, stage.order - 1) and torch.equal(found["warp_k"][:, 0], found["k1_per_s"])
+
+
+def test_stages_are_the_functions_on_axes() -> None:
+    data = target(0, yc_m=0.7)
+    found = UnevenRotation(RADAR)(signal_of(data), yc_m=torch.tensor(0.7, dtype=F64))
+    assert torch.equal(found["warp_k"], uneven_rotation(data, **OPTIONS, yc_m=0.7)["warp_k"]) and found["yc_m"] == 0.7
+    held = UnevenRotation(RADAR, yc_m=0.7)(signal_of(data))
+    assert torch.equal(held["warp_k"], found["warp_k"])
+
+
+def pulse_phases() -> Tensor:
+    return torch.cumsum(0.15 * torch.randn(PULSES, dtype=F64, generator=torch.Generator().manual_seed(9)), 0)
+
+
+def test_the_autofocus_takes_the_rotation_out() -> None:
+    walk, data = pulse_phases(), target(0)
+    damaged = data * torch.exp(1j * walk)[:, None]
+    phi = warp(torch.arange(PULSES, dtype=F64) / PRF, K)
+    flat = damaged * torch.exp(-2j * math.pi / WAVELENGTH * RANGE_M * (OMEGA * phi[:, None]).square())
+    found = rotating_autofocus(flat, PRF, K[None])
+    assert found.ok and off_the_warp(found["phase_rad"] - walk, phi) < 0.1
+    blind = RotationAutofocus(RADAR)(signal_of(damaged))
+    assert off_the_warp(blind["phase_rad"] - walk, phi) > 0.3, "an autofocus that knows of no rotation leaves more"
+    told = RotationAutofocus(RADAR)(signal_of(damaged), omega_rad_s=torch.tensor(OMEGA, dtype=F64), warp_k=K, yc_m=torch.tensor(0.0, dtype=F64))
+    torch.testing.assert_close(told["phase_rad"], found["phase_rad"], atol=1e-6, rtol=0)
+
+
+def off_the_warp(error: Tensor, phi: Tensor) -> float:
+    """Rms of phases (rad) less the constant and the line in the warp that no image shows, to the nearest turn."""
+    basis = torch.stack([torch.ones_like(phi), phi / phi[-1]], -1)
+    smooth = torch.linalg.lstsq(basis, residual_phase(error)[..., None]).solution
+    left = residual_phase(error) - (basis @ smooth)[..., 0]
+    return float(torch.angle(torch.exp(1j * left)).square().mean().sqrt())
+
+
+def test_phase_and_rotation_in_turn() -> None:
+    """A phase that is free in every pulse and a rotation: the autofocus takes yc with it, so the estimator holds it."""
+    damaged = target(0) * torch.exp(1j * pulse_phases())[:, None]
+    stage = Alternate(3, phase=Turn(RotationAutofocus(RADAR), CorrectPulsePhase()), rotation=Turn(UnevenRotation(RADAR, yc_m=0.0), RangePhase(RADAR)))
+    alone = UnevenRotation(RADAR)(signal_of(damaged))
+    found = Chain(fit=stage, out=use(CorrectPulsePhase(), phase_rad="fit")).trace(signal_of(damaged)).estimates["fit"]
+    assert (found["warp_k"] / K - 1).abs().max() < 0.05
+    assert found.info["rotation.entropy_nats"] < alone.info["entropy_nats"] - 0.3
+
+
+def test_refusals() -> None:
+    data = target(0)
+    with pytest.raises(ValueError, match="at least 8 pulses"):
+        uneven_rotation(data[:7], **OPTIONS)
+    with pytest.raises(TypeError, match="complex range-compressed samples .* got torch.float64"):
+        uneven_rotation(data.real, **OPTIONS)
+    with pytest.raises(ValueError, match="1 of 19200 samples are NaN or Inf"):
+        uneven_rotation(data.index_put((torch.tensor(3), torch.tensor(5)), torch.tensor(math.nan + 0j, dtype=data.dtype)), **OPTIONS)
+    with pytest.raises(ValueError, match="range_m needs the 24 coordinates"):
+        uneven_rotation(data, **{**OPTIONS, "range_m": RANGE_M[:5]})
+    with pytest.raises(ValueError, match="wavelength_m must be a positive number, got -1"):
+        uneven_rotation(data, **{**OPTIONS, "wavelength_m": -1.0})
+    with pytest.raises(ValueError, match="order must be 1"):
+        uneven_rotation(data, **OPTIONS, order=0)
+    with pytest.raises(ValueError, match="an order of 1"):
+        UnevenRotation(RADAR, 0)

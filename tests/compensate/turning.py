@@ -1,0 +1,58 @@
+"""Range-compressed pulses of small targets that turn unevenly, made by plain formulas (brief 003, Eq. 3, with sine and cosine unabridged)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchsar.core.warp import warp
+from torchsar.radar import LIGHT_M_S, InverseRadar
+
+F64 = torch.float64
+WAVELENGTH, PRF, PULSES, BINS, CELL, OMEGA = 1.55e-6, 40e3, 800, 24, 0.3, 0.02
+K = torch.tensor([10.0, 1000.0], dtype=F64)
+RANGE_M = CELL * (torch.arange(BINS, dtype=F64) - BINS // 2)
+RADAR = InverseRadar(LIGHT_M_S / WAVELENGTH, LIGHT_M_S / (2 * CELL), PRF)
+OPTIONS = {"wavelength_m": WAVELENGTH, "prf_hz": PRF, "range_m": RANGE_M}
+
+
+def points(seed: int = 0, count: int = 30) -> tuple[Tensor, Tensor, Tensor]:
+    """Cross range over 0.6 m, range over 5.6 m, complex amplitudes of levels 0.5 to 1.5."""
+    source = torch.Generator().manual_seed(seed)
+    x, y, level, phase = (torch.rand(count, generator=source, dtype=F64) for _ in range(4))
+    return 0.6 * (x - 0.5), 5.6 * (y - 0.5), torch.polar(0.5 + level, 2 * math.pi * phase)
+
+
+def echo(x: Tensor, y: Tensor, amplitude: Tensor, k: Tensor = K, yc_m: float = 0.0, n_pulse: int = PULSES) -> Tensor:
+    """(pulse, range) complex128."""
+    angle = OMEGA * warp(torch.arange(n_pulse, dtype=F64) / PRF, k)
+    way = x[:, None] * torch.sin(angle) - (y + yc_m)[:, None] * 2 * torch.sin(angle / 2).square()
+    return (torch.exp(-4j * math.pi / WAVELENGTH * way) * amplitude[:, None]).mT @ response((RANGE_M - y[:, None]) / CELL, BINS)
+
+
+def response(x: Tensor, cells: int) -> Tensor:
+    """Of range cells x cells away from a scatterer: the mean of the `cells` frequencies that an FFT of so many samples has."""
+    frequency = (torch.arange(cells, dtype=F64) - cells // 2) / cells
+    return torch.exp(2j * math.pi * x[..., None] * frequency).mean(-1)
+
+
+def noise(seed: int, *shape: int) -> Tensor:
+    return torch.randn(shape, dtype=torch.complex128, generator=torch.Generator().manual_seed(1000 + seed))
+
+
+def noise_std(clean: Tensor, snr_db: float) -> Tensor:
+    """SNR: mean power of all samples over the noise power."""
+    return (clean.abs().square().mean() * 10 ** (-snr_db / 10)).sqrt()
+
+
+def target(seed: int = 0, snr_db: float = 20.0, k: Tensor = K, yc_m: float = 0.0, n_pulse: int = PULSES, draw: int = 0) -> Tensor:
+    """One scene, one draw of the noise."""
+    clean = echo(*points(seed), k, yc_m, n_pulse)
+    return clean + noise_std(clean, snr_db) * noise(100 * seed + draw, *clean.shape)
+
+
+def targets(count: int, **options) -> Tensor:
+    """As many scenes, (trial, pulse, range)."""
+    return torch.stack([target(seed, **options) for seed in range(count)])

@@ -1,0 +1,136 @@
+"""`torchsar requires` for targets that turn unevenly: limits of their estimators, and what the scene requires of its model."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Draws
+from torchsar.focus.ladar_requirements import Limit
+from torchsar.focus.requirements import Requirement
+from torchsar.focus.rotation_requirements import least_order, rotation_limits, rotation_requirements
+from torchsar.metrics.rotation_bounds import rotation_bounds
+from torchsar.study.case_run import write_requirements
+from torchsar.study.cases import cases_of
+from torchsar.study.config import Loaded
+from torchsar.study.errors import ConfigError
+from torchsar.study.registry import stages
+from torchsar.study.rotation.build import Turntable, check, refuse_recordings
+from torchsar.study.rotation.sections import RotationConfig
+from torchsar.study.rotation.trials import true_k
+
+log = logging.getLogger("torchsar")
+# limits that stop only methods which estimate something
+_OF_ESTIMATORS = {"scatterers above the noise": "warp_k", "range term, pi lambda sigma_y / ra^2": "omega_rad_s"}
+
+
+def requires(loaded: Loaded, out: Path | None) -> str:
+    """Both tables of every case of a simulation as text, predicted from the config alone. With `out`: config.yaml, requires.json and requires.txt there."""
+    refuse_recordings(loaded)
+    check(loaded)
+
+    def find() -> tuple[str, dict[str, object]]:
+        found = {name or loaded.name: Needs.of(case) for name, case in cases_of(loaded).items()}
+        return "\n\n".join(_text(name, needs) for name, needs in found.items()), {name: needs.tree() for name, needs in found.items()}
+
+    return write_requirements(loaded, out, find)
+
+
+def heed_limits(loaded: Loaded, case: str) -> None:
+    """Refuse a case beyond a limit that stops a method, unless the config shows the method beyond its limits on purpose; warn of the other limits.
+
+    Raises ConfigError with the limit, what it comes to and what helps.
+    """
+    where = f"cases.{case}: " if case else ""
+    for limit in Needs.of(loaded).limits:
+        stopped = _stopped(limit, loaded) if limit.verdict == "refuse" else []
+        if stopped:
+            raise ConfigError(f"{loaded.file}: {where}processor.{stopped[0]}: {limit.sentence} (or name the method in beyond_limits)")
+        if limit.verdict != "ok":
+            log.warning("warning: %s%s", where, limit.sentence)
+
+
+def _stopped(limit: Limit, loaded: Loaded) -> list[str]:
+    """Methods that a limit stops and that the config does not show beyond their limits."""
+    config = loaded.config
+    assert isinstance(config, RotationConfig)
+    names = [name for name in config.processor if name not in config.beyond_limits]
+    estimated = _OF_ESTIMATORS.get(limit.name)
+    return names if estimated is None else [name for name in names if estimated in _estimated(loaded, name)]
+
+
+def _estimated(loaded: Loaded, name: str) -> set[str]:
+    """Values that the stages of a method estimate."""
+    radar, found = Turntable.of(loaded).radar, set()
+    for stage, entry in (loaded.config.processor[name].stages or {}).items():
+        made = stages().make({key: value for key, value in entry.items() if key != "uses"}, f"processor.{name}.stages.{stage}", loaded.file, radar=radar)
+        found |= set(getattr(made, "provides", ()))
+    return found
+
+
+@dataclass(frozen=True)
+class Needs:
+    """Limits and fidelity rows of one case."""
+
+    limits: tuple[Limit, ...]
+    rows: tuple[Requirement, ...]
+
+    @staticmethod
+    def of(loaded: Loaded) -> Needs:
+        """Predicted from the first trial of a run. Raises ConfigError for what the world refuses."""
+        try:
+            return _needs(Turntable.of(loaded), loaded.config.seed)
+        except ValueError as error:
+            raise ConfigError(f"{loaded.file}: {' '.join(str(error).split())}") from None
+
+    def tree(self) -> dict[str, object]:
+        limits = [{**asdict(limit), "verdict": limit.verdict} for limit in self.limits]
+        rows = [{**asdict(row), "ok": row.ok, "verdict": row.verdict} for row in self.rows]
+        return {"limits": limits, "order": least_order(self.rows), "fidelity": self.fidelity, "requirements": rows}
+
+    @property
+    def fidelity(self) -> str:
+        """The simplest echo model that the scene allows."""
+        return "phase_only" if next(row for row in self.rows if row.effect.startswith("fixed envelopes")).ok else "dechirped"
+
+
+def _needs(table: Turntable, seed: int) -> Needs:
+    scene = table.world.scene.scatterers(Draws(seed, "run", [0]))
+    x, y, amplitude = (v.reshape(-1, v.shape[-1])[0] for v in (scene.azimuth_m, scene.range_m, scene.amplitude))
+    yc, omega, k = float(table.world.centre_deviation_m), float(table.rotation.omega_rad_s), true_k(table)
+    noise_std = _noise_std(table, amplitude)
+    bound = _rate_bound(table, x, y, amplitude, noise_std) if noise_std > 0 else None
+    limits = rotation_limits(table.radar, table.pulses, omega, k, x, y + yc, amplitude, noise_std, bound)
+    rows = rotation_requirements(table.radar, table.pulses, omega, k, float(x.abs().max()), float((y + yc).abs().max()))
+    return Needs(limits, rows)
+
+
+def _noise_std(table: Turntable, amplitude: Tensor) -> float:
+    """Of the noise of a sample, from the mean power of scatterers spread over the range cells."""
+    snr_db = table.world.snr_db
+    return 0.0 if snr_db is None else math.sqrt(float(amplitude.abs().square().sum()) / table.samples) * 10 ** (-float(snr_db) / 20)
+
+
+def _rate_bound(table: Turntable, x: Tensor, y: Tensor, amplitude: Tensor, noise_std: float) -> float:
+    """The centre known: with a free one it is larger where the ranges are few."""
+    k = torch.tensor(true_k(table), dtype=torch.float64)
+    told = {"wavelength_m": table.radar.wavelength_m, "prf_hz": table.radar.prf_hz, "n_pulse": table.pulses, "free_centre": False}
+    return float(rotation_bounds(x, y, amplitude, noise_std, float(table.rotation.omega_rad_s), k, float(table.world.centre_deviation_m), **told)["omega_rad_s"])
+
+
+def _text(name: str, needs: Needs) -> str:
+    lines = [name, f"{'limit':<42}{'value':>12}{'limit':>14} {'unit':<6}{'verdict':<9}what then"]
+    for row in needs.limits:
+        then = "" if row.ok else f"{row.consequence}; {row.remedy}"
+        lines.append(f"{row.name:<42}{row.value:>12.4g}{('>= ' if row.at_least else '< ') + format(row.limit, '.4g'):>14} {row.unit:<6}{row.verdict:<9}{then}".rstrip())
+    lines += ["", f"{'simplification':<32}{'neglected phase':>16}{'range cells':>13}  {'verdict':<48}neglects"]
+    for row in needs.rows:
+        cells = "" if math.isnan(row.range_cells) else f"{row.range_cells:.3g}"
+        lines.append(f"{row.effect:<32}{row.phase_rad:>12.3g} rad{cells:>13}  {row.verdict:<48}{row.neglects}")
+    order = least_order(needs.rows)
+    return "\n".join([*lines, f"the simplest model that this scene allows: order {order}{'' if order <= 4 else ' or more'}, {needs.fidelity}"])
