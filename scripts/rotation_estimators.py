@@ -179,7 +179,7 @@ def main(arguments: list[str] | None = None) -> None:
     bench = simulated("tiny" if options.small else "mid", options.seed, options.snr_db)
     print(f"{'estimator':34}{'evals':>8}{'CPU s':>10}{'Om (%)':>11}{'k1 (%)':>11}{'k2 (%)':>11}{'ok':>5}")
     without_box(bench)
-    from_starts(bench, 2 if options.small else 20, (1.0,) if options.small else (1.0, 2.0, 4.0))
+    from_starts(bench, 1 if options.small else 20, (1.0,) if options.small else (1.0, 2.0, 4.0))
     in_box(bench, 1 if options.small else options.genetic_seeds, (3, 2, 2) if options.small else (39, 30, 36))  # 162, 870 and 888 evaluations
     ratios(bench, on_grid(bench, (1, 2, 2) if options.small else PART))
     draw(bench, options.out / "time_and_error.png")

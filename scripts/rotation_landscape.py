@@ -49,11 +49,12 @@ class Cut:
 
     @property
     def minimum(self) -> float:
-        """Ratio at the vertex of the parabola through the least value and its neighbours."""
-        i = int(self.entropy[1:-1].argmin()) + 1
+        """Ratio at the vertex of the parabola through the least value and its neighbours, or the end of the cut where that is least."""
+        i = int(self.entropy.argmin())
+        if i in (0, len(self.ratio) - 1):
+            return float(self.ratio[i])
         below, here, above = (float(e) for e in self.entropy[i - 1 : i + 2])
-        bend = below - 2 * here + above
-        return float(self.ratio[i]) + (0.5 * (below - above) / bend if bend > 0 else 0.0) * float(self.ratio[1] - self.ratio[0])
+        return float(self.ratio[i]) + 0.5 * (below - above) / (below - 2 * here + above) * float(self.ratio[1] - self.ratio[0])
 
     @property
     def minima(self) -> int:

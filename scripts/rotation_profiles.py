@@ -29,7 +29,7 @@ OMEGA_RAD_S, WARP_K = 0.02, (10.0, 1000.0)
 TRUE_K = torch.tensor(WARP_K, dtype=torch.float64)
 PLACES_M, RANGE_M = (-12.0, 0.0, 12.0), 12.0
 FINE = 16  # lines of a profile per Doppler cell
-WINDOW_M = 1.5  # of a profile to either side of its strongest part
+REACH_M = 5.0  # to either side of a point, for the figures of its profile
 SECOND_K1 = 20.8  # of a fit of second order to the phase by least squares; least entropy gives 20.05, k1 + k2 T / 2 is 20
 NAMES = {"none": "no compensation", "order 2": "order 2, azimuth", "true k1": "true k1, k2 = 0", "azimuth": "order 3, azimuth", "full": "order 3, two-dimensional"}
 EXPECTED = {  # brief 003, experiment 1: peak (dB), width (mm), highest side lobe (dB) at 12 m and at 0 m
@@ -109,16 +109,16 @@ def compensated(signal: Signal, radar: InverseRadar) -> dict[str, Profile]:
 def table(profiles: Mapping[str, Profile]) -> None:
     print(f"{'three points, y = 12 m':26}" + "".join(f"{f'x = {x:g} m':>27}" for x in PLACES_M) + f"{'expected, 12 m':>27}{'expected, 0 m':>27}")
     for name, profile in profiles.items():
-        cells = [profile.near(x, 3.5 * WINDOW_M).figures() for x in PLACES_M]
+        cells = [profile.near(x, REACH_M).figures() for x in PLACES_M]
         known = EXPECTED.get(name, (None, None))
         print(f"{NAMES[name]:26}" + "".join(f"{'-' if one is None else '{:.1f} dB {:.2f} mm {:.1f} dB'.format(*one):>27}" for one in (*cells, *known)))
 
 
-def draw_profiles(profiles: Mapping[str, Profile], names: Sequence[str], reach_m: float, path: Path) -> None:
-    """Profiles of the three points, beside each other."""
+def draw_profiles(profiles: Mapping[str, Profile], names: Sequence[str], reach_m: Sequence[float], path: Path) -> None:
+    """Profiles of the three points, beside each other, each within its reach."""
     parts = []
-    for place in PLACES_M:
-        near = {NAMES[name]: profiles[name].near(place, reach_m) for name in names}
+    for place, reach in zip(PLACES_M, reach_m, strict=True):
+        near = {NAMES[name]: profiles[name].near(place, reach) for name in names}
         series = {name: (plot.array(p.cross_range_m), plot.decibel(p.amplitude, 1.0)) for name, p in near.items()}
         parts.append({"series": series, "xlabel": "cross range (m)", "ylabel": "amplitude (dB of an ideal point)", "title": f"x = {place:g} m", "ylim": (-50.0, 3.0)})
     plot.save(plot.panels(parts, columns=3), path)
@@ -160,10 +160,10 @@ def main(arguments: list[str] | None = None) -> None:
     world = TurntableWorld(points, rotation=PolynomialRotation(OMEGA_RAD_S, WARP_K))
     profiles = compensated(simulate_turntable(radar, world, 20000, 8, Draws(1))[0].signal, radar)
     table(profiles)
-    draw_profiles(profiles, ("none", "azimuth", "full"), 0.05, options.out / "figure_02.png")
-    draw_profiles(profiles, ("none", "order 2", "full"), 0.05, options.out / "figure_03.png")
+    draw_profiles(profiles, ("none", "azimuth", "full"), (0.05, 0.05, 0.05), options.out / "figure_02.png")
+    draw_profiles(profiles, ("none", "order 2", "full"), (1.5, 0.05, 1.5), options.out / "figure_03.png")
 
-    yc = torch.linspace(-3, 3, 5 if options.small else 13, dtype=torch.float64)
+    yc = torch.linspace(-3, 3, 3 if options.small else 13, dtype=torch.float64)
     size = (instrument(0.24, 50e3), 1000, 32, 60) if options.small else (instrument(0.24, 500e3), 10000, 32, 300)
     cell = {f"y = {y:g} m": one_cell(yc, y) for y in (3.4, 6.0, 12.0)}
     image = whole_image(yc, *size, options.snr_db)

@@ -84,11 +84,18 @@ def draw_target(truth: Truth, path: Path) -> None:
     plot.save(plot.places(y, x, abs(a), "range (m)", "cross range (m)", f"{len(x)} scatterers"), path)
 
 
+def over_peak(image: Signal) -> Signal:
+    return image.with_data(image.data / image.data.abs().max())
+
+
 def draw_images(shown: Mapping[str, Signal], half_width_m: float, out: Path) -> None:
-    """Figures 5 to 8: every method and two regions of it, in dB of its peak. Figure 9: the best image alone, in metres."""
+    """Figures 5 to 8: every method and two regions of it, in dB of its peak. Figure 9: the best image alone, in metres. And all methods together, each over its peak."""
     for name, file in FIGURES.items():
         parts = {region: cropped(shown[name], *edges, half_width_m) for region, edges in ({name: WHOLE} | REGIONS).items()}
         plot.save(plot.images(parts, 40, 3, percentile=100), out / file)
+    compared = [cropped(shown[name], *edges, half_width_m) for edges in (WHOLE, REGIONS["A, tip of a panel"]) for name in FIGURES]
+    titles = [*FIGURES, *("tip of a panel" + " " * i for i in range(len(FIGURES)))]
+    plot.save(plot.images({title: over_peak(image) for title, image in zip(titles, compared, strict=True)}, 40, len(FIGURES), percentile=100), out / "methods.png")
     best = cropped(shown["order 3, two-dimensional"], *WHOLE, half_width_m)
     plot.save(plot.image(best, 40, "scaled to metres", percentile=100), out / "figure_09.png")
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.compensate.turning import CELL, F64, K, OMEGA, PRF, PULSES, RANGE_M, WAVELENGTH, echo, noise, points, response, target
+from tests.compensate.turning import CELL, F64, OMEGA, PRF, PULSES, RANGE_M, WAVELENGTH, K, echo, noise, points, response, target
 from torchsar.compensate.rotation.histories import refined_by_histories, solved
 from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of, without_range_term
 from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
@@ -106,6 +106,13 @@ def test_histories_correct_an_error(error: tuple[float, float]) -> None:
     assert ((once.k[0] - K).abs() < 0.5 * offset).all() and ((thrice.k[0] - K).abs() < 0.3 * offset).all()
 
 
+def test_a_range_term_that_pulses_cannot_follow_is_impossible() -> None:
+    still, wild, broken = Motion.still(K[None]), truth(), truth()
+    assert still.possible(SAMPLING) and truth().possible(SAMPLING) and truth(centre_m=-50.0).possible(SAMPLING)
+    for motion in (Motion(wild.k, 1e3 * wild.w, wild.v, wild.centre_m), Motion(wild.k, wild.w, wild.v - 5.0, wild.centre_m), Motion(broken.k * math.nan, broken.w, broken.v, broken.centre_m)):
+        assert not motion.possible(SAMPLING)
+
+
 def test_histories_of_nothing_leave_the_motion() -> None:
     start = Motion.still(K[None].expand(2, -1))
     for data in (torch.zeros(2, PULSES, 24, dtype=torch.complex128), 0 * noise(0, 2, PULSES, 24)):
@@ -129,7 +136,7 @@ def few() -> tuple[Scatterers, Motion]:
     """Six scatterers that overlap, their Doppler cells on the steps of the table of couplings."""
     source = torch.Generator().manual_seed(3)
     level, phase, cell, row = (torch.rand(1, FEW, dtype=F64, generator=source) for _ in range(4))
-    motion = Motion(K[None], *torch.tensor([[4e-4], [1e-4], [0.7]], dtype=F64))
+    motion = Motion(K[None], *torch.tensor([[1e-7], [1e-4], [0.7]], dtype=F64))  # couplings leave out that range terms differ between cells
     return Scatterers(torch.polar(0.5 + level, 6 * phase), (6 * 16 * (cell - 0.5)).round() / 16, 5 + 4 * row), motion
 
 

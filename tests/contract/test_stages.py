@@ -33,8 +33,35 @@ from torchsar.compensate import (
     SegmentedInterference,
     SpectrumCorrelation,
 )
-from torchsar.core import Estimate, Signal, Stage, real_dtype
-from torchsar.focus import AzimuthMatchedFilter, AzimuthTransform, Backproject, ClosestRange, CompressSweeps, DerampAzimuth, Detect, OmegaK, OmegaKStolt, PaddedLines, RangeCompress, RangeDoppler
+from torchsar.compensate.rotation import (
+    ChirpletClean,
+    CoarseRotation,
+    PhaseFitRotation,
+    RotationAutofocus,
+    RotationDescent,
+    RotationEvolution,
+    RotationGenetic,
+    RotationNewton,
+    RotationSearch,
+    UnevenRotation,
+)
+from torchsar.core import Alternate, Estimate, Signal, Stage, Turn, real_dtype
+from torchsar.focus import (
+    AzimuthMatchedFilter,
+    AzimuthTransform,
+    Backproject,
+    ClosestRange,
+    CompressSweeps,
+    DerampAzimuth,
+    Detect,
+    MatchedFourier,
+    OmegaK,
+    OmegaKStolt,
+    PaddedLines,
+    RangeCompress,
+    RangeDoppler,
+    RangePhase,
+)
 from torchsar.focus.target import TargetImage
 from torchsar.radar import InverseRadar
 from torchsar.repair import (
@@ -138,6 +165,18 @@ def _calibration(signal: Signal) -> dict[str, Tensor]:
     return {"calibration": torch.polar(torch.ones_like(tone), 2 * torch.pi * tone).to(signal.data.dtype).expand(*signal.trials, 2, 1, len(u)).contiguous()}
 
 
+def _turn(signal: Signal) -> dict[str, Tensor]:
+    at = torch.arange(signal.trials.numel(), dtype=torch.float64).reshape(signal.trials)
+    return {"omega_rad_s": 0.3 + 0.1 * at, "warp_k": torch.stack([1.0 + at, 5.0 - at], -1), "yc_m": 2.0 * at}
+
+
+def _warp(signal: Signal) -> dict[str, Tensor]:
+    return {"warp_k": _turn(signal)["warp_k"]}
+
+
+SEARCH = {"oversampling": 1.0, "order": 2}
+
+
 CASES = [
     Case("range_compress", lambda: RangeCompress(RADAR)),
     Case("omega_k", lambda: OmegaK(RADAR), _geometry),
@@ -177,6 +216,19 @@ CASES = [
     Case("correct_pulse_phase", lambda: CorrectPulsePhase(), _phases),
     Case("azimuth_transform", lambda: AzimuthTransform(TURNTABLE, "hann", 2)),
     Case("target_image", lambda: TargetImage(TURNTABLE)),
+    Case("range_phase", lambda: RangePhase(TURNTABLE), _turn),
+    Case("matched_fourier", lambda: MatchedFourier(TURNTABLE), _warp),
+    Case("rotation_search", lambda: RotationSearch(TURNTABLE, [0.1, -2.0], [0.5, 2.0], [2, 3], **SEARCH), differentiable=False, vmap=False),
+    Case("rotation_genetic", lambda: RotationGenetic(TURNTABLE, [0.1, -2.0], [0.5, 2.0], population=6, generations=2, **SEARCH), differentiable=False, vmap=False),
+    Case("rotation_evolution", lambda: RotationEvolution(TURNTABLE, [0.1, -2.0], [0.5, 2.0], population=6, generations=2, **SEARCH), differentiable=False, vmap=False),
+    Case("rotation_newton", lambda: RotationNewton(TURNTABLE, [0.3, 0.5], steps=2, **SEARCH), differentiable=False, vmap=False, tolerance=1e-3),
+    Case("rotation_descent", lambda: RotationDescent(TURNTABLE, [0.3, 0.5], steps=2, **SEARCH), differentiable=False, vmap=False, tolerance=1e-3),
+    Case("rotation_coarse", lambda: CoarseRotation(TURNTABLE), differentiable=False, vmap=False),
+    Case("rotation_phase_fit", lambda: PhaseFitRotation(TURNTABLE), differentiable=False, vmap=False, tolerance=1e-6),
+    Case("rotation", lambda: UnevenRotation(TURNTABLE), differentiable=False, vmap=False, tolerance=1e-6),
+    Case("rotation_autofocus", lambda: RotationAutofocus(TURNTABLE, 4, 2), _turn, differentiable=False, vmap=False, tolerance=1e-6),
+    Case("chirplet_clean", lambda: ChirpletClean(TURNTABLE, atoms=3), differentiable=False, vmap=False, tolerance=1e-6),
+    Case("alternate", lambda: Alternate(2, phase=Turn(Autofocus(), CorrectPulsePhase()), rotation=Turn(CoarseRotation(TURNTABLE))), differentiable=False, vmap=False, tolerance=1e-6),
     Case("split_sweeps", lambda: SplitSweeps(LADAR, 3.3e-6), ladar="record"),
     Case("circular_shift", lambda: CircularShift(LADAR, 3.3e-6), ladar="record"),
     Case("blank_turning_points", lambda: BlankTurningPoints(LADAR, 100.0), ladar="sweeps"),
@@ -264,7 +316,7 @@ def test_dtype_and_device_are_kept(case: Case, dtype: torch.dtype) -> None:
 
 @pytest.mark.parametrize("case", [c for c in CASES if c.differentiable], ids=[c.name for c in CASES if c.differentiable])
 def test_gradients(case: Case) -> None:
-    stage, signal = case.build(), entering(case, raw(2, n_pulse=6, n_range=32))
+    stage, signal = case.build(), entering(case, raw(2, n_pulse=8, n_range=32))
     values = case.values(signal)
     floating = {name: value.requires_grad_() for name, value in values.items() if value.is_floating_point()}
 

@@ -24,19 +24,19 @@ from torchsar.study.rotation.trials import RotationTrials, run_batch
 from torchsar.study.systems import system_of
 
 TRUE = {"omega_rad_s": 0.02, "warp_k": [10.0, 1000.0]}
-TAKEN_OUT = {"range": {"stage": "range_phase", "uses": {name: "rotation" for name in ("omega_rad_s", "warp_k", "yc_m")}}, "image": {"stage": "matched_fourier", "uses": {"warp_k": "rotation"}}}
+TAKEN_OUT = {"range": {"stage": "range_phase", "uses": dict.fromkeys(("omega_rad_s", "warp_k", "yc_m"), "rotation")}, "image": {"stage": "matched_fourier", "uses": {"warp_k": "rotation"}}}
 KNOWN = {"range": {"stage": "range_phase", **TRUE}, "image": {"stage": "matched_fourier", "warp_k": TRUE["warp_k"]}}
 BOX = {"low": [0.018, 9.0, 900.0], "high": [0.022, 11.0, 1100.0]}
 TINY: dict = {
     "system": "isal_rotation",
     "title": "tiny satellite",
     "seed": 3,
-    "radar": {"wavelength_m": 1.55e-6, "bandwidth_hz": 624.567621e6, "prf_hz": 30e3, "reference_range_m": 100e3},
+    "radar": {"wavelength_m": 1.55e-6, "bandwidth_hz": 624.567621e6, "prf_hz": 50e3, "reference_range_m": 100e3},
     "world": {
-        "pulses": 600,
+        "pulses": 1000,
         "samples": 32,
         "trials": 2,
-        "scene": {"satellite": {"kind": "satellite", "count": 60, "half_width_m": 0.36}},
+        "scene": {"satellite": {"kind": "satellite", "count": 60, "half_width_m": 0.6}},
         "rotation": {"omega_rad_s": 0.02, "k": [10.0, 1000.0]},
         "noise": {"snr_db": 20.0},
     },
@@ -172,7 +172,7 @@ def _points(x: list[float], y: list[float]) -> dict:
         (_world(rotation={"omega_rad_s": 0.02, "k1": 10.0}), "key 'world.rotation.k1' is not known"),
         (_world(rotation={"omega_rad_s": 0.02, "k": [-100.0, 2000.0]}), "two times share an angle"),
         (_world(rotation_rad_s=0.02), "world.rotation_rad_s"),
-        (_world(scene={"satellite": {"kind": "satellite", "count": 60, "half_width_m": 0.6}}), "Doppler over half the pulse rate is 1.445"),
+        (_world(scene={"satellite": {"kind": "satellite", "count": 60, "half_width_m": 1.0}}), "Doppler over half the pulse rate is 1.445"),
         (_world(**_points([0.05, 0.1, 0.2, 0.3], [0.0, 0.0, 0.0, 0.0])), "range term, pi lambda sigma_y / ra^2 is 0 rad, and must be at least 1 rad: the rate"),
         (_world(**_points([0.1, 0.2], [1.0, 2.0])), "scatterers above the noise is 2, and must be at least 3"),
         ({"beyond_limits": ["recomended"]}, "beyond_limits names the method 'recomended'"),
@@ -241,8 +241,8 @@ def test_neglected_phases_follow_their_formulas() -> None:
 
 
 def limits(x: list[float], y: list[float], **given: float) -> dict:
-    places = (torch.tensor(v, dtype=torch.float64) for v in (x, y, [1.0] * len(x)))
-    return {row.name: row for row in rotation_limits(*TURN, *places, **given)}
+    across, lever, level = (torch.tensor(v, dtype=torch.float64) for v in (x, y, [1.0] * len(x)))
+    return {row.name: row for row in rotation_limits(*TURN, across, lever, level, **given)}
 
 
 def test_limits_follow_their_formulas() -> None:

@@ -40,7 +40,8 @@ def refined_by_histories(data: Tensor, sampling: Sampling, motion: Motion, *, fr
     order = motion.k.shape[-1]
     w, v = (change[:, order] if free_rate else 0), (change[:, -1] if free_centre else 0)
     found = (peaks.power > 0).sum(-1)
-    return replace(motion, k=motion.k + change[:, :order], w=motion.w + w, v=motion.v + v).where(found > 0, motion), found
+    moved = replace(motion, k=motion.k + change[:, :order], w=motion.w + w, v=motion.v + v)
+    return moved.where((found > 0) & moved.possible(sampling), motion), found
 
 
 def _histories(image: Tensor, peaks: Peaks, half_cells: int) -> tuple[Tensor, Tensor]:

@@ -76,6 +76,13 @@ class Motion:
         """The range centre deviation; the known one where the rate is not positive."""
         return self.centre_m + torch.where(self.w > 0, self.v / torch.where(self.w > 0, self.w, 1), 0)
 
+    def possible(self, sampling: Sampling) -> Tensor:
+        """Whether the numbers are finite and the range term changes by less than half a turn from pulse to pulse in every cell, as in data it must, (trial,)."""
+        ends = sampling.range_m(torch.tensor([0.0, sampling.cells - 1.0], dtype=torch.float64, device=self.w.device))
+        whole = warp(torch.tensor([sampling.duration_s], dtype=torch.float64, device=self.w.device), self.k)
+        turns = sampling.turns_per_square * (self.w[:, None] * ends + self.offset[:, None]).abs() * whole.square()
+        return torch.isfinite(self.k).all(-1) & (turns < sampling.pulses / 4).all(-1)
+
     def where(self, keep: Tensor, other: Motion) -> Motion:
         """This motion in trials where `keep` (trial,) holds, the other elsewhere."""
         w, v = (torch.where(keep, getattr(self, name), getattr(other, name)) for name in ("w", "v"))

@@ -52,7 +52,7 @@ class Row:
 def trade(loaded: Loaded, out: Path | None) -> str:
     """Tables of orders of the warp, of the gridding knob, of estimators and of precisions on the first case of a config; returns them as text.
 
-    Orders and gridding form images with the true rotation. With `out`: config.yaml, trade.json, trade.txt and figures/ in that folder.
+    Orders and gridding form images with the true rotation; phase errors of pulses are left out of all of them. With `out`: config.yaml, trade.json, trade.txt and figures/ in that folder.
     """
     refuse_recordings(loaded)
     check(loaded)
@@ -85,12 +85,14 @@ class _Trials:
     @staticmethod
     def of(loaded: Loaded) -> _Trials:
         table, settings = Turntable.of(loaded), loaded.config.trade
-        recording, truth = table.recorded(Draws(loaded.config.seed, "trade", range(settings.trials)), dtype=torch.complex128)
-        if recording.signal.names != ("pulse", "range"):
+        _, truth = table.recorded(Draws(loaded.config.seed, "trade", range(settings.trials)), dtype=torch.complex128)
+        assert truth.clean is not None
+        signal = truth.clean.signal
+        if signal.names != ("pulse", "range"):
             raise ValueError("trade compares range-compressed pulses; choose the fidelity phase_only")
         stages = (loaded.config.processor["recommended"].stages or {}).values()
         given = next((entry for entry in stages if str(entry["stage"]).startswith("rotation")), {})
-        return _Trials(table, settings, recording.signal.data, recording.signal.axis("range").values(), truth, given.get("yc_m"), table.dtype)
+        return _Trials(table, settings, signal.data, signal.axis("range").values(), truth, given.get("yc_m"), table.dtype)
 
     @property
     def prf_hz(self) -> float:
