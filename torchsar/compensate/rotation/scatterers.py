@@ -27,6 +27,7 @@ _FEWEST = 128
 _SAMPLES_EACH = 1250  # of the data for each scatterer, so that a fit costs as much as some twenty images
 _SEARCHES = {0: 0.6, 2: 1.0}  # rounds that look for further scatterers, up to which part of all; the rounds between settle what was found
 _BLOCK_BYTES = 1 << 19
+_APART = 0.7  # cells, in Doppler and in range
 _STEP = 0.3  # cells that a scatterer moves at most in a step
 _RIDGE = 1e-3
 _LEAST_RATE = 0.05
@@ -50,6 +51,13 @@ class Scatterers:
         """These and the new ones; trials that are `closed` (trial,) take none."""
         added = torch.where(closed[:, None], 0, new.amplitude)
         return Scatterers(torch.cat([self.amplitude, added], -1), torch.cat([self.cell, new.cell], -1), torch.cat([self.row, new.row], -1))
+
+    def apart(self) -> Scatterers:
+        """Without those that lie within the resolution of a brighter one: such pairs grow against each other without end, and pull the motion along."""
+        level = self.amplitude.abs()
+        near = ((self.cell[:, :, None] - self.cell[:, None]).abs() < _APART) & ((self.row[:, :, None] - self.row[:, None]).abs() < _APART)
+        beside = (near & (level[:, None] > level[:, :, None])).any(-1)
+        return replace(self, amplitude=torch.where(beside, 0, self.amplitude))
 
 
 @dataclass(frozen=True)
@@ -85,7 +93,7 @@ def fit_scatterers(data: Tensor, sampling: Sampling, start: Motion, *, free_rate
         if step is not None:
             fit = _advanced(fit, step.taken(), noise, sampling, search_over=turn > max(_SEARCHES))
         if new is not None:
-            fit = replace(fit, scatterers=fit.scatterers.joined(new, fit.settled), noise=noise)
+            fit = replace(fit, scatterers=fit.scatterers.joined(new, fit.settled).apart(), noise=noise)
         if turn == rounds or bool(fit.settled.all()):
             break
         residual, step = _Step.of(data, sampling, fit, present, unknowns)
@@ -264,7 +272,7 @@ def _advanced(fit: Fit, taken: tuple[Motion, Scatterers, Tensor, Tensor], noise:
     pairs = ((found.amplitude, old.amplitude), (found.cell, old.cell), (found.row, old.row))
     return Fit(
         motion=motion.where(active & sane, fit.motion),
-        scatterers=Scatterers(*(torch.where(pick, new, before) for new, before in pairs)),
+        scatterers=Scatterers(*(torch.where(pick, new, before) for new, before in pairs)).apart(),
         covariance=torch.where(active[:, None, None], covariance, fit.covariance),
         noise=torch.where(active, noise, fit.noise),
         steps=fit.steps + active,
