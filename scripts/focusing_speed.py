@@ -85,9 +85,7 @@ def measure(sizes: list[int], threads: list[int], trials: int = 1, repeats: int 
     for size in sizes:
         radar, (target, place) = sensor(size), edge_target(size)
         flat = Signal(target.data.reshape(size, size), target.axes)
-        exact = OmegaKStolt.form(
-            flat.data.to(torch.complex128), radar, doppler_hz=0.0, reference=OmegaK(radar, "flat").spectrum(size), eps=1e-12
-        )
+        exact = OmegaKStolt.form(flat.data.to(torch.complex128), radar, doppler_hz=0.0, reference=OmegaK(radar, "flat").spectrum(size), eps=1e-12)
         raw = Signal(torch.randn((trials, size, size) if trials > 1 else (size, size), dtype=torch.complex64), target.axes)
         quality = {name: quality_of(build(radar, raw.axes)(flat), exact, place) for name, build in FORMS.items()}
         for count in threads:

@@ -1,7 +1,7 @@
 """Keep what a finished sweep claims: RMSE, intervals, bounds and shares of its errors (and of metrics named besides), as a small file that tests check.
 
-    python scripts/keep_sweep.py out/stripmap_doppler docs/sweeps/stripmap_doppler.json
-    python scripts/keep_sweep.py out/isal_snr docs/sweeps/isal_snr.json residual_phase_rms_rad entropy_above_ideal_nats
+python scripts/keep_sweep.py out/stripmap_doppler docs/sweeps/stripmap_doppler.json
+python scripts/keep_sweep.py out/isal_snr docs/sweeps/isal_snr.json residual_phase_rms_rad entropy_above_ideal_nats
 """
 
 from __future__ import annotations

@@ -38,10 +38,7 @@ TINY: dict = {
     "processor": {
         "ideal": {"input": "clean", "stages": {"image": {"stage": "azimuth_transform"}}},
         "none": {"stages": {"image": {"stage": "azimuth_transform"}}},
-        **{
-            name: {"stages": {"phase": stage, "correct": {"stage": "pulse_phase_correct", "uses": {"phase_rad": "phase"}}, "image": {"stage": "azimuth_transform"}}}
-            for name, stage in PHASES.items()
-        },
+        **{name: {"stages": {"phase": stage, "correct": {"stage": "pulse_phase_correct", "uses": {"phase_rad": "phase"}}, "image": {"stage": "azimuth_transform"}}} for name, stage in PHASES.items()},
     },
     "metrics": {"reference": "ideal", "published_ideal": 7.0, "published": {"noisy": {"sca": 8.0}}},
 }
@@ -136,9 +133,7 @@ def yak_like(folder: Path, n_pulse: int = 64, n_range: int = 96) -> Path:
     """Range profiles of a few points, as an archive."""
     rng = np.random.default_rng(5)
     k, n = np.arange(n_pulse), np.arange(n_range)
-    profiles = sum(
-        rng.normal() * np.sinc(n[:, None] - rng.uniform(20, 70)) * np.exp(2j * np.pi * (rng.uniform(-0.4, 0.4) * k + rng.uniform())) for _ in range(40)
-    )
+    profiles = sum(rng.normal() * np.sinc(n[:, None] - rng.uniform(20, 70)) * np.exp(2j * np.pi * (rng.uniform(-0.4, 0.4) * k + rng.uniform())) for _ in range(40))
     profiles = profiles + 0.05 * (rng.normal(size=profiles.shape) + 1j * rng.normal(size=profiles.shape))
     path = folder / "flight.npz"
     np.savez(path, profiles=profiles.astype(np.complex64), range_step_m=0.375, bandwidth_hz=400e6, prf_hz=100.0)
@@ -174,7 +169,7 @@ def test_injected_phases_are_found_in_recordings(tmp_path: Path, made) -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"system": "isla"}, "it should be one of isal, sal, stripmap; did you mean 'isal'"),
+        ({"system": "isla"}, "it should be one of isal, isal_rotation, sal, stripmap; did you mean 'isal'"),
         ({"cases": {"empty": {}}}, "cases.empty changes nothing"),
         ({"cases": {"odd": {"world.nose.snr_db": 3.0}}}, "leads nowhere at 'nose'"),
         ({"cases": {"odd": {"world.noise.snr_db": "loud"}}}, "world.noise.snr_db"),

@@ -84,7 +84,7 @@ def test_report_shows_the_figures_of_metrics_json_and_asks_for_nothing(out: Path
     tree = json.loads((out / "metrics.json").read_text())
     assert f"{tree['methods']['recommended']['metrics']['entropy_nats']:.3f}" in text
     assert "published" in text and "islr_extent_nulls" in text and "snr_db: 20.0" in text
-    for outside in ("http://", "https://", "<script", "src=\"figures", "@import", "url("):
+    for outside in ("http://", "https://", "<script", 'src="figures', "@import", "url("):
         assert outside not in text
     assert text.count("data:image/png;base64,") == len(list((out / "figures").iterdir()))
 

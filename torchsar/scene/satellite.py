@@ -17,12 +17,12 @@ from torchsar.scene.vibration import refuse_unless_finite
 
 # body axes before the tilt: along the panels, along the line of sight (away from the radar), across both. Only proportions count: the whole is
 # fitted to the extents asked for.
-_BUS = (1.15, 1.1, 1.2)
-_PANEL = (1.75, 6.43, 1.5)  # first and last place along the panels, half chord
-_BAYS, _STRINGS = 6, 3  # cells of a panel's grid along and across
-_DISH = (0.3, -1.5, 1.3, 0.8)  # place along the panels, place of the vertex on the line of sight, radius of the rim, depth
+_BUS = (0.7, 1.3, 1.2)
+_PANEL = (0.8, 6.43, 1.9)  # first and last place along the panels, half chord
+_BAYS, _STRINGS = 4, 8  # cells of a panel's grid along and across
+_DISH = (0.2, -1.5, 1.2, 0.8)  # place along the panels, place of the vertex on the line of sight, radius of the rim, depth
 _FEED = -3.1
-_BOOM = ((-0.7, 1.1, 0.3), (-1.9, 3.5, 0.3))
+_BOOM = ((-0.3, 1.3, 0.3), (-0.5, 3.5, 0.3))
 _CROSSBAR = 0.45
 _SHARES = {"bus": 0.26, "panel_left": 0.29, "panel_right": 0.29, "dish": 0.08, "boom": 0.08}
 _LEAST = 60
@@ -134,7 +134,7 @@ class Satellite:
     half_width_m: float = 6.43
     half_depth_m: float = 3.4
     tilt_rad: float = 0.42
-    corner_level: float = 3.0
+    corner_level: float = 1.5
 
     def __post_init__(self) -> None:
         if self.count < _LEAST:

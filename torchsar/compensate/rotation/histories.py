@@ -21,7 +21,8 @@ _OVERSAMPLING = 2
 _ISOLATED = 0.5  # of the amplitude of the brightest within the windows
 _ENDS = 16  # the window smears a history at both ends, by this part of it
 _ROBUST_ROUNDS = 3
-_RIDGE = 1e-9
+_NOTHING = 1e-7  # of an eigenvalue of a normal matrix of unit diagonal
+_SHARE_LOST = 0.01  # of an unknown in a direction
 
 
 def refined_by_histories(data: Tensor, sampling: Sampling, motion: Motion, *, free_rate: bool = True, free_centre: bool = True, count: int = 128, half_cells: int = 24) -> tuple[Motion, Tensor]:
@@ -99,8 +100,17 @@ def _fitted(history: Tensor, bases: Tensor, used: Tensor) -> Tensor:
 
 
 def solved(normal: Tensor, right: Tensor) -> Tensor:
-    """Solution of small normal equations (trial, n, n), (trial, n), scaled to a unit diagonal first; directions that nothing is known about stay at zero."""
+    """Solution of small normal equations (trial, n, n), (trial, n); directions that nothing is known about stay at zero."""
+    inverse, _ = inverted(normal)
+    return (inverse @ right[..., None])[..., 0]
+
+
+def inverted(normal: Tensor) -> tuple[Tensor, Tensor]:
+    """Inverse of small normal matrices (trial, n, n) without the directions that nothing is known about, and which unknowns have a part in those, (trial, n) bool."""
     scale = normal.diagonal(dim1=-2, dim2=-1)
-    scale = torch.where(scale > 0, scale, 1).rsqrt()
-    unit = torch.eye(normal.shape[-1], dtype=normal.dtype, device=normal.device)
-    return scale * torch.linalg.solve(normal * scale[:, :, None] * scale[:, None] + _RIDGE * unit, (right * scale)[..., None])[..., 0]
+    root = torch.where(scale > 0, scale, 1).rsqrt()
+    value, vector = torch.linalg.eigh(normal * root[:, :, None] * root[:, None])
+    known = value > _NOTHING
+    inverse = (vector * torch.where(known, 1 / torch.where(known, value, 1), 0)[:, None]) @ vector.mT
+    lost = (~known[:, None] & (vector.square() > _SHARE_LOST)).any(-1)
+    return inverse * root[:, :, None] * root[:, None], lost

@@ -23,8 +23,8 @@ MOST_RATE_ERROR = 0.05  # predicted, of omega, beyond which images cannot be sca
 _LEAST_EXPLAINED = 0.4  # of the energy above the noise
 _ENTROPY_ROUNDING = 1e-3
 _BLOCKS = 8  # a block of trials is so many times what one operation likes best
-_FINE_RATE = 0.25  # of omega: a deviation at which nothing is known
-_HISTORY_STEPS = 4
+_STANDING_STILL = 3.0  # deviations: the last step of a fit that has come to an end
+_START_STEPS, _HISTORY_STEPS = 2, 4
 
 Part = Callable[[Tensor, Sampling, Tensor | None], Estimate]
 
@@ -45,11 +45,12 @@ def uneven_rotation(
     Needs scatterers apart in range: Om shows only in the curvature that grows with range, and not at all where all lie in one range cell and yc is unknown.
     Raises TypeError or ValueError for data that are not finite, complex, of 8 pulses at least.
     """
-    if order < 1:
-        raise ValueError(f"uneven_rotation: order must be 1 (even rotation) or more, got {order}")
+    _refuse_less("uneven_rotation", 1, order=order, rounds=rounds, scatterers=1 if scatterers is None else scatterers)
 
     def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Estimate:
-        motion, _ = refined_by_histories(rows, sampling, _start(rows, sampling, order, known), free_centre=known is None)
+        motion = _start(rows, sampling, order, known)
+        for _ in range(_START_STEPS):
+            motion, _ = refined_by_histories(rows, sampling, motion, free_centre=known is None)
         fit = fit_scatterers(rows, sampling, motion, free_centre=known is None, count=scatterers, rounds=rounds)
         return _estimate(rows, sampling, fit, known is None)
 
@@ -58,6 +59,7 @@ def uneven_rotation(
 
 def coarse_rotation(data: Tensor, *, wavelength_m: float, prf_hz: float, range_m: Tensor, order: int = 3, yc_m: Tensor | float | None = None) -> Estimate:
     """The first step of `uneven_rotation` alone, `coarse_warp`: k1 and k2 to about a percent; omega is not looked at and stays 0. ok: entropy lower than without compensation."""
+    _refuse_less("coarse_rotation", 1, order=order)
 
     def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Estimate:
         return _judged(rows, sampling, _start(rows, sampling, order, known))
@@ -68,7 +70,9 @@ def coarse_rotation(data: Tensor, *, wavelength_m: float, prf_hz: float, range_m
 def phase_fit_rotation(
     data: Tensor, *, wavelength_m: float, prf_hz: float, range_m: Tensor, order: int = 3, yc_m: Tensor | float | None = None, steps: int = _HISTORY_STEPS, half_cells: int = 24
 ) -> Estimate:
-    """The first two steps of `uneven_rotation` alone: coarse, then `steps` of phase least squares on windows of half_cells to either side. A quarter of the time, two to five times the error."""
+    """The first two steps of `uneven_rotation` alone: coarse, then `steps` of phase least squares on windows of half_cells to either side. Half of the time, two to twenty times the error."""
+    _refuse_less("phase_fit_rotation", 1, order=order, steps=steps)
+    _refuse_less("phase_fit_rotation", 4, half_cells=half_cells)
 
     def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Estimate:
         motion = _start(rows, sampling, order, known)
@@ -91,7 +95,7 @@ def _over_trials(name: str, find: Part, data: Tensor, wavelength_m: float, prf_h
     """find(rows, sampling, known centre) by blocks of trials, each over its own largest sample."""
     sampling = _checked(name, data, wavelength_m, prf_hz, range_m)
     trials, rows = data.shape[:-2], data.detach().reshape(-1, *data.shape[-2:])
-    known = None if yc_m is None else torch.as_tensor(yc_m, dtype=torch.float64, device=data.device).expand(trials).reshape(-1)
+    known = None if yc_m is None else _centre(name, torch.as_tensor(yc_m, dtype=torch.float64, device=data.device), trials)
     height = max(1, _BLOCKS * block_bytes_of(data.device) // (rows[0].numel() * rows.element_size()))
     parts: dict[int, Estimate] = {}
 
@@ -99,11 +103,27 @@ def _over_trials(name: str, find: Part, data: Tensor, wavelength_m: float, prf_h
     def work(first: int) -> None:
         part = slice(first, first + height)
         peak = torch.maximum(rows[part].real.abs(), rows[part].imag.abs()).amax((-2, -1), keepdim=True)  # |z| itself may overflow
-        parts[first] = find(rows[part] / torch.where(peak > 0, peak, 1), sampling, None if known is None else known[part])
+        found = find(rows[part] / torch.where(peak > 0, peak, 1), sampling, None if known is None else known[part])
+        scaled = {"noise_power": found.info["noise_power"] * peak[:, 0, 0].double().square()} if "noise_power" in found.info else {}
+        parts[first] = replace(found, info={**found.info, **scaled})
 
     starts = range(0, rows.shape[0], height)
     over_blocks(work, starts, rows)
     return Estimate.joined([parts[first] for first in starts], trials)
+
+
+def _refuse_less(name: str, least: int, **counts: int) -> None:
+    for what, count in counts.items():
+        if isinstance(count, bool) or not isinstance(count, int) or count < least:
+            raise ValueError(f"{name}: {what} must be a whole number of {least} or more, got {count!r}")
+
+
+def _centre(name: str, yc_m: Tensor, trials: torch.Size) -> Tensor:
+    """The known deviation of every trial, (trial,)."""
+    refuse_non_finite(yc_m, f"{name}: yc_m")
+    if yc_m.ndim and yc_m.shape != trials:
+        raise ValueError(f"{name}: yc_m must be one number (m) or one a trial {tuple(trials)}, got shape {tuple(yc_m.shape)}")
+    return yc_m.expand(trials).reshape(-1)
 
 
 def _checked(name: str, data: Tensor, wavelength_m: float, prf_hz: float, range_m: Tensor) -> Sampling:
@@ -114,10 +134,15 @@ def _checked(name: str, data: Tensor, wavelength_m: float, prf_hz: float, range_
     for what, value in (("wavelength_m", wavelength_m), ("prf_hz", prf_hz)):
         if not (math.isfinite(value) and value > 0):
             raise ValueError(f"{name}: {what} must be a positive number, got {value}")
-    if range_m.shape != data.shape[-1:]:
-        raise ValueError(f"{name}: range_m needs the {data.shape[-1]} coordinates of the range axis, got the shape {tuple(range_m.shape)}")
+    if not isinstance(range_m, Tensor) or range_m.shape != data.shape[-1:]:
+        got = f"the shape {tuple(range_m.shape)}" if isinstance(range_m, Tensor) else type(range_m).__name__
+        raise ValueError(f"{name}: range_m needs a tensor of the {data.shape[-1]} coordinates of the range axis, got {got}")
     refuse_non_finite(data, name)
-    step = float(range_m[1] - range_m[0]) if len(range_m) > 1 else 1.0
+    refuse_non_finite(range_m, f"{name}: range_m")
+    steps = torch.diff(range_m.to(torch.float64))
+    step = float(steps.mean()) if len(steps) else 1.0
+    if step == 0 or bool(((steps - step).abs() > 1e-6 * abs(step)).any()):
+        raise ValueError(f"{name}: range_m must be evenly spaced, got steps of {float(steps.min()):g} to {float(steps.max()):g} m; resample range first")
     return Sampling(wavelength_m, prf_hz, data.shape[-2], data.shape[-1], float(range_m[0]), step)
 
 
@@ -126,27 +151,29 @@ def _estimate(rows: Tensor, sampling: Sampling, fit: Fit, free_centre: bool) -> 
     found = _judged(rows, sampling, fit.motion)
     live = fit.scatterers.amplitude != 0
     count = live.sum(-1)
-    explained = (fit.scatterers.amplitude.abs().square().sum(-1) * sampling.pulses) / _energy(rows, fit.noise)
+    present = (rows != 0).any(-1).sum(-1)
+    explained = fit.scatterers.amplitude.abs().square().sum(-1) * present / _energy(rows, fit.noise, present)
     quality = settle(explained.clamp(0, 1), 0.0)[0]
     std = _deviations(fit, free_centre)
-    focused = found.ok & (count >= LEAST_SCATTERERS) & (quality >= _LEAST_EXPLAINED)
+    focused = found.ok & (count >= LEAST_SCATTERERS) & (quality >= _LEAST_EXPLAINED) & (fit.last_step <= _STANDING_STILL)
     scaled = (std["omega_rad_s"] < MOST_RATE_ERROR * fit.motion.omega_rad_s) & (fit.motion.w > 0)
     info = {**found.info, "focused": focused, "scatterers": count, "noise_power": fit.noise, "steps": fit.steps}
     return Estimate(found.value, quality, focused & scaled, std, info)
 
 
-def _energy(rows: Tensor, noise: Tensor) -> Tensor:
-    """Energy above the noise, (trial,)."""
+def _energy(rows: Tensor, noise: Tensor, present: Tensor) -> Tensor:
+    """Energy above the noise of the pulses that are present (their number, (trial,)), (trial,)."""
     power = torch.view_as_real(rows).double().square().sum((-3, -2, -1))
-    return (power - noise * rows[0].numel()).clamp_min(1e-3 * power).clamp_min(torch.finfo(torch.float64).tiny)
+    return (power - noise * present * rows.shape[-1]).clamp_min(1e-3 * power).clamp_min(torch.finfo(torch.float64).tiny)
 
 
 def _deviations(fit: Fit, free_centre: bool) -> dict[str, Tensor]:
-    """From the covariance of (k, w, v) to that of what is reported; a rate that nothing is known about gets a deviation as large as itself."""
+    """From the covariance of (k, w, v) to that of what is reported; infinite where nothing is known."""
     motion, order = fit.motion, fit.motion.k.shape[-1]
-    covariance = fit.covariance * fit.noise[:, None, None]
+    known = (fit.scatterers.amplitude != 0).any(-1)
+    covariance = torch.where(known[:, None, None], fit.covariance * fit.noise[:, None, None], math.inf)
     k = covariance.diagonal(dim1=-2, dim2=-1)[:, :order].clamp_min(0).sqrt()
-    w = torch.where(motion.w > 0, motion.w, torch.finfo(torch.float64).tiny)
+    w = torch.where(motion.w > 0, motion.w, 0)
     ww = covariance[:, order, order]
     omega = ww.clamp_min(0).sqrt() / (2 * w.sqrt())
     yc = torch.zeros_like(w)
@@ -154,7 +181,7 @@ def _deviations(fit: Fit, free_centre: bool) -> dict[str, Tensor]:
         found = motion.yc_m - motion.centre_m
         yc = (covariance[:, -1, -1] - 2 * found * covariance[:, order, -1] + found.square() * ww).clamp_min(0).sqrt() / w
     named = {"warp_k": k, **{k_name(i + 1): column for i, column in enumerate(k.unbind(-1))}, "omega_rad_s": omega, "yc_m": yc}
-    return {name: settle(value, torch.finfo(torch.float64).max)[0] for name, value in named.items()}
+    return {name: torch.where(torch.isnan(value), math.inf, value) for name, value in named.items()}
 
 
 def _judged(rows: Tensor, sampling: Sampling, motion: Motion) -> Estimate:

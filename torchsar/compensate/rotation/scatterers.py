@@ -1,8 +1,9 @@
 """Maximum likelihood of the motion and of every scatterer together: amplitude, Doppler cell and range of each, and the rotation that all share.
 
 Each round removes the model of all scatterers known so far from the data, finds further ones in the image of what is left, and takes a Gauss-Newton step of
-everything at once: amplitudes and places of all scatterers and the motion, with the couplings of those next to each other. The gradient is that of the exact
-residual, so that neighbours and side lobes leave no error at the end. Assumes range-compressed echoes of a flat band that fills the cells (`band_response`).
+everything at once: amplitudes and places of all scatterers and the motion, with the couplings of those next to each other. Steps come from the exact residual, so
+that neighbours and side lobes leave no error at the end; what range terms change in the curvature, a few percent, is left out. Assumes range-compressed echoes of a
+flat band that fills the cells (`band_response`).
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate.rotation.couplings import Pairs, band_response
-from torchsar.compensate.rotation.histories import solved
+from torchsar.compensate.rotation.histories import inverted, solved
 from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of
 from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
 from torchsar.core import real_dtype, reduced_turns
@@ -62,7 +63,9 @@ class Scatterers:
 
 @dataclass(frozen=True)
 class Fit:
-    """Where a fit has come to. covariance: of (k1, k2, ..., w, v), the free ones, per unit noise power; noise: per sample, (trial,); steps: taken, (trial,)."""
+    """Where a fit has come to. covariance: of (k1, k2, ..., w, v), the free ones, per unit noise power; noise: per sample, (trial,); steps: taken; last_step:
+    largest of the shared unknowns, in their deviations, (trial,).
+    """
 
     motion: Motion
     scatterers: Scatterers
@@ -70,6 +73,7 @@ class Fit:
     noise: Tensor
     steps: Tensor
     settled: Tensor
+    last_step: Tensor
 
 
 def fit_scatterers(data: Tensor, sampling: Sampling, start: Motion, *, free_rate: bool = True, free_centre: bool = True, count: int | None = None, rounds: int = ROUNDS) -> Fit:
@@ -84,12 +88,12 @@ def fit_scatterers(data: Tensor, sampling: Sampling, start: Motion, *, free_rate
     noise = torch.full((trials,), math.inf, dtype=torch.float64, device=device)
     covariance = torch.zeros(trials, unknowns.size, unknowns.size, dtype=torch.float64, device=device)
     never = torch.zeros(trials, dtype=torch.bool, device=device)
-    fit = Fit(start, Scatterers.none(data), covariance, noise, never.long(), never)
+    fit = Fit(start, Scatterers.none(data), covariance, noise, never.long(), never, noise)
     residual, step = data, None
     for turn in range(rounds + 1):
         new, noise = None, fit.noise
         if turn in _SEARCHES:
-            new, noise = _standing_out(residual, sampling, fit, math.ceil(count * _SEARCHES[turn]))
+            new, noise = _standing_out(residual, sampling, fit, present, math.ceil(count * _SEARCHES[turn]))
         if step is not None:
             fit = _advanced(fit, step.taken(), noise, sampling, search_over=turn > max(_SEARCHES))
         if new is not None:
@@ -113,13 +117,14 @@ class _Unknowns:
         return self.order + self.rate + self.centre
 
 
-def _standing_out(residual: Tensor, sampling: Sampling, fit: Fit, bound: int) -> tuple[Scatterers, Tensor]:
+def _standing_out(residual: Tensor, sampling: Sampling, fit: Fit, present: Tensor, bound: int) -> tuple[Scatterers, Tensor]:
     """Scatterers that stand out of the residual, in no trial more than make `bound` with those that it has, and the noise power per sample (trial,)."""
     image = image_of(residual, sampling, fit.motion, oversampling=_OVERSAMPLING)
     power = image.real.square() + image.imag.square()
-    noise = torch.minimum(fit.noise, noise_power(power).double())
+    floor = noise_power(power).double()  # of a pixel: pulses that are not there bring none
+    noise = torch.minimum(fit.noise, floor / present.double().mean(-1).clamp_min(1e-3))
     known = (fit.scatterers.amplitude != 0).sum(-1)
-    peaks = find_peaks(power, (noise * threshold(power)).to(power.dtype), bound, _SHARE, _LINES, _CELLS).first(bound - known)
+    peaks = find_peaks(power, (floor * threshold(power)).to(power.dtype), bound, _SHARE, _LINES, _CELLS).first(bound - known)
     value = torch.gather(image.flatten(1), 1, peaks.line * image.shape[2] + peaks.cell).to(torch.complex128) / math.sqrt(sampling.pulses)
     cell, row = (peaks.line - image.shape[1] // 2) / _OVERSAMPLING, peaks.cell.to(torch.float64)
     return Scatterers(torch.where(peaks.power > 0, value, 0), cell, row), noise
@@ -200,7 +205,7 @@ class _Step:
         grow, turn, line, row = (joint[..., -1] - (joint[..., :-1] @ change[..., None])[..., 0]).unflatten(-1, (4, -1)).unbind(-2)
         amplitude = found.amplitude * torch.complex(1 + grow, turn)
         place = (found.row + row.clamp(-_STEP, _STEP)).clamp(0, self.sampling.cells - 1)
-        return self._moved(change), Scatterers(amplitude, found.cell + line.clamp(-_STEP, _STEP), place), change, _inverse(schur) / 2
+        return self._moved(change), Scatterers(amplitude, found.cell + line.clamp(-_STEP, _STEP), place), change, _covariance(schur)
 
     def _curvature(self, slopes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Gauss-Newton curvature of growth, turn, Doppler cell and row of all scatterers (trial, 4 scatterer, 4 scatterer), theirs with the shared unknowns
@@ -253,20 +258,18 @@ def _solved_symmetric(matrix: Tensor, right: Tensor) -> Tensor:
     return torch.linalg.solve(matrix, right) if bool(failed.any()) else torch.cholesky_solve(right, factor)
 
 
-def _inverse(normal: Tensor) -> Tensor:
-    """Inverse of a normal matrix, scaled first; infinite in directions that nothing is known about."""
-    scale = normal.diagonal(dim1=-2, dim2=-1)
-    root = torch.where(scale > 0, scale, 1).rsqrt()
-    unit = torch.eye(normal.shape[-1], dtype=normal.dtype, device=normal.device)
-    return torch.linalg.inv(normal * root[:, :, None] * root[:, None] + 1e-12 * unit) * root[:, :, None] * root[:, None]
+def _covariance(normal: Tensor) -> Tensor:
+    """Of the shared unknowns per unit noise power, infinite for those that nothing is known about."""
+    inverse, lost = inverted(normal)
+    return inverse / 2 + torch.diag_embed(torch.where(lost, math.inf, 0.0)).nan_to_num(nan=0.0, posinf=math.inf)
 
 
 def _advanced(fit: Fit, taken: tuple[Motion, Scatterers, Tensor, Tensor], noise: Tensor, sampling: Sampling, search_over: bool) -> Fit:
     """The fit after a step; settled trials, and steps to a motion that turns back, stay where they are."""
     motion, found, change, covariance = taken
-    sane = torch.isfinite(change).all(-1) & (least_rate(motion.k, sampling.duration_s) > _LEAST_RATE)
-    deviation = (covariance * noise[:, None, None]).diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
-    small = (change.abs() <= _SETTLED * deviation).all(-1)
+    sane = torch.isfinite(change).all(-1) & motion.possible(sampling) & (least_rate(motion.k, sampling.duration_s) > _LEAST_RATE)
+    deviation = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt() * noise.sqrt()[:, None]
+    step = torch.where(sane, (change.abs() / deviation.clamp_min(torch.finfo(torch.float64).tiny)).amax(-1), math.inf)
     active, old = ~fit.settled, fit.scatterers
     pick = (active & sane)[:, None]
     pairs = ((found.amplitude, old.amplitude), (found.cell, old.cell), (found.row, old.row))
@@ -276,5 +279,6 @@ def _advanced(fit: Fit, taken: tuple[Motion, Scatterers, Tensor, Tensor], noise:
         covariance=torch.where(active[:, None, None], covariance, fit.covariance),
         noise=torch.where(active, noise, fit.noise),
         steps=fit.steps + active,
-        settled=fit.settled | (small & sane & search_over),
+        settled=fit.settled | ((step <= _SETTLED) & search_over),
+        last_step=torch.where(active, step, fit.last_step),
     )
