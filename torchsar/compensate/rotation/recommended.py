@@ -23,8 +23,8 @@ MOST_RATE_ERROR = 0.05  # predicted, of omega, beyond which images cannot be sca
 _LEAST_EXPLAINED = 0.4  # of the energy above the noise
 _ENTROPY_ROUNDING = 1e-3
 _BLOCKS = 8  # a block of trials is so many times what one operation likes best
-_STANDING_STILL = 3.0  # deviations: the last step of a fit that has come to an end
-_START_STEPS, _HISTORY_STEPS = 2, 4
+_STANDING_STILL, _STILL_RAD = 3.0, 0.02  # deviations, or phase of the scatterers: the last step of a fit that has come to an end
+_HISTORY_STEPS = 4
 
 Part = Callable[[Tensor, Sampling, Tensor | None], Estimate]
 
@@ -48,9 +48,7 @@ def uneven_rotation(
     _refuse_less("uneven_rotation", 1, order=order, rounds=rounds, scatterers=1 if scatterers is None else scatterers)
 
     def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Estimate:
-        motion = _start(rows, sampling, order, known)
-        for _ in range(_START_STEPS):
-            motion, _ = refined_by_histories(rows, sampling, motion, free_centre=known is None)
+        motion, _ = refined_by_histories(rows, sampling, _start(rows, sampling, order, known), free_centre=known is None)
         fit = fit_scatterers(rows, sampling, motion, free_centre=known is None, count=scatterers, rounds=rounds)
         return _estimate(rows, sampling, fit, known is None)
 
@@ -152,10 +150,12 @@ def _estimate(rows: Tensor, sampling: Sampling, fit: Fit, free_centre: bool) -> 
     live = fit.scatterers.amplitude != 0
     count = live.sum(-1)
     present = (rows != 0).any(-1).sum(-1)
-    explained = fit.scatterers.amplitude.abs().square().sum(-1) * present / _energy(rows, fit.noise, present)
+    energy = fit.scatterers.amplitude.abs().square().sum(-1) * present
+    explained = energy / _energy(rows, fit.noise, present)
+    resting = (fit.last_step <= _STANDING_STILL) | (fit.last_step * (fit.noise / (2 * energy.clamp_min(torch.finfo(torch.float64).tiny))).sqrt() <= _STILL_RAD)
     quality = settle(explained.clamp(0, 1), 0.0)[0]
     std = _deviations(fit, free_centre)
-    focused = found.ok & (count >= LEAST_SCATTERERS) & (quality >= _LEAST_EXPLAINED) & (fit.last_step <= _STANDING_STILL)
+    focused = found.ok & (count >= LEAST_SCATTERERS) & (quality >= _LEAST_EXPLAINED) & resting
     scaled = (std["omega_rad_s"] < MOST_RATE_ERROR * fit.motion.omega_rad_s) & (fit.motion.w > 0)
     info = {**found.info, "focused": focused, "scatterers": count, "noise_power": fit.noise, "steps": fit.steps}
     return Estimate(found.value, quality, focused & scaled, std, info)
@@ -187,7 +187,7 @@ def _deviations(fit: Fit, free_centre: bool) -> dict[str, Tensor]:
 def _judged(rows: Tensor, sampling: Sampling, motion: Motion) -> Estimate:
     """A motion as an estimate, ok where its image has no more entropy than that of even rotation without compensation."""
     motion = replace(motion, k=settle(motion.k, 0.0)[0], w=settle(motion.w, 0.0)[0], v=settle(motion.v, 0.0)[0])
-    before = entropy(image_of(rows, sampling, Motion.still(torch.zeros_like(motion.k))))
+    before = entropy(torch.fft.fft(rows, 2 * sampling.pulses, dim=-2))
     after = entropy(image_of(rows, sampling, motion))
     value = {"warp_k": motion.k, **{k_name(i + 1): k for i, k in enumerate(motion.k.unbind(-1))}, "omega_rad_s": motion.omega_rad_s, "yc_m": motion.yc_m}
     gained = (before - after).double()

@@ -23,12 +23,12 @@ from torchsar.core.warp import least_rate
 
 _OVERSAMPLING = 2
 _SHARE, _LINES, _CELLS = 0.5, 24, 2  # a new scatterer is at least this part of the brightest about it
-MOST, ROUNDS = 800, 4
+MOST, ROUNDS = 800, 6
 _FEWEST = 128
-_SAMPLES_EACH = 1250  # of the data for each scatterer, so that a fit costs as much as some twenty images
-_SEARCHES = {0: 0.6, 2: 1.0}  # rounds that look for further scatterers, up to which part of all; the rounds between settle what was found
+_SAMPLES_EACH = 1450  # of the data for each scatterer, so that a fit costs as much as some twenty images
+_SEARCHES = {0: 0.1, 2: 0.6, 4: 1.0}  # rounds that look for further scatterers, up to which part of all: the brightest alone bring the motion near; the rounds between settle what was found
 _BLOCK_BYTES = 1 << 19
-_APART = 0.7  # cells, in Doppler and in range
+_APART = 0.5  # cells, in Doppler and in range
 _STEP = 0.3  # cells that a scatterer moves at most in a step
 _RIDGE = 1e-3
 _LEAST_RATE = 0.05
@@ -79,7 +79,7 @@ class Fit:
 def fit_scatterers(data: Tensor, sampling: Sampling, start: Motion, *, free_rate: bool = True, free_centre: bool = True, count: int | None = None, rounds: int = ROUNDS) -> Fit:
     """Maximum likelihood from `start`, on data (trial, pulse, range); a trial ends when its motion moves by less than a fifth of its deviation.
 
-    count: scatterers at most, which grow over the first rounds, by default one for every 1250 samples, 128 to 800; rounds: steps at most.
+    count: scatterers at most, which grow over the first rounds, by default one for every 1450 samples, 128 to 800; rounds: steps at most.
     """
     count = min(MOST, max(_FEWEST, sampling.pulses * sampling.cells // _SAMPLES_EACH)) if count is None else count
     unknowns = _Unknowns(start.k.shape[-1], free_rate, free_centre)
