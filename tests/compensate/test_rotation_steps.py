@@ -160,7 +160,7 @@ def model(unknown: Tensor, found: Scatterers, motion: Motion) -> Tensor:
 def step_of(data: Tensor, present: Tensor) -> tuple[Tensor, _Step]:
     found, motion = few()
     none = torch.zeros(1, dtype=torch.bool)
-    fit = Fit(motion, found, torch.zeros(1, 4, 4, dtype=F64), torch.ones(1, dtype=F64), none.long(), none)
+    fit = Fit(motion, found, torch.zeros(1, 4, 4, dtype=F64), torch.ones(1, dtype=F64), none.long(), none, torch.zeros(1, dtype=F64))
     return _Step.of(data, SMALL, fit, present, _Unknowns(2, True, True))
 
 
@@ -198,7 +198,7 @@ def test_steps_explain_all_of_clean_data() -> None:
     present, none = torch.ones(1, SHORT, dtype=torch.bool), torch.zeros(1, dtype=torch.bool)
     left = []
     for _ in range(5):
-        fit = Fit(motion, found, torch.zeros(1, 4, 4, dtype=F64), torch.ones(1, dtype=F64), none.long(), none)
+        fit = Fit(motion, found, torch.zeros(1, 4, 4, dtype=F64), torch.ones(1, dtype=F64), none.long(), none, torch.zeros(1, dtype=F64))
         residual, step = _Step.of(data, SMALL, fit, present, _Unknowns(2, True, True))
         left.append(float(residual.abs().square().sum() / data.abs().square().sum()))
         _, found, _, covariance = step.taken()

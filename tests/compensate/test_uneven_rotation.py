@@ -266,7 +266,7 @@ def test_refusals() -> None:
         uneven_rotation(data, **{**OPTIONS, "range_m": RANGE_M[:5]})
     with pytest.raises(ValueError, match="wavelength_m must be a positive number, got -1"):
         uneven_rotation(data, **{**OPTIONS, "wavelength_m": -1.0})
-    with pytest.raises(ValueError, match="order must be 1"):
+    with pytest.raises(ValueError, match="order must be a whole number of 1 or more"):
         uneven_rotation(data, **OPTIONS, order=0)
     with pytest.raises(ValueError, match="an order of 1"):
         UnevenRotation(RADAR, 0)

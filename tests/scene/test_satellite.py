@@ -38,21 +38,21 @@ def test_parts_hold_their_shares_and_lie_where_they_should() -> None:
 
 
 def test_panels_are_grids() -> None:
-    """Every point of a panel lies on one of its 7 ribs or 4 strings, and both hold many."""
+    """Every point of a panel lies on one of its 5 ribs or 9 strings, and both hold many."""
     satellite = Satellite()
     s = satellite.scatterers(Draws(2))
     members = satellite.parts()["panel_right"]
     x, y = s.azimuth_m[members], s.range_m[members]
-    to_rib, to_string = ((v - v.min()) / (v.max() - v.min()) * cells for v, cells in ((x, 6), (y, 3)))
+    to_rib, to_string = ((v - v.min()) / (v.max() - v.min()) * cells for v, cells in ((x, 4), (y, 8)))
     on_rib, on_string = ((v - v.round()).abs() < 1e-9 for v in (to_rib, to_string))
-    assert bool((on_rib | on_string).all()) and int(on_rib.sum()) > 40 and int(on_string.sum()) > 80
+    assert bool((on_rib | on_string).all()) and int(on_rib.sum()) > 30 and int(on_string.sum()) > 80
 
 
 def test_corners_are_strong_and_shared_and_tips_are_at_the_ends() -> None:
     satellite = Satellite()
     s, corners = satellite.scatterers(Draws(3, trials=range(5))), satellite.corners()
     assert int(corners.sum()) == 20
-    torch.testing.assert_close(s.amplitude.abs()[:, corners], torch.full((5, 20), 3.0, dtype=torch.float64))
+    torch.testing.assert_close(s.amplitude.abs()[:, corners], torch.full((5, 20), 1.5, dtype=torch.float64))
     assert bool((s.azimuth_m[:, corners] == s.azimuth_m[:1, corners]).all()) and bool((s.range_m[:, corners] == s.range_m[:1, corners]).all())
     tips = corners & (s.azimuth_m[0].abs() == 6.43)
     assert int(tips.sum()) == 4

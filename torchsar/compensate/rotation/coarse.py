@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchsar.core.warp import warp_rate
 
-SECTIONS = 28
+MOST_SECTIONS, LEAST_SECTIONS = 28, 8
 _OCTAVES = 3.5
 _STEPS_PER_UNIT = 200  # of the logarithm of Doppler
 _WIDEST = 1.4  # of the logarithm of a rate over another: a factor of 4
@@ -48,13 +48,15 @@ class _Agreement:
         return (low + rest * (high - low)).sum(-1)
 
 
-def coarse_warp(data: Tensor, prf_hz: float, sections: int = SECTIONS) -> Tensor:
+def coarse_warp(data: Tensor, prf_hz: float, sections: int | None = None) -> Tensor:
     """(k1, k2) of data (trial, pulse, range), good to about a percent of the rate. Returns float64 (trial, 2).
 
     Looks at all rates between a quarter and four times that of the first pulse. Needs scatterers off the axis in at least one range cell.
+    sections: half-overlapping, by default half the root of the number of pulses, 8 to 28: the Doppler of a section then changes by about as much as it resolves.
     """
     pulses = data.shape[1]
-    sections = max(4, min(sections, pulses // 8))
+    wanted = min(MOST_SECTIONS, max(LEAST_SECTIONS, round(math.sqrt(pulses) / 2))) if sections is None else sections
+    sections = max(4, min(wanted, pulses // 8))
     length = 2 * (pulses // (sections + 1))
     spectra = _log_spectra(_brightest(data, _ROWS), length)
     middles = (torch.arange(spectra.shape[1], dtype=torch.float64, device=data.device) * (length // 2) + (length - 1) / 2) / prf_hz

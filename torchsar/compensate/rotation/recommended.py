@@ -134,7 +134,7 @@ def _checked(name: str, data: Tensor, wavelength_m: float, prf_hz: float, range_
             raise ValueError(f"{name}: {what} must be a positive number, got {value}")
     if not isinstance(range_m, Tensor) or range_m.shape != data.shape[-1:]:
         got = f"the shape {tuple(range_m.shape)}" if isinstance(range_m, Tensor) else type(range_m).__name__
-        raise ValueError(f"{name}: range_m needs a tensor of the {data.shape[-1]} coordinates of the range axis, got {got}")
+        raise ValueError(f"{name}: range_m needs the {data.shape[-1]} coordinates of the range axis as a tensor, got {got}")
     refuse_non_finite(data, name)
     refuse_non_finite(range_m, f"{name}: range_m")
     steps = torch.diff(range_m.to(torch.float64))
