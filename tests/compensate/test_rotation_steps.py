@@ -183,7 +183,7 @@ def test_gradient_and_curvature_of_a_step_are_those_of_the_model(gaps: bool) -> 
     torch.testing.assert_close(own[0], gradient[: 4 * FEW], rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(torch.einsum("bpin,bpn->bi", slopes, turned.imag)[0], gradient[4 * FEW :], rtol=1e-6, atol=1e-9)
     flat = jacobian.flatten(0, 2)
-    local, cross, shared = step._curvature(slopes)
+    local, (cross, shared) = step._local(), step._shared(slopes)
     local = local[0] - torch.diag(local[0].diagonal() * _RIDGE / (1 + _RIDGE))
     mine = torch.cat([torch.cat([local, cross[0]], 1), torch.cat([cross[0].mT, shared[0]], 1)])
     size = flat.square().sum(0).sqrt()

@@ -32,6 +32,7 @@ _APART = 0.5  # cells, in Doppler and in range
 _STEP = 0.3  # cells that a scatterer moves at most in a step
 _RIDGE = 1e-3
 _LEAST_RATE = 0.05
+_AGREES = 5.0  # deviations by which the curvature of a scatterer may lie off
 _SETTLED = 0.2  # of its deviation: steps of the motion below it end a trial
 
 
@@ -95,7 +96,7 @@ def fit_scatterers(data: Tensor, sampling: Sampling, start: Motion, *, free_rate
         if turn in _SEARCHES:
             new, noise = _standing_out(residual, sampling, fit, present, math.ceil(count * _SEARCHES[turn]))
         if step is not None:
-            fit = _advanced(fit, step.taken(), noise, sampling, search_over=turn > max(_SEARCHES))
+            fit = _advanced(fit, step.taken(fit.noise if turn >= max(_SEARCHES) else None), noise, sampling, search_over=turn > max(_SEARCHES))
         if new is not None:
             fit = replace(fit, scatterers=fit.scatterers.joined(new, fit.settled).apart(), noise=noise)
         if turn == rounds or bool(fit.settled.all()):
@@ -163,6 +164,7 @@ class _Step:
     moments: Tensor
     shift: Tensor
     pairs: Pairs
+    gram: Tensor
 
     @staticmethod
     def of(data: Tensor, sampling: Sampling, fit: Fit, present: Tensor, unknowns: _Unknowns) -> tuple[Tensor, _Step]:
@@ -189,17 +191,38 @@ class _Step:
             shift += turned_back.mT @ rest
         moments = torch.view_as_complex(moments.unflatten(-1, (-1, 2)).to(torch.float64))
         shifts = (shift.to(torch.complex128) * slope.conj()).sum(-1)
-        return residual, _Step(sampling, motion, found, unknowns, moments.mT, shifts, Pairs.find(sampling, motion.k, found.amplitude, found.cell, bases))
+        return residual, _Step(sampling, motion, found, unknowns, moments.mT, shifts, Pairs.find(sampling, motion.k, found.amplitude, found.cell, bases), bases @ bases.mT)
 
-    def taken(self) -> tuple[Motion, Scatterers, Tensor, Tensor]:
-        """Motion and scatterers after the step, the step of the shared unknowns, and their covariance per unit noise power."""
+    def taken(self, noise: Tensor | None = None) -> tuple[Motion, Scatterers, Tensor, Tensor]:
+        """Motion and scatterers after the step, the step of the shared unknowns, and their covariance per unit noise power.
+
+        noise: per sample (trial,); with it, scatterers whose own curvature disagrees with the step (several in one resolution cell) lose their say in rate and centre.
+        """
+        slopes, factor = self._slopes(), _Factor.of(self._local())
+        found = self._solved(slopes, factor)
+        if noise is None or not (self.unknowns.rate or self.unknowns.centre):
+            return found
+        slopes[..., self.unknowns.order :, -1] *= self._agreement(slopes, found[2], noise)[..., None]
+        return self._solved(slopes, factor)
+
+    def _agreement(self, slopes: Tensor, change: Tensor, noise: Tensor) -> Tensor:
+        """Weights 0..1 (trial, scatterer) by how far the curvature of each scatterer alone lies from what the step gives it, in its deviations."""
+        power = self.found.amplitude.abs().square()
+        turned = (self.found.amplitude.conj()[..., None] * self.moments).imag
+        project = inverted(self.gram[:, :2, :2])[0] @ self.gram[:, :2]
+        curvature = (self.gram - self.gram[:, :2].mT @ project)[:, -1, -1, None].clamp_min(torch.finfo(torch.float64).tiny)
+        own = (turned - turned[..., :2] @ project)[..., -1] / torch.where(power > 0, power, 1) / curvature
+        off = own - torch.einsum("bpi,bi->bp", slopes[..., self.unknowns.order :, -1], change[:, self.unknowns.order :])
+        return 1 / (1 + off.square() * 2 * power * curvature / noise[:, None] / _AGREES**2)
+
+    def _solved(self, slopes: Tensor, factor: _Factor) -> tuple[Motion, Scatterers, Tensor, Tensor]:
+        """The step for these coefficients of the shared unknowns."""
         found = self.found
-        slopes = self._slopes()
-        local, cross, shared = self._curvature(slopes)
+        cross, shared = self._shared(slopes)
         turned = found.amplitude.conj()[..., None] * self.moments
         moved = (found.amplitude.conj() * self.shift).real
         own = torch.cat([turned[..., 0].real, turned[..., 0].imag, -2 * math.pi * turned[..., 1].imag, moved], -1)
-        joint = _solved_symmetric(local, torch.cat([cross, own[..., None]], -1))
+        joint = factor.solve(torch.cat([cross, own[..., None]], -1))
         schur = shared - cross.mT @ joint[..., :-1]
         change = solved(schur, torch.einsum("bpin,bpn->bi", slopes, turned.imag) - (cross.mT @ joint[..., -1:])[..., 0])
         grow, turn, line, row = (joint[..., -1] - (joint[..., :-1] @ change[..., None])[..., 0]).unflatten(-1, (4, -1)).unbind(-2)
@@ -207,12 +230,10 @@ class _Step:
         place = (found.row + row.clamp(-_STEP, _STEP)).clamp(0, self.sampling.cells - 1)
         return self._moved(change), Scatterers(amplitude, found.cell + line.clamp(-_STEP, _STEP), place), change, _covariance(schur)
 
-    def _curvature(self, slopes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Gauss-Newton curvature of growth, turn, Doppler cell and row of all scatterers (trial, 4 scatterer, 4 scatterer), theirs with the shared unknowns
-        (trial, 4 scatterer, unknown), and that of the shared ones (trial, unknown, unknown).
-        """
-        pairs, found = self.pairs, self.found
-        overlap, slope, bend = band_response(pairs.of(found.row, 0) - pairs.of(found.row, 1), self.sampling.cells)
+    def _local(self) -> Tensor:
+        """Gauss-Newton curvature of growth, turn, Doppler cell and row of all scatterers, (trial, 4 scatterer, 4 scatterer)."""
+        overlap, slope, bend = self._overlaps()
+        pairs = self.pairs
         flat, line, bent = pairs.products[(0, 0)], 2 * math.pi * pairs.products[(0, 1)], 4 * math.pi**2 * pairs.products[(1, 1)]
         a, u, s, us = flat * overlap, line * overlap, -flat * slope, -line * slope
         rows = [
@@ -224,6 +245,17 @@ class _Step:
         local = pairs.matrix(rows)
         diagonal = local.diagonal(dim1=-2, dim2=-1)
         diagonal += torch.where(diagonal > 0, _RIDGE * diagonal, 1.0)  # no scatterer, or one range cell that tells nothing of range
+        return local
+
+    def _overlaps(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Inner product over range cells of the envelopes of each pair, and its derivatives."""
+        row = self.found.row
+        return band_response(self.pairs.of(row, 0) - self.pairs.of(row, 1), self.sampling.cells)
+
+    def _shared(self, slopes: Tensor) -> tuple[Tensor, Tensor]:
+        """Curvature between the scatterers' unknowns and the shared ones (trial, 4 scatterer, unknown), and of the shared ones (trial, unknown, unknown)."""
+        pairs = self.pairs
+        overlap, slope, _ = self._overlaps()
         size = slopes.shape[-1]
         column, row = (slopes[pairs.trial, scatterer] for scatterer in (pairs.second, pairs.first))  # (pair, unknown, base)
         seen, bowed = (sum(pairs.products[(base, n)][:, None] * column[..., n] for n in range(2, size)) for base in (0, 1))
@@ -231,7 +263,7 @@ class _Step:
         cross = torch.cat([pairs.per_scatterer(part) for part in parts], 1)
         shared = range(2, size)
         both = torch.stack([(pairs.products[(n, m)] * overlap).real[:, None, None] * row[..., n, None] * column[:, None, :, m] for n in shared for m in shared]).sum(0)
-        return local, cross, pairs.per_trial(both)
+        return cross, pairs.per_trial(both)
 
     def _moved(self, change: Tensor) -> Motion:
         order, motion = self.unknowns.order, self.motion
@@ -252,10 +284,20 @@ class _Step:
         return slopes
 
 
-def _solved_symmetric(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solution by Cholesky factors, or by elimination where rounding has left a matrix indefinite."""
-    factor, failed = torch.linalg.cholesky_ex(matrix)
-    return torch.linalg.solve(matrix, right) if bool(failed.any()) else torch.cholesky_solve(right, factor)
+@dataclass(frozen=True)
+class _Factor:
+    """A symmetric matrix (trial, n, n) made ready to solve with: its Cholesky factor, or None where rounding has left it indefinite."""
+
+    matrix: Tensor
+    factor: Tensor | None
+
+    @staticmethod
+    def of(matrix: Tensor) -> _Factor:
+        factor, failed = torch.linalg.cholesky_ex(matrix)
+        return _Factor(matrix, None if bool(failed.any()) else factor)
+
+    def solve(self, right: Tensor) -> Tensor:
+        return torch.linalg.solve(self.matrix, right) if self.factor is None else torch.cholesky_solve(right, self.factor)
 
 
 def _covariance(normal: Tensor) -> Tensor:
