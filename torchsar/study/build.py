@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from torchsar.core import Chain, Recording, Truth, use
-from torchsar.radar import InverseRadar, StripmapRadar, TriangularLadar
+from torchsar.radar import LIGHT_M_S, InverseRadar, StripmapRadar, TriangularLadar
 from torchsar.study.catalogue import Catalogue
 from torchsar.study.config import Config, Loaded, Method
 from torchsar.study.errors import ConfigError, did_you_mean
@@ -108,3 +108,10 @@ def refuse_oversize(lines: int, samples: int, file: str, smaller: str) -> None:
         return
     if 8 * lines * samples > memory:
         raise ConfigError(f"{file}: world: {lines} lines of {samples} samples take {8 * lines * samples / 1e9:.3g} GB, and this machine has {memory / 1e9:.3g} GB; make {smaller} smaller")
+
+
+def carried(radar: Mapping[str, Any]) -> dict[str, Any]:
+    """Values of a section `radar` with carrier_hz in place of the wavelength_m that it may give instead."""
+    values = dict(radar)
+    wavelength = values.pop("wavelength_m")
+    return values if wavelength is None else {**values, "carrier_hz": LIGHT_M_S / wavelength}

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Self
+
+from pydantic import model_validator
 
 from torchsar.study.config import RESERVED, Config, Loaded
 from torchsar.study.errors import ConfigError
@@ -15,6 +17,19 @@ class CasedConfig(Config):
     """An experiment of several cases; cases: name -> dotted keys with the values that make the case."""
 
     cases: dict[str, dict[str, Any]] = {}
+
+
+class LimitedConfig(CasedConfig):
+    """Cases that limits may stop; beyond_limits: methods that the config shows beyond their limits on purpose, of which it only warns."""
+
+    beyond_limits: list[str] = []
+
+    @model_validator(mode="after")
+    def _known_methods(self) -> Self:
+        for name in self.beyond_limits:
+            if name not in self.processor:
+                raise ValueError(f"beyond_limits names the method {name!r}; there is {', '.join(self.processor)}")
+        return self
 
 
 def cases_of(loaded: Loaded) -> dict[str, Loaded]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -18,6 +17,7 @@ from torchsar.study.cases import cases_of
 from torchsar.study.config import Loaded
 from torchsar.study.errors import ConfigError
 from torchsar.study.isal.build import build_radar, build_world, check
+from torchsar.study.limits import requirement_lines
 
 _SAMPLING = ("vibration followed by pulses", "cross range unambiguous", "range unambiguous")
 
@@ -65,8 +65,4 @@ def fidelity_for(rows: Sequence[Requirement]) -> str:
 
 
 def _text(name: str, rows: Sequence[Requirement]) -> str:
-    lines = [f"{name}", f"{'simplification':<34}{'neglected phase':>16}{'range cells':>13}  {'verdict':<58}neglects"]
-    for row in rows:
-        cells = "" if math.isnan(row.range_cells) else f"{row.range_cells:.3g}"
-        lines.append(f"{row.effect:<34}{row.phase_rad:>12.3g} rad{cells:>13}  {row.verdict:<58}{row.neglects}")
-    return "\n".join([*lines, f"the simplest echo model that this scene allows: {fidelity_for(rows)}"])
+    return "\n".join([name, *requirement_lines(rows), f"the simplest echo model that this scene allows: {fidelity_for(rows)}"])

@@ -9,9 +9,9 @@ import torch
 
 from torchsar.core import Draws, Recording, Truth
 from torchsar.echo import Damage, simulate_turntable
-from torchsar.radar import LIGHT_M_S, InverseRadar
+from torchsar.radar import InverseRadar
 from torchsar.scene import Points, PolynomialRotation, Scatterers, Scene, Together, TurntableWorld
-from torchsar.study.build import build_damages, precision, refuse_oversize
+from torchsar.study.build import build_damages, carried, precision, refuse_oversize
 from torchsar.study.cases import cases_of, check_judged
 from torchsar.study.config import Loaded
 from torchsar.study.errors import ConfigError
@@ -65,12 +65,8 @@ class Turntable:
 
 def build_radar(loaded: Loaded) -> InverseRadar:
     """The instrument."""
-    values = loaded.config.radar.model_dump()
-    wavelength = values.pop("wavelength_m")
-    if wavelength is not None:
-        values["carrier_hz"] = LIGHT_M_S / wavelength
     try:
-        return InverseRadar(**values)
+        return InverseRadar(**carried(loaded.config.radar.model_dump()))
     except ValueError as error:
         raise ConfigError(f"{loaded.file}: radar: {error}") from None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -15,10 +15,9 @@ from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Requirement
 from torchsar.focus.rotation_requirements import least_order, rotation_limits, rotation_requirements
 from torchsar.metrics.rotation_bounds import rotation_bounds
-from torchsar.study.case_run import write_requirements
-from torchsar.study.cases import cases_of
 from torchsar.study.config import Loaded
 from torchsar.study.errors import ConfigError
+from torchsar.study.limits import heed, limit_lines, limit_rows, requirement_lines, requirement_rows, write_needs
 from torchsar.study.registry import stages
 from torchsar.study.rotation.build import Turntable, check, refuse_recordings
 from torchsar.study.rotation.sections import RotationConfig
@@ -33,26 +32,12 @@ def requires(loaded: Loaded, out: Path | None) -> str:
     """Both tables of every case of a simulation as text, predicted from the config alone. With `out`: config.yaml, requires.json and requires.txt there."""
     refuse_recordings(loaded)
     check(loaded)
-
-    def find() -> tuple[str, dict[str, object]]:
-        found = {name or loaded.name: Needs.of(case) for name, case in cases_of(loaded).items()}
-        return "\n\n".join(_text(name, needs) for name, needs in found.items()), {name: needs.tree() for name, needs in found.items()}
-
-    return write_requirements(loaded, out, find)
+    return write_needs(loaded, out, Needs.of)
 
 
 def heed_limits(loaded: Loaded, case: str) -> None:
-    """Refuse a case beyond a limit that stops a method, unless the config shows the method beyond its limits on purpose; warn of the other limits.
-
-    Raises ConfigError with the limit, what it comes to and what helps.
-    """
-    where = f"cases.{case}: " if case else ""
-    for limit in Needs.of(loaded).limits:
-        stopped = _stopped(limit, loaded) if limit.verdict == "refuse" else []
-        if stopped:
-            raise ConfigError(f"{loaded.file}: {where}processor.{stopped[0]}: {limit.sentence} (or name the method in beyond_limits)")
-        if limit.verdict != "ok":
-            log.warning("warning: %s%s", where, limit.sentence)
+    """Refuse or warn of what the case goes beyond, see `heed`."""
+    heed(loaded, case, Needs.of(loaded).limits, lambda limit: _stopped(limit, loaded))
 
 
 def _stopped(limit: Limit, loaded: Loaded) -> list[str]:
@@ -89,9 +74,12 @@ class Needs:
             raise ConfigError(f"{loaded.file}: {' '.join(str(error).split())}") from None
 
     def tree(self) -> dict[str, object]:
-        limits = [{**asdict(limit), "verdict": limit.verdict} for limit in self.limits]
-        rows = [{**asdict(row), "ok": row.ok, "verdict": row.verdict} for row in self.rows]
-        return {"limits": limits, "order": least_order(self.rows), "fidelity": self.fidelity, "requirements": rows}
+        return {"limits": limit_rows(self.limits), "order": least_order(self.rows), "fidelity": self.fidelity, "requirements": requirement_rows(self.rows)}
+
+    def text(self, name: str) -> str:
+        order = least_order(self.rows)
+        simplest = f"the simplest model that this scene allows: order {order}{'' if order <= 4 else ' or more'}, {self.fidelity}"
+        return "\n".join([name, *limit_lines(self.limits), "", *requirement_lines(self.rows), simplest])
 
     @property
     def fidelity(self) -> str:
@@ -121,16 +109,3 @@ def _rate_bound(table: Turntable, x: Tensor, y: Tensor, amplitude: Tensor, noise
     k = torch.tensor(true_k(table), dtype=torch.float64)
     told = {"wavelength_m": table.radar.wavelength_m, "prf_hz": table.radar.prf_hz, "n_pulse": table.pulses, "free_centre": False}
     return float(rotation_bounds(x, y, amplitude, noise_std, float(table.rotation.omega_rad_s), k, float(table.world.centre_deviation_m), **told)["omega_rad_s"])
-
-
-def _text(name: str, needs: Needs) -> str:
-    lines = [name, f"{'limit':<42}{'value':>12}{'limit':>14} {'unit':<6}{'verdict':<9}what then"]
-    for row in needs.limits:
-        then = "" if row.ok else f"{row.consequence}; {row.remedy}"
-        lines.append(f"{row.name:<42}{row.value:>12.4g}{('>= ' if row.at_least else '< ') + format(row.limit, '.4g'):>14} {row.unit:<6}{row.verdict:<9}{then}".rstrip())
-    lines += ["", f"{'simplification':<32}{'neglected phase':>16}{'range cells':>13}  {'verdict':<48}neglects"]
-    for row in needs.rows:
-        cells = "" if math.isnan(row.range_cells) else f"{row.range_cells:.3g}"
-        lines.append(f"{row.effect:<32}{row.phase_rad:>12.3g} rad{cells:>13}  {row.verdict:<48}{row.neglects}")
-    order = least_order(needs.rows)
-    return "\n".join([*lines, f"the simplest model that this scene allows: order {order}{'' if order <= 4 else ' or more'}, {needs.fidelity}"])

@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from torchsar.core import Draws
 from torchsar.study.case_run import run_cases
 from torchsar.study.cases import cases_of, methods_tree
 from torchsar.study.config import Loaded, check_methods
-from torchsar.study.montecarlo.record import OK
+from torchsar.study.limits import warn_of_doubt
 from torchsar.study.rotation.build import check, refuse_recordings
 from torchsar.study.rotation.figures import CaseResult, draw
 from torchsar.study.rotation.judge import DEFINITIONS
@@ -58,15 +57,8 @@ def _simulated(loaded: Loaded, name: str) -> CaseResult:
             refuse_no_image(method, outcome.trace.signal, ENDING)
         parts.append(CaseResult.of(bench, batch))
     result = CaseResult.joined(parts)
-    _warn_of_doubt(name, result.metrics, count)
+    warn_of_doubt(name, result.metrics, count)
     return result
-
-
-def _warn_of_doubt(name: str, metrics: Mapping[str, Mapping[str, Tensor]], count: int) -> None:
-    verdicts = metrics["recommended"].get(OK)
-    doubted = 0 if verdicts is None else int((~verdicts).sum())
-    if doubted:
-        log.warning("warning: %srecommended does not trust its estimate in %d of %d trials", f"{name}: " if name else "", doubted, count)
 
 
 def metrics_tree(loaded: Loaded, results: Mapping[str, CaseResult]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from torchsar.study.cases import CasedConfig
+from torchsar.study.cases import LimitedConfig
 from torchsar.study.catalogue import Strict
 from torchsar.study.isal import sections
 
@@ -78,19 +78,11 @@ class Trade(Strict):
     repeats: int = Field(default=1, ge=1)
 
 
-class RotationConfig(CasedConfig):
+class RotationConfig(LimitedConfig):
     """An experiment with a target that turns unevenly; beyond_limits: methods that it shows beyond their limits on purpose, of which it only warns."""
 
     system: Literal["isal_rotation"] = "isal_rotation"
     radar: Radar | None = None
     world: World | None = None
-    beyond_limits: list[str] = []
     metrics: Metrics = Metrics()
     trade: Trade = Trade()
-
-    @model_validator(mode="after")
-    def _known_methods(self) -> RotationConfig:
-        for name in self.beyond_limits:
-            if name not in self.processor:
-                raise ValueError(f"beyond_limits names the method {name!r}; there is {', '.join(self.processor)}")
-        return self

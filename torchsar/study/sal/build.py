@@ -11,9 +11,9 @@ import torch
 
 from torchsar.core import Draws, Recording, Truth
 from torchsar.echo import Damage, simulate_ladar, simulate_ladar_record
-from torchsar.radar import LIGHT_M_S, TriangularLadar
+from torchsar.radar import TriangularLadar
 from torchsar.scene import LadarWorld, Points, RetroAndBrokenLine, Together
-from torchsar.study.build import build_damages, precision, refuse_oversize
+from torchsar.study.build import build_damages, carried, precision, refuse_oversize
 from torchsar.study.cases import cases_of, check_judged
 from torchsar.study.catalogue import Catalogue
 from torchsar.study.config import Loaded
@@ -29,12 +29,8 @@ _OF_DERAMPED = ("azimuth_matched_filter", "phase_polish")
 
 def build_radar(loaded: Loaded) -> TriangularLadar:
     """The instrument."""
-    values = loaded.config.radar.model_dump()
-    wavelength = values.pop("wavelength_m")
-    if wavelength is not None:
-        values["carrier_hz"] = LIGHT_M_S / wavelength
     try:
-        return TriangularLadar(**values)
+        return TriangularLadar(**carried(loaded.config.radar.model_dump()))
     except ValueError as error:
         raise ConfigError(f"{loaded.file}: radar: {str(error).removeprefix('radar.')}") from None
 

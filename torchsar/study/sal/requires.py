@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -17,10 +16,9 @@ from torchsar.focus.requirements import Requirement
 from torchsar.radar import TriangularLadar
 from torchsar.scene import Extremes, Fidelity, LinearInSweep, QuadraticInSweep, drawn_motion
 from torchsar.scene.vibration import displacement_m
-from torchsar.study.case_run import write_requirements
-from torchsar.study.cases import cases_of
 from torchsar.study.config import Loaded
 from torchsar.study.errors import ConfigError
+from torchsar.study.limits import heed, limit_lines, limit_rows, requirement_lines, requirement_rows, write_needs
 from torchsar.study.sal.build import Ladar, check, refuse_recordings
 from torchsar.study.sal.judge import leading, lit_periods
 from torchsar.study.sal.sections import SalConfig
@@ -40,26 +38,12 @@ def requires(loaded: Loaded, out: Path | None) -> str:
     """Both tables of every case of a simulation as text, predicted from the config alone. With `out`: config.yaml, requires.json and requires.txt there."""
     refuse_recordings(loaded)
     check(loaded)
-
-    def find() -> tuple[str, dict[str, object]]:
-        found = {name or loaded.name: Needs.of(case) for name, case in cases_of(loaded).items()}
-        return "\n\n".join(_text(name, needs) for name, needs in found.items()), {name: needs.tree() for name, needs in found.items()}
-
-    return write_requirements(loaded, out, find)
+    return write_needs(loaded, out, Needs.of)
 
 
 def heed_limits(loaded: Loaded, case: str) -> None:
-    """Refuse a case beyond a limit that stops a method, unless the config shows the method beyond its limits on purpose; warn of the other limits.
-
-    Raises ConfigError with the limit, what it comes to and what helps.
-    """
-    where = f"cases.{case}: " if case else ""
-    for limit in Needs.of(loaded).limits:
-        stopped = _stopped(limit, loaded) if limit.verdict == "refuse" else []
-        if stopped:
-            raise ConfigError(f"{loaded.file}: {where}processor.{stopped[0]}: {limit.sentence} (or name the method in beyond_limits)")
-        if limit.verdict != "ok":
-            log.warning("warning: %s%s", where, limit.sentence)
+    """Refuse or warn of what the case goes beyond, see `heed`."""
+    heed(loaded, case, Needs.of(loaded).limits, lambda limit: _stopped(limit, loaded))
 
 
 def _stopped(limit: Limit, loaded: Loaded) -> list[str]:
@@ -90,8 +74,10 @@ class Needs:
             raise ConfigError(f"{loaded.file}: {' '.join(str(error).split())}") from None
 
     def tree(self) -> dict[str, object]:
-        limits = [{**asdict(limit), "verdict": limit.verdict} for limit in self.limits]
-        return {"limits": limits, "fidelity": self.fidelity, "requirements": [{**asdict(row), "ok": row.ok, "verdict": row.verdict} for row in self.rows]}
+        return {"limits": limit_rows(self.limits), "fidelity": self.fidelity, "requirements": requirement_rows(self.rows)}
+
+    def text(self, name: str) -> str:
+        return "\n".join([name, *limit_lines(self.limits), "", *requirement_lines(self.rows), f"the simplest echo model that this scene allows: {self.fidelity}"])
 
 
 def _needs(ladar: Ladar, seed: int) -> Needs:
@@ -177,24 +163,3 @@ def simplest_fidelity(radar: TriangularLadar, extremes: Extremes) -> str:
         if level.neglected_phase_rad(radar, extremes)["level"] < _TOLERANCE_RAD:
             return name
     return "every_sample"
-
-
-def _text(name: str, needs: Needs) -> str:
-    return "\n".join([name, *_limit_lines(needs.limits), "", *_requirement_lines(needs.rows), f"the simplest echo model that this scene allows: {needs.fidelity}"])
-
-
-def _limit_lines(limits: Sequence[Limit]) -> list[str]:
-    lines = [f"{'limit':<40}{'value':>12}{'limit':>14} {'unit':<8}{'verdict':<9}what then"]
-    for row in limits:
-        then = "" if row.ok else f"{row.consequence}; {row.remedy}"
-        lines.append(f"{row.name:<40}{row.value:>12.4g}{('>= ' if row.at_least else '< ') + format(row.limit, '.4g'):>14} {row.unit:<8}{row.verdict:<9}{then}".rstrip())
-    return lines
-
-
-def _requirement_lines(rows: Sequence[Requirement]) -> list[str]:
-    wide = 2 + max(len(row.verdict) for row in rows)
-    lines = [f"{'simplification':<34}{'neglected phase':>16}{'range cells':>13}  {'verdict':<{wide}}neglects"]
-    for row in rows:
-        cells = "" if math.isnan(row.range_cells) else f"{row.range_cells:.3g}"
-        lines.append(f"{row.effect:<34}{row.phase_rad:>12.3g} rad{cells:>13}  {row.verdict:<{wide}}{row.neglects}")
-    return lines

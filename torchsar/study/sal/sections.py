@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from torchsar.study.cases import CasedConfig
+from torchsar.study.cases import LimitedConfig
 from torchsar.study.catalogue import Catalogue, Strict
 from torchsar.study.config import Noise
 from torchsar.study.registry import CALIBRATIONS, DAMAGES, LOG_AMPLITUDES, RADIAL_MOTIONS, SCENES, SWEEP_ERRORS, SWEEP_FIDELITIES
@@ -96,7 +96,7 @@ class Trade(Strict):
     repeats: int = Field(default=3, ge=1)
 
 
-class SalConfig(CasedConfig):
+class SalConfig(LimitedConfig):
     """An experiment with a triangular-sweep ladar; beyond_limits: methods that it shows beyond their limits on purpose, of which it only warns."""
 
     recording: ClassVar[str] = "ladar"
@@ -104,13 +104,5 @@ class SalConfig(CasedConfig):
     system: Literal["sal"] = "sal"
     radar: Radar | None = None
     world: World | None = None
-    beyond_limits: list[str] = []
     metrics: Metrics = Metrics()
     trade: Trade = Trade()
-
-    @model_validator(mode="after")
-    def _known_methods(self) -> SalConfig:
-        for name in self.beyond_limits:
-            if name not in self.processor:
-                raise ValueError(f"beyond_limits names the method {name!r}; there is {', '.join(self.processor)}")
-        return self
