@@ -161,7 +161,7 @@ def step_of(data: Tensor, present: Tensor) -> tuple[Tensor, _Step]:
     found, motion = few()
     none = torch.zeros(1, dtype=torch.bool)
     fit = Fit(motion, found, torch.zeros(1, 4, 4, dtype=F64), torch.ones(1, dtype=F64), none.long(), none, torch.zeros(1, dtype=F64))
-    return _Step.of(data, SMALL, fit, present, _Unknowns(2, True, True))
+    return _Step.of(data, SMALL, fit, present, _Unknowns(2, True))
 
 
 @pytest.mark.parametrize("gaps", [False, True])
@@ -199,7 +199,7 @@ def test_steps_explain_all_of_clean_data() -> None:
     left = []
     for _ in range(5):
         fit = Fit(motion, found, torch.zeros(1, 4, 4, dtype=F64), torch.ones(1, dtype=F64), none.long(), none, torch.zeros(1, dtype=F64))
-        residual, step = _Step.of(data, SMALL, fit, present, _Unknowns(2, True, True))
+        residual, step = _Step.of(data, SMALL, fit, present, _Unknowns(2, True))
         left.append(float(residual.abs().square().sum() / data.abs().square().sum()))
         _, found, _, covariance = step.taken()
         assert (covariance.diagonal(dim1=1, dim2=2) > 0).all()

@@ -225,6 +225,7 @@ CASES = [
     Case("rotation_descent", lambda: RotationDescent(TURNTABLE, [0.3, 0.5], steps=2, **SEARCH), differentiable=False, vmap=False, tolerance=1e-3),
     Case("rotation_coarse", lambda: CoarseRotation(TURNTABLE), differentiable=False, vmap=False),
     Case("rotation_phase_fit", lambda: PhaseFitRotation(TURNTABLE), differentiable=False, vmap=False, tolerance=1e-6),
+    # an iterated fit of noise, which amplifies the rounding of its sums
     Case("rotation", lambda: UnevenRotation(TURNTABLE), differentiable=False, vmap=False, tolerance=1e-4),
     Case("rotation_autofocus", lambda: RotationAutofocus(TURNTABLE, 4, 2), _turn, differentiable=False, vmap=False, tolerance=1e-6),
     Case("chirplet_clean", lambda: ChirpletClean(TURNTABLE, atoms=3), differentiable=False, vmap=False, tolerance=1e-6),

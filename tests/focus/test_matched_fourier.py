@@ -13,7 +13,8 @@ from torchsar.compensate.pulse_phase.imaging import Through
 from torchsar.core import Signal
 from torchsar.core.warp import warp, warp_rate
 from torchsar.focus import MatchedFourier, MatchedFourierOperator, RangePhase, cross_range_of, lines_for, matched_fourier, mean_rate, range_phase
-from torchsar.focus.matched_fourier import kernel_of, times_of_even_angle
+from torchsar.focus.matched_fourier import kernel_of
+from torchsar.focus.warped_sums import times_of_even_angle
 from torchsar.metrics import entropy
 from torchsar.radar import LIGHT_M_S, InverseRadar
 

@@ -60,7 +60,7 @@ def test_entropy_falls_with_the_order_and_uniform_autofocus_fails() -> None:
     assert min(entropy["pga"], entropy["uniform_autofocus"]) > order[3] + 3
     assert abs(entropy["recommended"] - order[3]) < 0.01 and abs(entropy["phase_fit"] - order[3]) < 0.02
     best = {key: float(value) for key, value in made.metrics["recommended"].items()}
-    assert abs(best["omega_error_percent"]) < 2 and max(abs(best["k1_error_percent"]), abs(best["k2_error_percent"])) < 0.02 and abs(best["yc_error_m"]) < 0.05
+    assert abs(best["omega_error_percent"]) < 1 and max(abs(best["k1_error_percent"]), abs(best["k2_error_percent"])) < 0.02 and abs(best["yc_error_m"]) < 0.05
     assert bool(best["ok"]) and not bool(made.metrics["pga"]["ok"])
 
 

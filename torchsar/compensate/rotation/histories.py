@@ -25,7 +25,7 @@ _NOTHING = 1e-7  # of an eigenvalue of a normal matrix of unit diagonal
 _SHARE_LOST = 0.01  # of an unknown in a direction
 
 
-def refined_by_histories(data: Tensor, sampling: Sampling, motion: Motion, *, free_rate: bool = True, free_centre: bool = True, count: int = 128, half_cells: int = 24) -> tuple[Motion, Tensor]:
+def refined_by_histories(data: Tensor, sampling: Sampling, motion: Motion, *, free_centre: bool = True, count: int = 128, half_cells: int = 24) -> tuple[Motion, Tensor]:
     """One step of phase least squares from `motion`, on data (trial, pulse, range). Returns the motion and the number of scatterers used (trial,).
 
     count: scatterers at most; half_cells: half width of a window in Doppler cells, wide enough for the error of the start.
@@ -35,13 +35,13 @@ def refined_by_histories(data: Tensor, sampling: Sampling, motion: Motion, *, fr
     peaks = find_peaks(power, noise_power(power) * threshold(power), count, _ISOLATED, 2 * half_cells, 1)
     cells = (peaks.line - image.shape[1] // 2) / _OVERSAMPLING
     history, u = _histories(image, peaks, half_cells)
-    bases = _bases(motion, sampling, cells, sampling.range_m(peaks.cell), u, free_rate, free_centre)
+    bases = _bases(motion, sampling, cells, sampling.range_m(peaks.cell), u, free_centre)
     keep = slice(max(1, len(u) // _ENDS), -max(1, len(u) // _ENDS))
     change = _fitted(history[..., keep], bases[..., keep], peaks.power > 0)
     order = motion.k.shape[-1]
-    w, v = (change[:, order] if free_rate else 0), (change[:, -1] if free_centre else 0)
+    v = change[:, -1] if free_centre else 0
     found = (peaks.power > 0).sum(-1)
-    moved = replace(motion, k=motion.k + change[:, :order], w=motion.w + w, v=motion.v + v)
+    moved = replace(motion, k=motion.k + change[:, :order], w=motion.w + change[:, order], v=motion.v + v)
     return moved.where((found > 0) & moved.possible(sampling), motion), found
 
 
@@ -57,13 +57,12 @@ def _histories(image: Tensor, peaks: Peaks, half_cells: int) -> tuple[Tensor, Te
     return window @ torch.polar(torch.ones_like(angle), angle), u
 
 
-def _bases(motion: Motion, sampling: Sampling, cells: Tensor, range_m: Tensor, u: Tensor, free_rate: bool, free_centre: bool) -> Tensor:
-    """Phase (rad) per unit of each unknown, (trial, peak, unknown, sample): k1, k2, ..., then w and v where they are free."""
+def _bases(motion: Motion, sampling: Sampling, cells: Tensor, range_m: Tensor, u: Tensor, free_centre: bool) -> Tensor:
+    """Phase (rad) per unit of each unknown, (trial, peak, unknown, sample): k1, k2, ..., w, then v where it is free."""
     warped = Warped.of(motion.k, _times_at(u, motion.k, sampling.duration_s), sampling.duration_s)
     square = 2 * math.pi * sampling.turns_per_square * warped.phi.square()[:, None]
     rows = [-2 * math.pi * cells[..., None] * slope[:, None] for slope in warped.slopes.unbind(1)]
-    if free_rate:
-        rows.append((range_m + motion.centre_m[:, None])[..., None] * square)
+    rows.append((range_m + motion.centre_m[:, None])[..., None] * square)
     if free_centre:
         rows.append(square.expand(-1, cells.shape[-1], -1))
     return torch.stack(rows, -2)

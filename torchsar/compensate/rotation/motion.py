@@ -10,7 +10,8 @@ from torch import Tensor
 
 from torchsar.core import outer_phasor, phasor_tables, unit_phasor
 from torchsar.core.warp import warp
-from torchsar.focus.matched_fourier import matched_fourier, slow_times
+from torchsar.focus.matched_fourier import matched_fourier
+from torchsar.focus.warped_sums import slow_times
 
 SEARCH_EPS = 1e-3  # of the transform: enough for estimates; images take less
 LEAST_PULSES = 8

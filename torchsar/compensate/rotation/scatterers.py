@@ -77,13 +77,13 @@ class Fit:
     last_step: Tensor
 
 
-def fit_scatterers(data: Tensor, sampling: Sampling, start: Motion, *, free_rate: bool = True, free_centre: bool = True, count: int | None = None, rounds: int = ROUNDS) -> Fit:
+def fit_scatterers(data: Tensor, sampling: Sampling, start: Motion, *, free_centre: bool = True, count: int | None = None, rounds: int = ROUNDS) -> Fit:
     """Maximum likelihood from `start`, on data (trial, pulse, range); a trial ends when its motion moves by less than a fifth of its deviation.
 
     count: scatterers at most, which grow over the first rounds, by default one for every 1450 samples, 128 to 800; rounds: steps at most.
     """
     count = min(MOST, max(_FEWEST, sampling.pulses * sampling.cells // _SAMPLES_EACH)) if count is None else count
-    unknowns = _Unknowns(start.k.shape[-1], free_rate, free_centre)
+    unknowns = _Unknowns(start.k.shape[-1], free_centre)
     present = (data != 0).any(-1)
     trials, device = data.shape[0], data.device
     noise = torch.full((trials,), math.inf, dtype=torch.float64, device=device)
@@ -107,15 +107,14 @@ def fit_scatterers(data: Tensor, sampling: Sampling, start: Motion, *, free_rate
 
 @dataclass(frozen=True)
 class _Unknowns:
-    """Which of the shared unknowns are estimated."""
+    """What all scatterers share: as many k, the rate w, and v where the centre is free."""
 
-    order: int
-    rate: bool
+    k: int
     centre: bool
 
     @property
     def size(self) -> int:
-        return self.order + self.rate + self.centre
+        return self.k + 1 + self.centre
 
 
 def _standing_out(residual: Tensor, sampling: Sampling, fit: Fit, present: Tensor, bound: int) -> tuple[Scatterers, Tensor]:
@@ -200,9 +199,9 @@ class _Step:
         """
         slopes, factor = self._slopes(), _Factor.of(self._local())
         found = self._solved(slopes, factor)
-        if noise is None or not (self.unknowns.rate or self.unknowns.centre):
+        if noise is None:
             return found
-        slopes[..., self.unknowns.order :, -1] *= self._agreement(slopes, found[2], noise)[..., None]
+        slopes[..., self.unknowns.k :, -1] *= self._agreement(slopes, found[2], noise)[..., None]
         return self._solved(slopes, factor)
 
     def _agreement(self, slopes: Tensor, change: Tensor, noise: Tensor) -> Tensor:
@@ -212,7 +211,7 @@ class _Step:
         project = inverted(self.gram[:, :2, :2])[0] @ self.gram[:, :2]
         curvature = (self.gram - self.gram[:, :2].mT @ project)[:, -1, -1, None].clamp_min(torch.finfo(torch.float64).tiny)
         own = (turned - turned[..., :2] @ project)[..., -1] / torch.where(power > 0, power, 1) / curvature
-        off = own - torch.einsum("bpi,bi->bp", slopes[..., self.unknowns.order :, -1], change[:, self.unknowns.order :])
+        off = own - torch.einsum("bpi,bi->bp", slopes[..., self.unknowns.k :, -1], change[:, self.unknowns.k :])
         return 1 / (1 + off.square() * 2 * power * curvature / noise[:, None] / _AGREES**2)
 
     def _solved(self, slopes: Tensor, factor: _Factor) -> tuple[Motion, Scatterers, Tensor, Tensor]:
@@ -266,19 +265,17 @@ class _Step:
         return cross, pairs.per_trial(both)
 
     def _moved(self, change: Tensor) -> Motion:
-        order, motion = self.unknowns.order, self.motion
-        w = motion.w + (change[:, order] if self.unknowns.rate else 0)
+        order, motion = self.unknowns.k, self.motion
         v = motion.v + (change[:, -1] if self.unknowns.centre else 0)
-        return replace(motion, k=motion.k + change[:, :order], w=w, v=v)
+        return replace(motion, k=motion.k + change[:, :order], w=motion.w + change[:, order], v=v)
 
     def _slopes(self) -> Tensor:
         """Coefficients of the bases in the phase per unit of each shared unknown, (trial, scatterer, unknown, base)."""
-        order, found = self.unknowns.order, self.found
+        order, found = self.unknowns.k, self.found
         slopes = found.cell.new_zeros(*found.cell.shape, self.unknowns.size, order + 3)
         for i in range(order):
             slopes[..., i, 2 + i] = -2 * math.pi * found.cell
-        if self.unknowns.rate:
-            slopes[..., order, -1] = self.sampling.range_m(found.row) + self.motion.centre_m[:, None]
+        slopes[..., order, -1] = self.sampling.range_m(found.row) + self.motion.centre_m[:, None]
         if self.unknowns.centre:
             slopes[..., -1, -1] = 1
         return slopes
@@ -303,7 +300,7 @@ class _Factor:
 def _covariance(normal: Tensor) -> Tensor:
     """Of the shared unknowns per unit noise power, infinite for those that nothing is known about."""
     inverse, lost = inverted(normal)
-    return inverse / 2 + torch.diag_embed(torch.where(lost, math.inf, 0.0)).nan_to_num(nan=0.0, posinf=math.inf)
+    return inverse / 2 + torch.diag_embed(torch.where(lost, math.inf, 0.0))
 
 
 def _advanced(fit: Fit, taken: tuple[Motion, Scatterers, Tensor, Tensor], noise: Tensor, sampling: Sampling, search_over: bool) -> Fit:

@@ -1,0 +1,217 @@
+"""Ways to form the sum of a matched Fourier transform over pulses, each with its exact adjoint: gridding, the sum itself, resampling, a compiled library.
+
+Source: Greengard and Lee 2004 (non-uniform FFT), see `focus.gridding`; Remote Sens. 2025, 17, 3447, Eq. (9).
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from torchsar.core import block_bytes_of, linear_phasor
+from torchsar.core.spline import second_differences
+from torchsar.core.warp import warp, warp_rate
+from torchsar.focus.chirp_z import chirp_z
+from torchsar.focus.gridding import PulseNufft
+from torchsar.focus.nufft import Kernel
+
+
+def slow_times(n_pulse: int, prf_hz: float, device: torch.device | str | None = None) -> Tensor:
+    """Time since the first pulse (s), float64 (n_pulse,)."""
+    return torch.arange(n_pulse, dtype=torch.float64, device=device) / prf_hz
+
+
+def normalised_warp(k: Tensor, n_pulse: int, prf_hz: float) -> tuple[Tensor, Tensor]:
+    """u = phi(t) / phi(T) and its rate du/d(t/T), 1 for even rotation. k: (..., order - 1). Returns two float64 (..., pulse). Differentiable."""
+    k = k.to(torch.float64)
+    total = whole_warp(k, n_pulse / prf_hz)
+    times = slow_times(n_pulse, prf_hz, k.device)
+    return warp(times, k) / total, warp_rate(times, k) * (n_pulse / prf_hz) / total
+
+
+def whole_warp(k: Tensor, duration_s: float) -> Tensor:
+    """phi(T), (..., 1)."""
+    return warp(torch.tensor([duration_s], dtype=torch.float64, device=k.device), k)
+
+
+class Sum(Protocol):
+    """Pulses (..., pulse, range) into lines (..., line, range), and the adjoint."""
+
+    def forward(self, pulses: Tensor) -> Tensor: ...
+
+    def adjoint(self, image: Tensor) -> Tensor: ...
+
+
+class Gridded:
+    """By gridding, see `focus.gridding`."""
+
+    def __init__(self, points: Tensor, lines: int, kernel: Kernel, dtype: torch.dtype, scale: float) -> None:
+        self.plan = PulseNufft(lines, kernel, dtype, points.device, scale)
+        self.points = self.plan.points(points)
+
+    def forward(self, pulses: Tensor) -> Tensor:
+        return self.plan.type1(pulses, self.points)
+
+    def adjoint(self, image: Tensor) -> Tensor:
+        return self.plan.type2(image, self.points)
+
+
+class Explicit:
+    """The sum itself, by blocks of lines."""
+
+    def __init__(self, points: Tensor, lines: int, dtype: torch.dtype, scale: float) -> None:
+        self.points, self.lines, self.dtype, self.scale = points, lines, dtype, scale
+
+    def _blocks(self) -> list[tuple[int, int]]:
+        size = max(16, 32 * block_bytes_of(self.points.device) // (self.points.numel() * self.dtype.itemsize))
+        return [(at, min(size, self.lines - at)) for at in range(0, self.lines, size)]
+
+    def _matrix(self, at: int, count: int) -> Tensor:
+        """(..., pulse, line)."""
+        return self.scale * linear_phasor(self.points, at - self.lines // 2, count, self.dtype)
+
+    def forward(self, pulses: Tensor) -> Tensor:
+        return torch.cat([self._matrix(*block).mT @ pulses for block in self._blocks()], -2)
+
+    def adjoint(self, image: Tensor) -> Tensor:
+        parts = [self._matrix(at, count).conj() @ image[..., at : at + count, :] for at, count in self._blocks()]
+        return torch.stack(parts).sum(0)
+
+
+class Resampled:
+    """Pulses interpolated to times of even angle, then a transform over those: the classical way. Over du, so that a sum over pulses takes 1 / rate."""
+
+    def __init__(self, k: Tensor, n_pulse: int, prf_hz: float, step: Tensor, lines: int, method: str, scale: float) -> None:
+        self.step, self.lines, self.n_pulse = step, lines, n_pulse
+        self.interpolate = {"linear": _linear, "spline": _spline}[method]
+        time = times_of_even_angle(k, n_pulse, prf_hz)
+        rate = warp_rate(time, k) * (n_pulse / prf_hz) / whole_warp(k, n_pulse / prf_hz)
+        self.position, self.factor = time * prf_hz, scale / rate
+
+    def forward(self, pulses: Tensor) -> Tensor:
+        even = self.interpolate(pulses, self.position) * self.factor.to(pulses.real.dtype)[..., None]
+        length = round(self.n_pulse / float(self.step)) if self.step.ndim == 0 and not self.step.requires_grad else 0
+        if length < self.lines or abs(length * float(self.step) - self.n_pulse) > 1e-9 * self.n_pulse:
+            step = self.step[..., None] / self.n_pulse
+            return chirp_z(even.mT, self.lines // 2 * step, -step, self.lines, centre=0).mT
+        whole, half = torch.fft.ifft(even.mT, length, norm="forward"), self.lines // 2
+        return torch.cat([whole[..., length - half :], whole[..., : self.lines - half]], -1).mT
+
+    def adjoint(self, image: Tensor) -> Tensor:
+        """By automatic differentiation of the linear map."""
+        trials = torch.broadcast_shapes(image.shape[:-2], self.position.shape[:-1])
+        with torch.enable_grad():
+            pulses = image.new_zeros(*trials, self.n_pulse, image.shape[-1]).requires_grad_()
+            return torch.autograd.grad(self.forward(pulses), pulses, image.expand(*trials, *image.shape[-2:]), create_graph=image.requires_grad)[0]
+
+
+def times_of_even_angle(k: Tensor, n_pulse: int, prf_hz: float) -> Tensor:
+    """Times (s) at which the warp reaches j phi(T) / n_pulse, float64 (..., n_pulse). Differentiable twice: the last two Newton steps carry gradients."""
+    duration = n_pulse / prf_hz
+    angle = torch.arange(n_pulse, dtype=torch.float64, device=k.device) / n_pulse * whole_warp(k, duration)
+    time = _table_times(angle.detach(), k.detach(), n_pulse, prf_hz)
+    for step in range(4):
+        at = k.detach() if step < 2 else k
+        time = time - (warp(time, at) - (angle.detach() if step < 2 else angle)) / warp_rate(time, at)
+    return time
+
+
+def _table_times(angle: Tensor, k: Tensor, n_pulse: int, prf_hz: float) -> Tensor:
+    """The same to within a pulse's bend, from a table of the warp at the pulses."""
+    table = warp(slow_times(n_pulse + 1, prf_hz, k.device), k)
+    piece = (torch.searchsorted(table.contiguous(), angle.contiguous(), right=True) - 1).clamp(0, n_pulse - 1)
+    low, high = table.gather(-1, piece), table.gather(-1, piece + 1)
+    return (piece + (angle - low) / (high - low)) / prf_hz
+
+
+def _linear(pulses: Tensor, position: Tensor) -> Tensor:
+    """Straight lines between pulses. pulses: (..., pulse, range), position in pulses (..., m). Returns (..., m, range); the end pieces go on."""
+    piece, right = _piece(position, pulses)
+    return (1 - right) * _pulses_at(pulses, piece) + right * _pulses_at(pulses, piece + 1)
+
+
+def _spline(pulses: Tensor, position: Tensor) -> Tensor:
+    """The not-a-knot cubic spline through the pulses; shapes as _linear."""
+    piece, right = _piece(position, pulses)
+    parts = torch.view_as_real(pulses.resolve_conj()).movedim(-3, -1).to(torch.float64)
+    bend = torch.view_as_complex(second_differences(parts).movedim(-1, -3).contiguous()).to(pulses.dtype)
+    left = 1 - right
+    straight = left * _pulses_at(pulses, piece) + right * _pulses_at(pulses, piece + 1)
+    curved = (left**3 - left) * _pulses_at(bend, piece) + (right**3 - right) * _pulses_at(bend, piece + 1)
+    return straight + curved / 6
+
+
+def _piece(position: Tensor, pulses: Tensor) -> tuple[Tensor, Tensor]:
+    """Index of the pulse before each position, and how far it is behind, (..., m, 1) in the precision of the pulses."""
+    piece = torch.floor(position.detach()).clamp(0, pulses.shape[-2] - 2)
+    return piece.to(torch.int64), (position - piece).to(pulses.real.dtype)[..., None]
+
+
+def _pulses_at(pulses: Tensor, index: Tensor) -> Tensor:
+    """pulses[..., index, :] with one index per trial."""
+    trials = torch.broadcast_shapes(pulses.shape[:-2], index.shape[:-1])
+    shape = (*trials, index.shape[-1], pulses.shape[-1])
+    return pulses.expand(*trials, *pulses.shape[-2:]).gather(-2, index[..., None].expand(shape))
+
+
+class Compiled:
+    """The compiled library, in float64 whatever the data: its single-precision points lose a thousandth of a cell far from zero."""
+
+    def __init__(self, points: Tensor, lines: int, eps: float, scale: float) -> None:
+        _library()
+        self.points, self.lines, self.eps, self.scale = points, lines, eps, scale
+
+    def forward(self, pulses: Tensor) -> Tensor:
+        return _CompiledSum.apply(*self._together(pulses), self.lines, self.eps).to(pulses.dtype) * self.scale
+
+    def adjoint(self, image: Tensor) -> Tensor:
+        return _CompiledSum.apply(*self._together(image), 0, self.eps).to(image.dtype) * self.scale
+
+    def _together(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Data and points with the same trials, in double precision."""
+        trials = torch.broadcast_shapes(x.shape[:-2], self.points.shape[:-1])
+        return x.expand(*trials, *x.shape[-2:]).to(torch.complex128), self.points.expand(*trials, self.points.shape[-1])
+
+
+class _CompiledSum(torch.autograd.Function):
+    """Type 1 into `lines` for lines > 0, else its adjoint. First derivatives, in data and points."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, points: Tensor, lines: int, eps: float) -> Tensor:
+        ctx.save_for_backward(x, points)
+        ctx.eps, ctx.lines = eps, lines
+        return _compiled(x, points, lines, eps)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        x, points = ctx.saved_tensors
+        back = _compiled(gradient, points, 0 if ctx.lines else x.shape[-2], ctx.eps)
+        image, pulses = (gradient, x) if ctx.lines else (x, gradient)
+        line = torch.arange(image.shape[-2], dtype=torch.float64, device=x.device) - image.shape[-2] // 2
+        slope = _compiled(-2j * math.pi * line[:, None] * image, points, 0, ctx.eps)
+        return back, (pulses * slope.conj()).real.sum(-1), None, None
+
+
+def _compiled(x: Tensor, points: Tensor, lines: int, eps: float) -> Tensor:
+    """One plan a trial: the library takes one set of points at a time."""
+    library, n, columns = _library(), lines or points.shape[-1], x.shape[-1]
+    rows = x.detach().mT.reshape(-1, columns, x.shape[-2]).contiguous().cpu().numpy()
+    angles = (2 * math.pi * torch.remainder(points.detach() + 0.5, 1) - math.pi).reshape(-1, points.shape[-1]).cpu().numpy()
+    options = {"eps": eps, "isign": 1 if lines else -1, "nthreads": torch.get_num_threads()}
+    out = torch.empty(len(rows), columns, n, dtype=x.dtype)
+    for row, angle, target in zip(rows, angles, out):
+        made = library.nufft1d1(angle, row, (lines,), **options) if lines else library.nufft1d2(angle, row, **options)
+        target.copy_(torch.from_numpy(made).reshape(columns, n))
+    return out.to(x.device).view(*x.shape[:-2], columns, n).mT
+
+
+def _library() -> Any:
+    try:
+        return importlib.import_module("finufft")
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError("method 'finufft' needs the package finufft: pip install 'torchsar-lab[nufft]', or choose method 'nufft'") from None
