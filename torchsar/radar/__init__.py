@@ -1,5 +1,6 @@
 """What an instrument knows about itself."""
 
+from torchsar.radar.bistatic import BistaticRadar, polynomial_range, receive_range
 from torchsar.radar.inverse import InverseRadar
 from torchsar.radar.ladar import TriangularLadar, sweep_middles
 from torchsar.radar.spotlight import FarField, PlaneWaveLoss, Spotlight, frequency_samples, geometry_of, plane_wave_loss, range_profiles
@@ -8,6 +9,7 @@ from torchsar.radar.waveform import LinearFM
 
 __all__ = [
     "LIGHT_M_S",
+    "BistaticRadar",
     "FarField",
     "InverseRadar",
     "LinearFM",
@@ -18,6 +20,8 @@ __all__ = [
     "frequency_samples",
     "geometry_of",
     "plane_wave_loss",
+    "polynomial_range",
     "range_profiles",
+    "receive_range",
     "sweep_middles",
 ]
