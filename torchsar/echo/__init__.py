@@ -1,5 +1,7 @@
 """Radar and scene to recordings: echoes, noise and receiver damage."""
 
+from torchsar.echo.bistatic import band_weights, bistatic_echo, simulate_bistatic
+from torchsar.echo.channel_errors import ChannelErrors, PolynomialDrift, SinusoidDrift, SynchronisationError, WalkDrift
 from torchsar.echo.channels import ChannelImbalance
 from torchsar.echo.interference import Quantiser, Tone, WideInterferer
 from torchsar.echo.jitter import PeriodicJitter
@@ -9,11 +11,13 @@ from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedL
 from torchsar.echo.pairs import SimulatedPairs
 from torchsar.echo.pulse_phase import PhaseSinusoid, PhaseWalk, WhitePhase
 from torchsar.echo.response import ChannelResponse
+from torchsar.echo.sea import sea_echo
 from torchsar.echo.stripmap import Damage, apply_damages, simulate, stripmap_echo, target_energy
 from torchsar.echo.sweep_error import PolynomialSweepError, SinusoidSweepError, calibration_channel
 from torchsar.echo.turntable import LostPulses, dechirped_echo, simulate_turntable, turntable_echo
 
 __all__ = [
+    "ChannelErrors",
     "ChannelImbalance",
     "ChannelResponse",
     "CorruptedNumbers",
@@ -24,20 +28,28 @@ __all__ = [
     "PeriodicJitter",
     "PhaseSinusoid",
     "PhaseWalk",
+    "PolynomialDrift",
     "PolynomialSweepError",
     "Quantiser",
     "RepeatedLines",
     "SimulatedPairs",
+    "SinusoidDrift",
     "SinusoidSweepError",
+    "SynchronisationError",
     "Tone",
+    "WalkDrift",
     "WhitePhase",
     "WideInterferer",
     "apply_damages",
+    "band_weights",
+    "bistatic_echo",
     "calibration_channel",
     "dechirped_echo",
     "ladar_echo",
     "ladar_record",
+    "sea_echo",
     "simulate",
+    "simulate_bistatic",
     "simulate_ladar",
     "simulate_ladar_record",
     "simulate_turntable",

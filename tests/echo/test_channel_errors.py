@@ -1,0 +1,118 @@
+"""Channels that differ and clocks that drift: what they do to recordings, what the direct path shows, and what is refused."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from tests.echo.test_bistatic import RADAR, SCENE, simulated
+from torchsar.core import Draws
+from torchsar.echo import ChannelErrors, PolynomialDrift, SinusoidDrift, SynchronisationError, WalkDrift, bistatic_echo
+from torchsar.scene import MovingPoints, Pattern
+
+CELL_S = 1 / 60e6
+
+
+def test_each_channel_gets_its_phase_gain_and_delay():
+    errors = ChannelErrors([0.3, 0.0, -2.0], [0.0, 1.5, -3.0], [0.0, 2 * CELL_S, -3 * CELL_S])
+    recording, truth = simulated(damages={"imbalance": errors})
+    assert truth.clean is not None
+    clean, damaged = truth.clean.signal.data, recording.signal.data
+    factors = torch.polar(torch.tensor([1.0, 10**0.075, 10**-0.15], dtype=torch.float64), torch.tensor([0.3, 0.0, -2.0], dtype=torch.float64))
+    for channel, shift in enumerate((0, 2, -3)):
+        torch.testing.assert_close(damaged[channel], factors[channel] * clean[channel].roll(shift, -1), rtol=0, atol=1e-11)
+    assert truth.values["imbalance.delay_s"].tolist() == [0.0, 2 * CELL_S, -3 * CELL_S]
+
+
+def test_a_part_of_a_cell_moves_the_envelope_and_not_the_carrier():
+    scene = MovingPoints([0.0], [0.0], [0.0], [0.0])
+    later = ChannelErrors(delay_s=[0.4 * CELL_S] * 3)
+    recording, _ = simulated(scene, n_pulse=1, damages={"late": later})
+    moved = simulated(MovingPoints([0.0], [0.0], [0.0], [0.4 * 5.0]), n_pulse=1)[0].signal.data
+    phase = torch.exp(2j * torch.tensor(math.pi / 0.24 * 0.4 * 5.0))
+    torch.testing.assert_close(recording.signal.data[..., 34:94], (moved * phase)[..., 34:94], rtol=0, atol=3e-3)
+
+
+def test_errors_may_differ_between_trials_and_spare_azimuth_only_data_delays():
+    phase = torch.tensor([[0.1, 0.2, 0.3], [1.0, 2.0, 3.0]], dtype=torch.float64)
+    recording, truth = simulated(n_range=None, trials=range(2), damages={"p": ChannelErrors(phase)}, dtype=torch.complex64)
+    assert truth.clean is not None and recording.signal.data.dtype == torch.complex64
+    torch.testing.assert_close(recording.signal.data, truth.clean.signal.data * torch.exp(1j * phase)[..., None].to(torch.complex64))
+
+
+def synchronised(**options):
+    drifts = {
+        "phase_rad": [PolynomialDrift([0.2, 3.0, -1.0]), SinusoidDrift(0.5, 2.0), WalkDrift(0.05)],
+        "delay_s": [PolynomialDrift([1e-9, 3e-9]), SinusoidDrift(4e-9, 1.0, 0.3)],
+    }
+    return SynchronisationError(**{**drifts, **options})
+
+
+def test_all_channels_of_a_pulse_share_its_phase_and_delay():
+    recording, truth = simulated(trials=range(2), damages={"clock": synchronised()})
+    phase, delay = truth.values["clock.phase_rad"], truth.values["clock.delay_s"]
+    time = RADAR.pulse_axis(90).values()
+    torch.testing.assert_close(delay[0], 1e-9 + 3e-9 * time + 4e-9 * torch.sin(2 * math.pi * time + 0.3), rtol=1e-12, atol=0)
+    assert phase.shape == (2, 90) and not torch.equal(phase[0], phase[1])
+    late = bistatic_echo(SCENE.movers(RADAR, Draws(3)), RADAR, 90, 128, gate=Pattern(), dtype=torch.complex128)
+    frequency = torch.fft.fftfreq(128, CELL_S, dtype=torch.float64)
+    late = torch.fft.ifft(torch.fft.fft(late) * torch.exp(-2j * math.pi * delay[1][:, None] * frequency))
+    torch.testing.assert_close(recording.signal.data[1], late * torch.exp(1j * phase[1])[:, None], rtol=0, atol=1e-11)
+
+
+def test_the_direct_path_shows_phase_and_delay_of_every_pulse():
+    recording, truth = simulated(damages={"clock": synchronised(direct_snr_db=None, direct_samples=96)})
+    path = recording.aux["direct_path"]
+    assert path.shape == (90, 96)
+    time = (torch.arange(96, dtype=torch.float64) - 48) * CELL_S
+    delay, phase = truth.values["clock.delay_s"][:, None], truth.values["clock.phase_rad"][:, None]
+    expected = torch.sinc(50e6 * (time - delay)) * torch.exp(1j * phase)
+    torch.testing.assert_close(path, expected, rtol=0, atol=8e-3)
+
+
+def test_the_direct_path_has_noise_of_its_own():
+    clean, noisy = (simulated(n_range=None, trials=range(2), damages={"clock": SynchronisationError([WalkDrift(0.1)], direct_snr_db=snr)})[0].aux["direct_path"] for snr in (None, 20.0))
+    assert float((noisy - clean).abs().square().mean()) == pytest.approx(0.01, rel=0.05)
+
+
+def test_walks_start_from_the_middle_and_have_the_step_asked_for():
+    walk = WalkDrift(0.2).values(RADAR.pulse_axis(901).values(), Draws(1, trials=range(20)))
+    assert bool((walk[:, 450] == 0).all())
+    assert float(walk.diff().std()) == pytest.approx(0.2, rel=0.03)
+
+
+def test_drifts_of_one_kind_differ_and_trials_do_not_depend_on_their_batch():
+    both = simulated(trials=range(3), n_range=None, damages={"c": SynchronisationError([SinusoidDrift(1.0, 2.0), SinusoidDrift(1.0, 2.0)])})[1].values["c.phase_rad"]
+    one = simulated(trials=[2], n_range=None, damages={"c": SynchronisationError([SinusoidDrift(1.0, 2.0)])})[1].values["c.phase_rad"]
+    alone = simulated(trials=[2], n_range=None, damages={"c": SynchronisationError([SinusoidDrift(1.0, 2.0), SinusoidDrift(1.0, 2.0)])})[1].values["c.phase_rad"]
+    assert torch.equal(both[2], alone[0]) and not torch.allclose(both[2], 2 * one[0], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("damage", "n_range", "says"),
+    [
+        (ChannelErrors([0.0, 1.0]), None, "each of the 3 channels"),
+        (ChannelErrors(delay_s=[0.0, 1e-9, 0.0]), None, "no range axis"),
+        (SynchronisationError(delay_s=[PolynomialDrift([1e-9])]), None, "no range axis"),
+        (SynchronisationError(delay_s=[PolynomialDrift([1e-6])]), 128, "a quarter of the 64"),
+    ],
+)
+def test_errors_that_do_not_fit_the_recording_are_refused(damage, n_range, says):
+    with pytest.raises(ValueError, match=says):
+        simulated(n_range=n_range, n_pulse=10, damages={"e": damage})
+
+
+@pytest.mark.parametrize(
+    ("build", "error", "says"),
+    [
+        (lambda: ChannelErrors([math.inf]), ValueError, "phase_rad of channels"),
+        (lambda: SynchronisationError(PolynomialDrift([1.0])), TypeError, "in brackets"),  # pyright: ignore[reportArgumentType]
+        (lambda: SynchronisationError(direct_samples=4), ValueError, "at least 8"),
+        (lambda: WalkDrift(-1.0), ValueError, "0 or more"),
+    ],
+)
+def test_errors_that_are_none_are_refused(build, error, says):
+    with pytest.raises(error, match=says):
+        build()

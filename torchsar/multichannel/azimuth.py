@@ -1,0 +1,75 @@
+"""Azimuth focusing of a moving point by the exact range history of an airborne receiver, and the correction of its place.
+
+Source: brief 001, Algorithm 7 (the exact spectrum of a hyperbola with y0); Remote Sens. 2020, 12, 1703, Eq. (30) with the sign corrected.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Axis, Signal, Stage, centred_ifft, per_trial, real_dtype, unit_phasor
+from torchsar.multichannel.motion import Number, PointMotion
+from torchsar.multichannel.response import doppler_centre_hz
+from torchsar.radar import BistaticRadar
+
+
+def azimuth_filter(offset_hz: Tensor, radar: BistaticRadar, motion: PointMotion, dtype: torch.dtype, centre_hz: Tensor | None = None) -> Tensor:
+    """exp(+j 2 pi / lambda (Rmin sqrt(1 - (lambda f / V)^2) - R_ref)), (..., bin) of `dtype`: takes the curvature out of the spectrum of a point with this motion.
+
+    offset_hz: float64 (bin,), Doppler against the centre; R_ref: the radar's reference range, against which phases of echoes are counted. centre_hz: (...,),
+    by default that of the motion. Zero at Doppler that no point of this speed has. Differentiable in the motion.
+    """
+    centre_hz = doppler_centre_hz(radar, motion) if centre_hz is None else centre_hz
+    sine = radar.wavelength_m * (centre_hz[..., None] + offset_hz) / motion.square_m2_s2.sqrt()[..., None]
+    real = sine.detach().abs() < 1
+    square = torch.where(real, sine, 0.0).square()
+    closest = motion.closest_m[..., None]
+    # Rmin sqrt(1 - s^2) - R_ref as a sum of differences
+    path = (closest - radar.reference_range_m) - closest * square / (1 + torch.sqrt(1 - square))
+    return unit_phasor(path / radar.wavelength_m, dtype) * real.to(real_dtype(dtype))
+
+
+def focus_azimuth(spectrum: Tensor, offset_hz: Tensor, radar: BistaticRadar, motion: PointMotion, bandwidth_hz: float | None = None) -> Tensor:
+    """Rebuilt spectra (..., bin) about the Doppler centre of the motion to images over slow time (..., bin), zero at bin n // 2, a point at `motion.image_s`.
+
+    bandwidth_hz: processed Doppler bandwidth about the centre, None for all. Differentiable in spectrum and motion.
+    """
+    filtered = spectrum * azimuth_filter(offset_hz, radar, motion, spectrum.dtype)
+    if bandwidth_hz is not None:
+        filtered = filtered * (offset_hz.abs() <= bandwidth_hz / 2)
+    return centred_ifft(filtered)
+
+
+class FocusAzimuth(Stage):
+    """Spectra (doppler[, range]) of `Reconstruct` to an image (azimuth[, range]) of points with the velocities given, x = V_R t (m) in the frame of the scene.
+
+    Along the track that the target itself sees, x = (speed - u_a) t, everything is (speed - u_a) / speed as wide. range_m: closest range of the points, None for the
+    radar's reference range; on a range axis every line has its own. bandwidth_hz: processed Doppler bandwidth about the centre, None for all.
+    """
+
+    works_on = ("doppler",)
+    also_on = (("doppler", "range"),)
+
+    def __init__(self, radar: BistaticRadar, range_m: float | None = None, bandwidth_hz: float | None = None) -> None:
+        super().__init__()
+        self.radar, self.range_m, self.bandwidth_hz = radar, range_m, bandwidth_hz
+        if bandwidth_hz is not None and not bandwidth_hz > 0:
+            raise ValueError(f"bandwidth_hz must be positive, or None for all that is rebuilt, got {bandwidth_hz}")
+
+    def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Signal:
+        doppler = signal.axis("doppler")
+        offset = doppler.values(signal.data.device)
+        axes = (image_axis(self.radar, doppler), *signal.axes[1:])
+        if "range" not in signal.names:
+            motion = PointMotion.of(self.radar, signal.data, u_r_m_s, u_a_m_s, y0_m, self.range_m)
+            return Signal(focus_azimuth(signal.data, offset, self.radar, motion, self.bandwidth_hz), axes)
+        u_r, u_a, y0 = (per_trial(value, 1, signal.data) for value in (u_r_m_s, u_a_m_s, y0_m))
+        motion = PointMotion.of(self.radar, signal.data, u_r, u_a, y0, signal.axis("range").values(signal.data.device))
+        return Signal(focus_azimuth(signal.data.mT, offset, self.radar, motion, self.bandwidth_hz).mT, axes)
+
+
+def image_axis(radar: BistaticRadar, doppler: Axis) -> Axis:
+    """x = V_R t (m) of the image of a spectrum."""
+    time = doppler.dual()
+    return Axis("azimuth", time.n, time.start * radar.speed_m_s, time.step * radar.speed_m_s, "m")

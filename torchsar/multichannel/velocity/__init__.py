@@ -1,0 +1,1 @@
+"""Velocity and place of moving points before several channels along track."""

@@ -1,0 +1,124 @@
+"""A bank of matched filters over velocities: where a moving point may be, without a start.
+
+Data are taken against the exact phase of each hypothesis; what is left of a point near it is one tone in all channels. The cubic phase of the range history, and not
+only the direction that the channels measure, tells slant-range velocities that differ by whole pulse rates (brief 001: modulo lambda PRF otherwise).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchsar.core import per_trial, unit_phasor
+from torchsar.focus.nufft import smooth_length
+from torchsar.multichannel.motion import Number, PointMotion
+from torchsar.multichannel.velocity.aperture import Aperture
+from torchsar.multichannel.velocity.model import chosen, point_phasor
+from torchsar.multichannel.velocity.whitening import Whitening
+from torchsar.radar import BistaticRadar
+
+_BLOCK_BYTES = 64 << 20
+
+
+@dataclass(frozen=True)
+class Search:
+    """What a bank covers: steps of velocities (m/s) and half widths about zero, and how far (m) along track from the middle a point may lie.
+
+    u_r_m_s: half width; u_a_m_s: half width, 0 where the along-track speed is told. Steps suit apertures of about 4.5 s at 300 m/s and 5 km.
+    """
+
+    u_r_m_s: float = 21.6
+    u_a_m_s: float = 20.0
+    y0_m: float = 150.0
+    u_r_step_m_s: float = 3.0
+    u_a_step_m_s: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name in ("u_r_m_s", "u_a_m_s", "y0_m"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise ValueError(f"search.{name} must be 0 or a positive half width, got {getattr(self, name)}")
+        if not (self.u_r_step_m_s > 0 and self.u_a_step_m_s > 0):
+            raise ValueError(f"steps of a search must be positive, got {self.u_r_step_m_s} and {self.u_a_step_m_s} m/s")
+
+
+def bank_search(
+    data: Tensor, radar: BistaticRadar, aperture: Aperture, search: Search, u_a_m_s: Tensor | float = 0.0, range_m: Number | None = None, whitening: Whitening | None = None
+) -> tuple[PointMotion, Tensor]:
+    """The hypothesis that explains most, per trial, and the energy that it explains (...,) by the normalised correlation.
+
+    data: complex (..., channel, pulse). u_a_m_s: (...,) middle of the search along track. The place along track is read from the tone left, within +-search.y0_m.
+    """
+    n = data.shape[-1]
+    time_s = radar.pulse_axis(n).values(data.device)
+    taken = (data if whitening is None else whitening.backed(data)).to(torch.complex128)
+    taken = taken.to(torch.complex64)
+    best = PointMotion.of(radar, data, 0.0, u_a_m_s, 0.0, range_m)
+    best = best.each(lambda value: value.expand(data.shape[:-2]))
+    energy = torch.full(data.shape[:-2], -torch.inf, dtype=torch.float64, device=data.device)
+    for u_r in _steps(search.u_r_m_s, search.u_r_step_m_s, data.device):
+        for offsets in _blocks(_steps(search.u_a_m_s, search.u_a_step_m_s, data.device), data):
+            u_a = torch.as_tensor(u_a_m_s, dtype=torch.float64, device=data.device)[..., None] + offsets
+            there = PointMotion.of(radar, data, u_r, u_a, 0.0, None if range_m is None else per_trial(range_m, 1, data))
+            found, place, along = _best_tone(taken, radar, there, aperture, time_s, search.y0_m, whitening)
+            better = found > energy
+            energy = torch.where(better, found, energy)
+            best = chosen(PointMotion(u_r.expand(found.shape), along, place, best.range_m, best.speed_m_s), best, better)
+    return best, energy
+
+
+def _steps(half: float, step: float, device: torch.device) -> Tensor:
+    count = 2 * round(half / step) + 1
+    return torch.linspace(-half, half, count, dtype=torch.float64, device=device) if count > 1 else torch.zeros(1, dtype=torch.float64, device=device)
+
+
+def _blocks(offsets: Tensor, data: Tensor) -> Iterator[Tensor]:
+    """So many offsets at once as the data of all trials leave room for."""
+    size = max(1, _BLOCK_BYTES // (32 * data.numel()))
+    yield from offsets.split(size)
+
+
+def _best_tone(taken: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture, time_s: Tensor, reach_m: float, whitening: Whitening | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Of motions (..., hypothesis) the greatest normalised correlation per trial (...,), the place y0 that its tone means, and its u_a."""
+    model = aperture.weight(radar, motion, time_s)[..., None, :].to(taken.dtype) * point_phasor(radar, motion, time_s, taken.dtype)
+    slowest = float(motion.along_m_s.max()) * reach_m / (radar.wavelength_m * radar.reference_range_m)
+    tones, rate_hz = _decimated(model.conj() * taken[..., None, :, :], radar.prf_hz, slowest)
+    length = smooth_length(2 * tones.shape[-1])
+    spectrum = torch.fft.fftshift(torch.fft.fft(tones, length), dim=-1)
+    tone_hz = (torch.arange(length, dtype=torch.float64, device=taken.device) - length // 2) * (rate_hz / length)
+    place = tone_hz * radar.wavelength_m * radar.reference_range_m / motion.along_m_s[..., None]
+    aligned = _aligned(spectrum, radar, place)
+    power = aligned.abs().square().to(torch.float64) / _norm(model, whitening).to(torch.float64)[..., None]
+    power = torch.where(place.abs() <= reach_m, power, -torch.inf).flatten(-2)
+    at = power.argmax(-1, keepdim=True)
+    wide = torch.broadcast_to(place, (*aligned.shape[:-1], length)).flatten(-2)
+    along = torch.broadcast_to(motion.u_a_m_s[..., None], aligned.shape).flatten(-2)
+    return power.gather(-1, at)[..., 0], wide.expand(power.shape).gather(-1, at)[..., 0], along.expand(power.shape).gather(-1, at)[..., 0]
+
+
+def _decimated(tones: Tensor, prf_hz: float, highest_hz: float) -> tuple[Tensor, float]:
+    """Sums of neighbouring pulses, as many as leave tones up to highest_hz with most of their energy, and the rate of the sums."""
+    factor = max(1, int(prf_hz / (3 * highest_hz))) if highest_hz > 0 else 1
+    if factor == 1:
+        return tones, prf_hz
+    whole = tones.shape[-1] // factor * factor
+    return tones[..., :whole].unflatten(-1, (-1, factor)).sum(-1), prf_hz / factor
+
+
+def _aligned(spectrum: Tensor, radar: BistaticRadar, place: Tensor) -> Tensor:
+    """Channels (..., channel, bin) added with the phases of a point at `place` (..., bin), against those of the model at zero."""
+    slope = place / (radar.wavelength_m * radar.reference_range_m)
+    total = torch.zeros_like(spectrum[..., 0, :])
+    for i, dx in enumerate(radar.channel_m):
+        total = total + spectrum[..., i, :] * unit_phasor(slope * dx, spectrum.dtype)
+    return total
+
+
+def _norm(model: Tensor, whitening: Whitening | None) -> Tensor:
+    """Energy of the models in the metric of the data, (..., hypothesis or 1): of white noise exactly, in clutter that of the middle one, as it hardly depends on the speed along track."""
+    if whitening is None:
+        return model.abs().square().sum((-2, -1))
+    middle = model[..., model.shape[-3] // 2, :, :].to(torch.complex128)
+    return whitening.applied(middle.expand(*whitening.factor.shape[:-3], *middle.shape[-2:])).abs().square().sum((-2, -1))[..., None]
