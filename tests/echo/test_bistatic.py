@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchsar.core import Draws
-from torchsar.echo import band_weights, bistatic_echo, simulate_bistatic
+from torchsar.echo import bistatic_echo, simulate_bistatic
 from torchsar.focus.reference import flat_reference, matched_reference, range_compress
 from torchsar.radar import BistaticRadar, LinearFM, Orbit, range_coefficients, seen_point
 from torchsar.scene import BandLimited, BistaticWorld, Fleet, GroundMovers, KSea, MovingPoints, MovingScene, OrbitTransmit, Pattern, PolynomialTransmit, Ship, TaylorRange
@@ -85,7 +85,7 @@ def test_compressed_echo_is_a_sinc_on_the_receive_path():
 
 def test_band_weights_peak_at_one_and_hold_the_band():
     for n in (96, 1000):
-        weights = band_weights(n, RADAR)
+        weights = RADAR.band_weights(n)
         assert float(torch.fft.ifft(weights)[0].real) == pytest.approx(1.0)
         assert float(weights.sum() / weights.max()) == pytest.approx(n * 50 / 60, abs=1e-9)
 

@@ -1,6 +1,6 @@
 """Radar and scene to recordings: echoes, noise and receiver damage."""
 
-from torchsar.echo.bistatic import band_weights, bistatic_echo, simulate_bistatic
+from torchsar.echo.bistatic import bistatic_echo, simulate_bistatic
 from torchsar.echo.channel_errors import ChannelErrors, PolynomialDrift, SinusoidDrift, SynchronisationError, WalkDrift
 from torchsar.echo.channels import ChannelImbalance
 from torchsar.echo.interference import Quantiser, Tone, WideInterferer
@@ -41,7 +41,6 @@ __all__ = [
     "WhitePhase",
     "WideInterferer",
     "apply_damages",
-    "band_weights",
     "bistatic_echo",
     "calibration_channel",
     "dechirped_echo",

@@ -106,14 +106,7 @@ class _Grid:
         """Of the transmitted pulse, or of its compressed response, complex128 (n_fft,) in FFT order."""
         if self.kind == "full":
             return radar.pulse.spectrum(self.n_fft, radar.sampling_hz, device)
-        return band_weights(self.n_fft, radar, device).to(torch.complex128)
-
-
-def band_weights(n: int, radar: BistaticRadar, device: torch.device | str | None = None) -> Tensor:
-    """Spectrum of a rectangular band of the pulse's width with a peak of 1, float64 (n,) in FFT order; the bins at its edges have the share that lies inside."""
-    bins = radar.range_frequency_hz(n, device).abs() * n / radar.sampling_hz
-    inside = (radar.pulse.bandwidth_hz * n / radar.sampling_hz / 2 - bins + 0.5).clamp(0, 1)
-    return inside * (n / inside.sum())
+        return radar.band_weights(self.n_fft, device).to(torch.complex128)
 
 
 def _smooth(n: int) -> bool:

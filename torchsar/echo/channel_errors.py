@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, Signal, real_dtype, unit_phasor
-from torchsar.echo.bistatic import band_weights
 from torchsar.radar import BistaticRadar
 from torchsar.scene.vibration import refuse_unless_finite
 
@@ -162,7 +161,7 @@ class SynchronisationError:
         if not worst <= n / 4:
             raise ValueError(f"a delay of {worst:.4g} samples passes a quarter of the {n} samples of the direct path; give it more (direct_samples) or smaller drifts")
         frequency = radar.range_frequency_hz(n, delay_s.device)
-        band = band_weights(n, radar, delay_s.device).to(turn.dtype)
+        band = radar.band_weights(n, delay_s.device).to(turn.dtype)
         line = torch.fft.ifft(band * unit_phasor(-(delay_s[..., None] + n // 2 / radar.sampling_hz) * frequency, turn.dtype))
         line = turn[..., None] * line
         if self.direct_snr_db is None:

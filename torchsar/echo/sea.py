@@ -49,7 +49,7 @@ def sea_echo(
     Raises TypeError for another gate or dtype, ValueError for frames that begin behind the receiver and for bands wider than a look of 53 degrees.
     """
     real_dtype(dtype)
-    light = Light.of(gate, radar, sea.lobes)
+    light = _Light.of(gate, radar, sea.lobes)
     lines = _Lines.of(radar, n_range, light.last_sin)
     bins = _Bins.of(sea, radar, n_pulse, light, lines)
     cells = sea.reflectivity(bins.azimuth_m(device), lines.offset_m(device), draws, dtype)
@@ -68,7 +68,7 @@ def sea_echo(
 
 
 @dataclass(frozen=True)
-class Light:
+class _Light:
     """What a gate is to a surface that stands still: an even weight over the sine of the look angle.
 
     edge_sin: of a band-limited gate, or where a pattern has half its power; last_sin: where the surface is cut off.
@@ -79,16 +79,16 @@ class Light:
     last_sin: float
 
     @staticmethod
-    def of(gate: BandLimited | Pattern, radar: BistaticRadar, lobes: int) -> Light:
+    def of(gate: BandLimited | Pattern, radar: BistaticRadar, lobes: int) -> _Light:
         """Raises TypeError for another gate, ValueError for one that no look angle has."""
         if isinstance(gate, BandLimited):
             edge = radar.speed_m_s * gate.duration_s / (2 * radar.reference_range_m)
             if edge > _STEEPEST:
                 raise ValueError(f"a gate of {gate.duration_s:g} s at {radar.reference_range_m:g} m ends at a look angle of sine {edge:.3g}, beyond {_STEEPEST}; shorten it, or use Pattern()")
-            return Light(torch.ones_like, edge, edge)
+            return _Light(torch.ones_like, edge, edge)
         if isinstance(gate, Pattern):
             null = radar.wavelength_m / (gate.element_m or radar.element_m)
-            return Light(lambda sine: torch.sinc(sine / null), min(_HALF_POWER * null, _STEEPEST), min(lobes * null, _STEEPEST))
+            return _Light(lambda sine: torch.sinc(sine / null), min(_HALF_POWER * null, _STEEPEST), min(lobes * null, _STEEPEST))
         raise TypeError(f"a sea is lit by BandLimited(duration_s) or Pattern(), got {gate!r}")
 
 
@@ -154,7 +154,7 @@ class _Transfer:
     bend: Tensor
 
     @staticmethod
-    def of(doppler_hz: Tensor, frequency_hz: Tensor, share: Tensor, radar: BistaticRadar, light: Light) -> _Transfer:
+    def of(doppler_hz: Tensor, frequency_hz: Tensor, share: Tensor, radar: BistaticRadar, light: _Light) -> _Transfer:
         """A cell is lit for a time per Doppler of lambda R0 / (V^2 cos^3(look)): stationary phase gives the square root of it as amplitude (without R0)."""
         f = radar.carrier_hz + frequency_hz
         sine = -radar.wave_speed_m_s * doppler_hz / (f * radar.speed_m_s)
@@ -176,7 +176,7 @@ class _Bins:
     speed_m_s: float
 
     @staticmethod
-    def of(sea: Sea, radar: BistaticRadar, n_pulse: int, light: Light, lines: _Lines) -> _Bins:
+    def of(sea: Sea, radar: BistaticRadar, n_pulse: int, light: _Light, lines: _Lines) -> _Bins:
         tangent = light.edge_sin / math.sqrt(1 - light.edge_sin**2)
         margin_s = lines.far_m * tangent / radar.speed_m_s if sea.margin_s is None else sea.margin_s
         highest_hz = (radar.carrier_hz + radar.pulse.bandwidth_hz / 2) * light.last_sin * radar.speed_m_s / radar.wave_speed_m_s

@@ -1,5 +1,6 @@
 """Figures of merit, and the bounds that estimators are judged by."""
 
+from torchsar.metrics.bistatic_bounds import bistatic_bounds, radial_velocity_bound_m_s
 from torchsar.metrics.bounds import (
     beam_centre_bound_hz,
     pulse_phase_bound_of_scene_rad,
@@ -18,10 +19,13 @@ from torchsar.metrics.ladar_bounds import (
     velocity_segmented_bound_m_s,
 )
 from torchsar.metrics.phase import phase_rmse, residual_phase, strehl
+from torchsar.metrics.replicas import azimuth_response, replica_level, replica_zones
 from torchsar.metrics.rotation_bounds import rotation_bounds
 
 __all__ = [
+    "azimuth_response",
     "beam_centre_bound_hz",
+    "bistatic_bounds",
     "contrast",
     "correlation",
     "entropy",
@@ -31,8 +35,11 @@ __all__ = [
     "phase_rmse",
     "pulse_phase_bound_of_scene_rad",
     "pulse_phase_bound_rad",
+    "radial_velocity_bound_m_s",
     "range_per_sweep_bound_m",
     "reference_doppler_std_hz",
+    "replica_level",
+    "replica_zones",
     "residual_phase",
     "rotation_bounds",
     "strehl",

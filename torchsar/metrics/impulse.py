@@ -53,7 +53,7 @@ def impulse_response(
     range_ = _slice_through(_patch(data, rows, cols, _PATCH, min(_SLICE, signal.axes[1].n)), tone_a, da, -2)
     out: dict[str, Tensor] = {}
     for axis, cut, tone, index, offset in ((signal.axes[0], azimuth, tone_a, rows, da), (signal.axes[1], range_, tone_r, cols, dr)):
-        figures, peak = _analyse(cut, tone, offset, sidelobe_nulls)
+        figures, peak = cut_figures(cut, tone, offset, sidelobe_nulls)
         out[f"irw_{axis.name}_m"] = figures["irw"] * axis.step
         out[f"pslr_{axis.name}_db"], out[f"islr_{axis.name}_db"] = figures["pslr"], figures["islr"]
         out[f"position_{axis.name}_m"] = axis.start + axis.step * (index + offset)
@@ -109,6 +109,14 @@ def _refined(data: Tensor, rows: Tensor, cols: Tensor, centre_turns: tuple[float
     return tone_a, tone_r, *_fine_peak(patch, tone_a, tone_r)
 
 
+def cut_offset(cut: Tensor, tone: Tensor) -> Tensor:
+    """Offset (...,) in samples of the interpolated maximum of cuts (..., n) from their strongest sample n//2. tone: as for `cut_figures`."""
+    grid = torch.linspace(-1, 1, 2 * _FINE + 1, dtype=torch.float64, device=cut.device).expand(*tone.shape, -1)
+    fine = (_kernel(grid, cut.shape[-1], tone) @ cut[..., None])[..., 0].abs().square()
+    best = fine.argmax(-1)
+    return (best + _parabola(fine, best) - _FINE) / _FINE
+
+
 def _centre_turns(patch: Tensor, dim: int) -> Tensor:
     """Centre of the spectrum along dim in turns per sample, from the phase of the lag-one product, (..., target)."""
     n = patch.shape[dim]
@@ -148,8 +156,11 @@ def _slice_through(patch: Tensor, tone: Tensor, offset: Tensor, dim: int) -> Ten
     return (patch * (weights[..., None, :] if dim == -1 else weights[..., :, None])).sum(dim)
 
 
-def _analyse(cut: Tensor, tone: Tensor, offset: Tensor, nulls: int) -> tuple[dict[str, Tensor], Tensor]:
-    """Width in samples, side lobes in dB, and the peak of a cut (..., target, n) whose maximum lies `offset` from sample n//2."""
+def cut_figures(cut: Tensor, tone: Tensor, offset: Tensor, nulls: int) -> tuple[dict[str, Tensor], Tensor]:
+    """irw (samples), pslr and islr (dB), and the complex peak, (...,) each, of cuts (..., n) whose maxima lie `offset` (...,) samples from sample n//2.
+
+    tone: centre of the spectrum in turns per sample, (...,). nulls: extent of the side lobes in null spacings of a rectangular band.
+    """
     n, factor = cut.shape[-1], 16
     base = torch.arange(n, dtype=torch.float64, device=cut.device) - n // 2
     base = cut * cis(-2 * math.pi * tone[..., None] * base)

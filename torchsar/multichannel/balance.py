@@ -17,7 +17,6 @@ from torch import Tensor
 from torchsar.core import Estimate, Signal, Stage, fft_lines, linear_phasor, take, unit_phasor
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.response import ElementPattern, Prior, band_matrix, doppler_offsets, first_bin, shared_response
-from torchsar.multichannel.transmit import ChannelStage
 from torchsar.radar import BistaticRadar
 
 _ROUNDS, _DELAY_PASSES = 25, 2
@@ -69,13 +68,14 @@ def estimate_balance(data: Tensor, radar: BistaticRadar, prior: Prior | None = N
         lines = lines / torch.where(own > 0, own, 1.0).sqrt()
         models = _Models.of(radar, prior or ElementPattern(), bands, data.shape[-2], data.device)
         centres, reference = frequency.view(blocks, -1).mean(-1), _reference(radar)
-        products, delay = _products(lines, blocks), torch.zeros(*data.shape[:-3], radar.channels, dtype=torch.float64, device=data.device)
+        silent = (power == 0).any(-1)
+        products, delay = _products(lines, blocks, silent), torch.zeros(*data.shape[:-3], radar.channels, dtype=torch.float64, device=data.device)
         for _ in range(_DELAY_PASSES if delays else 0):
             delay = delay + _slope(models.solve(products.movedim(-3, 0), _COARSE_DB)[0].movedim(0, -2), centres, reference)
-            products = _products(lines * unit_phasor(delay[..., None, None] * frequency, lines.dtype), blocks)
+            products = _products(lines * unit_phasor(delay[..., None, None] * frequency, lines.dtype), blocks, silent)
         weights, hessian, snr_db = models.best(products.mean(-3))
         looks = data.shape[-2] * frequency.numel() * _HANN_SHARE
-        return _judged(weights, hessian, delay, snr_db, power, reference, looks, centres if delays else None)
+        return _judged(weights, hessian, delay, snr_db, silent, reference, looks, centres if delays else None)
 
 
 def _refuse_data(data: Tensor, radar: BistaticRadar, blocks: int, bands: int) -> None:
@@ -107,10 +107,12 @@ def _band_lines(data: Tensor, radar: BistaticRadar, blocks: int) -> tuple[Tensor
     return lines, torch.fft.fftshift(radar.range_frequency_hz(n, data.device))[inside]
 
 
-def _products(lines: Tensor, blocks: int) -> Tensor:
-    """Mean of x_m conj(x_m') over each block of range frequencies, complex128 (..., bin, block, channel, channel)."""
+def _products(lines: Tensor, blocks: int, silent: Tensor) -> Tensor:
+    """Mean of x_m conj(x_m') over each block of range frequencies, complex128 (..., bin, block, channel, channel); those of plain noise for silent trials (...,)."""
     by_bin = lines.unflatten(-1, (blocks, -1)).movedim(-4, -2)
-    return (by_bin @ by_bin.mH).to(torch.complex128) / by_bin.shape[-1]
+    products = (by_bin @ by_bin.mH).to(torch.complex128) / by_bin.shape[-1]
+    noise = torch.eye(products.shape[-1], dtype=products.dtype, device=products.device)
+    return torch.where(silent[..., None, None, None, None], noise, products)
 
 
 @dataclass(frozen=True)
@@ -200,7 +202,7 @@ def _slope(weights: Tensor, frequency_hz: Tensor, reference: int) -> Tensor:
     return coarse + (angle * f).sum(-2) / f.square().sum() / (2 * math.pi)
 
 
-def _judged(weights: Tensor, hessian: Tensor, delay_s: Tensor, snr_db: Tensor, power: Tensor, reference: int, looks: float, centres: Tensor | None) -> Estimate:
+def _judged(weights: Tensor, hessian: Tensor, delay_s: Tensor, snr_db: Tensor, silent: Tensor, reference: int, looks: float, centres: Tensor | None) -> Estimate:
     value = {
         "phase_rad": torch.angle(weights.conj() * weights[..., reference, None]),
         "gain_db": 20 * torch.log10(weights[..., reference, None].abs() / weights.abs()),
@@ -210,7 +212,7 @@ def _judged(weights: Tensor, hessian: Tensor, delay_s: Tensor, snr_db: Tensor, p
     per_hz = 0.0 if centres is None else 1 / (2 * math.pi * float(centres.square().mean().sqrt()))
     std = {"phase_rad": phase_std, "gain_db": log_std * (20 / math.log(10)), "delay_s": phase_std * per_hz}
     worst = phase_std.amax(-1)
-    ok = torch.stack([v.isfinite().all(-1) for v in value.values()]).all(0) & (power > 0).all(-1) & (worst < _TRUSTED_RAD)
+    ok = torch.stack([v.isfinite().all(-1) for v in value.values()]).all(0) & ~silent & (worst < _TRUSTED_RAD)
     value = {name: torch.where(ok[..., None], v, 0.0) for name, v in value.items()}
     return Estimate(value, torch.where(ok, 1 - worst / _TRUSTED_RAD, 0.0).clamp(0, 1), ok, std, {"snr_db": snr_db})
 
@@ -240,8 +242,11 @@ class EstimateBalance(Stage):
         return estimate_balance(signal.data, self.radar, self.prior, self.bands, self.delays, self.blocks)
 
 
-class CorrectBalance(ChannelStage):
+class CorrectBalance(Stage):
     """`correct_balance` by values that were estimated or measured: `use(CorrectBalance(radar), phase_rad="balance", gain_db="balance", delay_s="balance")`."""
+
+    works_on = ("channel", "pulse")
+    also_on = (("channel", "pulse", "range"),)
 
     def __init__(self, radar: BistaticRadar) -> None:
         super().__init__()

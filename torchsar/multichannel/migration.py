@@ -20,6 +20,7 @@ from torchsar.core import Signal, Stage, block_bytes_of, linear_phasor, per_tria
 from torchsar.focus import keystone
 from torchsar.focus.nufft import nufft_type2
 from torchsar.multichannel.motion import Number, PointMotion
+from torchsar.multichannel.reconstruct import refuse_shifted
 from torchsar.radar import BistaticRadar, receive_range
 
 _EPS = {torch.complex64: 1e-5, torch.complex128: 1e-10}
@@ -219,5 +220,6 @@ class CorrectMigration(Stage):
         self.hold("range_m", radar.reference_range_m if range_m is None else range_m)
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0, ambiguity: Number = 0) -> Signal:
+        refuse_shifted(self.radar, signal.axis("pulse"))
         reference = PointMotion.of(self.radar, signal.data, u_r_m_s, u_a_m_s, y0_m, self.range_m)
         return signal.with_data(correct_migration(signal.data, Frame.of(self.radar, signal), reference, self.migration, ambiguity))

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchsar.core import Axis, Signal, Stage, centred_ifft
 from torchsar.focus import omega_k, omega_k_stolt
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import mind_condition, reconstruct_lines
+from torchsar.multichannel.reconstruct import mind_condition, reconstruct_lines, refuse_shifted
 from torchsar.multichannel.response import LeastSquares, Rebuild
 from torchsar.radar import BistaticRadar, StripmapRadar
 
@@ -35,12 +35,6 @@ def two_way_radar(radar: BistaticRadar, bands: int, near_range_m: float) -> Stri
     )
 
 
-def unaliased(data: Tensor, radar: BistaticRadar, rebuild: Rebuild) -> Tensor:
-    """Channels (..., channel, pulse, range) of a scene at rest as pulses at bands * PRF of the reference of the track, (..., bands * pulse, range)."""
-    motion = PointMotion.of(radar, data.real)
-    return centred_ifft(reconstruct_lines(data, radar, motion, rebuild), dim=-2)
-
-
 def stationary_image(data: Tensor, radar: BistaticRadar, near_range_m: float, rebuild: Rebuild | None = None, form: str = "stolt", band_hz: float | None = None) -> Tensor:
     """Image (..., azimuth, range) of what is at rest, azimuth x = V_R t and range the closest range R0. data: (..., channel, pulse, range), transmit range removed.
 
@@ -50,10 +44,15 @@ def stationary_image(data: Tensor, radar: BistaticRadar, near_range_m: float, re
     The image is as long as the record and wraps around along azimuth. Moving points appear displaced by V_R u_r R0 / V^2, blurred, and repeated. Differentiable in the data.
     """
     rebuild = LeastSquares() if rebuild is None else rebuild
+    spectrum = reconstruct_lines(data, radar, PointMotion.of(radar, data.real), rebuild)
+    return focus_stationary(spectrum, radar, near_range_m, rebuild.bands, form, band_hz)
+
+
+def focus_stationary(spectrum: Tensor, radar: BistaticRadar, near_range_m: float, bands: int, form: str = "stolt", band_hz: float | None = None) -> Tensor:
+    """The second half of `stationary_image`: Doppler spectra (..., bands * pulse, range), bins about zero, to an image."""
     if form not in FORMS:
         raise ValueError(f"form of a stationary image must be one of {sorted(FORMS)}, got {form!r}")
-    lines = unaliased(data, radar, rebuild)
-    return FORMS[form](lines, two_way_radar(radar, rebuild.bands, near_range_m), doppler_hz=0.0, band_hz=band_hz)
+    return FORMS[form](centred_ifft(spectrum, dim=-2), two_way_radar(radar, bands, near_range_m), doppler_hz=0.0, band_hz=band_hz)
 
 
 class StationaryImage(Stage):
@@ -69,9 +68,14 @@ class StationaryImage(Stage):
             raise ValueError(why)
 
     def forward(self, signal: Signal) -> Signal:
-        _, pulse, range_ = signal.axes
+        refuse_shifted(self.radar, signal.axis("pulse"))
         mind_condition(self.radar, PointMotion.of(self.radar, signal.data.real), self.rebuild, signal.data.dtype)
-        image = stationary_image(signal.data, self.radar, range_.start, self.rebuild, self.form, self.band_hz)
+        return self.focused(reconstruct_lines(signal.data, self.radar, PointMotion.of(self.radar, signal.data.real), self.rebuild), signal)
+
+    def focused(self, spectrum: Tensor, signal: Signal) -> Signal:
+        """The image of a spectrum (..., doppler, range) that was rebuilt of `signal` in some way, bins about zero Doppler."""
+        _, pulse, range_ = signal.axes
+        image = focus_stationary(spectrum, self.radar, range_.start, self.rebuild.bands, self.form, self.band_hz)
         return Signal(image, (stationary_axis(self.radar, pulse, self.rebuild.bands), range_))
 
 

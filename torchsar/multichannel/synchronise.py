@@ -11,8 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, linear_phasor, unit_phasor
-from torchsar.multichannel.transmit import ChannelStage
+from torchsar.core import Estimate, Signal, Stage, linear_phasor, unit_phasor
 from torchsar.radar import BistaticRadar
 
 _OVERSAMPLING, _NEWTON = 4, 4
@@ -101,9 +100,11 @@ def remove_synchronisation(data: Tensor, radar: BistaticRadar, phase_rad: Tensor
     return torch.fft.ifft(torch.fft.fft(data * turn[..., None]) * advance)
 
 
-class EstimateSynchronisation(ChannelStage):
+class EstimateSynchronisation(Stage):
     """`estimate_synchronisation` of a direct path recorded beside the channels: `use(EstimateSynchronisation(radar), direct_path="aux.direct_path")`. The signal is left alone."""
 
+    works_on = ("channel", "pulse")
+    also_on = (("channel", "pulse", "range"),)
     provides = ("phase_rad", "delay_s")
 
     def __init__(self, radar: BistaticRadar) -> None:
@@ -116,8 +117,11 @@ class EstimateSynchronisation(ChannelStage):
         return estimate_synchronisation(direct_path, self.radar)
 
 
-class RemoveSynchronisation(ChannelStage):
+class RemoveSynchronisation(Stage):
     """`remove_synchronisation` by values of `EstimateSynchronisation`, or known ones."""
+
+    works_on = ("channel", "pulse")
+    also_on = (("channel", "pulse", "range"),)
 
     def __init__(self, radar: BistaticRadar) -> None:
         super().__init__()

@@ -56,21 +56,14 @@ def _over_range(phasor: Tensor, with_range: bool) -> Tensor:
     return phasor[..., None] if with_range else phasor
 
 
-class ChannelStage(Stage):
-    """Base of stages that work on (channel, pulse, range) and on (channel, pulse) alike."""
-
-    works_on = ("channel", "pulse", "range")
-
-    def __call__(self, signal: Signal, *args, **values):
-        self.works_on = ("channel", "pulse", "range") if isinstance(signal, Signal) and signal.names[-1:] == ("range",) else ("channel", "pulse")
-        return super().__call__(signal, *args, **values)
-
-
-class RemoveTransmitRange(ChannelStage):
+class RemoveTransmitRange(Stage):
     """`remove_transmit_range` by the radar's ephemeris coefficients. order: how many of them, None for all.
 
     Two are enough for apertures below 20 s (brief 001); warns where the rest exceeds 0.3 rad at the ends of the data.
     """
+
+    works_on = ("channel", "pulse")
+    also_on = (("channel", "pulse", "range"),)
 
     def __init__(self, radar: BistaticRadar, order: int | None = None) -> None:
         super().__init__()
@@ -87,8 +80,11 @@ class RemoveTransmitRange(ChannelStage):
         return signal.with_data(remove_transmit_range(signal.data, pulse.values(signal.data.device), coefficients, self.radar.wavelength_m, "range" in signal.names))
 
 
-class AzimuthScaling(ChannelStage):
+class AzimuthScaling(Stage):
     """`scale_azimuth`, the paper's own form, which leaves k1 to the reconstruction. order: highest coefficient taken out, 2..4; velocities per trial."""
+
+    works_on = ("channel", "pulse")
+    also_on = (("channel", "pulse", "range"),)
 
     def __init__(self, radar: BistaticRadar, order: int = 4) -> None:
         super().__init__()

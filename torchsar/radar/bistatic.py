@@ -93,6 +93,12 @@ class BistaticRadar:
         """Baseband range frequencies of an n-point FFT, FFT order, float64 (n,)."""
         return torch.fft.fftfreq(n, 1 / self.sampling_hz, dtype=torch.float64, device=device)
 
+    def band_weights(self, n: int, device: torch.device | str | None = None) -> Tensor:
+        """Spectrum of the range response, a rectangular band of the pulse's width with a peak of 1, float64 (n,) in FFT order; the bins at its edges have the share that lies inside."""
+        bins = self.range_frequency_hz(n, device).abs() * n / self.sampling_hz
+        inside = (self.pulse.bandwidth_hz * n / self.sampling_hz / 2 - bins + 0.5).clamp(0, 1)
+        return inside * (n / inside.sum())
+
     def transmit_range_m(self, time_s: Tensor) -> Tensor:
         """R_T(t) - R_T(0) (m) by the ephemeris, float64, shape of time_s."""
         return polynomial_range(self.transmit_range, time_s)

@@ -67,7 +67,7 @@ class KSea(Sea):
     """K-distributed clutter: gamma texture of the given shape times speckle, so that <I^2> / <I>^2 = 2 (1 + 1 / shape).
 
     shape: 0.1..1000, small for spiky seas, or inf for a surface of pure speckle. cell_m: sides along track and in closest range of the rectangles that share
-    one texture; an image shows the K distribution where it resolves them, and pure speckle where many fall into a resolution cell.
+    one texture, none smaller than a cell of the grid; an image shows the K distribution where it resolves them.
     Source: Ward, Tough and Watts, Sea Clutter, IET 2013, compound model; shape 1.5 is that of brief 001.
     """
 

@@ -7,7 +7,7 @@ only the direction that the channels measure, tells slant-range velocities that 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -45,11 +45,19 @@ class Search:
 
 
 def bank_search(
-    data: Tensor, radar: BistaticRadar, aperture: Aperture, search: Search, u_a_m_s: Tensor | float = 0.0, range_m: Number | None = None, whitening: Whitening | None = None
+    data: Tensor,
+    radar: BistaticRadar,
+    aperture: Aperture,
+    search: Search,
+    u_a_m_s: Tensor | float = 0.0,
+    range_m: Number | None = None,
+    whitening: Whitening | None = None,
+    image_s: Number | None = None,
 ) -> tuple[PointMotion, Tensor]:
     """The hypothesis that explains most, per trial, and the energy that it explains (...,) by the normalised correlation.
 
-    data: complex (..., channel, pulse). u_a_m_s: (...,) middle of the search along track. The place along track is read from the tone left, within +-search.y0_m.
+    data: complex (..., channel, pulse). u_a_m_s: (...,) middle of the search along track. The place along track is read from the tone left, within +-search.y0_m of zero, or of
+    where a point of each velocity lies that appears at the slow time image_s (...,) in an image: what a detection knows.
     """
     n = data.shape[-1]
     time_s = radar.pulse_axis(n).values(data.device)
@@ -62,10 +70,12 @@ def bank_search(
         for offsets in _blocks(_steps(search.u_a_m_s, search.u_a_step_m_s, data.device), data):
             u_a = torch.as_tensor(u_a_m_s, dtype=torch.float64, device=data.device)[..., None] + offsets
             there = PointMotion.of(radar, data, u_r, u_a, 0.0, None if range_m is None else per_trial(range_m, 1, data))
+            if image_s is not None:
+                there = replace(there, y0_m=there.place_m(per_trial(image_s, 1, data)))
             found, place, along = _best_tone(taken, radar, there, aperture, time_s, search.y0_m, whitening)
             better = found > energy
             energy = torch.where(better, found, energy)
-            best = chosen(PointMotion(u_r.expand(found.shape), along, place, best.range_m, best.speed_m_s), best, better)
+            best = chosen(replace(best, u_r_m_s=u_r.expand(found.shape), u_a_m_s=along, y0_m=place), best, better)
     return best, energy
 
 
@@ -88,12 +98,12 @@ def _best_tone(taken: Tensor, radar: BistaticRadar, motion: PointMotion, apertur
     length = smooth_length(2 * tones.shape[-1])
     spectrum = torch.fft.fftshift(torch.fft.fft(tones, length), dim=-1)
     tone_hz = (torch.arange(length, dtype=torch.float64, device=taken.device) - length // 2) * (rate_hz / length)
-    place = tone_hz * radar.wavelength_m * radar.reference_range_m / motion.along_m_s[..., None]
-    aligned = _aligned(spectrum, radar, place)
+    shift = tone_hz * radar.wavelength_m * radar.reference_range_m / motion.along_m_s[..., None]
+    aligned = _aligned(spectrum, radar, shift)
     power = aligned.abs().square().to(torch.float64) / _norm(model, whitening).to(torch.float64)[..., None]
-    power = torch.where(place.abs() <= reach_m, power, -torch.inf).flatten(-2)
+    power = torch.where(shift.abs() <= reach_m, power, -torch.inf).flatten(-2)
     at = power.argmax(-1, keepdim=True)
-    wide = torch.broadcast_to(place, (*aligned.shape[:-1], length)).flatten(-2)
+    wide = torch.broadcast_to(motion.y0_m[..., None] + shift, (*aligned.shape[:-1], length)).flatten(-2)
     along = torch.broadcast_to(motion.u_a_m_s[..., None], aligned.shape).flatten(-2)
     return power.gather(-1, at)[..., 0], wide.expand(power.shape).gather(-1, at)[..., 0], along.expand(power.shape).gather(-1, at)[..., 0]
 

@@ -21,8 +21,8 @@ _HALVINGS = 4
 
 
 @dataclass(frozen=True)
-class _Fit:
-    """Of data at a motion: amplitude, energy explained, gradient (..., unknown) and normal matrix (..., unknown, unknown) of half the explained energy."""
+class PointFit:
+    """Of data at a motion, per trial: amplitude, energy explained, gradient (..., unknown) and normal matrix (..., unknown, unknown) of half the explained energy."""
 
     amplitude: Tensor
     energy: Tensor
@@ -45,7 +45,7 @@ def maximum_likelihood(
     estimated; the rest stays at the start. whitening: covariance of what is not the point, None for white noise. The expected amplitude stays where the start puts
     it: where it ends says nothing about the place. A step is halved, or not taken, in trials where it explains no more energy than before, so that neighbours change nothing.
     """
-    problem = _Problem.of(data, radar, start, aperture, unknowns, whitening)
+    problem = PointLikelihood.of(data, radar, start, aperture, unknowns, whitening)
     motion = start.each(lambda value: value.expand(data.shape[:-2]))
     fit = problem.fit(motion)
     for _ in range(steps):
@@ -56,8 +56,11 @@ def maximum_likelihood(
 
 
 @dataclass(frozen=True)
-class _Problem:
-    """Data, whitened where there is a covariance, and all that stays the same from step to step."""
+class PointLikelihood:
+    """Data (..., channel, pulse), whitened where there is a covariance, and all that stays the same from step to step of a search.
+
+    weight: expected amplitude (..., 1, pulse); unknowns: of u_r_m_s, u_a_m_s, y0_m.
+    """
 
     data: Tensor
     radar: BistaticRadar
@@ -67,13 +70,13 @@ class _Problem:
     whitening: Whitening | None
 
     @staticmethod
-    def of(data: Tensor, radar: BistaticRadar, start: PointMotion, aperture: Aperture, unknowns: tuple[str, ...], whitening: Whitening | None) -> _Problem:
+    def of(data: Tensor, radar: BistaticRadar, start: PointMotion, aperture: Aperture, unknowns: tuple[str, ...], whitening: Whitening | None) -> PointLikelihood:
         time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
         weight = aperture.weight(radar, start, time_s)[..., None, :]
         data = data.to(torch.complex128)
-        return _Problem(data if whitening is None else whitening.applied(data), radar, weight, time_s, unknowns, whitening)
+        return PointLikelihood(data if whitening is None else whitening.applied(data), radar, weight, time_s, unknowns, whitening)
 
-    def fit(self, motion: PointMotion) -> _Fit:
+    def fit(self, motion: PointMotion) -> PointFit:
         """Least squares of the amplitude at a motion, and its slopes by the unknowns."""
         slopes = phase_slopes(self.radar, motion, self.time_s, self.unknowns)
         phasor = point_phasor(self.radar, motion, self.time_s, torch.complex128)
@@ -82,7 +85,7 @@ class _Problem:
         model = self.weight * phasor
         return _coloured(self.data, self.whitening.applied(model), self.whitening.applied(1j * slopes * model[..., None, :, :]))
 
-    def noise_power(self, fit: _Fit) -> Tensor:
+    def noise_power(self, fit: PointFit) -> Tensor:
         """Power per sample that the point leaves, where it shines; relative to the covariance where there is one."""
         power = self.data.abs().square()
         shines = torch.ones_like(power) if self.whitening is not None else (self.weight != 0).expand(power.shape).to(power.dtype)
@@ -90,7 +93,7 @@ class _Problem:
         return left.clamp_min(0) / shines.sum((-2, -1)).clamp_min(1)
 
 
-def _white(deramped: Tensor, weight: Tensor, slopes: Tensor) -> _Fit:
+def _white(deramped: Tensor, weight: Tensor, slopes: Tensor) -> PointFit:
     """In white noise all happens on the deramped data, which are constant where the motion is right."""
     power = weight.square().expand(deramped.shape)
     total = power.sum((-2, -1)).clamp_min(_TINY)
@@ -99,10 +102,10 @@ def _white(deramped: Tensor, weight: Tensor, slopes: Tensor) -> _Fit:
     turned = (weight * (amplitude.conj()[..., None, None] * deramped).imag)[..., None, :, :]
     gradient = (centred * turned).sum((-2, -1))
     flat = (centred * weight[..., None, :, :]).flatten(-2)
-    return _Fit(amplitude, amplitude.abs().square() * total, gradient, amplitude.abs().square()[..., None, None] * (flat @ flat.mT))
+    return PointFit(amplitude, amplitude.abs().square() * total, gradient, amplitude.abs().square()[..., None, None] * (flat @ flat.mT))
 
 
-def _coloured(data: Tensor, model: Tensor, columns: Tensor) -> _Fit:
+def _coloured(data: Tensor, model: Tensor, columns: Tensor) -> PointFit:
     """The same on whitened data, model and columns (..., unknown, channel, bin)."""
     x, s, d = data.flatten(-2), model.flatten(-2), columns.flatten(-2)
     total = s.abs().square().sum(-1).clamp_min(_TINY)
@@ -110,7 +113,7 @@ def _coloured(data: Tensor, model: Tensor, columns: Tensor) -> _Fit:
     d = d - ((d * s.conj()[..., None, :]).sum(-1) / total[..., None])[..., None] * s[..., None, :]
     gradient = (amplitude.conj()[..., None] * (d.conj() * x[..., None, :]).sum(-1)).real
     normal = (d.conj()[..., :, None, :] * d[..., None, :, :]).sum(-1).real
-    return _Fit(amplitude, amplitude.abs().square() * total, gradient, amplitude.abs().square()[..., None, None] * normal)
+    return PointFit(amplitude, amplitude.abs().square() * total, gradient, amplitude.abs().square()[..., None, None] * normal)
 
 
 def _solved(normal: Tensor, right: Tensor) -> Tensor:
@@ -121,7 +124,7 @@ def _solved(normal: Tensor, right: Tensor) -> Tensor:
     return scale[..., :, None] * torch.linalg.solve(unit + floor, scale[..., :, None] * right)
 
 
-def _stepped(problem: _Problem, motion: PointMotion, fit: _Fit) -> tuple[PointMotion, _Fit]:
+def _stepped(problem: PointLikelihood, motion: PointMotion, fit: PointFit) -> tuple[PointMotion, PointFit]:
     """One Gauss-Newton step, halved where it explains less."""
     step = _bounded(_solved(fit.normal, fit.gradient[..., None])[..., 0], motion, problem.unknowns)
     pending = torch.ones_like(fit.energy, dtype=torch.bool)
@@ -130,7 +133,7 @@ def _stepped(problem: _Problem, motion: PointMotion, fit: _Fit) -> tuple[PointMo
         fit_there = problem.fit(there)
         better = pending & (fit_there.energy > fit.energy)
         motion = chosen(there, motion, better)
-        fit = _Fit(*(torch.where(better[(...,) + (None,) * (new.ndim - better.ndim)], new, old) for new, old in zip(vars(fit_there).values(), vars(fit).values(), strict=True)))
+        fit = PointFit(*(torch.where(better[(...,) + (None,) * (new.ndim - better.ndim)], new, old) for new, old in zip(vars(fit_there).values(), vars(fit).values(), strict=True)))
         pending = pending & ~better
         if not bool(pending.any()):
             break

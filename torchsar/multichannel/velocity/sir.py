@@ -20,7 +20,7 @@ from torchsar.optim.scalar import grid_minimum, parabola_minimum
 from torchsar.radar import BistaticRadar
 
 _TOLERANCE_M_S = 1e-4
-_CURVE_M_S = 0.2
+_CURVE_M_S = 0.5
 _GROUPS = 16
 
 
@@ -38,11 +38,14 @@ class Intensity:
     @property
     def total(self) -> Intensity:
         """Summed over the last dim."""
-        return Intensity(*(x.sum(-1) for x in (self.energy_in, self.energy_out, self.amplitude_in, self.amplitude_out)), self.bins_in, self.bins_out)
+        return self._each(lambda x: x.sum(-1))
 
     def summed(self, weight: Tensor) -> Intensity:
         """Summed over the last dim with weights (last, group): (..., group)."""
-        return Intensity(*(x @ weight for x in (self.energy_in, self.energy_out, self.amplitude_in, self.amplitude_out)), self.bins_in, self.bins_out)
+        return self._each(lambda x: x @ weight)
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> Intensity:
+        return Intensity(change(self.energy_in), change(self.energy_out), change(self.amplitude_in), change(self.amplitude_out), self.bins_in, self.bins_out)
 
     @property
     def power_ratio(self) -> Tensor:
@@ -100,7 +103,9 @@ class SignalIntensityRatio(Stage):
 
     std: of noise, from how the maximum moves as parts of the spectrum are left out. quality: 1 - median / largest Gamma over the grid. Not ok: trials
     without data, whose value is the middle of the search, with the best point at an end of it, and of a quality below `least_quality`.
-    Its threshold lies at about 0 to +7 dB a sample, 15 dB above interferometry between the channels. Raises ValueError as `signal_intensity`.
+    Its threshold lies at about 0 to +7 dB a sample, 15 dB above interferometry between the channels; below it estimates are biased by more than std says. Without noise
+    it errs by up to 0.06 m/s: what a gate leaves beyond the rebuilt bands aliases into them. Records that end inside the target's gate disturb it. Raises ValueError as
+    `signal_intensity`.
     """
 
     provides = ("u_r_m_s",)

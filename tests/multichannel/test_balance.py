@@ -1,0 +1,106 @@
+"""Differences between channels, found in clutter and taken out."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from tests.multichannel.helpers import published_radar
+from torchsar.core import Signal
+from torchsar.multichannel.balance import CorrectBalance, EstimateBalance, correct_balance, estimate_balance
+from torchsar.multichannel.response import ElementPattern, FlatBand
+
+PHASE, GAIN, DELAY = (torch.tensor(x, dtype=torch.float64) for x in ([0.3, 0.0, -0.5], [0.5, 0.0, -1.0], [2e-9, 0.0, -9e-9]))
+N, CELLS, LONG = 256, 160, 4096
+
+
+def clutter(radar, power_of_doppler, snr_db, trials=2, n_range=CELLS, seed=3):
+    """Gaussian clutter of a Doppler spectrum in pulses of channels that lie dx / V apart, cut from a long periodic one, (trial, channel, pulse, range), in the pulse's band."""
+    generator = torch.Generator().manual_seed(seed)
+    factor = 8
+    f = torch.fft.fftfreq(LONG, 1 / (factor * radar.prf_hz), dtype=torch.float64)
+    white = torch.randn(trials, LONG, n_range, dtype=torch.complex128, generator=generator)
+    power = power_of_doppler(f)
+    spectrum = white * (power / power.mean()).sqrt()[:, None]
+    dx = torch.tensor(radar.channel_m, dtype=torch.float64)[:, None]
+    delayed = spectrum[:, None] * torch.exp(-2j * math.pi * f * dx / radar.speed_m_s)[..., None]
+    pulses = torch.fft.ifft(delayed, dim=-2, norm="ortho")[..., : N * factor : factor, :]
+    noisy = pulses + 10 ** (-snr_db / 20) * torch.randn(pulses.shape, dtype=torch.complex128, generator=generator)
+    band = torch.fft.fftfreq(n_range, 1 / radar.sampling_hz, dtype=torch.float64).abs() < radar.pulse.bandwidth_hz / 2
+    return torch.fft.ifft(torch.fft.fft(noisy) * band)
+
+
+def differed(data, radar):
+    return correct_balance(data, radar, -PHASE, -GAIN, -DELAY)
+
+
+def flat(f):
+    return (f.abs() < 160).to(torch.float64)
+
+
+def pattern(f):
+    return torch.sinc(0.8 * f / 300).square()
+
+
+@pytest.mark.parametrize("prf, chosen, power, limit_deg", [(180.0, (FlatBand(360.0), 2), flat, 0.1), (160.0, (FlatBand(320.0), 2), flat, 0.1), (180.0, (ElementPattern(), 5), pattern, 2.5)])
+def test_found_as_well_as_foretold(prf, chosen, power, limit_deg):
+    radar = published_radar(prf_hz=prf)
+    found = estimate_balance(differed(clutter(radar, power, 40.0), radar), radar, *chosen)
+    assert bool(found.ok.all())
+    errors = {"phase_rad": found["phase_rad"] - PHASE, "gain_db": found["gain_db"] - GAIN, "delay_s": found["delay_s"] - DELAY}
+    assert float(torch.rad2deg(errors["phase_rad"]).abs().max()) < limit_deg
+    assert float(errors["gain_db"].abs().max()) < (0.5 if chosen[1] > 2 else 0.1)
+    for name in ("phase_rad", "delay_s"):
+        assert bool((errors[name].abs() <= 4 * found.std[name] + 1e-15).all()), name
+        assert bool((found.std[name][..., [0, 2]] > 0).all())
+
+
+def test_deviations_are_the_foretold_ones():
+    radar = published_radar()
+    found = estimate_balance(clutter(radar, flat, 30.0, trials=24, n_range=48), radar, FlatBand(360.0), 2, delays=False, blocks=4)
+    seen = found["phase_rad"].square().mean(0).sqrt()[[0, 2]]
+    torch.testing.assert_close(seen / found.std["phase_rad"].mean(0)[[0, 2]], torch.ones(2, dtype=torch.float64), atol=0.5, rtol=0)
+    assert float(found.info["snr_db"].mean()) == pytest.approx(30 - 3, abs=3.5)
+
+
+def test_stages_undo_what_was_done():
+    radar = published_radar()
+    clean = clutter(radar, flat, 40.0, trials=1)
+    signal = Signal(differed(clean, radar), radar.axes(N, CELLS))
+    estimate = EstimateBalance(radar, FlatBand(360.0), 2)(signal)
+    out = CorrectBalance(radar)(signal, **{name: estimate[name] for name in EstimateBalance.provides})
+    assert (out.data - clean).norm() < 0.01 * clean.norm() < 0.05 * (signal.data - clean).norm()
+    torch.testing.assert_close(CorrectBalance(radar)(signal, PHASE, GAIN, DELAY).data, clean, atol=1e-9, rtol=0)
+    line = signal.data[..., 0]
+    flat_line = CorrectBalance(radar)(Signal(line, radar.axes(N)), PHASE, GAIN).data
+    torch.testing.assert_close(flat_line, line * (10 ** (-GAIN / 20) * torch.exp(-1j * PHASE))[:, None])
+
+
+def test_trials_stand_alone_and_silence_is_told():
+    radar = published_radar()
+    data = differed(clutter(radar, flat, 30.0), radar)
+    dead = data[:1] * torch.tensor([1.0, 0.0, 1.0])[:, None, None]
+    data = torch.cat([data * torch.tensor([1.0, 1e3])[:, None, None, None], torch.zeros_like(data[:1]), dead])
+    together = estimate_balance(data, radar, FlatBand(360.0), 2)
+    assert together.ok.tolist() == [True, True, False, False]
+    assert all(bool(torch.isfinite(v).all()) for v in (*together.value.values(), *together.std.values(), together.quality))
+    for i in range(4):
+        alone = estimate_balance(data[i], radar, FlatBand(360.0), 2)
+        for name, value in alone.value.items():
+            torch.testing.assert_close(together[name][i], value, atol=1e-9, rtol=1e-6)
+    single = estimate_balance(data.to(torch.complex64), radar, FlatBand(360.0), 2)
+    torch.testing.assert_close(single["phase_rad"], together["phase_rad"], atol=1e-4, rtol=0)
+
+
+def test_refusals():
+    radar = published_radar()
+    with pytest.raises(ValueError, match="the radar has one"):
+        estimate_balance(torch.zeros(1, 8, 64, dtype=torch.complex128), published_radar(channel_m=(0.0,)))
+    with pytest.raises(ValueError, match=r"data \(\.\.\., 3, pulse, range\)"):
+        estimate_balance(torch.zeros(2, 8, 64, dtype=torch.complex128), radar)
+    with pytest.raises(ValueError, match="gain_db .* got shape \\(2,\\)"):
+        correct_balance(torch.zeros(3, 8, 64, dtype=torch.complex128), radar, PHASE, GAIN[:2])
+    with pytest.raises(ValueError, match="leave delay_s out"):
+        correct_balance(torch.zeros(3, 8, dtype=torch.complex128), radar, PHASE, GAIN, DELAY, with_range=False)
