@@ -1,9 +1,9 @@
 """A moving body of any extent: one velocity for all of it, its picture, and its echo to be taken out of the data.
 
 Range lines about the body are shifted by its range history and deramped channel by channel. Each part of the body then is one tone in all channels, whatever the
-aliasing: the frequency F gives its place along track, y = y0 + F lambda R0 / v, and that place and the velocity give its phases across the channels. Lines beside
-the body show the covariance of the sea among the channels of a tone. All parts together then tell the slant-range velocity, by likelihood with a free amplitude
-for each; the sharpness of the picture tells the along-track velocity; and what fits both is the body's echo.
+aliasing: the frequency F gives its place along track, y = y0 + F lambda R0 / v, and that place and the velocity give its phases across the channels. In short segments
+of slow time the sea behind a tone comes from as few directions as there are Doppler bands; lines beside the body show its covariance. All parts and segments together
+tell the slant-range velocity, by likelihood with a free amplitude for each; the sharpness of the picture tells the along-track velocity; what fits both is its echo.
 Source: brief 001, Velocity (stationary clutter, whitening) and Algorithm 8 (subtraction); Remote Sens. 2020, 12, 1703, section 4.3 (one speed for targets close together).
 """
 
@@ -26,150 +26,218 @@ _GUARD_CELLS = 6
 _LEAST_LINES = 12
 _LOADING = 1e-5
 _BRIGHT = 12.0  # times what sea and noise leave in a pixel
-_CLEAR = 4.0
+_CLEAR = 2.0
 _CREDIBLE = 40.0  # times what sea and noise leave, the mean of the bright pixels
 
 
 @dataclass(frozen=True)
 class Extraction:
-    """What belongs to a body: half widths (m) along track and in range about its middle, and the time (s) for which it shines."""
+    """What belongs to a body: half widths (m) along track and in range about its middle, the time (s) for which a point shines, and the length (s) of segments."""
 
-    along_m: float = 110.0
-    range_m: float = 30.0
+    along_m: float = 120.0
+    range_m: float = 60.0
     integration_s: float = 4.5
+    segment_s: float = 0.6
 
     def __post_init__(self) -> None:
-        for name in ("along_m", "range_m", "integration_s"):
+        for name in ("along_m", "range_m", "integration_s", "segment_s"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} of an extraction must be positive, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
-class Tones:
-    """Lines about a body as tones. data: complex128 (line, channel, tone), tone_hz: (tone,); start_s: slow time that their phases count from; range_m: (line,) closest ranges; motion: of the middle, which was deramped.
+class Segments:
+    """Short Fourier transforms of slow time: half-overlapping segments and the bins kept of each. bins: (tone,) FFT indices; rows: (segment,) of those in which a body shines."""
 
-    inverse: (channel, channel, ...) inverse covariance of sea and noise for tones whose phases over channels are those of the middle, complex128 (tone, channel, channel).
+    n: int
+    length: int
+    bins: Tensor
+    rows: Tensor
+
+    @property
+    def hop(self) -> int:
+        return self.length // 2
+
+    def window(self) -> Tensor:
+        return torch.hann_window(self.length, dtype=torch.float64, device=self.bins.device)
+
+    def of(self, x: Tensor) -> Tensor:
+        """(..., pulse) complex128 to (..., segment, tone)."""
+        made = torch.stft(x.flatten(0, -2), self.length, self.hop, window=self.window(), center=True, pad_mode="constant", onesided=False, return_complex=True)
+        return made[:, self.bins][..., self.rows].mT.unflatten(0, x.shape[:-1])
+
+    def back(self, cells: Tensor) -> Tensor:
+        """Inverse of `of`, zero where segments or bins were left out."""
+        full = torch.zeros(cells.shape[:-2].numel(), self.length, self.n // self.hop + 1, dtype=cells.dtype, device=cells.device)
+        full[:, self.bins[:, None], self.rows] = cells.flatten(0, -3).mT
+        made = torch.istft(full, self.length, self.hop, window=self.window(), center=True, onesided=False, length=self.n, return_complex=True)
+        return made.unflatten(0, cells.shape[:-2])
+
+
+@dataclass(frozen=True)
+class Chip:
+    """Lines about a body, deramped by the motion of its middle, in segments. cells: complex128 (line, channel, segment, tone); beside: the same of lines beside it; tone_hz: (tone,).
+
+    range_m: (line,) closest ranges; inverse: (segment, tone, channel, channel) inverse covariance of the sea and noise; lit: (pulse,) bool, some part of the body shines.
     """
 
     radar: BistaticRadar
     motion: PointMotion
-    data: Tensor
+    segments: Segments
+    cells: Tensor
+    beside: Tensor
     tone_hz: Tensor
-    start_s: float
     range_m: Tensor
     inverse: Tensor
+    lit: Tensor
+    time_s: Tensor
 
-    def steering(self, motion: PointMotion) -> Tensor:
-        """Phases over channels of what has this motion and lies at each tone, against what was deramped, complex128 (..., tone, channel)."""
-        place = self.place_m(motion) - self.motion.y0_m
+    def steering(self, motion: PointMotion, tone_hz: Tensor) -> Tensor:
+        """Phases over channels of what has this motion and lies at tones, against what was deramped, complex128 (..., tone, channel)."""
+        place = self.place_m(motion, tone_hz) - self.motion.y0_m
         return unit_phasor(-place[..., None] * self.radar.channels_at(place.device) / (self.radar.wavelength_m * motion.range_m[..., None, None]), torch.complex128)
 
-    def place_m(self, motion: PointMotion) -> Tensor:
-        """Along-track place at t = 0 of each tone for a motion whose y0 is that of tone zero, (..., tone)."""
+    def place_m(self, motion: PointMotion, tone_hz: Tensor) -> Tensor:
+        """Along-track place at t = 0 of tones for a motion whose y0 is that of tone zero, (..., tone)."""
         per_hz = self.radar.wavelength_m * motion.range_m / motion.along_m_s
-        return motion.y0_m[..., None] + per_hz[..., None] * self.tone_hz
+        return motion.y0_m[..., None] + per_hz[..., None] * tone_hz
 
-    def amplitudes(self, motion: PointMotion) -> tuple[Tensor, Tensor]:
-        """Most likely complex amplitude of every pixel (line, tone) for a motion, and its variance by sea and noise (tone,)."""
-        steering = self.steering(motion)
-        weight = (self.inverse @ steering[..., None])[..., 0]
-        gain = (steering.conj() * weight).sum(-1).real.clamp_min(_TINY)
-        return torch.einsum("lmf,fm->lf", self.data, weight.conj()) / gain, 1 / gain
+    def _weights(self, motion: PointMotion) -> tuple[Tensor, Tensor]:
+        """R^-1 a (..., segment, tone, channel) and a^H R^-1 a (..., segment, tone)."""
+        steering = self.steering(motion, self.tone_hz)
+        weight = torch.einsum("sfmn,...fn->...sfm", self.inverse, steering)
+        return weight, (steering[..., None, :, :].conj() * weight).sum(-1).real.clamp_min(_TINY)
 
     def energy(self, motions: PointMotion) -> Tensor:
-        """What pixels of free amplitude explain of the data for each motion (candidate,): the log-likelihood but for constants."""
-        steering = self.steering(motions)
-        weight = torch.einsum("fmn,cfn->cfm", self.inverse, steering)
-        gain = (steering.conj() * weight).sum(-1).real.clamp_min(_TINY)
-        return (torch.einsum("lmf,cfm->clf", self.data, weight.conj()).abs().square() / gain[:, None]).sum((-2, -1))
+        """What cells of free amplitude explain of the data for each motion (candidate,): the log-likelihood but for constants."""
+        weight, gain = self._weights(motions)
+        return (torch.einsum("lmsf,csfm->clsf", self.cells, weight.conj()).abs().square() / gain[:, None]).sum((-3, -2, -1))
+
+    def echo(self, cells: Tensor) -> Tensor:
+        """Most likely deramped echo, seen from the reference of the track, of what has the chip's motion: (line, channel, segment, tone) to (line, pulse), zero where nothing shines."""
+        weight, gain = self._weights(self.motion)
+        return self.segments.back(torch.einsum("lmsf,sfm->lsf", cells, weight.conj()) / gain) * self.lit
+
+    def picture(self) -> Picture:
+        """Of the body: spectra of its echo, and the mean intensity that sea and noise leave in them, by the lines beside it."""
+        n = self.segments.n
+        hz = torch.fft.fftfreq(n, 1 / self.radar.prf_hz, dtype=torch.float64, device=self.lit.device)
+        inside = (hz.abs() <= self.tone_hz.abs().max()).nonzero()[:, 0]
+        own, others = (torch.fft.fft(self.echo(cells))[:, inside] for cells in (self.cells, self.beside))
+        return Picture(own, others.abs().square().mean().clamp_min(_TINY), hz[inside], inside)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Complex amplitudes (line, tone) of a body, sum over lit pulses of its echo at each tone; left: mean intensity of sea and noise in them (); index: of the tones in an FFT of all pulses."""
+
+    amplitude: Tensor
+    left: Tensor
+    tone_hz: Tensor
+    index: Tensor
+
+    @property
+    def level(self) -> Tensor:
+        """Intensity over what sea and noise leave."""
+        return self.amplitude.abs().square() / self.left
+
+    @property
+    def bright(self) -> Tensor:
+        level = self.level
+        return level > torch.maximum(level.new_tensor(_BRIGHT), 0.01 * level.max())
 
 
 @dataclass(frozen=True)
 class Body:
-    """A body that was found. motion: velocity, and along-track place and closest range of its middle, by intensity; std: predicted deviation of u_r (m/s).
+    """A body that was found. motion: velocity, and along-track place and closest range of its middle, by intensity; u_r_std_m_s: predicted deviation of u_r.
 
-    tones: its data; level: mean intensity of its bright pixels over that of sea and noise in a pixel; bright: their number. ok: they stand out by 16 dB, and u_r does not end its search.
+    chip, picture: its data, deramped by that motion, and what they show; level: mean of the bright pixels over what sea and noise leave. ok: it stands out by 16 dB, and u_r
+    does not end its search.
     """
 
     motion: PointMotion
     u_r_std_m_s: Tensor
-    tones: Tones
+    chip: Chip
+    picture: Picture
     level: Tensor
-    bright: Tensor
     ok: Tensor
 
 
-def tones_about(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extraction) -> Tones:
-    """Lines about a body of this motion as tones. data: complex (channel, pulse, range), range compressed, transmit range removed, with lines beside the body to learn the sea from.
+def chip_about(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extraction) -> Chip:
+    """Lines about a body of this motion. data: complex (channel, pulse, range), range compressed, transmit range removed, with lines beside the body to learn the sea from.
 
-    Raises ValueError where too few lines lie beside it.
+    Raises ValueError where the body lies outside the lines, or too few lie beside it.
     """
-    deramped = _deramped(data, frame, motion, extraction)
-    spectrum = torch.fft.fft(deramped.movedim(-1, 0))
-    n = spectrum.shape[-1]
-    tone_hz = torch.fft.fftfreq(n, 1 / frame.radar.prf_hz, dtype=torch.float64, device=data.device)
-    near = tone_hz.abs() * frame.radar.wavelength_m * float(motion.range_m / motion.along_m_s) <= extraction.along_m
     off = (frame.range_m - motion.range_m).abs()
     body, beside = off <= extraction.range_m, off > extraction.range_m + _GUARD_CELLS * frame.radar.range_step_m
-    if not bool(body.any()):
-        raise ValueError(f"no range line lies within {extraction.range_m:g} m of a body at {float(motion.range_m):.0f} m; give lines about it")
-    if int(beside.sum()) < _LEAST_LINES:
-        raise ValueError(f"a body of +-{extraction.range_m:g} m at {float(motion.range_m):.0f} m needs {_LEAST_LINES} range lines beside it to learn the sea from, got {int(beside.sum())}")
-    found = Tones(frame.radar, motion, spectrum[body][..., near], tone_hz[near], float(frame.time_s[0]), frame.range_m[body], torch.zeros(0))
-    return replace(found, inverse=_inverse_covariance(found, spectrum[beside][..., near]))
-
-
-def _deramped(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extraction) -> Tensor:
-    """(channel, pulse, range) complex128, lines shifted by the history of the motion and multiplied by its conjugate phase, zero where no part of the body shines."""
-    shifted = correct_migration(data.to(torch.complex128), frame, motion, StaticBulk())
-    return shifted * _ramp(frame, motion, extraction).conj()[..., None]
-
-
-def _ramp(frame: Frame, motion: PointMotion, extraction: Extraction) -> Tensor:
+    if not bool(body.any()) or int(beside.sum()) < _LEAST_LINES:
+        counts = f"{int(body.sum())} lines within {extraction.range_m:g} m of {float(motion.range_m):.0f} m and {int(beside.sum())} beside them"
+        raise ValueError(f"a body needs range lines about it and {_LEAST_LINES} beside it to learn the sea from, got {counts}")
     lit = (frame.time_s - motion.y0_m / motion.along_m_s).abs() < extraction.integration_s / 2 + extraction.along_m / 2 / motion.along_m_s
-    return point_phasor(frame.radar, motion, frame.time_s, torch.complex128) * lit
+    shifted = correct_migration(data.to(torch.complex128), frame, motion, StaticBulk()).movedim(-1, 0)
+    deramped = shifted * point_phasor(frame.radar, motion, frame.time_s, torch.complex128).conj()
+    segments, tone_hz = _segments(frame, motion, extraction, lit)
+    empty = torch.zeros(0, device=data.device)
+    chip = Chip(frame.radar, motion, segments, segments.of(deramped[body]), segments.of(deramped[beside]), tone_hz, frame.range_m[body], empty, lit, frame.time_s)
+    return replace(chip, inverse=_inverse_covariance(chip))
 
 
-def _inverse_covariance(tones: Tones, beside: Tensor) -> Tensor:
-    """Inverse of the covariance among channels of lines beside the body (line, channel, tone): it turns with the tone as phases of places do, and else is the same over the body."""
-    turn = tones.steering(tones.motion)
-    aligned = beside.movedim(-2, -1) * turn.conj()
-    covariance = torch.einsum("lfm,lfn->mn", aligned, aligned.conj()) / (aligned.shape[0] * aligned.shape[1])
-    covariance = covariance + _LOADING * covariance.diagonal().real.mean().clamp_min(_TINY) * torch.eye(len(covariance), dtype=covariance.dtype, device=covariance.device)
-    return turn[..., :, None] * torch.linalg.inv(covariance) * turn.conj()[..., None, :]
+def _segments(frame: Frame, motion: PointMotion, extraction: Extraction, lit: Tensor) -> tuple[Segments, Tensor]:
+    """Segments in which the body shines, and the tones at which it may lie."""
+    n, prf = len(frame.time_s), frame.radar.prf_hz
+    length = min(2 * max(4, round(extraction.segment_s * prf / 2)), n // 2 * 2)
+    tone_hz = torch.fft.fftfreq(length, 1 / prf, dtype=torch.float64, device=lit.device)
+    reach = extraction.along_m * float(motion.along_m_s / motion.range_m) / frame.radar.wavelength_m + 2 * prf / length
+    bins = (tone_hz.abs() <= reach).nonzero()[:, 0]
+    middle = torch.arange(n // (length // 2) + 1, device=lit.device) * (length // 2)
+    covered = torch.cat([torch.zeros(1, device=lit.device), lit.to(torch.float32).cumsum(0)])
+    rows = (covered[(middle + length // 2).clamp(0, n)] - covered[(middle - length // 2).clamp(0, n)] > 0).nonzero()[:, 0]
+    return Segments(n, length, bins, rows), tone_hz[bins]
+
+
+def _inverse_covariance(chip: Chip) -> Tensor:
+    """Of the lines beside the body: from tone to tone it turns as phases of places do, and else is the same for all tones of a segment."""
+    turn = chip.steering(chip.motion, chip.tone_hz)
+    aligned = chip.beside.movedim(1, -1) * turn.conj()
+    covariance = torch.einsum("lsfm,lsfn->smn", aligned, aligned.conj()) / (aligned.shape[0] * aligned.shape[2])
+    level = covariance.diagonal(dim1=-2, dim2=-1).real.mean(-1).clamp_min(_TINY)
+    covariance = covariance + _LOADING * level[:, None, None] * torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
+    return turn[..., :, None] * torch.linalg.inv(covariance)[:, None] * turn.conj()[..., None, :]
 
 
 def find_body(data: Tensor, frame: Frame, image_s: float, image_m: float, extraction: Extraction, u_r_half_m_s: float | None = None, u_a_half_m_s: float = 20.0, rounds: int = 4) -> Body:
     """Velocity and place of the body that appears at slow time image_s and range image_m (m) of an image of everything at rest.
 
-    data: complex (channel, pulse, range) about the body (see `tones_about`). u_r_half_m_s: of the search, by default half of lambda PRF. Every round shifts and deramps by the motion found so far.
+    data: complex (channel, pulse, range) about the body (see `chip_about`). u_r_half_m_s: of the search, by default half of lambda PRF. Every round shifts and deramps by the motion found so far.
     """
     half = frame.radar.ambiguous_velocity_m_s / 2 if u_r_half_m_s is None else u_r_half_m_s
-    tones = tones_about(data, frame, _appearing(frame.radar, data, 0.0, 0.0, image_s, image_m), extraction)
+    chip = chip_about(data, frame, _appearing(frame.radar, data, 0.0, 0.0, image_s, image_m), extraction)
     for number in range(rounds):
-        u_r, std, _ = _closing_speed(tones, image_s, image_m, half if number < 2 else 2.0)
-        motion = _appearing(frame.radar, data, u_r, tones.motion.u_a_m_s, image_s, image_m)
+        u_r, std = _closing_speed(chip, image_s, image_m, half if number < 2 else 2.0)
+        motion = _appearing(frame.radar, data, u_r, chip.motion.u_a_m_s, image_s, image_m)
         if not _covered(frame, motion, extraction):
-            return _judged(tones, std, half, lost=True)
-        u_a = _along_speed(tones_about(data, frame, motion, extraction), extraction, u_a_half_m_s if number < 2 else 1.0)
-        tones = tones_about(data, frame, _appearing(frame.radar, data, u_r, u_a, image_s, image_m), extraction)
-        image_s, image_m, motion = _centred(tones, image_s, image_m)
-        tones = tones_about(data, frame, motion, extraction)
-    u_r, std, _ = _closing_speed(tones, image_s, image_m, 1.0)
-    motion = _appearing(frame.radar, data, u_r, tones.motion.u_a_m_s, image_s, image_m)
-    return _judged(tones_about(data, frame, motion, extraction), std, half)
+            return _judged(chip, std, half, lost=True)
+        u_a = _along_speed(chip_about(data, frame, motion, extraction), extraction, u_a_half_m_s if number < 2 else 1.0)
+        chip = chip_about(data, frame, _appearing(frame.radar, data, u_r, u_a, image_s, image_m), extraction)
+        image_s, image_m, motion = _centred(chip, image_s, image_m)
+        chip = chip_about(data, frame, motion, extraction)
+    u_r, std = _closing_speed(chip, image_s, image_m, 1.0)
+    motion = _appearing(frame.radar, data, u_r, chip.motion.u_a_m_s, image_s, image_m)
+    return _judged(chip_about(data, frame, motion, extraction), std, half)
 
 
 def _covered(frame: Frame, motion: PointMotion, extraction: Extraction) -> bool:
     """The lines of the frame hold a body of this motion, and some more."""
-    reach = extraction.range_m + _GUARD_CELLS * frame.radar.range_step_m
+    reach = extraction.range_m / 2
     return bool((frame.range_m[0] + reach <= motion.range_m) & (motion.range_m <= frame.range_m[-1] - reach))
 
 
-def _judged(tones: Tones, std: Tensor, half_m_s: float, lost: bool = False) -> Body:
-    level, bright = _brightness(tones)
-    ok = (level > _CREDIBLE) & (tones.motion.u_r_m_s.abs() < 0.98 * half_m_s)
-    return Body(tones.motion, std, tones, level, bright, ok & (not lost))
+def _judged(chip: Chip, std: Tensor, half_m_s: float, lost: bool = False) -> Body:
+    picture = chip.picture()
+    bright = picture.bright
+    level = (picture.level * bright).sum() / bright.sum().clamp_min(1)
+    ok = (level > _CREDIBLE) & (chip.motion.u_r_m_s.abs() < 0.98 * half_m_s)
+    return Body(chip.motion, std, chip, picture, level, ok & (not lost))
 
 
 def _appearing(radar: BistaticRadar, like: Tensor, u_r: Tensor | float, u_a: Tensor | float, image_s: Tensor | float, image_m: Tensor | float) -> PointMotion:
@@ -180,91 +248,74 @@ def _appearing(radar: BistaticRadar, like: Tensor, u_r: Tensor | float, u_a: Ten
     return replace(m, range_m=(m.along_m_s * least + m.u_r_m_s * turned) / speed, y0_m=(m.along_m_s * turned - m.u_r_m_s * least) / speed)
 
 
-def _candidates(radar: BistaticRadar, like: Tensor, u_r: Tensor, u_a: Tensor, image_s: float, image_m: float) -> PointMotion:
-    return _appearing(radar, like, u_r, u_a.expand(u_r.shape), image_s, image_m)
-
-
-def _closing_speed(tones: Tones, image_s: float, image_m: float, half_m_s: float) -> tuple[Tensor, Tensor, bool]:
-    """The most likely u_r within half_m_s of that of the tones, by grids and a parabola; its predicted deviation; and whether it ends the search."""
-    middle, step = tones.motion.u_r_m_s, half_m_s / 40
+def _closing_speed(chip: Chip, image_s: float, image_m: float, half_m_s: float) -> tuple[Tensor, Tensor]:
+    """The most likely u_r within half_m_s of that of the chip, by grids and a parabola, and its predicted deviation."""
+    middle, step = chip.motion.u_r_m_s, torch.as_tensor(half_m_s / 40, dtype=torch.float64)
+    std = step
     for _ in range(3):
         u_r = middle + step * torch.arange(-40, 41, dtype=torch.float64, device=middle.device)
-        energy = tones.energy(_candidates(tones.radar, tones.data, u_r, tones.motion.u_a_m_s, image_s, image_m))
-        at = int(energy.argmax())
-        inner = min(max(at, 1), len(u_r) - 2)
-        low, top, high = energy[inner - 1 : inner + 2]
-        bend = (2 * top - low - high).clamp_min(_TINY)
-        middle = u_r[inner] + step * (0.5 * (high - low) / bend).clamp(-1, 1)
-        std, step = step / torch.sqrt(bend), step / 10
-    return middle, std, at != inner
+        energy = torch.cat([chip.energy(_appearing(chip.radar, chip.cells, part, chip.motion.u_a_m_s.expand(part.shape), image_s, image_m)) for part in u_r.split(9)])
+        shift, bend = _peak(energy)
+        middle, std, step = middle + step * shift, step / torch.sqrt(bend), step / 10
+    return middle, std
 
 
-def _along_speed(tones: Tones, extraction: Extraction, half_m_s: float) -> Tensor:
-    """The u_a within half_m_s of that of the tones whose picture is sharpest (mean square over squared mean of intensities), by grids and a parabola."""
-    amplitude, _ = tones.amplitudes(tones.motion)
-    radar, motion = tones.radar, tones.motion
-    since = torch.arange(-extraction.integration_s / 2, extraction.integration_s / 2, 1 / radar.prf_hz, dtype=torch.float64, device=amplitude.device)
-    time_s = since + motion.y0_m / motion.along_m_s
-    echo = torch.einsum("lf,ft->lt", amplitude, torch.exp(2j * math.pi * tones.tone_hz[:, None] * (time_s - tones.start_s)))
+def _peak(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Place of the greatest value against the middle, in steps, by a parabola through its neighbours, and minus the second difference there."""
+    inner = min(max(int(values.argmax()), 1), len(values) - 2)
+    low, top, high = values[inner - 1 : inner + 2]
+    bend = (2 * top - low - high).clamp_min(_TINY)
+    return inner - len(values) // 2 + (0.5 * (high - low) / bend).clamp(-1, 1), bend
+
+
+def _along_speed(chip: Chip, extraction: Extraction, half_m_s: float) -> Tensor:
+    """The u_a within half_m_s of that of the chip whose picture is sharpest (mean square over squared mean of intensities), by grids and a parabola."""
+    radar, motion = replace(chip.radar, channel_m=(0.0,)), chip.motion
+    time_s = chip.time_s[chip.lit]
+    # a taper, since side lobes of neighbours would interfere
+    echo = chip.echo(chip.cells)[:, chip.lit] * torch.hann_window(len(time_s), dtype=torch.float64, device=time_s.device)
+    back = point_phasor(radar, motion, time_s, torch.complex128)[0]
     middle, step = motion.u_a_m_s, half_m_s / 40
-    echo = echo * torch.hann_window(len(since), dtype=torch.float64, device=echo.device)  # side lobes of neighbours would interfere
-    alone = replace(radar, channel_m=(0.0,))
-    back = point_phasor(alone, motion, time_s, torch.complex128)[0]
     for _ in range(3):
         u_a = middle + step * torch.arange(-40, 41, dtype=torch.float64, device=middle.device)
-        there = replace(motion, u_a_m_s=u_a, y0_m=motion.y0_m.expand(u_a.shape), u_r_m_s=motion.u_r_m_s.expand(u_a.shape), range_m=motion.range_m.expand(u_a.shape))
-        turn = point_phasor(alone, there, time_s, torch.complex128)[:, 0].conj() * back
+        there = replace(motion.each(lambda value: value.expand(81)), u_a_m_s=u_a)
+        turn = point_phasor(radar, there, time_s, torch.complex128)[:, 0].conj() * back
         picture = torch.fft.fft(echo * turn[:, None], 2 * echo.shape[-1]).abs().square()
-        sharp = picture.square().sum((-2, -1)) / picture.sum((-2, -1)).square().clamp_min(_TINY)
-        inner = min(max(int(sharp.argmax()), 1), len(u_a) - 2)
-        low, top, high = sharp[inner - 1 : inner + 2]
-        middle = u_a[inner] + step * (0.5 * (high - low) / (2 * top - low - high).clamp_min(_TINY)).clamp(-1, 1)
-        step = step / 10
+        shift, _ = _peak(picture.square().sum((-2, -1)) / picture.sum((-2, -1)).square().clamp_min(_TINY))
+        middle, step = middle + step * shift, step / 10
     return middle
 
 
-def _bright(tones: Tones) -> tuple[Tensor, Tensor]:
-    """Intensity of the picture over its variance by sea and noise, (line, tone), and where it is bright."""
-    amplitude, variance = tones.amplitudes(tones.motion)
-    level = amplitude.abs().square() / variance
-    return level, level > torch.maximum(level.new_tensor(_BRIGHT), 0.01 * level.max())
-
-
-def _brightness(tones: Tones) -> tuple[Tensor, Tensor]:
-    level, bright = _bright(tones)
-    return (level * bright).sum() / bright.sum().clamp_min(1), bright.sum()
-
-
-def _centred(tones: Tones, image_s: float, image_m: float) -> tuple[float, float, PointMotion]:
+def _centred(chip: Chip, image_s: float, image_m: float) -> tuple[float, float, PointMotion]:
     """Where the middle of the bright pixels appears, and its motion."""
-    level, bright = _bright(tones)
-    weight = level * bright
+    picture = chip.picture()
+    weight = picture.level * picture.bright
     total = weight.sum()
-    if float(total) == 0:
-        return image_s, image_m, tones.motion
-    place = (weight.sum(0) * tones.place_m(tones.motion)).sum() / total
-    near = (weight.sum(1) * tones.range_m).sum() / total
-    motion = replace(tones.motion, y0_m=place, range_m=near)
+    if not float(total) > 0:
+        return image_s, image_m, chip.motion
+    place = (weight.sum(0) * chip.place_m(chip.motion, picture.tone_hz)).sum() / total
+    near = (weight.sum(1) * chip.range_m).sum() / total
+    motion = replace(chip.motion, y0_m=place, range_m=near)
     return float(motion.image_s), float(motion.closest_m), motion
 
 
-def body_echo(body: Body, frame: Frame, extraction: Extraction, everything: bool = False) -> Tensor:
-    """The echo of all that moves as the body does within its extent, complex128 (channel, pulse, range): what to subtract from the data that the body was found in.
+def body_echo(body: Body, frame: Frame, everything: bool = False) -> Tensor:
+    """The echo of a body, complex128 (channel, pulse, range): what to subtract from the data of the frame in which it was found.
 
-    Only pixels brighter than what sea and noise leave of them count. everything: all that lies in its lines and tones instead, sea included.
+    It is what pixels hold that stand above sea and noise. everything: all that lies in its lines and tones instead, sea included.
     """
-    tones, n = body.tones, len(frame.time_s)
-    amplitude, variance = tones.amplitudes(tones.motion)
-    clear = amplitude.abs().square() > _CLEAR * variance
-    fitted = tones.data if everything else (amplitude * clear)[:, None, :] * tones.steering(tones.motion).mT
-    full = torch.zeros(len(frame.range_m), frame.radar.channels, n, dtype=torch.complex128, device=amplitude.device)
-    lines = torch.isin(frame.range_m, tones.range_m)
-    index = torch.round(tones.tone_hz * n / frame.radar.prf_hz).long() % n
-    part = torch.zeros(int(lines.sum()), frame.radar.channels, n, dtype=torch.complex128, device=amplitude.device)
-    part[..., index] = fitted
-    full[lines] = torch.fft.ifft(part)
-    ramped = full.movedim(0, -1) * _ramp(frame, tones.motion, extraction)[..., None]
-    return _shifted_back(ramped, frame, tones.motion)
+    chip, picture = body.chip, body.picture
+    if everything:
+        deramped = chip.segments.back(chip.cells)
+    else:
+        clear = picture.amplitude * (picture.level > _CLEAR)
+        spectrum = torch.zeros(len(clear), frame.radar.channels, chip.segments.n, dtype=clear.dtype, device=clear.device)
+        spectrum[..., picture.index] = clear[:, None] * chip.steering(chip.motion, picture.tone_hz).mT
+        deramped = torch.fft.ifft(spectrum)
+    full = torch.zeros(len(frame.range_m), frame.radar.channels, chip.segments.n, dtype=deramped.dtype, device=deramped.device)
+    full[torch.isin(frame.range_m, chip.range_m)] = deramped * chip.lit
+    ramped = full.movedim(0, -1) * point_phasor(frame.radar, chip.motion, frame.time_s, torch.complex128)[..., None]
+    return _shifted_back(ramped, frame, chip.motion)
 
 
 def _shifted_back(data: Tensor, frame: Frame, motion: PointMotion) -> Tensor:
@@ -273,3 +324,12 @@ def _shifted_back(data: Tensor, frame: Frame, motion: PointMotion) -> Tensor:
     turns = -frame.path_m(motion) / (frame.radar.range_step_m * n)
     phasor = torch.fft.ifftshift(linear_phasor(turns, -(n // 2), n, data.dtype), dim=-1)
     return torch.fft.ifft(torch.fft.fft(data) * phasor)
+
+
+def body_image(body: Body, place_m: Tensor, extraction: Extraction) -> Tensor:
+    """Complex amplitudes of the points of a body at along-track places (place,) at t = 0, (place, line), the sea suppressed: that of a point of amplitude 1 is 1."""
+    chip, motion = body.chip, body.chip.motion
+    echo, time_s = chip.echo(chip.cells)[:, chip.lit], chip.time_s[chip.lit]
+    hz = (place_m - motion.y0_m) * motion.along_m_s / (chip.radar.wavelength_m * motion.range_m)
+    kernel = torch.exp(-2j * math.pi * hz[:, None] * time_s)
+    return (kernel @ echo.mT) / (extraction.integration_s * chip.radar.prf_hz)

@@ -14,8 +14,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchsar.core import Axis, Estimate, Signal, Stage, fft_lines, linear_phasor
-from torchsar.multichannel.body import Body, Extraction, body_echo, find_body
+from torchsar.core import Estimate, Signal, Stage, fft_lines, linear_phasor
+from torchsar.multichannel.body import Body, Extraction, body_echo, body_image, find_body
 from torchsar.multichannel.detection import Detection, detect
 from torchsar.multichannel.migration import Frame
 from torchsar.multichannel.motion import PointMotion
@@ -156,7 +156,7 @@ class ImageMovers(Stage):
     def _without(self, signal: Signal, body: Body) -> Signal:
         lines, frame = self._lines(signal, float(body.motion.range_m))
         data = signal.data.clone()
-        data[..., lines] -= body_echo(body, frame, self.extraction, everything=self.removal == "zero").to(data.dtype)
+        data[..., lines] -= body_echo(body, frame, everything=self.removal == "zero").to(data.dtype)
         return signal.with_data(data)
 
     def _estimate(self, bodies: list[Body], like: Tensor) -> Estimate:
@@ -205,34 +205,13 @@ def _matched(data: Tensor, radar: BistaticRadar, motion: PointMotion, bands: int
 
 
 def placed(image: Signal, body: Body, extraction: Extraction) -> Signal:
-    """The image (azimuth, range) with the picture of a body added in its place: along track at t = 0, where its closest ranges are, scaled as points at rest are."""
+    """The image (azimuth, range) with the picture of a body added in its place: along track at t = 0, at its closest ranges, scaled as points at rest are."""
     azimuth, range_ = image.axes
-    tones, motion = body.tones, body.tones.motion
-    inside = (azimuth.values(image.data.device) - motion.y0_m).abs() <= extraction.along_m
-    place = azimuth.values(image.data.device)[inside]
-    picture = body_picture(body, place, extraction)
-    scale = extraction.integration_s * motion.along_m_s / torch.sqrt(tones.radar.wavelength_m * motion.range_m)
+    chip, motion = body.chip, body.chip.motion
+    place = azimuth.values(image.data.device)
+    rows = ((place - motion.y0_m).abs() <= extraction.along_m).nonzero()[:, 0]
+    columns = torch.round((chip.range_m - range_.start) / range_.step).long()
+    scale = extraction.integration_s * motion.along_m_s / torch.sqrt(chip.radar.wavelength_m * motion.range_m)
     data = image.data.clone()
-    columns = torch.round((tones.range_m - range_.start) / range_.step).long()
-    rows = inside.nonzero()[:, 0]
-    data[rows[:, None], columns] += (scale * picture).to(data.dtype)
+    data[rows[:, None], columns] += (scale * body_image(body, place[rows], extraction)).to(data.dtype)
     return image.with_data(data)
-
-
-def body_picture(body: Body, place_m: Tensor, extraction: Extraction) -> Tensor:
-    """Complex amplitude of the body's points at along-track places (place,), (place, line), the sea suppressed."""
-    tones, motion = body.tones, body.tones.motion
-    amplitude, _ = tones.amplitudes(motion)
-    n = round(extraction.integration_s * tones.radar.prf_hz)
-    hz = (place_m - motion.y0_m) * motion.along_m_s / (tones.radar.wavelength_m * motion.range_m)
-    # tones of a record are samples of the spectrum of an aperture: between them lies a sinc, about the middle of the aperture
-    off = (hz[:, None] - tones.tone_hz) * extraction.integration_s
-    middle = motion.y0_m / motion.along_m_s - tones.start_s
-    kernel = torch.sinc(off) * torch.exp(2j * math.pi * (tones.tone_hz - hz[:, None]) * middle)
-    return (kernel @ amplitude.mT) / n * (extraction.integration_s * (tones.tone_hz[1] - tones.tone_hz[0]).abs())
-
-
-def image_rows(axis: Axis, middle_m: float, half_m: float) -> slice:
-    """Samples of an axis within half_m of a place."""
-    first, last = (round((middle_m + side * half_m - axis.start) / axis.step) for side in (-1, 1))
-    return slice(max(0, first), min(axis.n, last + 1))

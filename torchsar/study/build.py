@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from torchsar.core import Chain, Recording, Truth, use
-from torchsar.radar import LIGHT_M_S, InverseRadar, StripmapRadar, TriangularLadar
+from torchsar.radar import LIGHT_M_S, BistaticRadar, InverseRadar, StripmapRadar, TriangularLadar
 from torchsar.study.catalogue import Catalogue
 from torchsar.study.config import Config, Loaded, Method
 from torchsar.study.errors import ConfigError, did_you_mean
@@ -62,7 +62,7 @@ def build_chain(method: Method, where: str, file: str, **given: Any) -> Chain:
 
 def foreign(error: AttributeError) -> str:
     """The sentence for a stage that asks its radar for what only another system's has. Any other AttributeError is a fault of the program and goes on."""
-    if not isinstance(error.obj, (StripmapRadar, InverseRadar, TriangularLadar)):
+    if not isinstance(error.obj, (StripmapRadar, InverseRadar, TriangularLadar, BistaticRadar)):
         raise error
     return f"this stage needs radar.{error.name}, which a radar of this system does not have; it is a stage of another system"
 

@@ -83,6 +83,14 @@ def check_judged(loaded: Loaded) -> None:
         raise ConfigError(f"{loaded.file}: metrics.reference names {reference!r}, whose image is not the ideal one; name a method with 'input: clean'")
 
 
+def refuse_recordings(loaded: Loaded) -> None:
+    """Raise ConfigError for a config of a recording, where a system judges by the truth of what it simulates."""
+    config = loaded.config
+    if config.data.file is not None or config.world is None:
+        instead = "leave data.file out and give the sections 'radar' and 'world'; systems stripmap and isal read recordings"
+        raise ConfigError(f"{loaded.file}: data.file: system {config.system} simulates and reads no recordings; {instead}")
+
+
 def check_sweep(loaded: Loaded, grid: Mapping[str, Any], example: str) -> None:
     """Refuse a sweep over what a sweep does not use; example: a key to sweep over instead of cases. Raises ConfigError."""
     assert isinstance(loaded.config, CasedConfig)

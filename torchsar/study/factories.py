@@ -12,6 +12,7 @@ from torchsar.compensate.pulse_phase.stages import Autofocus, CorrectPulsePhase
 from torchsar.compensate.rotation import RotationAutofocus, UnevenRotation
 from torchsar.compensate.velocity import EffectiveVelocity
 from torchsar.core import Alternate, Estimate, Signal, Stage, Turn
+from torchsar.echo.channel_errors import Drift, PolynomialDrift, SinusoidDrift, SynchronisationError, WalkDrift
 from torchsar.echo.response import ChannelResponse
 from torchsar.focus import OmegaK, PaddedLines, TargetImage
 from torchsar.optim.scalar import gradient_minimum, parabola_minimum
@@ -19,7 +20,7 @@ from torchsar.radar import FarField, InverseRadar, Spotlight, StripmapRadar
 from torchsar.repair.jitter import BandLimited, CorrectJitter, Exact, Lagrange
 from torchsar.repair.response import band_grid
 from torchsar.repair.response_phase import EstimateResponse, estimate_response_points, estimate_response_sharpest
-from torchsar.scene import Dechirped, MeasuredTrack, Polynomial, Sinusoid
+from torchsar.scene import Dechirped, ImageReflectivity, KSea, MeasuredTrack, Polynomial, Sinusoid
 
 _REFINE = {"gradient": gradient_minimum, "parabola": parabola_minimum}
 
@@ -155,3 +156,37 @@ class AutofocusOfImage(Autofocus):
         if self.target is not None:
             self.imaging = self.target.operator(signal.data)
         return super().forward(signal, start)
+
+
+def k_sea(cnr_db: float = 30.0, shape: float = 1.5, cell_m: tuple[float, float] = (20.0, 20.0), margin_s: float | None = None, lobes: int = 1) -> KSea:
+    """K-distributed sea, cnr_db over the noise in a range-compressed sample."""
+    return KSea(power_db=cnr_db, shape=shape, cell_m=cell_m, margin_s=margin_s, lobes=lobes)
+
+
+def image_sea(file: str, azimuth_extent_m: float, range_extent_m: float, cnr_db: float = 30.0, key: str | None = None, margin_s: float | None = None, lobes: int = 1) -> ImageReflectivity:
+    """A surface whose mean intensity is the image in a .npy or .npz file (array `key`), cnr_db over the noise in a range-compressed sample."""
+    try:
+        return ImageReflectivity.from_file(file, azimuth_extent_m, range_extent_m, key, power_db=cnr_db, margin_s=margin_s, lobes=lobes)
+    except OSError as error:
+        raise ValueError(f"the image {file!r} cannot be read: {error.strerror or error}") from None
+
+
+def clock_errors(
+    phase_rad: list[float] | None = None,
+    phase_sinusoid_rad: float = 0.0,
+    phase_walk_rad: float = 0.0,
+    delay_s: list[float] | None = None,
+    delay_sinusoid_s: float = 0.0,
+    sinusoid_hz: float = 0.5,
+    direct_snr_db: float | None = 40.0,
+    direct_samples: int = 64,
+) -> SynchronisationError:
+    """Clocks that drift apart: polynomials c0, c1, ... over seconds, sinusoids and a random walk from pulse to pulse; recorded beside a direct path that shows them."""
+    phase, delay = _drifts(phase_rad, phase_sinusoid_rad, sinusoid_hz, phase_walk_rad), _drifts(delay_s, delay_sinusoid_s, sinusoid_hz, 0.0)
+    return SynchronisationError(phase, delay, direct_snr_db, direct_samples)
+
+
+def _drifts(coefficients: list[float] | None, amplitude: float, frequency_hz: float, step: float) -> list[Drift]:
+    found: list[Drift] = [PolynomialDrift(coefficients)] if coefficients else []
+    found += [SinusoidDrift(amplitude, frequency_hz)] if amplitude else []
+    return found + ([WalkDrift(step)] if step else [])

@@ -84,7 +84,7 @@ def limit_lines(limits: Sequence[Limit]) -> list[str]:
 
 def requirement_lines(rows: Sequence[Requirement]) -> list[str]:
     """A table for the screen."""
-    wide = 2 + max(len(row.verdict) for row in rows)
+    wide = 2 + max((len(row.verdict) for row in rows), default=0)
     lines = [f"{'simplification':<34}{'neglected phase':>16}{'range cells':>13}  {'verdict':<{wide}}neglects"]
     for row in rows:
         cells = "" if math.isnan(row.range_cells) else f"{row.range_cells:.3g}"

@@ -28,6 +28,7 @@ from torchsar.compensate.rotation import (
     RotationSearch,
     UnevenRotation,
 )
+from torchsar.echo.channel_errors import ChannelErrors
 from torchsar.echo.channels import ChannelImbalance
 from torchsar.echo.interference import Quantiser, Tone, WideInterferer
 from torchsar.echo.jitter import PeriodicJitter
@@ -38,6 +39,12 @@ from torchsar.echo.turntable import LostPulses
 from torchsar.focus import AzimuthTransform, Backproject, ClosestRange, CompressDechirped, OmegaK, OmegaKStolt, RangeCompress, RangeDoppler, TargetImage
 from torchsar.focus.matched_fourier import MatchedFourier, RangePhase
 from torchsar.focus.triangular import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
+from torchsar.multichannel.azimuth import FocusAzimuth
+from torchsar.multichannel.balance import CorrectBalance
+from torchsar.multichannel.compress import CompressChannels
+from torchsar.multichannel.synchronise import EstimateSynchronisation, RemoveSynchronisation
+from torchsar.multichannel.transmit import AzimuthScaling, RemoveTransmitRange
+from torchsar.multichannel.velocity.walk import WalkAmbiguity
 from torchsar.repair.channels import CorrectImbalance, EstimateImbalance
 from torchsar.repair.fill import BandLimitedFill, LinearFill, SparseFill, ZeroFill
 from torchsar.repair.interference import DropInterference, NotchInterference, SubtractInterference
@@ -51,9 +58,11 @@ from torchsar.scene import (
     Aircraft,
     AlwaysLit,
     Antenna,
+    BandLimited,
     CalibrationFibre,
     Dwell,
     EverySample,
+    ExactRange,
     Hyperbola,
     LetterE,
     LinearInSweep,
@@ -62,6 +71,7 @@ from torchsar.scene import (
     OnePerSweep,
     Parabola,
     PathFluctuation,
+    Pattern,
     PhaseOnly,
     Points,
     Polynomial,
@@ -73,11 +83,13 @@ from torchsar.scene import (
     Speckle,
     SpreadRows,
     StartPhase,
+    TaylorRange,
     UniformStartPhase,
     VibrationSpectrum,
 )
 from torchsar.study import factories
 from torchsar.study.catalogue import Catalogue
+from torchsar.study.geo import stages as channels
 
 SCENES = Catalogue(
     "scene",
@@ -123,6 +135,10 @@ SWEEP_FIDELITIES = Catalogue(
 LOG_AMPLITUDES = Catalogue("log-amplitude", "kind", {"scintillation": LogAmplitude})
 SWEEP_ERRORS = Catalogue("sweep error", "kind", {"polynomial": PolynomialSweepError, "sinusoid": SinusoidSweepError})
 CALIBRATIONS = Catalogue("calibration", "kind", {"fibre": CalibrationFibre})
+GATES = Catalogue("gate", "kind", {"band_limited": BandLimited, "pattern": Pattern})
+SEAS = Catalogue("sea", "kind", {"k_sea": factories.k_sea, "image": factories.image_sea})
+RECEIVE_RANGES = Catalogue("receive range", "kind", {"exact": ExactRange, "taylor": TaylorRange})
+MULTICHANNEL_DAMAGES = Catalogue("damage of a multichannel recording", "kind", {"channel_errors": ChannelErrors, "clock_errors": factories.clock_errors})
 DAMAGES = Catalogue(
     "damage",
     "kind",
@@ -167,6 +183,10 @@ REPAIR: dict[str, Callable[..., Any]] = {
     "circular_shift": CircularShift,
     "blank_turning_points": BlankTurningPoints,
     "calibrate_sweeps": CalibrateSweeps,
+    "channel_balance": channels.channel_balance,
+    "channel_balance_correct": CorrectBalance,
+    "synchronisation": EstimateSynchronisation,
+    "synchronisation_remove": RemoveSynchronisation,
 }
 COMPENSATE: dict[str, Callable[..., Any]] = {
     "phase_increment": PhaseIncrement,
@@ -203,6 +223,17 @@ COMPENSATE: dict[str, Callable[..., Any]] = {
     "rotation_descent": RotationDescent,
     "rotation_autofocus": RotationAutofocus,
     "rotation_and_phase": factories.rotation_and_phase,
+    "transmit_range_remove": RemoveTransmitRange,
+    "azimuth_scaling": AzimuthScaling,
+    "walk_ambiguity": WalkAmbiguity,
+    "migration_correct": channels.MigrationOfLines,
+    "moving_point_velocity": channels.moving_point_velocity,
+    "interferometry": channels.interferometry,
+    "along_track_autofocus": channels.along_track_autofocus,
+    "likelihood_velocity": channels.likelihood_velocity,
+    "gradient_velocity": channels.gradient_velocity,
+    "intensity_ratio": channels.intensity_ratio,
+    "alternate_velocity": channels.alternate_velocity,
 }
 FOCUS: dict[str, Callable[..., Any]] = {
     "range_compress": RangeCompress,
@@ -221,6 +252,10 @@ FOCUS: dict[str, Callable[..., Any]] = {
     "range_phase": RangePhase,
     "matched_fourier": MatchedFourier,
     "chirplet_clean": ChirpletClean,
+    "compress_channels": CompressChannels,
+    "rebuild_bands": channels.rebuild_bands,
+    "focus_lines": FocusAzimuth,
+    "focus_target": channels.FocusTarget,
 }
 GROUPS = {"repair": REPAIR, "compensate": COMPENSATE, "focus": FOCUS}
 

@@ -48,6 +48,12 @@ class System:
 @cache
 def systems() -> dict[str, System]:
     """All systems by name."""
+    from torchsar.study.geo import run as geo_run
+    from torchsar.study.geo.judge import DEFINITIONS as GEO
+    from torchsar.study.geo.requires import requires as geo_requires
+    from torchsar.study.geo.sections import GeoConfig
+    from torchsar.study.geo.trade import trade as geo_trade
+    from torchsar.study.geo.trials import GeoTrials
     from torchsar.study.isal import run as isal_run
     from torchsar.study.isal.judge import DEFINITIONS as ISAL
     from torchsar.study.isal.requires import requires as isal_requires
@@ -74,6 +80,7 @@ def systems() -> dict[str, System]:
     from torchsar.study.stripmap.trials import StripmapTrials
 
     return {
+        "geo": System(GeoConfig, geo_run.check, geo_run.run, geo_requires, geo_trade, GeoTrials, GEO),
         "isal": System(IsalConfig, isal_run.check, isal_run.run, isal_requires, isal_trade, IsalTrials, ISAL),
         "isal_rotation": System(RotationConfig, rotation_run.check, rotation_run.run, rotation_requires, rotation_trade, RotationTrials, ROTATION),
         "sal": System(SalConfig, sal_run.check, sal_run.run, sal_requires, sal_trade, SalTrials, SAL),

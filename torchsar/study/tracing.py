@@ -16,10 +16,10 @@ from torchsar.study.montecarlo.record import OK
 IMAGE = ("azimuth", "range")
 
 
-def traced(chain: Chain, recording: Recording, name: str) -> Trace:
-    """The trace of a method, whose name goes before whatever its stages refuse."""
+def traced(chain: Chain, recording: Recording, name: str, given: Mapping[str, Tensor] | None = None) -> Trace:
+    """The trace of a method, whose name goes before whatever its stages refuse. given: values to hold, see `Chain.trace`."""
     try:
-        return chain.trace(recording)
+        return chain.trace(recording, given)
     except AttributeError as error:
         raise ConfigError(f"processor.{name}: {foreign(error)}") from error
     except (ValueError, TypeError, KeyError) as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -53,3 +54,17 @@ def written(
         for name, figure in figures(found).items():
             plot.save(figure, folder / "figures" / f"trade_{name}.png")
     return f"{said}\n{out}"
+
+
+def table_text(case: str, tables: Tables, titles: Mapping[str, str], columns: Mapping[str, tuple[str, str]]) -> str:
+    """Tables for the screen: a line an alternative, columns (field -> heading and format) that any row of a table has. -inf reads "exact"."""
+    parts = [f"case {case!r}" if case else "one case"]
+    for key, rows in tables.items():
+        kept = [name for name in columns if any(getattr(row, name) is not None for row in rows)]
+        parts += ["", titles[key], f"{'alternative':<36}{'ms a trial':>12}{'spread':>9}" + "".join(f"{columns[name][0]:>18}" for name in kept)]
+        parts += [f"{row.name:<36}{1e3 * row.seconds:>12.2f}{1e3 * row.spread_s:>9.2f}" + "".join(f"{_cell(getattr(row, name), columns[name][1]):>18}" for name in kept) for row in rows]
+    return "\n".join(parts)
+
+
+def _cell(value: float | None, form: str) -> str:
+    return "–" if value is None else "exact" if value == -math.inf else format(value, form)

@@ -17,7 +17,7 @@ from torchsar.study.pictures import Picture
 
 PANELS = 6
 _UNITS = {"_rad_s": "rad/s", "_m_s2": "m/s²", "_m_s": "m/s", "_hz": "Hz", "_db": "dB", "_nats": "nats", "_rad": "rad", "_deg": "deg", "_m": "m", "_s": "s"}
-_ACRONYMS = {word.lower(): word for word in ("Doppler", "SNR", "PRF", "RMS", "IRW", "PSLR", "ISLR", "RCS", "SIR", "CNR", "ADC")}
+_ACRONYMS = {word.lower(): word for word in ("Doppler", "SNR", "PRF", "RMS", "IRW", "PSLR", "ISLR", "RCS", "SIR", "CNR", "SCR", "SCNR", "MFTA", "ADC")}
 
 
 def name_and_unit(name: str) -> tuple[str, str]:

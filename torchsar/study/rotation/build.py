@@ -101,12 +101,6 @@ def named_targets(world: TurntableWorld) -> dict[str, int]:
     return names
 
 
-def refuse_recordings(loaded: Loaded) -> None:
-    """Raise ConfigError for a config of a recording."""
-    if loaded.config.data.file is not None or loaded.config.world is None:
-        raise ConfigError(f"{loaded.file}: system {loaded.config.system} simulates and judges by the truth; leave data.file out, and use system isal for a recording")
-
-
 def check(loaded: Loaded) -> None:
     """Build all that a simulation names, without computing anything."""
     for case in cases_of(loaded).values():

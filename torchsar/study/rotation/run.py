@@ -11,10 +11,10 @@ import torch
 
 from torchsar.core import Draws
 from torchsar.study.case_run import run_cases
-from torchsar.study.cases import cases_of, methods_tree
+from torchsar.study.cases import cases_of, methods_tree, refuse_recordings
 from torchsar.study.config import Loaded, check_methods
 from torchsar.study.limits import warn_of_doubt
-from torchsar.study.rotation.build import check, refuse_recordings
+from torchsar.study.rotation.build import check
 from torchsar.study.rotation.figures import CaseResult, draw
 from torchsar.study.rotation.judge import DEFINITIONS
 from torchsar.study.rotation.report import write_report

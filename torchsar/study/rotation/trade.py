@@ -20,13 +20,13 @@ from torchsar.core import Draws, Estimate, Truth
 from torchsar.core.warp import k_of_shape, shape_of
 from torchsar.focus.matched_fourier import matched_fourier, range_phase
 from torchsar.metrics import entropy, error_db
-from torchsar.study.cases import cases_of
+from torchsar.study.cases import cases_of, refuse_recordings
 from torchsar.study.config import Loaded
 from torchsar.study.errors import ConfigError
-from torchsar.study.rotation.build import Turntable, check, refuse_recordings
+from torchsar.study.rotation.build import Turntable, check
 from torchsar.study.rotation.sections import Trade
 from torchsar.study.rotation.trials import true_k
-from torchsar.study.trading import Tables, timed, written
+from torchsar.study.trading import Tables, table_text, timed, written
 
 log = logging.getLogger("torchsar")
 _YARDSTICK_EPS = 1e-12
@@ -57,7 +57,7 @@ def trade(loaded: Loaded, out: Path | None) -> str:
     refuse_recordings(loaded)
     check(loaded)
     name, case = next(iter(cases_of(loaded).items()))
-    return written(loaded, out, lambda: _tables(case), lambda tables: _text(name, tables), _figures)
+    return written(loaded, out, lambda: _tables(case), lambda tables: table_text(name, tables, _TITLES, _COLUMNS), _figures)
 
 
 @torch.no_grad()
@@ -217,20 +217,6 @@ _COLUMNS = {
     "k1_error_percent": ("k1 (%)", ".5f"),
     "k2_error_percent": ("k2 (%)", ".5f"),
 }
-
-
-def _text(case: str, tables: Tables) -> str:
-    parts = [f"case {case!r}" if case else "one case"]
-    for key, rows in tables.items():
-        columns = [name for name in _COLUMNS if any(getattr(row, name) is not None for row in rows)]
-        parts += ["", _TITLES[key], f"{'alternative':<36}{'ms a trial':>12}{'spread':>9}" + "".join(f"{_COLUMNS[name][0]:>18}" for name in columns)]
-        parts += [f"{row.name:<36}{1e3 * row.seconds:>12.2f}{1e3 * row.spread_s:>9.2f}" + "".join(f"{_cell(row, name):>18}" for name in columns) for row in rows]
-    return "\n".join(parts)
-
-
-def _cell(row: Row, name: str) -> str:
-    value = getattr(row, name)
-    return "–" if value is None else "exact" if value == -math.inf else format(value, _COLUMNS[name][1])
 
 
 def _figures(tables: Tables) -> dict[str, plot.Figure]:

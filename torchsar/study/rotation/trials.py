@@ -16,12 +16,12 @@ from torchsar.core import Chain, Draws, Signal, Trace, Truth
 from torchsar.focus.matched_fourier import MatchedFourier
 from torchsar.metrics.rotation_bounds import rotation_bounds
 from torchsar.study.benches import Benches
-from torchsar.study.cases import check_judged, check_sweep
+from torchsar.study.cases import check_judged, check_sweep, refuse_recordings
 from torchsar.study.config import Config, Loaded
 from torchsar.study.errors import ConfigError
 from torchsar.study.methods import build_chains
 from torchsar.study.montecarlo.work import BOUNDS, SAVED
-from torchsar.study.rotation.build import Turntable, named_targets, refuse_recordings
+from torchsar.study.rotation.build import Turntable, named_targets
 from torchsar.study.rotation.judge import Cut, Turned, cut_through, image_metrics, in_metres, k_metric, rotation_metrics, told_metrics
 from torchsar.study.tracing import IMAGE, image_of, not_an_image, saved_of, traced
 

@@ -108,12 +108,6 @@ def check_target(loaded: Loaded, world: LadarWorld) -> None:
         raise ConfigError(f"{loaded.file}: metrics.target names {target!r}, which is no point target of the scene{did_you_mean(target, names)}")
 
 
-def refuse_recordings(loaded: Loaded) -> None:
-    """Raise ConfigError for a config with data.file."""
-    if loaded.config.data.file is not None or loaded.config.world is None:
-        raise ConfigError(f"{loaded.file}: data.file: system sal simulates and reads no recordings; give the sections 'radar' and 'world'")
-
-
 def check(loaded: Loaded) -> None:
     """Build all that a simulation names, without computing anything."""
     for case in cases_of(loaded).values():

@@ -15,12 +15,12 @@ from torchsar.core import Chain, Draws, Recording, Signal, Trace, Truth
 from torchsar.metrics import range_per_sweep_bound_m, velocity_free_offset_bound_m_s, velocity_known_offset_bound_m_s, velocity_segmented_bound_m_s
 from torchsar.scene import Points, Together
 from torchsar.study.benches import Benches
-from torchsar.study.cases import check_judged, check_sweep
+from torchsar.study.cases import check_judged, check_sweep, refuse_recordings
 from torchsar.study.config import Config, Loaded
 from torchsar.study.errors import ConfigError
 from torchsar.study.methods import build_chains
 from torchsar.study.montecarlo.work import BOUNDS, SAVED
-from torchsar.study.sal.build import Ladar, check_deramped, check_target, named_targets, refuse_recordings
+from torchsar.study.sal.build import Ladar, check_deramped, check_target, named_targets
 from torchsar.study.sal.judge import Course, course_of, image_metrics, motion_metrics, target_metrics
 from torchsar.study.tracing import IMAGE, not_an_image, saved_of, traced, verdict
 

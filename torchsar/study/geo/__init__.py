@@ -1,0 +1,1 @@
+"""Azimuth-multichannel bistatic radar with moving targets (system 001): `system: geo`."""
