@@ -105,7 +105,11 @@ def draw_parameters(speed: Tensor, point: PointMotion, name: str, path: Path) ->
     x, label = plot.array(speed), f"{name} (m/s)"
     shifts = {"transmit range removed": phase_shift_rad(point)[:, 2], f"k1 = {LEFT_K1_M_S:g} m/s left in": phase_shift_rad(point, LEFT_K1_M_S)[:, 2]}
     shifts = {key: value - value[speed.abs().argmin()] for key, value in shifts.items()}
-    values = [({"": point.effective_m_s}, "v_e (m/s)", "relative sensor velocity"), ({"": 1e3 * delay_s(point)[:, 2]}, "delay (ms)", "azimuth delay"), (shifts, "phase (rad)", "phase shift against 0 m/s")]
+    values = [
+        ({"": point.effective_m_s}, "v_e (m/s)", "relative sensor velocity"),
+        ({"": 1e3 * delay_s(point)[:, 2]}, "delay (ms)", "azimuth delay"),
+        (shifts, "phase (rad)", "phase shift against 0 m/s"),
+    ]
     parts = [{"series": {key: (x, plot.array(y)) for key, y in series.items()}, "xlabel": label, "ylabel": unit, "title": title} for series, unit, title in values]
     plot.save(plot.panels(parts, columns=3), path)
 
@@ -161,7 +165,15 @@ def show_channel() -> None:
             print(f"{f'{name}: {row}':34}" + "".join(f"{float(x) + 0.0:>12.4f}" for x in values))
     along, radial = tables["u_a"], tables["u_r"]
     delay = [1e3 * delay_s(point)[:, 2] for point in (along, radial)]
-    ours = [along.effective_m_s[0], along.effective_m_s[-1], delay[0][0], delay[0][-1], 100 * (delay[1][-1] / delay[1][0] - 1).abs(), phase_shift_rad(radial)[1, 2] / SPEEDS[1], worst_phase_rad(0.0, speed)[2]]
+    ours = [
+        along.effective_m_s[0],
+        along.effective_m_s[-1],
+        delay[0][0],
+        delay[0][-1],
+        100 * (delay[1][-1] / delay[1][0] - 1).abs(),
+        phase_shift_rad(radial)[1, 2] / SPEEDS[1],
+        worst_phase_rad(0.0, speed)[2],
+    ]
     print(f"\n{'':34}{'ours':>12}{'expected':>18}")
     for (name, expected), value in zip(EXPECTED.items(), ours, strict=True):
         print(f"{name:34}{float(value):>12.4f}{expected:>18}")

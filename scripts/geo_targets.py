@@ -14,29 +14,28 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.core import Axis, Draws, Recording, Signal, take
+from torchsar.core import Axis, Draws, Signal, take, unit_phasor
 from torchsar.echo import simulate_bistatic
 from torchsar.metrics import azimuth_response, replica_level, replica_zones
 from torchsar.multichannel.azimuth import FocusAzimuth
 from torchsar.multichannel.migration import CorrectMigration, Keystone
+from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.reconstruct import Reconstruct
 from torchsar.multichannel.response import LeastSquares
 from torchsar.multichannel.transmit import RemoveTransmitRange
 from torchsar.radar import BistaticRadar, LinearFM
 from torchsar.scene import BandLimited, BistaticWorld, MovingPoints
 
-RADAR = BistaticRadar(
-    1.25e9, LinearFM(50e6, 10e-6), sampling_hz=60e6, prf_hz=180.0, speed_m_s=300.0, reference_range_m=5000.0, transmit_range=(-243.0, 0.02, 5e-7), wave_speed_m_s=3e8
-)
+RADAR = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), sampling_hz=60e6, prf_hz=180.0, speed_m_s=300.0, reference_range_m=5000.0, transmit_range=(-243.0, 0.02, 5e-7), wave_speed_m_s=3e8)
 INTEGRATION_S, BANDWIDTH_HZ = 4.5, 337.5
-SINGLE = {"at rest": (0.0, 0.0), "u_a = 10 m/s": (0.0, 10.0), "u_r = 10 m/s": (10.0, 0.0)}
-NAMED = {"P1": (0.0, 10.0), "P2": (10.0, 0.0), "P3": (10.0, 5.0), "P4": (5.0, 10.0)}
-PLACES = {"P1": (-400.0, 60.0), "P2": (-200.0, -60.0), "P3": (150.0, 60.0), "P4": (400.0, -60.0)}  # azimuth and range (m) in figure 16, which prints none
-FIGURES = ("azimuth width (m)", "azimuth PSLR (dB)", "azimuth ISLR (dB)", "range width (m)", "range PSLR (dB)", "range ISLR (dB)", "MFTA (dB)")
+SPEEDS = {"at rest": (0.0, 0.0), "P1": (0.0, 10.0), "P2": (10.0, 0.0), "P3": (10.0, 5.0), "P4": (5.0, 10.0)}
+PLACES = {"P1": (-300.0, 60.0), "P2": (-150.0, -60.0), "P3": (150.0, 60.0), "P4": (250.0, -60.0)}  # azimuth and receive range (m) in figure 16, which prints none
+FIGURES = ("az width", "az PSLR", "az ISLR", "rg width", "rg PSLR", "rg ISLR", "MFTA")
 PUBLISHED = {  # width, PSLR, ISLR along azimuth, then MFTA; along range 2.64 to 2.66 m, -13 dB, -9.8 dB
     "conventional": {"P1": (59.55, -26.30, -26.37, -44.43), "P2": (1.06, None, None, -21.95), "P3": (8.77, None, None, -20.8), "P4": (17.99, None, None, -25.0)},
     "proposed": {"P1": (0.83, -13.25, -10.01, -68.9), "P2": (0.80, -13.07, -10.14, -56.7), "P3": (0.81, -13.11, -10.11, -52.4), "P4": (0.83, -13.26, -10.09, -47.6)},
@@ -45,18 +44,16 @@ PUBLISHED = {  # width, PSLR, ISLR along azimuth, then MFTA; along range 2.64 to
 
 @dataclass(frozen=True)
 class Batch:
-    """Targets, one a trial, and their channels after migration correction. speeds: name -> (u_r, u_a)."""
+    """Targets, one a trial, and their channels. speeds: name -> (u_r, u_a)."""
 
     speeds: Mapping[str, tuple[float, float]]
-    migrated: Signal
+    channels: Signal
 
     @property
-    def u_r_m_s(self) -> Tensor:
-        return torch.tensor([u_r for u_r, _ in self.speeds.values()], dtype=torch.float64)
-
-    @property
-    def u_a_m_s(self) -> Tensor:
-        return torch.tensor([u_a for _, u_a in self.speeds.values()], dtype=torch.float64)
+    def values(self) -> dict[str, Tensor]:
+        """What stages are told of the targets, (trial,) each."""
+        u_r, u_a = torch.tensor(list(self.speeds.values()), dtype=torch.float64).T
+        return {"u_r_m_s": u_r, "u_a_m_s": u_a}
 
 
 @dataclass(frozen=True)
@@ -69,26 +66,32 @@ class Product:
     moving: bool
 
 
-def migrated(recording: Recording) -> Signal:
-    """Channels without the transmit range and without range migration."""
-    return CorrectMigration(RADAR, Keystone(whole_swath=False))(RemoveTransmitRange(RADAR)(recording.signal))
+def received(world: BistaticWorld, n_pulse: int, n_range: int, trials: int | None = None) -> Signal:
+    """Range-compressed channels (channel, pulse, range) without the transmit range."""
+    recording, _ = simulate_bistatic(RADAR, world, n_pulse, n_range, Draws(1, trials=None if trials is None else range(trials)))
+    return RemoveTransmitRange(RADAR)(recording.signal)
 
 
 def simulated(speeds: Mapping[str, tuple[float, float]], n_pulse: int, n_range: int) -> Batch:
     """One target at the middle of the scene in each trial, without noise."""
     u_r, u_a = torch.tensor(list(speeds.values()), dtype=torch.float64).T[..., None]
     world = BistaticWorld(MovingPoints(u_r, u_a, torch.zeros_like(u_r), torch.zeros_like(u_r)), BandLimited(INTEGRATION_S))
-    recording, _ = simulate_bistatic(RADAR, world, n_pulse, n_range, Draws(1, trials=range(len(speeds))))
-    return Batch(speeds, migrated(recording))
+    return Batch(speeds, received(world, n_pulse, n_range, len(speeds)))
 
 
-def product(batch: Batch, bands: int, moving: bool) -> Product:
-    """Conventional (as if at rest) or proposed (moving)."""
-    values = {"u_r_m_s": batch.u_r_m_s, "u_a_m_s": batch.u_a_m_s} if moving else {}
+def products(batch: Batch, way: str) -> list[Product]:
+    """With two and three bands, "conventional" (as if at rest) or "proposed" (with the velocities)."""
+    values = batch.values if way == "proposed" else {}
+    standing = CorrectMigration(RADAR, Keystone(whole_swath=False))(batch.channels, **values)
+    return [product(standing, bands, values) for bands in (2, 3)]
+
+
+def product(standing: Signal, bands: int, values: Mapping[str, Tensor]) -> Product:
+    """From channels without migration."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # three bands of three channels are poorly conditioned, which is what the table shows
-        spectrum = Reconstruct(RADAR, LeastSquares(bands))(batch.migrated, **values)
-    return Product(spectrum, FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(spectrum, **values), bands, moving)
+        spectrum = Reconstruct(RADAR, LeastSquares(bands))(standing, **values)
+    return Product(spectrum, FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(spectrum, **values), bands, bool(values))
 
 
 def brightest(image: Signal) -> Tensor:
@@ -102,42 +105,48 @@ def range_cut(image: Signal) -> Tensor:
     return take(image.data, image.data.abs().amax(-1).argmax(-1), -2)
 
 
+def range_response(batch: Batch, made: Product) -> dict[str, Tensor]:
+    """Along range; the focusing filter leaves the phase of the closest range of every line, which turns from line to line."""
+    step = made.image.axis("range").step
+    motion = PointMotion.of(RADAR, made.image.data, **batch.values) if made.moving else PointMotion.of(RADAR, made.image.data)
+    turns = (motion.along_m_s / motion.square_m2_s2.sqrt() * step / RADAR.wavelength_m).expand(made.image.trials)
+    line = torch.arange(made.image.axis("range").n, dtype=torch.float64)
+    return azimuth_response(range_cut(made.image) * unit_phasor(-turns[:, None] * line, torch.complex128), step / 2)
+
+
 def measured(batch: Batch, made: Product) -> Tensor:
     """Numbers named by FIGURES, (trial, figure)."""
-    azimuth, range_ = made.image.axes
-    profile, along = brightest(made.image), RADAR.speed_m_s - batch.u_a_m_s
-    across = azimuth_response(range_cut(made.image), range_.step / 2)
-    own = azimuth_response(profile, azimuth.step)
-    zones = replica_zones(RADAR, made.bands, batch.u_r_m_s, batch.u_a_m_s, integration_s=INTEGRATION_S, focused_at=None if made.moving else (0.0, 0.0))
-    level = replica_level(profile, azimuth.step, zones)["mfta_db"]
-    width = own["irw_m"] * along / RADAR.speed_m_s
+    profile, step = brightest(made.image), made.image.axis("azimuth").step
+    own, across = azimuth_response(profile, step), range_response(batch, made)
+    zones = replica_zones(RADAR, made.bands, **batch.values, integration_s=INTEGRATION_S, focused_at=None if made.moving else (0.0, 0.0))
+    level = replica_level(profile, step, zones)["mfta_db"]
+    width = own["irw_m"] * (1 - batch.values["u_a_m_s"] / RADAR.speed_m_s)
     return torch.stack([width, own["pslr_db"], own["islr_db"], across["irw_m"], across["pslr_db"], across["islr_db"], level], -1)
 
 
-def show(batch: Batch, bands: int) -> None:
+def show(batch: Batch, made: Mapping[str, Product], bands: int) -> None:
     """Table 4 with so many bands."""
-    tables = {way: measured(batch, product(batch, bands, way == "proposed")) for way in PUBLISHED}
-    print(f"\n{f'Table 4, N = {bands}':30}" + "".join(f"{name:>10}" for name in FIGURE_HEADS))
-    for way, table in tables.items():
-        for name, row in zip(batch.speeds, table, strict=True):
-            print(f"{f'{way} {name}':30}" + "".join(f"{float(x):>10.2f}" for x in row))
-            known = PUBLISHED[way][name]
-            cells = (*known[:3], None, None, None, known[3])
-            print(f"{'  published':30}" + "".join(f"{'-' if x is None else f'{x:.2f}':>10}" for x in cells))
-
-
-FIGURE_HEADS = ("az width", "az PSLR", "az ISLR", "rg width", "rg PSLR", "rg ISLR", "MFTA")
+    print(f"{f'Table 4, N = {bands} (m, dB)':28}" + "".join(f"{name:>10}" for name in FIGURES))
+    for way, one in made.items():
+        for name, row in zip(batch.speeds, measured(batch, one), strict=True):
+            print(f"{f'{way} {name}':28}" + "".join(f"{float(x):>10.2f}" for x in row))
+            if name in PUBLISHED[way]:
+                known = PUBLISHED[way][name]
+                print(f"{'  published':28}" + "".join(f"{'-' if x is None else f'{x:.2f}':>10}" for x in (*known[:3], None, None, None, known[3])))
+    print()
 
 
 def near(image: Signal, along_m: float, range_m: float, place: int) -> Signal:
-    """Surroundings of the peak of one trial, azimuth counted from it, range on the axis c tau / 2."""
+    """Surroundings of the peak of one trial, azimuth and range counted from it, range on the axis c tau / 2."""
     azimuth, range_ = image.axes
     data = image.data[place]
-    row, column = divmod(int(data.abs().argmax()), data.shape[-1])
-    rows, columns = round(along_m / azimuth.step), round(2 * range_m / range_.step)
-    first, left = max(row - rows, 0), max(column - columns, 0)
-    part = data[first : row + rows + 1, left : column + columns + 1]
-    return Signal(part, (Axis("azimuth", part.shape[0], (first - row) * azimuth.step, azimuth.step, "m"), Axis("range", part.shape[1], (left - column) * range_.step / 2, range_.step / 2, "m")))
+    peak = divmod(int(data.abs().argmax()), data.shape[-1])
+    reach = round(along_m / azimuth.step), round(2 * range_m / range_.step)
+    first = [max(at - side, 0) for at, side in zip(peak, reach, strict=True)]
+    part = data[first[0] : peak[0] + reach[0] + 1, first[1] : peak[1] + reach[1] + 1]
+    steps = azimuth.step, range_.step / 2
+    axes = (Axis(axis.name, n, (begin - at) * step, step, "m") for axis, n, begin, at, step in zip(image.axes, part.shape, first, peak, steps, strict=True))
+    return Signal(part, tuple(axes))
 
 
 def finer(image: Signal, factor: int = 8) -> Signal:
@@ -172,29 +181,77 @@ def draw_target(made: Product, place: int, title: str, path: Path) -> None:
     plot.save(plot.overlays(parts, columns=3, dynamic_range_db=50), path)
 
 
-def draw_single(batch: Batch, out: Path) -> dict[str, Signal]:
-    """Figures 5 to 7 (conventional) and 14, 15 (proposed); returns what their contours need."""
-    names, details = list(batch.speeds), {}
+def draw_single(batch: Batch, by_way: Mapping[str, Product], out: Path) -> None:
+    """Figures 5 to 7 (conventional) and 14, 15 (proposed), their contours in one picture."""
+    names, contours = list(batch.speeds), {}
     for way, first, figures in (("conventional", 0, (5, 6, 7)), ("proposed", 1, (14, 15))):
-        made = product(batch, 2, way == "proposed")
+        made = by_way[way]
         for place, figure in enumerate(figures, first):
-            draw_target(made, place, f"{names[place]}, {way}", out / f"figure_{figure:02}.png")
-            details[f"{figure}: {names[place]}, {way}"] = finer(near(made.image, 30.0 if figure == 6 else 6.0, 15.0, place))
-    return details
+            u_r, u_a = batch.speeds[names[place]]
+            title = f"({u_r:g}, {u_a:g}) m/s, {way}"
+            draw_target(made, place, title, out / f"figure_{figure:02}.png")
+            contours[f"{figure}: {title}"] = finer(near(made.image, 60.0 if figure == 6 else 6.0, 15.0, place))
+    plot.save(plot.contours(contours), out / "contours.png")
 
 
-def draw_scene(small: bool, out: Path) -> None:
-    """Figure 16: four targets in one scene, where they are, as if at rest, and contours of each with its own velocities."""
-    azimuth, range_ = zip(*PLACES.values())
-    u_r, u_a = zip(*NAMED.values())
+def draw_scene(n_pulse: int, out: Path) -> None:
+    """Figure 16: four targets in one scene, and each with its own velocities."""
+    azimuth, range_ = zip(*PLACES.values(), strict=True)
+    u_r, u_a = zip(*(SPEEDS[name] for name in PLACES), strict=True)
     world = BistaticWorld(MovingPoints(u_r, u_a, azimuth, range_), BandLimited(INTEGRATION_S))
-    recording, truth = simulate_bistatic(RADAR, world, 1080 if small else 1800, 96, Draws(1))
-    batch = Batch({}, migrated(recording))
-    still = FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(Reconstruct(RADAR)(batch.migrated))
-    plot.save(plot.overlays([{"title": "four targets, conventional (crosses of lines: true places)", "signal": relative(still), "lines": marks(truth.values)}], columns=1, dynamic_range_db=50), out / "figure_16.png")
+    data = received(world, n_pulse, 96)
+    still = FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(Reconstruct(RADAR)(CorrectMigration(RADAR)(data)))
+    lines = {name: (np.full(2, x), np.array([-115.0, 115.0])) for name, (x, _) in PLACES.items()}
+    part = {"title": "four targets as if at rest; lines: true azimuth", "signal": transposed(relative(still)), "lines": lines}
+    plot.save(plot.overlays([part], columns=1, dynamic_range_db=50), out / "figure_16.png")
+    plot.save(plot.contours({name: own_image(data, name) for name in PLACES}, columns=4), out / "figure_16_contours.png")
+
+
+def own_image(data: Signal, name: str) -> Signal:
+    """A target of the scene, found where it appears, focused with its own velocities and place."""
+    (u_r, u_a), (y0, beyond) = SPEEDS[name], PLACES[name]
+    values, range_m = {"u_r_m_s": u_r, "u_a_m_s": u_a, "y0_m": y0}, RADAR.reference_range_m + beyond
+    standing = CorrectMigration(RADAR, Keystone(whole_swath=False), range_m=range_m)(data, **values)
+    image = FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(Reconstruct(RADAR)(standing, **values), **values)
+    shown = RADAR.speed_m_s * float(PointMotion.of(RADAR, data.data, **values, range_m=range_m).image_s)
+    part = image.crop(azimuth=around(image.axis("azimuth"), shown, 20.0), range=around(image.axis("range"), range_m, 40.0))
+    return finer(near(part.with_data(part.data[None]), 6.0, 15.0, 0))
+
+
+def around(axis: Axis, place: float, reach: float) -> tuple[int, int]:
+    """First sample, and the one behind the last, within reach of a place."""
+    first, last = (round(float(axis.index_of(place + side))) for side in (-reach, reach))
+    return max(first, 0), min(last, axis.n)
 
 
 def relative(image: Signal) -> Signal:
     """Range from the reference on the axis c tau / 2."""
     azimuth, range_ = image.axes
     return Signal(image.data, (azimuth, Axis("range", range_.n, (range_.start - RADAR.reference_range_m) / 2, range_.step / 2, "m")))
+
+
+def transposed(image: Signal) -> Signal:
+    """Azimuth horizontal."""
+    return Signal(image.data.mT, image.axes[::-1])
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("geo_targets"), help="folder of the figures")
+    parser.add_argument("--small", action="store_true", help="records of 6 s and short lines in place of 10 s: one replica to either side")
+    options = parser.parse_args(arguments)
+    options.out.mkdir(parents=True, exist_ok=True)
+
+    n_pulse, n_range = (1080, 48) if options.small else (1800, 96)
+    batch = simulated(SPEEDS, n_pulse, n_range)
+    made = {way: products(batch, way) for way in PUBLISHED}
+    two, three = ({way: both[i] for way, both in made.items()} for i in range(2))
+    show(batch, two, 2)
+    show(batch, three, 3)
+    print(f"theory: azimuth 0.886 lambda R0 / (v T) = {0.886 * RADAR.wavelength_m * RADAR.reference_range_m / (RADAR.speed_m_s * INTEGRATION_S):.3f} m at rest, range 2.66 m, PSLR -13.26 dB")
+    draw_single(batch, two, options.out)
+    draw_scene(n_pulse, options.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import linear_phasor, unit_phasor
+from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.migration import Frame, StaticBulk, correct_migration
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.model import point_phasor
@@ -23,6 +24,7 @@ from torchsar.radar import BistaticRadar
 
 _TINY = torch.finfo(torch.float64).tiny
 _GUARD_CELLS = 6
+_LINES_USED = 8  # for the sharpness of a picture
 _LEAST_LINES = 12
 _LOADING = 1e-5
 _BRIGHT = 12.0  # times what sea and noise leave in a pixel
@@ -274,13 +276,14 @@ def _along_speed(chip: Chip, extraction: Extraction, half_m_s: float) -> Tensor:
     time_s = chip.time_s[chip.lit]
     # a taper, since side lobes of neighbours would interfere
     echo = chip.echo(chip.cells)[:, chip.lit] * torch.hann_window(len(time_s), dtype=torch.float64, device=time_s.device)
+    echo = echo[echo.abs().square().sum(-1).topk(min(_LINES_USED, len(echo))).indices]
     back = point_phasor(radar, motion, time_s, torch.complex128)[0]
     middle, step = motion.u_a_m_s, half_m_s / 40
     for _ in range(3):
         u_a = middle + step * torch.arange(-40, 41, dtype=torch.float64, device=middle.device)
         there = replace(motion.each(lambda value: value.expand(81)), u_a_m_s=u_a)
         turn = point_phasor(radar, there, time_s, torch.complex128)[:, 0].conj() * back
-        picture = torch.fft.fft(echo * turn[:, None], 2 * echo.shape[-1]).abs().square()
+        picture = torch.fft.fft((echo * turn[:, None]).to(torch.complex64), smooth_length(2 * echo.shape[-1])).abs().square().to(torch.float64)
         shift, _ = _peak(picture.square().sum((-2, -1)) / picture.sum((-2, -1)).square().clamp_min(_TINY))
         middle, step = middle + step * shift, step / 10
     return middle

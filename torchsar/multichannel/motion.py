@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from torchsar.core import per_trial
@@ -55,6 +56,11 @@ class PointMotion:
         return self.square_m2_s2 / self.along_m_s
 
     @property
+    def trial_dims(self) -> int:
+        """Number of trial dims of what depends on the velocities."""
+        return max(self.u_r_m_s.ndim, self.u_a_m_s.ndim)
+
+    @property
     def image_s(self) -> Tensor:
         """Slow time t0 of zero Doppler, where the focused point appears: (u_r R0 + v y0) / V^2."""
         return (self.u_r_m_s * self.range_m + self.along_m_s * self.y0_m) / self.square_m2_s2
@@ -73,8 +79,11 @@ class PointMotion:
 def _refuse_overtaking(motion: PointMotion) -> None:
     try:
         slowest, nearest = float(motion.along_m_s.min()), float(motion.range_m.min())
+        wild = [name for name in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m") if not bool(torch.isfinite(getattr(motion, name)).all())]
     except RuntimeError:  # inside vmap a value cannot be looked at
         return
+    if wild:
+        raise ValueError(f"velocity and place of a point must be finite, got NaN or Inf in {', '.join(wild)}; replace estimates that failed before they are used")
     if not slowest > 0:
         fastest = motion.speed_m_s - slowest
         raise ValueError(f"a point moves along track at {fastest:g} m/s, as fast as the receiver ({motion.speed_m_s:g} m/s) or faster, so that no aperture forms; give u_a_m_s below that")

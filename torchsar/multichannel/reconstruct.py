@@ -36,7 +36,7 @@ def reconstruct_lines(data: Tensor, radar: BistaticRadar, motion: PointMotion, r
     n, dtype = data.shape[-2], data.dtype
     spectrum = fft_lines(torch.fft.ifftshift(_demodulated(data, radar, motion, left_k1_m_s), dim=-2))
     spectrum = torch.roll(spectrum, -first_bin(n, rebuild.bands), -2) * shared_response(radar, motion, n, rebuild.bands, dtype, left_k1_m_s).conj()[..., None]
-    return _combined(spectrum, rebuild.weights(radar, motion, n).to(dtype) * rebuild.bands, motion.u_r_m_s.ndim)
+    return _combined(spectrum, rebuild.weights(radar, motion, n).to(dtype) * rebuild.bands, motion.trial_dims)
 
 
 def _demodulated(data: Tensor, radar: BistaticRadar, motion: PointMotion, left_k1_m_s: float) -> Tensor:

@@ -165,7 +165,13 @@ def condition_number(radar: BistaticRadar, motion: PointMotion, bands: int) -> T
 
 
 def noise_gain_db(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, n_pulse: int = 64) -> Tensor:
-    """Noise power of a rebuilt bin against that of ideal uniform sampling by as many channels, M / N trace(W W^H), in dB, mean over bins, (...,)."""
+    """Noise power of a rebuilt bin against that of ideal uniform sampling by as many channels, M / N trace(W W^H), in dB, mean over bins, (...,).
+
+    Infinite where an inverse is singular, although its damped weights are finite: they lose bands instead.
+    """
     weights = rebuild.weights(radar, motion, n_pulse)
     power = weights.abs().square().sum((-2, -1)) * (radar.channels / rebuild.bands)
-    return 10 * torch.log10(power.mean(-1) if power.ndim > motion.u_r_m_s.ndim else power)
+    gain = 10 * torch.log10(power.mean(-1) if power.ndim > motion.trial_dims else power)
+    if not isinstance(rebuild, LeastSquares):
+        return gain
+    return torch.where(condition_number(radar, motion, rebuild.bands) > SINGULAR, torch.inf, gain)

@@ -108,18 +108,20 @@ class ImageMovers(Stage):
     def _taken_out(self, left: Signal, look, bodies: list[Body]) -> tuple[Signal, list[Body]]:
         """Targets found and movers removed, strongest first, until a look shows nothing new."""
         bodies, seen = list(bodies), [self._shown(body) for body in bodies]
-        while len(bodies) < self.detector.most:
-            new = [d for d in self.detector.found(look(left)) if self._whole(d, left) and not any(self._same(d, other) for other in seen)]
-            if not new:
-                break
-            seen.append(new[0])
-            body = self._body(left, new[0])
+        waiting = self.detector.found(look(left))
+        while waiting and len(bodies) < self.detector.most:
+            place = waiting.pop(0)
+            if not self._whole(place, left) or any(self._same(place, other) for other in seen):
+                continue
+            seen.append(place)
+            body = self._body(left, place)
             if not bool(body.ok):
                 continue
             bodies.append(body)
             seen.append(self._shown(body))
             if self._moves(body):
                 left = self._without(left, body)
+                waiting = self.detector.found(look(left))
         return left, bodies
 
     def _whole(self, detection: Detection, signal: Signal) -> bool:

@@ -16,7 +16,7 @@ from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.interferometry import DETECTED_DB
-from torchsar.multichannel.velocity.model import point_phasor
+from torchsar.multichannel.velocity.model import energy_ratio_db, point_phasor
 from torchsar.radar import BistaticRadar
 
 _TINY = torch.finfo(torch.float64).tiny
@@ -28,6 +28,9 @@ def along_track_velocity(data: Tensor, radar: BistaticRadar, start: PointMotion,
     A grid of step_m_s, then `fine` grids of five, each a fifth as wide, and a parabola. std: from the curvature of the likelihood of the tone. ok: not at the end of the search, and
     the tone stands above the threshold. What is measured is the curvature of the phase: an acceleration along the line of sight looks the same (brief 001: 0.05 m/s^2 as 0.42 m/s).
     """
+    if not half_m_s > 0:
+        raise ValueError(f"half_m_s of a search along track must be positive, got {half_m_s}; where u_a is known there is nothing to search")
+    PointMotion.of(radar, data, 0.0, start.u_a_m_s + half_m_s)  # refuses a search up to the receiver's speed
     data = data.to(torch.complex128)
     centre = start.u_a_m_s.expand(data.shape[:-2])
     count = 2 * max(1, round(half_m_s / step_m_s)) + 1
@@ -38,7 +41,8 @@ def along_track_velocity(data: Tensor, radar: BistaticRadar, start: PointMotion,
     for _ in range(fine):
         step = 2 * step / 5
         top = _best(data, radar, start, aperture, top.u_a_m_s, step * torch.arange(-2, 3, dtype=torch.float64, device=data.device))
-    return _judged(data, radar, replace(start, u_a_m_s=top.u_a_m_s), aperture, top.energy, top.curvature, ended)
+    found = torch.where(top.energy > 0, top.u_a_m_s.clamp(centre - half_m_s, centre + half_m_s), centre)
+    return _judged(data, radar, replace(start, u_a_m_s=found), aperture, top.energy, top.curvature, ended)
 
 
 class _Top(NamedTuple):
@@ -75,10 +79,11 @@ def _judged(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: A
     weight = aperture.weight(radar, motion, radar.pulse_axis(data.shape[-1]).values(data.device))[..., None, :]
     shines = (weight != 0).expand(data.shape)
     noise = ((data.abs().square() * shines).sum((-2, -1)) - energy).clamp_min(0) / shines.sum((-2, -1)).clamp_min(1)
-    snr = 10 * torch.log10((energy / noise.clamp_min(_TINY)).clamp_min(_TINY))
+    snr = energy_ratio_db(energy, noise)
     value = {"u_a_m_s": motion.u_a_m_s}
     ok = (snr >= DETECTED_DB) & ~ended
-    return Estimate(value, torch.sigmoid((snr - DETECTED_DB) / 3), ok, {"u_a_m_s": torch.sqrt(noise / bend.clamp_min(_TINY))}, {"snr_db": snr, "at_the_end": ended})
+    std = torch.where(bend > _TINY, torch.sqrt(noise / bend.clamp_min(_TINY)), torch.inf)
+    return Estimate(value, torch.sigmoid((snr - DETECTED_DB) / 3), ok, {"u_a_m_s": std}, {"snr_db": snr, "at_the_end": ended})
 
 
 def motion_from(radar: BistaticRadar, data: Tensor, u_r_m_s: Number, u_a_m_s: Number, y0_m: Number, range_m: Number | None) -> PointMotion:

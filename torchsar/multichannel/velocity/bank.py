@@ -21,6 +21,7 @@ from torchsar.multichannel.velocity.whitening import Whitening
 from torchsar.radar import BistaticRadar
 
 _BLOCK_BYTES = 64 << 20
+_TINY = torch.finfo(torch.float32).tiny
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def bank_search(
     whitening: Whitening | None = None,
     image_s: Number | None = None,
 ) -> tuple[PointMotion, Tensor]:
-    """The hypothesis that explains most, per trial, and the energy that it explains (...,) by the normalised correlation.
+    """The hypothesis that explains most, per trial, and the energy that it explains (...,) by the normalised correlation: zero velocity for trials of zeros.
 
     data: complex (..., channel, pulse). u_a_m_s: (...,) middle of the search along track. The place along track is read from the tone left, within +-search.y0_m of zero, or of
     where a point of each velocity lies that appears at the slow time image_s (...,) in an image: what a detection knows.
@@ -62,10 +63,11 @@ def bank_search(
     n = data.shape[-1]
     time_s = radar.pulse_axis(n).values(data.device)
     taken = (data if whitening is None else whitening.backed(data)).to(torch.complex128)
-    taken = taken.to(torch.complex64)
+    level = taken.abs().amax((-2, -1), keepdim=True)
+    taken = (taken / torch.where(level > 0, level, 1.0)).to(torch.complex64)
     best = PointMotion.of(radar, data, 0.0, u_a_m_s, 0.0, range_m)
     best = best.each(lambda value: value.expand(data.shape[:-2]))
-    energy = torch.full(data.shape[:-2], -torch.inf, dtype=torch.float64, device=data.device)
+    energy = torch.zeros(data.shape[:-2], dtype=torch.float64, device=data.device)
     for u_r in _steps(search.u_r_m_s, search.u_r_step_m_s, data.device):
         for offsets in _blocks(_steps(search.u_a_m_s, search.u_a_step_m_s, data.device), data):
             u_a = torch.as_tensor(u_a_m_s, dtype=torch.float64, device=data.device)[..., None] + offsets
@@ -76,7 +78,7 @@ def bank_search(
             better = found > energy
             energy = torch.where(better, found, energy)
             best = chosen(replace(best, u_r_m_s=u_r.expand(found.shape), u_a_m_s=along, y0_m=place), best, better)
-    return best, energy
+    return best, energy * level[..., 0, 0].square()
 
 
 def _steps(half: float, step: float, device: torch.device) -> Tensor:
@@ -100,7 +102,7 @@ def _best_tone(taken: Tensor, radar: BistaticRadar, motion: PointMotion, apertur
     tone_hz = (torch.arange(length, dtype=torch.float64, device=taken.device) - length // 2) * (rate_hz / length)
     shift = tone_hz * radar.wavelength_m * radar.reference_range_m / motion.along_m_s[..., None]
     aligned = _aligned(spectrum, radar, shift)
-    power = aligned.abs().square().to(torch.float64) / _norm(model, whitening).to(torch.float64)[..., None]
+    power = aligned.abs().square().to(torch.float64) / _norm(model, whitening).to(torch.float64).clamp_min(_TINY)[..., None]
     power = torch.where(shift.abs() <= reach_m, power, -torch.inf).flatten(-2)
     at = power.argmax(-1, keepdim=True)
     wide = torch.broadcast_to(motion.y0_m[..., None] + shift, (*aligned.shape[:-1], length)).flatten(-2)

@@ -9,8 +9,8 @@ from torchsar.core import Estimate
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.interferometry import DETECTED_DB
-from torchsar.multichannel.velocity.likelihood import maximum_likelihood
-from torchsar.multichannel.velocity.model import UNKNOWNS, estimate_of, moved, point_phasor
+from torchsar.multichannel.velocity.likelihood import PointLikelihood, maximum_likelihood
+from torchsar.multichannel.velocity.model import UNKNOWNS, estimate_of, moved, point_phasor, round_units
 from torchsar.optim import lbfgs
 from torchsar.radar import BistaticRadar
 
@@ -31,11 +31,11 @@ def gradient_likelihood(data: Tensor, radar: BistaticRadar, start: PointMotion, 
     """Maximum likelihood near `start` by limited-memory BFGS: the check of `maximum_likelihood`, and the pattern for objectives of your own. Arguments as there."""
     energy = data.abs().to(torch.float64).square().sum((-2, -1)).clamp_min(_TINY)
     at_start = maximum_likelihood(data, radar, start, aperture, unknowns, steps=0)
-    # unknowns are nearly alike in their phases: in units of the deviations of their sums and differences the objective is round
-    units = torch.linalg.cholesky(at_start.covariance)
-    units = units / torch.linalg.matrix_norm(units, keepdim=True)
-
-    weight = aperture.weight(radar, at_start.motion, radar.pulse_axis(data.shape[-1]).values(data.device))
+    # unknowns are nearly alike in their phases: in units of their deviations the objective is round
+    time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
+    weight = aperture.weight(radar, at_start.motion, time_s)
+    echo = weight[..., None, :] * point_phasor(radar, at_start.motion, time_s, torch.complex128)
+    units = round_units(PointLikelihood.of(echo, radar, at_start.motion, aperture, unknowns, None).fit(at_start.motion).normal)
 
     def there(x: Tensor) -> PointMotion:
         return moved(at_start.motion, (units @ x[..., None])[..., 0], unknowns)

@@ -15,7 +15,7 @@ from torchsar.core import Estimate
 from torchsar.focus.nufft import smooth_length
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
-from torchsar.multichannel.velocity.model import Found, estimate_of, phase_slopes, point_phasor
+from torchsar.multichannel.velocity.model import Found, covariance_of, estimate_of, phase_slopes, point_phasor
 from torchsar.radar import BistaticRadar
 
 _PAD = 4
@@ -105,6 +105,5 @@ def _judged(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: Ten
     slopes = phase_slopes(radar, motion, time_s, ("u_r_m_s", "y0_m")) * weight[..., None, :, :]
     total = (weight.square()[..., None, :, :] * torch.ones_like(slopes)).sum((-2, -1), keepdim=True).clamp_min(_TINY)
     flat = (slopes - weight[..., None, :, :] * (slopes * weight[..., None, :, :]).sum((-2, -1), keepdim=True) / total).flatten(-2)
-    normal = 2 * amplitude.abs().square()[..., None, None] * (flat @ flat.mT) / noise.clamp_min(_TINY)[..., None, None]
-    floor = _TINY * torch.eye(2, dtype=torch.float64, device=data.device)
-    return Found(motion, amplitude, noise, torch.linalg.pinv(normal + floor, hermitian=True), energy, ("u_r_m_s", "y0_m"))
+    normal = amplitude.abs().square()[..., None, None] * (flat @ flat.mT)
+    return Found(motion, amplitude, noise, covariance_of(normal, noise), energy, ("u_r_m_s", "y0_m"))

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Aperture
-from torchsar.multichannel.velocity.model import UNKNOWNS, Found, chosen, moved, phase_slopes, point_phasor
+from torchsar.multichannel.velocity.model import UNKNOWNS, Found, chosen, covariance_of, moved, phase_slopes, point_phasor, refuse_unknowns, solved
 from torchsar.multichannel.velocity.whitening import Whitening
 from torchsar.radar import BistaticRadar
 
@@ -39,7 +39,7 @@ def maximum_likelihood(
     whitening: Whitening | None = None,
     steps: int = 12,
 ) -> Found:
-    """The most likely motion near `start`.
+    """The most likely motion near `start`, whose residual tone (du_r + v dy0 / R0) / lambda must lie within half a Doppler cell: 0.03 m/s at 4.5 s. `interferometry` and `bank_search` do.
 
     data: complex (..., channel, pulse), slow time zero at pulse n // 2, transmit range removed. aperture: expected amplitude. unknowns: of u_r_m_s, u_a_m_s, y0_m, what is
     estimated; the rest stays at the start. whitening: covariance of what is not the point, None for white noise. The expected amplitude stays where the start puts
@@ -51,7 +51,7 @@ def maximum_likelihood(
     for _ in range(steps):
         motion, fit = _stepped(problem, motion, fit)
     noise = problem.noise_power(fit)
-    covariance = noise[..., None, None] / 2 * _solved(fit.normal, torch.eye(len(unknowns), dtype=torch.float64, device=data.device).expand(fit.normal.shape))
+    covariance = covariance_of(fit.normal, noise)
     return Found(motion, fit.amplitude, noise, covariance, fit.energy, unknowns)
 
 
@@ -71,6 +71,7 @@ class PointLikelihood:
 
     @staticmethod
     def of(data: Tensor, radar: BistaticRadar, start: PointMotion, aperture: Aperture, unknowns: tuple[str, ...], whitening: Whitening | None) -> PointLikelihood:
+        refuse_unknowns(unknowns)
         time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
         weight = aperture.weight(radar, start, time_s)[..., None, :]
         data = data.to(torch.complex128)
@@ -116,17 +117,9 @@ def _coloured(data: Tensor, model: Tensor, columns: Tensor) -> PointFit:
     return PointFit(amplitude, amplitude.abs().square() * total, gradient, amplitude.abs().square()[..., None, None] * normal)
 
 
-def _solved(normal: Tensor, right: Tensor) -> Tensor:
-    """normal^-1 right with unit diagonal and a floor, so that an unknown that data say nothing about stays finite."""
-    scale = normal.diagonal(dim1=-2, dim2=-1).clamp_min(_TINY).rsqrt()
-    unit = normal * scale[..., :, None] * scale[..., None, :]
-    floor = 1e-13 * torch.eye(unit.shape[-1], dtype=unit.dtype, device=unit.device)
-    return scale[..., :, None] * torch.linalg.solve(unit + floor, scale[..., :, None] * right)
-
-
 def _stepped(problem: PointLikelihood, motion: PointMotion, fit: PointFit) -> tuple[PointMotion, PointFit]:
     """One Gauss-Newton step, halved where it explains less."""
-    step = _bounded(_solved(fit.normal, fit.gradient[..., None])[..., 0], motion, problem.unknowns)
+    step = _bounded(solved(fit.normal, fit.gradient[..., None])[..., 0], motion, problem.unknowns)
     pending = torch.ones_like(fit.energy, dtype=torch.bool)
     for _ in range(_HALVINGS):
         there = moved(motion, step, problem.unknowns)

@@ -45,9 +45,47 @@ class Found:
 
     @property
     def snr_db(self) -> Tensor:
-        """Of the point over all its samples together: what decides whether it was found at all."""
-        tiny = torch.finfo(torch.float64).tiny
-        return 10 * torch.log10((self.energy / self.noise_power.clamp_min(tiny)).clamp_min(tiny))
+        """Of the point over all its samples together, within +-300 dB: what decides whether it was found at all."""
+        return energy_ratio_db(self.energy, self.noise_power)
+
+
+def energy_ratio_db(energy: Tensor, noise_power: Tensor) -> Tensor:
+    """In dB, within +-300 dB; -300 dB where there is neither."""
+    return 10 * torch.log10((energy / noise_power.clamp_min(torch.finfo(torch.float64).tiny)).clamp(1e-30, 1e30))
+
+
+def covariance_of(normal: Tensor, noise_power: Tensor) -> Tensor:
+    """Of the unknowns of a fit with normal matrices (..., n, n) of half the explained energy, variances infinite where data say nothing."""
+    silent = torch.diag_embed((normal.diagonal(dim1=-2, dim2=-1) <= 0).to(normal.dtype)) > 0
+    eye = torch.eye(normal.shape[-1], dtype=normal.dtype, device=normal.device)
+    return torch.where(silent, torch.inf, noise_power[..., None, None] / 2 * solved(normal, eye.expand(normal.shape)))
+
+
+def solved(normal: Tensor, right: Tensor) -> Tensor:
+    """normal^-1 right (..., n, k), with a floor for unknowns that data hardly tell apart; those that they say nothing about keep what is on the right."""
+    unit, scale = _of_unit_diagonal(normal)
+    return scale[..., :, None] * torch.linalg.solve(unit, scale[..., :, None] * right)
+
+
+def round_units(normal: Tensor) -> Tensor:
+    """Combinations (..., unknown, n) of the unknowns in which the explained energy falls off alike in all directions."""
+    unit, scale = _of_unit_diagonal(normal)
+    units = scale[..., :, None] * torch.linalg.inv(torch.linalg.cholesky(unit)).mT
+    return units / torch.linalg.matrix_norm(units, keepdim=True)
+
+
+def _of_unit_diagonal(normal: Tensor) -> tuple[Tensor, Tensor]:
+    """Matrices with a unit diagonal and a floor, and the scale (..., n) on either side that makes them."""
+    diagonal = normal.diagonal(dim1=-2, dim2=-1)
+    scale = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
+    unit = normal * scale[..., :, None] * scale[..., None, :] + torch.diag_embed((diagonal <= 0).to(normal.dtype))
+    return unit + 1e-13 * torch.eye(unit.shape[-1], dtype=unit.dtype, device=unit.device), scale
+
+
+def refuse_unknowns(unknowns: tuple[str, ...]) -> None:
+    """Raise ValueError unless these are some of UNKNOWNS, each once."""
+    if not unknowns or len(set(unknowns)) != len(unknowns) or not set(unknowns) <= set(UNKNOWNS):
+        raise ValueError(f"unknowns names some of {UNKNOWNS}, each once, got {tuple(unknowns)}")
 
 
 def moved(motion: PointMotion, step: Tensor, unknowns: tuple[str, ...]) -> PointMotion:

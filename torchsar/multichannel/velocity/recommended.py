@@ -36,7 +36,7 @@ def moving_point_velocity(
     three pulse rates of u_r, whose ambiguity modulo lambda PRF the cubic phase of the range history resolves. u_a_m_s: where it is known, None to estimate it.
     whitening: covariance of the clutter, from neighbouring lines, say; None to take it from what the point leaves of the data themselves: the point is sought in white noise and
     in the covariance of the data, both are refined against what they leave, and the more likely one is taken, per trial.
-    ok: found above the threshold of 19 dB over all samples, and inside of the search. info: snr_db, noise_power, coloured (clutter was found).
+    ok: found above the threshold of 19 dB over all samples, inside of the search, and with a predicted deviation of u_r below its half width (one channel cannot). info: snr_db, noise_power, coloured (clutter was found).
     """
     search = search or Search(u_r_m_s=1.5 * radar.ambiguous_velocity_m_s)
     unknowns = UNKNOWNS if u_a_m_s is None else ("u_r_m_s", "y0_m")
@@ -49,7 +49,7 @@ def moving_point_velocity(
     if not bool(plain.coloured.any()):
         return job.estimate(plain.found, plain.coloured)
     other = job.refined(job.found(sample_whitening(job.data, radar)))
-    first = plain.log_det <= other.log_det
+    first = ~plain.coloured | (plain.log_det <= other.log_det)  # whatever the other trials are
     return job.estimate(_either(plain.found, other.found, first), torch.where(first, plain.coloured, other.coloured))
 
 
@@ -103,7 +103,8 @@ class _Job:
         inside = found.motion.u_r_m_s.abs() <= self.search.u_r_m_s + self.search.u_r_step_m_s
         if "u_a_m_s" in self.unknowns:
             inside = inside & ((found.motion.u_a_m_s - self.u_a_m_s).abs() <= self.search.u_a_m_s + self.search.u_a_step_m_s)
-        return estimate_of(found, inside & (snr >= DETECTED_DB), torch.sigmoid((snr - DETECTED_DB) / 3), coloured=coloured)
+        told = found.covariance[..., 0, 0].sqrt() <= self.search.u_r_m_s + self.search.u_r_step_m_s  # one channel tells no velocity from a place
+        return estimate_of(found, inside & told & (snr >= DETECTED_DB), torch.sigmoid((snr - DETECTED_DB) / 3), coloured=coloured)
 
 
 def _either(a: Found, b: Found, first: Tensor) -> Found:

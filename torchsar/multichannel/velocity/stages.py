@@ -7,15 +7,18 @@ from torch import Tensor
 
 from torchsar.core import Estimate, Signal, Stage, take
 from torchsar.multichannel.motion import Number, PointMotion
+from torchsar.multichannel.reconstruct import refuse_shifted
 from torchsar.multichannel.velocity.along_track import along_track_velocity, motion_from
 from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.bank import Search
 from torchsar.multichannel.velocity.gradient import gradient_likelihood
 from torchsar.multichannel.velocity.interferometry import DETECTED_DB, interferometry
 from torchsar.multichannel.velocity.likelihood import maximum_likelihood
-from torchsar.multichannel.velocity.model import UNKNOWNS, estimate_of
+from torchsar.multichannel.velocity.model import UNKNOWNS, estimate_of, refuse_unknowns
 from torchsar.multichannel.velocity.recommended import moving_point_velocity
 from torchsar.radar import BistaticRadar
+
+_LEAST_PULSES = 4
 
 
 def strongest_line(data: Tensor) -> tuple[Tensor, Tensor]:
@@ -36,7 +39,13 @@ class _Velocity(Stage):
         self.radar, self.aperture, self.range_m = radar, aperture, range_m
 
     def line(self, signal: Signal) -> tuple[Tensor, Tensor | float | None]:
-        """The data (..., channel, pulse) to work on, and the closest range of their points."""
+        """The data (..., channel, pulse) to work on, and the closest range of their points. Raises ValueError for other channels than the radar's, shifted slow time and too few pulses."""
+        refuse_shifted(self.radar, signal.axis("pulse"))
+        channels, pulses = signal.axes[0].n, signal.axes[1].n
+        if channels != self.radar.channels or pulses < _LEAST_PULSES:
+            raise ValueError(
+                f"{type(self).__name__} expects {self.radar.channels} channels by the radar's channel_m and at least {_LEAST_PULSES} pulses, got {channels} and {pulses}; select the channels of both"
+            )
         if "range" not in signal.names:
             return signal.data, self.range_m
         data, index = strongest_line(signal.data)
@@ -75,6 +84,7 @@ class LikelihoodVelocity(_Velocity):
     def __init__(self, radar: BistaticRadar, aperture: Aperture, range_m: float | None = None, unknowns: tuple[str, ...] = UNKNOWNS) -> None:
         super().__init__(radar, aperture, range_m)
         self.unknowns = tuple(unknowns)
+        refuse_unknowns(self.unknowns)
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
         found = maximum_likelihood(*self.begin(signal, u_r_m_s, u_a_m_s, y0_m), self.unknowns)
@@ -87,6 +97,7 @@ class GradientVelocity(_Velocity):
     def __init__(self, radar: BistaticRadar, aperture: Aperture, range_m: float | None = None, unknowns: tuple[str, ...] = UNKNOWNS) -> None:
         super().__init__(radar, aperture, range_m)
         self.unknowns = tuple(unknowns)
+        refuse_unknowns(self.unknowns)
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
         return gradient_likelihood(*self.begin(signal, u_r_m_s, u_a_m_s, y0_m), self.unknowns)
