@@ -19,10 +19,10 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.core import Axis, Draws, Signal, take, unit_phasor
+from torchsar.core import Axis, Draws, Signal, take
 from torchsar.echo import simulate_bistatic
 from torchsar.metrics import azimuth_response, replica_level, replica_zones
-from torchsar.multichannel.azimuth import FocusAzimuth
+from torchsar.multichannel.azimuth import FocusAzimuth, focus_azimuth, image_axis
 from torchsar.multichannel.migration import CorrectMigration, Keystone
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.reconstruct import Reconstruct
@@ -86,12 +86,15 @@ def products(batch: Batch, way: str) -> list[Product]:
     return [product(standing, bands, values) for bands in (2, 3)]
 
 
-def product(standing: Signal, bands: int, values: Mapping[str, Tensor]) -> Product:
-    """From channels without migration."""
+def product(standing: Signal, bands: int, values: Mapping[str, Tensor | float], range_m: float | None = None) -> Product:
+    """From channels without migration. One filter serves all lines, that of the target: side lobes along range have its history, not that of their line."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # three bands of three channels are poorly conditioned, which is what the table shows
         spectrum = Reconstruct(RADAR, LeastSquares(bands))(standing, **values)
-    return Product(spectrum, FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(spectrum, **values), bands, bool(values))
+    doppler, range_ = spectrum.axes
+    motion = PointMotion.of(RADAR, standing.data, **values, range_m=range_m).each(lambda value: value[..., None])
+    image = focus_azimuth(spectrum.data.mT, doppler.values(), RADAR, motion, BANDWIDTH_HZ).mT
+    return Product(spectrum, Signal(image, (image_axis(RADAR, doppler), range_)), bands, bool(values))
 
 
 def brightest(image: Signal) -> Tensor:
@@ -105,19 +108,10 @@ def range_cut(image: Signal) -> Tensor:
     return take(image.data, image.data.abs().amax(-1).argmax(-1), -2)
 
 
-def range_response(batch: Batch, made: Product) -> dict[str, Tensor]:
-    """Along range; the focusing filter leaves the phase of the closest range of every line, which turns from line to line."""
-    step = made.image.axis("range").step
-    motion = PointMotion.of(RADAR, made.image.data, **batch.values) if made.moving else PointMotion.of(RADAR, made.image.data)
-    turns = (motion.along_m_s / motion.square_m2_s2.sqrt() * step / RADAR.wavelength_m).expand(made.image.trials)
-    line = torch.arange(made.image.axis("range").n, dtype=torch.float64)
-    return azimuth_response(range_cut(made.image) * unit_phasor(-turns[:, None] * line, torch.complex128), step / 2)
-
-
 def measured(batch: Batch, made: Product) -> Tensor:
     """Numbers named by FIGURES, (trial, figure)."""
     profile, step = brightest(made.image), made.image.axis("azimuth").step
-    own, across = azimuth_response(profile, step), range_response(batch, made)
+    own, across = azimuth_response(profile, step), azimuth_response(range_cut(made.image), made.image.axis("range").step / 2)
     zones = replica_zones(RADAR, made.bands, **batch.values, integration_s=INTEGRATION_S, focused_at=None if made.moving else (0.0, 0.0))
     level = replica_level(profile, step, zones)["mfta_db"]
     width = own["irw_m"] * (1 - batch.values["u_a_m_s"] / RADAR.speed_m_s)
@@ -169,13 +163,13 @@ def spectrum_2d(made: Product, place: int) -> Signal:
     return Signal(data, (doppler, Axis("range frequency", range_.n, -(range_.n // 2) * step, step, "MHz")))
 
 
-def draw_target(made: Product, place: int, title: str, path: Path) -> None:
-    """Spectrum, image and azimuth profile of a target."""
+def draw_target(made: Product, place: int, title: str, path: Path, reach_m: float) -> None:
+    """Spectrum, image to reach_m along azimuth, and azimuth profile of a target."""
     profile, azimuth = brightest(made.image)[place], made.image.axis("azimuth")
     curve = (plot.array(azimuth.values()), plot.decibel(profile))
     parts = [
         {"title": f"{title}: spectrum", "signal": spectrum_2d(made, place), "lines": {}},
-        {"title": "image about the peak", "signal": near(made.image, 60.0, 40.0, place), "lines": {}},
+        {"title": "image about the peak", "signal": finer(near(made.image, reach_m, 30.0, place)), "lines": {}},
         {"series": {"": curve}, "xlabel": "azimuth (m)", "ylabel": "amplitude (dB)", "title": "azimuth profile", "ylim": (-80.0, 2.0)},
     ]
     plot.save(plot.overlays(parts, columns=3, dynamic_range_db=50), path)
@@ -189,8 +183,9 @@ def draw_single(batch: Batch, by_way: Mapping[str, Product], out: Path) -> None:
         for place, figure in enumerate(figures, first):
             u_r, u_a = batch.speeds[names[place]]
             title = f"({u_r:g}, {u_a:g}) m/s, {way}"
-            draw_target(made, place, title, out / f"figure_{figure:02}.png")
-            contours[f"{figure}: {title}"] = finer(near(made.image, 60.0 if figure == 6 else 6.0, 15.0, place))
+            blurred = way == "conventional" and u_a != 0
+            draw_target(made, place, title, out / f"figure_{figure:02}.png", 60.0 if blurred else 15.0)
+            contours[f"{figure}: {title}"] = finer(near(made.image, 60.0 if blurred else 6.0, 15.0, place))
     plot.save(plot.contours(contours), out / "contours.png")
 
 
@@ -212,7 +207,7 @@ def own_image(data: Signal, name: str) -> Signal:
     (u_r, u_a), (y0, beyond) = SPEEDS[name], PLACES[name]
     values, range_m = {"u_r_m_s": u_r, "u_a_m_s": u_a, "y0_m": y0}, RADAR.reference_range_m + beyond
     standing = CorrectMigration(RADAR, Keystone(whole_swath=False), range_m=range_m)(data, **values)
-    image = FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(Reconstruct(RADAR)(standing, **values), **values)
+    image = product(standing, 2, values, range_m).image
     shown = RADAR.speed_m_s * float(PointMotion.of(RADAR, data.data, **values, range_m=range_m).image_s)
     part = image.crop(azimuth=around(image.axis("azimuth"), shown, 20.0), range=around(image.axis("range"), range_m, 40.0))
     return finer(near(part.with_data(part.data[None]), 6.0, 15.0, 0))

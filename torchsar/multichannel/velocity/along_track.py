@@ -82,7 +82,7 @@ def _judged(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: A
     snr = energy_ratio_db(energy, noise)
     value = {"u_a_m_s": motion.u_a_m_s}
     ok = (snr >= DETECTED_DB) & ~ended
-    std = torch.where(bend > _TINY, torch.sqrt(noise / bend.clamp_min(_TINY)), torch.inf)
+    std = torch.where(energy > 0, torch.sqrt(noise / bend.clamp_min(_TINY)), torch.inf)
     return Estimate(value, torch.sigmoid((snr - DETECTED_DB) / 3), ok, {"u_a_m_s": std}, {"snr_db": snr, "at_the_end": ended})
 
 

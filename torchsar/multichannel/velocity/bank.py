@@ -81,6 +81,12 @@ def bank_search(
     return best, energy * level[..., 0, 0].square()
 
 
+def tone_energy(data: Tensor, radar: BistaticRadar, motions: PointMotion, aperture: Aperture, reach_m: float) -> Tensor:
+    """The greatest energy (...,) that any of the motions (..., hypothesis) explains of data (..., channel, pulse), its place along track within reach_m of where the motion has it."""
+    time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
+    return _best_tone(data.to(torch.complex64), radar, motions, aperture, time_s, reach_m, None)[0]
+
+
 def _steps(half: float, step: float, device: torch.device) -> Tensor:
     count = 2 * round(half / step) + 1
     return torch.linspace(-half, half, count, dtype=torch.float64, device=device) if count > 1 else torch.zeros(1, dtype=torch.float64, device=device)

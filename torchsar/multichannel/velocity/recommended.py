@@ -36,7 +36,8 @@ def moving_point_velocity(
     three pulse rates of u_r, whose ambiguity modulo lambda PRF the cubic phase of the range history resolves. u_a_m_s: where it is known, None to estimate it.
     whitening: covariance of the clutter, from neighbouring lines, say; None to take it from what the point leaves of the data themselves: the point is sought in white noise and
     in the covariance of the data, both are refined against what they leave, and the more likely one is taken, per trial.
-    ok: found above the threshold of 19 dB over all samples, inside of the search, and with a predicted deviation of u_r below its half width (one channel cannot). info: snr_db, noise_power, coloured (clutter was found).
+    ok: found above the threshold of 19 dB over all samples, inside of the search, and with a predicted deviation of u_r below its half width (one channel cannot).
+    info: snr_db, noise_power, coloured (clutter was found).
     """
     search = search or Search(u_r_m_s=1.5 * radar.ambiguous_velocity_m_s)
     unknowns = UNKNOWNS if u_a_m_s is None else ("u_r_m_s", "y0_m")

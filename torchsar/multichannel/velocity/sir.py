@@ -12,10 +12,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.core import Estimate, Signal, Stage
+from torchsar.core import Estimate, Signal, Stage, take
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.reconstruct import mind_condition, reconstruct_lines
 from torchsar.multichannel.response import LeastSquares, Rebuild, doppler_offsets
+from torchsar.multichannel.velocity.ambiguity import warned_of_ambiguity
+from torchsar.multichannel.velocity.aperture import Dwell
 from torchsar.optim.scalar import grid_minimum, parabola_minimum
 from torchsar.radar import BistaticRadar
 
@@ -108,6 +110,8 @@ class SignalIntensityRatio(Stage):
     `signal_intensity`.
     """
 
+    works_on = ("channel", "pulse")
+    also_on = (("channel", "pulse", "range"),)
     provides = ("u_r_m_s",)
 
     def __init__(
@@ -132,10 +136,6 @@ class SignalIntensityRatio(Stage):
             raise ValueError(why)
         refuse_full_band(radar, self.rebuild, bandwidth_hz)
 
-    def __call__(self, signal: Signal, *args, **values):
-        self.works_on = ("channel", "pulse", "range") if isinstance(signal, Signal) and signal.names[-1:] == ("range",) else ("channel", "pulse")
-        return super().__call__(signal, *args, **values)
-
     def forward(self, signal: Signal, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
         lines = signal.data if "range" in signal.names else signal.data[..., None]
         middle = sum(self.search_m_s) / 2
@@ -151,7 +151,15 @@ class SignalIntensityRatio(Stage):
         reach = (self.search_m_s[1] - self.search_m_s[0]) / 2
         coarse, costs = grid_minimum(cost, start, reach, 2 * round(reach / self.step_m_s) + 1)
         fine, _ = parabola_minimum(cost, coarse, self.step_m_s / 2, _TOLERANCE_M_S)
-        return self._estimate(fine, coarse, costs, lines, _deviation(intensity, fine))
+        found = self._estimate(fine, coarse, costs, lines, _deviation(intensity, fine))
+        return self._minding_ambiguity(found, lines, u_a_m_s, y0_m)
+
+    def _minding_ambiguity(self, found: Estimate, lines: Tensor, u_a_m_s: Number, y0_m: Number) -> Estimate:
+        """Not ok, with a warning, where the strongest line shows that the velocity lies whole pulse rates off."""
+        motion = self._motion(lines, found["u_r_m_s"], u_a_m_s, y0_m)
+        line = take(lines.movedim(-1, -3), lines.detach().abs().square().sum((-3, -2)).argmax(-1), -3)
+        dwell_s = self.bandwidth_hz * self.radar.wavelength_m * self.radar.reference_range_m / self.radar.speed_m_s**2
+        return warned_of_ambiguity(found, line, self.radar, motion, Dwell(dwell_s))
 
     def _motion(self, lines: Tensor, u_r_m_s: Tensor, u_a_m_s: Number, y0_m: Number) -> PointMotion:
         return PointMotion.of(self.radar, lines, u_r_m_s, u_a_m_s, y0_m, self.range_m)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -9,6 +11,7 @@ from torchsar.core import Estimate, Signal, Stage, take
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.reconstruct import refuse_shifted
 from torchsar.multichannel.velocity.along_track import along_track_velocity, motion_from
+from torchsar.multichannel.velocity.ambiguity import warned_of_ambiguity
 from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.bank import Search
 from torchsar.multichannel.velocity.gradient import gradient_likelihood
@@ -59,10 +62,17 @@ class _Velocity(Stage):
 
 
 class Interferometry(_Velocity):
-    """Along-track interferometry (see `interferometry`), u_a as given."""
+    """Along-track interferometry (see `interferometry`), u_a as given. mind_ambiguity: warn, and say not ok, where the velocity lies whole pulse rates off (some 10 ms a trial)."""
+
+    def __init__(self, radar: BistaticRadar, aperture: Aperture, range_m: float | None = None, mind_ambiguity: bool = True) -> None:
+        super().__init__(radar, aperture, range_m)
+        self.mind_ambiguity = mind_ambiguity
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
-        return interferometry(*self.begin(signal, u_r_m_s, u_a_m_s, y0_m))
+        data, radar, start, aperture = self.begin(signal, u_r_m_s, u_a_m_s, y0_m)
+        found = interferometry(data, radar, start, aperture)
+        there = replace(start, u_r_m_s=found["u_r_m_s"], y0_m=found["y0_m"])
+        return warned_of_ambiguity(found, data, radar, there, aperture) if self.mind_ambiguity else found
 
 
 class AlongTrackAutofocus(_Velocity):
@@ -104,7 +114,8 @@ class GradientVelocity(_Velocity):
 
 
 class MovingPointVelocity(_Velocity):
-    """The recommended estimator (see `moving_point_velocity`). search: what its bank covers; u_a_m_s: the along-track velocity where it is known, None to estimate it."""
+    """The recommended estimator (see `moving_point_velocity`). search: what its bank covers (where that is less than one pulse rate
+    of u_r, velocities that lie beyond are warned of); u_a_m_s: the along-track velocity where it is known, None to estimate it."""
 
     def __init__(self, radar: BistaticRadar, aperture: Aperture, range_m: float | None = None, search: Search | None = None, u_a_m_s: float | None = None) -> None:
         super().__init__(radar, aperture, range_m)
@@ -112,4 +123,8 @@ class MovingPointVelocity(_Velocity):
 
     def forward(self, signal: Signal) -> Estimate:
         data, range_m = self.line(signal)
-        return moving_point_velocity(data, self.radar, self.aperture, self.search, self.u_a_m_s, range_m)
+        found = moving_point_velocity(data, self.radar, self.aperture, self.search, self.u_a_m_s, range_m)
+        if self.search is None or self.search.u_r_m_s >= self.radar.ambiguous_velocity_m_s:
+            return found
+        there = motion_from(self.radar, data, found["u_r_m_s"], found["u_a_m_s"], found["y0_m"], range_m)
+        return warned_of_ambiguity(found, data, self.radar, there, self.aperture)
