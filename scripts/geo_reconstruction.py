@@ -156,6 +156,7 @@ def draw_ratios(data: Mapping[str, Signal], guesses: Tensor, out: Path) -> None:
             print(f"{f'{gate}: {name}':26}{float(guesses[curve.argmax()]):>12.2f}{float(curve.max() - curve[0]):>18.1f}{known:>18.1f}")
         series = {name: (plot.array(guesses), plot.array(curve)) for name, curve in curves.items()}
         parts.append({"series": series, "xlabel": "u_r of the reconstruction (m/s)", "ylabel": "ratio (dB)", "title": gate})
+    print("the brief's figures are those of three bands and nothing beyond; what aliases from further out lowers band-limited peaks by as much as shown")
     plot.save(plot.panels(parts), out / "figure_12.png")
 
 
@@ -174,7 +175,7 @@ def show_conditions() -> None:
             print(f"{f'N = {bands}, {name}':30}" + "".join(f"{float(x) + 0.0:>8.2f}" for x in values))
             print(f"{'  brief 001':30}" + "".join(f"{x:>8g}" for x in expected))
         print(f"{f'N = {bands}, uneven, condition':30}" + "".join(f"{float(x):>8.2f}" for x in conditions(UNEVEN, rates, bands)[0]))
-    print("uneven: channels at -0.8, 0, 0.75 m; brief 001 at 180 Hz: 5.8 with N = 3, 1.39 with N = 2")
+    print("uneven: channels at -0.8, 0, 0.75 m; brief 001 at 180 Hz: 5.8 with N = 3, 1.39 with N = 2; their outer two sample the same places at 300 / 1.55 = 193.5 Hz")
 
 
 def draw_conditions(rates: Tensor, out: Path) -> None:

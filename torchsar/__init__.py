@@ -12,7 +12,7 @@ from __future__ import annotations
 import importlib
 from types import ModuleType
 
-from torchsar import compensate, core, echo, focus, io, metrics, radar, repair, scene
+from torchsar import compensate, core, echo, focus, io, metrics, multichannel, radar, repair, scene
 from torchsar.core import Axis, Chain, Draws, Estimate, Recording, Signal, Stage, Trace, Truth, use
 
 __version__ = "0.1.0"
@@ -41,6 +41,7 @@ __all__ = [
     "focus",
     "io",
     "metrics",
+    "multichannel",
     "radar",
     "repair",
     "scene",

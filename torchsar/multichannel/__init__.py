@@ -1,1 +1,102 @@
-"""Azimuth-multichannel data: reconstruction, focusing, velocity of moving points, and what channels are told by clutter and by a direct path."""
+"""Azimuth-multichannel data: reconstruction and focusing with the velocity of a target, velocities, movers in a scene, calibration of channels and clocks."""
+
+from torchsar.multichannel.azimuth import FocusAzimuth, azimuth_filter, focus_azimuth
+from torchsar.multichannel.balance import CorrectBalance, EstimateBalance, correct_balance, estimate_balance
+from torchsar.multichannel.body import Body, Extraction, body_echo, find_body
+from torchsar.multichannel.compress import CompressChannels
+from torchsar.multichannel.detection import Detection, detect
+from torchsar.multichannel.migration import CorrectMigration, Frame, Keystone, NoMigration, StaticBulk, ambiguity_number, correct_migration
+from torchsar.multichannel.motion import PointMotion
+from torchsar.multichannel.reconstruct import Reconstruct, reconstruct, reconstruct_lines
+from torchsar.multichannel.response import ElementPattern, FlatBand, LeastSquares, MinimumMeanSquare, band_matrix, condition_number, doppler_offsets, noise_gain_db
+from torchsar.multichannel.scene_image import Detector, ImageMovers, SceneImage
+from torchsar.multichannel.stationary import StationaryImage, stationary_image
+from torchsar.multichannel.synchronise import EstimateSynchronisation, RemoveSynchronisation
+from torchsar.multichannel.transmit import AzimuthScaling, RemoveTransmitRange, remove_transmit_range, scale_azimuth
+from torchsar.multichannel.velocity import (
+    AlongTrackAutofocus,
+    Dwell,
+    ElementBeam,
+    GradientVelocity,
+    Interferometry,
+    LikelihoodVelocity,
+    MovingPointVelocity,
+    Search,
+    SignalIntensityRatio,
+    WalkAmbiguity,
+    Whitening,
+    along_track_velocity,
+    explained_energy,
+    gradient_likelihood,
+    interferometry,
+    line_whitening,
+    maximum_likelihood,
+    moving_point_velocity,
+    sample_whitening,
+)
+
+__all__ = [
+    "AlongTrackAutofocus",
+    "AzimuthScaling",
+    "Body",
+    "CompressChannels",
+    "CorrectBalance",
+    "CorrectMigration",
+    "Detection",
+    "Detector",
+    "Dwell",
+    "ElementBeam",
+    "ElementPattern",
+    "EstimateBalance",
+    "EstimateSynchronisation",
+    "Extraction",
+    "FlatBand",
+    "FocusAzimuth",
+    "Frame",
+    "GradientVelocity",
+    "ImageMovers",
+    "Interferometry",
+    "Keystone",
+    "LeastSquares",
+    "LikelihoodVelocity",
+    "MinimumMeanSquare",
+    "MovingPointVelocity",
+    "NoMigration",
+    "PointMotion",
+    "Reconstruct",
+    "RemoveSynchronisation",
+    "RemoveTransmitRange",
+    "SceneImage",
+    "Search",
+    "SignalIntensityRatio",
+    "StaticBulk",
+    "StationaryImage",
+    "WalkAmbiguity",
+    "Whitening",
+    "along_track_velocity",
+    "ambiguity_number",
+    "azimuth_filter",
+    "band_matrix",
+    "body_echo",
+    "condition_number",
+    "correct_balance",
+    "correct_migration",
+    "detect",
+    "doppler_offsets",
+    "estimate_balance",
+    "explained_energy",
+    "find_body",
+    "focus_azimuth",
+    "gradient_likelihood",
+    "interferometry",
+    "line_whitening",
+    "maximum_likelihood",
+    "moving_point_velocity",
+    "noise_gain_db",
+    "reconstruct",
+    "reconstruct_lines",
+    "remove_transmit_range",
+    "sample_whitening",
+    "scale_azimuth",
+    "stationary_image",
+]

@@ -42,31 +42,37 @@ def focus_azimuth(spectrum: Tensor, offset_hz: Tensor, radar: BistaticRadar, mot
 
 
 class FocusAzimuth(Stage):
-    """Spectra (doppler[, range]) of `Reconstruct` to an image (azimuth[, range]) of points with the velocities given, x = V_R t (m) in the frame of the scene.
+    """Spectra (doppler[, range]) of `Reconstruct` to the image (azimuth[, range]) of one target per trial with the velocities given, x = V_R t (m) in the frame of the scene.
 
-    Along the track that the target itself sees, x = (speed - u_a) t, everything is (speed - u_a) / speed as wide. range_m: closest range of the points, None for the
-    radar's reference range; on a range axis every line has its own. bandwidth_hz: processed Doppler bandwidth about the centre, None for all.
+    Along the track that the target itself sees, x = (speed - u_a) t, everything is (speed - u_a) / speed as wide. All lines are focused for one range, that of forward (...,), else
+    that of the strongest line, or the radar's reference range where there is no range axis: to focus each for its own would bend the range side lobes of the target. (A whole scene at
+    rest: `StationaryImage`.) bandwidth_hz: processed Doppler bandwidth about the centre, None for all.
     """
 
     works_on = ("doppler",)
     also_on = (("doppler", "range"),)
 
-    def __init__(self, radar: BistaticRadar, range_m: float | None = None, bandwidth_hz: float | None = None) -> None:
+    def __init__(self, radar: BistaticRadar, bandwidth_hz: float | None = None) -> None:
         super().__init__()
-        self.radar, self.range_m, self.bandwidth_hz = radar, range_m, bandwidth_hz
+        self.radar, self.bandwidth_hz = radar, bandwidth_hz
         if bandwidth_hz is not None and not bandwidth_hz > 0:
             raise ValueError(f"bandwidth_hz must be positive, or None for all that is rebuilt, got {bandwidth_hz}")
 
-    def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Signal:
-        doppler = signal.axis("doppler")
-        offset = doppler.values(signal.data.device)
-        axes = (image_axis(self.radar, doppler), *signal.axes[1:])
+    def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0, range_m: Number | None = None) -> Signal:
+        lines, doppler = "range" in signal.names, signal.axis("doppler")
+        near = self._range(signal) if range_m is None else range_m
+        u_r, u_a, y0, near = (per_trial(value, int(lines), signal.data) for value in (u_r_m_s, u_a_m_s, y0_m, near))
+        motion = PointMotion.of(self.radar, signal.data, u_r, u_a, y0, near)
+        data = signal.data.mT if lines else signal.data
+        image = focus_azimuth(data, doppler.values(data.device), self.radar, motion, self.bandwidth_hz)
+        return Signal(image.mT if lines else image, (image_axis(self.radar, doppler), *signal.axes[1:]))
+
+    def _range(self, signal: Signal) -> Number:
+        """Of the strongest line, or of the scene."""
         if "range" not in signal.names:
-            motion = PointMotion.of(self.radar, signal.data, u_r_m_s, u_a_m_s, y0_m, self.range_m)
-            return Signal(focus_azimuth(signal.data, offset, self.radar, motion, self.bandwidth_hz), axes)
-        u_r, u_a, y0 = (per_trial(value, 1, signal.data) for value in (u_r_m_s, u_a_m_s, y0_m))
-        motion = PointMotion.of(self.radar, signal.data, u_r, u_a, y0, signal.axis("range").values(signal.data.device))
-        return Signal(focus_azimuth(signal.data.mT, offset, self.radar, motion, self.bandwidth_hz).mT, axes)
+            return self.radar.reference_range_m
+        across = signal.axis("range")
+        return across.start + across.step * signal.data.detach().abs().square().sum(-2).argmax(-1).to(torch.float64)
 
 
 def image_axis(radar: BistaticRadar, doppler: Axis) -> Axis:

@@ -291,15 +291,27 @@ def _along_speed(chip: Chip, extraction: Extraction, half_m_s: float) -> Tensor:
 
 def _centred(chip: Chip, image_s: float, image_m: float) -> tuple[float, float, PointMotion]:
     """Where the middle of the bright pixels appears, and its motion."""
+    motion = centred_motion(chip)
+    return (image_s, image_m, chip.motion) if motion is chip.motion else (float(motion.image_s), float(motion.closest_m), motion)
+
+
+def centred_motion(chip: Chip) -> PointMotion:
+    """The motion of a chip with the place and range of the middle, by intensity, of the bright pixels of its picture; the very motion where nothing is bright."""
     picture = chip.picture()
     weight = picture.level * picture.bright
     total = weight.sum()
     if not float(total) > 0:
-        return image_s, image_m, chip.motion
+        return chip.motion
     place = (weight.sum(0) * chip.place_m(chip.motion, picture.tone_hz)).sum() / total
     near = (weight.sum(1) * chip.range_m).sum() / total
-    motion = replace(chip.motion, y0_m=place, range_m=near)
-    return float(motion.image_s), float(motion.closest_m), motion
+    return replace(chip.motion, y0_m=place, range_m=near)
+
+
+def known_body(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extraction) -> Body:
+    """The body of a known motion: its velocity is kept, its middle is put where its picture has it. Data and errors as in `chip_about`."""
+    chip = chip_about(data, frame, motion, extraction)
+    chip = chip_about(data, frame, centred_motion(chip), extraction)
+    return _judged(chip, torch.zeros_like(motion.u_r_m_s), math.inf)
 
 
 def body_echo(body: Body, frame: Frame, everything: bool = False) -> Tensor:

@@ -78,7 +78,7 @@ class PointMotion:
 
 def _refuse_overtaking(motion: PointMotion) -> None:
     try:
-        slowest, nearest = float(motion.along_m_s.min()), float(motion.range_m.min())
+        slowest, nearest = float(motion.along_m_s.detach().min()), float(motion.range_m.detach().min())
         wild = [name for name in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m") if not bool(torch.isfinite(getattr(motion, name)).all())]
     except RuntimeError:  # inside vmap a value cannot be looked at
         return

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Estimate, Signal, Stage, fft_lines, linear_phasor
-from torchsar.multichannel.body import Body, Extraction, body_echo, body_image, find_body
+from torchsar.multichannel.body import Body, Extraction, body_echo, body_image, find_body, known_body
 from torchsar.multichannel.detection import Detection, detect
 from torchsar.multichannel.migration import Frame
 from torchsar.multichannel.motion import PointMotion
@@ -85,13 +85,17 @@ class ImageMovers(Stage):
         self.image, self.removal = StationaryImage(radar, rebuild or LeastSquares()), removal
         self.slowest_m_s, self.u_a_half_m_s = slowest_m_s, u_a_half_m_s
 
-    def forward(self, signal: Signal) -> SceneImage:
+    def forward(self, signal: Signal, known: Sequence[PointMotion] | None = None) -> SceneImage:
+        """known: motions of all targets, strongest first, by their middles; nothing is looked for then. None to find targets."""
         if signal.trials:
             raise ValueError(f"ImageMovers works on one frame at a time, got trials {tuple(signal.trials)}; call it for each")
         conventional = self.image(signal)
         left, bodies = signal, []
-        for image in self._looks(signal):
-            left, bodies = self._taken_out(left, image, bodies)
+        if known is not None:
+            left, bodies = self._told(left, known)
+        else:
+            for image in self._looks(signal):
+                left, bodies = self._taken_out(left, image, bodies)
         rest = self.image(left)
         fused = rest
         for body in bodies:
@@ -122,6 +126,19 @@ class ImageMovers(Stage):
             if self._moves(body):
                 left = self._without(left, body)
                 waiting = self.detector.found(look(left))
+        return left, bodies
+
+    def _told(self, left: Signal, known: Sequence[PointMotion]) -> tuple[Signal, list[Body]]:
+        """Bodies of known motions, and the data without those that move."""
+        if len(known) > self.detector.most:
+            raise ValueError(f"{len(known)} motions are known, and the detector takes at most {self.detector.most} targets; raise its `most`")
+        bodies = []
+        for motion in known:
+            lines, frame = self._lines(left, float(motion.range_m))
+            body = known_body(left.data[..., lines], frame, motion, self.extraction)
+            bodies.append(body)
+            if self._moves(body):
+                left = self._without(left, body)
         return left, bodies
 
     def _whole(self, detection: Detection, signal: Signal) -> bool:

@@ -254,8 +254,7 @@ FOCUS: dict[str, Callable[..., Any]] = {
     "chirplet_clean": ChirpletClean,
     "compress_channels": CompressChannels,
     "rebuild_bands": channels.rebuild_bands,
-    "focus_lines": FocusAzimuth,
-    "focus_target": channels.FocusTarget,
+    "focus_target": FocusAzimuth,
 }
 GROUPS = {"repair": REPAIR, "compensate": COMPENSATE, "focus": FOCUS}
 

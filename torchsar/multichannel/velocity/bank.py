@@ -74,7 +74,9 @@ def bank_search(
             there = PointMotion.of(radar, data, u_r, u_a, 0.0, None if range_m is None else per_trial(range_m, 1, data))
             if image_s is not None:
                 there = replace(there, y0_m=there.place_m(per_trial(image_s, 1, data)))
-            found, place, along = _best_tone(taken, radar, there, aperture, time_s, search.y0_m, whitening)
+            # what all trials search alike needs the pulses of its aperture alone
+            lit = _lit(aperture.weight(radar, there, time_s)) if there.y0_m.ndim <= 1 and whitening is None else slice(None)
+            found, place, along = _best_tone(taken[..., lit], radar, there, aperture, time_s[lit], search.y0_m, whitening)
             better = found > energy
             energy = torch.where(better, found, energy)
             best = chosen(replace(best, u_r_m_s=u_r.expand(found.shape), u_a_m_s=along, y0_m=place), best, better)
@@ -114,6 +116,12 @@ def _best_tone(taken: Tensor, radar: BistaticRadar, motion: PointMotion, apertur
     wide = torch.broadcast_to(motion.y0_m[..., None] + shift, (*aligned.shape[:-1], length)).flatten(-2)
     along = torch.broadcast_to(motion.u_a_m_s[..., None], aligned.shape).flatten(-2)
     return power.gather(-1, at)[..., 0], wide.expand(power.shape).gather(-1, at)[..., 0], along.expand(power.shape).gather(-1, at)[..., 0]
+
+
+def _lit(weight: Tensor) -> slice:
+    """From the first to the last pulse (..., pulse) at which any hypothesis shines."""
+    shines = (weight != 0).flatten(0, -2).any(0).nonzero()[:, 0]
+    return slice(int(shines[0]), int(shines[-1]) + 1) if len(shines) else slice(None)
 
 
 def _decimated(tones: Tensor, prf_hz: float, highest_hz: float) -> tuple[Tensor, float]:

@@ -17,7 +17,6 @@ from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.reconstruct import Reconstruct
 from torchsar.multichannel.response import condition_number, noise_gain_db
 from torchsar.radar import BistaticRadar
-from torchsar.study.geo.stages import FocusTarget
 from torchsar.study.tracing import verdict
 
 DEFINITIONS: dict[str, Any] = {
@@ -77,14 +76,14 @@ class Focused:
 
     stage: str
     rebuild: Reconstruct
-    focus: FocusAzimuth | FocusTarget
+    focus: FocusAzimuth
     rebuilt_for: PointMotion
     focused_for: PointMotion
 
     @staticmethod
     def of(chain: Chain, trace: Trace, radar: BistaticRadar) -> Focused | None:
         """None where a chain has no reconstruction and focusing."""
-        rebuild, focus = ([name for name, stage in chain.stages.items() if isinstance(stage, kind)] for kind in (Reconstruct, (FocusAzimuth, FocusTarget)))
+        rebuild, focus = ([name for name, stage in chain.stages.items() if isinstance(stage, kind)] for kind in (Reconstruct, FocusAzimuth))
         if not rebuild or not focus:
             return None
         stages: Any = chain.stages

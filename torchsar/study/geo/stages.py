@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
-import torch
-
-from torchsar.core import Alternate, Estimate, Signal, Stage, Turn, per_trial
-from torchsar.multichannel.azimuth import FocusAzimuth, focus_azimuth, image_axis
+from torchsar.core import Alternate, Estimate, Signal, Stage, Turn
 from torchsar.multichannel.balance import EstimateBalance
 from torchsar.multichannel.migration import CorrectMigration, Keystone, NoMigration, StaticBulk
-from torchsar.multichannel.motion import Number, PointMotion
+from torchsar.multichannel.motion import Number
 from torchsar.multichannel.reconstruct import Reconstruct
 from torchsar.multichannel.response import ElementPattern, FlatBand, LeastSquares, MinimumMeanSquare, Prior
 from torchsar.multichannel.velocity.aperture import Aperture, Dwell, ElementBeam
@@ -28,7 +25,8 @@ def _aperture(dwell_s: float | None) -> Aperture:
     return ElementBeam() if dwell_s is None else Dwell(dwell_s)
 
 
-def _prior(band_hz: float | None) -> Prior:
+def prior_of(band_hz: float | None) -> Prior:
+    """Power in a flat band, or by the pattern of the elements (None)."""
     return ElementPattern() if band_hz is None else FlatBand(band_hz)
 
 
@@ -73,44 +71,17 @@ class Stilled(Stage):
         return replace(found, ok=found.ok & walk.ok, quality=found.quality.minimum(walk.quality), info={**found.info, "ambiguity": walk["ambiguity"]})
 
 
-class FocusTarget(Stage):
-    """Spectra (doppler[, range]) of `rebuild_bands` to the image (azimuth[, range]) of one target per trial, x = V_R t (m): every line is focused for the range of the target.
-
-    Focusing each line for its own range, as `focus_lines` does for whole scenes, bends the range side lobes of a target. bandwidth_hz: processed Doppler band about the centre, null for
-    all. range_m: of forward, (...,), else that of the strongest line, or the radar's reference range where there is none.
-    """
-
-    works_on = ("doppler",)
-    also_on = (("doppler", "range"),)
-
-    def __init__(self, radar: BistaticRadar, bandwidth_hz: float | None = None) -> None:
-        super().__init__()
-        self.radar, self.bandwidth_hz = radar, FocusAzimuth(radar, None, bandwidth_hz).bandwidth_hz
-
-    def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0, range_m: Number | None = None) -> Signal:
-        lines, doppler = "range" in signal.names, signal.axis("doppler")
-        if lines and range_m is None:
-            across = signal.axis("range")
-            range_m = across.start + across.step * signal.data.abs().square().sum(-2).argmax(-1).to(torch.float64)
-        trailing = 1 if lines else 0
-        u_r, u_a, y0, near = (per_trial(value, trailing, signal.data) for value in (u_r_m_s, u_a_m_s, y0_m, self.radar.reference_range_m if range_m is None else range_m))
-        motion = PointMotion.of(self.radar, signal.data, u_r, u_a, y0, near)
-        data = signal.data.mT if lines else signal.data
-        image = focus_azimuth(data, doppler.values(data.device), self.radar, motion, self.bandwidth_hz)
-        return Signal(image.mT if lines else image, (image_axis(self.radar, doppler), *signal.axes[1:]))
-
-
 def rebuild_bands(
     radar: BistaticRadar, bands: int = 2, method: Literal["least_squares", "mmse"] = "least_squares", band_hz: float | None = None, snr_db: float = 40.0, range_m: float | None = None
 ) -> Reconstruct:
     """Channels to the full Doppler band of the velocities given; mmse expects power in a flat band of band_hz, or by the pattern of the elements (null)."""
-    rebuild = LeastSquares(bands) if method == "least_squares" else MinimumMeanSquare(bands, snr_db, _prior(band_hz))
+    rebuild = LeastSquares(bands) if method == "least_squares" else MinimumMeanSquare(bands, snr_db, prior_of(band_hz))
     return Reconstruct(radar, rebuild, range_m)
 
 
 def channel_balance(radar: BistaticRadar, band_hz: float | None = None, bands: int = 5, delays: bool = True) -> EstimateBalance:
     """Phase, gain and delay of channels from clutter at rest in a flat band of band_hz, or seen through the pattern of the elements (null)."""
-    return EstimateBalance(radar, _prior(band_hz), bands, delays)
+    return EstimateBalance(radar, prior_of(band_hz), bands, delays)
 
 
 def interferometry(radar: BistaticRadar, dwell_s: float | None = None, range_m: float | None = None) -> Interferometry:

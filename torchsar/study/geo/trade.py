@@ -29,7 +29,6 @@ from torchsar.study.errors import ConfigError
 from torchsar.study.geo.build import TOLD, Echoes, Recorded, check
 from torchsar.study.geo.judge import Focused, Profiles, response_metrics
 from torchsar.study.geo.sections import GeoConfig, Trade
-from torchsar.study.geo.stages import FocusTarget
 from torchsar.study.methods import build_chains
 from torchsar.study.trading import Tables, table_text, timed, written
 
@@ -101,7 +100,7 @@ class _Target:
         echoes = Echoes.of(loaded)
         first = dict(list(echoes.targets.items())[:1])
         stages = build_chains(loaded, radar=echoes.radar)["recommended"].stages.values()
-        band = next((stage.bandwidth_hz for stage in stages if isinstance(stage, (FocusAzimuth, FocusTarget))), None)
+        band = next((stage.bandwidth_hz for stage in stages if isinstance(stage, FocusAzimuth)), None)
         alone = replace(echoes, targets=first, sea=None, damages={}, snr_db=None, samples=None, kind="compressed")
         return _Target(alone, config.trade, config.metrics.orders, band, Draws(config.seed, "trade", range(config.trade.trials)))
 
@@ -116,7 +115,7 @@ class _Target:
         if migration is not None:
             stages["correct"] = use(CorrectMigration(radar, migration), **(_TOLD_AS if followed else {}))
         stages["rebuild"] = use(Reconstruct(radar, rebuild), **_TOLD_AS)
-        stages["focus"] = use(FocusTarget(radar, self.bandwidth_hz), **_TOLD_AS, range_m=f"aux.{TOLD}range_m")
+        stages["focus"] = use(FocusAzimuth(radar, self.bandwidth_hz), **_TOLD_AS, range_m=f"aux.{TOLD}range_m")
         return Chain(**stages)
 
     def histories(self) -> Iterator[Row]:

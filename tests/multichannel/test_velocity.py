@@ -1,0 +1,292 @@
+"""Estimators of a moving point's velocity against their bounds, each other, ambiguities and clutter."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from tests.multichannel.helpers import azimuth_echo, compressed_echo, published_radar
+from torchsar.core import Axis, Draws, Signal
+from torchsar.echo import sea_echo
+from torchsar.metrics.bistatic_bounds import bistatic_bounds
+from torchsar.multichannel.motion import PointMotion
+from torchsar.multichannel.velocity.aperture import Dwell, ElementBeam
+from torchsar.multichannel.velocity.bank import Search, bank_search
+from torchsar.multichannel.velocity.gradient import explained_energy
+from torchsar.multichannel.velocity.likelihood import PointLikelihood, maximum_likelihood
+from torchsar.multichannel.velocity.model import UNKNOWNS, moved, phase_slopes, point_phasor
+from torchsar.multichannel.velocity.recommended import moving_point_velocity
+from torchsar.multichannel.velocity.stages import AlongTrackAutofocus, GradientVelocity, Interferometry, LikelihoodVelocity, MovingPointVelocity
+from torchsar.multichannel.velocity.walk import WalkAmbiguity
+from torchsar.multichannel.velocity.whitening import line_whitening
+from torchsar.scene import KSea, Pattern
+
+F64, C128 = torch.float64, torch.complex128
+RADAR, N, GATE = published_radar(), 900, Dwell(4.5)
+NEAR = Search(u_r_m_s=12.0, u_a_m_s=6.0, y0_m=100.0, u_a_step_m_s=1.0)
+ESTIMATORS = {"interferometry": Interferometry, "along_track": AlongTrackAutofocus, "likelihood": LikelihoodVelocity, "gradient": GradientVelocity, "recommended": MovingPointVelocity}
+
+
+def noise(trials, seed, n=N, channels=3):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.view_as_complex(torch.randn(trials, channels, n, 2, dtype=F64, generator=generator)) * math.sqrt(0.5)
+
+
+def noisy(snr_db, trials, seed=1, radar=RADAR, **move):
+    clean = azimuth_echo(radar, N, **move)
+    return Signal(10 ** (snr_db / 20) * clean + noise(trials, seed, channels=radar.channels), radar.axes(N))
+
+
+def rms(x):
+    return float(x.square().mean().sqrt())
+
+
+def bound(snr_db, unknown=UNKNOWNS, **move):
+    values = {"u_r_m_s": move.get("u_r", 0.0), "u_a_m_s": move.get("u_a", 0.0), "y0_m": move.get("y0", 0.0)}
+    return {name: float(x) for name, x in bistatic_bounds(RADAR, N, 10 ** (snr_db / 10), **values, integration_s=4.5, unknown=unknown).items()}
+
+
+def test_model_is_the_echo_and_its_slopes():
+    move = (10.0, 5.0, 30.0)
+    motion, time_s = PointMotion.of(RADAR, torch.zeros(1), *move), RADAR.pulse_axis(N).values()
+    echo = azimuth_echo(RADAR, N, *move)
+    weight = GATE.weight(RADAR, motion, time_s)
+    torch.testing.assert_close(weight * point_phasor(RADAR, motion, time_s, C128), echo, atol=1e-8, rtol=0)
+    slopes = phase_slopes(RADAR, motion, time_s)
+    for i in range(3):
+        step = torch.zeros(3, dtype=F64)
+        step[i] = 1e-4
+        ends = [point_phasor(RADAR, moved(motion, s, UNKNOWNS), time_s, C128) for s in (step, -step)]
+        torch.testing.assert_close(torch.angle(ends[0] * ends[1].conj()) / 2e-4, slopes[i], atol=1e-4, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("snr_db", "worst", "move"), [(0.0, 1.3, {"u_r": 10.0}), (7.0, 1.3, {"u_r": -7.0, "u_a": 3.0, "y0": 40.0}), (-10.0, 1.6, {"u_r": 4.0})])
+def test_recommended_reaches_the_bound(snr_db, worst, move):
+    """And never beats it by more than chance: the edges of the gate must tell nothing."""
+    signal = noisy(snr_db, 40, **move)
+    estimate = MovingPointVelocity(RADAR, GATE, search=NEAR)(signal)
+    least = bound(snr_db, **move)
+    assert bool(estimate.ok.all())
+    for name, key in (("u_r_m_s", "u_r"), ("u_a_m_s", "u_a"), ("y0_m", "y0")):
+        assert 0.7 < rms(estimate.value[name] - move.get(key, 0.0)) / least[name] < worst, name
+        assert float(estimate.std[name].median()) == pytest.approx(least[name], rel=0.3)
+
+
+def test_with_the_along_track_speed_told():
+    estimate = MovingPointVelocity(RADAR, GATE, search=NEAR, u_a_m_s=5.0)(noisy(0.0, 40, u_r=10.0, u_a=5.0))
+    assert set(estimate.std) == {"u_r_m_s", "y0_m"} and bool((estimate.value["u_a_m_s"] == 5).all())
+    assert 0.7 < rms(estimate.value["u_r_m_s"] - 10) / bound(0.0, ("u_r_m_s", "y0_m"), u_r=10.0, u_a=5.0)["u_r_m_s"] < 1.3
+
+
+@pytest.mark.parametrize("snr_db", [-10.0, 0.0, 17.0])
+def test_interferometry_within_twice_the_bound(snr_db):
+    estimate = Interferometry(RADAR, GATE)(noisy(snr_db, 200, u_r=10.0))
+    ratio = rms(estimate.value["u_r_m_s"] - 10) / bound(snr_db, ("u_r_m_s", "y0_m"), u_r=10.0)["u_r_m_s"]
+    assert 0.7 < ratio < 2.2 and bool(estimate.ok.all())
+
+
+@pytest.mark.parametrize("channels", [(-0.8, 0.0, 0.75), (-0.4, 0.4), (0.8, -0.8, 0.0)])
+def test_interferometry_with_channels_anywhere(channels):
+    radar = published_radar(channel_m=channels)
+    estimate = Interferometry(radar, GATE)(noisy(10.0, 20, radar=radar, u_r=10.0, u_a=5.0), u_a_m_s=5.0)
+    assert rms(estimate.value["u_r_m_s"] - 10) < 0.12 and rms(estimate.value["y0_m"]) < 2.5
+
+
+def test_interferometry_and_the_ends_of_its_interval():
+    """u_r comes within half of lambda PRF, 43.2 m/s, about the start: 25 is seen as -18.2 (brief 001)."""
+    for u_r, seen in ((21.0, 21.0), (-21.0, -21.0), (25.0, 25 - 43.2)):
+        estimate = Interferometry(RADAR, GATE)(noisy(17.0, 4, u_r=u_r))
+        assert bool(((estimate.value["u_r_m_s"] - seen).abs() < 1.5).all()) and bool(torch.isfinite(estimate.std["u_r_m_s"]).all())
+    near = Interferometry(RADAR, GATE)(noisy(17.0, 4, u_r=25.0), u_r_m_s=15.0)
+    assert rms(near.value["u_r_m_s"] - 25) < 0.1
+
+
+def test_along_track_speed():
+    signal = noisy(0.0, 60, u_r=10.0, u_a=12.0, y0=20.0)  # three bands could not be told apart at 12 m/s
+    estimate = AlongTrackAutofocus(RADAR, GATE)(signal, u_r_m_s=10.0, y0_m=20.0)
+    least = bound(0.0, ("u_a_m_s", "u_r_m_s"), u_r=10.0, u_a=12.0, y0=20.0)["u_a_m_s"]
+    assert 0.7 < rms(estimate.value["u_a_m_s"] - 12) / least < 2.2
+    assert rms(estimate.value["u_a_m_s"] - 12) == pytest.approx(float(estimate.std["u_a_m_s"].mean()), rel=0.35)
+    assert bool(estimate.ok.all())
+    outside = AlongTrackAutofocus(RADAR, GATE, half_m_s=8.0)(signal, u_r_m_s=10.0, y0_m=20.0)
+    assert not bool(outside.ok.any()) and bool((outside.value["u_a_m_s"].abs() <= 8).all())
+
+
+@pytest.mark.parametrize("aperture", [GATE, ElementBeam()], ids=["gate", "beam"])
+def test_gauss_newton_and_gradients_agree(aperture):
+    signal = noisy(10.0, 3, u_r=10.0, u_a=5.0, y0=30.0)
+    start = {"u_r_m_s": 10.01, "u_a_m_s": 5.05, "y0_m": 30.1}
+    newton = LikelihoodVelocity(RADAR, aperture)(signal, **start)
+    descent = GradientVelocity(RADAR, aperture)(signal, **start)
+    for name in UNKNOWNS:
+        torch.testing.assert_close(newton.value[name], descent.value[name], atol=0.03 * float(newton.std[name].max()), rtol=0)
+    # both stand where the likelihood is flat
+    motion = PointMotion.of(RADAR, signal.data, *(newton.value[name] for name in UNKNOWNS)).each(lambda x: x.requires_grad_())
+    time_s = RADAR.pulse_axis(N).values()
+    weight = aperture.weight(RADAR, PointMotion.of(RADAR, signal.data, *start.values()), time_s)
+    slopes = torch.autograd.grad(explained_energy(signal.data, RADAR, motion, weight).sum(), (motion.u_r_m_s, motion.u_a_m_s, motion.y0_m))
+    for name, slope in zip(UNKNOWNS, slopes, strict=True):
+        assert float((slope * newton.std[name]).abs().max()) < 0.05 * float(explained_energy(signal.data, RADAR, motion, weight).detach().min()) ** 0.5
+
+
+def test_gradient_of_the_likelihood_by_hand():
+    data = noisy(10.0, 2, u_r=10.0).data
+    start = PointMotion.of(RADAR, data, 10.01, 0.02, 0.3).each(lambda x: x.expand(2).clone().requires_grad_())
+    weight = GATE.weight(RADAR, start, RADAR.pulse_axis(N).values())
+    slopes = torch.autograd.grad(explained_energy(data, RADAR, start, weight).sum(), (start.u_r_m_s, start.u_a_m_s, start.y0_m))
+    fit = PointLikelihood.of(data, RADAR, start, GATE, UNKNOWNS, None).fit(start)
+    torch.testing.assert_close(2 * fit.gradient.detach(), torch.stack(slopes, -1), rtol=1e-7, atol=1e-6)
+
+
+@pytest.mark.parametrize(("u_r", "u_a"), [(25.0, 0.0), (-35.0, -4.0)])
+def test_the_bank_resolves_pulse_rates(u_r, u_a):
+    """By the cubic phase of the range history alone."""
+    estimate = MovingPointVelocity(RADAR, GATE, search=Search(u_r_m_s=42.0, u_a_m_s=6.0, y0_m=60.0, u_a_step_m_s=1.0))(noisy(0.0, 2, u_r=u_r, u_a=u_a))
+    assert bool(estimate.ok.all()) and rms(estimate.value["u_r_m_s"] - u_r) < 1.0 and rms(estimate.value["u_a_m_s"] - u_a) < 0.15
+
+
+@pytest.mark.parametrize(("u_r", "number"), [(25.0, 1), (-35.0, -1), (3.0, 0)])
+def test_range_walk_resolves_pulse_rates(u_r, number):
+    signal = compressed_echo(RADAR, 810, 64, [{"u_r": u_r}])
+    trials = torch.stack([signal.data + 0.5 * noise(1, seed, 810)[0, ..., None] * torch.randn(64, dtype=C128, generator=torch.Generator().manual_seed(seed)) for seed in (1, 2)])
+    estimate = WalkAmbiguity(RADAR)(signal.with_data(trials.to(torch.complex64)))
+    assert estimate.value["ambiguity"].tolist() == [number, number] and bool(estimate.ok.all())
+
+
+def test_a_place_known_from_an_image():
+    """`bank_search` about the slow time at which the point appears in an image."""
+    move = {"u_r": 10.0, "u_a": 5.0, "y0": 300.0}
+    data = noisy(0.0, 3, **move).data
+    appears = PointMotion.of(RADAR, data, 10.0, 5.0, 300.0).image_s
+    start, energy = bank_search(data, RADAR, GATE, Search(u_r_m_s=15.0, u_a_m_s=8.0, y0_m=30.0, u_a_step_m_s=1.0), image_s=appears)
+    assert rms(start.u_r_m_s - 10) <= 2.0 and rms(start.u_a_m_s - 5) <= 1.0 and bool((energy > 500).all())
+    found = maximum_likelihood(data, RADAR, start, GATE)
+    assert rms(found.motion.y0_m - 300) < 15
+
+
+class TestClutter:
+    """K-distributed sea at rest, 30 dB above noise of unit power, seen through the pattern of the elements, a point at u_r = 10 m/s."""
+
+    RADAR = published_radar()
+
+    def data(self, scr_db, trials=2, lines=1, seed=3, n=N, u_r=10.0):
+        t = self.RADAR.pulse_axis(n).values()
+        motion = PointMotion.of(self.RADAR, torch.zeros(1), u_r)
+        point = ElementBeam().weight(self.RADAR, motion, t) * point_phasor(self.RADAR, motion, t, C128)
+        sea = torch.stack([sea_echo(KSea(power_db=30.0), self.RADAR, n, None, Pattern(), Draws(seed + 100 * line, trials=range(trials)), C128) for line in range(lines)], 1)
+        sea = sea + noise(trials * lines, seed, n).view(trials, lines, 3, n)
+        return sea[:, 0] + 10 ** ((30 + scr_db) / 20) * point, sea[:, 1:]
+
+    def test_covariance_from_the_data_themselves(self):
+        data, _ = self.data(0.0)
+        estimate = moving_point_velocity(data, self.RADAR, ElementBeam(), NEAR)
+        assert bool(estimate.info["coloured"].all() and estimate.ok.all())
+        assert rms(estimate.value["u_r_m_s"] - 10) < 0.3
+
+    def test_covariance_from_neighbouring_lines(self):
+        data, around = self.data(-10.0, lines=5)
+        estimate = moving_point_velocity(data, self.RADAR, ElementBeam(), NEAR, whitening=line_whitening(around, self.RADAR))
+        assert bool(estimate.ok.all()) and rms(estimate.value["u_r_m_s"] - 10) < 0.3
+
+    def test_white_noise_stays_white(self):
+        estimate = MovingPointVelocity(RADAR, GATE, search=NEAR)(noisy(10.0, 6, u_r=5.0))
+        assert not bool(estimate.info["coloured"].any())
+
+
+def test_below_the_threshold_nothing_is_found():
+    """19 dB over all samples, -15 dB per sample (brief 001)."""
+    for snr_db, found in ((-300.0, False), (-20.0, False), (-8.0, True)):
+        signal = noisy(snr_db, 6, u_r=5.0)
+        assert bool(torch.equal(MovingPointVelocity(RADAR, GATE, search=NEAR)(signal).ok, torch.full((6,), found)))
+        assert bool(torch.equal(Interferometry(RADAR, GATE)(signal).ok, torch.full((6,), found)))
+
+
+@pytest.mark.parametrize("aperture", [GATE, ElementBeam()], ids=["gate", "beam"])
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_silence_and_points_outside_the_record(name, aperture):
+    stage = _small(name, RADAR, aperture)
+    start = {} if name == "recommended" else {"y0_m": 2500.0}
+    for data in (torch.zeros(2, 3, 200, dtype=C128), azimuth_echo(RADAR, 200, y0=2500.0).expand(2, 3, 200)):
+        for values in ({}, start):
+            estimate = stage(Signal(data, RADAR.axes(200)), **values)
+            assert not bool(estimate.ok.any())
+            assert all(bool(torch.isfinite(x).all()) for x in (*estimate.value.values(), estimate.quality, estimate.info["snr_db"]))
+            assert all(bool((x > 1e3).all()) for x in estimate.std.values())
+    rest = stage(Signal(torch.zeros(3, 200, dtype=C128), RADAR.axes(200)))
+    assert all(float(x) == 0 for x in rest.value.values())
+
+
+def _small(name, radar=RADAR, aperture=GATE, **settings):
+    extra = {"search": Search(u_r_m_s=6.0, u_a_m_s=2.0, y0_m=60.0, u_a_step_m_s=1.0)} if name == "recommended" else {}
+    return ESTIMATORS[name](radar, aperture, **extra, **settings)
+
+
+@pytest.mark.parametrize("dtype", [torch.complex64, C128])
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_trials_do_not_know_of_each_other(name, dtype):
+    """Loud, quiet, silent and noisy trials, and one in clutter, together and alone."""
+    quiet = noisy(10.0, 2, u_r=3.0).data[..., N // 2 - 256 : N // 2 + 256]
+    slow = torch.exp(2j * math.pi * 0.01 * torch.arange(512, dtype=F64))
+    data = torch.stack([1e3 * quiet[0], 1e-6 * quiet[1], torch.zeros_like(quiet[0]), noise(1, 4, 512)[0], quiet[0] + 30 * slow]).to(dtype)
+    signal, start = Signal(data, RADAR.axes(512)), {} if name == "recommended" else {"u_r_m_s": 3.01}
+    stage = _small(name)
+    together = stage(signal, **start)
+    for i in range(5):
+        alone = stage(signal.with_data(data[i]), **start)
+        assert bool(alone.ok) == bool(together.ok[i])
+        for key, value in alone.value.items():
+            torch.testing.assert_close(together.value[key][i], value, atol=1e-6, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_single_precision_and_range_lines(name):
+    """complex64 data give the velocities of complex128 data; on lines the strongest one is taken, with its own closest range."""
+    signal, start = noisy(10.0, 2, u_r=3.0), {} if name == "recommended" else {"u_r_m_s": 3.01}
+    double, single = (_small(name)(signal.with_data(signal.data.to(dtype)), **start) for dtype in (C128, torch.complex64))
+    lines = torch.stack([0.1 * signal.data.flip(-1), signal.data, 0.1 * signal.data.conj()], -1)
+    axes = (*signal.axes, Axis("range", 3, 4995.0, 5.0, "m"))
+    among = _small(name)(Signal(lines, axes), **start)
+    for key, value in double.value.items():
+        assert value.dtype == F64 == single.value[key].dtype
+        torch.testing.assert_close(single.value[key], value, atol=1e-3 * float(double.std[key].max()) if key in double.std else 1e-9, rtol=0)
+        torch.testing.assert_close(among.value[key], value, atol=1e-9, rtol=0)
+
+
+def test_one_channel():
+    """It cannot tell a velocity from a place: interferometry refuses, the others say that they do not know."""
+    radar = published_radar(channel_m=(0.0,))
+    signal = noisy(10.0, 2, radar=radar, u_r=3.0)
+    with pytest.raises(ValueError, match="one channel cannot tell a place from a velocity"):
+        Interferometry(radar, GATE)(signal)
+    estimate = _small("recommended", radar)(signal)
+    assert not bool(estimate.ok.any()) and bool((estimate.std["u_r_m_s"] > 20).all()) and bool(torch.isfinite(estimate.value["u_r_m_s"]).all())
+    known = AlongTrackAutofocus(radar, GATE)(signal, u_r_m_s=3.0)
+    assert rms(known.value["u_a_m_s"]) < 0.05 and bool(known.ok.all())
+
+
+def test_refusals():
+    signal = noisy(10.0, 1)
+    channel, pulse = RADAR.axes(N)
+    cropped = Signal(signal.data[..., :800], (channel, Axis("pulse", 800, pulse.start, pulse.step, "s")))
+    for name in ESTIMATORS:
+        with pytest.raises(ValueError, match="slow time must be zero at pulse 400 of 800"):
+            _small(name)(cropped)
+        with pytest.raises(ValueError, match="expects 2 channels .* got 3 and 900"):
+            _small(name, published_radar(channel_m=(0.0, 0.8)))(signal)
+        with pytest.raises(ValueError, match="at least 4 pulses, got 3 and 2"):
+            _small(name)(Signal(signal.data[..., :2], RADAR.axes(2)))
+    for unknowns in (("u_r",), (), ("u_r_m_s", "u_r_m_s")):
+        with pytest.raises(ValueError, match="unknowns names some of"):
+            LikelihoodVelocity(RADAR, GATE, unknowns=unknowns)
+    with pytest.raises(ValueError, match="half_m_s of a search along track must be positive, got 0"):
+        AlongTrackAutofocus(RADAR, GATE, half_m_s=0.0)(signal)
+    with pytest.raises(ValueError, match="400 m/s, as fast as the receiver"):
+        AlongTrackAutofocus(RADAR, GATE, half_m_s=400.0)(signal)
+    with pytest.raises(ValueError, match="as fast as the receiver"):
+        MovingPointVelocity(RADAR, GATE, search=Search(u_a_m_s=400.0))(signal)
+    with pytest.raises(ValueError, match="search.u_r_m_s must be 0 or a positive half width, got -1"):
+        Search(u_r_m_s=-1)
+    with pytest.raises(ValueError, match="positive duration_s, got 0"):
+        Dwell(0.0)
