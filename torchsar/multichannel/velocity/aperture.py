@@ -35,13 +35,13 @@ class Dwell:
 
 @dataclass(frozen=True)
 class ElementBeam:
-    """The one-way pattern of a channel's aperture, sinc(element sin(look) / lambda), its main lobe alone."""
+    """The one-way pattern of a channel's aperture, sinc(element sin(look) / lambda), side lobes and their signs included."""
 
     def weight(self, radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
         along = motion.along_m_s.detach()[..., None] * time_s - motion.y0_m.detach()[..., None]
         across = motion.range_m.detach()[..., None] - motion.u_r_m_s.detach()[..., None] * time_s
         place = radar.element_m * along / torch.sqrt(along.square() + across.square()) / radar.wavelength_m
-        return torch.sinc(place) * (place.abs() < 1)
+        return torch.sinc(place)
 
 
 def _abeam_s(motion: PointMotion) -> Tensor:
