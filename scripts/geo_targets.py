@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -112,7 +112,7 @@ def measured(batch: Batch, made: Product) -> Tensor:
     """Numbers named by FIGURES, (trial, figure)."""
     profile, step = brightest(made.image), made.image.axis("azimuth").step
     own, across = azimuth_response(profile, step), azimuth_response(range_cut(made.image), made.image.axis("range").step / 2)
-    zones = replica_zones(RADAR, made.bands, **batch.values, integration_s=INTEGRATION_S, focused_at=None if made.moving else (0.0, 0.0))
+    zones = replica_zones(RADAR, made.bands, batch.values["u_r_m_s"], batch.values["u_a_m_s"], integration_s=INTEGRATION_S, focused_at=None if made.moving else (0.0, 0.0))
     level = replica_level(profile, step, zones)["mfta_db"]
     width = own["irw_m"] * (1 - batch.values["u_a_m_s"] / RADAR.speed_m_s)
     return torch.stack([width, own["pslr_db"], own["islr_db"], across["irw_m"], across["pslr_db"], across["islr_db"], level], -1)
@@ -175,12 +175,14 @@ def draw_target(made: Product, place: int, title: str, path: Path, reach_m: floa
     plot.save(plot.overlays(parts, columns=3, dynamic_range_db=50), path)
 
 
-def draw_single(batch: Batch, by_way: Mapping[str, Product], out: Path) -> None:
-    """Figures 5 to 7 (conventional) and 14, 15 (proposed), their contours in one picture."""
+def draw_single(batch: Batch, by_way: Mapping[str, Product], places: Sequence[int], out: Path) -> None:
+    """Of the targets at these places of the batch figures 5 to 7 (conventional) and 14, 15 (proposed), their contours in one picture."""
     names, contours = list(batch.speeds), {}
-    for way, first, figures in (("conventional", 0, (5, 6, 7)), ("proposed", 1, (14, 15))):
+    for way, figures in (("conventional", {0: 5, 1: 6, 2: 7}), ("proposed", {1: 14, 2: 15})):
         made = by_way[way]
-        for place, figure in enumerate(figures, first):
+        for place, figure in figures.items():
+            if place not in places:
+                continue
             u_r, u_a = batch.speeds[names[place]]
             title = f"({u_r:g}, {u_a:g}) m/s, {way}"
             blurred = way == "conventional" and u_a != 0
@@ -189,12 +191,12 @@ def draw_single(batch: Batch, by_way: Mapping[str, Product], out: Path) -> None:
     plot.save(plot.contours(contours), out / "contours.png")
 
 
-def draw_scene(n_pulse: int, out: Path) -> None:
+def draw_scene(n_pulse: int, n_range: int, out: Path) -> None:
     """Figure 16: four targets in one scene, and each with its own velocities."""
     azimuth, range_ = zip(*PLACES.values(), strict=True)
     u_r, u_a = zip(*(SPEEDS[name] for name in PLACES), strict=True)
     world = BistaticWorld(MovingPoints(u_r, u_a, azimuth, range_), BandLimited(INTEGRATION_S))
-    data = received(world, n_pulse, 96)
+    data = received(world, n_pulse, n_range)
     still = FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(Reconstruct(RADAR)(CorrectMigration(RADAR)(data)))
     lines = {name: (np.full(2, x), np.array([-115.0, 115.0])) for name, (x, _) in PLACES.items()}
     part = {"title": "four targets as if at rest; lines: true azimuth", "signal": transposed(relative(still)), "lines": lines}
@@ -233,7 +235,7 @@ def transposed(image: Signal) -> Signal:
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("geo_targets"), help="folder of the figures")
-    parser.add_argument("--small", action="store_true", help="records of 6 s and short lines in place of 10 s: one replica to either side")
+    parser.add_argument("--small", action="store_true", help="records of 6 s with one replica to either side, short lines, one target drawn")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
 
@@ -244,8 +246,8 @@ def main(arguments: list[str] | None = None) -> None:
     show(batch, two, 2)
     show(batch, three, 3)
     print(f"theory: azimuth 0.886 lambda R0 / (v T) = {0.886 * RADAR.wavelength_m * RADAR.reference_range_m / (RADAR.speed_m_s * INTEGRATION_S):.3f} m at rest, range 2.66 m, PSLR -13.26 dB")
-    draw_single(batch, two, options.out)
-    draw_scene(n_pulse, options.out)
+    draw_single(batch, two, (2,) if options.small else (0, 1, 2), options.out)
+    draw_scene(n_pulse, n_range, options.out)
 
 
 if __name__ == "__main__":

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Self
 
 from pydantic import model_validator
 
-from torchsar.study.config import RESERVED, Config, Loaded
+from torchsar.study.config import RESERVED, Config, Loaded, check_methods
 from torchsar.study.errors import ConfigError
 
 _OF_ALL_CASES = ("system", "title", "cases", "metrics", "trade", "sweep")
@@ -89,6 +89,15 @@ def refuse_recordings(loaded: Loaded) -> None:
     if config.data.file is not None or config.world is None:
         instead = "leave data.file out and give the sections 'radar' and 'world'; systems stripmap and isal read recordings"
         raise ConfigError(f"{loaded.file}: data.file: system {config.system} simulates and reads no recordings; {instead}")
+
+
+def check_simulated(loaded: Loaded, check: Callable[[Loaded], None], heed: Callable[[Loaded, str], None]) -> None:
+    """What comes before a run that simulates: methods, no recording, all that the config names, and the limits of every case (heed). Raises ConfigError."""
+    check_methods(loaded.config, loaded.file)
+    refuse_recordings(loaded)
+    check(loaded)
+    for name, case in cases_of(loaded).items():
+        heed(case, name)
 
 
 def check_sweep(loaded: Loaded, grid: Mapping[str, Any], example: str) -> None:

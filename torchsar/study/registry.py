@@ -90,6 +90,7 @@ from torchsar.scene import (
 from torchsar.study import factories
 from torchsar.study.catalogue import Catalogue
 from torchsar.study.geo import stages as channels
+from torchsar.study.ocean import stages as scenes
 
 SCENES = Catalogue(
     "scene",
@@ -254,6 +255,8 @@ FOCUS: dict[str, Callable[..., Any]] = {
     "chirplet_clean": ChirpletClean,
     "compress_channels": CompressChannels,
     "rebuild_bands": channels.rebuild_bands,
+    "stationary_image": scenes.stationary_image,
+    "movers_image": scenes.MoversImage,
     "focus_target": FocusAzimuth,
 }
 GROUPS = {"repair": REPAIR, "compensate": COMPENSATE, "focus": FOCUS}

@@ -60,6 +60,12 @@ def systems() -> dict[str, System]:
     from torchsar.study.isal.sections import IsalConfig
     from torchsar.study.isal.trade import trade as isal_trade
     from torchsar.study.isal.trials import IsalTrials
+    from torchsar.study.ocean import run as ocean_run
+    from torchsar.study.ocean.judge import DEFINITIONS as OCEAN
+    from torchsar.study.ocean.requires import requires as ocean_requires
+    from torchsar.study.ocean.sections import OceanConfig
+    from torchsar.study.ocean.trade import trade as ocean_trade
+    from torchsar.study.ocean.trials import OceanTrials
     from torchsar.study.rotation import run as rotation_run
     from torchsar.study.rotation.judge import DEFINITIONS as ROTATION
     from torchsar.study.rotation.requires import requires as rotation_requires
@@ -81,6 +87,7 @@ def systems() -> dict[str, System]:
 
     return {
         "geo": System(GeoConfig, geo_run.check, geo_run.run, geo_requires, geo_trade, GeoTrials, GEO),
+        "geo_ocean": System(OceanConfig, ocean_run.check, ocean_run.run, ocean_requires, ocean_trade, OceanTrials, OCEAN),
         "isal": System(IsalConfig, isal_run.check, isal_run.run, isal_requires, isal_trade, IsalTrials, ISAL),
         "isal_rotation": System(RotationConfig, rotation_run.check, rotation_run.run, rotation_requires, rotation_trade, RotationTrials, ROTATION),
         "sal": System(SalConfig, sal_run.check, sal_run.run, sal_requires, sal_trade, SalTrials, SAL),

@@ -25,8 +25,7 @@ def _aperture(dwell_s: float | None) -> Aperture:
     return ElementBeam() if dwell_s is None else Dwell(dwell_s)
 
 
-def prior_of(band_hz: float | None) -> Prior:
-    """Power in a flat band, or by the pattern of the elements (None)."""
+def _prior(band_hz: float | None) -> Prior:
     return ElementPattern() if band_hz is None else FlatBand(band_hz)
 
 
@@ -75,13 +74,13 @@ def rebuild_bands(
     radar: BistaticRadar, bands: int = 2, method: Literal["least_squares", "mmse"] = "least_squares", band_hz: float | None = None, snr_db: float = 40.0, range_m: float | None = None
 ) -> Reconstruct:
     """Channels to the full Doppler band of the velocities given; mmse expects power in a flat band of band_hz, or by the pattern of the elements (null)."""
-    rebuild = LeastSquares(bands) if method == "least_squares" else MinimumMeanSquare(bands, snr_db, prior_of(band_hz))
+    rebuild = LeastSquares(bands) if method == "least_squares" else MinimumMeanSquare(bands, snr_db, _prior(band_hz))
     return Reconstruct(radar, rebuild, range_m)
 
 
 def channel_balance(radar: BistaticRadar, band_hz: float | None = None, bands: int = 5, delays: bool = True) -> EstimateBalance:
     """Phase, gain and delay of channels from clutter at rest in a flat band of band_hz, or seen through the pattern of the elements (null)."""
-    return EstimateBalance(radar, prior_of(band_hz), bands, delays)
+    return EstimateBalance(radar, _prior(band_hz), bands, delays)
 
 
 def interferometry(radar: BistaticRadar, dwell_s: float | None = None, range_m: float | None = None) -> Interferometry:

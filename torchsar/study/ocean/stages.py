@@ -11,17 +11,16 @@ from torch import Tensor
 from torchsar.core import Estimate, Signal, Stage
 from torchsar.multichannel.body import Extraction
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.response import LeastSquares, MinimumMeanSquare, Rebuild
+from torchsar.multichannel.response import ElementPattern, FlatBand, LeastSquares, MinimumMeanSquare, Rebuild
 from torchsar.multichannel.scene_image import Detector, ImageMovers, Removal, SceneImage
 from torchsar.multichannel.stationary import StationaryImage
 from torchsar.radar import BistaticRadar
-from torchsar.study.geo.stages import prior_of
 
 Method = Literal["least_squares", "mmse"]
 
 
 def _rebuild(bands: int, method: Method, band_hz: float | None, snr_db: float) -> Rebuild:
-    return LeastSquares(bands) if method == "least_squares" else MinimumMeanSquare(bands, snr_db, prior_of(band_hz))
+    return LeastSquares(bands) if method == "least_squares" else MinimumMeanSquare(bands, snr_db, ElementPattern() if band_hz is None else FlatBand(band_hz))
 
 
 def stationary_image(
@@ -73,9 +72,7 @@ class MoversImage(Stage):
         radar, like = self.flow.radar, signal.data.real
         return self.flow(signal, known=[PointMotion.of(radar, like, *of_one) for of_one in zip(*(value.to(torch.float64) for value in told), strict=True)])
 
-    def forward(
-        self, signal: Signal, u_r_m_s: Tensor | None = None, u_a_m_s: Tensor | None = None, y0_m: Tensor | None = None, range_m: Tensor | None = None
-    ) -> tuple[Signal, Estimate]:
+    def forward(self, signal: Signal, u_r_m_s: Tensor | None = None, u_a_m_s: Tensor | None = None, y0_m: Tensor | None = None, range_m: Tensor | None = None) -> tuple[Signal, Estimate]:
         made = self.scene(signal, u_r_m_s, u_a_m_s, y0_m, range_m)
         assert made.estimate is not None
         return made.fused, made.estimate

@@ -11,8 +11,8 @@ import torch
 
 from torchsar.core import Draws
 from torchsar.study.case_run import run_cases
-from torchsar.study.cases import cases_of, methods_tree, refuse_recordings
-from torchsar.study.config import Loaded, check_methods
+from torchsar.study.cases import check_simulated, methods_tree
+from torchsar.study.config import Loaded
 from torchsar.study.limits import warn_of_doubt
 from torchsar.study.rotation.build import check
 from torchsar.study.rotation.figures import CaseResult, draw
@@ -33,15 +33,7 @@ def run(loaded: Loaded, out: Path, command: str = "torchsar run") -> Path:
     OUT appears whole or not at all. Returns the path of the report. Raises ConfigError for whatever the user can put right, limits that the
     scene exceeds among it.
     """
-
-    def prepare() -> None:
-        check_methods(loaded.config, loaded.file)
-        refuse_recordings(loaded)
-        check(loaded)
-        for name, case in cases_of(loaded).items():
-            heed_limits(case, name)
-
-    return run_cases(loaded, out, command, prepare, _simulated, metrics_tree, draw, write_report)
+    return run_cases(loaded, out, command, lambda: check_simulated(loaded, check, heed_limits), _simulated, metrics_tree, draw, write_report)
 
 
 @torch.no_grad()
