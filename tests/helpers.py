@@ -6,10 +6,10 @@ import signal
 
 import torch
 
-from torchsar.core import Draws, Recording, Truth
-from torchsar.echo import simulate, simulate_ladar, simulate_ladar_record
-from torchsar.radar import LIGHT_M_S, LinearFM, StripmapRadar, TriangularLadar
-from torchsar.scene import AlwaysLit, Dwell, LadarWorld, Points, Polynomial, StripmapWorld
+from torchsar.core import Draws, Recording, Signal, Truth
+from torchsar.echo import simulate, simulate_bistatic, simulate_ladar, simulate_ladar_record
+from torchsar.radar import LIGHT_M_S, BistaticRadar, LinearFM, StripmapRadar, TriangularLadar
+from torchsar.scene import AlwaysLit, BandLimited, BistaticWorld, Dwell, LadarWorld, MovingPoints, Points, Polynomial, StripmapWorld
 
 
 def mind_interrupts() -> None:
@@ -65,3 +65,15 @@ def small_ladar_recording(n_period: int = 48, trials: int | None = None, dtype: 
     draws = Draws(seed, trials=None if trials is None else range(trials))
     simulated = simulate_ladar_record if record else simulate_ladar
     return simulated(small_ladar(**changes), world, n_period, draws, dtype=dtype)
+
+
+def small_bistatic(**changes: object) -> BistaticRadar:
+    """The receiver of brief 001 with a short pulse."""
+    values: dict = {"carrier_hz": 1.25e9, "pulse": LinearFM(50e6, 0.2e-6), "sampling_hz": 60e6, "prf_hz": 180.0, "speed_m_s": 300.0, "reference_range_m": 5000.0, "transmit_range": (-3.0, 0.02)}
+    return BistaticRadar(**{**values, **changes})
+
+
+def small_bistatic_echo(n_pulse: int = 48, n_range: int = 32, trials: int | None = None, dtype: torch.dtype = torch.complex128) -> Signal:
+    """Two moving points in noise, range compressed, (channel, pulse, range)."""
+    world = BistaticWorld(MovingPoints([3.0, -4.0], [1.0, 2.0], [0.0, 5.0], [0.0, 20.0], random_phase=True), BandLimited(4.0), snr_db=20.0)
+    return simulate_bistatic(small_bistatic(), world, n_pulse, n_range, Draws(1, trials=None if trials is None else range(trials)), dtype=dtype)[0].signal

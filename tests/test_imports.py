@@ -12,7 +12,7 @@ import pytest
 import torchsar
 
 PACKAGE = Path(torchsar.__file__).parent
-PROCESSING = ("repair", "compensate", "focus", "metrics", "optim")
+PROCESSING = ("repair", "compensate", "focus", "metrics", "multichannel", "optim")
 CORE = [path for folder in ("core", "radar", "scene", "echo", "io", *PROCESSING) for path in sorted((PACKAGE / folder).rglob("*.py"))]
 
 _ONLY_TORCH_AND_NUMPY = """

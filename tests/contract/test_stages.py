@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.helpers import small_ladar, small_ladar_recording, small_radar, small_recording
+from tests.helpers import small_bistatic, small_bistatic_echo, small_ladar, small_ladar_recording, small_radar, small_recording
 from torchsar.compensate import (
     Autofocus,
     CompensateMotion,
@@ -63,6 +63,20 @@ from torchsar.focus import (
     RangePhase,
 )
 from torchsar.focus.target import TargetImage
+from torchsar.multichannel.azimuth import FocusAzimuth
+from torchsar.multichannel.balance import CorrectBalance, EstimateBalance
+from torchsar.multichannel.compress import CompressChannels
+from torchsar.multichannel.migration import CorrectMigration, Keystone
+from torchsar.multichannel.reconstruct import Reconstruct
+from torchsar.multichannel.response import FlatBand, LeastSquares, MinimumMeanSquare
+from torchsar.multichannel.stationary import StationaryImage
+from torchsar.multichannel.synchronise import EstimateSynchronisation, RemoveSynchronisation
+from torchsar.multichannel.transmit import AzimuthScaling, RemoveTransmitRange
+from torchsar.multichannel.velocity.aperture import Dwell
+from torchsar.multichannel.velocity.bank import Search
+from torchsar.multichannel.velocity.sir import SignalIntensityRatio
+from torchsar.multichannel.velocity.stages import AlongTrackAutofocus, GradientVelocity, Interferometry, LikelihoodVelocity, MovingPointVelocity
+from torchsar.multichannel.velocity.walk import WalkAmbiguity
 from torchsar.radar import InverseRadar
 from torchsar.repair import (
     BandLimitedFill,
@@ -90,6 +104,7 @@ from torchsar.repair import (
 RADAR = small_radar()
 TURNTABLE = InverseRadar(3.2e9, 50e6, 400.0, 0.01)
 LADAR = small_ladar()
+BISTATIC = small_bistatic()
 FEW_POINTS = partial(estimate_response_sharpest, points=40, orders=(4, 8), passes=2)
 
 
@@ -107,6 +122,7 @@ class Case:
     keeps_complex: bool = True
     n_range: int = 64
     ladar: str = ""
+    channels: str = ""
 
 
 def _geometry(signal: Signal) -> dict[str, Tensor]:
@@ -174,7 +190,34 @@ def _warp(signal: Signal) -> dict[str, Tensor]:
     return {"warp_k": _turn(signal)["warp_k"]}
 
 
+def _motion(signal: Signal) -> dict[str, Tensor]:
+    at = torch.arange(signal.trials.numel(), dtype=torch.float64).reshape(signal.trials)
+    return {"u_r_m_s": 3.0 + at, "u_a_m_s": 2.0 - at, "y0_m": 5.0 * at}
+
+
+def _some_motion(*names: str) -> Callable[[Signal], dict[str, Tensor]]:
+    return lambda signal: {name: _motion(signal)[name] for name in names}
+
+
+def _balance(signal: Signal) -> dict[str, Tensor]:
+    one = torch.ones(*signal.trials, 1, dtype=torch.float64)
+    return {"phase_rad": torch.cat([0.3 * one, 0 * one, -0.2 * one], -1), "gain_db": torch.cat([one, 0 * one, 0.5 * one], -1)}
+
+
+def _errors(signal: Signal) -> dict[str, Tensor]:
+    at = torch.arange(signal.trials.numel() * signal.axis("pulse").n, dtype=torch.float64)
+    return {"phase_rad": torch.sin(0.7 * at).reshape(*signal.trials, -1)}
+
+
+def _direct_path(signal: Signal) -> dict[str, Tensor]:
+    phase = _errors(signal)["phase_rad"]
+    shape = torch.sinc((torch.arange(16, dtype=torch.float64) - 8) * BISTATIC.pulse.bandwidth_hz / BISTATIC.sampling_hz)
+    return {"direct_path": (torch.polar(torch.ones_like(phase), phase)[..., None] * shape).to(signal.data.dtype)}
+
+
 SEARCH = {"oversampling": 1.0, "order": 2}
+LIT = Dwell(1.4)
+FEW_VELOCITIES = Search(u_r_m_s=3.0, u_a_m_s=2.0, y0_m=20.0, u_a_step_m_s=1.0)
 
 
 CASES = [
@@ -246,6 +289,25 @@ CASES = [
     Case("deramp_azimuth", lambda: DerampAzimuth(LADAR), ladar="profiles"),
     Case("azimuth_matched_filter", lambda: AzimuthMatchedFilter(LADAR), ladar="profiles"),
     Case("phase_polish", lambda: PhasePolish(), vmap=False, ladar="profiles"),
+    Case("compress_channels", lambda: CompressChannels(BISTATIC), channels="range"),
+    Case("remove_transmit_range", lambda: RemoveTransmitRange(BISTATIC), channels="range"),
+    Case("azimuth_scaling", lambda: AzimuthScaling(BISTATIC), _some_motion("u_r_m_s", "u_a_m_s"), channels="line"),
+    Case("correct_migration", lambda: CorrectMigration(BISTATIC, Keystone(whole_swath=False)), _motion, tolerance=1e-8, channels="range"),
+    Case("estimate_balance", lambda: EstimateBalance(BISTATIC, FlatBand(300.0), 3, blocks=4), differentiable=False, vmap=False, tolerance=1e-6, channels="range"),
+    Case("correct_balance", lambda: CorrectBalance(BISTATIC), _balance, channels="range"),
+    Case("estimate_synchronisation", lambda: EstimateSynchronisation(BISTATIC), _direct_path, differentiable=False, vmap=False, channels="line"),
+    Case("remove_synchronisation", lambda: RemoveSynchronisation(BISTATIC), _errors, channels="range"),
+    Case("reconstruct", lambda: Reconstruct(BISTATIC), _motion, vmap=False, channels="line"),
+    Case("reconstruct_lines", lambda: Reconstruct(BISTATIC, MinimumMeanSquare(4)), _motion, channels="range"),
+    Case("focus_azimuth", lambda: FocusAzimuth(BISTATIC, bandwidth_hz=300.0), _motion, channels="doppler"),
+    Case("stationary_image", lambda: StationaryImage(BISTATIC, form="bulk"), vmap=False, channels="range"),
+    Case("walk_ambiguity", lambda: WalkAmbiguity(BISTATIC), _motion, differentiable=False, vmap=False, tolerance=1e-6, channels="range"),
+    Case("interferometry", lambda: Interferometry(BISTATIC, LIT), _motion, differentiable=False, vmap=False, tolerance=1e-7, channels="line"),
+    Case("along_track", lambda: AlongTrackAutofocus(BISTATIC, LIT), _some_motion("u_r_m_s", "y0_m"), differentiable=False, vmap=False, tolerance=1e-6, channels="line"),
+    Case("likelihood_velocity", lambda: LikelihoodVelocity(BISTATIC, LIT), _motion, differentiable=False, vmap=False, tolerance=1e-6, channels="line"),
+    Case("gradient_velocity", lambda: GradientVelocity(BISTATIC, LIT), _motion, differentiable=False, vmap=False, tolerance=1e-3, channels="line"),
+    Case("moving_point", lambda: MovingPointVelocity(BISTATIC, LIT, search=FEW_VELOCITIES), differentiable=False, vmap=False, tolerance=1e-5, channels="line"),
+    Case("signal_intensity", lambda: SignalIntensityRatio(BISTATIC, 300.0, LeastSquares(2), step_m_s=2.0), differentiable=False, vmap=False, tolerance=1e-6, channels="line"),
 ]
 IDS = [case.name for case in CASES]
 
@@ -281,8 +343,23 @@ def raw_ladar(kind: str, trials: int | None, dtype: torch.dtype, n_pulse: int) -
     return signal.with_data(signal.data * level[(slice(None),) + (None,) * len(signal.axes)])
 
 
+def raw_channels(kind: str, like: Signal) -> Signal:
+    """Channels of a bistatic receiver, as many trials and pulses: "range", "line" without the range axis, or "doppler", rebuilt."""
+    n_pulse, n_range = (like.axes[0].n, 32 if like.axes[0].n > 8 else 16) if kind == "range" else (6 * like.axes[0].n, 4)
+    signal = small_bistatic_echo(n_pulse, n_range, like.trials.numel() if like.trials else None, like.data.dtype)
+    if like.trials:
+        level = torch.logspace(0, 3, len(signal.data)).to(like.data.dtype)
+        signal = signal.with_data(signal.data * level[:, None, None, None])
+    if kind == "range":
+        return signal
+    line = Signal(signal.data[..., signal.axes[2].n // 2], signal.axes[:2])
+    return Reconstruct(BISTATIC)(line) if kind == "doppler" else line
+
+
 def entering(case: Case, signal: Signal) -> Signal:
-    """What the stage works on: the raw signal, an image of it, or as many trials and pulses of a ladar."""
+    """What the stage works on: the raw signal, an image of it, or as many trials and pulses of a ladar or of several channels."""
+    if case.channels:
+        return raw_channels(case.channels, signal)
     if case.ladar:
         return raw_ladar(case.ladar, signal.trials.numel() if signal.trials else None, signal.data.dtype, signal.axes[0].n)
     return Signal(signal.data, RADAR.image_axes(signal.axes)) if case.image else signal
@@ -349,7 +426,7 @@ def test_vmap_equals_batch(case: Case) -> None:
 def test_non_finite_input_is_refused(case: Case, bad: float) -> None:
     stage, signal = case.build(), entering(case, raw(2, n_range=case.n_range))
     data = signal.data.clone()
-    place = (1, *(0,) * (data.ndim - 3), 3, 5)
+    place = (1, *(0,) * (data.ndim - 3), *(min(i, n - 1) for i, n in zip((3, 5), data.shape[1:][-2:])))
     data[place] = bad
     with pytest.raises(ValueError, match=r"1 of \d+ samples are NaN or Inf, the first at index " + re.escape(str(place))):
         stage(signal.with_data(data), **case.values(signal))

@@ -29,22 +29,24 @@ def motion_of(radar, u_r=0.0, u_a=0.0, y0=0.0):
     return PointMotion.of(radar, torch.zeros(1), u_r, u_a, y0)
 
 
-def focused(data, radar, motion, rebuild, band_hz=BAND_HZ, left_k1=0.0):
+def focused(data, radar, motion, rebuild, band_hz: float | None = BAND_HZ, left_k1=0.0):
     spectrum = reconstruct(data, radar, motion, rebuild, left_k1)
     return focus_azimuth(spectrum, doppler_offsets(data.shape[-1], rebuild.bands, radar.prf_hz), radar, motion, band_hz)
 
 
-def figures_of(image, radar, bands, u_r=0.0, u_a=0.0, y0=0.0, gate_s=GATE_S, used=None):
+def figures_of(image, radar, bands, u_r=0.0, u_a=0.0, y0=0.0, gate_s: float | None = GATE_S, used=None):
     """Along the track that the target sees, x = v t, as the printed figures have it."""
     along = radar.speed_m_s - u_a
     step, n = along / (bands * radar.prf_hz), image.shape[-1]
     response = replicas.azimuth_response(image, step, -(n // 2) * step)
     zones = replicas.replica_zones(radar, bands, u_r, u_a, y0, integration_s=gate_s, focused_at=used, axis_speed_m_s=along)
     mfta = replicas.replica_level(image, step, zones)["mfta_db"]
-    return Figures(*(float(response[name]) for name in ("irw_m", "pslr_db", "islr_db")), float(mfta), float(response["position_m"]) / along, complex(response["peak"]))
+    irw, pslr, islr, place = (float(response[name]) for name in ("irw_m", "pslr_db", "islr_db", "position_m"))
+    return Figures(irw, pslr, islr, float(mfta), place / along, complex(response["peak"]))
 
 
-def measured(radar, rebuild, u_r=0.0, u_a=0.0, y0=0.0, n_pulse=LONG, band_hz=BAND_HZ, used=None):
+def measured(radar, rebuild, u_r=0.0, u_a=0.0, y0=0.0, n_pulse=LONG, band_hz: float | None = BAND_HZ, used=None):
     """Figures of a band-limited point, rebuilt with its own motion or the `used` one."""
-    image = focused(azimuth_echo(radar, n_pulse, u_r, u_a, y0), radar, motion_of(radar, *(used or (u_r, u_a, y0))), rebuild, band_hz)
-    return figures_of(image, radar, rebuild.bands, u_r, u_a, y0, used=None if used is None else used[:2])
+    assumed = (u_r, u_a, y0) if used is None else used
+    image = focused(azimuth_echo(radar, n_pulse, u_r, u_a, y0), radar, motion_of(radar, *assumed), rebuild, band_hz)
+    return figures_of(image, radar, rebuild.bands, u_r, u_a, y0, used=None if used is None else (used[0], used[1]))

@@ -115,16 +115,20 @@ def test_trials_equal_singles_and_keep_precision(dtype):
     assert float(x[int(together.data[1].abs().argmax())]) == pytest.approx(300 * 10 * 5000 / (300**2 + 100), abs=0.5)
 
 
-def test_each_range_line_has_its_own_closest_range():
-    points = [{"u_r": 10.0, "r0": 4900.0}, {"u_r": 10.0, "r0": 5150.0}]
+def test_every_line_is_focused_for_the_range_of_one_target():
+    """That of the strongest line, or the one given."""
+    points = [{"u_r": 10.0, "r0": 4900.0}, {"u_r": 10.0, "r0": 5150.0, "amplitude": 0.5}]
     signal = compressed_echo(RADAR, 900, 96, points)
-    cropped = CorrectMigration(RADAR, Keystone())(signal, u_r_m_s=10.0)
-    image = FocusAzimuth(RADAR, bandwidth_hz=BAND_HZ)(Reconstruct(RADAR)(cropped, u_r_m_s=10.0), u_r_m_s=10.0)
-    place, near = image.axis("azimuth").values(), image.axis("range").values()
-    for point in points:
-        column = image.data[:, int((near - point["r0"]).abs().argmin())].abs()
-        assert float(column.max()) > 0.93 * GATE_S * math.sqrt(300**2 / (0.24 * point["r0"])) * 0.9
-        assert float(place[int(column.argmax())]) == pytest.approx(300 * 10 * point["r0"] / (300**2 + 100), abs=0.5)
+    still = CorrectMigration(RADAR, Keystone())(signal, u_r_m_s=10.0)
+    spectrum = Reconstruct(RADAR)(still, u_r_m_s=10.0)
+    near = spectrum.axis("range").values()
+    for range_m, of in ((None, 0), (5150.0, 1)):
+        image = FocusAzimuth(RADAR, bandwidth_hz=BAND_HZ)(spectrum, u_r_m_s=10.0, range_m=range_m)
+        place, r0, amplitude = image.axis("azimuth").values(), points[of]["r0"], points[of].get("amplitude", 1.0)
+        columns = [image.data[:, int((near - point["r0"]).abs().argmin())].abs() for point in points]
+        assert float(columns[of].max()) > 0.9 * amplitude * GATE_S * math.sqrt(300**2 / (0.24 * r0))
+        assert float(columns[1 - of].max()) < 0.4 * GATE_S * math.sqrt(300**2 / (0.24 * 5000))
+        assert float(place[int(columns[of].argmax())]) == pytest.approx(300 * 10 * r0 / (300**2 + 100), abs=0.5)
 
 
 def test_gradients():

@@ -10,7 +10,7 @@ import torch
 from tests.multichannel.helpers import azimuth_echo, compressed_echo, published_radar
 from torchsar.core import Axis, Draws, Signal
 from torchsar.echo import sea_echo
-from torchsar.metrics.bistatic_bounds import bistatic_bounds
+from torchsar.metrics.bistatic_bounds import bistatic_bounds, radial_velocity_bound_m_s
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.aperture import Dwell, ElementBeam
 from torchsar.multichannel.velocity.bank import Search, bank_search
@@ -25,7 +25,7 @@ from torchsar.scene import KSea, Pattern
 
 F64, C128 = torch.float64, torch.complex128
 RADAR, N, GATE = published_radar(), 900, Dwell(4.5)
-NEAR = Search(u_r_m_s=12.0, u_a_m_s=6.0, y0_m=100.0, u_a_step_m_s=1.0)
+NEAR = Search(u_r_m_s=12.0, u_a_m_s=4.0, y0_m=100.0, u_a_step_m_s=1.0)
 ESTIMATORS = {"interferometry": Interferometry, "along_track": AlongTrackAutofocus, "likelihood": LikelihoodVelocity, "gradient": GradientVelocity, "recommended": MovingPointVelocity}
 
 
@@ -34,9 +34,9 @@ def noise(trials, seed, n=N, channels=3):
     return torch.view_as_complex(torch.randn(trials, channels, n, 2, dtype=F64, generator=generator)) * math.sqrt(0.5)
 
 
-def noisy(snr_db, trials, seed=1, radar=RADAR, **move):
-    clean = azimuth_echo(radar, N, **move)
-    return Signal(10 ** (snr_db / 20) * clean + noise(trials, seed, channels=radar.channels), radar.axes(N))
+def noisy(snr_db, trials, radar=RADAR, u_r=0.0, u_a=0.0, y0=0.0):
+    clean = azimuth_echo(radar, N, u_r, u_a, y0)
+    return Signal(10 ** (snr_db / 20) * clean + noise(trials, 1, channels=radar.channels), radar.axes(N))
 
 
 def rms(x):
@@ -65,8 +65,7 @@ def test_model_is_the_echo_and_its_slopes():
 @pytest.mark.parametrize(("snr_db", "worst", "move"), [(0.0, 1.3, {"u_r": 10.0}), (7.0, 1.3, {"u_r": -7.0, "u_a": 3.0, "y0": 40.0}), (-10.0, 1.6, {"u_r": 4.0})])
 def test_recommended_reaches_the_bound(snr_db, worst, move):
     """And never beats it by more than chance: the edges of the gate must tell nothing."""
-    signal = noisy(snr_db, 40, **move)
-    estimate = MovingPointVelocity(RADAR, GATE, search=NEAR)(signal)
+    estimate = moving_point_velocity(noisy(snr_db, 32, **move).data, RADAR, GATE, NEAR)
     least = bound(snr_db, **move)
     assert bool(estimate.ok.all())
     for name, key in (("u_r_m_s", "u_r"), ("u_a_m_s", "u_a"), ("y0_m", "y0")):
@@ -75,14 +74,14 @@ def test_recommended_reaches_the_bound(snr_db, worst, move):
 
 
 def test_with_the_along_track_speed_told():
-    estimate = MovingPointVelocity(RADAR, GATE, search=NEAR, u_a_m_s=5.0)(noisy(0.0, 40, u_r=10.0, u_a=5.0))
+    estimate = MovingPointVelocity(RADAR, GATE, search=NEAR, u_a_m_s=5.0)(noisy(0.0, 32, u_r=10.0, u_a=5.0))
     assert set(estimate.std) == {"u_r_m_s", "y0_m"} and bool((estimate.value["u_a_m_s"] == 5).all())
     assert 0.7 < rms(estimate.value["u_r_m_s"] - 10) / bound(0.0, ("u_r_m_s", "y0_m"), u_r=10.0, u_a=5.0)["u_r_m_s"] < 1.3
 
 
 @pytest.mark.parametrize("snr_db", [-10.0, 0.0, 17.0])
 def test_interferometry_within_twice_the_bound(snr_db):
-    estimate = Interferometry(RADAR, GATE)(noisy(snr_db, 200, u_r=10.0))
+    estimate = Interferometry(RADAR, GATE, mind_ambiguity=False)(noisy(snr_db, 60, u_r=10.0))
     ratio = rms(estimate.value["u_r_m_s"] - 10) / bound(snr_db, ("u_r_m_s", "y0_m"), u_r=10.0)["u_r_m_s"]
     assert 0.7 < ratio < 2.2 and bool(estimate.ok.all())
 
@@ -91,20 +90,25 @@ def test_interferometry_within_twice_the_bound(snr_db):
 def test_interferometry_with_channels_anywhere(channels):
     radar = published_radar(channel_m=channels)
     estimate = Interferometry(radar, GATE)(noisy(10.0, 20, radar=radar, u_r=10.0, u_a=5.0), u_a_m_s=5.0)
-    assert rms(estimate.value["u_r_m_s"] - 10) < 0.12 and rms(estimate.value["y0_m"]) < 2.5
+    # what the direction between the channels tells, that is without the cubic phase
+    least = float(radial_velocity_bound_m_s(radar, 10.0, 810, 5.0))
+    assert 0.6 < rms(estimate.value["u_r_m_s"] - 10) / least < 1.5 and 0.6 < rms(estimate.value["y0_m"]) / (least * 5000 / 295) < 1.5
 
 
 def test_interferometry_and_the_ends_of_its_interval():
     """u_r comes within half of lambda PRF, 43.2 m/s, about the start: 25 is seen as -18.2 (brief 001)."""
-    for u_r, seen in ((21.0, 21.0), (-21.0, -21.0), (25.0, 25 - 43.2)):
+    for u_r in (21.0, -21.0):
         estimate = Interferometry(RADAR, GATE)(noisy(17.0, 4, u_r=u_r))
-        assert bool(((estimate.value["u_r_m_s"] - seen).abs() < 1.5).all()) and bool(torch.isfinite(estimate.std["u_r_m_s"]).all())
+        assert rms(estimate.value["u_r_m_s"] - u_r) < 0.1 and bool(estimate.ok.all())
+    with pytest.warns(UserWarning, match="in 4 of 4 trials the slant-range velocity is whole pulse rates, 43.2 m/s each, off"):
+        estimate = Interferometry(RADAR, GATE)(noisy(17.0, 4, u_r=25.0))
+    assert bool(((estimate.value["u_r_m_s"] - 25 + 43.2).abs() < 1.5).all()) and not bool(estimate.ok.any()) and estimate.info["pulse_rates"].tolist() == [1] * 4
     near = Interferometry(RADAR, GATE)(noisy(17.0, 4, u_r=25.0), u_r_m_s=15.0)
     assert rms(near.value["u_r_m_s"] - 25) < 0.1
 
 
 def test_along_track_speed():
-    signal = noisy(0.0, 60, u_r=10.0, u_a=12.0, y0=20.0)  # three bands could not be told apart at 12 m/s
+    signal = noisy(0.0, 24, u_r=10.0, u_a=12.0, y0=20.0)  # three bands could not be told apart at 12 m/s
     estimate = AlongTrackAutofocus(RADAR, GATE)(signal, u_r_m_s=10.0, y0_m=20.0)
     least = bound(0.0, ("u_a_m_s", "u_r_m_s"), u_r=10.0, u_a=12.0, y0=20.0)["u_a_m_s"]
     assert 0.7 < rms(estimate.value["u_a_m_s"] - 12) / least < 2.2
@@ -116,7 +120,7 @@ def test_along_track_speed():
 
 @pytest.mark.parametrize("aperture", [GATE, ElementBeam()], ids=["gate", "beam"])
 def test_gauss_newton_and_gradients_agree(aperture):
-    signal = noisy(10.0, 3, u_r=10.0, u_a=5.0, y0=30.0)
+    signal = noisy(10.0, 3, radar=RADAR, u_r=10.0, u_a=5.0, y0=30.0)
     start = {"u_r_m_s": 10.01, "u_a_m_s": 5.05, "y0_m": 30.1}
     newton = LikelihoodVelocity(RADAR, aperture)(signal, **start)
     descent = GradientVelocity(RADAR, aperture)(signal, **start)
@@ -150,15 +154,14 @@ def test_the_bank_resolves_pulse_rates(u_r, u_a):
 @pytest.mark.parametrize(("u_r", "number"), [(25.0, 1), (-35.0, -1), (3.0, 0)])
 def test_range_walk_resolves_pulse_rates(u_r, number):
     signal = compressed_echo(RADAR, 810, 64, [{"u_r": u_r}])
-    trials = torch.stack([signal.data + 0.5 * noise(1, seed, 810)[0, ..., None] * torch.randn(64, dtype=C128, generator=torch.Generator().manual_seed(seed)) for seed in (1, 2)])
+    trials = signal.data + 0.5 * torch.randn(2, *signal.data.shape, dtype=C128, generator=torch.Generator().manual_seed(1))
     estimate = WalkAmbiguity(RADAR)(signal.with_data(trials.to(torch.complex64)))
     assert estimate.value["ambiguity"].tolist() == [number, number] and bool(estimate.ok.all())
 
 
 def test_a_place_known_from_an_image():
     """`bank_search` about the slow time at which the point appears in an image."""
-    move = {"u_r": 10.0, "u_a": 5.0, "y0": 300.0}
-    data = noisy(0.0, 3, **move).data
+    data = noisy(0.0, 3, u_r=10.0, u_a=5.0, y0=300.0).data
     appears = PointMotion.of(RADAR, data, 10.0, 5.0, 300.0).image_s
     start, energy = bank_search(data, RADAR, GATE, Search(u_r_m_s=15.0, u_a_m_s=8.0, y0_m=30.0, u_a_step_m_s=1.0), image_s=appears)
     assert rms(start.u_r_m_s - 10) <= 2.0 and rms(start.u_a_m_s - 5) <= 1.0 and bool((energy > 500).all())
@@ -186,9 +189,10 @@ class TestClutter:
         assert rms(estimate.value["u_r_m_s"] - 10) < 0.3
 
     def test_covariance_from_neighbouring_lines(self):
-        data, around = self.data(-10.0, lines=5)
+        """The place found decides where the aperture is expected, and clutter then drags the place: the estimate must not be biased by that."""
+        data, around = self.data(10.0, trials=4, lines=5)
         estimate = moving_point_velocity(data, self.RADAR, ElementBeam(), NEAR, whitening=line_whitening(around, self.RADAR))
-        assert bool(estimate.ok.all()) and rms(estimate.value["u_r_m_s"] - 10) < 0.3
+        assert bool(estimate.ok.all()) and rms(estimate.value["u_r_m_s"] - 10) < 2 * float(estimate.std["u_r_m_s"].median()) < 0.14
 
     def test_white_noise_stays_white(self):
         estimate = MovingPointVelocity(RADAR, GATE, search=NEAR)(noisy(10.0, 6, u_r=5.0))
@@ -207,19 +211,17 @@ def test_below_the_threshold_nothing_is_found():
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_silence_and_points_outside_the_record(name, aperture):
     stage = _small(name, RADAR, aperture)
-    start = {} if name == "recommended" else {"y0_m": 2500.0}
-    for data in (torch.zeros(2, 3, 200, dtype=C128), azimuth_echo(RADAR, 200, y0=2500.0).expand(2, 3, 200)):
-        for values in ({}, start):
-            estimate = stage(Signal(data, RADAR.axes(200)), **values)
-            assert not bool(estimate.ok.any())
-            assert all(bool(torch.isfinite(x).all()) for x in (*estimate.value.values(), estimate.quality, estimate.info["snr_db"]))
-            assert all(bool((x > 1e3).all()) for x in estimate.std.values())
-    rest = stage(Signal(torch.zeros(3, 200, dtype=C128), RADAR.axes(200)))
-    assert all(float(x) == 0 for x in rest.value.values())
+    data = torch.stack([torch.zeros(3, 200, dtype=C128), azimuth_echo(RADAR, 200, y0=2500.0)])
+    for values in ({},) if name == "recommended" else ({}, {"y0_m": 2500.0}):
+        estimate = stage(Signal(data, RADAR.axes(200)), **values)
+        assert not bool(estimate.ok.any())
+        assert all(bool(torch.isfinite(x).all()) for x in (*estimate.value.values(), estimate.quality, estimate.info["snr_db"]))
+        assert all(bool((x > 1e3).all()) for x in estimate.std.values())
+        assert all(float(x[0]) == values.get(key, 0) for key, x in estimate.value.items())
 
 
 def _small(name, radar=RADAR, aperture=GATE, **settings):
-    extra = {"search": Search(u_r_m_s=6.0, u_a_m_s=2.0, y0_m=60.0, u_a_step_m_s=1.0)} if name == "recommended" else {}
+    extra = {"search": Search(u_r_m_s=3.0, u_a_m_s=1.0, y0_m=60.0, u_a_step_m_s=1.0)} if name == "recommended" else {}
     return ESTIMATORS[name](radar, aperture, **extra, **settings)
 
 
@@ -227,10 +229,10 @@ def _small(name, radar=RADAR, aperture=GATE, **settings):
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_trials_do_not_know_of_each_other(name, dtype):
     """Loud, quiet, silent and noisy trials, and one in clutter, together and alone."""
-    quiet = noisy(10.0, 2, u_r=3.0).data[..., N // 2 - 256 : N // 2 + 256]
-    slow = torch.exp(2j * math.pi * 0.01 * torch.arange(512, dtype=F64))
-    data = torch.stack([1e3 * quiet[0], 1e-6 * quiet[1], torch.zeros_like(quiet[0]), noise(1, 4, 512)[0], quiet[0] + 30 * slow]).to(dtype)
-    signal, start = Signal(data, RADAR.axes(512)), {} if name == "recommended" else {"u_r_m_s": 3.01}
+    quiet = noisy(10.0, 2, u_r=3.0).data[..., N // 2 - 192 : N // 2 + 192]
+    slow = torch.exp(2j * math.pi * 0.01 * torch.arange(384, dtype=F64))
+    data = torch.stack([1e3 * quiet[0], 1e-6 * quiet[1], torch.zeros_like(quiet[0]), noise(1, 4, 384)[0], quiet[0] + 30 * slow]).to(dtype)
+    signal, start = Signal(data, RADAR.axes(384)), {} if name == "recommended" else {"u_r_m_s": 3.01}
     stage = _small(name)
     together = stage(signal, **start)
     for i in range(5):

@@ -7,6 +7,7 @@ from torchsar.multichannel.compress import CompressChannels
 from torchsar.multichannel.detection import Detection, detect
 from torchsar.multichannel.migration import CorrectMigration, Frame, Keystone, NoMigration, StaticBulk, ambiguity_number, correct_migration
 from torchsar.multichannel.motion import PointMotion
+from torchsar.multichannel.plan import AzimuthPlan, FocusPlan
 from torchsar.multichannel.reconstruct import Reconstruct, reconstruct, reconstruct_lines
 from torchsar.multichannel.response import ElementPattern, FlatBand, LeastSquares, MinimumMeanSquare, band_matrix, condition_number, doppler_offsets, noise_gain_db
 from torchsar.multichannel.scene_image import Detector, ImageMovers, SceneImage
@@ -37,6 +38,7 @@ from torchsar.multichannel.velocity import (
 
 __all__ = [
     "AlongTrackAutofocus",
+    "AzimuthPlan",
     "AzimuthScaling",
     "Body",
     "CompressChannels",
@@ -52,6 +54,7 @@ __all__ = [
     "Extraction",
     "FlatBand",
     "FocusAzimuth",
+    "FocusPlan",
     "Frame",
     "GradientVelocity",
     "ImageMovers",

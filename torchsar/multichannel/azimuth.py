@@ -35,10 +35,10 @@ def focus_azimuth(spectrum: Tensor, offset_hz: Tensor, radar: BistaticRadar, mot
 
     bandwidth_hz: processed Doppler bandwidth about the centre, None for all. Differentiable in spectrum and motion.
     """
-    filtered = spectrum * azimuth_filter(offset_hz, radar, motion, spectrum.dtype)
+    matched = azimuth_filter(offset_hz, radar, motion, spectrum.dtype)
     if bandwidth_hz is not None:
-        filtered = filtered * (offset_hz.abs() <= bandwidth_hz / 2)
-    return centred_ifft(filtered)
+        matched = matched * (offset_hz.abs() <= bandwidth_hz / 2)
+    return centred_ifft(spectrum * matched)
 
 
 class FocusAzimuth(Stage):

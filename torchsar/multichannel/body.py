@@ -22,7 +22,7 @@ from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.model import point_phasor
 from torchsar.radar import BistaticRadar
 
-_TINY = torch.finfo(torch.float64).tiny
+_TINY = 1e-100  # far from where reciprocals overflow
 _GUARD_CELLS = 6
 _LINES_USED = 8  # for the sharpness of a picture
 _LEAST_LINES = 12

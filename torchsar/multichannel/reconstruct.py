@@ -34,14 +34,18 @@ def reconstruct_lines(data: Tensor, radar: BistaticRadar, motion: PointMotion, r
     """As `reconstruct` for data (..., channel, pulse, range) with one motion for all range lines; returns (..., bands * pulse, range)."""
     _refuse_bands(data, radar, rebuild)
     n, dtype = data.shape[-2], data.dtype
-    spectrum = fft_lines(torch.fft.ifftshift(_demodulated(data, radar, motion, left_k1_m_s), dim=-2))
-    spectrum = torch.roll(spectrum, -first_bin(n, rebuild.bands), -2) * shared_response(radar, motion, n, rebuild.bands, dtype, left_k1_m_s).conj()[..., None]
+    spectrum = fft_lines(_demodulated(data, radar, motion, rebuild.bands, left_k1_m_s))
+    # pulse 0 was sampled n // 2 pulses before slow time zero
+    late = linear_phasor(torch.tensor(n // 2 / n, dtype=torch.float64, device=data.device), 0.0, n, dtype)
+    spectrum = spectrum * (shared_response(radar, motion, n, rebuild.bands, dtype, left_k1_m_s).conj() * late)[..., None]
     return _combined(spectrum, rebuild.weights(radar, motion, n).to(dtype) * rebuild.bands, motion.trial_dims)
 
 
-def _demodulated(data: Tensor, radar: BistaticRadar, motion: PointMotion, left_k1_m_s: float) -> Tensor:
-    turns = -doppler_centre_hz(radar, motion, left_k1_m_s) / radar.prf_hz
-    return data * linear_phasor(turns, -(data.shape[-2] // 2), data.shape[-2], data.dtype)[..., None, :, None]
+def _demodulated(data: Tensor, radar: BistaticRadar, motion: PointMotion, bands: int, left_k1_m_s: float) -> Tensor:
+    """Data whose FFT begins with the lowest bin of the lowest band about the Doppler centre: no spectrum need be rolled."""
+    n = data.shape[-2]
+    turns = -doppler_centre_hz(radar, motion, left_k1_m_s) / radar.prf_hz - first_bin(n, bands) % n / n
+    return data * linear_phasor(turns, -(n // 2), n, data.dtype)[..., None, :, None]
 
 
 def _combined(spectrum: Tensor, weights: Tensor, trial_dims: int) -> Tensor:
@@ -119,6 +123,6 @@ def mind_condition(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, 
 
 def _sentence(radar: BistaticRadar, motion: PointMotion, bands: int, worst: float, then: str) -> str:
     found = condition_number(radar, motion, bands)
-    speed = motion.effective_m_s.expand(found.shape).flatten()[int(found.flatten().argmax())]
+    speed = motion.effective_m_s.detach().expand(found.shape).flatten()[int(found.flatten().argmax())]
     where = f"at a pulse rate of {radar.prf_hz:g} Hz and a speed past the target of {float(speed):.4g} m/s"
     return f"{where} the channels sample nearly the same places (condition number {worst:.3g}), {then}"

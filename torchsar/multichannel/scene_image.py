@@ -25,6 +25,8 @@ from torchsar.multichannel.velocity.whitening import line_whitening
 from torchsar.radar import BistaticRadar
 
 Removal = Literal["subtract", "zero"]
+_ALIKE_M_S = 5.0
+_SIDE_LOBES = 20.0  # times those of one point: a body has many, and its brightest pixels stand above the mean
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,7 @@ class ImageMovers(Stage):
                 continue
             seen.append(place)
             body = self._body(left, place)
-            if not bool(body.ok):
+            if not bool(body.ok) or any(self._side_lobe(body, other) for other in bodies):
                 continue
             bodies.append(body)
             seen.append(self._shown(body))
@@ -151,6 +153,14 @@ class ImageMovers(Stage):
 
     def _same(self, a: Detection, b: Detection) -> bool:
         return abs(a.azimuth_m - b.azimuth_m) < self.detector.apart_m[0] / 2 and abs(a.range_m - b.range_m) < self.detector.apart_m[1]
+
+    def _side_lobe(self, body: Body, other: Body) -> bool:
+        """What a body shows may be side lobes in range, beyond the lines that were removed, of another at the same place along track and of nearly the same velocity."""
+        away_m = float((body.motion.range_m - other.motion.range_m).abs())
+        moves_alike = abs(float(body.motion.u_r_m_s - other.motion.u_r_m_s)) < _ALIKE_M_S and abs(float(body.motion.u_a_m_s - other.motion.u_a_m_s)) < _ALIKE_M_S
+        beside = abs(self._shown(body).azimuth_m - self._shown(other).azimuth_m) < self.detector.apart_m[0] / 2
+        cell_m = self.radar.wave_speed_m_s / self.radar.pulse.bandwidth_hz
+        return moves_alike and beside and float(body.level) < _SIDE_LOBES * float(other.level) * (cell_m / (math.pi * max(away_m, cell_m))) ** 2
 
     def _shown(self, body: Body) -> Detection:
         """Where an image of everything at rest shows a body."""

@@ -16,6 +16,7 @@ from torchsar.radar import BistaticRadar
 
 _AROUND_M_S, _STEP_M_S, _REACH_M = 3.0, 0.5, 150.0
 _CLEARLY = 1.3
+_FASTEST = 0.9  # of the receiver: fits that failed may end anywhere
 
 
 def better_pulse_rate(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture) -> Tensor:
@@ -26,11 +27,12 @@ def better_pulse_rate(data: Tensor, radar: BistaticRadar, motion: PointMotion, a
     """
     begin = motion.each(lambda value: value.expand(data.shape[:-2])[..., None])
     offsets = torch.arange(-_AROUND_M_S, _AROUND_M_S + _STEP_M_S / 2, _STEP_M_S, dtype=torch.float64, device=data.device)
-    energies = []
+    level = data.abs().amax((-2, -1), keepdim=True)
+    data, energies = data / torch.where(level > 0, level, 1.0), []  # its squares must fit into single precision
     for number in (-1, 0, 1):
         u_r = begin.u_r_m_s + number * radar.ambiguous_velocity_m_s
         u_a = begin.speed_m_s - torch.sqrt((begin.square_m2_s2 - u_r.square()).clamp_min(1.0))
-        energies.append(tone_energy(data, radar, replace(begin, u_r_m_s=u_r, u_a_m_s=u_a + offsets), aperture, _REACH_M))
+        energies.append(tone_energy(data, radar, replace(begin, u_r_m_s=u_r, u_a_m_s=(u_a + offsets).clamp_max(_FASTEST * begin.speed_m_s)), aperture, _REACH_M))
     energy = torch.stack(energies)
     return torch.where(energy.amax(0) > _CLEARLY * energy[1], energy.argmax(0) - 1, 0).to(torch.float64)
 

@@ -19,6 +19,7 @@ from torchsar.radar import BistaticRadar
 
 _COARSE_S = 4.5
 _ROUNDS = 2
+_CENTRED, _FEW = 4, 4
 
 
 def moving_point_velocity(
@@ -45,7 +46,7 @@ def moving_point_velocity(
         search = replace(search, u_a_m_s=0.0)
     job = _Job(data.to(torch.complex128), radar, aperture, search, u_a_m_s or 0.0 if not isinstance(u_a_m_s, Tensor) else u_a_m_s, range_m, unknowns)
     if whitening is not None:
-        return job.estimate(job.found(whitening), torch.ones(data.shape[:-2], dtype=torch.bool, device=data.device))
+        return job.estimate(job.centred(job.found(whitening), whitening), torch.ones(data.shape[:-2], dtype=torch.bool, device=data.device))
     plain = job.refined(job.found(None))
     if not bool(plain.coloured.any()):
         return job.estimate(plain.found, plain.coloured)
@@ -81,6 +82,12 @@ class _Job:
         start, _ = bank_search(self.data, self.radar, coarse, self.search, self.u_a_m_s, self.range_m, whitening)
         near = maximum_likelihood(self.data, self.radar, start, coarse, self.unknowns, whitening)
         return maximum_likelihood(self.data, self.radar, near.motion, self.aperture, self.unknowns, whitening)
+
+    def centred(self, found: Found, whitening: Whitening) -> Found:
+        """The fit again with the aperture about the place found: in clutter an expected amplitude that lies off drags the place along, to a third in each round."""
+        for _ in range(_CENTRED):
+            found = maximum_likelihood(self.data, self.radar, found.motion, self.aperture, self.unknowns, whitening, _FEW)
+        return found
 
     def refined(self, found: Found) -> _Refined:
         """The fit again in the covariance of what it left, twice: where that is white nothing changes."""

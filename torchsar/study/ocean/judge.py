@@ -32,8 +32,8 @@ DEFINITIONS: dict[str, Any] = {
     "displacement_vt_m: what the motion predicts on the axis x = (V_R - u_a) t, which the source prints",
     "replica_distance_m": "distance on x = V_R t of the stronger first replica from the image itself, centroids of the same image; replica_distance_vt_m: "
     "PRF lambda R0 / (V_R - u_a), on the axis of the source. A blurred ship that reaches beyond the rebuilt band loses one end to its replica: measured centroids then lie nearer than predicted",
-    "replica_db": "mean power of the final image within 100 m along track and 20 m in range of the replica, over the sea's in the same lines; the sea itself has 0 dB, spread by its texture "
-    "by about 1 dB. replica_before_db: of the image of everything at rest; replica_left_db: of the difference from the image of what does not move",
+    "replica_db": "mean power of the final image within 100 m along track and 40 m in range of the strongest replica one or two pulse rates away, over the sea's in the same lines; the sea "
+    "itself has 0 dB, spread by its texture by about 1 dB. replica_before_db: of the image of everything at rest; replica_left_db: of the difference from the image of what does not move",
     "sea_error_db": "power of the difference of the image without movers from the image of what does not move, over the power of the latter, within 400 m along track and 30 m in range of where the "
     "image at rest showed the ship; sea_error_before_db: the same without removal. Of ships that move",
     "hole_db": "power of the image without movers within 60 m and 12 m of where the image at rest showed the ship, over that of the sea there: 0 dB is untouched",
@@ -42,7 +42,8 @@ DEFINITIONS: dict[str, Any] = {
     "seconds": "wall time of the chain of the method a scene",
     "published": "figures of Remote Sens. 2020, 12, 1703, Fig. 18, whose azimuth is x = (V_R - u_a) t",
 }
-NEAR_M, GATE_M, REPLICA_M = (400.0, 30.0), (60.0, 12.0), (100.0, 20.0)
+NEAR_M, GATE_M, REPLICA_M = (400.0, 30.0), (60.0, 12.0), (100.0, 40.0)
+_SPREAD_M = (150.0, 110.0)
 
 
 @dataclass(frozen=True)
@@ -81,21 +82,21 @@ def shown_at(motion: PointMotion) -> Place:
 
 @dataclass(frozen=True)
 class Sight:
-    """What a ship looks like without sea and noise. centre: motion of the centroid of its own picture; image, replica: places of the image at rest; replica_vt_m: predicted distance of the replica
-    on x = (V_R - u_a) t; scatterers: centroid of powers, y0 and range."""
+    """What a ship looks like without sea and noise. centre: motion of the centroid of its own picture; image, replica: places of the image at rest; replica: the strongest of one and two
+    pulse rates; away_m: distance of that of one, measured on x = V_R t, and predicted on x = (V_R - u_a) t; scatterers: centroid of powers, y0 and range."""
 
     ship: Vouched
     centre: PointMotion
     image: Place
     replica: Place
-    replica_vt_m: float
+    away_m: tuple[float, float]
     scatterers: tuple[float, float]
 
     def metrics(self) -> dict[str, float]:
         """What only the echo decides."""
         y0, along = float(self.centre.y0_m), float(self.centre.along_m_s)
         places = {"image_position_m": self.image.azimuth_m, "displacement_m": self.image.azimuth_m - y0, "displacement_vt_m": along * float(self.centre.image_s) - y0}
-        away = {"replica_distance_m": abs(self.replica.azimuth_m - self.image.azimuth_m), "replica_distance_vt_m": self.replica_vt_m}
+        away = {"replica_distance_m": self.away_m[0], "replica_distance_vt_m": self.away_m[1]}
         return {**places, **away} if self.ship.moves else places
 
 
@@ -121,10 +122,17 @@ def _sight(radar: BistaticRadar, ship: Vouched, data: Signal, echo: Signal, extr
     shown = shown.centroid(image, (250.0, 60.0))
     off_vt = radar.prf_hz * radar.wavelength_m * float(ship.motion.range_m) / float(ship.motion.along_m_s)
     off = off_vt * radar.speed_m_s / float(ship.motion.along_m_s)
-    sides = [replace(shown, azimuth_m=shown.azimuth_m + side * off) for side in (-1, 1)]
-    replica = max(sides, key=lambda place: place.power(image, REPLICA_M)).centroid(image, (150.0, 60.0))
+    first, *_ = places = [_repeated(image, shown, order * off) for order in (1, 2)]
+    strongest = max(places, key=lambda place: place.power(image, REPLICA_M))
+    away = abs(first.azimuth_m - shown.azimuth_m)
     y0, near = centroid(ship.movers, radar)
-    return Sight(ship, _own_centre(radar, ship.motion, data, echo, extraction), shown, replica, off_vt, (float(y0), float(near)))
+    return Sight(ship, _own_centre(radar, ship.motion, data, echo, extraction), shown, strongest, (away, off_vt), (float(y0), float(near)))
+
+
+def _repeated(image: Signal, shown: Place, off_m: float) -> Place:
+    """Where a replica lies so far to either side of the image itself, on the side where it is stronger: it is wide in range, since its migration is that of another band."""
+    sides = [replace(shown, azimuth_m=shown.azimuth_m + side * off_m) for side in (-1, 1)]
+    return max(sides, key=lambda place: place.power(image, _SPREAD_M)).centroid(image, _SPREAD_M)
 
 
 def _own_centre(radar: BistaticRadar, motion: PointMotion, data: Signal, echo: Signal, extraction: Extraction) -> PointMotion:

@@ -1,0 +1,130 @@
+"""The whole flow: movers found, taken out, and put in their places."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import pytest
+import torch
+
+from torchsar.core import Signal
+from torchsar.multichannel.motion import PointMotion
+from torchsar.multichannel.response import LeastSquares, MinimumMeanSquare
+from torchsar.multichannel.scene_image import ImageMovers, SceneImage, placed
+from torchsar.multichannel.stationary import StationaryImage
+
+from .helpers import published_radar
+from .ocean import EXTRACTION, RADAR, flow, frame_of, ship
+
+
+@cache
+def scenes() -> tuple[Signal, Signal]:
+    """A moving ship on a sea, and the sea alone."""
+    return frame_of({"one": ship()}), frame_of({})
+
+
+@cache
+def made() -> SceneImage:
+    return flow()(scenes()[0])
+
+
+def known() -> PointMotion:
+    return PointMotion.of(RADAR, torch.zeros((), dtype=torch.float64), 8.0, 0.0, 0.0, 5000.0)
+
+
+def near(image: Signal, azimuth_m: float, range_m: float, reach=(100.0, 15.0)) -> torch.Tensor:
+    azimuth, range_ = (axis.values() for axis in image.axes)
+    return image.data[((azimuth - azimuth_m).abs() < reach[0])][:, (range_ - range_m).abs() < reach[1]]
+
+
+def ratio_db(a: torch.Tensor, b: torch.Tensor) -> float:
+    return 10 * math.log10(float(a.abs().square().mean() / b.abs().square().mean()))
+
+
+def test_a_ship_is_found_removed_and_put_in_its_place() -> None:
+    scene, still = made(), StationaryImage(RADAR)(scenes()[1])
+    (body,) = scene.bodies
+    assert abs(float(body.motion.u_r_m_s) - 8) < 0.5 and abs(float(body.motion.y0_m)) < 20
+    shown = 300 * float(known().image_s)
+    assert shown == pytest.approx(133, abs=1)
+    before, after = (ratio_db(near(image, shown, 5000.0) - near(still, shown, 5000.0), near(still, shown, 5000.0)) for image in (scene.conventional, scene.rest))
+    assert before > 15 and after < before - 23
+    assert ratio_db(near(scene.fused, float(body.motion.y0_m), 5000.0, (40.0, 10.0)), near(still, 0.0, 5000.0)) > 10
+    estimate = scene.estimate
+    assert estimate is not None and estimate.ok.tolist() == [True] + 7 * [False] and float(estimate["u_r_m_s"][0]) == float(body.motion.u_r_m_s)
+    assert float(estimate["u_r_m_s"][1:].abs().max()) == 0
+
+
+def test_a_known_motion_is_kept() -> None:
+    scene = flow()(scenes()[0], known=[known()])
+    assert float(scene.bodies[0].motion.u_r_m_s) == 8 and torch.equal(scene.conventional.data, made().conventional.data)
+    still = StationaryImage(RADAR)(scenes()[1])
+    shown = 300 * float(known().image_s)
+    assert ratio_db(near(scene.rest, shown, 5000.0) - near(still, shown, 5000.0), near(still, shown, 5000.0)) < -5
+    none = flow()(scenes()[0], known=[])
+    assert none.bodies == [] and torch.equal(none.rest.data, none.conventional.data)
+    with pytest.raises(ValueError, match="9 motions are known, and the detector takes at most 8"):
+        flow()(scenes()[0], known=9 * [known()])
+
+
+def test_zeroing_takes_the_sea_along() -> None:
+    still, zero = StationaryImage(RADAR)(scenes()[1]), flow(removal="zero")(scenes()[0], known=[known()])
+    shown = 300 * float(known().image_s)
+    left = [ratio_db(near(scene.rest, shown, 5000.0) - near(still, shown, 5000.0), near(still, shown, 5000.0)) for scene in (made(), zero)]
+    assert left[0] + 5 < left[1] < 1
+
+
+def test_a_ship_at_rest_stays_in_the_image() -> None:
+    data = frame_of({"still": ship(0.0)})
+    scene = flow()(data)
+    assert len(scene.bodies) == 1 and torch.equal(scene.rest.data, scene.conventional.data) and torch.equal(scene.fused.data, scene.rest.data)
+
+
+def test_a_placed_point_lies_as_high_as_one_at_rest() -> None:
+    point = ship(length_m=0.0, range_cells=1, count=1, level_db=40.0)
+    scene = flow()(frame_of({"one": point}, sea=False), known=[known()])
+    rest = StationaryImage(RADAR)(frame_of({"one": ship(0.0, length_m=0.0, range_cells=1, count=1, level_db=40.0)}, sea=False))
+    assert float(scene.fused.data.abs().max() / rest.data.abs().max()) == pytest.approx(1.0, abs=0.05)
+    row, column = divmod(int(scene.fused.data.abs().argmax()), scene.fused.axes[1].n)
+    azimuth, range_ = scene.fused.axes
+    assert float(azimuth.values()[row]) == pytest.approx(0.0, abs=1.0) and float(range_.values()[column]) == pytest.approx(5000.0, abs=2.6)
+    empty = scene.rest.with_data(torch.zeros_like(scene.rest.data))
+    assert float(placed(empty, scene.bodies[0], EXTRACTION).data[~((azimuth.values()).abs() < 70)].abs().max()) == 0
+
+
+def test_nothing_is_found_where_nothing_moves() -> None:
+    for data in (scenes()[1], scenes()[1].with_data(torch.zeros_like(scenes()[1].data))):
+        scene = ImageMovers(RADAR, EXTRACTION)(data)
+        assert scene.bodies == [] and torch.equal(scene.rest.data, scene.fused.data) and bool(torch.isfinite(torch.view_as_real(scene.fused.data)).all())
+
+
+def test_side_lobes_of_a_ship_are_no_targets() -> None:
+    ship, movers = made().bodies[0], flow()
+    # a point's side lobes have (6 / 90 pi)^2 = 4.5e-4 of it 90 m away
+    beside = replace(ship, motion=replace(ship.motion, range_m=ship.motion.range_m + 90.0), level=5e-3 * ship.level)
+    assert movers._side_lobe(beside, ship)
+    assert not movers._side_lobe(replace(beside, level=0.05 * ship.level), ship)
+    assert not movers._side_lobe(replace(beside, motion=replace(beside.motion, u_r_m_s=-ship.motion.u_r_m_s)), ship)
+    assert not movers._side_lobe(replace(beside, motion=replace(beside.motion, y0_m=ship.motion.y0_m + 300.0)), ship)
+
+
+def test_any_rebuild_serves_what_is_at_rest() -> None:
+    for rebuild in (LeastSquares(1), MinimumMeanSquare(3)):
+        scene = flow(rebuild=rebuild)(scenes()[0], known=[known()])
+        assert scene.rest.axes[0].n == rebuild.bands * 540 and bool(torch.isfinite(torch.view_as_real(scene.fused.data)).all())
+
+
+def test_mistakes_are_named() -> None:
+    data = scenes()[0]
+    with pytest.raises(ValueError, match="one frame at a time"):
+        flow()(data.with_data(data.data[None]))
+    broken = data.data.clone()
+    broken[0, 0, 0] = torch.nan
+    with pytest.raises(ValueError, match="NaN|finite"):
+        flow()(data.with_data(broken))
+    with pytest.raises(ValueError, match="removal must be"):
+        flow(removal="paint")
+    with pytest.raises(ValueError, match="2 Doppler bands cannot be told apart by 1 channel"):
+        ImageMovers(published_radar(channel_m=(0.0,)))
