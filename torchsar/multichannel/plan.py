@@ -40,7 +40,7 @@ class AzimuthPlan:
             expected = f"(..., {self.matrix.shape[-2]}, {self.matrix.shape[-1]}) of {self.matrix.dtype}"
             raise ValueError(f"this plan works on channels and pulses {expected}, got {tuple(data.shape)} of {data.dtype}")
         rows = data.flatten(0, -3) if data.ndim > 3 else data
-        if rows.ndim < 3 or torch.is_grad_enabled() and data.requires_grad:
+        if rows.ndim < 3 or (torch.is_grad_enabled() and data.requires_grad):
             return self._image(data)
         # a few trials at a time stay in the cache
         height = max(1, block_bytes_of(data.device) // (rows[0].numel() * data.element_size()))
@@ -65,7 +65,8 @@ def _matrix(radar: BistaticRadar, motion: PointMotion, n: int, rebuild: Rebuild,
     offset = doppler_offsets(n, bands, radar.prf_hz, middle_hz.device)
     weights = rebuild.weights(radar, motion, n)
     weights = (weights if weights.ndim == 3 else weights.expand(n, -1, -1)).transpose(0, 1).reshape(total, radar.channels)
-    seen = shared_response(radar, motion, n, bands, torch.complex128) * unit_phasor(-(middle_hz - centre_hz) * radar.channels_at(offset.device) / motion.effective_m_s, torch.complex128)[:, None]
+    delay = radar.channels_at(offset.device) / motion.effective_m_s
+    seen = shared_response(radar, motion, n, bands, torch.complex128) * unit_phasor(-(middle_hz - centre_hz) * delay, torch.complex128)[:, None]
     found = bands * weights * seen.conj().mT.repeat(bands, 1) * azimuth_filter(offset, radar, motion, torch.complex128, middle_hz)[:, None]
     if bandwidth_hz is not None:
         found = found * ((middle_hz + offset - centre_hz).abs() <= bandwidth_hz / 2)[:, None]
@@ -80,7 +81,8 @@ def _matrix(radar: BistaticRadar, motion: PointMotion, n: int, rebuild: Rebuild,
 class FocusPlan(Stage):
     """Channels (channel, pulse) to the image (azimuth,) of points with one motion told beforehand, x = V_R t (m): `AzimuthPlan` as a stage.
 
-    Its plan is kept as long as pulses, dtype and device of the data stay. Arguments as Reconstruct and FocusAzimuth have them, velocities as numbers. Refuses motions at which channels sample the same places, and warns of poor ones.
+    Its plan is kept as long as pulses, dtype and device of the data stay. Arguments as Reconstruct and FocusAzimuth have them, velocities as numbers. Refuses motions at which
+    channels sample the same places, and warns of poor ones.
     """
 
     works_on = ("channel", "pulse")
@@ -102,7 +104,8 @@ class FocusPlan(Stage):
 
     def plan(self, data: Tensor) -> AzimuthPlan:
         """For data like these, formed at the first call."""
-        if self._plan is None or self._plan.n_pulse != data.shape[-1] or self._plan.matrix.dtype != data.dtype or self._plan.matrix.device != data.device:
+        kept = None if self._plan is None else (self._plan.n_pulse, self._plan.matrix.dtype, self._plan.matrix.device)
+        if self._plan is None or kept != (data.shape[-1], data.dtype, data.device):
             mind_condition(self.radar, self.motion, self.rebuild, data.dtype)
             motion = self.motion.each(lambda value: value.to(data.device))
             self._plan = AzimuthPlan(self.radar, motion, data.shape[-1], self.rebuild, self.bandwidth_hz, data.dtype)

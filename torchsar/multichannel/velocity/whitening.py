@@ -88,5 +88,5 @@ def _or_white(covariance: Tensor, size: Tensor) -> tuple[Tensor, Tensor, Tensor]
     log_det = (torch.linalg.slogdet(loaded)[1] * size).sum(-1)
     white = channels * torch.log(power) * size.sum()
     chance = _EVIDENCE * channels**2 * len(size) / 2
-    plain = white - log_det < chance
+    plain = (white - log_det < chance) | ~(level.amax(-1) > 0)
     return torch.where(plain[..., None, None, None], power[..., None, None, None] * eye, loaded), torch.where(plain, white, log_det), ~plain
