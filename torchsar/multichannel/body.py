@@ -39,7 +39,7 @@ class Extraction:
     along_m: float = 120.0
     range_m: float = 60.0
     integration_s: float = 4.5
-    segment_s: float = 0.6
+    segment_s: float = 1.0
 
     def __post_init__(self) -> None:
         for name in ("along_m", "range_m", "integration_s", "segment_s"):
