@@ -1,4 +1,4 @@
-"""What the recorded sweep of system 001 claims (Table 2 of the source, 200 trials a point); a reduced form runs in test_001_moving.py."""
+"""What the recorded sweeps of system 001 claim (Table 2 of the source, 200 trials a point; clutter, 50); a reduced form runs in test_001_moving.py."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-RECORDED = json.loads((Path(__file__).resolve().parents[2] / "docs" / "sweeps" / "geo_velocity_scnr.json").read_text(encoding="utf-8"))
+FOLDER = Path(__file__).resolve().parents[2] / "docs" / "sweeps"
+RECORDED = json.loads((FOLDER / "geo_velocity_scnr.json").read_text(encoding="utf-8"))
+CLUTTER = json.loads((FOLDER / "geo_velocity_clutter.json").read_text(encoding="utf-8"))
 PRF, SCNR = "radar.prf_hz", "world.noise.raw_scnr_db"
 # brief 001: mean errors of its trial, which rms errors of ours may exceed by what 24 trials leave open
 SIR_TRIAL = {170.0: {-20.0: 0.25, -10.0: 0.08, 0.0: 0.06, 10.0: 0.06}, 180.0: {-20.0: 0.40, -10.0: 0.05, 0.0: 0.04, 10.0: 0.03}, 190.0: {-20.0: 2.0, -10.0: 0.18, 0.0: 0.03, 10.0: 0.03}}
@@ -42,3 +44,12 @@ def test_the_intensity_ratio_is_of_the_trials_order(prf_hz: float) -> None:
 def test_below_threshold_nobody_is_trusted() -> None:
     for algorithm in ("sir", "ati", "recommended"):
         assert found("points", "ok_share", 180.0, -50.0, algorithm=algorithm) < 0.3
+
+
+@pytest.mark.parametrize("scr_db", [-20.0, -10.0, 0.0, 17.0])
+def test_in_clutter_the_estimated_covariance_is_nearly_as_good_as_the_true_one(scr_db: float) -> None:
+    at = {"metric": "u_r_error_m_s", "parameters": {"world.noise.scr_db": scr_db}}
+    rms = {p["algorithm"]: p["rmse"] for p in CLUTTER["points"] if all(p[key] == value for key, value in at.items())}
+    bound = next(b["rms"] for b in CLUTTER["bounds"] if all(b[key] == value for key, value in at.items()) and b["bound"] == "Cramer-Rao, u_a known")
+    assert 0.7 < rms["recommended"] / bound < 3
+    assert rms["recommended"] < 0.1 * min(rms["ati"], rms["sir"])
