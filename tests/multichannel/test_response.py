@@ -189,7 +189,7 @@ def test_singular_weights_stay_finite():
 
 
 def test_refusals():
-    with pytest.raises(ValueError, match="at least one Doppler band, got bands=0"):
+    with pytest.raises(ValueError, match="Doppler bands, at least one, got bands=0"):
         LeastSquares(0)
     with pytest.raises(ValueError, match="within \\+-120 dB, got 130"):
         MinimumMeanSquare(5, 130.0)

@@ -290,5 +290,5 @@ def test_refusals():
         MovingPointVelocity(RADAR, GATE, search=Search(u_a_m_s=400.0))(signal)
     with pytest.raises(ValueError, match="search.u_r_m_s must be 0 or a positive half width, got -1"):
         Search(u_r_m_s=-1)
-    with pytest.raises(ValueError, match="positive duration_s, got 0"):
+    with pytest.raises(ValueError, match="finite duration_s, got 0"):
         Dwell(0.0)

@@ -169,7 +169,7 @@ def test_injected_phases_are_found_in_recordings(tmp_path: Path, made) -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"system": "isla"}, "it should be one of geo, isal, isal_rotation, sal, stripmap; did you mean 'isal'"),
+        ({"system": "isla"}, "it should be one of geo, geo_ocean, isal, isal_rotation, sal, stripmap; did you mean 'isal'"),
         ({"cases": {"empty": {}}}, "cases.empty changes nothing"),
         ({"cases": {"odd": {"world.nose.snr_db": 3.0}}}, "leads nowhere at 'nose'"),
         ({"cases": {"odd": {"world.noise.snr_db": "loud"}}}, "world.noise.snr_db"),

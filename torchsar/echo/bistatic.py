@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
@@ -15,7 +16,7 @@ from torchsar.echo.pulsed import echo_spectrum
 from torchsar.echo.sea import sea_echo
 from torchsar.echo.stripmap import Damage
 from torchsar.radar import BistaticRadar
-from torchsar.scene import BistaticWorld, ExactRange, Gate, Movers, ReceiveRange, TransmitRange
+from torchsar.scene import BandLimited, BistaticWorld, ExactRange, Gate, Movers, ReceiveRange, TransmitRange
 
 Kind = Literal["compressed", "full"]
 _TABLE_BYTES = 8 << 20
@@ -140,10 +141,11 @@ def simulate_bistatic(
     damages: applied in order, by name. The truth, float64 (..., target): `u_r_m_s`, `u_a_m_s`, `y0_m` (also as `azimuth_m`), `range_m` (R0), `amplitude`, and
     `u_t_m_s`, the closing speed towards the transmitter, where there is one; `transmit_range_m` (pulse,), the true R_T(t) - R_T(0); `noise_std` of a sample
     of this kind (...,); what each damage says under "<damage>.<name>". `clean` is the recording without noise and damages.
-    Raises ValueError for targets as fast as the receiver or far outside the range axis, no pulses, or lines that do not hold the pulse.
+    Warns of targets that shine at no pulse. Raises ValueError for targets as fast as the receiver or far outside the range axis, no pulses, or lines that do not hold the pulse.
     """
     _refuse_impossible(radar, world, n_pulse, n_range, kind, draws)
     movers = _movers(radar, world, n_range, draws, device)
+    _warn_of_dark(movers, radar, world.gate, n_pulse)
     axes = radar.axes(n_pulse, n_range)
     time_s = axes[1].values(device)
     transmit_m = radar.transmit_range_m(time_s) if world.transmit is None else world.transmit.range_m(time_s)
@@ -177,10 +179,24 @@ def _movers(radar: BistaticRadar, world: BistaticWorld, n_range: int | None, dra
         raise ValueError(f"a target moves along track at {radar.speed_m_s - slowest:g} m/s, as fast as the receiver ({radar.speed_m_s:g} m/s) or faster; give u_a_m_s below that")
     if not nearest > 0:
         raise ValueError(f"a target lies at a closest range of {nearest:g} m; range_m counts from the reference range of {radar.reference_range_m:g} m and must leave a positive range")
-    nearest, width = float(movers.range_m.detach().abs().min()), (n_range or 0) * radar.range_step_m
-    if n_range is not None and nearest > 1.5 * width:
-        raise ValueError(f"every target lies {nearest:g} m or more from the middle of a range axis of {width:g} m; range_m counts from the reference range, or record longer lines (n_range)")
+    off, width = movers.range_m.detach().abs().flatten(0, -2).amin(0) if movers.range_m.ndim > 1 else movers.range_m.detach().abs(), (n_range or 0) * radar.range_step_m
+    outside = (off > 1.5 * width).nonzero()[:, 0].tolist()
+    if n_range is not None and outside:
+        far = f"targets {outside} (counted from 0) lie {float(off.max()):g} m" if len(outside) > 1 else f"target {outside[0]} (counted from 0) lies {float(off.max()):g} m"
+        raise ValueError(f"{far} from the middle of a range axis of {width:g} m; range_m counts from the reference range, or record longer lines (n_range)")
     return movers
+
+
+def _warn_of_dark(movers: Movers, radar: BistaticRadar, gate: Gate, n_pulse: int) -> None:
+    """Targets that the gate lights at no pulse of the record."""
+    if not isinstance(gate, BandLimited):
+        return
+    abeam_s = (movers.y0_m / (radar.speed_m_s - movers.u_a_m_s)).detach().abs()
+    dark = abeam_s > (n_pulse // 2) / radar.prf_hz + gate.duration_s / 2
+    if bool(dark.any()):
+        last = float(abeam_s.max())
+        when = f"one is abeam {last:.3g} s from the middle of a record of {n_pulse / radar.prf_hz:.3g} s"
+        warnings.warn(f"{int(dark.sum())} of {dark.numel()} targets shine at no pulse: {when}; record longer, or move it", stacklevel=3)
 
 
 def _refuse_impossible(radar: BistaticRadar, world: BistaticWorld, n_pulse: int, n_range: int | None, kind: str, draws: Draws) -> None:

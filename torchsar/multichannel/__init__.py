@@ -9,6 +9,7 @@ from torchsar.multichannel.migration import CorrectMigration, Frame, Keystone, N
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.plan import AzimuthPlan, FocusPlan
 from torchsar.multichannel.reconstruct import Reconstruct, reconstruct, reconstruct_lines
+from torchsar.multichannel.requirements import MultichannelUse, multichannel_limits, multichannel_requirements
 from torchsar.multichannel.response import ElementPattern, FlatBand, LeastSquares, MinimumMeanSquare, band_matrix, condition_number, doppler_offsets, noise_gain_db
 from torchsar.multichannel.scene_image import Detector, ImageMovers, SceneImage
 from torchsar.multichannel.stationary import StationaryImage, stationary_image
@@ -64,6 +65,7 @@ __all__ = [
     "LikelihoodVelocity",
     "MinimumMeanSquare",
     "MovingPointVelocity",
+    "MultichannelUse",
     "NoMigration",
     "PointMotion",
     "Reconstruct",
@@ -95,6 +97,8 @@ __all__ = [
     "line_whitening",
     "maximum_likelihood",
     "moving_point_velocity",
+    "multichannel_limits",
+    "multichannel_requirements",
     "noise_gain_db",
     "reconstruct",
     "reconstruct_lines",

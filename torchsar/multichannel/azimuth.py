@@ -55,7 +55,7 @@ class FocusAzimuth(Stage):
     def __init__(self, radar: BistaticRadar, bandwidth_hz: float | None = None) -> None:
         super().__init__()
         self.radar, self.bandwidth_hz = radar, bandwidth_hz
-        if bandwidth_hz is not None and not bandwidth_hz > 0:
+        if bandwidth_hz is not None and not 0 < bandwidth_hz < float("inf"):
             raise ValueError(f"bandwidth_hz must be positive, or None for all that is rebuilt, got {bandwidth_hz}")
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0, range_m: Number | None = None) -> Signal:

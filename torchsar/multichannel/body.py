@@ -43,8 +43,8 @@ class Extraction:
 
     def __post_init__(self) -> None:
         for name in ("along_m", "range_m", "integration_s", "segment_s"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} of an extraction must be positive, got {getattr(self, name)}")
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} of an extraction must be positive and finite, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True)

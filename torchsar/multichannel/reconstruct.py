@@ -13,11 +13,8 @@ from torch import Tensor
 
 from torchsar.core import Axis, Signal, Stage, fft_lines, linear_phasor
 from torchsar.multichannel.motion import Number, PointMotion
-from torchsar.multichannel.response import SINGULAR, LeastSquares, Rebuild, condition_number, doppler_centre_hz, first_bin, shared_response
+from torchsar.multichannel.response import POOR, SINGULAR, SINGULAR_SINGLE, LeastSquares, Rebuild, condition_number, doppler_centre_hz, first_bin, shared_response
 from torchsar.radar import BistaticRadar
-
-_POOR = 5.0
-_SINGLE = 1e4
 
 
 def reconstruct(data: Tensor, radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, left_k1_m_s: float = 0.0) -> Tensor:
@@ -75,6 +72,8 @@ class Reconstruct(Stage):
 
     def __init__(self, radar: BistaticRadar, rebuild: Rebuild | None = None, range_m: float | None = None) -> None:
         super().__init__()
+        if rebuild is not None and not hasattr(rebuild, "refusal"):
+            raise TypeError(f"rebuild must be LeastSquares(bands) or MinimumMeanSquare(...), got {rebuild!r}")
         self.radar, self.rebuild, self.range_m = radar, rebuild or LeastSquares(), range_m
         why = self.rebuild.refusal(radar.channels)
         if why is not None:
@@ -112,11 +111,11 @@ def mind_condition(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, 
     if not isinstance(rebuild, LeastSquares):
         return
     found = condition_number(radar, motion, rebuild.bands)
-    limit = SINGULAR if dtype == torch.complex128 else _SINGLE
+    limit = SINGULAR if dtype == torch.complex128 else SINGULAR_SINGLE
     if bool((found > limit).all()):
         then = f"so that {rebuild.bands} bands cannot be told apart; rebuild fewer bands, use MinimumMeanSquare, or change the pulse rate"
         raise ValueError(_sentence(radar, motion, rebuild.bands, float(found.min()), then))
-    if bool((found > _POOR).any()):
+    if bool((found > POOR).any()):
         worst = float(found.max())
         warnings.warn(_sentence(radar, motion, rebuild.bands, worst, "so that noise and errors of the velocity grow; rebuild fewer bands, or use MinimumMeanSquare"), stacklevel=3)
 

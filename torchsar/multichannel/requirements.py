@@ -19,10 +19,10 @@ from torchsar.core import cis
 from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Requirement
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.response import SINGULAR, LeastSquares, MinimumMeanSquare, Rebuild, band_matrix, condition_number
+from torchsar.multichannel.response import POOR, SINGULAR, SINGULAR_SINGLE, LeastSquares, MinimumMeanSquare, Rebuild, band_matrix, condition_number
 from torchsar.radar import BistaticRadar, receive_range
 
-POOR_CONDITION, SINGLE_CONDITION, NEAR_AMBIGUOUS = 5.0, 1e4, 0.95
+NEAR_AMBIGUOUS = 0.95
 GATHERED_SNR_DB, SIR_SNR_DB, FAINT_RAD = 19.0, 7.0, 0.3
 _POINTS = 65
 _GEO_RANGE_M = 3.9e7
@@ -119,12 +119,12 @@ def _channel_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Limi
     if isinstance(use.rebuild, MinimumMeanSquare) or bands > radar.channels or bands == 1:
         return
     rest = float(condition_number(radar, PointMotion.of(radar, torch.zeros(())), bands))
-    least = SINGULAR if use.dtype == torch.complex128 else SINGLE_CONDITION
+    least = SINGULAR if use.dtype == torch.complex128 else SINGULAR_SINGLE
     same = f"at a pulse rate of {radar.prf_hz:g} Hz and {radar.speed_m_s:g} m/s channels sample the same places, and {bands} bands cannot be told apart"
     other = "rebuild fewer bands, use MinimumMeanSquare, or change the pulse rate"
     yield Limit("condition number at rest", rest, least, "", "refuse", same, other)
     worst, speed = _worst_condition(radar, use)
-    yield Limit("condition number within the velocities", worst, POOR_CONDITION, "", "warn", f"noise and errors of the velocity grow, most at u_a = {speed:.3g} m/s", other)
+    yield Limit("condition number within the velocities", worst, POOR, "", "warn", f"noise and errors of the velocity grow, most at u_a = {speed:.3g} m/s", other)
     singular = singular_speeds_m_s(radar, bands, use.u_a_m_s)
     named = ", ".join(f"{u:.3g}" for u in singular[:3])
     yield Limit("singular speeds along track within the search", len(singular), 1, "", "warn", f"the search crosses a singular reconstruction at u_a = {named} m/s", other)

@@ -18,7 +18,7 @@ from torchsar.core import linear_phasor, unit_phasor
 from torchsar.multichannel.motion import PointMotion
 from torchsar.radar import BistaticRadar
 
-SINGULAR = 1e6
+SINGULAR, SINGULAR_SINGLE, POOR = 1e6, 1e4, 5.0  # condition numbers: refused in float64, in single precision, warned of
 _TINY = SINGULAR**-2  # of the largest eigenvalue of the normal matrix
 
 
@@ -99,8 +99,8 @@ class Rebuild(Protocol):
 
 
 def _refuse_no_bands(bands: int) -> None:
-    if bands < 1:
-        raise ValueError(f"a reconstruction needs at least one Doppler band, got bands={bands}")
+    if not (isinstance(bands, int) and bands >= 1):
+        raise ValueError(f"a reconstruction needs a whole number of Doppler bands, at least one, got bands={bands}")
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ Replicas of a target go with it, so that they are not taken for targets. Weaker 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -41,6 +42,10 @@ class Detector:
     apart_m: tuple[float, float] = (250.0, 40.0)
     most: int = 8
     suppressed_m_s: Sequence[float] = (-16.0, -10.0, -5.0, 5.0, 10.0, 16.0)
+
+    def __post_init__(self) -> None:
+        if not (self.threshold_db > 0 and all(x > 0 for x in (*self.extent_m, *self.apart_m)) and self.most >= 1):
+            raise ValueError(f"a detector needs a threshold_db above 0, positive extents and distances, and most of 1 or more, got {self}")
 
     def found(self, image: Signal) -> list[Detection]:
         return detect(image, self.threshold_db, self.extent_m, self.apart_m, self.most)
@@ -92,6 +97,9 @@ class ImageMovers(Stage):
         if signal.trials:
             raise ValueError(f"ImageMovers works on one frame at a time, got trials {tuple(signal.trials)}; call it for each")
         conventional = self.image(signal)
+        axis = signal.axis("range")
+        if known is None and not self._whole(Detection(0.0, axis.start + axis.step * (axis.n // 2), 0.0), signal):
+            warnings.warn(f"no target can be looked for in a swath of {axis.n} range lines: what it walks through leaves it; give more lines, or a smaller extraction", stacklevel=3)
         left, bodies = signal, []
         if known is not None:
             left, bodies = self._told(left, known)

@@ -47,6 +47,10 @@ class Pattern:
 
     element_m: float | None = None
 
+    def __post_init__(self) -> None:
+        if self.element_m is not None and not 0 < self.element_m < math.inf:
+            raise ValueError(f"element_m of a pattern must be a positive length, or None for that of the radar, got {self.element_m}")
+
     def weight(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
         """Amplitude gain of the receive pattern, float64 (..., channel, pulse, target)."""
         closest = movers.closest_m(radar)[..., None, None, :]

@@ -114,7 +114,9 @@ class MovingScene(Protocol):
 
 def _numbers(values: Numbers) -> Tensor:
     """float64 of real numbers, complex128 of complex ones."""
-    x = values if isinstance(values, Tensor) else torch.tensor(list(values), dtype=torch.float64)
+    if isinstance(values, (int, float, complex)) or (isinstance(values, Tensor) and not values.ndim):
+        raise ValueError(f"moving points take lists or tensors with one entry a target, got the number {values}; write [{values}]")
+    x = values if isinstance(values, Tensor) else torch.tensor(list(values), dtype=torch.complex128 if any(isinstance(v, complex) for v in values) else torch.float64)
     return x.to(torch.complex128 if x.is_complex() else torch.float64)
 
 

@@ -14,7 +14,7 @@ from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.bank import tone_energy
 from torchsar.radar import BistaticRadar
 
-_AROUND_M_S, _STEP_M_S, _REACH_M = 3.0, 0.5, 150.0
+_AROUND_M_S, _STEP_M_S, _REACH_M = 22.0, 0.5, 150.0
 _CLEARLY = 1.3
 _FASTEST = 0.9  # of the receiver: fits that failed may end anywhere
 
@@ -22,8 +22,8 @@ _FASTEST = 0.9  # of the receiver: fits that failed may end anywhere
 def better_pulse_rate(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture) -> Tensor:
     """How many pulse rates (..., whole, -1..1) must be added to the Doppler of a fitted motion to explain clearly more of data (..., channel, pulse); 0 where it is right as it is.
 
-    One pulse rate is lambda PRF of slant-range velocity. Each alternative has the direction that the channels measured, and the along-track speed, within 3 m/s, that
-    keeps the curvature of the phase.
+    One pulse rate is lambda PRF of slant-range velocity. Each alternative has the direction that the channels measured, and the best along-track speed within 22 m/s of the one
+    that keeps the curvature of the phase: what an estimator was told of it may be wrong.
     """
     begin = motion.each(lambda value: value.expand(data.shape[:-2])[..., None])
     offsets = torch.arange(-_AROUND_M_S, _AROUND_M_S + _STEP_M_S / 2, _STEP_M_S, dtype=torch.float64, device=data.device)

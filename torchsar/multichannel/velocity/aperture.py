@@ -25,8 +25,8 @@ class Dwell:
     duration_s: float
 
     def __post_init__(self) -> None:
-        if not self.duration_s > 0:
-            raise ValueError(f"an aperture needs a positive duration_s, got {self.duration_s}")
+        if not 0 < self.duration_s < float("inf"):
+            raise ValueError(f"an aperture needs a positive, finite duration_s, got {self.duration_s}; ElementBeam() has no ends")
 
     def weight(self, radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
         since = time_s - _abeam_s(motion)[..., None]

@@ -86,7 +86,10 @@ def bank_search(
 def tone_energy(data: Tensor, radar: BistaticRadar, motions: PointMotion, aperture: Aperture, reach_m: float) -> Tensor:
     """The greatest energy (...,) that any of the motions (..., hypothesis) explains of data (..., channel, pulse), its place along track within reach_m of where the motion has it."""
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
-    return _best_tone(data.to(torch.complex64), radar, motions, aperture, time_s, reach_m, None)[0]
+    motions, taken = motions.each(lambda value: torch.broadcast_to(value, motions.u_a_m_s.shape)), data.to(torch.complex64)
+    size = max(1, _BLOCK_BYTES // (32 * data.numel()))
+    parts = [slice(at, at + size) for at in range(0, motions.u_a_m_s.shape[-1], size)]
+    return torch.stack([_best_tone(taken, radar, motions.each(lambda value, part=part: value[..., part]), aperture, time_s, reach_m, None)[0] for part in parts]).amax(0)
 
 
 def _steps(half: float, step: float, device: torch.device) -> Tensor:

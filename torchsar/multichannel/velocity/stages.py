@@ -76,7 +76,7 @@ class Interferometry(_Velocity):
 
 
 class AlongTrackAutofocus(_Velocity):
-    """Along-track velocity by the power of the deramped tone (see `along_track_velocity`); u_r and y0 as given. half_m_s: half width of the search."""
+    """Along-track velocity by the power of the deramped tone (see `along_track_velocity`); u_r and y0 as given. half_m_s: half width of the search about u_a = 0."""
 
     provides = ("u_a_m_s",)
 

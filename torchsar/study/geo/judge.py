@@ -139,7 +139,12 @@ class Profiles:
 
 
 def response_metrics(image: Signal, focused: Focused, truth: Mapping[str, Tensor], integration_s: float | None, orders: int) -> dict[str, Tensor]:
-    """Responses, false targets and places in a clean image, (row,) each."""
+    """Responses, false targets and places in a clean image, (row,) each; NaN for images without any energy."""
+    seen = image.data.abs().flatten(len(image.trials)).amax(-1) > 0
+    return {name: torch.where(seen, value, math.nan) for name, value in _responses(image, focused, truth, integration_s, orders).items()}
+
+
+def _responses(image: Signal, focused: Focused, truth: Mapping[str, Tensor], integration_s: float | None, orders: int) -> dict[str, Tensor]:
     radar = focused.rebuild.radar
     along = radar.speed_m_s - truth["u_a_m_s"]
     cuts = Profiles.of(image, along, radar.speed_m_s)

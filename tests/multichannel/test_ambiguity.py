@@ -1,0 +1,46 @@
+"""Whether velocities lie whole pulse rates off is told rightly, whatever an estimator was told of the along-track speed."""
+
+from __future__ import annotations
+
+import warnings
+
+import pytest
+import torch
+
+from torchsar.core import Draws
+from torchsar.echo import simulate_bistatic
+from torchsar.multichannel import Dwell, Interferometry, SignalIntensityRatio
+from torchsar.radar import BistaticRadar, LinearFM
+from torchsar.scene import BandLimited, BistaticWorld, MovingPoints
+
+RADAR = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0, wave_speed_m_s=3e8)
+
+
+@pytest.mark.parametrize(("u_r", "u_a", "off"), [(10.0, 5.0, 0.0), (0.0, 10.0, 0.0), (10.0, 15.0, 0.0), (30.0, 0.0, 1.0), (30.0, 10.0, 1.0), (-30.0, 5.0, -1.0)])
+def test_the_number_of_pulse_rates_is_right_though_the_speed_along_track_is_not(u_r: float, u_a: float, off: float) -> None:
+    world = BistaticWorld(MovingPoints([u_r], [u_a], [0.0], [0.0]), BandLimited(4.5), snr_db=20.0)
+    signal = simulate_bistatic(RADAR, world, 900, None, Draws(3))[0].signal
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        found = SignalIntensityRatio(RADAR, 337.5)(signal)
+    assert float(found.info["pulse_rates"]) == off and bool(found.ok) <= (off == 0)
+    assert any("whole pulse rates" in str(warning.message) for warning in said) <= (off != 0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert float(Interferometry(RADAR, Dwell(4.5))(signal, u_a_m_s=u_a).info["pulse_rates"]) == off
+
+
+def test_targets_that_no_pulse_sees_are_named() -> None:
+    far = MovingPoints([0.0, 0.0], [0.0, 0.0], [0.0, 9000.0], [0.0, 0.0])
+    with pytest.warns(UserWarning, match="1 of 2 targets shine at no pulse"):
+        simulate_bistatic(RADAR, BistaticWorld(far, BandLimited(4.5)), 90, None, Draws(1))
+    with pytest.raises(ValueError, match=r"target 1 \(counted from 0\) lies 9000 m"):
+        simulate_bistatic(RADAR, BistaticWorld(MovingPoints([0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [0.0, 9000.0]), BandLimited(4.5)), 90, 32, Draws(1))
+    with pytest.raises(ValueError, match="one entry a target"):
+        MovingPoints(10.0, 0.0, 0.0, 0.0)  # type: ignore[arg-type]
+
+
+def test_silence_is_not_ambiguous() -> None:
+    world = BistaticWorld(MovingPoints([5.0], [0.0], [0.0], [0.0]), BandLimited(4.5))
+    signal = simulate_bistatic(RADAR, world, 120, None, Draws(1))[0].signal
+    assert float(Interferometry(RADAR, Dwell(4.5))(signal.with_data(torch.zeros_like(signal.data))).info["pulse_rates"]) == 0
