@@ -67,6 +67,7 @@ from torchsar.multichannel.azimuth import FocusAzimuth
 from torchsar.multichannel.balance import CorrectBalance, EstimateBalance
 from torchsar.multichannel.compress import CompressChannels
 from torchsar.multichannel.migration import CorrectMigration, Keystone
+from torchsar.multichannel.plan import FocusPlan
 from torchsar.multichannel.reconstruct import Reconstruct
 from torchsar.multichannel.response import FlatBand, LeastSquares, MinimumMeanSquare
 from torchsar.multichannel.stationary import StationaryImage
@@ -300,6 +301,7 @@ CASES = [
     Case("reconstruct", lambda: Reconstruct(BISTATIC), _motion, vmap=False, channels="line"),
     Case("reconstruct_lines", lambda: Reconstruct(BISTATIC, MinimumMeanSquare(4)), _motion, channels="range"),
     Case("focus_azimuth", lambda: FocusAzimuth(BISTATIC, bandwidth_hz=300.0), _motion, channels="doppler"),
+    Case("focus_plan", lambda: FocusPlan(BISTATIC, bandwidth_hz=300.0, u_r_m_s=5.0, u_a_m_s=2.0), vmap=False, channels="line"),
     Case("stationary_image", lambda: StationaryImage(BISTATIC, form="bulk"), vmap=False, channels="range"),
     Case("walk_ambiguity", lambda: WalkAmbiguity(BISTATIC), _motion, differentiable=False, vmap=False, tolerance=1e-6, channels="range"),
     Case("interferometry", lambda: Interferometry(BISTATIC, LIT), _motion, differentiable=False, vmap=False, tolerance=1e-7, channels="line"),

@@ -39,22 +39,25 @@ class AzimuthPlan:
         if data.dtype != self.matrix.dtype or data.shape[-2:] != self.matrix.shape[-2:]:
             expected = f"(..., {self.matrix.shape[-2]}, {self.matrix.shape[-1]}) of {self.matrix.dtype}"
             raise ValueError(f"this plan works on channels and pulses {expected}, got {tuple(data.shape)} of {data.dtype}")
-        rows = data.flatten(0, -3) if data.ndim > 3 else data
-        if rows.ndim < 3 or (torch.is_grad_enabled() and data.requires_grad):
-            return self._image(data)
+        if torch.is_grad_enabled() and data.requires_grad:
+            spectrum = torch.fft.fft(data)
+            return torch.fft.ifft(torch.einsum("bmp,...mp->...bp", self.matrix, spectrum).flatten(-2))
+        rows = data.reshape(-1, *data.shape[-2:])
+        image = rows.new_empty(len(rows), self.bands * self.n_pulse)
         # a few trials at a time stay in the cache
-        height = max(1, block_bytes_of(data.device) // (rows[0].numel() * data.element_size()))
-        return torch.cat([self._image(part) for part in rows.split(height)]).unflatten(0, data.shape[:-2])
+        height = max(1, block_bytes_of(data.device) // (self.matrix[0].numel() * data.element_size()))
+        for part, out in zip(rows.split(height), image.split(height)):
+            torch.fft.ifft(self._bands(torch.fft.fft(part)).flatten(-2), out=out)
+        return image.view(*data.shape[:-2], -1)
 
-    def _image(self, data: Tensor) -> Tensor:
-        spectrum = torch.fft.fft(data)
-        bands = []
-        for weights in self.matrix:
-            band = weights[0] * spectrum[..., 0, :]
+    def _bands(self, spectrum: Tensor) -> Tensor:
+        """Spectra (trial, channel, pulse) to bands (trial, band, pulse), in place as far as it goes."""
+        bands = spectrum.new_empty(len(spectrum), self.bands, self.n_pulse)
+        for weights, band in zip(self.matrix, bands.unbind(1)):
+            torch.mul(spectrum[:, 0], weights[0], out=band)
             for channel in range(1, len(weights)):
-                band = torch.addcmul(band, weights[channel], spectrum[..., channel, :])
-            bands.append(band)
-        return torch.fft.ifft(torch.cat(bands, -1))
+                band.addcmul_(spectrum[:, channel], weights[channel])
+        return bands
 
 
 def _matrix(radar: BistaticRadar, motion: PointMotion, n: int, rebuild: Rebuild, bandwidth_hz: float | None) -> Tensor:

@@ -70,7 +70,7 @@ class ImageMovers(Stage):
     """Channels (channel, pulse, range) of one frame, range compressed and without the transmit range, to a `SceneImage`.
 
     rebuild: for what is at rest. removal: "subtract" the echo that fits a mover, or "zero" all that lies in its lines and its extent, sea included (kept for comparison).
-    slowest_m_s: what a target must exceed in u_r, u_a to count as a mover; one at rest stays in the image. Trials are worked on one by one: how many targets there are differs.
+    slowest_m_s: what a target must exceed in u_r, u_a to count as a mover; one at rest stays in the image. It takes one frame at a time, since the number of targets differs.
     """
 
     works_on = ("channel", "pulse", "range")

@@ -44,7 +44,7 @@ def moving_point_velocity(
     unknowns = UNKNOWNS if u_a_m_s is None else ("u_r_m_s", "y0_m")
     if u_a_m_s is not None:
         search = replace(search, u_a_m_s=0.0)
-    job = _Job(data.to(torch.complex128), radar, aperture, search, u_a_m_s or 0.0 if not isinstance(u_a_m_s, Tensor) else u_a_m_s, range_m, unknowns)
+    job = _Job(data.to(torch.complex128), radar, aperture, search, 0.0 if u_a_m_s is None else u_a_m_s, range_m, unknowns)
     if whitening is not None:
         return job.estimate(job.centred(job.found(whitening), whitening), torch.ones(data.shape[:-2], dtype=torch.bool, device=data.device))
     plain = job.refined(job.found(None))
