@@ -14,7 +14,9 @@ import torch
 
 from torchsar import plot
 from torchsar.study.build import resolved
+from torchsar.study.cases import cases_of, refuse_recordings
 from torchsar.study.config import Loaded
+from torchsar.study.errors import ConfigError
 from torchsar.study.folder import fresh_folder, write_json
 
 Result = TypeVar("Result")
@@ -54,6 +56,29 @@ def written(
         for name, figure in figures(found).items():
             plot.save(figure, folder / "figures" / f"trade_{name}.png")
     return f"{said}\n{out}"
+
+
+def traded(
+    loaded: Loaded,
+    out: Path | None,
+    check: Callable[[Loaded], None],
+    tables: Callable[[Loaded], Tables],
+    titles: Mapping[str, str],
+    columns: Mapping[str, tuple[str, str]],
+    figures: Callable[[Tables], Mapping[str, plot.Figure]],
+) -> str:
+    """The tables of the first case of a config that simulates, as `table_text` and `written` have them. Raises ConfigError for what the config, or then the simulation or a stage, refuses."""
+    refuse_recordings(loaded)
+    check(loaded)
+    name, case = next(iter(cases_of(loaded).items()))
+
+    def made() -> Tables:
+        try:
+            return tables(case)
+        except (ValueError, TypeError, RuntimeError) as error:
+            raise ConfigError(f"{loaded.file}: {' '.join(str(error).split())}") from error
+
+    return written(loaded, out, made, lambda found: table_text(name, found, titles, columns), figures)
 
 
 def table_text(case: str, tables: Tables, titles: Mapping[str, str], columns: Mapping[str, tuple[str, str]]) -> str:

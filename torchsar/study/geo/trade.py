@@ -23,14 +23,12 @@ from torchsar.multichannel.reconstruct import Reconstruct
 from torchsar.multichannel.response import FlatBand, LeastSquares, MinimumMeanSquare, Rebuild
 from torchsar.multichannel.transmit import RemoveTransmitRange
 from torchsar.scene import TaylorRange
-from torchsar.study.cases import cases_of, refuse_recordings
 from torchsar.study.config import Loaded
-from torchsar.study.errors import ConfigError
 from torchsar.study.geo.build import TOLD, Echoes, Recorded, check
 from torchsar.study.geo.judge import Focused, Profiles, response_metrics
 from torchsar.study.geo.sections import GeoConfig, Trade
 from torchsar.study.methods import build_chains
-from torchsar.study.trading import Tables, table_text, timed, written
+from torchsar.study.trading import Tables, timed, traded
 
 log = logging.getLogger("torchsar")
 _REBUILD = LeastSquares(2)
@@ -61,26 +59,19 @@ def trade(loaded: Loaded, out: Path | None) -> str:
 
     Velocities are the true ones, echoes free of noise and damage. With `out`: config.yaml, trade.json, trade.txt and figures/ in that folder.
     """
-    refuse_recordings(loaded)
-    check(loaded)
-    name, case = next(iter(cases_of(loaded).items()))
-    return written(loaded, out, lambda: _tables(case), lambda tables: table_text(name, tables, _TITLES, _COLUMNS), _figures)
+    return traded(loaded, out, check, _tables, _TITLES, _COLUMNS, _figures)
 
 
 @torch.no_grad()
 def _tables(loaded: Loaded) -> dict[str, list[Row]]:
-    """Raises ConfigError for what simulation or stages refuse."""
-    try:
-        made = _Target.of(loaded)
-        return {
-            "history": list(made.histories()),
-            "dimensions": list(made.dimensions()),
-            "migration": list(made.migrations()),
-            "rebuild": list(made.rebuilds()),
-            "precision": list(made.precisions()),
-        }
-    except (ValueError, TypeError, RuntimeError) as error:
-        raise ConfigError(f"{loaded.file}: {' '.join(str(error).split())}") from error
+    made = _Target.of(loaded)
+    return {
+        "history": list(made.histories()),
+        "dimensions": list(made.dimensions()),
+        "migration": list(made.migrations()),
+        "rebuild": list(made.rebuilds()),
+        "precision": list(made.precisions()),
+    }
 
 
 @dataclass(frozen=True)

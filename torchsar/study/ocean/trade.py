@@ -16,14 +16,12 @@ from torchsar import plot
 from torchsar.core import Draws
 from torchsar.multichannel.scene_image import ImageMovers
 from torchsar.multichannel.transmit import RemoveTransmitRange
-from torchsar.study.cases import cases_of, refuse_recordings
 from torchsar.study.config import Loaded
-from torchsar.study.errors import ConfigError
 from torchsar.study.ocean.build import Sighted, check
 from torchsar.study.ocean.judge import Judged, Reference, judged
 from torchsar.study.ocean.stages import MoversImage
 from torchsar.study.ocean.trials import Bench
-from torchsar.study.trading import Tables, table_text, timed, written
+from torchsar.study.trading import Tables, timed, traded
 
 log = logging.getLogger("torchsar")
 
@@ -48,20 +46,13 @@ def trade(loaded: Loaded, out: Path | None) -> str:
 
     With `out`: config.yaml, trade.json, trade.txt and figures/ in that folder.
     """
-    refuse_recordings(loaded)
-    check(loaded)
-    name, case = next(iter(cases_of(loaded).items()))
-    return written(loaded, out, lambda: _tables(case), lambda tables: table_text(name, tables, _TITLES, _COLUMNS), _figures)
+    return traded(loaded, out, check, _tables, _TITLES, _COLUMNS, _figures)
 
 
 @torch.no_grad()
 def _tables(loaded: Loaded) -> dict[str, list[Row]]:
-    """Raises ConfigError for what simulation or stages refuse."""
-    try:
-        made = _Flow.of(loaded)
-        return {"segment": list(made.segments()), "lines": list(made.lines()), "removal": list(made.removals()), "precision": list(made.precisions())}
-    except (ValueError, TypeError, RuntimeError) as error:
-        raise ConfigError(f"{loaded.file}: {' '.join(str(error).split())}") from error
+    made = _Flow.of(loaded)
+    return {"segment": list(made.segments()), "lines": list(made.lines()), "removal": list(made.removals()), "precision": list(made.precisions())}
 
 
 @dataclass(frozen=True)

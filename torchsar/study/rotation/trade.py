@@ -20,13 +20,11 @@ from torchsar.core import Draws, Estimate, Truth
 from torchsar.core.warp import k_of_shape, shape_of
 from torchsar.focus.matched_fourier import matched_fourier, range_phase
 from torchsar.metrics import entropy, error_db
-from torchsar.study.cases import cases_of, refuse_recordings
 from torchsar.study.config import Loaded
-from torchsar.study.errors import ConfigError
 from torchsar.study.rotation.build import Turntable, check
 from torchsar.study.rotation.sections import Trade
 from torchsar.study.rotation.trials import true_k
-from torchsar.study.trading import Tables, table_text, timed, written
+from torchsar.study.trading import Tables, timed, traded
 
 log = logging.getLogger("torchsar")
 _YARDSTICK_EPS = 1e-12
@@ -54,20 +52,13 @@ def trade(loaded: Loaded, out: Path | None) -> str:
 
     Orders and gridding form images with the true rotation; phase errors of pulses are left out of all of them. With `out`: config.yaml, trade.json, trade.txt and figures/ in that folder.
     """
-    refuse_recordings(loaded)
-    check(loaded)
-    name, case = next(iter(cases_of(loaded).items()))
-    return written(loaded, out, lambda: _tables(case), lambda tables: table_text(name, tables, _TITLES, _COLUMNS), _figures)
+    return traded(loaded, out, check, _tables, _TITLES, _COLUMNS, _figures)
 
 
 @torch.no_grad()
 def _tables(loaded: Loaded) -> dict[str, list[Row]]:
-    """Raises ConfigError for what simulation or methods refuse."""
-    try:
-        made = _Trials.of(loaded)
-        return {"order": list(made.orders()), "gridding": list(made.griddings()), "estimators": list(made.estimators()), "precision": list(made.precisions())}
-    except (ValueError, TypeError, RuntimeError) as error:
-        raise ConfigError(f"{loaded.file}: {' '.join(str(error).split())}") from error
+    made = _Trials.of(loaded)
+    return {"order": list(made.orders()), "gridding": list(made.griddings()), "estimators": list(made.estimators()), "precision": list(made.precisions())}
 
 
 @dataclass(frozen=True)
