@@ -1,9 +1,12 @@
-"""Autofocus methods by time and error, beside the bare Fourier transforms that their iterations need.
+"""Autofocus methods by time and error, beside the bare Fourier transforms that their iterations
+need.
 
-    python scripts/autofocus_speed.py [--trials 16] [--snr 10] [--pulses 400] [--cells 256] [--rounds 5]
+    python scripts/autofocus_speed.py [--trials 16] [--snr 10] [--pulses 400] [--cells 256]
+    [--rounds 5]
 
-A turning aircraft with white phase errors (system 002), complex64, one thread. Times are the best of the rounds, in turn; the ratio is that to as many pairs
-of transforms of the whole batch, forward and back, as the method's iterations made (of twice the length where it pads).
+A turning aircraft with white phase errors (system 002), complex64, one thread. Times are the best
+of the rounds, in turn; the ratio is that to as many pairs of transforms of the whole batch, forward
+and back, as the method's iterations made (of twice the length where it pads).
 """
 
 from __future__ import annotations
@@ -40,7 +43,9 @@ def simulated(options: argparse.Namespace) -> tuple[Tensor, Tensor]:
     """Data (trial, pulse, range) and true phases."""
     radar = InverseRadar(193.414489e12, 150e9, 2000.0, rotation_rad_s=0.005 * 400 / options.pulses, pulse_s=100e-6)
     world = TurntableWorld(Aircraft(), start_phase=[UniformStartPhase()], snr_db=options.snr)
-    recording, truth = simulate_turntable(radar, world, options.pulses, options.cells, Draws(1, trials=range(options.trials)))
+    recording, truth = simulate_turntable(
+        radar, world, options.pulses, options.cells, Draws(1, trials=range(options.trials))
+    )
     return recording.signal.data, truth.values["phase_rad"]
 
 
@@ -53,7 +58,8 @@ def pairs_ms(rows: Tensor, padding: int) -> float:
 
 def bare_ms(name: str, iterations: float, plain: float, padded: float) -> float:
     """Milliseconds of the transforms that so many iterations make."""
-    if name == "autofocus":  # the search is plain, the polish padded; its last iterations are the polish
+    # the search is plain, the polish padded; its last iterations are the polish
+    if name == "autofocus":
         polish = min(iterations, 20)
         return (iterations - polish) * plain + polish * padded
     return iterations * (padded if name in PADDED else plain)
@@ -76,14 +82,23 @@ def main() -> None:
             found[name] = method(data)
             best[name] = min(best[name], 1e3 * (time.perf_counter() - began))
         plain, padded = min(plain, pairs_ms(rows, 1)), min(padded, pairs_ms(rows, 2))
-    print(f"{options.trials} trials of {options.pulses} pulses x {options.cells} cells, {options.snr:g} dB, complex64, one thread")
-    print(f"{'method':<24}{'ms a trial':>11}{'iterations':>12}{'bare transforms':>17}{'ratio':>7}{'median error (rad)':>20}{'trusted':>9}")
+    print(
+        f"{options.trials} trials of {options.pulses} pulses x {options.cells} cells, "
+        f"{options.snr:g} dB, complex64, one thread"
+    )
+    print(
+        f"{'method':<24}{'ms a trial':>11}{'iterations':>12}{'bare transforms':>17}"
+        f"{'ratio':>7}{'median error (rad)':>20}{'trusted':>9}"
+    )
     for name, estimate in found.items():
         count = float(estimate.info["iterations"].double().mean())
         bare = bare_ms(name, count, plain, padded) / options.trials
         ratio = "" if name in ("sca", "minimum_entropy") else f"{best[name] / options.trials / bare:.1f}"
         error = float(phase_rmse(estimate["phase_rad"], truth).median())
-        print(f"{name:<24}{best[name] / options.trials:>11.1f}{count:>12.1f}{bare:>14.1f} ms{ratio:>7}{error:>20.4f}{float(estimate.ok.double().mean()):>9.2f}")
+        print(
+            f"{name:<24}{best[name] / options.trials:>11.1f}{count:>12.1f}{bare:>14.1f} "
+            f"ms{ratio:>7}{error:>20.4f}{float(estimate.ok.double().mean()):>9.2f}"
+        )
 
 
 if __name__ == "__main__":

@@ -1,12 +1,18 @@
-"""Your own autofocus in ten lines: descend on any figure of any chain, and learn a schedule from simulated trials.
+"""Your own autofocus in ten lines: descend on any figure of any chain, and learn a schedule from
+simulated trials.
 
-    python scripts/compose_autofocus.py [--trials 8] [--candidates 60] [--pulses 200] [--out compose_autofocus.png]
+    python scripts/compose_autofocus.py [--trials 8] [--candidates 60] [--pulses 200] [--out
+    compose_autofocus.png]
 
-Both experiments print the median phase error (rad) over SNR on trials whose truth no estimator sees, and share one figure.
+Both experiments print the median phase error (rad) over SNR on trials whose truth no estimator
+sees, and share one figure.
 
-1. The motion of a turning aircraft is a polynomial in time, while three bright points fly through the same range window on a path of their own. Few
-   coefficients, found through a whole chain by the entropy of the aircraft's range cells, come nearer to it than a free phase per pulse can.
-2. Phase gradient autofocus with three iterations: which three windows? Random search over simulated pairs (data, true phase), then trials of another seed.
+1. The motion of a turning aircraft is a polynomial in time, while three bright points fly through
+the same range window on a path of their own. Few
+   coefficients, found through a whole chain by the entropy of the aircraft's range cells, come
+   nearer to it than a free phase per pulse can.
+2. Phase gradient autofocus with three iterations: which three windows? Random search over simulated
+pairs (data, true phase), then trials of another seed.
 """
 
 from __future__ import annotations
@@ -29,18 +35,30 @@ from torchsar.optim import lbfgs
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.scene import Aircraft, Points, Polynomial, TurntableWorld, UniformStartPhase
 
-RADAR = InverseRadar(carrier_hz=LIGHT_M_S / 1.55e-6, bandwidth_hz=150e9, prf_hz=1000.0, rotation_rad_s=0.005, pulse_s=100e-6, reference_range_m=20e3)
+RADAR = InverseRadar(
+    carrier_hz=LIGHT_M_S / 1.55e-6,
+    bandwidth_hz=150e9,
+    prf_hz=1000.0,
+    rotation_rad_s=0.005,
+    pulse_s=100e-6,
+    reference_range_m=20e3,
+)
 PLANE = Aircraft(length_m=0.095, width_m=0.075)
 SNR_DB = [-9.0, -6.0, -3.0, 0.0, 5.0, 10.0]
 N_RANGE = 128
 
 
 def motion_through_a_chain(n_pulse: int, trials: int) -> dict[str, Tensor]:
-    """Phase errors (SNR, trial) of a polynomial found through a chain, with and without a region, and of a free phase."""
+    """Phase errors (SNR, trial) of a polynomial found through a chain, with and without a region,
+    and of a free phase.
+    """
     signal, truth = plane_and_strangers(n_pulse, trials)
 
-    # the experiment: a model of the phase, a chain, a figure of its image, a descent that every trial makes by itself
-    basis = legendre(torch.linspace(-1, 1, n_pulse, dtype=torch.float64), 3).mT[2:]  # constant and slope only turn and shift an image
+    # the experiment: a model of the phase, a chain, a figure of its image, a descent that every
+    # trial makes by itself
+    basis = legendre(torch.linspace(-1, 1, n_pulse, dtype=torch.float64), 3).mT[
+        2:
+    ]  # constant and slope only turn and shift an image
     region = (torch.arange(N_RANGE) - N_RANGE // 2).abs() <= 40  # where the aircraft is
     chain = Chain(phase=Sca(), correct=use(CorrectPulsePhase(), phase_rad="phase"), image=AzimuthTransform(RADAR))
     trace = chain.trace(signal)
@@ -63,10 +81,16 @@ def motion_through_a_chain(n_pulse: int, trials: int) -> dict[str, Tensor]:
 def plane_and_strangers(n_pulse: int, trials: int) -> tuple[Signal, Tensor]:
     """Pulses of both targets, (SNR * trial, pulse, range), and the phase of the aircraft."""
     draws = Draws(1, trials=range(len(SNR_DB) * trials))
-    plane, truth = simulate_turntable(RADAR, TurntableWorld(PLANE, motion=(drift(draws, n_pulse),), snr_db=snr_of(trials)), n_pulse, N_RANGE, draws)
+    plane, truth = simulate_turntable(
+        RADAR, TurntableWorld(PLANE, motion=(drift(draws, n_pulse),), snr_db=snr_of(trials)), n_pulse, N_RANGE, draws
+    )
     other = draws.part("strangers")
-    points = Points(azimuth_m=[-0.02, 0.0, 0.03], range_m=[0.048, 0.051, 0.056], amplitude=[12.0, 12.0, 12.0], random_phase=True)
-    strangers, _ = simulate_turntable(RADAR, TurntableWorld(points, motion=(drift(other, n_pulse),)), n_pulse, N_RANGE, other)
+    points = Points(
+        azimuth_m=[-0.02, 0.0, 0.03], range_m=[0.048, 0.051, 0.056], amplitude=[12.0, 12.0, 12.0], random_phase=True
+    )
+    strangers, _ = simulate_turntable(
+        RADAR, TurntableWorld(points, motion=(drift(other, n_pulse),)), n_pulse, N_RANGE, other
+    )
     return plane.signal.with_data(plane.signal.data + strangers.signal.data), truth.values["phase_rad"]
 
 
@@ -78,7 +102,9 @@ def drift(draws: Draws, n_pulse: int) -> Polynomial:
 
 
 def learnt_windows(n_pulse: int, trials: int, candidates: int) -> tuple[list[int], dict[str, Tensor]]:
-    """Three windows by random search on pairs of one seed, and phase errors (SNR, trial) on pairs of another seed."""
+    """Three windows by random search on pairs of one seed, and phase errors (SNR, trial) on pairs
+    of another seed.
+    """
     data, truth = pairs(Draws(2, trials=range(8)), n_pulse, 5.0)
 
     # the experiment: what is tuned, how it is drawn, how it is judged
@@ -86,7 +112,13 @@ def learnt_windows(n_pulse: int, trials: int, candidates: int) -> tuple[list[int
         found = pga_sca(data, windows=Listed(tuple(cells.tolist())), iterations=len(cells))
         return phase_rmse(found["phase_rad"], truth).mean()
 
-    drawn = Draws(3, trials=range(candidates)).uniform("windows", (3,), math.log(3), math.log(n_pulse)).exp().sort(-1, descending=True).values
+    drawn = (
+        Draws(3, trials=range(candidates))
+        .uniform("windows", (3,), math.log(3), math.log(n_pulse))
+        .exp()
+        .sort(-1, descending=True)
+        .values
+    )
     best = drawn[torch.stack([judged(cells) for cells in drawn]).argmin()].tolist()
 
     data, truth = pairs(Draws(4, trials=range(len(SNR_DB) * trials)), n_pulse, snr_of(trials))
@@ -96,7 +128,9 @@ def learnt_windows(n_pulse: int, trials: int, candidates: int) -> tuple[list[int
         "pga_sca, 20 iterations": pga_sca(data),
         "autofocus, a free phase": autofocus(data),
     }
-    return [round(cells) for cells in best], {name: errors(estimate["phase_rad"], truth) for name, estimate in found.items()}
+    return [round(cells) for cells in best], {
+        name: errors(estimate["phase_rad"], truth) for name, estimate in found.items()
+    }
 
 
 def pairs(draws: Draws, n_pulse: int, snr_db: Tensor | float) -> tuple[Tensor, Tensor]:
@@ -128,7 +162,12 @@ def panel(title: str, results: Mapping[str, Tensor], names: Iterable[str]) -> di
     nothing = torch.full((len(SNR_DB), 1), torch.nan, dtype=torch.float64)
     share = torch.tensor([0.5, 0.25, 0.75], dtype=torch.float64)
     levels = {name: plot.array(results.get(name, nothing).quantile(share, -1)) for name in names}
-    return {"title": title, "x": plot.array(torch.tensor(SNR_DB)), "series": {name: (level[0], level[1:].T) for name, level in levels.items()}, "bounds": {}}
+    return {
+        "title": title,
+        "x": plot.array(torch.tensor(SNR_DB)),
+        "series": {name: (level[0], level[1:].T) for name, level in levels.items()},
+        "bounds": {},
+    }
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -143,7 +182,9 @@ def main(arguments: list[str] | None = None) -> None:
     titles = "A polynomial phase, through a chain", f"Three learnt windows: {', '.join(map(str, windows))} cells"
     show(titles[0], fitted)
     show(titles[1], learnt)
-    parts = [panel(title, results, {**fitted, **learnt}) for title, results in zip(titles, (fitted, learnt), strict=True)]
+    parts = [
+        panel(title, results, {**fitted, **learnt}) for title, results in zip(titles, (fitted, learnt), strict=True)
+    ]
     plot.save(plot.error_curves(parts, "SNR (dB)", "phase RMSE (rad)", log_y=True), options.out)
 
 

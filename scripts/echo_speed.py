@@ -1,9 +1,10 @@
-"""Echo synthesis: targets x samples per second and error in complex64, for always-lit and gated scenes.
+"""Echo synthesis: targets x samples per second and error in complex64, for always-lit and gated
+scenes.
 
     python scripts/echo_speed.py [--targets 4096] [--pulses 256] [--samples 2048] [--threads 1]
 
-A gated scene is counted by the target samples that are actually lit; its rate is lower because targets enter and leave inside a block
-of pulses.
+A gated scene is counted by the target samples that are actually lit; its rate is lower because
+targets enter and leave inside a block of pulses.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ from torchsar.scene import AlwaysLit, Beam, Dwell, Speckle, StripmapWorld
 
 
 def measure(beam: Beam, targets: int, pulses: int, samples: int, repeats: int = 3) -> tuple[float, float, float]:
-    """(seconds of the best of `repeats`, lit target samples, error in dB of complex64 against complex128)."""
+    """(seconds of the best of `repeats`, lit target samples, error in dB of complex64 against
+    complex128).
+    """
     radar = StripmapRadar(3.2e9, LinearFM(200e6, 1e-6), 250e6, 4000.0, 7000.0, 700e3, pointing_doppler_hz=0.0)
     length_m = pulses / radar.prf_hz * radar.velocity_m_s
     world = StripmapWorld(Speckle(targets, length_m, 0.6 * (samples - radar.pulse_samples) * radar.range_step_m), beam)
@@ -46,7 +49,10 @@ def main() -> None:
     dwell = args.pulses / 4000.0 / 2
     for name, beam in (("always lit", AlwaysLit()), ("gated to half the strip", Dwell(dwell))):
         seconds, lit, error = measure(beam, args.targets, args.pulses, args.samples)
-        print(f"{name:24s} {lit / seconds / 1e9 / args.threads:6.2f} G target*sample/s per core   {seconds:7.2f} s   error {error:6.1f} dB")
+        print(
+            f"{name:24s} {lit / seconds / 1e9 / args.threads:6.2f} G target*sample/s per core   "
+            f"{seconds:7.2f} s   error {error:6.1f} dB"
+        )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,13 @@
-"""Focusing: time as a multiple of bare FFTs, peak memory, and what each form loses against the exact one.
+"""Focusing: time as a multiple of bare FFTs, peak memory, and what each form loses against the
+exact one.
 
     python scripts/focusing_speed.py [--sizes 2048 4096] [--threads 1 2] [--trials 1] [--memory]
 
-`floor` is torch.fft.ifft2(torch.fft.fft2(x)) of the same array in the same process. The loss is that of a point target at the edge of the
-swath: image error against Stolt in complex128 at full accuracy, range and azimuth width and side lobes of the response. `peak arrays`
-(--memory) is the peak memory above the process before the raw matrix exists, in raw matrices, measured in a process of its own.
+`floor` is torch.fft.ifft2(torch.fft.fft2(x)) of the same array in the same process. The loss is
+that of a point target at the edge of the swath: image error against Stolt in complex128 at full
+accuracy, range and azimuth width and side lobes of the response. `peak arrays` (--memory) is the
+peak memory above the process before the raw matrix exists, in raw matrices, measured in a process
+of its own.
 """
 
 from __future__ import annotations
@@ -55,7 +58,9 @@ class Row:
 
 def sensor(size: int) -> StripmapRadar:
     """A Kondor-like radar whose pulse fits a line of `size` samples."""
-    return StripmapRadar(3.2e9, LinearFM(200e6, min(2e-6, size / 8 / 250e6)), 250e6, 4000.0, 7000.0, 700e3, pointing_doppler_hz=0.0)
+    return StripmapRadar(
+        3.2e9, LinearFM(200e6, min(2e-6, size / 8 / 250e6)), 250e6, 4000.0, 7000.0, 700e3, pointing_doppler_hz=0.0
+    )
 
 
 def best_seconds(work: Callable[[], object], repeats: int) -> float:
@@ -70,7 +75,9 @@ def best_seconds(work: Callable[[], object], repeats: int) -> float:
 
 
 def edge_target(size: int) -> tuple[Signal, tuple[float, float]]:
-    """Raw matrix (complex64) of one target at a tenth from the far edge of the swath, and its place in the image."""
+    """Raw matrix (complex64) of one target at a tenth from the far edge of the swath, and its place
+    in the image.
+    """
     radar = sensor(size)
     usable_m = (size - radar.pulse_samples) * radar.range_step_m
     dwell = 0.5 * size / radar.prf_hz
@@ -80,13 +87,24 @@ def edge_target(size: int) -> tuple[Signal, tuple[float, float]]:
 
 
 def measure(sizes: list[int], threads: list[int], trials: int = 1, repeats: int = 5) -> list[Row]:
-    """Every form at every size and thread count. trials > 1: a batch of random matrices instead of a single one."""
+    """Every form at every size and thread count.
+
+    trials > 1: a batch of random matrices instead of a single one.
+    """
     rows, before = [], torch.get_num_threads()
     for size in sizes:
         radar, (target, place) = sensor(size), edge_target(size)
         flat = Signal(target.data.reshape(size, size), target.axes)
-        exact = OmegaKStolt.form(flat.data.to(torch.complex128), radar, doppler_hz=0.0, reference=OmegaK(radar, "flat").spectrum(size), eps=1e-12)
-        raw = Signal(torch.randn((trials, size, size) if trials > 1 else (size, size), dtype=torch.complex64), target.axes)
+        exact = OmegaKStolt.form(
+            flat.data.to(torch.complex128),
+            radar,
+            doppler_hz=0.0,
+            reference=OmegaK(radar, "flat").spectrum(size),
+            eps=1e-12,
+        )
+        raw = Signal(
+            torch.randn((trials, size, size) if trials > 1 else (size, size), dtype=torch.complex64), target.axes
+        )
         quality = {name: quality_of(build(radar, raw.axes)(flat), exact, place) for name, build in FORMS.items()}
         for count in threads:
             torch.set_num_threads(count)
@@ -100,7 +118,9 @@ def measure(sizes: list[int], threads: list[int], trials: int = 1, repeats: int 
     return rows
 
 
-def quality_of(image: Signal, exact: torch.Tensor, place: tuple[float, float]) -> tuple[float, float, float, float, float]:
+def quality_of(
+    image: Signal, exact: torch.Tensor, place: tuple[float, float]
+) -> tuple[float, float, float, float, float]:
     """Image error in dB; -3 dB width and highest side lobe in range and in azimuth."""
     response = impulse_response(image, place)
     keys = ("irw_range_m", "pslr_range_db", "irw_azimuth_m", "pslr_azimuth_db")
@@ -109,13 +129,20 @@ def quality_of(image: Signal, exact: torch.Tensor, place: tuple[float, float]) -
 
 
 def peak_arrays(form: str, size: int) -> float:
-    """Peak memory of focusing one matrix in a fresh process, above that process before the matrix exists, in raw matrices."""
-    done = subprocess.run([sys.executable, __file__, "--child", form, "--sizes", str(size)], check=True, capture_output=True, text=True)
+    """Peak memory of focusing one matrix in a fresh process, above that process before the matrix
+    exists, in raw matrices.
+    """
+    done = subprocess.run(
+        [sys.executable, __file__, "--child", form, "--sizes", str(size)], check=True, capture_output=True, text=True
+    )
     return json.loads(done.stdout)["arrays"]
 
 
 def peak_bytes() -> int:
-    """Peak resident memory of this process. Linux counts the parent's in ru_maxrss, so its own figure is read where there is one."""
+    """Peak resident memory of this process.
+
+    Linux counts the parent's in ru_maxrss, so its own figure is read where there is one.
+    """
     status = Path("/proc/self/status")
     if status.exists():
         return next(int(line.split()[1]) * 1024 for line in status.read_text().splitlines() if line.startswith("VmHWM"))
@@ -126,7 +153,8 @@ def _child(form: str, size: int) -> None:
     torch.set_num_threads(1)
     radar = sensor(size)
     small = radar.raw_axes(256, 512)
-    FORMS[form](radar, small)(Signal(torch.zeros(256, 512, dtype=torch.complex64), small))  # loads the libraries
+    # loads the libraries
+    FORMS[form](radar, small)(Signal(torch.zeros(256, 512, dtype=torch.complex64), small))
     before = peak_bytes()
     axes = radar.raw_axes(size, size)
     raw = Signal(torch.randn(size, size, dtype=torch.complex64), axes)
@@ -145,10 +173,19 @@ def main(arguments: list[str] | None = None) -> None:
     if options.child:
         _child(options.child, options.sizes[0])
         return
-    print(f"{'form':24}{'size':>6}{'threads':>8}{'ms':>9}{'x floor':>9}{'loss dB':>9}{'IRW rg m':>10}{'PSLR':>8}{'IRW az m':>10}{'PSLR':>8}")
+    print(
+        f"{'form':24}{'size':>6}{'threads':>8}{'ms':>9}{'x floor':>9}{'loss dB':>9}"
+        f"{'IRW rg m':>10}{'PSLR':>8}{'IRW az m':>10}{'PSLR':>8}"
+    )
     for row in measure(options.sizes, options.threads, options.trials):
-        quality = f"{row.loss_db:9.1f}{row.irw_range_m:10.3f}{row.pslr_range_db:8.2f}{row.irw_azimuth_m:10.3f}{row.pslr_azimuth_db:8.2f}"
-        print(f"{row.form:24}{row.size:6}{row.threads:8}{row.seconds * 1e3:9.1f}{row.ratio:9.2f}" + (quality if row.form in FORMS else ""))
+        quality = (
+            f"{row.loss_db:9.1f}{row.irw_range_m:10.3f}{row.pslr_range_db:8.2f}"
+            f"{row.irw_azimuth_m:10.3f}{row.pslr_azimuth_db:8.2f}"
+        )
+        print(
+            f"{row.form:24}{row.size:6}{row.threads:8}{row.seconds * 1e3:9.1f}{row.ratio:9.2f}"
+            + (quality if row.form in FORMS else "")
+        )
     if options.memory:
         print("\npeak arrays (raw matrix included):")
         for size in options.sizes:

@@ -1,9 +1,13 @@
-"""Moving ships on a sea before a GEO spaceborne-airborne bistatic radar: figure 18 of Remote Sens. 2020, 12, 1703.
+"""Moving ships on a sea before a GEO spaceborne-airborne bistatic radar: figure 18 of Remote Sens.
+
+2020, 12, 1703.
 
     python scripts/geo_ocean.py [--out geo_ocean] [--seed 1] [--small]
 
-Ship 1 rests, ship 2 closes at 10 m/s, ship 3 closes at 10 m/s and moves along track at 10 m/s. Focused as if everything stood still, ships that close appear beside their places and
-are repeated; the flow of figure 13 finds what moves, takes its echo out, and pictures it in its place. The source prints azimuth on x = (V_R - u_a) t of each target.
+Ship 1 rests, ship 2 closes at 10 m/s, ship 3 closes at 10 m/s and moves along track at 10 m/s.
+Focused as if everything stood still, ships that close appear beside their places and are repeated;
+the flow of figure 13 finds what moves, takes its echo out, and pictures it in its place. The source
+prints azimuth on x = (V_R - u_a) t of each target.
 """
 
 from __future__ import annotations
@@ -26,9 +30,23 @@ from torchsar.multichannel.transmit import RemoveTransmitRange
 from torchsar.radar import BistaticRadar, LinearFM
 from torchsar.scene import BandLimited, BistaticWorld, Fleet, KSea, Ship
 
-RADAR = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), sampling_hz=60e6, prf_hz=180.0, speed_m_s=300.0, reference_range_m=5700.0, transmit_range=(-243.0, 0.02, 5e-7), wave_speed_m_s=3e8)
-PUBLISHED = {"ship 2": (216.3, 934.58), "ship 3": (167.6, 723.99)}  # displacement and distance of the false target, m
-SHIPS = {"ship 1": Ship(0.0, 0.0, -300.0, 0.0), "ship 2": Ship(10.0, 0.0, 0.0, 790.0), "ship 3": Ship(10.0, 10.0, 100.0, -840.0)}
+RADAR = BistaticRadar(
+    1.25e9,
+    LinearFM(50e6, 10e-6),
+    sampling_hz=60e6,
+    prf_hz=180.0,
+    speed_m_s=300.0,
+    reference_range_m=5700.0,
+    transmit_range=(-243.0, 0.02, 5e-7),
+    wave_speed_m_s=3e8,
+)
+# displacement and distance of the false target, m
+PUBLISHED = {"ship 2": (216.3, 934.58), "ship 3": (167.6, 723.99)}
+SHIPS = {
+    "ship 1": Ship(0.0, 0.0, -300.0, 0.0),
+    "ship 2": Ship(10.0, 0.0, 0.0, 790.0),
+    "ship 3": Ship(10.0, 10.0, 100.0, -840.0),
+}
 SMALL = {"ship 2": Ship(10.0, 0.0, 0.0, 0.0, length_m=40.0, range_cells=2, count=6)}
 SCR_DB, CNR_DB = 10.0, 30.0
 
@@ -52,12 +70,31 @@ def whole() -> Setting:
 
 def small() -> Setting:
     """One ship, in seconds."""
-    return Setting(SMALL, 540, 120, 2.0, 2 * SCR_DB, ImageMovers(RADAR, Extraction(60.0, 30.0, 2.0, 0.4), Detector(suppressed_m_s=()), u_a_half_m_s=12.0))
+    return Setting(
+        SMALL,
+        540,
+        120,
+        2.0,
+        2 * SCR_DB,
+        ImageMovers(RADAR, Extraction(60.0, 30.0, 2.0, 0.4), Detector(suppressed_m_s=()), u_a_half_m_s=12.0),
+    )
 
 
 def received(setting: Setting, seed: int) -> Signal:
     """Channels (channel, pulse, range) without the transmit range, the sea of unit power."""
-    ships = {name: Ship(ship.u_r_m_s, ship.u_a_m_s, ship.azimuth_m, ship.range_m, ship.length_m, ship.range_cells, ship.count, level_db=setting.scr_db) for name, ship in setting.ships.items()}
+    ships = {
+        name: Ship(
+            ship.u_r_m_s,
+            ship.u_a_m_s,
+            ship.azimuth_m,
+            ship.range_m,
+            ship.length_m,
+            ship.range_cells,
+            ship.count,
+            level_db=setting.scr_db,
+        )
+        for name, ship in setting.ships.items()
+    }
     world = BistaticWorld(Fleet(ships), BandLimited(setting.gate_s), KSea(shape=1.5), snr_db=CNR_DB)
     recording, _ = simulate_bistatic(RADAR, world, setting.pulses, setting.lines, Draws(seed))
     return RemoveTransmitRange(RADAR)(recording.signal)
@@ -65,12 +102,24 @@ def received(setting: Setting, seed: int) -> Signal:
 
 def nearest(ship: Ship, bodies: list[Body]) -> Body | None:
     """What was found nearest to the middle of a ship, within 50 m."""
-    away = [(float(torch.hypot(body.motion.y0_m - ship.azimuth_m, body.motion.range_m - RADAR.reference_range_m - ship.range_m)), i) for i, body in enumerate(bodies)]
+    away = [
+        (
+            float(
+                torch.hypot(
+                    body.motion.y0_m - ship.azimuth_m, body.motion.range_m - RADAR.reference_range_m - ship.range_m
+                )
+            ),
+            i,
+        )
+        for i, body in enumerate(bodies)
+    ]
     return bodies[min(away)[1]] if away and min(away)[0] < 50 else None
 
 
 def predicted(motion: PointMotion) -> tuple[float, float]:
-    """Displacement and distance of the first false target of a motion, on the axis of the source."""
+    """Displacement and distance of the first false target of a motion, on the axis of the
+    source.
+    """
     v = float(motion.along_m_s)
     return v * float(motion.image_s) - float(motion.y0_m), RADAR.prf_hz * RADAR.wavelength_m * float(motion.range_m) / v
 
@@ -80,10 +129,16 @@ def show(setting: Setting, made: SceneImage) -> None:
     print(f"{'':18}{'u_r':>9}{'u_a':>9}{'azimuth':>9}{'range':>9}{'shift':>9}{'replica':>9}")
     for name, ship in setting.ships.items():
         like = torch.zeros((), dtype=torch.float64)
-        true = PointMotion.of(RADAR, like, ship.u_r_m_s, ship.u_a_m_s, ship.azimuth_m, RADAR.reference_range_m + ship.range_m)
+        true = PointMotion.of(
+            RADAR, like, ship.u_r_m_s, ship.u_a_m_s, ship.azimuth_m, RADAR.reference_range_m + ship.range_m
+        )
         rows = {name: true, "  found": None if (body := nearest(ship, made.bodies)) is None else body.motion}
         for title, motion in rows.items():
-            values = [] if motion is None else [float(getattr(motion, key)) for key in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")]
+            values = (
+                []
+                if motion is None
+                else [float(getattr(motion, key)) for key in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")]
+            )
             values += [] if motion is None or not ship.u_r_m_s else predicted(motion)
             print(f"{title:18}" + ("".join(f"{value:>9.2f}" for value in values) or "  nothing"))
         if name in PUBLISHED and len(setting.ships) > 1:
@@ -98,11 +153,28 @@ def levelled(image: Signal) -> Signal:
 
 
 def draw(setting: Setting, made: SceneImage, path: Path) -> None:
-    """The image of everything at rest, what does not move, and all in place, with outlines about true places."""
-    outlines = [np.array([[s.range_m + RADAR.reference_range_m + 60 * i, s.azimuth_m + 120 * j] for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]) for s in setting.ships.values()]
+    """The image of everything at rest, what does not move, and all in place, with outlines about
+    true places.
+    """
+    outlines = [
+        np.array(
+            [
+                [s.range_m + RADAR.reference_range_m + 60 * i, s.azimuth_m + 120 * j]
+                for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
+            ]
+        )
+        for s in setting.ships.values()
+    ]
     joined = np.concatenate([np.append(outline, [[np.nan, np.nan]], 0) for outline in outlines]).T
     named = {"everything at rest": made.conventional, "without movers": made.rest, "fused": made.fused}
-    figure = plot.overlays([{"title": title, "signal": levelled(image), "lines": {"true place": (joined[0], joined[1])}} for title, image in named.items()], 3, 35.0)
+    figure = plot.overlays(
+        [
+            {"title": title, "signal": levelled(image), "lines": {"true place": (joined[0], joined[1])}}
+            for title, image in named.items()
+        ],
+        3,
+        35.0,
+    )
     plot.save(figure, path)
     print(f"wrote {path}")
 

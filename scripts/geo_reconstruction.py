@@ -1,9 +1,11 @@
-"""Rebuilding the Doppler band of moving points from few channels: figures 10 to 12 and 17 of Remote Sens. 2020, 12, 1703, and how well posed it is.
+"""Rebuilding the Doppler band of moving points from few channels: figures 10 to 12 and 17 of Remote
+Sens. 2020, 12, 1703, and how well posed it is.
 
     python scripts/geo_reconstruction.py [--out geo_reconstruction] [--small]
 
-Azimuth only, without noise. "Band-limited": the target is seen for 4.5 s; "pattern": through the pattern of the elements, in records of 20 s, so that replicas up to three
-pulse rates away have their own places. MFTA: largest false target against the peak. N: Doppler bands that are rebuilt.
+Azimuth only, without noise. "Band-limited": the target is seen for 4.5 s; "pattern": through the
+pattern of the elements, in records of 20 s, so that replicas up to three pulse rates away have
+their own places. MFTA: largest false target against the peak. N: Doppler bands that are rebuilt.
 """
 
 from __future__ import annotations
@@ -29,12 +31,23 @@ from torchsar.multichannel.velocity.sir import Intensity, signal_intensity
 from torchsar.radar import BistaticRadar, LinearFM
 from torchsar.scene import BandLimited, BistaticWorld, Gate, MovingPoints, Pattern
 
-RADAR = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), sampling_hz=60e6, prf_hz=180.0, speed_m_s=300.0, reference_range_m=5000.0, wave_speed_m_s=3e8)
+RADAR = BistaticRadar(
+    1.25e9,
+    LinearFM(50e6, 10e-6),
+    sampling_hz=60e6,
+    prf_hz=180.0,
+    speed_m_s=300.0,
+    reference_range_m=5000.0,
+    wave_speed_m_s=3e8,
+)
 UNEVEN = replace(RADAR, channel_m=(-0.8, 0.0, 0.75))
 INTEGRATION_S, BANDWIDTH_HZ, RECORD_S = 4.5, 337.5, 20.0
 GATES: dict[str, Gate] = {"band-limited": BandLimited(INTEGRATION_S), "pattern": Pattern()}
 TRUE_M_S, GUESSES_M_S = 10.0, (5.0, 8.0, 10.0)
-BRIEF_SIR = {"band-limited": (24.5, 14.8, 39.2), "pattern": (7.3, 4.4, 11.6)}  # dB, peak of Gamma1, Gamma2, Gamma over their value at 0 m/s
+BRIEF_SIR = {
+    "band-limited": (24.5, 14.8, 39.2),
+    "pattern": (7.3, 4.4, 11.6),
+}  # dB, peak of Gamma1, Gamma2, Gamma over their value at 0 m/s
 PUBLISHED_MFTA = {"band-limited": "below -60 dB", "pattern": "below -25 dB"}
 BRIEF_PRF = (125.0, 160.0, 170.0, 180.0, 185.0, 187.0, 190.0, 195.0, 200.0, 250.0)
 BRIEF_CONDITION = {  # at BRIEF_PRF, condition number and noise gain (dB)
@@ -45,7 +58,9 @@ BRIEF_CONDITION = {  # at BRIEF_PRF, condition number and noise gain (dB)
 
 @dataclass(frozen=True)
 class Way:
-    """How bands are told apart. moving: with the velocity of the target, else as if it stood still."""
+    """How bands are told apart. moving: with the velocity of the target, else as if it
+    stood still.
+    """
 
     rebuild: Rebuild
     moving: bool
@@ -91,7 +106,9 @@ def replicas_db(data: Signal, u_r_m_s: Tensor, way: Way, gate: Gate) -> Tensor:
     assumed = u_r_m_s if way.moving else torch.zeros_like(u_r_m_s)
     image = FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(spectrum(data, way.rebuild, assumed), assumed)
     seen = INTEGRATION_S if isinstance(gate, BandLimited) else None
-    zones = replica_zones(RADAR, way.rebuild.bands, u_r_m_s, integration_s=seen, focused_at=(assumed, 0.0), orders=(1, 2, 3))
+    zones = replica_zones(
+        RADAR, way.rebuild.bands, u_r_m_s, integration_s=seen, focused_at=(assumed, 0.0), orders=(1, 2, 3)
+    )
     return replica_level(image.data, image.axis("azimuth").step, zones)["mfta_db"]
 
 
@@ -119,12 +136,16 @@ def draw_false_targets(speeds: Tensor, found: Mapping[str, Mapping[str, Tensor]]
     parts = []
     for gate, ways in found.items():
         series = {label: (plot.array(speeds), plot.array(levels)) for label, levels in ways.items()}
-        parts.append({"series": series, "xlabel": "u_r (m/s)", "ylabel": "MFTA (dB)", "title": gate, "ylim": (-80.0, 45.0)})
+        parts.append(
+            {"series": series, "xlabel": "u_r (m/s)", "ylabel": "MFTA (dB)", "title": gate, "ylim": (-80.0, 45.0)}
+        )
     plot.save(plot.panels(parts), out / "figure_17.png")
 
 
 def draw_spectra(data: Mapping[str, Signal], out: Path) -> None:
-    """Figures 10 and 11: spectra of a target of 10 m/s rebuilt with guesses of its velocity, over Doppler from zero; dashed: the processed band about the guess."""
+    """Figures 10 and 11: spectra of a target of 10 m/s rebuilt with guesses of its velocity, over
+    Doppler from zero; dashed: the processed band about the guess.
+    """
     for figure, signal in zip((10, 11), data.values(), strict=True):
         parts = []
         for guess in GUESSES_M_S:
@@ -132,7 +153,16 @@ def draw_spectra(data: Mapping[str, Signal], out: Path) -> None:
             centre = guess / RADAR.wavelength_m
             curve = (plot.array(rebuilt.axis("doppler").values() + centre), plot.decibel(rebuilt.data[0]))
             edges = {"processed band": centre - BANDWIDTH_HZ / 2, "its end": centre + BANDWIDTH_HZ / 2}
-            parts.append({"series": {"spectrum": curve}, "xlabel": "Doppler (Hz)", "ylabel": "amplitude (dB)", "title": f"rebuilt with {guess:g} m/s", "marks": edges, "ylim": (-60.0, 20.0)})
+            parts.append(
+                {
+                    "series": {"spectrum": curve},
+                    "xlabel": "Doppler (Hz)",
+                    "ylabel": "amplitude (dB)",
+                    "title": f"rebuilt with {guess:g} m/s",
+                    "marks": edges,
+                    "ylim": (-60.0, 20.0),
+                }
+            )
         plot.save(plot.panels(parts, columns=3), out / f"figure_{figure}.png")
 
 
@@ -143,7 +173,10 @@ def intensity(signal: Signal, guesses: Tensor) -> Intensity:
 
 
 def ratios_db(found: Intensity) -> dict[str, Tensor]:
-    return {name: 10 * torch.log10(ratio) for name, ratio in (("Gamma1", found.power_ratio), ("Gamma2", found.amplitude_ratio), ("Gamma", found.ratio))}
+    return {
+        name: 10 * torch.log10(ratio)
+        for name, ratio in (("Gamma1", found.power_ratio), ("Gamma2", found.amplitude_ratio), ("Gamma", found.ratio))
+    }
 
 
 def draw_ratios(data: Mapping[str, Signal], guesses: Tensor, out: Path) -> None:
@@ -153,10 +186,18 @@ def draw_ratios(data: Mapping[str, Signal], guesses: Tensor, out: Path) -> None:
     for gate, signal in data.items():
         curves = ratios_db(intensity(signal, guesses))
         for (name, curve), known in zip(curves.items(), BRIEF_SIR[gate], strict=True):
-            print(f"{f'{gate}: {name}':26}{float(guesses[curve.argmax()]):>12.2f}{float(curve.max() - curve[0]):>18.1f}{known:>18.1f}")
+            print(
+                f"{f'{gate}: {name}':26}{float(guesses[curve.argmax()]):>12.2f}"
+                f"{float(curve.max() - curve[0]):>18.1f}{known:>18.1f}"
+            )
         series = {name: (plot.array(guesses), plot.array(curve)) for name, curve in curves.items()}
-        parts.append({"series": series, "xlabel": "u_r of the reconstruction (m/s)", "ylabel": "ratio (dB)", "title": gate})
-    print("the brief's figures are those of three bands and nothing beyond; what aliases from further out lowers band-limited peaks by as much as shown")
+        parts.append(
+            {"series": series, "xlabel": "u_r of the reconstruction (m/s)", "ylabel": "ratio (dB)", "title": gate}
+        )
+    print(
+        "the brief's figures are those of three bands and nothing beyond; what aliases from "
+        "further out lowers band-limited peaks by as much as shown"
+    )
     plot.save(plot.panels(parts), out / "figure_12.png")
 
 
@@ -164,24 +205,43 @@ def conditions(radar: BistaticRadar, rates: Tensor, bands: int) -> tuple[Tensor,
     """Condition number and noise gain (dB) of least squares for points at rest over pulse rates."""
     radars = [replace(radar, prf_hz=float(prf)) for prf in rates]
     still = PointMotion.of(radar, torch.zeros((), dtype=torch.float64))
-    return torch.stack([condition_number(r, still, bands) for r in radars]), torch.stack([noise_gain_db(r, still, LeastSquares(bands)) for r in radars])
+    return torch.stack([condition_number(r, still, bands) for r in radars]), torch.stack(
+        [noise_gain_db(r, still, LeastSquares(bands)) for r in radars]
+    )
 
 
 def show_conditions() -> None:
     rates = torch.tensor(BRIEF_PRF, dtype=torch.float64)
     print(f"\n{'pulse rate (Hz)':30}" + "".join(f"{prf:>8g}" for prf in BRIEF_PRF))
     for bands, known in BRIEF_CONDITION.items():
-        for name, values, expected in zip(("condition", "noise gain (dB)"), conditions(RADAR, rates, bands), known, strict=True):
+        for name, values, expected in zip(
+            ("condition", "noise gain (dB)"), conditions(RADAR, rates, bands), known, strict=True
+        ):
             print(f"{f'N = {bands}, {name}':30}" + "".join(f"{float(x) + 0.0:>8.2f}" for x in values))
             print(f"{'  brief 001':30}" + "".join(f"{x:>8g}" for x in expected))
-        print(f"{f'N = {bands}, uneven, condition':30}" + "".join(f"{float(x):>8.2f}" for x in conditions(UNEVEN, rates, bands)[0]))
-    print("uneven: channels at -0.8, 0, 0.75 m; brief 001 at 180 Hz: 5.8 with N = 3, 1.39 with N = 2; their outer two sample the same places at 300 / 1.55 = 193.5 Hz")
+        print(
+            f"{f'N = {bands}, uneven, condition':30}"
+            + "".join(f"{float(x):>8.2f}" for x in conditions(UNEVEN, rates, bands)[0])
+        )
+    print(
+        "uneven: channels at -0.8, 0, 0.75 m; brief 001 at 180 Hz: 5.8 with N = 3, 1.39 with "
+        "N = 2; their outer two sample the same places at 300 / 1.55 = 193.5 Hz"
+    )
 
 
 def draw_conditions(rates: Tensor, out: Path) -> None:
-    """Condition and noise gain over the pulse rate; even channels sample the same places twice at 187.5 Hz."""
-    cases = {f"N = {bands}, {name}": conditions(radar, rates, bands) for bands in (3, 2) for name, radar in (("even", RADAR), ("uneven", UNEVEN))}
-    labels = (("condition number (dB)", lambda pair: 20 * torch.log10(pair[0])), ("noise gain (dB)", lambda pair: pair[1]))
+    """Condition and noise gain over the pulse rate; even channels sample the same places twice at
+    187.5 Hz.
+    """
+    cases = {
+        f"N = {bands}, {name}": conditions(radar, rates, bands)
+        for bands in (3, 2)
+        for name, radar in (("even", RADAR), ("uneven", UNEVEN))
+    }
+    labels = (
+        ("condition number (dB)", lambda pair: 20 * torch.log10(pair[0])),
+        ("noise gain (dB)", lambda pair: pair[1]),
+    )
     parts = []
     for label, of in labels:
         series = {name: (plot.array(rates), plot.array(of(pair))) for name, pair in cases.items()}

@@ -1,9 +1,12 @@
-"""What processing of multichannel bistatic data costs, and what it loses: precision, range migration, estimators of velocity.
+"""What processing of multichannel bistatic data costs, and what it loses: precision, range
+migration, estimators of velocity.
 
     python scripts/geo_speed.py [--out geo_speed] [--trials 16] [--rounds 3] [--small]
 
-One thread. Chain: reconstruction (two bands) and focusing of azimuth lines, beside nothing but its Fourier transforms, that of the channels and that of the image. Times are
-the best of the rounds. Errors of images are rms over rms against the same in double precision with an exact history. Migration: a target at rest, beyond the reference range.
+One thread. Chain: reconstruction (two bands) and focusing of azimuth lines, beside nothing but its
+Fourier transforms, that of the channels and that of the image. Times are the best of the rounds.
+Errors of images are rms over rms against the same in double precision with an exact history.
+Migration: a target at rest, beyond the reference range.
 """
 
 from __future__ import annotations
@@ -29,11 +32,24 @@ from torchsar.multichannel.response import LeastSquares
 from torchsar.multichannel.velocity.aperture import Dwell
 from torchsar.multichannel.velocity.bank import Search
 from torchsar.multichannel.velocity.sir import SignalIntensityRatio
-from torchsar.multichannel.velocity.stages import GradientVelocity, Interferometry, LikelihoodVelocity, MovingPointVelocity
+from torchsar.multichannel.velocity.stages import (
+    GradientVelocity,
+    Interferometry,
+    LikelihoodVelocity,
+    MovingPointVelocity,
+)
 from torchsar.radar import BistaticRadar, LinearFM
 from torchsar.scene import BandLimited, BistaticWorld, MovingPoints
 
-RADAR = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), sampling_hz=60e6, prf_hz=180.0, speed_m_s=300.0, reference_range_m=5000.0, wave_speed_m_s=3e8)
+RADAR = BistaticRadar(
+    1.25e9,
+    LinearFM(50e6, 10e-6),
+    sampling_hz=60e6,
+    prf_hz=180.0,
+    speed_m_s=300.0,
+    reference_range_m=5000.0,
+    wave_speed_m_s=3e8,
+)
 INTEGRATION_S, BANDWIDTH_HZ, N_PULSE = 4.5, 337.5, 900
 U_R_M_S, SNR_DB = 10.0, 7.0
 MIGRATIONS: dict[str, Migration] = {
@@ -43,7 +59,8 @@ MIGRATIONS: dict[str, Migration] = {
     "static bulk, one reference": StaticBulk(),
     "none": NoMigration(),
 }
-BRIEF_MS = {"SIR": 21.0, "ATI": 2.6, "ML from ATI": 36.0}  # a trial; the brief's SIR tries 94 velocities
+# a trial; the brief's SIR tries 94 velocities
+BRIEF_MS = {"SIR": 21.0, "ATI": 2.6, "ML from ATI": 36.0}
 BRIEF_ERROR_DB = {2: -134.0, 3: -125.0}
 
 
@@ -60,7 +77,9 @@ def best_s(work: Callable[[], object], rounds: int) -> float:
 def azimuth_lines(trials: int, dtype: torch.dtype, snr_db: float | None = None) -> Signal:
     """Channels (trial, channel, pulse) of a target of 10 m/s."""
     world = BistaticWorld(MovingPoints([U_R_M_S], [0.0], [0.0], [0.0]), BandLimited(INTEGRATION_S), snr_db=snr_db)
-    signal = simulate_bistatic(RADAR, world, N_PULSE, None, Draws(1, trials=range(trials)), dtype=torch.complex128)[0].signal
+    signal = simulate_bistatic(RADAR, world, N_PULSE, None, Draws(1, trials=range(trials)), dtype=torch.complex128)[
+        0
+    ].signal
     return signal.to(dtype)
 
 
@@ -81,20 +100,32 @@ def error_db(found: Tensor, exact: Tensor) -> float:
 
 def precision(trials: int, rounds: int) -> None:
     """The chain by precision and bands, beside its transforms."""
-    print(f"{'azimuth chain':28}{'chain (ms/line)':>17}{'FFTs (ms/line)':>17}{'ratio':>8}{'error (dB)':>12}{'brief (dB)':>12}")
+    print(
+        f"{'azimuth chain':28}{'chain (ms/line)':>17}{'FFTs (ms/line)':>17}{'ratio':>8}"
+        f"{'error (dB)':>12}{'brief (dB)':>12}"
+    )
     for bands in (2, 3):
         exact = image(azimuth_lines(trials, torch.complex128), bands)
         for dtype in (torch.complex128, torch.complex64):
             signal = azimuth_lines(trials, dtype)
-            chain, bare = (best_s(work, rounds) for work in (lambda s=signal, n=bands: image(s, n), lambda s=signal, n=bands: transforms(s.data, n)))
+            chain, bare = (
+                best_s(work, rounds)
+                for work in (lambda s=signal, n=bands: image(s, n), lambda s=signal, n=bands: transforms(s.data, n))
+            )
             name = f"N = {bands}, {str(dtype).removeprefix('torch.')}"
-            tail = f"{error_db(image(signal, bands), exact):>12.1f}{BRIEF_ERROR_DB[bands]:>12.0f}" if dtype == torch.complex64 else f"{'-':>12}{'-':>12}"
+            tail = (
+                f"{error_db(image(signal, bands), exact):>12.1f}{BRIEF_ERROR_DB[bands]:>12.0f}"
+                if dtype == torch.complex64
+                else f"{'-':>12}{'-':>12}"
+            )
             print(f"{name:28}{1e3 * chain / trials:>17.3f}{1e3 * bare / trials:>17.3f}{chain / bare:>8.1f}{tail}")
     print()
 
 
 def peak_loss_db(migration: Migration, u_r_m_s: float, beyond_m: float, n_range: int) -> float:
-    """What range migration that is left takes from the peak of a target beyond the reference range, against one without any."""
+    """What range migration that is left takes from the peak of a target beyond the reference range,
+    against one without any.
+    """
     world = BistaticWorld(MovingPoints([u_r_m_s], [0.0], [0.0], [beyond_m]), BandLimited(INTEGRATION_S))
     signal = simulate_bistatic(RADAR, world, N_PULSE, n_range, Draws(1))[0].signal
     exact = CorrectMigration(RADAR, StaticBulk(), range_m=RADAR.reference_range_m + beyond_m)(signal, u_r_m_s)
@@ -103,12 +134,19 @@ def peak_loss_db(migration: Migration, u_r_m_s: float, beyond_m: float, n_range:
 
 def peak(signal: Signal, u_r_m_s: float) -> float:
     """Of the focused image."""
-    return float(FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(Reconstruct(RADAR)(signal, u_r_m_s), u_r_m_s).data.abs().max())
+    return float(
+        FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(Reconstruct(RADAR)(signal, u_r_m_s), u_r_m_s).data.abs().max()
+    )
 
 
 def show_migration(offsets: Sequence[float], n_range: int, rounds: int, out: Path) -> None:
-    """Time of a frame, and loss of the peak over the distance from the reference range, of a target at rest and a moving one."""
-    print(f"{f'migration, {N_PULSE} pulses':28}{f'{n_range} lines (ms)':>17}" + "".join(f"{f'{beyond:g} m':>8}" for beyond in offsets) * 2)
+    """Time of a frame, and loss of the peak over the distance from the reference range, of a target
+    at rest and a moving one.
+    """
+    print(
+        f"{f'migration, {N_PULSE} pulses':28}{f'{n_range} lines (ms)':>17}"
+        + "".join(f"{f'{beyond:g} m':>8}" for beyond in offsets) * 2
+    )
     print(f"{'':28}{'':>17}{'peak (dB), at rest':>{8 * len(offsets)}}{'closing at 10 m/s':>{8 * len(offsets)}}")
     frame = Signal(torch.randn(RADAR.channels, N_PULSE, n_range, dtype=torch.complex64), RADAR.axes(N_PULSE, n_range))
     losses: dict[float, dict[str, list[float]]] = {0.0: {}, U_R_M_S: {}}
@@ -117,17 +155,33 @@ def show_migration(offsets: Sequence[float], n_range: int, rounds: int, out: Pat
         seconds = best_s(lambda stage=stage: stage(frame), rounds)
         for u_r, table in losses.items():
             table[name] = [peak_loss_db(migration, u_r, beyond, n_range) for beyond in offsets]
-        print(f"{name:28}{1e3 * seconds:>17.1f}" + "".join(f"{loss:>8.2f}" for table in losses.values() for loss in table[name]))
+        print(
+            f"{name:28}{1e3 * seconds:>17.1f}"
+            + "".join(f"{loss:>8.2f}" for table in losses.values() for loss in table[name])
+        )
     parts = []
     for u_r, table in losses.items():
-        series = {name: (plot.array(torch.tensor(offsets)), plot.array(torch.tensor(values))) for name, values in table.items()}
-        parts.append({"series": series, "xlabel": "beyond the reference range (m)", "ylabel": "peak (dB)", "title": f"target of u_r = {u_r:g} m/s", "ylim": (-18.0, 16.0)})
+        series = {
+            name: (plot.array(torch.tensor(offsets)), plot.array(torch.tensor(values)))
+            for name, values in table.items()
+        }
+        parts.append(
+            {
+                "series": series,
+                "xlabel": "beyond the reference range (m)",
+                "ylabel": "peak (dB)",
+                "title": f"target of u_r = {u_r:g} m/s",
+                "ylim": (-18.0, 16.0),
+            }
+        )
     plot.save(plot.panels(parts), out / "migration.png")
     print()
 
 
 def estimators(search: Search | None) -> dict[str, Callable[[Signal], Tensor]]:
-    """u_r (trial,) of azimuth lines; The others know the along-track velocity; "nothing told", bank and ML too, seeks it."""
+    """u_r (trial,) of azimuth lines; The others know the along-track velocity; "nothing told", bank
+    and ML too, seeks it.
+    """
     aperture = Dwell(INTEGRATION_S)
     known = ("u_r_m_s", "y0_m")
     rough, alone = Interferometry(RADAR, aperture), SignalIntensityRatio(RADAR, BANDWIDTH_HZ)
@@ -151,27 +205,41 @@ def estimators(search: Search | None) -> dict[str, Callable[[Signal], Tensor]]:
 
 def bound_m_s(told: bool) -> float:
     unknown = ("u_r_m_s", "y0_m") if told else ("u_r_m_s", "u_a_m_s", "y0_m")
-    return float(bistatic_bounds(RADAR, N_PULSE, 10 ** (SNR_DB / 10), U_R_M_S, integration_s=INTEGRATION_S, unknown=unknown)["u_r_m_s"])
+    return float(
+        bistatic_bounds(RADAR, N_PULSE, 10 ** (SNR_DB / 10), U_R_M_S, integration_s=INTEGRATION_S, unknown=unknown)[
+            "u_r_m_s"
+        ]
+    )
 
 
 def show_estimators(trials: int, search: Search | None, out: Path) -> None:
     """Time of a trial in a batch, and rms error at 7 dB a sample after range compression."""
-    print(f"{f'velocity, {SNR_DB:g} dB a sample':28}{'ms a trial':>17}{'brief (ms)':>12}{'rms (m/s)':>12}{'bound (m/s)':>13}")
+    print(
+        f"{f'velocity, {SNR_DB:g} dB a sample':28}{'ms a trial':>17}{'brief (ms)':>12}"
+        f"{'rms (m/s)':>12}{'bound (m/s)':>13}"
+    )
     signal, found = azimuth_lines(trials, torch.complex128, SNR_DB), {}
     for name, estimator in estimators(search).items():
         began = time.perf_counter()
         errors = estimator(signal) - U_R_M_S
         found[name] = (time.perf_counter() - began) / trials, float(errors.square().mean().sqrt())
         known = f"{BRIEF_MS[name]:g}" if name in BRIEF_MS else "-"
-        print(f"{name:28}{1e3 * found[name][0]:>17.1f}{known:>12}{found[name][1]:>12.4f}{bound_m_s(not name.endswith('nothing told')):>13.4f}")
+        print(
+            f"{name:28}{1e3 * found[name][0]:>17.1f}{known:>12}{found[name][1]:>12.4f}"
+            f"{bound_m_s(not name.endswith('nothing told')):>13.4f}"
+        )
     draw_trade(found, out)
 
 
 def draw_trade(found: Mapping[str, tuple[float, float]], out: Path) -> None:
-    found = {name: figures for name, figures in found.items() if "autograd" not in name}  # lies on the other ML
+    # lies on the other ML
+    found = {name: figures for name, figures in found.items() if "autograd" not in name}
     seconds, rms = zip(*found.values(), strict=True)
     decibels = [20 * math.log10(error) for error in rms]
-    plot.save(plot.trade(list(found), seconds, decibels, "rms error of u_r (dB of 1 m/s)", "estimators of velocity, a trial"), out / "estimators.png")
+    plot.save(
+        plot.trade(list(found), seconds, decibels, "rms error of u_r (dB of 1 m/s)", "estimators of velocity, a trial"),
+        out / "estimators.png",
+    )
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -188,7 +256,12 @@ def main(arguments: list[str] | None = None) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the poor condition of three bands
         precision(trials, rounds)
-        show_migration((0.0, 150.0) if options.small else (0.0, 100.0, 200.0, 400.0, 800.0), 96 if options.small else 512, rounds, options.out)
+        show_migration(
+            (0.0, 150.0) if options.small else (0.0, 100.0, 200.0, 400.0, 800.0),
+            96 if options.small else 512,
+            rounds,
+            options.out,
+        )
         show_estimators(trials, Search(u_a_m_s=2.0) if options.small else None, options.out)
 
 

@@ -1,9 +1,12 @@
-"""Point targets of a GEO spaceborne-airborne bistatic radar, in two dimensions: figures 5 to 7 and 14 to 16 and Table 4 of Remote Sens. 2020, 12, 1703.
+"""Point targets of a GEO spaceborne-airborne bistatic radar, in two dimensions: figures 5 to 7 and
+14 to 16 and Table 4 of Remote Sens. 2020, 12, 1703.
 
     python scripts/geo_targets.py [--out geo_targets] [--small]
 
-Channels are rebuilt and focused as if everything stood still, and with the velocities of each target (u_r closing, u_a along track, m/s). The first blurs what moves along
-track and repeats what moves along range; the second does neither. Range resolutions are those of the axis c tau / 2, half of the receive path; azimuth is x = v t.
+Channels are rebuilt and focused as if everything stood still, and with the velocities of each
+target (u_r closing, u_a along track, m/s). The first blurs what moves along track and repeats what
+moves along range; the second does neither. Range resolutions are those of the axis c tau / 2, half
+of the receive path; azimuth is x = v t.
 """
 
 from __future__ import annotations
@@ -31,14 +34,39 @@ from torchsar.multichannel.transmit import RemoveTransmitRange
 from torchsar.radar import BistaticRadar, LinearFM
 from torchsar.scene import BandLimited, BistaticWorld, MovingPoints
 
-RADAR = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), sampling_hz=60e6, prf_hz=180.0, speed_m_s=300.0, reference_range_m=5000.0, transmit_range=(-243.0, 0.02, 5e-7), wave_speed_m_s=3e8)
+RADAR = BistaticRadar(
+    1.25e9,
+    LinearFM(50e6, 10e-6),
+    sampling_hz=60e6,
+    prf_hz=180.0,
+    speed_m_s=300.0,
+    reference_range_m=5000.0,
+    transmit_range=(-243.0, 0.02, 5e-7),
+    wave_speed_m_s=3e8,
+)
 INTEGRATION_S, BANDWIDTH_HZ = 4.5, 337.5
 SPEEDS = {"at rest": (0.0, 0.0), "P1": (0.0, 10.0), "P2": (10.0, 0.0), "P3": (10.0, 5.0), "P4": (5.0, 10.0)}
-PLACES = {"P1": (-300.0, 60.0), "P2": (-150.0, -60.0), "P3": (150.0, 60.0), "P4": (250.0, -60.0)}  # azimuth and receive range (m) in figure 16, which prints none
+PLACES = {
+    "P1": (-300.0, 60.0),
+    "P2": (-150.0, -60.0),
+    "P3": (150.0, 60.0),
+    "P4": (250.0, -60.0),
+}  # azimuth and receive range (m) in figure 16, which prints none
 FIGURES = ("az width", "az PSLR", "az ISLR", "rg width", "rg PSLR", "rg ISLR", "MFTA")
-PUBLISHED = {  # width, PSLR, ISLR along azimuth, then MFTA; along range 2.64 to 2.66 m, -13 dB, -9.8 dB
-    "conventional": {"P1": (59.55, -26.30, -26.37, -44.43), "P2": (1.06, None, None, -21.95), "P3": (8.77, None, None, -20.8), "P4": (17.99, None, None, -25.0)},
-    "proposed": {"P1": (0.83, -13.25, -10.01, -68.9), "P2": (0.80, -13.07, -10.14, -56.7), "P3": (0.81, -13.11, -10.11, -52.4), "P4": (0.83, -13.26, -10.09, -47.6)},
+# width, PSLR, ISLR along azimuth, then MFTA; along range 2.64 to 2.66 m, -13 dB, -9.8 dB
+PUBLISHED = {
+    "conventional": {
+        "P1": (59.55, -26.30, -26.37, -44.43),
+        "P2": (1.06, None, None, -21.95),
+        "P3": (8.77, None, None, -20.8),
+        "P4": (17.99, None, None, -25.0),
+    },
+    "proposed": {
+        "P1": (0.83, -13.25, -10.01, -68.9),
+        "P2": (0.80, -13.07, -10.14, -56.7),
+        "P3": (0.81, -13.11, -10.11, -52.4),
+        "P4": (0.83, -13.26, -10.09, -47.6),
+    },
 }
 
 
@@ -58,7 +86,9 @@ class Batch:
 
 @dataclass(frozen=True)
 class Product:
-    """Rebuilt spectrum (doppler, range) and image (azimuth, range) of every trial, and how they were made. moving: with the velocities of the targets."""
+    """Rebuilt spectrum (doppler, range) and image (azimuth, range) of every trial, and how they
+    were made. moving: with the velocities of the targets.
+    """
 
     spectrum: Signal
     image: Signal
@@ -68,28 +98,42 @@ class Product:
 
 def received(world: BistaticWorld, n_pulse: int, n_range: int, trials: int | None = None) -> Signal:
     """Range-compressed channels (channel, pulse, range) without the transmit range."""
-    recording, _ = simulate_bistatic(RADAR, world, n_pulse, n_range, Draws(1, trials=None if trials is None else range(trials)))
+    recording, _ = simulate_bistatic(
+        RADAR, world, n_pulse, n_range, Draws(1, trials=None if trials is None else range(trials))
+    )
     return RemoveTransmitRange(RADAR)(recording.signal)
 
 
 def simulated(speeds: Mapping[str, tuple[float, float]], n_pulse: int, n_range: int) -> Batch:
     """One target at the middle of the scene in each trial, without noise."""
     u_r, u_a = torch.tensor(list(speeds.values()), dtype=torch.float64).T[..., None]
-    world = BistaticWorld(MovingPoints(u_r, u_a, torch.zeros_like(u_r), torch.zeros_like(u_r)), BandLimited(INTEGRATION_S))
+    world = BistaticWorld(
+        MovingPoints(u_r, u_a, torch.zeros_like(u_r), torch.zeros_like(u_r)), BandLimited(INTEGRATION_S)
+    )
     return Batch(speeds, received(world, n_pulse, n_range, len(speeds)))
 
 
 def products(batch: Batch, way: str) -> list[Product]:
-    """With two and three bands, "conventional" (as if at rest) or "proposed" (with the velocities)."""
+    """With two and three bands, "conventional" (as if at rest) or "proposed" (with the
+    velocities).
+    """
     values = batch.values if way == "proposed" else {}
     standing = CorrectMigration(RADAR, Keystone(whole_swath=False))(batch.channels, **values)
     return [product(standing, bands, values) for bands in (2, 3)]
 
 
-def product(standing: Signal, bands: int, values: Mapping[str, Tensor | float], range_m: float | None = None) -> Product:
-    """From channels without migration. One filter serves all lines, that of the target: side lobes along range have its history, not that of their line."""
+def product(
+    standing: Signal, bands: int, values: Mapping[str, Tensor | float], range_m: float | None = None
+) -> Product:
+    """From channels without migration.
+
+    One filter serves all lines, that of the target: side lobes along range have its history, not
+    that of their line.
+    """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # three bands of three channels are poorly conditioned, which is what the table shows
+        warnings.simplefilter(
+            "ignore"
+        )  # three bands of three channels are poorly conditioned, which is what the table shows
         spectrum = Reconstruct(RADAR, LeastSquares(bands))(standing, **values)
     doppler, range_ = spectrum.axes
     motion = PointMotion.of(RADAR, standing.data, **values, range_m=range_m).each(lambda value: value[..., None])
@@ -111,11 +155,23 @@ def range_cut(image: Signal) -> Tensor:
 def measured(batch: Batch, made: Product) -> Tensor:
     """Numbers named by FIGURES, (trial, figure)."""
     profile, step = brightest(made.image), made.image.axis("azimuth").step
-    own, across = azimuth_response(profile, step), azimuth_response(range_cut(made.image), made.image.axis("range").step / 2)
-    zones = replica_zones(RADAR, made.bands, batch.values["u_r_m_s"], batch.values["u_a_m_s"], integration_s=INTEGRATION_S, focused_at=None if made.moving else (0.0, 0.0))
+    own, across = (
+        azimuth_response(profile, step),
+        azimuth_response(range_cut(made.image), made.image.axis("range").step / 2),
+    )
+    zones = replica_zones(
+        RADAR,
+        made.bands,
+        batch.values["u_r_m_s"],
+        batch.values["u_a_m_s"],
+        integration_s=INTEGRATION_S,
+        focused_at=None if made.moving else (0.0, 0.0),
+    )
     level = replica_level(profile, step, zones)["mfta_db"]
     width = own["irw_m"] * (1 - batch.values["u_a_m_s"] / RADAR.speed_m_s)
-    return torch.stack([width, own["pslr_db"], own["islr_db"], across["irw_m"], across["pslr_db"], across["islr_db"], level], -1)
+    return torch.stack(
+        [width, own["pslr_db"], own["islr_db"], across["irw_m"], across["pslr_db"], across["islr_db"], level], -1
+    )
 
 
 def show(batch: Batch, made: Mapping[str, Product], bands: int) -> None:
@@ -126,12 +182,19 @@ def show(batch: Batch, made: Mapping[str, Product], bands: int) -> None:
             print(f"{f'{way} {name}':28}" + "".join(f"{float(x):>10.2f}" for x in row))
             if name in PUBLISHED[way]:
                 known = PUBLISHED[way][name]
-                print(f"{'  published':28}" + "".join(f"{'-' if x is None else f'{x:.2f}':>10}" for x in (*known[:3], None, None, None, known[3])))
+                print(
+                    f"{'  published':28}"
+                    + "".join(
+                        f"{'-' if x is None else f'{x:.2f}':>10}" for x in (*known[:3], None, None, None, known[3])
+                    )
+                )
     print()
 
 
 def near(image: Signal, along_m: float, range_m: float, place: int) -> Signal:
-    """Surroundings of the peak of one trial, azimuth and range counted from it, range on the axis c tau / 2."""
+    """Surroundings of the peak of one trial, azimuth and range counted from it, range on the axis c
+    tau / 2.
+    """
     azimuth, range_ = image.axes
     data = image.data[place]
     peak = divmod(int(data.abs().argmax()), data.shape[-1])
@@ -139,7 +202,10 @@ def near(image: Signal, along_m: float, range_m: float, place: int) -> Signal:
     first = [max(at - side, 0) for at, side in zip(peak, reach, strict=True)]
     part = data[first[0] : peak[0] + reach[0] + 1, first[1] : peak[1] + reach[1] + 1]
     steps = azimuth.step, range_.step / 2
-    axes = (Axis(axis.name, n, (begin - at) * step, step, "m") for axis, n, begin, at, step in zip(image.axes, part.shape, first, peak, steps, strict=True))
+    axes = (
+        Axis(axis.name, n, (begin - at) * step, step, "m")
+        for axis, n, begin, at, step in zip(image.axes, part.shape, first, peak, steps, strict=True)
+    )
     return Signal(part, tuple(axes))
 
 
@@ -149,7 +215,9 @@ def finer(image: Signal, factor: int = 8) -> Signal:
     for dim, axis in zip((-2, -1), image.axes, strict=True):
         n = data.shape[dim]
         spectrum = torch.fft.fftshift(torch.fft.fft(data, dim=dim), dim=dim).movedim(dim, -1)
-        padded = torch.nn.functional.pad(spectrum, ((factor * n) // 2 - n // 2, factor * n - n - ((factor * n) // 2 - n // 2)))
+        padded = torch.nn.functional.pad(
+            spectrum, ((factor * n) // 2 - n // 2, factor * n - n - ((factor * n) // 2 - n // 2))
+        )
         data = factor * torch.fft.ifft(torch.fft.ifftshift(padded, dim=-1)).movedim(-1, dim)
         axes.append(Axis(axis.name, factor * n, axis.start, axis.step / factor, axis.unit))
     return Signal(data, tuple(axes))
@@ -170,13 +238,21 @@ def draw_target(made: Product, place: int, title: str, path: Path, reach_m: floa
     parts = [
         {"title": f"{title}: spectrum", "signal": spectrum_2d(made, place), "lines": {}},
         {"title": "image about the peak", "signal": finer(near(made.image, reach_m, 30.0, place)), "lines": {}},
-        {"series": {"": curve}, "xlabel": "azimuth (m)", "ylabel": "amplitude (dB)", "title": "azimuth profile", "ylim": (-80.0, 2.0)},
+        {
+            "series": {"": curve},
+            "xlabel": "azimuth (m)",
+            "ylabel": "amplitude (dB)",
+            "title": "azimuth profile",
+            "ylim": (-80.0, 2.0),
+        },
     ]
     plot.save(plot.overlays(parts, columns=3, dynamic_range_db=50), path)
 
 
 def draw_single(batch: Batch, by_way: Mapping[str, Product], places: Sequence[int], out: Path) -> None:
-    """Of the targets at these places of the batch figures 5 to 7 (conventional) and 14, 15 (proposed), their contours in one picture."""
+    """Of the targets at these places of the batch figures 5 to 7 (conventional) and 14, 15
+    (proposed), their contours in one picture.
+    """
     names, contours = list(batch.speeds), {}
     for way, figures in (("conventional", {0: 5, 1: 6, 2: 7}), ("proposed", {1: 14, 2: 15})):
         made = by_way[way]
@@ -199,9 +275,15 @@ def draw_scene(n_pulse: int, n_range: int, out: Path) -> None:
     data = received(world, n_pulse, n_range)
     still = FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(Reconstruct(RADAR)(CorrectMigration(RADAR)(data)))
     lines = {name: (np.full(2, x), np.array([-115.0, 115.0])) for name, (x, _) in PLACES.items()}
-    part = {"title": "four targets as if at rest; lines: true azimuth", "signal": transposed(relative(still)), "lines": lines}
+    part = {
+        "title": "four targets as if at rest; lines: true azimuth",
+        "signal": transposed(relative(still)),
+        "lines": lines,
+    }
     plot.save(plot.overlays([part], columns=1, dynamic_range_db=50), out / "figure_16.png")
-    plot.save(plot.contours({name: own_image(data, name) for name in PLACES}, columns=4), out / "figure_16_contours.png")
+    plot.save(
+        plot.contours({name: own_image(data, name) for name in PLACES}, columns=4), out / "figure_16_contours.png"
+    )
 
 
 def own_image(data: Signal, name: str) -> Signal:
@@ -211,7 +293,9 @@ def own_image(data: Signal, name: str) -> Signal:
     standing = CorrectMigration(RADAR, Keystone(whole_swath=False), range_m=range_m)(data, **values)
     image = product(standing, 2, values, range_m).image
     shown = RADAR.speed_m_s * float(PointMotion.of(RADAR, data.data, **values, range_m=range_m).image_s)
-    part = image.crop(azimuth=around(image.axis("azimuth"), shown, 20.0), range=around(image.axis("range"), range_m, 40.0))
+    part = image.crop(
+        azimuth=around(image.axis("azimuth"), shown, 20.0), range=around(image.axis("range"), range_m, 40.0)
+    )
     return finer(near(part.with_data(part.data[None]), 6.0, 15.0, 0))
 
 
@@ -224,7 +308,10 @@ def around(axis: Axis, place: float, reach: float) -> tuple[int, int]:
 def relative(image: Signal) -> Signal:
     """Range from the reference on the axis c tau / 2."""
     azimuth, range_ = image.axes
-    return Signal(image.data, (azimuth, Axis("range", range_.n, (range_.start - RADAR.reference_range_m) / 2, range_.step / 2, "m")))
+    return Signal(
+        image.data,
+        (azimuth, Axis("range", range_.n, (range_.start - RADAR.reference_range_m) / 2, range_.step / 2, "m")),
+    )
 
 
 def transposed(image: Signal) -> Signal:
@@ -235,7 +322,11 @@ def transposed(image: Signal) -> Signal:
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("geo_targets"), help="folder of the figures")
-    parser.add_argument("--small", action="store_true", help="records of 6 s with one replica to either side, short lines, one target drawn")
+    parser.add_argument(
+        "--small",
+        action="store_true",
+        help="records of 6 s with one replica to either side, short lines, one target drawn",
+    )
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
 
@@ -245,7 +336,11 @@ def main(arguments: list[str] | None = None) -> None:
     two, three = ({way: both[i] for way, both in made.items()} for i in range(2))
     show(batch, two, 2)
     show(batch, three, 3)
-    print(f"theory: azimuth 0.886 lambda R0 / (v T) = {0.886 * RADAR.wavelength_m * RADAR.reference_range_m / (RADAR.speed_m_s * INTEGRATION_S):.3f} m at rest, range 2.66 m, PSLR -13.26 dB")
+    print(
+        "theory: azimuth 0.886 lambda R0 / (v T) = "
+        f"{0.886 * RADAR.wavelength_m * RADAR.reference_range_m / (RADAR.speed_m_s * INTEGRATION_S):.3f} "
+        "m at rest, range 2.66 m, PSLR -13.26 dB"
+    )
     draw_single(batch, two, (2,) if options.small else (0, 1, 2), options.out)
     draw_scene(n_pulse, n_range, options.out)
 

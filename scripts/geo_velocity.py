@@ -1,10 +1,15 @@
-"""Slant-range velocity of moving targets from three channels: Tables 2 and 3 of Remote Sens. 2020, 12, 1703, bounds, and velocities beyond the ambiguity.
+"""Slant-range velocity of moving targets from three channels: Tables 2 and 3 of Remote Sens.
+
+2020, 12, 1703, bounds, and velocities beyond the ambiguity.
 
     python scripts/geo_velocity.py [--out geo_velocity] [--trials 24] [--seed 1] [--small]
 
-The signal intensity ratio (SIR) is the paper's estimator; along-track interferometry (ATI) and maximum likelihood (ML) are told the same, the along-track velocity;
-"nothing told" is the recommended estimator that finds u_r, u_a and the place at once. White noise, a target seen for 4.5 s. SCNR is read as that of a raw sample, which range
-compression improves by 10 lg(B tau) = 27 dB. Errors are means of |error| over trials, bounds are Cramer-Rao deviations times sqrt(2 / pi), the mean |error| of a Gaussian.
+The signal intensity ratio (SIR) is the paper's estimator; along-track interferometry (ATI) and
+maximum likelihood (ML) are told the same, the along-track velocity; "nothing told" is the
+recommended estimator that finds u_r, u_a and the place at once. White noise, a target seen for 4.5
+s. SCNR is read as that of a raw sample, which range compression improves by 10 lg(B tau) = 27 dB.
+Errors are means of |error| over trials, bounds are Cramer-Rao deviations times sqrt(2 / pi), the
+mean |error| of a Gaussian.
 """
 
 from __future__ import annotations
@@ -33,7 +38,15 @@ from torchsar.multichannel.velocity.walk import WalkAmbiguity
 from torchsar.radar import BistaticRadar, LinearFM
 from torchsar.scene import BandLimited, BistaticWorld, MovingPoints
 
-RADAR = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), sampling_hz=60e6, prf_hz=180.0, speed_m_s=300.0, reference_range_m=5000.0, wave_speed_m_s=3e8)
+RADAR = BistaticRadar(
+    1.25e9,
+    LinearFM(50e6, 10e-6),
+    sampling_hz=60e6,
+    prf_hz=180.0,
+    speed_m_s=300.0,
+    reference_range_m=5000.0,
+    wave_speed_m_s=3e8,
+)
 INTEGRATION_S, BANDWIDTH_HZ, RECORD_S = 4.5, 337.5, 5.0
 GAIN_DB = 10 * math.log10(RADAR.pulse.bandwidth_hz * 10e-6)
 SCNR_DB = (-50.0, -40.0, -30.0, -20.0, -10.0, 0.0, 10.0)
@@ -42,7 +55,18 @@ TABLE_2 = {  # |error| (m/s) at SCNR_DB, a single trial each
     180.0: (4.95, 4.32, 1.33, 0.59, 0.19, 0.12, 0.12),
     190.0: (5.68, 4.73, 1.99, 0.73, 0.12, 0.11, 0.04),
 }
-TABLE_3 = {-14.0: 0.19, -11.0: 0.11, -8.0: 0.09, -5.0: 0.12, -2.0: 0.11, 1.0: 0.15, 4.0: 0.15, 7.0: 0.11, 10.0: 0.17, 13.0: 0.14}  # u_r -> |error| (m/s) at -10 dB
+TABLE_3 = {
+    -14.0: 0.19,
+    -11.0: 0.11,
+    -8.0: 0.09,
+    -5.0: 0.12,
+    -2.0: 0.11,
+    1.0: 0.15,
+    4.0: 0.15,
+    7.0: 0.11,
+    10.0: 0.17,
+    13.0: 0.14,
+}  # u_r -> |error| (m/s) at -10 dB
 MEAN_OF_DEVIATION = math.sqrt(2 / math.pi)
 AMBIGUOUS_M_S = (25.0, -35.0)
 
@@ -68,7 +92,11 @@ def mean_bound(radar: BistaticRadar, u_r_m_s: float, scnr_db: float, told: bool)
     """Least mean |error| of u_r (m/s), u_a told or not."""
     unknown = ("u_r_m_s", "y0_m") if told else ("u_r_m_s", "u_a_m_s", "y0_m")
     snr = 10 ** ((scnr_db + GAIN_DB) / 10)
-    return MEAN_OF_DEVIATION * float(bistatic_bounds(radar, round(RECORD_S * radar.prf_hz), snr, u_r_m_s, integration_s=INTEGRATION_S, unknown=unknown)["u_r_m_s"])
+    return MEAN_OF_DEVIATION * float(
+        bistatic_bounds(
+            radar, round(RECORD_S * radar.prf_hz), snr, u_r_m_s, integration_s=INTEGRATION_S, unknown=unknown
+        )["u_r_m_s"]
+    )
 
 
 def errors(radar: BistaticRadar, u_r_m_s: float, scnr_db: float, draws: Draws, along_m_s: float) -> dict[str, Tensor]:
@@ -76,7 +104,9 @@ def errors(radar: BistaticRadar, u_r_m_s: float, scnr_db: float, draws: Draws, a
     signal = simulated(radar, u_r_m_s, scnr_db + GAIN_DB, draws)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the poor condition of three bands, which SIR needs
-        return {name: (stage(signal)["u_r_m_s"] - u_r_m_s).abs() for name, stage in estimators(radar, along_m_s).items()}
+        return {
+            name: (stage(signal)["u_r_m_s"] - u_r_m_s).abs() for name, stage in estimators(radar, along_m_s).items()
+        }
 
 
 def show(title: str, columns: Sequence[str], rows: Mapping[str, Sequence[float]]) -> None:
@@ -86,17 +116,28 @@ def show(title: str, columns: Sequence[str], rows: Mapping[str, Sequence[float]]
     print()
 
 
-def table(columns: Sequence[dict[str, Tensor]], bounds: Mapping[str, Sequence[float]], published: Sequence[float]) -> dict[str, Sequence[float]]:
+def table(
+    columns: Sequence[dict[str, Tensor]], bounds: Mapping[str, Sequence[float]], published: Sequence[float]
+) -> dict[str, Sequence[float]]:
     """Rows of a table of mean errors."""
     means = {name: [float(column[name].mean()) for column in columns] for name in columns[0]}
     return {"published": published, **means, **bounds}
 
 
-def part(title: str, x: Sequence[float], columns: Sequence[dict[str, Tensor]], bounds: Mapping[str, Sequence[float]], published: Sequence[float]) -> dict:
+def part(
+    title: str,
+    x: Sequence[float],
+    columns: Sequence[dict[str, Tensor]],
+    bounds: Mapping[str, Sequence[float]],
+    published: Sequence[float],
+) -> dict:
     """A panel: means with 95 % intervals."""
     series = {}
     for name in columns[0]:
-        mean, half = (np.array([float(of(column[name])) for column in columns]) for of in (torch.mean, lambda e: 1.96 * e.std() / math.sqrt(len(e))))
+        mean, half = (
+            np.array([float(of(column[name])) for column in columns])
+            for of in (torch.mean, lambda e: 1.96 * e.std() / math.sqrt(len(e)))
+        )
         series[name] = (mean, np.stack([np.maximum(mean - half, 0.2 * mean), mean + half], -1))
     lines = {"published": np.array(published), **{name: np.array(values) for name, values in bounds.items()}}
     return {"title": title, "x": np.array(x), "series": series, "bounds": lines}
@@ -104,7 +145,10 @@ def part(title: str, x: Sequence[float], columns: Sequence[dict[str, Tensor]], b
 
 def bounds_of(radar: BistaticRadar, places: Sequence[tuple[float, float]]) -> dict[str, list[float]]:
     """At (u_r, SCNR), with u_a told and not."""
-    return {name: [mean_bound(radar, u_r, scnr, told) for u_r, scnr in places] for name, told in (("bound, u_a told", True), ("bound, nothing told", False))}
+    return {
+        name: [mean_bound(radar, u_r, scnr, told) for u_r, scnr in places]
+        for name, told in (("bound, u_a told", True), ("bound, nothing told", False))
+    }
 
 
 def over_noise(rates: Sequence[float], scnr_db: Sequence[float], draws: Draws, along_m_s: float, out: Path) -> None:
@@ -113,8 +157,13 @@ def over_noise(rates: Sequence[float], scnr_db: Sequence[float], draws: Draws, a
     for prf in rates:
         radar = replace(RADAR, prf_hz=prf)
         columns = [errors(radar, 10.0, scnr, draws.part(f"{prf:g} Hz, {scnr:g} dB"), along_m_s) for scnr in scnr_db]
-        bounds, published = bounds_of(radar, [(10.0, scnr) for scnr in scnr_db]), [TABLE_2[prf][SCNR_DB.index(scnr)] for scnr in scnr_db]
-        show(f"Table 2, {prf:g} Hz; raw SCNR (dB)", [f"{scnr:g}" for scnr in scnr_db], table(columns, bounds, published))
+        bounds, published = (
+            bounds_of(radar, [(10.0, scnr) for scnr in scnr_db]),
+            [TABLE_2[prf][SCNR_DB.index(scnr)] for scnr in scnr_db],
+        )
+        show(
+            f"Table 2, {prf:g} Hz; raw SCNR (dB)", [f"{scnr:g}" for scnr in scnr_db], table(columns, bounds, published)
+        )
         parts.append(part(f"{prf:g} Hz", scnr_db, columns, bounds, published))
     plot.save(plot.error_curves(parts, "raw SCNR (dB)", "mean |error| of u_r (m/s)", log_y=True), out / "table_2.png")
 
@@ -124,11 +173,18 @@ def over_velocity(velocities: Sequence[float], draws: Draws, along_m_s: float, o
     columns = [errors(RADAR, u_r, -10.0, draws.part(f"{u_r:g} m/s"), along_m_s) for u_r in velocities]
     bounds, published = bounds_of(RADAR, [(u_r, -10.0) for u_r in velocities]), [TABLE_3[u_r] for u_r in velocities]
     show("Table 3, -10 dB; u_r (m/s)", [f"{u_r:g}" for u_r in velocities], table(columns, bounds, published))
-    plot.save(plot.error_curves([part("", velocities, columns, bounds, published)], "u_r (m/s)", "mean |error| of u_r (m/s)", log_y=True), out / "table_3.png")
+    plot.save(
+        plot.error_curves(
+            [part("", velocities, columns, bounds, published)], "u_r (m/s)", "mean |error| of u_r (m/s)", log_y=True
+        ),
+        out / "table_3.png",
+    )
 
 
 def resolved_by_walk(u_r_m_s: float, draws: Draws) -> tuple[float, float]:
-    """The walk through range tells how often lambda PRF must be added to what the channels tell: that number, and what interferometry finds from there."""
+    """The walk through range tells how often lambda PRF must be added to what the channels tell:
+    that number, and what interferometry finds from there.
+    """
     aperture = Dwell(INTEGRATION_S)
     migrate = use(CorrectMigration(RADAR, Keystone(whole_swath=False)), ambiguity="walk")
     chain = Chain(walk=WalkAmbiguity(RADAR), migrate=migrate, velocity=Interferometry(RADAR, aperture))
@@ -140,14 +196,30 @@ def resolved_by_walk(u_r_m_s: float, draws: Draws) -> tuple[float, float]:
 
 def beyond_ambiguity(draws: Draws) -> None:
     """Velocities beyond +-21.6 m/s, at 10 dB after range compression."""
-    rows: dict[str, list[float]] = {"interferometry alone": [], "bank and likelihood": [], "range walk: pulse rates": [], "range walk, interferometry": []}
+    rows: dict[str, list[float]] = {
+        "interferometry alone": [],
+        "bank and likelihood": [],
+        "range walk: pulse rates": [],
+        "range walk, interferometry": [],
+    }
     for u_r in AMBIGUOUS_M_S:
         here = draws.for_trials([0]).part(f"{u_r:g} m/s")
         line = simulated(RADAR, u_r, 10.0, here)
-        alone, bank = (stage(line)["u_r_m_s"] for stage in (Interferometry(RADAR, Dwell(INTEGRATION_S)), MovingPointVelocity(RADAR, Dwell(INTEGRATION_S), u_a_m_s=0.0)))
-        for row, value in zip(rows.values(), (float(alone[0]), float(bank[0]), *resolved_by_walk(u_r, here)), strict=True):
+        alone, bank = (
+            stage(line)["u_r_m_s"]
+            for stage in (
+                Interferometry(RADAR, Dwell(INTEGRATION_S)),
+                MovingPointVelocity(RADAR, Dwell(INTEGRATION_S), u_a_m_s=0.0),
+            )
+        )
+        for row, value in zip(
+            rows.values(), (float(alone[0]), float(bank[0]), *resolved_by_walk(u_r, here)), strict=True
+        ):
             row.append(value)
-    print(f"{f'true u_r, known modulo {RADAR.ambiguous_velocity_m_s:.1f} m/s':34}" + "".join(f"{f'{u_r:g} m/s':>10}" for u_r in AMBIGUOUS_M_S))
+    print(
+        f"{f'true u_r, known modulo {RADAR.ambiguous_velocity_m_s:.1f} m/s':34}"
+        + "".join(f"{f'{u_r:g} m/s':>10}" for u_r in AMBIGUOUS_M_S)
+    )
     for name, row in rows.items():
         print(f"{name:34}" + "".join(f"{x:>10.2f}" for x in row))
 
@@ -163,7 +235,13 @@ def main(arguments: list[str] | None = None) -> None:
 
     along = 2.0 if options.small else 20.0
     draws = Draws(options.seed, trials=range(2 if options.small else options.trials))
-    over_noise((180.0,) if options.small else tuple(TABLE_2), (-30.0, -10.0) if options.small else SCNR_DB, draws, along, options.out)
+    over_noise(
+        (180.0,) if options.small else tuple(TABLE_2),
+        (-30.0, -10.0) if options.small else SCNR_DB,
+        draws,
+        along,
+        options.out,
+    )
     over_velocity((-14.0, 1.0) if options.small else tuple(TABLE_3), draws, along, options.out)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # interferometry sees that it is whole pulse rates off

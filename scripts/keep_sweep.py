@@ -1,7 +1,9 @@
-"""Keep what a finished sweep claims: RMSE, intervals, bounds and shares of its errors (and of metrics named besides), as a small file that tests check.
+"""Keep what a finished sweep claims: RMSE, intervals, bounds and shares of its errors (and of
+metrics named besides), as a small file that tests check.
 
-python scripts/keep_sweep.py out/stripmap_doppler docs/sweeps/stripmap_doppler.json
-python scripts/keep_sweep.py out/isal_snr docs/sweeps/isal_snr.json residual_phase_rms_rad entropy_above_ideal_nats
+python scripts/keep_sweep.py out/stripmap_doppler docs/sweeps/stripmap_doppler.json python
+scripts/keep_sweep.py out/isal_snr docs/sweeps/isal_snr.json residual_phase_rms_rad
+entropy_above_ideal_nats
 """
 
 from __future__ import annotations
@@ -29,15 +31,36 @@ def main() -> None:
     options = parser.parse_args()
     summary = json.loads((options.folder / "summary.json").read_text(encoding="utf-8"))
     session = summary["about"]["sessions"][-1]
-    wanted = {point["metric"] for point in summary["points"] if "error" in point["metric"] or point["metric"] in options.metrics}
+    wanted = {
+        point["metric"]
+        for point in summary["points"]
+        if "error" in point["metric"] or point["metric"] in options.metrics
+    }
     kept = {
         "title": summary["title"],
-        "made_with": {"seed": summary["about"]["seed"], "hash": summary["about"]["hash"], "versions": session["versions"], "trials": summary["trials"]},
-        "points": [{key: rounded(point[key]) for key in KEPT if key in point} for point in summary["points"] if point["metric"] in wanted and point["n"]],
-        "bounds": [rounded_bound for rounded_bound in ({**bound, "rms": rounded(bound["rms"])} for bound in summary["bounds"]) if rounded_bound["rms"] is not None],
+        "made_with": {
+            "seed": summary["about"]["seed"],
+            "hash": summary["about"]["hash"],
+            "versions": session["versions"],
+            "trials": summary["trials"],
+        },
+        "points": [
+            {key: rounded(point[key]) for key in KEPT if key in point}
+            for point in summary["points"]
+            if point["metric"] in wanted and point["n"]
+        ],
+        "bounds": [
+            rounded_bound
+            for rounded_bound in ({**bound, "rms": rounded(bound["rms"])} for bound in summary["bounds"])
+            if rounded_bound["rms"] is not None
+        ],
     }
     lines = [f'"{key}": {json.dumps(value)}' for key, value in kept.items() if not isinstance(value, list)]
-    lines += [f'"{key}": [\n' + ",\n".join(json.dumps(row) for row in value) + "\n]" for key, value in kept.items() if isinstance(value, list)]
+    lines += [
+        f'"{key}": [\n' + ",\n".join(json.dumps(row) for row in value) + "\n]"
+        for key, value in kept.items()
+        if isinstance(value, list)
+    ]
     options.file.parent.mkdir(parents=True, exist_ok=True)
     options.file.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
 

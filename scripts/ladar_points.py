@@ -1,9 +1,12 @@
-"""Three points seen by a moving triangular-sweep ladar: figures 2 and 5 to 9 and Table 2 of Remote Sens. 2024, 16, 793.
+"""Three points seen by a moving triangular-sweep ladar: figures 2 and 5 to 9 and Table 2 of Remote
+Sens. 2024, 16, 793.
 
-    python scripts/ladar_points.py [--out ladar_points] [--seed 1] [--snr-db 20] [--stripmap] [--small]
+    python scripts/ladar_points.py [--out ladar_points] [--seed 1] [--snr-db 20] [--stripmap]
+    [--small]
 
-Micrometres of radial motion ruin the focus in azimuth, and decimetres per second move the beats by several range cells. The up and the down half of
-each triangle tell the radial velocity; its integral is the range error, which is taken out before the image is focused.
+Micrometres of radial motion ruin the focus in azimuth, and decimetres per second move the beats by
+several range cells. The up and the down half of each triangle tell the radial velocity; its
+integral is the range error, which is taken out before the image is focused.
 """
 
 from __future__ import annotations
@@ -29,17 +32,38 @@ from torchsar.scene import LadarWorld, Points, Polynomial, QuadraticInSweep, Sin
 from torchsar.study.cuts import impulse_cuts
 from torchsar.study.sal.judge import Course, course_of, finer_in_range, motion_metrics
 
-RADAR = TriangularLadar(LIGHT_M_S / 1.55e-6, bandwidth_hz=5e9, period_s=16e-6, sample_rate_hz=64e6, speed_m_s=60.0, reference_range_m=3000.0)
+RADAR = TriangularLadar(
+    LIGHT_M_S / 1.55e-6, bandwidth_hz=5e9, period_s=16e-6, sample_rate_hz=64e6, speed_m_s=60.0, reference_range_m=3000.0
+)
 BEAM_RAD = 114e-6  # an azimuth aperture of 0.342 m, for 6.0 mm
 SCENE = Points(azimuth_m=[-0.06, 0.0, 0.06], range_m=[1.0, 1.5, 2.0], amplitude=[0.7, 1.0, 0.7])
-MOTION = (Polynomial((0.35, 10.0)), Sinusoid(160e-6, 100.0, math.degrees(0.3)), Sinusoid(10e-6, 330.0, math.degrees(1.0)))  # 0.35 m/s and 20 m/s^2
-NULLS = 2  # extent of side lobes for the ISLR: -12.84 dB for a sinc, 3 give -11.54 and 10 give -10.17; the paper does not say
-PUBLISHED = {"irw_range_m": 0.030, "pslr_range_db": -13.23, "islr_range_db": -12.26, "irw_azimuth_m": 0.006, "pslr_azimuth_db": -12.49, "islr_azimuth_db": -11.98}
+MOTION = (
+    Polynomial((0.35, 10.0)),
+    Sinusoid(160e-6, 100.0, math.degrees(0.3)),
+    Sinusoid(10e-6, 330.0, math.degrees(1.0)),
+)  # 0.35 m/s and 20 m/s^2
+# extent of side lobes for the ISLR: -12.84 dB for a sinc, 3 give -11.54 and 10 give -10.17; the
+# paper does not say
+NULLS = 2
+PUBLISHED = {
+    "irw_range_m": 0.030,
+    "pslr_range_db": -13.23,
+    "islr_range_db": -12.26,
+    "irw_azimuth_m": 0.006,
+    "pslr_azimuth_db": -12.49,
+    "islr_azimuth_db": -11.98,
+}
 
 
 def methods(radar: TriangularLadar) -> dict[str, Chain]:
-    """No compensation, the paper's, and the recommended one: they share what comes before and after."""
-    compress, deramp, image = CompressSweeps(radar), DerampAzimuth(radar), AzimuthMatchedFilter(radar, beam_rad=BEAM_RAD)
+    """No compensation, the paper's, and the recommended one: they share what comes before and
+    after.
+    """
+    compress, deramp, image = (
+        CompressSweeps(radar),
+        DerampAzimuth(radar),
+        AzimuthMatchedFilter(radar, beam_rad=BEAM_RAD),
+    )
     compensate = use(CompensateMotion(radar), velocity_m_s="motion")
     segmented = SegmentedInterference(radar, hann=True, scatterers=1 if radar.beam_rad is None else 3)
     polished = RadialMotion(radar, window_m=(0.0, 3.0))
@@ -47,19 +71,31 @@ def methods(radar: TriangularLadar) -> dict[str, Chain]:
     return {
         "uncompensated": Chain(compress=compress, deramp=deramp, image=image),
         "segmented": Chain(motion=segmented, compensate=compensate, compress=compress, deramp=deramp, image=image),
-        "recommended": Chain(motion=polished, compensate=compensate, compress=compress, deramp=deramp, correct=correct, image=image),
+        "recommended": Chain(
+            motion=polished, compensate=compensate, compress=compress, deramp=deramp, correct=correct, image=image
+        ),
     }
 
 
 def draw_frequencies(out: Path, draws: Draws) -> None:
-    """Figure 2: the triangle and its echo, and the dechirped beat at rest and in motion. 50 MHz in place of 5 GHz, so that the delay can be seen."""
+    """Figure 2: the triangle and its echo, and the dechirped beat at rest and in motion.
+
+    50 MHz in place of 5 GHz, so that the delay can be seen.
+    """
     radar, range_m = replace(RADAR, bandwidth_hz=50e6), 150.0
     time_s = torch.linspace(0, 3 * radar.period_s, 1500, dtype=torch.float64)
-    us, sent, echo = (plot.array(1e6 * time_s), *(1e-6 * triangle_hz(time_s - delay, radar) for delay in (0, 2 * range_m / radar.wave_speed_m_s)))
+    us, sent, echo = (
+        plot.array(1e6 * time_s),
+        *(1e-6 * triangle_hz(time_s - delay, radar) for delay in (0, 2 * range_m / radar.wave_speed_m_s)),
+    )
     swept = {"local oscillator": (us, plot.array(sent)), "echo of 150 m beyond the reference": (us, plot.array(echo))}
-    parts = [{"series": swept, "xlabel": "time (us)", "ylabel": "frequency (MHz)", "title": "sweeps", "ylim": (-28.0, 40.0)}]
+    parts = [
+        {"series": swept, "xlabel": "time (us)", "ylabel": "frequency (MHz)", "title": "sweeps", "ylim": (-28.0, 40.0)}
+    ]
     for title, speed in (("dechirped, at rest", 0.0), ("dechirped, receding at 2 m/s", 2.0)):
-        record, _ = simulate_ladar_record(radar, LadarWorld(Points([0.0], [range_m]), [Polynomial((speed,))], snr_db=30.0), 3, draws)
+        record, _ = simulate_ladar_record(
+            radar, LadarWorld(Points([0.0], [range_m]), [Polynomial((speed,))], snr_db=30.0), 3, draws
+        )
         spectrum = plot.short_time_spectrum(record.signal.data.flatten(), radar.sample_rate_hz)
         theory = {"theory": (us, plot.array(sent - echo + 1e-6 * radar.doppler_hz(speed)))}
         parts.append({"title": title, "signal": spectrum, "lines": theory, "ylim": (-15.0, 20.0)})
@@ -74,11 +110,18 @@ def triangle_hz(time_s: Tensor, radar: TriangularLadar) -> Tensor:
 def draw_images(traces: Mapping[str, Trace], out: Path) -> None:
     """Figures 5 and 7: profiles and image before and after compensation; figure 8: contours."""
     for name, file in (("uncompensated", "figure_05.png"), ("segmented", "figure_07.png")):
-        shown = {f"range profiles, {name}": over_peak(near(traces[name].outputs["compress"])), f"image, {name}": over_peak(near(traces[name].signal))}
+        shown = {
+            f"range profiles, {name}": over_peak(near(traces[name].outputs["compress"])),
+            f"image, {name}": over_peak(near(traces[name].signal)),
+        }
         plot.save(plot.images(shown, dynamic_range_db=40, percentile=100), out / file)
-    before, after = (near(finer_in_range(finer_in_range(traces[name].signal))) for name in ("uncompensated", "segmented"))
+    before, after = (
+        near(finer_in_range(finer_in_range(traces[name].signal))) for name in ("uncompensated", "segmented")
+    )
     points = {f"point at {r:g} m": around(after, x, r) for x, r in zip(SCENE.azimuth_m, SCENE.range_m, strict=True)}
-    plot.save(plot.contours({"no compensation": before, "segmented interference": after, **points}), out / "figure_08.png")
+    plot.save(
+        plot.contours({"no compensation": before, "segmented interference": after, **points}), out / "figure_08.png"
+    )
 
 
 def over_peak(signal: Signal) -> Signal:
@@ -107,26 +150,48 @@ def draw_motion(courses: Mapping[str, Course], truth: Truth, out: Path) -> None:
     motion = {"segmented": 1e3 * (true + found.error_m - found.error_m[0]), "true": 1e3 * true}
     error = {name: 1e9 * (courses[name].error_m - courses[name].error_m[0]) for name in ("segmented", "recommended")}
     ms, parts = plot.array(1e3 * found.pulse.values()), []
-    for title, unit, lines in (("radial velocity", "m/s", velocity), ("range error", "mm", motion), ("estimated minus true range error", "nm", error)):
-        parts.append({"series": {name: (ms, plot.array(y)) for name, y in lines.items()}, "xlabel": "slow time (ms)", "ylabel": unit, "title": title})
+    for title, unit, lines in (
+        ("radial velocity", "m/s", velocity),
+        ("range error", "mm", motion),
+        ("estimated minus true range error", "nm", error),
+    ):
+        parts.append(
+            {
+                "series": {name: (ms, plot.array(y)) for name, y in lines.items()},
+                "xlabel": "slow time (ms)",
+                "ylabel": unit,
+                "title": title,
+            }
+        )
     plot.save(plot.panels(parts, columns=3), out / "figure_06.png")
 
 
 def draw_slices(image: Signal, ideal: Signal, out: Path) -> None:
     """Figure 9: the response of the middle point, and that without motion."""
-    cuts = {name: impulse_cuts(finer_in_range(one), (0.0, 1.5)) for name, one in (("without motion", ideal), ("segmented", image))}
+    cuts = {
+        name: impulse_cuts(finer_in_range(one), (0.0, 1.5))
+        for name, one in (("without motion", ideal), ("segmented", image))
+    }
     parts = []
     for axis in ("range", "azimuth"):
         series = {name: (plot.array(cut[axis][0]), plot.decibel(cut[axis][1])) for name, cut in cuts.items()}
-        parts.append({"series": series, "xlabel": f"{axis} from the peak (m)", "ylabel": "amplitude (dB)", "ylim": (-40.0, 1.0)})
+        parts.append(
+            {"series": series, "xlabel": f"{axis} from the peak (m)", "ylabel": "amplitude (dB)", "ylim": (-40.0, 1.0)}
+        )
     plot.save(plot.panels(parts), out / "figure_09.png")
 
 
 def judge(image: Signal, course: Course) -> list[float]:
-    """The column of a method: response of the middle point, largest range error (m), and what is left of it (rad) without constant and slope."""
+    """The column of a method: response of the middle point, largest range error (m), and what is
+    left of it (rad) without constant and slope.
+    """
     response = impulse_response(image, (0.0, 1.5), sidelobe_nulls=NULLS, search_m=0.2, centre_turns=(None, 0.0))
     left = motion_metrics(course, RADAR)
-    return [*(float(response[name]) for name in PUBLISHED), float(left["range_error_max_m"]), float(left["residual_phase_rms_rad"])]
+    return [
+        *(float(response[name]) for name in PUBLISHED),
+        float(left["range_error_max_m"]),
+        float(left["residual_phase_rms_rad"]),
+    ]
 
 
 def show(rows: Sequence[str], columns: Mapping[str, Sequence[float]]) -> None:
@@ -140,20 +205,29 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("ladar_points"), help="folder of the figures")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--snr-db", type=float, help="per sample before compression, of the middle point; without it no noise")
-    parser.add_argument("--stripmap", action="store_true", help="the beam lights 0.342 m at a time; else all points always")
+    parser.add_argument(
+        "--snr-db", type=float, help="per sample before compression, of the middle point; without it no noise"
+    )
+    parser.add_argument(
+        "--stripmap", action="store_true", help="the beam lights 0.342 m at a time; else all points always"
+    )
     parser.add_argument("--small", action="store_true", help="half the aperture")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
 
     radar = replace(RADAR, beam_rad=BEAM_RAD if options.stripmap else None)
     world = LadarWorld(SCENE, MOTION, snr_db=options.snr_db, fidelity=QuadraticInSweep())
-    n_period = 256 if options.small else 448 if options.stripmap else 512  # a strip with a point in the beam all the time
+    n_period = (
+        256 if options.small else 448 if options.stripmap else 512
+    )  # a strip with a point in the beam all the time
     recording, truth = simulate_ladar(radar, world, n_period, Draws(options.seed))
     chains = methods(radar)
     traces = {name: chain.trace(recording) for name, chain in chains.items()}
     courses = {name: course_of(chain, traces[name], truth, radar, clean=False) for name, chain in chains.items()}
-    columns = {"published": [*PUBLISHED.values(), 2e-7, math.nan], **{name: judge(trace.signal, courses[name]) for name, trace in traces.items()}}
+    columns = {
+        "published": [*PUBLISHED.values(), 2e-7, math.nan],
+        **{name: judge(trace.signal, courses[name]) for name, trace in traces.items()},
+    }
     show([*PUBLISHED, "largest range error (m)", "residual phase (rad rms)"], columns)
     draw_frequencies(options.out, Draws(options.seed))
     draw_images(traces, options.out)

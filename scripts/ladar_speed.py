@@ -1,10 +1,14 @@
-"""Estimators of the radial motion of a ladar by time and error, beside the bare Fourier transforms that they cannot do without.
+"""Estimators of the radial motion of a ladar by time and error, beside the bare Fourier transforms
+that they cannot do without.
 
-    python scripts/ladar_speed.py [--trials 64] [--periods 256] [--snr 10] [--window 40] [--rounds 5] [--threads 1]
+    python scripts/ladar_speed.py [--trials 64] [--periods 256] [--snr 10] [--window 40] [--rounds
+    5] [--threads 1]
 
-One point at RD 1.5 m in the motion of system 000, both precisions. Times are the best of the rounds, in turn. The ratio is that to a transform of every sweep to twice its
-length and one transform pair along the periods of the range cells of the window. Velocity: median over trials of the rms error, beside the bound with unknown
-phases of the sweeps (with known ones it is half of that). Range: the same of the integrated error, its line removed.
+One point at RD 1.5 m in the motion of system 000, both precisions. Times are the best of the
+rounds, in turn. The ratio is that to a transform of every sweep to twice its length and one
+transform pair along the periods of the range cells of the window. Velocity: median over trials of
+the rms error, beside the bound with unknown phases of the sweeps (with known ones it is half of
+that). Range: the same of the integrated error, its line removed.
 """
 
 from __future__ import annotations
@@ -18,7 +22,14 @@ import torch
 from torch import Tensor
 
 from torchsar import Draws
-from torchsar.compensate import mirror_product, ml_peak, radial_motion, range_error, segmented_interference, spectrum_correlation
+from torchsar.compensate import (
+    mirror_product,
+    ml_peak,
+    radial_motion,
+    range_error,
+    segmented_interference,
+    spectrum_correlation,
+)
 from torchsar.core import Axis, Estimate, Truth
 from torchsar.echo import simulate_ladar
 from torchsar.metrics import velocity_free_offset_bound_m_s
@@ -41,7 +52,9 @@ MOTION = (Polynomial([0.35, 10.0]), Sinusoid(160e-6, 100.0, 17.2), Sinusoid(10e-
 def simulated(options: argparse.Namespace, dtype: torch.dtype) -> tuple[Tensor, Axis, Truth]:
     """Sweeps (trial, 2, period, N), pulse axis, truth."""
     world = LadarWorld(Points([0.0], [1.5]), motion=MOTION, snr_db=options.snr)
-    recording, truth = simulate_ladar(RADAR, world, options.periods, Draws(1, trials=range(options.trials)), dtype=dtype)
+    recording, truth = simulate_ladar(
+        RADAR, world, options.periods, Draws(1, trials=range(options.trials)), dtype=dtype
+    )
     return recording.signal.data, recording.signal.axis("pulse"), truth
 
 
@@ -54,7 +67,9 @@ def bare_ms(sweeps: Tensor, cells: Tensor) -> float:
 
 
 def range_nm(estimate: Estimate, truth: Truth, pulse: Axis) -> float:
-    """Median over trials of the rms error of the range at the middles of the up sweeps, the line removed, nm."""
+    """Median over trials of the rms error of the range at the middles of the up sweeps, the line
+    removed, nm.
+    """
     error = range_error(estimate, RADAR, pulse, sweep_middles(RADAR, pulse)[0]) - truth.values["range_error_up_m"]
     k = torch.linspace(-1, 1, pulse.n, dtype=torch.float64)
     error = error - error.mean(-1, keepdim=True)
@@ -75,19 +90,38 @@ def table(options: argparse.Namespace, dtype: torch.dtype) -> None:
             found[name] = method(sweeps, RADAR, pulse, window_m=window)
             best[name] = min(best[name], 1e3 * (time.perf_counter() - began))
         bare = min(bare, bare_ms(sweeps, cells))
-    bound = float(velocity_free_offset_bound_m_s(10 ** (options.snr / 10), RADAR.sweep_samples, RADAR.wavelength_m, RADAR.sweep_s))
+    bound = float(
+        velocity_free_offset_bound_m_s(10 ** (options.snr / 10), RADAR.sweep_samples, RADAR.wavelength_m, RADAR.sweep_s)
+    )
     precision = str(dtype).removeprefix("torch.")
-    print(f"{precision}: {options.trials} trials of {options.periods} periods x 2 x {RADAR.sweep_samples} samples, {options.snr:g} dB; bare transforms {bare / options.trials:.2f} ms a trial")
-    print(f"{'method':<24}{'ms a trial':>11}{'ratio':>7}{'velocity (mm/s)':>17}{'over bound':>12}{'range (nm)':>12}{'trusted':>9}")
+    print(
+        f"{precision}: {options.trials} trials of {options.periods} periods x 2 x "
+        f"{RADAR.sweep_samples} samples, {options.snr:g} dB; bare transforms "
+        f"{bare / options.trials:.2f} ms a trial"
+    )
+    print(
+        f"{'method':<24}{'ms a trial':>11}{'ratio':>7}{'velocity (mm/s)':>17}"
+        f"{'over bound':>12}{'range (nm)':>12}{'trusted':>9}"
+    )
     for name, estimate in found.items():
         error = float((estimate["velocity_m_s"] - truth.values["velocity_m_s"]).square().mean(-1).sqrt().median())
-        line = f"{name:<24}{best[name] / options.trials:>11.2f}{best[name] / bare:>7.2f}{1e3 * error:>17.4f}{error / bound:>12.2f}"
+        line = (
+            f"{name:<24}{best[name] / options.trials:>11.2f}{best[name] / bare:>7.2f}"
+            f"{1e3 * error:>17.4f}{error / bound:>12.2f}"
+        )
         print(f"{line}{range_nm(estimate, truth, pulse):>12.2f}{float(estimate.ok.double().mean()):>9.2f}")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    for name, default in (("trials", 64), ("periods", 256), ("snr", 10.0), ("window", 40), ("rounds", 5), ("threads", 1)):
+    for name, default in (
+        ("trials", 64),
+        ("periods", 256),
+        ("snr", 10.0),
+        ("window", 40),
+        ("rounds", 5),
+        ("threads", 1),
+    ):
         parser.add_argument(f"--{name}", type=type(default), default=default)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)

@@ -1,9 +1,11 @@
-"""Impair a recorded raw block, repair it, and compare the images: one line per impairment of brief 004.
+"""Impair a recorded raw block, repair it, and compare the images: one line per impairment of brief
+004.
 
     python scripts/recorded_impairments.py PATH.npz [--seed 0] [--only lost tone] [--threads 2]
 
-rho is the correlation of the complex images inside the window of full apertures and full compression, against the unimpaired
-recording; both are focused with the Doppler centroid found on the unimpaired one, so that only the repair is judged.
+rho is the correlation of the complex images inside the window of full apertures and full
+compression, against the unimpaired recording; both are focused with the Doppler centroid found on
+the unimpaired one, so that only the repair is judged.
 """
 
 from __future__ import annotations
@@ -19,7 +21,17 @@ from torch import Tensor
 
 from torchsar.compensate import DopplerCentroid
 from torchsar.core import Draws, Recording, Signal
-from torchsar.echo import ChannelImbalance, ChannelResponse, LostGaps, LostLines, PeriodicJitter, Quantiser, Tone, WideInterferer, apply_damages
+from torchsar.echo import (
+    ChannelImbalance,
+    ChannelResponse,
+    LostGaps,
+    LostLines,
+    PeriodicJitter,
+    Quantiser,
+    Tone,
+    WideInterferer,
+    apply_damages,
+)
 from torchsar.echo.stripmap import Damage
 from torchsar.focus import OmegaK
 from torchsar.io import read_stripmap
@@ -117,7 +129,9 @@ def nothing(bench: Bench, damaged: Recording) -> Signal:
 
 
 def without_shift(curve: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
-    """The curve less its straight line over the band: a constant and a slope are a phase and a shift, which no processor can see."""
+    """The curve less its straight line over the band: a constant and a slope are a phase and a
+    shift, which no processor can see.
+    """
     u = torch.linspace(-1, 1, 2001, dtype=torch.float64)
     line = torch.linalg.lstsq(torch.stack([torch.ones_like(u), u], -1), curve(u)[:, None]).solution[:, 0]
     return lambda v: curve(v) - line[0] - line[1] * v
@@ -135,19 +149,33 @@ def rows(radar_band_hz: float, fs_hz: float) -> list[Row]:
     def tone(level: float, **more: float) -> dict[str, Damage]:
         return {"tone": Tone(level, 0.17 * radar_band_hz, drift_hz=0.02 * radar_band_hz, **more)}  # type: ignore[arg-type]
 
-    period_8 = 0.1 * math.sqrt(2) * torch.cos(torch.tensor([0.3, 2.1, 4.4, 1.2, 5.9, 3.3, 0.9, 2.7], dtype=torch.float64))
+    period_8 = (
+        0.1 * math.sqrt(2) * torch.cos(torch.tensor([0.3, 2.1, 4.4, 1.2, 5.9, 3.3, 0.9, 2.7], dtype=torch.float64))
+    )
     jitter = {"jitter": PeriodicJitter((period_8 - period_8.mean()).tolist())}
-    lost = [Row(f"lost lines {share:.0%}", {"lost": LostLines(fraction=share)}, fill_sparse, bar) for share, bar in ((0.01, 0.998), (0.05, 0.991), (0.20, 0.96))]
+    lost = [
+        Row(f"lost lines {share:.0%}", {"lost": LostLines(fraction=share)}, fill_sparse, bar)
+        for share, bar in ((0.01, 0.998), (0.05, 0.991), (0.20, 0.96))
+    ]
     tones = [Row(f"tone {level} dB", tone(level), subtract, 0.999) for level in (0, 10, 20, 30)]
-    coarse = [Row(f"tone {level} dB, 4 bit", {**tone(level), "converter": Quantiser(4)}, subtract, bar) for level, bar in ((0, 0.988), (10, 0.958), (20, 0.751), (30, 0.369))]
-    wide = [Row(f"200 kHz wide, {level} dB", {"wide": WideInterferer(level, 0.17 * radar_band_hz, 200e3)}, subtract, bar) for level, bar in ((10, 0.985), (20, 0.975))]
+    coarse = [
+        Row(f"tone {level} dB, 4 bit", {**tone(level), "converter": Quantiser(4)}, subtract, bar)
+        for level, bar in ((0, 0.988), (10, 0.958), (20, 0.751), (30, 0.369))
+    ]
+    wide = [
+        Row(f"200 kHz wide, {level} dB", {"wide": WideInterferer(level, 0.17 * radar_band_hz, 200e3)}, subtract, bar)
+        for level, bar in ((10, 0.985), (20, 0.975))
+    ]
     curves: list[tuple[str, Callable[[Tensor], Tensor], float]] = [
         ("3 rad quadratic", lambda u: 3 * u.square(), 0.997),
         ("3 rad cubic", lambda u: 3 * u**3, 0.997),
         ("0.8 rad ripple", lambda u: 0.8 * torch.sin(3 * math.pi * u), 0.997),
         ("12 rad quadratic, 8 rad cubic", lambda u: 12 * u.square() + 8 * u**3, 0.99),
     ]
-    phases = [Row(f"range phase {name}", {"response": ChannelResponse(without_shift(curve))}, response, bar) for name, curve, bar in curves]
+    phases = [
+        Row(f"range phase {name}", {"response": ChannelResponse(without_shift(curve))}, response, bar)
+        for name, curve, bar in curves
+    ]
     slope = ChannelResponse(None, lambda u: 10 ** ((3 * u + 1.5 * torch.cos(4 * math.pi * u)) / 20))
     return [
         *lost,
@@ -161,7 +189,12 @@ def rows(radar_band_hz: float, fs_hz: float) -> list[Row]:
         Row("jitter period 8, blind", jitter, jitter_blind, 0.9999),
         *phases,
         Row("amplitude 6 dB slope, 3 dB ripple", {"response": slope}, amplitude, 0.995),
-        Row("two channels, 1.2 at 60 deg", {"channels": ChannelImbalance((1.0, 1.2), (0.0, math.pi / 3))}, imbalance, 0.9999),
+        Row(
+            "two channels, 1.2 at 60 deg",
+            {"channels": ChannelImbalance((1.0, 1.2), (0.0, math.pi / 3))},
+            imbalance,
+            0.9999,
+        ),
     ]
 
 
@@ -183,7 +216,11 @@ def main() -> None:
         start = time.perf_counter()
         repaired = row.repair(bench, damaged)
         seconds = time.perf_counter() - start
-        print(f"{row.name:36s} {bench.rho(nothing(bench, damaged)):9.4f} {bench.rho(repaired):9.4f} {row.at_least:9.4f} {seconds:8.1f}", flush=True)
+        print(
+            f"{row.name:36s} {bench.rho(nothing(bench, damaged)):9.4f} {bench.rho(repaired):9.4f} "
+            f"{row.at_least:9.4f} {seconds:8.1f}",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

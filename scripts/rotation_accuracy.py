@@ -1,9 +1,12 @@
-"""The matched Fourier transform by accuracy and time: kernels of 2 to 8 taps, two grids, both precisions, beside interpolation and a compiled library.
+"""The matched Fourier transform by accuracy and time: kernels of 2 to 8 taps, two grids, both
+precisions, beside interpolation and a compiled library.
 
     python scripts/rotation_accuracy.py [--out rotation_accuracy] [--rounds 5] [--small]
 
-A satellite of 300 scatterers at 20 dB ("mid" of brief 003, its Doppler at 93 % of the pulse rate), one thread. Errors against the sum itself: of the image, rms over
-rms; of the entropy, nats. Times are the best of the rounds, in turn: of the transform, and of the whole objective of a search (range phase, transform, entropy).
+A satellite of 300 scatterers at 20 dB ("mid" of brief 003, its Doppler at 93 % of the pulse rate),
+one thread. Errors against the sum itself: of the image, rms over rms; of the entropy, nats. Times
+are the best of the rounds, in turn: of the transform, and of the whole objective of a search (range
+phase, transform, entropy).
 """
 
 from __future__ import annotations
@@ -34,7 +37,13 @@ SIZES = {  # pulse rate, pulses, range cells and their size, scatterers, half wi
     "mid": (500e3, 10000, 32, 0.24, 300, 6.43),
     "tiny": (50e3, 1000, 32, 0.24, 60, 0.643),
 }
-EXPECTED = {(4, 1.25): 4e-3, (4, 2.0): 4e-4, (6, 1.25): 2e-4, (6, 2.0): 4e-6, (8, 2.0): 4e-8}  # brief 003, error of the image
+EXPECTED = {
+    (4, 1.25): 4e-3,
+    (4, 2.0): 4e-4,
+    (6, 1.25): 2e-4,
+    (6, 2.0): 4e-6,
+    (8, 2.0): 4e-8,
+}  # brief 003, error of the image
 
 
 @dataclass(frozen=True)
@@ -56,8 +65,15 @@ class Cost:
 
 
 def ways() -> list[Way]:
-    kernels = [Way(f"{taps} taps, grid {grid:g}", {"taps": taps, "kernel_oversampling": grid}) for grid in GRIDS for taps in TAPS]
-    others = [Way("linear resampling + FFT", {"method": "linear"}), Way("spline resampling + FFT", {"method": "spline"})]
+    kernels = [
+        Way(f"{taps} taps, grid {grid:g}", {"taps": taps, "kernel_oversampling": grid})
+        for grid in GRIDS
+        for taps in TAPS
+    ]
+    others = [
+        Way("linear resampling + FFT", {"method": "linear"}),
+        Way("spline resampling + FFT", {"method": "spline"}),
+    ]
     return [*kernels, *others, *compiled()]
 
 
@@ -79,7 +95,14 @@ class Objective:
     radar: InverseRadar
 
     def flat(self) -> Tensor:
-        return range_phase(self.signal.data, self.signal.axis("range").values(), self.radar.wavelength_m, self.radar.prf_hz, OMEGA_RAD_S, WARP_K)
+        return range_phase(
+            self.signal.data,
+            self.signal.axis("range").values(),
+            self.radar.wavelength_m,
+            self.radar.prf_hz,
+            OMEGA_RAD_S,
+            WARP_K,
+        )
 
     def image(self, flat: Tensor, way: Way) -> Tensor:
         return matched_fourier(flat, WARP_K, self.radar.prf_hz, oversampling=1.0, **way.options)
@@ -92,8 +115,12 @@ def simulated(size: str) -> Objective:
     """In double precision."""
     prf_hz, n_pulse, n_range, cell_m, count, half_width_m = SIZES[size]
     radar = InverseRadar(LIGHT_M_S / 1.55e-6, LIGHT_M_S / (2 * cell_m), prf_hz)
-    world = TurntableWorld(Satellite(count, half_width_m), rotation=PolynomialRotation(OMEGA_RAD_S, WARP_K), snr_db=20.0)
-    return Objective(simulate_turntable(radar, world, n_pulse, n_range, Draws(1), dtype=torch.complex128)[0].signal, radar)
+    world = TurntableWorld(
+        Satellite(count, half_width_m), rotation=PolynomialRotation(OMEGA_RAD_S, WARP_K), snr_db=20.0
+    )
+    return Objective(
+        simulate_turntable(radar, world, n_pulse, n_range, Draws(1), dtype=torch.complex128)[0].signal, radar
+    )
 
 
 def seconds(work: Callable[[], object]) -> float:
@@ -119,20 +146,30 @@ def measured(objective: Objective, choices: Sequence[Way], exact: Tensor, rounds
 
 def show(table: Mapping[str, Cost], title: str) -> None:
     expected = {f"{taps} taps, grid {grid:g}": value for (taps, grid), value in EXPECTED.items()}
-    print(f"{title:28}{'image error':>13}{'entropy error':>15}{'transform (ms)':>16}{'objective (ms)':>16}{'brief':>10}")
+    print(
+        f"{title:28}{'image error':>13}{'entropy error':>15}{'transform (ms)':>16}{'objective (ms)':>16}{'brief':>10}"
+    )
     for name, cost in table.items():
         known = f"{expected[name]:.0e}" if name in expected else "-"
-        print(f"{name:28}{cost.image:>13.1e}{cost.entropy:>15.1e}{1e3 * cost.transform_s:>16.2f}{1e3 * cost.objective_s:>16.2f}{known:>10}")
+        print(
+            f"{name:28}{cost.image:>13.1e}{cost.entropy:>15.1e}{1e3 * cost.transform_s:>16.2f}"
+            f"{1e3 * cost.objective_s:>16.2f}{known:>10}"
+        )
 
 
 def beside_compiled(table: Mapping[str, Cost]) -> None:
-    """Time of the cheapest objective that is as accurate as the compiled library, over that of the library's."""
+    """Time of the cheapest objective that is as accurate as the compiled library, over that of the
+    library's.
+    """
     for name, cost in table.items():
         if name.startswith("finufft"):
             rivals = {rival: c for rival, c in table.items() if "taps" in rival and c.image <= cost.image}
             best = min(rivals, key=lambda rival: rivals[rival].objective_s, default=None)
             if best is not None:
-                print(f"{best} takes {rivals[best].objective_s / cost.objective_s:.2f} times the objective of {name}, at errors of {rivals[best].image:.0e} and {cost.image:.0e}")
+                print(
+                    f"{best} takes {rivals[best].objective_s / cost.objective_s:.2f} times the objective "
+                    f"of {name}, at errors of {rivals[best].image:.0e} and {cost.image:.0e}"
+                )
 
 
 def draw(tables: Mapping[str, Mapping[str, Cost]], out: Path) -> None:
@@ -144,8 +181,18 @@ def draw(tables: Mapping[str, Mapping[str, Cost]], out: Path) -> None:
             for grid in GRIDS:
                 costs = [table[f"{taps} taps, grid {grid:g}"] for taps in TAPS]
                 levels = [math.log10(max(getattr(cost, what), 1e-12)) for cost in costs]
-                series[f"{precision}, grid {grid:g}"] = (np.array([1e3 * cost.transform_s for cost in costs]), np.array(levels))
-        parts.append({"series": series, "xlabel": "time of a transform (ms)", "ylabel": f"lg of the error of the {what}", "title": f"2 to 8 taps: {what}"})
+                series[f"{precision}, grid {grid:g}"] = (
+                    np.array([1e3 * cost.transform_s for cost in costs]),
+                    np.array(levels),
+                )
+        parts.append(
+            {
+                "series": series,
+                "xlabel": "time of a transform (ms)",
+                "ylabel": f"lg of the error of the {what}",
+                "title": f"2 to 8 taps: {what}",
+            }
+        )
     plot.save(plot.panels(parts), out / "accuracy.png")
 
 

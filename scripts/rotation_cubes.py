@@ -1,9 +1,12 @@
-"""Five corner cubes on a turntable, through air that shakes the phase: figures 18 to 20 and Table 6 of Remote Sens. 2025, 17, 3447.
+"""Five corner cubes on a turntable, through air that shakes the phase: figures 18 to 20 and Table 6
+of Remote Sens. 2025, 17, 3447.
 
     python scripts/rotation_cubes.py [--out rotation_cubes] [--seed 1] [--small]
 
-A simulated stand-in for a recording that is not public: 10 degrees a second with a changing rate, a random walk of phase of 0.15 rad a pulse, 10 dB. A phase that is
-free in every pulse and the rotation are found in turn; what each leaves in the data misleads the other, so that one pass is not enough.
+A simulated stand-in for a recording that is not public: 10 degrees a second with a changing rate, a
+random walk of phase of 0.15 rad a pulse, 10 dB. A phase that is free in every pulse and the
+rotation are found in turn; what each leaves in the data misleads the other, so that one pass is not
+enough.
 """
 
 from __future__ import annotations
@@ -19,7 +22,13 @@ from torch import Tensor
 
 from torchsar import plot
 from torchsar.compensate import autofocus, correct_pulse_phase
-from torchsar.compensate.rotation import ImageEntropy, coarse_rotation, descend_rotation, genetic_rotation, uneven_rotation
+from torchsar.compensate.rotation import (
+    ImageEntropy,
+    coarse_rotation,
+    descend_rotation,
+    genetic_rotation,
+    uneven_rotation,
+)
 from torchsar.core import Axis, Draws, Estimate, Signal, Truth
 from torchsar.echo import simulate_turntable
 from torchsar.focus.matched_fourier import MatchedFourier, RangePhase, mean_rate
@@ -32,7 +41,11 @@ RADAR = InverseRadar(LIGHT_M_S / 1.55e-6, LIGHT_M_S / (2 * 0.015), 50e3)
 CUBES = Points(azimuth_m=[-0.06, -0.03, 0.0, 0.03, 0.06], range_m=[0.09, -0.12, 0.0, 0.06, -0.06], random_phase=True)
 ROTATION = PolynomialRotation(math.radians(10), (6.0, 1100.0))
 PULSES, CELLS = 1000, 32
-PUBLISHED = {"genetic": (0.2040, 6.1372, 1091.0), "search": (0.2, 6.0, 1200.0), "Gauss-Newton": (0.14, 5.998, 1570.0)}  # of the paper's own recording
+PUBLISHED = {
+    "genetic": (0.2040, 6.1372, 1091.0),
+    "search": (0.2, 6.0, 1200.0),
+    "Gauss-Newton": (0.14, 5.998, 1570.0),
+}  # of the paper's own recording
 BRIEF = {  # entropy and contrast of brief 003
     "no compensation": (6.78, 13.9),
     "uniform autofocus": (6.39, 17.5),
@@ -58,7 +71,9 @@ def told(signal: Signal) -> dict:
 
 
 def focused(signal: Signal, rotation: Mapping[str, Tensor] | None = None) -> Signal:
-    """Image on a Doppler axis, with what is known of the rotation taken out: all of it, its warp alone, or nothing."""
+    """Image on a Doppler axis, with what is known of the rotation taken out: all of it, its warp
+    alone, or nothing.
+    """
     rotation = rotation or {}
     if "omega_rad_s" in rotation:
         signal = RangePhase(RADAR)(signal, **{name: rotation[name] for name in ("omega_rad_s", "warp_k", "yc_m")})
@@ -100,14 +115,21 @@ def results(signal: Signal, truth: Truth, generations: int) -> Results:
         "autofocus + genetic": focused(uniform, genetic.value),
         "autofocus + third order": focused(uniform, third.value),
         "alternation": focused(corrected, both.value),
-        "clean reference": focused(truth.clean.signal, {name: truth.values[name] for name in ("omega_rad_s", "warp_k", "yc_m")}),
+        "clean reference": focused(
+            truth.clean.signal, {name: truth.values[name] for name in ("omega_rad_s", "warp_k", "yc_m")}
+        ),
     }
-    return Results(images, {"autofocus + genetic": genetic.value, "autofocus + third order": third.value, "alternation": both.value})
+    return Results(
+        images,
+        {"autofocus + genetic": genetic.value, "autofocus + third order": third.value, "alternation": both.value},
+    )
 
 
 def scale_m_hz(rotation: Mapping[str, Tensor]) -> float:
     """Metres of cross range per Hz of Doppler."""
-    return RADAR.wavelength_m / (2 * float(mean_rate(rotation["omega_rad_s"], rotation["warp_k"], PULSES / RADAR.prf_hz)))
+    return RADAR.wavelength_m / (
+        2 * float(mean_rate(rotation["omega_rad_s"], rotation["warp_k"], PULSES / RADAR.prf_hz))
+    )
 
 
 def scaled(image: Signal, rotation: Mapping[str, Tensor]) -> Signal:
@@ -130,19 +152,36 @@ def table(found: Results, truth: Truth) -> None:
         known = BRIEF.get(name, ("-", "-"))
         print(f"{name:26}{float(entropy(image)):>10.3f}{float(contrast(image)):>10.2f}{known[0]:>10}{known[1]:>10}")
     print(f"\n{'estimates':26}{'Om (rad/s)':>12}{'k1 (1/s)':>12}{'k2 (1/s2)':>12}")
-    rows = {name: tuple(float(value[key]) for key in ("omega_rad_s", "k1_per_s", "k2_per_s2")) for name, value in found.estimates.items()}
-    for name, row in ({"truth": (float(truth.values["omega_rad_s"]), 6.0, 1100.0)} | rows | {f"published, {name}": row for name, row in PUBLISHED.items()}).items():
+    rows = {
+        name: tuple(float(value[key]) for key in ("omega_rad_s", "k1_per_s", "k2_per_s2"))
+        for name, value in found.estimates.items()
+    }
+    for name, row in (
+        {"truth": (float(truth.values["omega_rad_s"]), 6.0, 1100.0)}
+        | rows
+        | {f"published, {name}": row for name, row in PUBLISHED.items()}
+    ).items():
         print(f"{name:26}" + "".join(f"{value:>12.5g}" for value in row))
 
 
 def draw_profiles(found: Results, truth: Truth, path: Path) -> None:
-    """Figure 20: a profile through each of the cubes, every method, on the true scale; a random phase also shifts images, so that each is centred at its peak."""
+    """Figure 20: a profile through each of the cubes, every method, on the true scale; a random
+    phase also shifts images, so that each is centred at its peak.
+    """
     names = ("uniform autofocus", "autofocus + SM", "alternation", "clean reference")
     shown = {name: scaled(found.images[name], truth.values) for name in names}
     parts = []
     for number, (x, y) in enumerate(zip(CUBES.azimuth_m, CUBES.range_m, strict=True), start=1):
         series = {name: profile(image, float(y)) for name, image in shown.items()}
-        parts.append({"series": series, "xlabel": "cross range from the peak (m)", "ylabel": "amplitude (dB)", "title": f"cube {number}, x = {1e3 * x:g} mm", "ylim": (-40.0, 1.0)})
+        parts.append(
+            {
+                "series": series,
+                "xlabel": "cross range from the peak (m)",
+                "ylabel": "amplitude (dB)",
+                "title": f"cube {number}, x = {1e3 * x:g} mm",
+                "ylim": (-40.0, 1.0),
+            }
+        )
     plot.save(plot.panels(parts, columns=3), path)
 
 
@@ -169,9 +208,19 @@ def main(arguments: list[str] | None = None) -> None:
     found = results(recording.signal, truth, 2 if options.small else 30)
     table(found, truth)
     x, y, level = (plot.array(truth.values[name]) for name in ("cross_range_m", "range_m", "amplitude"))
-    plot.save(plot.places(y, x, abs(level), "range (m)", "cross range (m)", "corner cubes"), options.out / "figure_18.png")
-    names = {"a: uniform autofocus": "uniform autofocus", "b: second order (SM)": "autofocus + SM", "c: third order": "autofocus + third order", "d: alternation": "alternation"}
-    shown = {title: close(scaled(found.images[name], found.estimates.get(name, truth.values))) for title, name in names.items()}
+    plot.save(
+        plot.places(y, x, abs(level), "range (m)", "cross range (m)", "corner cubes"), options.out / "figure_18.png"
+    )
+    names = {
+        "a: uniform autofocus": "uniform autofocus",
+        "b: second order (SM)": "autofocus + SM",
+        "c: third order": "autofocus + third order",
+        "d: alternation": "alternation",
+    }
+    shown = {
+        title: close(scaled(found.images[name], found.estimates.get(name, truth.values)))
+        for title, name in names.items()
+    }
     plot.save(plot.images(shown, 40, 2, percentile=100), options.out / "figure_19.png")
     draw_profiles(found, truth, options.out / "figure_20.png")
 

@@ -1,10 +1,15 @@
-"""Every estimator of uneven rotation on the same data: evaluations, CPU time and error. Table 2 and the times of Remote Sens. 2025, 17, 3447.
+"""Every estimator of uneven rotation on the same data: evaluations, CPU time and error.
 
-    python scripts/rotation_estimators.py [--out rotation_estimators] [--seed 1] [--snr-db 20] [--genetic-seeds 5] [--small]
+Table 2 and the times of Remote Sens. 2025, 17, 3447.
 
-A satellite of 300 scatterers ("mid" of brief 003), complex64, one thread. Searches get what the paper gives them: a box of +-10 % about the truth, or a start
-at 0.9, 1.0 or 1.1 times it. The grid is searched on a part of its points; its time in full is that of a point times their number. The coarse stage, the
-phase fit and the recommended estimator get nothing but the data, and estimate the range centre deviation as well; the coarse stage gives no rate.
+    python scripts/rotation_estimators.py [--out rotation_estimators] [--seed 1] [--snr-db 20]
+    [--genetic-seeds 5] [--small]
+
+A satellite of 300 scatterers ("mid" of brief 003), complex64, one thread. Searches get what the
+paper gives them: a box of +-10 % about the truth, or a start at 0.9, 1.0 or 1.1 times it. The grid
+is searched on a part of its points; its time in full is that of a point times their number. The
+coarse stage, the phase fit and the recommended estimator get nothing but the data, and estimate the
+range centre deviation as well; the coarse stage gives no rate.
 """
 
 from __future__ import annotations
@@ -66,7 +71,12 @@ def timed(find: Callable[[], Estimate], rounds: int) -> Run:
         seconds.append(time.process_time() - began)
     values = torch.stack([found[name] for name in ("omega_rad_s", "k1_per_s", "k2_per_s2")])
     error = 100 * (values / TRUTH - 1)
-    return Run(float(found.info.get("evaluations", torch.tensor(math.nan))), statistics.median(seconds), tuple(error.tolist()), bool(found.ok))
+    return Run(
+        float(found.info.get("evaluations", torch.tensor(math.nan))),
+        statistics.median(seconds),
+        tuple(error.tolist()),
+        bool(found.ok),
+    )
 
 
 @dataclass
@@ -84,22 +94,35 @@ class Bench:
         """Run, keep and print."""
         run = self.runs[name] = timed(find, rounds)
         count = "-" if math.isnan(run.evaluations) else f"{run.evaluations:.0f}"
-        print(f"{name:34}{count:>8}{run.seconds:>10.2f}" + "".join(f"{e:>11.4f}" for e in run.error) + f"{'yes' if run.ok else 'no':>5}", flush=True)
+        print(
+            f"{name:34}{count:>8}{run.seconds:>10.2f}"
+            + "".join(f"{e:>11.4f}" for e in run.error)
+            + f"{'yes' if run.ok else 'no':>5}",
+            flush=True,
+        )
 
     @property
     def told(self) -> dict:
-        return {"wavelength_m": self.radar.wavelength_m, "prf_hz": self.radar.prf_hz, "range_m": self.signal.axis("range").values()}
+        return {
+            "wavelength_m": self.radar.wavelength_m,
+            "prf_hz": self.radar.prf_hz,
+            "range_m": self.signal.axis("range").values(),
+        }
 
 
 def simulated(size: str, seed: int, snr_db: float) -> Bench:
     prf_hz, n_pulse, n_range, cell_m, count, half_width_m = SIZES[size]
     radar = InverseRadar(LIGHT_M_S / 1.55e-6, LIGHT_M_S / (2 * cell_m), prf_hz)
-    world = TurntableWorld(Satellite(count, half_width_m), rotation=PolynomialRotation(0.02, (10.0, 1000.0)), snr_db=snr_db)
+    world = TurntableWorld(
+        Satellite(count, half_width_m), rotation=PolynomialRotation(0.02, (10.0, 1000.0)), snr_db=snr_db
+    )
     return Bench(simulate_turntable(radar, world, n_pulse, n_range, Draws(seed))[0].signal, radar)
 
 
 def without_box(bench: Bench) -> None:
-    """What needs the data alone, short enough to be timed several times; the first call in a process is slower."""
+    """What needs the data alone, short enough to be timed several times; the first call in a
+    process is slower.
+    """
     bench.add("coarse", lambda: coarse_rotation(bench.signal.data, **bench.told), 5)
     bench.add("coarse + phase fit", lambda: phase_fit_rotation(bench.signal.data, **bench.told), 5)
     bench.add("recommended", lambda: uneven_rotation(bench.signal.data, **bench.told), 5)
@@ -112,41 +135,73 @@ def starts() -> Iterator[tuple[float, str]]:
 
 
 def from_starts(bench: Bench, steps: int, oversamplings: tuple[float, ...]) -> None:
-    """Newton's method, which is what the paper calls Gauss-Newton, and the quasi-Newton method with a line search."""
+    """Newton's method, which is what the paper calls Gauss-Newton, and the quasi-Newton method with
+    a line search.
+    """
     for factor, variables in starts():
         for damped in (False, True):
             name = f"Newton{' damped' if damped else ''} x{factor:g} {variables}"
             figure = bench.figure(2.0, variables)
-            bench.add(name, lambda f=figure, x=factor, d=damped: newton_rotation(f, f.start(x * TRUTH[0], x * TRUTH[1:]), damped=d, steps=steps))
+            bench.add(
+                name,
+                lambda f=figure, x=factor, d=damped: newton_rotation(
+                    f, f.start(x * TRUTH[0], x * TRUTH[1:]), damped=d, steps=steps
+                ),
+            )
     for oversampling in oversamplings:
         for factor in (0.9, 1.1):
             figure = bench.figure(oversampling, "shape")
-            bench.add(f"quasi-Newton x{factor:g} shape, os {oversampling:g}", lambda f=figure, x=factor: descend_rotation(f, f.start(x * TRUTH[0], x * TRUTH[1:])))
+            bench.add(
+                f"quasi-Newton x{factor:g} shape, os {oversampling:g}",
+                lambda f=figure, x=factor: descend_rotation(f, f.start(x * TRUTH[0], x * TRUTH[1:])),
+            )
 
 
 def in_box(bench: Bench, seeds: int, generations: tuple[int, int, int]) -> None:
-    """The genetic algorithm with as many evaluations as the paper's time allows and with many more, and differential evolution."""
+    """The genetic algorithm with as many evaluations as the paper's time allows and with many more,
+    and differential evolution.
+    """
     few, many, evolved = generations
     for oversampling in (1.0, 2.0):
         figure = bench.figure(oversampling)
         for seed in range(1, seeds + 1):
-            bench.add(f"GA 6 x {few}, os {oversampling:g}, seed {seed}", lambda f=figure, s=seed: genetic_rotation(f, LOW, HIGH, draws=Draws(s), population=6, generations=few))
-        bench.add(f"GA 30 x {many}, os {oversampling:g}", lambda f=figure: genetic_rotation(f, LOW, HIGH, draws=Draws(1), generations=many))
-    bench.add(f"differential evolution 24 x {evolved}", lambda: evolve_rotation(bench.figure(2.0), LOW, HIGH, draws=Draws(1), generations=evolved))
+            bench.add(
+                f"GA 6 x {few}, os {oversampling:g}, seed {seed}",
+                lambda f=figure, s=seed: genetic_rotation(f, LOW, HIGH, draws=Draws(s), population=6, generations=few),
+            )
+        bench.add(
+            f"GA 30 x {many}, os {oversampling:g}",
+            lambda f=figure: genetic_rotation(f, LOW, HIGH, draws=Draws(1), generations=many),
+        )
+    bench.add(
+        f"differential evolution 24 x {evolved}",
+        lambda: evolve_rotation(bench.figure(2.0), LOW, HIGH, draws=Draws(1), generations=evolved),
+    )
 
 
 def on_grid(bench: Bench, counts: tuple[int, ...]) -> float:
-    """A part of the paper's grid, of the same extent. Returns the seconds that all of it would take."""
-    axes = [torch.linspace(float(low), float(high), n, dtype=torch.float64) for low, high, n in zip(LOW, HIGH, counts, strict=True)]
+    """A part of the paper's grid, of the same extent.
+
+    Returns the seconds that all of it would take.
+    """
+    axes = [
+        torch.linspace(float(low), float(high), n, dtype=torch.float64)
+        for low, high, n in zip(LOW, HIGH, counts, strict=True)
+    ]
     name = f"grid {' x '.join(map(str, counts))}"
     bench.add(name, lambda: search_rotation(bench.figure(2.0), axes))
     whole = bench.runs[name].seconds * math.prod(GRID) / math.prod(counts)
-    print(f"{f'grid {GRID[0]} x {GRID[1]} x {GRID[2]}, extrapolated':34}{math.prod(GRID):>8}{whole:>10.0f}{'half a step of the grid: 2.5, 0.5, 0.05':>40}")
+    print(
+        f"{f'grid {GRID[0]} x {GRID[1]} x {GRID[2]}, extrapolated':34}{math.prod(GRID):>8}"
+        f"{whole:>10.0f}{'half a step of the grid: 2.5, 0.5, 0.05':>40}"
+    )
     return whole
 
 
 def ratios(bench: Bench, grid_s: float) -> None:
-    """CPU time over that of the recommended estimator, beside what the paper measured against its own genetic algorithm."""
+    """CPU time over that of the recommended estimator, beside what the paper measured against its
+    own genetic algorithm.
+    """
     own = bench.runs["recommended"]
     print(f"\n{'over the recommended estimator':34}{'time':>8}{'|Om|':>10}{'|k1|':>10}{'|k2|':>10}")
     for name, run in bench.runs.items():
@@ -154,22 +209,47 @@ def ratios(bench: Bench, grid_s: float) -> None:
             worse = [abs(theirs) / max(abs(ours), 1e-12) for theirs, ours in zip(run.error, own.error, strict=True)]
             print(f"{name:34}{run.seconds / own.seconds:>8.1f}" + "".join(f"{ratio:>10.3g}" for ratio in worse))
     print(f"{'grid, extrapolated':34}{grid_s / own.seconds:>8.0f}")
-    print(f"published: grid {PUBLISHED_S['grid']:.0f} s, genetic {PUBLISHED_S['genetic']:.0f} s, Gauss-Newton {PUBLISHED_S['newton']:.0f} s")
+    print(
+        f"published: grid {PUBLISHED_S['grid']:.0f} s, genetic {PUBLISHED_S['genetic']:.0f} "
+        f"s, Gauss-Newton {PUBLISHED_S['newton']:.0f} s"
+    )
 
 
 def draw(bench: Bench, path: Path) -> None:
     """Time against error, of one run of each kind."""
-    kinds = ("phase fit", "recommended", "Newton damped x1 raw", "Newton damped x1.1 raw", "quasi-Newton x0.9", "seed 1", "GA 30", "evolution")
-    shown = {name.replace(", seed 1", ""): run for name, run in bench.runs.items() if any(kind in name for kind in kinds)}
+    kinds = (
+        "phase fit",
+        "recommended",
+        "Newton damped x1 raw",
+        "Newton damped x1.1 raw",
+        "quasi-Newton x0.9",
+        "seed 1",
+        "GA 30",
+        "evolution",
+    )
+    shown = {
+        name.replace(", seed 1", ""): run for name, run in bench.runs.items() if any(kind in name for kind in kinds)
+    }
     error = [20 * math.log10(max(math.sqrt(sum(e * e for e in run.error) / 3), 1e-4)) for run in shown.values()]
-    plot.save(plot.trade(list(shown), [run.seconds for run in shown.values()], error, "rms error of (Om, k1, k2) (dB of 1 %)", "estimators of uneven rotation"), path)
+    plot.save(
+        plot.trade(
+            list(shown),
+            [run.seconds for run in shown.values()],
+            error,
+            "rms error of (Om, k1, k2) (dB of 1 %)",
+            "estimators of uneven rotation",
+        ),
+        path,
+    )
 
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("rotation_estimators"), help="folder of the figure")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--snr-db", type=float, default=20.0, help="mean power of all samples over the variance of the noise")
+    parser.add_argument(
+        "--snr-db", type=float, default=20.0, help="mean power of all samples over the variance of the noise"
+    )
     parser.add_argument("--genetic-seeds", type=int, default=5, help="runs of the short genetic algorithm")
     parser.add_argument("--small", action="store_true", help="a tiny target and short searches")
     options = parser.parse_args(arguments)
@@ -180,7 +260,9 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"{'estimator':34}{'evals':>8}{'CPU s':>10}{'Om (%)':>11}{'k1 (%)':>11}{'k2 (%)':>11}{'ok':>5}")
     without_box(bench)
     from_starts(bench, 1 if options.small else 20, (1.0,) if options.small else (1.0, 2.0, 4.0))
-    in_box(bench, 1 if options.small else options.genetic_seeds, (3, 2, 2) if options.small else (39, 30, 36))  # 162, 870 and 888 evaluations
+    in_box(
+        bench, 1 if options.small else options.genetic_seeds, (3, 2, 2) if options.small else (39, 30, 36)
+    )  # 162, 870 and 888 evaluations
     ratios(bench, on_grid(bench, (1, 2, 2) if options.small else PART))
     draw(bench, options.out / "time_and_error.png")
 

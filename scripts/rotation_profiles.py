@@ -2,8 +2,9 @@
 
     python scripts/rotation_profiles.py [--out rotation_profiles] [--snr-db 20] [--small]
 
-Profiles of points at -12, 0 and 12 m of cross range, 12 m behind the centre of rotation, by what is taken out of the echo; and what a range centre deviation
-does to the estimated rate where it is ignored: of one range cell, as the paper has it, and of a whole image.
+Profiles of points at -12, 0 and 12 m of cross range, 12 m behind the centre of rotation, by what is
+taken out of the echo; and what a range centre deviation does to the estimated rate where it is
+ignored: of one range cell, as the paper has it, and of a whole image.
 """
 
 from __future__ import annotations
@@ -30,9 +31,20 @@ TRUE_K = torch.tensor(WARP_K, dtype=torch.float64)
 PLACES_M, RANGE_M = (-12.0, 0.0, 12.0), 12.0
 FINE = 16  # lines of a profile per Doppler cell
 REACH_M = 5.0  # to either side of a point, for the figures of its profile
-SECOND_K1 = 20.8  # of a fit of second order to the phase by least squares; least entropy gives 20.05, k1 + k2 T / 2 is 20
-NAMES = {"none": "no compensation", "order 2": "order 2, azimuth", "true k1": "true k1, k2 = 0", "azimuth": "order 3, azimuth", "full": "order 3, two-dimensional"}
-EXPECTED = {  # brief 003, experiment 1: peak (dB), width (mm), highest side lobe (dB) at 12 m and at 0 m
+SECOND_K1 = (
+    # of a fit of second order to the phase by least squares; least entropy gives 20.05, k1 + k2 T /
+    # 2 is 20
+    20.8
+)
+NAMES = {
+    "none": "no compensation",
+    "order 2": "order 2, azimuth",
+    "true k1": "true k1, k2 = 0",
+    "azimuth": "order 3, azimuth",
+    "full": "order 3, two-dimensional",
+}
+# brief 003, experiment 1: peak (dB), width (mm), highest side lobe (dB) at 12 m and at 0 m
+EXPECTED = {
     "none": ((-29.7, 655, 0.0), (-4.1, 6.7, -16.0)),
     "order 2": ((-15.4, 8.3, -2.1), None),
     "azimuth": ((-2.8, 2.16, -5.1), (-2.8, 2.16, -5.1)),
@@ -54,9 +66,16 @@ class Profile:
 
     @staticmethod
     def of(line: Tensor, pulse: Axis, wavelength_m: float) -> Profile:
-        """Of one range cell (line,). Whatever was compensated, the target turned by the same angle in all: the mean rate scales the line."""
+        """Of one range cell (line,).
+
+        Whatever was compensated, the target turned by the same angle in all: the mean rate scales
+        the line.
+        """
         doppler = (torch.arange(len(line), dtype=torch.float64) - len(line) // 2) / (FINE * pulse.n * pulse.step)
-        return Profile(cross_range_of(doppler, OMEGA_RAD_S, TRUE_K, wavelength_m, pulse.n * pulse.step), line.abs() / math.sqrt(pulse.n))
+        return Profile(
+            cross_range_of(doppler, OMEGA_RAD_S, TRUE_K, wavelength_m, pulse.n * pulse.step),
+            line.abs() / math.sqrt(pulse.n),
+        )
 
     def near(self, place_m: float, reach_m: float) -> Profile:
         inside = (self.cross_range_m - place_m).abs() <= reach_m
@@ -94,7 +113,9 @@ def compensated(signal: Signal, radar: InverseRadar) -> dict[str, Profile]:
     cell = int(range_.index_of(RANGE_M).round())
 
     def profile(pulses: Tensor, *k: float) -> Profile:
-        image = matched_fourier(pulses[:, cell, None], torch.tensor(k, dtype=torch.float64), radar.prf_hz, oversampling=FINE)
+        image = matched_fourier(
+            pulses[:, cell, None], torch.tensor(k, dtype=torch.float64), radar.prf_hz, oversampling=FINE
+        )
         return Profile.of(image[:, 0], pulse, radar.wavelength_m)
 
     return {
@@ -107,11 +128,21 @@ def compensated(signal: Signal, radar: InverseRadar) -> dict[str, Profile]:
 
 
 def table(profiles: Mapping[str, Profile]) -> None:
-    print(f"{'three points, y = 12 m':26}" + "".join(f"{f'x = {x:g} m':>27}" for x in PLACES_M) + f"{'expected, 12 m':>27}{'expected, 0 m':>27}")
+    print(
+        f"{'three points, y = 12 m':26}"
+        + "".join(f"{f'x = {x:g} m':>27}" for x in PLACES_M)
+        + f"{'expected, 12 m':>27}{'expected, 0 m':>27}"
+    )
     for name, profile in profiles.items():
         cells = [profile.near(x, REACH_M).figures() for x in PLACES_M]
         known = EXPECTED.get(name, (None, None))
-        print(f"{NAMES[name]:26}" + "".join(f"{'-' if one is None else '{:.1f} dB {:.2f} mm {:.1f} dB'.format(*one):>27}" for one in (*cells, *known)))
+        print(
+            f"{NAMES[name]:26}"
+            + "".join(
+                f"{'-' if one is None else '{:.1f} dB {:.2f} mm {:.1f} dB'.format(*one):>27}"
+                for one in (*cells, *known)
+            )
+        )
 
 
 def draw_profiles(profiles: Mapping[str, Profile], names: Sequence[str], reach_m: Sequence[float], path: Path) -> None:
@@ -120,22 +151,42 @@ def draw_profiles(profiles: Mapping[str, Profile], names: Sequence[str], reach_m
     for place, reach in zip(PLACES_M, reach_m, strict=True):
         near = {NAMES[name]: profiles[name].near(place, reach) for name in names}
         series = {name: (plot.array(p.cross_range_m), plot.decibel(p.amplitude, 1.0)) for name, p in near.items()}
-        parts.append({"series": series, "xlabel": "cross range (m)", "ylabel": "amplitude (dB of an ideal point)", "title": f"x = {place:g} m", "ylim": (-50.0, 3.0)})
+        parts.append(
+            {
+                "series": series,
+                "xlabel": "cross range (m)",
+                "ylabel": "amplitude (dB of an ideal point)",
+                "title": f"x = {place:g} m",
+                "ylim": (-50.0, 3.0),
+            }
+        )
     plot.save(plot.panels(parts, columns=3), path)
 
 
 def one_cell(yc_m: Tensor, y_m: float) -> Tensor:
-    """Estimated over true rate (yc,) of one range cell whose centre deviation is ignored, Eq. (6): the range term of y_m must stand for that of y_m + yc."""
+    """Estimated over true rate (yc,) of one range cell whose centre deviation is ignored, Eq.
+
+    (6): the range term of y_m must stand for that of y_m + yc.
+    """
     return torch.sqrt((1 + yc_m / y_m).clamp_min(0))
 
 
-def whole_image(yc_m: Tensor, radar: InverseRadar, n_pulse: int, n_range: int, scatterers: int, snr_db: float) -> dict[str, Tensor]:
-    """Estimated over true rate (yc,) of a satellite on both sides of the centre, one trial per deviation, with the deviation ignored and estimated."""
+def whole_image(
+    yc_m: Tensor, radar: InverseRadar, n_pulse: int, n_range: int, scatterers: int, snr_db: float
+) -> dict[str, Tensor]:
+    """Estimated over true rate (yc,) of a satellite on both sides of the centre, one trial per
+    deviation, with the deviation ignored and estimated.
+    """
     target = Satellite(scatterers, half_width_m=6.43 * radar.prf_hz / 500e3)
-    world = TurntableWorld(target, rotation=PolynomialRotation(OMEGA_RAD_S, WARP_K), centre_deviation_m=yc_m, snr_db=snr_db)
+    world = TurntableWorld(
+        target, rotation=PolynomialRotation(OMEGA_RAD_S, WARP_K), centre_deviation_m=yc_m, snr_db=snr_db
+    )
     signal = simulate_turntable(radar, world, n_pulse, n_range, Draws(1, trials=[0] * len(yc_m)))[0].signal
     told = {"wavelength_m": radar.wavelength_m, "prf_hz": radar.prf_hz, "range_m": signal.axis("range").values()}
-    return {name: uneven_rotation(signal.data, **told, yc_m=known)["omega_rad_s"] / OMEGA_RAD_S for name, known in (("ignored", 0.0), ("estimated", None))}
+    return {
+        name: uneven_rotation(signal.data, **told, yc_m=known)["omega_rad_s"] / OMEGA_RAD_S
+        for name, known in (("ignored", 0.0), ("estimated", None))
+    }
 
 
 def draw_centre(yc_m: Tensor, cell: Mapping[str, Tensor], image: Mapping[str, Tensor], path: Path) -> None:
@@ -143,7 +194,14 @@ def draw_centre(yc_m: Tensor, cell: Mapping[str, Tensor], image: Mapping[str, Te
     parts = []
     for title, ratios in (("one range cell, yc ignored", cell), ("a whole image", image)):
         series = {name: (plot.array(yc_m), plot.array(ratio)) for name, ratio in ratios.items()}
-        parts.append({"series": series, "xlabel": "range centre deviation yc (m)", "ylabel": "estimated over true rate", "title": title})
+        parts.append(
+            {
+                "series": series,
+                "xlabel": "range centre deviation yc (m)",
+                "ylabel": "estimated over true rate",
+                "title": title,
+            }
+        )
     plot.save(plot.panels(parts), path)
 
 
@@ -169,7 +227,9 @@ def main(arguments: list[str] | None = None) -> None:
     image = whole_image(yc, *size, options.snr_db)
     draw_centre(yc, cell, image, options.out / "figure_01.png")
     print(f"\n{'yc (m)':26}" + "".join(f"{y:>8.2f}" for y in yc))
-    for name, ratio in ({f"{name}, one cell": r for name, r in cell.items()} | {f"image, yc {name}": r for name, r in image.items()}).items():
+    for name, ratio in (
+        {f"{name}, one cell": r for name, r in cell.items()} | {f"image, yc {name}": r for name, r in image.items()}
+    ).items():
         print(f"{name:26}" + "".join(f"{r:>8.3f}" for r in ratio))
 
 

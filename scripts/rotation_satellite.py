@@ -1,9 +1,13 @@
-"""A satellite that turns unevenly: figures 4 to 9 of Remote Sens. 2025, 17, 3447, with a procedural satellite in place of the one that is not published.
+"""A satellite that turns unevenly: figures 4 to 9 of Remote Sens.
 
-    python scripts/rotation_satellite.py [--out rotation_satellite] [--target full] [--seed 1] [--snr-db 20] [--small]
+2025, 17, 3447, with a procedural satellite in place of the one that is not published.
 
-The image without compensation, as a sum of chirplets (ACL), with the acceleration alone taken out (SM), and with the recommended estimate of the
-whole rotation; entropy and contrast of each beside those of brief 003, and the places of both panel tips in the image that is scaled to metres.
+    python scripts/rotation_satellite.py [--out rotation_satellite] [--target full] [--seed 1]
+    [--snr-db 20] [--small]
+
+The image without compensation, as a sum of chirplets (ACL), with the acceleration alone taken out
+(SM), and with the recommended estimate of the whole rotation; entropy and contrast of each beside
+those of brief 003, and the places of both panel tips in the image that is scaled to metres.
 """
 
 from __future__ import annotations
@@ -17,7 +21,13 @@ from torch import Tensor
 
 from torchsar import plot
 from torchsar.compensate import autofocus, correct_pulse_phase
-from torchsar.compensate.rotation import ImageEntropy, chirplet_clean, coarse_rotation, descend_rotation, uneven_rotation
+from torchsar.compensate.rotation import (
+    ImageEntropy,
+    chirplet_clean,
+    coarse_rotation,
+    descend_rotation,
+    uneven_rotation,
+)
 from torchsar.core import Axis, Draws, Estimate, Signal, Truth
 from torchsar.echo import simulate_turntable
 from torchsar.focus.matched_fourier import MatchedFourier, RangePhase, mean_rate
@@ -27,15 +37,32 @@ from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
 
 ROTATION = PolynomialRotation(0.02, (10.0, 1000.0))
 TIP_M = 6.43
-TARGETS = {"full": (500e3, 10000, 128, 0.06, 600), "mid": (500e3, 10000, 32, 0.24, 300), "tiny": (50e3, 1000, 32, 0.24, 60)}  # pulse rate, pulses, cells, cell size, scatterers
-WHOLE = ((-1.09, 1.09), (-3.8, 3.8))  # parts of an image: cross range in half widths of the target, range (m)
+TARGETS = {
+    "full": (500e3, 10000, 128, 0.06, 600),
+    "mid": (500e3, 10000, 32, 0.24, 300),
+    "tiny": (50e3, 1000, 32, 0.24, 60),
+}  # pulse rate, pulses, cells, cell size, scatterers
+# parts of an image: cross range in half widths of the target, range (m)
+WHOLE = ((-1.09, 1.09), (-3.8, 3.8))
 REGIONS = {"A, tip of a panel": ((-1.03, -0.81), (-1.6, 1.6)), "B, bus and dish": ((-0.11, 0.11), (-3.6, -0.4))}
-EXPECTED = {"no compensation": (11.22, 4.5), "SM, order 2": (10.05, 9.4), "order 3, azimuth": (7.79, 25.0), "order 3, two-dimensional": (7.766, 25.3)}  # brief 003, "mid"
-FIGURES = {"no compensation": "figure_05.png", "chirplets (ACL)": "figure_06.png", "SM, order 2": "figure_07.png", "order 3, two-dimensional": "figure_08.png"}
+EXPECTED = {
+    "no compensation": (11.22, 4.5),
+    "SM, order 2": (10.05, 9.4),
+    "order 3, azimuth": (7.79, 25.0),
+    "order 3, two-dimensional": (7.766, 25.3),
+}  # brief 003, "mid"
+FIGURES = {
+    "no compensation": "figure_05.png",
+    "chirplets (ACL)": "figure_06.png",
+    "SM, order 2": "figure_07.png",
+    "order 3, two-dimensional": "figure_08.png",
+}
 
 
 def second_order(signal: Signal, radar: InverseRadar) -> Estimate:
-    """The second-order method, azimuth only: its one number from short sections, then by least entropy. It is not k1 of the target but about k1 + k2 T / 2."""
+    """The second-order method, azimuth only: its one number from short sections, then by least
+    entropy. It is not k1 of the target but about k1 + k2 T / 2.
+    """
     figure = ImageEntropy.of(signal, radar, order=2, range_term=False)
     start = coarse_rotation(signal.data, order=2, **told(signal, radar))
     return descend_rotation(figure, figure.start(0.0, start["warp_k"]))
@@ -89,13 +116,30 @@ def over_peak(image: Signal) -> Signal:
 
 
 def draw_images(shown: Mapping[str, Signal], half_width_m: float, out: Path) -> None:
-    """Figures 5 to 8: every method and two regions of it, in dB of its peak. Figure 9: the best image alone, in metres. And all methods together, each over its peak."""
+    """Figures 5 to 8: every method and two regions of it, in dB of its peak.
+
+    Figure 9: the best image alone, in metres. And all methods together, each over its peak.
+    """
     for name, file in FIGURES.items():
-        parts = {region: cropped(shown[name], *edges, half_width_m) for region, edges in ({name: WHOLE} | REGIONS).items()}
+        parts = {
+            region: cropped(shown[name], *edges, half_width_m) for region, edges in ({name: WHOLE} | REGIONS).items()
+        }
         plot.save(plot.images(parts, 40, 3, percentile=100), out / file)
-    compared = [cropped(shown[name], *edges, half_width_m) for edges in (WHOLE, REGIONS["A, tip of a panel"]) for name in FIGURES]
+    compared = [
+        cropped(shown[name], *edges, half_width_m)
+        for edges in (WHOLE, REGIONS["A, tip of a panel"])
+        for name in FIGURES
+    ]
     titles = [*FIGURES, *("tip of a panel" + " " * i for i in range(len(FIGURES)))]
-    plot.save(plot.images({title: over_peak(image) for title, image in zip(titles, compared, strict=True)}, 40, len(FIGURES), percentile=100), out / "methods.png")
+    plot.save(
+        plot.images(
+            {title: over_peak(image) for title, image in zip(titles, compared, strict=True)},
+            40,
+            len(FIGURES),
+            percentile=100,
+        ),
+        out / "methods.png",
+    )
     best = cropped(shown["order 3, two-dimensional"], *WHOLE, half_width_m)
     plot.save(plot.image(best, 40, "scaled to metres", percentile=100), out / "figure_09.png")
 
@@ -106,7 +150,9 @@ def tips(image: Signal, truth: Truth) -> dict[float, float]:
     found = {}
     for side in (-1, 1):
         which = int(torch.where(side * x > 0.999 * x.abs().max(), level.abs(), 0).argmax())
-        found[float(x[which])] = float(impulse_response(image, (x[which], y[which]), search_m=0.1)["position_azimuth_m"])
+        found[float(x[which])] = float(
+            impulse_response(image, (x[which], y[which]), search_m=0.1)["position_azimuth_m"]
+        )
     return found
 
 
@@ -115,21 +161,35 @@ def table(raw: Mapping[str, Signal], target: str) -> None:
     print(f"{target + ' target':26}{'entropy':>10}{'contrast':>10}{'brief':>10}{'brief':>10}")
     for name, image in raw.items():
         known = EXPECTED.get(name) if target == "mid" else None
-        print(f"{name:26}{float(entropy(image)):>10.3f}{float(contrast(image)):>10.2f}" + "".join(f"{'-' if value is None else value:>10}" for value in known or (None, None)))
+        print(
+            f"{name:26}{float(entropy(image)):>10.3f}{float(contrast(image)):>10.2f}"
+            + "".join(f"{'-' if value is None else value:>10}" for value in known or (None, None))
+        )
 
 
 def report(estimate: Estimate, image: Signal, truth: Truth) -> None:
     for name, unit, value in (("omega_rad_s", "rad/s", 0.02), ("k1_per_s", "1/s", 10.0), ("k2_per_s2", "1/s2", 1000.0)):
         print(f"{name:14}{float(estimate[name]):>12.6g} +- {float(estimate.std[name]):.2g} {unit}, truth {value:g}")
-    print("ok" if bool(estimate.ok) else "NOT ok", "; tips:", ", ".join(f"{seen:.3f} m for {place:.3f} m" for place, seen in tips(image, truth).items()))
+    print(
+        "ok" if bool(estimate.ok) else "NOT ok",
+        "; tips:",
+        ", ".join(f"{seen:.3f} m for {place:.3f} m" for place, seen in tips(image, truth).items()),
+    )
 
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("rotation_satellite"), help="folder of the figures")
-    parser.add_argument("--target", choices=TARGETS, default="full", help="how finely the satellite is sampled; the brief's figures are of mid")
+    parser.add_argument(
+        "--target",
+        choices=TARGETS,
+        default="full",
+        help="how finely the satellite is sampled; the brief's figures are of mid",
+    )
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--snr-db", type=float, default=20.0, help="mean power of all samples over the variance of the noise")
+    parser.add_argument(
+        "--snr-db", type=float, default=20.0, help="mean power of all samples over the variance of the noise"
+    )
     parser.add_argument("--small", action="store_true", help="a tiny target, few chirplets")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)

@@ -1,10 +1,15 @@
-"""Uneven rotation by signal-to-noise ratio: figures 13 to 17 and Tables 3 and 4 of Remote Sens. 2025, 17, 3447.
+"""Uneven rotation by signal-to-noise ratio: figures 13 to 17 and Tables 3 and 4 of Remote Sens.
 
-    python scripts/rotation_snr.py [--out rotation_snr] [--seed 1] [--trials 100] [--genetic-trials 4] [--scenes 4] [--small]
+2025, 17, 3447.
 
-Monte Carlo on a small satellite (120 scatterers), a new scene and new noise in every trial: the recommended estimator, which gets the data alone, the genetic
-algorithm in a box of +-10 % about the truth, with image lines of one and of half a Doppler cell, and the Cramer-Rao bound. Then the full satellite: its
-images, and the error of the cross range of its tip, which is that of the rate. SNR: mean power of all samples over the variance of the noise.
+    python scripts/rotation_snr.py [--out rotation_snr] [--seed 1] [--trials 100] [--genetic-trials
+    4] [--scenes 4] [--small]
+
+Monte Carlo on a small satellite (120 scatterers), a new scene and new noise in every trial: the
+recommended estimator, which gets the data alone, the genetic algorithm in a box of +-10 % about the
+truth, with image lines of one and of half a Doppler cell, and the Cramer-Rao bound. Then the full
+satellite: its images, and the error of the cross range of its tip, which is that of the rate. SNR:
+mean power of all samples over the variance of the noise.
 """
 
 from __future__ import annotations
@@ -55,8 +60,14 @@ class Target:
         return InverseRadar(LIGHT_M_S / 1.55e-6, LIGHT_M_S / (2 * self.cell_m), self.prf_hz)
 
     def simulated(self, snr_db: float, seed: int, trials: Sequence[int]) -> tuple[Signal, Truth]:
-        """Trials are scenes, with noise of their own; their numbers make them, so that every SNR sees the same."""
-        world = TurntableWorld(Satellite(self.scatterers, self.half_width_m), rotation=PolynomialRotation(TRUE["omega_rad_s"], (TRUE["k1_per_s"], TRUE["k2_per_s2"])), snr_db=snr_db)
+        """Trials are scenes, with noise of their own; their numbers make them, so that every SNR
+        sees the same.
+        """
+        world = TurntableWorld(
+            Satellite(self.scatterers, self.half_width_m),
+            rotation=PolynomialRotation(TRUE["omega_rad_s"], (TRUE["k1_per_s"], TRUE["k2_per_s2"])),
+            snr_db=snr_db,
+        )
         recording, truth = simulate_turntable(self.radar, world, self.n_pulse, self.n_range, Draws(seed, trials=trials))
         return recording.signal, truth
 
@@ -67,14 +78,22 @@ TINY = Target(50e3, 1000, 32, 0.24, 60, TIP_M / 10)
 
 
 def recommended(signal: Signal, radar: InverseRadar) -> Estimate:
-    return uneven_rotation(signal.data, wavelength_m=radar.wavelength_m, prf_hz=radar.prf_hz, range_m=signal.axis("range").values())
+    return uneven_rotation(
+        signal.data, wavelength_m=radar.wavelength_m, prf_hz=radar.prf_hz, range_m=signal.axis("range").values()
+    )
 
 
 def genetic(oversampling: float, generations: int) -> Finder:
     """All trials of a batch at once."""
 
     def find(signal: Signal, radar: InverseRadar) -> Estimate:
-        return genetic_rotation(ImageEntropy.of(signal, radar, oversampling=oversampling), LOW, HIGH, draws=Draws(1), generations=generations)
+        return genetic_rotation(
+            ImageEntropy.of(signal, radar, oversampling=oversampling),
+            LOW,
+            HIGH,
+            draws=Draws(1),
+            generations=generations,
+        )
 
     return find
 
@@ -92,8 +111,13 @@ def errors(find: Finder, target: Target, snr_db: float, seed: int, trials: int) 
 def bounds(target: Target, snr_db: float, seed: int, trials: int) -> dict[str, Tensor]:
     """Cramer-Rao bounds in %, root of the mean square over scenes."""
     _, truth = target.simulated(snr_db, seed, range(min(trials, BATCH)))
-    places = (truth.values[name] for name in ("cross_range_m", "range_m", "amplitude", "noise_std", "omega_rad_s", "warp_k", "yc_m"))
-    least = rotation_bounds(*places, wavelength_m=target.radar.wavelength_m, prf_hz=target.prf_hz, n_pulse=target.n_pulse)
+    places = (
+        truth.values[name]
+        for name in ("cross_range_m", "range_m", "amplitude", "noise_std", "omega_rad_s", "warp_k", "yc_m")
+    )
+    least = rotation_bounds(
+        *places, wavelength_m=target.radar.wavelength_m, prf_hz=target.prf_hz, n_pulse=target.n_pulse
+    )
     return {name: 100 * least[name].square().mean().sqrt() / TRUE[name] for name in TRUE}
 
 
@@ -107,10 +131,15 @@ def rows(snr_db: float, found: Mapping[tuple[str, float], Mapping[str, Tensor]],
         if at == snr_db:
             cells = [f"{float(e.mean()):.3f} +- {float(e.std()):.3f}" for e in error.values()]
             print(f"{f'{at:g} dB, {method}':30}{len(error['k1_per_s']):>8}" + "".join(f"{cell:>20}" for cell in cells))
-    print(f"{f'{snr_db:g} dB, bound':30}{'':8}" + "".join(f"{float(bound):>20.3f}" for bound in least.values()), flush=True)
+    print(
+        f"{f'{snr_db:g} dB, bound':30}{'':8}" + "".join(f"{float(bound):>20.3f}" for bound in least.values()),
+        flush=True,
+    )
 
 
-def draw_errors(found: Mapping[tuple[str, float], Mapping[str, Tensor]], least: Mapping[float, Mapping[str, Tensor]], out: Path) -> None:
+def draw_errors(
+    found: Mapping[tuple[str, float], Mapping[str, Tensor]], least: Mapping[float, Mapping[str, Tensor]], out: Path
+) -> None:
     """Figure 13: estimates over truth with their deviations; and rms errors beside the bound."""
     methods, snr = list(dict.fromkeys(method for method, _ in found)), list(least)
     estimates, rms = [], []
@@ -120,13 +149,21 @@ def draw_errors(found: Mapping[tuple[str, float], Mapping[str, Tensor]], least: 
         seen = {method: (plot.array(v[:, 0]), plot.array(v[:, 1:3])) for method, v in spreads.items()}
         error = {method: (plot.array(v[:, 3]), plot.array(v[:, 4:])) for method, v in spreads.items()}
         estimates.append(part | {"series": seen, "bounds": {"truth": plot.array(torch.ones(len(snr)))}})
-        rms.append(part | {"series": error, "bounds": {"Cramer-Rao bound": plot.array(torch.stack([least[at][name] for at in snr]))}})
+        rms.append(
+            part
+            | {
+                "series": error,
+                "bounds": {"Cramer-Rao bound": plot.array(torch.stack([least[at][name] for at in snr]))},
+            }
+        )
     plot.save(plot.error_curves(estimates, "SNR (dB)", "estimate over truth"), out / "figure_13.png")
     plot.save(plot.error_curves(rms, "SNR (dB)", "rms error (%)", log_y=True), out / "errors.png")
 
 
 def spread(error: Tensor) -> Tensor:
-    """Of errors in %: mean of the estimate over the truth, that less and plus a deviation; rms error, and that less and plus its own deviation."""
+    """Of errors in %: mean of the estimate over the truth, that less and plus a deviation; rms
+    error, and that less and plus its own deviation.
+    """
     mean, std, rms = error.mean(), error.std(), error.square().mean().sqrt()
     own = rms / math.sqrt(2 * len(error))
     return torch.stack([1 + mean / 100, 1 + (mean - std) / 100, 1 + (mean + std) / 100, rms, rms - own, rms + own])
@@ -134,7 +171,10 @@ def spread(error: Tensor) -> Tensor:
 
 def full_target(target: Target, seed: int, scenes: int, out: Path) -> None:
     """Table 4 and figures 14 to 17."""
-    print(f"\n{'tip of the full target':30}{'scenes':>8}{'rms error (%)':>20}{'bound (%)':>20}{'seen, scene 1 (m)':>20}{'published (%)':>20}{'trusted':>9}")
+    print(
+        f"\n{'tip of the full target':30}{'scenes':>8}{'rms error (%)':>20}{'bound (%)':>20}"
+        f"{'seen, scene 1 (m)':>20}{'published (%)':>20}{'trusted':>9}"
+    )
     shown = {}
     for snr in SNR_DB:
         signal, truth = target.simulated(snr, seed, range(scenes))
@@ -144,7 +184,11 @@ def full_target(target: Target, seed: int, scenes: int, out: Path) -> None:
         shown[f"{snr:g} dB"] = image
         rms, bound = 100 * (1 / scale - 1).square().mean().sqrt(), bounds(target, snr, seed, scenes)["omega_rad_s"]
         trusted = found.ok.double().mean()
-        print(f"{f'{snr:g} dB':30}{scenes:>8}{float(rms):>20.3f}{float(bound):>20.3f}{tip(image, truth):>20.4f}{PUBLISHED_TIP.get(snr, '-'):>20}{float(trusted):>9.2f}", flush=True)
+        print(
+            f"{f'{snr:g} dB':30}{scenes:>8}{float(rms):>20.3f}{float(bound):>20.3f}"
+            f"{tip(image, truth):>20.4f}{PUBLISHED_TIP.get(snr, '-'):>20}{float(trusted):>9.2f}",
+            flush=True,
+        )
     plot.save(plot.images(shown, 45, 2, percentile=100), out / "figure_14_17.png")
 
 
@@ -159,7 +203,9 @@ def focused(signal: Signal, radar: InverseRadar, found: Estimate, trial: int) ->
 
 
 def tip(image: Signal, truth: Truth) -> float:
-    """Cross range (m) of the brightest scatterer at the far end of the panel of positive cross range, in the first scene."""
+    """Cross range (m) of the brightest scatterer at the far end of the panel of positive cross
+    range, in the first scene.
+    """
     x, y, level = (truth.values[name][0] for name in ("cross_range_m", "range_m", "amplitude"))
     which = int(torch.where(x > 0.999 * x.max(), level.abs(), 0).argmax())
     return float(impulse_response(image, (x[which], y[which]), search_m=0.1 * float(x[which]))["position_azimuth_m"])
@@ -170,21 +216,31 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("rotation_snr"), help="folder of the figures")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--trials", type=int, default=100, help="scenes per SNR of the recommended estimator")
-    parser.add_argument("--genetic-trials", type=int, default=4, help="scenes per SNR of the genetic algorithm, 870 images each")
+    parser.add_argument(
+        "--genetic-trials", type=int, default=4, help="scenes per SNR of the genetic algorithm, 870 images each"
+    )
     parser.add_argument("--scenes", type=int, default=4, help="of the full target")
-    parser.add_argument("--small", action="store_true", help="three scenes of a tiny target, a genetic algorithm of one generation")
+    parser.add_argument(
+        "--small", action="store_true", help="three scenes of a tiny target, a genetic algorithm of one generation"
+    )
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
 
     trials, few, scenes = (3, 2, 2) if options.small else (options.trials, options.genetic_trials, options.scenes)
     target, full = (TINY, TINY) if options.small else (SMALL, FULL)
     generations = 1 if options.small else 30
-    methods = {"recommended": (recommended, trials), "GA, os 1": (genetic(1.0, generations), few), "GA, os 2": (genetic(2.0, generations), few)}
+    methods = {
+        "recommended": (recommended, trials),
+        "GA, os 1": (genetic(1.0, generations), few),
+        "GA, os 2": (genetic(2.0, generations), few),
+    }
     found: dict[tuple[str, float], dict[str, Tensor]] = {}
     least: dict[float, dict[str, Tensor]] = {}
     head()
     for snr in SNR_DB:
-        found |= {(name, snr): errors(find, target, snr, options.seed, count) for name, (find, count) in methods.items()}
+        found |= {
+            (name, snr): errors(find, target, snr, options.seed, count) for name, (find, count) in methods.items()
+        }
         least[snr] = bounds(target, snr, options.seed, trials)
         rows(snr, found, least[snr])
     draw_errors(found, least, options.out)

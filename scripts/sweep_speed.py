@@ -1,9 +1,11 @@
-"""Trials a second of a sweep: one trial at a time, all trials at once, automatic chunks, and two processes; one thread of torch each.
+"""Trials a second of a sweep: one trial at a time, all trials at once, automatic chunks, and two
+processes; one thread of torch each.
 
     python scripts/sweep_speed.py [CONFIG] [--trials N] [--rounds N] [key=value ...]
 
-The alternatives take turns, so that a machine that others use too is equally slow for all; the median round counts. Only the first point
-of the config's grid is run, without a store. On two idle cores two workers reach at least 1.6 times the automatic chunks.
+The alternatives take turns, so that a machine that others use too is equally slow for all; the
+median round counts. Only the first point of the config's grid is run, without a store. On two idle
+cores two workers reach at least 1.6 times the automatic chunks.
 """
 
 from __future__ import annotations
@@ -59,12 +61,17 @@ def main() -> None:
                 found = rate(plan, trial, two if "workers" in name else InProcess())
                 if turn:  # the first round builds chains and plans transforms
                     rates[name].append(found)
-    print(f"{loaded.name}, {options.trials} trials, torch {torch.__version__}, {platform.machine()}, one thread a process")
+    print(
+        f"{loaded.name}, {options.trials} trials, torch {torch.__version__}, {platform.machine()}, one thread a process"
+    )
     reference = statistics.median(rates["automatic"])
     print(f"{'alternative':<24}{'trials a batch':>15}{'trials/s':>12}{'of automatic':>14}{'spread':>16}")
     for name, found in rates.items():
         middle = statistics.median(found)
-        print(f"{name:<24}{chunks[name]:>15}{middle:>12.2f}{middle / reference:>14.2f}{min(found):>8.2f}..{max(found):.2f}")
+        print(
+            f"{name:<24}{chunks[name]:>15}{middle:>12.2f}{middle / reference:>14.2f}"
+            f"{min(found):>8.2f}..{max(found):.2f}"
+        )
 
 
 if __name__ == "__main__":

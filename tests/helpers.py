@@ -9,16 +9,30 @@ import torch
 from torchsar.core import Draws, Recording, Signal, Truth
 from torchsar.echo import simulate, simulate_bistatic, simulate_ladar, simulate_ladar_record
 from torchsar.radar import LIGHT_M_S, BistaticRadar, LinearFM, StripmapRadar, TriangularLadar
-from torchsar.scene import AlwaysLit, BandLimited, BistaticWorld, Dwell, LadarWorld, MovingPoints, Points, Polynomial, StripmapWorld
+from torchsar.scene import (
+    AlwaysLit,
+    BandLimited,
+    BistaticWorld,
+    Dwell,
+    LadarWorld,
+    MovingPoints,
+    Points,
+    Polynomial,
+    StripmapWorld,
+)
 
 
 def mind_interrupts() -> None:
-    """For the child of a Popen: tests that were started in the background ignore Ctrl-C, and their children would, too."""
+    """For the child of a Popen: tests that were started in the background ignore Ctrl-C, and their
+    children would, too.
+    """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def small_radar(**changes: object) -> StripmapRadar:
-    """A short-range S-band radar whose apertures fit a hundred pulses: cheap, with real migration."""
+    """A short-range S-band radar whose apertures fit a hundred pulses: cheap, with real
+    migration.
+    """
     values: dict = {
         "carrier_hz": 3.2e9,
         "pulse": LinearFM(40e6, 0.5e-6),
@@ -45,23 +59,56 @@ def kondor_radar(**changes: object) -> StripmapRadar:
     return StripmapRadar(**{**values, **changes})
 
 
-def small_recording(n_pulse: int = 128, n_range: int = 96, trials: int | None = None, snr_db: float | None = 20.0, dwell_s: float | None = 0.2, **kwargs) -> tuple[Recording, Truth]:
+def small_recording(
+    n_pulse: int = 128,
+    n_range: int = 96,
+    trials: int | None = None,
+    snr_db: float | None = 20.0,
+    dwell_s: float | None = 0.2,
+    **kwargs,
+) -> tuple[Recording, Truth]:
     """Three points seen by the small radar."""
     scene = Points([0.0, 6.0, -9.0], [0.0, 30.0, -45.0], [1.0, 0.7, 0.5], random_phase=True)
-    world = StripmapWorld(scene, Dwell(dwell_s) if dwell_s else AlwaysLit(), snr_db=snr_db, velocity_m_s=kwargs.pop("velocity_m_s", None), doppler_hz=kwargs.pop("doppler_hz", None))
+    world = StripmapWorld(
+        scene,
+        Dwell(dwell_s) if dwell_s else AlwaysLit(),
+        snr_db=snr_db,
+        velocity_m_s=kwargs.pop("velocity_m_s", None),
+        doppler_hz=kwargs.pop("doppler_hz", None),
+    )
     draws = Draws(kwargs.pop("seed", 1), trials=None if trials is None else range(trials))
     return simulate(kwargs.pop("radar", None) or small_radar(), world, n_pulse, n_range, draws, **kwargs)
 
 
 def small_ladar(**changes: object) -> TriangularLadar:
-    """The simulated ladar of brief 000 with 32 samples a sweep: a beat band of half a metre to either side."""
-    values: dict = {"carrier_hz": LIGHT_M_S / 1.55e-6, "bandwidth_hz": 5e9, "period_s": 16e-6, "sample_rate_hz": 4e6, "speed_m_s": 60.0, "reference_range_m": 3000.0}
+    """The simulated ladar of brief 000 with 32 samples a sweep: a beat band of half a metre to
+    either side.
+    """
+    values: dict = {
+        "carrier_hz": LIGHT_M_S / 1.55e-6,
+        "bandwidth_hz": 5e9,
+        "period_s": 16e-6,
+        "sample_rate_hz": 4e6,
+        "speed_m_s": 60.0,
+        "reference_range_m": 3000.0,
+    }
     return TriangularLadar(**{**values, **changes})
 
 
-def small_ladar_recording(n_period: int = 48, trials: int | None = None, dtype: torch.dtype = torch.complex128, record: bool = False, seed: int = 1, **changes) -> tuple[Recording, Truth]:
-    """Two points seen by the small ladar, in accelerated motion: separated sweeps, or a continuous record."""
-    world = LadarWorld(Points([0.0, 0.01], [0.1, 0.25], [1.0, 0.5], random_phase=True), motion=(Polynomial([0.06, 10.0]),), snr_db=20.0)
+def small_ladar_recording(
+    n_period: int = 48,
+    trials: int | None = None,
+    dtype: torch.dtype = torch.complex128,
+    record: bool = False,
+    seed: int = 1,
+    **changes,
+) -> tuple[Recording, Truth]:
+    """Two points seen by the small ladar, in accelerated motion: separated sweeps, or a continuous
+    record.
+    """
+    world = LadarWorld(
+        Points([0.0, 0.01], [0.1, 0.25], [1.0, 0.5], random_phase=True), motion=(Polynomial([0.06, 10.0]),), snr_db=20.0
+    )
     draws = Draws(seed, trials=None if trials is None else range(trials))
     simulated = simulate_ladar_record if record else simulate_ladar
     return simulated(small_ladar(**changes), world, n_period, draws, dtype=dtype)
@@ -69,11 +116,30 @@ def small_ladar_recording(n_period: int = 48, trials: int | None = None, dtype: 
 
 def small_bistatic(**changes: object) -> BistaticRadar:
     """The receiver of brief 001 with a short pulse."""
-    values: dict = {"carrier_hz": 1.25e9, "pulse": LinearFM(50e6, 0.2e-6), "sampling_hz": 60e6, "prf_hz": 180.0, "speed_m_s": 300.0, "reference_range_m": 5000.0, "transmit_range": (-3.0, 0.02)}
+    values: dict = {
+        "carrier_hz": 1.25e9,
+        "pulse": LinearFM(50e6, 0.2e-6),
+        "sampling_hz": 60e6,
+        "prf_hz": 180.0,
+        "speed_m_s": 300.0,
+        "reference_range_m": 5000.0,
+        "transmit_range": (-3.0, 0.02),
+    }
     return BistaticRadar(**{**values, **changes})
 
 
-def small_bistatic_echo(n_pulse: int = 48, n_range: int = 32, trials: int | None = None, dtype: torch.dtype = torch.complex128) -> Signal:
+def small_bistatic_echo(
+    n_pulse: int = 48, n_range: int = 32, trials: int | None = None, dtype: torch.dtype = torch.complex128
+) -> Signal:
     """Two moving points in noise, range compressed, (channel, pulse, range)."""
-    world = BistaticWorld(MovingPoints([3.0, -4.0], [1.0, 2.0], [0.0, 5.0], [0.0, 20.0], random_phase=True), BandLimited(4.0), snr_db=20.0)
-    return simulate_bistatic(small_bistatic(), world, n_pulse, n_range, Draws(1, trials=None if trials is None else range(trials)), dtype=dtype)[0].signal
+    world = BistaticWorld(
+        MovingPoints([3.0, -4.0], [1.0, 2.0], [0.0, 5.0], [0.0, 20.0], random_phase=True), BandLimited(4.0), snr_db=20.0
+    )
+    return simulate_bistatic(
+        small_bistatic(),
+        world,
+        n_pulse,
+        n_range,
+        Draws(1, trials=None if trials is None else range(trials)),
+        dtype=dtype,
+    )[0].signal

@@ -31,7 +31,9 @@ def run(name: str, folder: Path, figures: set[str], capsys: pytest.CaptureFixtur
 
 
 def rows(text: str, label: int) -> dict[str, list[float]]:
-    """Numbers of every line by what stands in its first `label` letters; of lines alike, the first."""
+    """Numbers of every line by what stands in its first `label` letters; of lines alike,
+    the first.
+    """
     found: dict[str, list[float]] = {}
     for line in text.splitlines():
         found.setdefault(line[:label].strip(), [float(word) for word in NUMBER.findall(line[label:])])

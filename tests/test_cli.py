@@ -44,7 +44,9 @@ def test_options_may_stand_before_or_after_overrides(tmp_path: Path, extra: list
 
 
 @pytest.mark.parametrize("command", ["run", "requires", "trade"])
-def test_a_mistake_is_one_sentence_and_status_two(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_mistake_is_one_sentence_and_status_two(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "result"
     assert main([command, str(write_tiny(tmp_path)), "radar.prf=3", "--out", str(out)]) == 2
     lines = spoken(capsys)
@@ -73,8 +75,14 @@ FOCUS = {"recommended": {"stages": {"focus": {"stage": "omega_k"}}}}
 
 def test_own_recording_runs(tmp_path: Path) -> None:
     config = write_tiny(tmp_path, world=None, radar=None, metrics=None, processor=FOCUS)
-    assert main(["run", str(config), f"data.file={recording(tmp_path / 'raw.npz')}", "--out", str(tmp_path / "result")]) == 0
-    assert "entropy_nats" in json.loads((tmp_path / "result" / "metrics.json").read_text())["methods"]["recommended"]["metrics"]
+    assert (
+        main(["run", str(config), f"data.file={recording(tmp_path / 'raw.npz')}", "--out", str(tmp_path / "result")])
+        == 0
+    )
+    assert (
+        "entropy_nats"
+        in json.loads((tmp_path / "result" / "metrics.json").read_text())["methods"]["recommended"]["metrics"]
+    )
 
 
 @pytest.mark.parametrize(
@@ -87,7 +95,9 @@ def test_own_recording_runs(tmp_path: Path) -> None:
         ({"line_number": np.zeros((2, 96), int)}, ["raw.npz", "line_number", "(2, 96)"]),
     ],
 )
-def test_bad_recordings_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict, expected: list[str]) -> None:
+def test_bad_recordings_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict, expected: list[str]
+) -> None:
     config = write_tiny(tmp_path, world=None, radar=None, metrics=None, processor=FOCUS)
     file = recording(tmp_path / "raw.npz", **changes)
     assert main(["run", str(config), f"data.file={file}", "--out", str(tmp_path / "result")]) == 2
@@ -100,15 +110,35 @@ def test_bad_recordings_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[
 @pytest.mark.parametrize(
     "changes, expected",
     [
-        ({"iq": np.concatenate([np.ones((90, 160, 2), np.float32), np.zeros((6, 160, 2), np.float32)])}, ["raw.npz", "6 of 96 lines hold only zeros", "line 90"]),
+        (
+            {"iq": np.concatenate([np.ones((90, 160, 2), np.float32), np.zeros((6, 160, 2), np.float32)])},
+            ["raw.npz", "6 of 96 lines hold only zeros", "line 90"],
+        ),
         ({"pilot": np.zeros(4096, np.complex64)}, ["recommended", "'pilot' found nothing to trust"]),
     ],
 )
-def test_doubtful_recordings_are_named_in_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict, expected: list[str]) -> None:
-    stages = {**({"pilot": {"stage": "jitter_pilot", "uses": {"pilot": "aux.pilot"}}} if "pilot" in changes else {}), **FOCUS["recommended"]["stages"]}
+def test_doubtful_recordings_are_named_in_a_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict, expected: list[str]
+) -> None:
+    stages = {
+        **({"pilot": {"stage": "jitter_pilot", "uses": {"pilot": "aux.pilot"}}} if "pilot" in changes else {}),
+        **FOCUS["recommended"]["stages"],
+    }
     config = write_tiny(tmp_path, world=None, radar=None, metrics=None, processor={"recommended": {"stages": stages}})
-    logging.getLogger("torchsar").handlers.clear()  # one of an earlier test writes to that test's stderr
-    assert main(["run", str(config), f"data.file={recording(tmp_path / 'raw.npz', **changes)}", "--out", str(tmp_path / "result")]) == 0
+    # one of an earlier test writes to that test's stderr
+    logging.getLogger("torchsar").handlers.clear()
+    assert (
+        main(
+            [
+                "run",
+                str(config),
+                f"data.file={recording(tmp_path / 'raw.npz', **changes)}",
+                "--out",
+                str(tmp_path / "result"),
+            ]
+        )
+        == 0
+    )
     said = [line for line in spoken(capsys) if "warning: " in line]
     assert len(said) == 1 and all(part in said[0] for part in expected)
 
@@ -121,7 +151,17 @@ def test_aliasing_is_named_with_both_figures(tmp_path: Path, capsys: pytest.Capt
 
 def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
     config = write_tiny(tmp_path)
-    command = [sys.executable, "-m", "torchsar.cli", "run", str(config), "world.lines=60000", "world.samples=1024", "--out", str(tmp_path / "result")]
+    command = [
+        sys.executable,
+        "-m",
+        "torchsar.cli",
+        "run",
+        str(config),
+        "world.lines=60000",
+        "world.samples=1024",
+        "--out",
+        str(tmp_path / "result"),
+    ]
     running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=mind_interrupts)
     assert running.stderr is not None and "simulating" in running.stderr.readline()
     running.send_signal(signal.SIGINT)
@@ -137,7 +177,9 @@ def test_threads_are_a_number_above_zero(word: str, capsys: pytest.CaptureFixtur
     assert f"{word!r} is not a whole number above 0" in capsys.readouterr().err
 
 
-def test_a_level_that_the_log_does_not_know(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_level_that_the_log_does_not_know(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setenv("TORCHSAR_LOG", "loud")
     assert main(["list"]) == 2
     assert "TORCHSAR_LOG=LOUD" in spoken(capsys)[-1]
@@ -151,7 +193,9 @@ def test_a_file_that_is_no_archive_is_named(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_the_command_is_installed() -> None:
-    done = subprocess.run([sys.executable, "-m", "torchsar.cli", "run", "nowhere"], capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-m", "torchsar.cli", "run", "nowhere"], capture_output=True, text=True, timeout=120
+    )
     assert done.returncode == 2 and "nowhere" in done.stderr and "Traceback" not in done.stderr
 
 
@@ -166,7 +210,18 @@ def test_requires_prints_the_table_and_writes_it(tmp_path: Path, capsys: pytest.
 
 def test_requires_follows_the_scene(tmp_path: Path) -> None:
     def squint_phase(doppler_hz: float) -> float:
-        assert main(["requires", str(write_tiny(tmp_path)), f"world.doppler_hz={doppler_hz}", "--out", str(tmp_path / "needs")]) == 0
+        assert (
+            main(
+                [
+                    "requires",
+                    str(write_tiny(tmp_path)),
+                    f"world.doppler_hz={doppler_hz}",
+                    "--out",
+                    str(tmp_path / "needs"),
+                ]
+            )
+            == 0
+        )
         rows = json.loads((tmp_path / "needs" / "requires.json").read_text())["requirements"]
         return next(row["phase_rad"] for row in rows if row["effect"] == "squint ignored")
 
@@ -176,7 +231,21 @@ def test_requires_follows_the_scene(tmp_path: Path) -> None:
 def test_trade_starts_with_the_yardstick(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "trade"
     beam = "world.beam.dwell_s=1.0"
-    assert main(["trade", str(write_tiny(tmp_path)), beam, "world.lines=640", "world.samples=256", "trade.repeats=1", "--out", str(out)]) == 0
+    assert (
+        main(
+            [
+                "trade",
+                str(write_tiny(tmp_path)),
+                beam,
+                "world.lines=640",
+                "world.samples=256",
+                "trade.repeats=1",
+                "--out",
+                str(out),
+            ]
+        )
+        == 0
+    )
     table = json.loads((out / "trade.json").read_text())
     assert table["focusing"][0]["name"].startswith("backprojection") and table["jitter"][0]["name"] == "uncorrected"
     errors = {row["name"]: row["error_db"] for row in table["focusing"] + table["jitter"]}

@@ -1,4 +1,6 @@
-"""The report in a real browser: nothing in the console, nothing asked for outside, every picture drawn."""
+"""The report in a real browser: nothing in the console, nothing asked for outside, every picture
+drawn.
+"""
 
 from __future__ import annotations
 
@@ -12,18 +14,35 @@ import pytest
 from tests.study.tiny import write_tiny
 from torchsar.cli import main
 
-BROWSER = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
+BROWSER = next(
+    (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None
+)
 PROBE = """<script>addEventListener("load", () => {
   const images = [...document.images], broken = images.filter(i => !i.complete || i.naturalWidth < 100).length;
   const outside = performance.getEntriesByType("resource").map(e => e.name).filter(n => !n.startsWith("data:"));
-  document.body.dataset.probe = JSON.stringify({images: images.length, broken, outside, title: document.title, wide: document.documentElement.scrollWidth > innerWidth});
+  const wide = document.documentElement.scrollWidth > innerWidth;
+  document.body.dataset.probe = JSON.stringify({images: images.length, broken, outside, title: document.title, wide});
 });</script>"""
 
 
 def browse(page: Path, profile: Path, *options: str) -> subprocess.CompletedProcess[str]:
     assert BROWSER is not None
-    common = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-extensions", "--virtual-time-budget=5000", f"--user-data-dir={profile}"]
-    return subprocess.run([BROWSER, *common, *options, page.as_uri()], capture_output=True, text=True, timeout=120, stdin=subprocess.DEVNULL)
+    common = [
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--no-first-run",
+        "--disable-extensions",
+        "--virtual-time-budget=5000",
+        f"--user-data-dir={profile}",
+    ]
+    return subprocess.run(
+        [BROWSER, *common, *options, page.as_uri()],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        stdin=subprocess.DEVNULL,
+    )
 
 
 @pytest.fixture(scope="module")

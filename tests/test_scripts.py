@@ -43,11 +43,22 @@ def test_the_sweep_of_the_readme_runs(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr[-1000:]
     assert (tmp_path / "out" / "mean" / "results.zarr").is_dir()
     rmse = [float(x) for x in re.findall(r"\d\.\d+(?:e-\d+)?", done.stdout)]
-    assert rmse[0] < 0.15 and rmse[3] > rmse[0]  # the median of Gaussian noise is worse than the mean
+    # the median of Gaussian noise is worse than the mean
+    assert rmse[0] < 0.15 and rmse[3] > rmse[0]
 
 
 def test_the_benchmark_of_sweeps_runs(tmp_path: Path) -> None:
-    command = [sys.executable, str(ROOT / "scripts" / "sweep_speed.py"), "stripmap_doppler", "--trials", "4", "--rounds", "1", "processor.recommended.stages.velocity.lines=16", "world.lines=384"]
+    command = [
+        sys.executable,
+        str(ROOT / "scripts" / "sweep_speed.py"),
+        "stripmap_doppler",
+        "--trials",
+        "4",
+        "--rounds",
+        "1",
+        "processor.recommended.stages.velocity.lines=16",
+        "world.lines=384",
+    ]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-1000:]
     for name in ("one by one", "one batch", "automatic ", "automatic, 2 workers"):
@@ -55,10 +66,23 @@ def test_the_benchmark_of_sweeps_runs(tmp_path: Path) -> None:
 
 
 def test_autofocus_is_composed(tmp_path: Path) -> None:
-    command = [sys.executable, str(ROOT / "scripts" / "compose_autofocus.py"), "--trials", "2", "--candidates", "2", "--pulses", "64"]
+    command = [
+        sys.executable,
+        str(ROOT / "scripts" / "compose_autofocus.py"),
+        "--trials",
+        "2",
+        "--candidates",
+        "2",
+        "--pulses",
+        "64",
+    ]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr[-1000:]
-    rows = {line[:32].strip(): [float(x) for x in line[32:].split()] for line in done.stdout.splitlines() if re.search(r"\d\.\d{3}$", line)}
+    rows = {
+        line[:32].strip(): [float(x) for x in line[32:].split()]
+        for line in done.stdout.splitlines()
+        if re.search(r"\d\.\d{3}$", line)
+    }
     assert all(len(row) == 6 for row in rows.values()) and len(rows) == 6
     middle = {name: sorted(row)[2] for name, row in rows.items()}
     assert middle["polynomial, region"] < 0.1 < middle["polynomial, whole image"]
@@ -66,13 +90,25 @@ def test_autofocus_is_composed(tmp_path: Path) -> None:
 
 
 def test_the_benchmark_of_ladar_estimators_runs(tmp_path: Path) -> None:
-    command = [sys.executable, str(ROOT / "scripts" / "ladar_speed.py"), "--trials", "2", "--rounds", "1", "--periods", "32"]
+    command = [
+        sys.executable,
+        str(ROOT / "scripts" / "ladar_speed.py"),
+        "--trials",
+        "2",
+        "--rounds",
+        "1",
+        "--periods",
+        "32",
+    ]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr[-1000:]
     for precision in ("complex64", "complex128"):
-        assert re.search(rf"^{precision}: 2 trials of 32 periods x 2 x 512 samples", done.stdout, re.MULTILINE), done.stdout
+        assert re.search(rf"^{precision}: 2 trials of 32 periods x 2 x 512 samples", done.stdout, re.MULTILINE), (
+            done.stdout
+        )
     over = [float(x) for x in re.findall(r"^radial_motion(?: +[\d.]+){3} +([\d.]+)", done.stdout, re.MULTILINE)]
-    assert len(over) == 2 and all(0.4 < x < 0.7 for x in over)  # of the bound with unknown phases; known ones halve it
+    # of the bound with unknown phases; known ones halve it
+    assert len(over) == 2 and all(0.4 < x < 0.7 for x in over)
 
 
 def test_readme_points_at_files_that_exist() -> None:

@@ -1,4 +1,6 @@
-"""Scripts of system 000: they run at reduced size, print what was published beside their own, and order the methods rightly."""
+"""Scripts of system 000: they run at reduced size, print what was published beside their own, and
+order the methods rightly.
+"""
 
 from __future__ import annotations
 
@@ -30,9 +32,14 @@ def run(name: str, folder: Path, figures: set[int], capsys: pytest.CaptureFixtur
 
 
 def rows(text: str, label: int) -> dict[str, list[float]]:
-    """Numbers of the rows of a table by what stands in their first `label` letters; NaN for a dash."""
+    """Numbers of the rows of a table by what stands in their first `label` letters; NaN for
+    a dash.
+    """
     found = (line for line in text.splitlines() if re.search(r"(\d|-)$", line))
-    return {line[:label].strip(): [float("nan") if word == "-" else float(word) for word in line[label:].split()] for line in found}
+    return {
+        line[:label].strip(): [float("nan") if word == "-" else float(word) for word in line[label:].split()]
+        for line in found
+    }
 
 
 def test_points(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -50,11 +57,19 @@ def test_letter(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "published" in first.splitlines()[0]
     table = rows(first, 26)
     assert table["segmented, summed"][1] == 11.3471
-    entropies, contrasts, residuals = ([table[name][i] for name in ("uncompensated", "cross-correlation", "segmented, summed")] for i in (0, 2, 4))
-    assert entropies == sorted(entropies, reverse=True) and contrasts == sorted(contrasts) and residuals == sorted(residuals, reverse=True)
+    entropies, contrasts, residuals = (
+        [table[name][i] for name in ("uncompensated", "cross-correlation", "segmented, summed")] for i in (0, 2, 4)
+    )
+    assert (
+        entropies == sorted(entropies, reverse=True)
+        and contrasts == sorted(contrasts)
+        and residuals == sorted(residuals, reverse=True)
+    )
     assert table["recommended"][4] < 0.15
     trapped = rows(trap, 26)
-    assert trapped["cross-correlation"][0] < trapped["ideal"][0] and trapped["cross-correlation"][4] > 1  # less entropy than the truth, and wrong
+    assert (
+        trapped["cross-correlation"][0] < trapped["ideal"][0] and trapped["cross-correlation"][4] > 1
+    )  # less entropy than the truth, and wrong
 
 
 def test_ground(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -62,8 +77,15 @@ def test_ground(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "published" in first.splitlines()[0] and second.splitlines()[0].count("published") == 2
     table = rows(first, 26)
     assert table["segmented"][1] == 11.9251
-    entropies, contrasts, residuals = ([table[name][i] for name in ("uncompensated", "cross-correlation", "segmented", "recommended")] for i in (0, 2, 4))
-    assert entropies == sorted(entropies, reverse=True) and contrasts == sorted(contrasts) and residuals == sorted(residuals, reverse=True)
+    entropies, contrasts, residuals = (
+        [table[name][i] for name in ("uncompensated", "cross-correlation", "segmented", "recommended")]
+        for i in (0, 2, 4)
+    )
+    assert (
+        entropies == sorted(entropies, reverse=True)
+        and contrasts == sorted(contrasts)
+        and residuals == sorted(residuals, reverse=True)
+    )
     assert table["recommended"][4] < 0.05 and table["segmented, in a ring"][4] > 140
     responses = rows(second, 26)
     assert responses["pslr_azimuth_db"][1] == -5.01
@@ -85,12 +107,17 @@ def test_short_time_spectrum_finds_a_tone(is_complex: bool) -> None:
 
 def test_contours_and_overlays_draw() -> None:
     axes = Axis("azimuth", 20, -1.0, 0.1, "m"), Axis("range", 30, 0.0, 0.1, "m")
-    blob = torch.exp(-(axes[0].values()[:, None].square() + (axes[1].values() - 1.5).square()) / 0.2).to(torch.complex64)
+    blob = torch.exp(-(axes[0].values()[:, None].square() + (axes[1].values() - 1.5).square()) / 0.2).to(
+        torch.complex64
+    )
     drawn = plot.contours({"a": Signal(blob, axes), "b": Signal(blob[None], axes)}, columns=2)
     assert [axes.get_title() for axes in drawn.axes] == ["a", "b"]
     assert len(drawn.axes[0].collections) and drawn.axes[0].get_xlabel() == "range (m)"
     line = np.array([0.0, 2.0]), np.array([0.0, 0.5])
-    parts = [{"title": "with", "signal": Signal(blob, axes), "lines": {"line": line}}, {"series": {"line": line}, "xlabel": "x", "ylabel": "y", "title": "without"}]
+    parts = [
+        {"title": "with", "signal": Signal(blob, axes), "lines": {"line": line}},
+        {"series": {"line": line}, "xlabel": "x", "ylabel": "y", "title": "without"},
+    ]
     laid = plot.overlays(parts)
     assert laid.axes[0].get_images() and len(laid.axes[0].get_lines()) == 1 and not laid.axes[1].get_images()
     assert laid.axes[0].get_xlim() == pytest.approx((-0.05, 2.95))

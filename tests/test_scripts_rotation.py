@@ -1,4 +1,6 @@
-"""Scripts of system 003: they run at reduced size, print what was expected or published beside their own, and order the methods rightly."""
+"""Scripts of system 003: they run at reduced size, print what was expected or published beside
+their own, and order the methods rightly.
+"""
 
 from __future__ import annotations
 
@@ -22,17 +24,29 @@ def test_profiles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert table["order 3, two-dimensional"][3:6] == pytest.approx([0.0, 1.48, -13.2], abs=0.06)
     assert table["y = 12 m, one cell"] == pytest.approx([math.sqrt(1 + yc / 12) for yc in table["yc (m)"]], abs=1e-3)
     ignored, estimated = (table[f"image, yc {how}"] for how in ("ignored", "estimated"))
-    assert all(abs(ratio - 1) < 0.02 for ratio in estimated) and abs(ignored[0] - 1) > 0.1 and abs(ignored[-1] - 1) > 0.1
+    assert (
+        all(abs(ratio - 1) < 0.02 for ratio in estimated) and abs(ignored[0] - 1) > 0.1 and abs(ignored[-1] - 1) > 0.1
+    )
 
 
 def test_satellite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = run("rotation_satellite", tmp_path, {"methods", *(f"figure_0{i}" for i in range(4, 10))}, capsys)
     table = rows(text, 26)
-    entropies, contrasts = ([table[name][i] for name in ("no compensation", "SM, order 2", "order 3, azimuth", "order 3, two-dimensional")] for i in (0, 1))
+    entropies, contrasts = (
+        [table[name][i] for name in ("no compensation", "SM, order 2", "order 3, azimuth", "order 3, two-dimensional")]
+        for i in (0, 1)
+    )
     assert entropies == sorted(entropies, reverse=True) and contrasts == sorted(contrasts)
     assert table["uniform autofocus"][0] > table["SM, order 2"][0]
-    tips = [float(number) for number in NUMBER.findall(next(line for line in text.splitlines() if line.startswith("ok ; tips")))]
-    assert tips[0] == pytest.approx(tips[1], rel=0.02) and tips[2] == pytest.approx(tips[3], rel=0.02) and tips[0] < 0 < tips[2]
+    tips = [
+        float(number)
+        for number in NUMBER.findall(next(line for line in text.splitlines() if line.startswith("ok ; tips")))
+    ]
+    assert (
+        tips[0] == pytest.approx(tips[1], rel=0.02)
+        and tips[2] == pytest.approx(tips[3], rel=0.02)
+        and tips[0] < 0 < tips[2]
+    )
 
 
 def test_estimators(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -63,7 +77,12 @@ def test_landscape(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert abs(table[name][2]) < 0.1 and table[name][3:] == [1, 1, 1]
     assert abs(table["q3"][2]) < abs(table["q3"][0])
     valley = next(line for line in text.splitlines() if line.startswith("along the valley"))
-    lean, half = (float(number) for number in re.findall(r"is (-[\d.]+) ms|is (-[\d.]+) ms", valley) for number in number if number)
+    lean, half = (
+        float(number)
+        for number in re.findall(r"is (-[\d.]+) ms|is (-[\d.]+) ms", valley)
+        for number in number
+        if number
+    )
     assert lean == pytest.approx(half, rel=0.2)
     slopes = [re.findall(r"-?\d+\.\d{6}", line) for line in text.splitlines() if line.startswith("slope")]
     assert len(slopes) == 6 and all(float(a) == pytest.approx(float(b), abs=2e-5) for a, b in slopes)

@@ -4,7 +4,8 @@
     chain = torchsar.Chain(focus=torchsar.focus.OmegaK(recording.radar))
     image = chain(recording)
 
-Needs torch and numpy alone; `torchsar.plot` adds matplotlib and `torchsar.study` what the extra `study` installs, both on first use.
+Needs torch and numpy alone; `torchsar.plot` adds matplotlib and `torchsar.study` what the extra
+`study` installs, both on first use.
 """
 
 from __future__ import annotations

@@ -17,7 +17,12 @@ EXIT_BAD_INPUT = 2
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     top = argparse.ArgumentParser(prog="torchsar", description="Synthetic aperture radar experiments from a config.")
-    top.add_argument("--threads", type=_positive, metavar="N", help="threads of torch (default: all cores; of a sweep, one in each process)")
+    top.add_argument(
+        "--threads",
+        type=_positive,
+        metavar="N",
+        help="threads of torch (default: all cores; of a sweep, one in each process)",
+    )
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, text in (
         ("run", "run an experiment and write its images, figures and report"),
@@ -27,12 +32,30 @@ def parser() -> argparse.ArgumentParser:
     ):
         one = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         one.add_argument("config", help="a YAML file, or the name of a packaged config (see `torchsar list`)")
-        one.add_argument("overrides", nargs="*", metavar="key=value", help="overrides with dotted keys, such as world.noise.snr_db=10")
-        one.add_argument("--out", type=Path, metavar="DIR", help="result folder" + (" (default: out/<config name>)" if name in ("run", "sweep") else ""))
+        one.add_argument(
+            "overrides",
+            nargs="*",
+            metavar="key=value",
+            help="overrides with dotted keys, such as world.noise.snr_db=10",
+        )
+        one.add_argument(
+            "--out",
+            type=Path,
+            metavar="DIR",
+            help="result folder" + (" (default: out/<config name>)" if name in ("run", "sweep") else ""),
+        )
     sweep = commands.choices["sweep"]
-    sweep.add_argument("--resume", action="store_true", help="go on with the sweep in the folder; on an empty folder it simply starts")
-    sweep.add_argument("--workers", type=_positive, metavar="N", help="compute in N processes of this machine (extra `cluster`)")
-    sweep.add_argument("--cluster", metavar="ADDRESS", help="compute on the workers of a running dask scheduler, such as tcp://host:8786")
+    sweep.add_argument(
+        "--resume", action="store_true", help="go on with the sweep in the folder; on an empty folder it simply starts"
+    )
+    sweep.add_argument(
+        "--workers", type=_positive, metavar="N", help="compute in N processes of this machine (extra `cluster`)"
+    )
+    sweep.add_argument(
+        "--cluster",
+        metavar="ADDRESS",
+        help="compute on the workers of a running dask scheduler, such as tcp://host:8786",
+    )
     sweep.add_argument("--device", default="cpu", metavar="NAME", help="cpu (default), cuda, cuda:1, ...")
     commands.add_parser("list", help="experiments, stages and data keys")
     return top
@@ -45,7 +68,10 @@ def _positive(text: str) -> int:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command. Returns 0, or 2 after one sentence on stderr for bad input, or 130 when interrupted."""
+    """Run one command.
+
+    Returns 0, or 2 after one sentence on stderr for bad input, or 130 when interrupted.
+    """
     given = list(sys.argv[1:] if arguments is None else arguments)
     options = _parse(given)
     try:
@@ -58,7 +84,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             warnings.showwarning = _show_warning
             return _dispatch(options, "torchsar " + shlex.join(given))
     except ImportError as error:
-        if (error.name or "").startswith("torchsar"):  # a fault of the program, not of the installation
+        # a fault of the program, not of the installation
+        if (error.name or "").startswith("torchsar"):
             raise
         return _fail(f"{error.name or error} is not installed; install the extra: pip install 'torchsar-lab[study]'")
     except ConfigError as error:
@@ -69,7 +96,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parse(given: Sequence[str]) -> argparse.Namespace:
-    """Overrides may stand before and after options; anything else that is left over is refused by argparse."""
+    """Overrides may stand before and after options; anything else that is left over is refused by
+    argparse.
+    """
     top = parser()
     options, rest = top.parse_known_args(given)
     if rest and (not hasattr(options, "overrides") or any(word.startswith("-") for word in rest)):
@@ -99,7 +128,18 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
     elif options.command == "sweep":
         from torchsar.study.sweeping import sweep_config
 
-        print(sweep_config(loaded, options.out or Path("out") / loaded.name, options.resume, options.workers, options.cluster, options.threads or 1, options.device, command))
+        print(
+            sweep_config(
+                loaded,
+                options.out or Path("out") / loaded.name,
+                options.resume,
+                options.workers,
+                options.cluster,
+                options.threads or 1,
+                options.device,
+                command,
+            )
+        )
     elif options.command == "requires":
         print(system_of(loaded).requires(loaded, options.out))
     else:

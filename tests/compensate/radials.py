@@ -1,4 +1,6 @@
-"""What tests of radial motion share: ladars in the motions of brief 000, estimators by name, figures of merit."""
+"""What tests of radial motion share: ladars in the motions of brief 000, estimators by name,
+figures of merit.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,14 @@ import torch
 from torch import Tensor
 
 from tests.echo.ladars import COMMON, table1
-from torchsar.compensate.radial import mirror_product, ml_peak, radial_motion, range_error, segmented_interference, spectrum_correlation
+from torchsar.compensate.radial import (
+    mirror_product,
+    ml_peak,
+    radial_motion,
+    range_error,
+    segmented_interference,
+    spectrum_correlation,
+)
 from torchsar.core import Axis, Draws, Estimate, Truth
 from torchsar.echo import simulate_ladar
 from torchsar.radar import TriangularLadar, sweep_middles
@@ -30,12 +39,24 @@ GATE = (0.9, 2.1)  # 40 cells about the one point
 
 
 def seen(
-    radar: TriangularLadar | None = None, n: int = 32, trials: int | None = None, scene=ONE, motion=COMMON, snr_db=None, dtype=torch.complex128, fidelity=None, seed=1
+    radar: TriangularLadar | None = None,
+    n: int = 32,
+    trials: int | None = None,
+    scene=ONE,
+    motion=COMMON,
+    snr_db=None,
+    dtype=torch.complex128,
+    fidelity=None,
+    seed=1,
 ) -> tuple[Tensor, Axis, Truth]:
-    """Sweeps, pulse axis and truth of a world, with the range at every sample unless told otherwise."""
+    """Sweeps, pulse axis and truth of a world, with the range at every sample unless told
+    otherwise.
+    """
     radar = table1() if radar is None else radar
     world = LadarWorld(scene, motion=motion, snr_db=snr_db, fidelity=EverySample() if fidelity is None else fidelity)
-    recording, truth = simulate_ladar(radar, world, n, Draws(seed, trials=None if trials is None else range(trials)), dtype=dtype)
+    recording, truth = simulate_ladar(
+        radar, world, n, Draws(seed, trials=None if trials is None else range(trials)), dtype=dtype
+    )
     return recording.signal.data, recording.signal.axis("pulse"), truth
 
 

@@ -12,12 +12,22 @@ from torchsar.compensate import autofocus, entropy_fixed_point, pga, pga_sca, sc
 from torchsar.core import Draws, Estimate, unit_phasor
 
 DOUBLE = torch.complex128
-METHODS: dict[str, Callable[[Tensor], Estimate]] = {"sca": sca, "pga": pga, "pga_sca": pga_sca, "entropy_fixed_point": entropy_fixed_point, "autofocus": autofocus}
+METHODS: dict[str, Callable[[Tensor], Estimate]] = {
+    "sca": sca,
+    "pga": pga,
+    "pga_sca": pga_sca,
+    "entropy_fixed_point": entropy_fixed_point,
+    "autofocus": autofocus,
+}
 EQUIVARIANT = ("sca", "pga_sca", "entropy_fixed_point", "autofocus")
 
 
-def still(trials: int, n_pulse: int = 128, n_range: int = 64, per_row: int = 3, width: float = 0.5, seed: int = 3) -> Tensor:
-    """Points at random places in every range cell, no phase error, (trial, pulse, range) complex128. width: share of the Doppler band they fill."""
+def still(
+    trials: int, n_pulse: int = 128, n_range: int = 64, per_row: int = 3, width: float = 0.5, seed: int = 3
+) -> Tensor:
+    """Points at random places in every range cell, no phase error, (trial, pulse, range)
+    complex128. width: share of the Doppler band they fill.
+    """
     draws = Draws(seed, trials=range(trials))
     shape = (n_range, per_row)
     cycles = width * draws.uniform("cycles", shape, -0.5, 0.5)

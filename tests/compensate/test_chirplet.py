@@ -1,4 +1,6 @@
-"""Adaptive chirplets: exact on chirps, sparse on a target that turns unevenly, and losing its weak scatterers."""
+"""Adaptive chirplets: exact on chirps, sparse on a target that turns unevenly, and losing its weak
+scatterers.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ def chirps(doppler_hz: Tensor, rate_hz_s: Tensor, amplitude: Tensor) -> Tensor:
 
 
 def turning(cells: Tensor, amplitude: Tensor, k: tuple[float, float]) -> Tensor:
-    """One bin of scatterers at those Doppler cells of the middle of the aperture, turning with the warp of k."""
+    """One bin of scatterers at those Doppler cells of the middle of the aperture, turning with the
+    warp of k.
+    """
     time = torch.arange(PULSES, dtype=F64) / PRF
     middle = PULSES / 2 / PRF
     phi = warp(time, torch.tensor(k, dtype=F64))
@@ -60,7 +64,10 @@ def test_the_image_is_that_of_tones() -> None:
 
 
 def test_weak_scatterers_are_lost_on_a_target_with_jerk() -> None:
-    """Two strong and six weak scatterers a bin. Without jerk all eight are imaged; with it the remains of the strong ones take the atoms."""
+    """Two strong and six weak scatterers a bin.
+
+    Without jerk all eight are imaged; with it the remains of the strong ones take the atoms.
+    """
     cells = torch.tensor([-220.0, -150.5, -90.2, -31.0, 43.7, 100.0, 161.5, 214.0], dtype=F64)
     amplitude = torch.full((8,), 0.07, dtype=torch.complex128)
     amplitude[[0, 7]] = 1.0
@@ -92,7 +99,9 @@ def test_a_batch_equals_its_singles(dtype: torch.dtype) -> None:
     for i in range(3):
         alone = chirplet_clean(data[i], PRF, atoms=3, floor_db=20.0)
         level = float(alone.image.abs().max())
-        torch.testing.assert_close(together.image[i], alone.image, atol=level * (1e-4 if dtype == torch.complex64 else 1e-9), rtol=0)
+        torch.testing.assert_close(
+            together.image[i], alone.image, atol=level * (1e-4 if dtype == torch.complex64 else 1e-9), rtol=0
+        )
 
 
 def test_any_number_of_pulses() -> None:

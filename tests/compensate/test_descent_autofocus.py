@@ -1,4 +1,6 @@
-"""Phases as the minimum of a figure of the image: gradients, regions, bases, and minima that do not depend on the start."""
+"""Phases as the minimum of a figure of the image: gradients, regions, bases, and minima that do not
+depend on the start.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ from torchsar.radar import InverseRadar
 DOUBLE = torch.complex128
 
 
-def points(trials: int = 2, n_pulse: int = 48, n_range: int = 24, noise: float = 0.05, dtype: torch.dtype = DOUBLE) -> Tensor:
+def points(
+    trials: int = 2, n_pulse: int = 48, n_range: int = 24, noise: float = 0.05, dtype: torch.dtype = DOUBLE
+) -> Tensor:
     """A few points a row at random places, in focus, (trial, pulse, range)."""
     draws = Draws(5, trials=range(trials))
     cycles = draws.uniform("cycles", (3, n_range), -0.35, 0.35)
@@ -63,7 +67,11 @@ def test_the_minimum_is_stationary_sharper_and_near_the_truth(objective: str, dt
     phase = found["phase_rad"]
     assert phase.dtype == data.real.dtype and found.ok.all() and (found.quality > 0.7).all()
     assert (phase_rmse(phase, truth) < 0.15).all()
-    cost = {"power_entropy": entropy, "amplitude_entropy": lambda x: entropy(x, "amplitude"), "contrast": lambda x: -contrast(x)}[objective]
+    cost = {
+        "power_entropy": entropy,
+        "amplitude_entropy": lambda x: entropy(x, "amplitude"),
+        "contrast": lambda x: -contrast(x),
+    }[objective]
 
     def at(p: Tensor) -> Tensor:
         return cost(azimuth_transform(turned(turned(data.to(DOUBLE), truth), -p)))
@@ -123,7 +131,9 @@ def test_any_image_formation_is_served():
 
 
 def test_a_mask_keeps_a_moving_neighbour_out():
-    """Half of the range cells hold a target with phases of its own; each trial watches its own half."""
+    """Half of the range cells hold a target with phases of its own; each trial watches its own
+    half.
+    """
     mine, its = white(2), white(2).flip(-1)
     data = turned(points(), mine)
     other = turned(3 * points().flip(-1), its)
@@ -133,10 +143,14 @@ def test_a_mask_keeps_a_moving_neighbour_out():
     masked = minimum_entropy(mixed, mask=watched, start=mine + 0.3 * torch.sin(torch.arange(48.0)))["phase_rad"]
     assert (phase_rmse(masked, mine) < 0.1).all()
     assert (phase_rmse(minimum_entropy(mixed)["phase_rad"], mine) > 0.5).any()
-    shared = minimum_entropy(mixed[:1], mask=watched[0, 0] > 0, start=mine[:1] + 0.3 * torch.sin(torch.arange(48.0)))["phase_rad"]
+    shared = minimum_entropy(mixed[:1], mask=watched[0, 0] > 0, start=mine[:1] + 0.3 * torch.sin(torch.arange(48.0)))[
+        "phase_rad"
+    ]
     assert float(phase_rmse(shared, masked[:1])) < 1e-3
     for i in range(2):
-        alone = minimum_entropy(mixed[i], mask=watched[i], start=mine[i] + 0.3 * torch.sin(torch.arange(48.0)))["phase_rad"]
+        alone = minimum_entropy(mixed[i], mask=watched[i], start=mine[i] + 0.3 * torch.sin(torch.arange(48.0)))[
+            "phase_rad"
+        ]
         assert float(phase_rmse(alone, masked[i])) < 1e-3
 
 
@@ -147,15 +161,23 @@ def test_a_basis_finds_few_coefficients_where_free_phases_drown():
     found = minimum_entropy(data, basis=basis)
     free = minimum_entropy(data, start=truth)["phase_rad"]
     assert (phase_rmse(found["phase_rad"], truth) < 0.5 * phase_rmse(free, truth)).all()
-    assert found.ok.all() and (found.std["phase_rad"][:, 0] > 0.05).all() and (found.std["phase_rad"][:, 0] < 0.25).all()
+    assert (
+        found.ok.all() and (found.std["phase_rad"][:, 0] > 0.05).all() and (found.std["phase_rad"][:, 0] < 0.25).all()
+    )
     # it stays within the span, whatever the functions are scaled by and whether trials share them
     phase = found["phase_rad"]
     torch.testing.assert_close(phase @ torch.linalg.pinv(basis) @ basis, phase, atol=1e-9, rtol=0)
-    own = minimum_entropy(data, basis=(basis * torch.tensor([1e3, 1.0, 1e-3, 7.0])[:, None]).expand(2, 4, 48))["phase_rad"]
+    own = minimum_entropy(data, basis=(basis * torch.tensor([1e3, 1.0, 1e-3, 7.0])[:, None]).expand(2, 4, 48))[
+        "phase_rad"
+    ]
     torch.testing.assert_close(own, phase, atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize("options", [{}, {"objective": "contrast"}, {"basis": smooth()}, {"method": "adam", "steps": 30}], ids=["free", "contrast", "basis", "adam"])
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"objective": "contrast"}, {"basis": smooth()}, {"method": "adam", "steps": 30}],
+    ids=["free", "contrast", "basis", "adam"],
+)
 def test_batch_equals_singles_at_any_level(options: dict):
     data = turned(points(3), white(3)) * torch.tensor([1.0, 1e-150, 1e150], dtype=torch.float64)[:, None, None]
     data[1, 7] = 0
@@ -170,7 +192,11 @@ def test_batch_equals_singles_at_any_level(options: dict):
 def test_blocks_of_trials_keep_what_is_each_trials_own(monkeypatch: pytest.MonkeyPatch):
     """Start, mask and basis follow their trials when the batch is cut."""
     data, start = turned(points(4), white(4)), white(4) + 0.2
-    own = {"start": start, "mask": torch.rand(4, 48, 24, generator=torch.Generator().manual_seed(2)), "basis": smooth() + torch.rand(4, 1, 48, generator=torch.Generator().manual_seed(3))}
+    own = {
+        "start": start,
+        "mask": torch.rand(4, 48, 24, generator=torch.Generator().manual_seed(2)),
+        "basis": smooth() + torch.rand(4, 1, 48, generator=torch.Generator().manual_seed(3)),
+    }
     whole = minimum_entropy(data, steps=3, **own)["phase_rad"]
     monkeypatch.setattr("torchsar.compensate.pulse_phase.verdict.block_bytes_of", lambda _: 1)
     torch.testing.assert_close(minimum_entropy(data, steps=3, **own)["phase_rad"], whole, atol=1e-8, rtol=0)
@@ -179,10 +205,14 @@ def test_blocks_of_trials_keep_what_is_each_trials_own(monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("shape", [(2, 5), (8, 1), (3, 2, 1), (2, 1, 3, 3)])
-@pytest.mark.parametrize("options", [{}, {"objective": "contrast"}, {"method": "adam", "steps": 3}], ids=["entropy", "contrast", "adam"])
+@pytest.mark.parametrize(
+    "options", [{}, {"objective": "contrast"}, {"method": "adam", "steps": 3}], ids=["entropy", "contrast", "adam"]
+)
 @pytest.mark.filterwarnings("ignore:sharpest_phase")
 def test_small_recordings_stay_finite(shape: tuple[int, ...], options: dict):
-    found = sharpest_phase(torch.randn(shape, dtype=torch.complex64, generator=torch.Generator().manual_seed(1)), **options)
+    found = sharpest_phase(
+        torch.randn(shape, dtype=torch.complex64, generator=torch.Generator().manual_seed(1)), **options
+    )
     assert found["phase_rad"].shape == shape[:-1] and found["phase_rad"].dtype == torch.float32
     assert torch.isfinite(found["phase_rad"]).all() and not found.ok.any()
 
@@ -192,7 +222,9 @@ def test_silence_and_noise_are_not_ok():
     noise[2] = 0
     for objective in ("power_entropy", "amplitude_entropy", "contrast"):
         found = sharpest_phase(noise, objective=objective)  # type: ignore[arg-type]
-        assert not found.ok.any() and all(torch.isfinite(value).all() for value in (found["phase_rad"], found.quality, found.std["phase_rad"]))
+        assert not found.ok.any() and all(
+            torch.isfinite(value).all() for value in (found["phase_rad"], found.quality, found.std["phase_rad"])
+        )
     assert maximum_contrast(noise)["phase_rad"].equal(sharpest_phase(noise, objective="contrast")["phase_rad"])
 
 
@@ -203,23 +235,35 @@ def test_values_of_a_chain_are_found_in_three_lines():
     signal = Signal(turned(points(), truth @ smooth()), radar.raw_axes(48, 24))
     chain = Chain(phase=Sca(), correct=use(CorrectPulsePhase(), phase_rad="phase"), image=AzimuthTransform(radar))
     trace = chain.trace(signal)
-    found = lbfgs(lambda c: entropy(chain.rerun(trace, "correct", given={"phase.phase_rad": c @ smooth()})), torch.zeros(2, 4, dtype=torch.float64))
+    found = lbfgs(
+        lambda c: entropy(chain.rerun(trace, "correct", given={"phase.phase_rad": c @ smooth()})),
+        torch.zeros(2, 4, dtype=torch.float64),
+    )
     assert (phase_rmse(found.x @ smooth(), truth @ smooth()) < 0.08).all()
 
 
 def test_mistakes_are_named():
     data = points()
     cases: list[tuple[dict, str]] = [
-        ({"objective": "sharpness"}, "objective 'sharpness' is not known; choose one of power_entropy, amplitude_entropy, contrast"),
+        (
+            {"objective": "sharpness"},
+            "objective 'sharpness' is not known; choose one of power_entropy, amplitude_entropy, contrast",
+        ),
         ({"method": "newton"}, "method 'newton' is not known; choose one of lbfgs, adam"),
         ({"objective": entropy, "mask": torch.ones(24)}, "a mask belongs to the objectives known by name"),
         ({"mask": torch.ones(3, 48, 24)}, r"mask of shape \(3, 48, 24\) does not fit \(2,\) trials"),
         ({"mask": torch.ones(24, 48)}, r"mask of shape \(24, 48\) does not broadcast"),
-        ({"basis": torch.ones(47)}, r"real functions \(coefficient, pulse\) over 48 pulses, got torch.float32 of shape \(47,\)"),
+        (
+            {"basis": torch.ones(47)},
+            r"real functions \(coefficient, pulse\) over 48 pulses, got torch.float32 of shape \(47,\)",
+        ),
         ({"basis": torch.ones(2, 48)}, "none a sum of the others"),
         ({"basis": torch.ones(3, 2, 48)}, r"basis of shape \(3, 2, 48\) does not fit"),
         ({"start": torch.ones(47)}, r"start has the shape \(47,\)"),
-        ({"objective": lambda image: image.abs().sum()}, r"objective returned torch.float64 of shape \(\) for 2 images"),
+        (
+            {"objective": lambda image: image.abs().sum()},
+            r"objective returned torch.float64 of shape \(\) for 2 images",
+        ),
         ({"objective": lambda image: entropy(image).detach()}, "objective returned detached torch.float64"),
         ({"steps": 0}, "steps is 0; choose a positive number"),
     ]

@@ -23,7 +23,12 @@ from torchsar.core import Chain, Draws, Recording, Signal, use
 from torchsar.echo import simulate
 from torchsar.focus import OmegaK
 from torchsar.io import read_stripmap
-from torchsar.metrics.bounds import beam_centre_bound_hz, reference_doppler_std_hz, tone_frequency_bound_hz, velocity_bound_m_s
+from torchsar.metrics.bounds import (
+    beam_centre_bound_hz,
+    reference_doppler_std_hz,
+    tone_frequency_bound_hz,
+    velocity_bound_m_s,
+)
 from torchsar.optim import gradient_minimum, grid_minimum, parabola_minimum
 from torchsar.radar import LIGHT_M_S, LinearFM, StripmapRadar
 from torchsar.scene import Dwell, RandomPoints, StripmapWorld
@@ -33,17 +38,32 @@ PRF = 1000.0
 
 def kondor(dwell_s: float = 0.3, squint_deg: float = 0.3) -> StripmapRadar:
     pointing = 2 * 7000 * math.sin(math.radians(squint_deg)) / (LIGHT_M_S / 3.2e9)
-    return StripmapRadar(3.2e9, LinearFM(200e6, 2e-6), 250e6, 4000.0, 7000.0, 700e3, pointing_doppler_hz=pointing, integration_s=dwell_s)
+    return StripmapRadar(
+        3.2e9, LinearFM(200e6, 2e-6), 250e6, 4000.0, 7000.0, 700e3, pointing_doppler_hz=pointing, integration_s=dwell_s
+    )
 
 
-def strip(radar: StripmapRadar, lines: int, samples: int, points: int = 24, trials: int = 2, velocity: float = 7000.0, seed: int = 1, snr_db: float = -5.0) -> tuple[Recording, torch.Tensor]:
+def strip(
+    radar: StripmapRadar,
+    lines: int,
+    samples: int,
+    points: int = 24,
+    trials: int = 2,
+    velocity: float = 7000.0,
+    seed: int = 1,
+    snr_db: float = -5.0,
+) -> tuple[Recording, torch.Tensor]:
     doppler = (radar.pointing_doppler_hz or 0.0) + torch.linspace(-40, 40, trials, dtype=torch.float64)
     scene = RandomPoints(points, lines * 7000 / 4000, 150.0)
-    world = StripmapWorld(scene, beam=Dwell(radar.integration_s or 1.0), velocity_m_s=velocity, doppler_hz=doppler, snr_db=snr_db)
+    world = StripmapWorld(
+        scene, beam=Dwell(radar.integration_s or 1.0), velocity_m_s=velocity, doppler_hz=doppler, snr_db=snr_db
+    )
     return simulate(radar, world, lines, samples, Draws(seed, trials=range(trials)))[0], doppler
 
 
-def coloured(seed: int, centre_hz: float, shape: tuple[int, int] = (2048, 1024), band_hz: float = 500.0) -> torch.Tensor:
+def coloured(
+    seed: int, centre_hz: float, shape: tuple[int, int] = (2048, 1024), band_hz: float = 500.0
+) -> torch.Tensor:
     """Uniform speckle with a rectangular azimuth band about centre_hz and noise 20 dB below."""
     generator = torch.Generator().manual_seed(seed)
     x = torch.fft.fft(torch.randn(shape, generator=generator, dtype=torch.complex64), dim=0)
@@ -93,7 +113,13 @@ def test_predicted_std_covers_the_scatter_over_seeds() -> None:
 
 
 def test_silent_trial_and_extreme_scales_leave_the_neighbours_alone() -> None:
-    x = torch.stack([coloured(0, 120.0, (256, 64)), torch.zeros(256, 64, dtype=torch.complex64), coloured(1, -200.0, (256, 64)) * 1e25])
+    x = torch.stack(
+        [
+            coloured(0, 120.0, (256, 64)),
+            torch.zeros(256, 64, dtype=torch.complex64),
+            coloured(1, -200.0, (256, 64)) * 1e25,
+        ]
+    )
     estimate = phase_increment(x, PRF)
     alone = phase_increment(x[0], PRF)
     torch.testing.assert_close(estimate["doppler_baseband_hz"][0], alone["doppler_baseband_hz"])
@@ -108,7 +134,9 @@ def test_range_dependent_centroid_follows_a_slope_past_a_bright_outlier() -> Non
     turn = torch.polar(torch.ones(512, 512, dtype=torch.float64), 2 * math.pi * t[:, None] * 60 * u)
     x = coloured(4, 120.0, (512, 512)) * turn.to(torch.complex64)
     x[:, 100:104] += 30 * torch.polar(torch.ones(512), 2 * math.pi * 400 * t.float())[:, None]
-    estimate = RangeDependentCentroid(radar)(Signal(x, radar.raw_axes(512, 512)), doppler_hz=torch.tensor(120.0 - 3 * PRF, dtype=torch.float64))
+    estimate = RangeDependentCentroid(radar)(
+        Signal(x, radar.raw_axes(512, 512)), doppler_hz=torch.tensor(120.0 - 3 * PRF, dtype=torch.float64)
+    )
     error = estimate["doppler_range_hz"] - (120 + 60 * u - 3 * PRF)
     assert float(error.abs().max()) < 12
 
@@ -133,7 +161,9 @@ def test_bounds_have_the_known_values() -> None:
     assert float(reference_doppler_std_hz(1e4, 1.5)) == pytest.approx(1 / 150)
     assert float(velocity_bound_m_s(1e4, 1.0, 7000.0, 0.0937, 700e3)) == pytest.approx(0.0707, rel=0.01)
     cosine = torch.cos(torch.linspace(-math.pi / 2, math.pi / 2, 4001, dtype=torch.float64))
-    assert float(beam_centre_bound_hz(cosine, 1e4, 1494.0, 4000.0)) == pytest.approx(1494 / math.sqrt(2e4) / math.pi, rel=0.01)
+    assert float(beam_centre_bound_hz(cosine, 1e4, 1494.0, 4000.0)) == pytest.approx(
+        1494 / math.sqrt(2e4) / math.pi, rel=0.01
+    )
 
 
 @pytest.mark.parametrize("refine", [parabola_minimum, gradient_minimum])
@@ -159,7 +189,9 @@ def test_centroid_of_points_cut_by_the_ends_of_the_strip(squint: float, ambiguit
     assert estimate["ambiguity"].tolist() == [ambiguity] * 2
     assert (estimate["doppler_hz"] - truth).abs().max() < 5
     blind = phase_increment(recording.signal.data, radar.prf_hz)["doppler_baseband_hz"]
-    assert (estimate["doppler_baseband_hz"] - truth + 4000 * ambiguity).abs().max() < (blind - truth + 4000 * ambiguity).abs().max()
+    assert (estimate["doppler_baseband_hz"] - truth + 4000 * ambiguity).abs().max() < (
+        blind - truth + 4000 * ambiguity
+    ).abs().max()
     exact = torch.rad2deg(torch.asin(radar.sin_squint(truth)))
     assert (estimate["squint_deg"] - exact).abs().max() < 0.01
 
@@ -168,7 +200,10 @@ def test_centroid_of_points_cut_by_the_ends_of_the_strip(squint: float, ambiguit
 def test_velocity_within_a_third_of_a_metre_per_second(off: float) -> None:
     radar = kondor(0.8)
     recording, _ = strip(radar, 4096, 900, trials=1, velocity=7000 + off)
-    chain = Chain(doppler=DopplerCentroid(radar), velocity=use(EffectiveVelocity(OmegaK(radar), refine=parabola_minimum, lines=256), doppler_hz="doppler"))
+    chain = Chain(
+        doppler=DopplerCentroid(radar),
+        velocity=use(EffectiveVelocity(OmegaK(radar), refine=parabola_minimum, lines=256), doppler_hz="doppler"),
+    )
     estimate = chain.trace(recording).estimates["velocity"]
     assert abs(float(estimate["velocity_m_s"]) - 7000 - off) < 0.3
     assert bool(estimate.ok)
@@ -188,7 +223,9 @@ def test_gradient_of_the_objective_is_the_slope_and_both_refinements_agree() -> 
     torch.testing.assert_close(slope, numeric, rtol=1e-4, atol=1e-9)
     signal = recording.signal.with_data(raw)
     by_gradient = stage(signal, doppler_hz=truth)["velocity_m_s"]
-    by_parabola = EffectiveVelocity(OmegaK(radar), lines=128, refine=parabola_minimum)(signal, doppler_hz=truth)["velocity_m_s"]
+    by_parabola = EffectiveVelocity(OmegaK(radar), lines=128, refine=parabola_minimum)(signal, doppler_hz=truth)[
+        "velocity_m_s"
+    ]
     torch.testing.assert_close(by_gradient, by_parabola, atol=0.05, rtol=0)
 
 
@@ -218,9 +255,13 @@ BLOCKS = [
 
 
 @pytest.mark.parametrize(("name", "lines", "columns", "baseband"), BLOCKS)
-def test_recorded_blocks_told_nothing(recorded, name: str, lines: tuple[int, int], columns: tuple[int, int], baseband: float | None) -> None:
+def test_recorded_blocks_told_nothing(
+    recorded, name: str, lines: tuple[int, int], columns: tuple[int, int], baseband: float | None
+) -> None:
     recording = read_stripmap(recorded(name))
-    radar = replace(recording.radar, near_range_m=recording.radar.near_range_m + columns[0] * recording.radar.range_step_m)
+    radar = replace(
+        recording.radar, near_range_m=recording.radar.near_range_m + columns[0] * recording.radar.range_step_m
+    )
     signal = recording.signal.crop(pulse=lines, range=columns)
     doppler = DopplerCentroid(radar)(signal)
     assert bool(doppler.ok)

@@ -1,4 +1,6 @@
-"""Alignment of envelopes: against direct sums, injected shifts, and what it costs and saves on an aircraft (brief 002, section 9)."""
+"""Alignment of envelopes: against direct sums, injected shifts, and what it costs and saves on an
+aircraft (brief 002, section 9).
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchsar.compensate.envelope import AlignEnvelopes, ShiftRange, align_envelopes, align_mean, align_running, drift_cells, refine_alignment, shift_range
+from torchsar.compensate.envelope import (
+    AlignEnvelopes,
+    ShiftRange,
+    align_envelopes,
+    align_mean,
+    align_running,
+    drift_cells,
+    refine_alignment,
+    shift_range,
+)
 from torchsar.compensate.envelope_fit import Envelopes, robust_fit
 from torchsar.compensate.pulse_phase.stages import correct_pulse_phase
 from torchsar.core import Axis, Chain, Draws, Signal, use
@@ -21,7 +32,12 @@ from torchsar.scene import Aircraft, Dechirped, Polynomial, Sinusoid, TurntableW
 
 DOUBLE = torch.complex128
 LADAR = InverseRadar(LIGHT_M_S / 1.55e-6, 150e9, 2000.0, 0.005, 100e-6, 20e3)
-SINGLE = {"running": align_running, "mean": align_mean, "mean of |s|": partial(align_mean, match="amplitude"), "not smoothed": partial(align_envelopes, degree=None)}
+SINGLE = {
+    "running": align_running,
+    "mean": align_mean,
+    "mean of |s|": partial(align_mean, match="amplitude"),
+    "not smoothed": partial(align_envelopes, degree=None),
+}
 METHODS = {**SINGLE, "degree 2": align_envelopes, "two tones": partial(align_envelopes, tones=2)}
 
 
@@ -29,7 +45,9 @@ def circular(*shape: int, seed: int = 0, dtype: torch.dtype = DOUBLE) -> Tensor:
     return torch.randn(*shape, dtype=dtype, generator=torch.Generator().manual_seed(seed))
 
 
-def aircraft(snr_db: float | None = None, trials: int = 2, n_pulse: int = 200, seed: int = 3, dtype: torch.dtype = DOUBLE) -> tuple[Tensor, Tensor]:
+def aircraft(
+    snr_db: float | None = None, trials: int = 2, n_pulse: int = 200, seed: int = 3, dtype: torch.dtype = DOUBLE
+) -> tuple[Tensor, Tensor]:
     """Aligned pulses of random phase (trial, pulse, range), and these phases."""
     world = TurntableWorld(Aircraft(), start_phase=[UniformStartPhase()], snr_db=snr_db)
     recording, truth = simulate_turntable(LADAR, world, n_pulse, 256, Draws(seed, trials=range(trials)), dtype=dtype)
@@ -39,7 +57,10 @@ def aircraft(snr_db: float | None = None, trials: int = 2, n_pulse: int = 200, s
 def rigid(n_pulse: int = 60, n_range: int = 64, trials: int = 2) -> Tensor:
     """The same band-limited profile in every pulse, at a random phase."""
     profile = circular(trials, 1, n_range) * torch.exp(-(((torch.arange(n_range) - n_range / 2) / (n_range / 8)) ** 2))
-    return profile * torch.polar(torch.ones(trials, n_pulse, 1, dtype=torch.float64), 6.3 * torch.rand(trials, n_pulse, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(1)))
+    return profile * torch.polar(
+        torch.ones(trials, n_pulse, 1, dtype=torch.float64),
+        6.3 * torch.rand(trials, n_pulse, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(1)),
+    )
 
 
 def off(found: Tensor, true: Tensor, n: int = 256) -> Tensor:
@@ -94,7 +115,9 @@ def test_correlations_equal_direct_sums() -> None:
     # quarter cells: the likelihood of every shift, sum over cells of -|s|^2 / T
     finer = torch.stack([shift_range(x, -part / 4) for part in range(4)], -1).flatten(-2).abs().square()
     finer = finer / finer.mean(-1, keepdim=True)
-    direct = torch.stack([-(finer.roll(-lag, -1) / finer.mean(-2).clamp_min(0.01)[:, None]).mean(-1) * 24 for lag in range(48)], -1)
+    direct = torch.stack(
+        [-(finer.roll(-lag, -1) / finer.mean(-2).clamp_min(0.01)[:, None]).mean(-1) * 24 for lag in range(48)], -1
+    )
     got = pulses.on_grid(pulses.spectra * pulses.likelihood(pulses.spectra.mean(-2, keepdim=True)).conj(), 4)
     torch.testing.assert_close(got, direct, atol=1e-10 * float(direct.abs().max()), rtol=0)
 
@@ -118,7 +141,10 @@ def test_recovers_shifts_of_a_rigid_profile(method) -> None:
 
 @pytest.mark.parametrize("method", METHODS.values(), ids=list(METHODS))
 def test_batch_equals_singles(method) -> None:
-    x = shift_range(aircraft(5.0, 3, 60)[0], 30 * unit_time(60)) * torch.logspace(0, 6, 3, dtype=torch.float64)[:, None, None]
+    x = (
+        shift_range(aircraft(5.0, 3, 60)[0], 30 * unit_time(60))
+        * torch.logspace(0, 6, 3, dtype=torch.float64)[:, None, None]
+    )
     together = method(x.reshape(3, 1, 60, 256))
     for i in range(3):
         alone = method(x[i])
@@ -130,7 +156,9 @@ def test_batch_equals_singles(method) -> None:
 @pytest.mark.parametrize("method", METHODS.values(), ids=list(METHODS))
 def test_phases_and_gains_of_pulses_change_nothing(method) -> None:
     x = shift_range(aircraft(0.0, 2, 60)[0], 30 * unit_time(60))
-    turned = x * torch.polar(torch.rand(2, 60, 1, dtype=torch.float64) + 0.5, 1e4 * torch.rand(2, 60, 1, dtype=torch.float64))
+    turned = x * torch.polar(
+        torch.rand(2, 60, 1, dtype=torch.float64) + 0.5, 1e4 * torch.rand(2, 60, 1, dtype=torch.float64)
+    )
     torch.testing.assert_close(method(turned)["shift_cells"], method(x)["shift_cells"], atol=1e-8, rtol=0)
 
 
@@ -171,7 +199,9 @@ def test_a_course_over_several_windows_is_found(snr_db: float | None) -> None:
 def test_vibration_is_a_tone() -> None:
     x, _ = aircraft(10.0, 2, 400)
     k = torch.arange(400, dtype=torch.float64)
-    true = 20 * unit_time(400) + 0.8 * torch.sin(2 * math.pi * 0.05 * k + 0.3) + 0.3 * torch.sin(2 * math.pi * 0.0173 * k)
+    true = (
+        20 * unit_time(400) + 0.8 * torch.sin(2 * math.pi * 0.05 * k + 0.3) + 0.3 * torch.sin(2 * math.pi * 0.0173 * k)
+    )
     error = [float(rms(off(align_envelopes(shift_range(x, true), tones=t)["shift_cells"], true)).max()) for t in (0, 2)]
     assert error[1] < 0.05 < 0.4 < error[0]
 
@@ -211,10 +241,16 @@ def test_nothing_stays_finite(method) -> None:
     torch.testing.assert_close(found["shift_cells"][0], method(x[0])["shift_cells"], atol=1e-8, rtol=0)
     for shape in [(1, 16), (2, 4), (3, 5), (7, 1)]:
         small = method(circular(*shape))
-        assert torch.isfinite(small["shift_cells"]).all() and torch.isfinite(small.std["shift_cells"]).all() and small.ok.shape == ()
+        assert (
+            torch.isfinite(small["shift_cells"]).all()
+            and torch.isfinite(small.std["shift_cells"]).all()
+            and small.ok.shape == ()
+        )
 
 
-@pytest.mark.parametrize("method", [*METHODS.values(), lambda x: refine_alignment(x, torch.zeros(5))], ids=[*METHODS, "refine"])
+@pytest.mark.parametrize(
+    "method", [*METHODS.values(), lambda x: refine_alignment(x, torch.zeros(5))], ids=[*METHODS, "refine"]
+)
 def test_bad_input_is_refused(method) -> None:
     x = circular(2, 5, 16)
     x[1, 3, 4] = float("nan")
@@ -248,7 +284,9 @@ def test_robust_fit_ignores_outliers() -> None:
     true = torch.tensor([[1.0, -2.0, 3.0], [0.0, 5.0, 0.5]], dtype=torch.float64)
     values = (basis @ true[..., None]).squeeze(-1)
     values[:, ::4] += 50 * circular(2, 10, seed=5).real
-    torch.testing.assert_close(robust_fit(values, basis, torch.ones(2, 40, dtype=torch.float64)), true, atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        robust_fit(values, basis, torch.ones(2, 40, dtype=torch.float64)), true, atol=1e-6, rtol=0
+    )
 
 
 def test_refinement_by_the_image_finds_a_bent_course() -> None:
@@ -260,8 +298,16 @@ def test_refinement_by_the_image_finds_a_bent_course() -> None:
 
 
 def test_stages_follow_a_target_that_is_tracked_badly() -> None:
-    """Compressed with 100 m/s, flying 100.3 m/s and vibrating: the chain removes the drift and gives the velocity back, with that of the coupling."""
-    world = TurntableWorld(Aircraft(), motion=[Polynomial([100.3, 0.1]), Sinusoid(2e-6, 100.0)], start_phase=[UniformStartPhase()], snr_db=5.0, fidelity=Dechirped([Polynomial([100.0])]))
+    """Compressed with 100 m/s, flying 100.3 m/s and vibrating: the chain removes the drift and
+    gives the velocity back, with that of the coupling.
+    """
+    world = TurntableWorld(
+        Aircraft(),
+        motion=[Polynomial([100.3, 0.1]), Sinusoid(2e-6, 100.0)],
+        start_phase=[UniformStartPhase()],
+        snr_db=5.0,
+        fidelity=Dechirped([Polynomial([100.0])]),
+    )
     recording, truth = simulate_turntable(LADAR, world, 200, 256, Draws(2, trials=range(2)), dtype=DOUBLE)
     used = torch.full((2,), 100.0, dtype=torch.float64)
     chain = Chain(
@@ -272,7 +318,12 @@ def test_stages_follow_a_target_that_is_tracked_badly() -> None:
     trace = chain.trace(recording, given={"aux.velocity_m_s": used})
     assert trace.estimates["align"].ok.all()
     coupled = 2 * 0.1 * LADAR.carrier_hz / LADAR.chirp_rate_hz_s
-    torch.testing.assert_close(trace.values["align.velocity_m_s"], torch.full((2,), 100.3 + 0.1 * 0.1 + coupled, dtype=torch.float64), atol=0.005, rtol=0)
+    torch.testing.assert_close(
+        trace.values["align.velocity_m_s"],
+        torch.full((2,), 100.3 + 0.1 * 0.1 + coupled, dtype=torch.float64),
+        atol=0.005,
+        rtol=0,
+    )
     drift_m = truth.values["displacement_m"] - 100 * torch.arange(200) / 2000
     residual = trace.values["align.shift_m"] - drift_m
     # what is left is the coupling of range and Doppler: acceleration and vibration times f0 / gamma
@@ -289,7 +340,9 @@ def test_stages_count_in_metres() -> None:
     torch.testing.assert_close(found["shift_m"], cells["shift_cells"] * 0.5)
     torch.testing.assert_close(found.std["shift_m"], cells.std["shift_cells"] * 0.5)
     torch.testing.assert_close(found["velocity_m_s"], drift_cells(cells["shift_cells"]) * 0.5 * 2000)
-    torch.testing.assert_close(ShiftRange()(signal, shift_m=found["shift_m"]).data, shift_range(x, -cells["shift_cells"]))
+    torch.testing.assert_close(
+        ShiftRange()(signal, shift_m=found["shift_m"]).data, shift_range(x, -cells["shift_cells"])
+    )
 
 
 @pytest.mark.parametrize("settings", [{}, {"tones": 2}, {"degree": None}])

@@ -15,12 +15,16 @@ from torchsar.metrics.bounds import reference_doppler_std_hz, tone_frequency_bou
 from torchsar.radar import LinearFM, StripmapRadar
 from torchsar.scene import Dwell, Points, StripmapWorld
 
-RADAR = StripmapRadar(3.2e9, LinearFM(50e6, 1e-6), 62.5e6, 1000.0, 7000.0, 700e3, pointing_doppler_hz=652.0, integration_s=0.3)
+RADAR = StripmapRadar(
+    3.2e9, LinearFM(50e6, 1e-6), 62.5e6, 1000.0, 7000.0, 700e3, pointing_doppler_hz=652.0, integration_s=0.3
+)
 
 
 def observed(snr_db: float, doppler_hz: float, trials: int = 60, seed: int = 1):
     world = StripmapWorld(Points([0.0], [0.0], random_phase=True), Dwell(0.3), doppler_hz=doppler_hz, snr_db=snr_db)
-    recording, truth = simulate(RADAR, world, 512, 192, Draws(seed, case=f"{snr_db}/{doppler_hz}", trials=range(trials)))
+    recording, truth = simulate(
+        RADAR, world, 512, 192, Draws(seed, case=f"{snr_db}/{doppler_hz}", trials=range(trials))
+    )
     q = float((target_energy(truth, world, RADAR, 512).sum(-1) / truth.values["noise_std"].square()).mean())
     return PointDoppler(RADAR)(OmegaK(RADAR)(recording.signal)), q
 
@@ -39,7 +43,9 @@ def test_noise_alone_is_not_trusted() -> None:
     noise = Draws(4, trials=range(20)).normal("n", (512, 192), torch.complex64)
     found = PointDoppler(RADAR)(Signal(noise, RADAR.image_axes(RADAR.raw_axes(512, 192))))
     assert int(found.ok.sum()) == 0
-    silent = PointDoppler(RADAR)(Signal(torch.zeros(2, 64, 64, dtype=torch.complex64), RADAR.image_axes(RADAR.raw_axes(64, 64))))
+    silent = PointDoppler(RADAR)(
+        Signal(torch.zeros(2, 64, 64, dtype=torch.complex64), RADAR.image_axes(RADAR.raw_axes(64, 64)))
+    )
     assert not bool(silent.ok.any()) and bool(torch.isfinite(silent["doppler_hz"]).all())
 
 
@@ -49,7 +55,12 @@ def test_doppler_at_inverts_the_place_in_the_image() -> None:
         ahead = velocity * (zero_s - crossing_s)
         doppler = 2 * velocity / RADAR.wavelength_m * ahead / math.hypot(closest_m, ahead)
         for frame_hz in (0.0, 652.0, -900.0):
-            place = RADAR.image_position(torch.tensor(zero_s, dtype=torch.float64), torch.tensor(closest_m, dtype=torch.float64), frame_hz, velocity)
+            place = RADAR.image_position(
+                torch.tensor(zero_s, dtype=torch.float64),
+                torch.tensor(closest_m, dtype=torch.float64),
+                frame_hz,
+                velocity,
+            )
             assert float(doppler_at(RADAR, *place, frame_hz, velocity, crossing_s)) == pytest.approx(doppler, abs=1e-7)
 
 
@@ -63,11 +74,19 @@ def test_a_frame_is_needed() -> None:
 
 @pytest.mark.parametrize("at_m, inside", [(40.0, True), (140.0, True), (-145.0, True), (165.0, False)])
 def test_an_aperture_that_the_record_cuts_is_measured_by_what_is_left_of_it(at_m: float, inside: bool) -> None:
-    """An airborne radar, 307 m of track, 120 m of aperture; the image holds the point at 140 m beyond its end, circularly."""
-    radar = StripmapRadar(9.6e9, LinearFM(60e6, 1.5e-6), 75e6, 400.0, 120.0, 5000.0, pointing_doppler_hz=0.0, integration_s=1.0)
-    world = StripmapWorld(Points([at_m], [0.0], random_phase=True), Dwell(1.0), doppler_hz=math.copysign(37.0, at_m), snr_db=-10.0)
+    """An airborne radar, 307 m of track, 120 m of aperture; the image holds the point at 140 m
+    beyond its end, circularly.
+    """
+    radar = StripmapRadar(
+        9.6e9, LinearFM(60e6, 1.5e-6), 75e6, 400.0, 120.0, 5000.0, pointing_doppler_hz=0.0, integration_s=1.0
+    )
+    world = StripmapWorld(
+        Points([at_m], [0.0], random_phase=True), Dwell(1.0), doppler_hz=math.copysign(37.0, at_m), snr_db=-10.0
+    )
     recording, truth = simulate(radar, world, 1024, 192, Draws(2, case=f"{at_m}", trials=range(30)))
-    found = PointDoppler(radar, crossing_s=float(truth.values["crossing_s"].flatten()[0]))(OmegaK(radar)(recording.signal))
+    found = PointDoppler(radar, crossing_s=float(truth.values["crossing_s"].flatten()[0]))(
+        OmegaK(radar)(recording.signal)
+    )
     q = float((target_energy(truth, world, radar, 1024).sum(-1) / truth.values["noise_std"].square()).mean())
     bound = float(tone_frequency_bound_hz(q, min(1.0, 0.5 + 1.28 - abs(at_m) / 120)))
     rmse = float((found["doppler_hz"] - world.doppler_hz).square().mean().sqrt())

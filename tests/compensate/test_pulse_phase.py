@@ -11,7 +11,23 @@ import torch
 from torch import Tensor
 
 from tests.compensate.scenes import DOUBLE, EQUIVARIANT, METHODS, doppler_image, noisy, still, turned, white
-from torchsar.compensate import Autofocus, CorrectPulsePhase, EntropyFixedPoint, Listed, Measured, Pga, PgaSca, Sca, Shrinking, autofocus, correct_pulse_phase, entropy_fixed_point, pga, pga_sca, sca
+from torchsar.compensate import (
+    Autofocus,
+    CorrectPulsePhase,
+    EntropyFixedPoint,
+    Listed,
+    Measured,
+    Pga,
+    PgaSca,
+    Sca,
+    Shrinking,
+    autofocus,
+    correct_pulse_phase,
+    entropy_fixed_point,
+    pga,
+    pga_sca,
+    sca,
+)
 from torchsar.compensate.pulse_phase.data import without_line
 from torchsar.compensate.pulse_phase.gradient import _centred, _solver, _view, _windowed
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
@@ -49,7 +65,9 @@ def test_pga_and_a_start_at_zero_are_not_equivariant():
 
 @pytest.mark.parametrize("name", EQUIVARIANT)
 def test_constant_and_linear_phases_cannot_be_seen(name):
-    """A constant changes nothing; a line of whole cells moves the image, and the estimate follows it."""
+    """A constant changes nothing; a line of whole cells moves the image, and the estimate follows
+    it.
+    """
     x = noisy(still(1), 20.0)
     line = 1.3 + 2 * math.pi * 7 / 128 * torch.arange(128, dtype=torch.float64)
     plain, moved = METHODS[name](x), METHODS[name](turned(x, line[None]))
@@ -67,10 +85,14 @@ def test_white_phases_are_found(name):
 
 
 def test_methods_rank_as_measured():
-    """SCA leaves much, PGA from it less, the entropy less, the Wiener estimate least; PGA from zero does not find white phases."""
+    """SCA leaves much, PGA from it less, the entropy less, the Wiener estimate least; PGA from zero
+    does not find white phases.
+    """
     x, a = noisy(still(4, per_row=5), 20.0), white(4)
     error = {name: float(phase_rmse(method(turned(x, a))["phase_rad"], a).median()) for name, method in METHODS.items()}
-    assert error["autofocus"] < error["entropy_fixed_point"] < error["pga_sca"] < 0.6 * error["sca"] and error["pga"] > 0.8
+    assert (
+        error["autofocus"] < error["entropy_fixed_point"] < error["pga_sca"] < 0.6 * error["sca"] and error["pga"] > 0.8
+    )
 
 
 # SCA
@@ -95,7 +117,9 @@ def test_sca_bridges_lost_pulses_by_the_product_of_their_neighbours():
         psi[k] = psi[before] + torch.angle((x[k] * x[before].conj()).sum())
     found = sca(x)
     torch.testing.assert_close(found["phase_rad"][kept], psi[kept], atol=1e-12, rtol=0)
-    assert found["phase_rad"][4] == found["phase_rad"][3] and found.info["present"].tolist() == [k in kept for k in range(12)]
+    assert found["phase_rad"][4] == found["phase_rad"][3] and found.info["present"].tolist() == [
+        k in kept for k in range(12)
+    ]
 
 
 # PGA
@@ -155,11 +179,16 @@ def test_pga_equals_its_slow_form(kernel, n_pulse):
 
 def test_pga_sca_is_pga_with_its_kernel_from_sca():
     x = turned(noisy(still(2), 10.0), white(2))
-    torch.testing.assert_close(pga_sca(x)["phase_rad"], pga(x, kernel="ml", start=sca(x)["phase_rad"])["phase_rad"], atol=1e-9, rtol=0)
+    torch.testing.assert_close(
+        pga_sca(x)["phase_rad"], pga(x, kernel="ml", start=sca(x)["phase_rad"])["phase_rad"], atol=1e-9, rtol=0
+    )
 
 
 def test_patience_waits_for_the_window():
-    """Wide windows over clutter blur the image for many iterations; narrow ones then sharpen it. No patience may end the search before."""
+    """Wide windows over clutter blur the image for many iterations; narrow ones then sharpen it.
+
+    No patience may end the search before.
+    """
     a = 0.5 * smooth(256)
     x = turned(noisy(still(1, 256, 100, per_row=1, width=0.9), -8.0), a[None])
     hasty, patient = (pga(x, patience=p) for p in (1, 20))
@@ -169,7 +198,9 @@ def test_patience_waits_for_the_window():
 
 @pytest.mark.parametrize("kernel", ["eigenvector", "synchronised"])
 def test_coherent_kernels_find_the_first_eigenvector(kernel):
-    """One point a row: every row, its peak at zero Doppler, is nearly the same vector of phases times a number; both kernels must say that vector."""
+    """One point a row: every row, its peak at zero Doppler, is nearly the same vector of phases
+    times a number; both kernels must say that vector.
+    """
     a = smooth(64)
     x = noisy(turned(still(1, 64, 32, per_row=1), a[None]), 30.0)
     assert float(phase_rmse(pga(x, kernel=kernel)["phase_rad"][0], a)) < 0.03
@@ -237,7 +268,9 @@ def _one_step(x: Tensor, psi: Tensor, weights) -> Tensor:
 
 @pytest.mark.parametrize("floor", [1e-9, 2.0])
 def test_the_step_points_down_the_entropy(floor):
-    """gradient = -(2 / mean power) |S| sin(step), with S the sum over range that the step is the angle of. floor 1e-9: the entropy itself."""
+    """gradient = -(2 / mean power) |S| sin(step), with S the sum over range that the step is the
+    angle of. floor 1e-9: the entropy itself.
+    """
     x, psi = noisy(still(1, 40, 12), 10.0), white(1, 40).requires_grad_()
     f = doppler_image(x, psi)
     p = f.abs().square() / f.abs().square().mean()
@@ -250,18 +283,29 @@ def test_the_step_points_down_the_entropy(floor):
         q = torch.fft.ifft(torch.log((p / floor).clamp_min(1)) * f, dim=-2, norm="ortho")
         size = (turned(x, -psi) * q.conj()).sum(-1).abs()
         step = _one_step(x, psi, LogAbove(floor))
-        torch.testing.assert_close(-2 / f.abs().square().mean() * size * torch.sin(step), gradient, atol=1e-9, rtol=1e-7)
+        torch.testing.assert_close(
+            -2 / f.abs().square().mean() * size * torch.sin(step), gradient, atol=1e-9, rtol=1e-7
+        )
 
 
 def test_weights_of_the_wrong_sign_blur():
-    """ln p of powers that add up to one is negative, and the iteration then seeks the most entropy."""
+    """ln p of powers that add up to one is negative, and the iteration then seeks the most
+    entropy.
+    """
     x = still(1, 64, 32)
     psi = 0.3 * white(1, 64)
     cells = x[0].numel()
     start = float(entropy(doppler_image(x, psi)))
-    blurred = fixed_point(x.mT.contiguous(), psi, Run(lambda p, mean: torch.log((p / (cells * mean)).clamp_min(1e-300)), AlongPulses(), 12, 1.0, 0.0))[0]
+    blurred = fixed_point(
+        x.mT.contiguous(),
+        psi,
+        Run(lambda p, mean: torch.log((p / (cells * mean)).clamp_min(1e-300)), AlongPulses(), 12, 1.0, 0.0),
+    )[0]
     sharpened = fixed_point(x.mT.contiguous(), psi, Run(LogAbove(2.0), AlongPulses(), 12, 1.0, 0.0))[0]
-    assert float(entropy(doppler_image(x, sharpened))) < start - 0.3 and float(entropy(doppler_image(x, blurred))) > start + 0.3
+    assert (
+        float(entropy(doppler_image(x, sharpened))) < start - 0.3
+        and float(entropy(doppler_image(x, blurred))) > start + 0.3
+    )
 
 
 def test_entropy_falls_with_every_step_above_its_floor():
@@ -298,7 +342,9 @@ def test_transform_along_pulses_and_its_adjoint(oversampling):
 def test_steps_taken_are_counted_and_a_quiet_trial_rests():
     x = still(2)
     x = torch.stack([x[0], turned(x, white(2))[1]])
-    found = autofocus(x, search=60, polish=0, start=torch.stack([autofocus(x)["phase_rad"][0], torch.zeros(128, dtype=torch.float64)]))
+    found = autofocus(
+        x, search=60, polish=0, start=torch.stack([autofocus(x)["phase_rad"][0], torch.zeros(128, dtype=torch.float64)])
+    )
     assert int(found.info["iterations"][0]) < int(found.info["iterations"][1]) <= 60
 
 
@@ -308,8 +354,11 @@ def test_steps_taken_are_counted_and_a_quiet_trial_rests():
 def test_corrector_takes_out_the_phase_and_drops_whole_turns_in_float64():
     x, a = still(2), white(2)
     torch.testing.assert_close(correct_pulse_phase(turned(x, a), a), x, atol=1e-12, rtol=0)
-    turns = 2 * math.pi * torch.round(1e8 * torch.rand(128, dtype=torch.float64))  # a displacement of metres, 1.6e8 rad
-    torch.testing.assert_close(correct_pulse_phase(x.to(torch.complex64), a + turns), turned(x, -a).to(torch.complex64), atol=1e-5, rtol=0)
+    # a displacement of metres, 1.6e8 rad
+    turns = 2 * math.pi * torch.round(1e8 * torch.rand(128, dtype=torch.float64))
+    torch.testing.assert_close(
+        correct_pulse_phase(x.to(torch.complex64), a + turns), turned(x, -a).to(torch.complex64), atol=1e-5, rtol=0
+    )
     one, other = (entropy_fixed_point(x.to(torch.complex64), start=start)["phase_rad"] for start in (a, a + turns))
     assert float(residual_phase(one, other).abs().max()) < 1e-4
     with pytest.raises(ValueError, match=r"\(..., 128\), got \(127,\)"):
@@ -320,14 +369,23 @@ def test_corrector_takes_out_the_phase_and_drops_whole_turns_in_float64():
 def test_an_estimator_and_the_corrector_make_a_chain(stage):
     x = turned(still(2), white(2))
     chain = Chain(find=stage(), correct=use(CorrectPulsePhase(), phase_rad="find.phase_rad"))
-    found = METHODS[{Sca: "sca", PgaSca: "pga_sca", EntropyFixedPoint: "entropy_fixed_point", Autofocus: "autofocus"}[stage]](x)
-    torch.testing.assert_close(chain(Signal(x, RADAR.raw_axes(128, 64))).data, correct_pulse_phase(x, found["phase_rad"]), atol=1e-12, rtol=0)
+    found = METHODS[
+        {Sca: "sca", PgaSca: "pga_sca", EntropyFixedPoint: "entropy_fixed_point", Autofocus: "autofocus"}[stage]
+    ](x)
+    torch.testing.assert_close(
+        chain(Signal(x, RADAR.raw_axes(128, 64))).data, correct_pulse_phase(x, found["phase_rad"]), atol=1e-12, rtol=0
+    )
 
 
 def test_a_start_connects_to_pga():
     x = turned(still(1), white(1))
     chain = Chain(first=Sca(), second=use(Pga(kernel="ml"), start="first.phase_rad"))
-    torch.testing.assert_close(chain.trace(Signal(x, RADAR.raw_axes(128, 64))).values["second.phase_rad"], pga_sca(x)["phase_rad"], atol=1e-9, rtol=0)
+    torch.testing.assert_close(
+        chain.trace(Signal(x, RADAR.raw_axes(128, 64))).values["second.phase_rad"],
+        pga_sca(x)["phase_rad"],
+        atol=1e-9,
+        rtol=0,
+    )
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,6 @@
-"""The autofocus family on data of any scale, with holes, too small, too strong, or of nothing but noise."""
+"""The autofocus family on data of any scale, with holes, too small, too strong, or of nothing but
+noise.
+"""
 
 from __future__ import annotations
 
@@ -24,12 +26,25 @@ def scene(trials: int = 2, snr_db: float = 10.0, **kwargs) -> tuple[Tensor, Tens
 # scale
 
 
-@pytest.mark.parametrize("dtype, scale", [(DOUBLE, 1e160), (DOUBLE, 1e-160), (DOUBLE, 1e300), (DOUBLE, 1e-300), (torch.complex64, 1e25), (torch.complex64, 1e-25), (torch.complex64, 1e-37)])
+@pytest.mark.parametrize(
+    "dtype, scale",
+    [
+        (DOUBLE, 1e160),
+        (DOUBLE, 1e-160),
+        (DOUBLE, 1e300),
+        (DOUBLE, 1e-300),
+        (torch.complex64, 1e25),
+        (torch.complex64, 1e-25),
+        (torch.complex64, 1e-37),
+    ],
+)
 @pytest.mark.parametrize("name", NAMES)
 def test_scale_is_of_no_account(name, dtype, scale):
     x, _ = scene(2, n_pulse=64, n_range=32)
     plain, scaled = METHODS[name](x.to(dtype)), METHODS[name]((x * scale).to(dtype))
-    assert float(residual_phase(scaled["phase_rad"], plain["phase_rad"]).abs().max()) < (1e-5 if dtype == torch.complex64 else 1e-10)
+    assert float(residual_phase(scaled["phase_rad"], plain["phase_rad"]).abs().max()) < (
+        1e-5 if dtype == torch.complex64 else 1e-10
+    )
     assert torch.equal(scaled.ok, plain.ok) and torch.isfinite(scaled.quality).all()
 
 
@@ -38,7 +53,9 @@ def test_single_precision_estimates_as_well(name):
     x, a = scene(2)
     single, double = METHODS[name](x.to(torch.complex64)), METHODS[name](x)
     assert single["phase_rad"].dtype == single.quality.dtype == torch.float32
-    torch.testing.assert_close(phase_rmse(single["phase_rad"], a), phase_rmse(double["phase_rad"], a), atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        phase_rmse(single["phase_rad"], a), phase_rmse(double["phase_rad"], a), atol=1e-4, rtol=0
+    )
 
 
 # what is refused
@@ -68,14 +85,23 @@ def test_an_empty_trial_is_zero_and_leaves_its_neighbours_alone(name):
     x, _ = scene(3, n_pulse=64, n_range=32)
     x[1] = 0
     found, rest = METHODS[name](x), METHODS[name](x[[0, 2]])
-    assert not found["phase_rad"][1].any() and not found.ok[1] and found.quality[1] == 0 and torch.isfinite(found.std["phase_rad"]).all()
+    assert (
+        not found["phase_rad"][1].any()
+        and not found.ok[1]
+        and found.quality[1] == 0
+        and torch.isfinite(found.std["phase_rad"]).all()
+    )
     torch.testing.assert_close(found["phase_rad"][[0, 2]], rest["phase_rad"], atol=1e-12, rtol=0)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_no_trials_make_an_estimate_of_none(name):
     found = METHODS[name](torch.zeros(0, 3, 16, 8, dtype=torch.complex64))
-    assert found["phase_rad"].shape == found.info["present"].shape == (0, 3, 16) and found.ok.shape == found.quality.shape == (0, 3)
+    assert found["phase_rad"].shape == found.info["present"].shape == (
+        0,
+        3,
+        16,
+    ) and found.ok.shape == found.quality.shape == (0, 3)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -95,7 +121,12 @@ def test_rows_of_zeros_are_harmless(name):
 def test_too_few_pulses_give_zero_and_a_warning(name, n_pulse):
     with pytest.warns(UserWarning, match=rf"{n_pulse} pulse\(s\) carry no phase error"):
         found = METHODS[name](noise(3, n_pulse, 8))
-    assert found["phase_rad"].shape == (3, n_pulse) and not found["phase_rad"].any() and not found.ok.any() and not found.quality.any()
+    assert (
+        found["phase_rad"].shape == (3, n_pulse)
+        and not found["phase_rad"].any()
+        and not found.ok.any()
+        and not found.quality.any()
+    )
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -111,7 +142,12 @@ def test_one_row_warns_and_is_never_believed(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_tiny_shapes_keep_theirs(name, shape):
     found = METHODS[name](torch.randn(shape, dtype=torch.complex64, generator=torch.Generator().manual_seed(0)))
-    assert found["phase_rad"].shape == shape[:-1] and found.ok.shape == shape[:-2] and torch.isfinite(found["phase_rad"]).all() and not found.ok.any()
+    assert (
+        found["phase_rad"].shape == shape[:-1]
+        and found.ok.shape == shape[:-2]
+        and torch.isfinite(found["phase_rad"]).all()
+        and not found.ok.any()
+    )
 
 
 def test_one_pulse_or_two_still_carry_gradients():
@@ -156,7 +192,10 @@ def test_lost_pulses_are_bridged(name, where):
 
 
 def test_sca_bridges_where_the_scene_is_coherent_over_the_gap():
-    """The scene fills a fifth of the Doppler band: pulses two apart still look alike. At half of the band they do not, and no product of two pulses bridges."""
+    """The scene fills a fifth of the Doppler band: pulses two apart still look alike.
+
+    At half of the band they do not, and no product of two pulses bridges.
+    """
     x, a = scene(6, 20.0, n_pulse=200, width=0.2)
     whole = float(phase_rmse(sca(x)["phase_rad"], a).median())
     x[:, LOST["ten"]] = 0
@@ -187,11 +226,23 @@ def test_noise_sampled_too_finely_in_range_is_not_believed(name, oversampling):
     spectrum = torch.zeros(8, 96, 160, dtype=torch.complex64)
     spectrum[..., : 160 // oversampling] = noise(8, 96, 160 // oversampling)
     x = torch.fft.ifft(spectrum, dim=-1)
-    torch.testing.assert_close(occupied_band(x.mT), torch.full((8,), 1 / oversampling, dtype=torch.float64), atol=0, rtol=0.05)
+    torch.testing.assert_close(
+        occupied_band(x.mT), torch.full((8,), 1 / oversampling, dtype=torch.float64), atol=0, rtol=0.05
+    )
     assert not METHODS[name](x).ok.any()
 
 
-@pytest.mark.parametrize("kind", ["rows of many levels", "pulses of many levels", "one bright pulse", "one bright sample", "most pulses lost", "7 of 8 pulses lost"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "rows of many levels",
+        "pulses of many levels",
+        "one bright pulse",
+        "one bright sample",
+        "most pulses lost",
+        "7 of 8 pulses lost",
+    ],
+)
 @pytest.mark.parametrize("name", NAMES)
 def test_uneven_noise_is_not_believed(name, kind):
     x = noise(10, 96, 64)
@@ -215,7 +266,9 @@ def test_uneven_noise_is_not_believed(name, kind):
 def test_sharpness_that_noise_is_given(rows):
     """The fitted figure against what the entropy fixed point makes of noise."""
     found = entropy_fixed_point(noise(12, 128, rows, DOUBLE), floors=((2.5, 120),))
-    assert float(found.info["sharpness_nats"].mean() / sharpness_of_noise(torch.tensor(float(rows)))) == pytest.approx(1, abs=0.35)
+    assert float(found.info["sharpness_nats"].mean() / sharpness_of_noise(torch.tensor(float(rows)))) == pytest.approx(
+        1, abs=0.35
+    )
     assert float((found.info["sharpness_nats"] / found.info["noise_sharpness_nats"]).max()) < 1.5
 
 
@@ -240,8 +293,17 @@ def test_a_strong_scatterer_gives_the_phase_away(name, above_db):
 def test_layout_is_of_no_account(name):
     x, _ = scene(2, n_pulse=48, n_range=24)
     expected = METHODS[name](x)["phase_rad"]
-    for other in (x.mT.contiguous().mT, torch.stack([x, x], -1)[..., 0], torch.cat([x, x])[::2][:1].expand(2, -1, -1), x.conj().resolve_conj().conj()):
-        want = expected if other.shape == x.shape and torch.equal(other, x) else METHODS[name](other.resolve_conj().contiguous())["phase_rad"]
+    for other in (
+        x.mT.contiguous().mT,
+        torch.stack([x, x], -1)[..., 0],
+        torch.cat([x, x])[::2][:1].expand(2, -1, -1),
+        x.conj().resolve_conj().conj(),
+    ):
+        want = (
+            expected
+            if other.shape == x.shape and torch.equal(other, x)
+            else METHODS[name](other.resolve_conj().contiguous())["phase_rad"]
+        )
         torch.testing.assert_close(METHODS[name](other)["phase_rad"], want, atol=1e-12, rtol=0)
 
 
@@ -297,7 +359,9 @@ def test_many_tiny_trials(name):
 )
 def test_gradients(find):
     x, _ = scene(2, 20.0, n_pulse=9, n_range=6)
-    assert torch.autograd.gradcheck(lambda data: find(data)["phase_rad"], x.requires_grad_(), fast_mode=True, atol=1e-5, rtol=1e-4)
+    assert torch.autograd.gradcheck(
+        lambda data: find(data)["phase_rad"], x.requires_grad_(), fast_mode=True, atol=1e-5, rtol=1e-4
+    )
 
 
 def test_gradients_through_lost_pulses_and_empty_trials_are_finite():

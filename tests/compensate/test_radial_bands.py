@@ -1,4 +1,6 @@
-"""The window of ranges that estimators work on, the shift that is taken out of it, and the periods that hold an echo."""
+"""The window of ranges that estimators work on, the shift that is taken out of it, and the periods
+that hold an echo.
+"""
 
 from __future__ import annotations
 
@@ -30,9 +32,16 @@ def test_window_lines() -> None:
 
 
 def test_bands_are_the_tone_less_its_shift() -> None:
-    """A scatterer whose velocity is a whole number of bins is the tone of its range in both sweeps, whole powers of two apart."""
+    """A scatterer whose velocity is a whole number of bins is the tone of its range in both sweeps,
+    whole powers of two apart.
+    """
     step = RADAR.ambiguous_velocity_m_s
-    sweeps, _, _ = seen(table1(speed_m_s=0.0), motion=(Polynomial([-7 * step]),), n=9, scene=Points([0.0], [50 * RADAR.range_step_m], [0.7]))
+    sweeps, _, _ = seen(
+        table1(speed_m_s=0.0),
+        motion=(Polynomial([-7 * step]),),
+        n=9,
+        scene=Points([0.0], [50 * RADAR.range_step_m], [0.7]),
+    )
     bands = bands_of(sweeps, table1(speed_m_s=0.0), GATE, taper=0.0, oversampling=2, video=True)
     assert bool((bands.shift == -7).all()) and bool(bands.lit.all()) and bands.up.shape == (9, 128)
     assert bands.noise_lines == 41
@@ -47,20 +56,27 @@ def test_bands_are_the_tone_less_its_shift() -> None:
 def test_filled() -> None:
     values = torch.tensor([[9.0, 1.0, 9.0, 9.0, 4.0, 9.0], [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]], dtype=torch.float64)
     known = torch.tensor([[False, True, False, False, True, False], [False] * 6])
-    torch.testing.assert_close(filled(values, known), torch.tensor([[1.0, 1.0, 2.0, 3.0, 4.0, 4.0], [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]], dtype=torch.float64))
+    torch.testing.assert_close(
+        filled(values, known),
+        torch.tensor([[1.0, 1.0, 2.0, 3.0, 4.0, 4.0], [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]], dtype=torch.float64),
+    )
 
 
 @pytest.mark.parametrize("snr_db", [None, 20.0])
 @pytest.mark.parametrize("name", list(ESTIMATORS))
 def test_periods_without_a_lit_scatterer_are_marked(name, snr_db) -> None:
-    """A beam of 12 urad lights the point for 37 periods; there the velocity is found, elsewhere it is a neighbour's and finite."""
+    """A beam of 12 urad lights the point for 37 periods; there the velocity is found, elsewhere it
+    is a neighbour's and finite.
+    """
     radar = table1(beam_rad=12e-6)
     sweeps, pulse, truth = seen(radar, n=96, snr_db=snr_db, fidelity=LinearInSweep())
     found = ESTIMATORS[name](sweeps, radar, pulse, window_m=GATE)
     lit = found.info["lit"]
     shines = (sweeps.abs().mean(-1) > 0.5).all(-2) if snr_db is None else lit
     assert torch.equal(lit, shines) and 35 <= int(lit.sum()) <= 38
-    assert float((found["velocity_m_s"] - truth.values["velocity_m_s"])[lit].abs().max()) < (6e-3 if snr_db is None and name == "correlation" else 8e-3 if snr_db else 2e-4)
+    assert float((found["velocity_m_s"] - truth.values["velocity_m_s"])[lit].abs().max()) < (
+        6e-3 if snr_db is None and name == "correlation" else 8e-3 if snr_db else 2e-4
+    )
     assert bool(torch.isfinite(found["velocity_m_s"]).all()) and bool(found.ok)
 
 
@@ -71,4 +87,6 @@ def test_few_periods(name, periods) -> None:
     sweeps, pulse, truth = seen(n=periods, motion=COMMON)
     found = ESTIMATORS[name](sweeps, RADAR, pulse, window_m=GATE)
     assert found["velocity_m_s"].shape == (periods,)
-    assert float((found["velocity_m_s"] - truth.values["velocity_m_s"]).abs().max()) < (2e-3 if name == "correlation" else 1e-4)
+    assert float((found["velocity_m_s"] - truth.values["velocity_m_s"]).abs().max()) < (
+        2e-3 if name == "correlation" else 1e-4
+    )

@@ -9,7 +9,14 @@ import torch
 
 from tests.compensate.radials import GATE, rms, seen, without_line
 from tests.echo.ladars import COMMON, direct_sweeps, table1
-from torchsar.compensate.radial import compensate_motion, integrated_range, radial_motion, range_error, sweep_motion, turning_points
+from torchsar.compensate.radial import (
+    compensate_motion,
+    integrated_range,
+    radial_motion,
+    range_error,
+    sweep_motion,
+    turning_points,
+)
 from torchsar.compensate.radial.compensate import polynomial_phasor
 from torchsar.core import Axis, Estimate
 from torchsar.focus import compress_sweeps
@@ -20,7 +27,9 @@ RADAR = table1()
 
 
 def true_motion(radar, n, motion=COMMON):
-    """Velocity at the turning points by automatic differentiation of the displacement, and the displacement at slow times."""
+    """Velocity at the turning points by automatic differentiation of the displacement, and the
+    displacement at slow times.
+    """
     pulse = radar.sweep_axes(n)[1]
     t = turning_points(radar, pulse).values() - pulse.start
     t.requires_grad_()
@@ -46,13 +55,17 @@ def test_sweep_motion_is_the_spline() -> None:
         u = radar.fast_time_axis().values()
         powers = u[:, None] ** torch.arange(5, dtype=torch.float64)
         found = (sweep_motion(v, radar, pulse)[..., None, :] * powers).sum(-1)
-        torch.testing.assert_close(found, integrated_range(v, radar, pulse, sweep_middles(radar, pulse)[..., None] + u), atol=1e-15, rtol=1e-10)
+        torch.testing.assert_close(
+            found, integrated_range(v, radar, pulse, sweep_middles(radar, pulse)[..., None] + u), atol=1e-15, rtol=1e-10
+        )
 
 
 @pytest.mark.parametrize("sign", ["lo_conj_echo", "echo_conj_lo"])
 @pytest.mark.parametrize("motion", [COMMON, (Polynomial([5.0, 100.0]),)])
 def test_moving_sweeps_become_those_at_rest(sign, motion) -> None:
-    """Against direct sums, the range of DR itself taken into account: what stays is the video term 2 K dtau DR / c, and that of DR alone."""
+    """Against direct sums, the range of DR itself taken into account: what stays is the video term
+    2 K dtau DR / c, and that of DR alone.
+    """
     radar = table1(dechirp_sign=sign)
     s = Scatterers(*(torch.tensor([x], dtype=torch.float64) for x in (0.0, 0.0)), torch.ones(1, dtype=torch.complex128))
     moving, still = direct_sweeps(s, radar, 24, motion), direct_sweeps(s, radar, 24)
@@ -62,23 +75,38 @@ def test_moving_sweeps_become_those_at_rest(sign, motion) -> None:
     found = compensate_motion(moving, v, radar, pulse)
     zero = turning_points(radar, pulse).values()[:1]
     constant = 4 * math.pi * float(place(zero)) / radar.wavelength_m * (1 if sign == "lo_conj_echo" else -1)
-    left = torch.angle(found * still.conj() * torch.polar(torch.ones(1, dtype=torch.float64), -torch.tensor([constant], dtype=torch.float64)))
+    left = torch.angle(
+        found
+        * still.conj()
+        * torch.polar(torch.ones(1, dtype=torch.float64), -torch.tensor([constant], dtype=torch.float64))
+    )
     # K (2 DR / c)^2 / 2 turns of video phase; f(u) of the offset at the first turning point
     moved = (place(sweep_middles(radar, pulse)) * 2 / radar.wave_speed_m_s).abs().max()
     video = math.pi * radar.chirp_rate_hz_s * float(moved) ** 2
     band = math.pi * radar.bandwidth_hz * 2 * float(place(zero).abs()) / radar.wave_speed_m_s
     assert float(left.abs().max()) < 1.05 * (video + band) + 1e-6
-    assert float(torch.angle(compensate_motion(moving.to(torch.complex64), v, radar, pulse).to(moving) * found.conj()).abs().max()) < 2e-5
+    assert (
+        float(
+            torch.angle(compensate_motion(moving.to(torch.complex64), v, radar, pulse).to(moving) * found.conj())
+            .abs()
+            .max()
+        )
+        < 2e-5
+    )
 
 
 def test_envelopes_come_along_only_with_f_of_u() -> None:
-    """Erratum 11: at 5 m/s the range moves by 4 cm in 512 periods; the carrier alone leaves the envelopes where they went (peak 274 of 355, exact 352)."""
+    """Erratum 11: at 5 m/s the range moves by 4 cm in 512 periods; the carrier alone leaves the
+    envelopes where they went (peak 274 of 355, exact 352).
+    """
     sweeps, pulse, truth = seen(n=512, motion=(Polynomial([5.0, 100.0]),))
     v = truth.values["velocity_m_s"]
     peak = {}
     for only in (False, True):
         cells = compress_sweeps(compensate_motion(sweeps, v, RADAR, pulse, carrier_only=only), RADAR)
-        turns = torch.fft.fft(cells * torch.polar(torch.ones(512, 1, dtype=torch.float64), -curve(pulse)), dim=0, n=2048)
+        turns = torch.fft.fft(
+            cells * torch.polar(torch.ones(512, 1, dtype=torch.float64), -curve(pulse)), dim=0, n=2048
+        )
         peak[only] = float(turns.abs().max())
     assert peak[False] > 0.955 * 512 * sinc_of_bin() and peak[True] < 0.87 * peak[False]
 
@@ -96,7 +124,9 @@ def sinc_of_bin() -> float:
 
 def test_polynomial_phasor_in_both_precisions_and_under_vmap() -> None:
     g = torch.Generator().manual_seed(1)
-    c = torch.randn(3, 2, 5, 6, dtype=torch.float64, generator=g) * torch.tensor([1e6, 1e8, 1e12, 1e16, 1e20, 1e24], dtype=torch.float64)
+    c = torch.randn(3, 2, 5, 6, dtype=torch.float64, generator=g) * torch.tensor(
+        [1e6, 1e8, 1e12, 1e16, 1e20, 1e24], dtype=torch.float64
+    )
     u = RADAR.fast_time_axis().values()
     turns = sum(c[..., k, None] * u**k for k in range(6))
     true = torch.polar(torch.ones_like(turns), 2 * math.pi * (turns - torch.round(turns)))
@@ -123,17 +153,24 @@ def test_range_error_adds_velocities_and_phases() -> None:
     phase = 4 * math.pi / RADAR.wavelength_m * bump
     one = torch.ones((), dtype=torch.bool)
     both = range_error(Estimate({"velocity_m_s": v, "phase_rad": phase}, one.double(), one), RADAR, pulse, at)
-    torch.testing.assert_close(both, place(at) - place(turning_points(RADAR, pulse).values()[:1]) + bump, atol=1e-12, rtol=0)
+    torch.testing.assert_close(
+        both, place(at) - place(turning_points(RADAR, pulse).values()[:1]) + bump, atol=1e-12, rtol=0
+    )
 
 
 def test_phase_has_the_sign_of_the_range() -> None:
-    """The chain with a wrong sign would double the noise of the velocities instead of removing it."""
+    """The chain with a wrong sign would double the noise of the velocities instead of
+    removing it.
+    """
     sweeps, pulse, truth = seen(n=128, trials=2, snr_db=0.0)
     found = radial_motion(sweeps, RADAR, pulse, window_m=GATE)
     middle = sweep_middles(RADAR, pulse)[0]
     alone = Estimate({"velocity_m_s": found["velocity_m_s"]}, found.quality, found.ok)
     wrong = Estimate({"velocity_m_s": found["velocity_m_s"], "phase_rad": -found["phase_rad"]}, found.quality, found.ok)
-    error = [float(rms(without_line(range_error(e, RADAR, pulse, middle) - truth.values["range_error_up_m"])).mean()) for e in (found, alone, wrong)]
+    error = [
+        float(rms(without_line(range_error(e, RADAR, pulse, middle) - truth.values["range_error_up_m"])).mean())
+        for e in (found, alone, wrong)
+    ]
     assert error[0] < 0.3 * error[1] and error[2] > 1.7 * error[1]
 
 

@@ -1,4 +1,6 @@
-"""What all estimators of the radial velocity have in common, without noise: brief 000, section 11, and its errata."""
+"""What all estimators of the radial velocity have in common, without noise: brief 000, section 11,
+and its errata.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,16 @@ from torchsar.scene import Points, Polynomial
 
 RADAR = table1()
 # rms error without noise, m/s: grids and summed bins leave something, the others next to nothing
-FLOOR = {"segmented": 5e-7, "segmented_sum": 1e-4, "correlation": 2e-3, "peak": 6e-7, "mirror": 3e-6, "mirror_free": 6e-6, "mirror_record": 6e-6, "recommended": 3e-6}
+FLOOR = {
+    "segmented": 5e-7,
+    "segmented_sum": 1e-4,
+    "correlation": 2e-3,
+    "peak": 6e-7,
+    "mirror": 3e-6,
+    "mirror_free": 6e-6,
+    "mirror_record": 6e-6,
+    "recommended": 3e-6,
+}
 IDS = list(ESTIMATORS)
 
 
@@ -28,7 +39,9 @@ def test_without_noise(name, window) -> None:
 
 @pytest.mark.parametrize("name", IDS)
 def test_rest_is_the_geometry(name) -> None:
-    """The echo of a target at rest has the velocity V (V t - x) / R, which azimuth_m takes out: erratum 14."""
+    """The echo of a target at rest has the velocity V (V t - x) / R, which azimuth_m takes out:
+    erratum 14.
+    """
     radar = table1(speed_m_s=600.0)
     sweeps, pulse, _ = seen(radar, motion=(), scene=Points([0.02], [1.5], [1.0]))
     found = ESTIMATORS[name](sweeps, radar, pulse, window_m=GATE, azimuth_m=0.02)
@@ -46,7 +59,10 @@ def test_both_dechirp_signs_are_the_same(name) -> None:
     first, pulse, _ = seen()
     second, _, _ = seen(table1(dechirp_sign="echo_conj_lo"))
     assert torch.equal(second, first.conj())
-    one, two = ESTIMATORS[name](first, RADAR, pulse, window_m=GATE), ESTIMATORS[name](second, table1(dechirp_sign="echo_conj_lo"), pulse, window_m=GATE)
+    one, two = (
+        ESTIMATORS[name](first, RADAR, pulse, window_m=GATE),
+        ESTIMATORS[name](second, table1(dechirp_sign="echo_conj_lo"), pulse, window_m=GATE),
+    )
     for value in one.value:
         torch.testing.assert_close(one[value], two[value], atol=1e-12, rtol=0)
 
@@ -54,7 +70,10 @@ def test_both_dechirp_signs_are_the_same(name) -> None:
 @pytest.mark.parametrize("name", IDS)
 @pytest.mark.parametrize("speed", [0.01, 0.0484, 0.05, 3.0, 12.5, 19.5])
 def test_velocities_to_the_band_limit_and_their_sign(name, speed) -> None:
-    """RD 1.5 m beats at 6.25 MHz; 20 m/s add 25.8 MHz to it, and 32 are there. Beyond lambda fs / 8 = 12.4 m/s the tone of a mirror product would fold, but for the shift."""
+    """RD 1.5 m beats at 6.25 MHz; 20 m/s add 25.8 MHz to it, and 32 are there.
+
+    Beyond lambda fs / 8 = 12.4 m/s the tone of a mirror product would fold, but for the shift.
+    """
     for sign in (1, -1):
         sweeps, pulse, truth = seen(motion=(Polynomial([sign * speed]),), n=16)
         assert float(velocity_rms(ESTIMATORS[name](sweeps, RADAR, pulse, window_m=GATE), truth)) < 2 * FLOOR[name]
@@ -62,14 +81,18 @@ def test_velocities_to_the_band_limit_and_their_sign(name, speed) -> None:
 
 @pytest.mark.parametrize("name", ["segmented", "peak"])
 def test_the_factor_of_the_band(name) -> None:
-    """Without 1 + B / 2 fc the error is 1.29e-5 of the velocity: below 1e-5 m/s here, and below 2e-6 with it (erratum 8)."""
+    """Without 1 + B / 2 fc the error is 1.29e-5 of the velocity: below 1e-5 m/s here, and below
+    2e-6 with it (erratum 8).
+    """
     sweeps, pulse, truth = seen()
     factor = 1 + RADAR.bandwidth_hz / (2 * RADAR.carrier_hz)
     assert factor - 1 == pytest.approx(1.29e-5, rel=0.01)
     found, true = ESTIMATORS[name](sweeps, RADAR, pulse, window_m=GATE)["velocity_m_s"], truth.values["velocity_m_s"]
     assert 2e-6 < float((found / factor - true).abs().max()) < 1e-5 and float((found - true).abs().max()) < 2e-6
     bands = type("Bands", (), {"radar": RADAR, "shift": torch.zeros(1, dtype=torch.int64)})
-    one_bin = from_beats(torch.ones(1, dtype=torch.float64) / RADAR.sweep_s, -torch.ones(1, dtype=torch.float64) / RADAR.sweep_s, bands)
+    one_bin = from_beats(
+        torch.ones(1, dtype=torch.float64) / RADAR.sweep_s, -torch.ones(1, dtype=torch.float64) / RADAR.sweep_s, bands
+    )
     assert float(one_bin) == pytest.approx(RADAR.wavelength_m / (2 * RADAR.sweep_s) * factor, rel=1e-12)
 
 
@@ -78,7 +101,14 @@ def test_batch_equals_singles_and_ignores_loud_neighbours(name) -> None:
     """Over blocks of trials, and beside trials of other levels, other velocities, and garbage."""
     sweeps, pulse, _ = seen(trials=3, snr_db=10.0, n=24, dtype=torch.complex64)
     g = torch.Generator().manual_seed(0)
-    others = torch.stack([1e25 * torch.randn(sweeps[0].shape, dtype=sweeps.dtype, generator=g), 0 * sweeps[0], 1e-28 * sweeps[1], 1e6 * sweeps[2].roll(7, -1).conj()])
+    others = torch.stack(
+        [
+            1e25 * torch.randn(sweeps[0].shape, dtype=sweeps.dtype, generator=g),
+            0 * sweeps[0],
+            1e-28 * sweeps[1],
+            1e6 * sweeps[2].roll(7, -1).conj(),
+        ]
+    )
     batch = torch.cat([sweeps, others]).reshape(1, 7, *sweeps.shape[1:]).expand(6, -1, -1, -1, -1)
     x = 0.01 * torch.arange(42, dtype=torch.float64).reshape(6, 7)
     together = ESTIMATORS[name](batch, RADAR, pulse, window_m=GATE, azimuth_m=x)
@@ -86,8 +116,13 @@ def test_batch_equals_singles_and_ignores_loud_neighbours(name) -> None:
         alone = ESTIMATORS[name](sweeps[i], RADAR, pulse, window_m=GATE, azimuth_m=float(x[4, i]))
         for key, value in {**alone.value, **alone.std, "ok": alone.ok, **alone.info}.items():
             whole = {**together.value, **together.std, "ok": together.ok, **together.info}[key]
-            torch.testing.assert_close(whole[4, i], value, atol=1e-4 if key in ("phase_rad", "weights", "std", "snr_db") else 1e-6, rtol=1e-5)
-    assert all(bool(torch.isfinite(v.double()).all()) for v in (*together.value.values(), *together.info.values(), *together.std.values()))
+            torch.testing.assert_close(
+                whole[4, i], value, atol=1e-4 if key in ("phase_rad", "weights", "std", "snr_db") else 1e-6, rtol=1e-5
+            )
+    assert all(
+        bool(torch.isfinite(v.double()).all())
+        for v in (*together.value.values(), *together.info.values(), *together.std.values())
+    )
     assert not bool(together.ok[:, 3:5].any())
 
 
@@ -109,16 +144,29 @@ def test_refusals(name) -> None:
         estimator(sweeps[..., :-1], RADAR, pulse)
     with pytest.raises(ValueError, match="up before down, got shape"):
         estimator(sweeps[0], RADAR, pulse)
-    for window, said in (((2.0, 1.0), "low < high"), ((0.0, 9.0), "beyond the beat band"), ((1.5, 1.55), "4 cells or wider")):
+    for window, said in (
+        ((2.0, 1.0), "low < high"),
+        ((0.0, 9.0), "beyond the beat band"),
+        ((1.5, 1.55), "4 cells or wider"),
+    ):
         with pytest.raises(ValueError, match=said):
             estimator(sweeps, RADAR, pulse, window_m=window)
 
 
 def test_a_velocity_that_rises_steeply_is_followed_to_the_ends() -> None:
-    """The shift of blocks of 8 periods goes on along a line to the ends of the record, whose last block is short."""
+    """The shift of blocks of 8 periods goes on along a line to the ends of the record, whose last
+    block is short.
+    """
     sweeps, pulse, truth = seen(motion=(Polynomial([-1.5, 1500.0]),), n=69, scene=ONE)
     for name in ("segmented_sum", "mirror", "peak"):
-        assert float((ESTIMATORS[name](sweeps, RADAR, pulse, window_m=GATE)["velocity_m_s"] - truth.values["velocity_m_s"]).abs().max()) < 5e-4, name
+        assert (
+            float(
+                (ESTIMATORS[name](sweeps, RADAR, pulse, window_m=GATE)["velocity_m_s"] - truth.values["velocity_m_s"])
+                .abs()
+                .max()
+            )
+            < 5e-4
+        ), name
 
 
 def test_common_motion_is_not_trivial() -> None:

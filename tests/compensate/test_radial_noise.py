@@ -1,4 +1,6 @@
-"""Estimators of the radial velocity in noise: against the bounds and the table of brief 000 (sections 6 and 8D), at few trials."""
+"""Estimators of the radial velocity in noise: against the bounds and the table of brief 000
+(sections 6 and 8D), at few trials.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,12 @@ import torch
 from tests.compensate.radials import ESTIMATORS, range_rms, seen, velocity_rms
 from tests.echo.ladars import table1
 from torchsar.compensate.radial import radial_motion
-from torchsar.metrics.ladar_bounds import integrated_range_detrended_bound_m, range_per_sweep_bound_m, velocity_free_offset_bound_m_s, velocity_known_offset_bound_m_s
+from torchsar.metrics.ladar_bounds import (
+    integrated_range_detrended_bound_m,
+    range_per_sweep_bound_m,
+    velocity_free_offset_bound_m_s,
+    velocity_known_offset_bound_m_s,
+)
 from torchsar.scene import LinearInSweep
 
 RADAR = table1()
@@ -35,7 +42,9 @@ def noisy(snr_db: float, n: int = 256, trials: int = 8, seed: int = 1):
 
 @pytest.mark.parametrize("snr_db", [-10, 0, 10, 30])
 def test_the_table_of_the_brief(snr_db) -> None:
-    """Medians over records of the rms error, within a fifth of the brief's or better; promised deviations within a fifth; the chain's range near the bound of one sweep's phase."""
+    """Medians over records of the rms error, within a fifth of the brief's or better; promised
+    deviations within a fifth; the chain's range near the bound of one sweep's phase.
+    """
     sweeps, pulse, truth = noisy(snr_db)
     for name, row in TABLE.items():
         found = ESTIMATORS[name](sweeps, RADAR, pulse, window_m=GATE)
@@ -47,14 +56,21 @@ def test_the_table_of_the_brief(snr_db) -> None:
     chain = 1e9 * float(range_rms(motion, truth, RADAR, pulse).median())
     phase = 1e9 * float(range_per_sweep_bound_m(10 ** (snr_db / 10), RADAR.sweep_samples, RADAR.wavelength_m))
     assert chain < 1.2 * CHAIN_NM[snr_db] and (snr_db > 20 or chain < 1.15 * phase)
-    assert float(motion.std["phase_rad"].median()) * RADAR.wavelength_m / (4 * torch.pi) * 1e9 == pytest.approx(phase, rel=0.2)
+    assert float(motion.std["phase_rad"].median()) * RADAR.wavelength_m / (4 * torch.pi) * 1e9 == pytest.approx(
+        phase, rel=0.2
+    )
 
 
 @pytest.mark.parametrize("snr_db", [-5, 0, 10, 15])
 def test_distance_from_the_bounds(snr_db) -> None:
-    """Segmented 4/3 in variance, peaks on the free bound, the mirror product with known offset near its own (section 11)."""
+    """Segmented 4/3 in variance, peaks on the free bound, the mirror product with known offset near
+    its own (section 11).
+    """
     sweeps, pulse, truth = noisy(snr_db, trials=16)
-    error = {name: float(velocity_rms(ESTIMATORS[name](sweeps, RADAR, pulse, window_m=GATE), truth).square().mean().sqrt()) for name in ("segmented", "peak", "mirror")}
+    error = {
+        name: float(velocity_rms(ESTIMATORS[name](sweeps, RADAR, pulse, window_m=GATE), truth).square().mean().sqrt())
+        for name in ("segmented", "peak", "mirror")
+    }
     assert error["mirror"] / bound(snr_db, known=True) == pytest.approx(1.04, abs=0.1)
     if snr_db >= 0:
         assert error["peak"] / bound(snr_db) == pytest.approx(1, abs=0.06)
@@ -69,13 +85,17 @@ def test_integrated_velocities_walk_and_the_chain_does_not() -> None:
         found = radial_motion(sweeps, RADAR, pulse, window_m=GATE)
         alone = type(found)({"velocity_m_s": found["velocity_m_s"]}, found.quality, found.ok)
         rms[n] = [float(range_rms(e, truth, RADAR, pulse).square().mean().sqrt()) for e in (alone, found)]
-        assert rms[n][0] == pytest.approx(float(integrated_range_detrended_bound_m(bound(10, known=True), pulse.step, n)), rel=0.35)
+        assert rms[n][0] == pytest.approx(
+            float(integrated_range_detrended_bound_m(bound(10, known=True), pulse.step, n)), rel=0.35
+        )
     assert rms[1024][0] / rms[128][0] == pytest.approx(8**0.5, rel=0.35)
     assert rms[1024][1] < 1.1 * rms[128][1] and rms[1024][1] < 1.5e-9
 
 
 def test_the_chain_survives_walks_of_radians() -> None:
-    """At -10 dB velocities integrate to more than a radian: a start by PGA keeps the polish from images of two peaks."""
+    """At -10 dB velocities integrate to more than a radian: a start by PGA keeps the polish from
+    images of two peaks.
+    """
     sweeps, pulse, truth = noisy(-8, trials=16)
     found = radial_motion(sweeps, RADAR, pulse, window_m=GATE)
     assert bool(found.ok.all()) and float(range_rms(found, truth, RADAR, pulse).max()) < 15e-9

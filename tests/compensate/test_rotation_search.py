@@ -36,7 +36,17 @@ RANGE_M = CELL * (torch.arange(BINS, dtype=F64) - BINS // 2)
 RADAR = InverseRadar(LIGHT_M_S / WAVELENGTH, LIGHT_M_S / (2 * CELL), PRF)
 
 
-def echo(x: Tensor, y: Tensor, amplitude: Tensor, n_pulse: int, prf_hz: float, range_m: Tensor, cell_m: float, yc_m: float = 0.0, k: Tensor = K) -> Tensor:
+def echo(
+    x: Tensor,
+    y: Tensor,
+    amplitude: Tensor,
+    n_pulse: int,
+    prf_hz: float,
+    range_m: Tensor,
+    cell_m: float,
+    yc_m: float = 0.0,
+    k: Tensor = K,
+) -> Tensor:
     """Eq. (3) of brief 003 with exact sine and cosine, (pulse, range)."""
     angle = OMEGA * warp(torch.arange(n_pulse, dtype=F64) / prf_hz, k)
     path = x[:, None] * torch.sin(angle) + (y + yc_m)[:, None] * (torch.cos(angle) - 1)
@@ -54,7 +64,9 @@ def target(seed: int = 0, yc_m: float = 0.0, k: Tensor = K, snr_db: float = 20.0
 
 
 def figure(data: Tensor, **options) -> ImageEntropy:
-    return ImageEntropy(data, wavelength_m=WAVELENGTH, prf_hz=PRF, range_m=RANGE_M, **{"oversampling": 4.0, "taps": 8, **options})
+    return ImageEntropy(
+        data, wavelength_m=WAVELENGTH, prf_hz=PRF, range_m=RANGE_M, **{"oversampling": 4.0, "taps": 8, **options}
+    )
 
 
 def signal_of(data: Tensor) -> Signal:
@@ -76,7 +88,9 @@ def test_the_objective_is_the_entropy_of_the_image() -> None:
     image = torch.exp(2j * math.pi * cells[:, None] * phi / total) @ flat
     found = figure(data, yc_m=0.7, oversampling=2.0, lines=300, taps=12)(TRUTH[None])
     torch.testing.assert_close(found[0], entropy(image), atol=1e-7, rtol=0)
-    searched = figure(data, yc_m=None, oversampling=2.0, lines=300, taps=12)(torch.cat([TRUTH, torch.tensor([0.7], dtype=F64)])[None])
+    searched = figure(data, yc_m=None, oversampling=2.0, lines=300, taps=12)(
+        torch.cat([TRUTH, torch.tensor([0.7], dtype=F64)])[None]
+    )
     torch.testing.assert_close(searched, found, atol=1e-12, rtol=0)
 
 
@@ -110,7 +124,11 @@ def test_impossible_candidates_cost_infinity() -> None:
     for variables in ("raw", "shape"):
         of = figure(target(), variables=variables)
         good = of.start(OMEGA, K)
-        folded = torch.tensor([OMEGA, -100.0, 2000.0], dtype=F64) if variables == "raw" else torch.tensor([4e-4, 2.0, 0.0], dtype=F64)
+        folded = (
+            torch.tensor([OMEGA, -100.0, 2000.0], dtype=F64)
+            if variables == "raw"
+            else torch.tensor([4e-4, 2.0, 0.0], dtype=F64)
+        )
         costs = of(torch.stack([good, folded, torch.full_like(good, torch.nan), good]))
         assert torch.isfinite(costs).tolist() == [True, False, False, True] and not torch.isnan(costs).any()
         assert torch.isfinite(of.with_gradient(folded)[1]).all()
@@ -181,7 +199,10 @@ def test_the_grid_is_a_landscape() -> None:
 
 def test_the_centre_deviation_is_searched_for_jointly() -> None:
     data = target(yc_m=1.5)
-    blind, told, joint = (descend_rotation(of, of.start(OMEGA, K)) for of in (figure(data, variables="shape", yc_m=yc) for yc in (0.0, 1.5, None)))
+    blind, told, joint = (
+        descend_rotation(of, of.start(OMEGA, K))
+        for of in (figure(data, variables="shape", yc_m=yc) for yc in (0.0, 1.5, None))
+    )
     assert joint.info["entropy_nats"] < blind.info["entropy_nats"] - 5e-3
     assert abs(float(joint["yc_m"]) - 1.5) < 0.3 and told["yc_m"] == 1.5 and blind["yc_m"] == 0
 
@@ -189,7 +210,15 @@ def test_the_centre_deviation_is_searched_for_jointly() -> None:
 def test_second_order_finds_the_middle_rate() -> None:
     """SM on the three points of experiment 1: not k1 = 10 but about k1 + k2 T / 2 = 20."""
     one = torch.tensor([0.0], dtype=F64)
-    data = echo(torch.tensor([-12.0, 0.0, 12.0], dtype=F64), torch.full((3,), 12.0, dtype=F64), torch.ones(3, dtype=torch.complex128), 20000, 1e6, one + 12.0, 1.0)
+    data = echo(
+        torch.tensor([-12.0, 0.0, 12.0], dtype=F64),
+        torch.full((3,), 12.0, dtype=F64),
+        torch.ones(3, dtype=torch.complex128),
+        20000,
+        1e6,
+        one + 12.0,
+        1.0,
+    )
     of = ImageEntropy(data, wavelength_m=WAVELENGTH, prf_hz=1e6, range_m=one, order=2, range_term=False)
     coarse = search_rotation(of, [torch.linspace(0, 40, 41, dtype=F64)])
     found = descend_rotation(of, of.start(0.0, coarse["warp_k"]))
@@ -211,13 +240,19 @@ def test_a_batch_equals_its_singles() -> None:
         "descent": lambda of: descend_rotation(of, of.start(OMEGA, 0.95 * K), steps=5),
         "newton": lambda of: newton_rotation(of, of.start(OMEGA, 0.95 * K), steps=3),
         "grid": lambda of: search_rotation(of, [[OMEGA], [9.0, 10.0, 11.0], [900.0, 1000.0, 1100.0]]),
-        "genetic": lambda of: genetic_rotation(of, 0.9 * TRUTH, 1.1 * TRUTH, draws=Draws(2), population=6, generations=2),
-        "evolution": lambda of: evolve_rotation(of, 0.9 * TRUTH, 1.1 * TRUTH, draws=Draws(2), population=6, generations=2),
+        "genetic": lambda of: genetic_rotation(
+            of, 0.9 * TRUTH, 1.1 * TRUTH, draws=Draws(2), population=6, generations=2
+        ),
+        "evolution": lambda of: evolve_rotation(
+            of, 0.9 * TRUTH, 1.1 * TRUTH, draws=Draws(2), population=6, generations=2
+        ),
     }
     for name, search in kinds.items():
         together = search(figure(data, oversampling=2.0))
         for i in range(3):
-            equal(search(figure(data[i], oversampling=2.0)), together, i, 1e-3 if name in ("descent", "newton") else 1e-9)
+            equal(
+                search(figure(data[i], oversampling=2.0)), together, i, 1e-3 if name in ("descent", "newton") else 1e-9
+            )
 
 
 def stages() -> list:

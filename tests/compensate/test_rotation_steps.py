@@ -1,4 +1,6 @@
-"""The mathematics below the estimators of uneven rotation, against automatic differentiation and plain sums."""
+"""The mathematics below the estimators of uneven rotation, against automatic differentiation and
+plain sums.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,21 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.compensate.turning import CELL, F64, OMEGA, PRF, PULSES, RANGE_M, WAVELENGTH, K, echo, noise, points, response, target
+from tests.compensate.turning import (
+    CELL,
+    F64,
+    OMEGA,
+    PRF,
+    PULSES,
+    RANGE_M,
+    WAVELENGTH,
+    K,
+    echo,
+    noise,
+    points,
+    response,
+    target,
+)
 from torchsar.compensate.rotation.histories import refined_by_histories, solved
 from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_of, without_range_term
 from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshold
@@ -42,7 +58,9 @@ def test_the_range_term_is_taken_out() -> None:
     phi = warp(TIME, K)
     lever = RANGE_M + 1.5 + 0.5  # v = w / 2
     expected = data * torch.exp(-2j * math.pi / WAVELENGTH * lever * 4e-4 * phi[:, None].square())
-    torch.testing.assert_close(without_range_term(data[None], SAMPLING, motion, phi[None])[0], expected, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(
+        without_range_term(data[None], SAMPLING, motion, phi[None])[0], expected, rtol=1e-9, atol=1e-9
+    )
     torch.testing.assert_close(motion.yc_m, torch.tensor([2.0], dtype=F64))
     unknown = Motion(K[None], *torch.tensor([[-1e-9], [2e-4], [1.5]], dtype=F64))
     assert unknown.yc_m == 1.5 and 0 <= unknown.omega_rad_s < 1e-100
@@ -66,7 +84,9 @@ def test_noise_power_and_threshold() -> None:
     above = (power > threshold(power)).flatten(1).any(1).sum()
     assert above <= 6, "pixels of noise exceed the threshold once in some ten images"
     power[0, :50] += 1e6
-    assert abs(float(noise_power(3.0 * power)[0]) / 3 - 1) < 0.25, "a tenth of the image full of scatterers moves the median a little"
+    assert abs(float(noise_power(3.0 * power)[0]) / 3 - 1) < 0.25, (
+        "a tenth of the image full of scatterers moves the median a little"
+    )
 
 
 def test_peaks_against_a_plain_search() -> None:
@@ -87,7 +107,11 @@ def plain_peaks(power: Tensor, floor: float, share: float, lines: int, cells: in
     for i in range(power.shape[0]):
         for j in range(power.shape[1]):
             level = power[i, j]
-            cross = [power[a, b] for a, b in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)) if 0 <= a < power.shape[0] and 0 <= b < power.shape[1]]
+            cross = [
+                power[a, b]
+                for a, b in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1))
+                if 0 <= a < power.shape[0] and 0 <= b < power.shape[1]
+            ]
             around = power[max(0, i - lines) : i + lines + 1, max(0, j - cells) : j + cells + 1].max()
             if level > floor and all(level > other for other in cross) and level >= share * around:
                 found.append((i, j))
@@ -96,7 +120,9 @@ def plain_peaks(power: Tensor, floor: float, share: float, lines: int, cells: in
 
 @pytest.mark.parametrize("error", [(1.0, -60.0), (-2.0, 60.0)])
 def test_histories_correct_an_error(error: tuple[float, float]) -> None:
-    """One step takes out most of an error as of the coarse warp, and finds a rate that was not known."""
+    """One step takes out most of an error as of the coarse warp, and finds a rate that was not
+    known.
+    """
     data, motion = target(0)[None], Motion.still((K + torch.tensor(error, dtype=F64))[None])
     offset = (motion.k[0] - K).abs()
     once, found = refined_by_histories(data, SAMPLING, motion)
@@ -109,7 +135,11 @@ def test_histories_correct_an_error(error: tuple[float, float]) -> None:
 def test_a_range_term_that_pulses_cannot_follow_is_impossible() -> None:
     still, wild, broken = Motion.still(K[None]), truth(), truth()
     assert still.possible(SAMPLING) and truth().possible(SAMPLING) and truth(centre_m=-50.0).possible(SAMPLING)
-    for motion in (Motion(wild.k, 1e3 * wild.w, wild.v, wild.centre_m), Motion(wild.k, wild.w, wild.v - 5.0, wild.centre_m), Motion(broken.k * math.nan, broken.w, broken.v, broken.centre_m)):
+    for motion in (
+        Motion(wild.k, 1e3 * wild.w, wild.v, wild.centre_m),
+        Motion(wild.k, wild.w, wild.v - 5.0, wild.centre_m),
+        Motion(broken.k * math.nan, broken.w, broken.v, broken.centre_m),
+    ):
         assert not motion.possible(SAMPLING)
 
 
@@ -121,10 +151,17 @@ def test_histories_of_nothing_leave_the_motion() -> None:
 
 
 def test_small_equations_of_any_scale() -> None:
-    rows = torch.randn(3, 10, 4, dtype=F64, generator=torch.Generator().manual_seed(0)) * torch.tensor([1e-9, 1.0, 1e6, 1e3], dtype=F64)
+    rows = torch.randn(3, 10, 4, dtype=F64, generator=torch.Generator().manual_seed(0)) * torch.tensor(
+        [1e-9, 1.0, 1e6, 1e3], dtype=F64
+    )
     answer = torch.tensor([1e9, 2.0, 3e-6, 0.0], dtype=F64)
     rows[:, :, 3] = 0
-    torch.testing.assert_close(solved(rows.mT @ rows, (rows.mT @ (rows @ answer)[..., None])[..., 0]), answer.expand(3, -1), rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(
+        solved(rows.mT @ rows, (rows.mT @ (rows @ answer)[..., None])[..., 0]),
+        answer.expand(3, -1),
+        rtol=1e-6,
+        atol=1e-9,
+    )
 
 
 CELLS, SHORT = 16, 96
@@ -136,22 +173,32 @@ def few() -> tuple[Scatterers, Motion]:
     """Six scatterers that overlap, their Doppler cells on the steps of the table of couplings."""
     source = torch.Generator().manual_seed(3)
     level, phase, cell, row = (torch.rand(1, FEW, dtype=F64, generator=source) for _ in range(4))
-    motion = Motion(K[None], *torch.tensor([[1e-7], [1e-4], [0.7]], dtype=F64))  # couplings leave out that range terms differ between cells
+    motion = Motion(
+        K[None], *torch.tensor([[1e-7], [1e-4], [0.7]], dtype=F64)
+    )  # couplings leave out that range terms differ between cells
     return Scatterers(torch.polar(0.5 + level, 6 * phase), (6 * 16 * (cell - 0.5)).round() / 16, 5 + 4 * row), motion
 
 
 def model(unknown: Tensor, found: Scatterers, motion: Motion) -> Tensor:
-    """Data of scatterers whose growth, turn, Doppler cell and row, and whose k, w and v, move by `unknown`.
+    """Data of scatterers whose growth, turn, Doppler cell and row, and whose k, w and v, move by
+    `unknown`.
 
     As a step takes it, the range term stays that of the first rows and of the first warp.
     """
     grow, turn, line, row = unknown[: 4 * FEW].view(4, FEW)
-    k, w, v = motion.k[0] + unknown[4 * FEW : -2], motion.w + unknown[-2], motion.offset + motion.centre_m * unknown[-2] + unknown[-1]
+    k, w, v = (
+        motion.k[0] + unknown[4 * FEW : -2],
+        motion.w + unknown[-2],
+        motion.offset + motion.centre_m * unknown[-2] + unknown[-1],
+    )
     time = torch.arange(SHORT, dtype=F64) / SMALL.prf_hz
     phi = warp(time, k)
     u = phi / warp(torch.tensor([SMALL.duration_s], dtype=F64), k)
     range_m = SMALL.first_m + SMALL.step_m * found.row[0]
-    turns = -(found.cell[0] + line) * u[:, None] + (w * range_m + v) * warp(time, motion.k[0])[:, None].square() / WAVELENGTH
+    turns = (
+        -(found.cell[0] + line) * u[:, None]
+        + (w * range_m + v) * warp(time, motion.k[0])[:, None].square() / WAVELENGTH
+    )
     amplitude = found.amplitude[0] * torch.complex(1 + grow, turn)
     profile = response(torch.arange(CELLS, dtype=F64) - (found.row[0] + row)[:, None], CELLS)
     return torch.view_as_real((torch.exp(2j * math.pi * turns) * amplitude) @ profile)
@@ -160,7 +207,15 @@ def model(unknown: Tensor, found: Scatterers, motion: Motion) -> Tensor:
 def step_of(data: Tensor, present: Tensor) -> tuple[Tensor, _Step]:
     found, motion = few()
     none = torch.zeros(1, dtype=torch.bool)
-    fit = Fit(motion, found, torch.zeros(1, 4, 4, dtype=F64), torch.ones(1, dtype=F64), none.long(), none, torch.zeros(1, dtype=F64))
+    fit = Fit(
+        motion,
+        found,
+        torch.zeros(1, 4, 4, dtype=F64),
+        torch.ones(1, dtype=F64),
+        none.long(),
+        none,
+        torch.zeros(1, dtype=F64),
+    )
     return _Step.of(data, SMALL, fit, present, _Unknowns(2, True))
 
 
@@ -174,14 +229,29 @@ def test_gradient_and_curvature_of_a_step_are_those_of_the_model(gaps: bool) -> 
     data = data * present[..., None]
     residual, step = step_of(data, present)
     expected = torch.view_as_real(residual[0])
-    torch.testing.assert_close(expected, (torch.view_as_real(data[0]) - model(zero, found, motion)) * present[0, :, None, None], atol=1e-9, rtol=0)
+    torch.testing.assert_close(
+        expected,
+        (torch.view_as_real(data[0]) - model(zero, found, motion)) * present[0, :, None, None],
+        atol=1e-9,
+        rtol=0,
+    )
     jacobian = torch.func.jacfwd(lambda x: model(x, found, motion))(zero) * present[0, :, None, None, None]
     gradient = (jacobian * expected[..., None]).sum((0, 1, 2))
     slopes = step._slopes()
     turned = found.amplitude.conj()[..., None] * step.moments
-    own = torch.cat([turned[..., 0].real, turned[..., 0].imag, -2 * math.pi * turned[..., 1].imag, (found.amplitude.conj() * step.shift).real], -1)
+    own = torch.cat(
+        [
+            turned[..., 0].real,
+            turned[..., 0].imag,
+            -2 * math.pi * turned[..., 1].imag,
+            (found.amplitude.conj() * step.shift).real,
+        ],
+        -1,
+    )
     torch.testing.assert_close(own[0], gradient[: 4 * FEW], rtol=1e-6, atol=1e-6)
-    torch.testing.assert_close(torch.einsum("bpin,bpn->bi", slopes, turned.imag)[0], gradient[4 * FEW :], rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(
+        torch.einsum("bpin,bpn->bi", slopes, turned.imag)[0], gradient[4 * FEW :], rtol=1e-6, atol=1e-9
+    )
     flat = jacobian.flatten(0, 2)
     local, (cross, shared) = step._local(), step._shared(slopes)
     local = local[0] - torch.diag(local[0].diagonal() * _RIDGE / (1 + _RIDGE))
@@ -198,7 +268,15 @@ def test_steps_explain_all_of_clean_data() -> None:
     present, none = torch.ones(1, SHORT, dtype=torch.bool), torch.zeros(1, dtype=torch.bool)
     left = []
     for _ in range(5):
-        fit = Fit(motion, found, torch.zeros(1, 4, 4, dtype=F64), torch.ones(1, dtype=F64), none.long(), none, torch.zeros(1, dtype=F64))
+        fit = Fit(
+            motion,
+            found,
+            torch.zeros(1, 4, 4, dtype=F64),
+            torch.ones(1, dtype=F64),
+            none.long(),
+            none,
+            torch.zeros(1, dtype=F64),
+        )
         residual, step = _Step.of(data, SMALL, fit, present, _Unknowns(2, True))
         left.append(float(residual.abs().square().sum() / data.abs().square().sum()))
         _, found, _, covariance = step.taken()

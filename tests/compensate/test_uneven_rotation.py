@@ -1,4 +1,6 @@
-"""The recommended estimator of uneven rotation, its steps, and the stages about it, on targets of thirty points."""
+"""The recommended estimator of uneven rotation, its steps, and the stages about it, on targets of
+thirty points.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,23 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.compensate.turning import F64, OMEGA, OPTIONS, PRF, PULSES, RADAR, RANGE_M, WAVELENGTH, K, echo, noise, noise_std, points, target, targets
+from tests.compensate.turning import (
+    F64,
+    OMEGA,
+    OPTIONS,
+    PRF,
+    PULSES,
+    RADAR,
+    RANGE_M,
+    WAVELENGTH,
+    K,
+    echo,
+    noise,
+    noise_std,
+    points,
+    target,
+    targets,
+)
 from torchsar.compensate import CorrectPulsePhase
 from torchsar.compensate.rotation import (
     CoarseRotation,
@@ -36,9 +54,13 @@ def z_scores(found: Estimate, k: Tensor, yc_m: float | None = 0.0) -> Tensor:
     return torch.stack([(found[name] - value) / found.std[name] for name, value in truth.items()], -1)
 
 
-@pytest.mark.parametrize("k", [(10.0, 1000.0), (0.0, 0.0), (20.0, -500.0), (-5.0, 3000.0), (40.0, 0.0), (0.0, 5000.0)], ids=str)
+@pytest.mark.parametrize(
+    "k", [(10.0, 1000.0), (0.0, 0.0), (20.0, -500.0), (-5.0, 3000.0), (40.0, 0.0), (0.0, 5000.0)], ids=str
+)
 def test_any_rotation_is_found_without_a_start(k: tuple[float, float]) -> None:
-    """Far outside of any box about the truth; (0, 5000) is where the first step of the brief was wrong. What is wrong is not ok."""
+    """Far outside of any box about the truth; (0, 5000) is where the first step of the brief was
+    wrong. What is wrong is not ok.
+    """
     truth = torch.tensor(k, dtype=F64)
     found = uneven_rotation(targets(4, k=truth), **OPTIONS)
     right = (z_scores(found, truth).abs() < 6).all(-1)
@@ -82,15 +104,22 @@ def test_deviations_are_predicted_and_at_the_bound(snr_db: float) -> None:
 
 def test_each_step_comes_closer() -> None:
     data = targets(4)
-    errors = {name: (estimator(data, **OPTIONS)["warp_k"] / K - 1).abs().median(0).values for name, estimator in ESTIMATORS.items()}
-    assert (errors["coarse"] < torch.tensor([0.5, 0.1], dtype=F64)).all() and errors["coarse"][0] > errors["phase_fit"][0]
+    errors = {
+        name: (estimator(data, **OPTIONS)["warp_k"] / K - 1).abs().median(0).values
+        for name, estimator in ESTIMATORS.items()
+    }
+    assert (errors["coarse"] < torch.tensor([0.5, 0.1], dtype=F64)).all() and errors["coarse"][0] > errors["phase_fit"][
+        0
+    ]
     assert (errors["uneven"] < 2e-3).all() and (errors["phase_fit"] > errors["uneven"]).all()
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_a_batch_equals_its_singles(name: str) -> None:
     """With neighbours that are louder, empty, noise alone, or settle at another step."""
-    data = torch.stack([target(0), 1e4 * target(1, -5.0), torch.zeros(PULSES, 24), noise(0, PULSES, 24), 1e-4 * target(2, 40.0)]).to(torch.complex128)
+    data = torch.stack(
+        [target(0), 1e4 * target(1, -5.0), torch.zeros(PULSES, 24), noise(0, PULSES, 24), 1e-4 * target(2, 40.0)]
+    ).to(torch.complex128)
     together = ESTIMATORS[name](data, **OPTIONS)
     for i in (0, 1, 2, 4):
         alone = ESTIMATORS[name](data[i], **OPTIONS)
@@ -99,9 +128,17 @@ def test_a_batch_equals_its_singles(name: str) -> None:
         for key, value in alone.std.items():
             torch.testing.assert_close(together.std[key][i], value, rtol=1e-4, atol=1e-9)
         assert alone.ok == together.ok[i] and torch.allclose(alone.quality, together.quality[i], atol=1e-6)
-    assert together.ok.tolist() == [True, name != "uneven" or bool(together.ok[1]), bool(together.ok[2]), bool(together.ok[3]), True]
+    assert together.ok.tolist() == [
+        True,
+        name != "uneven" or bool(together.ok[1]),
+        bool(together.ok[2]),
+        bool(together.ok[3]),
+        True,
+    ]
     grid = ESTIMATORS[name](data[:4].view(2, 2, PULSES, 24), **OPTIONS)
-    assert grid["warp_k"].shape == (2, 2, 2) and torch.equal(grid["warp_k"].flatten(0, 1), ESTIMATORS[name](data[:4], **OPTIONS)["warp_k"])
+    assert grid["warp_k"].shape == (2, 2, 2) and torch.equal(
+        grid["warp_k"].flatten(0, 1), ESTIMATORS[name](data[:4], **OPTIONS)["warp_k"]
+    )
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
@@ -131,7 +168,12 @@ def test_where_the_range_axis_begins() -> None:
     torch.testing.assert_close(shifted["yc_m"], usual["yc_m"] - 700.0, rtol=0, atol=1e-3)
     torch.testing.assert_close(shifted["omega_rad_s"], usual["omega_rad_s"], rtol=1e-4, atol=0)
     cropped = uneven_rotation(data[:, 5:], **{**OPTIONS, "range_m": RANGE_M[5:]})
-    assert cropped.ok and (cropped["omega_rad_s"] / OMEGA - 1).abs() < 0.05 and (cropped["warp_k"] / K - 1).abs().max() < 0.01 and cropped["yc_m"].abs() < 0.1
+    assert (
+        cropped.ok
+        and (cropped["omega_rad_s"] / OMEGA - 1).abs() < 0.05
+        and (cropped["warp_k"] / K - 1).abs().max() < 0.01
+        and cropped["yc_m"].abs() < 0.1
+    )
 
 
 def test_odd_and_missing_pulses() -> None:
@@ -156,7 +198,9 @@ def degenerate() -> dict[str, Tensor]:
         "constant": torch.ones(PULSES, 24, dtype=torch.complex128),
         "one point": one + 0.1 * noise(2, PULSES, 24),
         "one range cell": row + 0.1 * noise(3, PULSES, 24),
-        "one sample": torch.zeros(PULSES, 24, dtype=torch.complex128).index_put((torch.tensor(7), torch.tensor(7)), torch.tensor(1.0 + 0j, dtype=torch.complex128)),
+        "one sample": torch.zeros(PULSES, 24, dtype=torch.complex128).index_put(
+            (torch.tensor(7), torch.tensor(7)), torch.tensor(1.0 + 0j, dtype=torch.complex128)
+        ),
         "8 pulses": target(0)[:8],
     }
 
@@ -189,7 +233,9 @@ def test_the_coarse_warp_turns_on_and_on() -> None:
 def test_the_coarse_warp_does_not_see_the_rate_or_the_scale_of_the_pulse_rate() -> None:
     data = target(0)
     k = coarse_warp(data[None], PRF)
-    torch.testing.assert_close(coarse_warp(data[None], 10 * PRF), k * torch.tensor([10.0, 100.0], dtype=F64), rtol=1e-9, atol=0)
+    torch.testing.assert_close(
+        coarse_warp(data[None], 10 * PRF), k * torch.tensor([10.0, 100.0], dtype=F64), rtol=1e-9, atol=0
+    )
     torch.testing.assert_close(coarse_warp(data[None].conj().resolve_conj(), PRF), k, rtol=1e-6, atol=0)
 
 
@@ -197,7 +243,17 @@ def signal_of(data: Tensor) -> Signal:
     return Signal(data, RADAR.raw_axes(*data.shape[-2:], start_s=3.0))
 
 
-@pytest.mark.parametrize("stage", [UnevenRotation(RADAR), CoarseRotation(RADAR), PhaseFitRotation(RADAR), UnevenRotation(RADAR, 4), UnevenRotation(RADAR, yc_m=0.5)], ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize(
+    "stage",
+    [
+        UnevenRotation(RADAR),
+        CoarseRotation(RADAR),
+        PhaseFitRotation(RADAR),
+        UnevenRotation(RADAR, 4),
+        UnevenRotation(RADAR, yc_m=0.5),
+    ],
+    ids=lambda s: type(s).__name__,
+)
 def test_stages_offer_what_they_promise(stage) -> None:
     found = stage(signal_of(targets(2).to(torch.complex64)))
     assert set(found.value) == set(stage.provides)
@@ -225,12 +281,16 @@ def test_the_autofocus_takes_the_rotation_out() -> None:
     assert found.ok and off_the_warp(found["phase_rad"] - walk, phi) < 0.1
     blind = RotationAutofocus(RADAR)(signal_of(damaged))
     assert off_the_warp(blind["phase_rad"] - walk, phi) > 0.3, "an autofocus that knows of no rotation leaves more"
-    told = RotationAutofocus(RADAR)(signal_of(damaged), omega_rad_s=torch.tensor(OMEGA, dtype=F64), warp_k=K, yc_m=torch.tensor(0.0, dtype=F64))
+    told = RotationAutofocus(RADAR)(
+        signal_of(damaged), omega_rad_s=torch.tensor(OMEGA, dtype=F64), warp_k=K, yc_m=torch.tensor(0.0, dtype=F64)
+    )
     torch.testing.assert_close(told["phase_rad"], found["phase_rad"], atol=1e-6, rtol=0)
 
 
 def off_the_warp(error: Tensor, phi: Tensor) -> float:
-    """Rms of phases (rad), to the nearest turn, less the constant and the line in the warp that no image shows: the brightest line of their spectrum over the warp."""
+    """Rms of phases (rad), to the nearest turn, less the constant and the line in the warp that no
+    image shows: the brightest line of their spectrum over the warp.
+    """
     cells = torch.linspace(-40, 40, 4001, dtype=F64)
     angle = error - 2 * math.pi * cells[:, None] * phi / phi[-1]
     best = angle[torch.exp(1j * angle).sum(-1).abs().argmax()]
@@ -238,9 +298,15 @@ def off_the_warp(error: Tensor, phi: Tensor) -> float:
 
 
 def test_phase_and_rotation_in_turn() -> None:
-    """A phase that is free in every pulse and a rotation: the autofocus takes yc with it, so the estimator holds it."""
+    """A phase that is free in every pulse and a rotation: the autofocus takes yc with it, so the
+    estimator holds it.
+    """
     damaged = target(0) * torch.exp(1j * pulse_phases())[:, None]
-    stage = Alternate(3, phase=Turn(RotationAutofocus(RADAR), CorrectPulsePhase()), rotation=Turn(UnevenRotation(RADAR, yc_m=0.0), RangePhase(RADAR)))
+    stage = Alternate(
+        3,
+        phase=Turn(RotationAutofocus(RADAR), CorrectPulsePhase()),
+        rotation=Turn(UnevenRotation(RADAR, yc_m=0.0), RangePhase(RADAR)),
+    )
     alone = UnevenRotation(RADAR)(signal_of(damaged))
     found = Chain(fit=stage, out=use(CorrectPulsePhase(), phase_rad="fit")).trace(signal_of(damaged)).estimates["fit"]
     assert (found["warp_k"] / K - 1).abs().max() < 0.05
@@ -254,7 +320,9 @@ def test_refusals() -> None:
     with pytest.raises(TypeError, match="complex range-compressed samples .* got torch.float64"):
         uneven_rotation(data.real, **OPTIONS)
     with pytest.raises(ValueError, match="1 of 19200 samples are NaN or Inf"):
-        uneven_rotation(data.index_put((torch.tensor(3), torch.tensor(5)), torch.tensor(math.nan + 0j, dtype=data.dtype)), **OPTIONS)
+        uneven_rotation(
+            data.index_put((torch.tensor(3), torch.tensor(5)), torch.tensor(math.nan + 0j, dtype=data.dtype)), **OPTIONS
+        )
     with pytest.raises(ValueError, match="range_m needs the 24 coordinates"):
         uneven_rotation(data, **{**OPTIONS, "range_m": RANGE_M[:5]})
     with pytest.raises(ValueError, match="wavelength_m must be a positive number, got -1"):

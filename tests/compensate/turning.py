@@ -1,4 +1,6 @@
-"""Range-compressed pulses of small targets that turn unevenly, made by plain formulas (brief 003, Eq. 3, with sine and cosine unabridged)."""
+"""Range-compressed pulses of small targets that turn unevenly, made by plain formulas (brief 003,
+Eq. 3, with sine and cosine unabridged).
+"""
 
 from __future__ import annotations
 
@@ -29,11 +31,15 @@ def echo(x: Tensor, y: Tensor, amplitude: Tensor, k: Tensor = K, yc_m: float = 0
     """(pulse, range) complex128."""
     angle = OMEGA * warp(torch.arange(n_pulse, dtype=F64) / PRF, k)
     way = x[:, None] * torch.sin(angle) - (y + yc_m)[:, None] * 2 * torch.sin(angle / 2).square()
-    return (torch.exp(-4j * math.pi / WAVELENGTH * way) * amplitude[:, None]).mT @ response((RANGE_M - y[:, None]) / CELL, BINS)
+    return (torch.exp(-4j * math.pi / WAVELENGTH * way) * amplitude[:, None]).mT @ response(
+        (RANGE_M - y[:, None]) / CELL, BINS
+    )
 
 
 def response(x: Tensor, cells: int) -> Tensor:
-    """Of range cells x cells away from a scatterer: the mean of the `cells` frequencies that an FFT of so many samples has."""
+    """Of range cells x cells away from a scatterer: the mean of the `cells` frequencies that an FFT
+    of so many samples has.
+    """
     frequency = (torch.arange(cells, dtype=F64) - cells // 2) / cells
     return torch.exp(2j * math.pi * x[..., None] * frequency).mean(-1)
 
@@ -47,7 +53,9 @@ def noise_std(clean: Tensor, snr_db: float) -> Tensor:
     return (clean.abs().square().mean() * 10 ** (-snr_db / 10)).sqrt()
 
 
-def target(seed: int = 0, snr_db: float = 20.0, k: Tensor = K, yc_m: float = 0.0, n_pulse: int = PULSES, draw: int = 0) -> Tensor:
+def target(
+    seed: int = 0, snr_db: float = 20.0, k: Tensor = K, yc_m: float = 0.0, n_pulse: int = PULSES, draw: int = 0
+) -> Tensor:
     """One scene, one draw of the noise."""
     clean = echo(*points(seed), k, yc_m, n_pulse)
     return clean + noise_std(clean, snr_db) * noise(100 * seed + draw, *clean.shape)

@@ -1,4 +1,7 @@
-"""What every stage promises: one list of stages, one family of tests. A new stage joins by one line."""
+"""What every stage promises: one list of stages, one family of tests.
+
+A new stage joins by one line.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.helpers import small_bistatic, small_bistatic_echo, small_ladar, small_ladar_recording, small_radar, small_recording
+from tests.helpers import (
+    small_bistatic,
+    small_bistatic_echo,
+    small_ladar,
+    small_ladar_recording,
+    small_radar,
+    small_recording,
+)
 from torchsar.compensate import (
     Autofocus,
     CompensateMotion,
@@ -76,7 +86,13 @@ from torchsar.multichannel.transmit import AzimuthScaling, RemoveTransmitRange
 from torchsar.multichannel.velocity.aperture import Dwell
 from torchsar.multichannel.velocity.bank import Search
 from torchsar.multichannel.velocity.sir import SignalIntensityRatio
-from torchsar.multichannel.velocity.stages import AlongTrackAutofocus, GradientVelocity, Interferometry, LikelihoodVelocity, MovingPointVelocity
+from torchsar.multichannel.velocity.stages import (
+    AlongTrackAutofocus,
+    GradientVelocity,
+    Interferometry,
+    LikelihoodVelocity,
+    MovingPointVelocity,
+)
 from torchsar.multichannel.velocity.walk import WalkAmbiguity
 from torchsar.radar import InverseRadar
 from torchsar.repair import (
@@ -111,7 +127,9 @@ FEW_POINTS = partial(estimate_response_sharpest, points=40, orders=(4, 8), passe
 
 @dataclass(frozen=True)
 class Case:
-    """A stage, the per-trial values it is called with (name -> trial index -> value), and what may be asked of it."""
+    """A stage, the per-trial values it is called with (name -> trial index -> value), and what may
+    be asked of it.
+    """
 
     name: str
     build: Callable[[], Stage]
@@ -134,7 +152,11 @@ def _geometry(signal: Signal) -> dict[str, Tensor]:
 
 def _missing(signal: Signal) -> dict[str, Tensor]:
     lines = torch.arange(signal.axes[0].n)
-    return {"missing": torch.stack([(lines % 11) == 3 + i for i in range(signal.trials.numel())]).reshape(*signal.trials, -1)}
+    return {
+        "missing": torch.stack([(lines % 11) == 3 + i for i in range(signal.trials.numel())]).reshape(
+            *signal.trials, -1
+        )
+    }
 
 
 def _numbers(signal: Signal) -> dict[str, Tensor]:
@@ -144,7 +166,10 @@ def _numbers(signal: Signal) -> dict[str, Tensor]:
 
 def _offsets(signal: Signal) -> dict[str, Tensor]:
     base = torch.tensor([0.05, -0.03, 0.02, -0.04], dtype=torch.float64)
-    return {"offset_samples": base * (1 + 0.1 * torch.arange(signal.trials.numel(), dtype=torch.float64).reshape(*signal.trials, 1))}
+    return {
+        "offset_samples": base
+        * (1 + 0.1 * torch.arange(signal.trials.numel(), dtype=torch.float64).reshape(*signal.trials, 1))
+    }
 
 
 def _pilot(signal: Signal) -> dict[str, Tensor]:
@@ -179,7 +204,12 @@ def _calibration(signal: Signal) -> dict[str, Tensor]:
     u = LADAR.fast_time_axis().values()
     turns = LADAR.chirp_rate_hz_s * 1e-9 * (u + 2e-8 * torch.sin(2 * torch.pi * u / LADAR.sweep_s))
     tone = torch.stack([turns, -turns])[:, None]
-    return {"calibration": torch.polar(torch.ones_like(tone), 2 * torch.pi * tone).to(signal.data.dtype).expand(*signal.trials, 2, 1, len(u)).contiguous()}
+    return {
+        "calibration": torch.polar(torch.ones_like(tone), 2 * torch.pi * tone)
+        .to(signal.data.dtype)
+        .expand(*signal.trials, 2, 1, len(u))
+        .contiguous()
+    }
 
 
 def _turn(signal: Signal) -> dict[str, Tensor]:
@@ -202,7 +232,10 @@ def _some_motion(*names: str) -> Callable[[Signal], dict[str, Tensor]]:
 
 def _balance(signal: Signal) -> dict[str, Tensor]:
     one = torch.ones(*signal.trials, 1, dtype=torch.float64)
-    return {"phase_rad": torch.cat([0.3 * one, 0 * one, -0.2 * one], -1), "gain_db": torch.cat([one, 0 * one, 0.5 * one], -1)}
+    return {
+        "phase_rad": torch.cat([0.3 * one, 0 * one, -0.2 * one], -1),
+        "gain_db": torch.cat([one, 0 * one, 0.5 * one], -1),
+    }
 
 
 def _errors(signal: Signal) -> dict[str, Tensor]:
@@ -235,13 +268,26 @@ CASES = [
     Case("energy_centre", lambda: EnergyCentre(RADAR, (2, 2))),
     Case("range_dependent_centroid", lambda: RangeDependentCentroid(RADAR, 1, (2, 4)), differentiable=False),
     Case("doppler_centroid", lambda: DopplerCentroid(RADAR), differentiable=False, vmap=False),
-    Case("effective_velocity", lambda: EffectiveVelocity(OmegaK(RADAR), 5.0), lambda s: {"doppler_hz": _geometry(s)["doppler_hz"]}, differentiable=False, vmap=False, tolerance=1e-6),
+    Case(
+        "effective_velocity",
+        lambda: EffectiveVelocity(OmegaK(RADAR), 5.0),
+        lambda s: {"doppler_hz": _geometry(s)["doppler_hz"]},
+        differentiable=False,
+        vmap=False,
+        tolerance=1e-6,
+    ),
     Case("point_doppler", lambda: PointDoppler(RADAR), differentiable=False, vmap=False, image=True, tolerance=1e-6),
     Case("line_integrity", lambda: LineIntegrity(), _numbers, differentiable=False, vmap=False),
     Case("zero_fill", lambda: ZeroFill(), _missing),
     Case("linear_fill", lambda: LinearFill(RADAR), lambda s: {**_missing(s), "doppler_hz": _geometry(s)["doppler_hz"]}),
     Case("band_limited_fill", lambda: BandLimitedFill(), _missing, differentiable=False),
-    Case("sparse_fill", lambda: SparseFill(RADAR), lambda s: {**_missing(s), **_geometry(s)}, differentiable=False, tolerance=1e-7),
+    Case(
+        "sparse_fill",
+        lambda: SparseFill(RADAR),
+        lambda s: {**_missing(s), **_geometry(s)},
+        differentiable=False,
+        tolerance=1e-7,
+    ),
     Case("subtract_interference", lambda: SubtractInterference(), differentiable=False, vmap=False),
     Case("notch_interference", lambda: NotchInterference(), differentiable=False, vmap=False),
     Case("drop_interference", lambda: DropInterference(), differentiable=False, vmap=False),
@@ -250,7 +296,15 @@ CASES = [
     Case("blind_jitter", lambda: BlindJitter(max_period=4), differentiable=False, vmap=False, n_range=128),
     Case("estimate_imbalance", lambda: EstimateImbalance()),
     Case("correct_imbalance", lambda: CorrectImbalance(), _imbalance),
-    Case("estimate_response", lambda: EstimateResponse(RADAR, FEW_POINTS), differentiable=False, vmap=False, image=True, tolerance=1e-6, n_range=300),
+    Case(
+        "estimate_response",
+        lambda: EstimateResponse(RADAR, FEW_POINTS),
+        differentiable=False,
+        vmap=False,
+        image=True,
+        tolerance=1e-6,
+        n_range=300,
+    ),
     Case("correct_response", lambda: CorrectResponse(RADAR), _response, image=True),
     Case("sca", lambda: Sca(), vmap=False),
     Case("pga", lambda: Pga(), vmap=False),
@@ -262,22 +316,69 @@ CASES = [
     Case("target_image", lambda: TargetImage(TURNTABLE)),
     Case("range_phase", lambda: RangePhase(TURNTABLE), _turn),
     Case("matched_fourier", lambda: MatchedFourier(TURNTABLE), _warp),
-    Case("rotation_search", lambda: RotationSearch(TURNTABLE, [0.1, -2.0], [0.5, 2.0], [2, 3], **SEARCH), differentiable=False, vmap=False),
-    Case("rotation_genetic", lambda: RotationGenetic(TURNTABLE, [0.1, -2.0], [0.5, 2.0], population=6, generations=2, **SEARCH), differentiable=False, vmap=False),
-    Case("rotation_evolution", lambda: RotationEvolution(TURNTABLE, [0.1, -2.0], [0.5, 2.0], population=6, generations=2, **SEARCH), differentiable=False, vmap=False),
-    Case("rotation_newton", lambda: RotationNewton(TURNTABLE, [0.3, 0.5], steps=2, **SEARCH), differentiable=False, vmap=False, tolerance=1e-3),
-    Case("rotation_descent", lambda: RotationDescent(TURNTABLE, [0.3, 0.5], steps=2, **SEARCH), differentiable=False, vmap=False, tolerance=1e-3),
+    Case(
+        "rotation_search",
+        lambda: RotationSearch(TURNTABLE, [0.1, -2.0], [0.5, 2.0], [2, 3], **SEARCH),
+        differentiable=False,
+        vmap=False,
+    ),
+    Case(
+        "rotation_genetic",
+        lambda: RotationGenetic(TURNTABLE, [0.1, -2.0], [0.5, 2.0], population=6, generations=2, **SEARCH),
+        differentiable=False,
+        vmap=False,
+    ),
+    Case(
+        "rotation_evolution",
+        lambda: RotationEvolution(TURNTABLE, [0.1, -2.0], [0.5, 2.0], population=6, generations=2, **SEARCH),
+        differentiable=False,
+        vmap=False,
+    ),
+    Case(
+        "rotation_newton",
+        lambda: RotationNewton(TURNTABLE, [0.3, 0.5], steps=2, **SEARCH),
+        differentiable=False,
+        vmap=False,
+        tolerance=1e-3,
+    ),
+    Case(
+        "rotation_descent",
+        lambda: RotationDescent(TURNTABLE, [0.3, 0.5], steps=2, **SEARCH),
+        differentiable=False,
+        vmap=False,
+        tolerance=1e-3,
+    ),
     Case("rotation_coarse", lambda: CoarseRotation(TURNTABLE), differentiable=False, vmap=False),
     Case("rotation_phase_fit", lambda: PhaseFitRotation(TURNTABLE), differentiable=False, vmap=False, tolerance=1e-6),
     # an iterated fit of noise, which amplifies the rounding of its sums
     Case("rotation", lambda: UnevenRotation(TURNTABLE), differentiable=False, vmap=False, tolerance=1e-4),
-    Case("rotation_autofocus", lambda: RotationAutofocus(TURNTABLE, 4, 2), _turn, differentiable=False, vmap=False, tolerance=1e-6),
+    Case(
+        "rotation_autofocus",
+        lambda: RotationAutofocus(TURNTABLE, 4, 2),
+        _turn,
+        differentiable=False,
+        vmap=False,
+        tolerance=1e-6,
+    ),
     Case("chirplet_clean", lambda: ChirpletClean(TURNTABLE, atoms=3), differentiable=False, vmap=False, tolerance=1e-6),
-    Case("alternate", lambda: Alternate(2, phase=Turn(Autofocus(), CorrectPulsePhase()), rotation=Turn(CoarseRotation(TURNTABLE))), differentiable=False, vmap=False, tolerance=1e-6),
+    Case(
+        "alternate",
+        lambda: Alternate(2, phase=Turn(Autofocus(), CorrectPulsePhase()), rotation=Turn(CoarseRotation(TURNTABLE))),
+        differentiable=False,
+        vmap=False,
+        tolerance=1e-6,
+    ),
     Case("split_sweeps", lambda: SplitSweeps(LADAR, 3.3e-6), ladar="record"),
     Case("circular_shift", lambda: CircularShift(LADAR, 3.3e-6), ladar="record"),
     Case("blank_turning_points", lambda: BlankTurningPoints(LADAR, 100.0), ladar="sweeps"),
-    Case("calibrate_sweeps", lambda: CalibrateSweeps(LADAR, 1e-9), _calibration, differentiable=False, vmap=False, ladar="sweeps"),
+    Case(
+        "calibrate_sweeps",
+        lambda: CalibrateSweeps(LADAR, 1e-9),
+        _calibration,
+        differentiable=False,
+        vmap=False,
+        ladar="sweeps",
+    ),
     Case("segmented_interference", lambda: SegmentedInterference(LADAR), ladar="sweeps"),
     Case("segmented_sum", lambda: SegmentedInterference(LADAR, "sum", "per_pulse"), ladar="sweeps"),
     Case("mirror_product", lambda: MirrorProduct(LADAR), ladar="sweeps"),
@@ -293,23 +394,102 @@ CASES = [
     Case("compress_channels", lambda: CompressChannels(BISTATIC), channels="range"),
     Case("remove_transmit_range", lambda: RemoveTransmitRange(BISTATIC), channels="range"),
     Case("azimuth_scaling", lambda: AzimuthScaling(BISTATIC), _some_motion("u_r_m_s", "u_a_m_s"), channels="line"),
-    Case("correct_migration", lambda: CorrectMigration(BISTATIC, Keystone(whole_swath=False)), _motion, tolerance=1e-8, channels="range"),
-    Case("estimate_balance", lambda: EstimateBalance(BISTATIC, FlatBand(300.0), 3, blocks=4), differentiable=False, vmap=False, tolerance=1e-6, channels="range"),
+    Case(
+        "correct_migration",
+        lambda: CorrectMigration(BISTATIC, Keystone(whole_swath=False)),
+        _motion,
+        tolerance=1e-8,
+        channels="range",
+    ),
+    Case(
+        "estimate_balance",
+        lambda: EstimateBalance(BISTATIC, FlatBand(300.0), 3, blocks=4),
+        differentiable=False,
+        vmap=False,
+        tolerance=1e-6,
+        channels="range",
+    ),
     Case("correct_balance", lambda: CorrectBalance(BISTATIC), _balance, channels="range"),
-    Case("estimate_synchronisation", lambda: EstimateSynchronisation(BISTATIC), _direct_path, differentiable=False, vmap=False, channels="line"),
+    Case(
+        "estimate_synchronisation",
+        lambda: EstimateSynchronisation(BISTATIC),
+        _direct_path,
+        differentiable=False,
+        vmap=False,
+        channels="line",
+    ),
     Case("remove_synchronisation", lambda: RemoveSynchronisation(BISTATIC), _errors, channels="range"),
     Case("reconstruct", lambda: Reconstruct(BISTATIC), _motion, vmap=False, channels="line"),
     Case("reconstruct_lines", lambda: Reconstruct(BISTATIC, MinimumMeanSquare(4)), _motion, channels="range"),
     Case("focus_azimuth", lambda: FocusAzimuth(BISTATIC, bandwidth_hz=300.0), _motion, channels="doppler"),
-    Case("focus_plan", lambda: FocusPlan(BISTATIC, bandwidth_hz=300.0, u_r_m_s=5.0, u_a_m_s=2.0), vmap=False, channels="line"),
+    Case(
+        "focus_plan",
+        lambda: FocusPlan(BISTATIC, bandwidth_hz=300.0, u_r_m_s=5.0, u_a_m_s=2.0),
+        vmap=False,
+        channels="line",
+    ),
     Case("stationary_image", lambda: StationaryImage(BISTATIC, form="bulk"), vmap=False, channels="range"),
-    Case("walk_ambiguity", lambda: WalkAmbiguity(BISTATIC), _motion, differentiable=False, vmap=False, tolerance=1e-6, channels="range"),
-    Case("interferometry", lambda: Interferometry(BISTATIC, LIT), _motion, differentiable=False, vmap=False, tolerance=1e-7, channels="line"),
-    Case("along_track", lambda: AlongTrackAutofocus(BISTATIC, LIT), _some_motion("u_r_m_s", "y0_m"), differentiable=False, vmap=False, tolerance=1e-6, channels="line"),
-    Case("likelihood_velocity", lambda: LikelihoodVelocity(BISTATIC, LIT), _motion, differentiable=False, vmap=False, tolerance=1e-6, channels="line"),
-    Case("gradient_velocity", lambda: GradientVelocity(BISTATIC, LIT), _motion, differentiable=False, vmap=False, tolerance=1e-3, channels="line"),
-    Case("moving_point", lambda: MovingPointVelocity(BISTATIC, LIT, search=FEW_VELOCITIES), differentiable=False, vmap=False, tolerance=1e-5, channels="line"),
-    Case("signal_intensity", lambda: SignalIntensityRatio(BISTATIC, 300.0, LeastSquares(2), step_m_s=2.0), differentiable=False, vmap=False, tolerance=1e-6, channels="line"),
+    Case(
+        "walk_ambiguity",
+        lambda: WalkAmbiguity(BISTATIC),
+        _motion,
+        differentiable=False,
+        vmap=False,
+        tolerance=1e-6,
+        channels="range",
+    ),
+    Case(
+        "interferometry",
+        lambda: Interferometry(BISTATIC, LIT),
+        _motion,
+        differentiable=False,
+        vmap=False,
+        tolerance=1e-7,
+        channels="line",
+    ),
+    Case(
+        "along_track",
+        lambda: AlongTrackAutofocus(BISTATIC, LIT),
+        _some_motion("u_r_m_s", "y0_m"),
+        differentiable=False,
+        vmap=False,
+        tolerance=1e-6,
+        channels="line",
+    ),
+    Case(
+        "likelihood_velocity",
+        lambda: LikelihoodVelocity(BISTATIC, LIT),
+        _motion,
+        differentiable=False,
+        vmap=False,
+        tolerance=1e-6,
+        channels="line",
+    ),
+    Case(
+        "gradient_velocity",
+        lambda: GradientVelocity(BISTATIC, LIT),
+        _motion,
+        differentiable=False,
+        vmap=False,
+        tolerance=1e-3,
+        channels="line",
+    ),
+    Case(
+        "moving_point",
+        lambda: MovingPointVelocity(BISTATIC, LIT, search=FEW_VELOCITIES),
+        differentiable=False,
+        vmap=False,
+        tolerance=1e-5,
+        channels="line",
+    ),
+    Case(
+        "signal_intensity",
+        lambda: SignalIntensityRatio(BISTATIC, 300.0, LeastSquares(2), step_m_s=2.0),
+        differentiable=False,
+        vmap=False,
+        tolerance=1e-6,
+        channels="line",
+    ),
 ]
 IDS = [case.name for case in CASES]
 
@@ -346,8 +526,12 @@ def raw_ladar(kind: str, trials: int | None, dtype: torch.dtype, n_pulse: int) -
 
 
 def raw_channels(kind: str, like: Signal) -> Signal:
-    """Channels of a bistatic receiver, as many trials and pulses: "range", "line" without the range axis, or "doppler", rebuilt."""
-    n_pulse, n_range = (like.axes[0].n, 32 if like.axes[0].n > 8 else 16) if kind == "range" else (6 * like.axes[0].n, 4)
+    """Channels of a bistatic receiver, as many trials and pulses: "range", "line" without the range
+    axis, or "doppler", rebuilt.
+    """
+    n_pulse, n_range = (
+        (like.axes[0].n, 32 if like.axes[0].n > 8 else 16) if kind == "range" else (6 * like.axes[0].n, 4)
+    )
     signal = small_bistatic_echo(n_pulse, n_range, like.trials.numel() if like.trials else None, like.data.dtype)
     if like.trials:
         level = torch.logspace(0, 3, len(signal.data)).to(like.data.dtype)
@@ -359,11 +543,15 @@ def raw_channels(kind: str, like: Signal) -> Signal:
 
 
 def entering(case: Case, signal: Signal) -> Signal:
-    """What the stage works on: the raw signal, an image of it, or as many trials and pulses of a ladar or of several channels."""
+    """What the stage works on: the raw signal, an image of it, or as many trials and pulses of a
+    ladar or of several channels.
+    """
     if case.channels:
         return raw_channels(case.channels, signal)
     if case.ladar:
-        return raw_ladar(case.ladar, signal.trials.numel() if signal.trials else None, signal.data.dtype, signal.axes[0].n)
+        return raw_ladar(
+            case.ladar, signal.trials.numel() if signal.trials else None, signal.data.dtype, signal.axes[0].n
+        )
     return Signal(signal.data, RADAR.image_axes(signal.axes)) if case.image else signal
 
 
@@ -381,7 +569,13 @@ def test_batch_equals_singles(case: Case, trials: int) -> None:
         alone = results(stage(signal.with_data(signal.data[i]), **single(values, i)))
         for name, value in alone.items():
             scale = float(value.abs().max()) if value.dtype != torch.bool and value.numel() else 1.0
-            torch.testing.assert_close(together[name][i], value, atol=case.tolerance * max(scale, 1e-30), rtol=0, msg=lambda m, n=name: f"{n}: {m}")
+            torch.testing.assert_close(
+                together[name][i],
+                value,
+                atol=case.tolerance * max(scale, 1e-30),
+                rtol=0,
+                msg=lambda m, n=name: f"{n}: {m}",
+            )
 
 
 @pytest.mark.parametrize("dtype", [torch.complex64, torch.complex128])
@@ -390,11 +584,16 @@ def test_dtype_and_device_are_kept(case: Case, dtype: torch.dtype) -> None:
     signal = entering(case, raw(2, dtype, n_range=case.n_range))
     out = results(case.build()(signal, **case.values(signal)))
     if "data" in out:
-        assert out["data"].dtype == (dtype if case.keeps_complex else real_dtype(dtype)) and out["data"].device == signal.data.device
+        assert (
+            out["data"].dtype == (dtype if case.keeps_complex else real_dtype(dtype))
+            and out["data"].device == signal.data.device
+        )
     assert all(torch.isfinite(value).all() for value in out.values())
 
 
-@pytest.mark.parametrize("case", [c for c in CASES if c.differentiable], ids=[c.name for c in CASES if c.differentiable])
+@pytest.mark.parametrize(
+    "case", [c for c in CASES if c.differentiable], ids=[c.name for c in CASES if c.differentiable]
+)
 def test_gradients(case: Case) -> None:
     stage, signal = case.build(), entering(case, raw(2, n_pulse=8, n_range=32))
     values = case.values(signal)
@@ -405,7 +604,9 @@ def test_gradients(case: Case) -> None:
         return tuple(value for value in out.values() if value.is_floating_point() or value.is_complex())
 
     data = signal.data / signal.data.abs().flatten(1).amax(1)[(slice(None),) + (None,) * (signal.data.ndim - 1)]
-    assert torch.autograd.gradcheck(outputs, (data.requires_grad_(), *floating.values()), fast_mode=True, atol=1e-4, rtol=1e-3)
+    assert torch.autograd.gradcheck(
+        outputs, (data.requires_grad_(), *floating.values()), fast_mode=True, atol=1e-4, rtol=1e-3
+    )
 
 
 @pytest.mark.parametrize("case", [c for c in CASES if c.vmap], ids=[c.name for c in CASES if c.vmap])
@@ -430,7 +631,9 @@ def test_non_finite_input_is_refused(case: Case, bad: float) -> None:
     data = signal.data.clone()
     place = (1, *(0,) * (data.ndim - 3), *(min(i, n - 1) for i, n in zip((3, 5), data.shape[1:][-2:])))
     data[place] = bad
-    with pytest.raises(ValueError, match=r"1 of \d+ samples are NaN or Inf, the first at index " + re.escape(str(place))):
+    with pytest.raises(
+        ValueError, match=r"1 of \d+ samples are NaN or Inf, the first at index " + re.escape(str(place))
+    ):
         stage(signal.with_data(data), **case.values(signal))
 
 

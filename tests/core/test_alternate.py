@@ -1,4 +1,6 @@
-"""Estimators in turn: what each of them sees, what it is handed, and what an alternation promises."""
+"""Estimators in turn: what each of them sees, what it is handed, and what an alternation
+promises.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,9 @@ F64 = torch.float64
 
 
 class Mean(Stage):
-    """Estimates a constant that is added to all samples: the mean of what it sees, less a part of what `slope` makes of it."""
+    """Estimates a constant that is added to all samples: the mean of what it sees, less a part of
+    what `slope` makes of it.
+    """
 
     provides = ("mean",)
 
@@ -23,11 +27,19 @@ class Mean(Stage):
     def forward(self, signal: Signal, mean: Tensor | None = None, slope: Tensor | None = None) -> Estimate:
         self.seen.append((signal.data.clone(), mean, slope))
         found = signal.data.real.mean((-2, -1)).to(F64)
-        return Estimate({"mean": found}, torch.full_like(found, self.quality), torch.full(found.shape, self.ok), {"mean": 0 * found + 0.1}, {"steps": 0 * found + 3})
+        return Estimate(
+            {"mean": found},
+            torch.full_like(found, self.quality),
+            torch.full(found.shape, self.ok),
+            {"mean": 0 * found + 0.1},
+            {"steps": 0 * found + 3},
+        )
 
 
 class Slope(Stage):
-    """Estimates a slope over pulses, by the first pulse and the last: a constant in the data would go into it."""
+    """Estimates a slope over pulses, by the first pulse and the last: a constant in the data would
+    go into it.
+    """
 
     provides = ("slope",)
 
@@ -44,7 +56,9 @@ class WithoutMean(Stage):
 
 class WithoutSlope(Stage):
     def forward(self, signal: Signal, slope: Tensor) -> Signal:
-        return signal.with_data(signal.data - slope[..., None, None] * torch.arange(signal.data.shape[-2], dtype=F64)[:, None])
+        return signal.with_data(
+            signal.data - slope[..., None, None] * torch.arange(signal.data.shape[-2], dtype=F64)[:, None]
+        )
 
 
 class Needy(Stage):
@@ -58,7 +72,9 @@ def lines(mean: Tensor, slope: Tensor) -> Signal:
     """mean + slope m in pulse m."""
     pulse = torch.arange(6, dtype=F64)
     data = (mean[..., None] + slope[..., None] * pulse)[..., None].expand(*mean.shape, 6, 4)
-    return Signal(data.to(torch.complex128).contiguous(), (Axis("pulse", 6, 0.0, 1.0, "s"), Axis("range", 4, 0.0, 1.0, "m")))
+    return Signal(
+        data.to(torch.complex128).contiguous(), (Axis("pulse", 6, 0.0, 1.0, "s"), Axis("range", 4, 0.0, 1.0, "m"))
+    )
 
 
 MEAN, SLOPE = torch.tensor([1.0, -2.0, 5.0], dtype=F64), torch.tensor([0.5, 0.0, -3.0], dtype=F64)
@@ -69,7 +85,9 @@ def both(rounds: int, mean: Mean | None = None) -> Alternate:
 
 
 def test_turns_agree_on_what_neither_finds_alone() -> None:
-    """Each turn takes the other's value out of the ORIGINAL data: this is block relaxation of least squares, which converges to both."""
+    """Each turn takes the other's value out of the ORIGINAL data: this is block relaxation of least
+    squares, which converges to both.
+    """
     signal = lines(MEAN, SLOPE)
     one, many = both(1)(signal), both(60)(signal)
     assert (one["mean"] - MEAN).abs().max() > 1
@@ -134,8 +152,13 @@ def test_refusals() -> None:
         Alternate(mean=Turn(Mean()))
     with pytest.raises(ValueError, match="rounds=0"):
         both(0)
-    with pytest.raises(ValueError, match=r"the turn 'needy' needs \['slope'\] in the first round, but the turns before it offer nothing"):
+    with pytest.raises(
+        ValueError,
+        match=r"the turn 'needy' needs \['slope'\] in the first round, but the turns before it offer nothing",
+    ):
         Alternate(needy=Turn(Needy()), slope=Turn(Slope()))
-    with pytest.raises(ValueError, match=r"the corrector of the turn 'slope' needs \['mean'\], which its estimator does not offer"):
+    with pytest.raises(
+        ValueError, match=r"the corrector of the turn 'slope' needs \['mean'\], which its estimator does not offer"
+    ):
         Alternate(slope=Turn(Slope(), WithoutMean()), mean=Turn(Mean()))
     assert Alternate(slope=Turn(Slope()), needy=Turn(Needy())).provides == ("slope", "offer")

@@ -1,4 +1,6 @@
-"""Composition: named values, different in every trial, consumed inside one batched chain and refined by re-running its tail."""
+"""Composition: named values, different in every trial, consumed inside one batched chain and
+refined by re-running its tail.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,9 @@ def test_estimates_that_differ_per_trial_are_consumed_and_refined_with_autograd(
     radar = small_radar()
     velocity = torch.tensor([112.0, 120.0, 131.0], dtype=torch.float64)
     doppler = torch.tensor([-60.0, 10.0, 90.0], dtype=torch.float64)
-    recording, _ = small_recording(448, 64, trials=3, velocity_m_s=velocity, doppler_hz=doppler, dwell_s=0.9, snr_db=40.0, dtype=torch.complex128)
+    recording, _ = small_recording(
+        448, 64, trials=3, velocity_m_s=velocity, doppler_hz=doppler, dwell_s=0.9, snr_db=40.0, dtype=torch.complex128
+    )
     chain = squinted_chain(radar)
     trace = chain.trace(recording)
     assert trace.values["doppler.doppler_hz"].shape == (3,)
@@ -58,7 +62,8 @@ def test_estimates_that_differ_per_trial_are_consumed_and_refined_with_autograd(
 
     guess = torch.tensor([114.0, 118.0, 128.0], dtype=torch.float64, requires_grad=True)
     step = torch.full((3,), 4.0, dtype=torch.float64)
-    for _ in range(14):  # a per-trial sign step with halving: enough to show that the tail is an objective
+    # a per-trial sign step with halving: enough to show that the tail is an objective
+    for _ in range(14):
         cost = entropy(chain.rerun(trace, "focus", given={"velocity.velocity_m_s": guess}))
         (slope,) = torch.autograd.grad(cost.sum(), guess)
         moved = (guess - step * slope.sign()).detach().requires_grad_()
@@ -97,9 +102,18 @@ def test_held_values_skip_their_estimator():
 @pytest.mark.parametrize(
     ("build", "match"),
     [
-        (lambda r: Chain(focus=use(OmegaK(r), doppler_hz="doppler")), r"'focus' uses 'doppler.doppler_hz'.*nothing yet"),
-        (lambda r: Chain(doppler=LagOneDoppler(), focus=use(OmegaK(r), speed="doppler.doppler_hz")), r"no value 'speed'.*doppler_hz"),
-        (lambda r: Chain(doppler=LagOneDoppler(), focus=use(OmegaK(r), doppler_hz="doppler.hz")), r"'doppler.hz'.*doppler.doppler_hz"),
+        (
+            lambda r: Chain(focus=use(OmegaK(r), doppler_hz="doppler")),
+            r"'focus' uses 'doppler.doppler_hz'.*nothing yet",
+        ),
+        (
+            lambda r: Chain(doppler=LagOneDoppler(), focus=use(OmegaK(r), speed="doppler.doppler_hz")),
+            r"no value 'speed'.*doppler_hz",
+        ),
+        (
+            lambda r: Chain(doppler=LagOneDoppler(), focus=use(OmegaK(r), doppler_hz="doppler.hz")),
+            r"'doppler.hz'.*doppler.doppler_hz",
+        ),
         (lambda r: Chain(), "at least one stage"),
     ],
 )
@@ -120,7 +134,9 @@ def test_misuse_names_the_stage_and_what_it_got():
 
 
 def test_gradients_flow_from_entropy_to_velocity_and_positions():
-    """One differentiable batch through world, chain and metric, checked against finite differences."""
+    """One differentiable batch through world, chain and metric, checked against finite
+    differences.
+    """
     radar = small_radar()
     chain = Chain(focus=OmegaK(radar, "flat"))
 
@@ -133,7 +149,9 @@ def test_gradients_flow_from_entropy_to_velocity_and_positions():
 
         world = StripmapWorld(Movable([], []), AlwaysLit())
         recording, _ = simulate(radar, world, 24, 40, Draws(0), dtype=torch.complex128)
-        return entropy(chain(recording.signal, given={})) + entropy(OmegaK(radar, "flat")(recording.signal, velocity_m_s=velocity))
+        return entropy(chain(recording.signal, given={})) + entropy(
+            OmegaK(radar, "flat")(recording.signal, velocity_m_s=velocity)
+        )
 
     azimuth = torch.tensor([[0.4, -1.3], [0.1, 0.9]], dtype=torch.float64, requires_grad=True)
     range_ = torch.tensor([[1.0, -7.0], [3.0, 9.5]], dtype=torch.float64, requires_grad=True)
@@ -152,7 +170,11 @@ def test_axis_of_one_sample_step():
         ({"a": OmegaK}, TypeError, "'a' must be a torch.nn.Module.* got the class OmegaK, not an instance"),
         ({"a": 3}, TypeError, "'a' must be a torch.nn.Module.* got int"),
         ({"forward": GivenVelocity()}, ValueError, "cannot be called 'forward'"),
-        ({"lines": LineIntegrity()}, ValueError, r"'lines' \(LineIntegrity\) needs the value 'line_number'.*a value of an earlier stage.*aux.NAME"),
+        (
+            {"lines": LineIntegrity()},
+            ValueError,
+            r"'lines' \(LineIntegrity\) needs the value 'line_number'.*a value of an earlier stage.*aux.NAME",
+        ),
     ],
 )
 def test_members_that_are_no_stages_are_refused_at_construction(stages, error, match):

@@ -7,7 +7,20 @@ import math
 import pytest
 import torch
 
-from torchsar.core import Axis, Draws, Recording, Signal, best_of, from_frequency, linear_phasor, reduced_turns, take, to_frequency, transform_in_blocks, unit_phasor
+from torchsar.core import (
+    Axis,
+    Draws,
+    Recording,
+    Signal,
+    best_of,
+    from_frequency,
+    linear_phasor,
+    reduced_turns,
+    take,
+    to_frequency,
+    transform_in_blocks,
+    unit_phasor,
+)
 
 
 def test_frequency_axis_and_data_move_together():
@@ -44,13 +57,18 @@ def test_crop_moves_the_axis():
 
 
 def test_recording_moves_only_the_samples_dtype():
-    recording = Recording(Signal(torch.zeros(2, 3, dtype=torch.complex64), (Axis("pulse", 2, 0, 1, "s"), Axis("range", 3, 0, 1, "m"))), None, {"line_number": torch.arange(2)})
+    recording = Recording(
+        Signal(torch.zeros(2, 3, dtype=torch.complex64), (Axis("pulse", 2, 0, 1, "s"), Axis("range", 3, 0, 1, "m"))),
+        None,
+        {"line_number": torch.arange(2)},
+    )
     moved = recording.to(torch.complex128)
     assert moved.signal.data.dtype == torch.complex128 and moved.aux["line_number"].dtype == torch.int64
 
 
 def test_phase_of_a_long_range_is_exact():
-    # 700 km at 3.2 GHz is 1.5e7 turns; an exact rational number of turns tells whether float64 was kept
+    # 700 km at 3.2 GHz is 1.5e7 turns; an exact rational number of turns tells whether float64 was
+    # kept
     turns = torch.tensor([15_000_000.25, -15_000_000.25, 123_456_789.5], dtype=torch.float64)
     expected = torch.tensor([1j, -1j, -1], dtype=torch.complex64)
     torch.testing.assert_close(unit_phasor(turns, torch.complex64), expected, atol=1e-6, rtol=0)
@@ -68,7 +86,12 @@ def test_phase_refuses_single_precision_and_huge_turns():
 def test_linear_phasor_equals_the_phasor_of_every_element():
     turns = torch.tensor([0.123456789, -7.3, 1e4 + 1 / 3], dtype=torch.float64)
     index = -37.5 + torch.arange(101, dtype=torch.float64)
-    torch.testing.assert_close(linear_phasor(turns, -37.5, 101, torch.complex128), unit_phasor(turns[:, None] * index, torch.complex128), atol=1e-9, rtol=0)
+    torch.testing.assert_close(
+        linear_phasor(turns, -37.5, 101, torch.complex128),
+        unit_phasor(turns[:, None] * index, torch.complex128),
+        atol=1e-9,
+        rtol=0,
+    )
 
 
 def test_linear_phasor_is_differentiable():
@@ -87,7 +110,9 @@ def test_transform_in_blocks_equals_the_plain_one(dim):
 class TestDraws:
     def test_chunks_and_order_do_not_matter(self):
         whole = Draws(7, trials=range(6)).normal("noise", (4, 5), torch.complex64)
-        parts = torch.cat([Draws(7, trials=t).normal("noise", (4, 5), torch.complex64) for t in ([0, 1], [2], [3, 4, 5])])
+        parts = torch.cat(
+            [Draws(7, trials=t).normal("noise", (4, 5), torch.complex64) for t in ([0, 1], [2], [3, 4, 5])]
+        )
         assert torch.equal(whole, parts)
         assert torch.equal(Draws(7, trials=[5, 0]).normal("noise", (4, 5), torch.complex64), whole[[5, 0]])
 

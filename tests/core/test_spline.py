@@ -29,7 +29,12 @@ def test_equals_scipy(n: int) -> None:
 def test_pieces_are_scipys() -> None:
     values = np.random.default_rng(0).standard_normal((2, 40))
     expected = CubicSpline(knots(40), values, axis=-1).c[::-1]
-    torch.testing.assert_close(UniformSpline(torch.tensor(values), START, STEP).pieces(), torch.tensor(np.moveaxis(expected, 0, -1).swapaxes(0, 1).copy()), atol=1e-12, rtol=1e-12)
+    torch.testing.assert_close(
+        UniformSpline(torch.tensor(values), START, STEP).pieces(),
+        torch.tensor(np.moveaxis(expected, 0, -1).swapaxes(0, 1).copy()),
+        atol=1e-12,
+        rtol=1e-12,
+    )
 
 
 def test_cubics_are_reproduced_and_integrals_begin_at_start() -> None:
@@ -45,14 +50,19 @@ def test_batch_equals_singles_and_trials_do_not_mix() -> None:
     values = torch.randn(3, 30, dtype=torch.float64) * torch.tensor([1.0, 1e6, 1e-6], dtype=torch.float64)[:, None]
     t = torch.linspace(0, 29, 50, dtype=torch.float64)
     together = UniformSpline(values, 0.0, 1.0).integral(t)
-    torch.testing.assert_close(together, torch.stack([UniformSpline(v, 0.0, 1.0).integral(t) for v in values]), rtol=1e-12, atol=1e-16)
+    torch.testing.assert_close(
+        together, torch.stack([UniformSpline(v, 0.0, 1.0).integral(t) for v in values]), rtol=1e-12, atol=1e-16
+    )
 
 
 @pytest.mark.parametrize("n", [2, 3, 5, 9])
 def test_gradients(n: int) -> None:
     values = torch.randn(2, n, dtype=torch.float64, requires_grad=True)
     t = (torch.rand(4, dtype=torch.float64) * (n - 1)).requires_grad_()
-    assert torch.autograd.gradcheck(lambda v, x: tuple(getattr(UniformSpline(v, 0.0, 1.0), name)(x) for name in ("at", "slope", "integral")), (values, t))
+    assert torch.autograd.gradcheck(
+        lambda v, x: tuple(getattr(UniformSpline(v, 0.0, 1.0), name)(x) for name in ("at", "slope", "integral")),
+        (values, t),
+    )
 
 
 def test_bad_input_is_refused() -> None:

@@ -21,7 +21,10 @@ ORDERS = [1, 2, 3, 4, 5]
 @pytest.mark.parametrize("order", ORDERS)
 def test_the_warp_is_the_integral_of_the_rate(order: int) -> None:
     k = K[:, : order - 1]
-    taylor = 1 + sum((k[:, i, None] * TIME ** (i + 1) / math.factorial(i + 1) for i in range(order - 1)), torch.zeros(3, len(TIME), dtype=F64))
+    taylor = 1 + sum(
+        (k[:, i, None] * TIME ** (i + 1) / math.factorial(i + 1) for i in range(order - 1)),
+        torch.zeros(3, len(TIME), dtype=F64),
+    )
     torch.testing.assert_close(warp_rate(TIME, k), taylor, rtol=1e-13, atol=0)
     node, weight = np.polynomial.legendre.leggauss(8)
     inner = TIME[:, None] / 2 * (torch.as_tensor(node) + 1)
@@ -47,7 +50,11 @@ def test_coefficients_are_those_of_a_polynomial() -> None:
 
 def test_trials_and_times_broadcast() -> None:
     assert warp(TIME, K).shape == warp_rate(TIME, K).shape == (3, 41)
-    assert warp(TIME.expand(3, -1), K[0]).shape == (3, 41) and warp(TIME, K[:, None].expand(3, 2, 4)).shape == (3, 2, 41)
+    assert warp(TIME.expand(3, -1), K[0]).shape == (3, 41) and warp(TIME, K[:, None].expand(3, 2, 4)).shape == (
+        3,
+        2,
+        41,
+    )
     own = torch.stack([TIME, 2 * TIME, 3 * TIME])
     torch.testing.assert_close(warp(own, K), torch.stack([warp(t, k) for t, k in zip(own, K)]))
     assert warp(TIME, K[:, :0]).shape == (3, 41) and torch.equal(warp(TIME, K[0, :0]), TIME)
@@ -65,22 +72,40 @@ def test_the_shape_is_a_legendre_series(order: int) -> None:
 
 
 def test_the_shape_by_the_formulas_of_third_order() -> None:
-    """c1 = h + k1 h^2 + 0.6 k2 h^3, q2 = (h^2 / 3) (k1 + k2 h) / c1, q3 = k2 h^3 / (15 c1), h half the aperture (brief 003, section c)."""
+    """c1 = h + k1 h^2 + 0.6 k2 h^3, q2 = (h^2 / 3) (k1 + k2 h) / c1, q3 = k2 h^3 / (15 c1), h half
+    the aperture (brief 003, section c).
+    """
     (k1, k2), h = K[:2, :2].unbind(-1), DURATION / 2
     c1 = h + k1 * h**2 + 0.6 * k2 * h**3
-    torch.testing.assert_close(shape_of(K[:2, :2], DURATION), torch.stack([h**2 / 3 * (k1 + k2 * h), k2 * h**3 / 15], -1) / c1[:, None], rtol=1e-13, atol=0)
+    torch.testing.assert_close(
+        shape_of(K[:2, :2], DURATION),
+        torch.stack([h**2 / 3 * (k1 + k2 * h), k2 * h**3 / 15], -1) / c1[:, None],
+        rtol=1e-13,
+        atol=0,
+    )
 
 
 def test_least_rate() -> None:
     assert least_rate(K[:, :0], DURATION).tolist() == [1, 1, 1]
-    torch.testing.assert_close(least_rate(torch.tensor([[-100.0, 2000.0], [10.0, 1000.0]], dtype=F64), DURATION), torch.tensor([-0.6, 1.0], dtype=F64))
-    dip = torch.tensor([-100.0, 10000.0], dtype=F64)  # 1 - 100 t + 5000 t^2: least 0.5 at the middle
+    torch.testing.assert_close(
+        least_rate(torch.tensor([[-100.0, 2000.0], [10.0, 1000.0]], dtype=F64), DURATION),
+        torch.tensor([-0.6, 1.0], dtype=F64),
+    )
+    # 1 - 100 t + 5000 t^2: least 0.5 at the middle
+    dip = torch.tensor([-100.0, 10000.0], dtype=F64)
     torch.testing.assert_close(least_rate(dip, DURATION), torch.tensor(0.5, dtype=F64))
 
 
 def test_gradients() -> None:
     def shapes(k: Tensor) -> tuple[Tensor, ...]:
         scaled = k * torch.tensor([1.0, 1e2, 1e4, 1e6], dtype=F64)
-        return warp(100 * TIME, scaled), warp_rate(TIME, scaled), 100 * shape_of(scaled, DURATION), k_of_shape(k / 50, DURATION) / 1e6
+        return (
+            warp(100 * TIME, scaled),
+            warp_rate(TIME, scaled),
+            100 * shape_of(scaled, DURATION),
+            k_of_shape(k / 50, DURATION) / 1e6,
+        )
 
-    assert torch.autograd.gradcheck(shapes, (K / torch.tensor([1.0, 1e2, 1e4, 1e6], dtype=F64)).requires_grad_(), atol=1e-4)
+    assert torch.autograd.gradcheck(
+        shapes, (K / torch.tensor([1.0, 1e2, 1e4, 1e6], dtype=F64)).requires_grad_(), atol=1e-4
+    )

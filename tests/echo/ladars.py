@@ -13,19 +13,42 @@ from torchsar.scene import Points, Polynomial, RetroAndBrokenLine, Scatterers, S
 DOUBLE = torch.complex128
 THREE = Points([-0.06, 0.0, 0.06], [1.0, 1.5, 2.0], [0.7, 1.0, 0.7])
 # brief 000, section 8
-COMMON = (Polynomial([0.35, 10.0]), Sinusoid(160e-6, 100.0, math.degrees(0.3)), Sinusoid(10e-6, 330.0, math.degrees(1.0)))
-GROUND = (Polynomial([0.08]), Sinusoid(2e-3, 12.0, math.degrees(0.4)), Sinusoid(100e-6, 47.0, math.degrees(1.1)), Sinusoid(3e-6, 180.0, math.degrees(2.0)))
+COMMON = (
+    Polynomial([0.35, 10.0]),
+    Sinusoid(160e-6, 100.0, math.degrees(0.3)),
+    Sinusoid(10e-6, 330.0, math.degrees(1.0)),
+)
+GROUND = (
+    Polynomial([0.08]),
+    Sinusoid(2e-3, 12.0, math.degrees(0.4)),
+    Sinusoid(100e-6, 47.0, math.degrees(1.1)),
+    Sinusoid(3e-6, 180.0, math.degrees(2.0)),
+)
 
 
 def table1(**changes) -> TriangularLadar:
     """The simulated SAL of the paper's Table 1."""
-    values: dict = {"carrier_hz": LIGHT_M_S / 1.55e-6, "bandwidth_hz": 5e9, "period_s": 16e-6, "sample_rate_hz": 64e6, "speed_m_s": 60.0, "reference_range_m": 3000.0}
+    values: dict = {
+        "carrier_hz": LIGHT_M_S / 1.55e-6,
+        "bandwidth_hz": 5e9,
+        "period_s": 16e-6,
+        "sample_rate_hz": 64e6,
+        "speed_m_s": 60.0,
+        "reference_range_m": 3000.0,
+    }
     return TriangularLadar(**{**values, **changes})
 
 
 def table4(**changes) -> TriangularLadar:
     """The ground experiment of Table 4, real detection, every fourth period."""
-    values: dict = {"period_s": 32e-6, "sample_rate_hz": 150e6, "speed_m_s": 3.125, "reference_range_m": 4339.5, "keep_every": 4, "detection": "real"}
+    values: dict = {
+        "period_s": 32e-6,
+        "sample_rate_hz": 150e6,
+        "speed_m_s": 3.125,
+        "reference_range_m": 4339.5,
+        "keep_every": 4,
+        "detection": "real",
+    }
     return table1(**{**values, **changes})
 
 
@@ -38,12 +61,20 @@ def unit(turns: Tensor) -> Tensor:
     return torch.polar(torch.ones_like(turns), 2 * math.pi * (turns - torch.round(turns)))
 
 
-def direct_range(x: Tensor, r: Tensor, radar: TriangularLadar, time: Tensor, start: Tensor, motion, flight: bool = False) -> Tensor:
-    """Relative range at every time; with the flight time the equation R = R(t - R / c) is solved by repetition."""
+def direct_range(
+    x: Tensor, r: Tensor, radar: TriangularLadar, time: Tensor, start: Tensor, motion, flight: bool = False
+) -> Tensor:
+    """Relative range at every time; with the flight time the equation R = R(t - R / c) is solved by
+    repetition.
+    """
 
     def history(t: Tensor) -> Tensor:
         across, near = radar.speed_m_s * t - x, radar.reference_range_m + r
-        return r + across.square() / (torch.sqrt(near.square() + across.square()) + near) + displacement_m(motion, t - start)
+        return (
+            r
+            + across.square() / (torch.sqrt(near.square() + across.square()) + near)
+            + displacement_m(motion, t - start)
+        )
 
     found = history(time)
     for _ in range(3 if flight else 0):
@@ -51,7 +82,14 @@ def direct_range(x: Tensor, r: Tensor, radar: TriangularLadar, time: Tensor, sta
     return found
 
 
-def direct_sweeps(s: Scatterers, radar: TriangularLadar, n_period: int, motion=(), flight: bool = False, error: SweepError | None = None) -> Tensor:
+def direct_sweeps(
+    s: Scatterers,
+    radar: TriangularLadar,
+    n_period: int,
+    motion=(),
+    flight: bool = False,
+    error: SweepError | None = None,
+) -> Tensor:
     """Scatterer by scatterer, the range at every sample."""
     start, u = radar.sweep_axes(n_period)[1].values(), radar.fast_time_axis().values()
     time = start[:, None] + radar.period_s * torch.tensor([0.25, 0.75], dtype=torch.float64)[:, None, None] + u
@@ -61,7 +99,9 @@ def direct_sweeps(s: Scatterers, radar: TriangularLadar, n_period: int, motion=(
         delay = 2 * direct_range(x, r, radar, time, start[0], motion, flight) / radar.wave_speed_m_s
         turns = radar.carrier_hz * delay + sign * radar.chirp_rate_hz_s * (u * delay - delay.square() / 2)
         if error is not None:
-            turns = turns + torch.stack([error.turns(u, ramp).expand_as(delay[ramp]) - error.turns(u - delay[ramp], ramp) for ramp in (0, 1)])
+            turns = turns + torch.stack(
+                [error.turns(u, ramp).expand_as(delay[ramp]) - error.turns(u - delay[ramp], ramp) for ramp in (0, 1)]
+            )
         out += a * unit(turns)
     return out
 
@@ -70,15 +110,32 @@ def triangle_turns(radar: TriangularLadar, position: Tensor) -> Tensor:
     """Antiderivative of the triangle's frequency, period by period."""
     sweep, rate = radar.sweep_s, radar.chirp_rate_hz_s
     position = torch.remainder(position, 2 * sweep)
-    return torch.where(position < sweep, rate * (position - sweep / 2) ** 2 / 2, rate * sweep**2 / 4 - rate * (position - 1.5 * sweep) ** 2 / 2)
+    return torch.where(
+        position < sweep,
+        rate * (position - sweep / 2) ** 2 / 2,
+        rate * sweep**2 / 4 - rate * (position - 1.5 * sweep) ** 2 / 2,
+    )
 
 
-def direct_record(s: Scatterers, radar: TriangularLadar, n_period: int, n_sample: int, motion=(), trigger_s: float = 0.0, flight: bool = False) -> Tensor:
+def direct_record(
+    s: Scatterers,
+    radar: TriangularLadar,
+    n_period: int,
+    n_sample: int,
+    motion=(),
+    trigger_s: float = 0.0,
+    flight: bool = False,
+) -> Tensor:
     """Complex beats as differences of the triangle's phase, the range at every sample."""
-    start, offset = radar.sweep_axes(n_period)[1].values(), (torch.arange(n_sample, dtype=torch.float64) + 0.5) / radar.sample_rate_hz
+    start, offset = (
+        radar.sweep_axes(n_period)[1].values(),
+        (torch.arange(n_sample, dtype=torch.float64) + 0.5) / radar.sample_rate_hz,
+    )
     position = offset - trigger_s
     out = torch.zeros(n_period, n_sample, dtype=DOUBLE)
     for x, r, a in zip(s.azimuth_m, s.range_m, s.amplitude, strict=True):
         delay = 2 * direct_range(x, r, radar, start[:, None] + offset, start[0], motion, flight) / radar.wave_speed_m_s
-        out += a * unit(radar.carrier_hz * delay + triangle_turns(radar, position) - triangle_turns(radar, position - delay))
+        out += a * unit(
+            radar.carrier_hz * delay + triangle_turns(radar, position) - triangle_turns(radar, position - delay)
+        )
     return out

@@ -1,4 +1,6 @@
-"""Echoes of moving points in channels: against direct sums, the pulse against its compressed response, noise, sea, trials and gradients."""
+"""Echoes of moving points in channels: against direct sums, the pulse against its compressed
+response, noise, sea, trials and gradients.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,20 @@ from torchsar.core import Draws
 from torchsar.echo import bistatic_echo, simulate_bistatic
 from torchsar.focus.reference import flat_reference, matched_reference, range_compress
 from torchsar.radar import BistaticRadar, LinearFM, Orbit, range_coefficients, seen_point
-from torchsar.scene import BandLimited, BistaticWorld, Fleet, GroundMovers, KSea, MovingPoints, MovingScene, OrbitTransmit, Pattern, PolynomialTransmit, Ship, TaylorRange
+from torchsar.scene import (
+    BandLimited,
+    BistaticWorld,
+    Fleet,
+    GroundMovers,
+    KSea,
+    MovingPoints,
+    MovingScene,
+    OrbitTransmit,
+    Pattern,
+    PolynomialTransmit,
+    Ship,
+    TaylorRange,
+)
 from torchsar.scene.moving import Movers
 
 C = 3e8
@@ -37,7 +52,16 @@ RADAR = radar_of()
 SCENE = MovingPoints([10.0, -4.0], [5.0, -8.0], [20.0, -60.0], [12.0, -33.0], [1.0, 0.6])
 
 
-def simulated(scene: MovingScene | None = SCENE, n_pulse=90, n_range: int | None = 128, radar=RADAR, trials=None, gate=None, dtype=torch.complex128, **options):
+def simulated(
+    scene: MovingScene | None = SCENE,
+    n_pulse=90,
+    n_range: int | None = 128,
+    radar=RADAR,
+    trials=None,
+    gate=None,
+    dtype=torch.complex128,
+    **options,
+):
     simulate = {name: options.pop(name) for name in ("kind", "damages") if name in options}
     world = BistaticWorld(scene, gate or Pattern(), **options)
     return simulate_bistatic(radar, world, n_pulse, n_range, Draws(3, trials=trials), dtype=dtype, **simulate)
@@ -46,7 +70,11 @@ def simulated(scene: MovingScene | None = SCENE, n_pulse=90, n_range: int | None
 def direct_ranges(radar: BistaticRadar, movers: Movers, n_pulse: int) -> tuple[torch.Tensor, torch.Tensor]:
     """R_m (m) and the sine of the look angle, (channel, pulse, target)."""
     time = ((torch.arange(n_pulse, dtype=torch.float64) - n_pulse // 2) / radar.prf_hz)[:, None]
-    along = (SPEED - movers.u_a_m_s) * time - movers.y0_m - torch.tensor(radar.channel_m, dtype=torch.float64)[:, None, None]
+    along = (
+        (SPEED - movers.u_a_m_s) * time
+        - movers.y0_m
+        - torch.tensor(radar.channel_m, dtype=torch.float64)[:, None, None]
+    )
     ranges = torch.sqrt((NEAR + movers.range_m - movers.u_r_m_s * time) ** 2 + along**2)
     return ranges, along / ranges
 
@@ -57,7 +85,9 @@ def direct_peaks(radar: BistaticRadar, n_pulse: int) -> torch.Tensor:
     ranges, sine = direct_ranges(radar, movers, n_pulse)
     time = ((torch.arange(n_pulse, dtype=torch.float64) - n_pulse // 2) / radar.prf_hz)[:, None]
     transmit = -243.0 * time + 0.02 * time**2
-    return torch.sinc(0.8 * sine / 0.24) * torch.exp(-2j * math.pi / 0.24 * (transmit + ranges - NEAR)) * movers.amplitude
+    return (
+        torch.sinc(0.8 * sine / 0.24) * torch.exp(-2j * math.pi / 0.24 * (transmit + ranges - NEAR)) * movers.amplitude
+    )
 
 
 def test_azimuth_only_echo_is_the_direct_sum():
@@ -96,7 +126,9 @@ def test_full_echoes_compress_to_the_compressed_ones(reference, within):
     radar = radar_of(pulse=LinearFM(50e6, 10e-6))
     raw = simulated(radar=radar, n_range=1500, n_pulse=12, kind="full")[0].signal
     data = range_compress(raw.data, reference(radar.pulse, 1500, radar.sampling_hz))
-    torch.testing.assert_close(data, simulated(radar=radar, n_range=1500, n_pulse=12)[0].signal.data, rtol=0, atol=within)
+    torch.testing.assert_close(
+        data, simulated(radar=radar, n_range=1500, n_pulse=12)[0].signal.data, rtol=0, atol=within
+    )
 
 
 def carrier(range_m: float) -> torch.Tensor:
@@ -108,7 +140,13 @@ def test_full_echo_starts_at_its_range_and_is_cut_not_wrapped():
     line = simulated(scene, n_pulse=1, n_range=150, radar=radar_of(channel_m=(0.0,)), kind="full")[0].signal.data[0, 0]
     assert float(line[:125].abs().max()) < 1e-9 and float((line[125:].abs() - 1).abs().max()) < 1e-6
     torch.testing.assert_close(line[125:], RADAR.pulse.samples(60e6)[:25] * carrier(250.0), rtol=0, atol=1e-6)
-    early = simulated(MovingPoints([0.0], [0.0], [0.0], [-100 * C / 60e6]), n_pulse=1, n_range=150, radar=radar_of(channel_m=(0.0,)), kind="full")[0].signal.data[0, 0]
+    early = simulated(
+        MovingPoints([0.0], [0.0], [0.0], [-100 * C / 60e6]),
+        n_pulse=1,
+        n_range=150,
+        radar=radar_of(channel_m=(0.0,)),
+        kind="full",
+    )[0].signal.data[0, 0]
     torch.testing.assert_close(early[:95], RADAR.pulse.samples(60e6)[25:] * carrier(-500.0), rtol=0, atol=1e-6)
     assert float(early[95:].abs().max()) < 1e-9
 
@@ -120,7 +158,9 @@ def test_echoes_beyond_the_line_do_not_come_back_at_its_other_end():
 
 
 def test_the_window_follows_the_ephemeris_and_the_carrier_the_truth():
-    """The envelope lies at R_m + what the truth has over the ephemeris; removing the ephemeris leaves that same range on the carrier."""
+    """The envelope lies at R_m + what the truth has over the ephemeris; removing the ephemeris
+    leaves that same range on the carrier.
+    """
     known = radar_of(transmit_range=(-243.0, 0.02))
     true = PolynomialTransmit((-223.0, 0.02))
     time = known.pulse_axis(90).values()
@@ -153,7 +193,9 @@ def test_motion_towards_the_transmitter_adds_to_doppler():
 
 
 def test_fidelity_of_the_receive_range_reaches_the_echo():
-    exact, series = (simulated(n_range=None, n_pulse=810, receive=r)[0].signal.data for r in (TaylorRange(12), TaylorRange(2)))
+    exact, series = (
+        simulated(n_range=None, n_pulse=810, receive=r)[0].signal.data for r in (TaylorRange(12), TaylorRange(2))
+    )
     torch.testing.assert_close(exact, simulated(n_range=None, n_pulse=810)[0].signal.data, rtol=0, atol=1e-6)
     assert float((series - exact).abs().max()) > 0.5
 
@@ -181,8 +223,16 @@ def test_noise_of_full_echoes_keeps_its_ratio_through_compression():
 def test_the_sea_joins_with_the_transmit_range_on_its_carrier(kind):
     """A full sea, compressed, is the compressed sea where lines are whole."""
     radar = radar_of(pulse=LinearFM(50e6, 4e-6))
-    data = simulated(None, radar=radar, n_range=1000, n_pulse=12, sea=KSea(power_db=0.0, margin_s=0.0), kind=kind)[0].signal.data
-    plain = simulated(None, radar=radar_of(pulse=radar.pulse, transmit_range=()), n_range=1000, n_pulse=12, sea=KSea(power_db=0.0, margin_s=0.0))[0].signal.data
+    data = simulated(None, radar=radar, n_range=1000, n_pulse=12, sea=KSea(power_db=0.0, margin_s=0.0), kind=kind)[
+        0
+    ].signal.data
+    plain = simulated(
+        None,
+        radar=radar_of(pulse=radar.pulse, transmit_range=()),
+        n_range=1000,
+        n_pulse=12,
+        sea=KSea(power_db=0.0, margin_s=0.0),
+    )[0].signal.data
     data = range_compress(data, flat_reference(radar.pulse, 1000, 60e6)) if kind == "full" else data
     time = radar.pulse_axis(12).values()[:, None]
     expected = plain * torch.exp(-2j * math.pi / 0.24 * (-243 * time + 0.02 * time**2))
@@ -193,8 +243,15 @@ def test_the_sea_joins_with_the_transmit_range_on_its_carrier(kind):
 
 @pytest.mark.parametrize("n_range", [None, 64])
 def test_batches_equal_single_trials(n_range):
-    scene = Fleet({"points": MovingPoints(torch.tensor([[1.0], [10.0], [-5.0]]), [3.0], [10.0], [0.0], random_phase=True), "ship": Ship(torch.tensor([0.0, 1.0, 2.0]), 4.0)})
-    batch, truth = simulated(scene, n_pulse=40, n_range=n_range, trials=range(3), snr_db=torch.tensor([0.0, 10.0, 20.0]))
+    scene = Fleet(
+        {
+            "points": MovingPoints(torch.tensor([[1.0], [10.0], [-5.0]]), [3.0], [10.0], [0.0], random_phase=True),
+            "ship": Ship(torch.tensor([0.0, 1.0, 2.0]), 4.0),
+        }
+    )
+    batch, truth = simulated(
+        scene, n_pulse=40, n_range=n_range, trials=range(3), snr_db=torch.tensor([0.0, 10.0, 20.0])
+    )
     for i, (a, b) in enumerate(zip((1.0, 10.0, -5.0), (0.0, 1.0, 2.0), strict=True)):
         one = Fleet({"points": MovingPoints([a], [3.0], [10.0], [0.0], random_phase=True), "ship": Ship(b, 4.0)})
         alone = simulated(one, n_pulse=40, n_range=n_range, trials=[i], snr_db=10.0 * i)[0].signal.data[0]
@@ -209,12 +266,17 @@ def test_a_scene_that_draws_nothing_has_all_trials():
 def test_single_precision_keeps_to_double():
     single = simulated(dtype=torch.complex64, n_pulse=200, snr_db=10.0)[0].signal.data
     assert single.dtype == torch.complex64
-    torch.testing.assert_close(single.to(torch.complex128), simulated(n_pulse=200, snr_db=10.0)[0].signal.data, rtol=0, atol=2e-5)
+    torch.testing.assert_close(
+        single.to(torch.complex128), simulated(n_pulse=200, snr_db=10.0)[0].signal.data, rtol=0, atol=2e-5
+    )
 
 
 @pytest.mark.parametrize("n_range", [None, 12])
 def test_gradients_of_speeds_places_and_amplitudes(n_range):
-    values = [torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in ([10.0, -4.0], [5.0, -8.0], [2.0, -6.0], [3.0, -2.0])]
+    values = [
+        torch.tensor(v, dtype=torch.float64, requires_grad=True)
+        for v in ([10.0, -4.0], [5.0, -8.0], [2.0, -6.0], [3.0, -2.0])
+    ]
     amplitude = torch.tensor([1.0 + 0.5j, -0.6j], dtype=torch.complex128, requires_grad=True)
 
     def echo(*args):
@@ -228,7 +290,13 @@ def test_channels_pass_through_vmap():
     rest = torch.zeros(1, dtype=torch.float64)
 
     def echo(u_r):
-        return bistatic_echo(Movers(u_r, rest, rest, rest, torch.ones(1, dtype=torch.complex128)), RADAR, 20, gate=BandLimited(4.5), dtype=torch.complex128)
+        return bistatic_echo(
+            Movers(u_r, rest, rest, rest, torch.ones(1, dtype=torch.complex128)),
+            RADAR,
+            20,
+            gate=BandLimited(4.5),
+            dtype=torch.complex128,
+        )
 
     torch.testing.assert_close(torch.vmap(echo)(speeds), torch.stack([echo(u) for u in speeds]))
 

@@ -1,4 +1,6 @@
-"""Channels that differ and clocks that drift: what they do to recordings, what the direct path shows, and what is refused."""
+"""Channels that differ and clocks that drift: what they do to recordings, what the direct path
+shows, and what is refused.
+"""
 
 from __future__ import annotations
 
@@ -20,9 +22,14 @@ def test_each_channel_gets_its_phase_gain_and_delay():
     recording, truth = simulated(damages={"imbalance": errors})
     assert truth.clean is not None
     clean, damaged = truth.clean.signal.data, recording.signal.data
-    factors = torch.polar(torch.tensor([1.0, 10**0.075, 10**-0.15], dtype=torch.float64), torch.tensor([0.3, 0.0, -2.0], dtype=torch.float64))
+    factors = torch.polar(
+        torch.tensor([1.0, 10**0.075, 10**-0.15], dtype=torch.float64),
+        torch.tensor([0.3, 0.0, -2.0], dtype=torch.float64),
+    )
     for channel, shift in enumerate((0, 2, -3)):
-        torch.testing.assert_close(damaged[channel], factors[channel] * clean[channel].roll(shift, -1), rtol=0, atol=1e-11)
+        torch.testing.assert_close(
+            damaged[channel], factors[channel] * clean[channel].roll(shift, -1), rtol=0, atol=1e-11
+        )
     assert truth.values["imbalance.delay_s"].tolist() == [0.0, 2 * CELL_S, -3 * CELL_S]
 
 
@@ -37,9 +44,13 @@ def test_a_part_of_a_cell_moves_the_envelope_and_not_the_carrier():
 
 def test_errors_may_differ_between_trials_and_spare_azimuth_only_data_delays():
     phase = torch.tensor([[0.1, 0.2, 0.3], [1.0, 2.0, 3.0]], dtype=torch.float64)
-    recording, truth = simulated(n_range=None, trials=range(2), damages={"p": ChannelErrors(phase)}, dtype=torch.complex64)
+    recording, truth = simulated(
+        n_range=None, trials=range(2), damages={"p": ChannelErrors(phase)}, dtype=torch.complex64
+    )
     assert truth.clean is not None and recording.signal.data.dtype == torch.complex64
-    torch.testing.assert_close(recording.signal.data, truth.clean.signal.data * torch.exp(1j * phase)[..., None].to(torch.complex64))
+    torch.testing.assert_close(
+        recording.signal.data, truth.clean.signal.data * torch.exp(1j * phase)[..., None].to(torch.complex64)
+    )
 
 
 def synchronised(**options):
@@ -54,7 +65,9 @@ def test_all_channels_of_a_pulse_share_its_phase_and_delay():
     recording, truth = simulated(trials=range(2), damages={"clock": synchronised()})
     phase, delay = truth.values["clock.phase_rad"], truth.values["clock.delay_s"]
     time = RADAR.pulse_axis(90).values()
-    torch.testing.assert_close(delay[0], 1e-9 + 3e-9 * time + 4e-9 * torch.sin(2 * math.pi * time + 0.3), rtol=1e-12, atol=0)
+    torch.testing.assert_close(
+        delay[0], 1e-9 + 3e-9 * time + 4e-9 * torch.sin(2 * math.pi * time + 0.3), rtol=1e-12, atol=0
+    )
     assert phase.shape == (2, 90) and not torch.equal(phase[0], phase[1])
     late = bistatic_echo(SCENE.movers(RADAR, Draws(3)), RADAR, 90, 128, gate=Pattern(), dtype=torch.complex128)
     frequency = torch.fft.fftfreq(128, CELL_S, dtype=torch.float64)
@@ -73,7 +86,12 @@ def test_the_direct_path_shows_phase_and_delay_of_every_pulse():
 
 
 def test_the_direct_path_has_noise_of_its_own():
-    clean, noisy = (simulated(n_range=None, trials=range(2), damages={"clock": SynchronisationError([WalkDrift(0.1)], direct_snr_db=snr)})[0].aux["direct_path"] for snr in (None, 20.0))
+    clean, noisy = (
+        simulated(
+            n_range=None, trials=range(2), damages={"clock": SynchronisationError([WalkDrift(0.1)], direct_snr_db=snr)}
+        )[0].aux["direct_path"]
+        for snr in (None, 20.0)
+    )
     assert float((noisy - clean).abs().square().mean()) == pytest.approx(0.01, rel=0.05)
 
 
@@ -84,9 +102,19 @@ def test_walks_start_from_the_middle_and_have_the_step_asked_for():
 
 
 def test_drifts_of_one_kind_differ_and_trials_do_not_depend_on_their_batch():
-    both = simulated(trials=range(3), n_range=None, damages={"c": SynchronisationError([SinusoidDrift(1.0, 2.0), SinusoidDrift(1.0, 2.0)])})[1].values["c.phase_rad"]
-    one = simulated(trials=[2], n_range=None, damages={"c": SynchronisationError([SinusoidDrift(1.0, 2.0)])})[1].values["c.phase_rad"]
-    alone = simulated(trials=[2], n_range=None, damages={"c": SynchronisationError([SinusoidDrift(1.0, 2.0), SinusoidDrift(1.0, 2.0)])})[1].values["c.phase_rad"]
+    both = simulated(
+        trials=range(3),
+        n_range=None,
+        damages={"c": SynchronisationError([SinusoidDrift(1.0, 2.0), SinusoidDrift(1.0, 2.0)])},
+    )[1].values["c.phase_rad"]
+    one = simulated(trials=[2], n_range=None, damages={"c": SynchronisationError([SinusoidDrift(1.0, 2.0)])})[1].values[
+        "c.phase_rad"
+    ]
+    alone = simulated(
+        trials=[2],
+        n_range=None,
+        damages={"c": SynchronisationError([SinusoidDrift(1.0, 2.0), SinusoidDrift(1.0, 2.0)])},
+    )[1].values["c.phase_rad"]
     assert torch.equal(both[2], alone[0]) and not torch.allclose(both[2], 2 * one[0], atol=1e-3)
 
 

@@ -12,16 +12,22 @@ from torchsar.echo.interference import Quantiser, Tone, WideInterferer
 RADAR = small_radar()
 
 
-def clutter(n_pulse: int = 64, n_range: int = 1024, trials: int | None = None, dtype: torch.dtype = torch.complex64) -> Recording:
+def clutter(
+    n_pulse: int = 64, n_range: int = 1024, trials: int | None = None, dtype: torch.dtype = torch.complex64
+) -> Recording:
     draws = Draws(5, trials=None if trials is None else range(trials))
-    return Recording(Signal(3 * draws.normal("clutter", (n_pulse, n_range), dtype), RADAR.raw_axes(n_pulse, n_range)), RADAR)
+    return Recording(
+        Signal(3 * draws.normal("clutter", (n_pulse, n_range), dtype), RADAR.raw_axes(n_pulse, n_range)), RADAR
+    )
 
 
 def power(x: torch.Tensor) -> torch.Tensor:
     return x.abs().square().mean((-2, -1))
 
 
-@pytest.mark.parametrize("damage", [Tone(20.0, 4e6, 1e5), Tone(20.0, 4e6, rate_hz_s=1e9, coherent=True), WideInterferer(20.0, -3e6, 1e6)])
+@pytest.mark.parametrize(
+    "damage", [Tone(20.0, 4e6, 1e5), Tone(20.0, 4e6, rate_hz_s=1e9, coherent=True), WideInterferer(20.0, -3e6, 1e6)]
+)
 def test_level_is_what_was_asked(damage) -> None:
     clean = clutter()
     damaged, _ = damage(clean, Draws(1))
@@ -76,10 +82,17 @@ def test_quantiser_has_odd_levels_and_clips() -> None:
     assert set(torch.unique(torch.round(levels)).int().tolist()) == set(range(-15, 16, 2))
     error = power(damaged.signal.data - clean.signal.data) / power(clean.signal.data)
     assert bool((error < 10**-1.8).all())  # 4 bits at 7 levels rms: about -20 dB
-    assert bool((power(Quantiser(12, 900.0)(clean, Draws(1))[0].signal.data - clean.signal.data) < 1e-6 * power(clean.signal.data)).all())
+    assert bool(
+        (
+            power(Quantiser(12, 900.0)(clean, Draws(1))[0].signal.data - clean.signal.data)
+            < 1e-6 * power(clean.signal.data)
+        ).all()
+    )
 
 
-@pytest.mark.parametrize("wrong", [lambda: Tone(10.0, 0.0, share=0.0), lambda: WideInterferer(10.0, 0.0, 0.0), lambda: Quantiser(0)])
+@pytest.mark.parametrize(
+    "wrong", [lambda: Tone(10.0, 0.0, share=0.0), lambda: WideInterferer(10.0, 0.0, 0.0), lambda: Quantiser(0)]
+)
 def test_mistakes_are_named(wrong) -> None:
     with pytest.raises(ValueError, match=r"share|bandwidth_hz|bits"):
         wrong()

@@ -28,7 +28,9 @@ def test_jitter_samples_the_fourier_series_at_the_true_instants(n):
 
 def test_jitter_leaves_a_pilot_of_the_stated_tone_and_noise():
     recording, _ = small_recording(trials=2)
-    damaged, truth = PeriodicJitter(OFFSETS, pilot_cycles=0.2, pilot_snr_db=20.0, pilot_samples=2000)(recording, Draws(1, trials=[0, 1]))
+    damaged, truth = PeriodicJitter(OFFSETS, pilot_cycles=0.2, pilot_snr_db=20.0, pilot_samples=2000)(
+        recording, Draws(1, trials=[0, 1])
+    )
     pilot = damaged.aux["pilot"].to(torch.complex128)
     tone = torch.exp(2j * math.pi * 0.2 * (torch.arange(2000) + OFFSETS[torch.arange(2000) % 4]))
     phase = torch.exp(1j * torch.angle((pilot * tone.conj()).sum(-1, keepdim=True)))

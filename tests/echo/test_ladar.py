@@ -1,4 +1,6 @@
-"""Sweeps of a triangular ladar: against direct sums, each level against the next, and what a world promises."""
+"""Sweeps of a triangular ladar: against direct sums, each level against the next, and what a world
+promises.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +56,9 @@ def test_every_sample_equals_direct_sums(motion, flight: bool) -> None:
 
 
 def test_levels_depart_by_the_published_figures() -> None:
-    """Brief 000, section 10: 0.17 to 0.46 percent for straight lines, nothing left of the signal's phase below them."""
+    """Brief 000, section 10: 0.17 to 0.46 percent for straight lines, nothing left of the signal's
+    phase below them.
+    """
     s = THREE.scatterers(Draws(0))
     expected, fast = direct_sweeps(s, table1(), 512, COMMON), direct_sweeps(s, table1(), 128, FAST)
     assert 0.0015 < off(ladar_echo(s, table1(), 512, COMMON, LinearInSweep()), expected) < 0.002
@@ -69,23 +73,52 @@ def worst_phase(a: Tensor, b: Tensor) -> float:
 
 
 CASES = {
-    "lines": (table1(speed_m_s=0.0), LinearInSweep(), (Polynomial([5.0, 500.0]),), 1.5, Extremes(velocity_m_s=5.0, acceleration_m_s2=1000.0)),
-    "parabolas": (table1(speed_m_s=0.0), QuadraticInSweep(), (Polynomial([0.0, 0.0, 5e8]),), 1.5, Extremes(jerk_m_s3=3e9)),
+    "lines": (
+        table1(speed_m_s=0.0),
+        LinearInSweep(),
+        (Polynomial([5.0, 500.0]),),
+        1.5,
+        Extremes(velocity_m_s=5.0, acceleration_m_s2=1000.0),
+    ),
+    "parabolas": (
+        table1(speed_m_s=0.0),
+        QuadraticInSweep(),
+        (Polynomial([0.0, 0.0, 5e8]),),
+        1.5,
+        Extremes(jerk_m_s3=3e9),
+    ),
     "sweeps": (table1(speed_m_s=0.0), OnePerSweep(), (Polynomial([0.04]),), 1.5, Extremes(velocity_m_s=0.04)),
     "periods": (table1(speed_m_s=0.0), OnePerPeriod(), (Polynomial([0.04]),), 1.5, Extremes(velocity_m_s=0.04)),
     "video": (table1(), EverySample(("flight", "residual_video")), (), 2.0, Extremes((0.0, 2.0))),
-    "hyperbola": (table1(reference_range_m=10.0, speed_m_s=0.0), EverySample(("flight", "hyperbola")), (), 0.0, Extremes(across_m=0.2)),
-    "flight": (table1(speed_m_s=0.0, reference_range_m=30.0, period_s=1.6e-3, sample_rate_hz=160e3), EverySample(), (Polynomial([0.0, 3.0]),), 0.0, Extremes(velocity_change_m_s=6 * 4.8e-3)),
+    "hyperbola": (
+        table1(reference_range_m=10.0, speed_m_s=0.0),
+        EverySample(("flight", "hyperbola")),
+        (),
+        0.0,
+        Extremes(across_m=0.2),
+    ),
+    "flight": (
+        table1(speed_m_s=0.0, reference_range_m=30.0, period_s=1.6e-3, sample_rate_hz=160e3),
+        EverySample(),
+        (Polynomial([0.0, 3.0]),),
+        0.0,
+        Extremes(velocity_change_m_s=6 * 4.8e-3),
+    ),
 }
 
 
 @pytest.mark.parametrize("radar, level, motion, range_m, extremes", CASES.values(), ids=list(CASES))
-def test_levels_say_what_they_neglect(radar: TriangularLadar, level, motion, range_m: float, extremes: Extremes) -> None:
+def test_levels_say_what_they_neglect(
+    radar: TriangularLadar, level, motion, range_m: float, extremes: Extremes
+) -> None:
     """Against the sum that has it all; the bound is met to a few percent."""
     s = Points([0.2 if extremes.across_m else 0.0], [range_m]).scatterers(Draws(0))
     full = EverySample(() if extremes.velocity_change_m_s else ("flight",))
     n_period = 3 if extremes.velocity_change_m_s else 1
-    worst = worst_phase(ladar_echo(s, radar, n_period, motion, level, dtype=DOUBLE), ladar_echo(s, radar, n_period, motion, full, dtype=DOUBLE))
+    worst = worst_phase(
+        ladar_echo(s, radar, n_period, motion, level, dtype=DOUBLE),
+        ladar_echo(s, radar, n_period, motion, full, dtype=DOUBLE),
+    )
     said = sum(level.neglected_phase_rad(radar, extremes).values())
     assert 0.9 * said <= worst <= 1.01 * said, (worst, said)
 
@@ -94,31 +127,58 @@ def test_what_is_not_left_out_is_not_neglected() -> None:
     assert EverySample(()).neglected_phase_rad(table1(), Extremes((1.0, 2.0), 0.2, 1.0, 1.0, 1.0, 1.0)) == {}
     assert set(LinearInSweep().neglected_phase_rad(table1(), Extremes())) == {"level", "flight"}
     # brief 000, section 10: 0.7 rad between up and down, RD 10.5 +- 0.2 m, Table 4
-    assert 2 * EverySample(("residual_video",)).neglected_phase_rad(table4(), Extremes((10.3, 10.7)))["residual_video"] == pytest.approx(0.7, abs=0.05)
-    assert EverySample(("hyperbola",)).neglected_phase_rad(table1(), Extremes(across_m=0.25))["hyperbola"] == pytest.approx(1.5e-7, rel=0.05)
+    assert 2 * EverySample(("residual_video",)).neglected_phase_rad(table4(), Extremes((10.3, 10.7)))[
+        "residual_video"
+    ] == pytest.approx(0.7, abs=0.05)
+    assert EverySample(("hyperbola",)).neglected_phase_rad(table1(), Extremes(across_m=0.25))[
+        "hyperbola"
+    ] == pytest.approx(1.5e-7, rel=0.05)
 
 
 def test_a_world_in_both_dechirp_signs_is_conjugate() -> None:
     world = LadarWorld(LetterE(), COMMON, LogAmplitude(0.1), 10.0, calibration=CalibrationFibre(50e-9, 20.0))
-    one, other = (simulate_ladar(table1(dechirp_sign=sign), world, 8, Draws(1, trials=range(2)))[0] for sign in ("lo_conj_echo", "echo_conj_lo"))
-    assert torch.equal(one.signal.data, other.signal.data.conj()) and torch.equal(one.aux["calibration"], other.aux["calibration"].conj())
+    one, other = (
+        simulate_ladar(table1(dechirp_sign=sign), world, 8, Draws(1, trials=range(2)))[0]
+        for sign in ("lo_conj_echo", "echo_conj_lo")
+    )
+    assert torch.equal(one.signal.data, other.signal.data.conj()) and torch.equal(
+        one.aux["calibration"], other.aux["calibration"].conj()
+    )
 
 
-@pytest.mark.parametrize("level", [LinearInSweep(), QuadraticInSweep(()), EverySample()], ids=["line", "parabola", "sample"])
+@pytest.mark.parametrize(
+    "level", [LinearInSweep(), QuadraticInSweep(()), EverySample()], ids=["line", "parabola", "sample"]
+)
 def test_batch_equals_singles(level) -> None:
-    """Trials are addressed, whatever else is in the batch; every random part differs between them."""
+    """Trials are addressed, whatever else is in the batch; every random part differs
+    between them.
+    """
     snr = torch.tensor([0.0, 40.0, -10.0], dtype=torch.float64)
     amplitude = torch.tensor([1e-5, 2e-5, 3e-5], dtype=torch.float64)
 
     def world(pick) -> LadarWorld:
         motion = (Sinusoid(amplitude[pick], 200.0), Polynomial([0.2]), PathFluctuation(1e-6))
-        return LadarWorld(Speckle(6, 0.2, 0.5, range_m=1.5), motion, LogAmplitude(0.1), snr[pick], level, sweep_error=SinusoidSweepError(1e6, 2e5), calibration=CalibrationFibre(5e-8, 10.0))
+        return LadarWorld(
+            Speckle(6, 0.2, 0.5, range_m=1.5),
+            motion,
+            LogAmplitude(0.1),
+            snr[pick],
+            level,
+            sweep_error=SinusoidSweepError(1e6, 2e5),
+            calibration=CalibrationFibre(5e-8, 10.0),
+        )
 
-    together, truth = simulate_ladar(table1(beam_rad=114e-6), world(slice(None)), 6, Draws(5, trials=[4, 0, 7]), dtype=DOUBLE)
+    together, truth = simulate_ladar(
+        table1(beam_rad=114e-6), world(slice(None)), 6, Draws(5, trials=[4, 0, 7]), dtype=DOUBLE
+    )
     for place, trial in enumerate([4, 0, 7]):
-        alone, known = simulate_ladar(table1(beam_rad=114e-6), world(slice(place, place + 1)), 6, Draws(5, trials=[trial]), dtype=DOUBLE)
+        alone, known = simulate_ladar(
+            table1(beam_rad=114e-6), world(slice(place, place + 1)), 6, Draws(5, trials=[trial]), dtype=DOUBLE
+        )
         torch.testing.assert_close(together.signal.data[place], alone.signal.data[0], atol=1e-11, rtol=0)
-        torch.testing.assert_close(truth.values["velocity_m_s"][place], known.values["velocity_m_s"][0], atol=1e-14, rtol=1e-12)
+        torch.testing.assert_close(
+            truth.values["velocity_m_s"][place], known.values["velocity_m_s"][0], atol=1e-14, rtol=1e-12
+        )
         assert torch.equal(together.aux["calibration"][place], alone.aux["calibration"][0])
     plain = simulate_ladar(table1(), LadarWorld(LetterE(), COMMON, snr_db=10.0), 6, Draws(5), dtype=DOUBLE)[0].signal
     assert plain.data.shape == (2, 6, 512) and plain.names == ("ramp", "pulse", "fast_time")
@@ -130,7 +190,12 @@ def test_truth_describes_the_motion_at_its_epochs() -> None:
     recording, truth = simulate_ladar(radar, world, 32, Draws(0, trials=range(2)))
     since = radar.pulse_step_s * torch.arange(32, dtype=torch.float64)
     for name, share in (("range_error_m", 0.5), ("range_error_up_m", 0.25), ("range_error_down_m", 0.75)):
-        torch.testing.assert_close(truth.values[name], displacement_m(COMMON, since + share * radar.period_s).expand(2, -1), atol=1e-16, rtol=1e-12)
+        torch.testing.assert_close(
+            truth.values[name],
+            displacement_m(COMMON, since + share * radar.period_s).expand(2, -1),
+            atol=1e-16,
+            rtol=1e-12,
+        )
     step = 1e-7
     around = since + radar.period_s / 2
     slope = (displacement_m(COMMON, around + step) - displacement_m(COMMON, around - step)) / (2 * step)
@@ -138,7 +203,9 @@ def test_truth_describes_the_motion_at_its_epochs() -> None:
     assert truth.clean is not None and truth.clean.signal.data.shape == recording.signal.data.shape == (2, 2, 32, 512)
     early = simulate_ladar(radar, LadarWorld(THREE, COMMON, fidelity=LinearInSweep(())), 32, Draws(0))[1]
     lag = radar.reference_range_m / radar.wave_speed_m_s
-    torch.testing.assert_close(early.values["range_error_m"], displacement_m(COMMON, around - lag), atol=1e-16, rtol=1e-12)
+    torch.testing.assert_close(
+        early.values["range_error_m"], displacement_m(COMMON, around - lag), atol=1e-16, rtol=1e-12
+    )
 
 
 def test_clean_has_the_noise_and_scintillation_but_no_motion() -> None:
@@ -162,16 +229,34 @@ def test_phases_hold_from_ten_metres_to_a_thousand_kilometres(reference_m: float
     getcontext().prec = 50
     radar = table1(reference_range_m=reference_m)
     s = Points([0.06], [1.7]).scatterers(Draws(0))
-    found, single = (ladar_echo(s, radar, 9, (Polynomial([0.4]),), EverySample(), dtype=dtype) for dtype in (DOUBLE, torch.complex64))
+    found, single = (
+        ladar_echo(s, radar, 9, (Polynomial([0.4]),), EverySample(), dtype=dtype) for dtype in (DOUBLE, torch.complex64)
+    )
     c, start, u = Decimal(radar.wave_speed_m_s), radar.sweep_axes(9)[1].values(), radar.fast_time_axis().values()
     for ramp, pulse, sample in ((0, 0, 0), (1, 8, 511), (0, 4, 200)):
-        time = Decimal(float(start[pulse])) + Decimal(radar.period_s) * (Decimal(1 + 2 * ramp) / 4) + Decimal(float(u[sample]))
-        across, near = Decimal(radar.speed_m_s) * time - Decimal(float(s.azimuth_m[0])), Decimal(reference_m) + Decimal(float(s.range_m[0]))
-        way = (near * near + across * across).sqrt() - Decimal(reference_m) + Decimal("0.4") * (time - Decimal(float(start[0])))
+        time = (
+            Decimal(float(start[pulse]))
+            + Decimal(radar.period_s) * (Decimal(1 + 2 * ramp) / 4)
+            + Decimal(float(u[sample]))
+        )
+        across, near = (
+            Decimal(radar.speed_m_s) * time - Decimal(float(s.azimuth_m[0])),
+            Decimal(reference_m) + Decimal(float(s.range_m[0])),
+        )
+        way = (
+            (near * near + across * across).sqrt()
+            - Decimal(reference_m)
+            + Decimal("0.4") * (time - Decimal(float(start[0])))
+        )
         delay = 2 * way / c
-        turns = Decimal(radar.carrier_hz) * delay + (1 - 2 * ramp) * Decimal(radar.chirp_rate_hz_s) * (Decimal(float(u[sample])) * delay - delay * delay / 2)
+        turns = Decimal(radar.carrier_hz) * delay + (1 - 2 * ramp) * Decimal(radar.chirp_rate_hz_s) * (
+            Decimal(float(u[sample])) * delay - delay * delay / 2
+        )
         expected = complex(math.cos(2 * math.pi * float(turns % 1)), math.sin(2 * math.pi * float(turns % 1)))
-        assert abs(complex(found[ramp, pulse, sample]) - expected) < 1e-7 and abs(complex(single[ramp, pulse, sample]) - expected) < 1e-6
+        assert (
+            abs(complex(found[ramp, pulse, sample]) - expected) < 1e-7
+            and abs(complex(single[ramp, pulse, sample]) - expected) < 1e-6
+        )
 
 
 def test_the_beam_lights_its_share() -> None:
@@ -202,7 +287,9 @@ def test_sweep_errors_equal_direct_sums(error) -> None:
     expected = direct_sweeps(s, table1(), 8, COMMON, error=error)
     assert off(direct_sweeps(s, table1(), 8, COMMON), expected) > 0.04
     assert off(ladar_echo(s, table1(), 8, COMMON, EverySample(), error, DOUBLE), expected) < 1e-8
-    lines = off(ladar_echo(s, table1(), 8, COMMON, LinearInSweep(), dtype=DOUBLE), direct_sweeps(s, table1(), 8, COMMON))
+    lines = off(
+        ladar_echo(s, table1(), 8, COMMON, LinearInSweep(), dtype=DOUBLE), direct_sweeps(s, table1(), 8, COMMON)
+    )
     assert off(ladar_echo(s, table1(), 8, COMMON, LinearInSweep(), error, DOUBLE), expected) < 1.2 * lines
 
 
@@ -217,7 +304,9 @@ def test_the_fibre_shows_the_sweep(error) -> None:
             turns = turns + error.turns(u, ramp) - error.turns(u - delay, ramp)
         expected = torch.polar(torch.ones_like(u), 2 * math.pi * (turns - torch.round(turns)))
         torch.testing.assert_close(found[ramp, 0], expected, atol=1e-7, rtol=0)
-    noisy = calibration_channel(radar, CalibrationFibre(delay, 10.0, every_period=True), error, 5, Draws(0, trials=range(3)), DOUBLE)
+    noisy = calibration_channel(
+        radar, CalibrationFibre(delay, 10.0, every_period=True), error, 5, Draws(0, trials=range(3)), DOUBLE
+    )
     assert noisy.shape == (3, 2, 5, 512)
     assert float((noisy - found).abs().square().mean()) == pytest.approx(0.1, rel=0.05)
 
@@ -226,31 +315,54 @@ def test_the_fibre_shows_the_sweep(error) -> None:
 def test_sweep_errors_are_integrals_of_their_frequency(error) -> None:
     u = torch.linspace(-4e-6, 4e-6, 81, dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(error.turns(u, 0).sum(), u)
-    known = error.amplitude_hz * torch.sin(2 * math.pi * error.frequency_hz * u + math.radians(20.0)) if isinstance(error, SinusoidSweepError) else 1e5 + 3e11 * u + 5e16 * u**2
+    known = (
+        error.amplitude_hz * torch.sin(2 * math.pi * error.frequency_hz * u + math.radians(20.0))
+        if isinstance(error, SinusoidSweepError)
+        else 1e5 + 3e11 * u + 5e16 * u**2
+    )
     torch.testing.assert_close(slope, known.detach(), rtol=1e-9, atol=1e-3)
     assert float(error.turns(torch.zeros((), dtype=torch.float64), 1)) == 0.0
 
 
-@pytest.mark.parametrize("level", [LinearInSweep(()), QuadraticInSweep(), EverySample()], ids=["line", "parabola", "sample"])
+@pytest.mark.parametrize(
+    "level", [LinearInSweep(()), QuadraticInSweep(), EverySample()], ids=["line", "parabola", "sample"]
+)
 def test_gradients(level) -> None:
     radar = table1(carrier_hz=1e9, bandwidth_hz=2e8, period_s=1e-3, sample_rate_hz=32e3, reference_range_m=50.0)
-    x, r = torch.tensor([[0.3, -0.2]], dtype=torch.float64, requires_grad=True), torch.tensor([[1.0, 2.0]], dtype=torch.float64, requires_grad=True)
-    a, move = torch.tensor([[1.0 + 0.2j, 0.5j]], dtype=DOUBLE, requires_grad=True), torch.tensor([0.01], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x, r, a, m: ladar_echo(Scatterers(x, r, a), radar, 2, (Sinusoid(m, 100.0, 30.0),), level, dtype=DOUBLE), (x, r, a, move))
+    x, r = (
+        torch.tensor([[0.3, -0.2]], dtype=torch.float64, requires_grad=True),
+        torch.tensor([[1.0, 2.0]], dtype=torch.float64, requires_grad=True),
+    )
+    a, move = (
+        torch.tensor([[1.0 + 0.2j, 0.5j]], dtype=DOUBLE, requires_grad=True),
+        torch.tensor([0.01], dtype=torch.float64, requires_grad=True),
+    )
+    assert torch.autograd.gradcheck(
+        lambda x, r, a, m: ladar_echo(Scatterers(x, r, a), radar, 2, (Sinusoid(m, 100.0, 30.0),), level, dtype=DOUBLE),
+        (x, r, a, move),
+    )
 
 
 def test_damages_are_told() -> None:
     def louder(recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         gain = draws.uniform("gain", (), 2.0, 3.0)
-        return replace(recording, signal=recording.signal.with_data(recording.signal.data * gain[:, None, None, None])), {"gain": gain}
+        return replace(
+            recording, signal=recording.signal.with_data(recording.signal.data * gain[:, None, None, None])
+        ), {"gain": gain}
 
-    recording, truth = simulate_ladar(table1(), LadarWorld(THREE), 16, Draws(0, trials=range(2)), {"louder": louder}, dtype=DOUBLE)
+    recording, truth = simulate_ladar(
+        table1(), LadarWorld(THREE), 16, Draws(0, trials=range(2)), {"louder": louder}, dtype=DOUBLE
+    )
     assert truth.clean is not None
-    torch.testing.assert_close(recording.signal.data, truth.clean.signal.data * truth.values["louder.gain"][:, None, None, None])
+    torch.testing.assert_close(
+        recording.signal.data, truth.clean.signal.data * truth.values["louder.gain"][:, None, None, None]
+    )
 
 
 def test_errors_are_sentences() -> None:
-    with pytest.raises(ValueError, match=r"beats at 33.3\d+ MHz, beyond half the sampling rate of 64 MHz; bring it nearer"):
+    with pytest.raises(
+        ValueError, match=r"beats at 33.3\d+ MHz, beyond half the sampling rate of 64 MHz; bring it nearer"
+    ):
         ladar_echo(Points([0.0], [8.0]).scatterers(Draws(0)), table1(), 4)
     with pytest.raises(ValueError, match="move it more slowly"):
         ladar_echo(Points([0.0], [1.5]).scatterers(Draws(0)), table1(), 4, (Polynomial([25.0]),))

@@ -17,10 +17,16 @@ def recording(trials: int | None = 3) -> Recording:
     """Line i holds i + 1 in every sample, and so does its AGC."""
     shape = (N, 4) if trials is None else (trials, N, 4)
     lines = (torch.arange(N) + 1.0).to(torch.complex64)[:, None].expand(shape).contiguous()
-    return Recording(Signal(lines, small_radar().raw_axes(N, 4)), small_radar(), {"agc": torch.arange(N) + 1.0, "pilot": torch.ones(N)})
+    return Recording(
+        Signal(lines, small_radar().raw_axes(N, 4)),
+        small_radar(),
+        {"agc": torch.arange(N) + 1.0, "pilot": torch.ones(N)},
+    )
 
 
-@pytest.mark.parametrize("damage, count", [(LostLines(count=7), 7), (LostLines(fraction=0.2), 40), (LostGaps(3, 8), 24)])
+@pytest.mark.parametrize(
+    "damage, count", [(LostLines(count=7), 7), (LostLines(fraction=0.2), 40), (LostGaps(3, 8), 24)]
+)
 def test_lost_lines_close_up_and_the_end_is_padded(damage, count: int) -> None:
     out, told = apply_damages(recording(), {"lost": damage}, Draws(1, trials=range(3)))
     number, lost = out.aux["line_number"], told["lost.lost"]
@@ -39,7 +45,9 @@ def test_lost_lines_close_up_and_the_end_is_padded(damage, count: int) -> None:
 def test_gaps_have_their_length_and_stay_apart() -> None:
     for seed in range(5):
         _, told = apply_damages(recording(None), {"gap": LostGaps(5, 8)}, Draws(seed))
-        edges = torch.diff(told["gap.lost"].int(), prepend=torch.zeros(1, dtype=torch.int32), append=torch.zeros(1, dtype=torch.int32))
+        edges = torch.diff(
+            told["gap.lost"].int(), prepend=torch.zeros(1, dtype=torch.int32), append=torch.zeros(1, dtype=torch.int32)
+        )
         begins, ends = (edges == 1).nonzero()[:, 0], (edges == -1).nonzero()[:, 0]
         assert (ends - begins).tolist() == [8] * 5
 

@@ -1,4 +1,6 @@
-"""Echo synthesis against direct summation, noise by its definition, and what a record may not do."""
+"""Echo synthesis against direct summation, noise by its definition, and what a record may
+not do.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +14,24 @@ from torchsar.core import Draws
 from torchsar.echo import SimulatedPairs, simulate, stripmap_echo
 from torchsar.echo.stripmap import _line_length, lit_power, place
 from torchsar.metrics import error_db
-from torchsar.scene import AlwaysLit, Antenna, Dwell, Hyperbola, Parabola, Points, RandomPoints, Speckle, StripmapWorld, Together
+from torchsar.scene import (
+    AlwaysLit,
+    Antenna,
+    Dwell,
+    Hyperbola,
+    Parabola,
+    Points,
+    RandomPoints,
+    Speckle,
+    StripmapWorld,
+    Together,
+)
 
 
 def direct(radar, world, n_pulse, n_range, draws):
-    """Sum over targets, pulses and frequencies, one phase at a time, in complex128, on the same band-limited grid."""
+    """Sum over targets, pulses and frequencies, one phase at a time, in complex128, on the same
+    band-limited grid.
+    """
     s = world.scene.scatterers(draws)
     doppler = 0.0 if world.doppler_hz is None else world.doppler_hz
     v = radar.velocity_m_s if world.velocity_m_s is None else world.velocity_m_s
@@ -25,10 +40,17 @@ def direct(radar, world, n_pulse, n_range, draws):
     f = torch.fft.fftfreq(n, 1 / radar.sampling_hz, dtype=torch.float64)
     t = torch.arange(n_pulse, dtype=torch.float64) / radar.prf_hz
     out = torch.zeros(n_pulse, n, dtype=torch.complex128)
-    for crossing, zero, closest, amplitude in zip(p.crossing_s, p.zero_doppler_s, p.closest_m, p.amplitude, strict=True):
+    for crossing, zero, closest, amplitude in zip(
+        p.crossing_s, p.zero_doppler_s, p.closest_m, p.amplitude, strict=True
+    ):
         r = torch.sqrt(closest**2 + (v * (t - zero)) ** 2)
-        w = world.beam.weight(t - crossing, -2 * v**2 * (t - zero) / (radar.wavelength_m * r) - doppler, torch.tensor(v))
-        turns = radar.carrier_hz * 2 * r[:, None] / radar.wave_speed_m_s + f * 2 * (r[:, None] - radar.near_range_m) / radar.wave_speed_m_s
+        w = world.beam.weight(
+            t - crossing, -2 * v**2 * (t - zero) / (radar.wavelength_m * r) - doppler, torch.tensor(v)
+        )
+        turns = (
+            radar.carrier_hz * 2 * r[:, None] / radar.wave_speed_m_s
+            + f * 2 * (r[:, None] - radar.near_range_m) / radar.wave_speed_m_s
+        )
         out += amplitude * w[:, None] * torch.polar(torch.ones_like(turns), -2 * math.pi * (turns % 1))
     return torch.fft.ifft(out * radar.pulse.spectrum(n, radar.sampling_hz))[:, :n_range]
 
@@ -57,14 +79,18 @@ def test_noise_follows_its_definition_per_trial():
     snr = torch.tensor([-10.0, 0.0, 30.0], dtype=torch.float64)
     world = StripmapWorld(Speckle(300, 10.0, 60.0), snr_db=snr)
     recording, truth = simulate(small_radar(), world, 64, 100, Draws(5, trials=range(3)), dtype=torch.complex128)
-    silent, _ = simulate(small_radar(), StripmapWorld(world.scene), 64, 100, Draws(5, trials=range(3)), dtype=torch.complex128)
+    silent, _ = simulate(
+        small_radar(), StripmapWorld(world.scene), 64, 100, Draws(5, trials=range(3)), dtype=torch.complex128
+    )
     noise = (recording.signal.data - silent.signal.data).abs().square().mean((-2, -1))
     torch.testing.assert_close(10 * torch.log10(lit_power(silent.signal.data) / noise), snr, atol=0.2, rtol=0)
     torch.testing.assert_close(truth.values["noise_std"].square(), noise, rtol=0.05, atol=0)
 
 
 def test_trials_are_the_same_in_any_chunk():
-    world = StripmapWorld(Together({"points": RandomPoints(3, 10.0, 40.0), "sea": Speckle(50, 20.0, 60.0)}), snr_db=10.0)
+    world = StripmapWorld(
+        Together({"points": RandomPoints(3, 10.0, 40.0), "sea": Speckle(50, 20.0, 60.0)}), snr_db=10.0
+    )
     whole, _ = simulate(small_radar(), world, 24, 80, Draws(2, trials=range(4)), dtype=torch.complex128)
     part, _ = simulate(small_radar(), world, 24, 80, Draws(2, trials=[3, 1]), dtype=torch.complex128)
     torch.testing.assert_close(part.signal.data, whole.signal.data[[3, 1]], rtol=0, atol=1e-10)
@@ -79,8 +105,15 @@ def test_echo_is_differentiable_in_positions_velocity_and_doppler():
         placed = place(type(base)(azimuth, range_, base.amplitude), radar, 3, 30, doppler, velocity)
         return stripmap_echo(placed, world, radar, 3, 30, torch.complex128)
 
-    values = (base.azimuth_m, base.range_m, torch.tensor(120.0, dtype=torch.float64), torch.tensor(5.0, dtype=torch.float64))
-    assert torch.autograd.gradcheck(echo, tuple(v.clone().requires_grad_() for v in values), eps=1e-5, atol=1e-5, rtol=1e-3)
+    values = (
+        base.azimuth_m,
+        base.range_m,
+        torch.tensor(120.0, dtype=torch.float64),
+        torch.tensor(5.0, dtype=torch.float64),
+    )
+    assert torch.autograd.gradcheck(
+        echo, tuple(v.clone().requires_grad_() for v in values), eps=1e-5, atol=1e-5, rtol=1e-3
+    )
 
 
 def test_parabola_says_what_it_neglects():
@@ -90,13 +123,19 @@ def test_parabola_says_what_it_neglects():
         measured = 4 * math.pi / radar.wavelength_m * float(Parabola().range_m(t, r, v) - Hyperbola().range_m(t, r, v))
         assert Parabola().neglected_phase_rad(radar, range_m, since) == pytest.approx(measured, rel=1e-4, abs=1e-6)
     # at the sensor of the paper the parabola suffices, at twenty kilometres it does not
-    assert Parabola().neglected_phase_rad(radar, 700e3, 0.75) < math.pi / 4 < Parabola().neglected_phase_rad(radar, 20e3, 0.5)
+    assert (
+        Parabola().neglected_phase_rad(radar, 700e3, 0.75)
+        < math.pi / 4
+        < Parabola().neglected_phase_rad(radar, 20e3, 0.5)
+    )
 
 
 def test_pairs_are_the_same_in_any_batch_size():
     world = StripmapWorld(RandomPoints(2, 10.0, 40.0), snr_db=5.0)
     by_two = list(SimulatedPairs(small_radar(), world, 12, 60, seed=4, count=5, batch=2))
-    assert [r.signal.data.shape[0] for r, _ in by_two] == [2, 2, 1] and len(SimulatedPairs(small_radar(), world, 12, 60, 4, 5, 2)) == 3
+    assert [r.signal.data.shape[0] for r, _ in by_two] == [2, 2, 1] and len(
+        SimulatedPairs(small_radar(), world, 12, 60, 4, 5, 2)
+    ) == 3
     one_by_one = torch.cat([r.signal.data for r, _ in SimulatedPairs(small_radar(), world, 12, 60, seed=4, count=5)])
     torch.testing.assert_close(torch.cat([r.signal.data for r, _ in by_two]), one_by_one, rtol=1e-4, atol=1e-6)
 

@@ -1,4 +1,6 @@
-"""The echo of a stationary sea: against direct summation of its points, its power, its channels, its precision and its draws."""
+"""The echo of a stationary sea: against direct summation of its points, its power, its channels,
+its precision and its draws.
+"""
 
 from __future__ import annotations
 
@@ -20,13 +22,23 @@ from torchsar.scene.sea import Sea
 
 def geo_radar(**changes: Any) -> BistaticRadar:
     """The receiver of brief 001, with a transmit range that no sea may know of."""
-    values: dict = {"carrier_hz": 1.25e9, "pulse": LinearFM(50e6, 10e-6), "sampling_hz": 60e6, "prf_hz": 180.0, "speed_m_s": 300.0, "reference_range_m": 5000.0, "transmit_range": (-243.0, 0.03)}
+    values: dict = {
+        "carrier_hz": 1.25e9,
+        "pulse": LinearFM(50e6, 10e-6),
+        "sampling_hz": 60e6,
+        "prf_hz": 180.0,
+        "speed_m_s": 300.0,
+        "reference_range_m": 5000.0,
+        "transmit_range": (-243.0, 0.03),
+    }
     return BistaticRadar(**{**values, **changes})
 
 
 @dataclass(frozen=True)
 class Bright(Sea):
-    """A dark surface with bright cells next to the places asked for; `found` tells where they are."""
+    """A dark surface with bright cells next to the places asked for; `found` tells where
+    they are.
+    """
 
     places: tuple[tuple[float, float], ...] = ()
     found: list[tuple[float, float]] = field(default_factory=list)
@@ -34,7 +46,9 @@ class Bright(Sea):
     def texture(self, azimuth_m: Tensor, range_m: Tensor, draws: Draws) -> tuple[Tensor, Tensor, Tensor]:
         raise NotImplementedError
 
-    def reflectivity(self, azimuth_m: Tensor, range_m: Tensor, draws: Draws, dtype: torch.dtype = torch.complex64) -> Tensor:
+    def reflectivity(
+        self, azimuth_m: Tensor, range_m: Tensor, draws: Draws, dtype: torch.dtype = torch.complex64
+    ) -> Tensor:
         cells = torch.zeros(len(azimuth_m), len(range_m), dtype=dtype)
         for azimuth, distance in self.places:
             i, j = int((azimuth_m - azimuth).abs().argmin()), int((range_m - distance).abs().argmin())
@@ -43,9 +57,21 @@ class Bright(Sea):
         return cells
 
 
-def direct(radar: BistaticRadar, points: list[tuple[float, float]], n_pulse: int, n_range: int | None, gate: BandLimited | Pattern) -> Tensor:
-    """One point after the other: carrier phase of the exact range, the band of the pulse in range (on the same bins), the gate in time. complex128."""
-    time_s, dx, wavelength = radar.pulse_axis(n_pulse).values()[:, None], radar.channels_at()[:, None, None], radar.wavelength_m
+def direct(
+    radar: BistaticRadar,
+    points: list[tuple[float, float]],
+    n_pulse: int,
+    n_range: int | None,
+    gate: BandLimited | Pattern,
+) -> Tensor:
+    """One point after the other: carrier phase of the exact range, the band of the pulse in range
+    (on the same bins), the gate in time. complex128.
+    """
+    time_s, dx, wavelength = (
+        radar.pulse_axis(n_pulse).values()[:, None],
+        radar.channels_at()[:, None, None],
+        radar.wavelength_m,
+    )
     frequency_hz, share = _Lines.of(radar, n_range, _Light.of(gate, radar, 1).last_sin).band(None)
     samples_m = torch.zeros(1) if n_range is None else (torch.arange(n_range) - n_range // 2) * radar.range_step_m
     per_metre = 2j * math.pi / LIGHT_M_S * frequency_hz
@@ -55,8 +81,14 @@ def direct(radar: BistaticRadar, points: list[tuple[float, float]], n_pulse: int
         beyond = receive_range(time_s, 0.0, 0.0, y, closest, radar.speed_m_s, dx) + offset
         along = radar.speed_m_s * time_s - y - dx
         element = None if isinstance(gate, BandLimited) else gate.element_m or radar.element_m
-        weight = (along.abs() < 675).double() if element is None else torch.sinc(element / wavelength * along / (closest + beyond - offset))
-        response = torch.exp(-beyond * per_metre) @ (share[:, None] / share.sum() * torch.exp(per_metre[:, None] * samples_m))
+        weight = (
+            (along.abs() < 675).double()
+            if element is None
+            else torch.sinc(element / wavelength * along / (closest + beyond - offset))
+        )
+        response = torch.exp(-beyond * per_metre) @ (
+            share[:, None] / share.sum() * torch.exp(per_metre[:, None] * samples_m)
+        )
         total = total + weight / math.sqrt(closest) * response * torch.exp(-2j * math.pi / wavelength * beyond)
     return total if n_range is not None else total[..., 0]
 
@@ -64,7 +96,9 @@ def direct(radar: BistaticRadar, points: list[tuple[float, float]], n_pulse: int
 def mismatch_db(x: Tensor, reference: Tensor) -> float:
     """Error of x against a reference, both scaled by one complex number at most."""
     scale = (reference.conj() * x).sum() / reference.abs().square().sum()
-    return float(20 * torch.log10(torch.linalg.vector_norm(x / scale - reference) / torch.linalg.vector_norm(reference)))
+    return float(
+        20 * torch.log10(torch.linalg.vector_norm(x / scale - reference) / torch.linalg.vector_norm(reference))
+    )
 
 
 PLACES = ((60.0, 35.0), (-110.0, -50.0), (3.0, 90.0))
@@ -74,7 +108,9 @@ GATES = {"pattern": (Pattern(), -100.0), "long element": (Pattern(1.0), -98.0), 
 @pytest.mark.parametrize("gate, limit_db", GATES.values(), ids=list(GATES))
 @pytest.mark.parametrize("n_pulse, n_range", [(240, 64), (181, 51)])
 def test_points_lie_and_migrate_as_by_direct_summation(gate, limit_db, n_pulse, n_range):
-    """Three channels at uneven places: phases of the carrier, curved lines in range, the order of the channels. The edges of the band leave a Fresnel ripple."""
+    """Three channels at uneven places: phases of the carrier, curved lines in range, the order of
+    the channels. The edges of the band leave a Fresnel ripple.
+    """
     radar, sea = geo_radar(channel_m=(-0.8, 0.0, 1.1)), Bright(places=PLACES, margin_s=3.5)
     x = sea_echo(sea, radar, n_pulse, n_range, gate, Draws(1), torch.complex128)
     assert x.shape == (3, n_pulse, n_range)
@@ -89,7 +125,9 @@ def test_a_line_agrees_with_direct_summation(gate, limit_db):
 
 
 def test_a_side_lobe_is_seen_where_direct_summation_puts_it():
-    """A point abreast 7 s after the record is lit by the first side lobe alone: dark for lobes=1, there for lobes=2."""
+    """A point abreast 7 s after the record is lit by the first side lobe alone: dark for lobes=1,
+    there for lobes=2.
+    """
     first, second = (Bright(places=((2200.0, 0.0),), margin_s=14.0, lobes=lobes) for lobes in (1, 2))
     dark, lit = (sea_echo(sea, geo_radar(), 90, None, Pattern(), Draws(1), torch.complex128) for sea in (first, second))
     assert float(dark.abs().max() / lit.abs().max()) < 1e-3
@@ -98,8 +136,13 @@ def test_a_side_lobe_is_seen_where_direct_summation_puts_it():
 
 @pytest.mark.parametrize("gate", [BandLimited(4.5), Pattern()])
 def test_nothing_beyond_a_frame_comes_back_on_its_other_side(gate):
-    """Cells that migrate past the far end, or lie 12 samples beyond either while they are abreast, leave side lobes at the most."""
-    inside, near, far = (sea_echo(Bright(places=((0.0, m),), margin_s=3.5), geo_radar(), 900, 24, gate, Draws(1), torch.complex128) for m in (0.0, -120.0, 115.0))
+    """Cells that migrate past the far end, or lie 12 samples beyond either while they are abreast,
+    leave side lobes at the most.
+    """
+    inside, near, far = (
+        sea_echo(Bright(places=((0.0, m),), margin_s=3.5), geo_radar(), 900, 24, gate, Draws(1), torch.complex128)
+        for m in (0.0, -120.0, 115.0)
+    )
     assert float(far.abs().max() / inside.abs().max()) < 0.05
     assert float(near[:, 400:500].abs().max() / inside.abs().max()) < 0.05
     assert float(inside[..., :8].abs().max() / inside.abs().max()) < 0.1
@@ -111,19 +154,29 @@ FRAMES = {"line": None, "frame": 24, "one sample": 1}
 @pytest.mark.parametrize("gate", [BandLimited(4.5), Pattern(), BandLimited(20.0)], ids=["band", "pattern", "wide band"])
 @pytest.mark.parametrize("n_range", FRAMES.values(), ids=list(FRAMES))
 def test_power_of_a_sample_is_as_promised(gate, n_range):
-    """Over trials at -30 and +20 dB; in a frame alike at both ends, in every channel, and at the first pulses."""
+    """Over trials at -30 and +20 dB; in a frame alike at both ends, in every channel, and at the
+    first pulses.
+    """
     power_db = torch.tensor([-30.0, 20.0], dtype=torch.float64).repeat_interleave(8)
-    x = sea_echo(KSea(math.inf, power_db=power_db, margin_s=0.1), geo_radar(), 40, n_range, gate, Draws(2, trials=range(16)))
-    level = (x.abs().square().double() / 10 ** (power_db / 10).reshape(-1, *(1 for _ in x.shape[1:]))).reshape(16, 3, 40, -1)
+    x = sea_echo(
+        KSea(math.inf, power_db=power_db, margin_s=0.1), geo_radar(), 40, n_range, gate, Draws(2, trials=range(16))
+    )
+    level = (x.abs().square().double() / 10 ** (power_db / 10).reshape(-1, *(1 for _ in x.shape[1:]))).reshape(
+        16, 3, 40, -1
+    )
     assert float(level.mean()) == pytest.approx(1, abs=0.03 if n_range == 24 else 0.1)
-    assert float(level[:8].mean()) == pytest.approx(1, abs=0.15) and float(level[8:].mean()) == pytest.approx(1, abs=0.15)
+    assert float(level[:8].mean()) == pytest.approx(1, abs=0.15) and float(level[8:].mean()) == pytest.approx(
+        1, abs=0.15
+    )
     if n_range == 24:
         for part in (level[..., :3], level[..., -3:], level[:, :, :8], *level.unbind(1)):
             assert float(part.mean()) == pytest.approx(1, abs=0.1)
 
 
 def test_a_sea_lies_in_the_band_of_its_gate():
-    """A pulse rate above the band of 337.5 Hz shows nothing beside it; a ring has no leakage to hide in."""
+    """A pulse rate above the band of 337.5 Hz shows nothing beside it; a ring has no leakage to
+    hide in.
+    """
     radar = geo_radar(prf_hz=450.0)
     x = sea_echo(KSea(margin_s=0.0), radar, 600, None, BandLimited(4.5), Draws(3), torch.complex128)
     power = torch.fft.fft(x).abs().square().mean(0)
@@ -134,18 +187,27 @@ def test_a_sea_lies_in_the_band_of_its_gate():
 
 
 def test_channels_are_one_delayed_signal():
-    """At a pulse rate above the band, channel m is the reference dx_m / V later, exactly on a ring."""
+    """At a pulse rate above the band, channel m is the reference dx_m / V later, exactly on
+    a ring.
+    """
     radar = geo_radar(prf_hz=450.0, channel_m=(-0.8, 0.0, 1.3))
-    x = torch.fft.fft(sea_echo(KSea(margin_s=0.0), radar, 300, 20, BandLimited(4.5), Draws(3), torch.complex128), dim=-2)
+    x = torch.fft.fft(
+        sea_echo(KSea(margin_s=0.0), radar, 300, 20, BandLimited(4.5), Draws(3), torch.complex128), dim=-2
+    )
     doppler = torch.fft.fftfreq(300, 1 / 450.0, dtype=torch.float64)[:, None]
     for m, dx in enumerate(radar.channel_m):
-        torch.testing.assert_close(x[m], x[1] * torch.exp(-2j * math.pi * doppler * dx / 300.0), rtol=0, atol=1e-9 * float(x.abs().max()))
+        torch.testing.assert_close(
+            x[m], x[1] * torch.exp(-2j * math.pi * doppler * dx / 300.0), rtol=0, atol=1e-9 * float(x.abs().max())
+        )
 
 
 @pytest.mark.parametrize("gate", [BandLimited(4.5), Pattern()])
 @pytest.mark.parametrize("n_range", [None, 40])
 def test_single_precision_agrees_with_double(gate, n_range):
-    single, double = (sea_echo(KSea(), geo_radar(), 100, n_range, gate, Draws(4), dtype) for dtype in (torch.complex64, torch.complex128))
+    single, double = (
+        sea_echo(KSea(), geo_radar(), 100, n_range, gate, Draws(4), dtype)
+        for dtype in (torch.complex64, torch.complex128)
+    )
     assert single.dtype == torch.complex64
     assert float(torch.linalg.vector_norm(single - double) / torch.linalg.vector_norm(double)) < 2e-6
 
@@ -165,10 +227,21 @@ def test_trials_do_not_know_of_each_other(n_range):
 
 
 def test_gradients_reach_power_and_image():
-    image, power = torch.rand(3, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(1)).add(0.1).requires_grad_(), torch.tensor(3.0, dtype=torch.float64, requires_grad=True)
+    image, power = (
+        torch.rand(3, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(1)).add(0.1).requires_grad_(),
+        torch.tensor(3.0, dtype=torch.float64, requires_grad=True),
+    )
 
     def echo(image: Tensor, power: Tensor) -> Tensor:
-        return sea_echo(ImageReflectivity(image, 300.0, 60.0, power_db=power, margin_s=0.0), geo_radar(), 8, 3, BandLimited(1.0), Draws(6), torch.complex128)
+        return sea_echo(
+            ImageReflectivity(image, 300.0, 60.0, power_db=power, margin_s=0.0),
+            geo_radar(),
+            8,
+            3,
+            BandLimited(1.0),
+            Draws(6),
+            torch.complex128,
+        )
 
     assert torch.autograd.gradcheck(echo, (image, power))
 
@@ -187,15 +260,27 @@ def test_impossible_frames_and_gates_are_refused(n_range, gate, error, sentence)
 
 
 def test_a_frame_near_the_receiver_is_finite():
-    x = sea_echo(KSea(margin_s=0.0), geo_radar(reference_range_m=400.0, height_m=100.0), 16, 150, BandLimited(0.5), Draws(1))
-    assert bool(torch.isfinite(torch.view_as_real(x)).all()) and float(x.abs().square().mean()) == pytest.approx(1, abs=0.2)
+    x = sea_echo(
+        KSea(margin_s=0.0), geo_radar(reference_range_m=400.0, height_m=100.0), 16, 150, BandLimited(0.5), Draws(1)
+    )
+    assert bool(torch.isfinite(torch.view_as_real(x)).all()) and float(x.abs().square().mean()) == pytest.approx(
+        1, abs=0.2
+    )
 
 
 @pytest.mark.parametrize("shape, moment", [(1.5, 10 / 3), (math.inf, 2.0)])
 def test_a_focused_line_is_k_distributed_where_it_resolves_the_texture(shape, moment):
     """At a resolution of 0.79 m in cells of 40 m, <I^2> / <I>^2 = 2 (1 + 1 / shape)."""
     radar = geo_radar(prf_hz=450.0)
-    x = sea_echo(KSea(shape, cell_m=(40.0, 20.0), margin_s=0.0), radar, 600, None, BandLimited(4.5), Draws(7, trials=range(400)), torch.complex128)[:, 1]
+    x = sea_echo(
+        KSea(shape, cell_m=(40.0, 20.0), margin_s=0.0),
+        radar,
+        600,
+        None,
+        BandLimited(4.5),
+        Draws(7, trials=range(400)),
+        torch.complex128,
+    )[:, 1]
     doppler = torch.fft.fftfreq(600, 1 / 450.0, dtype=torch.float64)
     root = torch.sqrt((1 / radar.wavelength_m) ** 2 - (doppler / 300.0) ** 2)
     image = torch.fft.ifft(torch.fft.fft(x) * torch.exp(2j * math.pi * 5000.0 * (root - 1 / radar.wavelength_m)))
@@ -206,8 +291,12 @@ def test_a_focused_line_is_k_distributed_where_it_resolves_the_texture(shape, mo
 @pytest.mark.parametrize("n_range", [None, 16])
 def test_a_simulated_world_holds_the_sea_under_the_transmit_range(n_range):
     radar, sea = geo_radar(), KSea(power_db=-10.0)
-    recording, _ = simulate_bistatic(radar, BistaticWorld(None, Pattern(), sea=sea), 30, n_range, Draws(8, trials=range(2)), dtype=torch.complex128)
+    recording, _ = simulate_bistatic(
+        radar, BistaticWorld(None, Pattern(), sea=sea), 30, n_range, Draws(8, trials=range(2)), dtype=torch.complex128
+    )
     alone = sea_echo(sea, radar, 30, n_range, Pattern(), Draws(8, trials=range(2)).part("sea"), torch.complex128)
     turns = -radar.transmit_range_m(radar.pulse_axis(30).values()) / radar.wavelength_m
     carrier = torch.exp(2j * math.pi * turns)
-    torch.testing.assert_close(recording.signal.data, alone * (carrier if n_range is None else carrier[:, None]), rtol=0, atol=1e-9)
+    torch.testing.assert_close(
+        recording.signal.data, alone * (carrier if n_range is None else carrier[:, None]), rtol=0, atol=1e-9
+    )

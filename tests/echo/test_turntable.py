@@ -1,4 +1,6 @@
-"""Echoes of turning targets against direct summation, each level against the next, and the figures of Ruan et al. 2013."""
+"""Echoes of turning targets against direct summation, each level against the next, and the figures
+of Ruan et al. 2013.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,14 @@ SMALL = RandomPoints(9, 0.2, 0.05)
 
 def ladar(**changes) -> InverseRadar:
     """The instrument of the paper, 400 pulses of 256 samples."""
-    values: dict = {"carrier_hz": LIGHT_M_S / 1.55e-6, "bandwidth_hz": 150e9, "prf_hz": 2000.0, "rotation_rad_s": 0.005, "pulse_s": 100e-6, "reference_range_m": 20e3}
+    values: dict = {
+        "carrier_hz": LIGHT_M_S / 1.55e-6,
+        "bandwidth_hz": 150e9,
+        "prf_hz": 2000.0,
+        "rotation_rad_s": 0.005,
+        "pulse_s": 100e-6,
+        "reference_range_m": 20e3,
+    }
     return InverseRadar(**{**values, **changes})
 
 
@@ -60,8 +69,19 @@ def direct_compressed(s: Scatterers, radar: InverseRadar, n_pulse: int, n_range:
     return out
 
 
-def direct_dechirped(s: Scatterers, radar: InverseRadar, n_pulse: int, n_fast: int, rate: float, motion=(), track=(), curved: bool = False) -> Tensor:
-    """Scatterer by scatterer, the range at every sample; `curved`: the distance of points instead of that of planes."""
+def direct_dechirped(
+    s: Scatterers,
+    radar: InverseRadar,
+    n_pulse: int,
+    n_fast: int,
+    rate: float,
+    motion=(),
+    track=(),
+    curved: bool = False,
+) -> Tensor:
+    """Scatterer by scatterer, the range at every sample; `curved`: the distance of points instead
+    of that of planes.
+    """
     assert radar.pulse_s is not None
     fast = (torch.arange(n_fast, dtype=torch.float64) - n_fast // 2) * radar.pulse_s / n_fast
     pulse = torch.arange(n_pulse, dtype=torch.float64) / radar.prf_hz
@@ -75,7 +95,12 @@ def direct_dechirped(s: Scatterers, radar: InverseRadar, n_pulse: int, n_fast: i
             across, far = x * torch.cos(theta) - y * torch.sin(theta), radar.reference_range_m + y + change
             change = change + across.square() / (torch.sqrt(far.square() + across.square()) + far)
         delay = 2 * (y + change) / radar.wave_speed_m_s
-        out += a * unit(-(radar.carrier_hz * 2 * change / radar.wave_speed_m_s + radar.chirp_rate_hz_s * (fast * delay - delay.square() / 2)))
+        out += a * unit(
+            -(
+                radar.carrier_hz * 2 * change / radar.wave_speed_m_s
+                + radar.chirp_rate_hz_s * (fast * delay - delay.square() / 2)
+            )
+        )
     return out
 
 
@@ -84,7 +109,9 @@ def test_level_a_equals_direct_sums(n_pulse: int, n_range: int) -> None:
     s = SMALL.scatterers(Draws(1))
     expected = direct_compressed(s, QUICK, n_pulse, n_range, 0.005)
     torch.testing.assert_close(turntable_echo(s, QUICK, n_pulse, n_range, 0.005, DOUBLE), expected, atol=1e-10, rtol=0)
-    torch.testing.assert_close(turntable_echo(s, QUICK, n_pulse, n_range, 0.005).to(DOUBLE), expected, atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        turntable_echo(s, QUICK, n_pulse, n_range, 0.005).to(DOUBLE), expected, atol=1e-5, rtol=0
+    )
 
 
 MOTIONS = {
@@ -100,12 +127,18 @@ def test_level_b_equals_direct_sums(motion, track) -> None:
     s = RandomPoints(9, 0.2, 0.2).scatterers(Draws(1))
     expected = direct_dechirped(s, QUICK, 40, 64, 0.005, motion, track)
     scale = float(expected.abs().max())
-    torch.testing.assert_close(dechirped_echo(s, QUICK, 40, 64, 0.005, motion, track, DOUBLE), expected, atol=1e-9 * scale, rtol=0)
-    torch.testing.assert_close(dechirped_echo(s, QUICK, 40, 64, 0.005, motion, track).to(DOUBLE), expected, atol=2e-6 * scale, rtol=0)
+    torch.testing.assert_close(
+        dechirped_echo(s, QUICK, 40, 64, 0.005, motion, track, DOUBLE), expected, atol=1e-9 * scale, rtol=0
+    )
+    torch.testing.assert_close(
+        dechirped_echo(s, QUICK, 40, 64, 0.005, motion, track).to(DOUBLE), expected, atol=2e-6 * scale, rtol=0
+    )
 
 
 def test_level_b_of_a_slow_pulse_and_fast_turn() -> None:
-    """A microwave pulse of a millisecond and 40 times the rotation: the power series has terms to add."""
+    """A microwave pulse of a millisecond and 40 times the rotation: the power series has terms to
+    add.
+    """
     radar = InverseRadar(10e9, 2e9, 500.0, 0.2, 1e-3)
     s = RandomPoints(7, 8.0, 4.0).scatterers(Draws(2))
     expected = direct_dechirped(s, radar, 10, 64, 0.2)
@@ -113,30 +146,45 @@ def test_level_b_of_a_slow_pulse_and_fast_turn() -> None:
 
 
 def test_cross_range_and_range_lie_where_they_should() -> None:
-    recording, _ = simulate_turntable(ladar(), TurntableWorld(Points([0.062], [-0.04 * 0.9993082])), 400, 256, Draws(0), dtype=DOUBLE)
+    recording, _ = simulate_turntable(
+        ladar(), TurntableWorld(Points([0.062], [-0.04 * 0.9993082])), 400, 256, Draws(0), dtype=DOUBLE
+    )
     axes = ladar().image_axes(recording.signal.axes)
     line, column = divmod(int(azimuth_transform(recording.signal.data).abs().argmax()), 256)
-    assert abs(axes[0].values()[line] - 0.062) < axes[0].step / 2 and abs(axes[1].values()[column] + 0.04) < axes[1].step / 2
+    assert (
+        abs(axes[0].values()[line] - 0.062) < axes[0].step / 2
+        and abs(axes[1].values()[column] + 0.04) < axes[1].step / 2
+    )
     torch.testing.assert_close(recording.signal.data[200, 88], torch.tensor(1 + 0j, dtype=DOUBLE), atol=1e-3, rtol=0)
 
 
 def test_levels_differ_by_the_published_figure() -> None:
-    """Brief 002, section 8: 5.6 percent rms, entropy within 0.006. The rest is rotation inside the pulse and the target's shape."""
+    """Brief 002, section 8: 5.6 percent rms, entropy within 0.006.
+
+    The rest is rotation inside the pulse and the target's shape.
+    """
     s = Aircraft().scatterers(Draws(1))
     a = turntable_echo(s, ladar(), 400, 256, 0.005, DOUBLE)
     b = compress_dechirped(dechirped_echo(s, ladar(), 400, 256, 0.005, dtype=DOUBLE), ladar())
     assert 0.045 < float((b - a).norm() / a.norm()) < 0.08
     assert abs(float(entropy(azimuth_transform(b)) - entropy(azimuth_transform(a)))) < 0.006
     # a target that neither turns nor moves: the levels agree but for the rounding of the delay
-    still = [turntable_echo(s, ladar(), 2, 256, 0.0, DOUBLE), compress_dechirped(dechirped_echo(s, ladar(), 2, 256, 0.0, dtype=DOUBLE), ladar())]
+    still = [
+        turntable_echo(s, ladar(), 2, 256, 0.0, DOUBLE),
+        compress_dechirped(dechirped_echo(s, ladar(), 2, 256, 0.0, dtype=DOUBLE), ladar()),
+    ]
     assert float((still[1] - still[0]).norm() / still[0].norm()) < 1e-3
 
 
 @pytest.mark.parametrize("x, y, speed", [(0.1, 0.06, 0.0), (0.0, 0.12, 0.0), (-0.09, -0.03, -1e-3), (0.02, 0.01, 5e-3)])
 def test_level_a_says_what_it_neglects(x: float, y: float, speed: float) -> None:
     s = Points([x], [y]).scatterers(Draws(0))
-    b = direct_dechirped(s, QUICK, 41, 65, 0.005, (Polynomial([speed]),) if speed else (), (Polynomial([speed]),) if speed else ())
-    a = torch.fft.fftshift(torch.fft.fft(torch.fft.ifftshift(turntable_echo(s, QUICK, 41, 65, 0.005, DOUBLE), dim=-1), dim=-1), dim=-1)
+    b = direct_dechirped(
+        s, QUICK, 41, 65, 0.005, (Polynomial([speed]),) if speed else (), (Polynomial([speed]),) if speed else ()
+    )
+    a = torch.fft.fftshift(
+        torch.fft.fft(torch.fft.ifftshift(turntable_echo(s, QUICK, 41, 65, 0.005, DOUBLE), dim=-1), dim=-1), dim=-1
+    )
     worst = float(torch.angle(b * a.conj()).abs().max())
     said = PhaseOnly().neglected_phase_rad(QUICK, 41, x, y, speed)
     assert 0.6 * said <= worst <= said
@@ -156,24 +204,36 @@ def test_level_b_says_what_it_neglects(x: float, y: float) -> None:
 
 
 def test_recording_is_the_clean_one_turned_exactly() -> None:
-    world = TurntableWorld(SMALL, motion=[Sinusoid(1e-3, 100.0, 60.0), Polynomial([100.0])], start_phase=[StartPhase(math.pi)], snr_db=3.0)
+    world = TurntableWorld(
+        SMALL, motion=[Sinusoid(1e-3, 100.0, 60.0), Polynomial([100.0])], start_phase=[StartPhase(math.pi)], snr_db=3.0
+    )
     recording, truth = simulate_turntable(QUICK, world, 40, 64, Draws(1, trials=range(3)))
     assert truth.clean is not None
-    turned = truth.clean.signal.data * unit_phasor(truth.values["phase_rad"] / (2 * math.pi), torch.complex64)[..., None]
+    turned = (
+        truth.clean.signal.data * unit_phasor(truth.values["phase_rad"] / (2 * math.pi), torch.complex64)[..., None]
+    )
     assert torch.equal(recording.signal.data, turned)
     # psi = delta - 4 pi d / lambda
     delta = start_phase_rad(world.start_phase, Draws(1, trials=range(3)), 40)
-    torch.testing.assert_close(truth.values["phase_rad"], delta - 4 * math.pi / 1.55e-6 * truth.values["displacement_m"], rtol=1e-12, atol=0)
+    torch.testing.assert_close(
+        truth.values["phase_rad"], delta - 4 * math.pi / 1.55e-6 * truth.values["displacement_m"], rtol=1e-12, atol=0
+    )
     free, _ = simulate_turntable(QUICK, TurntableWorld(SMALL, snr_db=3.0), 40, 64, Draws(1, trials=range(3)))
     assert torch.equal(truth.clean.signal.data, free.signal.data)
 
 
 def test_level_b_carries_the_same_phase() -> None:
-    """Slow small motion neither shifts nor blurs: compressed pulses are those of a still target times exp(j psi)."""
+    """Slow small motion neither shifts nor blurs: compressed pulses are those of a still target
+    times exp(j psi).
+    """
     effects = {"motion": [Sinusoid(20e-6, 0.5, 40.0), Polynomial([1e-5])], "start_phase": [UniformStartPhase()]}
-    recording, truth = simulate_turntable(ladar(), TurntableWorld(SMALL, **effects, fidelity=Dechirped()), 40, 64, Draws(1), dtype=DOUBLE)
+    recording, truth = simulate_turntable(
+        ladar(), TurntableWorld(SMALL, **effects, fidelity=Dechirped()), 40, 64, Draws(1), dtype=DOUBLE
+    )
     assert truth.clean is not None and recording.signal.names == ("pulse", "fast_time")
-    turned = compress_dechirped(truth.clean.signal.data, ladar()) * unit(truth.values["phase_rad"] / (2 * math.pi))[:, None]
+    turned = (
+        compress_dechirped(truth.clean.signal.data, ladar()) * unit(truth.values["phase_rad"] / (2 * math.pi))[:, None]
+    )
     got = compress_dechirped(recording.signal.data, ladar())
     assert float((got - turned).norm() / turned.norm()) < 0.05
     assert float(truth.values["phase_rad"].diff().abs().max()) > 1
@@ -181,12 +241,20 @@ def test_level_b_carries_the_same_phase() -> None:
 
 def test_the_window_follows_the_track() -> None:
     motion, track = [Polynomial([100.0, 2.0])], [Polynomial([100.0])]
-    recording, truth = simulate_turntable(ladar(), TurntableWorld(SMALL, motion=motion, fidelity=Dechirped(track)), 20, 64, Draws(1), dtype=DOUBLE)
+    recording, truth = simulate_turntable(
+        ladar(), TurntableWorld(SMALL, motion=motion, fidelity=Dechirped(track)), 20, 64, Draws(1), dtype=DOUBLE
+    )
     time_s = torch.arange(20, dtype=torch.float64) / 2000
     torch.testing.assert_close(recording.aux["reference_m"], 100 * time_s)
     torch.testing.assert_close(truth.values["displacement_m"], 100 * time_s + 2 * time_s**2)
     torch.testing.assert_close(truth.values["phase_rad"], -4 * math.pi / 1.55e-6 * 2 * time_s**2, atol=1e-6, rtol=1e-9)
-    with pytest.raises(ValueError, match=r"the target reaches from .* of a range window of -0.0324775 to 0.0314782 m; .* let the reference follow it"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            r"the target reaches from .* of a range window of -0.0324775 to 0.0314782 m; .* let "
+            r"the reference follow it"
+        ),
+    ):
         simulate_turntable(ladar(), TurntableWorld(SMALL, motion=motion, fidelity=Dechirped()), 20, 64, Draws(1))
 
 
@@ -194,7 +262,9 @@ def test_the_window_follows_the_track() -> None:
 def test_noise_follows_its_definition_per_trial(fidelity) -> None:
     snr = torch.tensor([-10.0, 0.0, 20.0], dtype=torch.float64)
     draws = Draws(5, trials=range(3))
-    noisy, truth = simulate_turntable(QUICK, TurntableWorld(SMALL, snr_db=snr, fidelity=fidelity), 60, 64, draws, dtype=DOUBLE)
+    noisy, truth = simulate_turntable(
+        QUICK, TurntableWorld(SMALL, snr_db=snr, fidelity=fidelity), 60, 64, draws, dtype=DOUBLE
+    )
     silent, _ = simulate_turntable(QUICK, TurntableWorld(SMALL, fidelity=fidelity), 60, 64, draws, dtype=DOUBLE)
     pairs = [(silent.signal.data, noisy.signal.data)]
     if noisy.signal.names[-1] == "fast_time":
@@ -202,30 +272,47 @@ def test_noise_follows_its_definition_per_trial(fidelity) -> None:
     for signal, both in pairs:
         ratio = signal.abs().square().mean((-2, -1)) / (both - signal).abs().square().mean((-2, -1))
         torch.testing.assert_close(10 * torch.log10(ratio), snr, atol=0.3, rtol=0)
-    torch.testing.assert_close(truth.values["noise_std"], (noisy.signal.data - silent.signal.data).abs().square().mean((-2, -1)).sqrt(), rtol=0.05, atol=0)
+    torch.testing.assert_close(
+        truth.values["noise_std"],
+        (noisy.signal.data - silent.signal.data).abs().square().mean((-2, -1)).sqrt(),
+        rtol=0.05,
+        atol=0,
+    )
 
 
 @pytest.mark.parametrize("fidelity", [PhaseOnly(), Dechirped([Polynomial([90.0])])])
 def test_batches_equal_singles_and_any_chunk(fidelity) -> None:
     motion = [Polynomial([90.0]), Sinusoid.named("1_100_90", unit="um")]
     scene = Together({"plane": Aircraft(4e-3, 0.1, 0.05), "points": RandomPoints(2, 0.1, 0.05)})
-    world = TurntableWorld(scene, motion=motion, start_phase=[StartPhase(1.0), UniformStartPhase()], snr_db=5.0, fidelity=fidelity)
+    world = TurntableWorld(
+        scene, motion=motion, start_phase=[StartPhase(1.0), UniformStartPhase()], snr_db=5.0, fidelity=fidelity
+    )
     damages = {"lost": LostPulses(count=3)}
     whole, told = simulate_turntable(QUICK, world, 24, 64, Draws(2, trials=range(4)), damages, DOUBLE)
     part, _ = simulate_turntable(QUICK, world, 24, 64, Draws(2, trials=[3, 1]), damages, DOUBLE)
     alone, said = simulate_turntable(QUICK, world, 24, 64, Draws(2), damages, DOUBLE)
     torch.testing.assert_close(part.signal.data, whole.signal.data[[3, 1]], atol=1e-12, rtol=0)
     torch.testing.assert_close(alone.signal.data, whole.signal.data[0], atol=1e-12, rtol=0)
-    assert torch.equal(said.values["phase_rad"], told.values["phase_rad"][0]) and torch.equal(said.values["lost.present"], told.values["lost.present"][0])
+    assert torch.equal(said.values["phase_rad"], told.values["phase_rad"][0]) and torch.equal(
+        said.values["lost.present"], told.values["lost.present"][0]
+    )
     assert not torch.equal(told.values["phase_rad"][0], told.values["phase_rad"][1])
 
 
 def test_parameters_are_per_trial() -> None:
     amplitude, rate = torch.tensor([1e-6, 5e-6], dtype=torch.float64), torch.tensor([0.005, 0.002], dtype=torch.float64)
-    world = TurntableWorld(SMALL, rate, [Sinusoid(amplitude, 100.0, 90.0)], [StartPhase(torch.tensor([0.0, 1.0]))], snr_db=torch.tensor([0.0, 30.0]))
+    world = TurntableWorld(
+        SMALL,
+        rate,
+        [Sinusoid(amplitude, 100.0, 90.0)],
+        [StartPhase(torch.tensor([0.0, 1.0]))],
+        snr_db=torch.tensor([0.0, 30.0]),
+    )
     both, truth = simulate_turntable(QUICK, world, 24, 64, Draws(2, trials=range(2)), dtype=DOUBLE)
     for i in range(2):
-        one = TurntableWorld(SMALL, float(rate[i]), [Sinusoid(float(amplitude[i]), 100.0, 90.0)], [StartPhase(float(i))], snr_db=30.0 * i)
+        one = TurntableWorld(
+            SMALL, float(rate[i]), [Sinusoid(float(amplitude[i]), 100.0, 90.0)], [StartPhase(float(i))], snr_db=30.0 * i
+        )
         single, said = simulate_turntable(QUICK, one, 24, 64, Draws(2, trials=[i]), dtype=DOUBLE)
         torch.testing.assert_close(single.signal.data[0], both.signal.data[i], atol=1e-12, rtol=0)
         torch.testing.assert_close(said.values["phase_rad"][0], truth.values["phase_rad"][i])
@@ -233,7 +320,12 @@ def test_parameters_are_per_trial() -> None:
 
 def test_trials_that_share_everything_still_have_their_dim() -> None:
     recording, truth = simulate_turntable(QUICK, TurntableWorld(Points([0.0], [0.0])), 8, 16, Draws(0, trials=range(3)))
-    assert recording.signal.trials == (3,) and truth.values["phase_rad"].shape == (3, 8) and truth.clean is not None and truth.clean.signal.trials == (3,)
+    assert (
+        recording.signal.trials == (3,)
+        and truth.values["phase_rad"].shape == (3, 8)
+        and truth.clean is not None
+        and truth.clean.signal.trials == (3,)
+    )
 
 
 @pytest.mark.parametrize("level", ["a", "b"])
@@ -242,7 +334,10 @@ def test_echoes_are_differentiable(level: str) -> None:
     amount = torch.tensor([2.0, 90.0, 40.0], dtype=torch.float64)  # um, Hz, degrees
 
     def echo(x: Tensor, y: Tensor, amplitude: Tensor, rate: Tensor, vibration: Tensor) -> Tensor:
-        scatterers, motion = Scatterers(1e-3 * x, 1e-3 * y, amplitude), [Sinusoid(1e-6 * vibration[0], vibration[1], vibration[2])]
+        scatterers, motion = (
+            Scatterers(1e-3 * x, 1e-3 * y, amplitude),
+            [Sinusoid(1e-6 * vibration[0], vibration[1], vibration[2])],
+        )
         if level == "b":
             return dechirped_echo(scatterers, QUICK, 3, 5, 1e-3 * rate, motion, dtype=DOUBLE)
         turns = -2 / QUICK.wavelength_m * displacement_m(motion, torch.arange(3, dtype=torch.float64) / QUICK.prf_hz)
@@ -253,11 +348,16 @@ def test_echoes_are_differentiable(level: str) -> None:
 
 
 def test_single_precision_keeps_phases_of_kilometres() -> None:
-    """Brief 002, section 11: 3e-5 rad at most, 20 m of motion and the window at 20 km (plain float32: 1.6 rad)."""
+    """Brief 002, section 11: 3e-5 rad at most, 20 m of motion and the window at 20 km (plain
+    float32: 1.6 rad).
+    """
     motion = [Polynomial([100.0]), Sinusoid.named("1_100_90", unit="mm")]
     for fidelity in (PhaseOnly(), Dechirped([Polynomial([100.0])])):
         world = TurntableWorld(Points([0.09], [0.02]), motion=motion, fidelity=fidelity)
-        data = [simulate_turntable(ladar(), world, 400, 64, Draws(0), dtype=t)[0].signal.data.to(DOUBLE) for t in (torch.complex64, DOUBLE)]
+        data = [
+            simulate_turntable(ladar(), world, 400, 64, Draws(0), dtype=t)[0].signal.data.to(DOUBLE)
+            for t in (torch.complex64, DOUBLE)
+        ]
         assert float((data[0] - data[1]).abs().max()) < 3e-5
 
 
@@ -270,7 +370,9 @@ CASES = {
 
 
 def test_aircraft_reproduces_the_published_pattern() -> None:
-    """Brief 002, section 6: entropy of the ideal image, and of the polluted ones above it; 12 scenes."""
+    """Brief 002, section 6: entropy of the ideal image, and of the polluted ones above it; 12
+    scenes.
+    """
     draws, radar = Draws(3, trials=range(12)), ladar()
     recording, _ = simulate_turntable(radar, TurntableWorld(Aircraft()), 400, 256, draws)
     ideal = entropy(azimuth_transform(recording.signal.data))
@@ -279,16 +381,27 @@ def test_aircraft_reproduces_the_published_pattern() -> None:
     share = power / power.sum(-1, keepdim=True)
     assert float(torch.exp(-(share * torch.log(share)).sum(-1)).mean()) == pytest.approx(90, abs=5)
     for motion, start, expected in CASES.values():
-        phase = start_phase_rad(start, draws, 400) - 4 * math.pi / radar.wavelength_m * displacement_m(motion, torch.arange(400, dtype=torch.float64) / 2000)
-        polluted = entropy(azimuth_transform(recording.signal.data * unit(phase / (2 * math.pi)).to(torch.complex64)[..., None]))
+        phase = start_phase_rad(start, draws, 400) - 4 * math.pi / radar.wavelength_m * displacement_m(
+            motion, torch.arange(400, dtype=torch.float64) / 2000
+        )
+        polluted = entropy(
+            azimuth_transform(recording.signal.data * unit(phase / (2 * math.pi)).to(torch.complex64)[..., None])
+        )
         assert float((polluted - ideal).mean()) == pytest.approx(expected, abs=0.12)
 
 
 def test_a_cosine_would_hardly_defocus() -> None:
     recording, _ = simulate_turntable(ladar(), TurntableWorld(Aircraft()), 400, 256, Draws(3))
     ideal = entropy(azimuth_transform(recording.signal.data))
-    turns = -2 / ladar().wavelength_m * Sinusoid.named("1_0.1_180", unit="mm").displacement_m(torch.arange(400, dtype=torch.float64) / 2000)
-    assert float(entropy(azimuth_transform(recording.signal.data * unit(turns).to(torch.complex64)[:, None])) - ideal) < 0.2
+    turns = (
+        -2
+        / ladar().wavelength_m
+        * Sinusoid.named("1_0.1_180", unit="mm").displacement_m(torch.arange(400, dtype=torch.float64) / 2000)
+    )
+    assert (
+        float(entropy(azimuth_transform(recording.signal.data * unit(turns).to(torch.complex64)[:, None])) - ideal)
+        < 0.2
+    )
 
 
 def test_aircraft_fits_the_window_and_turns() -> None:
@@ -297,10 +410,14 @@ def test_aircraft_fits_the_window_and_turns() -> None:
     extent = [float(v.max() - v.min()) for v in (s.azimuth_m, s.range_m)]
     assert extent == pytest.approx([0.19, 0.15], abs=2e-3)
     outline = Aircraft().outline()
-    torch.testing.assert_close(Aircraft(heading_deg=90).outline(), torch.stack([-outline[:, 1], outline[:, 0]], -1), atol=1e-15, rtol=0)
+    torch.testing.assert_close(
+        Aircraft(heading_deg=90).outline(), torch.stack([-outline[:, 1], outline[:, 0]], -1), atol=1e-15, rtol=0
+    )
     neighbours = outline.diff(dim=0).norm(dim=-1)
     assert float(neighbours.median()) == pytest.approx(1.2e-3, rel=1e-6)
-    torch.testing.assert_close(s.amplitude.abs().square().mean(-1), torch.ones(2, dtype=torch.float64), atol=0.2, rtol=0)
+    torch.testing.assert_close(
+        s.amplitude.abs().square().mean(-1), torch.ones(2, dtype=torch.float64), atol=0.2, rtol=0
+    )
 
 
 def test_spread_rows_hold_their_cells_alone() -> None:
@@ -319,8 +436,15 @@ def test_names_of_vibrations() -> None:
     assert Sinusoid.named("1_0.1_90", unit="mm") == Sinusoid(1e-3, 0.1, 90.0)
     assert Sinusoid.named("0.5_100_-60", unit="um") == Sinusoid(0.5e-6, 100.0, -60.0)
     at = torch.tensor([0.0, 0.0025], dtype=torch.float64)
-    torch.testing.assert_close(Sinusoid(1e-3, 100.0, 90.0).displacement_m(at), torch.tensor([1e-3, 0.0], dtype=torch.float64), atol=1e-15, rtol=0)
-    torch.testing.assert_close(Sinusoid(1e-3, 100.0).displacement_m(at), torch.tensor([0.0, 1e-3], dtype=torch.float64), atol=1e-15, rtol=0)
+    torch.testing.assert_close(
+        Sinusoid(1e-3, 100.0, 90.0).displacement_m(at),
+        torch.tensor([1e-3, 0.0], dtype=torch.float64),
+        atol=1e-15,
+        rtol=0,
+    )
+    torch.testing.assert_close(
+        Sinusoid(1e-3, 100.0).displacement_m(at), torch.tensor([0.0, 1e-3], dtype=torch.float64), atol=1e-15, rtol=0
+    )
     torch.testing.assert_close(Polynomial([2.0, 3.0]).displacement_m(at), 2 * at + 3 * at**2)
     with pytest.raises(ValueError, match="'1_0_1_90' is no name of the form amplitude_frequency_phase"):
         Sinusoid.named("1_0_1_90", unit="mm")
@@ -334,14 +458,21 @@ def test_start_phases() -> None:
     draws = Draws(1, trials=range(4))
     normal, uniform = StartPhase(0.5).phase_rad(draws, 2000), UniformStartPhase().phase_rad(draws, 2000)
     torch.testing.assert_close(normal.std(-1), torch.full((4,), 0.5, dtype=torch.float64), atol=0.03, rtol=0)
-    assert float(uniform.min()) >= 0 and float(uniform.max()) < 2 * math.pi and float(uniform.mean()) == pytest.approx(math.pi, abs=0.1)
-    twice = start_phase_rad([StartPhase(1.0), StartPhase(1.0)], draws, 2000)  # two effects of one kind are independent
+    assert (
+        float(uniform.min()) >= 0
+        and float(uniform.max()) < 2 * math.pi
+        and float(uniform.mean()) == pytest.approx(math.pi, abs=0.1)
+    )
+    # two effects of one kind are independent
+    twice = start_phase_rad([StartPhase(1.0), StartPhase(1.0)], draws, 2000)
     assert float(twice.std()) == pytest.approx(math.sqrt(2), abs=0.05)
 
 
 def test_lost_pulses_keep_their_place() -> None:
     draws = Draws(1, trials=range(3))
-    recording, truth = simulate_turntable(QUICK, TurntableWorld(SMALL), 40, 16 * 4, draws, {"lost": LostPulses(fraction=0.1)})
+    recording, truth = simulate_turntable(
+        QUICK, TurntableWorld(SMALL), 40, 16 * 4, draws, {"lost": LostPulses(fraction=0.1)}
+    )
     present = truth.values["lost.present"]
     assert ((~present).sum(-1) == 4).all() and not torch.equal(present[0], present[1]) and truth.clean is not None
     assert torch.equal(recording.signal.data, truth.clean.signal.data * present[..., None])
@@ -353,31 +484,68 @@ def test_lost_pulses_keep_their_place() -> None:
 
 
 REFUSED = {
-    "window": (lambda: simulate_turntable(QUICK, TurntableWorld(Points([0.0], [0.14])), 4, 256, Draws(0)), r"the target reaches from 0.14 to 0.14 m of a range window of -0.128411 to 0.127412 m"),
-    "empty": (lambda: simulate_turntable(QUICK, TurntableWorld(Points([], [])), 4, 16, Draws(0)), "the scene holds no scatterer"),
-    "rotation": (lambda: simulate_turntable(ladar(rotation_rad_s=None), TurntableWorld(SMALL), 4, 64, Draws(0)), "neither radar.rotation_rad_s nor world.rotation_rad_s is set"),
-    "pulse": (lambda: simulate_turntable(ladar(pulse_s=None), TurntableWorld(SMALL, fidelity=Dechirped()), 4, 64, Draws(0)), "radar.pulse_s is not set"),
-    "pulses": (lambda: simulate_turntable(QUICK, TurntableWorld(SMALL), 0, 64, Draws(0)), "a recording needs at least one pulse of one sample, got n_pulse=0, n_range=64"),
+    "window": (
+        lambda: simulate_turntable(QUICK, TurntableWorld(Points([0.0], [0.14])), 4, 256, Draws(0)),
+        r"the target reaches from 0.14 to 0.14 m of a range window of -0.128411 to 0.127412 m",
+    ),
+    "empty": (
+        lambda: simulate_turntable(QUICK, TurntableWorld(Points([], [])), 4, 16, Draws(0)),
+        "the scene holds no scatterer",
+    ),
+    "rotation": (
+        lambda: simulate_turntable(ladar(rotation_rad_s=None), TurntableWorld(SMALL), 4, 64, Draws(0)),
+        "neither radar.rotation_rad_s nor world.rotation_rad_s is set",
+    ),
+    "pulse": (
+        lambda: simulate_turntable(ladar(pulse_s=None), TurntableWorld(SMALL, fidelity=Dechirped()), 4, 64, Draws(0)),
+        "radar.pulse_s is not set",
+    ),
+    "pulses": (
+        lambda: simulate_turntable(QUICK, TurntableWorld(SMALL), 0, 64, Draws(0)),
+        "a recording needs at least one pulse of one sample, got n_pulse=0, n_range=64",
+    ),
     "other trials": (
-        lambda: LostPulses(count=1)(simulate_turntable(QUICK, TurntableWorld(SMALL), 4, 64, Draws(0))[0], Draws(0, trials=range(2))),
+        lambda: LostPulses(count=1)(
+            simulate_turntable(QUICK, TurntableWorld(SMALL), 4, 64, Draws(0))[0], Draws(0, trials=range(2))
+        ),
         r"draws for \(2,\) trials do not fit a recording of \(\) trials",
     ),
     "spun out": (
-        lambda: dechirped_echo(Points([4e3], [0.0]).scatterers(Draws(0)), InverseRadar(10e9, 5e9, 50.0, 4e-4, 1e-2), 4, 16, 4e-4),
+        lambda: dechirped_echo(
+            Points([4e3], [0.0]).scatterers(Draws(0)), InverseRadar(10e9, 5e9, 50.0, 4e-4, 1e-2), 4, 16, 4e-4
+        ),
         "phases bend by .* rad within a pulse; the dechirped model holds to 0.6 rad",
     ),
-    "snr": (lambda: TurntableWorld(SMALL, snr_db=math.nan), "snr_db must be a finite number, or one per trial, got nan"),
-    "fidelity": (lambda: TurntableWorld(SMALL, fidelity="b"), r"fidelity must be PhaseOnly\(\) or Dechirped\(\), got 'b'"),  # pyright: ignore[reportArgumentType]
-    "frequency": (lambda: Sinusoid(1e-3, -5.0), "frequency_hz of a vibration must be a finite number of 0 or more, or one per trial, got -5"),
+    "snr": (
+        lambda: TurntableWorld(SMALL, snr_db=math.nan),
+        "snr_db must be a finite number, or one per trial, got nan",
+    ),
+    "fidelity": (
+        lambda: TurntableWorld(SMALL, fidelity="b"),
+        r"fidelity must be PhaseOnly\(\) or Dechirped\(\), got 'b'",
+    ),  # pyright: ignore[reportArgumentType]
+    "frequency": (
+        lambda: Sinusoid(1e-3, -5.0),
+        "frequency_hz of a vibration must be a finite number of 0 or more, or one per trial, got -5",
+    ),
     "sigma": (lambda: StartPhase(-1.0), "sigma_rad of a start phase must be a finite number of 0 or more"),
     "no coefficients": (lambda: Polynomial([]), "a translation needs at least one coefficient"),
     "bad coefficient": (lambda: Polynomial([1.0, math.inf]), "coefficient 2 of a translation must be a finite number"),
-    "aircraft": (lambda: Aircraft(spacing_m=0.0), "spacing_m of an aircraft must be a positive number of metres, got 0"),
+    "aircraft": (
+        lambda: Aircraft(spacing_m=0.0),
+        "spacing_m of an aircraft must be a positive number of metres, got 0",
+    ),
     "heading": (lambda: Aircraft(heading_deg=math.nan), "heading_deg of an aircraft must be a finite number"),
     "rows": (lambda: SpreadRows(300, 1, 0.5, 0.3, 1e-3), "spread rows need 1 to range_cells=256 rows"),
     "width": (lambda: SpreadRows(3, 1, 1.5, 0.3, 1e-3), "spread rows need a width in 0..1"),
-    "spin": (lambda: dechirped_echo(SMALL.scatterers(Draws(0)), QUICK, 4, 16, 50.0), "the target turns by 0.0025 rad in half a pulse, of which the dechirped model drops .* rad"),
-    "jerk": (lambda: dechirped_echo(SMALL.scatterers(Draws(0)), QUICK, 4, 16, 0.005, [Sinusoid(1.0, 9000.0)]), "the motion bends by .* m within a pulse"),
+    "spin": (
+        lambda: dechirped_echo(SMALL.scatterers(Draws(0)), QUICK, 4, 16, 50.0),
+        "the target turns by 0.0025 rad in half a pulse, of which the dechirped model drops .* rad",
+    ),
+    "jerk": (
+        lambda: dechirped_echo(SMALL.scatterers(Draws(0)), QUICK, 4, 16, 0.005, [Sinusoid(1.0, 9000.0)]),
+        "the motion bends by .* m within a pulse",
+    ),
 }
 
 

@@ -1,4 +1,6 @@
-"""The ladar's estimators and image formation where numbers end: levels, distances, lengths, noise."""
+"""The ladar's estimators and image formation where numbers end: levels, distances, lengths,
+noise.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,11 @@ def test_ten_metres_to_a_thousand_kilometres(name, reference_m, speed) -> None:
     radar = table1(reference_range_m=reference_m, speed_m_s=speed)
     sweeps, pulse, truth = seen(radar, n=16)
     found = ESTIMATORS[name](sweeps, radar, pulse, window_m=GATE)
-    assert bool(found.ok) and finite(found) and float(velocity_rms(found, truth)) < (ROUGH if name == "correlation" else 1e-4)
+    assert (
+        bool(found.ok)
+        and finite(found)
+        and float(velocity_rms(found, truth)) < (ROUGH if name == "correlation" else 1e-4)
+    )
 
 
 @pytest.mark.parametrize("name", IDS)
@@ -56,13 +62,22 @@ def test_ranges_on_either_side_and_at_the_edge_of_the_band(name, range_m) -> Non
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_nothing(name) -> None:
     for n in (1, 2, 9):
-        found = ESTIMATORS[name](torch.zeros(3, 2, n, 512, dtype=torch.complex64), RADAR, RADAR.sweep_axes(n)[1], window_m=GATE)
-        assert finite(found) and not bool(found.ok.any()) and not bool(found.info["lit"].any()) and not bool(found.quality.any())
+        found = ESTIMATORS[name](
+            torch.zeros(3, 2, n, 512, dtype=torch.complex64), RADAR, RADAR.sweep_axes(n)[1], window_m=GATE
+        )
+        assert (
+            finite(found)
+            and not bool(found.ok.any())
+            and not bool(found.info["lit"].any())
+            and not bool(found.quality.any())
+        )
 
 
 @pytest.mark.parametrize("name", IDS)
 def test_noise_from_none_to_nothing_else(name) -> None:
-    """From 100 dB down the error never falls with the noise rising, and what is trusted is right."""
+    """From 100 dB down the error never falls with the noise rising, and what is trusted is
+    right.
+    """
     errors = []
     for snr_db in (100.0, 60.0, 30.0, 0.0, -10.0, -20.0, -30.0):
         sweeps, pulse, truth = seen(n=64, trials=2, snr_db=snr_db, dtype=torch.complex64, fidelity=LinearInSweep())
@@ -93,7 +108,9 @@ def test_images_at_any_level(level) -> None:
     sweeps, pulse, _ = seen(n=64, dtype=torch.complex64)
     found = radial_motion(sweeps * level, RADAR, pulse, window_m=GATE)
     still = compensate_motion(sweeps * level, found["velocity_m_s"], RADAR, pulse)
-    image = AzimuthMatchedFilter(RADAR)(DerampAzimuth(RADAR)(CompressSweeps(RADAR)(Signal(still, RADAR.sweep_axes(64)))))
+    image = AzimuthMatchedFilter(RADAR)(
+        DerampAzimuth(RADAR)(CompressSweeps(RADAR)(Signal(still, RADAR.sweep_axes(64))))
+    )
     assert image.data.dtype == torch.complex64 and bool(torch.isfinite(image.data).all())
     assert 0.6 < float(image.data.abs().max()) / level < 1.05
 
@@ -108,5 +125,14 @@ def test_a_velocity_of_a_kilometre_a_second_is_taken_out_exactly() -> None:
     assert float((back - 1).abs().max()) < 1e-5
     t = pulse.values()[:, None] + RADAR.fast_time_axis().values() + RADAR.period_s / 4
     place = 1000.0 * (t - pulse.start - RADAR.period_s / 2)
-    turns = -2 * (RADAR.carrier_hz + RADAR.chirp_rate_hz_s * RADAR.fast_time_axis().values()) / RADAR.wave_speed_m_s * place
-    assert float(torch.angle(there[0] * torch.polar(torch.ones_like(turns), -2 * math.pi * (turns - torch.round(turns)))).abs().max()) < 1e-5
+    turns = (
+        -2 * (RADAR.carrier_hz + RADAR.chirp_rate_hz_s * RADAR.fast_time_axis().values()) / RADAR.wave_speed_m_s * place
+    )
+    assert (
+        float(
+            torch.angle(there[0] * torch.polar(torch.ones_like(turns), -2 * math.pi * (turns - torch.round(turns))))
+            .abs()
+            .max()
+        )
+        < 1e-5
+    )

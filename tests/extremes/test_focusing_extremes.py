@@ -26,10 +26,13 @@ def test_levels_pass_linearly_in_single_precision(scale):
     torch.testing.assert_close(entropy(scaled), entropy(image), rtol=1e-3, atol=1e-3)
 
 
-def focused_point(near_range_m: float, velocity_m_s: float, squint_deg: float = 0.0, dtype: torch.dtype = torch.complex128):
+def focused_point(
+    near_range_m: float, velocity_m_s: float, squint_deg: float = 0.0, dtype: torch.dtype = torch.complex128
+):
     """One point with a time-bandwidth product of 50; returns (radar, image, its place).
 
-    The PRF holds the Doppler band of the aperture and its spread over range frequency, f_dc B / f0, with a margin of 1.5.
+    The PRF holds the Doppler band of the aperture and its spread over range frequency, f_dc B / f0,
+    with a margin of 1.5.
     """
     sin = torch.sin(torch.deg2rad(torch.tensor(squint_deg, dtype=torch.float64)))
     radar = small_radar(near_range_m=near_range_m, velocity_m_s=velocity_m_s, pointing_doppler_hz=None)
@@ -41,7 +44,11 @@ def focused_point(near_range_m: float, velocity_m_s: float, squint_deg: float = 
     world = StripmapWorld(Points([0.0], [0.0]), Dwell(dwell), doppler_hz=doppler)
     recording, truth = simulate(radar, world, int(1.4 * dwell * radar.prf_hz), 160, Draws(0), dtype=dtype)
     image = OmegaK(radar, "flat", doppler_hz=doppler)(recording.signal)
-    return radar, image, radar.image_position(truth.values["zero_doppler_s"], truth.values["closest_range_m"], doppler, velocity_m_s)
+    return (
+        radar,
+        image,
+        radar.image_position(truth.values["zero_doppler_s"], truth.values["closest_range_m"], doppler, velocity_m_s),
+    )
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,9 @@ from torchsar.scene import Dwell, Points, StripmapWorld
 
 @dataclass(frozen=True)
 class PointCase:
-    """Targets on one image line at several ranges; where they belong in the image, and the arguments to focus them."""
+    """Targets on one image line at several ranges; where they belong in the image, and the
+    arguments to focus them.
+    """
 
     radar: StripmapRadar
     raw: Tensor
@@ -34,8 +36,12 @@ class PointCase:
         return Signal(self.raw.to(dtype), self.radar.raw_axes(*self.raw.shape))
 
 
-def point_case(radar: StripmapRadar, n_pulse: int, n_range: int, dwell_s: float, doppler_hz: float, offsets_m: tuple[float, ...]) -> PointCase:
-    """Echo of unit targets on the middle line, complex128, each offset from the middle of the swath."""
+def point_case(
+    radar: StripmapRadar, n_pulse: int, n_range: int, dwell_s: float, doppler_hz: float, offsets_m: tuple[float, ...]
+) -> PointCase:
+    """Echo of unit targets on the middle line, complex128, each offset from the middle of the
+    swath.
+    """
     world = StripmapWorld(Points([0.0] * len(offsets_m), list(offsets_m)), Dwell(dwell_s), doppler_hz=doppler_hz)
     recording, _ = simulate(radar, world, n_pulse, n_range, Draws(0), dtype=torch.complex128)
     middle = (n_range - radar.pulse_samples) / 2
@@ -58,13 +64,17 @@ def radarsat_case() -> PointCase:
 
 
 def airborne_case(doppler_hz: float = 0.0) -> PointCase:
-    """S band at 7 km, where the migration differs by a cell over the swath: bulk + refocus is not enough."""
+    """S band at 7 km, where the migration differs by a cell over the swath: bulk + refocus is not
+    enough.
+    """
     radar = StripmapRadar(3.2e9, LinearFM(200e6, 1e-6), 250e6, 400.0, 150.0, 7e3)
     return point_case(radar, 2048, 1536, 3.0, doppler_hz, (-330.0, 0.0, 330.0))
 
 
 def at_position(image: Tensor, line: Tensor, cell: Tensor) -> Tensor:
-    """Band-limited interpolation of a whole image (line, cell) on the grid of fractional lines x cells."""
+    """Band-limited interpolation of a whole image (line, cell) on the grid of fractional lines x
+    cells.
+    """
     spectrum = torch.fft.fftshift(torch.fft.fft2(image))
     rows, columns = (torch.arange(n, dtype=torch.float64) - n // 2 for n in image.shape)
     left = torch.exp(2j * math.pi * line[:, None] * rows / image.shape[0])

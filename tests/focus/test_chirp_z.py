@@ -23,10 +23,16 @@ def direct(x, start, step, n, centre):
 
 @pytest.mark.parametrize("m, n, centre", [(7, 12, None), (64, 20, 0), (33, 33, 40), (5, 1, None)])
 def test_equals_the_direct_sum(m, n, centre):
-    x, start, step = noise(2, 3, m), torch.tensor([0.3, -5.2, 17.0], dtype=torch.float64), torch.tensor([[0.01], [-0.37]], dtype=torch.float64)
+    x, start, step = (
+        noise(2, 3, m),
+        torch.tensor([0.3, -5.2, 17.0], dtype=torch.float64),
+        torch.tensor([[0.01], [-0.37]], dtype=torch.float64),
+    )
     want = direct(x, *torch.broadcast_tensors(start, step), n, m // 2 if centre is None else centre)
     torch.testing.assert_close(chirp_z(x, start, step, n, centre=centre), want, rtol=1e-11, atol=1e-11)
-    assert torch.linalg.vector_norm(chirp_z(x.to(torch.complex64), start, step, n, centre=centre) - want) < 2e-6 * torch.linalg.vector_norm(want)
+    assert torch.linalg.vector_norm(
+        chirp_z(x.to(torch.complex64), start, step, n, centre=centre) - want
+    ) < 2e-6 * torch.linalg.vector_norm(want)
 
 
 def test_along_another_dim_and_of_a_plain_fft():
@@ -37,13 +43,19 @@ def test_along_another_dim_and_of_a_plain_fft():
 
 
 def test_gradients():
-    x, start, step = noise(2, 6).requires_grad_(), torch.tensor([0.1, 0.4], dtype=torch.float64).requires_grad_(), torch.tensor(0.07, dtype=torch.float64).requires_grad_()
+    x, start, step = (
+        noise(2, 6).requires_grad_(),
+        torch.tensor([0.1, 0.4], dtype=torch.float64).requires_grad_(),
+        torch.tensor(0.07, dtype=torch.float64).requires_grad_(),
+    )
     assert torch.autograd.gradcheck(lambda *a: chirp_z(*a, 5), (x, start, step))
     assert torch.autograd.gradgradcheck(lambda *a: chirp_z(*a, 5), (x, start, step))
 
 
 def walking(cells, n=64, m=48, carrier=1000.0, step=4.0):
-    """(pulse, range frequency) of a point at 3 cells that walks `cells` over the aperture, slow time zero at pulse n // 2."""
+    """(pulse, range frequency) of a point at 3 cells that walks `cells` over the aperture, slow
+    time zero at pulse n // 2.
+    """
     frequency = step * (torch.arange(m, dtype=torch.float64) - m // 2)
     time = torch.arange(n, dtype=torch.float64) - n // 2
     delay = cells / (m * step) * time / n
@@ -74,7 +86,10 @@ def test_whole_doppler_bins_are_scaled_exactly():
     data = torch.exp(2j * math.pi * 3 / n * time)[:, None].expand(n, 3)
     want = torch.exp(2j * math.pi * 3 / n * time[:, None] * carrier / (carrier + frequency))
     torch.testing.assert_close(keystone(data, frequency, carrier), want)
-    torch.testing.assert_close(keystone(data.expand(2, n, 3), frequency, carrier, torch.tensor([0, 1]))[1], want * torch.exp(2j * math.pi * time[:, None] * carrier / (carrier + frequency)))
+    torch.testing.assert_close(
+        keystone(data.expand(2, n, 3), frequency, carrier, torch.tensor([0, 1]))[1],
+        want * torch.exp(2j * math.pi * time[:, None] * carrier / (carrier + frequency)),
+    )
 
 
 def test_mistakes_are_named():

@@ -20,13 +20,19 @@ def test_a_point_appears_at_its_closest_range(doppler_hz):
     recording, truth = simulate(radar, world, 600, 256, Draws(0), dtype=torch.complex128)
     beam = OmegaK(radar, "flat")(recording.signal, doppler_hz=torch.tensor(doppler_hz))
     image = ClosestRange(radar)(beam, doppler_hz=torch.tensor(doppler_hz))
-    azimuth, slant = radar.image_position(truth.values["zero_doppler_s"], truth.values["closest_range_m"], doppler_hz, radar.velocity_m_s)
+    azimuth, slant = radar.image_position(
+        truth.values["zero_doppler_s"], truth.values["closest_range_m"], doppler_hz, radar.velocity_m_s
+    )
     closest = truth.values["closest_range_m"]
-    assert float((slant - closest).abs().min()) > 2 * radar.range_step_m  # there is something to correct
+    # there is something to correct
+    assert float((slant - closest).abs().min()) > 2 * radar.range_step_m
     found = impulse_response(image, (azimuth, closest))
     torch.testing.assert_close(found["position_range_m"], closest, atol=0.05 * radar.range_step_m, rtol=0)
-    torch.testing.assert_close(found["position_azimuth_m"], azimuth, atol=0.15, rtol=0)  # a twentieth of a cell
-    torch.testing.assert_close(found["pslr_range_db"], impulse_response(beam, (azimuth, slant))["pslr_range_db"], atol=0.1, rtol=0)
+    # a twentieth of a cell
+    torch.testing.assert_close(found["position_azimuth_m"], azimuth, atol=0.15, rtol=0)
+    torch.testing.assert_close(
+        found["pslr_range_db"], impulse_response(beam, (azimuth, slant))["pslr_range_db"], atol=0.1, rtol=0
+    )
 
 
 def test_without_squint_nothing_moves():
@@ -44,7 +50,8 @@ def test_the_centroid_is_asked_for_where_the_pointing_is_unknown():
 
 def test_padding_keeps_cut_apertures_from_wrapping():
     radar = small_radar()
-    # lit all the time and far beyond the end of the record: unpadded, its echo folds back into the image
+    # lit all the time and far beyond the end of the record: unpadded, its echo folds back into the
+    # image
     world = StripmapWorld(Points([25.0], [0.0]), AlwaysLit())
     recording, _ = simulate(radar, world, 128, 96, Draws(0), dtype=torch.complex128)
     plain, padded = OmegaK(radar, "flat")(recording.signal), PaddedLines(OmegaK(radar, "flat"))(recording.signal)

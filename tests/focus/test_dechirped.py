@@ -1,4 +1,6 @@
-"""Compression of dechirped pulses, the azimuth transform, and what a turning target requires, against direct sums and measured images."""
+"""Compression of dechirped pulses, the azimuth transform, and what a turning target requires,
+against direct sums and measured images.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,13 @@ from torch import Tensor
 from tests.echo.test_turntable import DOUBLE, QUICK, ladar, unit
 from torchsar.core import Chain, Draws, Signal, use
 from torchsar.echo import dechirped_echo, simulate_turntable, turntable_echo
-from torchsar.focus import AzimuthTransform, CompressDechirped, azimuth_transform, compress_dechirped, inverse_requirements
+from torchsar.focus import (
+    AzimuthTransform,
+    CompressDechirped,
+    azimuth_transform,
+    compress_dechirped,
+    inverse_requirements,
+)
 from torchsar.metrics import entropy
 from torchsar.radar import InverseRadar
 from torchsar.scene import Aircraft, Dechirped, Points, Polynomial, RandomPoints, Scatterers, Sinusoid, TurntableWorld
@@ -40,24 +48,37 @@ def noise(*shape: int, seed: int = 1) -> Tensor:
 
 @pytest.mark.parametrize("n", [64, 65])
 def test_compression_is_a_matched_sum(n: int) -> None:
-    """Row by row against the echo of each range: exp(+j) of the beat, and of the residual video phase."""
+    """Row by row against the echo of each range: exp(+j) of the beat, and of the residual video
+    phase.
+    """
     radar, raw = ladar(), noise(3, n)
     cell = torch.arange(n, dtype=torch.float64) - n // 2
     fast, delay = cell * 100e-6 / n, 2 * cell * radar.range_step_m / radar.wave_speed_m_s
     echo = unit(-radar.chirp_rate_hz_s * (fast * delay[:, None] - delay[:, None].square() / 2))
     torch.testing.assert_close(compress_dechirped(raw, radar), raw @ echo.mH / n, atol=1e-12, rtol=0)
     plain = unit(-radar.chirp_rate_hz_s * fast * delay[:, None])
-    torch.testing.assert_close(compress_dechirped(raw, radar, residual_video=False), raw @ plain.mH / n, atol=1e-12, rtol=0)
+    torch.testing.assert_close(
+        compress_dechirped(raw, radar, residual_video=False), raw @ plain.mH / n, atol=1e-12, rtol=0
+    )
 
 
 def test_a_unit_echo_has_a_unit_peak_where_it_belongs() -> None:
     radar = ladar()
-    raw = dechirped_echo(Points([0.0], [11 * radar.range_step_m]).scatterers(Draws(0)), radar, 1, 64, 0.005, dtype=DOUBLE)
-    torch.testing.assert_close(compress_dechirped(raw, radar)[0], torch.nn.functional.one_hot(torch.tensor(32 + 11), 64).to(DOUBLE), atol=1e-9, rtol=0)
+    raw = dechirped_echo(
+        Points([0.0], [11 * radar.range_step_m]).scatterers(Draws(0)), radar, 1, 64, 0.005, dtype=DOUBLE
+    )
+    torch.testing.assert_close(
+        compress_dechirped(raw, radar)[0],
+        torch.nn.functional.one_hot(torch.tensor(32 + 11), 64).to(DOUBLE),
+        atol=1e-9,
+        rtol=0,
+    )
 
 
 def test_velocity_takes_shift_and_blur_back_per_trial() -> None:
-    """100 m/s shift by 12.9 m, many windows, and blur by 20 cells; both are undone by the true velocity, of each trial its own."""
+    """100 m/s shift by 12.9 m, many windows, and blur by 20 cells; both are undone by the true
+    velocity, of each trial its own.
+    """
     s = SMALL.scatterers(Draws(1))
     speed = torch.tensor([100.0, -35.0], dtype=torch.float64)
     motion = [Polynomial([speed])]
@@ -74,46 +95,87 @@ def test_velocity_takes_shift_and_blur_back_per_trial() -> None:
 @pytest.mark.parametrize("n", [16, 17])
 def test_azimuth_transform_is_a_unitary_sum(n: int, oversampling: int) -> None:
     x, m = noise(2, n, 5), n * oversampling
-    kernel = unit((torch.arange(m, dtype=torch.float64) - m // 2)[:, None] * (torch.arange(n, dtype=torch.float64) - n // 2) / m) / math.sqrt(m)
+    kernel = unit(
+        (torch.arange(m, dtype=torch.float64) - m // 2)[:, None] * (torch.arange(n, dtype=torch.float64) - n // 2) / m
+    ) / math.sqrt(m)
     torch.testing.assert_close(azimuth_transform(x, oversampling=oversampling), kernel @ x, atol=1e-12, rtol=0)
     torch.testing.assert_close(azimuth_transform(x, oversampling=oversampling).norm(), x.norm())
     w = torch.sin(math.pi * (torch.arange(n, dtype=torch.float64) + 0.5) / n).square()
-    torch.testing.assert_close(azimuth_transform(x, "hann", oversampling), kernel @ (x * (w / w.square().mean().sqrt())[:, None]), atol=1e-12, rtol=0)
+    torch.testing.assert_close(
+        azimuth_transform(x, "hann", oversampling),
+        kernel @ (x * (w / w.square().mean().sqrt())[:, None]),
+        atol=1e-12,
+        rtol=0,
+    )
 
 
 def test_image_axes_say_where_targets_are() -> None:
-    recording, _ = simulate_turntable(ladar(), TurntableWorld(Points([0.0601], [-0.03])), 400, 128, Draws(0), dtype=DOUBLE)
+    recording, _ = simulate_turntable(
+        ladar(), TurntableWorld(Points([0.0601], [-0.03])), 400, 128, Draws(0), dtype=DOUBLE
+    )
     for stage, step in ((AzimuthTransform(ladar()), 0.775e-3), (AzimuthTransform(ladar(), "hann", 4), 0.775e-3 / 4)):
         image = stage(recording.signal)
-        assert image.names == ("azimuth", "range") and image.axes[0].step == pytest.approx(step) and image.axes[0].unit == "m"
+        assert (
+            image.names == ("azimuth", "range")
+            and image.axes[0].step == pytest.approx(step)
+            and image.axes[0].unit == "m"
+        )
         line = int(image.data.abs().amax(-1).argmax())
         assert abs(image.axes[0].values()[line] - 0.0601) < 0.51 * step
     unknown = AzimuthTransform(ladar(rotation_rad_s=None))(recording.signal)
     assert unknown.axes[0].unit == "Hz" and unknown.axes[0].step == pytest.approx(5.0)
-    assert float(unknown.axes[0].values()[int(unknown.data.abs().amax(-1).argmax())]) == pytest.approx(2 * 0.005 * 0.0601 / 1.55e-6, abs=2.5)
+    assert float(unknown.axes[0].values()[int(unknown.data.abs().amax(-1).argmax())]) == pytest.approx(
+        2 * 0.005 * 0.0601 / 1.55e-6, abs=2.5
+    )
 
 
 def test_stages_make_a_chain_and_take_the_velocity() -> None:
     motion = [Polynomial([40.0])]
-    recording, truth = simulate_turntable(ladar(), TurntableWorld(SMALL, motion=motion, fidelity=Dechirped(motion)), 40, 64, Draws(1, trials=range(2)), dtype=DOUBLE)
+    recording, truth = simulate_turntable(
+        ladar(),
+        TurntableWorld(SMALL, motion=motion, fidelity=Dechirped(motion)),
+        40,
+        64,
+        Draws(1, trials=range(2)),
+        dtype=DOUBLE,
+    )
     assert truth.clean is not None
-    chain = Chain(compress=use(CompressDechirped(ladar()), velocity_m_s="aux.velocity_m_s"), image=AzimuthTransform(ladar()))
-    told = type(recording)(recording.signal, recording.radar, {**recording.aux, "velocity_m_s": torch.tensor([40.0, 40.0], dtype=torch.float64)})
+    chain = Chain(
+        compress=use(CompressDechirped(ladar()), velocity_m_s="aux.velocity_m_s"), image=AzimuthTransform(ladar())
+    )
+    told = type(recording)(
+        recording.signal,
+        recording.radar,
+        {**recording.aux, "velocity_m_s": torch.tensor([40.0, 40.0], dtype=torch.float64)},
+    )
     image, clean = chain(told), Chain(compress=CompressDechirped(ladar()), image=AzimuthTransform(ladar()))(truth.clean)
     torch.testing.assert_close(image.data, clean.data, atol=1e-3 * float(clean.data.abs().max()), rtol=0)
     assert image.names == ("azimuth", "range") and image.axes[1] == ladar().raw_axes(40, 64)[1]
 
 
-@pytest.mark.parametrize("stage", [CompressDechirped(QUICK), AzimuthTransform(QUICK, "hann", 2)], ids=["compress", "azimuth"])
+@pytest.mark.parametrize(
+    "stage", [CompressDechirped(QUICK), AzimuthTransform(QUICK, "hann", 2)], ids=["compress", "azimuth"]
+)
 def test_stages_keep_trials_apart(stage) -> None:
-    axes = (QUICK.raw_axes(12, 16)[0], simulate_turntable(QUICK, TurntableWorld(Points([0.0], [0.0]), fidelity=Dechirped()), 12, 16, Draws(0))[0].signal.axes[1])
+    axes = (
+        QUICK.raw_axes(12, 16)[0],
+        simulate_turntable(QUICK, TurntableWorld(Points([0.0], [0.0]), fidelity=Dechirped()), 12, 16, Draws(0))[
+            0
+        ].signal.axes[1],
+    )
     axes = axes if stage.works_on[-1] == "fast_time" else QUICK.raw_axes(12, 16)
     data = noise(3, 12, 16) * torch.tensor([1.0, 1e3, 1e-3], dtype=torch.float64)[:, None, None]
-    velocity = {"velocity_m_s": torch.tensor([0.0, 5.0, -80.0], dtype=torch.float64)} if stage.works_on[-1] == "fast_time" else {}
+    velocity = (
+        {"velocity_m_s": torch.tensor([0.0, 5.0, -80.0], dtype=torch.float64)}
+        if stage.works_on[-1] == "fast_time"
+        else {}
+    )
     out = stage(Signal(data, axes), **velocity).data
     for i in range(3):
         assert torch.equal(stage(Signal(data[i], axes), **{k: v[i] for k, v in velocity.items()}).data, out[i])
-    mapped = torch.vmap(lambda x, *v: stage(Signal(x, axes), **dict(zip(velocity, v, strict=True))).data)(data, *velocity.values())
+    mapped = torch.vmap(lambda x, *v: stage(Signal(x, axes), **dict(zip(velocity, v, strict=True))).data)(
+        data, *velocity.values()
+    )
     torch.testing.assert_close(mapped, out, atol=1e-12, rtol=1e-12)
     assert stage(Signal(data.to(torch.complex64), axes), **velocity).data.dtype == torch.complex64
 
@@ -122,12 +184,18 @@ def test_compression_and_transform_are_differentiable() -> None:
     def image(raw: Tensor, velocity: Tensor) -> Tensor:
         return azimuth_transform(compress_dechirped(raw, QUICK, velocity), "hann", 2)
 
-    assert torch.autograd.gradcheck(image, (noise(2, 4, 8).requires_grad_(), torch.tensor([0.3, -0.7], dtype=torch.float64, requires_grad=True)), fast_mode=True)
+    assert torch.autograd.gradcheck(
+        image,
+        (noise(2, 4, 8).requires_grad_(), torch.tensor([0.3, -0.7], dtype=torch.float64, requires_grad=True)),
+        fast_mode=True,
+    )
 
 
 def test_misuse_is_refused() -> None:
     recording, _ = simulate_turntable(ladar(), TurntableWorld(SMALL, fidelity=Dechirped()), 4, 64, Draws(0))
-    with pytest.raises(ValueError, match=r"64 fast-time samples from -5e-05 s by 1.5625e-06 s do not fill the pulse of 0.0002 s"):
+    with pytest.raises(
+        ValueError, match=r"64 fast-time samples from -5e-05 s by 1.5625e-06 s do not fill the pulse of 0.0002 s"
+    ):
         CompressDechirped(ladar(pulse_s=200e-6))(recording.signal)
     with pytest.raises(ValueError, match=r"CompressDechirped works on the axes \('pulse', 'fast_time'\)"):
         CompressDechirped(ladar())(Signal(recording.signal.data, ladar().raw_axes(4, 64)))
@@ -146,14 +214,32 @@ def table(radar: InverseRadar | None = None, cross_m: float = 0.19, range_m: flo
 def test_sizes_of_section_8() -> None:
     """Brief 002, section 8, column "size here": 100 m/s, 1 mm at 100 Hz."""
     rows = table(velocity_m_s=100.0, vibrations=[(1e-3, 100.0)])
-    assert rows["range-Doppler coupling"].range_cells == pytest.approx(12.9e3, rel=0.01) and rows["range-Doppler coupling"].ok
-    assert rows["intra-pulse walk"].phase_rad == pytest.approx(15.7, rel=0.01) and "known to 5 m/s" in rows["intra-pulse walk"].verdict
-    assert rows["intra-pulse acceleration"].phase_rad == pytest.approx(4.0, rel=0.01) and not rows["intra-pulse acceleration"].ok
+    assert (
+        rows["range-Doppler coupling"].range_cells == pytest.approx(12.9e3, rel=0.01)
+        and rows["range-Doppler coupling"].ok
+    )
+    assert (
+        rows["intra-pulse walk"].phase_rad == pytest.approx(15.7, rel=0.01)
+        and "known to 5 m/s" in rows["intra-pulse walk"].verdict
+    )
+    assert (
+        rows["intra-pulse acceleration"].phase_rad == pytest.approx(4.0, rel=0.01)
+        and not rows["intra-pulse acceleration"].ok
+    )
     assert rows["vibration coupling"].range_cells == pytest.approx(81, rel=0.01) and not rows["vibration coupling"].ok
-    assert rows["rotation migration ignored"].range_cells == pytest.approx(0.095, rel=0.01) and rows["rotation migration ignored"].ok
-    assert rows["phase linear in rotation"].phase_rad == pytest.approx(0.076, rel=0.01) and rows["phase linear in rotation"].ok
+    assert (
+        rows["rotation migration ignored"].range_cells == pytest.approx(0.095, rel=0.01)
+        and rows["rotation migration ignored"].ok
+    )
+    assert (
+        rows["phase linear in rotation"].phase_rad == pytest.approx(0.076, rel=0.01)
+        and rows["phase linear in rotation"].ok
+    )
     assert rows["residual video phase"].phase_rad < 0.003 and rows["residual video phase"].ok
-    assert rows["vibration followed by pulses"].phase_rad == pytest.approx(807 * math.pi, rel=0.01) and not rows["vibration followed by pulses"].ok
+    assert (
+        rows["vibration followed by pulses"].phase_rad == pytest.approx(807 * math.pi, rel=0.01)
+        and not rows["vibration followed by pulses"].ok
+    )
     assert rows["envelopes not aligned"].range_cells == pytest.approx(20 / 0.9993e-3 / math.sqrt(12), rel=0.01)
 
 
@@ -171,8 +257,16 @@ def test_rules_of_section_8() -> None:
     }
     for effect, (rows, limit) in limits.items():
         assert rows(0.97 * limit)[effect].ok and not rows(1.03 * limit)[effect].ok, effect
-    assert table(cross_m=1.2)["rotation migration ignored"].verdict.startswith("warning") and table(cross_m=2.2)["rotation migration ignored"].verdict.startswith("resample")
-    assert set(table()) - set(table(ladar(pulse_s=None))) == {"range-Doppler coupling", "intra-pulse walk", "intra-pulse acceleration", "vibration coupling", "residual video phase"}
+    assert table(cross_m=1.2)["rotation migration ignored"].verdict.startswith("warning") and table(cross_m=2.2)[
+        "rotation migration ignored"
+    ].verdict.startswith("resample")
+    assert set(table()) - set(table(ladar(pulse_s=None))) == {
+        "range-Doppler coupling",
+        "intra-pulse walk",
+        "intra-pulse acceleration",
+        "vibration coupling",
+        "residual video phase",
+    }
 
 
 def test_requirements_refuse_what_cannot_be() -> None:
@@ -187,7 +281,9 @@ def test_requirements_refuse_what_cannot_be() -> None:
 
 
 def test_images_of_a_wrong_velocity(aircraft: Scatterers, ideal: float) -> None:
-    """Measured in brief 002: errors of 1, 5, 20 m/s cost 0.01, 0.15, 0.76, of which up to 0.24 is where rows fall between cells; here the tracking is perfect."""
+    """Measured in brief 002: errors of 1, 5, 20 m/s cost 0.01, 0.15, 0.76, of which up to 0.24 is
+    where rows fall between cells; here the tracking is perfect.
+    """
     motion = [Polynomial([100.0])]
     raw = dechirped_echo(aircraft, ladar(), 400, 256, 0.005, motion, motion)
     loss = {error: image_entropy(raw, 100.0 - error) - ideal for error in (0.0, 1.0, 5.0, 20.0, 100.0)}
@@ -196,38 +292,58 @@ def test_images_of_a_wrong_velocity(aircraft: Scatterers, ideal: float) -> None:
 
 
 def phases_of(lines: Tensor, still: Tensor) -> Tensor:
-    """Lines with the phase of each pulse that fits the still target best: what a perfect estimator would find."""
+    """Lines with the phase of each pulse that fits the still target best: what a perfect estimator
+    would find.
+    """
     match = (lines * still.conj()).sum(-1, keepdim=True)
     return lines * match.conj() / match.abs()
 
 
 @pytest.mark.parametrize("amplitude_um, low, high", [(100, -0.02, 0.08), (500, 0.3, 0.7)])
-def test_images_of_intra_pulse_acceleration(aircraft: Scatterers, ideal: float, amplitude_um: int, low: float, high: float) -> None:
-    """Measured in brief 002 with the shift of each pulse known: +.03 for 100 um at 100 Hz, +.50 for 500 um."""
+def test_images_of_intra_pulse_acceleration(
+    aircraft: Scatterers, ideal: float, amplitude_um: int, low: float, high: float
+) -> None:
+    """Measured in brief 002 with the shift of each pulse known: +.03 for 100 um at 100 Hz, +.50 for
+    500 um.
+    """
     vibration, radar = Sinusoid(1e-6 * amplitude_um, 100.0, 90.0), ladar()
     raw = dechirped_echo(aircraft, radar, 400, 256, 0.005, [vibration])
     time_s = torch.arange(400, dtype=torch.float64) / 2000
     fast_s = (torch.arange(256, dtype=torch.float64) - 128) * 100e-6 / 256
     ahead = (vibration.displacement_m(time_s + 1e-6) - vibration.displacement_m(time_s - 1e-6)) / 2e-6
-    known = 2 / radar.wave_speed_m_s * (vibration.displacement_m(time_s)[:, None] + ahead[:, None] * fast_s) * (radar.carrier_hz + radar.chirp_rate_hz_s * fast_s)
+    known = (
+        2
+        / radar.wave_speed_m_s
+        * (vibration.displacement_m(time_s)[:, None] + ahead[:, None] * fast_s)
+        * (radar.carrier_hz + radar.chirp_rate_hz_s * fast_s)
+    )
     lines = compress_dechirped(raw * unit(known).to(raw.dtype), radar)
     still = turntable_echo(aircraft, radar, 400, 256, 0.005)
     assert low < float(entropy(azimuth_transform(phases_of(lines, still)))) - ideal < high
 
 
 def test_images_of_unaligned_vibration(aircraft: Scatterers, ideal: float) -> None:
-    """Measured in brief 002 after phase correction: 10 um at 100 Hz unaligned 8.53, 1 um 7.16, ideal 7.11."""
+    """Measured in brief 002 after phase correction: 10 um at 100 Hz unaligned 8.53, 1 um 7.16,
+    ideal 7.11.
+    """
     for amplitude, low, high in ((10e-6, 0.9, 1.8), (1e-6, -0.01, 0.1)):
         vibration, radar = Sinusoid(amplitude, 100.0, 90.0), ladar()
         lines = compress_dechirped(dechirped_echo(aircraft, radar, 400, 256, 0.005, [vibration]), radar)
-        assert low < float(entropy(azimuth_transform(phases_of(lines, turntable_echo(aircraft, radar, 400, 256, 0.005))))) - ideal < high
+        assert (
+            low
+            < float(entropy(azimuth_transform(phases_of(lines, turntable_echo(aircraft, radar, 400, 256, 0.005)))))
+            - ideal
+            < high
+        )
 
 
 @pytest.mark.parametrize("cells, low, high", [(0.38, 0.0, 0.05), (1.5, 0.1, 0.35)])
 def test_images_of_rotation_migration(aircraft: Scatterers, cells: float, low: float, high: float) -> None:
     """Measured in brief 002: +.02 at 0.38 cell, +.20 at 1.5 cells of x omega T."""
     times = cells / 0.095
-    radar = ladar(carrier_hz=ladar().carrier_hz / times, rotation_rad_s=0.005 * times)  # the same cells from a longer wave and a wider angle
+    radar = ladar(
+        carrier_hz=ladar().carrier_hz / times, rotation_rad_s=0.005 * times
+    )  # the same cells from a longer wave and a wider angle
     straight = entropy(azimuth_transform(turntable_echo(aircraft, radar, 400, 256, 0.005 * times)))
     lines = compress_dechirped(dechirped_echo(aircraft, radar, 400, 256, 0.005 * times), radar)
     assert low < float(entropy(azimuth_transform(lines)) - straight) < high

@@ -23,7 +23,10 @@ def rows(form):
 def test_gradcheck_in_raw_velocity_and_frame(form):
     torch.manual_seed(0)
     raw = torch.randn(2, 6, 8, dtype=torch.complex128, requires_grad=True)
-    velocity, frame = torch.tensor([118.0, 121.0], dtype=torch.float64, requires_grad=True), torch.tensor([5.0, -7.0], dtype=torch.float64, requires_grad=True)
+    velocity, frame = (
+        torch.tensor([118.0, 121.0], dtype=torch.float64, requires_grad=True),
+        torch.tensor([5.0, -7.0], dtype=torch.float64, requires_grad=True),
+    )
     assert torch.autograd.gradcheck(rows(form), (raw, velocity, frame), atol=1e-4)
 
 
@@ -32,14 +35,21 @@ def test_gradcheck_of_backprojection_in_all_that_varies():
     raw = torch.randn(5, 8, dtype=torch.complex128, requires_grad=True)
     x, r = (torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in ([0.5, 0.9], [2008.0, 2011.0]))
     velocity = torch.tensor(119.0, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda raw, x, r, v: backproject(raw, RADAR, x, r, doppler_hz=8.0, velocity_m_s=v), (raw, x, r, velocity), atol=1e-4)
+    assert torch.autograd.gradcheck(
+        lambda raw, x, r, v: backproject(raw, RADAR, x, r, doppler_hz=8.0, velocity_m_s=v),
+        (raw, x, r, velocity),
+        atol=1e-4,
+    )
 
 
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("shape", [(48, 60), (33, 47)])
 def test_a_batch_with_different_values_equals_its_singles(form, shape):
     raw = torch.randn(3, *shape, dtype=torch.complex128)
-    doppler, velocity = torch.tensor([0.0, 130.0, -900.0], dtype=torch.float64), torch.tensor([120.0, 90.0, 125.0], dtype=torch.float64)
+    doppler, velocity = (
+        torch.tensor([0.0, 130.0, -900.0], dtype=torch.float64),
+        torch.tensor([120.0, 90.0, 125.0], dtype=torch.float64),
+    )
     batch = form(raw, RADAR, doppler_hz=doppler, velocity_m_s=velocity)
     singles = [form(raw[i], RADAR, doppler_hz=doppler[i], velocity_m_s=velocity[i]) for i in range(3)]
     torch.testing.assert_close(batch, torch.stack(singles), rtol=1e-10, atol=1e-10)
@@ -60,7 +70,9 @@ def test_backprojected_batch_equals_singles_and_blocks_do_not_matter():
     batch = backproject(raw, RADAR, x, r, velocity_m_s=velocity, **kw)
     assert batch.shape == (2, 5, 7)
     for i in range(2):
-        torch.testing.assert_close(batch[i], backproject(raw[i], RADAR, x, r, velocity_m_s=velocity[i], block_bytes=1, **kw))
+        torch.testing.assert_close(
+            batch[i], backproject(raw[i], RADAR, x, r, velocity_m_s=velocity[i], block_bytes=1, **kw)
+        )
 
 
 def test_apertures_limit_the_pulses():
@@ -74,8 +86,14 @@ def test_apertures_limit_the_pulses():
 
 def test_a_processed_band_removes_what_lies_outside_and_warns_beyond_the_prf():
     n = 256
-    tone = torch.exp(2j * torch.pi * 90.625 / 400 * torch.arange(n, dtype=torch.float64))[:, None].expand(n, 32).contiguous()
-    kept, removed = (omega_k(tone, RADAR, doppler_hz=centre, frame_hz=0.0, band_hz=100.0).abs().mean() for centre in (90.0, 0.0))
+    tone = (
+        torch.exp(2j * torch.pi * 90.625 / 400 * torch.arange(n, dtype=torch.float64))[:, None]
+        .expand(n, 32)
+        .contiguous()
+    )
+    kept, removed = (
+        omega_k(tone, RADAR, doppler_hz=centre, frame_hz=0.0, band_hz=100.0).abs().mean() for centre in (90.0, 0.0)
+    )
     assert removed < 0.02 * kept
     with pytest.warns(UserWarning, match=r"PRF 400 Hz .* 450"):
         omega_k(tone, RADAR, doppler_hz=0.0, band_hz=450.0)

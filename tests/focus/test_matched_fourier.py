@@ -1,4 +1,6 @@
-"""Matched Fourier transform: every method against the sum itself, adjoints, gradients, units, and what is refused."""
+"""Matched Fourier transform: every method against the sum itself, adjoints, gradients, units, and
+what is refused.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,16 @@ import torch
 from torchsar.compensate.pulse_phase.imaging import Through
 from torchsar.core import Signal
 from torchsar.core.warp import warp, warp_rate
-from torchsar.focus import MatchedFourier, MatchedFourierOperator, RangePhase, cross_range_of, lines_for, matched_fourier, mean_rate, range_phase
+from torchsar.focus import (
+    MatchedFourier,
+    MatchedFourierOperator,
+    RangePhase,
+    cross_range_of,
+    lines_for,
+    matched_fourier,
+    mean_rate,
+    range_phase,
+)
 from torchsar.focus.matched_fourier import kernel_of
 from torchsar.focus.warped_sums import times_of_even_angle
 from torchsar.metrics import entropy
@@ -53,7 +64,13 @@ def points(x_m, y_m, k=K, omega=OMEGA, n_range=1, step_m=0.25, yc_m=0.0):
     return data
 
 
-METHODS = ["nufft", "explicit", pytest.param("finufft", marks=pytest.mark.skipif(not importlib.util.find_spec("finufft"), reason="finufft is not installed"))]
+METHODS = [
+    "nufft",
+    "explicit",
+    pytest.param(
+        "finufft", marks=pytest.mark.skipif(not importlib.util.find_spec("finufft"), reason="finufft is not installed")
+    ),
+]
 
 
 @pytest.mark.parametrize("weight", ["matched", "warped"])
@@ -61,7 +78,9 @@ METHODS = ["nufft", "explicit", pytest.param("finufft", marks=pytest.mark.skipif
 @pytest.mark.parametrize("method", METHODS)
 def test_equals_the_sum(method, oversampling, lines, weight):
     data = noise(2, N, 3)
-    image = matched_fourier(data, K, PRF, oversampling=oversampling, lines=lines, weight=weight, method=method, eps=1e-9)
+    image = matched_fourier(
+        data, K, PRF, oversampling=oversampling, lines=lines, weight=weight, method=method, eps=1e-9
+    )
     assert image.shape == (2, lines or round(oversampling * N), 3)
     assert relative(image, direct(data, K, oversampling, image.shape[-2], weight)) < 1e-9
 
@@ -81,7 +100,9 @@ def test_kernel_choice():
 
 
 def edge(share=0.93):
-    """Points spread up to `share` of what the pulse rate carries at the fastest turn, and their image by the sum."""
+    """Points spread up to `share` of what the pulse rate carries at the fastest turn, and their
+    image by the sum.
+    """
     reach = share * LAMBDA * PRF / 4 / float((OMEGA[0] * warp_rate(TIMES, K[0])).max())
     data = points(torch.linspace(-reach, reach, 41).tolist(), [0.0] * 41)[:1]
     return data, matched_fourier(data, K[:1], PRF, method="explicit")
@@ -100,50 +121,98 @@ def edge(share=0.93):
     ],
 )
 def test_what_each_method_loses(options, low, high):
-    """Brief 003: 4e-3, 4e-4, 2e-4, 4e-6, 4e-8 of the kernels; 0.20 and 0.077 of resampling with targets up to 93 % of half the pulse rate."""
+    """Brief 003: 4e-3, 4e-4, 2e-4, 4e-6, 4e-8 of the kernels; 0.20 and 0.077 of resampling with
+    targets up to 93 % of half the pulse rate.
+    """
     data, exact = edge()
     assert low < relative(matched_fourier(data, K[:1], PRF, **options), exact) < high
 
 
-@pytest.mark.parametrize("taps, oversampling, worst", [(2, 2.0, 2e-2), (4, 1.25, 4e-3), (4, 2.0, 1.5e-4), (6, 2.0, 7e-7)])
+@pytest.mark.parametrize(
+    "taps, oversampling, worst", [(2, 2.0, 2e-2), (4, 1.25, 4e-3), (4, 2.0, 1.5e-4), (6, 2.0, 7e-7)]
+)
 def test_entropy_follows_the_kernel(taps, oversampling, worst):
     data, exact = edge()
-    assert abs(float(entropy(matched_fourier(data, K[:1], PRF, taps=taps, kernel_oversampling=oversampling)) - entropy(exact))) < worst
+    assert (
+        abs(
+            float(
+                entropy(matched_fourier(data, K[:1], PRF, taps=taps, kernel_oversampling=oversampling)) - entropy(exact)
+            )
+        )
+        < worst
+    )
 
 
 @pytest.mark.parametrize("method", ["linear", "spline"])
 def test_resampling_is_right_well_inside_the_band(method):
-    """Tapered, because a sum over even angles weighs the outermost pulses differently, by some hundredths of an image."""
+    """Tapered, because a sum over even angles weighs the outermost pulses differently, by some
+    hundredths of an image.
+    """
     data = edge(0.1)[0] * torch.sin(math.pi * TIMES / DURATION).square()[:, None]
     for options in ({}, {"oversampling": 1.3, "lines": 300}):
         exact = matched_fourier(data, K[:1], PRF, method="explicit", **options)
-        assert relative(matched_fourier(data, K[:1], PRF, method=method, **options), exact) < (0.01 if method == "linear" else 2e-4)
+        assert relative(matched_fourier(data, K[:1], PRF, method=method, **options), exact) < (
+            0.01 if method == "linear" else 2e-4
+        )
 
 
 def test_times_of_even_angle():
     time = times_of_even_angle(K, N, PRF)
-    torch.testing.assert_close(warp(time, K), torch.arange(N, dtype=torch.float64) / N * warp(torch.tensor([DURATION], dtype=torch.float64), K), rtol=1e-13, atol=1e-16)
+    torch.testing.assert_close(
+        warp(time, K),
+        torch.arange(N, dtype=torch.float64) / N * warp(torch.tensor([DURATION], dtype=torch.float64), K),
+        rtol=1e-13,
+        atol=1e-16,
+    )
 
 
 @pytest.mark.parametrize("metres", [{}, {"cross_range_m": (1e-4, 120), "omega_rad_s": OMEGA, "wavelength_m": LAMBDA}])
 @pytest.mark.parametrize("method", [*METHODS, "linear", "spline"])
 def test_adjoint(method, metres):
-    operator = MatchedFourierOperator(K, N, PRF, dtype=torch.complex128, oversampling=1.3, lines=None if metres else 120, weight="warped", method=method, **metres)
+    operator = MatchedFourierOperator(
+        K,
+        N,
+        PRF,
+        dtype=torch.complex128,
+        oversampling=1.3,
+        lines=None if metres else 120,
+        weight="warped",
+        method=method,
+        **metres,
+    )
     pulses, image = noise(3, 2, N, 4), noise(3, 2, 120, 4, seed=2)
-    torch.testing.assert_close((operator.image(pulses) * image.conj()).sum(), (pulses * operator.adjoint(image).conj()).sum(), rtol=1e-7 if method == "finufft" else 1e-11, atol=1e-9)
+    torch.testing.assert_close(
+        (operator.image(pulses) * image.conj()).sum(),
+        (pulses * operator.adjoint(image).conj()).sum(),
+        rtol=1e-7 if method == "finufft" else 1e-11,
+        atol=1e-9,
+    )
 
 
 def test_operator_serves_autofocus():
     imaging = Through(MatchedFourierOperator(K, N, PRF, dtype=torch.complex128))
     rows, image = noise(2, 3, N), noise(2, 3, 2 * N, seed=2)
-    torch.testing.assert_close((imaging.image(rows) * image.mT.conj()).sum(), (rows * imaging.adjoint(image.mT).conj()).sum(), rtol=1e-11, atol=1e-9)
+    torch.testing.assert_close(
+        (imaging.image(rows) * image.mT.conj()).sum(),
+        (rows * imaging.adjoint(image.mT).conj()).sum(),
+        rtol=1e-11,
+        atol=1e-9,
+    )
 
 
 SMALL = torch.tensor([[0.1, 0.01], [0.05, 0.03]], dtype=torch.float64)
 
 
 @pytest.mark.parametrize(
-    "options", [{"taps": 5}, {"taps": 4, "kernel_oversampling": 1.25, "weight": "warped"}, {"method": "explicit"}, {"method": "spline"}, {"method": "linear", "oversampling": 1.1}], ids=str
+    "options",
+    [
+        {"taps": 5},
+        {"taps": 4, "kernel_oversampling": 1.25, "weight": "warped"},
+        {"method": "explicit"},
+        {"method": "spline"},
+        {"method": "linear", "oversampling": 1.1},
+    ],
+    ids=str,
 )
 def test_two_derivatives(options):
     data, k = noise(2, 10, 2).requires_grad_(), SMALL.clone().requires_grad_()
@@ -151,17 +220,25 @@ def test_two_derivatives(options):
     def image(data, k):
         return matched_fourier(data, k, 10.0, lines=7, **options)
 
-    assert torch.autograd.gradcheck(image, (data, k), fast_mode=True) and torch.autograd.gradgradcheck(image, (data, k), fast_mode=True)
+    assert torch.autograd.gradcheck(image, (data, k), fast_mode=True) and torch.autograd.gradgradcheck(
+        image, (data, k), fast_mode=True
+    )
 
 
 def test_two_derivatives_in_metres():
-    data, k, omega = noise(2, 10, 2).requires_grad_(), SMALL.clone().requires_grad_(), torch.tensor([0.3, 0.2], dtype=torch.float64).requires_grad_()
+    data, k, omega = (
+        noise(2, 10, 2).requires_grad_(),
+        SMALL.clone().requires_grad_(),
+        torch.tensor([0.3, 0.2], dtype=torch.float64).requires_grad_(),
+    )
 
     def image(data, k, omega, yc):
         data = range_phase(data, torch.tensor([-0.1, 0.3], dtype=torch.float64), 1.0, 10.0, omega, k, yc)
         return matched_fourier(data, k, 10.0, cross_range_m=(0.1, 9), omega_rad_s=omega, wavelength_m=1.0)
 
-    assert torch.autograd.gradcheck(image, (data, k, omega, omega), fast_mode=True) and torch.autograd.gradgradcheck(image, (data, k, omega, omega), fast_mode=True)
+    assert torch.autograd.gradcheck(image, (data, k, omega, omega), fast_mode=True) and torch.autograd.gradgradcheck(
+        image, (data, k, omega, omega), fast_mode=True
+    )
 
 
 @pytest.mark.skipif(not importlib.util.find_spec("finufft"), reason="finufft is not installed")
@@ -190,9 +267,18 @@ def test_batch_equals_singles_and_broadcasts(method):
     data = noise(2, N, 3) * torch.tensor([1.0, 1e4])[:, None, None]
     together = matched_fourier(data, K, PRF, method=method)
     for i in range(2):
-        torch.testing.assert_close(together[i], matched_fourier(data[i], K[i], PRF, method=method), rtol=1e-12, atol=1e-12 * 1e4**i)
-        torch.testing.assert_close(matched_fourier(data[0], K, PRF, method=method)[i], matched_fourier(data[0], K[i], PRF, method=method), rtol=1e-12, atol=1e-11)
-    torch.testing.assert_close(torch.vmap(lambda k: matched_fourier(data[0], k, PRF))(K), matched_fourier(data[0], K, PRF))
+        torch.testing.assert_close(
+            together[i], matched_fourier(data[i], K[i], PRF, method=method), rtol=1e-12, atol=1e-12 * 1e4**i
+        )
+        torch.testing.assert_close(
+            matched_fourier(data[0], K, PRF, method=method)[i],
+            matched_fourier(data[0], K[i], PRF, method=method),
+            rtol=1e-12,
+            atol=1e-11,
+        )
+    torch.testing.assert_close(
+        torch.vmap(lambda k: matched_fourier(data[0], k, PRF))(K), matched_fourier(data[0], K, PRF)
+    )
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
@@ -208,7 +294,10 @@ def test_no_warp_is_a_plain_transform():
     data = noise(N, 2)
     want = torch.fft.fftshift(torch.fft.ifft(data, dim=0, norm="ortho"), dim=0)
     assert relative(matched_fourier(data, torch.zeros(0), PRF, oversampling=1.0, eps=1e-12), want) < 1e-12
-    assert relative(matched_fourier(data, torch.zeros(1, dtype=torch.float64), PRF, oversampling=1.0, eps=1e-12), want) < 1e-12
+    assert (
+        relative(matched_fourier(data, torch.zeros(1, dtype=torch.float64), PRF, oversampling=1.0, eps=1e-12), want)
+        < 1e-12
+    )
 
 
 def test_any_order():
@@ -242,10 +331,14 @@ def test_range_phase_is_the_factor_itself(yc_m):
 
 
 def test_a_point_is_focused_in_both_axes_and_scaled():
-    """8 mm to one side and 12 m from the centre, where the range term alone costs more than 2 dB."""
+    """8 mm to one side and 12 m from the centre, where the range term alone costs more than
+    2 dB.
+    """
     data = points([8e-3], [12.0], n_range=5, yc_m=12.0)
     signal = Signal(data, RADAR.raw_axes(N, 5))
-    focused = MatchedFourier(RADAR, oversampling=8.0)(RangePhase(RADAR)(signal, OMEGA, K, torch.full((2,), 12.0, dtype=torch.float64)), K)
+    focused = MatchedFourier(RADAR, oversampling=8.0)(
+        RangePhase(RADAR)(signal, OMEGA, K, torch.full((2,), 12.0, dtype=torch.float64)), K
+    )
     line = focused.data[..., 2].abs()
     torch.testing.assert_close(line.amax(-1), torch.full((2,), math.sqrt(N), dtype=torch.float64), rtol=0.02, atol=0)
     doppler = focused.axis("azimuth").values()[line.argmax(-1)]
@@ -261,15 +354,25 @@ def test_metre_mode_puts_all_trials_on_one_axis():
     axis = image.axis("azimuth")
     assert (axis.unit, axis.n, axis.name) == ("m", 121, "azimuth") and axis.values()[60] == 0
     at = image.data[..., 0].abs()
-    assert (at[:, 100] > 0.9 * math.sqrt(N)).all() and (at[:, 45] > 0.9 * math.sqrt(N)).all() and (at[:, 115] < 0.2 * math.sqrt(N)).all()
+    assert (
+        (at[:, 100] > 0.9 * math.sqrt(N)).all()
+        and (at[:, 45] > 0.9 * math.sqrt(N)).all()
+        and (at[:, 115] < 0.2 * math.sqrt(N)).all()
+    )
     explicit = MatchedFourier(RADAR, cross_range_m=(2e-4, 121), method="explicit")(signal, warp_k=K, omega_rad_s=OMEGA)
     assert relative(image.data, explicit.data) < 1e-6
-    cells = torch.exp(4j * math.pi / LAMBDA * axis.values()[:, None] * (OMEGA[:, None] * warp(TIMES, K))[:, None, :]) @ signal.data / math.sqrt(N)
+    cells = (
+        torch.exp(4j * math.pi / LAMBDA * axis.values()[:, None] * (OMEGA[:, None] * warp(TIMES, K))[:, None, :])
+        @ signal.data
+        / math.sqrt(N)
+    )
     assert relative(explicit.data, cells) < 1e-10
 
 
 def test_doppler_axis_and_mean_rate():
-    axis = MatchedFourier(RADAR, oversampling=4.0, lines=100)(Signal(noise(2, N, 1), RADAR.raw_axes(N, 1)), K).axis("azimuth")
+    axis = MatchedFourier(RADAR, oversampling=4.0, lines=100)(Signal(noise(2, N, 1), RADAR.raw_axes(N, 1)), K).axis(
+        "azimuth"
+    )
     assert axis.unit == "Hz" and axis.step == pytest.approx(1 / (4 * DURATION)) and axis.values()[50] == 0
     total = DURATION + K[:, 0] * DURATION**2 / 2 + K[:, 1] * DURATION**3 / 6
     torch.testing.assert_close(mean_rate(OMEGA, K, DURATION), OMEGA * total / DURATION)
@@ -283,8 +386,13 @@ def test_constants_serve_and_connected_values_win():
     torch.testing.assert_close(held(signal, K).data, matched_fourier(signal.data, K, PRF))
     torch.testing.assert_close(MatchedFourier(RADAR)(signal).data, matched_fourier(signal.data, torch.zeros(0), PRF))
     phase = RangePhase(RADAR, omega_rad_s=0.02, warp_k=K[0], yc_m=1.0)
-    torch.testing.assert_close(phase(signal).data, range_phase(signal.data, signal.axis("range").values(), LAMBDA, PRF, 0.02, K[0], 1.0))
-    torch.testing.assert_close(phase(signal, OMEGA, K, OMEGA).data, range_phase(signal.data, signal.axis("range").values(), LAMBDA, PRF, OMEGA, K, OMEGA))
+    torch.testing.assert_close(
+        phase(signal).data, range_phase(signal.data, signal.axis("range").values(), LAMBDA, PRF, 0.02, K[0], 1.0)
+    )
+    torch.testing.assert_close(
+        phase(signal, OMEGA, K, OMEGA).data,
+        range_phase(signal.data, signal.axis("range").values(), LAMBDA, PRF, OMEGA, K, OMEGA),
+    )
 
 
 def test_start_of_slow_time_does_not_matter():

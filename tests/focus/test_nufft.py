@@ -60,7 +60,10 @@ def test_gradients(transform):
 
 def test_gradient_in_the_points_is_that_of_the_direct_sum():
     x, points = torch.randn(2, 40, dtype=torch.complex128), torch.rand(2, 30, dtype=torch.float64).requires_grad_()
-    got, want = (torch.autograd.grad(f(x, points).abs().square().sum(), points)[0] for f in (lambda x, p: nufft_type2(x, p, 1e-9), direct))
+    got, want = (
+        torch.autograd.grad(f(x, points).abs().square().sum(), points)[0]
+        for f in (lambda x, p: nufft_type2(x, p, 1e-9), direct)
+    )
     assert torch.linalg.vector_norm(got - want) < 1e-6 * torch.linalg.vector_norm(want)
 
 

@@ -1,4 +1,6 @@
-"""The non-uniform FFT along pulses against the direct sum, its adjoint, its gradients, and the kernels behind it."""
+"""The non-uniform FFT along pulses against the direct sum, its adjoint, its gradients, and the
+kernels behind it.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ def noise(*shape, seed=1, dtype=torch.complex128):
 
 
 def warped(m=120):
-    """Points of two trials: even, and bent with some anywhere, on the grid, at its edges, and out of order."""
+    """Points of two trials: even, and bent with some anywhere, on the grid, at its edges, and out
+    of order.
+    """
     p = torch.linspace(0, 1 - 1 / m, m, dtype=torch.float64) ** torch.tensor([[1.0], [1.3]], dtype=torch.float64)
     p[1, :8] = torch.tensor([-1.2, 5.3, 0.5, 0.9999999, 1e-12, 0.0, 1.0, 0.25])
     return p
@@ -39,7 +43,9 @@ def test_error_is_below_that_of_the_kernel(taps, oversampling, dtype, floor):
     at = plan.points(points)
     forward, backward = plan.type1(y.to(dtype), at), plan.type2(x.to(dtype), at)
     assert forward.dtype == backward.dtype == dtype
-    assert relative(forward, exact.mT @ y) < max(kernel.error, floor) and relative(backward, exact.conj() @ x) < max(kernel.error, floor)
+    assert relative(forward, exact.mT @ y) < max(kernel.error, floor) and relative(backward, exact.conj() @ x) < max(
+        kernel.error, floor
+    )
     assert relative(forward, exact.mT @ y) > kernel.error / 30 or floor  # the bound says something
 
 
@@ -66,13 +72,17 @@ def test_impossible_kernels_are_refused():
 def test_type1_is_the_adjoint_of_type2(taps):
     plan, points = PulseNufft(50, Kernel(taps, 1.25), torch.complex128), warped()
     y, x, at = noise(3, 2, 120, 4), noise(3, 2, 50, 4, seed=2), plan.points(points)
-    torch.testing.assert_close((plan.type1(y, at) * x.conj()).sum(), (y * plan.type2(x, at).conj()).sum(), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(
+        (plan.type1(y, at) * x.conj()).sum(), (y * plan.type2(x, at).conj()).sum(), rtol=1e-12, atol=1e-12
+    )
 
 
 def test_one_point_anywhere_loses_nothing():
     """Also where the tap set changes, at rows and half rows, and at both ends of the circle."""
     plan = PulseNufft(32, Kernel(7), torch.complex128)
-    points = torch.cat([torch.linspace(-0.1, 1.1, 997, dtype=torch.float64), torch.arange(130, dtype=torch.float64) / 128])[:, None]
+    points = torch.cat(
+        [torch.linspace(-0.1, 1.1, 997, dtype=torch.float64), torch.arange(130, dtype=torch.float64) / 128]
+    )[:, None]
     out = plan.type1(torch.ones(1, 1, dtype=torch.complex128), plan.points(points))[..., 0]
     assert (out - matrix(points[:, 0], 32)).abs().max() < 3 * Kernel(7).error
 
@@ -95,7 +105,10 @@ def test_blocks_of_trials_and_columns_equal_one_pass(monkeypatch):
 
 
 def test_parts_of_the_trilinear_form_are_each_others_gradients():
-    weights, values, grid = (noise(2, *shape, dtype=torch.float64, seed=i).requires_grad_() for i, shape in enumerate([(5, 3), (5, 2), (9, 2)]))
+    weights, values, grid = (
+        noise(2, *shape, dtype=torch.float64, seed=i).requires_grad_()
+        for i, shape in enumerate([(5, 3), (5, 2), (9, 2)])
+    )
     first = torch.tensor([[0, 2, 2, 5, 6], [6, 1, 0, 3, 3]])
     for function, parts in (
         (lambda w, v: spread_rows(w, v, first, 9), (weights, values)),

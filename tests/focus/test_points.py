@@ -1,4 +1,6 @@
-"""Focused points against direct evaluation: place and phase over the swath, at several squints; precision; requirements."""
+"""Focused points against direct evaluation: place and phase over the swath, at several squints;
+precision; requirements.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,16 @@ import pytest
 import torch
 
 from tests.focus import helpers
-from torchsar.focus import OmegaK, StoredOmegaK, backproject, omega_k, omega_k_stolt, range_doppler, recommended_form, requirements
+from torchsar.focus import (
+    OmegaK,
+    StoredOmegaK,
+    backproject,
+    omega_k,
+    omega_k_stolt,
+    range_doppler,
+    recommended_form,
+    requirements,
+)
 from torchsar.focus.requirements import Aperture
 from torchsar.metrics import error_db
 
@@ -56,7 +67,13 @@ def test_backprojection_agrees_with_stolt_in_phase_and_shape(name):
     x = (torch.arange(-4, 5, dtype=torch.float64) + case.line) / case.radar.prf_hz * case.radar.velocity_m_s
     for cell in (case.cells[0], case.cells[-1]):
         cells = torch.arange(-4, 5, dtype=torch.float64) + round(cell)
-        patch = backproject(case.raw, case.radar, x[:, None], case.radar.near_range_m + cells * case.radar.range_step_m, **case.arguments)
+        patch = backproject(
+            case.raw,
+            case.radar,
+            x[:, None],
+            case.radar.near_range_m + cells * case.radar.range_step_m,
+            **case.arguments,
+        )
         other = stolt[case.line - 4 : case.line + 5, round(cell) - 4 : round(cell) + 5]
         gain = (patch * other.conj()).sum() / other.abs().square().sum()
         # amplitudes follow different laws of the stationary phase; the phases are the same
@@ -70,7 +87,12 @@ def test_range_doppler_is_a_baseline_without_squint_only():
     assert max(abs(x) for cell in straight.cells for x in helpers.peak_offset(image, straight.line, cell)) < 0.02
     image = range_doppler(squinted.raw, squinted.radar, **squinted.arguments)
     assert abs(helpers.peak_offset(image, squinted.line, squinted.cells[1])[0]) > 0.3
-    rows = requirements(squinted.radar, squinted.radar.raw_axes(*squinted.raw.shape), squinted.arguments["doppler_hz"], integration_s=0.6)
+    rows = requirements(
+        squinted.radar,
+        squinted.radar.raw_axes(*squinted.raw.shape),
+        squinted.arguments["doppler_hz"],
+        integration_s=0.6,
+    )
     assert rows[0].ok and not rows[1].ok
 
 
@@ -78,13 +100,17 @@ def test_range_doppler_is_a_baseline_without_squint_only():
 @pytest.mark.parametrize("form", [omega_k, omega_k_stolt, range_doppler])
 def test_complex64_image_is_the_complex128_image(name, form):
     case = CASES[name]()
-    single, double = (form(case.raw.to(dtype), case.radar, **case.arguments) for dtype in (torch.complex64, torch.complex128))
+    single, double = (
+        form(case.raw.to(dtype), case.radar, **case.arguments) for dtype in (torch.complex64, torch.complex128)
+    )
     assert single.dtype == torch.complex64
     assert error_db(single.to(torch.complex128), double) < -90
 
 
 def exact_patch(case, lines, cells):
-    """Part of the exact image: backprojected at 7 km, Stolt from orbit, where the band of a target fills more lines."""
+    """Part of the exact image: backprojected at 7 km, Stolt from orbit, where the band of a target
+    fills more lines.
+    """
     if case is CASES["airborne"]():
         x = lines.double() / case.radar.prf_hz * case.radar.velocity_m_s
         r = case.radar.near_range_m + cells.double() * case.radar.range_step_m
@@ -94,17 +120,24 @@ def exact_patch(case, lines, cells):
 
 @pytest.mark.parametrize("name, dwell_s", [("airborne", 3.0), ("kondor_squint", 0.6)])
 def test_predicted_phase_of_bulk_and_refocus_is_the_measured_one(name, dwell_s):
-    """Spectra of the bulk + refocus and the exact response of a target at the edge of the swath, compared over the inner band."""
+    """Spectra of the bulk + refocus and the exact response of a target at the edge of the swath,
+    compared over the inner band.
+    """
     case = CASES[name]()
     edge, doppler_hz = case.cells[0], case.arguments["doppler_hz"]
     offset_m = (edge - case.raw.shape[1] // 2) * case.radar.range_step_m
     lines, cells = torch.arange(case.line - 64, case.line + 64), torch.arange(round(edge) - 32, round(edge) + 32)
-    window = torch.hann_window(128, periodic=False, dtype=torch.float64)[:, None] * torch.hann_window(64, periodic=False, dtype=torch.float64)
+    window = torch.hann_window(128, periodic=False, dtype=torch.float64)[:, None] * torch.hann_window(
+        64, periodic=False, dtype=torch.float64
+    )
     bulk = omega_k(case.raw, case.radar, **case.arguments)[lines][:, cells]
     ratio = torch.fft.fft2(bulk * window) * torch.fft.fft2(exact_patch(case, lines, cells) * window).conj()
     doppler, frequency = case.radar.doppler_hz(128, doppler_hz), case.radar.range_frequency_hz(64)
     whole = Aperture.of(case.radar, case.radar.near_range_m, doppler_hz, case.radar.velocity_m_s, doppler_hz, dwell_s)
-    rows, columns = (doppler - doppler_hz).abs() < 0.4 * whole.doppler_band_hz, frequency.abs() < 0.4 * case.radar.pulse.bandwidth_hz
+    rows, columns = (
+        (doppler - doppler_hz).abs() < 0.4 * whole.doppler_band_hz,
+        frequency.abs() < 0.4 * case.radar.pulse.bandwidth_hz,
+    )
     inner = replace(whole, at=replace(whole.at, doppler_hz=doppler[rows]), frequency_hz=frequency[columns])
     predicted = inner.bulk_residual_rad(offset_m)
     # bulk + refocus leaves exp(-j phase) on the spectrum of the target

@@ -33,13 +33,21 @@ def profiles(*trials: int, dtype: torch.dtype = torch.complex128) -> torch.Tenso
 
 
 def matrix(window: str) -> torch.Tensor:
-    """The map from frequency samples (pulse, frequency) to pixels (azimuth, range), entry by entry."""
+    """The map from frequency samples (pulse, frequency) to pixels (azimuth, range), entry
+    by entry.
+    """
     geometry = waves()
     x, y = RANGE.values(), AZIMUTH.values()[:, None]
-    ranges = geometry.direction[:, 0, None, None] * x + geometry.direction[:, 1, None, None] * y + geometry.offset_m[:, None, None]
+    ranges = (
+        geometry.direction[:, 0, None, None] * x
+        + geometry.direction[:, 1, None, None] * y
+        + geometry.offset_m[:, None, None]
+    )
     phasor = torch.exp(4j * math.pi / LIGHT_M_S * FREQUENCY[:, None, None] * ranges[:, None])
     if window == "hann":
-        a, b = (torch.sin(math.pi * torch.arange(1, n + 1, dtype=torch.float64) / (n + 1)).square() for n in (PULSES, CELLS))
+        a, b = (
+            torch.sin(math.pi * torch.arange(1, n + 1, dtype=torch.float64) / (n + 1)).square() for n in (PULSES, CELLS)
+        )
         phasor = phasor * (a[:, None] * b)[..., None, None]
     return phasor
 
@@ -65,7 +73,12 @@ def test_adjoint_is_exact_at_any_accuracy(eps, window):
 def test_equals_backprojection_of_plane_waves():
     x = profiles()
     image = PolarOperator(waves(), AZIMUTH, RANGE, eps=1e-11, dtype=torch.complex128).image(x)
-    torch.testing.assert_close(image, backproject_spotlight(x, waves(), RANGE.values(), AZIMUTH.values()[:, None], eps=1e-12), rtol=0, atol=1e-8)
+    torch.testing.assert_close(
+        image,
+        backproject_spotlight(x, waves(), RANGE.values(), AZIMUTH.values()[:, None], eps=1e-12),
+        rtol=0,
+        atol=1e-8,
+    )
 
 
 def test_gradients_of_any_order():
@@ -90,10 +103,14 @@ def test_batches_blocks_and_vmap_change_nothing(monkeypatch):
     monkeypatch.setattr(polar, "block_bytes_of", lambda device: 1)
     for i in range(2):
         for j in range(3):
-            torch.testing.assert_close(together[i, j], operator.image(x[i, j]), rtol=0, atol=1e-13 * float(together[i, j].abs().max()))
+            torch.testing.assert_close(
+                together[i, j], operator.image(x[i, j]), rtol=0, atol=1e-13 * float(together[i, j].abs().max())
+            )
     torch.testing.assert_close(operator.image(x), together)
     torch.testing.assert_close(torch.vmap(operator.image)(x), together)
-    torch.testing.assert_close(torch.vmap(operator.adjoint, in_dims=1, out_dims=1)(together), operator.adjoint(together))
+    torch.testing.assert_close(
+        torch.vmap(operator.adjoint, in_dims=1, out_dims=1)(together), operator.adjoint(together)
+    )
 
 
 def test_dtypes_are_kept_and_never_mixed():
@@ -103,7 +120,9 @@ def test_dtypes_are_kept_and_never_mixed():
     image = single.image(x.to(torch.complex64))
     assert image.dtype == torch.complex64 and single.adjoint(image).dtype == torch.complex64
     assert torch.linalg.vector_norm(image - double.image(x)) < 5e-6 * torch.linalg.vector_norm(image)
-    with pytest.raises(TypeError, match=r"built for torch.complex64, got torch.complex128; build it with dtype=torch.complex128"):
+    with pytest.raises(
+        TypeError, match=r"built for torch.complex64, got torch.complex128; build it with dtype=torch.complex128"
+    ):
         single.image(x)
     with pytest.raises(TypeError, match="expected complex64 or complex128, got torch.float64"):
         double.image(x.real)
@@ -122,7 +141,9 @@ def test_stage_on_a_turntable_recording():
     data = recording(profiles(2), angle_rad=angle)
     build = {"extent_m": 9.0, "step_m": 0.75, "centre_m": (1.0, -0.5), "window": "none", "eps": 1e-9}
     connected = {"frequency_hz": "aux.frequency_hz", "angle_rad": "aux.angle_rad"}
-    image, exact = (Chain(image=use(stage(**build), **connected))(data) for stage in (PolarFormat, SpotlightBackprojection))
+    image, exact = (
+        Chain(image=use(stage(**build), **connected))(data) for stage in (PolarFormat, SpotlightBackprojection)
+    )
     assert image.axes == exact.axes and image.names == ("azimuth", "range")
     torch.testing.assert_close(image.data, exact.data, rtol=0, atol=1e-7 * float(exact.data.abs().max()))
 
@@ -130,8 +151,16 @@ def test_stage_on_a_turntable_recording():
 def test_a_point_lies_at_its_place_with_x_along_range():
     angle = torch.linspace(-0.2, 0.25, PULSES, dtype=torch.float64)
     geometry = FarField.turntable(FREQUENCY, angle)
-    ranges = geometry.range_m(slice(None), torch.tensor([2.0], dtype=torch.float64), torch.tensor([-1.0], dtype=torch.float64))
-    echo = recording(torch.fft.fftshift(torch.fft.ifft(torch.fft.ifftshift(torch.exp(-4j * math.pi / LIGHT_M_S * FREQUENCY * ranges), dim=-1)), dim=-1), angle_rad=angle)
+    ranges = geometry.range_m(
+        slice(None), torch.tensor([2.0], dtype=torch.float64), torch.tensor([-1.0], dtype=torch.float64)
+    )
+    echo = recording(
+        torch.fft.fftshift(
+            torch.fft.ifft(torch.fft.ifftshift(torch.exp(-4j * math.pi / LIGHT_M_S * FREQUENCY * ranges), dim=-1)),
+            dim=-1,
+        ),
+        angle_rad=angle,
+    )
     for turn, place in ((0.0, (-1.0, 2.0)), (math.pi / 2, (-2.0, -1.0)), (math.pi, (1.0, -2.0))):
         image = PolarFormat(6.0, 0.5, range_axis_rad=turn, window="none", geometry=geometry)(echo.signal)
         line, cell = divmod(int(image.data.abs().argmax()), image.axes[1].n)
@@ -144,7 +173,9 @@ def test_operator_is_kept_for_its_geometry_and_dtype_only():
     assert stage.operator(profiles(4), waves()) is first
     assert stage.operator(profiles(dtype=torch.complex64), geometry).dtype == torch.complex64
     other = stage.operator(profiles(), geometry.turned(0.1))
-    torch.testing.assert_close(pickle.loads(pickle.dumps(copy.deepcopy(first))).image(profiles()), first.image(profiles()))
+    torch.testing.assert_close(
+        pickle.loads(pickle.dumps(copy.deepcopy(first))).image(profiles()), first.image(profiles())
+    )
     assert other is not first and not torch.equal(other.image(profiles()), first.image(profiles()))
 
 
@@ -174,10 +205,15 @@ def gotcha(recorded) -> tuple[Recording, Spotlight]:
 def test_recorded_car_park(recorded):
     data, geometry = gotcha(recorded)
     image = PolarFormat(100.0, 0.25, geometry=geometry)(data.signal)
-    assert float(entropy(image)) == pytest.approx(8.731, abs=0.02) and float(contrast(image)) == pytest.approx(23.68, abs=0.5)
+    assert float(entropy(image)) == pytest.approx(8.731, abs=0.02) and float(contrast(image)) == pytest.approx(
+        23.68, abs=0.5
+    )
     line, cell = divmod(int(image.data.abs().argmax()), 401)
     # the curvature of the wavefront moves it by up to 4 cm, less than a pixel
-    assert abs(float(image.axes[1].values()[cell]) + 15.5) <= 0.25 and abs(float(image.axes[0].values()[line]) - 21.5) <= 0.25
+    assert (
+        abs(float(image.axes[1].values()[cell]) + 15.5) <= 0.25
+        and abs(float(image.axes[0].values()[line]) - 21.5) <= 0.25
+    )
 
 
 def test_recorded_car_park_agrees_with_backprojection(recorded):
@@ -185,17 +221,29 @@ def test_recorded_car_park_agrees_with_backprojection(recorded):
     patch = {"extent_m": 12.0, "step_m": 0.25, "geometry": geometry}
     image, exact = (stage(**patch)(data.signal) for stage in (PolarFormat, SpotlightBackprojection))
     assert float(correlation(image.data.abs().to(torch.complex64), exact.data.abs().to(torch.complex64))) > 0.9999
-    # at the edge the picture is the same, but displaced: on apparent positions plane waves agree, phase and all
-    x, y = torch.meshgrid(torch.linspace(40, 46, 25, dtype=torch.float64), torch.linspace(-48, -42, 25, dtype=torch.float64), indexing="xy")
+    # at the edge the picture is the same, but displaced: on apparent positions plane waves agree,
+    # phase and all
+    x, y = torch.meshgrid(
+        torch.linspace(40, 46, 25, dtype=torch.float64),
+        torch.linspace(-48, -42, 25, dtype=torch.float64),
+        indexing="xy",
+    )
     place = (v.reshape(x.shape) for v in geometry.apparent(x.reshape(-1), y.reshape(-1)))
-    waves, sight = (backproject_spotlight(data.signal.data, g, *at, window="hann", eps=1e-5) for g, at in ((geometry.far_field(), place), (geometry, (x, y))))
+    waves, sight = (
+        backproject_spotlight(data.signal.data, g, *at, window="hann", eps=1e-5)
+        for g, at in ((geometry.far_field(), place), (geometry, (x, y)))
+    )
     assert float(correlation(waves, sight)) > 0.9995
 
 
 def test_recorded_turntable(recorded):
     data = read_inverse(recorded("isar_thz_airplane_even.npz"))
     connected = {"frequency_hz": "aux.frequency_hz", "angle_rad": "aux.angle_rad"}
-    image, exact = (Chain(image=use(stage(0.72, 0.003), **connected))(data) for stage in (PolarFormat, SpotlightBackprojection))
+    image, exact = (
+        Chain(image=use(stage(0.72, 0.003), **connected))(data) for stage in (PolarFormat, SpotlightBackprojection)
+    )
     assert image.data.shape == (241, 241) and float(correlation(image, exact)) > 0.9999
     for form in (image, exact):
-        assert float(entropy(form)) == pytest.approx(7.931, abs=0.005) and float(contrast(form)) == pytest.approx(7.66, abs=0.05)
+        assert float(entropy(form)) == pytest.approx(7.931, abs=0.005) and float(contrast(form)) == pytest.approx(
+            7.66, abs=0.05
+        )

@@ -1,4 +1,6 @@
-"""Backprojection of spotlight and turntable data against the direct double sum, and what plane waves neglect."""
+"""Backprojection of spotlight and turntable data against the direct double sum, and what plane
+waves neglect.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +14,37 @@ from torchsar.core import Recording, Signal
 from torchsar.focus import GroundGrid, SpotlightBackprojection, backproject_spotlight
 from torchsar.io import read_inverse
 from torchsar.metrics import contrast, entropy, error_db
-from torchsar.radar import LIGHT_M_S, FarField, InverseRadar, Spotlight, frequency_samples, geometry_of, plane_wave_loss, range_profiles
+from torchsar.radar import (
+    LIGHT_M_S,
+    FarField,
+    InverseRadar,
+    Spotlight,
+    frequency_samples,
+    geometry_of,
+    plane_wave_loss,
+    range_profiles,
+)
 
 FREQUENCY = 9.3e9 + 8e6 * torch.arange(12, dtype=torch.float64)
 
 
-def spotlight(n_pulse: int = 9, range_m: float = 900.0, degrees: float = 3.0, frequency: torch.Tensor = FREQUENCY, height_m: float = 0.0) -> Spotlight:
+def spotlight(
+    n_pulse: int = 9,
+    range_m: float = 900.0,
+    degrees: float = 3.0,
+    frequency: torch.Tensor = FREQUENCY,
+    height_m: float = 0.0,
+) -> Spotlight:
     azimuth = torch.deg2rad(torch.linspace(-0.3, degrees - 0.3, n_pulse, dtype=torch.float64))
-    position = range_m * torch.stack([torch.cos(azimuth), torch.sin(azimuth), torch.ones_like(azimuth)], -1) / math.sqrt(2)
-    return Spotlight(frequency, position, torch.linalg.vector_norm(position, dim=-1) + 0.01 * torch.randn(n_pulse, dtype=torch.float64), height_m)
+    position = (
+        range_m * torch.stack([torch.cos(azimuth), torch.sin(azimuth), torch.ones_like(azimuth)], -1) / math.sqrt(2)
+    )
+    return Spotlight(
+        frequency,
+        position,
+        torch.linalg.vector_norm(position, dim=-1) + 0.01 * torch.randn(n_pulse, dtype=torch.float64),
+        height_m,
+    )
 
 
 def turntable(n_pulse: int = 9) -> FarField:
@@ -34,7 +58,11 @@ def profiles(*trials: int, n_pulse: int = 9, dtype: torch.dtype = torch.complex1
 def direct(x, geometry, ranges):
     """The double sum over pulses and frequencies. ranges: (pulse, *pixels)."""
     turns = 2 / LIGHT_M_S * geometry.frequency_hz.reshape(-1, *[1] * (ranges.ndim - 1)) * ranges[:, None]
-    return torch.einsum("...kf,kf...->...", frequency_samples(x), torch.exp(2j * math.pi * turns)) if x.ndim == 2 else torch.stack([direct(item, geometry, ranges) for item in x])
+    return (
+        torch.einsum("...kf,kf...->...", frequency_samples(x), torch.exp(2j * math.pi * turns))
+        if x.ndim == 2
+        else torch.stack([direct(item, geometry, ranges) for item in x])
+    )
 
 
 def slant(geometry: Spotlight, x, y, z):
@@ -43,14 +71,23 @@ def slant(geometry: Spotlight, x, y, z):
     return distance - geometry.reference_m.reshape(-1, *[1] * x.ndim)
 
 
-X, Y = torch.meshgrid(torch.linspace(-6, 8, 5, dtype=torch.float64), torch.linspace(-7, 5, 4, dtype=torch.float64), indexing="xy")
+X, Y = torch.meshgrid(
+    torch.linspace(-6, 8, 5, dtype=torch.float64), torch.linspace(-7, 5, 4, dtype=torch.float64), indexing="xy"
+)
 
 
 @pytest.mark.parametrize("height_m", [0.0, 3.5])
 def test_equals_the_double_sum(height_m):
     geometry, x = spotlight(height_m=height_m), profiles()
-    expected = torch.stack([direct(x, geometry, slant(geometry, X.reshape(-1)[i : i + 1], Y.reshape(-1)[i : i + 1], height_m))[0] for i in range(20)]).reshape(4, 5)
-    torch.testing.assert_close(backproject_spotlight(x, geometry, X, Y, eps=1e-12), expected, rtol=0, atol=1e-9 * float(expected.abs().max()))
+    expected = torch.stack(
+        [
+            direct(x, geometry, slant(geometry, X.reshape(-1)[i : i + 1], Y.reshape(-1)[i : i + 1], height_m))[0]
+            for i in range(20)
+        ]
+    ).reshape(4, 5)
+    torch.testing.assert_close(
+        backproject_spotlight(x, geometry, X, Y, eps=1e-12), expected, rtol=0, atol=1e-9 * float(expected.abs().max())
+    )
 
 
 def test_turntable_equals_the_double_sum():
@@ -58,7 +95,9 @@ def test_turntable_equals_the_double_sum():
     angle = torch.linspace(0.2, 0.35, 9, dtype=torch.float64)
     ranges = X * torch.cos(angle)[:, None, None] + Y * torch.sin(angle)[:, None, None]
     expected = torch.stack([direct(x, geometry, ranges.flatten(1)[:, i : i + 1])[0] for i in range(20)]).reshape(4, 5)
-    torch.testing.assert_close(backproject_spotlight(x, geometry, X, Y, eps=1e-12), expected, rtol=0, atol=1e-9 * float(expected.abs().max()))
+    torch.testing.assert_close(
+        backproject_spotlight(x, geometry, X, Y, eps=1e-12), expected, rtol=0, atol=1e-9 * float(expected.abs().max())
+    )
 
 
 def test_a_point_gives_the_sum_of_the_weights_with_its_own_phase():
@@ -66,9 +105,14 @@ def test_a_point_gives_the_sum_of_the_weights_with_its_own_phase():
     x, y = torch.tensor([2.0], dtype=torch.float64), torch.tensor([-3.0], dtype=torch.float64)
     turns = -2 / LIGHT_M_S * FREQUENCY * slant(geometry, x, y, 0.0)
     echo = range_profiles(0.5j * torch.exp(2j * math.pi * turns))
-    torch.testing.assert_close(backproject_spotlight(echo, geometry, x, y), torch.tensor([0.5j * 9 * 12], dtype=torch.complex128))
+    torch.testing.assert_close(
+        backproject_spotlight(echo, geometry, x, y), torch.tensor([0.5j * 9 * 12], dtype=torch.complex128)
+    )
     weights = [float((torch.hann_window(n + 2, periodic=False, dtype=torch.float64)).sum()) for n in (9, 12)]
-    torch.testing.assert_close(backproject_spotlight(echo, geometry, x, y, window="hann"), torch.tensor([0.5j * weights[0] * weights[1]], dtype=torch.complex128))
+    torch.testing.assert_close(
+        backproject_spotlight(echo, geometry, x, y, window="hann"),
+        torch.tensor([0.5j * weights[0] * weights[1]], dtype=torch.complex128),
+    )
 
 
 def test_blocks_and_batches_change_nothing():
@@ -94,11 +138,15 @@ def test_gradients_in_profiles_pixels_and_antennas():
     geometry = spotlight(4)
 
     def image(x, at, position):
-        return backproject_spotlight(x, Spotlight(FREQUENCY, position, geometry.reference_m), at, -at, eps=1e-8, window="hann")
+        return backproject_spotlight(
+            x, Spotlight(FREQUENCY, position, geometry.reference_m), at, -at, eps=1e-8, window="hann"
+        )
 
     at = torch.tensor([1.3, -2.1], dtype=torch.float64, requires_grad=True)
     x = profiles(n_pulse=4).requires_grad_()
-    assert torch.autograd.gradcheck(image, (x, at, geometry.position_m.clone().requires_grad_()), atol=1e-4, rtol=1e-4, eps=1e-7)
+    assert torch.autograd.gradcheck(
+        image, (x, at, geometry.position_m.clone().requires_grad_()), atol=1e-4, rtol=1e-4, eps=1e-7
+    )
 
 
 def test_plane_waves_touch_the_exact_ranges_at_the_centre():
@@ -131,11 +179,17 @@ def test_plane_wave_loss_bounds_the_exact_geometry_tightly():
 def test_apparent_positions_leave_only_defocus():
     frequency = 9.3e9 + 2e6 * torch.arange(32, dtype=torch.float64)
     geometry = spotlight(64, 9000.0, 3.0, frequency)
-    x, y = torch.meshgrid(torch.linspace(38, 42, 21, dtype=torch.float64), torch.linspace(28, 32, 21, dtype=torch.float64), indexing="xy")
-    echo = range_profiles(torch.exp(-4j * math.pi / LIGHT_M_S * frequency * geometry.range_m(slice(None), x[9, 12][None], y[9, 12][None])))
+    x, y = torch.meshgrid(
+        torch.linspace(38, 42, 21, dtype=torch.float64), torch.linspace(28, 32, 21, dtype=torch.float64), indexing="xy"
+    )
+    echo = range_profiles(
+        torch.exp(-4j * math.pi / LIGHT_M_S * frequency * geometry.range_m(slice(None), x[9, 12][None], y[9, 12][None]))
+    )
     exact = backproject_spotlight(echo, geometry, x, y)
     naive = backproject_spotlight(echo, geometry.far_field(), x, y)
-    placed = backproject_spotlight(echo, geometry.far_field(), *(v.reshape(x.shape) for v in geometry.apparent(x.reshape(-1), y.reshape(-1))))
+    placed = backproject_spotlight(
+        echo, geometry.far_field(), *(v.reshape(x.shape) for v in geometry.apparent(x.reshape(-1), y.reshape(-1)))
+    )
     assert float(error_db(placed, exact)) < -30 < 0 < float(error_db(naive, exact)) + 3
 
 
@@ -146,7 +200,12 @@ def test_turned_coordinates_keep_ranges(build, angle):
     x, y = X.reshape(-1), Y.reshape(-1)
     along = math.cos(angle) * x + math.sin(angle) * y
     across = math.cos(angle) * y - math.sin(angle) * x
-    torch.testing.assert_close(geometry.turned(angle).range_m(slice(None), along, across), geometry.range_m(slice(None), x, y), rtol=0, atol=1e-9)
+    torch.testing.assert_close(
+        geometry.turned(angle).range_m(slice(None), along, across),
+        geometry.range_m(slice(None), x, y),
+        rtol=0,
+        atol=1e-9,
+    )
 
 
 def test_ground_grid_axes():
@@ -160,13 +219,29 @@ def test_ground_grid_axes():
 def test_stage_in_a_chain_takes_recorded_side_data():
     geometry, x = spotlight(), profiles(2)
     radar = InverseRadar(9.3e9, 12 * 8e6, 1.0)
-    recording = Recording.from_arrays(x, radar, dtype=torch.complex128, frequency_hz=FREQUENCY, position_m=geometry.position_m, reference_m=geometry.reference_m)
+    recording = Recording.from_arrays(
+        x,
+        radar,
+        dtype=torch.complex128,
+        frequency_hz=FREQUENCY,
+        position_m=geometry.position_m,
+        reference_m=geometry.reference_m,
+    )
     stage = SpotlightBackprojection(8.0, 2.0, window="none", eps=1e-9)
-    image = Chain(image=use(stage, frequency_hz="aux.frequency_hz", position_m="aux.position_m", reference_m="aux.reference_m"))(recording)
+    image = Chain(
+        image=use(stage, frequency_hz="aux.frequency_hz", position_m="aux.position_m", reference_m="aux.reference_m")
+    )(recording)
     assert image.names == ("azimuth", "range") and image.data.shape == (2, 5, 5)
     y, along = image.axes[0].values(), image.axes[1].values()
-    torch.testing.assert_close(image.data, backproject_spotlight(x, geometry, along, y[:, None]), rtol=0, atol=1e-7 * float(image.data.abs().max()))
-    torch.testing.assert_close(SpotlightBackprojection(8.0, 2.0, window="none", eps=1e-9, geometry=geometry)(recording.signal).data, image.data)
+    torch.testing.assert_close(
+        image.data,
+        backproject_spotlight(x, geometry, along, y[:, None]),
+        rtol=0,
+        atol=1e-7 * float(image.data.abs().max()),
+    )
+    torch.testing.assert_close(
+        SpotlightBackprojection(8.0, 2.0, window="none", eps=1e-9, geometry=geometry)(recording.signal).data, image.data
+    )
 
 
 def test_misuse_is_named():
@@ -192,8 +267,12 @@ def test_misuse_is_named():
 def test_recorded_car_park(recorded):
     recording = read_inverse(recorded("gotcha_pass1_hh_az001_003.npz"))
     stage = SpotlightBackprojection(100.0, 0.25)
-    image = Chain(image=use(stage, frequency_hz="aux.frequency_hz", position_m="aux.position_m", reference_m="aux.reference_m"))(recording)
+    image = Chain(
+        image=use(stage, frequency_hz="aux.frequency_hz", position_m="aux.position_m", reference_m="aux.reference_m")
+    )(recording)
     assert image.data.shape == (401, 401)
-    assert float(entropy(image)) == pytest.approx(8.731, abs=0.005) and float(contrast(image)) == pytest.approx(23.68, abs=0.1)
+    assert float(entropy(image)) == pytest.approx(8.731, abs=0.005) and float(contrast(image)) == pytest.approx(
+        23.68, abs=0.1
+    )
     line, cell = divmod(int(image.data.abs().argmax()), 401)
     assert (float(image.axes[1].values()[cell]), float(image.axes[0].values()[line])) == (-15.5, 21.5)

@@ -11,7 +11,20 @@ import pytest
 import torch
 
 from torchsar.core import Signal
-from torchsar.focus import Detect, OmegaK, OmegaKStolt, QuickLook, amplitude, focus_strip, multilook, plan_strip, reach_lines, requirements, to_db, write_strip
+from torchsar.focus import (
+    Detect,
+    OmegaK,
+    OmegaKStolt,
+    QuickLook,
+    amplitude,
+    focus_strip,
+    multilook,
+    plan_strip,
+    reach_lines,
+    requirements,
+    to_db,
+    write_strip,
+)
 from torchsar.focus.strip import ARRAYS
 from torchsar.radar import LinearFM, StripmapRadar
 
@@ -83,13 +96,19 @@ def test_a_memory_that_is_too_small_is_named():
         plan_strip((30000, 1000), (-400, 400), 1 << 20)
     assert plan_strip((300, 1000), (-400, 400), 1 << 30).blocks == [(slice(0, 300), slice(0, 300))]
     with pytest.raises(ValueError, match="plan anew"):
-        next(focus_strip(torch.zeros(10, 4, dtype=torch.complex64), OmegaK(RADAR), RADAR, plan_strip((11, 4), (-1, 1), 1 << 20)))
+        next(
+            focus_strip(
+                torch.zeros(10, 4, dtype=torch.complex64), OmegaK(RADAR), RADAR, plan_strip((11, 4), (-1, 1), 1 << 20)
+            )
+        )
 
 
 def test_multilook_averages_power_and_moves_the_axes():
     image = torch.full((2, 9, 8), 3 + 4j, dtype=torch.complex128)
     image[1] *= 2
-    assert torch.equal(multilook(image, (2, 4)), torch.tensor([25.0, 100.0], dtype=torch.float64)[:, None, None].expand(2, 4, 2))
+    assert torch.equal(
+        multilook(image, (2, 4)), torch.tensor([25.0, 100.0], dtype=torch.float64)[:, None, None].expand(2, 4, 2)
+    )
     axes = RADAR.image_axes(RADAR.raw_axes(9, 8))
     looked = Detect((2, 4))(Signal(image, axes))
     assert looked.data.shape == (2, 4, 2) and not looked.data.is_complex()
@@ -125,15 +144,23 @@ def test_quicklook_is_small_and_square_in_metres():
 
 
 def test_requirements_of_the_brief():
-    """r0 = 700 km, T_c = 1.5 s, dr = 5 km: 0.14 m, a quarter of a cell, so that bulk + refocus is enough; squint walks 80 to 90 cells."""
-    radar = StripmapRadar(3.2e9, LinearFM(200e6, 5e-6), 250e6, 4000.0, 7000.0, 695e3, pointing_doppler_hz=0.0, integration_s=1.5)
+    """r0 = 700 km, T_c = 1.5 s, dr = 5 km: 0.14 m, a quarter of a cell, so that bulk + refocus is
+    enough; squint walks 80 to 90 cells.
+    """
+    radar = StripmapRadar(
+        3.2e9, LinearFM(200e6, 5e-6), 250e6, 4000.0, 7000.0, 695e3, pointing_doppler_hz=0.0, integration_s=1.5
+    )
     rows = {row.effect: row for row in requirements(radar, radar.raw_axes(4096, 16678))}
     bulk = rows["bulk + refocus (omega_k)"]
     assert bulk.ok and bulk.range_cells * radar.range_step_m == pytest.approx(0.14, abs=0.005)
     doppler = 2 * 7000 * math.sin(math.radians(0.3)) / radar.wavelength_m
-    walk = next(row for row in requirements(radar, radar.raw_axes(4096, 16678), doppler) if row.effect == "squint ignored")
+    walk = next(
+        row for row in requirements(radar, radar.raw_axes(4096, 16678), doppler) if row.effect == "squint ignored"
+    )
     assert 80 < walk.range_cells < 95 and not walk.ok
-    near = StripmapRadar(3.2e9, LinearFM(200e6, 5e-6), 250e6, 400.0, 150.0, 7e3, pointing_doppler_hz=0.0, integration_s=3.0)
+    near = StripmapRadar(
+        3.2e9, LinearFM(200e6, 5e-6), 250e6, 400.0, 150.0, 7e3, pointing_doppler_hz=0.0, integration_s=3.0
+    )
     assert requirements(near, near.raw_axes(4096, 2048))[0].verdict == "use omega_k_stolt"
     with pytest.warns(UserWarning, match="PRF 400 Hz"):
         requirements(near, near.raw_axes(4096, 2048), integration_s=20.0)

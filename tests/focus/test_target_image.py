@@ -22,8 +22,12 @@ RADAR = InverseRadar(float(FREQUENCY[CELLS // 2]), 12e6 * CELLS, 1.0, TURN)
 GEOMETRY = geometry_of(frequency_hz=FREQUENCY, angle_rad=ANGLE)
 
 
-def recorded_points(range_m: torch.Tensor, azimuth_m: torch.Tensor, amplitude: torch.Tensor, dtype=torch.complex128) -> torch.Tensor:
-    """Range profiles (pulse, range) of points given along and across the mean line of sight, by the turntable's own formula."""
+def recorded_points(
+    range_m: torch.Tensor, azimuth_m: torch.Tensor, amplitude: torch.Tensor, dtype=torch.complex128
+) -> torch.Tensor:
+    """Range profiles (pulse, range) of points given along and across the mean line of sight, by the
+    turntable's own formula.
+    """
     x = range_m * math.cos(0.6) - azimuth_m * math.sin(0.6)
     y = range_m * math.sin(0.6) + azimuth_m * math.cos(0.6)
     way = x * torch.cos(ANGLE)[:, None] + y * torch.sin(ANGLE)[:, None]
@@ -32,12 +36,16 @@ def recorded_points(range_m: torch.Tensor, azimuth_m: torch.Tensor, amplitude: t
 
 
 def many(trials: int = 2, n: int = 60) -> torch.Tensor:
-    """Points on one side of the unambiguous extent, so that the middle of their Doppler is not that of the image."""
+    """Points on one side of the unambiguous extent, so that the middle of their Doppler is not that
+    of the image.
+    """
     g = torch.Generator().manual_seed(4)
     draw = [torch.rand(trials, n, dtype=torch.float64, generator=g) - 0.5 for _ in range(2)]
     amplitude = torch.randn(trials, n, dtype=torch.complex128, generator=g)
     across = RADAR.wavelength_m / (2 * TURN)
-    return torch.stack([recorded_points(9 * draw[0][i], across * (0.2 + 0.4 * draw[1][i]), amplitude[i]) for i in range(trials)])
+    return torch.stack(
+        [recorded_points(9 * draw[0][i], across * (0.2 + 0.4 * draw[1][i]), amplitude[i]) for i in range(trials)]
+    )
 
 
 def as_signal(x: torch.Tensor) -> Signal:
@@ -47,14 +55,19 @@ def as_signal(x: torch.Tensor) -> Signal:
 @pytest.mark.parametrize("window, oversampling", [("none", 1), ("hann", 2)])
 def test_without_a_geometry_it_is_the_transform_along_pulses(window, oversampling):
     signal = as_signal(many())
-    image, expected = TargetImage(RADAR, window=window, oversampling=oversampling)(signal), AzimuthTransform(RADAR, window, oversampling)(signal)
+    image, expected = (
+        TargetImage(RADAR, window=window, oversampling=oversampling)(signal),
+        AzimuthTransform(RADAR, window, oversampling)(signal),
+    )
     assert image.axes == expected.axes and torch.equal(image.data, expected.data)
     assert TargetImage(RADAR).operator(signal.data) is None
 
 
 @pytest.mark.parametrize("at", [(0.0, 0.0), (2.0, 1.5), (-3.1, 2.2), (1.7, -3.3)])
 def test_a_point_appears_at_its_range_and_cross_range(at):
-    image = TargetImage(RADAR, GEOMETRY)(as_signal(recorded_points(torch.tensor([at[0]]), torch.tensor([at[1]]), torch.ones(1))))
+    image = TargetImage(RADAR, GEOMETRY)(
+        as_signal(recorded_points(torch.tensor([at[0]]), torch.tensor([at[1]]), torch.ones(1)))
+    )
     azimuth, range_ = image.axes
     peak = int(image.data.abs().argmax())
     assert image.names == ("azimuth", "range")
@@ -67,7 +80,9 @@ def test_it_covers_the_unambiguous_extent():
     assert azimuth.n * azimuth.step == pytest.approx(RADAR.wavelength_m / (2 * TURN), rel=0.02)
     assert range_.n * range_.step == pytest.approx(CELLS * RADAR.range_step_m, rel=0.02)
     assert azimuth.n == 2 * PULSES and range_.n == 2 * CELLS
-    assert azimuth.values()[azimuth.n // 2] == pytest.approx(0, abs=1e-12) and range_.values()[range_.n // 2] == pytest.approx(0, abs=1e-12)
+    assert azimuth.values()[azimuth.n // 2] == pytest.approx(0, abs=1e-12) and range_.values()[
+        range_.n // 2
+    ] == pytest.approx(0, abs=1e-12)
 
 
 def test_the_operator_is_kept_and_follows_the_precision():
@@ -80,17 +95,22 @@ def test_the_operator_is_kept_and_follows_the_precision():
 
 
 def test_autofocus_through_the_image_finds_what_migration_blurs():
-    """White phases: the transform along pulses cannot tell the place of the image, so that its scatterers migrate wrongly; the polar image can."""
+    """White phases: the transform along pulses cannot tell the place of the image, so that its
+    scatterers migrate wrongly; the polar image can.
+    """
     x = many()
     a = 2 * math.pi * torch.rand(2, PULSES, dtype=torch.float64, generator=torch.Generator().manual_seed(9))
     dirty = x * torch.exp(1j * a)[..., None]
     stage = TargetImage(RADAR, GEOMETRY)
     found = autofocus(dirty, imaging=stage.operator(dirty))
     plain = autofocus(dirty)
-    assert found.ok.all() and float(phase_rmse(found["phase_rad"], a).max()) < 0.1 < float(phase_rmse(plain["phase_rad"], a).min())
+    assert found.ok.all() and float(phase_rmse(found["phase_rad"], a).max()) < 0.1 < float(
+        phase_rmse(plain["phase_rad"], a).min()
+    )
     clean, focused = (stage(as_signal(v)).data for v in (x, dirty * torch.exp(-1j * found["phase_rad"])[..., None]))
     assert float((entropy(focused) - entropy(clean)).abs().max()) < 0.05
-    # the slope is found as well, to a fraction of a cell: the image lies where it should, not anywhere in the unambiguous extent
+    # the slope is found as well, to a fraction of a cell: the image lies where it should, not
+    # anywhere in the unambiguous extent
     assert float(correlation(focused.abs().to(focused.dtype), clean.abs().to(clean.dtype)).min()) > 0.6
 
 

@@ -1,4 +1,6 @@
-"""Image formation of the triangular ladar against direct sums: range compression, residual video phase, azimuth deramp and matched filter."""
+"""Image formation of the triangular ladar against direct sums: range compression, residual video
+phase, azimuth deramp and matched filter.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ MOVING = table1()
 
 
 def scatterers(x=(0.0,), r=(1.5,), a=(1.0,)) -> Scatterers:
-    return Scatterers(torch.tensor(x, dtype=torch.float64), torch.tensor(r, dtype=torch.float64), torch.tensor(a, dtype=DOUBLE))
+    return Scatterers(
+        torch.tensor(x, dtype=torch.float64), torch.tensor(r, dtype=torch.float64), torch.tensor(a, dtype=DOUBLE)
+    )
 
 
 def carrier_rad(range_m: float) -> float:
@@ -46,7 +50,10 @@ def test_a_scatterer_has_its_amplitude_and_the_phase_of_its_range(ramp, sign, ce
 
 
 def test_the_residual_video_phase_and_the_sign_that_doubles_it() -> None:
-    """Erratum 2: -pi K dtau^2 in the up sweep, + in the down sweep. The printed sign of Eq. (5) leaves twice that, 2.8 rad at RD 4 m."""
+    """Erratum 2: -pi K dtau^2 in the up sweep, + in the down sweep. The printed sign of Eq.
+
+    (5) leaves twice that, 2.8 rad at RD 4 m.
+    """
     range_m = 133 * RADAR.range_step_m
     data = direct_sweeps(scatterers(r=(range_m,)), RADAR, 1)
     video = math.pi * RADAR.chirp_rate_hz_s * (2 * range_m / RADAR.wave_speed_m_s) ** 2
@@ -72,9 +79,18 @@ def test_the_filter_before_the_compensation_leaves_a_phase() -> None:
     assert off(torch.angle(early)[None], carrier_rad(place) + left) < 5e-3 and left > 0.02
 
 
-@pytest.mark.parametrize("radar, n", [(MOVING, 200), (table1(reference_range_m=10.0, speed_m_s=3.0), 200), (table1(reference_range_m=1e6, speed_m_s=7000.0), 200)])
+@pytest.mark.parametrize(
+    "radar, n",
+    [
+        (MOVING, 200),
+        (table1(reference_range_m=10.0, speed_m_s=3.0), 200),
+        (table1(reference_range_m=1e6, speed_m_s=7000.0), 200),
+    ],
+)
 def test_azimuth_against_direct_sums(radar, n) -> None:
-    """At every pixel the sum over the aperture of the profile times the conjugate of the hyperbola's phase, from 10 m to 1000 km."""
+    """At every pixel the sum over the aperture of the profile times the conjugate of the
+    hyperbola's phase, from 10 m to 1000 km.
+    """
     pulse, range_ = profile_axes(radar.sweep_axes(n)[1], radar)
     range_ = Axis("range", 3, 1.2, 0.3, "m")
     g = torch.Generator().manual_seed(0)
@@ -83,7 +99,12 @@ def test_azimuth_against_direct_sums(radar, n) -> None:
     for beam in (None, 60 * radar.speed_m_s * pulse.step / radar.reference_range_m):
         image = azimuth_matched_filter(deramp_azimuth(data, radar, pulse, range_), radar, pulse, range_, beam)
         across = radar.speed_m_s * (t[:, None] - t)  # (x, t)
-        turns = 2 / radar.wavelength_m * across[..., None].square() / (torch.sqrt(r.square() + across[..., None].square()) + r)
+        turns = (
+            2
+            / radar.wavelength_m
+            * across[..., None].square()
+            / (torch.sqrt(r.square() + across[..., None].square()) + r)
+        )
         inside = torch.ones_like(turns) if beam is None else (across[..., None].abs() <= beam * r / 2)
         direct = (data * torch.polar(inside.to(torch.float64), -2 * math.pi * turns)).sum(1)
         count = n if beam is None else 2 * torch.floor(beam * r / 2 / (radar.speed_m_s * pulse.step)) + 1
@@ -97,7 +118,9 @@ def test_three_points_focus_where_they_are() -> None:
     assert signal.axis("pulse").start == pytest.approx(MOVING.sweep_axes(400)[1].start + MOVING.period_s / 4)
     image = AzimuthMatchedFilter(MOVING, 40e-6)(signal.with_data(deramp_azimuth(signal.data, MOVING, *signal.axes)))
     for at, (place, range_m) in enumerate(zip(x, (1.2, 1.5, 1.8), strict=True)):
-        row, column = (round(float(axis.index_of(value))) for axis, value in zip(image.axes, (place, range_m), strict=True))
+        row, column = (
+            round(float(axis.index_of(value))) for axis, value in zip(image.axes, (place, range_m), strict=True)
+        )
         near = image.data[row - 4 : row + 5, column - 1 : column + 2].abs()
         assert float(near.max()) == pytest.approx((0.7, 1.0, 0.5)[at], rel=0.06)
         assert abs(int(near.amax(-1).argmax()) - 4) <= 1
@@ -106,7 +129,9 @@ def test_three_points_focus_where_they_are() -> None:
 def test_window_and_refusals() -> None:
     sweeps = Signal(torch.zeros(2, 3, 512, dtype=DOUBLE), MOVING.sweep_axes(3))
     out = CompressSweeps(MOVING, window_m=[0.0, 3.0])(sweeps)
-    assert out.axis("range").start == pytest.approx(0.0, abs=1e-9) and out.axis("range").stop == pytest.approx(3.0, abs=0.04)
+    assert out.axis("range").start == pytest.approx(0.0, abs=1e-9) and out.axis("range").stop == pytest.approx(
+        3.0, abs=0.04
+    )
     with pytest.raises(ValueError, match="does not lie in the relative ranges"):
         CompressSweeps(MOVING, window_m=(0.0, 9.0))(sweeps)
     with pytest.raises(ValueError, match="ramp must be"):

@@ -18,13 +18,22 @@ ANGLE_DEG = np.linspace(-1.0, 1.0, 5)
 
 
 def profiles(**changes):
-    return {"profiles": np.arange(24).reshape(6, 4) * (1 + 2j), "range_step_m": 0.375, "bandwidth_hz": 400e6, "prf_hz": 100.0} | changes
+    return {
+        "profiles": np.arange(24).reshape(6, 4) * (1 + 2j),
+        "range_step_m": 0.375,
+        "bandwidth_hz": 400e6,
+        "prf_hz": 100.0,
+    } | changes
 
 
 def turntable(x_m=0.0, y_m=0.0, **changes):
     angle = np.deg2rad(ANGLE_DEG)
     way = x_m * np.cos(angle) + y_m * np.sin(angle)
-    return {"sig": np.exp(-4j * np.pi / LIGHT_M_S * FREQUENCY[:, None] * way), "freq_hz": FREQUENCY, "angle_deg": ANGLE_DEG} | changes
+    return {
+        "sig": np.exp(-4j * np.pi / LIGHT_M_S * FREQUENCY[:, None] * way),
+        "freq_hz": FREQUENCY,
+        "angle_deg": ANGLE_DEG,
+    } | changes
 
 
 def spotlight(point=(0.0, 0.0, 0.0), **changes):
@@ -33,7 +42,15 @@ def spotlight(point=(0.0, 0.0, 0.0), **changes):
     r0 = np.linalg.norm(antenna, axis=-1)
     way = np.linalg.norm(antenna - np.array(point), axis=-1) - r0
     samples = np.exp(-4j * np.pi / LIGHT_M_S * FREQUENCY[:, None] * way)
-    return {"fp": samples, "freq_hz": FREQUENCY, "x_m": antenna[:, 0], "y_m": antenna[:, 1], "z_m": antenna[:, 2], "r0_m": r0, "af_r_m": np.ones(5)} | changes
+    return {
+        "fp": samples,
+        "freq_hz": FREQUENCY,
+        "x_m": antenna[:, 0],
+        "y_m": antenna[:, 1],
+        "z_m": antenna[:, 2],
+        "r0_m": r0,
+        "af_r_m": np.ones(5),
+    } | changes
 
 
 def saved(tmp_path, values):
@@ -45,7 +62,11 @@ def saved(tmp_path, values):
 def test_profiles_keep_their_samples_and_step(tmp_path):
     recording = read_inverse(saved(tmp_path, profiles()))
     pulse, range_ = recording.signal.axes
-    assert recording.signal.names == ("pulse", "range") and recording.signal.data.shape == (4, 6) and recording.signal.data.dtype == torch.complex64
+    assert (
+        recording.signal.names == ("pulse", "range")
+        and recording.signal.data.shape == (4, 6)
+        and recording.signal.data.dtype == torch.complex64
+    )
     assert complex(recording.signal.data[1, 2]) == (2 * 4 + 1) * (1 + 2j)
     assert range_.step == pytest.approx(0.375) and range_.values()[3] == 0 and pulse.step == pytest.approx(0.01)
     assert recording.radar.carrier_hz == 5.52e9 and recording.radar.rotation_rad_s is None and not recording.aux
@@ -68,7 +89,9 @@ def test_range_grows_away_from_the_radar(tmp_path):
     cell = LIGHT_M_S / (2 * 16 * 2e6)
     far = read_inverse(saved(tmp_path, turntable(x_m=3 * cell))).signal
     assert far.axis("range").step == pytest.approx(cell)
-    torch.testing.assert_close(far.axis("range").values()[far.data.abs().argmax(-1)], torch.full((5,), 3 * cell, dtype=torch.float64))
+    torch.testing.assert_close(
+        far.axis("range").values()[far.data.abs().argmax(-1)], torch.full((5,), 3 * cell, dtype=torch.float64)
+    )
     # the antenna stands at +x and +z: a point that is lower or at -x is farther away
     behind = read_inverse(saved(tmp_path, spotlight((-3 * cell, 0.0, -3 * cell)))).signal
     assert behind.axis("range").values()[behind.data.abs().argmax(-1)].min() > 3 * cell
@@ -95,11 +118,17 @@ def test_geometry_and_instrument_of_a_spotlight(tmp_path):
 @pytest.mark.parametrize(
     ("values", "match"),
     [
-        ({"freq_hz": FREQUENCY}, r"holds none of the sample arrays.*profiles with range_step_m.*this one: \['freq_hz'\]"),
+        (
+            {"freq_hz": FREQUENCY},
+            r"holds none of the sample arrays.*profiles with range_step_m.*this one: \['freq_hz'\]",
+        ),
         (turntable() | spotlight(), r"holds \['sig', 'fp'\] of the sample arrays; .* exactly one"),
         (turntable(angle_deg=None), r"lacks \['angle_deg'\]; beside 'sig'"),
         (spotlight(y_m=None, r0_m=None), r"lacks \['y_m', 'r0_m'\]"),
-        (profiles(profiles=np.ones((6, 4))), r"profiles must be complex \(range, pulse\) .* got float64 of shape \(6, 4\)"),
+        (
+            profiles(profiles=np.ones((6, 4))),
+            r"profiles must be complex \(range, pulse\) .* got float64 of shape \(6, 4\)",
+        ),
         (spotlight(fp=np.ones((16, 5, 1), complex)), r"fp must be complex \(frequency, pulse\)"),
         (profiles(prf_hz=0.0), "prf_hz must be one positive number, got 0.0"),
         (profiles(range_step_m="fine"), "range_step_m must be one positive number, got 'fine'"),
@@ -131,6 +160,9 @@ def test_recorded_aircraft_is_in_focus_after_a_doppler_transform(recorded):
     recording = read_inverse(recorded("isar_yak42_a.npz"))
     n = recording.signal.axes[0].n
     image = centred_fft(recording.signal.data * torch.hann_window(n + 2, periodic=False)[1:-1, None], -2)
-    assert float(entropy(image)) == pytest.approx(5.437, abs=0.005) and float(contrast(image)) == pytest.approx(21.7, abs=0.1)
+    assert float(entropy(image)) == pytest.approx(5.437, abs=0.005) and float(contrast(image)) == pytest.approx(
+        21.7, abs=0.1
+    )
     energy = image.abs().square().sum(-2)
-    assert energy[85:176].sum() > 0.98 * energy.sum()  # the target lies in these cells, and is not mirrored in range
+    # the target lies in these cells, and is not mirrored in range
+    assert energy[85:176].sum() > 0.98 * energy.sum()

@@ -83,7 +83,9 @@ def test_missing_and_foreign_files(tmp_path):
 
 def test_own_arrays_in_batches():
     data = torch.randn(3, 6, 80, dtype=torch.complex128)
-    recording = Recording.from_arrays(data, small_radar(), dtype=torch.complex128, agc_db=torch.zeros(3, 6), line_number=torch.arange(6).expand(3, 6))
+    recording = Recording.from_arrays(
+        data, small_radar(), dtype=torch.complex128, agc_db=torch.zeros(3, 6), line_number=torch.arange(6).expand(3, 6)
+    )
     assert recording.signal.trials == (3,)
     assert torch.equal(recording.signal.data, data)
     with pytest.raises(ValueError, match="expected complex samples"):

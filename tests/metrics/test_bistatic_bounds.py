@@ -1,4 +1,6 @@
-"""Bounds of a moving point against the closed form, the figures of brief 001, and Fisher information by numerical differences of the printed model."""
+"""Bounds of a moving point against the closed form, the figures of brief 001, and Fisher
+information by numerical differences of the printed model.
+"""
 
 from __future__ import annotations
 
@@ -31,11 +33,22 @@ def pattern(unknown, time, path):
     return torch.sinc(0.8 / 0.24 * ((300 - unknown["u_a_m_s"]) * time - unknown["y0_m"] - dx) / path)
 
 
-def brute_force(at: dict[str, float], names, snr: float, n_pulse: int, gate, differentiated_gate=None, covariance=None) -> list[float]:
-    """Central differences of all samples by the unknowns and by both parts of the amplitude; the gate held still unless told otherwise."""
+def brute_force(
+    at: dict[str, float], names, snr: float, n_pulse: int, gate, differentiated_gate=None, covariance=None
+) -> list[float]:
+    """Central differences of all samples by the unknowns and by both parts of the amplitude; the
+    gate held still unless told otherwise.
+    """
     held = lambda unknown, time, path: gate(at, time, range_of(RADAR, time, at["u_r_m_s"], at["u_a_m_s"], at["y0_m"]))  # noqa: E731
     moving = differentiated_gate or held
-    columns = [(samples({**at, name: at[name] + STEPS[name]}, n_pulse, moving) - samples({**at, name: at[name] - STEPS[name]}, n_pulse, moving)) / (2 * STEPS[name]) for name in names]
+    columns = [
+        (
+            samples({**at, name: at[name] + STEPS[name]}, n_pulse, moving)
+            - samples({**at, name: at[name] - STEPS[name]}, n_pulse, moving)
+        )
+        / (2 * STEPS[name])
+        for name in names
+    ]
     point = samples(at, n_pulse, gate)
     stacked = torch.stack([*columns, point, 1j * point], -1)
     if covariance is None:
@@ -53,10 +66,16 @@ def brute_force(at: dict[str, float], names, snr: float, n_pulse: int, gate, dif
 
 def test_published_figures_at_zero_db():
     args = (RADAR, 900, 1.0, 10.0)
-    assert float(radial_velocity_bound_m_s(RADAR, 1.0, 810)) == pytest.approx(300 * 0.24 / (4 * math.pi * 0.8 * math.sqrt(810)), rel=1e-12)
+    assert float(radial_velocity_bound_m_s(RADAR, 1.0, 810)) == pytest.approx(
+        300 * 0.24 / (4 * math.pi * 0.8 * math.sqrt(810)), rel=1e-12
+    )
     assert float(bistatic_bounds(*args, integration_s=4.5)["u_r_m_s"]) == pytest.approx(0.251, abs=0.002)
-    assert float(bistatic_bounds(*args, integration_s=4.5, unknown=("u_r_m_s", "y0_m"))["u_r_m_s"]) == pytest.approx(0.148, abs=0.001)
-    assert float(bistatic_bounds(*args, integration_s=4.5, unknown=("u_r_m_s",))["u_r_m_s"]) == pytest.approx(0.00042, abs=0.00001)
+    assert float(bistatic_bounds(*args, integration_s=4.5, unknown=("u_r_m_s", "y0_m"))["u_r_m_s"]) == pytest.approx(
+        0.148, abs=0.001
+    )
+    assert float(bistatic_bounds(*args, integration_s=4.5, unknown=("u_r_m_s",))["u_r_m_s"]) == pytest.approx(
+        0.00042, abs=0.00001
+    )
 
 
 def test_bounds_fall_as_the_root_of_the_snr_and_are_made_per_trial():
@@ -74,7 +93,9 @@ def test_bounds_fall_as_the_root_of_the_snr_and_are_made_per_trial():
 def test_phases_against_numerical_differences(names):
     at = {"u_r_m_s": 10.0, "u_a_m_s": 5.0, "y0_m": 40.0}
     found = bistatic_bounds(RADAR, 900, 3.0, 10.0, 5.0, 40.0, integration_s=4.5, unknown=names)
-    assert [float(found[name]) for name in names] == pytest.approx(brute_force(at, names, 3.0, 900, rectangle), rel=1e-4)
+    assert [float(found[name]) for name in names] == pytest.approx(
+        brute_force(at, names, 3.0, 900, rectangle), rel=1e-4
+    )
 
 
 @pytest.mark.parametrize("tells", [False, True])
@@ -86,7 +107,9 @@ def test_patterns_against_numerical_differences(tells):
 
 
 def clutter(n_pulse: int, cnr: float) -> torch.Tensor:
-    """Stationary scene in the band of a 4.5 s aperture, plus unit noise, (n_pulse, channel, channel)."""
+    """Stationary scene in the band of a 4.5 s aperture, plus unit noise, (n_pulse, channel,
+    channel).
+    """
     total = torch.eye(3, dtype=torch.complex128).repeat(n_pulse, 1, 1)
     for band in (-1, 0, 1):
         doppler = torch.fft.fftfreq(n_pulse, 1 / 180, dtype=F64) + 180 * band
@@ -101,14 +124,24 @@ def test_clutter_against_numerical_differences_and_white_noise():
     expected = brute_force(at, UNKNOWNS, 5.0, 900, rectangle, covariance=covariance)
     assert [float(found[name]) for name in UNKNOWNS] == pytest.approx(expected, rel=1e-4)
     white = bistatic_bounds(RADAR, 900, 5.0, 6.0, 0.0, 10.0, integration_s=4.5)
-    noise = bistatic_bounds(RADAR, 900, 5.0, 6.0, 0.0, 10.0, integration_s=4.5, covariance=4 * torch.eye(3, dtype=torch.complex128).expand(900, 3, 3))
+    noise = bistatic_bounds(
+        RADAR,
+        900,
+        5.0,
+        6.0,
+        0.0,
+        10.0,
+        integration_s=4.5,
+        covariance=4 * torch.eye(3, dtype=torch.complex128).expand(900, 3, 3),
+    )
     for name in UNKNOWNS:
         assert float(noise[name]) == pytest.approx(2 * float(white[name]), rel=1e-6)
         assert float(found[name]) > 1.5 * float(white[name])
 
 
 def test_what_the_data_do_not_tell_is_infinite():
-    nowhere = bistatic_bounds(RADAR, 900, 1.0, 0.0, 0.0, 5000.0, integration_s=4.5)  # lit after the record
+    # lit after the record
+    nowhere = bistatic_bounds(RADAR, 900, 1.0, 0.0, 0.0, 5000.0, integration_s=4.5)
     assert all(math.isinf(float(value)) for value in nowhere.values())
     single = published_radar(channel_m=(0.0,))
     assert math.isinf(float(radial_velocity_bound_m_s(single, 1.0, 810)))

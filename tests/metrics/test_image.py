@@ -59,12 +59,17 @@ def direct(metric, of: str, levels: torch.Tensor) -> float:
 
 @pytest.mark.parametrize(("metric", "of"), FORMS, ids=FORM_IDS)
 def test_figures_of_regions_are_those_of_their_pixels(metric, of):
-    image = torch.randn(3, 5, 6, dtype=torch.complex128, generator=torch.Generator().manual_seed(4)) * torch.tensor([1.0, 1e3, 1e-9])[:, None, None]
+    image = (
+        torch.randn(3, 5, 6, dtype=torch.complex128, generator=torch.Generator().manual_seed(4))
+        * torch.tensor([1.0, 1e3, 1e-9])[:, None, None]
+    )
     image[0, 1, 2] = 0
     times = torch.randint(0, 4, (3, 5, 6), generator=torch.Generator().manual_seed(5))
     for i in range(3):
         assert float(metric(image, of)[i]) == pytest.approx(direct(metric, of, image[i].abs().flatten()), rel=1e-12)
-        assert float(metric(image, of=of, mask=times > 1)[i]) == pytest.approx(direct(metric, of, image[i].abs()[times[i] > 1]), rel=1e-12)
+        assert float(metric(image, of=of, mask=times > 1)[i]) == pytest.approx(
+            direct(metric, of, image[i].abs()[times[i] > 1]), rel=1e-12
+        )
         counted = image[i].abs().flatten().repeat_interleave(times[i].flatten())
         assert float(metric(image, of, mask=times)[i]) == pytest.approx(direct(metric, of, counted), rel=1e-12)
     torch.testing.assert_close(metric(image, of, mask=torch.ones(6, dtype=torch.bool)), metric(image, of))

@@ -1,4 +1,6 @@
-"""Bounds of a triangular ladar against Fisher information that is summed and inverted numerically."""
+"""Bounds of a triangular ladar against Fisher information that is summed and inverted
+numerically.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ ONE, NONE = torch.ones_like(U), torch.zeros_like(U)
 
 
 def deviation(*columns: tuple[torch.Tensor, torch.Tensor]) -> float:
-    """Least deviation of the first parameter; a column holds the derivative of the phase (rad) of up and down sweep by each."""
+    """Least deviation of the first parameter; a column holds the derivative of the phase (rad) of
+    up and down sweep by each.
+    """
     derivative = torch.stack([torch.cat(column) for column in columns])
     return float(torch.linalg.inv(2 * SNR * derivative @ derivative.mT)[0, 0].sqrt())
 
@@ -42,15 +46,22 @@ def test_velocity_bounds_are_inverse_fisher_information():
 
 def test_segmented_bound_is_that_of_four_phases_of_half_sweeps():
     phase = 1 / math.sqrt(2 * SNR * N / 2)
-    assert float(velocity_segmented_bound_m_s(SNR, N, WAVELENGTH, SWEEP)) == pytest.approx(2 * phase * WAVELENGTH / (4 * math.pi * SWEEP), rel=1e-12)
+    assert float(velocity_segmented_bound_m_s(SNR, N, WAVELENGTH, SWEEP)) == pytest.approx(
+        2 * phase * WAVELENGTH / (4 * math.pi * SWEEP), rel=1e-12
+    )
 
 
 def test_range_of_one_sweep():
     per_m = 4 * math.pi / WAVELENGTH
-    assert float(range_per_sweep_bound_m(SNR, N, WAVELENGTH)) == pytest.approx(deviation((per_m * ONE, NONE)), rel=1e-12)
+    assert float(range_per_sweep_bound_m(SNR, N, WAVELENGTH)) == pytest.approx(
+        deviation((per_m * ONE, NONE)), rel=1e-12
+    )
 
 
-@pytest.mark.parametrize("db, free, known, phase_nm", [(-10, 3.73, 1.87, 12.2), (0, 1.18, 0.59, 3.85), (10, 0.373, 0.187, 1.22), (30, 0.037, 0.019, 0.122)])
+@pytest.mark.parametrize(
+    "db, free, known, phase_nm",
+    [(-10, 3.73, 1.87, 12.2), (0, 1.18, 0.59, 3.85), (10, 0.373, 0.187, 1.22), (30, 0.037, 0.019, 0.122)],
+)
 def test_figures_of_the_brief(db, free, known, phase_nm):
     snr = 10 ** (db / 10)
     assert 1e3 * float(velocity_free_offset_bound_m_s(snr, N, WAVELENGTH, SWEEP)) == pytest.approx(free, rel=0.02)
@@ -64,7 +75,9 @@ def test_integrated_range_is_the_detrended_random_walk():
     walk = step * std * torch.cumsum(torch.randn(1000, m, dtype=torch.float64, generator=generator), -1)
     line = torch.stack([torch.ones(m, dtype=torch.float64), torch.linspace(-1, 1, m, dtype=torch.float64)], -1)
     left = walk - (line @ torch.linalg.lstsq(line, walk.mT).solution).mT
-    assert float(integrated_range_detrended_bound_m(std, step, m)) == pytest.approx(float(left.square().mean().sqrt()), rel=0.03)
+    assert float(integrated_range_detrended_bound_m(std, step, m)) == pytest.approx(
+        float(left.square().mean().sqrt()), rel=0.03
+    )
     segmented = velocity_segmented_bound_m_s(SNR, N, WAVELENGTH, SWEEP)
     assert 1e9 * float(integrated_range_detrended_bound_m(segmented, 16e-6, 1024)) == pytest.approx(57, rel=0.01)
 

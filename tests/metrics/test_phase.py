@@ -34,7 +34,9 @@ def test_whole_turns_of_single_pulses_do_not_count():
 
 
 def test_errors_beyond_half_a_turn_are_not_unwrapped():
-    """A smooth error of many turns stays what it is on the circle; unwrapping would make it a large number."""
+    """A smooth error of many turns stays what it is on the circle; unwrapping would make it a large
+    number.
+    """
     t = torch.linspace(-1, 1, 300, dtype=torch.float64)
     residual = residual_phase(200 * t**2, torch.zeros(300))
     assert float(residual.abs().max()) <= math.pi and 1.4 < float(phase_rmse(200 * t**2, torch.zeros(300))) < 1.9
@@ -65,9 +67,13 @@ def test_pulses_that_are_not_there_do_not_count():
     present[0, 3:20], present[1, ::2] = False, False
     wild = torch.where(present, a + error, 1e5 * normal(2, 40, seed=6))
     residual = residual_phase(wild, a, present)
-    torch.testing.assert_close(residual, residual_phase(torch.where(present, a + error, 0), a, present), atol=1e-9, rtol=0)
+    torch.testing.assert_close(
+        residual, residual_phase(torch.where(present, a + error, 0), a, present), atol=1e-9, rtol=0
+    )
     assert not residual[~present].any()
-    torch.testing.assert_close(phase_rmse(wild, a, present)[0], residual[0][present[0]].square().mean().sqrt(), atol=1e-12, rtol=0)
+    torch.testing.assert_close(
+        phase_rmse(wild, a, present)[0], residual[0][present[0]].square().mean().sqrt(), atol=1e-12, rtol=0
+    )
     # the pulses that are there, on their own, say the same
     alone = residual_phase(wild[1, 1::2], a[1, 1::2])
     torch.testing.assert_close(residual[1, 1::2], alone, atol=1e-9, rtol=0)
@@ -77,7 +83,9 @@ def test_pulses_that_are_not_there_do_not_count():
 def test_white_phases_and_strehl():
     rmse = phase_rmse(white(50, 400), white(50, 400, seed=1))
     assert float(rmse.min()) > 1.55 and float(rmse.max()) < 1.75
-    assert float(strehl(torch.zeros(9))) == pytest.approx(1) and float(strehl(0.47 * normal(20000))) == pytest.approx(0.8, abs=0.01)
+    assert float(strehl(torch.zeros(9))) == pytest.approx(1) and float(strehl(0.47 * normal(20000))) == pytest.approx(
+        0.8, abs=0.01
+    )
     assert float(strehl(torch.tensor([0.0, math.pi]))) == pytest.approx(0, abs=1e-12)
 
 
@@ -105,12 +113,20 @@ def test_non_finite_phases_are_refused():
 
 def tiny(trials: int = 1, n_pulse: int = 6, n_range: int = 4, targets: int = 5, seed: int = 1):
     g = torch.Generator().manual_seed(seed)
-    azimuth = torch.exp(2j * math.pi * torch.rand(trials, 1, targets, dtype=torch.float64, generator=g) * torch.arange(n_pulse)[:, None])
-    return azimuth, torch.randn(trials, targets, n_range, dtype=DOUBLE, generator=g), torch.randn(trials, targets, dtype=DOUBLE, generator=g)
+    azimuth = torch.exp(
+        2j * math.pi * torch.rand(trials, 1, targets, dtype=torch.float64, generator=g) * torch.arange(n_pulse)[:, None]
+    )
+    return (
+        azimuth,
+        torch.randn(trials, targets, n_range, dtype=DOUBLE, generator=g),
+        torch.randn(trials, targets, dtype=DOUBLE, generator=g),
+    )
 
 
 def fisher_bound(azimuth, range_, amplitude, std):
-    """All unknowns at once: free phases (no constant, no line), real and imaginary parts of all amplitudes; derivatives by autograd."""
+    """All unknowns at once: free phases (no constant, no line), real and imaginary parts of all
+    amplitudes; derivatives by autograd.
+    """
     n, m = azimuth.shape
     k = torch.arange(n, dtype=torch.float64)
     free = torch.linalg.svd(torch.stack([torch.ones_like(k), k]), full_matrices=True)[2][2:].mT
@@ -137,18 +153,29 @@ def test_bound_of_a_scene_equals_the_whole_fisher_matrix(seed):
 def test_bound_scales_and_counts_equal_places_once():
     azimuth, range_, amplitude = tiny()
     bound = pulse_phase_bound_of_scene_rad(azimuth, range_, amplitude, 0.3)
-    torch.testing.assert_close(pulse_phase_bound_of_scene_rad(azimuth, range_, 1e6 * amplitude, 0.15e6), bound / 2, rtol=1e-5, atol=0)
-    places, shapes, strengths = torch.cat([azimuth, azimuth[..., :1]], -1), torch.cat([range_, range_[:, :1]], 1), torch.cat([amplitude, 0 * amplitude[:, :1]], -1)
+    torch.testing.assert_close(
+        pulse_phase_bound_of_scene_rad(azimuth, range_, 1e6 * amplitude, 0.15e6), bound / 2, rtol=1e-5, atol=0
+    )
+    places, shapes, strengths = (
+        torch.cat([azimuth, azimuth[..., :1]], -1),
+        torch.cat([range_, range_[:, :1]], 1),
+        torch.cat([amplitude, 0 * amplitude[:, :1]], -1),
+    )
     torch.testing.assert_close(pulse_phase_bound_of_scene_rad(places, shapes, strengths, 0.3), bound, rtol=1e-4, atol=0)
 
 
 def test_bound_of_a_known_scene():
-    """One pulse of known samples is known to 1 / sqrt(2 N SNR), as the phase of its correlation with them; to less where amplitudes are not known."""
+    """One pulse of known samples is known to 1 / sqrt(2 N SNR), as the phase of its correlation
+    with them; to less where amplitudes are not known.
+    """
     echo = torch.exp(1j * torch.arange(64))
     noise = torch.randn(20000, 64, dtype=DOUBLE, generator=torch.Generator().manual_seed(1)) / math.sqrt(10.0)
     measured = torch.angle(((echo + noise) * echo.conj()).sum(-1)).std()
     assert float(measured / pulse_phase_bound_rad(10.0, 64)) == pytest.approx(1, abs=0.02)
     azimuth, range_, amplitude = tiny(n_pulse=40, n_range=16, targets=3)
     power = ((azimuth * amplitude[..., None, :]) @ range_).abs().square().mean()
-    unknown, known = pulse_phase_bound_of_scene_rad(azimuth, range_, amplitude, 0.1)[0], pulse_phase_bound_rad(power / 0.01, 16)
+    unknown, known = (
+        pulse_phase_bound_of_scene_rad(azimuth, range_, amplitude, 0.1)[0],
+        pulse_phase_bound_rad(power / 0.01, 16),
+    )
     assert 0.95 * known < unknown < 1.5 * known

@@ -1,4 +1,6 @@
-"""Azimuth responses with known answers, and false targets of known level at places computed pulse by pulse."""
+"""Azimuth responses with known answers, and false targets of known level at places computed pulse
+by pulse.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +20,15 @@ F64 = torch.float64
 RADAR = published_radar()
 
 
-def sinc_profile(n: int, places: list[float], amplitudes: list[float], band: float = 0.9, tone: float = 0.0) -> torch.Tensor:
+def sinc_profile(
+    n: int, places: list[float], amplitudes: list[float], band: float = 0.9, tone: float = 0.0
+) -> torch.Tensor:
     """Points of a rectangular band (turns per sample) about `tone`, places in samples."""
     i = torch.arange(n, dtype=F64)
-    return sum(a * torch.sinc(band * (i - p)) * torch.exp(2j * math.pi * tone * (i - p)) for p, a in zip(places, amplitudes, strict=True))  # type: ignore[return-value]
+    return sum(
+        a * torch.sinc(band * (i - p)) * torch.exp(2j * math.pi * tone * (i - p))
+        for p, a in zip(places, amplitudes, strict=True)
+    )  # type: ignore[return-value]
 
 
 @pytest.mark.parametrize(("nulls", "islr"), [(10, -10.17), (20, -9.92)])
@@ -54,21 +61,32 @@ def test_each_trial_by_itself():
 
 def test_known_replicas_are_found_between_samples():
     zones = torch.tensor([[-310.0, -290.0], [290.0, 310.0]], dtype=F64)
-    profiles = torch.stack([sinc_profile(4096, [2000.3, 2300.8, 1999.3 - 600], [1.0, 0.1, 0.5]), sinc_profile(4096, [1000.0, 695.5], [1.0, 0.03])])
+    profiles = torch.stack(
+        [
+            sinc_profile(4096, [2000.3, 2300.8, 1999.3 - 600], [1.0, 0.1, 0.5]),
+            sinc_profile(4096, [1000.0, 695.5], [1.0, 0.03]),
+        ]
+    )
     found = replica_level(profiles, 1.0, zones)
-    assert found["mfta_db"].tolist() == pytest.approx([-20.0, -30.46], abs=0.4)  # side lobes of the point itself lie at -59 dB there
+    assert found["mfta_db"].tolist() == pytest.approx(
+        [-20.0, -30.46], abs=0.4
+    )  # side lobes of the point itself lie at -59 dB there
     assert found["offset_m"].tolist() == pytest.approx([300.5, -304.5], abs=0.6)
     assert found["covered"].tolist() == [1.0, 1.0]
 
 
 def image(u_r, u_a, bands, n_pulse=3600, focused=None, r0=5000.0):
-    """Image (azimuth,) of one point, its spectrum cut to the processed band, and the step of x = v t."""
+    """Image (azimuth,) of one point, its spectrum cut to the processed band, and the step of x = v
+    t.
+    """
     u = (u_r, u_a) if focused is None else focused
     data = azimuth_echo(RADAR, n_pulse, u_r, u_a, r0=r0)
     motion = PointMotion.of(RADAR, data, u[0], u[1], 0.0, r0)
     spectrum = reconstruct(data, RADAR, motion, LeastSquares(bands))
     band = float(motion.square_m2_s2) * 4.5 / (0.24 * r0)
-    return focus_azimuth(spectrum, doppler_offsets(n_pulse, bands, 180.0), RADAR, motion, band), (300 - u[1]) / (bands * 180)
+    return focus_azimuth(spectrum, doppler_offsets(n_pulse, bands, 180.0), RADAR, motion, band), (300 - u[1]) / (
+        bands * 180
+    )
 
 
 # brief 001: Table 4 and Fig 17, trial
@@ -87,7 +105,15 @@ CASES = [
 @pytest.mark.parametrize(("velocity", "bands", "focused", "level", "within"), CASES)
 def test_published_cases(velocity, bands, focused, level, within):
     profile, step = image(velocity[0], velocity[1], bands, focused=focused)
-    zones = replica_zones(RADAR, bands, velocity[0], velocity[1], integration_s=4.5, focused_at=focused, axis_speed_m_s=300.0 - (velocity if focused is None else focused)[1])
+    zones = replica_zones(
+        RADAR,
+        bands,
+        velocity[0],
+        velocity[1],
+        integration_s=4.5,
+        focused_at=focused,
+        axis_speed_m_s=300.0 - (velocity if focused is None else focused)[1],
+    )
     assert float(replica_level(profile, step, zones)["mfta_db"]) == pytest.approx(level, abs=within)
 
 
@@ -104,7 +130,9 @@ def test_two_bands_with_known_velocities_reach_what_the_brief_asks(velocity):
 
 
 def test_zones_lie_where_a_hyperbola_puts_replicas():
-    """A point at 6490 m, u_r 10: 937.2 m in the trial of the brief, not 933.9 = PRF lambda R0 V_R / V^2."""
+    """A point at 6490 m, u_r 10: 937.2 m in the trial of the brief, not 933.9 = PRF lambda R0 V_R /
+    V^2.
+    """
     zones = replica_zones(RADAR, 2, 10.0, range_m=6490.0, integration_s=4.5)
     assert zones.shape == (4, 2)
     first, last = zones[2].tolist()
@@ -118,7 +146,9 @@ def test_zones_lie_where_a_hyperbola_puts_replicas():
 
 
 def test_replica_of_a_scene_lies_in_its_zone_at_the_measured_place():
-    """The largest false target of the conventional image is found where the whole profile has it."""
+    """The largest false target of the conventional image is found where the whole profile
+    has it.
+    """
     profile, step = image(10, 0, 2, focused=(0, 0))
     zones = replica_zones(RADAR, 2, 10.0, integration_s=4.5, focused_at=(0.0, 0.0))
     found = float(replica_level(profile, step, zones)["offset_m"])
@@ -137,4 +167,11 @@ def test_refusals():
         replica_zones(RADAR, 2, orders=(0,))
     with pytest.raises(ValueError, match="NaN or Inf"):
         azimuth_response(profile * math.nan, 1.0)
-    assert float(replica_level(torch.zeros(256, dtype=torch.complex64), 1.0, torch.tensor([[70.0, 74.0]], dtype=F64))["mfta_db"]) == -300
+    assert (
+        float(
+            replica_level(torch.zeros(256, dtype=torch.complex64), 1.0, torch.tensor([[70.0, 74.0]], dtype=F64))[
+                "mfta_db"
+            ]
+        )
+        == -300
+    )

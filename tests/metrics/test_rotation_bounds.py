@@ -1,4 +1,6 @@
-"""Bounds of uneven rotation against Fisher information of the whole model, by automatic differentiation with every nuisance written out."""
+"""Bounds of uneven rotation against Fisher information of the whole model, by automatic
+differentiation with every nuisance written out.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +28,21 @@ def points(count: int = 5, seed: int = 1) -> tuple[Tensor, Tensor, Tensor]:
     return 4 * (x - 0.5), 6 * (y - 0.5), torch.polar(0.5 + level, 2 * math.pi * phase)
 
 
-def brute_force(x: Tensor, y: Tensor, amplitude: Tensor, noise_std: float, omega: float, k: Tensor, yc: float, prf_hz: float, n_pulse: int, free_centre: bool) -> Tensor:
-    """Each scatterer in a row of its own: real and imaginary parts of all samples, differentiated by motion, amplitudes and cross ranges."""
+def brute_force(
+    x: Tensor,
+    y: Tensor,
+    amplitude: Tensor,
+    noise_std: float,
+    omega: float,
+    k: Tensor,
+    yc: float,
+    prf_hz: float,
+    n_pulse: int,
+    free_centre: bool,
+) -> Tensor:
+    """Each scatterer in a row of its own: real and imaginary parts of all samples, differentiated
+    by motion, amplitudes and cross ranges.
+    """
     time, c4, count, order = torch.arange(n_pulse, dtype=F64) / prf_hz, 4 * math.pi / WAVELENGTH, len(x), len(k)
 
     def samples(unknown: Tensor) -> Tensor:
@@ -38,7 +53,9 @@ def brute_force(x: Tensor, y: Tensor, amplitude: Tensor, noise_std: float, omega
         echo = torch.complex(real, imaginary)[:, None] * torch.polar(torch.ones_like(phase), phase)
         return torch.view_as_real(echo).flatten()
 
-    at = torch.cat([torch.tensor([omega], dtype=F64), k, torch.tensor([yc], dtype=F64), amplitude.real, amplitude.imag, x])
+    at = torch.cat(
+        [torch.tensor([omega], dtype=F64), k, torch.tensor([yc], dtype=F64), amplitude.real, amplitude.imag, x]
+    )
     jacobian = torch.func.jacrev(samples)(at)
     keep = torch.ones(len(at), dtype=torch.bool)
     keep[1 + order] = free_centre
@@ -53,30 +70,48 @@ def brute_force(x: Tensor, y: Tensor, amplitude: Tensor, noise_std: float, omega
 def test_equals_the_inverse_fisher_information_of_the_whole_model(order: int, free_centre: bool) -> None:
     x, y, amplitude = points()
     k = K[: order - 1]
-    found = rotation_bounds(x, y, amplitude, 0.3, 0.02, k, 0.8, wavelength_m=WAVELENGTH, prf_hz=4e3, n_pulse=81, free_centre=free_centre)
+    found = rotation_bounds(
+        x, y, amplitude, 0.3, 0.02, k, 0.8, wavelength_m=WAVELENGTH, prf_hz=4e3, n_pulse=81, free_centre=free_centre
+    )
     assert list(found) == NAMES[:order] + ["yc_m"] * free_centre
     expected = brute_force(x, y, amplitude, 0.3, 0.02, k, 0.8, 4e3, 81, free_centre)
     torch.testing.assert_close(torch.stack(list(found.values())), expected, rtol=1e-6, atol=0)
 
 
 def satellite(snr_db: float, n_pulse: int = 10000, trials: int = 4, **shape: float) -> Tensor:
-    """Relative bounds of Om, k1 and k2 and that of yc in m of the satellite of brief 003, averaged over trials."""
+    """Relative bounds of Om, k1 and k2 and that of yc in m of the satellite of brief 003, averaged
+    over trials.
+    """
     seen = Satellite(**{"count": 600, **shape}).scatterers(Draws(1, trials=range(trials)))  # pyright: ignore[reportArgumentType]
     # mean power of the samples: each scatterer fills one cell's worth of 128
     noise_std = (seen.amplitude.abs().square().sum(-1) / 128 * 10 ** (-snr_db / 10)).sqrt()
-    found = rotation_bounds(seen.azimuth_m, seen.range_m, seen.amplitude, noise_std, 0.02, K[:2], wavelength_m=WAVELENGTH, prf_hz=500e3, n_pulse=n_pulse)
+    found = rotation_bounds(
+        seen.azimuth_m,
+        seen.range_m,
+        seen.amplitude,
+        noise_std,
+        0.02,
+        K[:2],
+        wavelength_m=WAVELENGTH,
+        prf_hz=500e3,
+        n_pulse=n_pulse,
+    )
     return (torch.stack(list(found.values()), -1) / torch.tensor([0.02, 10.0, 1000.0, 1.0], dtype=F64)).mean(0)
 
 
 def test_figures_of_the_satellite() -> None:
-    """1.25, 0.016 and 0.015 % of Om, k1 and k2, and 0.03 m of yc, at -10 dB; they fall as 10^(-SNR / 20)."""
+    """1.25, 0.016 and 0.015 % of Om, k1 and k2, and 0.03 m of yc, at -10 dB; they fall as 10^(-SNR
+    / 20).
+    """
     low = satellite(-10.0)
     torch.testing.assert_close(low, torch.tensor([1.25e-2, 1.6e-4, 1.5e-4, 0.03], dtype=F64), rtol=0.35, atol=0)
     torch.testing.assert_close(satellite(20.0), low * 10**-1.5, rtol=1e-9, atol=0)
 
 
 def test_longer_apertures_tell_far_more() -> None:
-    """5, 10, 15, 20 and 30 ms: 32, 5.3, 1.8, 0.8 and 0.23 % of Om by the brief, whose scene is not kept: their ratios are."""
+    """5, 10, 15, 20 and 30 ms: 32, 5.3, 1.8, 0.8 and 0.23 % of Om by the brief, whose scene is not
+    kept: their ratios are.
+    """
     found = torch.stack([satellite(0.0, n)[:2] for n in (2500, 5000, 7500, 10000, 15000)])
     brief = torch.tensor([[32, 0.23], [5.3, 0.04], [1.8, 0.015], [0.8, 0.007], [0.23, 0.003]], dtype=F64)
     # a bound at a fixed SNR also falls with the root of the pulses
@@ -86,7 +121,11 @@ def test_longer_apertures_tell_far_more() -> None:
 def test_trials_broadcast() -> None:
     several = [points(seed=seed) for seed in range(3)]
     x, y, amplitude = (torch.stack(part) for part in zip(*several))
-    noise, omega, yc = torch.tensor([0.1, 1.0, 10.0], dtype=F64), torch.tensor([0.01, 0.02, 0.03], dtype=F64), torch.tensor([-1.0, 0.0, 2.0], dtype=F64)
+    noise, omega, yc = (
+        torch.tensor([0.1, 1.0, 10.0], dtype=F64),
+        torch.tensor([0.01, 0.02, 0.03], dtype=F64),
+        torch.tensor([-1.0, 0.0, 2.0], dtype=F64),
+    )
     k = torch.stack([K[:2], 0 * K[:2], -K[:2] / 10])
     kind = {"wavelength_m": WAVELENGTH, "prf_hz": 4e3, "n_pulse": 80}
     together = rotation_bounds(x, y, amplitude, noise, omega, k, yc, **kind)
@@ -103,7 +142,16 @@ def test_what_the_data_do_not_tell_is_infinite() -> None:
     kind = {"wavelength_m": WAVELENGTH, "prf_hz": 4e3, "n_pulse": 80}
 
     def infinite(**changes) -> list[str]:
-        values = {"cross_range_m": x, "range_m": y, "amplitude": amplitude, "noise_std": 0.1, "omega_rad_s": 0.02, "warp_k": K[:2], **kind, **changes}
+        values = {
+            "cross_range_m": x,
+            "range_m": y,
+            "amplitude": amplitude,
+            "noise_std": 0.1,
+            "omega_rad_s": 0.02,
+            "warp_k": K[:2],
+            **kind,
+            **changes,
+        }
         found = rotation_bounds(**values)
         assert not any(value.isnan().any() for value in found.values())
         return [name for name, value in found.items() if torch.isinf(value).any()]
@@ -112,9 +160,16 @@ def test_what_the_data_do_not_tell_is_infinite() -> None:
     assert infinite(range_m=0 * y) == ["omega_rad_s"]
     assert infinite(range_m=0 * y + 2.0) == ["omega_rad_s", "yc_m"]
     assert infinite(range_m=0 * y + 2.0, free_centre=False) == []
-    assert infinite(amplitude=0 * amplitude) == infinite(omega_rad_s=0.0) == infinite(noise_std=math.inf) == NAMES[:3] + ["yc_m"]
+    assert (
+        infinite(amplitude=0 * amplitude)
+        == infinite(omega_rad_s=0.0)
+        == infinite(noise_std=math.inf)
+        == NAMES[:3] + ["yc_m"]
+    )
     assert infinite(cross_range_m=x[:1], range_m=y[:1], amplitude=amplitude[:1]) == ["omega_rad_s", "yc_m"]
-    assert infinite(n_pulse=3) == NAMES[:3], "one curve over the pulses tells what goes with x, with y and with neither: yc alone is the last"
+    assert infinite(n_pulse=3) == NAMES[:3], (
+        "one curve over the pulses tells what goes with x, with y and with neither: yc alone is the last"
+    )
     assert infinite(n_pulse=1) == NAMES[:3] + ["yc_m"]
     assert infinite(noise_std=0.0) == []
 
@@ -133,10 +188,19 @@ def test_gradients() -> None:
     kind = {"wavelength_m": WAVELENGTH, "prf_hz": 4e3, "n_pulse": 40}
 
     def logs(*values: Tensor) -> Tensor:
-        return torch.stack([value.log() for value in rotation_bounds(values[0], values[1], values[2], values[3], values[4], 1e3 * values[5], **kind).values()])
+        return torch.stack(
+            [
+                value.log()
+                for value in rotation_bounds(
+                    values[0], values[1], values[2], values[3], values[4], 1e3 * values[5], **kind
+                ).values()
+            ]
+        )
 
     noise, omega = torch.tensor(0.1, dtype=F64), torch.tensor(0.5, dtype=F64)
-    assert torch.autograd.gradcheck(logs, [v.clone().requires_grad_() for v in (x, y, amplitude, noise, omega, K[:2] / 1e3)], atol=1e-4, rtol=1e-3)
+    assert torch.autograd.gradcheck(
+        logs, [v.clone().requires_grad_() for v in (x, y, amplitude, noise, omega, K[:2] / 1e3)], atol=1e-4, rtol=1e-3
+    )
 
 
 def test_refusals() -> None:

@@ -1,4 +1,6 @@
-"""Echoes of moving points before a bistatic receiver, by direct sums: nothing that the package computes them with."""
+"""Echoes of moving points before a bistatic receiver, by direct sums: nothing that the package
+computes them with.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +53,9 @@ def azimuth_echo(radar, n_pulse, u_r=0.0, u_a=0.0, y0=0.0, r0=None, gate_s=4.5):
 
 
 def compressed_echo(radar, n_pulse, n_range, points, gate_s=4.5):
-    """Signal (channel, pulse, range) of points (dicts of u_r, u_a, y0, r0, amplitude): a rectangular band of unit peak at R_m(t), the transmit range in the carrier only."""
+    """Signal (channel, pulse, range) of points (dicts of u_r, u_a, y0, r0, amplitude): a
+    rectangular band of unit peak at R_m(t), the transmit range in the carrier only.
+    """
     t = time_of(radar, n_pulse)
     fr = torch.fft.fftfreq(n_range, 1 / radar.sampling_hz, dtype=torch.float64)
     band = (fr.abs() < radar.pulse.bandwidth_hz / 2).to(torch.float64)

@@ -25,10 +25,14 @@ def ship(u_r=8.0, u_a=0.0, **values) -> Ship:
 
 def frame_of(ships: Mapping[str, Ship], seed=1, pulses=540, lines=120, sea=True, dtype=torch.complex64) -> Signal:
     """Channels (channel, pulse, range) with noise of -30 dB, a sea of 0 dB."""
-    world = BistaticWorld(Fleet(ships) if ships else None, BandLimited(GATE_S), KSea(shape=1.5) if sea else None, snr_db=30.0)
+    world = BistaticWorld(
+        Fleet(ships) if ships else None, BandLimited(GATE_S), KSea(shape=1.5) if sea else None, snr_db=30.0
+    )
     return simulate_bistatic(RADAR, world, pulses, lines, Draws(seed), dtype=dtype)[0].signal
 
 
 def flow(**values) -> ImageMovers:
     """Looks at the conventional image only, which is enough for bright ships."""
-    return ImageMovers(RADAR, **{"extraction": EXTRACTION, "detector": Detector(suppressed_m_s=()), "u_a_half_m_s": 12.0, **values})
+    return ImageMovers(
+        RADAR, **{"extraction": EXTRACTION, "detector": Detector(suppressed_m_s=()), "u_a_half_m_s": 12.0, **values}
+    )

@@ -1,4 +1,6 @@
-"""Images of single points along azimuth, rebuilt and focused with given velocities, and their figures."""
+"""Images of single points along azimuth, rebuilt and focused with given velocities, and their
+figures.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,9 @@ def figures_of(image, radar, bands, u_r=0.0, u_a=0.0, y0=0.0, gate_s: float | No
     along = radar.speed_m_s - u_a
     step, n = along / (bands * radar.prf_hz), image.shape[-1]
     response = replicas.azimuth_response(image, step, -(n // 2) * step)
-    zones = replicas.replica_zones(radar, bands, u_r, u_a, y0, integration_s=gate_s, focused_at=used, axis_speed_m_s=along)
+    zones = replicas.replica_zones(
+        radar, bands, u_r, u_a, y0, integration_s=gate_s, focused_at=used, axis_speed_m_s=along
+    )
     mfta = replicas.replica_level(image, step, zones)["mfta_db"]
     irw, pslr, islr, place = (float(response[name]) for name in ("irw_m", "pslr_db", "islr_db", "position_m"))
     return Figures(irw, pslr, islr, float(mfta), place / along, complex(response["peak"]))

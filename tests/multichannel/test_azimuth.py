@@ -1,4 +1,6 @@
-"""Focused points against the theory of a rectangular band and the tables of brief 001, by echoes summed directly."""
+"""Focused points against the theory of a rectangular band and the tables of brief 001, by echoes
+summed directly.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ def test_table_4_with_velocities_told(u_r, u_a):
     assert found.image_s == pytest.approx(u_r * 5000 / ((300 - u_a) ** 2 + u_r**2), abs=2e-5)
 
 
-@pytest.mark.parametrize(("u_r", "u_a", "mfta_db"), [(0.0, 10.0, -58.3), (10.0, 0.0, -56.0), (10.0, 5.0, -51.5), (5.0, 10.0, -49.7)])
+@pytest.mark.parametrize(
+    ("u_r", "u_a", "mfta_db"), [(0.0, 10.0, -58.3), (10.0, 0.0, -56.0), (10.0, 5.0, -51.5), (5.0, 10.0, -49.7)]
+)
 def test_inverse_of_three_bands(u_r, u_a, mfta_db):
     assert measured(RADAR, LeastSquares(3), u_r, u_a).mfta_db == pytest.approx(mfta_db, abs=2.0)
 
@@ -46,7 +50,11 @@ def test_inverse_of_three_bands(u_r, u_a, mfta_db):
 @pytest.mark.parametrize("y0", [150.0, -400.0])
 def test_a_point_beside_the_middle(y0):
     found = measured(RADAR, LeastSquares(2), 10.0, 5.0, y0)
-    assert found.irw_m == pytest.approx(theory_m(5.0), rel=0.02) and found.pslr_db == pytest.approx(-13.26, abs=0.15) and found.mfta_db < -65
+    assert (
+        found.irw_m == pytest.approx(theory_m(5.0), rel=0.02)
+        and found.pslr_db == pytest.approx(-13.26, abs=0.15)
+        and found.mfta_db < -65
+    )
     motion = motion_of(RADAR, 10.0, 5.0, y0)
     assert found.image_s == pytest.approx(float(motion.image_s), abs=2e-5)
     assert float(motion.place_m(motion.image_s)) == pytest.approx(y0, abs=1e-9)
@@ -56,7 +64,9 @@ def test_the_place_belongs_into_the_filter():
     """Brief 001, Algorithm 7: at y0 = 150 m, u_r = 10 m/s the least range is 5 m smaller."""
     motion = motion_of(RADAR, 10.0, 0.0, 150.0)
     assert float(motion_of(RADAR, 10.0).closest_m - motion.closest_m) == pytest.approx(5.0, abs=0.02)
-    assert measured(RADAR, LeastSquares(2), 10.0, 0.0, 150.0, used=(10.0, 0.0, 0.0)).pslr_db == pytest.approx(-10.7, abs=0.3)
+    assert measured(RADAR, LeastSquares(2), 10.0, 0.0, 150.0, used=(10.0, 0.0, 0.0)).pslr_db == pytest.approx(
+        -10.7, abs=0.3
+    )
 
 
 def test_conventional_processing_makes_false_targets():
@@ -67,7 +77,11 @@ def test_conventional_processing_makes_false_targets():
         assert irw > 50 or found.irw_m == pytest.approx(irw, rel=0.1)
 
 
-@pytest.mark.parametrize(("rebuild", "mfta_db"), [(LeastSquares(2), -17.8), (LeastSquares(3), -28.0), (MinimumMeanSquare(5, 40.0), -30.7)], ids=["two", "three", "prior"])
+@pytest.mark.parametrize(
+    ("rebuild", "mfta_db"),
+    [(LeastSquares(2), -17.8), (LeastSquares(3), -28.0), (MinimumMeanSquare(5, 40.0), -30.7)],
+    ids=["two", "three", "prior"],
+)
 def test_through_the_pattern_of_an_antenna(rebuild, mfta_db):
     """Fig. 17 (trial) at u_r = 10 m/s: energy two pulse rates away aliases."""
     t = time_of(RADAR, LONG)
@@ -79,13 +93,18 @@ def test_through_the_pattern_of_an_antenna(rebuild, mfta_db):
 
 
 def test_peak_and_phase():
-    """A unit point for T seconds: T V / sqrt(lambda R) at -45 degrees, against its phase at zero Doppler offset and the reference range."""
+    """A unit point for T seconds: T V / sqrt(lambda R) at -45 degrees, against its phase at zero
+    Doppler offset and the reference range.
+    """
     for u_r, u_a, y0 in ((0.0, 0.0, 0.0), (10.0, 5.0, 30.0), (-10.0, 5.0, -60.0)):
         motion, v = motion_of(RADAR, u_r, u_a, y0), 300 - u_a
         peak = measured(RADAR, LeastSquares(2), u_r, u_a, y0, band_hz=None).peak
         assert abs(peak) == pytest.approx(GATE_S * math.sqrt((v**2 + u_r**2) / (0.24 * 5000)), rel=0.01)
         turns = u_r / 0.24 * float(motion.image_s)  # the demodulation, which the image keeps
-        assert abs(math.remainder(math.atan2(peak.imag, peak.real) + math.pi / 4 + 2 * math.pi * turns, 2 * math.pi)) < 0.05
+        assert (
+            abs(math.remainder(math.atan2(peak.imag, peak.real) + math.pi / 4 + 2 * math.pi * turns, 2 * math.pi))
+            < 0.05
+        )
 
 
 def test_filter_is_the_exact_phase_of_the_spectrum():
@@ -94,7 +113,9 @@ def test_filter_is_the_exact_phase_of_the_spectrum():
     v2, cross = 295.0**2 + 100.0, 10.0 * 5000 + 295.0 * 100
     least = math.sqrt(5000.0**2 + 100.0**2 - cross**2 / v2)
     phase = 2 * math.pi / 0.24 * (least * torch.sqrt(1 - 0.24**2 * f**2 / v2) - 5000)
-    torch.testing.assert_close(azimuth_filter(offset, RADAR, motion, torch.complex128), torch.exp(1j * phase), atol=1e-8, rtol=0)
+    torch.testing.assert_close(
+        azimuth_filter(offset, RADAR, motion, torch.complex128), torch.exp(1j * phase), atol=1e-8, rtol=0
+    )
     slow = published_radar(speed_m_s=15.0)  # Doppler beyond 2 V / lambda belongs to no point
     gone = azimuth_filter(offset, slow, motion_of(slow), torch.complex128)
     assert torch.equal(gone == 0, 0.24 * offset.abs() >= 15.0)
@@ -108,7 +129,9 @@ def test_trials_equal_singles_and_keep_precision(dtype):
     focus, rebuild = FocusAzimuth(RADAR, bandwidth_hz=BAND_HZ), Reconstruct(RADAR)
     together = focus(rebuild(signal, u_r_m_s=u_r, u_a_m_s=u_a), u_r_m_s=u_r, u_a_m_s=u_a)
     assert together.data.dtype == dtype and together.names == ("azimuth",)
-    exact = [focused(azimuth_echo(RADAR, 900, *move), RADAR, motion_of(RADAR, *move), LeastSquares(2)) for move in TABLE_4]
+    exact = [
+        focused(azimuth_echo(RADAR, 900, *move), RADAR, motion_of(RADAR, *move), LeastSquares(2)) for move in TABLE_4
+    ]
     for found, expected in zip(together.data, exact, strict=True):
         assert float((found - expected).norm() / expected.norm()) < (1e-6 if dtype == torch.complex64 else 1e-12)
     x = together.axis("azimuth").values()
@@ -135,11 +158,15 @@ def test_gradients():
     offset = doppler_offsets(5, 2, 180.0)
     data = torch.randn(2, 10, dtype=torch.complex128, requires_grad=True)
     values = [torch.tensor(x, dtype=F64, requires_grad=True) for x in ([3.0, -5.0], [1.0, 2.0], [10.0, 30.0])]
-    assert torch.autograd.gradcheck(lambda d, *x: focus_azimuth(d, offset, RADAR, PointMotion.of(RADAR, d, *x), 100.0), (data, *values))
+    assert torch.autograd.gradcheck(
+        lambda d, *x: focus_azimuth(d, offset, RADAR, PointMotion.of(RADAR, d, *x), 100.0), (data, *values)
+    )
 
 
 def test_records_that_do_not_hold_the_point():
-    """Nothing in, nothing out; a point whose image lies beyond the record wraps around and stays finite."""
+    """Nothing in, nothing out; a point whose image lies beyond the record wraps around and stays
+    finite.
+    """
     motion = motion_of(RADAR, 0.0, 0.0, 2000.0)
     assert float(focused(azimuth_echo(RADAR, 900, 0.0, 0.0, 2000.0), RADAR, motion, LeastSquares(2)).abs().max()) == 0
     far = focused(azimuth_echo(RADAR, 900, 40.0, 0.0, 0.0), RADAR, motion_of(RADAR, 40.0), LeastSquares(2))
@@ -150,6 +177,9 @@ def test_refusals():
     for bad in (0.0, -1.0):
         with pytest.raises(ValueError, match="bandwidth_hz must be positive, or None"):
             FocusAzimuth(RADAR, bandwidth_hz=bad)
-    spectrum = Signal(reconstruct(azimuth_echo(RADAR, 90), RADAR, motion_of(RADAR), LeastSquares(2)), (Reconstruct(RADAR)(Signal(azimuth_echo(RADAR, 90), RADAR.axes(90))).axis("doppler"),))
+    spectrum = Signal(
+        reconstruct(azimuth_echo(RADAR, 90), RADAR, motion_of(RADAR), LeastSquares(2)),
+        (Reconstruct(RADAR)(Signal(azimuth_echo(RADAR, 90), RADAR.axes(90))).axis("doppler"),),
+    )
     with pytest.raises(ValueError, match="NaN or Inf in u_r_m_s"):
         FocusAzimuth(RADAR)(spectrum, u_r_m_s=math.nan)

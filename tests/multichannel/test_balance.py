@@ -12,12 +12,16 @@ from torchsar.core import Signal
 from torchsar.multichannel.balance import CorrectBalance, EstimateBalance, correct_balance, estimate_balance
 from torchsar.multichannel.response import ElementPattern, FlatBand
 
-PHASE, GAIN, DELAY = (torch.tensor(x, dtype=torch.float64) for x in ([0.3, 0.0, -0.5], [0.5, 0.0, -1.0], [2e-9, 0.0, -9e-9]))
+PHASE, GAIN, DELAY = (
+    torch.tensor(x, dtype=torch.float64) for x in ([0.3, 0.0, -0.5], [0.5, 0.0, -1.0], [2e-9, 0.0, -9e-9])
+)
 N, CELLS, LONG = 256, 160, 4096
 
 
 def clutter(radar, power_of_doppler, snr_db, trials=2, n_range=CELLS, seed=3):
-    """Gaussian clutter of a Doppler spectrum in pulses of channels that lie dx / V apart, cut from a long periodic one, (trial, channel, pulse, range), in the pulse's band."""
+    """Gaussian clutter of a Doppler spectrum in pulses of channels that lie dx / V apart, cut from
+    a long periodic one, (trial, channel, pulse, range), in the pulse's band.
+    """
     generator = torch.Generator().manual_seed(seed)
     factor = 8
     f = torch.fft.fftfreq(LONG, 1 / (factor * radar.prf_hz), dtype=torch.float64)
@@ -44,12 +48,23 @@ def pattern(f):
     return torch.sinc(0.8 * f / 300).square()
 
 
-@pytest.mark.parametrize("prf, chosen, power, limit_deg", [(180.0, (FlatBand(360.0), 2), flat, 0.1), (160.0, (FlatBand(320.0), 2), flat, 0.1), (180.0, (ElementPattern(), 5), pattern, 2.5)])
+@pytest.mark.parametrize(
+    "prf, chosen, power, limit_deg",
+    [
+        (180.0, (FlatBand(360.0), 2), flat, 0.1),
+        (160.0, (FlatBand(320.0), 2), flat, 0.1),
+        (180.0, (ElementPattern(), 5), pattern, 2.5),
+    ],
+)
 def test_found_as_well_as_foretold(prf, chosen, power, limit_deg):
     radar = published_radar(prf_hz=prf)
     found = estimate_balance(differed(clutter(radar, power, 40.0), radar), radar, *chosen)
     assert bool(found.ok.all())
-    errors = {"phase_rad": found["phase_rad"] - PHASE, "gain_db": found["gain_db"] - GAIN, "delay_s": found["delay_s"] - DELAY}
+    errors = {
+        "phase_rad": found["phase_rad"] - PHASE,
+        "gain_db": found["gain_db"] - GAIN,
+        "delay_s": found["delay_s"] - DELAY,
+    }
     assert float(torch.rad2deg(errors["phase_rad"]).abs().max()) < limit_deg
     assert float(errors["gain_db"].abs().max()) < (0.5 if chosen[1] > 2 else 0.1)
     for name in ("phase_rad", "delay_s"):
@@ -59,9 +74,13 @@ def test_found_as_well_as_foretold(prf, chosen, power, limit_deg):
 
 def test_deviations_are_the_foretold_ones():
     radar = published_radar()
-    found = estimate_balance(clutter(radar, flat, 30.0, trials=24, n_range=48), radar, FlatBand(360.0), 2, delays=False, blocks=4)
+    found = estimate_balance(
+        clutter(radar, flat, 30.0, trials=24, n_range=48), radar, FlatBand(360.0), 2, delays=False, blocks=4
+    )
     seen = found["phase_rad"].square().mean(0).sqrt()[[0, 2]]
-    torch.testing.assert_close(seen / found.std["phase_rad"].mean(0)[[0, 2]], torch.ones(2, dtype=torch.float64), atol=0.5, rtol=0)
+    torch.testing.assert_close(
+        seen / found.std["phase_rad"].mean(0)[[0, 2]], torch.ones(2, dtype=torch.float64), atol=0.5, rtol=0
+    )
     assert float(found.info["snr_db"].mean()) == pytest.approx(30 - 3, abs=3.5)
 
 
@@ -85,7 +104,9 @@ def test_trials_stand_alone_and_silence_is_told():
     data = torch.cat([data * torch.tensor([1.0, 1e3])[:, None, None, None], torch.zeros_like(data[:1]), dead])
     together = estimate_balance(data, radar, FlatBand(360.0), 2)
     assert together.ok.tolist() == [True, True, False, False]
-    assert all(bool(torch.isfinite(v).all()) for v in (*together.value.values(), *together.std.values(), together.quality))
+    assert all(
+        bool(torch.isfinite(v).all()) for v in (*together.value.values(), *together.std.values(), together.quality)
+    )
     for i in range(4):
         alone = estimate_balance(data[i], radar, FlatBand(360.0), 2)
         for name, value in alone.value.items():

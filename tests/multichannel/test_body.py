@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from torchsar.multichannel.body import Extraction, Segments, body_echo, body_image, centred_motion, chip_about, find_body, known_body
+from torchsar.multichannel.body import (
+    Extraction,
+    Segments,
+    body_echo,
+    body_image,
+    centred_motion,
+    chip_about,
+    find_body,
+    known_body,
+)
 from torchsar.multichannel.migration import Frame
 from torchsar.multichannel.motion import PointMotion
 
@@ -43,7 +52,14 @@ def test_segments_are_inverted() -> None:
     few = replace(whole, bins=torch.tensor([2, 3, 4]))
     assert few.of(x).shape == (3, 2, 11, 3)
     torch.testing.assert_close(few.back(few.of(tone[None]))[0, 48:-48], tone[48:-48], atol=1e-12, rtol=0)
-    assert float(few.back(few.of(tone[None] * torch.exp(2j * np.pi * 12 / 48 * torch.arange(240, dtype=torch.float64)))).abs()[0, 48:-48].max()) < 1e-12
+    assert (
+        float(
+            few.back(few.of(tone[None] * torch.exp(2j * np.pi * 12 / 48 * torch.arange(240, dtype=torch.float64))))
+            .abs()[0, 48:-48]
+            .max()
+        )
+        < 1e-12
+    )
 
 
 def test_the_echo_of_a_body_is_the_direct_sum() -> None:
@@ -51,7 +67,8 @@ def test_the_echo_of_a_body_is_the_direct_sum() -> None:
     frame = Frame.of(RADAR, data)
     body = known_body(data.data, frame, motion_of(), WIDE)
     assert bool(body.ok) and float(body.motion.u_r_m_s) == 7
-    assert left_db(clean.data, body_echo(body, frame)) < -20  # side lobes in range beyond the lines have -23 dB
+    # side lobes in range beyond the lines have -23 dB
+    assert left_db(clean.data, body_echo(body, frame)) < -20
     assert body_echo(body, frame).dtype == torch.complex128
 
 
@@ -65,8 +82,12 @@ def test_everything_is_the_data_of_its_lines_and_tones() -> None:
 def test_the_place_and_amplitude_of_a_point() -> None:
     data, _ = noisy_point()
     frame = Frame.of(RADAR, data)
-    body = known_body(data.data, frame, motion_of(y0=10.0, r0=5003.0), EXTRACTION)  # the middle is put right, the velocity kept
-    assert float(body.motion.y0_m) == pytest.approx(20.0, abs=0.05) and float(body.motion.range_m) == pytest.approx(5010.0, abs=0.5)
+    body = known_body(
+        data.data, frame, motion_of(y0=10.0, r0=5003.0), EXTRACTION
+    )  # the middle is put right, the velocity kept
+    assert float(body.motion.y0_m) == pytest.approx(20.0, abs=0.05) and float(body.motion.range_m) == pytest.approx(
+        5010.0, abs=0.5
+    )
     place = torch.linspace(10.0, 30.0, 81, dtype=torch.float64)
     image = body_image(body, place, EXTRACTION).abs()
     row, line = divmod(int(image.argmax()), image.shape[1])
@@ -78,7 +99,9 @@ def test_a_ship_on_a_sea_is_found_with_its_velocity() -> None:
     data = frame_of({"one": ship(8.0, 5.0)})
     alone = frame_of({"one": ship(8.0, 5.0)}, sea=False)
     frame, true = Frame.of(RADAR, data), motion_of(8.0, 5.0, 0.0, 5000.0)
-    body = find_body(data.data, frame, float(true.image_s) + 0.02, float(true.closest_m) + 3.0, EXTRACTION, u_a_half_m_s=12.0)
+    body = find_body(
+        data.data, frame, float(true.image_s) + 0.02, float(true.closest_m) + 3.0, EXTRACTION, u_a_half_m_s=12.0
+    )
     assert bool(body.ok) and abs(float(body.motion.u_r_m_s) - 8) < 0.5 and abs(float(body.motion.u_a_m_s) - 5) < 1.0
     assert abs(float(body.motion.u_r_m_s) - 8) < 6 * float(body.u_r_std_m_s) + 0.1
     own = centred_motion(chip_about(alone.data, frame, true, EXTRACTION))
@@ -89,7 +112,9 @@ def test_a_ship_on_a_sea_is_found_with_its_velocity() -> None:
 def test_a_body_that_cannot_be_found_is_not_ok() -> None:
     data = frame_of({}, seed=4)
     body = find_body(data.data, Frame.of(RADAR, data), 0.0, 5000.0, EXTRACTION)
-    assert not bool(body.ok) and all(bool(torch.isfinite(getattr(body.motion, name))) for name in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m"))
+    assert not bool(body.ok) and all(
+        bool(torch.isfinite(getattr(body.motion, name))) for name in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
+    )
     silent = find_body(torch.zeros_like(data.data), Frame.of(RADAR, data), 0.0, 5000.0, EXTRACTION)
     assert not bool(silent.ok) and bool(torch.isfinite(silent.level)) and bool(torch.isfinite(silent.motion.u_r_m_s))
 

@@ -43,7 +43,12 @@ def test_contrast_is_the_mean_of_a_neighbourhood_over_the_median() -> None:
     data[120:180, 10:12] = 3.0
     level, (rows, columns) = contrast(Signal(data, AXES))
     i, j = int((rows - (149.5 - 400)).abs().argmin()), int((columns - 5052.5).abs().argmin())
-    assert rows[i] == 149.5 - 400 and columns[j] == 5052.5 and float(level[i, j]) == pytest.approx(9.0) and float(level.median()) == 1
+    assert (
+        rows[i] == 149.5 - 400
+        and columns[j] == 5052.5
+        and float(level[i, j]) == pytest.approx(9.0)
+        and float(level.median()) == 1
+    )
 
 
 def test_nothing_is_found_in_speckle_or_silence_and_trials_are_refused() -> None:

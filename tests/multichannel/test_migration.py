@@ -12,7 +12,15 @@ from tests.multichannel.helpers import compressed_echo, published_radar
 from torchsar.core import Signal
 from torchsar.metrics import impulse_response
 from torchsar.multichannel.azimuth import focus_azimuth, image_axis
-from torchsar.multichannel.migration import CorrectMigration, Frame, Keystone, NoMigration, StaticBulk, ambiguity_number, correct_migration
+from torchsar.multichannel.migration import (
+    CorrectMigration,
+    Frame,
+    Keystone,
+    NoMigration,
+    StaticBulk,
+    ambiguity_number,
+    correct_migration,
+)
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.reconstruct import doppler_axis, reconstruct_lines
 from torchsar.multichannel.response import LeastSquares
@@ -26,10 +34,15 @@ def motion(u_r=0.0, u_a=0.0, y0=0.0, r0=None, radar=RADAR):
 
 
 def figures(signal, of, range_m):
-    """Widths on x = v t and on c tau / 2, and the peak, of the image of a target with its true motion."""
+    """Widths on x = v t and on c tau / 2, and the peak, of the image of a target with its true
+    motion.
+    """
     spectrum = reconstruct_lines(signal.data, RADAR, of, LeastSquares())
     doppler, lines = doppler_axis(RADAR, N, 2), signal.axis("range")
-    image = Signal(focus_azimuth(spectrum.mT, doppler.values(), RADAR, of).mT, (image_axis(RADAR, doppler), replace(lines, start=lines.start / 2, step=lines.step / 2)))
+    image = Signal(
+        focus_azimuth(spectrum.mT, doppler.values(), RADAR, of).mT,
+        (image_axis(RADAR, doppler), replace(lines, start=lines.start / 2, step=lines.step / 2)),
+    )
     return impulse_response(image, (float(of.image_s) * RADAR.speed_m_s, range_m / 2), search_m=6.0)
 
 
@@ -62,19 +75,26 @@ def test_as_good_as_with_the_true_motion(move, loss_db):
     assert got["pslr_range_db"] == pytest.approx(-13.3, abs=0.2)
     assert 2 * got["position_range_m"] == pytest.approx(lies_at, abs=0.2)
     if move == {"u_r": 10.0}:  # brief 001: 0.793 and 2.647 m
-        assert got["irw_azimuth_m"] == pytest.approx(0.793, abs=0.004) and got["irw_range_m"] == pytest.approx(2.647, abs=0.02)
+        assert got["irw_azimuth_m"] == pytest.approx(0.793, abs=0.004) and got["irw_range_m"] == pytest.approx(
+            2.647, abs=0.02
+        )
 
 
 def test_what_the_simpler_forms_lose():
     move = {"u_r": 10.0, "r0": 5400.0}
     signal, of = compressed_echo(RADAR, N, 256, [move]), motion(**move)
-    whole, bulk, fixed, none = (figures(corrected(signal, motion(), m), of, 5400.0) for m in (Keystone(), StaticBulk(), Keystone(whole_swath=False), NoMigration()))
+    whole, bulk, fixed, none = (
+        figures(corrected(signal, motion(), m), of, 5400.0)
+        for m in (Keystone(), StaticBulk(), Keystone(whole_swath=False), NoMigration())
+    )
     loss = [20 * math.log10(whole["peak"].abs() / f["peak"].abs()) for f in (fixed, bulk, none)]
     assert 0.2 < loss[0] < 0.6 and loss[1] > 10 and loss[2] > 8
 
 
 def test_moving_envelopes_are_foretold():
-    """Neglected migration against where the strongest cell of a pulse at the edge of the aperture lies."""
+    """Neglected migration against where the strongest cell of a pulse at the edge of the aperture
+    lies.
+    """
     move = {"u_r": 12.0, "r0": 5600.0}
     signal, of = compressed_echo(RADAR, N, 512, [move]), motion(**move)
     for migration in (NoMigration(), StaticBulk(False), Keystone(False)):
@@ -99,7 +119,10 @@ def test_a_reference_that_moves_needs_no_ambiguity_number():
     signal, of = compressed_echo(RADAR, N, 128, [{"u_r": 30.0, "u_a": 8.0}]), motion(30.0, 8.0)
     assert float(ambiguity_number(RADAR, of, of)) == 0
     stage = CorrectMigration(RADAR)
-    got, best = figures(stage(signal, u_r_m_s=30.0, u_a_m_s=8.0), of, 5000.0), figures(corrected(signal, of, StaticBulk()), of, 5000.0)
+    got, best = (
+        figures(stage(signal, u_r_m_s=30.0, u_a_m_s=8.0), of, 5000.0),
+        figures(corrected(signal, of, StaticBulk()), of, 5000.0),
+    )
     assert got["peak"].abs() == pytest.approx(float(best["peak"].abs()), rel=2e-3)
 
 
@@ -126,7 +149,12 @@ def test_gradients(migration):
     def run(data, u_r):
         return correct_migration(data, frame, PointMotion.of(radar, data, u_r, 0.0, 100.0), migration)
 
-    assert torch.autograd.gradcheck(run, (signal.data.requires_grad_(), torch.tensor(4.0, dtype=torch.float64, requires_grad=True)), atol=1e-5, fast_mode=True)
+    assert torch.autograd.gradcheck(
+        run,
+        (signal.data.requires_grad_(), torch.tensor(4.0, dtype=torch.float64, requires_grad=True)),
+        atol=1e-5,
+        fast_mode=True,
+    )
 
 
 def test_refuses_data_of_other_axes():

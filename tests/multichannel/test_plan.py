@@ -8,7 +8,15 @@ import pytest
 import torch
 
 from torchsar.core import Signal
-from torchsar.multichannel import ElementPattern, FocusAzimuth, FocusPlan, LeastSquares, MinimumMeanSquare, PointMotion, Reconstruct
+from torchsar.multichannel import (
+    ElementPattern,
+    FocusAzimuth,
+    FocusPlan,
+    LeastSquares,
+    MinimumMeanSquare,
+    PointMotion,
+    Reconstruct,
+)
 from torchsar.multichannel.plan import AzimuthPlan
 from torchsar.multichannel.response import Rebuild
 from torchsar.radar import BistaticRadar, LinearFM
@@ -17,17 +25,26 @@ F64 = torch.float64
 
 
 def receiver(**changes: object) -> BistaticRadar:
-    values: dict = {"sampling_hz": 60e6, "prf_hz": 180.0, "speed_m_s": 300.0, "reference_range_m": 5000.0, "wave_speed_m_s": 3e8}
+    values: dict = {
+        "sampling_hz": 60e6,
+        "prf_hz": 180.0,
+        "speed_m_s": 300.0,
+        "reference_range_m": 5000.0,
+        "wave_speed_m_s": 3e8,
+    }
     return BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), **{**values, **changes})
 
 
 @pytest.mark.parametrize("n", [90, 91])
-@pytest.mark.parametrize("rebuild", [LeastSquares(1), LeastSquares(2), LeastSquares(3), MinimumMeanSquare(5, 40.0, ElementPattern())])
+@pytest.mark.parametrize(
+    "rebuild", [LeastSquares(1), LeastSquares(2), LeastSquares(3), MinimumMeanSquare(5, 40.0, ElementPattern())]
+)
 @pytest.mark.parametrize("u_r", [0.0, 7.0, -19.3, 180.0 * 0.24 / 90 * 8])
 def test_a_plan_is_the_chain_of_two_stages(n: int, rebuild: Rebuild, u_r: float) -> None:
     radar = receiver(channel_m=(-0.8, 0.0, 0.75))
     data = torch.randn(2, 3, n, dtype=torch.complex128, generator=torch.Generator().manual_seed(1))
-    centre = round(u_r / 0.24 * n / 180) * 180 / n * 0.24  # a velocity whose Doppler is that of a bin
+    # a velocity whose Doppler is that of a bin
+    centre = round(u_r / 0.24 * n / 180) * 180 / n * 0.24
     values = {"u_r_m_s": centre, "u_a_m_s": 4.0, "y0_m": 30.0}
     signal = Signal(data, radar.axes(n))
     expected = FocusAzimuth(radar)(Reconstruct(radar, rebuild)(signal, **values), **values)
@@ -61,7 +78,9 @@ def test_gradients_and_refusals() -> None:
 
 
 def test_an_image_costs_little_more_than_its_transforms() -> None:
-    """At most three times (measured 2 to 2.5); the best of many turns on a machine that others use."""
+    """At most three times (measured 2 to 2.5); the best of many turns on a machine that
+    others use.
+    """
     radar = receiver()
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

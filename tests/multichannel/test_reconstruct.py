@@ -20,11 +20,15 @@ quiet = pytest.mark.filterwarnings("ignore:at a pulse rate of")
 
 
 def smooth_echo(radar, time_s, u_r=0.0, u_a=0.0, y0=0.0, width_s=0.8):
-    """(channel, time): a Gaussian amplitude that each channel sees as late as its phases, so that no band overflows."""
+    """(channel, time): a Gaussian amplitude that each channel sees as late as its phases, so that
+    no band overflows.
+    """
     v = 300 - u_a
     delay = torch.tensor(radar.channel_m, dtype=F64)[:, None] * v / (v**2 + u_r**2)
     amplitude = torch.exp(-(((time_s - y0 / v - delay) / width_s) ** 2))
-    return amplitude * torch.exp(-2j * math.pi * torch.remainder((range_of(radar, time_s, u_r, u_a, y0) - 5000) / radar.wavelength_m, 1))
+    return amplitude * torch.exp(
+        -2j * math.pi * torch.remainder((range_of(radar, time_s, u_r, u_a, y0) - 5000) / radar.wavelength_m, 1)
+    )
 
 
 def full_band(radar, n, bands, move):
@@ -36,26 +40,36 @@ def full_band(radar, n, bands, move):
 
 
 @quiet
-@pytest.mark.parametrize("move", [(0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (-20.0, 0.0, 0.0), (10.0, 5.0, 150.0), (20.0, 8.0, -80.0)])
+@pytest.mark.parametrize(
+    "move", [(0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (-20.0, 0.0, 0.0), (10.0, 5.0, 150.0), (20.0, 8.0, -80.0)]
+)
 @pytest.mark.parametrize("n", [900, 901])
-@pytest.mark.parametrize("rebuild", [LeastSquares(2), LeastSquares(3), MinimumMeanSquare(4, 60.0)], ids=["two", "three", "prior"])
+@pytest.mark.parametrize(
+    "rebuild", [LeastSquares(2), LeastSquares(3), MinimumMeanSquare(4, 60.0)], ids=["two", "three", "prior"]
+)
 def test_rebuilds_the_spectrum_of_fast_sampling(rebuild, n, move):
     for channels in ((-0.8, 0.0, 0.8), (-0.8, 0.0, 0.75)):
         radar = published_radar(prf_hz=200.0, channel_m=channels)
         found = reconstruct(smooth_echo(radar, time_of(radar, n), *move), radar, motion_of(radar, *move), rebuild)
         expected = full_band(radar, n, rebuild.bands, move)
-        assert float((found - expected).norm() / expected.norm()) < (0.025 if isinstance(rebuild, LeastSquares) else 0.05)
+        assert float((found - expected).norm() / expected.norm()) < (
+            0.025 if isinstance(rebuild, LeastSquares) else 0.05
+        )
 
 
 def test_one_channel_and_one_band():
     radar = published_radar(channel_m=(0.0,), prf_hz=400.0)
-    found = Reconstruct(radar, LeastSquares(1))(Signal(smooth_echo(radar, time_of(radar, 1600), 10.0), radar.axes(1600)), u_r_m_s=10.0).data
+    found = Reconstruct(radar, LeastSquares(1))(
+        Signal(smooth_echo(radar, time_of(radar, 1600), 10.0), radar.axes(1600)), u_r_m_s=10.0
+    ).data
     torch.testing.assert_close(found, full_band(radar, 1600, 1, (10.0, 0.0, 0.0)), atol=1e-6, rtol=0)
 
 
 @quiet
 @pytest.mark.parametrize("name", ["u_r_m_s", "u_a_m_s", "y0_m"])
-@pytest.mark.parametrize("rebuild", [LeastSquares(2), LeastSquares(3), MinimumMeanSquare()], ids=["two", "three", "prior"])
+@pytest.mark.parametrize(
+    "rebuild", [LeastSquares(2), LeastSquares(3), MinimumMeanSquare()], ids=["two", "three", "prior"]
+)
 def test_trials_with_one_value_each(rebuild, name):
     """Any of the values alone may have trials."""
     radar, values = published_radar(), torch.tensor([3.0, -8.0], dtype=F64)
@@ -63,7 +77,9 @@ def test_trials_with_one_value_each(rebuild, name):
     stage = Reconstruct(radar, rebuild)
     together = stage(Signal(data, radar.axes(64)), **{name: values}).data
     for i in range(2):
-        torch.testing.assert_close(together[i], stage(Signal(data[i], radar.axes(64)), **{name: float(values[i])}).data, atol=1e-9, rtol=0)
+        torch.testing.assert_close(
+            together[i], stage(Signal(data[i], radar.axes(64)), **{name: float(values[i])}).data, atol=1e-9, rtol=0
+        )
 
 
 @quiet
@@ -72,7 +88,9 @@ def test_range_lines_are_rebuilt_one_by_one():
     motion = PointMotion.of(radar, data, torch.tensor([3.0, -8.0], dtype=F64))
     for rebuild in (LeastSquares(2), MinimumMeanSquare()):
         together = reconstruct_lines(data, radar, motion, rebuild)
-        torch.testing.assert_close(together[..., 4], reconstruct(data[..., 4], radar, motion, rebuild), atol=1e-10, rtol=0)
+        torch.testing.assert_close(
+            together[..., 4], reconstruct(data[..., 4], radar, motion, rebuild), atol=1e-10, rtol=0
+        )
         out = Reconstruct(radar, rebuild)(Signal(data, radar.axes(50, 6)), u_r_m_s=motion.u_r_m_s)
         assert out.names == ("doppler", "range") and torch.equal(out.data, together)
 
@@ -102,7 +120,9 @@ def test_single_precision_agrees():
     radar = published_radar()
     data = azimuth_echo(radar, 900, 10.0)
     for bands, most_db in ((2, -125), (3, -115)):
-        double, single = (reconstruct(x, radar, motion_of(radar, 10.0), LeastSquares(bands)) for x in (data, data.to(torch.complex64)))
+        double, single = (
+            reconstruct(x, radar, motion_of(radar, 10.0), LeastSquares(bands)) for x in (data, data.to(torch.complex64))
+        )
         assert single.dtype == torch.complex64
         assert 20 * math.log10(float((single - double).norm() / double.norm())) < most_db
 
@@ -111,7 +131,12 @@ def test_single_precision_agrees():
 def test_channels_at_the_same_places_are_refused(prf, u_a):
     radar = published_radar(prf_hz=prf)
     signal = Signal(azimuth_echo(radar, 90), radar.axes(90))
-    with pytest.raises(ValueError, match=f"pulse rate of {prf:g} Hz and a speed past the target of {300 - u_a:g} m/s .* 3 bands cannot be told apart"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            f"pulse rate of {prf:g} Hz and a speed past the target of {300 - u_a:g} m/s .* 3 bands cannot be told apart"
+        ),
+    ):
         Reconstruct(radar, LeastSquares(3))(signal, u_a_m_s=u_a)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # two bands, or a prior, take it
@@ -142,10 +167,14 @@ def test_refusals():
     with pytest.raises(ValueError, match="4 Doppler bands cannot be told apart by 3 channels"):
         Reconstruct(radar, LeastSquares(4))
     with pytest.raises(ValueError, match="expects 3 channels .* got data with 2"):
-        Reconstruct(radar)(Signal(torch.ones(2, 8, dtype=torch.complex64), published_radar(channel_m=(0.0, 1.0)).axes(8)))
+        Reconstruct(radar)(
+            Signal(torch.ones(2, 8, dtype=torch.complex64), published_radar(channel_m=(0.0, 1.0)).axes(8))
+        )
     channel, pulse = radar.axes(90)
     with pytest.raises(ValueError, match="slow time must be zero at pulse 40 of 80"):
-        Reconstruct(radar)(Signal(torch.ones(3, 80, dtype=torch.complex64), (channel, Axis("pulse", 80, pulse.start, pulse.step, "s"))))
+        Reconstruct(radar)(
+            Signal(torch.ones(3, 80, dtype=torch.complex64), (channel, Axis("pulse", 80, pulse.start, pulse.step, "s")))
+        )
     signal = Signal(torch.ones(3, 90, dtype=torch.complex64), radar.axes(90))
     for name in ("u_r_m_s", "u_a_m_s", "y0_m"):
         with pytest.raises(ValueError, match=f"NaN or Inf in {name}"):

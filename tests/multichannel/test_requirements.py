@@ -1,4 +1,6 @@
-"""Limits and requirements against the figures of brief 001, and against replicas measured in images."""
+"""Limits and requirements against the figures of brief 001, and against replicas measured in
+images.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,12 @@ from torchsar.metrics import replica_level, replica_zones
 from torchsar.multichannel.azimuth import focus_azimuth
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.reconstruct import reconstruct
-from torchsar.multichannel.requirements import MultichannelUse, multichannel_limits, multichannel_requirements, singular_speeds_m_s
+from torchsar.multichannel.requirements import (
+    MultichannelUse,
+    multichannel_limits,
+    multichannel_requirements,
+    singular_speeds_m_s,
+)
 from torchsar.multichannel.response import LeastSquares, MinimumMeanSquare, doppler_offsets
 
 RADAR = published_radar(transmit_range=(-243.0, 0.0208, 1e-6, 1e-9))
@@ -35,11 +42,17 @@ def test_the_default_of_two_bands_passes():
     assert all(row.ok for row in rows.values()), [row.sentence for row in rows.values() if not row.ok]
 
 
-# changes, radar changes, name of the row, verdict: every line of "Refuse or warn" that can be predicted
+# changes, radar changes, name of the row, verdict: every line of "Refuse or warn" that can be
+# predicted
 CASES = [
     ({"rebuild": LeastSquares(3), **STILL}, {"prf_hz": 187.5}, "condition number at rest", "refuse"),
     ({"rebuild": LeastSquares(3), **STILL}, {}, "condition number within the velocities", "warn"),
-    ({"rebuild": LeastSquares(3), "u_a_m_s": (-20.0, 20.0)}, {}, "singular speeds along track within the search", "warn"),
+    (
+        {"rebuild": LeastSquares(3), "u_a_m_s": (-20.0, 20.0)},
+        {},
+        "singular speeds along track within the search",
+        "warn",
+    ),
     ({"rebuild": LeastSquares(4)}, {}, "channels", "refuse"),
     ({"u_a_m_s": (0.0, 300.0)}, {}, "speed past the fastest target", "refuse"),
     ({"n_pulse": 800}, {}, "record", "refuse"),
@@ -64,14 +77,24 @@ def test_each_limit_speaks(changes, radar, name, verdict):
 
 
 def test_sentences_name_what_makes_a_reconstruction_singular():
-    assert "187.5 Hz" in limits(published_radar(prf_hz=187.5), rebuild=LeastSquares(3), **STILL)["condition number at rest"].sentence
-    assert "u_a = 12 m/s" in limits(rebuild=LeastSquares(3), u_a_m_s=(-20.0, 20.0))["singular speeds along track within the search"].sentence
+    assert (
+        "187.5 Hz"
+        in limits(published_radar(prf_hz=187.5), rebuild=LeastSquares(3), **STILL)["condition number at rest"].sentence
+    )
+    assert (
+        "u_a = 12 m/s"
+        in limits(rebuild=LeastSquares(3), u_a_m_s=(-20.0, 20.0))[
+            "singular speeds along track within the search"
+        ].sentence
+    )
 
 
 def test_thresholds_where_the_brief_has_them():
     assert limits(snr_db=-14.0)["SNR gathered over channels and pulses"].ok
     assert limits(n_pulse=1800, pattern=True, **STILL)["record with a pattern"].limit == pytest.approx(9.6)
-    assert limits(rebuild=LeastSquares(3), **STILL)["condition number within the velocities"].value == pytest.approx(10.2, abs=0.1)
+    assert limits(rebuild=LeastSquares(3), **STILL)["condition number within the velocities"].value == pytest.approx(
+        10.2, abs=0.1
+    )
     assert limits(dtype=torch.complex128)["condition number at rest"].limit == 1e6
     assert "condition number at rest" not in limits(rebuild=MinimumMeanSquare(5))
 
@@ -80,7 +103,9 @@ def test_singular_speeds():
     assert singular_speeds_m_s(RADAR, 3, (-20.0, 20.0)) == pytest.approx([12.0])
     assert singular_speeds_m_s(RADAR, 2, (-20.0, 20.0)) == []
     assert singular_speeds_m_s(published_radar(channel_m=(-0.8, 0.0, 0.75)), 3, (-20.0, 20.0)) == []
-    assert singular_speeds_m_s(published_radar(channel_m=(-1.6, -0.8, 0.0, 0.8, 1.6)), 3, (-20.0, 20.0)) == pytest.approx([12.0])
+    assert singular_speeds_m_s(
+        published_radar(channel_m=(-1.6, -0.8, 0.0, 0.8, 1.6)), 3, (-20.0, 20.0)
+    ) == pytest.approx([12.0])
     assert singular_speeds_m_s(published_radar(channel_m=(0.0, 1.6)), 2, (-20.0, 20.0)) == pytest.approx([12.0])
 
 
@@ -104,8 +129,14 @@ def test_phases_of_the_brief():
         assert rows[effect].phase_rad == pytest.approx(phase, rel=0.1), effect
     assert rows["transmit range of order 2"].phase_rad < 2e-3
     assert rows["channels as delays of one another"].phase_rad < 0.03
-    assert rows["one reference range"].range_cells == pytest.approx(0.25, rel=0.01) and not needs(swath_m=170.0)["one reference range"].ok
-    assert {effect for effect in rows if not rows[effect].ok} >= {*known} - {"motion in the slant plane"} | {"no range migration correction", "static bulk correction"}
+    assert (
+        rows["one reference range"].range_cells == pytest.approx(0.25, rel=0.01)
+        and not needs(swath_m=170.0)["one reference range"].ok
+    )
+    assert {effect for effect in rows if not rows[effect].ok} >= {*known} - {"motion in the slant plane"} | {
+        "no range migration correction",
+        "static bulk correction",
+    }
     assert needs(**STILL)["parabolic receive range"].phase_rad == pytest.approx(5.4, rel=0.05)
     assert needs(**STILL)["static bulk correction"].ok and not needs(**STILL)["no range migration correction"].ok
     assert needs(integration_s=0.5, **STILL)["no range migration correction"].ok
@@ -139,13 +170,22 @@ def test_predicted_replicas_are_those_of_images(bands, error):
     profile = focus_azimuth(spectrum, doppler_offsets(n, bands, 180.0), radar, motion, 337.5)
     zones = replica_zones(radar, bands, 0.0, integration_s=4.5, focused_at=(error, 0.0))
     measured = float(replica_level(profile, 300 / (bands * 180), zones)["mfta_db"])
-    row = next(row for name, row in needs(radar, rebuild=LeastSquares(bands), u_r_error_m_s=error, **STILL).items() if name.startswith("u_r wrong"))
+    row = next(
+        row
+        for name, row in needs(radar, rebuild=LeastSquares(bands), u_r_error_m_s=error, **STILL).items()
+        if name.startswith("u_r wrong")
+    )
     assert float(row.neglects.split("at ")[1].split(" dB")[0]) == pytest.approx(measured, abs=3.5)
 
 
 @pytest.mark.parametrize(
     ("changes", "match"),
-    [({"u_r_m_s": (5.0, -5.0)}, "in order"), ({"n_pulse": 0}, "n_pulse of 1 or more"), ({"y0_m": math.nan}, "y0_m=nan"), ({"u_a_m_s": (0.0, math.inf)}, "finite")],
+    [
+        ({"u_r_m_s": (5.0, -5.0)}, "in order"),
+        ({"n_pulse": 0}, "n_pulse of 1 or more"),
+        ({"y0_m": math.nan}, "y0_m=nan"),
+        ({"u_a_m_s": (0.0, math.inf)}, "finite"),
+    ],
 )
 def test_refusals(changes, match):
     with pytest.raises(ValueError, match=match):

@@ -1,4 +1,6 @@
-"""The channel response and the weights that tell Doppler bands apart, against the tables of brief 001 and matrices written out."""
+"""The channel response and the weights that tell Doppler bands apart, against the tables of brief
+001 and matrices written out.
+"""
 
 from __future__ import annotations
 
@@ -62,12 +64,16 @@ def test_the_singular_pulse_rate_moves_with_the_target():
     u_a = torch.tensor([5.0, 10.0, 11.0, 12.0], dtype=F64)
     found = condition_number(radar, PointMotion.of(radar, u_a, u_a_m_s=u_a), 3)
     assert found.tolist() == pytest.approx([17.2, 59.1, 117.8, math.inf], rel=0.01)
-    assert float(condition_number(published_radar(prf_hz=187.5, channel_m=(-0.4, 0.4)), motion_of(radar), 2)) == pytest.approx(1, abs=1e-6)
+    assert float(
+        condition_number(published_radar(prf_hz=187.5, channel_m=(-0.4, 0.4)), motion_of(radar), 2)
+    ) == pytest.approx(1, abs=1e-6)
     # five channels half as far apart are of no help, uneven places are
     five = published_radar(channel_m=(-1.6, -0.8, 0.0, 0.8, 1.6))
     assert float(condition_number(five, motion_of(five, u_a=12.0), 3)) == math.inf
     uneven = published_radar(channel_m=(-0.8, 0.0, 0.75))
-    assert [float(condition_number(uneven, motion_of(uneven), n)) for n in (3, 2)] == pytest.approx([5.8, 1.39], rel=0.01)
+    assert [float(condition_number(uneven, motion_of(uneven), n)) for n in (3, 2)] == pytest.approx(
+        [5.8, 1.39], rel=0.01
+    )
     assert float(condition_number(radar, motion_of(radar), 4)) == math.inf
 
 
@@ -83,9 +89,14 @@ def test_response_is_the_printed_formula(move, bands, n):
     torch.testing.assert_close(found, printed_response(radar, f, *move), atol=1e-10, rtol=0)
 
 
-@pytest.mark.parametrize(("move", "worst_rad"), [((0.0, 0.0, 0.0), 1e-6), ((10.0, 0.0, 0.0), 0.012), ((20.0, 0.0, 0.0), 0.03), ((10.0, 5.0, 150.0), 0.015)])
+@pytest.mark.parametrize(
+    ("move", "worst_rad"),
+    [((0.0, 0.0, 0.0), 1e-6), ((10.0, 0.0, 0.0), 0.012), ((20.0, 0.0, 0.0), 0.03), ((10.0, 5.0, 150.0), 0.015)],
+)
 def test_response_against_exact_ranges(move, worst_rad):
-    """R_m(t) = R(t - dx / v_e) + C / (2 R0): the phase that the formula leaves over an aperture (brief 001, Signal model)."""
+    """R_m(t) = R(t - dx / v_e) + C / (2 R0): the phase that the formula leaves over an aperture
+    (brief 001, Signal model).
+    """
     radar = published_radar()
     u_r, u_a, y0 = move
     t = torch.linspace(-2.25, 2.25, 201, dtype=F64) + y0 / (300 - u_a)
@@ -103,12 +114,23 @@ def test_34_against_27_with_k1_left_in_the_data():
     radar = published_radar(transmit_range=(k1,))
     data, motion = azimuth_echo(radar, LONG, u_r), motion_of(radar, u_r)
     for rebuild, most in ((LeastSquares(3), -52.0), (LeastSquares(2), -64.0)):
-        image = torch.fft.fftshift(torch.fft.ifft(torch.fft.ifftshift(spectrum_by(printed_34, data, radar, rebuild, u_r, k1) * flat_filter(radar, motion, rebuild))))
+        image = torch.fft.fftshift(
+            torch.fft.ifft(
+                torch.fft.ifftshift(
+                    spectrum_by(printed_34, data, radar, rebuild, u_r, k1) * flat_filter(radar, motion, rebuild)
+                )
+            )
+        )
         own = focused(data, radar, motion, rebuild, left_k1=k1)
         assert figures_of(own, radar, rebuild.bands, u_r).mfta_db < most
         torch.testing.assert_close(own.abs(), image.abs(), atol=1e-7 * float(image.abs().max()), rtol=0)
         wrong = spectrum_by(printed_27, data, radar, rebuild, u_r, k1) * flat_filter(radar, motion, rebuild)
-        assert figures_of(torch.fft.fftshift(torch.fft.ifft(torch.fft.ifftshift(wrong))), radar, rebuild.bands, u_r).mfta_db > -8
+        assert (
+            figures_of(
+                torch.fft.fftshift(torch.fft.ifft(torch.fft.ifftshift(wrong))), radar, rebuild.bands, u_r
+            ).mfta_db
+            > -8
+        )
 
 
 def printed_34(radar, f, u_r, u_a, k1):
@@ -148,7 +170,12 @@ def test_least_mean_square_error_written_out():
     matrix = band_matrix(radar, motion, bands)
     for i in range(n):
         offset = [(first_bin(n, bands) + b * n + i) * 180 / n for b in range(bands)]
-        pattern = torch.diag(torch.tensor([(math.sin(math.pi * x) / (math.pi * x) if x else 1.0) ** 2 for x in (0.8 * f / 295 for f in offset)], dtype=C128))
+        pattern = torch.diag(
+            torch.tensor(
+                [(math.sin(math.pi * x) / (math.pi * x) if x else 1.0) ** 2 for x in (0.8 * f / 295 for f in offset)],
+                dtype=C128,
+            )
+        )
         expected = pattern @ matrix.mH @ torch.linalg.inv(matrix @ pattern @ matrix.mH + 1e-4 * torch.eye(3))
         torch.testing.assert_close(weights[i], expected, atol=1e-9, rtol=0)
 
@@ -160,13 +187,23 @@ def test_least_mean_square_becomes_the_inverse_without_noise():
     torch.testing.assert_close(weights, LeastSquares(3).weights(radar, motion, 8).expand(8, 3, 3), atol=1e-6, rtol=0)
     # bands without expected power come out empty
     empty = MinimumMeanSquare(3, 40.0, FlatBand(100.0)).weights(radar, motion, 8)
-    assert float(empty[:, 0].abs().max()) == 0 == float(empty[:, 2].abs().max()) and float(empty[4, 1].abs().max()) > 0.3
+    assert (
+        float(empty[:, 0].abs().max()) == 0 == float(empty[:, 2].abs().max()) and float(empty[4, 1].abs().max()) > 0.3
+    )
 
 
 def test_weights_of_trials_and_their_gradients():
     radar = published_radar()
-    u_r, u_a = torch.tensor([10.0, -3.0], dtype=F64, requires_grad=True), torch.tensor([5.0, -7.0], dtype=F64, requires_grad=True)
-    for rebuild in (LeastSquares(2), LeastSquares(3), MinimumMeanSquare(5, 20.0), MinimumMeanSquare(2, 20.0, ElementPattern())):
+    u_r, u_a = (
+        torch.tensor([10.0, -3.0], dtype=F64, requires_grad=True),
+        torch.tensor([5.0, -7.0], dtype=F64, requires_grad=True),
+    )
+    for rebuild in (
+        LeastSquares(2),
+        LeastSquares(3),
+        MinimumMeanSquare(5, 20.0),
+        MinimumMeanSquare(2, 20.0, ElementPattern()),
+    ):
 
         def weights(u_r, u_a, rebuild=rebuild):
             return rebuild.weights(radar, PointMotion.of(radar, u_r, u_r, u_a), 4)
@@ -175,9 +212,13 @@ def test_weights_of_trials_and_their_gradients():
             return noise_gain_db(radar, PointMotion.of(radar, u_r, u_r, u_a), rebuild, 4)
 
         assert torch.autograd.gradcheck(weights, (u_r, u_a)) and torch.autograd.gradcheck(gain, (u_r, u_a))
-        together = rebuild.weights(radar, PointMotion.of(radar, u_a, 0.0, u_a), 4)  # only one of the values has trials
+        # only one of the values has trials
+        together = rebuild.weights(radar, PointMotion.of(radar, u_a, 0.0, u_a), 4)
         torch.testing.assert_close(together[1], rebuild.weights(radar, motion_of(radar, 0.0, -7.0), 4))
-        torch.testing.assert_close(noise_gain_db(radar, PointMotion.of(radar, u_a, 0.0, u_a), rebuild, 4)[1], noise_gain_db(radar, motion_of(radar, 0.0, -7.0), rebuild, 4))
+        torch.testing.assert_close(
+            noise_gain_db(radar, PointMotion.of(radar, u_a, 0.0, u_a), rebuild, 4)[1],
+            noise_gain_db(radar, motion_of(radar, 0.0, -7.0), rebuild, 4),
+        )
 
 
 def test_singular_weights_stay_finite():
@@ -199,5 +240,8 @@ def test_refusals():
         motion_of(published_radar(), 0.0, 300.0)
     with pytest.raises(ValueError, match="NaN or Inf in u_r_m_s"):
         motion_of(published_radar(), math.nan)
-    assert LeastSquares(2).refusal(1) == "2 Doppler bands cannot be told apart by 1 channel; rebuild at most 1, or give a prior (MinimumMeanSquare)"
+    assert (
+        LeastSquares(2).refusal(1)
+        == "2 Doppler bands cannot be told apart by 1 channel; rebuild at most 1, or give a prior (MinimumMeanSquare)"
+    )
     assert MinimumMeanSquare(5).refusal(1) is None

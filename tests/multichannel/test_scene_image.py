@@ -49,11 +49,18 @@ def test_a_ship_is_found_removed_and_put_in_its_place() -> None:
     assert abs(float(body.motion.u_r_m_s) - 8) < 0.5 and abs(float(body.motion.y0_m)) < 20
     shown = 300 * float(known().image_s)
     assert shown == pytest.approx(133, abs=1)
-    before, after = (ratio_db(near(image, shown, 5000.0) - near(still, shown, 5000.0), near(still, shown, 5000.0)) for image in (scene.conventional, scene.rest))
+    before, after = (
+        ratio_db(near(image, shown, 5000.0) - near(still, shown, 5000.0), near(still, shown, 5000.0))
+        for image in (scene.conventional, scene.rest)
+    )
     assert before > 15 and after < before - 23
     assert ratio_db(near(scene.fused, float(body.motion.y0_m), 5000.0, (40.0, 10.0)), near(still, 0.0, 5000.0)) > 10
     estimate = scene.estimate
-    assert estimate is not None and estimate.ok.tolist() == [True] + 7 * [False] and float(estimate["u_r_m_s"][0]) == float(body.motion.u_r_m_s)
+    assert (
+        estimate is not None
+        and estimate.ok.tolist() == [True] + 7 * [False]
+        and float(estimate["u_r_m_s"][0]) == float(body.motion.u_r_m_s)
+    )
     assert float(estimate["u_r_m_s"][1:].abs().max()) == 0
 
 
@@ -72,24 +79,35 @@ def test_a_known_motion_is_kept() -> None:
 def test_zeroing_takes_the_sea_along() -> None:
     still, zero = StationaryImage(RADAR)(scenes()[1]), flow(removal="zero")(scenes()[0], known=[known()])
     shown = 300 * float(known().image_s)
-    left = [ratio_db(near(scene.rest, shown, 5000.0) - near(still, shown, 5000.0), near(still, shown, 5000.0)) for scene in (made(), zero)]
+    left = [
+        ratio_db(near(scene.rest, shown, 5000.0) - near(still, shown, 5000.0), near(still, shown, 5000.0))
+        for scene in (made(), zero)
+    ]
     assert left[0] + 5 < left[1] < 1
 
 
 def test_a_ship_at_rest_stays_in_the_image() -> None:
     data = frame_of({"still": ship(0.0)})
     scene = flow()(data)
-    assert len(scene.bodies) == 1 and torch.equal(scene.rest.data, scene.conventional.data) and torch.equal(scene.fused.data, scene.rest.data)
+    assert (
+        len(scene.bodies) == 1
+        and torch.equal(scene.rest.data, scene.conventional.data)
+        and torch.equal(scene.fused.data, scene.rest.data)
+    )
 
 
 def test_a_placed_point_lies_as_high_as_one_at_rest() -> None:
     point = ship(length_m=0.0, range_cells=1, count=1, level_db=40.0)
     scene = flow()(frame_of({"one": point}, sea=False), known=[known()])
-    rest = StationaryImage(RADAR)(frame_of({"one": ship(0.0, length_m=0.0, range_cells=1, count=1, level_db=40.0)}, sea=False))
+    rest = StationaryImage(RADAR)(
+        frame_of({"one": ship(0.0, length_m=0.0, range_cells=1, count=1, level_db=40.0)}, sea=False)
+    )
     assert float(scene.fused.data.abs().max() / rest.data.abs().max()) == pytest.approx(1.0, abs=0.05)
     row, column = divmod(int(scene.fused.data.abs().argmax()), scene.fused.axes[1].n)
     azimuth, range_ = scene.fused.axes
-    assert float(azimuth.values()[row]) == pytest.approx(0.0, abs=1.0) and float(range_.values()[column]) == pytest.approx(5000.0, abs=2.6)
+    assert float(azimuth.values()[row]) == pytest.approx(0.0, abs=1.0) and float(
+        range_.values()[column]
+    ) == pytest.approx(5000.0, abs=2.6)
     empty = scene.rest.with_data(torch.zeros_like(scene.rest.data))
     assert float(placed(empty, scene.bodies[0], EXTRACTION).data[~((azimuth.values()).abs() < 70)].abs().max()) == 0
 
@@ -97,7 +115,11 @@ def test_a_placed_point_lies_as_high_as_one_at_rest() -> None:
 def test_nothing_is_found_where_nothing_moves() -> None:
     for data in (scenes()[1], scenes()[1].with_data(torch.zeros_like(scenes()[1].data))):
         scene = ImageMovers(RADAR, EXTRACTION)(data)
-        assert scene.bodies == [] and torch.equal(scene.rest.data, scene.fused.data) and bool(torch.isfinite(torch.view_as_real(scene.fused.data)).all())
+        assert (
+            scene.bodies == []
+            and torch.equal(scene.rest.data, scene.fused.data)
+            and bool(torch.isfinite(torch.view_as_real(scene.fused.data)).all())
+        )
 
 
 def test_side_lobes_of_a_ship_are_no_targets() -> None:
@@ -113,7 +135,9 @@ def test_side_lobes_of_a_ship_are_no_targets() -> None:
 def test_any_rebuild_serves_what_is_at_rest() -> None:
     for rebuild in (LeastSquares(1), MinimumMeanSquare(3)):
         scene = flow(rebuild=rebuild)(scenes()[0], known=[known()])
-        assert scene.rest.axes[0].n == rebuild.bands * 540 and bool(torch.isfinite(torch.view_as_real(scene.fused.data)).all())
+        assert scene.rest.axes[0].n == rebuild.bands * 540 and bool(
+            torch.isfinite(torch.view_as_real(scene.fused.data)).all()
+        )
 
 
 def test_mistakes_are_named() -> None:

@@ -1,4 +1,6 @@
-"""The signal intensity ratio against its printed formulas, the figures of brief 001 and Monte Carlo of its Table 2."""
+"""The signal intensity ratio against its printed formulas, the figures of brief 001 and Monte Carlo
+of its Table 2.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,10 @@ def reference_spectrum(n_pulse: int, u_r: float, gate_s: float | None, bands: in
 
 
 def three_bands_of(n_pulse: int, u_r: float, gate_s: float | None) -> torch.Tensor:
-    """(channel, pulse) as Eq. (35) has them: the three bands seen by Eq. (34), and nothing beyond, aliased."""
+    """(channel, pulse) as Eq. (35) has them: the three bands seen by Eq.
+
+    (34), and nothing beyond, aliased.
+    """
     spectrum = reference_spectrum(n_pulse, u_r, gate_s)
     offset = (torch.arange(3 * n_pulse, dtype=F64) + first_bin(n_pulse, 3)) * 180 / n_pulse
     dx, square = torch.tensor(RADAR.channel_m, dtype=F64)[:, None], 300**2 + u_r**2
@@ -53,7 +58,11 @@ def ratios(data: torch.Tensor, u_r: list[float]) -> tuple[torch.Tensor, torch.Te
 
 
 def test_printed_formulas():
-    """Eqs. (37), (38) over a spectrum that no reconstruction touches: what is rebuilt from three bands is that spectrum."""
+    """Eqs.
+
+    (37), (38) over a spectrum that no reconstruction touches: what is rebuilt from three bands is
+    that spectrum.
+    """
     spectrum = reference_spectrum(900, 10.0, 4.5).abs()
     inside = ((torch.arange(2700) + first_bin(900, 3)) * 0.2).abs() <= BAND / 2
     power = (spectrum**2)[inside].sum() / ((spectrum**2).sum() - (spectrum**2)[inside].sum())
@@ -72,7 +81,9 @@ def test_peaks_over_the_value_at_rest(gate_s, published):
 
 
 def test_what_aliases_from_beyond_the_bands_lowers_the_peak():
-    """Direct echoes: what lies beyond three bands comes back through a matrix of condition 10 and noise gain 12 dB."""
+    """Direct echoes: what lies beyond three bands comes back through a matrix of condition 10 and
+    noise gain 12 dB.
+    """
     direct = ratios(azimuth_echo(RADAR, 3600, 10.0), [0.0, 10.0])
     assert [float(decibel(x[1] / x[0])) for x in direct] == pytest.approx((17.9, 10.1, 28.1), abs=0.2)
 
@@ -85,13 +96,17 @@ def test_the_ratio_has_no_steps():
     assert float(curve.diff().abs().max()) < 0.05
 
     def total(value: torch.Tensor) -> torch.Tensor:
-        return signal_intensity(data[..., None], RADAR, PointMotion.of(RADAR, data, value), LeastSquares(3), BAND).ratio.log()
+        return signal_intensity(
+            data[..., None], RADAR, PointMotion.of(RADAR, data, value), LeastSquares(3), BAND
+        ).ratio.log()
 
     at = torch.tensor(9.0, dtype=F64, requires_grad=True)
     total(at).backward()
     step = 1e-5
     assert at.grad is not None
-    assert float(at.grad) == pytest.approx(float(total(at.detach() + step) - total(at.detach() - step)) / (2 * step), rel=1e-3)
+    assert float(at.grad) == pytest.approx(
+        float(total(at.detach() + step) - total(at.detach() - step)) / (2 * step), rel=1e-3
+    )
 
 
 @pytest.mark.parametrize("u_r", [-14.0, 0.0, 10.0])
@@ -105,14 +120,24 @@ def test_noise_free_velocity(u_r):
 
 
 def noisy(radar, trials: int, raw_db: float, seed: int = 1) -> Signal:
-    """Echoes at u_r 10 m/s in white noise, SNR as before range compression (27 dB below that of a sample)."""
+    """Echoes at u_r 10 m/s in white noise, SNR as before range compression (27 dB below that of a
+    sample).
+    """
     n = round(5 * radar.prf_hz)
     noise = torch.randn(trials, 3, n, generator=torch.Generator().manual_seed(seed), dtype=torch.complex64)
     return Signal(azimuth_echo(radar, n, 10.0).to(torch.complex64) + 10 ** (-(raw_db + 27) / 20) * noise, radar.axes(n))
 
 
 # brief 001, Table 2, SIR trial
-TABLE = [(170.0, -20, 0.25), (170.0, -10, 0.08), (180.0, -20, 0.40), (180.0, -10, 0.05), (180.0, 0, 0.04), (190.0, -20, 2.0), (190.0, 0, 0.03)]
+TABLE = [
+    (170.0, -20, 0.25),
+    (170.0, -10, 0.08),
+    (180.0, -20, 0.40),
+    (180.0, -10, 0.05),
+    (180.0, 0, 0.04),
+    (190.0, -20, 2.0),
+    (190.0, 0, 0.03),
+]
 
 
 @pytest.mark.parametrize(("prf_hz", "raw_db", "error"), TABLE)
@@ -132,7 +157,10 @@ def test_predicted_deviation_and_verdict():
 
 def test_a_stationary_scene_says_that_nothing_moves():
     """Brief 001: the error equals u_r."""
-    still = sum((10 * azimuth_echo(RADAR, 900, 0.0, y0=y0) for y0 in (-60.0, -10.0, 25.0, 70.0)), torch.zeros(3, 900, dtype=torch.complex128))
+    still = sum(
+        (10 * azimuth_echo(RADAR, 900, 0.0, y0=y0) for y0 in (-60.0, -10.0, 25.0, 70.0)),
+        torch.zeros(3, 900, dtype=torch.complex128),
+    )
     found = SignalIntensityRatio(RADAR, BAND)(Signal(azimuth_echo(RADAR, 900, 10.0) + still, RADAR.axes(900)))
     assert abs(float(found["u_r_m_s"])) < 1
 
@@ -140,18 +168,26 @@ def test_a_stationary_scene_says_that_nothing_moves():
 def test_trials_and_lines_stand_for_themselves():
     data = torch.stack([azimuth_echo(RADAR, 900, u_r, u_a) for u_r, u_a in ((3.0, 0.0), (-7.0, 5.0))])
     stage, axes = SignalIntensityRatio(RADAR, BAND, step_m_s=1.0), RADAR.axes(900)
-    together = stage(Signal(data * torch.tensor([1.0, 1e-6])[:, None, None], axes), u_a_m_s=torch.tensor([0.0, 5.0], dtype=F64))
+    together = stage(
+        Signal(data * torch.tensor([1.0, 1e-6])[:, None, None], axes), u_a_m_s=torch.tensor([0.0, 5.0], dtype=F64)
+    )
     for i, u_a in enumerate((0.0, 5.0)):
         alone = stage(Signal(data[i], axes), u_a_m_s=u_a)
         assert float(together["u_r_m_s"][i]) == pytest.approx(float(alone["u_r_m_s"]), abs=1e-6)
     lines = torch.stack([data[0], 0 * data[0], 0.5 * data[0]], -1)
-    assert float(stage(Signal(lines, RADAR.axes(900, 3)))["u_r_m_s"]) == pytest.approx(float(together["u_r_m_s"][0]), abs=1e-3)
+    assert float(stage(Signal(lines, RADAR.axes(900, 3)))["u_r_m_s"]) == pytest.approx(
+        float(together["u_r_m_s"][0]), abs=1e-3
+    )
 
 
 def test_no_data_and_the_end_of_the_search_are_marked():
-    nothing = SignalIntensityRatio(RADAR, BAND, search_m_s=(-5.0, 10.0))(Signal(torch.zeros(2, 3, 64, dtype=torch.complex64), RADAR.axes(64)))
+    nothing = SignalIntensityRatio(RADAR, BAND, search_m_s=(-5.0, 10.0))(
+        Signal(torch.zeros(2, 3, 64, dtype=torch.complex64), RADAR.axes(64))
+    )
     assert nothing["u_r_m_s"].tolist() == [2.5, 2.5] and not bool(nothing.ok.any())
-    beyond = SignalIntensityRatio(RADAR, BAND, search_m_s=(-5.0, 8.0))(Signal(azimuth_echo(RADAR, 900, 12.0), RADAR.axes(900)))
+    beyond = SignalIntensityRatio(RADAR, BAND, search_m_s=(-5.0, 8.0))(
+        Signal(azimuth_echo(RADAR, 900, 12.0), RADAR.axes(900))
+    )
     assert not bool(beyond.ok)
 
 
@@ -168,4 +204,6 @@ def test_refusals_and_warnings():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         prior = SignalIntensityRatio(RADAR, BAND, MinimumMeanSquare(3), search_m_s=(8.0, 12.0))
-        assert float(prior(Signal(azimuth_echo(RADAR, 900, 10.0), RADAR.axes(900)))["u_r_m_s"]) == pytest.approx(10, abs=0.5)
+        assert float(prior(Signal(azimuth_echo(RADAR, 900, 10.0), RADAR.axes(900)))["u_r_m_s"]) == pytest.approx(
+            10, abs=0.5
+        )

@@ -1,4 +1,6 @@
-"""The conventional image of what is at rest: places, widths, phases over the whole swath, and what motion does to it."""
+"""The conventional image of what is at rest: places, widths, phases over the whole swath, and what
+motion does to it.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,10 @@ def test_the_bulk_form_is_exact_in_the_middle_only():
     points = [{}, {"r0": 5600.0}]
     signal = compressed_echo(RADAR, 960, 320, points)
     image = {form: StationaryImage(RADAR, form=form)(signal) for form in ("stolt", "bulk")}
-    peak = {form: [impulse_response(x, (0.0, p.get("r0", 5000.0)), search_m=10.0)["peak"].abs() for p in points] for form, x in image.items()}
+    peak = {
+        form: [impulse_response(x, (0.0, p.get("r0", 5000.0)), search_m=10.0)["peak"].abs() for p in points]
+        for form, x in image.items()
+    }
     assert float(peak["bulk"][0] / peak["stolt"][0]) == pytest.approx(1, abs=0.01)
     assert float(peak["bulk"][1] / peak["stolt"][1]) < 0.97
 
@@ -53,7 +58,10 @@ def test_a_moving_point_is_displaced():
 
 def test_unaliased_pulses_are_those_of_a_fast_radar():
     fast = published_radar(prf_hz=2 * RADAR.prf_hz, channel_m=(0.0,))
-    slow, want = compressed_echo(RADAR, 600, 32, [{"r0": 5010.0}], gate_s=2.5), compressed_echo(fast, 1200, 32, [{"r0": 5010.0}], gate_s=2.5)
+    slow, want = (
+        compressed_echo(RADAR, 600, 32, [{"r0": 5010.0}], gate_s=2.5),
+        compressed_echo(fast, 1200, 32, [{"r0": 5010.0}], gate_s=2.5),
+    )
     motion = PointMotion.of(RADAR, slow.data.real)
     got = centred_ifft(reconstruct_lines(slow.data, RADAR, motion, LeastSquares()), dim=-2)
     inside = slice(200, 1000)

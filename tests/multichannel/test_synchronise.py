@@ -10,7 +10,12 @@ import torch
 from tests.multichannel.helpers import compressed_echo, published_radar
 from torchsar.core import Signal
 from torchsar.multichannel.compress import CompressChannels
-from torchsar.multichannel.synchronise import EstimateSynchronisation, RemoveSynchronisation, estimate_synchronisation, remove_synchronisation
+from torchsar.multichannel.synchronise import (
+    EstimateSynchronisation,
+    RemoveSynchronisation,
+    estimate_synchronisation,
+    remove_synchronisation,
+)
 
 RADAR = published_radar()
 
@@ -22,13 +27,17 @@ def direct_path(phase, delay, n=64, noise=0.0, seed=0):
     t = (torch.arange(n, dtype=torch.float64) - n // 2) / RADAR.sampling_hz
     line = torch.exp(2j * math.pi * f * (t[:, None] - delay[..., None, None])).mean(-1)
     generator = torch.Generator().manual_seed(seed)
-    return line * torch.exp(1j * phase)[..., None] + noise * torch.randn(line.shape, dtype=torch.complex128, generator=generator)
+    return line * torch.exp(1j * phase)[..., None] + noise * torch.randn(
+        line.shape, dtype=torch.complex128, generator=generator
+    )
 
 
 def errors(trials=3, pulses=200):
     t = torch.linspace(-1, 1, pulses, dtype=torch.float64)
     phase = torch.stack([3.0 * torch.sin(4 * t + i) for i in range(trials)])
-    return torch.remainder(phase + math.pi, 2 * math.pi) - math.pi, torch.stack([(i + 1) * 4e-8 * t - 1e-8 for i in range(trials)])
+    return torch.remainder(phase + math.pi, 2 * math.pi) - math.pi, torch.stack(
+        [(i + 1) * 4e-8 * t - 1e-8 for i in range(trials)]
+    )
 
 
 def test_exact_without_noise():
@@ -57,7 +66,11 @@ def test_a_lost_direct_path_is_told_per_trial():
     direct[1, 21] = 0.01 * torch.randn(64, dtype=torch.complex128, generator=torch.Generator().manual_seed(5))
     found = estimate_synchronisation(direct, RADAR)
     assert found.ok.tolist() == [True, False]
-    assert found["phase_rad"][1, 20] == 0 and found["delay_s"][1, 20] == 0 and bool(torch.isfinite(found.std["delay_s"]).all())
+    assert (
+        found["phase_rad"][1, 20] == 0
+        and found["delay_s"][1, 20] == 0
+        and bool(torch.isfinite(found.std["delay_s"]).all())
+    )
     alone = estimate_synchronisation(direct[0], RADAR)
     torch.testing.assert_close(alone["phase_rad"], found["phase_rad"][0])
 
@@ -66,17 +79,30 @@ def test_all_channels_are_freed_of_both():
     signal = compressed_echo(RADAR, 40, 96, [{"r0": 5020.0}])
     phase, delay = (x[0] for x in errors(1, 40))
     f = torch.fft.fftfreq(96, 1 / RADAR.sampling_hz, dtype=torch.float64)
-    spoiled = torch.fft.ifft(torch.fft.fft(signal.data) * torch.exp(-2j * math.pi * delay[:, None] * f)) * torch.exp(1j * phase)[:, None]
+    spoiled = (
+        torch.fft.ifft(torch.fft.fft(signal.data) * torch.exp(-2j * math.pi * delay[:, None] * f))
+        * torch.exp(1j * phase)[:, None]
+    )
     both = signal.with_data(torch.stack([spoiled, 2 * spoiled]))
     direct = direct_path(phase, delay).expand(2, -1, -1)
     estimate = EstimateSynchronisation(RADAR)(both, direct)
     out = RemoveSynchronisation(RADAR)(both, phase_rad=estimate["phase_rad"], delay_s=estimate["delay_s"])
     torch.testing.assert_close(out.data[1] / 2, signal.data, atol=1e-6, rtol=0)
     line = Signal(both.data[..., 48], RADAR.axes(40))
-    torch.testing.assert_close(RemoveSynchronisation(RADAR)(line, estimate["phase_rad"]).data, line.data * torch.exp(-1j * phase), atol=1e-7, rtol=0)
+    torch.testing.assert_close(
+        RemoveSynchronisation(RADAR)(line, estimate["phase_rad"]).data,
+        line.data * torch.exp(-1j * phase),
+        atol=1e-7,
+        rtol=0,
+    )
     small = signal.data[:, :3, :6].clone().requires_grad_()
-    values = tuple(torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in ([0.1, 0.2, -2.0], [1e-9, 0.0, 3e-9]))
-    assert torch.autograd.gradcheck(lambda d, p, t: remove_synchronisation(d, RADAR, p, t * 1e-9), (small, values[0], (values[1] * 1e9).detach().requires_grad_()))
+    values = tuple(
+        torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in ([0.1, 0.2, -2.0], [1e-9, 0.0, 3e-9])
+    )
+    assert torch.autograd.gradcheck(
+        lambda d, p, t: remove_synchronisation(d, RADAR, p, t * 1e-9),
+        (small, values[0], (values[1] * 1e9).detach().requires_grad_()),
+    )
 
 
 def test_refusals():

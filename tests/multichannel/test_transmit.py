@@ -1,4 +1,6 @@
-"""The range of the transmitter taken out by the ephemeris, and by the paper's scaling phase with k1 left to the reconstruction."""
+"""The range of the transmitter taken out by the ephemeris, and by the paper's scaling phase with k1
+left to the reconstruction.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,12 @@ from torchsar.multichannel.azimuth import azimuth_filter
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.reconstruct import reconstruct
 from torchsar.multichannel.response import LeastSquares, doppler_centre_hz, doppler_offsets
-from torchsar.multichannel.transmit import AzimuthScaling, RemoveTransmitRange, neglected_transmit_phase_rad, remove_transmit_range
+from torchsar.multichannel.transmit import (
+    AzimuthScaling,
+    RemoveTransmitRange,
+    neglected_transmit_phase_rad,
+    remove_transmit_range,
+)
 
 K = (-243.0, 0.0208, -1.3e-6, 2e-9)
 N = 900
@@ -40,7 +47,9 @@ def test_orders_are_kept_out_one_by_one_and_counted():
     lit = data.abs() > 0
     phase = torch.angle((left * full.conj())[lit])
     expected = (-2 * math.pi / 0.24 * (K[1] * time**2 + K[2] * time**3 + K[3] * time**4)).expand(3, N)[lit]
-    torch.testing.assert_close(torch.remainder(phase - expected + math.pi, 2 * math.pi), torch.full_like(phase, math.pi), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        torch.remainder(phase - expected + math.pi, 2 * math.pi), torch.full_like(phase, math.pi), atol=1e-6, rtol=0
+    )
     # brief 001: k2 matters, third order does not
     assert neglected_transmit_phase_rad(radar, 1, 4.5) == pytest.approx(2 * math.pi / 0.24 * 0.0208 * 2.25**2, rel=1e-3)
     assert neglected_transmit_phase_rad(radar, 2, 4.5) < 1e-3
@@ -60,11 +69,18 @@ def test_coefficients_per_trial_with_gradients():
 @pytest.mark.parametrize("u_r, u_a", [(0.0, 10.0), (10.0, 5.0)])
 def test_scaling_with_k1_in_the_response_rebuilds_the_same_image(u_r, u_a):
     radar = published_radar(transmit_range=K)
-    signal, motion, rebuild = echo(radar, u_r=u_r, u_a=u_a), PointMotion.of(radar, torch.zeros(1), u_r, u_a), LeastSquares()
+    signal, motion, rebuild = (
+        echo(radar, u_r=u_r, u_a=u_a),
+        PointMotion.of(radar, torch.zeros(1), u_r, u_a),
+        LeastSquares(),
+    )
     removed = reconstruct(RemoveTransmitRange(radar)(signal).data, radar, motion, rebuild)
     scaled = reconstruct(AzimuthScaling(radar)(signal, u_r_m_s=u_r, u_a_m_s=u_a).data, radar, motion, rebuild, K[0])
     offset = doppler_offsets(N, rebuild.bands, radar.prf_hz)
-    filtered = [torch.fft.ifft(s * azimuth_filter(offset, radar, motion, s.dtype, doppler_centre_hz(radar, motion))).abs() for s in (removed, scaled)]
+    filtered = [
+        torch.fft.ifft(s * azimuth_filter(offset, radar, motion, s.dtype, doppler_centre_hz(radar, motion))).abs()
+        for s in (removed, scaled)
+    ]
     assert (filtered[0] - filtered[1]).norm() < 0.01 * filtered[0].norm()
     assert filtered[0].max() > 25  # focused: the energy of 810 pulses in one place
     # without k1 in the response the channels do not fit together

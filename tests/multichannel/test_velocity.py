@@ -1,4 +1,6 @@
-"""Estimators of a moving point's velocity against their bounds, each other, ambiguities and clutter."""
+"""Estimators of a moving point's velocity against their bounds, each other, ambiguities and
+clutter.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,13 @@ from torchsar.multichannel.velocity.gradient import explained_energy
 from torchsar.multichannel.velocity.likelihood import PointLikelihood, maximum_likelihood
 from torchsar.multichannel.velocity.model import UNKNOWNS, moved, phase_slopes, point_phasor
 from torchsar.multichannel.velocity.recommended import moving_point_velocity
-from torchsar.multichannel.velocity.stages import AlongTrackAutofocus, GradientVelocity, Interferometry, LikelihoodVelocity, MovingPointVelocity
+from torchsar.multichannel.velocity.stages import (
+    AlongTrackAutofocus,
+    GradientVelocity,
+    Interferometry,
+    LikelihoodVelocity,
+    MovingPointVelocity,
+)
 from torchsar.multichannel.velocity.walk import WalkAmbiguity
 from torchsar.multichannel.velocity.whitening import line_whitening
 from torchsar.scene import KSea, Pattern
@@ -26,7 +34,13 @@ from torchsar.scene import KSea, Pattern
 F64, C128 = torch.float64, torch.complex128
 RADAR, N, GATE = published_radar(), 900, Dwell(4.5)
 NEAR = Search(u_r_m_s=12.0, u_a_m_s=4.0, y0_m=100.0, u_a_step_m_s=1.0)
-ESTIMATORS = {"interferometry": Interferometry, "along_track": AlongTrackAutofocus, "likelihood": LikelihoodVelocity, "gradient": GradientVelocity, "recommended": MovingPointVelocity}
+ESTIMATORS = {
+    "interferometry": Interferometry,
+    "along_track": AlongTrackAutofocus,
+    "likelihood": LikelihoodVelocity,
+    "gradient": GradientVelocity,
+    "recommended": MovingPointVelocity,
+}
 
 
 def noise(trials, seed, n=N, channels=3):
@@ -45,7 +59,12 @@ def rms(x):
 
 def bound(snr_db, unknown=UNKNOWNS, **move):
     values = {"u_r_m_s": move.get("u_r", 0.0), "u_a_m_s": move.get("u_a", 0.0), "y0_m": move.get("y0", 0.0)}
-    return {name: float(x) for name, x in bistatic_bounds(RADAR, N, 10 ** (snr_db / 10), **values, integration_s=4.5, unknown=unknown).items()}
+    return {
+        name: float(x)
+        for name, x in bistatic_bounds(
+            RADAR, N, 10 ** (snr_db / 10), **values, integration_s=4.5, unknown=unknown
+        ).items()
+    }
 
 
 def test_model_is_the_echo_and_its_slopes():
@@ -62,7 +81,10 @@ def test_model_is_the_echo_and_its_slopes():
         torch.testing.assert_close(torch.angle(ends[0] * ends[1].conj()) / 2e-4, slopes[i], atol=1e-4, rtol=1e-5)
 
 
-@pytest.mark.parametrize(("snr_db", "worst", "move"), [(0.0, 1.3, {"u_r": 10.0}), (7.0, 1.3, {"u_r": -7.0, "u_a": 3.0, "y0": 40.0}), (-10.0, 1.6, {"u_r": 4.0})])
+@pytest.mark.parametrize(
+    ("snr_db", "worst", "move"),
+    [(0.0, 1.3, {"u_r": 10.0}), (7.0, 1.3, {"u_r": -7.0, "u_a": 3.0, "y0": 40.0}), (-10.0, 1.6, {"u_r": 4.0})],
+)
 def test_recommended_reaches_the_bound(snr_db, worst, move):
     """And never beats it by more than chance: the edges of the gate must tell nothing."""
     estimate = moving_point_velocity(noisy(snr_db, 32, **move).data, RADAR, GATE, NEAR)
@@ -76,7 +98,9 @@ def test_recommended_reaches_the_bound(snr_db, worst, move):
 def test_with_the_along_track_speed_told():
     estimate = MovingPointVelocity(RADAR, GATE, search=NEAR, u_a_m_s=5.0)(noisy(0.0, 32, u_r=10.0, u_a=5.0))
     assert set(estimate.std) == {"u_r_m_s", "y0_m"} and bool((estimate.value["u_a_m_s"] == 5).all())
-    assert 0.7 < rms(estimate.value["u_r_m_s"] - 10) / bound(0.0, ("u_r_m_s", "y0_m"), u_r=10.0, u_a=5.0)["u_r_m_s"] < 1.3
+    assert (
+        0.7 < rms(estimate.value["u_r_m_s"] - 10) / bound(0.0, ("u_r_m_s", "y0_m"), u_r=10.0, u_a=5.0)["u_r_m_s"] < 1.3
+    )
 
 
 @pytest.mark.parametrize("snr_db", [-10.0, 0.0, 17.0])
@@ -92,23 +116,35 @@ def test_interferometry_with_channels_anywhere(channels):
     estimate = Interferometry(radar, GATE)(noisy(10.0, 20, radar=radar, u_r=10.0, u_a=5.0), u_a_m_s=5.0)
     # what the direction between the channels tells, that is without the cubic phase
     least = float(radial_velocity_bound_m_s(radar, 10.0, 810, 5.0))
-    assert 0.6 < rms(estimate.value["u_r_m_s"] - 10) / least < 1.5 and 0.6 < rms(estimate.value["y0_m"]) / (least * 5000 / 295) < 1.5
+    assert (
+        0.6 < rms(estimate.value["u_r_m_s"] - 10) / least < 1.5
+        and 0.6 < rms(estimate.value["y0_m"]) / (least * 5000 / 295) < 1.5
+    )
 
 
 def test_interferometry_and_the_ends_of_its_interval():
-    """u_r comes within half of lambda PRF, 43.2 m/s, about the start: 25 is seen as -18.2 (brief 001)."""
+    """u_r comes within half of lambda PRF, 43.2 m/s, about the start: 25 is seen as -18.2 (brief
+    001).
+    """
     for u_r in (21.0, -21.0):
         estimate = Interferometry(RADAR, GATE)(noisy(17.0, 4, u_r=u_r))
         assert rms(estimate.value["u_r_m_s"] - u_r) < 0.1 and bool(estimate.ok.all())
-    with pytest.warns(UserWarning, match="in 4 of 4 trials the slant-range velocity is whole pulse rates, 43.2 m/s each, off"):
+    with pytest.warns(
+        UserWarning, match="in 4 of 4 trials the slant-range velocity is whole pulse rates, 43.2 m/s each, off"
+    ):
         estimate = Interferometry(RADAR, GATE)(noisy(17.0, 4, u_r=25.0))
-    assert bool(((estimate.value["u_r_m_s"] - 25 + 43.2).abs() < 1.5).all()) and not bool(estimate.ok.any()) and estimate.info["pulse_rates"].tolist() == [1] * 4
+    assert (
+        bool(((estimate.value["u_r_m_s"] - 25 + 43.2).abs() < 1.5).all())
+        and not bool(estimate.ok.any())
+        and estimate.info["pulse_rates"].tolist() == [1] * 4
+    )
     near = Interferometry(RADAR, GATE)(noisy(17.0, 4, u_r=25.0), u_r_m_s=15.0)
     assert rms(near.value["u_r_m_s"] - 25) < 0.1
 
 
 def test_along_track_speed():
-    signal = noisy(0.0, 24, u_r=10.0, u_a=12.0, y0=20.0)  # three bands could not be told apart at 12 m/s
+    # three bands could not be told apart at 12 m/s
+    signal = noisy(0.0, 24, u_r=10.0, u_a=12.0, y0=20.0)
     estimate = AlongTrackAutofocus(RADAR, GATE)(signal, u_r_m_s=10.0, y0_m=20.0)
     least = bound(0.0, ("u_a_m_s", "u_r_m_s"), u_r=10.0, u_a=12.0, y0=20.0)["u_a_m_s"]
     assert 0.7 < rms(estimate.value["u_a_m_s"] - 12) / least < 2.2
@@ -125,21 +161,32 @@ def test_gauss_newton_and_gradients_agree(aperture):
     newton = LikelihoodVelocity(RADAR, aperture)(signal, **start)
     descent = GradientVelocity(RADAR, aperture)(signal, **start)
     for name in UNKNOWNS:
-        torch.testing.assert_close(newton.value[name], descent.value[name], atol=0.03 * float(newton.std[name].max()), rtol=0)
+        torch.testing.assert_close(
+            newton.value[name], descent.value[name], atol=0.03 * float(newton.std[name].max()), rtol=0
+        )
     # both stand where the likelihood is flat
-    motion = PointMotion.of(RADAR, signal.data, *(newton.value[name] for name in UNKNOWNS)).each(lambda x: x.requires_grad_())
+    motion = PointMotion.of(RADAR, signal.data, *(newton.value[name] for name in UNKNOWNS)).each(
+        lambda x: x.requires_grad_()
+    )
     time_s = RADAR.pulse_axis(N).values()
     weight = aperture.weight(RADAR, PointMotion.of(RADAR, signal.data, *start.values()), time_s)
-    slopes = torch.autograd.grad(explained_energy(signal.data, RADAR, motion, weight).sum(), (motion.u_r_m_s, motion.u_a_m_s, motion.y0_m))
+    slopes = torch.autograd.grad(
+        explained_energy(signal.data, RADAR, motion, weight).sum(), (motion.u_r_m_s, motion.u_a_m_s, motion.y0_m)
+    )
     for name, slope in zip(UNKNOWNS, slopes, strict=True):
-        assert float((slope * newton.std[name]).abs().max()) < 0.05 * float(explained_energy(signal.data, RADAR, motion, weight).detach().min()) ** 0.5
+        assert (
+            float((slope * newton.std[name]).abs().max())
+            < 0.05 * float(explained_energy(signal.data, RADAR, motion, weight).detach().min()) ** 0.5
+        )
 
 
 def test_gradient_of_the_likelihood_by_hand():
     data = noisy(10.0, 2, u_r=10.0).data
     start = PointMotion.of(RADAR, data, 10.01, 0.02, 0.3).each(lambda x: x.expand(2).clone().requires_grad_())
     weight = GATE.weight(RADAR, start, RADAR.pulse_axis(N).values())
-    slopes = torch.autograd.grad(explained_energy(data, RADAR, start, weight).sum(), (start.u_r_m_s, start.u_a_m_s, start.y0_m))
+    slopes = torch.autograd.grad(
+        explained_energy(data, RADAR, start, weight).sum(), (start.u_r_m_s, start.u_a_m_s, start.y0_m)
+    )
     fit = PointLikelihood.of(data, RADAR, start, GATE, UNKNOWNS, None).fit(start)
     torch.testing.assert_close(2 * fit.gradient.detach(), torch.stack(slopes, -1), rtol=1e-7, atol=1e-6)
 
@@ -147,14 +194,22 @@ def test_gradient_of_the_likelihood_by_hand():
 @pytest.mark.parametrize(("u_r", "u_a"), [(25.0, 0.0), (-35.0, -4.0)])
 def test_the_bank_resolves_pulse_rates(u_r, u_a):
     """By the cubic phase of the range history alone."""
-    estimate = MovingPointVelocity(RADAR, GATE, search=Search(u_r_m_s=42.0, u_a_m_s=6.0, y0_m=60.0, u_a_step_m_s=1.0))(noisy(0.0, 2, u_r=u_r, u_a=u_a))
-    assert bool(estimate.ok.all()) and rms(estimate.value["u_r_m_s"] - u_r) < 1.0 and rms(estimate.value["u_a_m_s"] - u_a) < 0.15
+    estimate = MovingPointVelocity(RADAR, GATE, search=Search(u_r_m_s=42.0, u_a_m_s=6.0, y0_m=60.0, u_a_step_m_s=1.0))(
+        noisy(0.0, 2, u_r=u_r, u_a=u_a)
+    )
+    assert (
+        bool(estimate.ok.all())
+        and rms(estimate.value["u_r_m_s"] - u_r) < 1.0
+        and rms(estimate.value["u_a_m_s"] - u_a) < 0.15
+    )
 
 
 @pytest.mark.parametrize(("u_r", "number"), [(25.0, 1), (-35.0, -1), (3.0, 0)])
 def test_range_walk_resolves_pulse_rates(u_r, number):
     signal = compressed_echo(RADAR, 810, 64, [{"u_r": u_r}])
-    trials = signal.data + 0.5 * torch.randn(2, *signal.data.shape, dtype=C128, generator=torch.Generator().manual_seed(1))
+    trials = signal.data + 0.5 * torch.randn(
+        2, *signal.data.shape, dtype=C128, generator=torch.Generator().manual_seed(1)
+    )
     estimate = WalkAmbiguity(RADAR)(signal.with_data(trials.to(torch.complex64)))
     assert estimate.value["ambiguity"].tolist() == [number, number] and bool(estimate.ok.all())
 
@@ -163,14 +218,18 @@ def test_a_place_known_from_an_image():
     """`bank_search` about the slow time at which the point appears in an image."""
     data = noisy(0.0, 3, u_r=10.0, u_a=5.0, y0=300.0).data
     appears = PointMotion.of(RADAR, data, 10.0, 5.0, 300.0).image_s
-    start, energy = bank_search(data, RADAR, GATE, Search(u_r_m_s=15.0, u_a_m_s=8.0, y0_m=30.0, u_a_step_m_s=1.0), image_s=appears)
+    start, energy = bank_search(
+        data, RADAR, GATE, Search(u_r_m_s=15.0, u_a_m_s=8.0, y0_m=30.0, u_a_step_m_s=1.0), image_s=appears
+    )
     assert rms(start.u_r_m_s - 10) <= 2.0 and rms(start.u_a_m_s - 5) <= 1.0 and bool((energy > 500).all())
     found = maximum_likelihood(data, RADAR, start, GATE)
     assert rms(found.motion.y0_m - 300) < 15
 
 
 class TestClutter:
-    """K-distributed sea at rest, 30 dB above noise of unit power, seen through the pattern of the elements, a point at u_r = 10 m/s."""
+    """K-distributed sea at rest, 30 dB above noise of unit power, seen through the pattern of the
+    elements, a point at u_r = 10 m/s.
+    """
 
     RADAR = published_radar()
 
@@ -178,7 +237,21 @@ class TestClutter:
         t = self.RADAR.pulse_axis(n).values()
         motion = PointMotion.of(self.RADAR, torch.zeros(1), u_r)
         point = ElementBeam().weight(self.RADAR, motion, t) * point_phasor(self.RADAR, motion, t, C128)
-        sea = torch.stack([sea_echo(KSea(power_db=30.0), self.RADAR, n, None, Pattern(), Draws(seed + 100 * line, trials=range(trials)), C128) for line in range(lines)], 1)
+        sea = torch.stack(
+            [
+                sea_echo(
+                    KSea(power_db=30.0),
+                    self.RADAR,
+                    n,
+                    None,
+                    Pattern(),
+                    Draws(seed + 100 * line, trials=range(trials)),
+                    C128,
+                )
+                for line in range(lines)
+            ],
+            1,
+        )
         sea = sea + noise(trials * lines, seed, n).view(trials, lines, 3, n)
         return sea[:, 0] + 10 ** ((30 + scr_db) / 20) * point, sea[:, 1:]
 
@@ -189,10 +262,17 @@ class TestClutter:
         assert rms(estimate.value["u_r_m_s"] - 10) < 0.3
 
     def test_covariance_from_neighbouring_lines(self):
-        """The place found decides where the aperture is expected, and clutter then drags the place: the estimate must not be biased by that."""
+        """The place found decides where the aperture is expected, and clutter then drags the place:
+        the estimate must not be biased by that.
+        """
         data, around = self.data(10.0, trials=4, lines=5)
-        estimate = moving_point_velocity(data, self.RADAR, ElementBeam(), NEAR, whitening=line_whitening(around, self.RADAR))
-        assert bool(estimate.ok.all()) and rms(estimate.value["u_r_m_s"] - 10) < 2 * float(estimate.std["u_r_m_s"].median()) < 0.14
+        estimate = moving_point_velocity(
+            data, self.RADAR, ElementBeam(), NEAR, whitening=line_whitening(around, self.RADAR)
+        )
+        assert (
+            bool(estimate.ok.all())
+            and rms(estimate.value["u_r_m_s"] - 10) < 2 * float(estimate.std["u_r_m_s"].median()) < 0.14
+        )
 
     def test_white_noise_stays_white(self):
         estimate = MovingPointVelocity(RADAR, GATE, search=NEAR)(noisy(10.0, 6, u_r=5.0))
@@ -215,7 +295,9 @@ def test_silence_and_points_outside_the_record(name, aperture):
     for values in ({},) if name == "recommended" else ({}, {"y0_m": 2500.0}):
         estimate = stage(Signal(data, RADAR.axes(200)), **values)
         assert not bool(estimate.ok.any())
-        assert all(bool(torch.isfinite(x).all()) for x in (*estimate.value.values(), estimate.quality, estimate.info["snr_db"]))
+        assert all(
+            bool(torch.isfinite(x).all()) for x in (*estimate.value.values(), estimate.quality, estimate.info["snr_db"])
+        )
         assert all(bool((x > 1e3).all()) for x in estimate.std.values())
         assert all(float(x[0]) == values.get(key, 0) for key, x in estimate.value.items())
 
@@ -231,7 +313,9 @@ def test_trials_do_not_know_of_each_other(name, dtype):
     """Loud, quiet, silent and noisy trials, and one in clutter, together and alone."""
     quiet = noisy(10.0, 2, u_r=3.0).data[..., N // 2 - 192 : N // 2 + 192]
     slow = torch.exp(2j * math.pi * 0.01 * torch.arange(384, dtype=F64))
-    data = torch.stack([1e3 * quiet[0], 1e-6 * quiet[1], torch.zeros_like(quiet[0]), noise(1, 4, 384)[0], quiet[0] + 30 * slow]).to(dtype)
+    data = torch.stack(
+        [1e3 * quiet[0], 1e-6 * quiet[1], torch.zeros_like(quiet[0]), noise(1, 4, 384)[0], quiet[0] + 30 * slow]
+    ).to(dtype)
     signal, start = Signal(data, RADAR.axes(384)), {} if name == "recommended" else {"u_r_m_s": 3.01}
     stage = _small(name)
     together = stage(signal, **start)
@@ -244,26 +328,38 @@ def test_trials_do_not_know_of_each_other(name, dtype):
 
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_single_precision_and_range_lines(name):
-    """complex64 data give the velocities of complex128 data; on lines the strongest one is taken, with its own closest range."""
+    """complex64 data give the velocities of complex128 data; on lines the strongest one is taken,
+    with its own closest range.
+    """
     signal, start = noisy(10.0, 2, u_r=3.0), {} if name == "recommended" else {"u_r_m_s": 3.01}
-    double, single = (_small(name)(signal.with_data(signal.data.to(dtype)), **start) for dtype in (C128, torch.complex64))
+    double, single = (
+        _small(name)(signal.with_data(signal.data.to(dtype)), **start) for dtype in (C128, torch.complex64)
+    )
     lines = torch.stack([0.1 * signal.data.flip(-1), signal.data, 0.1 * signal.data.conj()], -1)
     axes = (*signal.axes, Axis("range", 3, 4995.0, 5.0, "m"))
     among = _small(name)(Signal(lines, axes), **start)
     for key, value in double.value.items():
         assert value.dtype == F64 == single.value[key].dtype
-        torch.testing.assert_close(single.value[key], value, atol=1e-3 * float(double.std[key].max()) if key in double.std else 1e-9, rtol=0)
+        torch.testing.assert_close(
+            single.value[key], value, atol=1e-3 * float(double.std[key].max()) if key in double.std else 1e-9, rtol=0
+        )
         torch.testing.assert_close(among.value[key], value, atol=1e-9, rtol=0)
 
 
 def test_one_channel():
-    """It cannot tell a velocity from a place: interferometry refuses, the others say that they do not know."""
+    """It cannot tell a velocity from a place: interferometry refuses, the others say that they do
+    not know.
+    """
     radar = published_radar(channel_m=(0.0,))
     signal = noisy(10.0, 2, radar=radar, u_r=3.0)
     with pytest.raises(ValueError, match="one channel cannot tell a place from a velocity"):
         Interferometry(radar, GATE)(signal)
     estimate = _small("recommended", radar)(signal)
-    assert not bool(estimate.ok.any()) and bool((estimate.std["u_r_m_s"] > 20).all()) and bool(torch.isfinite(estimate.value["u_r_m_s"]).all())
+    assert (
+        not bool(estimate.ok.any())
+        and bool((estimate.std["u_r_m_s"] > 20).all())
+        and bool(torch.isfinite(estimate.value["u_r_m_s"]).all())
+    )
     known = AlongTrackAutofocus(radar, GATE)(signal, u_r_m_s=3.0)
     assert rms(known.value["u_a_m_s"]) < 0.05 and bool(known.ok.all())
 

@@ -1,4 +1,6 @@
-"""Descents of many trials at once: they reach what single descents reach, and no trial feels another."""
+"""Descents of many trials at once: they reach what single descents reach, and no trial feels
+another.
+"""
 
 from __future__ import annotations
 
@@ -32,8 +34,14 @@ def rosenbrock_with_gradient(x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def periodic(x: Tensor) -> Tensor:
-    """A chain of phases: differences want to be 0.3 modulo 2 pi, each phase wants to be 0 modulo pi; many minima."""
-    return (1 - torch.cos(x[..., 1:] - x[..., :-1] - 0.3)).sum(-1) + 0.05 * (1 - torch.cos(2 * x)).sum(-1) + 0.01 * x.square().sum(-1)
+    """A chain of phases: differences want to be 0.3 modulo 2 pi, each phase wants to be 0 modulo
+    pi; many minima.
+    """
+    return (
+        (1 - torch.cos(x[..., 1:] - x[..., :-1] - 0.3)).sum(-1)
+        + 0.05 * (1 - torch.cos(2 * x)).sum(-1)
+        + 0.01 * x.square().sum(-1)
+    )
 
 
 def quadratic(n: int, condition: float, seed: int = 0) -> tuple[Callable[[Tensor], Tensor], Tensor]:
@@ -85,7 +93,9 @@ def test_minima_of_a_periodic_cost() -> None:
     assert found.cost.unique().numel() > 1
 
 
-@pytest.mark.parametrize("objective, n", [(rosenbrock, 2), (rosenbrock, 10), (periodic, 30), (quadratic(20, 1e3, seed=50)[0], 20)])
+@pytest.mark.parametrize(
+    "objective, n", [(rosenbrock, 2), (rosenbrock, 10), (periodic, 30), (quadratic(20, 1e3, seed=50)[0], 20)]
+)
 def test_as_few_evaluations_as_scipy(objective: Callable, n: int) -> None:
     start = torch.stack([normal(n, seed=seed) for seed in range(5)])
     (slope,) = torch.autograd.grad(objective(x := start.clone().requires_grad_()).sum(), x)
@@ -98,7 +108,13 @@ def test_as_few_evaluations_as_scipy(objective: Callable, n: int) -> None:
             value = objective(at)
             return value.item(), torch.autograd.grad(value, at)[0].numpy()
 
-        limits = {"maxcor": 10, "gtol": 1e-6 * float(slope[i].norm()) / n**0.5, "ftol": 1e-14, "maxiter": 1000, "maxfun": 5000}
+        limits = {
+            "maxcor": 10,
+            "gtol": 1e-6 * float(slope[i].norm()) / n**0.5,
+            "ftol": 1e-14,
+            "maxiter": 1000,
+            "maxfun": 5000,
+        }
         theirs = minimize(single, row, jac=True, method="L-BFGS-B", options=limits)
         counts.append(theirs.nfev)
         assert float(found.cost[i]) <= theirs.fun + 1e-6 * max(1.0, abs(theirs.fun)) or objective is periodic
@@ -161,15 +177,28 @@ def test_a_start_without_slope_is_the_result(descend: Callable) -> None:
 
 
 def test_a_value_tolerance_ends_earlier() -> None:
-    rough, fine = (lbfgs(lambda x: 1 + rosenbrock(x), normal(4, 8), steps=300, gradient_tolerance=0, value_tolerance=part) for part in (1e-3, 1e-12))
+    rough, fine = (
+        lbfgs(lambda x: 1 + rosenbrock(x), normal(4, 8), steps=300, gradient_tolerance=0, value_tolerance=part)
+        for part in (1e-3, 1e-12)
+    )
     assert rough.converged.all() and fine.converged.all()
-    assert (rough.evaluations < fine.evaluations).all() and (fine.cost < 1 + 1e-9).any() and (rough.cost >= fine.cost).all()
+    assert (
+        (rough.evaluations < fine.evaluations).all()
+        and (fine.cost < 1 + 1e-9).any()
+        and (rough.cost >= fine.cost).all()
+    )
 
 
 def test_a_rounded_cost_wastes_no_evaluations() -> None:
     """Near the minimum the cost 1e6 + q cannot tell points apart, the slope can."""
     objective, centre = quadratic(10, 100.0)
-    found = lbfgs(lambda x: 1e6 + objective(x), centre + normal(6, 10, seed=7), steps=200, gradient_tolerance=1e-12, value_tolerance=0)
+    found = lbfgs(
+        lambda x: 1e6 + objective(x),
+        centre + normal(6, 10, seed=7),
+        steps=200,
+        gradient_tolerance=1e-12,
+        value_tolerance=0,
+    )
     assert found.converged.all() and (found.evaluations <= found.steps + 6).all()
     torch.testing.assert_close(found.x, centre.expand(6, 10), atol=1e-4, rtol=0)
 
@@ -205,7 +234,10 @@ def test_float32_at_all_levels(descend: Callable, limits: dict, tolerance: float
 
 @pytest.mark.parametrize("level", [1e-200, 1e200])
 def test_float64_at_all_levels(level: float) -> None:
-    found, plain = lbfgs(lambda x: level * rosenbrock(x), normal(3, 5), steps=100), lbfgs(rosenbrock, normal(3, 5), steps=100)
+    found, plain = (
+        lbfgs(lambda x: level * rosenbrock(x), normal(3, 5), steps=100),
+        lbfgs(rosenbrock, normal(3, 5), steps=100),
+    )
     torch.testing.assert_close(found.x, plain.x, atol=1e-4, rtol=0)
     torch.testing.assert_close(found.gradient_norm / level, plain.gradient_norm, atol=1e-3, rtol=0)
 
@@ -227,7 +259,11 @@ def test_a_minimum_at_the_start_ends_soon() -> None:
 
 def test_steps_over_a_wall_are_shortened() -> None:
     """-log x + x is not finite for x <= 0; its minimum is at 1."""
-    found = lbfgs(lambda x: (x - torch.log(x)).sum(-1), torch.tensor([[0.01, 0.02], [3.0, 8.0], [0.5, 30.0]], dtype=F64), first_step=5.0)
+    found = lbfgs(
+        lambda x: (x - torch.log(x)).sum(-1),
+        torch.tensor([[0.01, 0.02], [3.0, 8.0], [0.5, 30.0]], dtype=F64),
+        first_step=5.0,
+    )
     assert found.ok.all() and found.converged.all()
     torch.testing.assert_close(found.x, torch.ones(3, 2, dtype=F64), atol=1e-4, rtol=0)
 
@@ -282,7 +318,9 @@ def test_callers_without_gradients_and_trials_of_any_shape(descend: Callable) ->
 
 
 def test_float64_costs_of_float32_unknowns_stay_float64() -> None:
-    found = lbfgs(lambda x: 1e6 + rosenbrock(x.double()), normal(3, 4, dtype=torch.float32), value_tolerance=1e-15, steps=200)
+    found = lbfgs(
+        lambda x: 1e6 + rosenbrock(x.double()), normal(3, 4, dtype=torch.float32), value_tolerance=1e-15, steps=200
+    )
     assert found.x.dtype == torch.float32 and found.cost.dtype == F64
     assert ((found.cost - 1e6) < 1e-3).all()
 
@@ -309,22 +347,42 @@ def test_adam_returns_the_best_point_visited() -> None:
 
 MISTAKES = [
     pytest.param(torch.zeros(3, 2, dtype=torch.int64), rosenbrock, {}, TypeError, "float32 or float64", id="integers"),
-    pytest.param(torch.zeros(3, 2, dtype=torch.complex128), rosenbrock, {}, TypeError, "real and imaginary", id="complex"),
+    pytest.param(
+        torch.zeros(3, 2, dtype=torch.complex128), rosenbrock, {}, TypeError, "real and imaginary", id="complex"
+    ),
     pytest.param(torch.tensor(1.0), rosenbrock, {}, ValueError, "last dim", id="scalar"),
     pytest.param(torch.zeros(3, 0), rosenbrock, {}, ValueError, "at least 1", id="no unknowns"),
-    pytest.param(torch.zeros(3, 2), lambda x: x.sum(), {}, ValueError, r"one real cost per trial, shape \(3,\)", id="one cost for all"),
+    pytest.param(
+        torch.zeros(3, 2),
+        lambda x: x.sum(),
+        {},
+        ValueError,
+        r"one real cost per trial, shape \(3,\)",
+        id="one cost for all",
+    ),
     pytest.param(torch.zeros(3, 2), lambda x: 1.0, {}, ValueError, "returned float", id="a number"),
     pytest.param(torch.zeros(3, 2), lambda x: x.detach().sum(-1), {}, ValueError, "cannot follow", id="detached"),
     pytest.param(torch.zeros(3, 2), rosenbrock, {"with_gradient": True}, TypeError, "cost, gradient", id="no pair"),
-    pytest.param(torch.zeros(3, 2), lambda x: (x.sum(-1), x.sum(-1)), {"with_gradient": True}, ValueError, "same shape as x", id="gradient of a wrong shape"),
-    pytest.param(torch.zeros(3, 2), rosenbrock, {"value_tolerance": -1.0}, ValueError, "at least 0", id="negative tolerance"),
+    pytest.param(
+        torch.zeros(3, 2),
+        lambda x: (x.sum(-1), x.sum(-1)),
+        {"with_gradient": True},
+        ValueError,
+        "same shape as x",
+        id="gradient of a wrong shape",
+    ),
+    pytest.param(
+        torch.zeros(3, 2), rosenbrock, {"value_tolerance": -1.0}, ValueError, "at least 0", id="negative tolerance"
+    ),
     pytest.param(torch.zeros(3, 2), rosenbrock, {"steps": 0}, ValueError, "steps is 0", id="no steps"),
 ]
 
 
 @pytest.mark.parametrize("descend", [lbfgs, adam])
 @pytest.mark.parametrize("start, objective, limits, error, words", MISTAKES)
-def test_mistakes_are_named(descend: Callable, start: Tensor, objective: Callable, limits: dict, error: type, words: str) -> None:
+def test_mistakes_are_named(
+    descend: Callable, start: Tensor, objective: Callable, limits: dict, error: type, words: str
+) -> None:
     with pytest.raises(error, match=words):
         descend(objective, start, **limits)
 

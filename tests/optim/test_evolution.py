@@ -23,7 +23,9 @@ def test_finds_the_bottom_of_bowls(strategy: Strategy) -> None:
 
 
 def test_leaves_local_minima() -> None:
-    found = differential_evolution(rastrigin, *box(8), draws=Draws(1, trials=range(8)), generations=150, weight=0.5, crossover=0.3)
+    found = differential_evolution(
+        rastrigin, *box(8), draws=Draws(1, trials=range(8)), generations=150, weight=0.5, crossover=0.3
+    )
     assert (found.cost < 1e-2).all()
 
 
@@ -37,10 +39,14 @@ def test_counts_and_never_forgets_the_best() -> None:
 @pytest.mark.parametrize("strategy", ["rand1bin", "best1bin"])
 def test_a_batch_equals_its_singles(strategy: Strategy) -> None:
     low, high = box(3)
-    whole = differential_evolution(rotated, low, high, draws=Draws(3, trials=range(3)), generations=8, strategy=strategy)
+    whole = differential_evolution(
+        rotated, low, high, draws=Draws(3, trials=range(3)), generations=8, strategy=strategy
+    )
     for i in range(3):
         one = slice(i, i + 1)
-        alone = differential_evolution(rotated, low[one], high[one], draws=Draws(3, trials=[i]), generations=8, strategy=strategy)
+        alone = differential_evolution(
+            rotated, low[one], high[one], draws=Draws(3, trials=[i]), generations=8, strategy=strategy
+        )
         torch.testing.assert_close(alone.x[0], whole.x[i], atol=1e-12, rtol=0)
 
 
@@ -48,13 +54,20 @@ def test_the_box_is_kept() -> None:
     low, high = torch.tensor([1.0, -2.0, -2.0], dtype=F64), torch.tensor([2.0, 3.0, 3.0], dtype=F64)
     found = differential_evolution(sphere, low, high, draws=Draws(1))
     assert found.x[0] == 1.0
-    nowhere = differential_evolution(lambda x: torch.full_like(x[..., 0], torch.nan), low, high, draws=Draws(1), generations=2)
+    nowhere = differential_evolution(
+        lambda x: torch.full_like(x[..., 0], torch.nan), low, high, draws=Draws(1), generations=2
+    )
     assert not nowhere.ok.any() and torch.isfinite(nowhere.x).all()
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"population": 3}, "population is 3"), ({"strategy": "rand2"}, "'rand1bin' or 'best1bin'"), ({"weight": 0.0}, "weight 0"), ({"crossover": -0.1}, "a chance in 0..1")],
+    [
+        ({"population": 3}, "population is 3"),
+        ({"strategy": "rand2"}, "'rand1bin' or 'best1bin'"),
+        ({"weight": 0.0}, "weight 0"),
+        ({"crossover": -0.1}, "a chance in 0..1"),
+    ],
 )
 def test_refuses_settings_that_make_no_sense(options: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):

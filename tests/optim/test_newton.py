@@ -40,7 +40,10 @@ def test_rosenbrock(damped: bool) -> None:
 
 def test_quadratic_convergence_near_the_minimum() -> None:
     near = torch.tensor([[1.01, 1.0]], dtype=F64)
-    errors = [float((newton(hill, near, steps=n, damped=False, value_tolerance=0, gradient_tolerance=0).x - 1).abs().max()) for n in (1, 2, 3)]
+    errors = [
+        float((newton(hill, near, steps=n, damped=False, value_tolerance=0, gradient_tolerance=0).x - 1).abs().max())
+        for n in (1, 2, 3)
+    ]
     assert errors[1] < 3 * errors[0] ** 2 and errors[2] < 1e-12
 
 
@@ -62,14 +65,21 @@ def test_divergence_ends_at_a_finite_point() -> None:
 
 def test_a_wall_is_stepped_back_from() -> None:
     def walled(x: Tensor) -> Tensor:
-        return torch.where((x > 2).any(-1), torch.inf, (x.square() - 2 * x + 0.1 * x.pow(4)).sum(-1) - 5 * torch.sqrt(torch.where(x < 0, 1.0, 1.0 + x.clamp_min(0))).sum(-1))
+        return torch.where(
+            (x > 2).any(-1),
+            torch.inf,
+            (x.square() - 2 * x + 0.1 * x.pow(4)).sum(-1)
+            - 5 * torch.sqrt(torch.where(x < 0, 1.0, 1.0 + x.clamp_min(0))).sum(-1),
+        )
 
     found = newton(walled, torch.tensor([[0.2, 0.3]], dtype=F64), steps=40)
     assert torch.isfinite(found.cost).all() and found.ok.all()
 
 
 def test_a_start_that_is_not_finite() -> None:
-    found = newton(lambda x: torch.where(x[..., 0] < 0, torch.nan, sphere(x)), torch.tensor([[-1.0, 0, 0], [1.0, 0, 0]], dtype=F64))
+    found = newton(
+        lambda x: torch.where(x[..., 0] < 0, torch.nan, sphere(x)), torch.tensor([[-1.0, 0, 0], [1.0, 0, 0]], dtype=F64)
+    )
     assert found.ok.tolist() == [False, True]
 
 

@@ -28,14 +28,22 @@ def unbalanced(x, gain, degrees):
     return x * factor[torch.arange(x.shape[-2]) % len(gain), None].to(x.dtype)
 
 
-@pytest.mark.parametrize("gain, degrees", [((1, 1.2), (0, 60)), ((1, 0.7), (0, -85)), ((1, 1.2, 0.9), (0, 30, -25)), ((1, 1, 1.1, 0.8), (0, 20, -15, 30))])
+@pytest.mark.parametrize(
+    "gain, degrees",
+    [((1, 1.2), (0, 60)), ((1, 0.7), (0, -85)), ((1, 1.2, 0.9), (0, 30, -25)), ((1, 1, 1.1, 0.8), (0, 20, -15, 30))],
+)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_imbalance_within_its_predicted_error(gain, degrees, seed):
     x = scene(seed=seed)
     estimate = estimate_imbalance(unbalanced(x, gain, degrees), len(gain))
     assert bool(estimate.ok.all())
     assert bool(((estimate["gain"] - torch.tensor(gain)).abs() <= 5 * estimate.std["gain"] + 1e-12).all())
-    assert bool(((estimate["phase_rad"] / DEGREE - torch.tensor(degrees)).abs() <= 5 * estimate.std["phase_rad"] / DEGREE + 1e-9).all())
+    assert bool(
+        (
+            (estimate["phase_rad"] / DEGREE - torch.tensor(degrees)).abs()
+            <= 5 * estimate.std["phase_rad"] / DEGREE + 1e-9
+        ).all()
+    )
     assert float(estimate.std["phase_rad"].max()) < 0.5 * DEGREE and float(estimate.std["gain"].max()) < 0.01
 
 
@@ -47,7 +55,10 @@ def test_the_doppler_settles_phases_beyond_ninety_degrees():
 
 
 def test_silent_trials_and_scale_do_not_matter():
-    y = unbalanced(scene(trials=3), (1, 1.2), (0, 60)).to(torch.complex64) * torch.tensor([1e-22, 1.0, 0.0])[:, None, None]
+    y = (
+        unbalanced(scene(trials=3), (1, 1.2), (0, 60)).to(torch.complex64)
+        * torch.tensor([1e-22, 1.0, 0.0])[:, None, None]
+    )
     estimate = estimate_imbalance(y)
     assert estimate.ok.tolist() == [True, True, False]
     assert estimate["gain"][2].tolist() == [1, 1] and estimate["phase_rad"][2].tolist() == [0, 0]
@@ -58,7 +69,9 @@ def test_correction_is_the_inverse_and_differentiable():
     x = scene(8, 4)
     gain, phase = torch.tensor([1.0, 1.2], dtype=torch.float64), torch.tensor([0.0, 60 * DEGREE], dtype=torch.float64)
     torch.testing.assert_close(correct_imbalance(unbalanced(x, (1, 1.2), (0, 60)), gain, phase), x)
-    assert torch.autograd.gradcheck(lambda g, p: torch.view_as_real(correct_imbalance(x, g, p)), (gain.requires_grad_(), phase.requires_grad_()))
+    assert torch.autograd.gradcheck(
+        lambda g, p: torch.view_as_real(correct_imbalance(x, g, p)), (gain.requires_grad_(), phase.requires_grad_())
+    )
 
 
 def test_too_few_lines_are_refused():
@@ -70,7 +83,9 @@ def test_too_few_lines_are_refused():
 def test_even_and_odd_lines_of_recorded_data(recorded, name, hz):
     clean = read_stripmap(recorded(name))
     damaged, _ = ChannelImbalance((1, 1.2), (0, 60 * DEGREE))(clean, Draws(0))
-    chain = Chain(imbalance=EstimateImbalance(), equalise=use(CorrectImbalance(), gain="imbalance", phase_rad="imbalance"))
+    chain = Chain(
+        imbalance=EstimateImbalance(), equalise=use(CorrectImbalance(), gain="imbalance", phase_rad="imbalance")
+    )
     trace = chain.trace(damaged)
     assert isinstance(damaged, Recording)
     assert abs(float(trace.values["imbalance.gain"][1]) - 1.2) < 0.0036

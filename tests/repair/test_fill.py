@@ -1,4 +1,6 @@
-"""Missing lines: received ones stay, the four methods rank as they should, and the model of the scene reaches its figures."""
+"""Missing lines: received ones stay, the four methods rank as they should, and the model of the
+scene reaches its figures.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,16 @@ from torchsar.focus import OmegaK, matched_reference, omega_k
 from torchsar.focus.defocus import InvertibleOmegaK, all_pass, defocus_omega_k
 from torchsar.io import read_stripmap
 from torchsar.metrics import correlation, error_db
-from torchsar.repair.fill import BandLimitedFill, LinearFill, SparseFill, ZeroFill, band_limited_fill, linear_fill, sparse_fill, zero_fill
+from torchsar.repair.fill import (
+    BandLimitedFill,
+    LinearFill,
+    SparseFill,
+    ZeroFill,
+    band_limited_fill,
+    linear_fill,
+    sparse_fill,
+    zero_fill,
+)
 from torchsar.repair.lines import LineIntegrity
 from torchsar.scene import Dwell, RandomPoints, Speckle, StripmapWorld, Together
 
@@ -25,9 +36,16 @@ STAGES = {"zero": ZeroFill(), "linear": LinearFill(RADAR), "band": BandLimitedFi
 
 
 def scene(seed: int, loss, radar=None, snr_db: float | None = 20.0, speckle_db: float = -10.0, trials=None) -> tuple:
-    """24 points on speckle all along the strip, azimuth band 70 % of the PRF: clean recording and lines on their grid with the mask."""
+    """24 points on speckle all along the strip, azimuth band 70 % of the PRF: clean recording and
+    lines on their grid with the mask.
+    """
     radar = radar or small_radar(prf_hz=80.0)
-    parts = Together({"points": RandomPoints(24, 1500.0, 300.0, spread_db=20.0), "speckle": Speckle(1500, 1500.0, 300.0, level_db=speckle_db)})
+    parts = Together(
+        {
+            "points": RandomPoints(24, 1500.0, 300.0, spread_db=20.0),
+            "speckle": Speckle(1500, 1500.0, 300.0, level_db=speckle_db),
+        }
+    )
     world = StripmapWorld(parts, Dwell(0.75), snr_db=snr_db)
     recording, truth = simulate(radar, world, 1024, 192, Draws(seed, trials=trials), {"loss": loss})
     signal, found = LineIntegrity()(recording.signal, recording.aux["line_number"])
@@ -94,8 +112,11 @@ def test_linear_fill_is_exact_on_a_turning_ramp() -> None:
 
 
 def test_band_limited_fill_is_near_exact_on_oversampled_lines() -> None:
-    lines = torch.fft.fft(torch.randn(256, 32, dtype=torch.complex128, generator=torch.Generator().manual_seed(1)), dim=0)
-    inside = ((torch.fft.fftfreq(256) - 0.4 + 0.5) % 1 - 0.5).abs() < 0.15  # the band wraps round the PRF
+    lines = torch.fft.fft(
+        torch.randn(256, 32, dtype=torch.complex128, generator=torch.Generator().manual_seed(1)), dim=0
+    )
+    # the band wraps round the PRF
+    inside = ((torch.fft.fftfreq(256) - 0.4 + 0.5) % 1 - 0.5).abs() < 0.15
     lines = torch.fft.ifft(lines * inside[:, None], dim=0)
     missing = torch.zeros(256, dtype=torch.bool)
     missing[20::40] = True
@@ -116,15 +137,24 @@ def test_defocus_inverts_and_is_the_adjoint(doppler: float) -> None:
     torch.testing.assert_close((operator.focus(x).conj() * y).sum(), (x.conj() * operator.defocus(y)).sum())
 
 
-@pytest.mark.parametrize("seed, snr_db, reach", [(1, None, -30.9), (1, 20.0, -30.0), (2, 20.0, -30.0), (3, 20.0, -30.0)])
+@pytest.mark.parametrize(
+    "seed, snr_db, reach", [(1, None, -30.9), (1, 20.0, -30.0), (2, 20.0, -30.0), (3, 20.0, -30.0)]
+)
 def test_a_model_of_the_scene_beats_the_rest(seed: int, snr_db: float | None, reach: float) -> None:
-    """Brief 004: 1 % of the lines lost, errors -20.0 (zeros), -20.3 (linear), -21.8 (band-limited), -30.9 dB (model of the scene)."""
+    """Brief 004: 1 % of the lines lost, errors -20.0 (zeros), -20.3 (linear), -21.8 (band-limited),
+    -30.9 dB (model of the scene).
+    """
     radar, clean, signal, missing = scene(seed, LostLines(fraction=0.01), snr_db=snr_db)
     focus = OmegaK(radar)
     truth = focus(clean.signal)
-    zero, linear, band, sparse = (float(error_db(focus(stage(signal, missing)), truth)) for stage in (ZeroFill(), LinearFill(radar), BandLimitedFill(), SparseFill(radar)))
+    zero, linear, band, sparse = (
+        float(error_db(focus(stage(signal, missing)), truth))
+        for stage in (ZeroFill(), LinearFill(radar), BandLimitedFill(), SparseFill(radar))
+    )
     assert abs(zero + 20) < 3 and linear < zero - 0.3 and band < zero - 1
-    assert sparse < min(band - 3, reach), f"zeros {zero:.1f}, linear {linear:.1f}, band-limited {band:.1f}, model {sparse:.1f} dB"
+    assert sparse < min(band - 3, reach), (
+        f"zeros {zero:.1f}, linear {linear:.1f}, band-limited {band:.1f}, model {sparse:.1f} dB"
+    )
 
 
 def test_gaps_in_simulation() -> None:
@@ -139,25 +169,44 @@ def test_geometry_need_not_be_exact() -> None:
     radar, clean, signal, missing = scene(4, LostLines(fraction=0.01))
     focus = OmegaK(radar)
     truth = focus(clean.signal)
-    exact, off = (float(error_db(focus(SparseFill(radar)(signal, missing, **values)), truth)) for values in ({}, {"doppler_hz": torch.tensor(3.0), "velocity_m_s": torch.tensor(120.5)}))
+    exact, off = (
+        float(error_db(focus(SparseFill(radar)(signal, missing, **values)), truth))
+        for values in ({}, {"doppler_hz": torch.tensor(3.0), "velocity_m_s": torch.tensor(120.5)})
+    )
     assert off < exact + 1.0
 
 
 def test_chain_from_line_numbers_to_filled_lines() -> None:
     recording, truth = small_recording(trials=2, damages={"loss": LostLines(count=3)})
-    chain = Chain(lines=use(LineIntegrity(), line_number="aux.line_number"), fill=use(SparseFill(RADAR), missing="lines.missing"), focus=OmegaK(RADAR))
+    chain = Chain(
+        lines=use(LineIntegrity(), line_number="aux.line_number"),
+        fill=use(SparseFill(RADAR), missing="lines.missing"),
+        focus=OmegaK(RADAR),
+    )
     closed = OmegaK(RADAR)(recording.signal)
     clean = OmegaK(RADAR)(truth.clean.signal)
     assert (error_db(chain(recording), clean) < error_db(closed, clean) - 10).all()
 
 
-@pytest.mark.parametrize("fill", [zero_fill, linear_fill, lambda x, m: band_limited_fill(x, m, 1, 3), lambda x, m: sparse_fill(x, m, RADAR, doppler_hz=0.0, looks=2, rounds=1, steps=2)])
+@pytest.mark.parametrize(
+    "fill",
+    [
+        zero_fill,
+        linear_fill,
+        lambda x, m: band_limited_fill(x, m, 1, 3),
+        lambda x, m: sparse_fill(x, m, RADAR, doppler_hz=0.0, looks=2, rounds=1, steps=2),
+    ],
+)
 def test_gradients_reach_received_lines(fill) -> None:
     x = torch.randn(12, 10, dtype=torch.complex128, generator=torch.Generator().manual_seed(3)).requires_grad_()
     missing = torch.zeros(12, dtype=torch.bool)
     missing[[2, 7]] = True
     (gradient,) = torch.autograd.grad(fill(x, missing).abs().square().sum(), x)
-    assert torch.isfinite(torch.view_as_real(gradient)).all() and (gradient[~missing] != 0).all() and (gradient[missing] == 0).all()
+    assert (
+        torch.isfinite(torch.view_as_real(gradient)).all()
+        and (gradient[~missing] != 0).all()
+        and (gradient[missing] == 0).all()
+    )
 
 
 @pytest.mark.parametrize(
@@ -166,7 +215,10 @@ def test_gradients_reach_received_lines(fill) -> None:
         (lambda: SparseFill(RADAR, "nearest"), "range reference 'nearest' is unknown"),
         (lambda: SparseFill(RADAR, looks=0), "at least one look"),
         (lambda: BandLimitedFill(steps=0), "at least one round"),
-        (lambda: zero_fill(torch.zeros(5, 3, dtype=torch.complex64), torch.zeros(4, dtype=torch.bool)), "does not fit 5 lines"),
+        (
+            lambda: zero_fill(torch.zeros(5, 3, dtype=torch.complex64), torch.zeros(4, dtype=torch.bool)),
+            "does not fit 5 lines",
+        ),
     ],
 )
 def test_mistakes_are_named(build, message: str) -> None:
@@ -174,11 +226,16 @@ def test_mistakes_are_named(build, message: str) -> None:
         build()
 
 
-BLOCKS = {"radarsat1_english_bay.npz": (-7053.88, (330, 1094), 320), "radarsat1_squamish.npz": (-6992.88, (330, 1206), 320)}
+BLOCKS = {
+    "radarsat1_english_bay.npz": (-7053.88, (330, 1094), 320),
+    "radarsat1_squamish.npz": (-6992.88, (330, 1206), 320),
+}
 
 
 def recorded_block(path, columns: int) -> Recording:
-    """The first columns of a recording after range compression, as range-compressed lines, which take a fraction of the time."""
+    """The first columns of a recording after range compression, as range-compressed lines, which
+    take a fraction of the time.
+    """
     recording = read_stripmap(path)
     n, radar = recording.signal.axis("range").n, recording.radar
     reference = matched_reference(radar.pulse, n, radar.sampling_hz)
@@ -202,8 +259,12 @@ def rho(image: Tensor, clean: Tensor, rows: tuple[int, int]) -> float:
     ],
 )
 def test_recorded_lines(recorded, name: str, loss, reach: float) -> None:
-    """Brief 004, table on recorded data. Squamish (mountains, few dark or very bright places) stays below the figures of the brief, which
-    even the local powers of the undamaged image, averaged over 3 x 3 pixels, would not reach there (0.9900 at 5 %, 0.957 at 20 %)."""
+    """Brief 004, table on recorded data.
+
+    Squamish (mountains, few dark or very bright places) stays below the figures of the brief, which
+    even the local powers of the undamaged image, averaged over 3 x 3 pixels, would not reach there
+    (0.9900 at 5 %, 0.957 at 20 %).
+    """
     doppler, rows, columns = BLOCKS[name]
     clean = recorded_block(recorded(name), columns)
     damaged, _ = apply_damages(clean, {"loss": loss}, Draws(7))

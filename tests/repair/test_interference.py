@@ -14,13 +14,24 @@ from torchsar.echo.interference import Quantiser, Tone, WideInterferer
 from torchsar.focus import OmegaK
 from torchsar.io import read_stripmap
 from torchsar.metrics.image import error_db
-from torchsar.repair.interference import DropInterference, NotchInterference, SubtractInterference, drop_interference, find_contamination, notch_interference, subtract_interference
+from torchsar.repair.interference import (
+    DropInterference,
+    NotchInterference,
+    SubtractInterference,
+    drop_interference,
+    find_contamination,
+    notch_interference,
+    subtract_interference,
+)
 from torchsar.scene import Dwell, Points, RandomPoints, Speckle, StripmapWorld
 
 RADAR = kondor_radar()
 SHARE = 300 / 8192
 DOPPLER = {"radarsat1_english_bay.npz": 488 - 6 * 1256.98, "radarsat1_squamish.npz": 549 - 6 * 1256.98}
-WINDOW = {"radarsat1_english_bay.npz": (slice(330, 1094), slice(0, 1480)), "radarsat1_squamish.npz": (slice(330, 1206), slice(0, 680))}
+WINDOW = {
+    "radarsat1_english_bay.npz": (slice(330, 1094), slice(0, 1480)),
+    "radarsat1_squamish.npz": (slice(330, 1206), slice(0, 680)),
+}
 
 
 @pytest.fixture(autouse=True)
@@ -32,10 +43,19 @@ def _no_gradients():
 def scene(kind: str, n_pulse: int, n_range: int):
     extent_r = (n_range - RADAR.pulse_samples - 60) * RADAR.range_step_m
     extent_a = n_pulse / RADAR.prf_hz * RADAR.velocity_m_s
-    rows = {"one": [0.0], "two": [0.0, 0.2], "comb5": [0.2 * i for i in range(-2, 3)], "comb9": [0.12 * i for i in range(-4, 5)], "comb25": [0.04 * i for i in range(-12, 13)]}
+    rows = {
+        "one": [0.0],
+        "two": [0.0, 0.2],
+        "comb5": [0.2 * i for i in range(-2, 3)],
+        "comb9": [0.12 * i for i in range(-4, 5)],
+        "comb25": [0.04 * i for i in range(-12, 13)],
+    }
     if kind in rows:
         return Points([0.0] * len(rows[kind]), [extent_r * r for r in rows[kind]])
-    return {"random": RandomPoints(60, extent_a, extent_r, spread_db=20.0), "speckle": Speckle(2000, extent_a, extent_r)}[kind]
+    return {
+        "random": RandomPoints(60, extent_a, extent_r, spread_db=20.0),
+        "speckle": Speckle(2000, extent_a, extent_r),
+    }[kind]
 
 
 def acquire(kind: str, snr_db: float | None, seed: int, n_pulse: int = 192, n_range: int = 2048) -> Recording:
@@ -69,7 +89,9 @@ def mean_db(values: list[float]) -> float:
 
 @pytest.mark.parametrize("kind", ["random", "speckle"])
 def test_figures_of_the_brief(kind: str) -> None:
-    """300 of 8192 lines, 20 dB: uncorrected +5.7 dB, notch -17.9 dB, subtraction -44.8 dB; here 9 of 256 lines, mean of six cases."""
+    """300 of 8192 lines, 20 dB: uncorrected +5.7 dB, notch -17.9 dB, subtraction -44.8 dB; here 9
+    of 256 lines, mean of six cases.
+    """
     figures: dict[str, list[float]] = {"raw": [], "notch": [], "subtract": []}
     for seed, frequency_hz in enumerate((20e6, -47e6, 70e6, -80e6, 3e6, -15e6)):
         clean = acquire(kind, 20.0, seed, n_pulse=256)
@@ -77,7 +99,9 @@ def test_figures_of_the_brief(kind: str) -> None:
         subtracted, notched = subtract_interference(damaged.signal.data), notch_interference(damaged.signal.data)
         for name, data in (("raw", damaged.signal.data), ("notch", notched.data), ("subtract", subtracted.data)):
             figures[name].append(image_error_db(data, clean))
-        assert torch.equal(subtracted.touched, told["contaminated"]) and torch.equal(notched.touched, told["contaminated"])
+        assert torch.equal(subtracted.touched, told["contaminated"]) and torch.equal(
+            notched.touched, told["contaminated"]
+        )
         untouched = ~told["contaminated"]
         assert torch.equal(subtracted.data[untouched], clean.signal.data[untouched])
     assert 5.0 < mean_db(figures["raw"]) < 6.4
@@ -107,8 +131,11 @@ def test_drop_gives_the_contaminated_lines_to_the_fill() -> None:
     ids=["sweeping", "band_edge", "coherent", "two", "wide", "wide_and_tone"],
 )
 def test_kinds_of_interferers_on_all_lines(damages, loss_db: float) -> None:
-    """All lines contaminated. A tone costs 1 to 2.5 of 2048 samples, at 1.25 of the mean density in the pulse band (-32 to -28 dB); a band
-    its degrees of freedom (8 cells here) and as many again for each edge."""
+    """All lines contaminated.
+
+    A tone costs 1 to 2.5 of 2048 samples, at 1.25 of the mean density in the pulse band (-32 to -28
+    dB); a band its degrees of freedom (8 cells here) and as many again for each edge.
+    """
     clean = acquire("speckle", 20.0, seed=5, n_pulse=160)
     damaged = clean
     for i, damage in enumerate(damages):
@@ -156,12 +183,16 @@ def test_complex64_follows_complex128() -> None:
 def test_gradient_through_the_subtraction() -> None:
     with torch.enable_grad():
         data = Draws(1).normal("x", (6, 128), torch.complex128)
-        data = data + 30 * torch.exp(2j * torch.pi * 0.2137 * torch.arange(128)) * torch.tensor([1, 0, 1, 0, 0, 1])[:, None]
+        data = (
+            data
+            + 30 * torch.exp(2j * torch.pi * 0.2137 * torch.arange(128)) * torch.tensor([1, 0, 1, 0, 0, 1])[:, None]
+        )
         assert int(subtract_interference(data).touched.sum()) == 3
         weight = Draws(2).normal("w", (6, 128), torch.complex128)
         x = data.clone().requires_grad_()
         (subtract_interference(x).data * weight.conj()).sum().abs().square().backward()
-        # a unit tone at the found frequency is removed whatever its amplitude: the gradient has no part along it
+        # a unit tone at the found frequency is removed whatever its amplitude: the gradient has no
+        # part along it
         along = torch.exp(2j * torch.pi * 0.2137 * torch.arange(128)) / 128**0.5
         for i in (0, 2, 5):
             assert float((x.grad[i] * along.conj()).sum().abs()) < 0.05 * float(torch.linalg.vector_norm(x.grad[i]))
@@ -180,7 +211,11 @@ def test_stages_in_a_chain_report_what_they_touched() -> None:
     assert float((found * RADAR.sampling_hz - 20e6).abs().max()) < 0.05 * RADAR.sampling_hz / 2048
 
 
-@pytest.mark.parametrize("data", [torch.zeros(8, 64, dtype=torch.complex64), torch.full((8, 64), 1e-25 + 0j, dtype=torch.complex64)], ids=["empty", "tiny"])
+@pytest.mark.parametrize(
+    "data",
+    [torch.zeros(8, 64, dtype=torch.complex64), torch.full((8, 64), 1e-25 + 0j, dtype=torch.complex64)],
+    ids=["empty", "tiny"],
+)
 def test_extremes_stay_finite(data: torch.Tensor) -> None:
     for repair in (subtract_interference, notch_interference, drop_interference):
         assert torch.isfinite(repair(data).data.abs()).all()
@@ -217,9 +252,23 @@ class Bench:
 @pytest.mark.parametrize(
     "name, cases",
     [
-        ("radarsat1_squamish.npz", {"0 dB": ([Tone(0.0, 3.1e6, 4e5)], 0.999), "30 dB": ([Tone(30.0, -8e6, 0.0, 3e5)], 0.999), "4 bit 20": ([Tone(20.0, 3.1e6, 4e5), Quantiser(4)], 0.751)}),
+        (
+            "radarsat1_squamish.npz",
+            {
+                "0 dB": ([Tone(0.0, 3.1e6, 4e5)], 0.999),
+                "30 dB": ([Tone(30.0, -8e6, 0.0, 3e5)], 0.999),
+                "4 bit 20": ([Tone(20.0, 3.1e6, 4e5), Quantiser(4)], 0.751),
+            },
+        ),
         ("radarsat1_squamish.npz", {"clean": ([], 0.9999)}),
-        ("radarsat1_english_bay.npz", {"clean": ([], 0.9999), "20 %": ([Tone(30.0, 3.1e6, 4e5, share=0.2)], 0.999), "wide 20": ([WideInterferer(20.0, -7e6, 2e5)], 0.975)}),
+        (
+            "radarsat1_english_bay.npz",
+            {
+                "clean": ([], 0.9999),
+                "20 %": ([Tone(30.0, 3.1e6, 4e5, share=0.2)], 0.999),
+                "wide 20": ([WideInterferer(20.0, -7e6, 2e5)], 0.975),
+            },
+        ),
     ],
     ids=["squamish", "squamish_clean", "english_bay"],
 )

@@ -11,7 +11,16 @@ from torchsar.core import Chain, Draws, use
 from torchsar.echo.jitter import PeriodicJitter, sample_unevenly
 from torchsar.io import read_stripmap
 from torchsar.metrics import correlation, error_db
-from torchsar.repair.jitter import BandLimited, CorrectJitter, Exact, Lagrange, correct_jitter, correct_jitter_band_limited, correct_jitter_exact, correct_jitter_lagrange
+from torchsar.repair.jitter import (
+    BandLimited,
+    CorrectJitter,
+    Exact,
+    Lagrange,
+    correct_jitter,
+    correct_jitter_band_limited,
+    correct_jitter_exact,
+    correct_jitter_lagrange,
+)
 from torchsar.repair.jitter_blind import detect_jitter_period, estimate_jitter_blind
 from torchsar.repair.jitter_pilot import PilotJitter, estimate_jitter_pilot
 
@@ -96,19 +105,32 @@ def test_pilot_reaches_the_predicted_error(snr_db, cycles, period):
 
 
 def test_clean_pilot_changes_nothing():
-    pilot = PeriodicJitter((0.0,)).pilot(torch.zeros(1, dtype=torch.float64), Draws(0, trials=range(200)), torch.zeros(1, dtype=torch.complex64))
-    estimate = estimate_jitter_pilot(pilot + 0.03 * Draws(1, trials=range(200)).normal("more", (4096,), torch.complex64))
+    pilot = PeriodicJitter((0.0,)).pilot(
+        torch.zeros(1, dtype=torch.float64), Draws(0, trials=range(200)), torch.zeros(1, dtype=torch.complex64)
+    )
+    estimate = estimate_jitter_pilot(
+        pilot + 0.03 * Draws(1, trials=range(200)).normal("more", (4096,), torch.complex64)
+    )
     assert bool(estimate.ok.all()) and float(estimate["offset_samples"].abs().max()) == 0
 
 
 def test_bad_pilots():
     good = PeriodicJitter(OFFSETS).pilot(OFFSETS, Draws(0, trials=range(5)), torch.zeros(1, dtype=torch.complex128))
     bad = good.clone()
-    bad[1], bad[2, 7], bad[3] = 0, math.nan, torch.randn(4096, dtype=torch.complex128, generator=torch.Generator().manual_seed(0))
+    bad[1], bad[2, 7], bad[3] = (
+        0,
+        math.nan,
+        torch.randn(4096, dtype=torch.complex128, generator=torch.Generator().manual_seed(0)),
+    )
     estimate = estimate_jitter_pilot(bad)
     assert estimate.ok.tolist() == [True, False, False, False, True]
-    assert bool(torch.isfinite(estimate["offset_samples"]).all()) and float(estimate["offset_samples"][1:4].abs().max()) == 0
-    torch.testing.assert_close(estimate["offset_samples"][[0, 4]], estimate_jitter_pilot(good[[0, 4]])["offset_samples"])
+    assert (
+        bool(torch.isfinite(estimate["offset_samples"]).all())
+        and float(estimate["offset_samples"][1:4].abs().max()) == 0
+    )
+    torch.testing.assert_close(
+        estimate["offset_samples"][[0, 4]], estimate_jitter_pilot(good[[0, 4]])["offset_samples"]
+    )
     with pytest.raises(ValueError, match="at least 64 samples"):
         estimate_jitter_pilot(good[:, :0])
     with pytest.raises(TypeError, match="complex"):
@@ -117,7 +139,10 @@ def test_bad_pilots():
 
 def test_chain_from_pilot_to_correction(small_jittered):
     recording, clean = small_jittered
-    chain = Chain(pilot=use(PilotJitter(origin="first"), pilot="aux.pilot"), jitter=use(CorrectJitter(), offset_samples="pilot", period="pilot"))
+    chain = Chain(
+        pilot=use(PilotJitter(origin="first"), pilot="aux.pilot"),
+        jitter=use(CorrectJitter(), offset_samples="pilot", period="pilot"),
+    )
     repaired = chain(recording)
     assert float(error_db(recording.signal, clean).max()) > -20
     assert float(error_db(repaired, clean).max()) < -75
@@ -153,7 +178,9 @@ def test_blind_keeps_a_silent_trial_apart():
 
 @pytest.mark.parametrize("name, seed", [("radarsat1_english_bay.npz", 0), ("radarsat1_squamish.npz", 1)])
 def test_blind_on_recorded_data(recorded, name, seed):
-    """The bar is 0.003 sample; the recordings hold a pattern of their own of about 0.0012 sample, of period 8."""
+    """The bar is 0.003 sample; the recordings hold a pattern of their own of about 0.0012 sample,
+    of period 8.
+    """
     x = read_stripmap(recorded(name)).signal.data[:1024]
     true = offsets(8, 0.1, seed)
     y = sample_unevenly(x, true)

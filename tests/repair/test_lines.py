@@ -50,12 +50,15 @@ def test_shorter_trials_stay_padded() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("loss", [LostLines(count=6), LostLines(fraction=0.05), LostLines(fraction=0.2), LostGaps(5, 8), LostGaps(2, 60)])
+@pytest.mark.parametrize(
+    "loss", [LostLines(count=6), LostLines(fraction=0.05), LostLines(fraction=0.2), LostGaps(5, 8), LostGaps(2, 60)]
+)
 def test_every_line_returns_to_its_place(seed: int, loss) -> None:
     clean, out, told = damaged(seed, loss=loss)
     repaired, estimate = LineIntegrity()(out.signal, out.aux["line_number"])
     lost = told["loss.lost"]
-    behind = (~lost).flip(-1).cumsum(-1).flip(-1) == 0  # lost behind the last received line: nothing tells of them
+    # lost behind the last received line: nothing tells of them
+    behind = (~lost).flip(-1).cumsum(-1).flip(-1) == 0
     assert torch.equal(estimate["missing"], lost & ~behind)
     assert torch.equal(repaired.data, torch.where(lost[..., None], 0, clean.signal.data))
     check_counts(estimate)
@@ -69,7 +72,9 @@ def test_corrupted_and_repeated_numbers(seed: int, share: float) -> None:
     placed = estimate.info["number"] != -1
     assert torch.equal(estimate.info["number"][placed], told["wrong.true_number"][placed])
     assert (estimate.info["repeated_count"] >= 4).all()  # one may have fallen off the end
-    assert (estimate.info["corrected_count"] + estimate.info["unplaced_count"] + estimate.info["repeated_count"] >= 12).all()
+    assert (
+        estimate.info["corrected_count"] + estimate.info["unplaced_count"] + estimate.info["repeated_count"] >= 12
+    ).all()
     assert (estimate.info["unplaced_count"] <= 3).all() and estimate.ok.all()
     check_counts(estimate)
 
@@ -102,8 +107,12 @@ def test_a_line_with_two_possible_places_is_left_out_and_counted() -> None:
 def test_grid_can_be_given() -> None:
     x = lines(None)
     plan = line_integrity(x[10:], torch.arange(10, N), first_number=0, n_lines=N)
-    assert plan.missing.nonzero()[:, 0].tolist() == list(range(10)) and torch.equal(plan.source[10:], torch.arange(N - 10))
-    assert torch.equal(place_per_line(torch.arange(10.0, N), plan.source, -5.0)[8:12], torch.tensor([-5.0, -5.0, 10.0, 11.0]))
+    assert plan.missing.nonzero()[:, 0].tolist() == list(range(10)) and torch.equal(
+        plan.source[10:], torch.arange(N - 10)
+    )
+    assert torch.equal(
+        place_per_line(torch.arange(10.0, N), plan.source, -5.0)[8:12], torch.tensor([-5.0, -5.0, 10.0, 11.0])
+    )
 
 
 def test_dead_lines_are_missing_and_silence_at_the_ends_is_not() -> None:

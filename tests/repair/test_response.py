@@ -1,4 +1,6 @@
-"""Channel response: conventions, correction, and estimates from bright places of simulated and recorded images."""
+"""Channel response: conventions, correction, and estimates from bright places of simulated and
+recorded images.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ def rms(x: torch.Tensor) -> float:
 
 
 def brief_phase(u: torch.Tensor) -> torch.Tensor:
-    """1.2 u^3 + 0.5 sin(6 pi u) less its straight line, which no processor can tell from a shift."""
+    """1.2 u^3 + 0.5 sin(6 pi u) less its straight line, which no processor can tell from a
+    shift.
+    """
     curve = 1.2 * u**3 + 0.5 * torch.sin(6 * math.pi * u)
     slope = 3 * (1.2 / 5 - 0.5 * 2 / (6 * math.pi) / 2)  # 3 times the mean of u * curve over -1..1
     return curve - slope * u
@@ -30,7 +34,9 @@ def brief_phase(u: torch.Tensor) -> torch.Tensor:
 
 def test_legendre_is_orthonormal_over_the_band():
     basis = unit_legendre(torch.linspace(-1, 1, 20001, dtype=torch.float64), 12)
-    torch.testing.assert_close(basis @ basis.mT / basis.shape[-1], torch.eye(13, dtype=torch.float64), atol=2e-3, rtol=0)
+    torch.testing.assert_close(
+        basis @ basis.mT / basis.shape[-1], torch.eye(13, dtype=torch.float64), atol=2e-3, rtol=0
+    )
 
 
 def test_constant_and_line_are_no_response():
@@ -49,9 +55,13 @@ def scene():
 
 def test_known_response_is_removed_exactly(scene):
     radar, recording = scene
-    damaged, truth = apply_damages(recording, {"r": ChannelResponse(brief_phase, lambda u: 10 ** (3 * u / 20))}, Draws(0))
+    damaged, truth = apply_damages(
+        recording, {"r": ChannelResponse(brief_phase, lambda u: 10 ** (3 * u / 20))}, Draws(0)
+    )
     u = band_grid()
-    back = correct_response(damaged.signal.data, brief_phase(u), 10 ** (3 * u / 20), radar.pulse.bandwidth_hz / radar.sampling_hz)
+    back = correct_response(
+        damaged.signal.data, brief_phase(u), 10 ** (3 * u / 20), radar.pulse.bandwidth_hz / radar.sampling_hz
+    )
     assert error_db(back, recording.signal.data) < -60
     assert set(truth) == {"r.phase_rad", "r.amplitude"}
 
@@ -92,7 +102,10 @@ def test_amplitude_against_an_expected_spectrum(scene):
 def test_featureless_images_are_not_ok():
     noise = torch.randn(2, 100, 1400, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
     noise[1] = 0
-    for found in (EstimateResponse(kondor_radar(), estimate_response_points)(_image(noise)), EstimateResponse(kondor_radar())(_image(noise))):
+    for found in (
+        EstimateResponse(kondor_radar(), estimate_response_points)(_image(noise)),
+        EstimateResponse(kondor_radar())(_image(noise)),
+    ):
         assert not bool(found.ok[1])
         assert bool(torch.isfinite(found["phase_rad"]).all()) and rms(found["phase_rad"][1]) == 0
 

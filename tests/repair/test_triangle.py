@@ -8,14 +8,23 @@ import torch
 from tests.repair.triangles import ground, record, sweeps, table1
 from torchsar.core import Axis, Chain, Draws, Recording, Signal, use
 from torchsar.echo import simulate_ladar, simulate_ladar_record
-from torchsar.repair import BlankTurningPoints, CircularShift, SplitSweeps, blank_turning_points, circular_shift, split_record
+from torchsar.repair import (
+    BlankTurningPoints,
+    CircularShift,
+    SplitSweeps,
+    blank_turning_points,
+    circular_shift,
+    split_record,
+)
 from torchsar.repair.analytic import delayed
 from torchsar.repair.triangle import canonical_ramps
 from torchsar.scene import EverySample, LadarWorld, Points, Polynomial
 
 
 def rms(x, first=12, last=2):
-    """Over samples without the transient and the very end, and over periods without the outer ones, where the record itself ends."""
+    """Over samples without the transient and the very end, and over periods without the outer ones,
+    where the record itself ends.
+    """
     return float(x[..., 2:-2, first : x.shape[-1] - last].abs().square().mean().sqrt())
 
 
@@ -65,7 +74,10 @@ def test_longer_blocks_are_cut_inside(radar):
     split = split_record(record(radar, 10e-6, 4, 8000, **SCENE[10.5]), radar, 10e-6)
     assert split.shape == (2, 4, 2400)
     assert float((split - sweeps(radar, 4, **SCENE[10.5]))[..., 12:-12].abs().square().mean().sqrt()) < 0.025
-    with pytest.raises(ValueError, match="blocks of 8000 samples do not hold a period of 4800 from the trigger on .triggers up to 2.133e-05 s"):
+    with pytest.raises(
+        ValueError,
+        match="blocks of 8000 samples do not hold a period of 4800 from the trigger on .triggers up to 2.133e-05 s",
+    ):
         split_record(record(radar, 0.0, 2, 8000), radar, 25e-6)
 
 
@@ -90,17 +102,23 @@ def test_slow_time_of_the_stage_and_its_drop_of_one_period():
 
 
 def test_records_of_the_radar_need_no_delay():
-    """The axis of a record starts half a sample after the block: sweeps of trigger zero are its samples."""
+    """The axis of a record starts half a sample after the block: sweeps of trigger zero are its
+    samples.
+    """
     radar = table1()
     axes = radar.record_axes(6, 1024)
     out = SplitSweeps(radar)(Signal(record(radar, 0.0, 6, first_s=axes[1].start), axes))
     assert axes[1].start == 0.5 / radar.sample_rate_hz
-    assert float((out.data - sweeps(radar, 6)).abs().max()) < 1e-7 and out.axis("pulse").start == pytest.approx(axes[0].start, abs=1e-15)
+    assert float((out.data - sweeps(radar, 6)).abs().max()) < 1e-7 and out.axis("pulse").start == pytest.approx(
+        axes[0].start, abs=1e-15
+    )
 
 
 @pytest.mark.parametrize("trigger_s", [0.0, 3.25e-6])
 def test_a_simulated_record_splits_into_simulated_sweeps(trigger_s):
-    """Away from the transient of 0.64 samples; a trigger of whole samples drops one period and moves slow time."""
+    """Away from the transient of 0.64 samples; a trigger of whole samples drops one period and
+    moves slow time.
+    """
     radar = table1()
     world = LadarWorld(Points([0.0], [1.5]), motion=[Polynomial([0.35, 10.0])], fidelity=EverySample())
     recorded, _ = simulate_ladar_record(radar, world, 8, Draws(1), trigger_s=trigger_s, dtype=torch.complex128)
@@ -116,8 +134,12 @@ def test_a_simulated_record_splits_into_simulated_sweeps(trigger_s):
 def test_recorded_trigger_in_a_chain():
     radar = table1()
     trigger = torch.tensor([5.3e-6, 2e-6], dtype=torch.float64)
-    recording = Recording(signal_of(radar, torch.stack([record(radar, float(t), 6) for t in trigger])), radar, {"trigger_s": trigger})
-    out = Chain(split=use(SplitSweeps(radar, "recorded"), trigger_s="aux.trigger_s"), blank=BlankTurningPoints(radar, 1.5))(recording)
+    recording = Recording(
+        signal_of(radar, torch.stack([record(radar, float(t), 6) for t in trigger])), radar, {"trigger_s": trigger}
+    )
+    out = Chain(
+        split=use(SplitSweeps(radar, "recorded"), trigger_s="aux.trigger_s"), blank=BlankTurningPoints(radar, 1.5)
+    )(recording)
     assert rms(out.data - blank_turning_points(sweeps(radar, 5), radar, 1.5)) < 2e-3
     with pytest.raises(ValueError, match="needs the recorded time"):
         SplitSweeps(radar, "recorded")(recording.signal)
@@ -141,8 +163,13 @@ def test_circular_shift_joins_samples_one_period_apart():
 def test_blanking():
     radar = ground()
     ones = torch.ones(2, 3, 2400)
-    assert int((blank_turning_points(ones, radar, 10.5)[0, 0] == 0).sum()) == 11 and float(blank_turning_points(ones, radar, 10.5)[0, 0, 10]) == 0
-    assert (blank_turning_points(ones, radar, 0.0, -10.5)[1, 2, -11:] == 0).all() and float(blank_turning_points(ones, radar, 0.0, -10.5).sum()) == 6 * 2389
+    assert (
+        int((blank_turning_points(ones, radar, 10.5)[0, 0] == 0).sum()) == 11
+        and float(blank_turning_points(ones, radar, 10.5)[0, 0, 10]) == 0
+    )
+    assert (blank_turning_points(ones, radar, 0.0, -10.5)[1, 2, -11:] == 0).all() and float(
+        blank_turning_points(ones, radar, 0.0, -10.5).sum()
+    ) == 6 * 2389
     assert float(blank_turning_points(ones, radar, 10.5, margin=3).sum()) == 6 * (2400 - 11 - 6)
     with pytest.raises(ValueError, match="are the ranges relative"):
         BlankTurningPoints(radar, 4339.5)
@@ -151,16 +178,26 @@ def test_blanking():
 @pytest.mark.parametrize("real", [False, True])
 def test_gradients_and_vmap(real):
     radar = table1(period_s=0.5e-6, detection="real" if real else "complex")
-    x = torch.randn(2, 3, 32, dtype=torch.float64 if real else torch.complex128, generator=torch.Generator().manual_seed(0))
+    x = torch.randn(
+        2, 3, 32, dtype=torch.float64 if real else torch.complex128, generator=torch.Generator().manual_seed(0)
+    )
     trigger = torch.tensor([0.12e-6, 0.3e-6], dtype=torch.float64)
     cut = lambda x, us: split_record(x, radar, us * 1e-6)  # noqa: E731
-    assert torch.autograd.gradcheck(cut, (x.requires_grad_(), (trigger * 1e6).requires_grad_()), fast_mode=True, atol=1e-5)
-    torch.testing.assert_close(torch.vmap(lambda y: split_record(y, radar, 0.12e-6))(x.detach()), split_record(x.detach(), radar, 0.12e-6))
+    assert torch.autograd.gradcheck(
+        cut, (x.requires_grad_(), (trigger * 1e6).requires_grad_()), fast_mode=True, atol=1e-5
+    )
+    torch.testing.assert_close(
+        torch.vmap(lambda y: split_record(y, radar, 0.12e-6))(x.detach()), split_record(x.detach(), radar, 0.12e-6)
+    )
 
 
 def test_dtype_is_kept_and_odd_input_refused():
     radar = table1()
-    for dtype, expected in ((torch.complex64, torch.complex64), (torch.float32, torch.complex64), (torch.float64, torch.complex128)):
+    for dtype, expected in (
+        (torch.complex64, torch.complex64),
+        (torch.float32, torch.complex64),
+        (torch.float64, torch.complex128),
+    ):
         x = record(radar, 0.0, 3)
         x = x.to(dtype) if dtype.is_complex else x.real.to(dtype)
         assert split_record(x, radar, 1e-6).dtype == expected

@@ -1,4 +1,6 @@
-"""Correction of non-linear sweeps by the calibration channel, against the sweeps of a linear transmitter."""
+"""Correction of non-linear sweeps by the calibration channel, against the sweeps of a linear
+transmitter.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,10 @@ def signed(radar, turns):
 
 def channel(radar, delay_s, n_period=1, noise=0.0):
     u = radar.fast_time_axis().values()
-    rows = [s * radar.chirp_rate_hz_s * delay_s * u + error_turns(radar, u, r) - error_turns(radar, u - delay_s, r) + 0.3 for r, s in ((0, 1), (1, -1))]
+    rows = [
+        s * radar.chirp_rate_hz_s * delay_s * u + error_turns(radar, u, r) - error_turns(radar, u - delay_s, r) + 0.3
+        for r, s in ((0, 1), (1, -1))
+    ]
     drift = 0.1 * torch.arange(n_period, dtype=torch.float64)[:, None]
     clean = signed(radar, torch.stack(rows)[:, None] + drift)
     return clean + noise * torch.randn(clean.shape, dtype=clean.dtype, generator=torch.Generator().manual_seed(0))
@@ -48,14 +53,23 @@ def residual_rad(x, reference, margin=10):
     return float(torch.angle(z * z.sum(-1, keepdim=True).conj()).square().mean().sqrt())
 
 
-@pytest.mark.parametrize("radar, delay_s", [(table1(), 50e-9), (table1(dechirp_sign="echo_conj_lo"), 50e-9), (ground(), 70e-9)])
+@pytest.mark.parametrize(
+    "radar, delay_s", [(table1(), 50e-9), (table1(dechirp_sign="echo_conj_lo"), 50e-9), (ground(), 70e-9)]
+)
 def test_error_of_the_sweep(radar, delay_s):
     u, h = radar.fast_time_axis().values(), 1e-10
-    true = torch.stack([s * (error_turns(radar, u + h, r) - error_turns(radar, u - h, r)) / (2 * h) / radar.chirp_rate_hz_s for r, s in ((0, 1), (1, -1))])
+    true = torch.stack(
+        [
+            s * (error_turns(radar, u + h, r) - error_turns(radar, u - h, r)) / (2 * h) / radar.chirp_rate_hz_s
+            for r, s in ((0, 1), (1, -1))
+        ]
+    )
     true = true - true.mean(-1, keepdim=True)
     assert 5e-9 < float(true.abs().max()) < 12e-9
     assert float((sweep_error_s(channel(radar, delay_s), radar, delay_s) - true).abs().max()) < 0.06e-9
-    assert float((sweep_error_s(channel(radar, delay_s, 64, 0.05), radar, delay_s) - true).square().mean().sqrt()) < 0.1e-9
+    assert (
+        float((sweep_error_s(channel(radar, delay_s, 64, 0.05), radar, delay_s) - true).square().mean().sqrt()) < 0.1e-9
+    )
 
 
 @pytest.mark.parametrize("sign", ["lo_conj_echo", "echo_conj_lo"])
@@ -64,17 +78,28 @@ def test_resampling_is_right_for_all_ranges_and_phase_for_one(sign):
     calibration = channel(radar, 50e-9)
     for range_m, before in ((1.5, 0.16), (2.0, 0.21), (-0.4, 0.043)):
         x, reference = echo(radar, range_m), echo(radar, range_m, linear=True)
-        resampled, phased = calibrate_sweeps(x, calibration, radar, 50e-9), calibrate_sweeps(x, calibration, radar, 50e-9, "phase", 1.5)
+        resampled, phased = (
+            calibrate_sweeps(x, calibration, radar, 50e-9),
+            calibrate_sweeps(x, calibration, radar, 50e-9, "phase", 1.5),
+        )
         assert residual_rad(x, reference) == pytest.approx(before, rel=0.05)
         assert residual_rad(resampled, reference) < 0.005
         assert (residual_rad(phased, reference) < 0.001) == (range_m == 1.5)
-    assert residual_rad(calibrate_sweeps(echo(radar, 2.0), calibration, radar, 50e-9, "phase", 1.5), echo(radar, 2.0, linear=True)) > 0.05
+    assert (
+        residual_rad(
+            calibrate_sweeps(echo(radar, 2.0), calibration, radar, 50e-9, "phase", 1.5), echo(radar, 2.0, linear=True)
+        )
+        > 0.05
+    )
 
 
 def test_range_of_the_gate_centre_helps_far_from_the_reference():
     radar = ground()
     x, reference = echo(radar, 10.8), echo(radar, 10.8, linear=True)
-    plain, centred = (residual_rad(calibrate_sweeps(x, channel(radar, 70e-9), radar, 70e-9, range_m=r), reference) for r in (None, 10.5))
+    plain, centred = (
+        residual_rad(calibrate_sweeps(x, channel(radar, 70e-9), radar, 70e-9, range_m=r), reference)
+        for r in (None, 10.5)
+    )
     assert plain < 0.04 and centred < 0.005
 
 
@@ -84,7 +109,9 @@ def test_carrier_phase_is_left_alone():
     x, reference = echo(radar, 1.5, 0.5), echo(radar, 1.5, 0.5, linear=True)
     out = calibrate_sweeps(x, channel(radar, 50e-9), radar, 50e-9)
     assert residual_rad(out, reference) < 0.02
-    steps = torch.angle((out[:, 1:] * out[:, :-1].conj() * (reference[:, 1:] * reference[:, :-1].conj()).conj()).mean(-1))
+    steps = torch.angle(
+        (out[:, 1:] * out[:, :-1].conj() * (reference[:, 1:] * reference[:, :-1].conj()).conj()).mean(-1)
+    )
     assert float(steps.abs().max()) < 1e-3
 
 
@@ -97,9 +124,14 @@ def test_stage_batches_gradients_and_dtype():
     told = CalibrateSweeps(radar)(signal, calibration, torch.tensor(50e-9, dtype=torch.float64))
     assert torch.equal(out.data, told.data)
     torch.testing.assert_close(out.data[1], calibrate_sweeps(x[1], calibration[1], radar, 50e-9), atol=1e-9, rtol=0)
-    assert CalibrateSweeps(radar, 50e-9)(signal.to(torch.complex64), calibration.to(torch.complex64)).data.dtype == torch.complex64
+    assert (
+        CalibrateSweeps(radar, 50e-9)(signal.to(torch.complex64), calibration.to(torch.complex64)).data.dtype
+        == torch.complex64
+    )
     few = x[0, :, :1].clone().requires_grad_()
-    assert torch.autograd.gradcheck(lambda y: calibrate_sweeps(y, calibration[0], radar, 50e-9), (few,), fast_mode=True, atol=1e-5)
+    assert torch.autograd.gradcheck(
+        lambda y: calibrate_sweeps(y, calibration[0], radar, 50e-9), (few,), fast_mode=True, atol=1e-5
+    )
 
 
 def test_odd_input_is_refused():

@@ -1,4 +1,6 @@
-"""Timing of a triangular record found from the record itself, against the timing it was made with."""
+"""Timing of a triangular record found from the record itself, against the timing it was
+made with.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +17,12 @@ SHARES = (0.0, 0.07, 0.3, 0.511, 0.97)
 def made(radar, n_period, block=None, snr_db=10.0, shares=SHARES, **scene):
     """Records of several triggers, and the triggers."""
     period = radar.period_s * (1 if block is None else 0.8)
-    trigger = torch.tensor(shares, dtype=torch.float64) * period + 1e-9 * torch.rand(len(shares), dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    return torch.stack([record(radar, float(t), n_period, block, snr_db=snr_db, seed=i, **scene) for i, t in enumerate(trigger)]), trigger
+    trigger = torch.tensor(shares, dtype=torch.float64) * period + 1e-9 * torch.rand(
+        len(shares), dtype=torch.float64, generator=torch.Generator().manual_seed(1)
+    )
+    return torch.stack(
+        [record(radar, float(t), n_period, block, snr_db=snr_db, seed=i, **scene) for i, t in enumerate(trigger)]
+    ), trigger
 
 
 def error(estimate, trigger, radar):
@@ -37,7 +43,13 @@ def test_complex_record_to_a_tenth_of_a_sample(sign, snr_db):
 @pytest.mark.parametrize("motion_sign", [1, -1])
 def test_real_record_and_its_order(motion_sign, side):
     radar = table1(detection="real")
-    x, trigger = made(radar, 192, shares=(0.07, 0.75), scatterers=((1.5 * side, 1.0),), motion=lambda t: motion_sign * (0.35 * t + 10 * t.square()))
+    x, trigger = made(
+        radar,
+        192,
+        shares=(0.07, 0.75),
+        scatterers=((1.5 * side, 1.0),),
+        motion=lambda t: motion_sign * (0.35 * t + 10 * t.square()),
+    )
     found = find_trigger(x, radar, nearer=side < 0)
     assert bool(found.ok.all()) and float(error(found, trigger, radar).abs().max()) < 0.1e-9
 
@@ -51,7 +63,9 @@ def test_blocks_of_the_ground_ladar():
 
 
 def test_a_real_record_without_motion_has_no_order():
-    """A motion v in one order is -v in the other, sample by sample: where nothing moves nothing tells, and nothing is claimed."""
+    """A motion v in one order is -v in the other, sample by sample: where nothing moves nothing
+    tells, and nothing is claimed.
+    """
     radar = table1(detection="real")
     x, trigger = made(radar, 32, motion=lambda t: 0 * t)
     found = find_trigger(x, radar)

@@ -1,4 +1,6 @@
-"""Direct float64 evaluation of the beat of a triangular ladar: the oracle of the tests that separate, time and calibrate sweeps."""
+"""Direct float64 evaluation of the beat of a triangular ladar: the oracle of the tests that
+separate, time and calibrate sweeps.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +13,26 @@ from torchsar.radar import LIGHT_M_S, TriangularLadar
 
 def table1(**changes) -> TriangularLadar:
     """The simulated ladar of brief 000."""
-    values = {"carrier_hz": LIGHT_M_S / 1.55e-6, "bandwidth_hz": 5e9, "period_s": 16e-6, "sample_rate_hz": 64e6, "speed_m_s": 60.0, "reference_range_m": 3000.0}
+    values = {
+        "carrier_hz": LIGHT_M_S / 1.55e-6,
+        "bandwidth_hz": 5e9,
+        "period_s": 16e-6,
+        "sample_rate_hz": 64e6,
+        "speed_m_s": 60.0,
+        "reference_range_m": 3000.0,
+    }
     return TriangularLadar(**{**values, **changes})
 
 
 def ground(**changes) -> TriangularLadar:
     """The ladar of its outdoor experiment, with a real detector."""
-    values = {"period_s": 32e-6, "sample_rate_hz": 150e6, "speed_m_s": 3.125, "reference_range_m": 4339.5, "detection": "real"}
+    values = {
+        "period_s": 32e-6,
+        "sample_rate_hz": 150e6,
+        "speed_m_s": 3.125,
+        "reference_range_m": 4339.5,
+        "detection": "real",
+    }
     return table1(**{**values, **changes})
 
 
@@ -27,14 +42,18 @@ def swing(t: Tensor) -> Tensor:
 
 
 def sweep_turns(radar: TriangularLadar, t: Tensor) -> Tensor:
-    """Turns of the triangular sweep about its carrier, continuous, t = 0 at the start of an up sweep."""
+    """Turns of the triangular sweep about its carrier, continuous, t = 0 at the start of an up
+    sweep.
+    """
     place = torch.remainder(t, radar.period_s)
     u = torch.remainder(place, radar.sweep_s) - radar.sweep_s / 2
     return torch.where(place < radar.sweep_s, 1, -1) * radar.chirp_rate_hz_s / 2 * (u.square() - radar.sweep_s**2 / 4)
 
 
 def beat(radar: TriangularLadar, t: Tensor, motion=swing, scatterers=((1.5, 1.0),)) -> Tensor:
-    """LO conj(echo), complex, at times t after the start of a triangle; the transients after turning points as they are."""
+    """LO conj(echo), complex, at times t after the start of a triangle; the transients after
+    turning points as they are.
+    """
     total = torch.zeros(t.shape, dtype=torch.complex128)
     for range_m, amplitude in scatterers:
         dtau = 2 * (range_m + motion(t)) / radar.wave_speed_m_s
@@ -43,18 +62,33 @@ def beat(radar: TriangularLadar, t: Tensor, motion=swing, scatterers=((1.5, 1.0)
     return total.conj() if radar.dechirp_sign == "echo_conj_lo" else total
 
 
-def record(radar: TriangularLadar, trigger_s: float, n_period: int, block: int | None = None, first_s: float = 0.0, snr_db: float | None = None, seed: int = 0, **scene) -> Tensor:
-    """Blocks (pulse, time) of a record whose triangles start trigger_s after the start of each block."""
+def record(
+    radar: TriangularLadar,
+    trigger_s: float,
+    n_period: int,
+    block: int | None = None,
+    first_s: float = 0.0,
+    snr_db: float | None = None,
+    seed: int = 0,
+    **scene,
+) -> Tensor:
+    """Blocks (pulse, time) of a record whose triangles start trigger_s after the start of each
+    block.
+    """
     block = 2 * radar.sweep_samples if block is None else block
     k, n = torch.arange(n_period, dtype=torch.float64)[:, None], torch.arange(block, dtype=torch.float64)
     x = beat(radar, k * radar.pulse_step_s + first_s + n / radar.sample_rate_hz - trigger_s, **scene)
     if snr_db is not None:
-        x = x + 10 ** (-snr_db / 20) * torch.randn(x.shape, dtype=x.dtype, generator=torch.Generator().manual_seed(seed))
+        x = x + 10 ** (-snr_db / 20) * torch.randn(
+            x.shape, dtype=x.dtype, generator=torch.Generator().manual_seed(seed)
+        )
     return x.real if radar.detection == "real" else x
 
 
 def sweeps(radar: TriangularLadar, n_period: int, first: int = 0, trigger_s: float = 0.0, **scene) -> Tensor:
-    """Separated sweeps (2, pulse, fast_time) on the symmetric grid, of the triangles first, first + 1, ... after time zero of the motion."""
+    """Separated sweeps (2, pulse, fast_time) on the symmetric grid, of the triangles first, first +
+    1, ... after time zero of the motion.
+    """
     u = radar.fast_time_axis().values()
     ramp = torch.tensor([0.5, 1.5], dtype=torch.float64)[:, None, None] * radar.sweep_s
     t = (first + torch.arange(n_period, dtype=torch.float64))[:, None] * radar.pulse_step_s + ramp + u

@@ -37,7 +37,9 @@ def test_the_letter() -> None:
     assert (-0.065, -0.35) not in places
     torch.testing.assert_close(s.amplitude.abs(), torch.ones(3, 62, dtype=torch.float64))
     assert not torch.equal(s.amplitude[0], s.amplitude[1])
-    assert torch.equal(LetterE(random_phase=False).scatterers(Draws(1)).amplitude, torch.ones(62, dtype=torch.complex128))
+    assert torch.equal(
+        LetterE(random_phase=False).scatterers(Draws(1)).amplitude, torch.ones(62, dtype=torch.complex128)
+    )
 
 
 def test_the_ground_target() -> None:
@@ -52,7 +54,9 @@ def test_the_ground_target() -> None:
     assert int((gaps > 1.5 * gaps.min()).sum()) == 2
 
 
-@pytest.mark.parametrize("kind, slope", [(PathFluctuation, -8 / 3), (VibrationSpectrum, -8 / 3), (LogAmplitude, -5 / 3)])
+@pytest.mark.parametrize(
+    "kind, slope", [(PathFluctuation, -8 / 3), (VibrationSpectrum, -8 / 3), (LogAmplitude, -5 / 3)]
+)
 def test_spectra_follow_their_power_law(kind, slope: float) -> None:
     tones = kind(2e-6, lowest_hz=10.0, highest_hz=1000.0, slope=slope, count=50).drawn(Draws(1, trials=range(4)), 1.0)
     power = (tones.cosine.square() + tones.sine.square()) / 2
@@ -77,7 +81,10 @@ def test_tones_are_sums_of_sinusoids_at_any_times() -> None:
     tones = PathFluctuation(1.0, 20.0, 500.0, count=7).drawn(Draws(2, trials=range(2)), 1.0)
     time = torch.rand(3, 7001, dtype=torch.float64)
     expected = sum(
-        (c[:, None, None] * torch.cos(2 * math.pi * f * time) + s[:, None, None] * torch.sin(2 * math.pi * f * time) for f, c, s in zip(tones.frequency_hz, tones.cosine.T, tones.sine.T, strict=True)),
+        (
+            c[:, None, None] * torch.cos(2 * math.pi * f * time) + s[:, None, None] * torch.sin(2 * math.pi * f * time)
+            for f, c, s in zip(tones.frequency_hz, tones.cosine.T, tones.sine.T, strict=True)
+        ),
         torch.zeros(2, 3, 7001, dtype=torch.float64),
     )
     torch.testing.assert_close(tones.displacement_m(time), expected, atol=1e-11, rtol=0)
@@ -89,8 +96,12 @@ def test_random_motions_have_addresses() -> None:
     time = torch.linspace(0, 0.01, 5, dtype=torch.float64)
     together = drawn_motion(motion, Draws(1, trials=[3, 5]), 0.01)
     alone = drawn_motion(motion, Draws(1, trials=[5]), 0.01)
-    torch.testing.assert_close(together[0].displacement_m(time)[1], alone[0].displacement_m(time)[0], atol=1e-18, rtol=1e-9)
-    assert together[1] is motion[1] and not torch.equal(together[0].displacement_m(time), together[2].displacement_m(time))
+    torch.testing.assert_close(
+        together[0].displacement_m(time)[1], alone[0].displacement_m(time)[0], atol=1e-18, rtol=1e-9
+    )
+    assert together[1] is motion[1] and not torch.equal(
+        together[0].displacement_m(time), together[2].displacement_m(time)
+    )
 
 
 def written(folder: Path, suffix: str, time: np.ndarray, track: np.ndarray) -> Path:
@@ -100,7 +111,9 @@ def written(folder: Path, suffix: str, time: np.ndarray, track: np.ndarray) -> P
     elif suffix == ".npz":
         np.savez(path, time_s=time, displacement_m=track)
     elif suffix == ".csv":
-        path.write_text("time,displacement\n" + "\n".join(f"{t:.17g},{d:.17g}" for t, d in zip(time, track, strict=True)))
+        path.write_text(
+            "time,displacement\n" + "\n".join(f"{t:.17g},{d:.17g}" for t, d in zip(time, track, strict=True))
+        )
     else:
         np.savetxt(path, np.stack([time, track], -1), fmt="%.17g", header="time displacement")
     return path

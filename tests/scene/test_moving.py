@@ -1,4 +1,6 @@
-"""Moving targets: ranges against three-dimensional geometry, series against the square root, and what ships and fleets draw."""
+"""Moving targets: ranges against three-dimensional geometry, series against the square root, and
+what ships and fleets draw.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +11,24 @@ import torch
 
 from torchsar.core import Draws
 from torchsar.radar import BistaticRadar, LinearFM, receive_range
-from torchsar.scene import BandLimited, BistaticWorld, ExactRange, Fleet, GroundMovers, Movers, MovingPoints, OrbitTransmit, Pattern, PolynomialTransmit, Ship, TaylorRange
+from torchsar.scene import (
+    BandLimited,
+    BistaticWorld,
+    ExactRange,
+    Fleet,
+    GroundMovers,
+    Movers,
+    MovingPoints,
+    OrbitTransmit,
+    Pattern,
+    PolynomialTransmit,
+    Ship,
+    TaylorRange,
+)
 
-RADAR = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0, channel_m=(-0.8, 0.1, 0.75), wave_speed_m_s=3e8)
+RADAR = BistaticRadar(
+    1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0, channel_m=(-0.8, 0.1, 0.75), wave_speed_m_s=3e8
+)
 TIME = torch.linspace(-2.25, 2.25, 31, dtype=torch.float64)
 
 
@@ -29,24 +46,38 @@ def test_ranges_of_points_are_those_of_the_slant_plane():
 
 def ground_truth(w, a, along, along_a, y0, ground) -> torch.Tensor:
     """Distances in three dimensions, (channel, pulse)."""
-    receiver = torch.stack([300 * TIME - RADAR.channels_at()[:, None], torch.zeros(3, 31, dtype=torch.float64), torch.full((3, 31), 3000.0, dtype=torch.float64)], -1)
+    receiver = torch.stack(
+        [
+            300 * TIME - RADAR.channels_at()[:, None],
+            torch.zeros(3, 31, dtype=torch.float64),
+            torch.full((3, 31), 3000.0, dtype=torch.float64),
+        ],
+        -1,
+    )
     target = torch.stack([y0 + along * TIME + along_a * TIME**2 / 2, ground + w * TIME + a * TIME**2 / 2, 0 * TIME], -1)
     return torch.linalg.vector_norm(receiver - target, dim=-1) - 5000
 
 
 def test_ground_movers_follow_three_dimensions_exactly():
-    scene = GroundMovers([12.5, -8.0], [4.0, -6.0], [30.0, -90.0], [4000.0, 4100.0], outward_m_s2=[0.2, -0.1], along_m_s2=[-0.3, 0.1])
+    scene = GroundMovers(
+        [12.5, -8.0], [4.0, -6.0], [30.0, -90.0], [4000.0, 4100.0], outward_m_s2=[0.2, -0.1], along_m_s2=[-0.3, 0.1]
+    )
     ranges = ExactRange().range_m(movers_of(scene), TIME, RADAR)
     for i, values in enumerate([(12.5, 0.2, 4.0, -0.3, 30.0, 4000.0), (-8.0, -0.1, -6.0, 0.1, -90.0, 4100.0)]):
         torch.testing.assert_close(ranges[..., i], ground_truth(*values), rtol=0, atol=1e-11)
 
 
 def test_ground_motion_in_the_slant_plane_is_an_along_track_bias():
-    """Brief 001, Model only what a scene requires: 12.5 m/s on the ground at 3 km height bends the phase like 0.094 m/s along track."""
+    """Brief 001, Model only what a scene requires: 12.5 m/s on the ground at 3 km height bends the
+    phase like 0.094 m/s along track.
+    """
     movers = movers_of(GroundMovers([-12.5], [0.0], [0.0], [4000.0]))
     assert float(movers.u_r_m_s) == pytest.approx(10.0) and float(movers.range_m) == pytest.approx(0.0)
     exact = ExactRange().range_m(movers, TIME, RADAR)[1, :, 0]
-    turns = [2 * math.pi / RADAR.wavelength_m * (exact - receive_range(TIME, 10.0, u_a, 0.0, 5000.0, 300.0, 0.1)) for u_a in (0.0, -0.094)]
+    turns = [
+        2 * math.pi / RADAR.wavelength_m * (exact - receive_range(TIME, 10.0, u_a, 0.0, 5000.0, 300.0, 0.1))
+        for u_a in (0.0, -0.094)
+    ]
     assert float(turns[0].abs().max()) == pytest.approx(0.745, abs=0.02)
     assert float(turns[1].abs().max()) < 0.02
 
@@ -71,7 +102,11 @@ def test_order_two_is_equation_5():
     movers = movers_of(MovingPoints([10.0], [5.0], [0.0], [0.0]))
     dx, v, u, near = RADAR.channels_at()[:, None], 295.0, 10.0, 5000.0
     square = v**2 + u**2
-    paper = square / (2 * near) * (TIME - u * near / square - v * dx / square) ** 2 - square / (2 * near) * ((near * u + v * dx) / square) ** 2 + dx**2 / (2 * near)
+    paper = (
+        square / (2 * near) * (TIME - u * near / square - v * dx / square) ** 2
+        - square / (2 * near) * ((near * u + v * dx) / square) ** 2
+        + dx**2 / (2 * near)
+    )
     torch.testing.assert_close(TaylorRange(2).range_m(movers, TIME, RADAR)[..., 0], paper, rtol=0, atol=1e-10)
 
 
@@ -102,7 +137,9 @@ def test_fleets_join_what_is_bent_with_what_is_not():
     fleet = movers_of(Fleet({"point": points, "ground": ground, "ship": ship, "again": ship}), range(2))
     assert fleet.u_r_m_s.shape == (2, 12) and not torch.equal(fleet.y0_m[0, 2:7], fleet.y0_m[0, 7:])
     for i, scene in enumerate((points, ground)):
-        torch.testing.assert_close(fleet.excess_m(TIME, RADAR)[0, ..., i], movers_of(scene).excess_m(TIME, RADAR)[..., 0], rtol=0, atol=1e-12)
+        torch.testing.assert_close(
+            fleet.excess_m(TIME, RADAR)[0, ..., i], movers_of(scene).excess_m(TIME, RADAR)[..., 0], rtol=0, atol=1e-12
+        )
 
 
 def test_points_may_differ_between_trials_and_be_complex():

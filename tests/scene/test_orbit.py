@@ -1,4 +1,6 @@
-"""Orbits against the laws of motion, the series of the range against its closed forms and the errata of brief 001, and the timing diagram against counting."""
+"""Orbits against the laws of motion, the series of the range against its closed forms and the
+errata of brief 001, and the timing diagram against counting.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,13 @@ import pytest
 import torch
 
 from torchsar.radar import Orbit, orbit_range, range_coefficients, seen_point, timing_diagram
-from torchsar.radar.orbit import EARTH_GRAVITY_M3_S2, EARTH_RADIUS_M, earth_velocity_m_s, gravity_m_s2, turned_with_earth
+from torchsar.radar.orbit import (
+    EARTH_GRAVITY_M3_S2,
+    EARTH_RADIUS_M,
+    earth_velocity_m_s,
+    gravity_m_s2,
+    turned_with_earth,
+)
 from torchsar.radar.timing import ground_slant_m, off_nadir_ground_m
 from torchsar.scene import OrbitTransmit, PolynomialTransmit
 
@@ -18,7 +26,9 @@ ECCENTRIC = Orbit(42_164e3, 0.3, 50.0, 20.0, 80.0, 30.0)
 
 
 def over_a_turn(orbit: Orbit, n: int = 181) -> torch.Tensor:
-    return torch.linspace(0, 2 * math.pi * math.sqrt(float(orbit.semi_major_m) ** 3 / EARTH_GRAVITY_M3_S2), n, dtype=torch.float64)
+    return torch.linspace(
+        0, 2 * math.pi * math.sqrt(float(orbit.semi_major_m) ** 3 / EARTH_GRAVITY_M3_S2), n, dtype=torch.float64
+    )
 
 
 @pytest.mark.parametrize("orbit", [PAPER, ECCENTRIC], ids=["paper", "eccentric"])
@@ -39,7 +49,10 @@ def test_elements_stand_for_what_they_say():
 
 
 def test_elements_have_gradients_and_trials():
-    elements = [torch.tensor([a, b], dtype=torch.float64, requires_grad=True) for a, b in ((4.2e7, 3e7), (0.1, 0.3), (60.0, 30.0), (10.0, 0.0), (270.0, 4.0), (5.0, 90.0))]
+    elements = [
+        torch.tensor([a, b], dtype=torch.float64, requires_grad=True)
+        for a, b in ((4.2e7, 3e7), (0.1, 0.3), (60.0, 30.0), (10.0, 0.0), (270.0, 4.0), (5.0, 90.0))
+    ]
     time = torch.tensor([0.0, 3e3], dtype=torch.float64)
     assert torch.autograd.gradcheck(lambda *e: Orbit(*e).state(time)[0] / 1e6, elements, eps=1e-4, atol=1e-4)
     alone = Orbit(*(float(e[1].detach()) for e in elements)).state(time)[1]
@@ -69,18 +82,29 @@ def test_higher_coefficients_follow_the_exact_range():
     time = torch.linspace(-300, 300, 21, dtype=torch.float64)
     exact = OrbitTransmit(PAPER, point.tolist(), epoch).range_m(time)
     lengths = torch.linalg.vector_norm(PAPER.state(epoch + time)[0] - turned_with_earth(point, time), dim=-1)
-    torch.testing.assert_close(exact, lengths - torch.linalg.vector_norm(PAPER.state(at)[0][0] - point), rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        exact, lengths - torch.linalg.vector_norm(PAPER.state(at)[0][0] - point), rtol=0, atol=1e-6
+    )
     misses = [float((exact - PolynomialTransmit(k[:n].tolist()).range_m(time)).abs().max()) for n in (2, 3, 4, 5)]
     assert misses[0] > 1 and misses[1] < 0.3 and misses[2] < 1e-3 and misses[3] < 4e-5
 
 
 @pytest.mark.parametrize(("orbit", "greatest"), [(PAPER, 0.0208), (Orbit(42_164e3, **ELEMENTS), 0.0215)])
 def test_published_sizes_of_the_transmit_range(orbit, greatest):
-    """Brief 001, erratum 3: k2 in -0.0146..0.0208 (0.0215 at the geosynchronous radius), k1 up to 376 m/s off zero Doppler, the third power below 1e-4 pi."""
+    """Brief 001, erratum 3: k2 in -0.0146..0.0208 (0.0215 at the geosynchronous radius), k1 up to
+    376 m/s off zero Doppler, the third power below 1e-4 pi.
+    """
     time = over_a_turn(orbit)
     position, velocity = orbit.state(time)
-    k = torch.stack([range_coefficients(orbit, seen_point(position, velocity, 7.0, float(squint)), time, 3) for squint in range(0, 360, 10)])
-    assert float(k[..., 1].max()) == pytest.approx(greatest, abs=6e-5) and float(k[..., 1].min()) == pytest.approx(-0.0146, abs=1e-4)
+    k = torch.stack(
+        [
+            range_coefficients(orbit, seen_point(position, velocity, 7.0, float(squint)), time, 3)
+            for squint in range(0, 360, 10)
+        ]
+    )
+    assert float(k[..., 1].max()) == pytest.approx(greatest, abs=6e-5) and float(k[..., 1].min()) == pytest.approx(
+        -0.0146, abs=1e-4
+    )
     assert float(k[..., 0].abs().max()) == pytest.approx(376, abs=2) and float(k[0, :, 0].abs().max()) < 1e-9
     assert float(k[..., 2].abs().max()) * 2.25**3 * 2 / 0.24 == pytest.approx(8.6e-5, abs=5e-6)
 
@@ -88,12 +112,16 @@ def test_published_sizes_of_the_transmit_range(orbit, greatest):
 def test_the_seen_point_lies_on_the_ground_and_under_the_angle():
     position, velocity = PAPER.state(torch.tensor([0.0, 9e3], dtype=torch.float64))
     point = seen_point(position, velocity, 7.0, 25.0, side=-1.0)
-    torch.testing.assert_close(torch.linalg.vector_norm(point, dim=-1), torch.full((2,), EARTH_RADIUS_M, dtype=torch.float64))
+    torch.testing.assert_close(
+        torch.linalg.vector_norm(point, dim=-1), torch.full((2,), EARTH_RADIUS_M, dtype=torch.float64)
+    )
     cosine = torch.nn.functional.cosine_similarity(point - position, -position, dim=-1)
     torch.testing.assert_close(cosine, torch.full((2,), math.cos(math.radians(7)), dtype=torch.float64))
     arc = EARTH_RADIUS_M * float(torch.arccos(torch.nn.functional.cosine_similarity(point, position, dim=-1))[0])
     assert arc == pytest.approx(off_nadir_ground_m(36_500e3, 7.0), abs=1e-3)
-    assert float(ground_slant_m(36_500e3, torch.tensor(arc, dtype=torch.float64))) == pytest.approx(float(torch.linalg.vector_norm(point - position, dim=-1)[0]), abs=1e-3)
+    assert float(ground_slant_m(36_500e3, torch.tensor(arc, dtype=torch.float64))) == pytest.approx(
+        float(torch.linalg.vector_norm(point - position, dim=-1)[0]), abs=1e-3
+    )
 
 
 def test_orbit_range_starts_at_zero_in_every_trial():
@@ -106,7 +134,9 @@ def test_orbit_range_starts_at_zero_in_every_trial():
 def diagram(pulse_s=20e-6, guard_s=50e-6, nadir_s=30e-6):
     middle = off_nadir_ground_m(36_500e3, 7.0)
     prf = torch.arange(150.0, 211.0, 2.0, dtype=torch.float64)
-    return timing_diagram(36_500e3, prf, torch.arange(middle - 500e3, middle + 500e3, 4e3, dtype=torch.float64), pulse_s, guard_s, nadir_s)
+    return timing_diagram(
+        36_500e3, prf, torch.arange(middle - 500e3, middle + 500e3, 4e3, dtype=torch.float64), pulse_s, guard_s, nadir_s
+    )
 
 
 def test_lost_places_are_those_where_echoes_meet_pulses():
@@ -130,7 +160,9 @@ def test_swaths_fit_where_every_place_is_clear():
         expected = [start + 125 < 250 and bool(d.clear[row, start : start + 126].all()) for start in range(250)]
         assert fits[row].tolist() == expected
     rates = d.prf_hz[fits.any(-1)]
-    assert 180.0 in rates and bool(((rates >= 160) & (rates <= 200)).any())  # Fig. 2 takes rates of 160 to 200 Hz for a swath of 500 km
+    assert 180.0 in rates and bool(
+        ((rates >= 160) & (rates <= 200)).any()
+    )  # Fig. 2 takes rates of 160 to 200 Hz for a swath of 500 km
     assert not bool(d.swath_fits(1e7).any())
 
 

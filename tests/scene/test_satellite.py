@@ -12,7 +12,13 @@ from torchsar.echo import simulate_turntable
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
 
-SETS = {"full": Satellite(), "mid": Satellite(300), "small": Satellite(120, 1.6), "upright": Satellite(200, 5.0, 2.0, 0.0), "leaning": Satellite(200, 5.0, 2.0, -0.7)}
+SETS = {
+    "full": Satellite(),
+    "mid": Satellite(300),
+    "small": Satellite(120, 1.6),
+    "upright": Satellite(200, 5.0, 2.0, 0.0),
+    "leaning": Satellite(200, 5.0, 2.0, -0.7),
+}
 
 
 @pytest.mark.parametrize("satellite", SETS.values(), ids=list(SETS))
@@ -30,7 +36,9 @@ def test_parts_hold_their_shares_and_lie_where_they_should() -> None:
     counts = {name: members.stop - members.start for name, members in parts.items()}
     assert counts == {"bus": 156, "panel_left": 174, "panel_right": 174, "dish": 48, "boom": 48}
     x, y = ({name: v[members] for name, members in parts.items()} for v in (s.azimuth_m, s.range_m))
-    assert float(x["panel_left"].max()) < float(x["bus"].min()) and float(x["bus"].max()) < float(x["panel_right"].min())
+    assert float(x["panel_left"].max()) < float(x["bus"].min()) and float(x["bus"].max()) < float(
+        x["panel_right"].min()
+    )
     assert float(y["boom"].max()) == 3.4 and float(y["dish"].min()) == -3.4
     assert float(y["boom"].min()) > 0 > float(y["dish"].mean())
     for count in (60, 61, 120, 299):
@@ -53,7 +61,9 @@ def test_corners_are_strong_and_shared_and_tips_are_at_the_ends() -> None:
     s, corners = satellite.scatterers(Draws(3, trials=range(5))), satellite.corners()
     assert int(corners.sum()) == 20
     torch.testing.assert_close(s.amplitude.abs()[:, corners], torch.full((5, 20), 1.5, dtype=torch.float64))
-    assert bool((s.azimuth_m[:, corners] == s.azimuth_m[:1, corners]).all()) and bool((s.range_m[:, corners] == s.range_m[:1, corners]).all())
+    assert bool((s.azimuth_m[:, corners] == s.azimuth_m[:1, corners]).all()) and bool(
+        (s.range_m[:, corners] == s.range_m[:1, corners]).all()
+    )
     tips = corners & (s.azimuth_m[0].abs() == 6.43)
     assert int(tips.sum()) == 4
     others = ~corners
@@ -71,10 +81,16 @@ def test_amplitudes_have_their_law() -> None:
 
 def test_draws_have_addresses() -> None:
     satellite = Satellite(120, 1.6)
-    whole, part, alone, other = (satellite.scatterers(d) for d in (Draws(5, trials=range(4)), Draws(5, trials=[3, 1]), Draws(5), Draws(6)))
+    whole, part, alone, other = (
+        satellite.scatterers(d) for d in (Draws(5, trials=range(4)), Draws(5, trials=[3, 1]), Draws(5), Draws(6))
+    )
     for name in ("azimuth_m", "range_m", "amplitude"):
-        assert torch.equal(getattr(part, name), getattr(whole, name)[[3, 1]]) and torch.equal(getattr(alone, name), getattr(whole, name)[0])
-        assert not torch.equal(getattr(alone, name), getattr(other, name)) and not torch.equal(getattr(whole, name)[0], getattr(whole, name)[1])
+        assert torch.equal(getattr(part, name), getattr(whole, name)[[3, 1]]) and torch.equal(
+            getattr(alone, name), getattr(whole, name)[0]
+        )
+        assert not torch.equal(getattr(alone, name), getattr(other, name)) and not torch.equal(
+            getattr(whole, name)[0], getattr(whole, name)[1]
+        )
 
 
 def test_the_small_set_is_simulated_as_a_batch() -> None:

@@ -1,4 +1,6 @@
-"""Seas: moments of K clutter, where its texture lies, images as texture, draws by address, and what is refused."""
+"""Seas: moments of K clutter, where its texture lies, images as texture, draws by address, and what
+is refused.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,10 @@ def test_normal_numbers_become_gamma_numbers_rank_for_rank(shape):
     torch.testing.assert_close(lower[x < 0], torch.special.ndtr(x[x < 0]), rtol=1e-3, atol=0)
     torch.testing.assert_close(upper[x > 0], torch.special.ndtr(-x[x > 0]), rtol=2e-3, atol=0)
     assert bool((value.diff() > 0).all())
-    torch.testing.assert_close(gamma_from_normal(torch.tensor([-50.0, 50.0], dtype=torch.float64), shape), gamma_from_normal(torch.tensor([-9.0, 9.0], dtype=torch.float64), shape))
+    torch.testing.assert_close(
+        gamma_from_normal(torch.tensor([-50.0, 50.0], dtype=torch.float64), shape),
+        gamma_from_normal(torch.tensor([-9.0, 9.0], dtype=torch.float64), shape),
+    )
 
 
 def test_a_gamma_of_shape_one_is_exponential():
@@ -45,7 +50,9 @@ def test_a_gamma_of_shape_one_is_exponential():
 
 
 def test_texture_is_shared_in_a_cell_and_only_there():
-    """Cells of 10 by 30 m under a grid of 5 m: averages of intensity over the trials of one texture are equal in a cell, and neighbouring cells know nothing of each other."""
+    """Cells of 10 by 30 m under a grid of 5 m: averages of intensity over the trials of one texture
+    are equal in a cell, and neighbouring cells know nothing of each other.
+    """
     sea = KSea(0.5, cell_m=(10.0, 30.0))
     table, row, column = sea.texture(grid(40, 5.0), grid(60, 5.0), Draws(2, trials=range(300)))
     field = table.index_select(-2, row).index_select(-1, column)
@@ -65,22 +72,36 @@ def test_an_unordered_grid_has_the_same_law():
 
 
 def test_draws_have_addresses():
-    whole, part, alone, other = (KSea().reflectivity(grid(), grid(10), d) for d in (Draws(5, trials=range(4)), Draws(5, trials=[3, 1]), Draws(5), Draws(6)))
+    whole, part, alone, other = (
+        KSea().reflectivity(grid(), grid(10), d)
+        for d in (Draws(5, trials=range(4)), Draws(5, trials=[3, 1]), Draws(5), Draws(6))
+    )
     assert torch.equal(part, whole[[3, 1]]) and torch.equal(alone, whole[0])
     assert not torch.equal(alone, other) and not torch.equal(whole[0], whole[1])
     assert whole.dtype == torch.complex64
-    torch.testing.assert_close(KSea().reflectivity(grid(), grid(10), Draws(5), torch.complex128).to(torch.complex64), alone)
+    torch.testing.assert_close(
+        KSea().reflectivity(grid(), grid(10), Draws(5), torch.complex128).to(torch.complex64), alone
+    )
 
 
 def test_an_image_lies_in_place_and_is_mirrored_beyond():
-    """Two by four pixels of 100 by 50 m: which pixel a place falls on, also far outside, and the mean of the image is one."""
+    """Two by four pixels of 100 by 50 m: which pixel a place falls on, also far outside, and the
+    mean of the image is one.
+    """
     image = torch.tensor([[1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0]])
     sea = ImageReflectivity(image, 200.0, 200.0)
-    azimuth, distance = torch.tensor([-50.0, 50.0, 150.0, -150.0, 250.0]), torch.tensor([-99.0, -1.0, 1.0, 99.0, 101.0, 199.0, -101.0])
+    azimuth, distance = (
+        torch.tensor([-50.0, 50.0, 150.0, -150.0, 250.0]),
+        torch.tensor([-99.0, -1.0, 1.0, 99.0, 101.0, 199.0, -101.0]),
+    )
     table, row, column = sea.texture(azimuth.double(), distance.double(), Draws(1))
     assert row.tolist() == [0, 1, 1, 0, 0] and column.tolist() == [0, 1, 2, 3, 3, 2, 0]
     torch.testing.assert_close(table, image.double() / 4.5)
-    s = sea.reflectivity(torch.full((50,), 50.0, dtype=torch.float64), torch.full((60,), 99.0, dtype=torch.float64), Draws(1, trials=range(5)))
+    s = sea.reflectivity(
+        torch.full((50,), 50.0, dtype=torch.float64),
+        torch.full((60,), 99.0, dtype=torch.float64),
+        Draws(1, trials=range(5)),
+    )
     assert float(s.abs().square().mean()) == pytest.approx(8 / 4.5, rel=0.05)
 
 
@@ -95,7 +116,12 @@ def test_images_come_from_files(tmp_path):
         assert sea.power_db == 3.0
     (tmp_path / "text.npy").write_text("no array")
     for path, key, error, sentence in (
-        ("two.npz", None, ValueError, r"two.npz holds the arrays \['sea', 'complex'\]; name the one to use, got key=None"),
+        (
+            "two.npz",
+            None,
+            ValueError,
+            r"two.npz holds the arrays \['sea', 'complex'\]; name the one to use, got key=None",
+        ),
         ("two.npz", "land", ValueError, "got key='land'"),
         ("none.npy", None, FileNotFoundError, "none.npy does not exist"),
         ("text.npy", None, ValueError, "text.npy is no numpy file of plain numbers"),
@@ -109,7 +135,10 @@ def test_images_come_from_files(tmp_path):
     [
         ({"shape": 0.05}, r"shape of a K sea must lie in 0.1..1000, or be inf for pure speckle, got 0.05"),
         ({"shape": math.nan}, "shape of a K sea must lie"),
-        ({"cell_m": (10.0, 0.0)}, r"cell_m of a K sea must be two positive sides \(m\), along track and in range, got \(10.0, 0.0\)"),
+        (
+            {"cell_m": (10.0, 0.0)},
+            r"cell_m of a K sea must be two positive sides \(m\), along track and in range, got \(10.0, 0.0\)",
+        ),
         ({"power_db": math.nan}, "power_db of a sea must be a finite number"),
         ({"margin_s": -1.0}, "margin_s of a sea must be 0 s or more, or None"),
         ({"lobes": 0}, "lobes of a sea must be a whole number of 1 or more, got 0"),

@@ -27,7 +27,19 @@ def refused(tmp_path: Path, *assignments: str, **changes: object) -> str:
 
 @pytest.mark.parametrize(
     "text, value",
-    [("1e-6", 1e-6), ("3.2e9", 3.2e9), ("-5E+3", -5e3), ("1_000.5", 1000.5), (".5", 0.5), ("7", 7), ("yes", "yes"), ("true", True), ("null", None), ("1.2.3", "1.2.3"), ("1e", "1e")],
+    [
+        ("1e-6", 1e-6),
+        ("3.2e9", 3.2e9),
+        ("-5E+3", -5e3),
+        ("1_000.5", 1000.5),
+        (".5", 0.5),
+        ("7", 7),
+        ("yes", "yes"),
+        ("true", True),
+        ("null", None),
+        ("1.2.3", "1.2.3"),
+        ("1e", "1e"),
+    ],
 )
 def test_yaml_reads_numbers_as_numbers(text: str, value: object) -> None:
     assert parse(text, "text") == value
@@ -45,7 +57,9 @@ def test_a_key_given_twice_is_refused() -> None:
 
 
 def test_overrides_make_sections_and_keep_the_rest() -> None:
-    tree = override({"world": {"noise": {"snr_db": 5.0}, "lines": 3}}, ["world.noise.snr_db=1e1", "data.file=/x y.npz", "seed=7"])
+    tree = override(
+        {"world": {"noise": {"snr_db": 5.0}, "lines": 3}}, ["world.noise.snr_db=1e1", "data.file=/x y.npz", "seed=7"]
+    )
     assert tree == {"world": {"noise": {"snr_db": 10.0}, "lines": 3}, "data": {"file": "/x y.npz"}, "seed": 7}
 
 
@@ -57,7 +71,8 @@ def test_override_through_a_value_is_refused() -> None:
 @pytest.mark.parametrize("name", sorted(packaged_configs()))
 def test_packaged_configs_are_complete(name: str) -> None:
     for spelled in (name, f"{name}.yaml", f"configs/{name}.yaml"):
-        loaded = load(spelled, [f"data.file={__file__}"])  # any file: only its presence is checked here
+        # any file: only its presence is checked here
+        loaded = load(spelled, [f"data.file={__file__}"])
         assert "recommended" in loaded.config.processor
     if loaded.config.radar is not None:
         system_of(loaded).check(loaded)
@@ -94,10 +109,22 @@ def test_unknown_config_names_what_there_is() -> None:
         (["world.scene.points.azimuth_m=[1,x]"], ["world.scene.points.azimuth_m", "'x'"]),
         (["world.scene.points.kind=null"], ["world.scene.points.kind", "unknown scene None"]),
         (["world.damages.x.kind=nothing"], ["world.damages.x.kind", "unknown damage 'nothing'"]),
-        (["processor.recommended.stages.focus.stage=omega"], ["processor.recommended.stages.focus.stage", "unknown stage 'omega'", "did you mean 'omega_k'"]),
-        (["processor.recommended.stages.focus.velocity=3"], ["processor.recommended.stages.focus.velocity", "did you mean 'velocity_m_s'"]),
-        (["processor.recommended.stages.focus.reference=best"], ["processor.recommended.stages.focus", "'best'", "matched"]),
-        (["processor.recommended.stages.focus.uses.doppler_hz=velocity"], ["processor.recommended", "no earlier stage provides"]),
+        (
+            ["processor.recommended.stages.focus.stage=omega"],
+            ["processor.recommended.stages.focus.stage", "unknown stage 'omega'", "did you mean 'omega_k'"],
+        ),
+        (
+            ["processor.recommended.stages.focus.velocity=3"],
+            ["processor.recommended.stages.focus.velocity", "did you mean 'velocity_m_s'"],
+        ),
+        (
+            ["processor.recommended.stages.focus.reference=best"],
+            ["processor.recommended.stages.focus", "'best'", "matched"],
+        ),
+        (
+            ["processor.recommended.stages.focus.uses.doppler_hz=velocity"],
+            ["processor.recommended", "no earlier stage provides"],
+        ),
         (["processor.recommended.stages.focus.uses.dopler_hz=doppler"], ["processor.recommended", "'dopler_hz'"]),
         (["processor.recommended.stages.focus.uses=7"], ["processor.recommended.stages.focus.uses", "7"]),
         (["processor.recommended.stages.a-b.stage=omega_k"], ["a-b", "stage name"]),
@@ -126,9 +153,15 @@ def test_unknown_config_names_what_there_is() -> None:
         (["world.beam.dwell_s=-1.0"], ["world.beam", "dwell_s", "-1.0"]),
         (["world.doppler_hz=3000.0"], ["world", "Doppler", "squint beyond 90 degrees"]),
         (["radar.pulse.duration_s=1.0"], ["world", "a line of 128 samples does not hold the pulse of 50000000"]),
-        (["world.damages={x: {kind: periodic_jitter, offset_samples: []}}"], ["world.damages.x", "at least one offset"]),
+        (
+            ["world.damages={x: {kind: periodic_jitter, offset_samples: []}}"],
+            ["world.damages.x", "at least one offset"],
+        ),
         (["processor.recommended.stages.keys.stage=omega_k"], ["processor.recommended", "cannot be called 'keys'"]),
-        (["processor.recommended.stages.lines.stage=line_integrity"], ["processor.recommended", "'lines'", "needs the value 'line_number'", "aux.NAME"]),
+        (
+            ["processor.recommended.stages.lines.stage=line_integrity"],
+            ["processor.recommended", "'lines'", "needs the value 'line_number'", "aux.NAME"],
+        ),
         (["seed=[1"], ["command line, seed", "not readable as YAML"]),
     ],
 )
@@ -148,6 +181,8 @@ def test_missing_sections_are_named(tmp_path: Path) -> None:
 
 def test_chain_of_a_method_is_built_as_written(tmp_path: Path) -> None:
     loaded = load(str(write_tiny(tmp_path)))
-    chain = build_chain(loaded.config.processor["recommended"], "processor.recommended", loaded.file, radar=build_radar(loaded))
+    chain = build_chain(
+        loaded.config.processor["recommended"], "processor.recommended", loaded.file, radar=build_radar(loaded)
+    )
     assert list(chain.stages) == ["doppler", "focus"]
     assert chain.uses["focus"] == {"doppler_hz": "doppler.doppler_baseband_hz"}

@@ -41,7 +41,14 @@ def test_every_stage_belongs_to_one_group() -> None:
 
 
 class Sample(Stage):
-    def __init__(self, radar: object, count: int = 3, level: torch.Tensor | float | None = None, table: torch.Tensor | None = None, pair: tuple[int, int] = (1, 2)) -> None:
+    def __init__(
+        self,
+        radar: object,
+        count: int = 3,
+        level: torch.Tensor | float | None = None,
+        table: torch.Tensor | None = None,
+        pair: tuple[int, int] = (1, 2),
+    ) -> None:
         super().__init__()
         self.radar, self.count, self.level, self.table, self.pair = radar, count, level, table, pair
 
@@ -49,7 +56,9 @@ class Sample(Stage):
 def test_signatures_become_keys_and_values_become_what_they_ask_for() -> None:
     catalogue = Catalogue("stage", "stage", {"sample": Sample}, given=("radar",))
     assert set(catalogue.model("sample").model_fields) == {"count", "level", "table", "pair"}
-    made = catalogue.make({"stage": "sample", "level": 2.5, "table": [1.0, 2.0], "pair": [3, 4]}, "here", "file", radar="the radar")
+    made = catalogue.make(
+        {"stage": "sample", "level": 2.5, "table": [1.0, 2.0], "pair": [3, 4]}, "here", "file", radar="the radar"
+    )
     assert made.radar == "the radar" and made.count == 3 and made.level == 2.5 and made.pair == (3, 4)
     assert made.table.dtype == torch.float64 and made.table.tolist() == [1.0, 2.0]
     for wrong in ({"count": 1.5}, {"count": True}, {"pair": 3}, {"level": "x"}, {"radar": 1}):
@@ -63,6 +72,17 @@ def test_own_stage_joins_through_the_entry_point(tmp_path: Path) -> None:
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: louder\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text("[torchsar.stages]\nlouder = louder:Louder\n")
-    code = "from torchsar.study.registry import stages, group_of; s = stages().make({'stage': 'louder', 'gain': 3.0}, 'x', 'f'); print(s.gain, group_of('louder'))"
-    done = subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(tmp_path)}, capture_output=True, text=True, timeout=120, cwd=Path(__file__).parents[2])
+    code = (
+        "from torchsar.study.registry import stages, group_of; s = "
+        "stages().make({'stage': 'louder', 'gain': 3.0}, 'x', 'f'); print(s.gain, "
+        "group_of('louder'))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        cwd=Path(__file__).parents[2],
+    )
     assert done.stdout.split() == ["3.0", "own"], done.stderr[-1500:]

@@ -25,7 +25,13 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_folder_holds_what_is_promised(out: Path) -> None:
-    assert sorted(path.name for path in out.iterdir()) == ["arrays.zarr", "config.yaml", "figures", "metrics.json", "report.html"]
+    assert sorted(path.name for path in out.iterdir()) == [
+        "arrays.zarr",
+        "config.yaml",
+        "figures",
+        "metrics.json",
+        "report.html",
+    ]
     assert not list(out.parent.glob("*.tmp")) and not list(out.parent.glob("*.old"))
     for png in (out / "figures").iterdir():
         assert png.read_bytes().startswith(b"\x89PNG")
@@ -33,12 +39,23 @@ def test_folder_holds_what_is_promised(out: Path) -> None:
 
 
 def test_metrics_follow_the_schema(out: Path) -> None:
-    tree = json.loads((out / "metrics.json").read_text(), parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    tree = json.loads(
+        (out / "metrics.json").read_text(), parse_constant=lambda name: pytest.fail(f"{name} is not JSON")
+    )
     assert set(tree) == {"methods", "published", "truth", "definitions"}
     assert {"snr", "contrast", "islr_extent_nulls"} <= set(tree["definitions"])
     best = tree["methods"]["recommended"]
     assert {"metrics", "estimates", "targets"} <= set(best)
-    assert {"entropy_nats", "contrast", "seconds", "doppler_baseband_hz", "doppler_centroid_hz", "effective_velocity_m_s", "squint_deg", "image_error_db"} <= set(best["metrics"])
+    assert {
+        "entropy_nats",
+        "contrast",
+        "seconds",
+        "doppler_baseband_hz",
+        "doppler_centroid_hz",
+        "effective_velocity_m_s",
+        "squint_deg",
+        "image_error_db",
+    } <= set(best["metrics"])
     assert all(isinstance(value, (int, float)) for value in best["metrics"].values())
     assert set(best["targets"]) == {"points.0", "points.1"}
     for estimate in best["estimates"].values():
@@ -72,7 +89,9 @@ def test_arrays_carry_images_and_axes(out: Path) -> None:
 def test_same_seed_same_numbers_other_seed_other_numbers(out: Path, tmp_path: Path) -> None:
     def entropy(*assignments: str) -> float:
         run(load(str(write_tiny(tmp_path)), assignments), tmp_path / "again")
-        return json.loads((tmp_path / "again" / "metrics.json").read_text())["methods"]["clean"]["metrics"]["entropy_nats"]
+        return json.loads((tmp_path / "again" / "metrics.json").read_text())["methods"]["clean"]["metrics"][
+            "entropy_nats"
+        ]
 
     first = json.loads((out / "metrics.json").read_text())["methods"]["clean"]["metrics"]["entropy_nats"]
     assert entropy() == first
@@ -90,7 +109,14 @@ def test_report_shows_the_figures_of_metrics_json_and_asks_for_nothing(out: Path
 
 
 def test_a_failed_run_leaves_nothing(tmp_path: Path) -> None:
-    loaded = load(str(write_tiny(tmp_path)), ["processor.recommended.stages.focus.doppler_hz=[1.0, 2.0]", "processor.recommended.stages.focus.uses={}", "processor.squint_ignored.rerun.start=doppler"])
+    loaded = load(
+        str(write_tiny(tmp_path)),
+        [
+            "processor.recommended.stages.focus.doppler_hz=[1.0, 2.0]",
+            "processor.recommended.stages.focus.uses={}",
+            "processor.squint_ignored.rerun.start=doppler",
+        ],
+    )
     with pytest.raises(ConfigError, match="processor.recommended: doppler_hz of shape"):
         run(loaded, tmp_path / "result")
     assert [path.name for path in tmp_path.iterdir()] == ["tiny.yaml"]

@@ -28,7 +28,13 @@ def test_figures_are_those_of_the_finite_trials(errors: np.ndarray) -> None:
     assert set(found) == set(FIELDS)
     for place in np.ndindex(2, 3):
         x = errors[place][np.isfinite(errors[place])]
-        expected = {"n": len(x), "mean": x.mean(), "median": np.median(x), "rmse": np.sqrt((x**2).mean()), "std": x.std(ddof=1)}
+        expected = {
+            "n": len(x),
+            "mean": x.mean(),
+            "median": np.median(x),
+            "rmse": np.sqrt((x**2).mean()),
+            "std": x.std(ddof=1),
+        }
         for name, value in expected.items():
             np.testing.assert_allclose(found[name][place], value, rtol=1e-12)
         for name in ("mean", "median", "rmse"):
@@ -92,7 +98,9 @@ def test_memory_stays_bounded_for_many_trials() -> None:
     np.testing.assert_allclose((high - low) / 2, 1.96 / np.sqrt(2 * 100_000), rtol=0.15)
 
 
-@pytest.mark.parametrize("k, n", [(0, 1), (1, 1), (0, 12), (12, 12), (3, 10), (37, 200), (199, 200), (1, 20_000), (9_950, 20_000)])
+@pytest.mark.parametrize(
+    "k, n", [(0, 1), (1, 1), (0, 12), (12, 12), (3, 10), (37, 200), (199, 200), (1, 20_000), (9_950, 20_000)]
+)
 @pytest.mark.parametrize("level", [0.68, 0.95])
 def test_share_is_exact(k: int, n: int, level: float) -> None:
     value, interval = share(np.arange(n) < k, np.ones(n, bool), level)
@@ -114,6 +122,8 @@ def test_half_width_shrinks_with_trials() -> None:
     for name in ("rmse", "mean", "median"):
         few, many = (half_width_ratio(x[:n], name, seed=0) for n in (100, 6400))
         assert 4 < few / many < 16
-    assert half_width_ratio(np.full(10, 3.0), "rmse", 0) == 0 and np.isnan(half_width_ratio(np.array([1.0, NAN]), "rmse", 0))
+    assert half_width_ratio(np.full(10, 3.0), "rmse", 0) == 0 and np.isnan(
+        half_width_ratio(np.array([1.0, NAN]), "rmse", 0)
+    )
     with pytest.raises(ValueError, match="choose rmse, mean or median"):
         half_width_ratio(x, "mode", seed=0)

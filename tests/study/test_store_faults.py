@@ -1,4 +1,6 @@
-"""A sweep that dies at any write of its store: what is marked done is there, and resuming gives what an undisturbed sweep gives."""
+"""A sweep that dies at any write of its store: what is marked done is there, and resuming gives
+what an undisturbed sweep gives.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ class Killed(BaseException):
 
 @pytest.fixture
 def writes(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
-    """Counts what a store writes and removes; nothing is written from number `end` on, which leaves half a file."""
+    """Counts what a store writes and removes; nothing is written from number `end` on, which leaves
+    half a file.
+    """
     state: dict[str, float] = {"number": 0, "end": float("inf")}
 
     def guarded(name: str):
@@ -42,8 +46,10 @@ def writes(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
 
     for name in ("set", "set_if_not_exists", "delete", "delete_dir"):
         monkeypatch.setattr(LocalStore, name, guarded(name))
-    monkeypatch.setattr(store_module.Store, "due", property(lambda store: True))  # every chunk is written at once
-    monkeypatch.setattr(store_module, "fcntl", None)  # the lock of a dead process is gone, that of an exception is not
+    # every chunk is written at once
+    monkeypatch.setattr(store_module.Store, "due", property(lambda store: True))
+    # the lock of a dead process is gone, that of an exception is not
+    monkeypatch.setattr(store_module, "fcntl", None)
     return state
 
 
@@ -51,12 +57,18 @@ def held_rows_are(held: Record, reference: Record) -> None:
     for index in np.argwhere(held.done):
         place = reference.place({name: known[i] for (name, known), i in zip(held.labels.items(), index)})
         for name, values in held.metrics.items():
-            np.testing.assert_array_equal(values[(slice(None), *index)], reference.metrics[name][(slice(None), *place, index[-1])])
+            np.testing.assert_array_equal(
+                values[(slice(None), *index)], reference.metrics[name][(slice(None), *place, index[-1])]
+            )
 
 
 @pytest.mark.filterwarnings("ignore:unclosed file")
-@pytest.mark.parametrize("before, options, first, step", [(None, SMALL, BEFORE_LABELS, 7), (SMALL, LARGE, 0, 17)], ids=["new", "growing"])
-def test_dying_at_any_write_loses_nothing_and_changes_nothing(writes: dict, tmp_path: Path, before: dict | None, options: dict, first: int, step: int) -> None:
+@pytest.mark.parametrize(
+    "before, options, first, step", [(None, SMALL, BEFORE_LABELS, 7), (SMALL, LARGE, 0, 17)], ids=["new", "growing"]
+)
+def test_dying_at_any_write_loses_nothing_and_changes_nothing(
+    writes: dict, tmp_path: Path, before: dict | None, options: dict, first: int, step: int
+) -> None:
     for given in filter(None, (before, options)):
         reference = toy.run(tmp_path / "undisturbed", **given)
     end, died = first, True

@@ -83,7 +83,9 @@ def test_results_are_labelled_and_whole(reference: Record) -> None:
 def test_the_numbers_are_those_of_each_trial_alone(reference: Record) -> None:
     point = address({"snr_db": 10.0, "law": "tilted"})
     alone = toy.trial({"snr_db": torch.tensor([10.0], dtype=torch.float64), "law": "tilted"}, Draws(5, (point,), [33]))
-    np.testing.assert_allclose(reference.metrics["level_error_m"][0, 1, 1, 33], float(alone["average"]["level_error_m"][0]), rtol=1e-5)
+    np.testing.assert_allclose(
+        reference.metrics["level_error_m"][0, 1, 1, 33], float(alone["average"]["level_error_m"][0]), rtol=1e-5
+    )
     assert reference.metrics["first_m"][1, 1, 1, 33] == float(alone["transformed"]["first_m"][0])
 
 
@@ -101,7 +103,8 @@ def test_automatic_chunks_follow_the_bytes_of_the_largest_tensor() -> None:
 
     work = Work(trial, tuple(make_grid({}).cases()), {}, (), 1)
     bytes_per_trial = probed_bytes(work, 0)
-    assert bytes_per_trial in (16 * 1024, 32 * 1024)  # the doubled complex64 row, or the float64 draws
+    # the doubled complex64 row, or the float64 draws
+    assert bytes_per_trial in (16 * 1024, 32 * 1024)
     assert rows_by_bytes(bytes_per_trial, "cpu") == CACHE_BYTES // bytes_per_trial
     assert rows_by_bytes(10 * CACHE_BYTES, "cpu") == 1
     trial.bytes_per_trial = lambda fixed: 12345
@@ -112,11 +115,22 @@ def test_chunks_are_equal_pieces_in_one_order() -> None:
     case = make_grid({"a": [1.0, 2.0, 3.0]}, ["a"]).cases()[0]
     chunks = list(cut(0, case, {0, 2}, 10, 15, 4))
     assert [len(c) for c in chunks] == [3, 4, 3]
-    assert [(p, t) for c in chunks for p, t in zip(c.points, c.trials)] == [(p, t) for p in (0, 2) for t in range(10, 15)]
+    assert [(p, t) for c in chunks for p, t in zip(c.points, c.trials)] == [
+        (p, t) for p in (0, 2) for t in range(10, 15)
+    ]
 
 
-@pytest.mark.parametrize("error", [torch.OutOfMemoryError("full"), MemoryError("full"), RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 10 bytes")])
-def test_too_large_a_batch_is_halved_and_the_sweep_goes_on(reference: Record, error: Exception, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize(
+    "error",
+    [
+        torch.OutOfMemoryError("full"),
+        MemoryError("full"),
+        RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 10 bytes"),
+    ],
+)
+def test_too_large_a_batch_is_halved_and_the_sweep_goes_on(
+    reference: Record, error: Exception, caplog: pytest.LogCaptureFixture
+) -> None:
     sizes = []
 
     def greedy(parameters, draws):
@@ -165,12 +179,28 @@ def test_the_store_holds_the_record_and_says_where_it_comes_from(reference: Reco
     toy.run(tmp_path / "s", chunk=7, config={"scene": "toy"})
     held = read_sweep(tmp_path / "s")
     same(held, reference)
-    np.testing.assert_array_equal(held.bounds["level_error_m"]["Cramer-Rao bound"], reference.bounds["level_error_m"]["Cramer-Rao bound"])
-    assert held.about["seed"] == 5 and held.about["identity"]["config"] == {"scene": "toy"} and len(held.about["hash"]) == 24
+    np.testing.assert_array_equal(
+        held.bounds["level_error_m"]["Cramer-Rao bound"], reference.bounds["level_error_m"]["Cramer-Rao bound"]
+    )
+    assert (
+        held.about["seed"] == 5
+        and held.about["identity"]["config"] == {"scene": "toy"}
+        and len(held.about["hash"]) == 24
+    )
     session = held.about["sessions"][0]
-    assert session["trials"] == 240 and session["versions"]["torch"] == torch.__version__ and session["device"] == "cpu" and session["seconds"] > 0
+    assert (
+        session["trials"] == 240
+        and session["versions"]["torch"] == torch.__version__
+        and session["device"] == "cpu"
+        and session["seconds"] > 0
+    )
     root = zarr.open_group(str(tmp_path / "s" / "results.zarr"), mode="r")
-    assert root.metadata.zarr_format == 3 and root["level_error_m"].metadata.dimension_names == ("algorithm", "snr_db", "law", "trial")
+    assert root.metadata.zarr_format == 3 and root["level_error_m"].metadata.dimension_names == (
+        "algorithm",
+        "snr_db",
+        "law",
+        "trial",
+    )
     assert list(root["law"][:]) == ["flat", "tilted"] and list(root["snr_db"][:]) == [0, 10, 20]
 
 
@@ -208,7 +238,9 @@ def test_foreign_folders_are_never_touched(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     for name in ("mine", "mine2", "file"):
         for resume in (False, True):
-            with pytest.raises(ConfigError, match="not the folder of a sweep|already|no results|not left by|cannot be written"):
+            with pytest.raises(
+                ConfigError, match="not the folder of a sweep|already|no results|not left by|cannot be written"
+            ):
                 toy.run(tmp_path / name, resume=resume)
     assert (tmp_path / "mine" / "precious.txt").read_text() == "x"
 
@@ -225,7 +257,8 @@ def test_trials_and_values_can_be_added(tmp_path: Path) -> None:
     grown = toy.run(tmp_path / "s", trial=noting, resume=True, chunk=7)
     same(grown, toy.run(chunk=7), 1e-5)
     assert len(seen) == len(set(seen)) == 240 - 40
-    assert read_sweep(tmp_path / "s").labels["snr_db"] == (0.0, 20.0, 10.0)  # what was there stays where it was
+    # what was there stays where it was
+    assert read_sweep(tmp_path / "s").labels["snr_db"] == (0.0, 20.0, 10.0)
     part = toy.run(tmp_path / "s", resume=True, grid={"snr_db": [20.0], "law": ["flat"]}, trials=20)
     assert part.labels == {"snr_db": (20.0,), "law": ("flat",)}
 
@@ -260,8 +293,13 @@ def test_arrays_of_chosen_trials_are_kept(tmp_path: Path) -> None:
     saved = zarr.open_group(str(tmp_path / "s" / "results.zarr"), mode="r")["saved"]
     point = saved[address({"snr_db": 0.0, "law": "flat"})]
     assert set(point.group_keys()) == {"1", "4"} and len(list(saved.group_keys())) == 6
-    expected = toy.trial({"snr_db": torch.zeros(1, dtype=torch.float64), "law": "flat"}, Draws(5, (address({"snr_db": 0.0, "law": "flat"}),), [4]))
-    np.testing.assert_allclose(point["4/average.samples"][:], expected["saved"]["average"]["samples"][0].numpy(), rtol=1e-6)
+    expected = toy.trial(
+        {"snr_db": torch.zeros(1, dtype=torch.float64), "law": "flat"},
+        Draws(5, (address({"snr_db": 0.0, "law": "flat"}),), [4]),
+    )
+    np.testing.assert_allclose(
+        point["4/average.samples"][:], expected["saved"]["average"]["samples"][0].numpy(), rtol=1e-6
+    )
     assert point["4"].attrs["parameters"] == {"snr_db": 0.0, "law": "flat"} and point["4"].attrs["trial"] == 4
 
 
@@ -272,7 +310,11 @@ def test_impossible_settings_are_refused(bad: dict) -> None:
 
 
 def test_points_end_early_by_the_trials_in_order_alone() -> None:
-    assert looks(200, None) == [200] and looks(401, Stop("m", 0.1)) == [50, 100, 200, 400, 401] and looks(30, Stop("m", 0.1)) == [30]
+    assert (
+        looks(200, None) == [200]
+        and looks(401, Stop("m", 0.1)) == [50, 100, 200, 400, 401]
+        and looks(30, Stop("m", 0.1)) == [30]
+    )
     stop = Stop("level_error_m", 0.12, "rmse")
     runs = [toy.run(stop=stop, trials=500, chunk=chunk) for chunk in (7, 64)]
     counts = runs[0].done.sum(-1)
@@ -299,7 +341,8 @@ def test_memory_stays_flat_over_ten_thousand_trials(tmp_path: Path) -> None:
         return {"m_m": x.sum(-1)}
 
     sweep(trial, {"a": [1.0, 2.0]}, trials=5_000, chunk=50, out=tmp_path / "s")
-    assert len(held) == 200 and held[-1] - held[20] < 6_000  # KiB; what a chunk holds, 3 MB, must not pile up to 600 MB
+    # KiB; what a chunk holds, 3 MB, must not pile up to 600 MB
+    assert len(held) == 200 and held[-1] - held[20] < 6_000
 
 
 def test_the_machinery_costs_less_than_five_percent(tmp_path: Path) -> None:

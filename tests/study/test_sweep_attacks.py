@@ -1,4 +1,6 @@
-"""Mistakes of a user of sweeps: each is answered by one sentence, and nothing that was computed is lost."""
+"""Mistakes of a user of sweeps: each is answered by one sentence, and nothing that was computed is
+lost.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,8 @@ def run(out: Path | None = None, function: Any = trial, **options: Any):
     return sweep(function, options.pop("grid", {"a": [1.0, 2.0]}), out=out, **{"trials": 4, **options})
 
 
-# --- grids ------------------------------------------------------------------------------------------------------------------------------------
+# --- grids
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -84,7 +87,8 @@ def test_names_of_batched_parameters_are_a_list() -> None:
         make_grid({"snr": [1.0]}, "snr")
 
 
-# --- what a trial gives -----------------------------------------------------------------------------------------------------------------------
+# --- what a trial gives
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -104,8 +108,14 @@ def test_names_of_batched_parameters_are_a_list() -> None:
         (lambda n: {"x/y": level(n)}, "without '/'"),
         (lambda n: {5: level(n)}, "cannot be called 5"),
         (lambda n: {"m" * 300: level(n)}, "has 300 bytes"),
-        (lambda n: {"m": level(n), "m_bound_x": level(n), "bounds": {"m": {"x": level(n)}}}, "cannot be called 'm_bound_x'"),
-        (lambda n: {"m": level(n), "bounds": {"m": {"a b": level(n), "a_b": level(n)}}}, "cannot be called 'm_bound_a_b'"),
+        (
+            lambda n: {"m": level(n), "m_bound_x": level(n), "bounds": {"m": {"x": level(n)}}},
+            "cannot be called 'm_bound_x'",
+        ),
+        (
+            lambda n: {"m": level(n), "bounds": {"m": {"a b": level(n), "a_b": level(n)}}},
+            "cannot be called 'm_bound_a_b'",
+        ),
     ],
 )
 def test_what_a_trial_gives_is_refused_by_name(result: Callable[[int], Any], said: str, tmp_path: Path) -> None:
@@ -122,7 +132,13 @@ def test_unusual_names_are_kept(name: str, tmp_path: Path) -> None:
 
 def test_an_algorithm_that_disappears_is_missed() -> None:
     with pytest.raises(ConfigError, match="results of x alone, those before it of x, y"):
-        run(function=lambda p, d: {"x": {"m": level(len(d.trials))}, **({"y": {"m": level(len(d.trials))}} if d.trials[0] == 0 else {})}, chunk=2)
+        run(
+            function=lambda p, d: {
+                "x": {"m": level(len(d.trials))},
+                **({"y": {"m": level(len(d.trials))}} if d.trials[0] == 0 else {}),
+            },
+            chunk=2,
+        )
 
 
 def test_halves_of_a_batch_may_give_other_metrics_but_not_other_algorithms() -> None:
@@ -144,12 +160,20 @@ def test_halves_of_a_batch_may_give_other_metrics_but_not_other_algorithms() -> 
 def test_half_precision_images_are_kept(tmp_path: Path) -> None:
     import zarr
 
-    run(tmp_path / "s", lambda p, d: {"m": level(len(d.trials)), "saved": {"x": {"y": torch.ones(len(d.trials), 3, dtype=torch.bfloat16)}}}, save=[1])
+    run(
+        tmp_path / "s",
+        lambda p, d: {
+            "m": level(len(d.trials)),
+            "saved": {"x": {"y": torch.ones(len(d.trials), 3, dtype=torch.bfloat16)}},
+        },
+        save=[1],
+    )
     kept: Any = zarr.open_group(str(tmp_path / "s" / "results.zarr"), mode="r")["saved"]
     assert [group["1/x.y"][:].tolist() for _, group in kept.groups()] == [[1, 1, 1]] * 2
 
 
-# --- settings ---------------------------------------------------------------------------------------------------------------------------------
+# --- settings
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -187,14 +211,19 @@ def test_rules_of_ending_early_are_checked_at_once(bad: dict) -> None:
 
 
 def test_a_metric_that_is_never_finite_ends_no_point() -> None:
-    assert run(function=lambda p, d: {"m": level(len(d.trials)) * float("nan")}, stop=Stop("m", 0.1), trials=60).done.all()
+    assert run(
+        function=lambda p, d: {"m": level(len(d.trials)) * float("nan")}, stop=Stop("m", 0.1), trials=60
+    ).done.all()
 
 
-# --- folders ----------------------------------------------------------------------------------------------------------------------------------
+# --- folders
+# --------------------------------------------------------------------------------------------------
 
 
 def remove(*parts: str) -> Callable[[Path], Any]:
-    return lambda root: shutil.rmtree(root.joinpath(*parts)) if root.joinpath(*parts).is_dir() else root.joinpath(*parts).unlink()
+    return lambda root: (
+        shutil.rmtree(root.joinpath(*parts)) if root.joinpath(*parts).is_dir() else root.joinpath(*parts).unlink()
+    )
 
 
 DAMAGES = {
@@ -204,7 +233,10 @@ DAMAGES = {
     "marks": (remove("done"), "'done' is missing"),
     "root": (remove("zarr.json"), "holds no results of a sweep"),
     "empty": (lambda root: (root / "done" / "zarr.json").write_text(""), "is damaged"),
-    "cut": (lambda root: [file.write_bytes(b"x") for file in (root / "error_m" / "c").rglob("*") if file.is_file()], "is damaged"),
+    "cut": (
+        lambda root: [file.write_bytes(b"x") for file in (root / "error_m" / "c").rglob("*") if file.is_file()],
+        "is damaged",
+    ),
 }
 
 
@@ -273,11 +305,16 @@ def test_an_algorithm_without_the_metric_neither_succeeds_nor_fails() -> None:
 
     record = run(function=function, grid={"a": [1.0]}, chunk=4)
     record.about = {**record.about, "title": "t"}
-    points = {point["algorithm"]: point for point in summary_tree(record, {"error_m": 0.5}, {})["points"] if point["metric"] == "error_m"}
+    points = {
+        point["algorithm"]: point
+        for point in summary_tree(record, {"error_m": 0.5}, {})["points"]
+        if point["metric"] == "error_m"
+    }
     assert points["with"]["success_share"] == 0.75 and np.isnan(points["without"]["success_share"])
 
 
-# --- processes --------------------------------------------------------------------------------------------------------------------------------
+# --- processes
+# --------------------------------------------------------------------------------------------------
 
 
 def test_what_cannot_be_sent_is_a_sentence() -> None:
@@ -308,7 +345,8 @@ def test_workers_that_do_not_start_are_a_sentence(monkeypatch: pytest.MonkeyPatc
         pass
 
 
-# --- configs ----------------------------------------------------------------------------------------------------------------------------------
+# --- configs
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -321,7 +359,9 @@ def test_workers_that_do_not_start_are_a_sentence(monkeypatch: pytest.MonkeyPatc
         ({"trials": 10**13}, "do not fit into memory"),
     ],
 )
-def test_settings_of_a_config_are_checked(settings: dict, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_settings_of_a_config_are_checked(
+    settings: dict, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     config = write_tiny(tmp_path, sweep={"world.noise.snr_db": [20.0], "trials": 2, **settings})
     assert main(["sweep", str(config), "--out", str(tmp_path / "s")]) == 2
     assert said in capsys.readouterr().err.splitlines()[-1]
@@ -336,13 +376,25 @@ def test_a_part_of_a_section_is_set_after_the_section(tmp_path: Path) -> None:
 def test_a_method_may_not_take_the_place_of_the_bounds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from tests.study.tiny import TINY
 
-    config = write_tiny(tmp_path, processor={**TINY["processor"], "bounds": TINY["processor"]["clean"]}, sweep={"world.noise.snr_db": [20.0], "trials": 1})
+    config = write_tiny(
+        tmp_path,
+        processor={**TINY["processor"], "bounds": TINY["processor"]["clean"]},
+        sweep={"world.noise.snr_db": [20.0], "trials": 1},
+    )
     assert main(["sweep", str(config), "--out", str(tmp_path / "s")]) == 2
     assert "processor.bounds: in a sweep this name is taken" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("error, said", [(OSError(errno.ENOSPC, "No space left on device"), "the report cannot be written"), (KeyboardInterrupt(), "go on with --resume")])
-def test_a_report_that_fails_leaves_the_results(error: BaseException, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    "error, said",
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), "the report cannot be written"),
+        (KeyboardInterrupt(), "go on with --resume"),
+    ],
+)
+def test_a_report_that_fails_leaves_the_results(
+    error: BaseException, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def fail(*_: Any) -> None:
         raise error
 

@@ -26,22 +26,40 @@ SMALL = ["sweep.world.noise.snr_db=[-10.0, 10.0]", "sweep.world.squint_deg=[0.25
 def record_of(loaded, chunk: int | None, trials: int) -> Record:
     from contextlib import nullcontext
 
-    return run_plan(Plan(sweep_grid(loaded), trials, loaded.config.seed, chunk), StripmapTrials(loaded), None, nullcontext(InProcess()))
+    return run_plan(
+        Plan(sweep_grid(loaded), trials, loaded.config.seed, chunk),
+        StripmapTrials(loaded),
+        None,
+        nullcontext(InProcess()),
+    )
 
 
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sweep")
-    config = write_tiny(folder, sweep={**SWEEP, "success": {"doppler_baseband_error_hz": 10.0}, "save": {"trials": [1], "taps": ["doppler"]}})
+    config = write_tiny(
+        folder,
+        sweep={**SWEEP, "success": {"doppler_baseband_error_hz": 10.0}, "save": {"trials": [1], "taps": ["doppler"]}},
+    )
     assert main(["sweep", str(config), "--resume", "--out", str(folder / "result")]) == 0
     return folder / "result"
 
 
 def test_the_folder_holds_what_is_promised(out: Path) -> None:
-    assert {p.name for p in out.iterdir() if not p.name.startswith(".")} == {"results.zarr", "config.yaml", "summary.json", "figures", "report.html"}
+    assert {p.name for p in out.iterdir() if not p.name.startswith(".")} == {
+        "results.zarr",
+        "config.yaml",
+        "summary.json",
+        "figures",
+        "report.html",
+    }
     summary = json.loads((out / "summary.json").read_text())
     assert summary["parameters"] == {"world.noise.snr_db": [0, 20], "world.doppler_hz": [-20, 30]}
-    asked = {"algorithm": "recommended", "metric": "doppler_baseband_error_hz", "parameters": {"world.noise.snr_db": 20.0, "world.doppler_hz": 30.0}}
+    asked = {
+        "algorithm": "recommended",
+        "metric": "doppler_baseband_error_hz",
+        "parameters": {"world.noise.snr_db": 20.0, "world.doppler_hz": 30.0},
+    }
     point = next(p for p in summary["points"] if asked.items() <= p.items())
     assert {"n", "mean", "median", "rmse", "interval", "ok_share", "success_share"} <= set(point) and point["n"] == 6
     values = read_sweep(out).metrics["doppler_baseband_error_hz"][1, 1, 1]
@@ -59,19 +77,32 @@ def test_images_of_chosen_trials_are_kept(out: Path) -> None:
 
     saved = zarr.open_group(str(out / "results.zarr"), mode="r")["saved"]
     groups = [saved[name]["1"] for name in saved.group_keys()]
-    assert len(groups) == 4 and all(g["recommended.last"].shape == (192, 128) and g["recommended.doppler"].shape == (192, 128) for g in groups)
+    assert len(groups) == 4 and all(
+        g["recommended.last"].shape == (192, 128) and g["recommended.doppler"].shape == (192, 128) for g in groups
+    )
 
 
 def test_a_batched_key_gives_what_a_config_of_that_value_gives() -> None:
     tiny = load_tree({**TINY, "sweep": SWEEP})
     swept = record_of(tiny, 5, 3)
-    alone = record_of(tiny.changed({"sweep": {"grid": {"world.noise.snr_db": [20.0], "world.doppler_hz": [30.0]}}}), 1, 3)
-    np.testing.assert_allclose(swept.metrics["doppler_baseband_hz"][1, 1, 1], alone.metrics["doppler_baseband_hz"][1, 0, 0], rtol=1e-5)
+    alone = record_of(
+        tiny.changed({"sweep": {"grid": {"world.noise.snr_db": [20.0], "world.doppler_hz": [30.0]}}}), 1, 3
+    )
+    np.testing.assert_allclose(
+        swept.metrics["doppler_baseband_hz"][1, 1, 1], alone.metrics["doppler_baseband_hz"][1, 0, 0], rtol=1e-5
+    )
 
 
 def test_keys_of_any_kind_make_cases() -> None:
-    found = record_of(load_tree({**TINY, "sweep": {"world.beam.dwell_s": [0.1, 0.2], "precision": ["complex64", "complex128"]}}), None, 2)
-    assert found.labels == {"world.beam.dwell_s": (0.1, 0.2), "precision": ("complex64", "complex128")} and found.done.all()
+    found = record_of(
+        load_tree({**TINY, "sweep": {"world.beam.dwell_s": [0.1, 0.2], "precision": ["complex64", "complex128"]}}),
+        None,
+        2,
+    )
+    assert (
+        found.labels == {"world.beam.dwell_s": (0.1, 0.2), "precision": ("complex64", "complex128")}
+        and found.done.all()
+    )
     entropy = found.metrics["entropy_nats"]
     assert (np.abs(entropy[:, 0] - entropy[:, 1]) > 0.01).any()
 
@@ -87,7 +118,10 @@ def test_the_log_says_what_is_batched(tmp_path: Path, caplog: pytest.LogCaptureF
     config = write_tiny(tmp_path, sweep={"world.noise.snr_db": [0.0], "world.beam.dwell_s": [0.1, 0.2], "trials": 1})
     with caplog.at_level(logging.INFO, "torchsar"):
         assert main(["sweep", str(config), "--out", str(tmp_path / "result")]) == 0
-    assert "per-trial tensors, which share batches: world.noise.snr_db (1); cases of their own: world.beam.dwell_s (2)" in caplog.text
+    assert (
+        "per-trial tensors, which share batches: world.noise.snr_db (1); cases of their own: world.beam.dwell_s (2)"
+        in caplog.text
+    )
 
 
 @pytest.mark.parametrize(
@@ -124,7 +158,15 @@ def test_mistakes_are_one_sentence(sweep: dict, said: str, tmp_path: Path, capsy
 def test_a_recording_cannot_be_swept(tmp_path: Path) -> None:
     loaded = load_tree({**TINY, "sweep": SWEEP})
     with pytest.raises(ConfigError, match="a sweep simulates its trials"):
-        sweep_grid(load_tree({**{k: v for k, v in TINY.items() if k not in ("world", "radar")}, "data": {"file": str(tmp_path)}, "sweep": SWEEP}))
+        sweep_grid(
+            load_tree(
+                {
+                    **{k: v for k, v in TINY.items() if k not in ("world", "radar")},
+                    "data": {"file": str(tmp_path)},
+                    "sweep": SWEEP,
+                }
+            )
+        )
     assert sweep_grid(loaded).shape == (2, 2)
 
 
@@ -140,17 +182,26 @@ def test_squint_is_the_doppler_of_the_true_velocity() -> None:
 @pytest.mark.parametrize("key", ["sweep.world.noise.snr_db", "sweep.grid.world.noise.snr_db"])
 def test_the_command_line_reaches_the_grid_and_its_settings(key: str, tmp_path: Path) -> None:
     loaded = load(str(write_tiny(tmp_path, sweep=SWEEP)), [f"{key}=[3.0]", "sweep.trials=9", "sweep.save.trials=[2]"])
-    assert loaded.config.sweep.grid["world.noise.snr_db"] == [3.0] and loaded.config.sweep.grid["world.doppler_hz"] == [-20.0, 30.0]
+    assert loaded.config.sweep.grid["world.noise.snr_db"] == [3.0] and loaded.config.sweep.grid["world.doppler_hz"] == [
+        -20.0,
+        30.0,
+    ]
     assert loaded.config.sweep.trials == 9 and loaded.config.sweep.save.trials == [2]
 
 
 def test_names_of_errors() -> None:
-    assert [error_name(n) for n in ("doppler_hz", "velocity_m_s", "gain")] == ["doppler_error_hz", "velocity_error_m_s", "gain_error"]
+    assert [error_name(n) for n in ("doppler_hz", "velocity_m_s", "gain")] == [
+        "doppler_error_hz",
+        "velocity_error_m_s",
+        "gain_error",
+    ]
 
 
 @pytest.mark.parametrize("precision, tolerance", [("complex64", 1e-5), ("complex128", 1e-12)])
 def test_chunks_change_the_stripmap_chain_only_by_rounding(precision: str, tolerance: float) -> None:
-    """All metrics of all methods; trials that hang on less would be counted and named here, and there is none."""
+    """All metrics of all methods; trials that hang on less would be counted and named here, and
+    there is none.
+    """
     loaded = load("stripmap_doppler", [*SMALL, f"precision={precision}"])
     records = {chunk: record_of(loaded, chunk, 3) for chunk in (1, 7, None)}
     for other in (records[1], records[None]):
@@ -158,7 +209,13 @@ def test_chunks_change_the_stripmap_chain_only_by_rounding(precision: str, toler
 
 
 def test_the_point_estimator_of_the_stripmap_sweep_stands_on_its_bound() -> None:
-    loaded = load("stripmap_doppler", [*SMALL, "sweep.world.scene={point: {target: {kind: points, azimuth_m: [0.0], range_m: [0.0], random_phase: true}}}"])
+    loaded = load(
+        "stripmap_doppler",
+        [
+            *SMALL,
+            "sweep.world.scene={point: {target: {kind: points, azimuth_m: [0.0], range_m: [0.0], random_phase: true}}}",
+        ],
+    )
     record = record_of(loaded, None, 30)
     row = record.algorithms.index("point")
     rmse = np.sqrt((record.metrics["doppler_error_hz"][row, 0, 0] ** 2).mean(-1))

@@ -23,17 +23,31 @@ from torchsar.study.montecarlo import Record, engines, read_sweep
 from torchsar.study.montecarlo.engines import engine
 
 ROOT = Path(__file__).resolve().parents[2]
-needs_dask = pytest.mark.skipif(pytest.importorskip("importlib.util").find_spec("distributed") is None, reason="dask.distributed (extra cluster) is not installed")
+needs_dask = pytest.mark.skipif(
+    pytest.importorskip("importlib.util").find_spec("distributed") is None,
+    reason="dask.distributed (extra cluster) is not installed",
+)
 
 
 def start(out: Path, *options: str) -> subprocess.Popen:
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    return subprocess.Popen([sys.executable, "-m", "tests.study.toy", str(out), *options], cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        [sys.executable, "-m", "tests.study.toy", str(out), *options],
+        cwd=ROOT,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
 
 
 def rows(log: Path) -> list[tuple[str, str]]:
     """Rows that the log says were computed: (address, trial)."""
-    return [tuple(line.split()[1:]) for line in log.read_text().splitlines() if line.count(" ") == 2] if log.exists() else []
+    return (
+        [tuple(line.split()[1:]) for line in log.read_text().splitlines() if line.count(" ") == 2]
+        if log.exists()
+        else []
+    )
 
 
 def marked(out: Path) -> np.ndarray | None:
@@ -82,10 +96,12 @@ def test_a_program_killed_at_random_moments_loses_nothing_and_repeats_nothing(al
         kills += 1
         if before is not None:
             assert not (before & ~after).any()  # nothing that was marked is lost
-            assert not set(rows(log)[known:]) & computed_before  # nothing that was marked is computed again
+            # nothing that was marked is computed again
+            assert not set(rows(log)[known:]) & computed_before
         record = read_sweep(out)
         for algorithm in range(len(record.algorithms)):
-            assert np.isfinite(record.metrics["level_error_m"][algorithm][after]).all()  # no torn chunk
+            # no torn chunk
+            assert np.isfinite(record.metrics["level_error_m"][algorithm][after]).all()
         computed_before = addresses(after)
     finished = start(out, "--log", str(log))
     assert finished.wait(timeout=120) == 0
@@ -109,7 +125,11 @@ def test_two_workers_give_the_same_bits_and_survive_the_death_of_workers(alone: 
     killed: set[int] = set()
     deadline = time.monotonic() + 120
     while running.poll() is None and len(killed) < 3 and time.monotonic() < deadline:
-        fresh = [int(line.split()[0]) for line in log.read_text().splitlines() if line.count(" ") == 2] if log.exists() else []
+        fresh = (
+            [int(line.split()[0]) for line in log.read_text().splitlines() if line.count(" ") == 2]
+            if log.exists()
+            else []
+        )
         victims = [pid for pid in dict.fromkeys(fresh[-14:]) if pid not in killed]
         if victims and len(fresh) > 30 * (len(killed) + 1):
             os.kill(victims[-1], signal.SIGKILL)
@@ -119,7 +139,9 @@ def test_two_workers_give_the_same_bits_and_survive_the_death_of_workers(alone: 
     assert running.returncode == 0, said[-2000:]
     assert len(killed) == 3
     bitwise(read_sweep(out), alone)
-    assert len({line.split()[0] for line in log.read_text().splitlines()}) >= 4  # both workers, and those that replaced the dead
+    assert (
+        len({line.split()[0] for line in log.read_text().splitlines()}) >= 4
+    )  # both workers, and those that replaced the dead
     assert max(Counter(rows(log)).values()) <= 1 + len(killed)
 
 
@@ -132,21 +154,30 @@ def test_a_scheduler_that_does_not_answer_is_named() -> None:
 
 
 def test_an_interrupted_sweep_says_how_to_go_on_and_does(tmp_path: Path) -> None:
-    config, out = write_tiny(tmp_path, sweep={"world.noise.snr_db": [0.0, 10.0], "trials": 4000, "chunk": 4}), tmp_path / "result"
+    config, out = (
+        write_tiny(tmp_path, sweep={"world.noise.snr_db": [0.0, 10.0], "trials": 4000, "chunk": 4}),
+        tmp_path / "result",
+    )
     command = [sys.executable, "-m", "torchsar.cli", "sweep", str(config), "--out", str(out)]
     for stop in (signal.SIGINT, signal.SIGTERM):
-        running = subprocess.Popen([*command, "--resume"], stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=mind_interrupts)
+        running = subprocess.Popen(
+            [*command, "--resume"], stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=mind_interrupts
+        )
         assert running.stderr is not None
         while "chunk" not in (line := running.stderr.readline()) and line:
             pass
         running.send_signal(stop)
         _, said = running.communicate(timeout=60)
         assert running.returncode == 130, said
-        assert "interrupted" in said and "trials are recorded in" in said and said.strip().endswith("go on with --resume")
+        assert (
+            "interrupted" in said and "trials are recorded in" in said and said.strip().endswith("go on with --resume")
+        )
         assert "Traceback" not in said and not (out / "report.html").exists()
     held = int(read_sweep(out).done.sum())
     assert held >= 8
-    done = subprocess.run([*command, "--resume", f"sweep.trials={held // 2 + 2}"], capture_output=True, text=True, cwd=ROOT, timeout=300)
+    done = subprocess.run(
+        [*command, "--resume", f"sweep.trials={held // 2 + 2}"], capture_output=True, text=True, cwd=ROOT, timeout=300
+    )
     assert done.returncode == 0, done.stderr[-2000:]
     assert (out / "report.html").exists()
 
@@ -159,19 +190,28 @@ def deadly(parameters: dict, draws) -> dict:
 
 
 @needs_dask
-def test_a_batch_that_kills_its_workers_is_halved(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_batch_that_kills_its_workers_is_halved(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     monkeypatch.setattr(engines, "_DEATHS", 0)
     with caplog.at_level(logging.WARNING, "torchsar"):
         record = toy.run(trial=deadly, workers=1, trials=6, grid={"snr_db": [0.0], "law": ["flat"]}, chunk=6)
     assert "the workers that ran 6 trials at once died" in caplog.text
-    np.testing.assert_allclose(record.metrics["level_error_m"], toy.run(trials=6, grid={"snr_db": [0.0], "law": ["flat"]}).metrics["level_error_m"], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(
+        record.metrics["level_error_m"],
+        toy.run(trials=6, grid={"snr_db": [0.0], "law": ["flat"]}).metrics["level_error_m"],
+        rtol=1e-5,
+        atol=1e-6,
+    )
 
 
 @needs_dask
 def test_a_running_scheduler_serves_and_a_failing_trial_is_named(alone: Record) -> None:
     from distributed import LocalCluster
 
-    with LocalCluster(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=40) as cluster:
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=40
+    ) as cluster:
         bitwise(toy.run(cluster=cluster.scheduler_address, chunk=7), alone)
         with pytest.raises(ConfigError, match="failed in trials 0 to 1 of law=flat: KeyError: 'nothing'"):
             toy.run(trial=failing, cluster=cluster.scheduler_address, chunk=2, trials=2)
@@ -183,9 +223,14 @@ def failing(parameters: dict, draws) -> dict:
 
 @needs_dask
 def test_ctrl_c_with_workers_is_one_sentence(tmp_path: Path) -> None:
-    config, out = write_tiny(tmp_path, sweep={"world.noise.snr_db": [0.0, 10.0], "trials": 4000, "chunk": 4}), tmp_path / "result"
+    config, out = (
+        write_tiny(tmp_path, sweep={"world.noise.snr_db": [0.0, 10.0], "trials": 4000, "chunk": 4}),
+        tmp_path / "result",
+    )
     command = [sys.executable, "-m", "torchsar.cli", "sweep", str(config), "--workers", "2", "--out", str(out)]
-    running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=mind_interrupts, start_new_session=True)
+    running = subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=mind_interrupts, start_new_session=True
+    )
     assert running.stderr is not None
     while "chunk" not in (line := running.stderr.readline()) and line:
         pass

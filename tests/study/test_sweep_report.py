@@ -22,8 +22,12 @@ GRID = {"world.noise.snr_db": (20.0, -10.0, 5.0), "world.squint_deg": (0.0, 3.0)
 SESSION = {"device": "cpu", "versions": {"torch": "2.13.0"}, "seconds": 4.0, "trials": 470}
 
 
-def synthetic(labels: dict[str, tuple[float | str, ...]], trials: int = 40, algorithms: tuple[str, ...] = ("wide", "narrow")) -> Record:
-    """Gaussian errors, three times wider for the first algorithm; the first point ends early and has a trial that failed."""
+def synthetic(
+    labels: dict[str, tuple[float | str, ...]], trials: int = 40, algorithms: tuple[str, ...] = ("wide", "narrow")
+) -> Record:
+    """Gaussian errors, three times wider for the first algorithm; the first point ends early and
+    has a trial that failed.
+    """
     shape, random = tuple(map(len, labels.values())), np.random.default_rng(8)
     done = np.ones((*shape, trials), bool)
     done.reshape(-1, trials)[0, trials // 4 :] = False
@@ -33,7 +37,15 @@ def synthetic(labels: dict[str, tuple[float | str, ...]], trials: int = 40, algo
     error.reshape(len(algorithms), -1, trials)[:, 0, 0] = np.inf
     entropy = np.where(done, 8 + random.random(error.shape), np.nan)
     about = {"title": "A sweep <of> trials", "seed": 7, "hash": "0123abcd", "dtype": "complex64", "sessions": [SESSION]}
-    return Record(algorithms, labels, done, np.isfinite(error) & (np.abs(error) < 12), {"doppler_error_hz": error, "entropy_nats": entropy}, {"doppler_error_hz": {"Cramer-Rao": bound}}, about)
+    return Record(
+        algorithms,
+        labels,
+        done,
+        np.isfinite(error) & (np.abs(error) < 12),
+        {"doppler_error_hz": error, "entropy_nats": entropy},
+        {"doppler_error_hz": {"Cramer-Rao": bound}},
+        about,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -63,16 +75,34 @@ def page(summary: dict[str, Any], drawn: tuple[Path, list[Picture]]) -> str:
     return path.read_text(encoding="utf-8")
 
 
-# --- summary ------------------------------------------------------------------------------------------------------------------------------
+# --- summary
+# --------------------------------------------------------------------------------------------------
 
 
 def test_summary_follows_the_schema(summary: dict[str, Any]) -> None:
     assert set(summary) == {"title", "parameters", "algorithms", "trials", "points", "bounds", "definitions", "about"}
     assert summary["parameters"] == {name: list(values) for name, values in GRID.items()} and summary["trials"] == 40
     assert len(summary["points"]) == 2 * 12 * 2 and len(summary["bounds"]) == 12
-    common = {"algorithm", "parameters", "metric", "n", "trials", "mean", "median", "rmse", "std", "interval", "mean_interval", "median_interval", "ok_share", "ok_interval"}
+    common = {
+        "algorithm",
+        "parameters",
+        "metric",
+        "n",
+        "trials",
+        "mean",
+        "median",
+        "rmse",
+        "std",
+        "interval",
+        "mean_interval",
+        "median_interval",
+        "ok_share",
+        "ok_interval",
+    }
     for point in summary["points"]:
-        assert set(point) == common | ({"success_limit", "success_share", "success_interval"} if point["metric"] == "doppler_error_hz" else set())
+        assert set(point) == common | (
+            {"success_limit", "success_share", "success_interval"} if point["metric"] == "doppler_error_hz" else set()
+        )
         assert len(point["interval"]) == len(point["ok_interval"]) == 2
     assert {"snr", "rmse", "interval", "ok_share", "success_share", "bound"} <= set(summary["definitions"])
     assert "ok" in summary["definitions"]["statistics"]
@@ -80,16 +110,31 @@ def test_summary_follows_the_schema(summary: dict[str, Any]) -> None:
 
 def test_points_hold_the_statistics_of_their_trials(record: Record, summary: dict[str, Any]) -> None:
     """All finite trials count, ok or not; failed and untrusted ones are no success."""
-    point = next(p for p in summary["points"] if p["algorithm"] == "wide" and p["parameters"] == {"world.noise.snr_db": 20.0, "world.squint_deg": 0.0, "world.scene": "point"})
+    point = next(
+        p
+        for p in summary["points"]
+        if p["algorithm"] == "wide"
+        and p["parameters"] == {"world.noise.snr_db": 20.0, "world.squint_deg": 0.0, "world.scene": "point"}
+    )
     values, ok = record.metrics["doppler_error_hz"][0, 0, 0, 0, :10], record.ok[0, 0, 0, 0, :10]
     assert point["trials"] == 10 and point["n"] == 9
     assert np.isclose(point["rmse"], np.sqrt(np.mean(values[1:] ** 2)))
-    assert np.isclose(point["ok_share"], ok.mean()) and np.isclose(point["success_share"], np.mean(ok & (np.abs(values) <= 4.0)))
+    assert np.isclose(point["ok_share"], ok.mean()) and np.isclose(
+        point["success_share"], np.mean(ok & (np.abs(values) <= 4.0))
+    )
     assert {bound["rms"] for bound in summary["bounds"]} == {2.0}
 
 
 def test_disowning_failures_changes_no_error(record: Record, summary: dict[str, Any]) -> None:
-    modest = Record(record.algorithms, record.labels, record.done, np.zeros_like(record.ok), record.metrics, record.bounds, record.about)
+    modest = Record(
+        record.algorithms,
+        record.labels,
+        record.done,
+        np.zeros_like(record.ok),
+        record.metrics,
+        record.bounds,
+        record.about,
+    )
     points = summary_tree(modest, {"doppler_error_hz": 4.0}, {})["points"]
     assert [p["rmse"] for p in points] == [p["rmse"] for p in summary["points"]]
     assert {p["success_share"] for p in points if "success_share" in p} == {0.0}
@@ -106,20 +151,46 @@ def test_numbers_that_are_missing_become_null(tmp_path: Path) -> None:
     empty.metrics["doppler_error_hz"][:] = np.nan
     write_json(tmp_path / "summary.json", summary_tree(empty, {}, {}))
     point = json.loads((tmp_path / "summary.json").read_text())["points"][0]
-    assert (point["n"], point["trials"], point["rmse"], point["interval"], point["ok_share"]) == (0, 0, None, [None, None], None)
+    assert (point["n"], point["trials"], point["rmse"], point["interval"], point["ok_share"]) == (
+        0,
+        0,
+        None,
+        [None, None],
+        None,
+    )
 
 
-# --- pictures -----------------------------------------------------------------------------------------------------------------------------
+# --- pictures
+# --------------------------------------------------------------------------------------------------
 
 
-WORDS: dict[str, tuple[float | str, ...]] = {"scene": ("point", "speckle"), "beam": ("dwell", "sinc"), "snr_db": (10.0,)}
-MANY: dict[str, tuple[float | str, ...]] = {"snr_db": (0.0, 10.0), "speed_m_s": tuple(map(float, range(7))), "gain": (0.1, 1.0, 1000.0), "scene": ("a", "b", "c")}
-THREE_PARAMETERS = ["error.*over_snr_db", "error.*over_squint", "success.*over_snr_db", "map_snr_db_squint", "entropy.*over_snr", "ok_share_over_snr_db"]
+WORDS: dict[str, tuple[float | str, ...]] = {
+    "scene": ("point", "speckle"),
+    "beam": ("dwell", "sinc"),
+    "snr_db": (10.0,),
+}
+MANY: dict[str, tuple[float | str, ...]] = {
+    "snr_db": (0.0, 10.0),
+    "speed_m_s": tuple(map(float, range(7))),
+    "gain": (0.1, 1.0, 1000.0),
+    "scene": ("a", "b", "c"),
+}
+THREE_PARAMETERS = [
+    "error.*over_snr_db",
+    "error.*over_squint",
+    "success.*over_snr_db",
+    "map_snr_db_squint",
+    "entropy.*over_snr",
+    "ok_share_over_snr_db",
+]
 SWEEPS = {
     "one number": ({"snr_db": (0.0, 10.0)}, ["error.*rmse_over_snr", "success_share_over_snr"]),
     "words alone": (WORDS, ["rmse_over_scene"]),
     "one place": ({}, ["rmse", "success_share", "ok_share"]),
-    "two pages": ({"gain": (0.1, 1.0, 1000.0), "scene": tuple("abcdefg")}, ["01_.*rmse_over_gain", "02_.*rmse_over_gain"]),
+    "two pages": (
+        {"gain": (0.1, 1.0, 1000.0), "scene": tuple("abcdefg")},
+        ["01_.*rmse_over_gain", "02_.*rmse_over_gain"],
+    ),
 }
 
 
@@ -137,10 +208,16 @@ def test_three_parameters_have_curves_shares_and_maps(drawn: tuple[Path, list[Pi
 
 
 @pytest.mark.parametrize("labels, expected", SWEEPS.values(), ids=SWEEPS)
-def test_every_sweep_has_its_pictures(labels: dict[str, tuple[float | str, ...]], expected: list[str], tmp_path: Path) -> None:
+def test_every_sweep_has_its_pictures(
+    labels: dict[str, tuple[float | str, ...]], expected: list[str], tmp_path: Path
+) -> None:
     record = synthetic(labels, trials=8)
     del record.metrics["entropy_nats"]
-    check_pictures(draw_sweep(summary_tree(record, {"doppler_error_hz": 4.0}, {}), tmp_path / "figures"), tmp_path / "figures", expected)
+    check_pictures(
+        draw_sweep(summary_tree(record, {"doppler_error_hz": 4.0}, {}), tmp_path / "figures"),
+        tmp_path / "figures",
+        expected,
+    )
 
 
 def test_errors_are_drawn_unless_something_else_is_asked_for(summary: dict[str, Any], tmp_path: Path) -> None:
@@ -154,7 +231,12 @@ def test_panels_are_thinned_and_the_caption_says_so() -> None:
     assert len(panels) == 6 and {p.index["speed_m_s"] for p in panels} == {0, 6}
     assert "Of 7 values of speed this shows 0, 6" in note
     panels, note = panels_beside(read_summary(summary_tree(synthetic(GRID), {}, {})), {"world.noise.snr_db"})
-    assert [p.title for p in panels] == ["scene: point, squint 0 deg", "scene: point, squint 3 deg", "scene: speckle, squint 0 deg", "scene: speckle, squint 3 deg"] and not note
+    assert [p.title for p in panels] == [
+        "scene: point, squint 0 deg",
+        "scene: point, squint 3 deg",
+        "scene: speckle, squint 0 deg",
+        "scene: speckle, squint 3 deg",
+    ] and not note
 
 
 def test_curves_run_along_sorted_numbers(summary: dict[str, Any]) -> None:
@@ -162,11 +244,22 @@ def test_curves_run_along_sorted_numbers(summary: dict[str, Any]) -> None:
     panel = panels_beside(cube, {"world.noise.snr_db"})[0][1]
     along = cube.cut(cube.figures["doppler_error_hz"]["rmse"], panel, "world.noise.snr_db")
     at = {"world.squint_deg": 3.0, "world.scene": "point"}
-    chosen = {p["parameters"]["world.noise.snr_db"]: p["rmse"] for p in summary["points"] if (p["algorithm"], p["metric"]) == ("narrow", "doppler_error_hz") and at.items() <= p["parameters"].items()}
+    chosen = {
+        p["parameters"]["world.noise.snr_db"]: p["rmse"]
+        for p in summary["points"]
+        if (p["algorithm"], p["metric"]) == ("narrow", "doppler_error_hz") and at.items() <= p["parameters"].items()
+    }
     np.testing.assert_array_equal(along[1], [chosen[-10.0], chosen[5.0], chosen[20.0]])
 
 
-LABELS = {"doppler_error_hz": "Doppler error (Hz)", "world.noise.snr_db": "SNR (dB)", "v_m_s": "v (m/s)", "yaw_rad_s": "yaw (rad/s)", "beam": "beam", "seconds": "seconds"}
+LABELS = {
+    "doppler_error_hz": "Doppler error (Hz)",
+    "world.noise.snr_db": "SNR (dB)",
+    "v_m_s": "v (m/s)",
+    "yaw_rad_s": "yaw (rad/s)",
+    "beam": "beam",
+    "seconds": "seconds",
+}
 
 
 @pytest.mark.parametrize("name, label", LABELS.items(), ids=LABELS)
@@ -174,7 +267,8 @@ def test_labels_come_from_names(name: str, label: str) -> None:
     assert axis_label(name) == label
 
 
-# --- report -------------------------------------------------------------------------------------------------------------------------------
+# --- report
+# --------------------------------------------------------------------------------------------------
 
 
 class Reader(HTMLParser):
@@ -223,10 +317,26 @@ def test_report_shows_the_numbers_of_the_summary(page: str, summary: dict[str, A
 
 def test_report_says_where_it_was_made(page: str) -> None:
     assert "A sweep &lt;of&gt; trials" in page and "<of>" not in page
-    for text in ("470", "10 to 40", "117.5", "0123abcd", "complex64", "torch 2.13.0", "power over variance", "trials: 40", "torchsar sweep synthetic"):
+    for text in (
+        "470",
+        "10 to 40",
+        "117.5",
+        "0123abcd",
+        "complex64",
+        "torch 2.13.0",
+        "power over variance",
+        "trials: 40",
+        "torchsar sweep synthetic",
+    ):
         assert text in page, text
 
 
 def test_numbers_read_well() -> None:
-    assert (figure(None), figure(float("nan")), figure(0.00012345), figure(12345.6), figure(-3e9)) == ("–", "–", "0.0001234", "12,346", "-3e+09")
+    assert (figure(None), figure(float("nan")), figure(0.00012345), figure(12345.6), figure(-3e9)) == (
+        "–",
+        "–",
+        "0.0001234",
+        "12,346",
+        "-3e+09",
+    )
     assert with_interval(2.0, [None, None]) == "2" and with_interval(2.0, [1.5, 2.5]) == "2 [1.5, 2.5]"

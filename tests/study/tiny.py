@@ -26,13 +26,30 @@ TINY: dict = {
         "noise": {"snr_db": 20.0},
         "scene": {
             "points": {"kind": "points", "azimuth_m": [0.0, 9.0], "range_m": [0.0, 40.0]},
-            "field": {"kind": "speckle", "count": 20, "azimuth_extent_m": 4.0, "range_extent_m": 10.0, "level_db": -20.0},
+            "field": {
+                "kind": "speckle",
+                "count": 20,
+                "azimuth_extent_m": 4.0,
+                "range_extent_m": 10.0,
+                "level_db": -20.0,
+            },
         },
     },
     "processor": {
         "clean": {"input": "clean", "stages": {"focus": {"stage": "omega_k", "reference": "flat"}}},
-        "recommended": {"stages": {"doppler": {"stage": "phase_increment"}, "focus": {"stage": "omega_k", "reference": "flat", "uses": {"doppler_hz": "doppler.doppler_baseband_hz"}}}},
-        "squint_ignored": {"rerun": {"method": "recommended", "start": "focus", "given": {"doppler.doppler_baseband_hz": 100.0}}},
+        "recommended": {
+            "stages": {
+                "doppler": {"stage": "phase_increment"},
+                "focus": {
+                    "stage": "omega_k",
+                    "reference": "flat",
+                    "uses": {"doppler_hz": "doppler.doppler_baseband_hz"},
+                },
+            }
+        },
+        "squint_ignored": {
+            "rerun": {"method": "recommended", "start": "focus", "given": {"doppler.doppler_baseband_hz": 100.0}}
+        },
     },
     "metrics": {"reference": "clean"},
 }

@@ -1,4 +1,6 @@
-"""A cheap trial function for tests of sweeps, and a program that runs it: python -m tests.study.toy OUT [--workers N] [--trials N] [--slow SECONDS] [--log FILE]."""
+"""A cheap trial function for tests of sweeps, and a program that runs it: python -m tests.study.toy
+OUT [--workers N] [--trials N] [--slow SECONDS] [--log FILE].
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,10 @@ SAMPLES = 64
 
 
 def trial(parameters: dict, draws) -> dict:
-    """Mean of noisy samples: by plain averaging, and by a chain of transforms that rounds. All batched; the noise is shared."""
+    """Mean of noisy samples: by plain averaging, and by a chain of transforms that rounds.
+
+    All batched; the noise is shared.
+    """
     noise = draws.normal("noise", (SAMPLES,), torch.complex64)
     level = 10 ** (-parameters["snr_db"] / 20)
     x = 1 + level[:, None].to(torch.float32) * noise
@@ -33,7 +38,9 @@ def trial(parameters: dict, draws) -> dict:
 
 
 class Logged:
-    """The trial, slowed down, with a line in a file for every row that it computes: process, address, trial."""
+    """The trial, slowed down, with a line in a file for every row that it computes: process,
+    address, trial.
+    """
 
     def __init__(self, slow_s: float, log: str | None) -> None:
         self.slow_s, self.log = slow_s, log
@@ -48,7 +55,13 @@ class Logged:
 
 def run(out: Path | None = None, **options) -> Record:
     """The toy sweep with 40 trials a point."""
-    return sweep(options.pop("trial", trial), options.pop("grid", GRID), batched=["snr_db"], out=out, **{"trials": 40, "seed": 5, **options})
+    return sweep(
+        options.pop("trial", trial),
+        options.pop("grid", GRID),
+        batched=["snr_db"],
+        out=out,
+        **{"trials": 40, "seed": 5, **options},
+    )
 
 
 if __name__ == "__main__":
@@ -60,4 +73,6 @@ if __name__ == "__main__":
     parser.add_argument("--log")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    run(given.out, trial=Logged(given.slow, given.log), trials=given.trials, workers=given.workers, chunk=7, resume=True)
+    run(
+        given.out, trial=Logged(given.slow, given.log), trials=given.trials, workers=given.workers, chunk=7, resume=True
+    )

@@ -1,4 +1,6 @@
-"""System 000 as a whole: errata of the paper as tests, limits of the methods, and what experiments A and B must reach."""
+"""System 000 as a whole: errata of the paper as tests, limits of the methods, and what experiments
+A and B must reach.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,14 @@ from torch import Tensor
 from tests.compensate.radials import ESTIMATORS, GATE, range_rms, seen, velocity_rms
 from tests.echo.ladars import COMMON, THREE, table1
 from torchsar.compensate import correct_pulse_phase, pga
-from torchsar.compensate.radial import compensate_motion, mirror_product, phase_polish, radial_motion, range_error, segmented_interference
+from torchsar.compensate.radial import (
+    compensate_motion,
+    mirror_product,
+    phase_polish,
+    radial_motion,
+    range_error,
+    segmented_interference,
+)
 from torchsar.core import Draws, Estimate, Signal
 from torchsar.echo import simulate_ladar_record
 from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
@@ -24,7 +33,9 @@ RADAR = table1()
 
 
 def half_phases(sweep: Tensor, beat_hz: Tensor) -> tuple[Tensor, Tensor]:
-    """Phases of a tone (pulse, N) in the middles of the halves of a sweep, as centre-referenced transforms at its own peak give them."""
+    """Phases of a tone (pulse, N) in the middles of the halves of a sweep, as centre-referenced
+    transforms at its own peak give them.
+    """
     u = RADAR.fast_time_axis().values()
     h = len(u) // 2
     still = torch.polar(torch.ones(1, h, dtype=torch.float64), -2 * math.pi * beat_hz[:, None] * (u[:h] - u[:h].mean()))
@@ -36,7 +47,9 @@ def wrapped(x: Tensor) -> Tensor:
 
 
 def test_equation_16_as_printed_gives_the_range() -> None:
-    """Erratum 7: s+ conj(s-) without conjugating the down sweep in time turns by 2 pi (t1 - t2) 2 f+, whatever the velocity; conjugated it turns by 4 pi (t1 - t2) fd."""
+    """Erratum 7: s+ conj(s-) without conjugating the down sweep in time turns by 2 pi (t1 - t2) 2
+    f+, whatever the velocity; conjugated it turns by 4 pi (t1 - t2) fd.
+    """
     sweeps, _, truth = seen(table1(speed_m_s=0.0), n=32)
     up, down = sweeps[0], sweeps[1]
     v, apart = truth.values["velocity_m_s"], -RADAR.sweep_s / 2
@@ -53,7 +66,9 @@ def test_equation_16_as_printed_gives_the_range() -> None:
 
 
 def test_segmented_phase_is_the_velocity() -> None:
-    """Errata 6 to 8: phi = -2 pi T fd modulo a turn, the turn being 0.0969 m/s, and the integer comes along."""
+    """Errata 6 to 8: phi = -2 pi T fd modulo a turn, the turn being 0.0969 m/s, and the integer
+    comes along.
+    """
     sweeps, pulse, truth = seen(table1(speed_m_s=0.0))
     found = segmented_interference(sweeps, table1(speed_m_s=0.0), pulse, window_m=GATE)
     fd = 2 * truth.values["velocity_m_s"] / RADAR.wavelength_m
@@ -63,7 +78,9 @@ def test_segmented_phase_is_the_velocity() -> None:
 
 
 def test_the_integer_comes_from_one_period_and_not_its_error() -> None:
-    """Erratum 9: a start from the envelopes alone would leave up to 1.2 mm/s; the phase of the first period counts."""
+    """Erratum 9: a start from the envelopes alone would leave up to 1.2 mm/s; the phase of the
+    first period counts.
+    """
     sweeps, pulse, truth = seen(motion=(Polynomial([0.4321]),))
     found = segmented_interference(sweeps, RADAR, pulse, window_m=GATE)
     assert float((found["velocity_m_s"] - truth.values["velocity_m_s"]).abs().max()) < 1e-6
@@ -75,7 +92,12 @@ def test_gradients_fail_beyond_their_limit_and_integers_of_each_period_do_not() 
     assert limit == pytest.approx(3027, rel=1e-3)
     for a, survives in ((0.97 * limit, True), (1.03 * limit, False)):
         sweeps, pulse, truth = seen(motion=(Polynomial([-a * 16e-6 * 32, a / 2]),), n=64)
-        error = {unwrap: float(velocity_rms(segmented_interference(sweeps, RADAR, pulse, window_m=(0.5, 2.5), unwrap=unwrap), truth)) for unwrap in ("gradient", "per_pulse")}
+        error = {
+            unwrap: float(
+                velocity_rms(segmented_interference(sweeps, RADAR, pulse, window_m=(0.5, 2.5), unwrap=unwrap), truth)
+            )
+            for unwrap in ("gradient", "per_pulse")
+        }
         assert error["per_pulse"] < 1e-5 and (error["gradient"] < 1e-5) == survives
         slips = segmented_interference(sweeps, RADAR, pulse, window_m=(0.5, 2.5)).info["slips"]
         assert (float(slips) == 0) == survives
@@ -113,7 +135,9 @@ def test_circular_shift_ruins_what_cutting_anew_keeps() -> None:
     error = []
     for signal in (anew, shifted):
         found = mirror_product(signal.data, RADAR, signal.axis("pulse"), window_m=GATE)
-        error.append(float((found["velocity_m_s"] - truth.values["velocity_m_s"][: signal.axis("pulse").n]).abs().max()))
+        error.append(
+            float((found["velocity_m_s"] - truth.values["velocity_m_s"][: signal.axis("pulse").n]).abs().max())
+        )
     assert error[0] < 2e-4 and error[1] > 20 * error[0]
 
 
@@ -126,53 +150,84 @@ def test_experiment_a_without_noise(window) -> None:
     error = range_error(found, RADAR, pulse, middle) - truth.values["range_error_up_m"]
     assert float((error - error[0]).abs().max()) < 2e-8
     figures = middle_point(RADAR, sweeps, pulse, found)
-    assert figures["irw_azimuth_m"] == pytest.approx(6.0e-3, rel=0.02) and figures["pslr_azimuth_db"] == pytest.approx(-13.2, abs=0.15)
-    assert figures["irw_range_m"] == pytest.approx(0.0266, rel=0.02) and figures["pslr_range_db"] == pytest.approx(-13.27, abs=0.15)
+    assert figures["irw_azimuth_m"] == pytest.approx(6.0e-3, rel=0.02) and figures["pslr_azimuth_db"] == pytest.approx(
+        -13.2, abs=0.15
+    )
+    assert figures["irw_range_m"] == pytest.approx(0.0266, rel=0.02) and figures["pslr_range_db"] == pytest.approx(
+        -13.27, abs=0.15
+    )
 
 
 def middle_point(radar, sweeps: Tensor, pulse, found: Estimate) -> dict[str, float]:
-    """Figures of the point at x = 0, RD = 1.5 m after compensation by an estimate, and its phases where it has them."""
+    """Figures of the point at x = 0, RD = 1.5 m after compensation by an estimate, and its phases
+    where it has them.
+    """
     still = compensate_motion(sweeps, found["velocity_m_s"], radar, pulse)
     profiles = DerampAzimuth(radar)(CompressSweeps(radar)(Signal(still, radar.sweep_axes(pulse.n))))
     if "phase_rad" in found.value:
         profiles = profiles.with_data(correct_pulse_phase(profiles.data, found["phase_rad"]))
     image = AzimuthMatchedFilter(radar, 114e-6)(profiles)
     centre = (None, 0.0)
-    return {name: float(value.abs()) if name == "peak" else float(value) for name, value in impulse_response(image, (0.0, 1.5), search_m=0.03, centre_turns=centre).items()}
+    return {
+        name: float(value.abs()) if name == "peak" else float(value)
+        for name, value in impulse_response(image, (0.0, 1.5), search_m=0.03, centre_turns=centre).items()
+    }
 
 
 @pytest.mark.parametrize("seed", [1])
 def test_experiment_a_stripmap_at_20_db(seed) -> None:
-    """Several x that enter and leave the beam: -13.0 dB or better with the recommended chain, where a mean over them gives -8.9."""
+    """Several x that enter and leave the beam: -13.0 dB or better with the recommended chain, where
+    a mean over them gives -8.9.
+    """
     radar = table1(beam_rad=114e-6)
     scene = Points([-0.06, 0.0, 0.06], [1.0, 1.5, 2.0], [0.7, 1.0, 0.7], random_phase=True)
     sweeps, pulse, _ = seen(radar, n=512, scene=scene, snr_db=20.0, fidelity=QuadraticInSweep(), seed=seed)
     found = radial_motion(sweeps, radar, pulse, window_m=(0.0, 3.0))
     assert bool(found.ok)
-    polished, plain = (middle_point(radar, sweeps, pulse, e)["pslr_azimuth_db"] for e in (found, Estimate({"velocity_m_s": found["velocity_m_s"]}, found.quality, found.ok)))
+    polished, plain = (
+        middle_point(radar, sweeps, pulse, e)["pslr_azimuth_db"]
+        for e in (found, Estimate({"velocity_m_s": found["velocity_m_s"]}, found.quality, found.ok))
+    )
     assert polished < -13.0 and polished < plain + 0.05
 
 
 def test_experiment_b_in_the_order_of_the_brief() -> None:
-    """Letter E, random phases: single peaks fail at 5 cm, summed bins and the mirror product do not, and the polish reaches 0.15 rad."""
-    sweeps, pulse, truth = seen(n=512, trials=3, scene=LetterE(), snr_db=20.0, fidelity=LinearInSweep(), dtype=torch.complex64)
+    """Letter E, random phases: single peaks fail at 5 cm, summed bins and the mirror product do
+    not, and the polish reaches 0.15 rad.
+    """
+    sweeps, pulse, truth = seen(
+        n=512, trials=3, scene=LetterE(), snr_db=20.0, fidelity=LinearInSweep(), dtype=torch.complex64
+    )
     per_m = 4 * math.pi / RADAR.wavelength_m
     window = (-1.0, 1.0)
-    found = {name: ESTIMATORS[name](sweeps, RADAR, pulse, window_m=window) for name in ("segmented", "segmented_sum", "correlation", "mirror", "recommended")}
+    found = {
+        name: ESTIMATORS[name](sweeps, RADAR, pulse, window_m=window)
+        for name in ("segmented", "segmented_sum", "correlation", "mirror", "recommended")
+    }
     residual = {name: per_m * range_rms(e, truth, RADAR, pulse) for name, e in found.items()}
     median = {name: float(r.median()) for name, r in residual.items()}
-    assert median["segmented"] > max(median["correlation"], median["mirror"], median["segmented_sum"]) and median["segmented"] > 1
+    assert (
+        median["segmented"] > max(median["correlation"], median["mirror"], median["segmented_sum"])
+        and median["segmented"] > 1
+    )
     assert median["mirror"] < 0.7 and median["segmented_sum"] < 0.7 and median["correlation"] < 1.2
     assert float(residual["recommended"].max()) < 0.15
 
 
 def test_polish_after_any_estimator() -> None:
-    """Segmented, mirror or correlation: after the polish they are one. The steps of a correlation, a radian here, need a start by PGA."""
+    """Segmented, mirror or correlation: after the polish they are one.
+
+    The steps of a correlation, a radian here, need a start by PGA.
+    """
     sweeps, pulse, truth = seen(n=256, snr_db=10.0, fidelity=LinearInSweep())
     for name in ("segmented", "correlation", "mirror"):
         coarse = ESTIMATORS[name](sweeps, RADAR, pulse, window_m=GATE)
         still = compensate_motion(sweeps, coarse["velocity_m_s"], RADAR, pulse)
-        profiles = DerampAzimuth(RADAR)(CompressSweeps(RADAR, window_m=(1.0, 2.0))(Signal(still, RADAR.sweep_axes(256))))
+        profiles = DerampAzimuth(RADAR)(
+            CompressSweeps(RADAR, window_m=(1.0, 2.0))(Signal(still, RADAR.sweep_axes(256)))
+        )
         fine = phase_polish(profiles.data, start=pga(profiles.data)["phase_rad"] if name == "correlation" else None)
         both = Estimate({**coarse.value, **fine.value}, fine.quality, fine.ok)
-        assert bool(fine.ok) and float(range_rms(both, truth, RADAR, pulse)) < 2e-9 < float(range_rms(coarse, truth, RADAR, pulse)), name
+        assert bool(fine.ok) and float(range_rms(both, truth, RADAR, pulse)) < 2e-9 < float(
+            range_rms(coarse, truth, RADAR, pulse)
+        ), name

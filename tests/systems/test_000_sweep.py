@@ -1,4 +1,6 @@
-"""What the recorded sweep of system 000 claims (200 trials a point over SNR, 20 to 40 in the others); a reduced form runs in tests/compensate/test_radial_noise.py."""
+"""What the recorded sweep of system 000 claims (200 trials a point over SNR, 20 to 40 in the
+others); a reduced form runs in tests/compensate/test_radial_noise.py.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ import pytest
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "sweeps"
 RECORDED = json.loads((FOLDER / "sal_snr.json").read_text(encoding="utf-8"))
 VELOCITY, RANGE = "velocity_rmse_m_s", "range_error_detrended_rms_m"
-# medians of the brief 000, section 8 D: velocity (mm/s) of segmented interference, correlation x20 in the gate, periodogram peaks, mirror product
+# medians of the brief 000, section 8 D: velocity (mm/s) of segmented interference, correlation x20
+# in the gate, periodogram peaks, mirror product
 BRIEF = {
     -10.0: {"segmented": 4.45, "cross_correlation": 4.2, "ml_peak": 3.80, "mirror": 2.21},
     0.0: {"segmented": 1.37, "cross_correlation": 1.42, "ml_peak": 1.20, "mirror": 0.61},
@@ -24,11 +27,19 @@ CHAIN_NM = {-10.0: 40.0, 0.0: 6.6, 10.0: 1.34, 20.0: 0.48, 30.0: 0.32}
 
 
 def point(algorithm: str, snr_db: float, metric: str = VELOCITY) -> dict:
-    return next(p for p in RECORDED["points"] if (p["algorithm"], p["metric"], p["parameters"]["world.noise.snr_db"]) == (algorithm, metric, snr_db))
+    return next(
+        p
+        for p in RECORDED["points"]
+        if (p["algorithm"], p["metric"], p["parameters"]["world.noise.snr_db"]) == (algorithm, metric, snr_db)
+    )
 
 
 def bound(name: str, snr_db: float, metric: str = VELOCITY) -> float:
-    return next(b["rms"] for b in RECORDED["bounds"] if (b["metric"], b["bound"], b["parameters"]["world.noise.snr_db"]) == (metric, name, snr_db))
+    return next(
+        b["rms"]
+        for b in RECORDED["bounds"]
+        if (b["metric"], b["bound"], b["parameters"]["world.noise.snr_db"]) == (metric, name, snr_db)
+    )
 
 
 def test_every_point_has_its_trials() -> None:
@@ -56,13 +67,20 @@ def test_the_range_of_the_chain_is_that_of_the_brief_or_better(snr_db: float) ->
 @pytest.mark.parametrize("snr_db", BRIEF)
 def test_nobody_knows_the_truth(snr_db: float) -> None:
     """An estimator well below its bound would be leaking truth."""
-    for algorithm, name in (("segmented", "segmented interference"), ("ml_peak", "unknown offsets"), ("mirror", "known offset"), ("recommended", "known offset")):
+    for algorithm, name in (
+        ("segmented", "segmented interference"),
+        ("ml_peak", "unknown offsets"),
+        ("mirror", "known offset"),
+        ("recommended", "known offset"),
+    ):
         assert point(algorithm, snr_db)["median"] > 0.93 * bound(name, snr_db), algorithm
 
 
 @pytest.mark.parametrize("snr_db", [10.0, 20.0])
 def test_segmented_interference_loses_1_25_db(snr_db: float) -> None:
-    assert (point("segmented", snr_db)["median"] / point("ml_peak", snr_db)["median"]) ** 2 == pytest.approx(4 / 3, rel=0.1)
+    assert (point("segmented", snr_db)["median"] / point("ml_peak", snr_db)["median"]) ** 2 == pytest.approx(
+        4 / 3, rel=0.1
+    )
 
 
 def test_correlation_stays_at_its_grid() -> None:
@@ -94,14 +112,18 @@ def test_the_error_is_the_same_up_to_the_band_limit() -> None:
 
 
 def test_gradients_wrap_at_their_limit() -> None:
-    """lambda / (4 T PRT) = 3027 m/s^2 (section 7): good 11 % below it, gone 9 % above it; integers of each period and the mirror product go on."""
+    """lambda / (4 T PRT) = 3027 m/s^2 (section 7): good 11 % below it, gone 9 % above it; integers
+    of each period and the mirror product go on.
+    """
     found = medians("sal_acceleration", "world.motion.drift.acceleration_m_s2", VELOCITY)
     assert found["segmented"][2700.0] < 0.5e-3 and found["segmented"][3300.0] > 1.0
     assert found["segmented_per_pulse"][5000.0] < 0.5e-3 and found["recommended"][5000.0] < 0.25e-3
 
 
 def test_integrated_velocities_walk_away_and_phases_do_not() -> None:
-    """sd v * PRT * sqrt(M / 15) (section 6): 57 nm after 1024 periods; the chain stays below 2.5 nm."""
+    """sd v * PRT * sqrt(M / 15) (section 6): 57 nm after 1024 periods; the chain stays below 2.5
+    nm.
+    """
     found = medians("sal_periods", "world.periods", RANGE)
     assert found["segmented"][1024.0] == pytest.approx(57e-9, rel=0.15)
     assert found["segmented"][4096.0] / found["segmented"][256.0] == pytest.approx(4.0, rel=0.2)

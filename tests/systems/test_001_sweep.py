@@ -1,4 +1,6 @@
-"""What the recorded sweeps of system 001 claim (Table 2 of the source, 200 trials a point; clutter, 50); a reduced form runs in test_001_moving.py."""
+"""What the recorded sweeps of system 001 claim (Table 2 of the source, 200 trials a point; clutter,
+50); a reduced form runs in test_001_moving.py.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +13,23 @@ FOLDER = Path(__file__).resolve().parents[2] / "docs" / "sweeps"
 RECORDED = json.loads((FOLDER / "geo_velocity_scnr.json").read_text(encoding="utf-8"))
 CLUTTER = json.loads((FOLDER / "geo_velocity_clutter.json").read_text(encoding="utf-8"))
 PRF, SCNR = "radar.prf_hz", "world.noise.raw_scnr_db"
-# brief 001: mean errors of its trial, which rms errors of ours may exceed by what 24 trials leave open
-SIR_TRIAL = {170.0: {-20.0: 0.25, -10.0: 0.08, 0.0: 0.06, 10.0: 0.06}, 180.0: {-20.0: 0.40, -10.0: 0.05, 0.0: 0.04, 10.0: 0.03}, 190.0: {-20.0: 2.0, -10.0: 0.18, 0.0: 0.03, 10.0: 0.03}}
+# brief 001: mean errors of its trial, which rms errors of ours may exceed by what 24 trials leave
+# open
+SIR_TRIAL = {
+    170.0: {-20.0: 0.25, -10.0: 0.08, 0.0: 0.06, 10.0: 0.06},
+    180.0: {-20.0: 0.40, -10.0: 0.05, 0.0: 0.04, 10.0: 0.03},
+    190.0: {-20.0: 2.0, -10.0: 0.18, 0.0: 0.03, 10.0: 0.03},
+}
 
 
 def found(kind: str, key: str, prf_hz: float, scnr_db: float, **more: str) -> float:
     wanted = {"metric": "u_r_error_m_s", **more}
-    return next(p[key] for p in RECORDED[kind] if all(p[k] == v for k, v in wanted.items()) and (p["parameters"][PRF], p["parameters"][SCNR]) == (prf_hz, scnr_db))
+    return next(
+        p[key]
+        for p in RECORDED[kind]
+        if all(p[k] == v for k, v in wanted.items())
+        and (p["parameters"][PRF], p["parameters"][SCNR]) == (prf_hz, scnr_db)
+    )
 
 
 def over_bound(algorithm: str, prf_hz: float, scnr_db: float) -> float:
@@ -50,6 +62,10 @@ def test_below_threshold_nobody_is_trusted() -> None:
 def test_in_clutter_the_estimated_covariance_is_nearly_as_good_as_the_true_one(scr_db: float) -> None:
     at = {"metric": "u_r_error_m_s", "parameters": {"world.noise.scr_db": scr_db}}
     rms = {p["algorithm"]: p["rmse"] for p in CLUTTER["points"] if all(p[key] == value for key, value in at.items())}
-    bound = next(b["rms"] for b in CLUTTER["bounds"] if all(b[key] == value for key, value in at.items()) and b["bound"] == "Cramer-Rao, u_a known")
+    bound = next(
+        b["rms"]
+        for b in CLUTTER["bounds"]
+        if all(b[key] == value for key, value in at.items()) and b["bound"] == "Cramer-Rao, u_a known"
+    )
     assert 0.7 < rms["recommended"] / bound < 3
     assert rms["recommended"] < 0.1 * min(rms["ati"], rms["sir"])

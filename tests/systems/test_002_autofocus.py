@@ -1,4 +1,6 @@
-"""System 002: the claims about phase errors of inverse synthetic aperture ladar, at reduced numbers of trials, and recordings with injected errors."""
+"""System 002: the claims about phase errors of inverse synthetic aperture ladar, at reduced numbers
+of trials, and recordings with injected errors.
+"""
 
 from __future__ import annotations
 
@@ -27,11 +29,25 @@ TABLE_1 = {
     "sigma 2 pi": ((), WHITE),
     "1_100_60 and sigma pi": ((Sinusoid.named("1_100_60", unit="mm"),), (StartPhase(math.pi),)),
 }
-METHODS = {"pga": pga, "sca": sca, "pga_sca": pga_sca, "entropy_fixed_point": entropy_fixed_point, "autofocus": autofocus}
+METHODS = {
+    "pga": pga,
+    "sca": sca,
+    "pga_sca": pga_sca,
+    "entropy_fixed_point": entropy_fixed_point,
+    "autofocus": autofocus,
+}
 SUCCESS_RAD = 0.47  # Strehl ratio 0.8
 
 
-def simulated(scene, motion=(), start=WHITE, snr_db: float | None = None, trials: int = 4, dtype: torch.dtype = torch.complex64, damages=None) -> tuple[Recording, Truth]:
+def simulated(
+    scene,
+    motion=(),
+    start=WHITE,
+    snr_db: float | None = None,
+    trials: int = 4,
+    dtype: torch.dtype = torch.complex64,
+    damages=None,
+) -> tuple[Recording, Truth]:
     world = TurntableWorld(scene, motion=motion, start_phase=start, snr_db=snr_db)
     return simulate_turntable(RADAR, world, 400, 256, Draws(3, trials=range(trials)), damages, dtype=dtype)
 
@@ -57,7 +73,9 @@ def table_1() -> dict[str, dict[str, Tensor]]:
         recording, truth = simulated(Aircraft(), motion, start, trials=2)
         assert truth.clean is not None
         ideal, data = image_entropy(truth.clean.signal.data), recording.signal.data
-        rows[row] = {name: image_entropy(data, METHODS[name](data)["phase_rad"]) - ideal for name in METHODS} | {"polluted": image_entropy(data) - ideal}
+        rows[row] = {name: image_entropy(data, METHODS[name](data)["phase_rad"]) - ideal for name in METHODS} | {
+            "polluted": image_entropy(data) - ideal
+        }
     return rows
 
 
@@ -95,13 +113,17 @@ def test_rows_of_table_1_are_the_same_for_methods_started_from_sca(name):
 
 @pytest.mark.parametrize("snr_db, most", [(-5.0, 0.13), (0.0, 0.075), (10.0, 0.045), (20.0, 0.035)])
 def test_autofocus_over_snr(snr_db, most):
-    """White errors: better than the entropy fixed point, itself better than PGA-SCA; its deviation is known; no better than the bound."""
+    """White errors: better than the entropy fixed point, itself better than PGA-SCA; its deviation
+    is known; no better than the bound.
+    """
     recording, truth = simulated(Aircraft(), snr_db=snr_db, trials=4)
     data, true = recording.signal.data, truth.values["phase_rad"]
     found = autofocus(data)
     error = phase_rmse(found["phase_rad"], true)
     others = {name: phase_rmse(METHODS[name](data)["phase_rad"], true) for name in ("entropy_fixed_point", "pga_sca")}
-    assert float(error.median()) < min(most, float(others["entropy_fixed_point"].median())) and float(others["entropy_fixed_point"].median()) < float(others["pga_sca"].median())
+    assert float(error.median()) < min(most, float(others["entropy_fixed_point"].median())) and float(
+        others["entropy_fixed_point"].median()
+    ) < float(others["pga_sca"].median())
     assert found.ok.all() and float(error.min()) > float(pulse_phase_bound_rad(10 ** (snr_db / 10), 256))
     ratio = found.std["phase_rad"][:, 0] / error
     assert 0.5 < float(ratio.median()) < 2
@@ -112,7 +134,9 @@ def test_far_below_the_threshold_nothing_is_claimed():
     recording, truth = simulated(Aircraft(), snr_db=-17.0, trials=3)
     for method in METHODS.values():
         found = method(recording.signal.data)
-        assert not found.ok.any() and float(phase_rmse(found["phase_rad"], truth.values["phase_rad"]).min()) > SUCCESS_RAD
+        assert (
+            not found.ok.any() and float(phase_rmse(found["phase_rad"], truth.values["phase_rad"]).min()) > SUCCESS_RAD
+        )
 
 
 # section 10: where estimators break
@@ -138,13 +162,17 @@ def test_dense_rows_defeat_pga_sca_and_not_autofocus():
 
 
 def test_what_still_moves_is_not_believed():
-    """256 scatterers a row: PGA-SCA errs by about a radian, slowly varying, and each step of the entropy shows little of it."""
+    """256 scatterers a row: PGA-SCA errs by about a radian, slowly varying, and each step of the
+    entropy shows little of it.
+    """
     error, ok = judged(pga_sca, SpreadRows(64, 256, 0.5, EXTENT_M, RADAR.range_step_m), 10.0)
     assert float(error.max()) > 2 * SUCCESS_RAD and not bool((ok & (error > SUCCESS_RAD)).any())
 
 
 def test_a_target_that_fills_the_band_defeats_pairs_and_pga_and_not_autofocus():
-    """4000 scatterers over the whole unambiguous cross range: adjacent pulses have nothing in common, so that there is nothing to start from."""
+    """4000 scatterers over the whole unambiguous cross range: adjacent pulses have nothing in
+    common, so that there is nothing to start from.
+    """
     scene = Speckle(4000, EXTENT_M, 0.2)
     for method in (sca, pga_sca):
         error, ok = judged(method, scene, 10.0)
@@ -169,7 +197,12 @@ def test_one_row_is_never_believed():
 
 def test_the_verdict_agrees_with_success():
     """Over scenes and SNR where methods succeed, fail, and nearly so: wrong claims are rare."""
-    scenes = [(Aircraft(), snr) for snr in (-15.0, -8.0, 10.0)] + [rows(2, 4), rows(16, 4), (SpreadRows(64, 64, 0.5, EXTENT_M, RADAR.range_step_m), 10.0), (Speckle(4000, 0.2 * EXTENT_M, 0.2), 10.0)]
+    scenes = [(Aircraft(), snr) for snr in (-15.0, -8.0, 10.0)] + [
+        rows(2, 4),
+        rows(16, 4),
+        (SpreadRows(64, 64, 0.5, EXTENT_M, RADAR.range_step_m), 10.0),
+        (Speckle(4000, 0.2 * EXTENT_M, 0.2), 10.0),
+    ]
     agree, false = [], []
     for scene, snr_db in scenes:
         for method in (sca, pga_sca, autofocus):
@@ -183,18 +216,27 @@ def test_the_verdict_agrees_with_success():
 
 
 def strip(n: int, seed: int, points: int, clutter: float, decades: tuple[float, float], patches: bool) -> Tensor:
-    """Speckle (in patches of many levels), clutter, and off-grid points 10**decades above it, in focus, (pulse, range)."""
+    """Speckle (in patches of many levels), clutter, and off-grid points 10**decades above it, in
+    focus, (pulse, range).
+    """
     g = torch.Generator().manual_seed(seed)
     level = torch.ones(n, n)
     if patches:
         coarse = torch.rand(1, 1, n // 32, n // 32, generator=g) ** 2 + 0.02
         level = torch.nn.functional.interpolate(coarse, size=(n, n), mode="bilinear")[0, 0]
-    image = torch.randn(n, n, dtype=torch.complex64, generator=g) * level.sqrt() + clutter * torch.randn(n, n, dtype=torch.complex64, generator=g)
+    image = torch.randn(n, n, dtype=torch.complex64, generator=g) * level.sqrt() + clutter * torch.randn(
+        n, n, dtype=torch.complex64, generator=g
+    )
     low, high = decades
-    amplitude = 10 ** (low + (high - low) * torch.rand(points, generator=g)) * torch.exp(2j * math.pi * torch.rand(points, generator=g))
+    amplitude = 10 ** (low + (high - low) * torch.rand(points, generator=g)) * torch.exp(
+        2j * math.pi * torch.rand(points, generator=g)
+    )
     place = n * torch.rand(2, points, 1, generator=g)
     k = torch.arange(n)
-    along, across = torch.exp(2j * math.pi / n * place[0] * k) / math.sqrt(n), torch.sinc(k - place[1]).to(torch.complex64)
+    along, across = (
+        torch.exp(2j * math.pi / n * place[0] * k) / math.sqrt(n),
+        torch.sinc(k - place[1]).to(torch.complex64),
+    )
     return torch.fft.ifft(image, dim=0, norm="ortho") + (along * amplitude[:, None]).mT @ across
 
 
@@ -209,7 +251,9 @@ def injected(n: int, kind: str, seed: int) -> Tensor:
 
 
 def best_iterate(x: Tensor, true: Tensor, start: Tensor, kernel: str) -> float:
-    """Least phase error of 20 iterations of the rule that the brief states, on padded pulses, without any stop."""
+    """Least phase error of 20 iterations of the rule that the brief states, on padded pulses,
+    without any stop.
+    """
     psi, least, n = start.double(), math.inf, len(x)
     k = torch.arange(n, dtype=torch.float64) - (n - 1) / 2
     for iteration in range(21):
@@ -243,25 +287,36 @@ def test_pga_ends_near_its_best_iterate(name):
     x = x * torch.exp(1j * true)[:, None].to(torch.complex64)
     found = pga(x) if start == "zero" else pga_sca(x)
     begin = torch.zeros(len(x)) if start == "zero" else sca(x)["phase_rad"]
-    error, best = float(phase_rmse(found["phase_rad"], true)), best_iterate(x, true, begin, "lumv" if start == "zero" else "ml")
+    error, best = (
+        float(phase_rmse(found["phase_rad"], true)),
+        best_iterate(x, true, begin, "lumv" if start == "zero" else "ml"),
+    )
     assert error < 1.1 * best + 1e-4 and best < 0.5 * float(phase_rmse(begin, true))
 
 
 # damages put into any range-compressed recording
 
 
-@pytest.mark.parametrize("damage", [WhitePhase(), PhaseWalk(0.5), PhaseSinusoid(30.0, 12.0)], ids=["white", "walk", "sinusoid"])
+@pytest.mark.parametrize(
+    "damage", [WhitePhase(), PhaseWalk(0.5), PhaseSinusoid(30.0, 12.0)], ids=["white", "walk", "sinusoid"]
+)
 def test_damages_turn_pulses_by_what_they_say(damage):
-    recording, truth = simulated(Aircraft(), start=(), snr_db=20.0, trials=2, damages={"phase": damage}, dtype=torch.complex128)
+    recording, truth = simulated(
+        Aircraft(), start=(), snr_db=20.0, trials=2, damages={"phase": damage}, dtype=torch.complex128
+    )
     assert truth.clean is not None
     said = truth.values["phase.phase_rad"]
     assert said.shape == (2, 400) and float(said.std(-1).min()) > 1 and not torch.equal(said[0], said[1])
-    torch.testing.assert_close(correct_pulse_phase(recording.signal.data, said), truth.clean.signal.data, atol=1e-9, rtol=0)
+    torch.testing.assert_close(
+        correct_pulse_phase(recording.signal.data, said), truth.clean.signal.data, atol=1e-9, rtol=0
+    )
     found = autofocus(recording.signal.data)
     assert float(phase_rmse(found["phase_rad"], said).max()) < 0.06 and found.ok.all()
 
 
-@pytest.mark.parametrize("make", [lambda: WhitePhase(-1.0), lambda: PhaseWalk(math.nan), lambda: PhaseSinusoid(cycles=math.inf)])
+@pytest.mark.parametrize(
+    "make", [lambda: WhitePhase(-1.0), lambda: PhaseWalk(math.nan), lambda: PhaseSinusoid(cycles=math.inf)]
+)
 def test_damages_that_make_no_sense(make):
     with pytest.raises(ValueError):
         make()
@@ -271,7 +326,9 @@ def test_damages_that_make_no_sense(make):
 
 
 def with_white_phases(path) -> tuple[Recording, Tensor, Tensor]:
-    """The recording, its data as they are and with phases of +- pi, (2, pulse, range), and these phases."""
+    """The recording, its data as they are and with phases of +- pi, (2, pulse, range), and these
+    phases.
+    """
     recording = read_inverse(path)
     x = recording.signal.data
     a = 2 * math.pi * torch.rand(len(x), generator=torch.Generator().manual_seed(1)) - math.pi
@@ -279,7 +336,9 @@ def with_white_phases(path) -> tuple[Recording, Tensor, Tensor]:
 
 
 def test_yak_42_in_flight(recorded):
-    """An aircraft with motion of its own: the estimate on injected errors is that on the recording, plus these. PGA from zero does not manage."""
+    """An aircraft with motion of its own: the estimate on injected errors is that on the recording,
+    plus these. PGA from zero does not manage.
+    """
     _, data, a = with_white_phases(recorded("isar_yak42_a.npz"))
     found, by_pga = autofocus(data), pga(data)
     left, right = image_entropy(data, found["phase_rad"])
@@ -289,12 +348,17 @@ def test_yak_42_in_flight(recorded):
     assert float(phase_rmse(by_pga["phase_rad"][1] - a, by_pga["phase_rad"][0])) > 1 and not by_pga.ok[1]
 
 
-@pytest.mark.parametrize("name, most_rad", [("isar_thz_airplane_even.npz", 0.1), ("gotcha_pass1_hh_az001_003.npz", 0.2)])
+@pytest.mark.parametrize(
+    "name, most_rad", [("isar_thz_airplane_even.npz", 0.1), ("gotcha_pass1_hh_az001_003.npz", 0.2)]
+)
 def test_recordings_with_a_geometry(recorded, name, most_rad):
     recording, data, a = with_white_phases(recorded(name))
     stage = TargetImage(recording.radar, geometry_of(**recording.aux))  # pyright: ignore[reportArgumentType]
     dirty = recording.signal.with_data(data[1])
     found = autofocus(dirty.data, imaging=stage.operator(dirty.data))
     assert bool(found.ok) and float(phase_rmse(found["phase_rad"], a)) < most_rad
-    focused, clean, blurred = (float(entropy(stage(recording.signal.with_data(v)).data)) for v in (correct_pulse_phase(data[1], found["phase_rad"]), data[0], data[1]))
+    focused, clean, blurred = (
+        float(entropy(stage(recording.signal.with_data(v)).data))
+        for v in (correct_pulse_phase(data[1], found["phase_rad"]), data[0], data[1])
+    )
     assert focused < clean + 0.05 < blurred

@@ -1,4 +1,6 @@
-"""Where methods break (brief 002, section 10), as the recorded sweep over scenes shows it (20 trials a point)."""
+"""Where methods break (brief 002, section 10), as the recorded sweep over scenes shows it (20
+trials a point).
+"""
 
 from __future__ import annotations
 
@@ -7,15 +9,37 @@ from pathlib import Path
 
 import pytest
 
-RECORDED = json.loads((Path(__file__).resolve().parents[2] / "docs" / "sweeps" / "isal_scene.json").read_text(encoding="utf-8"))
+RECORDED = json.loads(
+    (Path(__file__).resolve().parents[2] / "docs" / "sweeps" / "isal_scene.json").read_text(encoding="utf-8")
+)
 METRIC = "residual_phase_rms_rad"
 
 
 def point(algorithm: str, scene: str) -> dict:
-    return next(p for p in RECORDED["points"] if (p["algorithm"], p["metric"], p["parameters"]["world.scene"]) == (algorithm, METRIC, scene))
+    return next(
+        p
+        for p in RECORDED["points"]
+        if (p["algorithm"], p["metric"], p["parameters"]["world.scene"]) == (algorithm, METRIC, scene)
+    )
 
 
-@pytest.mark.parametrize("scene", ["1 a row", "5 a row", "20 a row", "64 a row", "128 a row", "4 rows of 4", "16 rows of 4", "128 rows of 4", "width 0.02", "width 0.2", "width 0.8", "width 1"])
+@pytest.mark.parametrize(
+    "scene",
+    [
+        "1 a row",
+        "5 a row",
+        "20 a row",
+        "64 a row",
+        "128 a row",
+        "4 rows of 4",
+        "16 rows of 4",
+        "128 rows of 4",
+        "width 0.02",
+        "width 0.2",
+        "width 0.8",
+        "width 1",
+    ],
+)
 def test_the_recommended_method_survives(scene: str) -> None:
     best = point("recommended", scene)
     assert best["success_share"] >= 0.95 and best["median"] < 0.15
@@ -24,7 +48,10 @@ def test_the_recommended_method_survives(scene: str) -> None:
 def test_pga_sca_fails_where_rows_are_dense_or_few() -> None:
     for scene in ("1 rows of 4", "2 rows of 4", "4 rows of 4", "width 1"):
         assert point("pga_sca", scene)["success_share"] <= 0.4
-    assert point("pga_sca", "128 a row")["success_share"] <= 0.75 and point("pga_sca", "128 a row")["median"] > 5 * point("recommended", "128 a row")["median"]
+    assert (
+        point("pga_sca", "128 a row")["success_share"] <= 0.75
+        and point("pga_sca", "128 a row")["median"] > 5 * point("recommended", "128 a row")["median"]
+    )
     assert point("pga_sca", "16 rows of 4")["success_share"] >= 0.9
 
 

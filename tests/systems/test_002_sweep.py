@@ -1,4 +1,6 @@
-"""What the recorded sweep of system 002 claims (200 trials a point); a reduced sweep runs in tests/study/test_isal.py."""
+"""What the recorded sweep of system 002 claims (200 trials a point); a reduced sweep runs in
+tests/study/test_isal.py.
+"""
 
 from __future__ import annotations
 
@@ -7,18 +9,28 @@ from pathlib import Path
 
 import pytest
 
-RECORDED = json.loads((Path(__file__).resolve().parents[2] / "docs" / "sweeps" / "isal_snr.json").read_text(encoding="utf-8"))
+RECORDED = json.loads(
+    (Path(__file__).resolve().parents[2] / "docs" / "sweeps" / "isal_snr.json").read_text(encoding="utf-8")
+)
 # median phase error of the entropy fixed point by SNR: brief 002, section 7, 12 trials
 BRIEF = {-10.0: 0.229, -7.5: 0.159, -5.0: 0.117, 0.0: 0.080, 10.0: 0.057, 30.0: 0.056}
 METRIC = "residual_phase_rms_rad"
 
 
 def point(algorithm: str, snr_db: float, metric: str = METRIC) -> dict:
-    return next(p for p in RECORDED["points"] if (p["algorithm"], p["metric"], p["parameters"]["world.noise.snr_db"]) == (algorithm, metric, snr_db))
+    return next(
+        p
+        for p in RECORDED["points"]
+        if (p["algorithm"], p["metric"], p["parameters"]["world.noise.snr_db"]) == (algorithm, metric, snr_db)
+    )
 
 
 def bound(name: str, snr_db: float) -> float:
-    return next(b["rms"] for b in RECORDED["bounds"] if (b["metric"], b["bound"], b["parameters"]["world.noise.snr_db"]) == (METRIC, name, snr_db))
+    return next(
+        b["rms"]
+        for b in RECORDED["bounds"]
+        if (b["metric"], b["bound"], b["parameters"]["world.noise.snr_db"]) == (METRIC, name, snr_db)
+    )
 
 
 def test_every_point_has_its_trials() -> None:
@@ -44,17 +56,25 @@ def test_failure_is_not_called_success(snr_db: float) -> None:
     for algorithm in ("sca", "pga", "pga_sca", "entropy_fixed_point", "least_entropy", "recommended"):
         found = point(algorithm, snr_db)
         assert found["median"] > 1.4 and found["ok_share"] <= 0.01
-    assert point("recommended", snr_db, "entropy_above_ideal_nats")["median"] < 0  # lower entropy than the error-free image, and wrong
+    assert (
+        point("recommended", snr_db, "entropy_above_ideal_nats")["median"] < 0
+    )  # lower entropy than the error-free image, and wrong
 
 
 @pytest.mark.parametrize("snr_db", BRIEF)
 def test_nobody_knows_the_truth(snr_db: float) -> None:
     for algorithm in ("entropy_fixed_point", "least_entropy", "recommended"):
-        assert point(algorithm, snr_db)["median"] > 0.95 * bound("amplitudes unknown (Cramer-Rao)", snr_db) > 0.95 * bound("scene known", snr_db)
+        assert (
+            point(algorithm, snr_db)["median"]
+            > 0.95 * bound("amplitudes unknown (Cramer-Rao)", snr_db)
+            > 0.95 * bound("scene known", snr_db)
+        )
 
 
 def test_the_papers_methods_keep_their_order_above_0_db() -> None:
     for snr_db in (10.0, 30.0):
-        medians = [point(algorithm, snr_db)["median"] for algorithm in ("sca", "pga_sca", "entropy_fixed_point", "recommended")]
+        medians = [
+            point(algorithm, snr_db)["median"] for algorithm in ("sca", "pga_sca", "entropy_fixed_point", "recommended")
+        ]
         assert medians == sorted(medians, reverse=True)
         assert point("sca", snr_db)["success_share"] < 0.1 and point("pga", snr_db)["success_share"] < 0.1

@@ -1,4 +1,8 @@
-"""Claims of system 003 (Remote Sens. 2025, 17, 3447, and brief 003) at reduced size, from the configs: three points, satellite, corner cubes, estimates against the bound."""
+"""Claims of system 003 (Remote Sens.
+
+2025, 17, 3447, and brief 003) at reduced size, from the configs: three points, satellite, corner
+cubes, estimates against the bound.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +22,17 @@ def kept(loaded: Loaded, methods: Sequence[str]) -> Loaded:
     return replace(loaded, config=loaded.config.model_copy(update={"processor": processor}))
 
 
-def batch(config: str, methods: Sequence[str], overrides: Sequence[str] = (), trials: int = 1, cuts: bool = False) -> tuple[Loaded, Batch]:
+def batch(
+    config: str, methods: Sequence[str], overrides: Sequence[str] = (), trials: int = 1, cuts: bool = False
+) -> tuple[Loaded, Batch]:
     loaded = kept(load(config, overrides), methods)
     bench = RotationTrials(loaded).bench({})
     with torch.no_grad():
         return loaded, run_batch(bench, Draws(loaded.config.seed, "run", range(trials)), cuts=cuts)
 
 
-# peak (dB), width (mm; None where a smear has none) and PSLR (dB) at -12, 0 and 12 m; brief 003, experiment 1
+# peak (dB), width (mm; None where a smear has none) and PSLR (dB) at -12, 0 and 12 m; brief 003,
+# experiment 1
 POINTS = {
     "second_order_azimuth": {"points.0": (-15.4, 8.3, -2.1), "points.2": (-15.4, 8.3, -2.1)},
     "third_order_azimuth": dict.fromkeys(("points.0", "points.1", "points.2"), (-2.8, 2.16, -5.1)),
@@ -47,12 +54,24 @@ def test_three_points_reach_the_figures_of_figs_2_and_3() -> None:
         assert float(figures["none"][target]["peak_db"]) == pytest.approx(-29.7, abs=0.3)
     assert float(figures["none"]["points.1"]["peak_db"]) == pytest.approx(-4.1, abs=0.3)
     fitted = made.metrics["second_order_azimuth"]["k1_error_percent"]
-    assert float(fitted) == pytest.approx(100, abs=5)  # a second-order fit is k1 + k2 T / 2 = 20, not k1
+    # a second-order fit is k1 + k2 T / 2 = 20, not k1
+    assert float(fitted) == pytest.approx(100, abs=5)
     assert abs(float(made.metrics["recommended"]["k1_error_percent"])) < 0.01
 
 
 def test_entropy_falls_with_the_order_and_uniform_autofocus_fails() -> None:
-    methods = ["ideal", "none", "second_order_azimuth", "third_order_azimuth", "third_order_2d", "pga", "uniform_autofocus", "coarse", "phase_fit", "recommended"]
+    methods = [
+        "ideal",
+        "none",
+        "second_order_azimuth",
+        "third_order_azimuth",
+        "third_order_2d",
+        "pga",
+        "uniform_autofocus",
+        "coarse",
+        "phase_fit",
+        "recommended",
+    ]
     _, made = batch("isal_satellite", methods)
     entropy = {name: float(row["entropy_nats"]) for name, row in made.metrics.items()}
     order = [entropy[name] for name in ("none", "second_order_azimuth", "third_order_azimuth", "third_order_2d")]
@@ -60,7 +79,11 @@ def test_entropy_falls_with_the_order_and_uniform_autofocus_fails() -> None:
     assert min(entropy["pga"], entropy["uniform_autofocus"]) > order[3] + 3
     assert abs(entropy["recommended"] - order[3]) < 0.01 and abs(entropy["phase_fit"] - order[3]) < 0.02
     best = {key: float(value) for key, value in made.metrics["recommended"].items()}
-    assert abs(best["omega_error_percent"]) < 1 and max(abs(best["k1_error_percent"]), abs(best["k2_error_percent"])) < 0.02 and abs(best["yc_error_m"]) < 0.05
+    assert (
+        abs(best["omega_error_percent"]) < 1
+        and max(abs(best["k1_error_percent"]), abs(best["k2_error_percent"])) < 0.02
+        and abs(best["yc_error_m"]) < 0.05
+    )
     assert bool(best["ok"]) and not bool(made.metrics["pga"]["ok"])
 
 
@@ -68,8 +91,13 @@ def test_corner_cubes_need_both_estimators_in_turn() -> None:
     methods = ["ideal", "none", "autofocus", "autofocus_second_order", "autofocus_third_order", "recommended"]
     _, made = batch("isal_corner_cubes", methods, trials=2)
     above = {name: row["entropy_above_ideal_nats"] for name, row in made.metrics.items() if name != "ideal"}
-    assert bool((above["none"] > above["autofocus"]).all() and (above["autofocus"] > above["autofocus_second_order"]).all())
-    assert bool((above["autofocus_second_order"] > above["recommended"] + 1).all() and (above["autofocus_third_order"] > above["recommended"] + 1).all())
+    assert bool(
+        (above["none"] > above["autofocus"]).all() and (above["autofocus"] > above["autofocus_second_order"]).all()
+    )
+    assert bool(
+        (above["autofocus_second_order"] > above["recommended"] + 1).all()
+        and (above["autofocus_third_order"] > above["recommended"] + 1).all()
+    )
     assert float(above["recommended"].abs().max()) < 0.1
     assert float(made.metrics["recommended"]["omega_error_percent"].abs().max()) < 3
 
@@ -79,7 +107,9 @@ def test_recommended_errors_stay_near_the_bound_on_new_scenes() -> None:
     table = RotationTrials(loaded).bench({}).table
     bounds = error_bounds(table, made.truth, free_centre=True)
     for name in ("omega_error_percent", "k1_error_percent", "k2_error_percent", "yc_error_m"):
-        rms, least = (float(x.square().mean().sqrt()) for x in (made.metrics["recommended"][name], bounds[name]["Cramer-Rao"]))
+        rms, least = (
+            float(x.square().mean().sqrt()) for x in (made.metrics["recommended"][name], bounds[name]["Cramer-Rao"])
+        )
         assert rms < 3 * least, (name, rms, least)
     assert bool(made.metrics["recommended"]["ok"].all())
 
@@ -87,4 +117,7 @@ def test_recommended_errors_stay_near_the_bound_on_new_scenes() -> None:
 def test_ignored_centre_deviation_spoils_the_rate() -> None:
     _, made = batch("isal_rotation_yc", ["ignored", "recommended"], ["world.centre_deviation_m=-3.0"], trials=2)
     assert float(made.metrics["ignored"]["omega_error_percent"].abs().max()) > 10
-    assert bool((made.metrics["recommended"]["omega_error_percent"].abs() < 3).all() and (made.metrics["recommended"]["yc_error_m"].abs() < 0.05).all())
+    assert bool(
+        (made.metrics["recommended"]["omega_error_percent"].abs() < 3).all()
+        and (made.metrics["recommended"]["yc_error_m"].abs() < 0.05).all()
+    )

@@ -1,4 +1,6 @@
-"""What the recorded sweep of system 003 claims (60 scenes and noise draws a point); a reduced form runs in tests/systems/test_003_rotation.py."""
+"""What the recorded sweep of system 003 claims (60 scenes and noise draws a point); a reduced form
+runs in tests/systems/test_003_rotation.py.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +16,17 @@ LOW = [-10.0, -5.0, 0.0, 5.0]
 
 
 def rms(algorithm: str, metric: str, snr_db: float) -> float:
-    return next(p["rmse"] for p in RECORDED["points"] if (p["algorithm"], p["metric"], p["parameters"]["world.noise.snr_db"]) == (algorithm, metric, snr_db))
+    return next(
+        p["rmse"]
+        for p in RECORDED["points"]
+        if (p["algorithm"], p["metric"], p["parameters"]["world.noise.snr_db"]) == (algorithm, metric, snr_db)
+    )
 
 
 def bound(metric: str, snr_db: float) -> float:
-    return next(b["rms"] for b in RECORDED["bounds"] if (b["metric"], b["parameters"]["world.noise.snr_db"]) == (metric, snr_db))
+    return next(
+        b["rms"] for b in RECORDED["bounds"] if (b["metric"], b["parameters"]["world.noise.snr_db"]) == (metric, snr_db)
+    )
 
 
 def test_every_point_has_its_trials() -> None:
@@ -33,7 +41,9 @@ def test_the_recommended_estimator_is_within_2_5_of_its_bound_and_never_below_it
 
 @pytest.mark.parametrize("snr_db", LOW)
 def test_each_step_of_the_recommended_estimator_comes_closer(snr_db: float) -> None:
-    coarse, fitted, found = (rms(algorithm, "k1_error_percent", snr_db) for algorithm in ("coarse", "phase_fit", "recommended"))
+    coarse, fitted, found = (
+        rms(algorithm, "k1_error_percent", snr_db) for algorithm in ("coarse", "phase_fit", "recommended")
+    )
     assert found < fitted < coarse
 
 

@@ -1,4 +1,6 @@
-"""System 004: every impairment at once, repaired; and the recordings focused end to end by the shipped configs."""
+"""System 004: every impairment at once, repaired; and the recordings focused end to end by the
+shipped configs.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +21,14 @@ def test_all_impairments_at_once(tmp_path):
     run(load("stripmap_damaged"), tmp_path / "strip")
     found = metrics(tmp_path / "strip")
     best, baseline, none = (found["methods"][name]["metrics"] for name in ("recommended", "baseline", "none"))
-    assert best["image_error_db"] < -17 and best["image_error_db"] < baseline["image_error_db"] - 6 < none["image_error_db"]
+    assert (
+        best["image_error_db"] < -17
+        and best["image_error_db"] < baseline["image_error_db"] - 6 < none["image_error_db"]
+    )
     assert best["targets_found"] == 24
     assert abs(best["effective_velocity_m_s"] - found["truth"]["velocity_m_s"]) < 0.3
-    assert abs(best["doppler_centroid_hz"] - found["truth"]["doppler_hz"]) < 26  # 0.01 degree of squint
+    # 0.01 degree of squint
+    assert abs(best["doppler_centroid_hz"] - found["truth"]["doppler_hz"]) < 26
 
 
 @pytest.mark.parametrize(

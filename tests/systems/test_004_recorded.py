@@ -1,4 +1,6 @@
-"""System 004 on a recording: impairments injected, repaired, and compared with the unimpaired image (the brief's table, its cheaper rows)."""
+"""System 004 on a recording: impairments injected, repaired, and compared with the unimpaired image
+(the brief's table, its cheaper rows).
+"""
 
 from __future__ import annotations
 

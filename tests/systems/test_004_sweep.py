@@ -1,4 +1,6 @@
-"""What the recorded sweep of system 004 claims (200 trials a point); the reduced version runs in tests/study/test_sweep_config.py."""
+"""What the recorded sweep of system 004 claims (200 trials a point); the reduced version runs in
+tests/study/test_sweep_config.py.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
-RECORDED = json.loads((Path(__file__).resolve().parents[2] / "docs" / "sweeps" / "stripmap_doppler.json").read_text(encoding="utf-8"))
+RECORDED = json.loads(
+    (Path(__file__).resolve().parents[2] / "docs" / "sweeps" / "stripmap_doppler.json").read_text(encoding="utf-8")
+)
 BOUND, CURVE = "Cramer-Rao bound of a point of known place", "1/(T sqrt q), Tsvetkov 2017"
 SNRS, SQUINTS = (-20.0, -10.0, 0.0, 10.0, 20.0), (0.15, 0.25, 0.35)
 
@@ -17,11 +21,15 @@ def place(scene: str, squint_deg: float, snr_db: float) -> dict:
 
 
 def point(algorithm: str, metric: str, at: dict) -> dict:
-    return next(p for p in RECORDED["points"] if (p["algorithm"], p["metric"], p["parameters"]) == (algorithm, metric, at))
+    return next(
+        p for p in RECORDED["points"] if (p["algorithm"], p["metric"], p["parameters"]) == (algorithm, metric, at)
+    )
 
 
 def bound(metric: str, name: str, at: dict) -> float:
-    return next(b["rms"] for b in RECORDED["bounds"] if (b["metric"], b["bound"], b["parameters"]) == (metric, name, at))
+    return next(
+        b["rms"] for b in RECORDED["bounds"] if (b["metric"], b["bound"], b["parameters"]) == (metric, name, at)
+    )
 
 
 def test_every_point_has_its_trials() -> None:
@@ -32,7 +40,9 @@ def test_every_point_has_its_trials() -> None:
 @pytest.mark.parametrize("squint_deg", SQUINTS)
 @pytest.mark.parametrize("snr_db", SNRS)
 def test_a_point_of_known_place_lies_between_its_bound_and_the_papers_curve(squint_deg: float, snr_db: float) -> None:
-    """Its velocity is found with the nominal pointing of 0.25 deg; where the squint is another, a velocity error of some m/s shows above 0 dB as 0.003 Hz."""
+    """Its velocity is found with the nominal pointing of 0.25 deg; where the squint is another, a
+    velocity error of some m/s shows above 0 dB as 0.003 Hz.
+    """
     at = place("point", squint_deg, snr_db)
     rmse = point("point", "doppler_error_hz", at)["rmse"]
     assert rmse >= 0.85 * bound("doppler_error_hz", BOUND, at)
@@ -46,7 +56,10 @@ def test_a_point_of_known_place_lies_between_its_bound_and_the_papers_curve(squi
 @pytest.mark.parametrize("squint_deg", SQUINTS)
 def test_complete_apertures_beat_the_plain_increment_in_noise(scene: str, squint_deg: float) -> None:
     at = place(scene, squint_deg, -10.0)
-    assert point("recommended", "doppler_baseband_error_hz", at)["rmse"] < 0.7 * point("phase_increment", "doppler_baseband_error_hz", at)["rmse"]
+    assert (
+        point("recommended", "doppler_baseband_error_hz", at)["rmse"]
+        < 0.7 * point("phase_increment", "doppler_baseband_error_hz", at)["rmse"]
+    )
 
 
 @pytest.mark.parametrize("squint_deg", SQUINTS)

@@ -13,14 +13,32 @@ from torchsar.compensate.doppler import (
     plain_energy_centre,
     point_doppler,
 )
-from torchsar.compensate.envelope import AlignEnvelopes, ShiftRange, align_envelopes, align_mean, align_running, drift_cells, refine_alignment, shift_range
+from torchsar.compensate.envelope import (
+    AlignEnvelopes,
+    ShiftRange,
+    align_envelopes,
+    align_mean,
+    align_running,
+    drift_cells,
+    refine_alignment,
+    shift_range,
+)
 from torchsar.compensate.point import PointDoppler, doppler_at, peak_time_s
 from torchsar.compensate.pulse_phase.descent import maximum_contrast, minimum_entropy, sharpest_phase
 from torchsar.compensate.pulse_phase.gradient import Listed, Measured, Shrinking, pga, pga_sca
 from torchsar.compensate.pulse_phase.pairs import sca
 from torchsar.compensate.pulse_phase.recommended import autofocus
 from torchsar.compensate.pulse_phase.sharpen import entropy_fixed_point
-from torchsar.compensate.pulse_phase.stages import Autofocus, CorrectPulsePhase, EntropyFixedPoint, Pga, PgaSca, Sca, SharpestPhase, correct_pulse_phase
+from torchsar.compensate.pulse_phase.stages import (
+    Autofocus,
+    CorrectPulsePhase,
+    EntropyFixedPoint,
+    Pga,
+    PgaSca,
+    Sca,
+    SharpestPhase,
+    correct_pulse_phase,
+)
 from torchsar.compensate.radial import (
     CompensateMotion,
     EqualisePulses,

@@ -1,8 +1,10 @@
 """The Doppler ambiguity from range migration, told nothing (brief 004, item 5).
 
-Three kinds of evidence, each a log-likelihood per candidate number of PRFs, from statistics over independent blocks of the data:
-    looks   range displacement between azimuth looks of the image: dr = lambda k prf df / (2 Ka); strong wherever there is contrast;
-    lines   range displacement between adjacent lines: the phase increment grows with range frequency as f_dc (f0 + f) / f0; works on
+Three kinds of evidence, each a log-likelihood per candidate number of PRFs, from statistics over
+independent blocks of the data:
+    looks   range displacement between azimuth looks of the image: dr = lambda k prf df / (2 Ka);
+    strong wherever there is contrast; lines   range displacement between adjacent lines: the phase
+    increment grows with range frequency as f_dc (f0 + f) / f0; works on
             featureless speckle, and is all there is to go by on it;
     entropy a small group of range lines focused with every candidate.
 They are added. Doppler is positive when closing; walk per second is -lambda f_dc / 2.
@@ -44,10 +46,12 @@ def candidate_turns(reach: int, device: torch.device | None = None) -> Tensor:
 
 
 def _evidence(scores: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Log-likelihood of each candidate (..., candidate): how surely it is worse than the best one, from scores of blocks (..., block, candidate).
+    """Log-likelihood of each candidate (..., candidate): how surely it is worse than the best one,
+    from scores of blocks (..., block, candidate).
 
-    weight: (..., block) with sum 1, equal by default. Student's t of the mean deficit; its degrees of freedom follow from how many blocks
-    carry weight, and a tenth of the deficit itself counts as uncertainty, so that no single kind of evidence becomes certainty.
+    weight: (..., block) with sum 1, equal by default. Student's t of the mean deficit; its degrees
+    of freedom follow from how many blocks carry weight, and a tenth of the deficit itself counts as
+    uncertainty, so that no single kind of evidence becomes certainty.
     """
     if weight is None:
         weight = torch.full(scores.shape[:-1], 1 / scores.shape[-2], dtype=scores.dtype, device=scores.device)
@@ -62,10 +66,12 @@ def _evidence(scores: Tensor, weight: Tensor | None = None) -> Tensor:
 
 
 def look_scores(group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turns: Tensor, looks: int = 16) -> Tensor:
-    """Correlation of neighbouring azimuth looks at the range displacement of every candidate, (..., block, candidate).
+    """Correlation of neighbouring azimuth looks at the range displacement of every candidate, (...,
+    block, candidate).
 
-    The group is focused with the baseband Doppler (...,) as if it were absolute; a true centroid k PRFs away displaces look l + 1
-    against look l by dr. Blocks are ranges of image lines. Intensities are limited to 20 times the mean, so that one ship cannot rule.
+    The group is focused with the baseband Doppler (...,) as if it were absolute; a true centroid k
+    PRFs away displaces look l + 1 against look l by dr. Blocks are ranges of image lines.
+    Intensities are limited to 20 times the mean, so that one ship cannot rule.
     """
     rows = beam_spectrum(group, doppler_hz).rows(doppler_hz, velocity_m_s)
     height = rows.shape[-2] // looks
@@ -90,10 +96,12 @@ def look_scores(group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turn
 
 
 def line_doppler(lines: Tensor, radar: StripmapRadar) -> tuple[Tensor, Tensor]:
-    """Absolute Doppler from the growth of the phase increment over range frequency, with its predicted deviation; (...,) each, Hz.
+    """Absolute Doppler from the growth of the phase increment over range frequency, with its
+    predicted deviation; (...,) each, Hz.
 
-    lines: range-compressed (..., pulse, range). Amplitudes are limited to three times their mean. Unambiguous, but coarse: its deviation
-    is about f0 / bandwidth * sqrt(12) times that of the baseband centroid.
+    lines: range-compressed (..., pulse, range). Amplitudes are limited to three times their mean.
+    Unambiguous, but coarse: its deviation is about f0 / bandwidth * sqrt(12) times that of the
+    baseband centroid.
     """
     modulus = lines.abs()
     level = 3 * modulus.mean((-2, -1), keepdim=True)
@@ -111,7 +119,9 @@ def line_doppler(lines: Tensor, radar: StripmapRadar) -> tuple[Tensor, Tensor]:
 
 
 def _phase_slope(products: Tensor, frequency_hz: Tensor) -> Tensor:
-    """Least-squares slope (rad/Hz) of the small phase of products (..., f) about their common phase."""
+    """Least-squares slope (rad/Hz) of the small phase of products (..., f) about their common
+    phase.
+    """
     mean = torch.angle(products.sum(-1, keepdim=True))
     turned = products * torch.polar(torch.ones_like(mean), -mean)
     weight = turned.real
@@ -120,8 +130,12 @@ def _phase_slope(products: Tensor, frequency_hz: Tensor) -> Tensor:
     return (offset * turned.imag).sum(-1) / (offset.square() * weight).sum(-1)
 
 
-def entropy_scores(group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turns: Tensor, dwell_s: float) -> tuple[Tensor, Tensor]:
-    """Negative entropies of the range blocks of a group focused with every candidate, (..., block, candidate), and the blocks' weights."""
+def entropy_scores(
+    group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turns: Tensor, dwell_s: float
+) -> tuple[Tensor, Tensor]:
+    """Negative entropies of the range blocks of a group focused with every candidate, (..., block,
+    candidate), and the blocks' weights.
+    """
     spectrum, weight = beam_spectrum(group, doppler_hz), block_weights(group.data, group.radar, doppler_hz, dwell_s)
     scores = []
     for k in turns.tolist():
@@ -130,11 +144,14 @@ def entropy_scores(group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, t
     return torch.stack(scores, -1), weight
 
 
-def ambiguity_evidence(raw: Tensor, radar: StripmapRadar, doppler_baseband_hz: Tensor, reference: Tensor | None, reach: int = 12) -> dict[str, Tensor]:
-    """Log-likelihoods of the candidates -reach..reach, each (..., candidate): "looks", "lines", "entropy"; and "line_doppler_hz" with its deviation.
+def ambiguity_evidence(
+    raw: Tensor, radar: StripmapRadar, doppler_baseband_hz: Tensor, reference: Tensor | None, reach: int = 12
+) -> dict[str, Tensor]:
+    """Log-likelihoods of the candidates -reach..reach, each (..., candidate): "looks", "lines",
+    "entropy"; and "line_doppler_hz" with its deviation.
 
-    raw: (..., pulse, range); reference: range reference spectrum, None for compressed data. Uses at most four apertures of lines and
-    4096 columns about mid-swath.
+    raw: (..., pulse, range); reference: range reference spectrum, None for compressed data. Uses at
+    most four apertures of lines and 4096 columns about mid-swath.
     """
     turns = candidate_turns(reach, raw.device)
     dwell = aperture_s(radar, raw.shape[-1])
@@ -154,33 +171,48 @@ def ambiguity_evidence(raw: Tensor, radar: StripmapRadar, doppler_baseband_hz: T
 
 
 def possible_reach(radar: StripmapRadar, reach: int) -> int:
-    """At most `reach` PRFs, and no further than squints of about 70 degrees: 0.94 * 2 v / lambda."""
+    """At most `reach` PRFs, and no further than squints of about 70 degrees: 0.94 * 2 v /
+    lambda.
+    """
     return max(0, min(reach, math.floor(1.88 * radar.velocity_m_s / (radar.wavelength_m * radar.prf_hz) - 0.5)))
 
 
 class DopplerCentroid(Stage):
-    """The recommended estimator: absolute Doppler centroid, its ambiguity and the squint angle; leaves the signal alone.
+    """The recommended estimator: absolute Doppler centroid, its ambiguity and the squint angle;
+    leaves the signal alone.
 
-    Baseband from the phase increment; the ambiguity from range migration, told nothing; then, where the beam's dwell is known
-    (`radar.integration_s`) and shorter than the record, the baseband again from targets that the record holds for their whole dwell: one
-    that the record's ends cut would pull the centroid. Values: doppler_hz (absolute), doppler_baseband_hz, ambiguity (PRFs, whole
-    numbers as float64), squint_deg (positive ahead, at the nominal velocity). quality is the probability of the ambiguity, ok where it
-    exceeds 0.9. info: block_hz, block_power, log-likelihoods `looks`, `lines`, `entropy`, `candidates`, margin (log-likelihood over the runner-up).
+    Baseband from the phase increment; the ambiguity from range migration, told nothing; then, where
+    the beam's dwell is known (`radar.integration_s`) and shorter than the record, the baseband
+    again from targets that the record holds for their whole dwell: one that the record's ends cut
+    would pull the centroid. Values: doppler_hz (absolute), doppler_baseband_hz, ambiguity (PRFs,
+    whole numbers as float64), squint_deg (positive ahead, at the nominal velocity). quality is the
+    probability of the ambiguity, ok where it exceeds 0.9. info: block_hz, block_power,
+    log-likelihoods `looks`, `lines`, `entropy`, `candidates`, margin (log-likelihood over the
+    runner-up).
     """
 
     provides = ("doppler_hz", "doppler_baseband_hz", "ambiguity", "squint_deg")
 
-    def __init__(self, radar: StripmapRadar, reference: str | None = "matched", reach: int = 12, blocks: tuple[int, int] = (8, 8)) -> None:
+    def __init__(
+        self, radar: StripmapRadar, reference: str | None = "matched", reach: int = 12, blocks: tuple[int, int] = (8, 8)
+    ) -> None:
         super().__init__()
         if reference is not None and reference not in REFERENCES:
-            raise ValueError(f"range reference {reference!r} is unknown; choose one of {sorted(REFERENCES)}, or None for compressed data")
+            raise ValueError(
+                f"range reference {reference!r} is unknown; choose one of {sorted(REFERENCES)}, or "
+                "None for compressed data"
+            )
         if reach < 1:
             raise ValueError(f"the ambiguity search needs a reach of at least one PRF, got {reach}")
         self.radar, self.reference, self.reach, self.blocks = radar, reference, possible_reach(radar, reach), blocks
 
     def spectrum(self, n: int, device: torch.device | str | None = None) -> Tensor | None:
         """Range reference for lines of n samples, None for compressed data."""
-        return None if self.reference is None else REFERENCES[self.reference](self.radar.pulse, n, self.radar.sampling_hz, device)
+        return (
+            None
+            if self.reference is None
+            else REFERENCES[self.reference](self.radar.pulse, n, self.radar.sampling_hz, device)
+        )
 
     @torch.no_grad()
     def forward(self, signal: Signal) -> Estimate:
@@ -192,13 +224,26 @@ class DopplerCentroid(Stage):
         joint = evidence["looks"] + evidence["lines"] + evidence["entropy"]
         ranked = joint.sort(-1, descending=True)
         absolute = base + radar.prf_hz * turns[ranked.indices[..., 0]]
-        absolute, std = complete_aperture_centroid(raw, radar, absolute, first.std["doppler_baseband_hz"], self.reference)
+        absolute, std = complete_aperture_centroid(
+            raw, radar, absolute, first.std["doppler_baseband_hz"], self.reference
+        )
         baseband = wrap_hz(absolute, radar.prf_hz)
         probability = torch.softmax(joint, -1).amax(-1)
         squint = torch.rad2deg(torch.asin(radar.sin_squint(absolute).clamp(-1, 1)))
-        info = {**first.info, **evidence, "candidates": turns, "margin": ranked.values[..., 0] - ranked.values[..., 1], "coherence": first.quality}
+        info = {
+            **first.info,
+            **evidence,
+            "candidates": turns,
+            "margin": ranked.values[..., 0] - ranked.values[..., 1],
+            "coherence": first.quality,
+        }
         return Estimate(
-            {"doppler_hz": absolute, "doppler_baseband_hz": baseband, "ambiguity": torch.round((absolute - baseband) / radar.prf_hz), "squint_deg": squint},
+            {
+                "doppler_hz": absolute,
+                "doppler_baseband_hz": baseband,
+                "ambiguity": torch.round((absolute - baseband) / radar.prf_hz),
+                "squint_deg": squint,
+            },
             probability,
             first.ok & (probability > 0.9),
             {"doppler_hz": std, "doppler_baseband_hz": std},

@@ -1,8 +1,9 @@
 """Doppler centroid from targets that the record holds for their whole dwell.
 
-The ends of a record cut the apertures of targets near them; of a strip with a few bright points that pulls the centroid by a good part
-of the beam's band. In an image each target sits at the time when the beam centre crosses it, so the lines of complete apertures can
-be told apart, and the azimuth spectrum of these lines alone is the beam's, whatever the scene. Brief 004, item 5.
+The ends of a record cut the apertures of targets near them; of a strip with a few bright points
+that pulls the centroid by a good part of the beam's band. In an image each target sits at the time
+when the beam centre crosses it, so the lines of complete apertures can be told apart, and the
+azimuth spectrum of these lines alone is the beam's, whatever the scene. Brief 004, item 5.
 """
 
 from __future__ import annotations
@@ -24,11 +25,15 @@ _TILE_LINES, _TILE_COLUMNS, _CHUNK_COLUMNS = 16, 32, 2048
 _GUARD = 0.02
 
 
-def complete_aperture_centroid(raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, std_hz: Tensor, reference: str | None, rounds: int = 2) -> tuple[Tensor, Tensor]:
-    """Refine an absolute centroid (...,) with predicted deviation std_hz (...,) by complete apertures; returns both anew.
+def complete_aperture_centroid(
+    raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, std_hz: Tensor, reference: str | None, rounds: int = 2
+) -> tuple[Tensor, Tensor]:
+    """Refine an absolute centroid (...,) with predicted deviation std_hz (...,) by complete
+    apertures; returns both anew.
 
-    raw: (..., pulse, range). A trial keeps what it had where the new deviation is more than twice the old one. Everything stays as it is
-    where the beam's dwell is not known (`radar.integration_s`) or the record is hardly longer.
+    raw: (..., pulse, range). A trial keeps what it had where the new deviation is more than twice
+    the old one. Everything stays as it is where the beam's dwell is not known
+    (`radar.integration_s`) or the record is hardly longer.
     """
     if radar.integration_s is None:
         return doppler_hz, std_hz
@@ -38,13 +43,18 @@ def complete_aperture_centroid(raw: Tensor, radar: StripmapRadar, doppler_hz: Te
     raw, value, std = unit_peak(raw), doppler_hz, std_hz
     for _ in range(rounds):
         found, found_std = _refined(raw, radar, value, dwell, reference)
-        better = found_std < 2 * std_hz  # the deviation of the first estimate does not know of the cut apertures
+        # the deviation of the first estimate does not know of the cut apertures
+        better = found_std < 2 * std_hz
         value, std = torch.where(better, found, doppler_hz), torch.where(better, found_std, std_hz)
     return value, std
 
 
-def _refined(raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwell: int, reference: str | None) -> tuple[Tensor, Tensor]:
-    """One round: image tiles' lag products in the frame doppler_hz, then the set of complete lines and the centroid in turns."""
+def _refined(
+    raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwell: int, reference: str | None
+) -> tuple[Tensor, Tensor]:
+    """One round: image tiles' lag products in the frame doppler_hz, then the set of complete lines
+    and the centroid in turns.
+    """
     parts = [_tiles(block, radar_part, doppler_hz, reference) for block, radar_part in _chunks(raw, radar, reference)]
     products = torch.cat([p for p, _, _ in parts], -1)
     rate = torch.cat([r.expand(p.shape[-1]) for p, _, r in parts])
@@ -69,10 +79,11 @@ def _refined(raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwell: int, 
 
 
 def _whole(crossing: Tensor, lines: int, dwell: int) -> Tensor:
-    """Weight of image lines by the line at which the beam crosses them: 1 where the dwell lies inside the record, 0 where not.
+    """Weight of image lines by the line at which the beam crosses them: 1 where the dwell lies
+    inside the record, 0 where not.
 
-    It falls off over a tenth of a dwell: a sharp end would cut responses that a wrong nominal velocity smears, and each part of such a
-    response has another Doppler.
+    It falls off over a tenth of a dwell: a sharp end would cut responses that a wrong nominal
+    velocity smears, and each part of such a response has another Doppler.
     """
     margin = torch.minimum(crossing - dwell / 2, lines - dwell / 2 - crossing)
     return (margin / min(0.1 * dwell, (lines - dwell) / 4)).clamp(0, 1)
@@ -84,25 +95,40 @@ def _chunks(raw: Tensor, radar: StripmapRadar, reference: str | None) -> list[tu
     columns = raw.shape[-1] - extra
     count = max(1, round(columns / _CHUNK_COLUMNS))
     edges = [round(i * columns / count) for i in range(count + 1)]
-    return [(raw[..., a : b + extra], replace(radar, near_range_m=radar.near_range_m + a * radar.range_step_m)) for a, b in pairwise(edges)]
+    return [
+        (raw[..., a : b + extra], replace(radar, near_range_m=radar.near_range_m + a * radar.range_step_m))
+        for a, b in pairwise(edges)
+    ]
 
 
-def _tiles(raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, reference: str | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Lag products and powers of image tiles (..., a, b), and the azimuth rate at the chunk's middle, (1,) Hz/s."""
-    spectrum = None if reference is None else REFERENCES[reference](radar.pulse, raw.shape[-1], radar.sampling_hz, raw.device)
+def _tiles(
+    raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, reference: str | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Lag products and powers of image tiles (..., a, b), and the azimuth rate at the chunk's
+    middle, (1,) Hz/s.
+    """
+    spectrum = (
+        None if reference is None else REFERENCES[reference](radar.pulse, raw.shape[-1], radar.sampling_hz, raw.device)
+    )
     lines = compress(raw, radar, spectrum)
     group = RangeGroup(lines, torch.zeros(lines.shape[:-2], device=raw.device), radar)
     image = full_spectrum(group, doppler_hz).image(doppler_hz, radar.velocity_m_s)
     tiles = (max(1, image.shape[-2] // _TILE_LINES), max(1, image.shape[-1] // _TILE_COLUMNS))
-    image = image * stays_inside(image.shape[-1], radar, doppler_hz, radar.integration_s or 0.0)[..., None, :].to(image.real.dtype)
+    image = image * stays_inside(image.shape[-1], radar, doppler_hz, radar.integration_s or 0.0)[..., None, :].to(
+        image.real.dtype
+    )
     products, power = lag_products(image, tiles)
-    scale = image.abs().amax((-2, -1)).to(torch.float64).square()[..., None, None]  # lag_products is scale free, chunks must stay comparable
+    scale = (
+        image.abs().amax((-2, -1)).to(torch.float64).square()[..., None, None]
+    )  # lag_products is scale free, chunks must stay comparable
     rate = radar.azimuth_rate_hz_s(radar.near_range_m + image.shape[-1] / 2 * radar.range_step_m).to(raw.device)
     return products * scale, power * scale, rate[None]
 
 
 def _noise_variance(power: Tensor) -> Tensor:
-    """Variance of the imaginary part of a tile's product by noise, against noise and against signal; the noise is the tile at the lowest tenth."""
+    """Variance of the imaginary part of a tile's product by noise, against noise and against
+    signal; the noise is the tile at the lowest tenth.
+    """
     flat = power.flatten(-2)
     floor = torch.where(flat > 0, flat, torch.inf).kthvalue(max(1, flat.shape[-1] // 10), dim=-1).values
     floor = settle(floor, 0.0)[0][..., None, None]
@@ -110,9 +136,11 @@ def _noise_variance(power: Tensor) -> Tensor:
 
 
 def _std_rad(products: Tensor, noise: Tensor, phase_rad: Tensor) -> Tensor:
-    """Deviation of the common phase from the scatter over columns of tiles in four parts of the strip, and from noise.
+    """Deviation of the common phase from the scatter over columns of tiles in four parts of the
+    strip, and from noise.
 
-    The parts are much longer than a point's response, whose tiles differ in Doppler when the nominal velocity is off.
+    The parts are much longer than a point's response, whose tiles differ in Doppler when the
+    nominal velocity is off.
     """
     parts = torch.stack([part.sum(-2) for part in products.tensor_split(4, -2)], -2).flatten(-2)
     turned = parts * torch.polar(torch.ones_like(phase_rad), -phase_rad)[..., None]
@@ -121,6 +149,8 @@ def _std_rad(products: Tensor, noise: Tensor, phase_rad: Tensor) -> Tensor:
 
 
 def _above_noise(products: Tensor, power: Tensor) -> Tensor:
-    """Weight 0..1 of a tile: how far its coherence exceeds that of white noise, 1 / sqrt(samples)."""
+    """Weight 0..1 of a tile: how far its coherence exceeds that of white noise, 1 /
+    sqrt(samples).
+    """
     coherence = products.abs() / torch.where(power > 0, power, 1)
     return (1 - 6 / (_TILE_LINES * _TILE_COLUMNS * coherence.square()).clamp_min(1e-9)).clamp_min(0)

@@ -1,8 +1,10 @@
-"""Doppler centroid within one PRF: phase increment and energy centre, blind to velocity (brief 004, item 5; Tsvetkov 2017).
+"""Doppler centroid within one PRF: phase increment and energy centre, blind to velocity (brief 004,
+item 5; Tsvetkov 2017).
 
-Both estimators are the first Fourier coefficient of the azimuth power spectrum, once taken in time (the products of adjacent lines) and
-once in frequency, so they agree to rounding and are not independent evidence. Doppler is positive when closing. Lines that are all
-zero (missing) take part in no product and bias neither.
+Both estimators are the first Fourier coefficient of the azimuth power spectrum, once taken in time
+(the products of adjacent lines) and once in frequency, so they agree to rounding and are not
+independent evidence. Doppler is positive when closing. Lines that are all zero (missing) take part
+in no product and bias neither.
 """
 
 from __future__ import annotations
@@ -25,7 +27,10 @@ def wrap_hz(frequency_hz: Tensor, prf_hz: float) -> Tensor:
 
 
 def unit_peak(x: Tensor) -> Tensor:
-    """x over its detached peak modulus per trial, so that squares neither under- nor overflow. (..., pulse, range)."""
+    """x over its detached peak modulus per trial, so that squares neither under- nor overflow.
+
+    (..., pulse, range).
+    """
     peak = x.detach().abs().amax((-2, -1), keepdim=True)
     return x / torch.where(peak > 0, peak, 1)
 
@@ -38,10 +43,12 @@ def _bounds(n: int, parts: int, what: str) -> list[tuple[int, int]]:
 
 
 def lag_products(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> tuple[Tensor, Tensor]:
-    """Sums of conj(line n) * line n+1 over blocks of (pulse, range), and the mean power of the same pairs.
+    """Sums of conj(line n) * line n+1 over blocks of (pulse, range), and the mean power of the same
+    pairs.
 
-    x: (..., pulse, range). Returns products (..., a, b) complex128 and power (..., a, b) float64 with |product| <= power; every pair of
-    adjacent lines belongs to exactly one block. Scale free: x is divided by its peak per trial. Differentiable.
+    x: (..., pulse, range). Returns products (..., a, b) complex128 and power (..., a, b) float64
+    with |product| <= power; every pair of adjacent lines belongs to exactly one block. Scale free:
+    x is divided by its peak per trial. Differentiable.
     """
     x = unit_peak(x)
     columns = [last - first for first, last in _bounds(x.shape[-1], blocks[1], "range samples")]
@@ -63,9 +70,11 @@ def _sums(x: Tensor, sizes: list[int]) -> Tensor:
 
 
 def block_spectra(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> Tensor:
-    """Azimuth power spectra of blocks of lines, summed over the range blocks: (..., a, b, n) float64 in FFT order.
+    """Azimuth power spectra of blocks of lines, summed over the range blocks: (..., a, b, n)
+    float64 in FFT order.
 
-    Blocks share one line with the next one and are zero-padded, so that their first Fourier coefficients are `lag_products`.
+    Blocks share one line with the next one and are zero-padded, so that their first Fourier
+    coefficients are `lag_products`.
     """
     x = unit_peak(x)
     segments = _bounds(x.shape[-2] - 1, blocks[0], "pairs of lines")
@@ -80,7 +89,9 @@ def block_spectra(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> Tensor:
 
 
 def circular_centre(spectrum: Tensor) -> Tensor:
-    """First Fourier coefficient of a power spectrum (..., n) in FFT order; its argument over 2 pi is the energy centre in sampling rates."""
+    """First Fourier coefficient of a power spectrum (..., n) in FFT order; its argument over 2 pi
+    is the energy centre in sampling rates.
+    """
     n = spectrum.shape[-1]
     turns = torch.arange(n, dtype=torch.float64, device=spectrum.device) / n
     weights = torch.polar(torch.ones_like(turns), 2 * math.pi * turns)
@@ -88,7 +99,10 @@ def circular_centre(spectrum: Tensor) -> Tensor:
 
 
 def plain_energy_centre(spectrum: Tensor, prf_hz: float) -> Tensor:
-    """Ordinary centre of mass of a spectrum (..., n) in FFT order, Hz. The baseline that is wrong wherever the spectrum wraps."""
+    """Ordinary centre of mass of a spectrum (..., n) in FFT order, Hz.
+
+    The baseline that is wrong wherever the spectrum wraps.
+    """
     spectrum = spectrum.to(torch.float64)
     frequency = torch.fft.fftfreq(spectrum.shape[-1], 1 / prf_hz, dtype=torch.float64, device=spectrum.device)
     total = spectrum.sum(-1)
@@ -98,8 +112,9 @@ def plain_energy_centre(spectrum: Tensor, prf_hz: float) -> Tensor:
 def combine_blocks(products: Tensor, over: str = "mean") -> Tensor:
     """One phase increment (rad) from the products of all blocks, (..., a, b) -> (...,).
 
-    "mean": argument of their sum, weighted by energy. "median": of the blocks' angles, measured from that mean so that they do not wrap;
-    each block with energy counts once, so that one bright block cannot rule.
+    "mean": argument of their sum, weighted by energy. "median": of the blocks' angles, measured
+    from that mean so that they do not wrap; each block with energy counts once, so that one bright
+    block cannot rule.
     """
     if over not in OVER:
         raise ValueError(f"blocks are combined by one of {OVER}, got {over!r}")
@@ -113,19 +128,25 @@ def combine_blocks(products: Tensor, over: str = "mean") -> Tensor:
 
 
 def increment_std_rad(products: Tensor, phase_rad: Tensor) -> Tensor:
-    """Predicted deviation of a combined increment from the scatter of the blocks about it, (..., a, b), (...,) -> (...,).
+    """Predicted deviation of a combined increment from the scatter of the blocks about it, (..., a,
+    b), (...,) -> (...,).
 
-    Holds whatever makes blocks differ: noise, speckle and scene content. pi where there is no energy.
+    Holds whatever makes blocks differ: noise, speckle and scene content. pi where there is no
+    energy.
     """
     flat = products.flatten(-2) * torch.polar(torch.ones_like(phase_rad), -phase_rad)[..., None]
     count = (flat.abs() > 0).sum(-1)
     gain = torch.where(count > 1, count / (count - 1).clamp_min(1), 1)
     total = flat.real.sum(-1)
-    return torch.where(total > 0, torch.sqrt(gain * flat.imag.square().sum(-1)) / torch.where(total > 0, total, 1), math.pi).clamp_max(math.pi)
+    return torch.where(
+        total > 0, torch.sqrt(gain * flat.imag.square().sum(-1)) / torch.where(total > 0, total, 1), math.pi
+    ).clamp_max(math.pi)
 
 
 def baseband_estimate(products: Tensor, power: Tensor, phase_rad: Tensor, prf_hz: float, **info: Tensor) -> Estimate:
-    """Estimate of `doppler_baseband_hz` from block products: quality is the lag-1 coherence, ok where the increment is known to a tenth of a turn."""
+    """Estimate of `doppler_baseband_hz` from block products: quality is the lag-1 coherence, ok
+    where the increment is known to a tenth of a turn.
+    """
     scale = prf_hz / (2 * math.pi)
     std = increment_std_rad(products, phase_rad)
     total = power.sum((-2, -1))
@@ -140,7 +161,8 @@ def baseband_estimate(products: Tensor, power: Tensor, phase_rad: Tensor, prf_hz
 
 
 def phase_increment(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8), over: str = "mean") -> Estimate:
-    """Doppler centroid from the mean phase increment between adjacent lines, f = prf * dphi / (2 pi). x: (..., pulse, range).
+    """Doppler centroid from the mean phase increment between adjacent lines, f = prf * dphi / (2
+    pi). x: (..., pulse, range).
 
     info: block_hz, block_power (..., a, b), the increments along the strip and over range.
     """
@@ -149,21 +171,33 @@ def phase_increment(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8), 
 
 
 def energy_centre(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8)) -> Estimate:
-    """Doppler centroid as the circular energy centre of the azimuth power spectrum averaged over range. x: (..., pulse, range).
+    """Doppler centroid as the circular energy centre of the azimuth power spectrum averaged over
+    range. x: (..., pulse, range).
 
-    info: as phase_increment, and spectrum (..., n) in FFT order, plain_baseband_hz (the non-circular centre, a baseline that is wrong).
+    info: as phase_increment, and spectrum (..., n) in FFT order, plain_baseband_hz (the
+    non-circular centre, a baseline that is wrong).
     """
     spectra = block_spectra(x, blocks)
     products, power = circular_centre(spectra), spectra.mean(-1)
     spectrum = spectra.sum((-3, -2))
-    return baseband_estimate(products, power, torch.angle(circular_centre(spectrum)), prf_hz, spectrum=spectrum, plain_baseband_hz=plain_energy_centre(spectrum, prf_hz))
+    return baseband_estimate(
+        products,
+        power,
+        torch.angle(circular_centre(spectrum)),
+        prf_hz,
+        spectrum=spectrum,
+        plain_baseband_hz=plain_energy_centre(spectrum, prf_hz),
+    )
 
 
 def fit_over_range(products: Tensor, power: Tensor, order: int, rounds: int = 12) -> tuple[Tensor, Tensor]:
-    """Robust polynomial of the phase increment over range blocks. products, power: (..., b). Returns coefficients (..., order + 1), residuals (..., b), rad.
+    """Robust polynomial of the phase increment over range blocks. products, power: (..., b).
 
-    Legendre polynomials of the block centre u in -1..1. Blocks weigh with their coherence; those that lie off the curve by more than
-    the common scatter lose weight (Cauchy), so a few very bright targets cannot bend it.
+    Returns coefficients (..., order + 1), residuals (..., b), rad.
+
+    Legendre polynomials of the block centre u in -1..1. Blocks weigh with their coherence; those
+    that lie off the curve by more than the common scatter lose weight (Cauchy), so a few very
+    bright targets cannot bend it.
     """
     count = products.shape[-1]
     if not 0 <= order < count:
@@ -197,7 +231,9 @@ def block_centres(count: int, device: torch.device | None = None) -> Tensor:
 
 
 class PhaseIncrement(Stage):
-    """`doppler_baseband_hz` from the mean (or median over blocks) phase increment between lines; leaves the signal alone."""
+    """`doppler_baseband_hz` from the mean (or median over blocks) phase increment between lines;
+    leaves the signal alone.
+    """
 
     provides = ("doppler_baseband_hz",)
 
@@ -212,7 +248,9 @@ class PhaseIncrement(Stage):
 
 
 class EnergyCentre(Stage):
-    """`doppler_baseband_hz` from the circular energy centre of the azimuth spectrum; leaves the signal alone."""
+    """`doppler_baseband_hz` from the circular energy centre of the azimuth spectrum; leaves the
+    signal alone.
+    """
 
     provides = ("doppler_baseband_hz",)
 
@@ -227,9 +265,10 @@ class EnergyCentre(Stage):
 class RangeDependentCentroid(Stage):
     """Doppler centroid of every range sample, a robust polynomial over range blocks.
 
-    Values: doppler_range_hz (..., range), and doppler_baseband_hz (...,) at the middle of the swath. Connected to an absolute
-    `doppler_hz`, the curve is absolute too (the multiple of the PRF nearest to it at mid-swath); otherwise it is baseband.
-    info: block_hz (..., b), coefficients_hz (..., order + 1) of Legendre polynomials.
+    Values: doppler_range_hz (..., range), and doppler_baseband_hz (...,) at the middle of the
+    swath. Connected to an absolute `doppler_hz`, the curve is absolute too (the multiple of the PRF
+    nearest to it at mid-swath); otherwise it is baseband. info: block_hz (..., b), coefficients_hz
+    (..., order + 1) of Legendre polynomials.
     """
 
     provides = ("doppler_range_hz", "doppler_baseband_hz")
@@ -244,7 +283,12 @@ class RangeDependentCentroid(Stage):
         scale = self.prf_hz / (2 * math.pi)
         n = products.shape[-1]
         std = scale * residual.square().mean(-1).sqrt() / math.sqrt(max(1, n - self.order - 1))
-        middle = scale * (coefficients @ legendre(torch.zeros(1, dtype=torch.float64, device=products.device), self.order).mT)[..., 0]
+        middle = (
+            scale
+            * (coefficients @ legendre(torch.zeros(1, dtype=torch.float64, device=products.device), self.order).mT)[
+                ..., 0
+            ]
+        )
         curve = scale * coefficients @ legendre(block_centres(signal.data.shape[-1], products.device), self.order).mT
         if doppler_hz is not None:
             curve = curve + (self.prf_hz * torch.round((doppler_hz - middle) / self.prf_hz))[..., None]
@@ -259,12 +303,16 @@ class RangeDependentCentroid(Stage):
         )
 
 
-def point_doppler(x: Tensor, prf_hz: float, rate_hz_s: Tensor | float = 0.0, centre_hz: Tensor | float = 0.0, rounds: int = 6) -> Tensor:
-    """Doppler of one point at the middle line of its aperture, from its azimuth history x (..., pulse): maximum likelihood.
+def point_doppler(
+    x: Tensor, prf_hz: float, rate_hz_s: Tensor | float = 0.0, centre_hz: Tensor | float = 0.0, rounds: int = 6
+) -> Tensor:
+    """Doppler of one point at the middle line of its aperture, from its azimuth history x (...,
+    pulse): maximum likelihood.
 
-    rate_hz_s: magnitude of its Doppler rate, (...,) or a number, taken out first (0 for a tone). The peak of the zero-padded spectrum is refined
-    by Newton steps; reaches the Cramer-Rao bound of a tone, 0.39 / (T sqrt(q)), below the paper's curve 1 / (T sqrt(q)). The result lies
-    within half a PRF of centre_hz. It is the Doppler of that point at that time, not the centroid of the beam.
+    rate_hz_s: magnitude of its Doppler rate, (...,) or a number, taken out first (0 for a tone).
+    The peak of the zero-padded spectrum is refined by Newton steps; reaches the Cramer-Rao bound of
+    a tone, 0.39 / (T sqrt(q)), below the paper's curve 1 / (T sqrt(q)). The result lies within half
+    a PRF of centre_hz. It is the Doppler of that point at that time, not the centroid of the beam.
     """
     n = x.shape[-1]
     t = (torch.arange(n, dtype=torch.float64, device=x.device) - (n - 1) / 2) / prf_hz
@@ -275,7 +323,9 @@ def point_doppler(x: Tensor, prf_hz: float, rate_hz_s: Tensor | float = 0.0, cen
     peak = torch.fft.fft(signal, size).abs().argmax(-1)
     frequency = peak.to(torch.float64) * prf_hz / size
     for _ in range(rounds):
-        turned = signal * torch.polar(torch.ones((), dtype=torch.float64, device=x.device), -2 * math.pi * frequency[..., None] * t)
+        turned = signal * torch.polar(
+            torch.ones((), dtype=torch.float64, device=x.device), -2 * math.pi * frequency[..., None] * t
+        )
         s0, s1, s2 = (((-2j * math.pi * t) ** k * turned).sum(-1) for k in range(3))
         slope = 2 * (s0.conj() * s1).real
         bend = 2 * (s1.abs().square() + (s0.conj() * s2).real)

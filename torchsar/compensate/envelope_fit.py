@@ -1,4 +1,6 @@
-"""The courses that shifts of envelopes take: shifts of single pulses, lines, robust polynomials and tones, found by the likelihood of speckle."""
+"""The courses that shifts of envelopes take: shifts of single pulses, lines, robust polynomials and
+tones, found by the likelihood of speckle.
+"""
 
 from __future__ import annotations
 
@@ -21,12 +23,18 @@ _TUKEY = 4.685
 _LEAST_CELLS = 1e-3
 _LEAST_TONE_CELLS = 0.05  # smaller ones cost less than they would add
 _TUNINGS = 5
-_STANDS_OUT = 6.0  # of the mean power of a periodogram, beyond the log of the number of its cells: one false tone in 400 trials
+_STANDS_OUT = (
+    # of the mean power of a periodogram, beyond the log of the number of its cells: one false tone
+    # in 400 trials
+    6.0
+)
 
 
 @dataclass(frozen=True)
 class Envelopes:
-    """Powers of pulses as half spectra (trial, pulse, frequency), frequency i being i / n cycles a cell; zero where not present (trial, pulse). n: cells."""
+    """Powers of pulses as half spectra (trial, pulse, frequency), frequency i being i / n cycles a
+    cell; zero where not present (trial, pulse). n: cells.
+    """
 
     spectra: Tensor
     present: Tensor
@@ -39,7 +47,9 @@ class Envelopes:
 
     @staticmethod
     def of(lines: Tensor) -> Envelopes:
-        """Envelopes of pulses (trial, pulse, range): |s|^2 on half cells over its mean in each pulse."""
+        """Envelopes of pulses (trial, pulse, range): |s|^2 on half cells over its mean in each
+        pulse.
+        """
         n = lines.shape[-1]
         present = (lines != 0).any(-1)
         real, imag = lines.real.abs().amax(-1, keepdim=True), lines.imag.abs().amax(-1, keepdim=True)
@@ -61,13 +71,19 @@ class Envelopes:
         return torch.fft.irfft(spectra, per_cell * self.n) * (per_cell / _HALF)
 
     def likelihood(self, mean: Tensor) -> Tensor:
-        """Spectrum of -1 / T, as far as envelopes reach, for that of the mean envelope T: correlated with the power of a pulse, the log-likelihood of its shift."""
+        """Spectrum of -1 / T, as far as envelopes reach, for that of the mean envelope T:
+        correlated with the power of a pulse, the log-likelihood of its shift.
+        """
         weight = -1 / self.on_grid(mean, _QUARTER).clamp_min(_FLOOR)
         return torch.fft.rfft(weight)[..., : self.spectra.shape[-1]] * (_HALF / _QUARTER)
 
     def peak(self, spectra: Tensor) -> Tensor:
-        """Place in cells, -n/2..n/2, of the maximum of a correlation given by its half spectrum (..., frequency): a parabola through three samples a quarter of a cell apart."""
-        samples = self.on_grid(torch.cat([torch.zeros_like(spectra[..., :1]), spectra[..., 1:]], -1), _QUARTER)  # its mean says nothing, and costs digits
+        """Place in cells, -n/2..n/2, of the maximum of a correlation given by its half spectrum
+        (..., frequency): a parabola through three samples a quarter of a cell apart.
+        """
+        samples = self.on_grid(
+            torch.cat([torch.zeros_like(spectra[..., :1]), spectra[..., 1:]], -1), _QUARTER
+        )  # its mean says nothing, and costs digits
         length = samples.shape[-1]
         at = samples.argmax(-1, keepdim=True)
         left, top, right = (samples.gather(-1, (at + step) % length).to(torch.float64) for step in (-1, 0, 1))
@@ -77,11 +93,15 @@ class Envelopes:
         return torch.where(place > length / 2, place - length, place) / _QUARTER
 
 
-Course = tuple[Tensor, Tensor | None]  # shifts (trial, pulse), and their deviation (trial,) where the method has one of its own
+Course = tuple[
+    Tensor, Tensor | None
+]  # shifts (trial, pulse), and their deviation (trial,) where the method has one of its own
 
 
 def _half_cells(lines: Tensor) -> Tensor:
-    """Band-limited interpolation to half cells; the whole spectrum of n samples stays, from -n // 2 on."""
+    """Band-limited interpolation to half cells; the whole spectrum of n samples stays, from -n // 2
+    on.
+    """
     n = lines.shape[-1]
     spectrum = torch.fft.fftshift(torch.fft.fft(lines), dim=-1)
     before = n - n // 2
@@ -90,9 +110,15 @@ def _half_cells(lines: Tensor) -> Tensor:
 
 
 def running_shifts(pulses: Envelopes, gain: float) -> Tensor:
-    """Shifts against a mean that each pulse enters with `gain`, (trial, pulse) float64, continued over the ends of the window from pulse to pulse."""
+    """Shifts against a mean that each pulse enters with `gain`, (trial, pulse) float64, continued
+    over the ends of the window from pulse to pulse.
+    """
     amplitude = pulses.amplitudes()
-    mean, shift, shifts = torch.zeros_like(amplitude.spectra[:, 0]), amplitude.spectra.new_zeros((), dtype=torch.float64).expand(len(pulses.present)), []
+    mean, shift, shifts = (
+        torch.zeros_like(amplitude.spectra[:, 0]),
+        amplitude.spectra.new_zeros((), dtype=torch.float64).expand(len(pulses.present)),
+        [],
+    )
     for k in range(pulses.present.shape[-1]):
         there, pulse = pulses.present[:, k], amplitude.spectra[:, k]
         found = amplitude.peak(pulse * mean.conj())
@@ -105,7 +131,9 @@ def running_shifts(pulses: Envelopes, gain: float) -> Tensor:
 
 
 def single_shifts(pulses: Envelopes, start: Tensor, match: Match, iterations: int) -> Tensor:
-    """Shifts of pulses by themselves against the mean envelope, within half a window of the start, (trial, pulse) float64."""
+    """Shifts of pulses by themselves against the mean envelope, within half a window of the start,
+    (trial, pulse) float64.
+    """
     used = pulses.amplitudes() if match == "amplitude" else pulses
     shift = start
     for _ in range(iterations):
@@ -117,7 +145,9 @@ def single_shifts(pulses: Envelopes, start: Tensor, match: Match, iterations: in
 
 
 def smooth_shifts(pulses: Envelopes, degree: int, passes: int, blocks: int) -> tuple[Tensor, Tensor]:
-    """Polynomial course of the shifts, (trial, pulse) float64 of mean zero, and its deviation by the scatter of the runs about it, (trial,)."""
+    """Polynomial course of the shifts, (trial, pulse) float64 of mean zero, and its deviation by
+    the scatter of the runs about it, (trial,).
+    """
     k = pulses.present.shape[-1]
     basis = legendre(unit_time(k, pulses.present.device), degree)
     runs = runs_of(k, max(blocks, degree + 1), pulses.present)
@@ -137,9 +167,11 @@ def smooth_shifts(pulses: Envelopes, degree: int, passes: int, blocks: int) -> t
 
 
 def mean_drift(pulses: Envelopes) -> Tensor:
-    """Cells a pulse, (trial,) float64, modulo the window: the line along which the coarse features of all envelopes together add up best.
+    """Cells a pulse, (trial,) float64, modulo the window: the line along which the coarse features
+    of all envelopes together add up best.
 
-    sum_f |sum_k P_k(f) exp(2j pi f v k / n)|^2 over the lowest frequencies f and all v at once, from one zero-padded transform along pulses.
+    sum_f |sum_k P_k(f) exp(2j pi f v k / n)|^2 over the lowest frequencies f and all v at once,
+    from one zero-padded transform along pulses.
     """
     k, last = pulses.present.shape[-1], min(_COARSE, pulses.n - 1)
     if last < 1:
@@ -153,9 +185,11 @@ def mean_drift(pulses: Envelopes) -> Tensor:
 
 
 def robust_fit(values: Tensor, basis: Tensor, weight: Tensor, iterations: int = 12) -> Tensor:
-    """Coefficients (trial, term) of basis (trial, m, term) through values (trial, m), by reweighted least squares: absolute deviations, then Tukey's biweight.
+    """Coefficients (trial, term) of basis (trial, m, term) through values (trial, m), by reweighted
+    least squares: absolute deviations, then Tukey's biweight.
 
-    weight: (trial, m), zero for values that do not count. The scale of the biweight is the median deviation of each trial.
+    weight: (trial, m), zero for values that do not count. The scale of the biweight is the median
+    deviation of each trial.
     """
     now, coefficients = weight, torch.zeros_like(basis[:, 0])
     for turn in range(iterations):
@@ -175,7 +209,10 @@ def _middling(off: Tensor, counts: Tensor) -> Tensor:
 
 
 def weighted_fit(values: Tensor, basis: Tensor, weight: Tensor) -> Tensor:
-    """Least squares, (trial, term); directions that nothing determines get zero. Shapes as `robust_fit`."""
+    """Least squares, (trial, term); directions that nothing determines get zero.
+
+    Shapes as `robust_fit`.
+    """
     share = weight / weight.sum(-1, keepdim=True).clamp_min(torch.finfo(weight.dtype).tiny)
     normal = (basis.mT * share[:, None]) @ basis
     eye = torch.eye(basis.shape[-1], dtype=basis.dtype, device=basis.device)
@@ -184,7 +221,9 @@ def weighted_fit(values: Tensor, basis: Tensor, weight: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class _Tone:
-    """One sinusoid per trial: frequency (trial,) in cycles a pulse, cosine and sine parts (trial, 2) in cells."""
+    """One sinusoid per trial: frequency (trial,) in cycles a pulse, cosine and sine parts (trial,
+    2) in cells.
+    """
 
     frequency: Tensor
     parts: Tensor
@@ -197,12 +236,16 @@ class _Tone:
     def columns(self, time: Tensor) -> Tensor:
         """Derivatives of the sinusoid after its two parts and its frequency, (trial, pulse, 3)."""
         waves = self.waves(time)
-        turned = (self.parts[:, None, 1] * waves[..., 0] - self.parts[:, None, 0] * waves[..., 1]) * (2 * math.pi * (time - time.mean()))
+        turned = (self.parts[:, None, 1] * waves[..., 0] - self.parts[:, None, 0] * waves[..., 1]) * (
+            2 * math.pi * (time - time.mean())
+        )
         return torch.cat([waves, turned[..., None]], -1)
 
 
 def with_tones(pulses: Envelopes, smooth: Tensor, tones: int, degree: int) -> Tensor:
-    """The course with up to `tones` sinusoids added one by one, each only in trials where it stands out of the jitter of single pulses, (trial, pulse)."""
+    """The course with up to `tones` sinusoids added one by one, each only in trials where it stands
+    out of the jitter of single pulses, (trial, pulse).
+    """
     course = smooth
     for _ in range(tones):
         course = _with_tone(pulses, course, degree)
@@ -210,7 +253,9 @@ def with_tones(pulses: Envelopes, smooth: Tensor, tones: int, degree: int) -> Te
 
 
 def _with_tone(pulses: Envelopes, course: Tensor, degree: int) -> Tensor:
-    """The course with one more sinusoid, tuned together with the polynomial by Gauss-Newton steps through the shifts of single pulses."""
+    """The course with one more sinusoid, tuned together with the polynomial by Gauss-Newton steps
+    through the shifts of single pulses.
+    """
     k = course.shape[-1]
     time, weight = torch.arange(k, dtype=torch.float64, device=course.device), pulses.present.to(torch.float64)
     terms = legendre(unit_time(k, course.device), degree).expand(len(course), -1, -1)
@@ -232,13 +277,17 @@ def _left(pulses: Envelopes, course: Tensor) -> Tensor:
 
 
 def log_likelihood(pulses: Envelopes, course: Tensor) -> Tensor:
-    """Of a course, (trial,), with the mean envelope T that is best for it: - pulses * sum over cells of ln T."""
+    """Of a course, (trial,), with the mean envelope T that is best for it: - pulses * sum over
+    cells of ln T.
+    """
     mean = pulses.on_grid(pulses.moved(course).sum(-2, keepdim=True) / pulses.count).clamp_min(_FLOOR)
     return -(torch.log(mean).sum(-1, keepdim=True) * pulses.count / _HALF)[:, 0, 0].to(torch.float64)
 
 
 def strongest_tone(rest: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
-    """Frequency (cycles a pulse) of the strongest sinusoid in residual shifts (trial, pulse), and whether noise would hardly hold it; both (trial,)."""
+    """Frequency (cycles a pulse) of the strongest sinusoid in residual shifts (trial, pulse), and
+    whether noise would hardly hold it; both (trial,).
+    """
     k = rest.shape[-1]
     limit = 3 * rest.abs().median(-1, keepdim=True).values
     power = torch.fft.rfft(torch.where(present, rest.clamp(-limit, limit), 0), 8 * k).abs().square()
@@ -248,7 +297,9 @@ def strongest_tone(rest: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def about_circular_mean(shift: Tensor, present: Tensor, n: int) -> Tensor:
-    """Shifts (trial, pulse) less their mean on the circle of n cells, in -n/2..n/2; zero where not present."""
+    """Shifts (trial, pulse) less their mean on the circle of n cells, in -n/2..n/2; zero where not
+    present.
+    """
     turn = torch.where(present, torch.polar(torch.ones_like(shift), 2 * math.pi / n * shift), 0)
     return torch.where(present, wrapped(shift - torch.angle(turn.sum(-1, keepdim=True)) * (n / (2 * math.pi)), n), 0)
 
@@ -269,7 +320,9 @@ def unit_time(n: int, device: torch.device) -> Tensor:
 
 
 def runs_of(n: int, blocks: int, present: Tensor) -> Tensor:
-    """Which pulses that are there belong to which of at most `blocks` runs of equal length, (trial, run, pulse) of 0 and 1, float64."""
+    """Which pulses that are there belong to which of at most `blocks` runs of equal length, (trial,
+    run, pulse) of 0 and 1, float64.
+    """
     length = -(-n // blocks)
     run = torch.arange(n, device=present.device) // length
     member = run == torch.arange(-(-n // length), device=present.device)[:, None]

@@ -1,7 +1,9 @@
-"""A small group of range lines cut out of a recording, focused by itself, quickly and as often as an estimator likes.
+"""A small group of range lines cut out of a recording, focused by itself, quickly and as often as
+an estimator likes.
 
-The group may lie elsewhere in every trial, so its reference range is a per-trial tensor. Focusing is the bulk + refocus omega-K of the
-chain (`torchsar.focus.omega_k`) referred to the middle of the group, in the frame of the Doppler centroid.
+The group may lie elsewhere in every trial, so its reference range is a per-trial tensor. Focusing
+is the bulk + refocus omega-K of the chain (`torchsar.focus.omega_k`) referred to the middle of the
+group, in the frame of the Doppler centroid.
 """
 
 from __future__ import annotations
@@ -21,7 +23,9 @@ BLOCK_COLUMNS = 32
 
 
 def aperture_s(radar: StripmapRadar, n_range: int) -> float:
-    """Time a target stays in the recorded band: the nominal dwell, or the time to sweep one PRF where none is known."""
+    """Time a target stays in the recorded band: the nominal dwell, or the time to sweep one PRF
+    where none is known.
+    """
     middle = radar.near_range_m + n_range / 2 * radar.range_step_m
     return radar.aperture_s(middle)
 
@@ -33,12 +37,17 @@ def central_lines(raw: Tensor, most: int) -> Tensor:
 
 
 def full_columns(n_range: int, pulse_samples: int) -> int:
-    """Columns of a compressed line that hold the whole pulse; all of them where the line is hardly longer than the pulse."""
+    """Columns of a compressed line that hold the whole pulse; all of them where the line is hardly
+    longer than the pulse.
+    """
     return n_range - pulse_samples if n_range > pulse_samples + 64 else n_range
 
 
 def compress(raw: Tensor, radar: StripmapRadar, spectrum: Tensor | None) -> Tensor:
-    """Range-compressed lines, only the fully compressed columns. spectrum: range reference, None for compressed data."""
+    """Range-compressed lines, only the fully compressed columns.
+
+    spectrum: range reference, None for compressed data.
+    """
     if spectrum is None:
         return raw
     return range_compress(raw, spectrum)[..., : full_columns(raw.shape[-1], radar.pulse_samples)]
@@ -46,7 +55,9 @@ def compress(raw: Tensor, radar: StripmapRadar, spectrum: Tensor | None) -> Tens
 
 @dataclass(frozen=True)
 class RangeGroup:
-    """Compressed lines (..., pulse, width) whose column 0 is column `start` (...,) of the recording."""
+    """Compressed lines (..., pulse, width) whose column 0 is column `start` (...,) of the
+    recording.
+    """
 
     data: Tensor
     start: Tensor
@@ -55,12 +66,17 @@ class RangeGroup:
     @property
     def middle_m(self) -> Tensor:
         """Slant range of column width // 2, (...,) float64."""
-        return self.radar.near_range_m + (self.start + self.data.shape[-1] // 2).to(torch.float64) * self.radar.range_step_m
+        return (
+            self.radar.near_range_m
+            + (self.start + self.data.shape[-1] // 2).to(torch.float64) * self.radar.range_step_m
+        )
 
 
 @dataclass(frozen=True)
 class BeamSpectrum:
-    """Two-dimensional spectrum of a group, or those of its rows that are wanted: data (..., d, width), doppler_hz (..., d)."""
+    """Two-dimensional spectrum of a group, or those of its rows that are wanted: data (..., d,
+    width), doppler_hz (..., d).
+    """
 
     group: RangeGroup
     data: Tensor
@@ -73,25 +89,39 @@ class BeamSpectrum:
     def rows(self, frame_hz: Tensor, velocity_m_s: Tensor | float) -> Tensor:
         """Range-Doppler rows of the focused group, (..., d, width)."""
         radar, n = self.group.radar, self.data.shape[-1]
-        at = FrameGeometry(radar, self.doppler_hz, torch.as_tensor(velocity_m_s, dtype=torch.float64, device=self.data.device), frame_hz)
+        at = FrameGeometry(
+            radar,
+            self.doppler_hz,
+            torch.as_tensor(velocity_m_s, dtype=torch.float64, device=self.data.device),
+            frame_hz,
+        )
         middle = self.group.middle_m[..., None, None]
         rows = self.data * bulk_filter(FrequencyBasis(radar, n, self.data.device), at, middle, None, self.data.dtype)
         return refocus(torch.fft.ifft(rows), refocus_turns_per_sample(at), n // 2)
 
     def image(self, frame_hz: Tensor, velocity_m_s: Tensor | float) -> Tensor:
-        """Image of the group, (..., azimuth, width), sampled as coarsely as the band allows. Differentiable in the velocity."""
+        """Image of the group, (..., azimuth, width), sampled as coarsely as the band allows.
+
+        Differentiable in the velocity.
+        """
         return fft_lines(self.rows(frame_hz, velocity_m_s), inverse=True)
 
 
 def full_spectrum(group: RangeGroup, doppler_hz: Tensor) -> BeamSpectrum:
-    """All rows in FFT order, unwrapped about the centroid (...,): images of it keep the phase from line to line."""
-    return BeamSpectrum(group, torch.fft.fft2(group.data), group.radar.doppler_hz(group.data.shape[-2], doppler_hz, group.data.device))
+    """All rows in FFT order, unwrapped about the centroid (...,): images of it keep the phase from
+    line to line.
+    """
+    return BeamSpectrum(
+        group, torch.fft.fft2(group.data), group.radar.doppler_hz(group.data.shape[-2], doppler_hz, group.data.device)
+    )
 
 
 def beam_spectrum(group: RangeGroup, doppler_hz: Tensor, margin: float = 1.2) -> BeamSpectrum:
-    """Rows of a group about the centroid (...,) in rising Doppler: `margin` times the band of the beam's dwell, all where no dwell is known.
+    """Rows of a group about the centroid (...,) in rising Doppler: `margin` times the band of the
+    beam's dwell, all where no dwell is known.
 
-    Outside that band there is only noise, whose phase under the azimuth filter changes fastest with velocity: it would make objectives rough.
+    Outside that band there is only noise, whose phase under the azimuth filter changes fastest with
+    velocity: it would make objectives rough.
     """
     radar, n, full = group.radar, group.data.shape[-2], full_spectrum(group, doppler_hz)
     order = full.doppler_hz.argsort(-1)
@@ -104,10 +134,11 @@ def beam_spectrum(group: RangeGroup, doppler_hz: Tensor, margin: float = 1.2) ->
 
 
 def column_signal(lines: Tensor) -> Tensor:
-    """Energy of each column above the background, in backgrounds, limited to 10: (..., pulse, range) -> (..., range) float64, never quite 0.
+    """Energy of each column above the background, in backgrounds, limited to 10: (..., pulse,
+    range) -> (..., range) float64, never quite 0.
 
-    The background is the column at the lowest tenth; what four deviations of noise could be does not count. The limit keeps one ship
-    from outweighing a hundred good columns.
+    The background is the column at the lowest tenth; what four deviations of noise could be does
+    not count. The limit keeps one ship from outweighing a hundred good columns.
     """
     energy = (lines.detach().real.square() + lines.detach().imag.square()).sum(-2).to(torch.float64)
     floor = energy.kthvalue(max(1, energy.shape[-1] // 10), dim=-1, keepdim=True).values
@@ -116,7 +147,9 @@ def column_signal(lines: Tensor) -> Tensor:
 
 
 def pick_group(lines: Tensor, radar: StripmapRadar, width: int) -> RangeGroup:
-    """The group of `width` columns with the most signal above the background, nearer to mid-swath where several are alike."""
+    """The group of `width` columns with the most signal above the background, nearer to mid-swath
+    where several are alike.
+    """
     count = lines.shape[-1]
     width = min(width, count)
     sums = torch.nn.functional.pad(column_signal(lines).cumsum(-1), (1, 0))
@@ -129,7 +162,8 @@ def pick_group(lines: Tensor, radar: StripmapRadar, width: int) -> RangeGroup:
 
 
 def stays_inside(width: int, radar: StripmapRadar, doppler_hz: Tensor, dwell_s: float) -> Tensor:
-    """1 for the columns of a group of `width` whose targets stay in it while they migrate for dwell_s, else 0, (..., width) float64.
+    """1 for the columns of a group of `width` whose targets stay in it while they migrate for
+    dwell_s, else 0, (..., width) float64.
 
     doppler_hz: absolute centroid (...,). The middle half always counts.
     """
@@ -141,10 +175,11 @@ def stays_inside(width: int, radar: StripmapRadar, doppler_hz: Tensor, dwell_s: 
 
 
 def block_weights(columns: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwell_s: float) -> Tensor:
-    """Weights of the range blocks of a group in an objective, (..., block) with sum 1: their signal (`column_signal`).
+    """Weights of the range blocks of a group in an objective, (..., block) with sum 1: their signal
+    (`column_signal`).
 
-    Columns whose targets would walk out of the group within the aperture do not count; those of the middle half always do.
-    columns: (..., n, width), lines or an image.
+    Columns whose targets would walk out of the group within the aperture do not count; those of the
+    middle half always do. columns: (..., n, width), lines or an image.
     """
     width = columns.shape[-1]
     weight = column_signal(columns) * stays_inside(width, radar, doppler_hz, dwell_s)
@@ -157,10 +192,11 @@ def _block_count(width: int) -> int:
 
 
 def block_entropy(image: Tensor) -> Tensor:
-    """Entropy of each block of about 32 range lines by itself, (..., azimuth, range) -> (..., block), nats, float64.
+    """Entropy of each block of about 32 range lines by itself, (..., azimuth, range) -> (...,
+    block), nats, float64.
 
-    A bright block counts no more than any other, so that a few ships do not rule; a block is wide enough for the range walk that a wrong
-    velocity leaves. Differentiable; 0 for an empty block.
+    A bright block counts no more than any other, so that a few ships do not rule; a block is wide
+    enough for the range walk that a wrong velocity leaves. Differentiable; 0 for an empty block.
     """
     power = image.real.square() + image.imag.square()
     tiny = torch.finfo(power.dtype).tiny
@@ -172,7 +208,9 @@ def block_entropy(image: Tensor) -> Tensor:
 
 
 def student_log_likelihood(t: Tensor, degrees: Tensor | int) -> Tensor:
-    """Logarithm of Student's density at t without its constant: how well a deviation of t predicted ones is explained, outliers included."""
+    """Logarithm of Student's density at t without its constant: how well a deviation of t predicted
+    ones is explained, outliers included.
+    """
     return -0.5 * (degrees + 1) * torch.log1p(t.square() / degrees)
 
 

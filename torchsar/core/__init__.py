@@ -6,7 +6,17 @@ from torchsar.core.chain import Chain, Trace, Use, use
 from torchsar.core.check import refuse_non_finite
 from torchsar.core.draws import Draws
 from torchsar.core.estimate import Estimate, settle
-from torchsar.core.fft import block_bytes_of, centred_fft, centred_ifft, fft_lines, from_frequency, over_blocks, spectrum_in_blocks, to_frequency, transform_in_blocks
+from torchsar.core.fft import (
+    block_bytes_of,
+    centred_fft,
+    centred_ifft,
+    fft_lines,
+    from_frequency,
+    over_blocks,
+    spectrum_in_blocks,
+    to_frequency,
+    transform_in_blocks,
+)
 from torchsar.core.phase import cis, linear_phasor, outer_phasor, phasor_tables, real_dtype, reduced_turns, unit_phasor
 from torchsar.core.polynomials import legendre
 from torchsar.core.select import best_of, per_trial, take

@@ -14,8 +14,9 @@ _DUAL_NAME = {"pulse": "doppler", "range": "range_frequency"}
 class Axis:
     """A uniform sampling grid: sample i lies at `start + i * step`, in `unit`.
 
-    Names in use: `pulse` (slow time, s), `range` (slant range, m), and the axes of an image, `azimuth` (m) and `range` (m).
-    The Fourier partner of an axis remembers where it came from, so that going back restores the origin.
+    Names in use: `pulse` (slow time, s), `range` (slant range, m), and the axes of an image,
+    `azimuth` (m) and `range` (m). The Fourier partner of an axis remembers where it came from, so
+    that going back restores the origin.
     """
 
     name: str
@@ -27,7 +28,9 @@ class Axis:
 
     def __post_init__(self) -> None:
         if self.n < 1 or not self.step > 0:
-            raise ValueError(f"axis {self.name!r} needs at least one sample and a positive step, got n={self.n}, step={self.step}")
+            raise ValueError(
+                f"axis {self.name!r} needs at least one sample and a positive step, got n={self.n}, step={self.step}"
+            )
 
     @property
     def stop(self) -> float:
@@ -39,7 +42,9 @@ class Axis:
         return self.start + self.step * torch.arange(self.n, dtype=torch.float64, device=device)
 
     def offsets(self, device: torch.device | str | None = None) -> Tensor:
-        """Coordinates relative to the first sample, float64, shape (n,): the form to build phases from."""
+        """Coordinates relative to the first sample, float64, shape (n,): the form to build phases
+        from.
+        """
         return self.step * torch.arange(self.n, dtype=torch.float64, device=device)
 
     def index_of(self, value: Tensor | float) -> Tensor:
@@ -55,7 +60,9 @@ class Axis:
         return replace(self, n=self.n * factor, step=self.step / factor)
 
     def dual(self) -> Axis:
-        """The centred frequency axis of this axis (cycles per unit); of a frequency axis, the axis it came from."""
+        """The centred frequency axis of this axis (cycles per unit); of a frequency axis, the axis
+        it came from.
+        """
         step = 1.0 / (self.n * self.step)
         if self.dual_start is not None:
             back = {dual: name for name, dual in _DUAL_NAME.items()}

@@ -15,7 +15,10 @@ from torchsar.core.signal import Recording, Signal
 
 
 class Use(nn.Module):
-    """A stage and where its values come from: {parameter of forward: "stage.value" or "aux.name"}. Made by `use`."""
+    """A stage and where its values come from: {parameter of forward: "stage.value" or "aux.name"}.
+
+    Made by `use`.
+    """
 
     def __init__(self, stage: nn.Module, names: Mapping[str, str]) -> None:
         super().__init__()
@@ -24,19 +27,28 @@ class Use(nn.Module):
 
 
 def use(stage: nn.Module, **names: str) -> Use:
-    """Connect values of earlier stages: `use(OmegaK(radar), doppler_hz="doppler", velocity_m_s="velocity")`.
+    """Connect values of earlier stages: `use(OmegaK(radar), doppler_hz="doppler",
+    velocity_m_s="velocity")`.
 
-    "doppler" alone is short for "doppler.doppler_hz", the value called like the parameter; "aux.NAME" is recorded side data.
+    "doppler" alone is short for "doppler.doppler_hz", the value called like the parameter;
+    "aux.NAME" is recorded side data.
     """
     for parameter, source in names.items():
         if not isinstance(source, str):
-            raise TypeError(f"{parameter}={source!r}: `use` connects values by name, such as {parameter}='doppler'; a constant belongs to the constructor of the stage")
-    return Use(stage, {parameter: source if "." in source else f"{source}.{parameter}" for parameter, source in names.items()})
+            raise TypeError(
+                f"{parameter}={source!r}: `use` connects values by name, such as "
+                f"{parameter}='doppler'; a constant belongs to the constructor of the stage"
+            )
+    return Use(
+        stage, {parameter: source if "." in source else f"{source}.{parameter}" for parameter, source in names.items()}
+    )
 
 
 @dataclass(frozen=True)
 class Trace:
-    """Every intermediate of one run: what went into each stage, what came out, the values, and what it cost."""
+    """Every intermediate of one run: what went into each stage, what came out, the values, and what
+    it cost.
+    """
 
     inputs: Mapping[str, Signal]
     outputs: Mapping[str, Signal]
@@ -61,18 +73,22 @@ class _Log:
 
 
 class Chain(nn.Module):
-    """`Chain(name=stage, ...)` runs stages in order; an estimator leaves the signal alone and offers its values by name.
+    """`Chain(name=stage, ...)` runs stages in order; an estimator leaves the signal alone and
+    offers its values by name.
 
-    chain(x): the signal after the last stage; x is a Recording or a Signal. chain.trace(x): every intermediate.
-    chain.rerun(trace, start, given={"velocity.velocity_m_s": v}): the part from `start` on, from the signal that entered it,
-    with values held fixed; this is the objective of minimum-entropy searches, always on the original data, and differentiable.
-    Connections are checked at construction; a misuse names the stage, what it needs and what there is.
+    chain(x): the signal after the last stage; x is a Recording or a Signal. chain.trace(x): every
+    intermediate. chain.rerun(trace, start, given={"velocity.velocity_m_s": v}): the part from
+    `start` on, from the signal that entered it, with values held fixed; this is the objective of
+    minimum-entropy searches, always on the original data, and differentiable. Connections are
+    checked at construction; a misuse names the stage, what it needs and what there is.
     """
 
     def __init__(self, **stages: nn.Module) -> None:
         super().__init__()
         if not stages:
-            raise ValueError("a chain needs at least one stage: Chain(compress=RangeCompress(radar), focus=OmegaK(radar))")
+            raise ValueError(
+                "a chain needs at least one stage: Chain(compress=RangeCompress(radar), focus=OmegaK(radar))"
+            )
         members = {name: item.stage if isinstance(item, Use) else item for name, item in stages.items()}
         for name, stage in members.items():
             _refuse_foreign(name, stage)
@@ -87,31 +103,52 @@ class Chain(nn.Module):
             accepted = [p.name for p in parameters]
             for parameter, source in self.uses[name].items():
                 if parameter not in accepted:
-                    raise ValueError(f"stage {name!r} ({type(stage).__name__}) has no value {parameter!r} to connect; it accepts {accepted or 'none'}")
+                    raise ValueError(
+                        f"stage {name!r} ({type(stage).__name__}) has no value {parameter!r} to connect; it "
+                        f"accepts {accepted or 'none'}"
+                    )
                 if not source.startswith("aux.") and source not in offered:
-                    raise ValueError(f"stage {name!r} uses {source!r}, which no earlier stage provides; there is {sorted(offered) or 'nothing yet'}, and 'aux.NAME' for recorded side data")
+                    raise ValueError(
+                        f"stage {name!r} uses {source!r}, which no earlier stage provides; there is "
+                        f"{sorted(offered) or 'nothing yet'}, and 'aux.NAME' for recorded side data"
+                    )
             for p in parameters:
-                if p.default is p.empty and p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY) and p.name not in self.uses[name]:
+                if (
+                    p.default is p.empty
+                    and p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)
+                    and p.name not in self.uses[name]
+                ):
                     there = f"one of {sorted(offered)}" if offered else "a value of an earlier stage"
-                    raise ValueError(f"stage {name!r} ({type(stage).__name__}) needs the value {p.name!r}; connect it (`use`) with {there}, or with 'aux.NAME' for recorded side data")
+                    raise ValueError(
+                        f"stage {name!r} ({type(stage).__name__}) needs the value {p.name!r}; connect it "
+                        f"(`use`) with {there}, or with 'aux.NAME' for recorded side data"
+                    )
             offered |= {f"{name}.{key}" for key in getattr(stage, "provides", ())}
 
     def forward(self, x: Recording | Signal, given: Mapping[str, Tensor] | None = None) -> Signal:
-        """The signal after the last stage. given: values that replace what an estimator would find."""
+        """The signal after the last stage. given: values that replace what an estimator
+        would find.
+        """
         signal, aux = _split(x)
         self._refuse_unknown(given, aux)
         return self._run(list(self.stages), signal, {**aux, **(given or {})}, set(given or {}), None)
 
     def trace(self, x: Recording | Signal, given: Mapping[str, Tensor] | None = None) -> Trace:
-        """Run and keep every intermediate by stage name, with wall seconds and bytes of each output."""
+        """Run and keep every intermediate by stage name, with wall seconds and bytes of each
+        output.
+        """
         signal, aux = _split(x)
         self._refuse_unknown(given, aux)
         values, log = {**aux, **(given or {})}, _Log()
         self._run(list(self.stages), signal, values, set(given or {}), log)
         return Trace(log.inputs, log.outputs, log.estimates, values, log.seconds, log.bytes)
 
-    def rerun(self, trace: Trace, start: str, stop: str | None = None, given: Mapping[str, Tensor] | None = None) -> Signal:
-        """Run again from stage `start` to `stop` (inclusive; the last by default) on what entered `start` in the trace."""
+    def rerun(
+        self, trace: Trace, start: str, stop: str | None = None, given: Mapping[str, Tensor] | None = None
+    ) -> Signal:
+        """Run again from stage `start` to `stop` (inclusive; the last by default) on what entered
+        `start` in the trace.
+        """
         names = list(self.stages)
         for name in (start, stop or start):
             if name not in names:
@@ -124,13 +161,17 @@ class Chain(nn.Module):
 
     def _refuse_unknown(self, given: Mapping[str, Tensor] | None, aux: Mapping[str, Tensor]) -> None:
         """A value that no stage offers or uses and nothing recorded would be held for nothing."""
-        offered = {f"{name}.{key}" for name, stage in self.stages.items() for key in getattr(stage, "provides", ())} | set(aux)
+        offered = {
+            f"{name}.{key}" for name, stage in self.stages.items() for key in getattr(stage, "provides", ())
+        } | set(aux)
         offered |= {source for names in self.uses.values() for source in names.values()}
         unknown = set(given or {}) - offered
         if unknown:
             raise KeyError(f"given {sorted(unknown)}, but the chain offers the values {sorted(offered)}")
 
-    def _run(self, names: list[str], signal: Signal, values: dict[str, Tensor], held: set[str], log: _Log | None) -> Signal:
+    def _run(
+        self, names: list[str], signal: Signal, values: dict[str, Tensor], held: set[str], log: _Log | None
+    ) -> Signal:
         for name in names:
             stage = self.stages[name]
             provided = {f"{name}.{key}" for key in getattr(stage, "provides", ())}
@@ -144,7 +185,9 @@ class Chain(nn.Module):
                 log.bytes[name] = signal.data.numel() * signal.data.element_size()
         return signal
 
-    def _step(self, name: str, stage: nn.Module, signal: Signal, values: dict[str, Tensor], held: set[str], log: _Log | None) -> Signal:
+    def _step(
+        self, name: str, stage: nn.Module, signal: Signal, values: dict[str, Tensor], held: set[str], log: _Log | None
+    ) -> Signal:
         arguments = {}
         for parameter, source in self.uses[name].items():
             if source not in values:
@@ -155,9 +198,14 @@ class Chain(nn.Module):
         if isinstance(out, Estimate):
             out, estimate = signal, out
         if not isinstance(out, Signal):
-            raise TypeError(f"stage {name!r} ({type(stage).__name__}) returned {type(out).__name__}; a stage returns a Signal, an Estimate, or (Signal, Estimate)")
+            raise TypeError(
+                f"stage {name!r} ({type(stage).__name__}) returned {type(out).__name__}; a stage "
+                "returns a Signal, an Estimate, or (Signal, Estimate)"
+            )
         if estimate is not None:
-            values.update({f"{name}.{key}": value for key, value in estimate.value.items() if f"{name}.{key}" not in held})
+            values.update(
+                {f"{name}.{key}": value for key, value in estimate.value.items() if f"{name}.{key}" not in held}
+            )
             if log is not None:
                 log.estimates[name] = estimate
         return out
@@ -169,7 +217,9 @@ def _refuse_foreign(name: str, stage: object) -> None:
         got = f"the class {stage.__name__}, not an instance of it" if isinstance(stage, type) else type(stage).__name__
         raise TypeError(f"stage {name!r} must be a torch.nn.Module, such as a Stage, got {got}")
     if hasattr(nn.ModuleDict(), name) or "." in name:
-        raise ValueError(f"a stage cannot be called {name!r}, which torch.nn.ModuleDict has for itself; choose another name")
+        raise ValueError(
+            f"a stage cannot be called {name!r}, which torch.nn.ModuleDict has for itself; choose another name"
+        )
 
 
 def _split(x: Recording | Signal) -> tuple[Signal, dict[str, Tensor]]:

@@ -13,7 +13,10 @@ from torchsar.core.signal import Signal
 
 
 def centred_fft(x: Tensor, dim: int = -1) -> Tensor:
-    """X(f) = sum_i x[i] exp(-2j pi f (i - n//2)), frequencies -n//2 .. in rising order. Differentiable; inverse: centred_ifft."""
+    """X(f) = sum_i x[i] exp(-2j pi f (i - n//2)), frequencies -n//2 .. in rising order.
+
+    Differentiable; inverse: centred_ifft.
+    """
     return torch.fft.fftshift(torch.fft.fft(torch.fft.ifftshift(x, dim=dim), dim=dim), dim=dim)
 
 
@@ -23,7 +26,8 @@ def centred_ifft(x: Tensor, dim: int = -1) -> Tensor:
 
 
 def fft_lines(x: Tensor, inverse: bool = False, n: int | None = None) -> Tensor:
-    """FFT along -2 that rounds alike for any number of trials: left to itself, the library takes another path for a single matrix.
+    """FFT along -2 that rounds alike for any number of trials: left to itself, the library takes
+    another path for a single matrix.
 
     x: (..., line, range); n: length, by default that of x. Differentiable.
     """
@@ -32,7 +36,9 @@ def fft_lines(x: Tensor, inverse: bool = False, n: int | None = None) -> Tensor:
 
 
 class _ContiguousGradient(torch.autograd.Function):
-    """Passes its input on; gradients come back contiguous, so that their transform rounds alike for any number of trials too."""
+    """Passes its input on; gradients come back contiguous, so that their transform rounds alike for
+    any number of trials too.
+    """
 
     generate_vmap_rule = True
 
@@ -54,7 +60,8 @@ class _ContiguousGradient(torch.autograd.Function):
 
 
 def to_frequency(signal: Signal, name: str) -> Signal:
-    """The named axis and its samples in frequency (`pulse` -> `doppler` in Hz, `range` -> `range_frequency` in 1/m).
+    """The named axis and its samples in frequency (`pulse` -> `doppler` in Hz, `range` ->
+    `range_frequency` in 1/m).
 
     Phases refer to the middle sample (n // 2) of the axis, not to its coordinate zero.
     """
@@ -67,15 +74,20 @@ def from_frequency(signal: Signal, name: str) -> Signal:
 
 
 def block_bytes_of(device: torch.device) -> int:
-    """Size of the blocks that large arrays are worked on in: what stays in the cache of a CPU core, much more on an accelerator."""
+    """Size of the blocks that large arrays are worked on in: what stays in the cache of a CPU core,
+    much more on an accelerator.
+    """
     return 1 << 20 if device.type == "cpu" else 1 << 28
 
 
 def over_blocks(work: Callable[[Any], None], parts: Iterable[Any], like: Tensor) -> None:
-    """Call work on every part of an array, in as many threads as torch uses; not differentiable. like: the array.
+    """Call work on every part of an array, in as many threads as torch uses; not differentiable.
 
-    Each thread works on blocks of its own with one-threaded operations: nothing waits for a slower thread at every operation, which on a
-    busy machine costs several times the work itself. Few blocks, accelerators and torch.func transforms go one after another.
+    like: the array.
+
+    Each thread works on blocks of its own with one-threaded operations: nothing waits for a slower
+    thread at every operation, which on a busy machine costs several times the work itself. Few
+    blocks, accelerators and torch.func transforms go one after another.
     """
     parts, threads = list(parts), torch.get_num_threads()
     if threads == 1 or len(parts) < 2 * threads or like.device.type != "cpu" or not _has_storage(like):
@@ -95,7 +107,8 @@ def over_blocks(work: Callable[[Any], None], parts: Iterable[Any], like: Tensor)
             for _ in pool.map(one, parts):
                 pass
     finally:
-        torch.set_num_threads(threads)  # the mathematics library counts threads for the whole process
+        # the mathematics library counts threads for the whole process
+        torch.set_num_threads(threads)
 
 
 def _has_storage(x: Tensor) -> bool:
@@ -106,11 +119,15 @@ def _has_storage(x: Tensor) -> bool:
         return False
 
 
-def transform_in_blocks(x: Tensor, dim: int, inverse: bool = False, out: Tensor | None = None, block_bytes: int | None = None) -> Tensor:
-    """FFT of x along -1 or -2 into `out` (x itself by default), by blocks that stay in the cache; not differentiable.
+def transform_in_blocks(
+    x: Tensor, dim: int, inverse: bool = False, out: Tensor | None = None, block_bytes: int | None = None
+) -> Tensor:
+    """FFT of x along -1 or -2 into `out` (x itself by default), by blocks that stay in the cache;
+    not differentiable.
 
-    A pass along -2 gathers a few columns into the cache, transforms them there and puts them back: two to four times as fast as one
-    call on the large array, and needs no second array (unless `out` is not contiguous).
+    A pass along -2 gathers a few columns into the cache, transforms them there and puts them back:
+    two to four times as fast as one call on the large array, and needs no second array (unless
+    `out` is not contiguous).
     """
     out = x if out is None else out
     transform = torch.fft.ifft if inverse else torch.fft.fft
@@ -119,7 +136,9 @@ def transform_in_blocks(x: Tensor, dim: int, inverse: bool = False, out: Tensor 
     source, target = (y.reshape(-1, *y.shape[-2:]) if dim == -2 else y.reshape(-1, y.shape[-1]) for y in (x, out))
 
     block_bytes = block_bytes_of(x.device) if block_bytes is None else block_bytes
-    several = dim == -2 and block_bytes // 16 // (source[0].numel() * source.element_size()) > 1  # small trials share blocks, the last may hold one
+    several = (
+        dim == -2 and block_bytes // 16 // (source[0].numel() * source.element_size()) > 1
+    )  # small trials share blocks, the last may hold one
 
     def work(part: tuple[slice, ...]) -> None:
         target[part] = fft_lines(source[part], inverse) if several else transform(source[part].contiguous(), dim=dim)
@@ -129,7 +148,9 @@ def transform_in_blocks(x: Tensor, dim: int, inverse: bool = False, out: Tensor 
 
 
 def spectrum_in_blocks(x: Tensor) -> Tensor:
-    """fft2 of x (..., pulse, range) into a new array, by whole trials where they fit the cache, else pass by pass; not differentiable."""
+    """fft2 of x (..., pulse, range) into a new array, by whole trials where they fit the cache,
+    else pass by pass; not differentiable.
+    """
     out = torch.empty_like(x, memory_format=torch.contiguous_format)
     if x.shape[-2] * x.shape[-1] * x.element_size() > 4 * block_bytes_of(x.device):
         return transform_in_blocks(transform_in_blocks(x, -1, out=out), -2)
@@ -143,9 +164,11 @@ def spectrum_in_blocks(x: Tensor) -> Tensor:
 
 
 def _blocks(x: Tensor, dim: int, block_bytes: int) -> Iterator[tuple[slice, ...]]:
-    """Slices of (row, n) for a transform along -1, of (trial, n, column) for one along -2: trials where they fit, else their columns.
+    """Slices of (row, n) for a transform along -1, of (trial, n, column) for one along -2: trials
+    where they fit, else their columns.
 
-    Trials go one by one unless they are tiny: a strided transform of several makes torch copy them first.
+    Trials go one by one unless they are tiny: a strided transform of several makes torch copy them
+    first.
     """
     item = x[0].numel() * x.element_size()
     if dim == -1 or item <= block_bytes:
@@ -154,4 +177,7 @@ def _blocks(x: Tensor, dim: int, block_bytes: int) -> Iterator[tuple[slice, ...]
         return
     width = max(16, block_bytes // (x.shape[-2] * x.element_size()))
     for trial in range(x.shape[0]):
-        yield from ((slice(trial, trial + 1), slice(None), slice(first, first + width)) for first in range(0, x.shape[-1], width))
+        yield from (
+            (slice(trial, trial + 1), slice(None), slice(first, first + width))
+            for first in range(0, x.shape[-1], width)
+        )

@@ -7,7 +7,10 @@ from torch import Tensor
 
 
 def legendre(u: Tensor, order: int) -> Tensor:
-    """Legendre polynomials of degree 0..order at u in -1..1, (*u.shape, order + 1). Their mean squares over -1..1 are 1 / (2 degree + 1)."""
+    """Legendre polynomials of degree 0..order at u in -1..1, (*u.shape, order + 1).
+
+    Their mean squares over -1..1 are 1 / (2 degree + 1).
+    """
     terms = [torch.ones_like(u), u]
     for k in range(1, order):
         terms.append(((2 * k + 1) * u * terms[k] - k * terms[k - 1]) / (k + 1))

@@ -1,4 +1,6 @@
-"""Cubic splines through values on a uniform grid: smooth curves between pulses, with slope and integral."""
+"""Cubic splines through values on a uniform grid: smooth curves between pulses, with slope and
+integral.
+"""
 
 from __future__ import annotations
 
@@ -17,11 +19,13 @@ _REACH = 32
 
 @dataclass(frozen=True)
 class UniformSpline:
-    """The cubic spline through values at `start + i * step`, not-a-knot at both ends (as scipy.interpolate.CubicSpline by default).
+    """The cubic spline through values at `start + i * step`, not-a-knot at both ends (as
+    scipy.interpolate.CubicSpline by default).
 
-    values: float64 (..., n), n >= 2; two make a line, three a parabola. Leading dims are trials, the grid is one for all. Outside the grid the end
-    pieces go on. Differentiable in the values and in the times of evaluation. Raises TypeError for values that are not float64,
-    ValueError for fewer than two of them or a step that is not positive.
+    values: float64 (..., n), n >= 2; two make a line, three a parabola. Leading dims are trials,
+    the grid is one for all. Outside the grid the end pieces go on. Differentiable in the values and
+    in the times of evaluation. Raises TypeError for values that are not float64, ValueError for
+    fewer than two of them or a step that is not positive.
     """
 
     values: Tensor
@@ -30,11 +34,17 @@ class UniformSpline:
 
     def __post_init__(self) -> None:
         if not isinstance(self.values, Tensor) or self.values.dtype != torch.float64:
-            raise TypeError(f"a spline needs float64 values, got {getattr(self.values, 'dtype', type(self.values).__name__)}; convert them with .double()")
+            raise TypeError(
+                "a spline needs float64 values, got "
+                f"{getattr(self.values, 'dtype', type(self.values).__name__)}; convert them with "
+                ".double()"
+            )
         if self.values.ndim < 1 or self.values.shape[-1] < 2:
             raise ValueError(f"a spline needs at least two values (..., n), got shape {tuple(self.values.shape)}")
         if not (math.isfinite(self.start) and math.isfinite(self.step) and self.step > 0):
-            raise ValueError(f"a spline needs a finite start and a positive step, got start={self.start}, step={self.step}")
+            raise ValueError(
+                f"a spline needs a finite start and a positive step, got start={self.start}, step={self.step}"
+            )
 
     def at(self, t: Tensor) -> Tensor:
         """Value at float64 times of any shape, which all trials share: (..., *t.shape)."""
@@ -53,7 +63,9 @@ class UniformSpline:
         return self._polynomial([before, c[0], c[1] / 2, c[2] / 3, c[3] / 4], t) * self.step
 
     def pieces(self) -> Tensor:
-        """Polynomial coefficients (..., n - 1, 4) of each interval, rising powers of the time since its first knot."""
+        """Polynomial coefficients (..., n - 1, 4) of each interval, rising powers of the time since
+        its first knot.
+        """
         return torch.stack([c / self.step**power for power, c in enumerate(self._unit)], -1)
 
     @cached_property
@@ -75,11 +87,13 @@ class UniformSpline:
 
 
 def second_differences(values: Tensor) -> Tensor:
-    """Second derivatives at the knots of the not-a-knot spline through values (..., n) one apart, (..., n).
+    """Second derivatives at the knots of the not-a-knot spline through values (..., n) one apart,
+    (..., n).
 
-    M[i-1] + 4 M[i] + M[i+1] = 6 (y[i-1] - 2 y[i] + y[i+1]) inside. With M linear through the first three knots, row 1 says M[1] = the
-    second difference there, and so at the other end; between them the rows are solved at once by the decaying response of the endless
-    grid, z^|k| / (2 sqrt 3), and two decaying terms that meet the known ends.
+    M[i-1] + 4 M[i] + M[i+1] = 6 (y[i-1] - 2 y[i] + y[i+1]) inside. With M linear through the first
+    three knots, row 1 says M[1] = the second difference there, and so at the other end; between
+    them the rows are solved at once by the decaying response of the endless grid, z^|k| / (2 sqrt
+    3), and two decaying terms that meet the known ends.
     """
     n = values.shape[-1]
     if n == 2:
@@ -92,7 +106,9 @@ def second_differences(values: Tensor) -> Tensor:
 
 
 def _dirichlet(known: Tensor) -> Tensor:
-    """x (..., m) with x[i-1] + 4 x[i] + x[i+1] = 6 known[i] between its ends, and equal to `known` at them; m >= 2."""
+    """x (..., m) with x[i-1] + 4 x[i] + x[i+1] = 6 known[i] between its ends, and equal to `known`
+    at them; m >= 2.
+    """
     m = known.shape[-1]
     away = torch.arange(-_REACH, _REACH + 1, dtype=torch.float64, device=known.device).abs()
     response = 6 * _power(away) / (2 * math.sqrt(3.0))

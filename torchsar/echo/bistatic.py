@@ -1,4 +1,6 @@
-"""Simulated acquisitions of an airborne multichannel receiver under a far transmitter: world in, recording and truth out."""
+"""Simulated acquisitions of an airborne multichannel receiver under a far transmitter: world in,
+recording and truth out.
+"""
 
 from __future__ import annotations
 
@@ -35,13 +37,17 @@ def bistatic_echo(
     kind: Kind = "compressed",
     dtype: torch.dtype = torch.complex64,
 ) -> Tensor:
-    """Echo of moving points without noise, (..., channel, pulse, range) of `dtype`; without n_range the peak lines alone, (..., channel, pulse).
+    """Echo of moving points without noise, (..., channel, pulse, range) of `dtype`; without n_range
+    the peak lines alone, (..., channel, pulse).
 
-    Phase -2 pi / lambda (R_T(t) - R_T(0) + R_m(t) - reference_range_m), one way each. The receive window follows the ephemeris: the envelope lies at R_m plus what
-    the true range to the transmitter has over radar.transmit_range. kind: "compressed" for a rectangular band of the pulse's width, peak 1 for amplitude 1;
-    "full" for the sampled pulse itself, whose leading edge lies at R_m (`focus.RangeCompress` gives the compressed echo). Ranges are frozen during a pulse.
-    transmit: None for the ephemeris. An echo partly outside the range axis is cut, never wrapped (compressed: below -35 dB).
-    Differentiable in speeds, places and amplitudes. Sources: Remote Sens. 2020, 12, 1703, Eqs. (1), (4), (15); brief 001, Signal model.
+    Phase -2 pi / lambda (R_T(t) - R_T(0) + R_m(t) - reference_range_m), one way each. The receive
+    window follows the ephemeris: the envelope lies at R_m plus what the true range to the
+    transmitter has over radar.transmit_range. kind: "compressed" for a rectangular band of the
+    pulse's width, peak 1 for amplitude 1; "full" for the sampled pulse itself, whose leading edge
+    lies at R_m (`focus.RangeCompress` gives the compressed echo). Ranges are frozen during a pulse.
+    transmit: None for the ephemeris. An echo partly outside the range axis is cut, never wrapped
+    (compressed: below -35 dB). Differentiable in speeds, places and amplitudes. Sources: Remote
+    Sens. 2020, 12, 1703, Eqs. (1), (4), (15); brief 001, Signal model.
     """
     time_s = radar.pulse_axis(n_pulse).values(movers.u_r_m_s.device)
     if n_range is None:
@@ -51,7 +57,9 @@ def bistatic_echo(
     grid = _Grid.of(radar, n_range, kind)
     spectrum = torch.fft.fftshift(grid.spectrum(radar, time_s.device)).to(dtype)
     parts = []
-    for pulses in _pulse_blocks(n_pulse, 16 * radar.channels * max(grid.n_fft, movers.amplitude.shape[-1])):  # whatever the number of trials: sums then round alike in any batch
+    for pulses in _pulse_blocks(
+        n_pulse, 16 * radar.channels * max(grid.n_fft, movers.amplitude.shape[-1])
+    ):  # whatever the number of trials: sums then round alike in any batch
         block = _Lines.of(movers, radar, time_s[pulses], gate, receive, transmit).spectrum(grid, radar, dtype)
         parts.append(torch.fft.ifft(torch.fft.ifftshift(block * spectrum, dim=-1))[..., :n_range])
     return torch.cat(parts, -2)
@@ -59,14 +67,23 @@ def bistatic_echo(
 
 @dataclass(frozen=True)
 class _Lines:
-    """Echoes of targets in some pulses: where their envelopes lie, turns of their carriers, and weights, (..., channel, pulse, target) each."""
+    """Echoes of targets in some pulses: where their envelopes lie, turns of their carriers, and
+    weights, (..., channel, pulse, target) each.
+    """
 
     envelope_m: Tensor
     turns: Tensor
     weight: Tensor
 
     @staticmethod
-    def of(movers: Movers, radar: BistaticRadar, time_s: Tensor, gate: Gate, receive: ReceiveRange, transmit: TransmitRange | None) -> _Lines:
+    def of(
+        movers: Movers,
+        radar: BistaticRadar,
+        time_s: Tensor,
+        gate: Gate,
+        receive: ReceiveRange,
+        transmit: TransmitRange | None,
+    ) -> _Lines:
         range_m = receive.range_m(movers, time_s, radar)
         if movers.bend is not None:
             range_m = range_m + movers.bend.transmit_m(time_s)
@@ -85,12 +102,16 @@ class _Lines:
         samples = self.envelope_m / radar.range_step_m + grid.n_range // 2
         inside = (samples > -grid.margin) & (samples < grid.n_range + grid.margin)
         weight = self.weight.expand(samples.shape) * inside
-        return echo_spectrum(samples / radar.sampling_hz, self.turns, weight, grid.n_fft, radar.sampling_hz / grid.n_fft, dtype)
+        return echo_spectrum(
+            samples / radar.sampling_hz, self.turns, weight, grid.n_fft, radar.sampling_hz / grid.n_fft, dtype
+        )
 
 
 @dataclass(frozen=True)
 class _Grid:
-    """Line of n_fft samples in which echoes of n_range recorded ones do not wrap; margin: samples beyond its ends from which echoes still reach in."""
+    """Line of n_fft samples in which echoes of n_range recorded ones do not wrap; margin: samples
+    beyond its ends from which echoes still reach in.
+    """
 
     n_range: int
     n_fft: int
@@ -104,7 +125,9 @@ class _Grid:
         return _Grid(n_range, next(n for n in range(need, 2 * need) if _smooth(n)), margin, kind)
 
     def spectrum(self, radar: BistaticRadar, device: torch.device) -> Tensor:
-        """Of the transmitted pulse, or of its compressed response, complex128 (n_fft,) in FFT order."""
+        """Of the transmitted pulse, or of its compressed response, complex128 (n_fft,) in FFT
+        order.
+        """
         if self.kind == "full":
             return radar.pulse.spectrum(self.n_fft, radar.sampling_hz, device)
         return radar.band_weights(self.n_fft, device).to(torch.complex128)
@@ -135,13 +158,17 @@ def simulate_bistatic(
     dtype: torch.dtype = torch.complex64,
     device: torch.device | str | None = None,
 ) -> tuple[Recording, Truth]:
-    """A recording (..., channel, pulse[, range]) of a world and the truth about it, batched over the trials of `draws`.
+    """A recording (..., channel, pulse[, range]) of a world and the truth about it, batched over
+    the trials of `draws`.
 
-    n_range: None for azimuth-only data, on which every target lies on the one recorded line. kind: see `bistatic_echo`; azimuth-only data are compressed.
-    damages: applied in order, by name. The truth, float64 (..., target): `u_r_m_s`, `u_a_m_s`, `y0_m` (also as `azimuth_m`), `range_m` (R0), `amplitude`, and
-    `u_t_m_s`, the closing speed towards the transmitter, where there is one; `transmit_range_m` (pulse,), the true R_T(t) - R_T(0); `noise_std` of a sample
-    of this kind (...,); what each damage says under "<damage>.<name>". `clean` is the recording without noise and damages.
-    Warns of targets that shine at no pulse. Raises ValueError for targets as fast as the receiver or far outside the range axis, no pulses, or lines that do not hold the pulse.
+    n_range: None for azimuth-only data, on which every target lies on the one recorded line. kind:
+    see `bistatic_echo`; azimuth-only data are compressed. damages: applied in order, by name. The
+    truth, float64 (..., target): `u_r_m_s`, `u_a_m_s`, `y0_m` (also as `azimuth_m`), `range_m`
+    (R0), `amplitude`, and `u_t_m_s`, the closing speed towards the transmitter, where there is one;
+    `transmit_range_m` (pulse,), the true R_T(t) - R_T(0); `noise_std` of a sample of this kind
+    (...,); what each damage says under "<damage>.<name>". `clean` is the recording without noise
+    and damages. Warns of targets that shine at no pulse. Raises ValueError for targets as fast as
+    the receiver or far outside the range axis, no pulses, or lines that do not hold the pulse.
     """
     _refuse_impossible(radar, world, n_pulse, n_range, kind, draws)
     movers = _movers(radar, world, n_range, draws, device)
@@ -149,17 +176,33 @@ def simulate_bistatic(
     axes = radar.axes(n_pulse, n_range)
     time_s = axes[1].values(device)
     transmit_m = radar.transmit_range_m(time_s) if world.transmit is None else world.transmit.range_m(time_s)
-    echo = bistatic_echo(movers, radar, n_pulse, n_range, gate=world.gate, receive=world.receive, transmit=world.transmit, kind=kind, dtype=dtype)
+    echo = bistatic_echo(
+        movers,
+        radar,
+        n_pulse,
+        n_range,
+        gate=world.gate,
+        receive=world.receive,
+        transmit=world.transmit,
+        kind=kind,
+        dtype=dtype,
+    )
     if world.sea is not None:
         gate: Any = world.gate  # sea_echo refuses what it does not know
         sea = sea_echo(world.sea, radar, n_pulse, n_range, gate, draws.part("sea"), dtype, device)
-        echo = echo + (_received(sea[..., None], transmit_m, radar, kind)[..., 0] if n_range is None else _received(sea, transmit_m, radar, kind))
+        echo = echo + (
+            _received(sea[..., None], transmit_m, radar, kind)[..., 0]
+            if n_range is None
+            else _received(sea, transmit_m, radar, kind)
+        )
     trials = torch.broadcast_shapes(echo.shape[: -len(axes)], () if draws.trials is None else (len(draws.trials),))
     echo = echo.expand(*trials, *echo.shape[-len(axes) :])
     std = _noise_std(radar, world, kind, echo)
     values = _truths(movers, radar, transmit_m, std)
     clean = Recording(Signal(echo, axes), radar)
-    recording = clean if world.snr_db is None else Recording(Signal(echo + _noise(std, axes, draws, dtype), axes), radar)
+    recording = (
+        clean if world.snr_db is None else Recording(Signal(echo + _noise(std, axes, draws, dtype), axes), radar)
+    )
     told: dict[str, Tensor] = {}
     for name, damage in (damages or {}).items():
         recording, said = damage(recording, draws.part(name))
@@ -167,23 +210,46 @@ def simulate_bistatic(
     return recording, Truth({**values, **told}, clean)
 
 
-def _movers(radar: BistaticRadar, world: BistaticWorld, n_range: int | None, draws: Draws, device: torch.device | str | None) -> Movers:
+def _movers(
+    radar: BistaticRadar, world: BistaticWorld, n_range: int | None, draws: Draws, device: torch.device | str | None
+) -> Movers:
     if world.scene is None:
         none = torch.zeros(0, dtype=torch.float64, device=device)
         return Movers(none, none, none, none, none.to(torch.complex128))
     movers = world.scene.movers(radar, draws).each(lambda x: x.to(device))
     if not movers.u_r_m_s.shape[-1]:
         raise ValueError("the scene holds no target; give it at least one, or scene=None for the sea alone")
-    slowest, nearest = float(radar.speed_m_s - movers.u_a_m_s.detach().max()), float(movers.closest_m(radar).detach().min())
+    slowest, nearest = (
+        float(radar.speed_m_s - movers.u_a_m_s.detach().max()),
+        float(movers.closest_m(radar).detach().min()),
+    )
     if not slowest > 0:
-        raise ValueError(f"a target moves along track at {radar.speed_m_s - slowest:g} m/s, as fast as the receiver ({radar.speed_m_s:g} m/s) or faster; give u_a_m_s below that")
+        raise ValueError(
+            f"a target moves along track at {radar.speed_m_s - slowest:g} m/s, as fast as the "
+            f"receiver ({radar.speed_m_s:g} m/s) or faster; give u_a_m_s below that"
+        )
     if not nearest > 0:
-        raise ValueError(f"a target lies at a closest range of {nearest:g} m; range_m counts from the reference range of {radar.reference_range_m:g} m and must leave a positive range")
-    off, width = movers.range_m.detach().abs().flatten(0, -2).amin(0) if movers.range_m.ndim > 1 else movers.range_m.detach().abs(), (n_range or 0) * radar.range_step_m
+        raise ValueError(
+            f"a target lies at a closest range of {nearest:g} m; range_m counts from the "
+            f"reference range of {radar.reference_range_m:g} m and must leave a positive range"
+        )
+    off, width = (
+        movers.range_m.detach().abs().flatten(0, -2).amin(0)
+        if movers.range_m.ndim > 1
+        else movers.range_m.detach().abs(),
+        (n_range or 0) * radar.range_step_m,
+    )
     outside = (off > 1.5 * width).nonzero()[:, 0].tolist()
     if n_range is not None and outside:
-        far = f"targets {outside} (counted from 0) lie {float(off.max()):g} m" if len(outside) > 1 else f"target {outside[0]} (counted from 0) lies {float(off.max()):g} m"
-        raise ValueError(f"{far} from the middle of a range axis of {width:g} m; range_m counts from the reference range, or record longer lines (n_range)")
+        far = (
+            f"targets {outside} (counted from 0) lie {float(off.max()):g} m"
+            if len(outside) > 1
+            else f"target {outside[0]} (counted from 0) lies {float(off.max()):g} m"
+        )
+        raise ValueError(
+            f"{far} from the middle of a range axis of {width:g} m; range_m counts from the "
+            "reference range, or record longer lines (n_range)"
+        )
     return movers
 
 
@@ -196,34 +262,56 @@ def _warn_of_dark(movers: Movers, radar: BistaticRadar, gate: Gate, n_pulse: int
     if bool(dark.any()):
         last = float(abeam_s.max())
         when = f"one is abeam {last:.3g} s from the middle of a record of {n_pulse / radar.prf_hz:.3g} s"
-        warnings.warn(f"{int(dark.sum())} of {dark.numel()} targets shine at no pulse: {when}; record longer, or move it", stacklevel=3)
+        warnings.warn(
+            f"{int(dark.sum())} of {dark.numel()} targets shine at no pulse: {when}; record longer, or move it",
+            stacklevel=3,
+        )
 
 
-def _refuse_impossible(radar: BistaticRadar, world: BistaticWorld, n_pulse: int, n_range: int | None, kind: str, draws: Draws) -> None:
+def _refuse_impossible(
+    radar: BistaticRadar, world: BistaticWorld, n_pulse: int, n_range: int | None, kind: str, draws: Draws
+) -> None:
     if not isinstance(radar, BistaticRadar) or not isinstance(world, BistaticWorld) or not isinstance(draws, Draws):
-        raise TypeError(f"a bistatic recording is simulated from a BistaticRadar, a BistaticWorld and Draws, got {type(radar).__name__}, {type(world).__name__} and {type(draws).__name__}")
-    if not (isinstance(n_pulse, int) and n_pulse >= 1) or not (n_range is None or (isinstance(n_range, int) and n_range >= 1)):
-        raise ValueError(f"a recording needs whole numbers of pulses and range samples, at least one each, got n_pulse={n_pulse} and n_range={n_range} (None for azimuth-only data)")
+        raise TypeError(
+            "a bistatic recording is simulated from a BistaticRadar, a BistaticWorld and Draws, "
+            f"got {type(radar).__name__}, {type(world).__name__} and {type(draws).__name__}"
+        )
+    if not (isinstance(n_pulse, int) and n_pulse >= 1) or not (
+        n_range is None or (isinstance(n_range, int) and n_range >= 1)
+    ):
+        raise ValueError(
+            "a recording needs whole numbers of pulses and range samples, at least one each, got "
+            f"n_pulse={n_pulse} and n_range={n_range} (None for azimuth-only data)"
+        )
     if kind not in get_args(Kind):
         raise ValueError(f"kind must be one of {', '.join(get_args(Kind))}, got {kind!r}")
     refuse_trials("snr_db", world.snr_db, draws)
     samples = radar.pulse.n_samples(radar.sampling_hz)
     if kind == "full" and (n_range is None or n_range < samples):
-        raise ValueError(f"full echoes need lines of at least the {samples} samples of the pulse, got n_range={n_range}; record longer lines, shorten the pulse, or take kind='compressed'")
+        raise ValueError(
+            f"full echoes need lines of at least the {samples} samples of the pulse, got "
+            f"n_range={n_range}; record longer lines, shorten the pulse, or take kind='compressed'"
+        )
 
 
 def _received(sea: Tensor, transmit_m: Tensor, radar: BistaticRadar, kind: Kind) -> Tensor:
-    """A sea with the range to the transmitter on its carrier, (..., channel, pulse, range); for full echoes spread out by the pulse."""
+    """A sea with the range to the transmitter on its carrier, (..., channel, pulse, range); for
+    full echoes spread out by the pulse.
+    """
     if kind == "full":
         n_range = sea.shape[-1]
         n_fft = _Grid.of(radar, n_range, kind).n_fft
-        spread = radar.pulse.spectrum(n_fft, radar.sampling_hz, sea.device) * radar.pulse.bandwidth_hz / radar.sampling_hz
+        spread = (
+            radar.pulse.spectrum(n_fft, radar.sampling_hz, sea.device) * radar.pulse.bandwidth_hz / radar.sampling_hz
+        )
         sea = torch.fft.ifft(torch.fft.fft(sea, n_fft) * spread.to(sea.dtype))[..., :n_range]
     return sea * unit_phasor(-transmit_m / radar.wavelength_m, sea.dtype)[..., None, :, None]
 
 
 def _noise_std(radar: BistaticRadar, world: BistaticWorld, kind: Kind, like: Tensor) -> Tensor:
-    """Deviation of the complex noise of a sample, (...,): a pulse of n samples gathers n times its power."""
+    """Deviation of the complex noise of a sample, (...,): a pulse of n samples gathers n times its
+    power.
+    """
     if world.snr_db is None:
         return torch.zeros((), dtype=torch.float64, device=like.device)
     gain = radar.pulse.n_samples(radar.sampling_hz) if kind == "full" else 1

@@ -15,8 +15,8 @@ from torchsar.core import Draws, Recording
 class ChannelImbalance:
     """Line i is multiplied by gain[c] exp(j phase_rad[c]), c = i mod the number of channels.
 
-    gain, phase_rad: one number per channel, or tensors (..., C) with one row per trial. Even and odd lines as two channels:
-    `ChannelImbalance(gain=(1, 1.2), phase_rad=(0, math.pi / 3))`.
+    gain, phase_rad: one number per channel, or tensors (..., C) with one row per trial. Even and
+    odd lines as two channels: `ChannelImbalance(gain=(1, 1.2), phase_rad=(0, math.pi / 3))`.
     """
 
     gain: Sequence[float] | Tensor
@@ -26,7 +26,9 @@ class ChannelImbalance:
         data = recording.signal.data
         gain, phase = (torch.as_tensor(x, dtype=torch.float64, device=data.device) for x in (self.gain, self.phase_rad))
         if gain.shape[-1] != phase.shape[-1]:
-            raise ValueError(f"channel imbalance needs as many gains as phases, got {gain.shape[-1]} and {phase.shape[-1]}")
+            raise ValueError(
+                f"channel imbalance needs as many gains as phases, got {gain.shape[-1]} and {phase.shape[-1]}"
+            )
         factor = torch.polar(*torch.broadcast_tensors(gain, phase))
         channel = torch.arange(data.shape[-2], device=data.device) % gain.shape[-1]
         damaged = data * factor[..., channel, None].to(data.dtype)

@@ -1,7 +1,9 @@
-"""Interference in the receiver: tones, wider emitters, and the converter that has to digitise them with the echo.
+"""Interference in the receiver: tones, wider emitters, and the converter that has to digitise them
+with the echo.
 
-Levels are the interferer's power over the mean power per sample, averaged over the contaminated lines, of the recording as it comes:
-of the echo and its noise for the first interferer, of these and the earlier interferers for a second. The world side of brief 004, item 3.
+Levels are the interferer's power over the mean power per sample, averaged over the contaminated
+lines, of the recording as it comes: of the echo and its noise for the first interferer, of these
+and the earlier interferers for a second. The world side of brief 004, item 3.
 """
 
 from __future__ import annotations
@@ -19,10 +21,12 @@ from torchsar.core import Draws, Recording, cis, per_trial, real_dtype, reduced_
 class Tone:
     """A tone on a share of the lines.
 
-    over_signal_db: tone power over mean power per sample of the contaminated lines. frequency_hz: baseband frequency at the first line;
-    drift_hz: frequency change from the first line to the last, linear; wander_hz: amplitude of one slow sine on top of it;
-    rate_hz_s: drift inside a line. share: of the lines, chosen at random. coherent: one oscillator through the whole recording (the
-    phase follows from slow and fast time); otherwise each line has its own random phase. Numbers, or per-trial tensors (...,).
+    over_signal_db: tone power over mean power per sample of the contaminated lines. frequency_hz:
+    baseband frequency at the first line; drift_hz: frequency change from the first line to the
+    last, linear; wander_hz: amplitude of one slow sine on top of it; rate_hz_s: drift inside a
+    line. share: of the lines, chosen at random. coherent: one oscillator through the whole
+    recording (the phase follows from slow and fast time); otherwise each line has its own random
+    phase. Numbers, or per-trial tensors (...,).
     """
 
     over_signal_db: Tensor | float
@@ -42,7 +46,11 @@ class Tone:
         frequency = self._frequency_hz(data.shape[-2], draws, data)
         fast = torch.arange(data.shape[-1], dtype=torch.float64, device=data.device) / fs
         since_middle = fast - fast.mean()
-        turns = frequency[..., None] * since_middle + 0.5 * per_trial(self.rate_hz_s, 2, data) * since_middle.square() + self._phase_turns(frequency, recording, draws)[..., None]
+        turns = (
+            frequency[..., None] * since_middle
+            + 0.5 * per_trial(self.rate_hz_s, 2, data) * since_middle.square()
+            + self._phase_turns(frequency, recording, draws)[..., None]
+        )
         wave = cis((2 * math.pi * reduced_turns(turns)).to(real_dtype(data.dtype)))
         damaged = _add(recording, wave, lines, self.over_signal_db)
         return damaged, {"contaminated": lines, "frequency_hz": frequency.expand(lines.shape)}
@@ -59,16 +67,19 @@ class Tone:
         n_pulse = frequency.shape[-1]
         if self.coherent:
             per_line = frequency / recording.radar.prf_hz
-            return draws.uniform("tone.phase", (1,), device=frequency.device) + (per_line - torch.round(per_line)).cumsum(-1)
+            return draws.uniform("tone.phase", (1,), device=frequency.device) + (
+                per_line - torch.round(per_line)
+            ).cumsum(-1)
         return draws.uniform("tone.phase", (n_pulse,), device=frequency.device)
 
 
 @dataclass(frozen=True)
 class WideInterferer:
-    """Band-limited noise of bandwidth_hz about frequency_hz on a share of the lines, independent from line to line.
+    """Band-limited noise of bandwidth_hz about frequency_hz on a share of the lines, independent
+    from line to line.
 
-    over_signal_db: its power over mean power per sample of the contaminated lines. The noise is stationary: a line is a cut
-    from a longer process, not a period of a circular one.
+    over_signal_db: its power over mean power per sample of the contaminated lines. The noise is
+    stationary: a line is a cut from a longer process, not a period of a circular one.
     """
 
     over_signal_db: Tensor | float
@@ -79,7 +90,9 @@ class WideInterferer:
     def __post_init__(self) -> None:
         _check_share(self.share)
         if not self.bandwidth_hz > 0:
-            raise ValueError(f"an interferer's bandwidth_hz must be positive, got {self.bandwidth_hz}; for a single tone use Tone")
+            raise ValueError(
+                f"an interferer's bandwidth_hz must be positive, got {self.bandwidth_hz}; for a single tone use Tone"
+            )
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         data, fs = recording.signal.data, recording.radar.sampling_hz
@@ -90,17 +103,26 @@ class WideInterferer:
         half = int(self.bandwidth_hz / 2 / fs * n_long)
         coefficients = draws.normal("wide.coefficients", (n_pulse, 2 * half + 1), data.dtype, data.device)
         cell = torch.arange(-half, half + 1, dtype=torch.float64, device=data.device) / n_long
-        turns = (cell[:, None] + per_trial(self.frequency_hz, 2, data) / fs) * torch.arange(n, dtype=torch.float64, device=data.device)
-        wave = (coefficients / math.sqrt(2 * half + 1)) @ cis((2 * math.pi * reduced_turns(turns)).to(real_dtype(data.dtype)))
-        return _add(recording, wave, lines, self.over_signal_db), {"contaminated": lines, "bandwidth_hz": torch.full(lines.shape[:-1], self.bandwidth_hz, dtype=torch.float64)}
+        turns = (cell[:, None] + per_trial(self.frequency_hz, 2, data) / fs) * torch.arange(
+            n, dtype=torch.float64, device=data.device
+        )
+        wave = (coefficients / math.sqrt(2 * half + 1)) @ cis(
+            (2 * math.pi * reduced_turns(turns)).to(real_dtype(data.dtype))
+        )
+        return _add(recording, wave, lines, self.over_signal_db), {
+            "contaminated": lines,
+            "bandwidth_hz": torch.full(lines.shape[:-1], self.bandwidth_hz, dtype=torch.float64),
+        }
 
 
 @dataclass(frozen=True)
 class Quantiser:
-    """An I/Q converter of `bits` bits behind an automatic gain: odd levels -(2^bits - 1) .. 2^bits - 1, clipped.
+    """An I/Q converter of `bits` bits behind an automatic gain: odd levels -(2^bits - 1) ..
 
-    The gain of a trial brings the rms of one component to rms_levels (RADARSAT-1 records 4 bits at 6.6 to 7.4) and is undone after
-    the conversion. No dither.
+    2^bits - 1, clipped.
+
+    The gain of a trial brings the rms of one component to rms_levels (RADARSAT-1 records 4 bits at
+    6.6 to 7.4) and is undone after the conversion. No dither.
     """
 
     bits: int
@@ -108,7 +130,10 @@ class Quantiser:
 
     def __post_init__(self) -> None:
         if not (1 <= self.bits <= 16 and self.rms_levels > 0):
-            raise ValueError(f"a converter needs 1 to 16 bits and rms_levels above 0, got bits={self.bits}, rms_levels={self.rms_levels}")
+            raise ValueError(
+                f"a converter needs 1 to 16 bits and rms_levels above 0, got bits={self.bits}, "
+                f"rms_levels={self.rms_levels}"
+            )
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         parts = torch.view_as_real(recording.signal.data)
@@ -118,7 +143,10 @@ class Quantiser:
         levels = (2 * torch.floor(parts * gain[..., None, None, None] / 2) + 1).clamp(-top, top)
         clipped = (levels.abs() == top).to(torch.float64).mean((-3, -2, -1))
         data = torch.view_as_complex((levels / gain[..., None, None, None]).contiguous())
-        return replace(recording, signal=recording.signal.with_data(data)), {"gain": gain.to(torch.float64), "extreme_share": clipped}
+        return replace(recording, signal=recording.signal.with_data(data)), {
+            "gain": gain.to(torch.float64),
+            "extreme_share": clipped,
+        }
 
 
 def _check_share(share: float) -> None:
@@ -135,9 +163,13 @@ def _chosen_lines(draws: Draws, share: float, data: Tensor) -> Tensor:
 
 
 def _add(recording: Recording, wave: Tensor, lines: Tensor, over_signal_db: Tensor | float) -> Recording:
-    """The recording with the wave (unit mean power) on some lines, at a level over the mean power of those lines."""
+    """The recording with the wave (unit mean power) on some lines, at a level over the mean power
+    of those lines.
+    """
     data = recording.signal.data
     power = (data.abs().square().mean(-1) * lines).sum(-1) / lines.sum(-1)
     ratio = 10 ** (per_trial(over_signal_db, 0, data) / 10)
     amplitude = torch.sqrt(power.to(torch.float64) * ratio).to(power.dtype)
-    return replace(recording, signal=recording.signal.with_data(data + wave * (amplitude[..., None] * lines)[..., None]))
+    return replace(
+        recording, signal=recording.signal.with_data(data + wave * (amplitude[..., None] * lines)[..., None])
+    )

@@ -12,7 +12,10 @@ from torchsar.core import Draws, Recording, linear_phasor, unit_phasor
 
 
 def sample_unevenly(x: Tensor, offset_samples: Tensor) -> Tensor:
-    """Samples of x at the instants n + e[n mod M]. x: (..., pulse, range), taken as band-limited and periodic; offset_samples: (M,) or (..., M)."""
+    """Samples of x at the instants n + e[n mod M].
+
+    x: (..., pulse, range), taken as band-limited and periodic; offset_samples: (M,) or (..., M).
+    """
     n, m = x.shape[-1], offset_samples.shape[-1]
     spectrum = torch.fft.fft(x)
     y = torch.empty_like(x)
@@ -25,11 +28,14 @@ def sample_unevenly(x: Tensor, offset_samples: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class PeriodicJitter:
-    """Sample n of every line is taken at n + e[n mod M]; a pilot tone through the same converter is recorded in aux["pilot"].
+    """Sample n of every line is taken at n + e[n mod M]; a pilot tone through the same converter is
+    recorded in aux["pilot"].
 
-    offset_samples: e_0 .. e_{M-1}, numbers or a tensor (..., M) with one row per trial. Only differences can be seen in a pilot: choose
-    offsets of mean zero (or e_0 = 0, with an estimator of that origin) where images are compared in position. pilot_cycles: frequency of the tone
-    in cycles per sample; pilot_snr_db: tone power over noise variance, None for no noise; pilot_samples: length, 0 for no record.
+    offset_samples: e_0 .. e_{M-1}, numbers or a tensor (..., M) with one row per trial. Only
+    differences can be seen in a pilot: choose offsets of mean zero (or e_0 = 0, with an estimator
+    of that origin) where images are compared in position. pilot_cycles: frequency of the tone in
+    cycles per sample; pilot_snr_db: tone power over noise variance, None for no noise;
+    pilot_samples: length, 0 for no record.
     """
 
     offset_samples: Sequence[float] | Tensor
@@ -39,18 +45,27 @@ class PeriodicJitter:
 
     def __post_init__(self) -> None:
         if not len(self.offset_samples) or self.pilot_samples < 0:
-            raise ValueError(f"jitter needs at least one offset and pilot_samples of 0 or more, got offsets {self.offset_samples} and {self.pilot_samples} samples")
+            raise ValueError(
+                "jitter needs at least one offset and pilot_samples of 0 or more, got offsets "
+                f"{self.offset_samples} and {self.pilot_samples} samples"
+            )
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         data = recording.signal.data
         offsets = torch.as_tensor(self.offset_samples, dtype=torch.float64, device=data.device)
         instants = torch.arange(offsets.shape[-1], device=data.device) + offsets
         if not bool((torch.cat([instants, instants[..., :1] + offsets.shape[-1]], -1).diff(dim=-1) > 0).all()):
-            raise ValueError(f"jitter offsets {offsets.tolist()} make sample instants coincide or cross; keep neighbouring offsets less than one sample apart")
+            raise ValueError(
+                f"jitter offsets {offsets.tolist()} make sample instants coincide or cross; keep "
+                "neighbouring offsets less than one sample apart"
+            )
         damaged = replace(recording, signal=recording.signal.with_data(sample_unevenly(data, offsets)))
         if self.pilot_samples:
             damaged = replace(damaged, aux={**damaged.aux, "pilot": self.pilot(offsets, draws, data)})
-        return damaged, {"offset_samples": offsets, "pilot_cycles": torch.tensor(self.pilot_cycles, dtype=torch.float64)}
+        return damaged, {
+            "offset_samples": offsets,
+            "pilot_cycles": torch.tensor(self.pilot_cycles, dtype=torch.float64),
+        }
 
     def pilot(self, offsets: Tensor, draws: Draws, like: Tensor) -> Tensor:
         """The recorded tone, (..., pilot_samples), with a random phase at its start."""
@@ -59,4 +74,6 @@ class PeriodicJitter:
         tone = unit_phasor(turns + draws.uniform("pilot.phase", device=like.device)[..., None], like.dtype)
         if self.pilot_snr_db is None:
             return tone
-        return tone + 10 ** (-self.pilot_snr_db / 20) * draws.normal("pilot.noise", (self.pilot_samples,), like.dtype, like.device)
+        return tone + 10 ** (-self.pilot_snr_db / 20) * draws.normal(
+            "pilot.noise", (self.pilot_samples,), like.dtype, like.device
+        )

@@ -1,4 +1,6 @@
-"""Simulated acquisitions of a triangular-sweep ladar, sweep by sweep: world in, recording and truth out."""
+"""Simulated acquisitions of a triangular-sweep ladar, sweep by sweep: world in, recording and truth
+out.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,16 @@ from torchsar.core import Draws, Recording, Truth, linear_phasor, real_dtype, un
 from torchsar.echo.ladar_course import LadarCourse, calibration_aux, hand_over
 from torchsar.echo.stripmap import Damage
 from torchsar.radar import TriangularLadar, sweep_middles
-from torchsar.scene import EverySample, Fidelity, LadarWorld, LinearInSweep, Motion, RangeHistory, Scatterers, SweepError
+from torchsar.scene import (
+    EverySample,
+    Fidelity,
+    LadarWorld,
+    LinearInSweep,
+    Motion,
+    RangeHistory,
+    Scatterers,
+    SweepError,
+)
 
 _TABLE_BYTES = 8 << 20
 _DEFAULT = LinearInSweep()
@@ -30,13 +41,16 @@ def ladar_echo(
     sweep_error: SweepError | None = None,
     dtype: torch.dtype = torch.complex64,
 ) -> Tensor:
-    """Dechirped sweeps without noise, (*trials, 2, pulse, fast_time) of `dtype`: up sweeps, then down sweeps, both in natural time order.
+    """Dechirped sweeps without noise, (*trials, 2, pulse, fast_time) of `dtype`: up sweeps, then
+    down sweeps, both in natural time order.
 
-    Turns of a scatterer at RD(t) beyond the reference, dtau = 2 RD / c, in the convention LO * conj(echo): fc dtau +- (K u dtau - K dtau^2 / 2), + in
-    the up sweep (brief 000, section 3); all conjugated for "echo_conj_lo". Beside the beam (radar.beam_rad) a scatterer is dark: |V t - x| beyond half
-    the beam in the middle of the sweep. motion: without random ones. sweep_error: below `EverySample` its change with the motion of
-    a scatterer within the sweep and with that of the whole is left out. Differentiable in positions, amplitudes and motions.
-    Raises ValueError where a beat does not fit the sampling rate.
+    Turns of a scatterer at RD(t) beyond the reference, dtau = 2 RD / c, in the convention LO *
+    conj(echo): fc dtau +- (K u dtau - K dtau^2 / 2), + in the up sweep (brief 000, section 3); all
+    conjugated for "echo_conj_lo". Beside the beam (radar.beam_rad) a scatterer is dark: |V t - x|
+    beyond half the beam in the middle of the sweep. motion: without random ones. sweep_error: below
+    `EverySample` its change with the motion of a scatterer within the sweep and with that of the
+    whole is left out. Differentiable in positions, amplitudes and motions. Raises ValueError where
+    a beat does not fit the sampling rate.
     """
     s = Scatterers(shared(scatterers.azimuth_m), shared(scatterers.range_m), scatterers.amplitude)
     history = RangeHistory(s, radar, motion, radar.sweep_axes(n_period)[1].start, fidelity.without)
@@ -53,27 +67,35 @@ def ladar_echo(
 
 def lit_by(s: Scatterers, radar: TriangularLadar, time_s: Tensor) -> Tensor:
     """Whether the beam lights each scatterer at times of any shape, bool (..., *times, target)."""
-    x, near = (v.detach()[(...,) + (None,) * time_s.ndim + (slice(None),)] for v in (s.azimuth_m, radar.reference_range_m + s.range_m))
+    x, near = (
+        v.detach()[(...,) + (None,) * time_s.ndim + (slice(None),)]
+        for v in (s.azimuth_m, radar.reference_range_m + s.range_m)
+    )
     half_m = math.inf if radar.beam_rad is None else radar.beam_rad * near / 2
     return (radar.speed_m_s * time_s[..., None] - x).abs() <= half_m
 
 
 def refuse_beats(beat_hz: Tensor, shines: Tensor, radar: TriangularLadar) -> None:
-    """Raise ValueError where a beat of a scatterer that shines lies beyond half the sampling rate."""
+    """Raise ValueError where a beat of a scatterer that shines lies beyond half the
+    sampling rate.
+    """
     try:
         worst = float(torch.where(shines, beat_hz.detach().abs(), 0.0).max())
     except RuntimeError:  # inside vmap a value cannot be looked at
         return
     if not worst < radar.sample_rate_hz / 2:
         raise ValueError(
-            f"a scatterer beats at {worst / 1e6:.6g} MHz, beyond half the sampling rate of {radar.sample_rate_hz / 1e6:g} MHz; bring it nearer to the reference range "
-            f"(1 m is {radar.beat_hz(1.0) / 1e6:.3g} MHz), move it more slowly (1 m/s is {radar.doppler_hz(1.0) / 1e6:.3g} MHz), sample faster, or gate it out (gate_m)"
+            f"a scatterer beats at {worst / 1e6:.6g} MHz, beyond half the sampling rate of "
+            f"{radar.sample_rate_hz / 1e6:g} MHz; bring it nearer to the reference range "
+            f"(1 m is {radar.beat_hz(1.0) / 1e6:.3g} MHz), move it more slowly (1 m/s is "
+            f"{radar.doppler_hz(1.0) / 1e6:.3g} MHz), sample faster, or gate it out (gate_m)"
         )
 
 
 @dataclass(frozen=True)
 class SweepLines:
-    """Phase of each scatterer in each sweep: turns in its middle, slope (Hz), and bend of all (turns / s^2), None for straight lines.
+    """Phase of each scatterer in each sweep: turns in its middle, slope (Hz), and bend of all
+    (turns / s^2), None for straight lines.
 
     start, slope: (*trials, 2, pulse, target); curve: (*trials, 2, pulse). float64.
     """
@@ -84,7 +106,9 @@ class SweepLines:
 
     @staticmethod
     def of(history: RangeHistory, fidelity: Fidelity, middle_s: Tensor) -> SweepLines:
-        """Lines at the level of `fidelity`; those of `EverySample` serve only to judge its beats."""
+        """Lines at the level of `fidelity`; those of `EverySample` serve only to judge its
+        beats.
+        """
         radar, per_m = history.radar, 2 / history.radar.wave_speed_m_s
         place, speed, bend = fidelity.sweep_range_m(history, middle_s)
         rate = radar.chirp_rate_hz_s * torch.tensor(_RATES, dtype=torch.float64, device=middle_s.device)[:, None, None]
@@ -98,8 +122,12 @@ class SweepLines:
         return SweepLines(start, slope, curve.mean(-1))
 
 
-def _lined(lines: SweepLines, s: Scatterers, error: SweepError | None, lit: Tensor, radar: TriangularLadar, dtype: torch.dtype) -> Tensor:
-    """Sum over scatterers of straight lines of phase, (*trials, 2, pulse, fast_time), bent together."""
+def _lined(
+    lines: SweepLines, s: Scatterers, error: SweepError | None, lit: Tensor, radar: TriangularLadar, dtype: torch.dtype
+) -> Tensor:
+    """Sum over scatterers of straight lines of phase, (*trials, 2, pulse, fast_time), bent
+    together.
+    """
     u = radar.fast_time_axis().values(lines.start.device)
     amplitude = s.amplitude[..., None, None, :].to(dtype) * lit
     table = None if error is None else _error_table(error, s, u, radar, dtype)
@@ -108,32 +136,45 @@ def _lined(lines: SweepLines, s: Scatterers, error: SweepError | None, lit: Tens
         weight = unit_phasor(lines.start[..., pulses, :], dtype) * amplitude[..., pulses, :]
         turns = lines.slope[..., pulses, :] / radar.sample_rate_hz
         total = _line_sum(weight, turns, len(u), dtype) if table is None else _erring_sum(weight, turns, table)
-        parts.append(total if lines.curve is None else total * unit_phasor(lines.curve[..., pulses, None] * u.square(), dtype))
+        parts.append(
+            total if lines.curve is None else total * unit_phasor(lines.curve[..., pulses, None] * u.square(), dtype)
+        )
     return torch.cat(parts, -2)
 
 
 def _line_sum(weight: Tensor, turns: Tensor, n: int, dtype: torch.dtype) -> Tensor:
-    """sum_m weight_m exp(2j pi turns_m i), i counted from the middle of n samples: (..., target) -> (..., n), as a product of two short tables."""
+    """sum_m weight_m exp(2j pi turns_m i), i counted from the middle of n samples: (..., target) ->
+    (..., n), as a product of two short tables.
+    """
     m = 2 ** round(math.log2(n) / 2)
     fine, coarse = linear_phasor(turns, 0, m, dtype), linear_phasor(m * turns, -(n - 1) / (2 * m), -(-n // m), dtype)
     return ((coarse * weight[..., None]).mT @ fine).flatten(-2)[..., :n]
 
 
 def _erring_sum(weight: Tensor, turns: Tensor, table: Tensor) -> Tensor:
-    """The same with phases of their own for each scatterer, table (..., 2, 1, target, n): scatterer by scatterer, as lines are no longer short tables."""
+    """The same with phases of their own for each scatterer, table (..., 2, 1, target, n): scatterer
+    by scatterer, as lines are no longer short tables.
+    """
     n, total = table.shape[-1], torch.zeros((), dtype=table.dtype, device=table.device)
     for at in range(turns.shape[-1]):
-        total = total + weight[..., at, None] * linear_phasor(turns[..., at], -(n - 1) / 2, n, table.dtype) * table[..., at, :]
+        total = (
+            total
+            + weight[..., at, None] * linear_phasor(turns[..., at], -(n - 1) / 2, n, table.dtype) * table[..., at, :]
+        )
     return total
 
 
 def _error_table(error: SweepError, s: Scatterers, u: Tensor, radar: TriangularLadar, dtype: torch.dtype) -> Tensor:
     """exp(2j pi (e(u) - e(u - dtau))) of scatterers at rest, (..., 2, 1, target, n)."""
     delay = (2 / radar.wave_speed_m_s * s.range_m)[..., None]
-    return torch.stack([unit_phasor(error.turns(u, ramp) - error.turns(u - delay, ramp), dtype) for ramp in (0, 1)], -3)[..., None, :, :]
+    return torch.stack(
+        [unit_phasor(error.turns(u, ramp) - error.turns(u - delay, ramp), dtype) for ramp in (0, 1)], -3
+    )[..., None, :, :]
 
 
-def _sampled(history: RangeHistory, error: SweepError | None, middle_s: Tensor, lit: Tensor, trials: int, dtype: torch.dtype) -> Tensor:
+def _sampled(
+    history: RangeHistory, error: SweepError | None, middle_s: Tensor, lit: Tensor, trials: int, dtype: torch.dtype
+) -> Tensor:
     """Direct evaluation, the range at every sample; blocks hold the ranges of so many trials."""
     s, radar = history.scatterers, history.radar
     u = radar.fast_time_axis().values(middle_s.device)
@@ -154,7 +195,10 @@ def _sample_turns(history: RangeHistory, error: SweepError | None, time_s: Tenso
     turns = delay * (radar.carrier_hz + rate * (u[:, None] - half * delay))
     if error is None:
         return turns
-    return turns + torch.stack([error.turns(u[:, None], ramp) - error.turns(u[:, None] - delay[..., ramp, :, :, :], ramp) for ramp in (0, 1)], -4)
+    return turns + torch.stack(
+        [error.turns(u[:, None], ramp) - error.turns(u[:, None] - delay[..., ramp, :, :, :], ramp) for ramp in (0, 1)],
+        -4,
+    )
 
 
 def shared(positions: Tensor) -> Tensor:
@@ -179,15 +223,18 @@ def simulate_ladar(
     dtype: torch.dtype = torch.complex64,
     device: torch.device | str | None = None,
 ) -> tuple[Recording, Truth]:
-    """Separated sweeps (ramp, pulse, fast_time) of a world and the truth about it, batched over the trials of `draws`.
+    """Separated sweeps (ramp, pulse, fast_time) of a world and the truth about it, batched over the
+    trials of `draws`.
 
-    The samples are complex whatever radar.detection is, as an ideal splitter would hand them over; `simulate_ladar_record` gives what the receiver
-    records. aux: `calibration` (..., 2, K or 1, fast_time) and `calibration_delay_s` where the world has a fibre.
-    The truth, float64 (..., pulse) at the turning points t_k + period / 2 (with the flight time R / c earlier): `velocity_m_s` of the motion alone, receding
-    positive; `range_error_m`, and `range_error_up_m`, `range_error_down_m` in the middles of sweeps; `log_amplitude` where modelled; `azimuth_m`,
-    `range_m`, `amplitude` of the scatterers; `noise_std` of a sample; what each damage says under "<damage>.<name>". `clean` is the same world without
-    motion and damages, with the same noise and scintillation.
-    Raises ValueError for beats beyond the sampling rate, an empty scene or gate.
+    The samples are complex whatever radar.detection is, as an ideal splitter would hand them over;
+    `simulate_ladar_record` gives what the receiver records. aux: `calibration` (..., 2, K or 1,
+    fast_time) and `calibration_delay_s` where the world has a fibre. The truth, float64 (...,
+    pulse) at the turning points t_k + period / 2 (with the flight time R / c earlier):
+    `velocity_m_s` of the motion alone, receding positive; `range_error_m`, and `range_error_up_m`,
+    `range_error_down_m` in the middles of sweeps; `log_amplitude` where modelled; `azimuth_m`,
+    `range_m`, `amplitude` of the scatterers; `noise_std` of a sample; what each damage says under
+    "<damage>.<name>". `clean` is the same world without motion and damages, with the same noise and
+    scintillation. Raises ValueError for beats beyond the sampling rate, an empty scene or gate.
     """
     course = LadarCourse.of(radar, world, n_period, draws, device)
     axes = radar.sweep_axes(n_period)
@@ -201,11 +248,22 @@ def simulate_ladar(
     noise = _noise(values["noise_std"], world.snr_db, (2, n_period, axes[2].n), radar, draws, dtype)
     clean = echo_of(()) * level + noise
     data = echo_of(course.motion) * level + noise if course.motion else clean
-    return hand_over(data, clean, axes, radar, calibration_aux(radar, world, n_period, draws, dtype, device), values, damages, draws)
+    return hand_over(
+        data, clean, axes, radar, calibration_aux(radar, world, n_period, draws, dtype, device), values, damages, draws
+    )
 
 
-def _noise(std: Tensor, snr_db: Tensor | float | None, shape: tuple[int, ...], radar: TriangularLadar, draws: Draws, dtype: torch.dtype) -> Tensor | float:
-    """Circular noise, conjugated with the dechirp sign, so that both conventions give conjugate recordings."""
+def _noise(
+    std: Tensor,
+    snr_db: Tensor | float | None,
+    shape: tuple[int, ...],
+    radar: TriangularLadar,
+    draws: Draws,
+    dtype: torch.dtype,
+) -> Tensor | float:
+    """Circular noise, conjugated with the dechirp sign, so that both conventions give conjugate
+    recordings.
+    """
     if snr_db is None:
         return 0.0
     unit = draws.normal("echo.ladar.noise", shape, dtype, std.device)

@@ -1,4 +1,6 @@
-"""What happens while a ladar records a world: everything that is drawn, the truth about it, and how recordings are handed over."""
+"""What happens while a ladar records a world: everything that is drawn, the truth about it, and how
+recordings are handed over.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ from torchsar.scene import LadarWorld, Motion, Scatterers, Tones, displacement_m
 
 @dataclass(frozen=True)
 class LadarCourse:
-    """What happens while a world is recorded: the scatterers within the gate, the motions, the scintillation (None for none)."""
+    """What happens while a world is recorded: the scatterers within the gate, the motions, the
+    scintillation (None for none).
+    """
 
     scatterers: Scatterers
     motion: list[Motion]
@@ -26,10 +30,15 @@ class LadarCourse:
     start_s: float
 
     @staticmethod
-    def of(radar: TriangularLadar, world: LadarWorld, n_period: int, draws: Draws, device: torch.device | str | None) -> LadarCourse:
+    def of(
+        radar: TriangularLadar, world: LadarWorld, n_period: int, draws: Draws, device: torch.device | str | None
+    ) -> LadarCourse:
         """Everything drawn. Raises ValueError for no period, or no scatterer within the gate."""
         if not isinstance(radar, TriangularLadar) or not isinstance(world, LadarWorld) or not isinstance(draws, Draws):
-            raise TypeError(f"a ladar is simulated from a TriangularLadar, a LadarWorld and Draws, got {type(radar).__name__}, {type(world).__name__} and {type(draws).__name__}")
+            raise TypeError(
+                "a ladar is simulated from a TriangularLadar, a LadarWorld and Draws, got "
+                f"{type(radar).__name__}, {type(world).__name__} and {type(draws).__name__}"
+            )
         if not (isinstance(n_period, int) and n_period >= 1):
             raise ValueError(f"a recording needs at least one period, a whole number of them, got n_period={n_period}")
         refuse_trials("snr_db", world.snr_db, draws)
@@ -49,15 +58,25 @@ class LadarCourse:
         return torch.zeros_like(time_s) if self.chi is None else self.chi.value(time_s - self.start_s)
 
     def velocity_m_s(self, time_s: Tensor, step_s: float) -> Tensor:
-        """Slope of the displacement at slow times, (*trials, *times), by central differences of sixth order: 1e-10 where motions turn once in 300 steps."""
+        """Slope of the displacement at slow times, (*trials, *times), by central differences of
+        sixth order: 1e-10 where motions turn once in 300 steps.
+        """
         if not self.motion:
             return torch.zeros_like(time_s)
         steps = [self.moved_m(time_s + k * step_s) - self.moved_m(time_s - k * step_s) for k in (1, 2, 3)]
         return (45 * steps[0] - 9 * steps[1] + steps[2]) / (60 * step_s)
 
-    def truths(self, radar: TriangularLadar, world: LadarWorld, middle_s: Tensor, later_s: Tensor | None = None) -> dict[str, Tensor]:
-        """Named truths of a recording whose sweeps have their middles at middle_s (2, pulse) + later_s (...,); with the flight time, at the reflection."""
-        then = middle_s if "flight" in world.fidelity.without else middle_s - radar.reference_range_m / radar.wave_speed_m_s
+    def truths(
+        self, radar: TriangularLadar, world: LadarWorld, middle_s: Tensor, later_s: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """Named truths of a recording whose sweeps have their middles at middle_s (2, pulse) +
+        later_s (...,); with the flight time, at the reflection.
+        """
+        then = (
+            middle_s
+            if "flight" in world.fidelity.without
+            else middle_s - radar.reference_range_m / radar.wave_speed_m_s
+        )
         turning, s = then.mean(-2), self.scatterers
         values = {
             "velocity_m_s": _later(partial(self.velocity_m_s, step_s=radar.sweep_s / 32), turning, later_s),
@@ -73,7 +92,9 @@ class LadarCourse:
 
 
 def _later(value: Callable[[Tensor], Tensor], time_s: Tensor, later_s: Tensor | None) -> Tensor:
-    """A function of slow time (n,) at times later by later_s (...,), (..., n): where trials differ, by a polynomial through eight times that all share."""
+    """A function of slow time (n,) at times later by later_s (...,), (..., n): where trials differ,
+    by a polynomial through eight times that all share.
+    """
     if later_s is None or later_s.ndim == 0:
         return value(time_s if later_s is None else time_s + later_s)
     first, last = float(later_s.min()), float(later_s.max())
@@ -88,13 +109,25 @@ def _later(value: Callable[[Tensor], Tensor], time_s: Tensor, later_s: Tensor | 
 
 def noise_std(snr_db: Tensor | float | None, like: Tensor) -> Tensor:
     """Deviation of the complex noise of a sample, (...,): 10^(-snr / 20)."""
-    return torch.zeros((), dtype=torch.float64, device=like.device) if snr_db is None else 10 ** (-per_trial(snr_db, 0, like) / 20)
+    return (
+        torch.zeros((), dtype=torch.float64, device=like.device)
+        if snr_db is None
+        else 10 ** (-per_trial(snr_db, 0, like) / 20)
+    )
 
 
 def refuse_trials(name: str, value: Tensor | float | None, draws: Draws) -> None:
     """Raise ValueError for a per-trial tensor of another number of trials than the draws have."""
-    if isinstance(value, Tensor) and value.ndim and draws.trials is not None and value.shape[-1] not in (1, len(draws.trials)):
-        raise ValueError(f"{name} must be a number or one for each of the {len(draws.trials)} trials of the draws, got shape {tuple(value.shape)}")
+    if (
+        isinstance(value, Tensor)
+        and value.ndim
+        and draws.trials is not None
+        and value.shape[-1] not in (1, len(draws.trials))
+    ):
+        raise ValueError(
+            f"{name} must be a number or one for each of the {len(draws.trials)} trials of the "
+            f"draws, got shape {tuple(value.shape)}"
+        )
 
 
 def _gated(s: Scatterers, gate_m: tuple[float, float] | None) -> Scatterers:
@@ -104,24 +137,46 @@ def _gated(s: Scatterers, gate_m: tuple[float, float] | None) -> Scatterers:
         return s
     inside = (s.range_m >= gate_m[0]) & (s.range_m <= gate_m[1])
     if not bool(inside.any(-1).all()):
-        raise ValueError(f"no scatterer lies within the gate of {gate_m[0]:g} to {gate_m[1]:g} m; they lie from {float(s.range_m.min()):g} to {float(s.range_m.max()):g} m: widen gate_m")
+        raise ValueError(
+            f"no scatterer lies within the gate of {gate_m[0]:g} to {gate_m[1]:g} m; they lie "
+            f"from {float(s.range_m.min()):g} to {float(s.range_m.max()):g} m: widen gate_m"
+        )
     return replace(s, amplitude=s.amplitude * inside)
 
 
-def calibration_aux(radar: TriangularLadar, world: LadarWorld, n_period: int, draws: Draws, dtype: torch.dtype, device: torch.device | str | None) -> dict[str, Tensor]:
+def calibration_aux(
+    radar: TriangularLadar,
+    world: LadarWorld,
+    n_period: int,
+    draws: Draws,
+    dtype: torch.dtype,
+    device: torch.device | str | None,
+) -> dict[str, Tensor]:
     """Side data of the calibration fibre, nothing where there is none."""
     if world.calibration is None:
         return {}
     channel = calibration_channel(radar, world.calibration, world.sweep_error, n_period, draws, dtype, device)
-    return {"calibration": channel, "calibration_delay_s": torch.tensor(world.calibration.delay_s, dtype=torch.float64, device=device)}
+    return {
+        "calibration": channel,
+        "calibration_delay_s": torch.tensor(world.calibration.delay_s, dtype=torch.float64, device=device),
+    }
 
 
 def hand_over(
-    data: Tensor, clean: Tensor, axes: tuple[Axis, ...], radar: TriangularLadar, aux: dict[str, Tensor], values: dict[str, Tensor], damages: Mapping[str, Damage] | None, draws: Draws
+    data: Tensor,
+    clean: Tensor,
+    axes: tuple[Axis, ...],
+    radar: TriangularLadar,
+    aux: dict[str, Tensor],
+    values: dict[str, Tensor],
+    damages: Mapping[str, Damage] | None,
+    draws: Draws,
 ) -> tuple[Recording, Truth]:
     """Recording and truth with the trial dims of `draws`, the recording damaged."""
     tail = len(axes)
-    trials = torch.broadcast_shapes(data.shape[:-tail], clean.shape[:-tail], () if draws.trials is None else (len(draws.trials),))
+    trials = torch.broadcast_shapes(
+        data.shape[:-tail], clean.shape[:-tail], () if draws.trials is None else (len(draws.trials),)
+    )
     data, clean = (v.expand(*trials, *v.shape[v.ndim - tail :]) for v in (data, clean))
     for name in ("velocity_m_s", "range_error_m", "range_error_up_m", "range_error_down_m", "log_amplitude"):
         if name in values:

@@ -1,8 +1,9 @@
 """Damage to the sequence of lines: lost, repeated and misnumbered ones (brief 004, item 1).
 
-A lost line is really gone: the later lines move up and the end of the matrix is filled with zero lines of number -1, as in recordings of
-different lengths. Recorded side data that has one entry a line moves with its line. Each object does one thing; combine them in the
-order lost, repeated, misnumbered. The first line is never lost: its number is where the processor's grid begins.
+A lost line is really gone: the later lines move up and the end of the matrix is filled with zero
+lines of number -1, as in recordings of different lengths. Recorded side data that has one entry a
+line moves with its line. Each object does one thing; combine them in the order lost, repeated,
+misnumbered. The first line is never lost: its number is where the processor's grid begins.
 """
 
 from __future__ import annotations
@@ -32,11 +33,17 @@ def _valid_count(number: Tensor) -> int:
 
 
 def _of_draws(index: Tensor, number: Tensor) -> Tensor:
-    """Drawn row indices (trial, k), or (k,), as (*trials of the recording, k). Raises ValueError where the trials do not agree."""
+    """Drawn row indices (trial, k), or (k,), as (*trials of the recording, k).
+
+    Raises ValueError where the trials do not agree.
+    """
     try:
         return index.to(number.device).expand(*number.shape[:-1], index.shape[-1])
     except RuntimeError:
-        raise ValueError(f"draws for {tuple(index.shape[:-1])} trials do not fit a recording of {tuple(number.shape[:-1])} trials; draw one unbatched trial for a single recording") from None
+        raise ValueError(
+            f"draws for {tuple(index.shape[:-1])} trials do not fit a recording of "
+            f"{tuple(number.shape[:-1])} trials; draw one unbatched trial for a single recording"
+        ) from None
 
 
 def _at(index: Tensor, n: int) -> Tensor:
@@ -45,7 +52,9 @@ def _at(index: Tensor, n: int) -> Tensor:
 
 
 def take_lines(recording: Recording, source: Tensor) -> Recording:
-    """The recording whose line i is line source[i] of the given one, a zero line of number -1 where source is -1. source: (*trials, pulse)."""
+    """The recording whose line i is line source[i] of the given one, a zero line of number -1 where
+    source is -1. source: (*trials, pulse).
+    """
     data, n = recording.signal.data, recording.signal.data.shape[-2]
     present, index = source >= 0, source.clamp_min(0)
     lines = torch.where(present[..., None], data.gather(-2, index[..., None].expand(data.shape)), 0)
@@ -65,14 +74,20 @@ def _drop(recording: Recording, lost: Tensor) -> tuple[Recording, dict[str, Tens
     kept = n - lost.sum(-1, keepdim=True)
     # the grid of line numbers starts where the undamaged numbers do
     slot = (number - number[..., :1]).clamp(0, n - 1)
-    return take_lines(recording, torch.where(row < kept, order, -1)), {"lost": torch.zeros_like(lost).scatter(-1, slot, lost), "lost_number": number[lost].reshape(*number.shape[:-1], -1)}
+    return take_lines(recording, torch.where(row < kept, order, -1)), {
+        "lost": torch.zeros_like(lost).scatter(-1, slot, lost),
+        "lost_number": number[lost].reshape(*number.shape[:-1], -1),
+    }
 
 
 @dataclass(frozen=True)
 class LostLines:
-    """Single lines lost at random places: `count` of them, or a `fraction` of all lines. Give one of the two.
+    """Single lines lost at random places: `count` of them, or a `fraction` of all lines.
 
-    Truth: `lost` (..., pulse), the lost lines on the grid line number - first number; `lost_number` (..., count).
+    Give one of the two.
+
+    Truth: `lost` (..., pulse), the lost lines on the grid line number - first number; `lost_number`
+    (..., count).
     """
 
     count: int | None = None
@@ -82,7 +97,9 @@ class LostLines:
         if (self.count is None) == (self.fraction is None):
             raise ValueError(f"lost lines need a count or a fraction, got count={self.count}, fraction={self.fraction}")
         if (self.count is not None and self.count < 0) or (self.fraction is not None and not 0 <= self.fraction < 1):
-            raise ValueError(f"lost lines need a count >= 0 or a fraction in 0..1, got count={self.count}, fraction={self.fraction}")
+            raise ValueError(
+                f"lost lines need a count >= 0 or a fraction in 0..1, got count={self.count}, fraction={self.fraction}"
+            )
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         number = _numbers(recording)
@@ -96,21 +113,29 @@ class LostLines:
 
 @dataclass(frozen=True)
 class LostGaps:
-    """`count` gaps of `length` consecutive lines each, apart from one another. Truth as for LostLines."""
+    """`count` gaps of `length` consecutive lines each, apart from one another.
+
+    Truth as for LostLines.
+    """
 
     count: int
     length: int
 
     def __post_init__(self) -> None:
         if self.count < 0 or self.length < 1:
-            raise ValueError(f"lost gaps need a count >= 0 and a length >= 1, got count={self.count}, length={self.length}")
+            raise ValueError(
+                f"lost gaps need a count >= 0 and a length >= 1, got count={self.count}, length={self.length}"
+            )
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         number = _numbers(recording)
         have = _valid_count(number)
         free = have - self.count * self.length
         if free <= self.count:
-            raise ValueError(f"{self.count} gaps of {self.length} lines do not fit a recording of {have} lines; lose fewer or shorter ones")
+            raise ValueError(
+                f"{self.count} gaps of {self.length} lines do not fit a recording of {have} lines; "
+                "lose fewer or shorter ones"
+            )
         # a gap begins behind a kept line: choose kept lines, then open the gaps
         begin = 1 + draws.subset("echo.lines.gaps", free - 1, self.count) + self.length * torch.arange(self.count)
         index = (begin[..., None] + torch.arange(self.length)).flatten(-2)
@@ -119,7 +144,8 @@ class LostGaps:
 
 @dataclass(frozen=True)
 class RepeatedLines:
-    """`count` lines that a buffer hands over twice, number and samples alike; the last lines of a full matrix fall off its end.
+    """`count` lines that a buffer hands over twice, number and samples alike; the last lines of a
+    full matrix fall off its end.
 
     Truth: `repeated` (..., pulse), the second copies in the damaged matrix.
     """
@@ -134,20 +160,26 @@ class RepeatedLines:
         number = _numbers(recording)
         n, have = number.shape[-1], _valid_count(number)
         if self.count > have // 2:
-            raise ValueError(f"{self.count} repeated lines are more than half of a recording of {have} lines; repeat fewer")
+            raise ValueError(
+                f"{self.count} repeated lines are more than half of a recording of {have} lines; repeat fewer"
+            )
         repeat = _at(_of_draws(draws.subset("echo.lines.repeated", have - self.count, self.count), number), n)
         # line i lands behind all copies of the lines before it, and its own copy behind it
         landing = torch.arange(n, device=number.device) + repeat.cumsum(-1) - repeat.long()
-        starts = torch.zeros((*number.shape[:-1], 2 * n), dtype=torch.int64, device=number.device).scatter(-1, landing, 1)[..., :n]
+        starts = torch.zeros((*number.shape[:-1], 2 * n), dtype=torch.int64, device=number.device).scatter(
+            -1, landing, 1
+        )[..., :n]
         source = (starts.cumsum(-1) - 1).clamp_max(n - 1)
         return take_lines(recording, source), {"repeated": starts == 0}
 
 
 @dataclass(frozen=True)
 class CorruptedNumbers:
-    """`count` line numbers overwritten: by any number 0..65535, or by the true one with one of its low `bits` bits flipped.
+    """`count` line numbers overwritten: by any number 0..65535, or by the true one with one of its
+    low `bits` bits flipped.
 
-    The samples are untouched. Truth: `corrupted` (..., pulse) and `true_number` (..., pulse), both in the order of the matrix.
+    The samples are untouched. Truth: `corrupted` (..., pulse) and `true_number` (..., pulse), both
+    in the order of the matrix.
     """
 
     count: int
@@ -155,13 +187,17 @@ class CorruptedNumbers:
 
     def __post_init__(self) -> None:
         if self.count < 0 or (self.bits is not None and not 1 <= self.bits <= 31):
-            raise ValueError(f"corrupted numbers need a count >= 0 and 1 to 31 bits, got count={self.count}, bits={self.bits}")
+            raise ValueError(
+                f"corrupted numbers need a count >= 0 and 1 to 31 bits, got count={self.count}, bits={self.bits}"
+            )
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         number = _numbers(recording)
         have = _valid_count(number)
         if self.count > have:
-            raise ValueError(f"{self.count} corrupted numbers are more than the {have} lines of the recording; corrupt fewer")
+            raise ValueError(
+                f"{self.count} corrupted numbers are more than the {have} lines of the recording; corrupt fewer"
+            )
         index = _of_draws(draws.subset("echo.lines.corrupted", have, self.count), number)
         drawn = draws.uniform("echo.lines.number", (self.count,), 0.0, 1.0).to(number.device).expand(index.shape)
         true = number.gather(-1, index)

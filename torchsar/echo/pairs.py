@@ -1,4 +1,6 @@
-"""Simulated (Recording, Truth) pairs as an iterable, for training and for judging over many scenes."""
+"""Simulated (Recording, Truth) pairs as an iterable, for training and for judging over many
+scenes.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +17,13 @@ from torchsar.scene import StripmapWorld
 
 @dataclass(frozen=True)
 class SimulatedPairs:
-    """Iterates over batches of trials of one world; batch b holds the trials b * batch .. (b + 1) * batch - 1 of `seed`.
+    """Iterates over batches of trials of one world; batch b holds the trials b * batch ..
 
-    Every trial draws its own scene, phases, noise and damage, and is the same in any batch size. count: trials in all; the last batch may
-    be smaller. World values that are given per trial must be numbers here, as a batch holds any of the trials.
+    (b + 1) * batch - 1 of `seed`.
+
+    Every trial draws its own scene, phases, noise and damage, and is the same in any batch size.
+    count: trials in all; the last batch may be smaller. World values that are given per trial must
+    be numbers here, as a batch holds any of the trials.
     """
 
     radar: StripmapRadar
@@ -38,4 +43,6 @@ class SimulatedPairs:
     def __iter__(self) -> Iterator[tuple[Recording, Truth]]:
         for first in range(0, self.count, self.batch):
             draws = Draws(self.seed, trials=range(first, min(first + self.batch, self.count)))
-            yield simulate(self.radar, self.world, self.n_pulse, self.n_range, draws, self.damages, self.dtype, self.device)
+            yield simulate(
+                self.radar, self.world, self.n_pulse, self.n_range, draws, self.damages, self.dtype, self.device
+            )

@@ -1,4 +1,6 @@
-"""Phase errors put into range-compressed pulses, simulated or recorded: damages that an autofocus has to find again."""
+"""Phase errors put into range-compressed pulses, simulated or recorded: damages that an autofocus
+has to find again.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from torchsar.core import Draws, Recording, unit_phasor
 
 
 def _turned(recording: Recording, phase_rad: Tensor) -> tuple[Recording, Mapping[str, Tensor]]:
-    """The recording with every pulse turned by exp(j phase), and the truth `phase_rad` (..., pulse) float64."""
+    """The recording with every pulse turned by exp(j phase), and the truth `phase_rad` (..., pulse)
+    float64.
+    """
     data = recording.signal.data
     phase = phase_rad.to(data.device).expand(data.shape[:-1])
     turned = data * unit_phasor(phase / (2 * math.pi), data.dtype)[..., None]
@@ -35,7 +39,9 @@ class WhitePhase:
             raise ValueError(f"limit_rad must be 0 rad or more, got {self.limit_rad}")
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, Mapping[str, Tensor]]:
-        return _turned(recording, draws.uniform("echo.phase.white", (_pulses(recording),), -self.limit_rad, self.limit_rad))
+        return _turned(
+            recording, draws.uniform("echo.phase.white", (_pulses(recording),), -self.limit_rad, self.limit_rad)
+        )
 
 
 @dataclass(frozen=True)
@@ -61,7 +67,9 @@ class PhaseSinusoid:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.amplitude_rad) and math.isfinite(self.cycles)):
-            raise ValueError(f"amplitude_rad and cycles must be finite numbers, got {self.amplitude_rad} and {self.cycles}")
+            raise ValueError(
+                f"amplitude_rad and cycles must be finite numbers, got {self.amplitude_rad} and {self.cycles}"
+            )
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, Mapping[str, Tensor]]:
         n = _pulses(recording)

@@ -19,14 +19,18 @@ _TABLE_BYTES = 8 << 20
 
 
 class Damage(Protocol):
-    """Something that happens to a recording on its way: returns the damaged recording and what is true about the damage."""
+    """Something that happens to a recording on its way: returns the damaged recording and what is
+    true about the damage.
+    """
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, Mapping[str, Tensor]]: ...
 
 
 @dataclass(frozen=True)
 class Placed:
-    """Scatterers on a straight path: when the beam centre crosses them, when they are closest, how far. float64, (..., target)."""
+    """Scatterers on a straight path: when the beam centre crosses them, when they are closest, how
+    far. float64, (..., target).
+    """
 
     crossing_s: Tensor
     zero_doppler_s: Tensor
@@ -34,7 +38,14 @@ class Placed:
     amplitude: Tensor
 
 
-def place(scatterers: Scatterers, radar: StripmapRadar, n_pulse: int, n_range: int, doppler_hz: Tensor | float, velocity_m_s: Tensor | float) -> Placed:
+def place(
+    scatterers: Scatterers,
+    radar: StripmapRadar,
+    n_pulse: int,
+    n_range: int,
+    doppler_hz: Tensor | float,
+    velocity_m_s: Tensor | float,
+) -> Placed:
     """From positions in the recorded frame to the geometry of the path.
 
     The frame's middle is the middle pulse and the middle of the fully compressed part of a line.
@@ -44,35 +55,53 @@ def place(scatterers: Scatterers, radar: StripmapRadar, n_pulse: int, n_range: i
     slant = middle_m + scatterers.range_m
     crossing = (n_pulse // 2) / radar.prf_hz + scatterers.azimuth_m / velocity
     sin = radar.sin_squint(doppler, velocity)
-    crossing, zero, closest, amplitude = torch.broadcast_tensors(crossing, crossing + sin * slant / velocity, slant * torch.sqrt(1 - sin.square()), scatterers.amplitude)
+    crossing, zero, closest, amplitude = torch.broadcast_tensors(
+        crossing, crossing + sin * slant / velocity, slant * torch.sqrt(1 - sin.square()), scatterers.amplitude
+    )
     return Placed(crossing, zero, closest, amplitude)
 
 
-def stripmap_echo(placed: Placed, world: StripmapWorld, radar: StripmapRadar, n_pulse: int, n_range: int, dtype: torch.dtype = torch.complex64) -> Tensor:
+def stripmap_echo(
+    placed: Placed,
+    world: StripmapWorld,
+    radar: StripmapRadar,
+    n_pulse: int,
+    n_range: int,
+    dtype: torch.dtype = torch.complex64,
+) -> Tensor:
     """Raw echo without noise, (..., pulse, range) of `dtype`. Slow time starts at 0.
 
-    Built in range frequency from the spectrum of the sampled pulse, by blocks of pulses and of the targets lit in them. Differentiable
-    in positions, amplitudes, velocity and Doppler. The echo of a target partly outside the record is cut, never wrapped.
+    Built in range frequency from the spectrum of the sampled pulse, by blocks of pulses and of the
+    targets lit in them. Differentiable in positions, amplitudes, velocity and Doppler. The echo of
+    a target partly outside the record is cut, never wrapped.
     """
     n_fft = _line_length(placed, radar, n_range)
     spectrum = torch.fft.fftshift(radar.pulse.spectrum(n_fft, radar.sampling_hz, placed.closest_m.device)).to(dtype)
     lines = []
     for pulses in _pulse_blocks(placed, n_pulse, n_fft):
-        pulse_s = torch.arange(pulses.start, pulses.stop, dtype=torch.float64, device=placed.closest_m.device) / radar.prf_hz
+        pulse_s = (
+            torch.arange(pulses.start, pulses.stop, dtype=torch.float64, device=placed.closest_m.device) / radar.prf_hz
+        )
         block = _block_spectrum(placed, world, radar, pulse_s, n_fft, dtype)
         lines.append(torch.fft.ifft(torch.fft.ifftshift(block * spectrum, dim=-1))[..., :n_range])
     return torch.cat(lines, -2)
 
 
-def _block_spectrum(placed: Placed, world: StripmapWorld, radar: StripmapRadar, pulse_s: Tensor, n_fft: int, dtype: torch.dtype) -> Tensor:
-    """Range spectrum (..., pulse, n_fft) of one block of pulses, summed over blocks of the targets that are lit in it."""
+def _block_spectrum(
+    placed: Placed, world: StripmapWorld, radar: StripmapRadar, pulse_s: Tensor, n_fft: int, dtype: torch.dtype
+) -> Tensor:
+    """Range spectrum (..., pulse, n_fft) of one block of pulses, summed over blocks of the targets
+    that are lit in it.
+    """
     velocity = per_trial(radar.velocity_m_s if world.velocity_m_s is None else world.velocity_m_s, 2, pulse_s)
     doppler = per_trial(_true_doppler(world, radar), 2, pulse_s)
     total = torch.zeros((*placed.closest_m.shape[:-1], pulse_s.numel(), n_fft), dtype=dtype, device=pulse_s.device)
     blocks = list(_target_blocks(placed, pulse_s.numel(), n_fft))
     for targets in blocks:
         since, closest, weight = _seen(placed, targets, world, radar, pulse_s, doppler, velocity)
-        lit = slice(None) if len(blocks) == 1 else _lit(weight)  # few targets all count, so that a trial's sum does not depend on its neighbours
+        lit = (
+            slice(None) if len(blocks) == 1 else _lit(weight)
+        )  # few targets all count, so that a trial's sum does not depend on its neighbours
         since, closest, weight = (x[..., lit] for x in (since, closest, weight))
         if not since.shape[-1]:
             continue
@@ -80,15 +109,40 @@ def _block_spectrum(placed: Placed, world: StripmapWorld, radar: StripmapRadar, 
         delay = 2 * (range_m - radar.near_range_m) / radar.wave_speed_m_s
         inside = (delay > -radar.pulse.duration_s) & (delay < n_fft / radar.sampling_hz)
         amplitude = placed.amplitude[..., None, targets][..., lit] * torch.where(inside, weight, 0)
-        total = total + echo_spectrum(delay, 2 * radar.carrier_hz / radar.wave_speed_m_s * range_m, amplitude, n_fft, radar.sampling_hz / n_fft, dtype)
+        total = total + echo_spectrum(
+            delay,
+            2 * radar.carrier_hz / radar.wave_speed_m_s * range_m,
+            amplitude,
+            n_fft,
+            radar.sampling_hz / n_fft,
+            dtype,
+        )
     return total
 
 
-def _seen(placed: Placed, targets: slice, world: StripmapWorld, radar: StripmapRadar, pulse_s: Tensor, doppler_hz: Tensor, velocity_m_s: Tensor) -> list[Tensor]:
-    """Time since closest approach, closest range and gain of the beam for targets at pulses, (..., pulse, target) each."""
-    crossing, zero, closest = (x[..., None, targets] for x in (placed.crossing_s, placed.zero_doppler_s, placed.closest_m))
+def _seen(
+    placed: Placed,
+    targets: slice,
+    world: StripmapWorld,
+    radar: StripmapRadar,
+    pulse_s: Tensor,
+    doppler_hz: Tensor,
+    velocity_m_s: Tensor,
+) -> list[Tensor]:
+    """Time since closest approach, closest range and gain of the beam for targets at pulses, (...,
+    pulse, target) each.
+    """
+    crossing, zero, closest = (
+        x[..., None, targets] for x in (placed.crossing_s, placed.zero_doppler_s, placed.closest_m)
+    )
     since = pulse_s[:, None] - zero
-    offset = 2 * velocity_m_s.square() * -since / (radar.wavelength_m * torch.sqrt(closest.square() + (velocity_m_s * since).square())) - doppler_hz
+    offset = (
+        2
+        * velocity_m_s.square()
+        * -since
+        / (radar.wavelength_m * torch.sqrt(closest.square() + (velocity_m_s * since).square()))
+        - doppler_hz
+    )
     return torch.broadcast_tensors(since, closest, world.beam.weight(pulse_s[:, None] - crossing, offset, velocity_m_s))
 
 
@@ -102,7 +156,9 @@ def _lit(weight: Tensor) -> Tensor:
 
 
 def _line_length(placed: Placed, radar: StripmapRadar, n_range: int) -> int:
-    """FFT length that keeps every echo from wrapping: the line itself where all echoes lie inside it, else one pulse longer."""
+    """FFT length that keeps every echo from wrapping: the line itself where all echoes lie inside
+    it, else one pulse longer.
+    """
     delay = 2 * (placed.closest_m.detach() - radar.near_range_m) / radar.wave_speed_m_s * radar.sampling_hz
     margin = 256 + radar.pulse_samples
     if float(delay.min()) >= 0 and float(delay.max()) + margin <= n_range:
@@ -119,7 +175,9 @@ def _smooth(n: int) -> bool:
 
 
 def _pulse_blocks(placed: Placed, n_pulse: int, n_fft: int) -> Iterator[slice]:
-    """Blocks of pulses, whatever the number of trials: sums then round alike in batches of any size."""
+    """Blocks of pulses, whatever the number of trials: sums then round alike in batches of any
+    size.
+    """
     height = max(1, min(64, _TABLE_BYTES // (8 * n_fft)))
     for first in range(0, n_pulse, height):
         yield slice(first, min(first + height, n_pulse))
@@ -132,9 +190,11 @@ def _target_blocks(placed: Placed, height: int, n_fft: int) -> Iterator[slice]:
 
 
 def target_energy(truth: Truth, world: StripmapWorld, radar: StripmapRadar, n_pulse: int) -> Tensor:
-    """Energy of each target's raw echo in squared sample amplitudes, (..., target), over the lines of the record that see it.
+    """Energy of each target's raw echo in squared sample amplitudes, (..., target), over the lines
+    of the record that see it.
 
-    Over the noise variance (`noise_std` squared) it is q, the peak signal-to-noise ratio after two-dimensional compression.
+    Over the noise variance (`noise_std` squared) it is q, the peak signal-to-noise ratio after
+    two-dimensional compression.
     """
     values = truth.values
     crossing = values["crossing_s"]
@@ -146,7 +206,9 @@ def target_energy(truth: Truth, world: StripmapWorld, radar: StripmapRadar, n_pu
 
 
 def lit_power(echo: Tensor) -> Tensor:
-    """Mean power of the lit raw samples, (...,): those above 1e-4 of the strongest sample's power in their trial."""
+    """Mean power of the lit raw samples, (...,): those above 1e-4 of the strongest sample's power
+    in their trial.
+    """
     power = echo.real.square() + echo.imag.square()
     lit = power > 1e-4 * power.amax((-2, -1), keepdim=True)
     return (power * lit).sum((-2, -1)) / lit.sum((-2, -1)).clamp_min(1)
@@ -164,10 +226,11 @@ def simulate(
 ) -> tuple[Recording, Truth]:
     """A recording of the world and the truth about it, batched over the trials of `draws`.
 
-    Noise follows `world.snr_db`: mean signal power per lit raw sample over noise variance. damages: applied in order, by name. The
-    truth holds target positions (zero-Doppler time, closest range), velocity, beam Doppler, noise deviation, what each damage says
-    under "<damage>.<name>", and the undamaged recording with the same noise as `clean`. Raises ValueError for what no radar
-    can record: a squint beyond 90 degrees, targets behind it, a pulse longer than a line.
+    Noise follows `world.snr_db`: mean signal power per lit raw sample over noise variance. damages:
+    applied in order, by name. The truth holds target positions (zero-Doppler time, closest range),
+    velocity, beam Doppler, noise deviation, what each damage says under "<damage>.<name>", and the
+    undamaged recording with the same noise as `clean`. Raises ValueError for what no radar can
+    record: a squint beyond 90 degrees, targets behind it, a pulse longer than a line.
     """
     velocity = radar.velocity_m_s if world.velocity_m_s is None else world.velocity_m_s
     doppler = _true_doppler(world, radar)
@@ -176,7 +239,10 @@ def simulate(
     _refuse_impossible(scatterers, radar, n_range, radar.sin_squint(doppler, velocity))
     placed = place(scatterers, radar, n_pulse, n_range, doppler, velocity)
     if bool((placed.closest_m <= 0).any()):
-        raise ValueError(f"a target lies behind the radar, at a range of {float(placed.closest_m.min()):.4g} m; range_m counts from the middle of the recorded frame")
+        raise ValueError(
+            f"a target lies behind the radar, at a range of {float(placed.closest_m.min()):.4g} "
+            "m; range_m counts from the middle of the recorded frame"
+        )
     echo = stripmap_echo(placed, world, radar, n_pulse, n_range, dtype)
     std = torch.zeros((), dtype=torch.float64, device=device)
     if world.snr_db is not None:
@@ -184,7 +250,8 @@ def simulate(
         noise = draws.normal("noise", (n_pulse, n_range), dtype, device)
         echo = echo + noise * std.to(echo.real.dtype)[..., None, None]
     trials = () if draws.trials is None else (len(draws.trials),)
-    echo = echo.expand(*torch.broadcast_shapes(echo.shape[:-2], trials), -1, -1)  # nothing may differ between trials
+    # nothing may differ between trials
+    echo = echo.expand(*torch.broadcast_shapes(echo.shape[:-2], trials), -1, -1)
     clean = Recording(Signal(echo, radar.raw_axes(n_pulse, n_range)), radar)
     values = {
         "crossing_s": placed.crossing_s,
@@ -204,16 +271,29 @@ def _refuse_impossible(scatterers: Scatterers, radar: StripmapRadar, n_range: in
         raise ValueError("the scene holds no scatterer; give it at least one")
     if not bool((sin_squint.abs() < 1).all()):
         worst = float(sin_squint.abs().max())
-        raise ValueError(f"the Doppler of the beam asks for a squint beyond 90 degrees (sine {worst:.4g}); it must stay below 2 * velocity / wavelength in magnitude")
+        raise ValueError(
+            f"the Doppler of the beam asks for a squint beyond 90 degrees (sine {worst:.4g}); it "
+            "must stay below 2 * velocity / wavelength in magnitude"
+        )
     if radar.pulse_samples > n_range:
-        raise ValueError(f"a line of {n_range} samples does not hold the pulse of {radar.pulse_samples}; record longer lines or shorten the pulse")
+        raise ValueError(
+            f"a line of {n_range} samples does not hold the pulse of {radar.pulse_samples}; "
+            "record longer lines or shorten the pulse"
+        )
 
 
-def apply_damages(recording: Recording, damages: Mapping[str, Damage], draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
-    """Damage a recording, simulated or real, in the order of the mapping. Returns it with the truth under "<damage>.<name>"."""
+def apply_damages(
+    recording: Recording, damages: Mapping[str, Damage], draws: Draws
+) -> tuple[Recording, dict[str, Tensor]]:
+    """Damage a recording, simulated or real, in the order of the mapping.
+
+    Returns it with the truth under "<damage>.<name>".
+    """
     if "line_number" not in recording.aux:
         lines = torch.arange(recording.signal.data.shape[-2], device=recording.signal.data.device)
-        recording = replace(recording, aux={**recording.aux, "line_number": lines.expand(recording.signal.data.shape[:-1])})
+        recording = replace(
+            recording, aux={**recording.aux, "line_number": lines.expand(recording.signal.data.shape[:-1])}
+        )
     told: dict[str, Tensor] = {}
     for name, damage in damages.items():
         recording, values = damage(recording, draws.part(name))

@@ -1,4 +1,6 @@
-"""Sweeps that are not straight: phase errors of the laser, and the internal channel that records them."""
+"""Sweeps that are not straight: phase errors of the laser, and the internal channel that records
+them.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ from torchsar.scene import CalibrationFibre, SweepError
 
 @dataclass(frozen=True)
 class PolynomialSweepError:
-    """Frequency error sum_i c_i (u / s)^i of the sweep, u from its middle: coefficients (Hz, Hz/s, Hz/s^2, ...) of up and down sweeps.
+    """Frequency error sum_i c_i (u / s)^i of the sweep, u from its middle: coefficients (Hz, Hz/s,
+    Hz/s^2, ...) of up and down sweeps.
 
     The phase error e(u) is its antiderivative, zero in the middle of each sweep.
     """
@@ -25,8 +28,15 @@ class PolynomialSweepError:
     down_hz: Sequence[float]
 
     def __post_init__(self) -> None:
-        if not len(self.up_hz) or not len(self.down_hz) or not all(math.isfinite(c) for c in (*self.up_hz, *self.down_hz)):
-            raise ValueError(f"a polynomial sweep error needs finite coefficients for up and down, got {self.up_hz} and {self.down_hz}; leave the effect out where there is none")
+        if (
+            not len(self.up_hz)
+            or not len(self.down_hz)
+            or not all(math.isfinite(c) for c in (*self.up_hz, *self.down_hz))
+        ):
+            raise ValueError(
+                "a polynomial sweep error needs finite coefficients for up and down, got "
+                f"{self.up_hz} and {self.down_hz}; leave the effect out where there is none"
+            )
 
     def turns(self, time_s: Tensor, ramp: int) -> Tensor:
         total = torch.zeros_like(time_s)
@@ -37,7 +47,9 @@ class PolynomialSweepError:
 
 @dataclass(frozen=True)
 class SinusoidSweepError:
-    """Frequency error A sin(2 pi F u + phase) of the sweep, u from its middle, with a phase of its own in up and down sweeps."""
+    """Frequency error A sin(2 pi F u + phase) of the sweep, u from its middle, with a phase of its
+    own in up and down sweeps.
+    """
 
     amplitude_hz: float
     frequency_hz: float
@@ -45,17 +57,28 @@ class SinusoidSweepError:
     phase_down_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        if not all(math.isfinite(v) for v in (self.amplitude_hz, self.frequency_hz, self.phase_up_deg, self.phase_down_deg)) or not self.frequency_hz > 0:
+        if (
+            not all(
+                math.isfinite(v) for v in (self.amplitude_hz, self.frequency_hz, self.phase_up_deg, self.phase_down_deg)
+            )
+            or not self.frequency_hz > 0
+        ):
             raise ValueError(f"a sinusoidal sweep error needs finite numbers and a frequency above 0 Hz, got {self}")
 
     def turns(self, time_s: Tensor, ramp: int) -> Tensor:
         phase = math.radians(self.phase_down_deg if ramp else self.phase_up_deg)
         middle = math.cos(phase)
-        return self.amplitude_hz / (2 * math.pi * self.frequency_hz) * (middle - torch.cos(2 * math.pi * self.frequency_hz * time_s + phase))
+        return (
+            self.amplitude_hz
+            / (2 * math.pi * self.frequency_hz)
+            * (middle - torch.cos(2 * math.pi * self.frequency_hz * time_s + phase))
+        )
 
 
 def wound_turns(error: SweepError, radar: TriangularLadar, position_s: Tensor) -> Tensor:
-    """Phase error as a continuous function of the time since the start of a triangle (turns): sweep joined to sweep, period to period."""
+    """Phase error as a continuous function of the time since the start of a triangle (turns): sweep
+    joined to sweep, period to period.
+    """
     half = torch.as_tensor(radar.sweep_s / 2, dtype=torch.float64, device=position_s.device)
     ends = [(error.turns(-half, ramp), error.turns(half, ramp)) for ramp in (0, 1)]
     gain_up, gain_down = (last - first for first, last in ends)
@@ -66,11 +89,21 @@ def wound_turns(error: SweepError, radar: TriangularLadar, position_s: Tensor) -
     return period * (gain_up + gain_down) + torch.where(within.detach() < radar.sweep_s, up, down)
 
 
-def calibration_channel(radar: TriangularLadar, fibre: CalibrationFibre, error: SweepError | None, n_period: int, draws: Draws, dtype: torch.dtype, device: torch.device | str | None = None) -> Tensor:
-    """What the internal fibre records in the sweeps, (*trials, 2, K or 1, fast_time) of `dtype`, amplitude 1.
+def calibration_channel(
+    radar: TriangularLadar,
+    fibre: CalibrationFibre,
+    error: SweepError | None,
+    n_period: int,
+    draws: Draws,
+    dtype: torch.dtype,
+    device: torch.device | str | None = None,
+) -> Tensor:
+    """What the internal fibre records in the sweeps, (*trials, 2, K or 1, fast_time) of `dtype`,
+    amplitude 1.
 
-    Turns in the up sweep: fc tc + K u tc - K tc^2 / 2 + e(u) - e(u - tc), in the down sweep with -K and its own e; conjugated where the radar's
-    dechirp sign is "echo_conj_lo". Noise by fibre.snr_db per sample.
+    Turns in the up sweep: fc tc + K u tc - K tc^2 / 2 + e(u) - e(u - tc), in the down sweep with -K
+    and its own e; conjugated where the radar's dechirp sign is "echo_conj_lo". Noise by
+    fibre.snr_db per sample.
     """
     u, delay, rate = radar.fast_time_axis().values(device), fibre.delay_s, radar.chirp_rate_hz_s
     rows = []

@@ -8,7 +8,16 @@ from torchsar.focus.defocus import InvertibleOmegaK, defocus_omega_k
 from torchsar.focus.detection import Detect, QuickLook, amplitude, multilook, quicklook_looks, to_db
 from torchsar.focus.inverse_requirements import inverse_requirements
 from torchsar.focus.ladar_requirements import Limit, ladar_limits, ladar_requirements
-from torchsar.focus.matched_fourier import MatchedFourier, MatchedFourierOperator, RangePhase, cross_range_of, lines_for, matched_fourier, mean_rate, range_phase
+from torchsar.focus.matched_fourier import (
+    MatchedFourier,
+    MatchedFourierOperator,
+    RangePhase,
+    cross_range_of,
+    lines_for,
+    matched_fourier,
+    mean_rate,
+    range_phase,
+)
 from torchsar.focus.nufft import Nufft, nufft_type1, nufft_type2
 from torchsar.focus.omega_k import OmegaK, StoredOmegaK, omega_k
 from torchsar.focus.polar import PolarFormat, PolarOperator
@@ -19,7 +28,15 @@ from torchsar.focus.spotlight import GroundGrid, SpotlightBackprojection, backpr
 from torchsar.focus.stolt import OmegaKStolt, omega_k_stolt
 from torchsar.focus.strip import StripPlan, focus_strip, plan_strip, reach_lines, write_strip
 from torchsar.focus.target import TargetImage
-from torchsar.focus.triangular import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth, azimuth_matched_filter, compress_sweeps, deramp_azimuth, profile_axes
+from torchsar.focus.triangular import (
+    AzimuthMatchedFilter,
+    CompressSweeps,
+    DerampAzimuth,
+    azimuth_matched_filter,
+    compress_sweeps,
+    deramp_azimuth,
+    profile_axes,
+)
 
 __all__ = [
     "AzimuthMatchedFilter",

@@ -16,7 +16,9 @@ from torchsar.radar import StripmapRadar
 
 
 class Aperture(Protocol):
-    """Which pulses form a pixel: (slow time since the beam centre crossed it, its Doppler relative to the centroid) -> weight."""
+    """Which pulses form a pixel: (slow time since the beam centre crossed it, its Doppler relative
+    to the centroid) -> weight.
+    """
 
     def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor: ...
 
@@ -41,7 +43,9 @@ class Integration:
 
 @dataclass(frozen=True)
 class DopplerBand:
-    """The pulses in which the pixel's Doppler is within width_hz about the centroid; with the PRF, what a Doppler processor uses."""
+    """The pulses in which the pixel's Doppler is within width_hz about the centroid; with the PRF,
+    what a Doppler processor uses.
+    """
 
     width_hz: float
 
@@ -64,17 +68,23 @@ def backproject(
     eps: float = 1e-10,
     block_bytes: int = 1 << 23,
 ) -> Tensor:
-    """Coherent sum over pulses of the compressed echo at each pixel's own range. raw: (..., pulse, range) -> (..., *pixels), complex.
+    """Coherent sum over pulses of the compressed echo at each pixel's own range.
 
-    azimuth_m, range_m: float64 pixel coordinates that broadcast to `pixels`, in the image coordinates of `omega_k`: x = nominal velocity *
-    slow time of crossing, and the slant range at crossing, in the frame Doppler. start_s: slow time of the first pulse. The range
-    history is the exact hyperbola, formed as a difference to the pixel's range at crossing; the echo between samples comes from its
-    range spectrum by a non-uniform FFT of relative error eps. A target has the phase -4 pi R / lambda and the sum of its pulses as
-    amplitude. Echoes outside the record count as zero. Costs pulses x pixels x 50 operations: for patches. Differentiable in raw, velocity,
-    frame and pixel positions.
+    raw: (..., pulse, range) -> (..., *pixels), complex.
+
+    azimuth_m, range_m: float64 pixel coordinates that broadcast to `pixels`, in the image
+    coordinates of `omega_k`: x = nominal velocity * slow time of crossing, and the slant range at
+    crossing, in the frame Doppler. start_s: slow time of the first pulse. The range history is the
+    exact hyperbola, formed as a difference to the pixel's range at crossing; the echo between
+    samples comes from its range spectrum by a non-uniform FFT of relative error eps. A target has
+    the phase -4 pi R / lambda and the sum of its pulses as amplitude. Echoes outside the record
+    count as zero. Costs pulses x pixels x 50 operations: for patches. Differentiable in raw,
+    velocity, frame and pixel positions.
     """
     at = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz)
-    x, r = torch.broadcast_tensors(*(torch.as_tensor(v, dtype=torch.float64, device=raw.device) for v in (azimuth_m, range_m)))
+    x, r = torch.broadcast_tensors(
+        *(torch.as_tensor(v, dtype=torch.float64, device=raw.device) for v in (azimuth_m, range_m))
+    )
     shape, x, r = x.shape, x.reshape(-1), r.reshape(-1)
     sight = _Sight(radar, at.velocity_m_s, at.frame_hz, per_trial(doppler_hz, 2, x), aperture or EveryPulse())
     echo = _EchoBetweenSamples(raw, reference, radar, eps)
@@ -83,7 +93,10 @@ def backproject(
     # each of the about 20 working arrays of a block takes 16 bytes a pulse and pixel
     pixels_at_once = min(max(1, x.numel()), 4096)
     height = max(1, min(raw.shape[-2], block_bytes // (16 * trials * max(pixels_at_once, 2 * raw.shape[-1]))))
-    sums = [torch.zeros((*raw.shape[:-2], min(pixels_at_once, x.numel() - p.start)), dtype=raw.dtype, device=raw.device) for p in _slices(x.numel(), pixels_at_once)]
+    sums = [
+        torch.zeros((*raw.shape[:-2], min(pixels_at_once, x.numel() - p.start)), dtype=raw.dtype, device=raw.device)
+        for p in _slices(x.numel(), pixels_at_once)
+    ]
     for pulses in _slices(raw.shape[-2], height):
         grid = echo.grid(pulses)
         for i, pixels in enumerate(_slices(x.numel(), pixels_at_once)):
@@ -98,7 +111,9 @@ def _slices(n: int, step: int) -> Iterator[slice]:
 
 @dataclass(frozen=True)
 class _Sight:
-    """The way a pixel is seen from the path: range relative to the crossing, and the weight of the aperture."""
+    """The way a pixel is seen from the path: range relative to the crossing, and the weight of the
+    aperture.
+    """
 
     radar: StripmapRadar
     velocity_m_s: Tensor
@@ -107,7 +122,10 @@ class _Sight:
     aperture: Aperture
 
     def __call__(self, pulse_s: Tensor, azimuth_m: Tensor, range_m: Tensor) -> tuple[Tensor, Tensor]:
-        """pulse_s: (pulse, 1); pixels (pixel,). Returns r(t) - R in metres and the weight, float64 (..., pulse, pixel)."""
+        """pulse_s: (pulse, 1); pixels (pixel,).
+
+        Returns r(t) - R in metres and the weight, float64 (..., pulse, pixel).
+        """
         velocity, frame = (per_trial(v, 2, pulse_s) for v in (self.velocity_m_s, self.frame_hz))
         sin = self.radar.wavelength_m * frame / (2 * velocity)
         since = pulse_s - azimuth_m / self.radar.velocity_m_s
@@ -115,11 +133,15 @@ class _Sight:
         excess = way * (way - 2 * range_m * sin)
         slant = torch.sqrt(range_m.square() + excess)
         doppler = 2 * velocity * (range_m * sin - way) / (slant * self.radar.wavelength_m)
-        return excess / (slant + range_m), self.aperture.weight(*torch.broadcast_tensors(since, doppler - self.centroid_hz))
+        return excess / (slant + range_m), self.aperture.weight(
+            *torch.broadcast_tensors(since, doppler - self.centroid_hz)
+        )
 
 
 class _EchoBetweenSamples:
-    """Range-compressed pulses at any range, demodulated by the carrier phase of the range difference."""
+    """Range-compressed pulses at any range, demodulated by the carrier phase of the range
+    difference.
+    """
 
     def __init__(self, raw: Tensor, reference: Tensor | None, radar: StripmapRadar, eps: float) -> None:
         self.raw, self.reference, self.radar = raw, reference, radar
@@ -137,15 +159,19 @@ class _EchoBetweenSamples:
         cell = ((range_m - self.radar.near_range_m) + difference_m) / self.radar.range_step_m
         weight = weight * ((cell >= 0) & (cell <= self.n - 1))
         # exp(+2j pi k q / n) asks for points of the other sign
-        points = Points.of(self.plan.kernel, -cell * (self.plan.length / self.n), self.plan.length, real_dtype(grid.dtype))
+        points = Points.of(
+            self.plan.kernel, -cell * (self.plan.length / self.n), self.plan.length, real_dtype(grid.dtype)
+        )
         carrier = unit_phasor(2 * self.radar.carrier_hz / self.radar.wave_speed_m_s * difference_m, grid.dtype)
         return interpolate(grid, points) * carrier * weight.to(real_dtype(grid.dtype))
 
 
 class Backproject(Focuser):
-    """Focus a patch by backprojection: lines and cells (first, last) of the raw matrix, all by default, sampled `oversampling` times finer.
+    """Focus a patch by backprojection: lines and cells (first, last) of the raw matrix, all by
+    default, sampled `oversampling` times finer.
 
-    Other arguments as `Focuser`. The exact reference for the faster focusers, on the same image axes.
+    Other arguments as `Focuser`. The exact reference for the faster focusers, on the same image
+    axes.
     """
 
     form = staticmethod(backproject)
@@ -168,7 +194,10 @@ class Backproject(Focuser):
 
     def forward(self, signal: Signal, doppler_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Signal:
         azimuth, range_ = self.radar.image_axes(signal.axes)
-        azimuth, range_ = (axis.part(*(bounds or (0, axis.n))).resampled(self.oversampling) for axis, bounds in ((azimuth, self.lines), (range_, self.cells)))
+        azimuth, range_ = (
+            axis.part(*(bounds or (0, axis.n))).resampled(self.oversampling)
+            for axis, bounds in ((azimuth, self.lines), (range_, self.cells))
+        )
         data = backproject(
             signal.data,
             replace(self.radar, near_range_m=signal.axes[-1].start),

@@ -1,4 +1,6 @@
-"""From beam coordinates to the range of closest approach, and room for apertures that begin or end outside of the record."""
+"""From beam coordinates to the range of closest approach, and room for apertures that begin or end
+outside of the record.
+"""
 
 from __future__ import annotations
 
@@ -13,16 +15,27 @@ from torchsar.focus.omega_k import Focuser
 from torchsar.radar import StripmapRadar
 
 
-def closest_range(image: Tensor, radar: StripmapRadar, frame_hz: Tensor | float, velocity_m_s: Tensor | float | None = None, eps: float = 1e-5) -> Tensor:
-    """Resample an image so that its range axis holds the range of closest approach r = R cos(squint) instead of the slant range R.
+def closest_range(
+    image: Tensor,
+    radar: StripmapRadar,
+    frame_hz: Tensor | float,
+    velocity_m_s: Tensor | float | None = None,
+    eps: float = 1e-5,
+) -> Tensor:
+    """Resample an image so that its range axis holds the range of closest approach r = R
+    cos(squint) instead of the slant range R.
 
-    image: (..., azimuth, range) in the frame Doppler frame_hz (...,). Band-limited interpolation with one set of points per trial, of
-    relative error eps; samples from beyond the record wrap. A squint of 1.6 degrees moves a target at 1000 km by 400 m. Differentiable.
+    image: (..., azimuth, range) in the frame Doppler frame_hz (...,). Band-limited interpolation
+    with one set of points per trial, of relative error eps; samples from beyond the record wrap. A
+    squint of 1.6 degrees moves a target at 1000 km by 400 m. Differentiable.
     """
     n = image.shape[-1]
-    sin = radar.sin_squint(per_trial(frame_hz, 2, image), per_trial(radar.velocity_m_s if velocity_m_s is None else velocity_m_s, 2, image))
+    sin = radar.sin_squint(
+        per_trial(frame_hz, 2, image), per_trial(radar.velocity_m_s if velocity_m_s is None else velocity_m_s, 2, image)
+    )
     cosine = torch.sqrt(1 - sin.square())
-    # column k shows r = near + k dr, which lies at the slant range r / cos; 1 / cos - 1 is formed without a difference of near ones
+    # column k shows r = near + k dr, which lies at the slant range r / cos; 1 / cos - 1 is formed
+    # without a difference of near ones
     excess = sin.square() / (cosine * (1 + cosine))
     column = torch.arange(n, dtype=torch.float64, device=image.device)
     source = column + (radar.near_range_m / radar.range_step_m + column) * excess
@@ -32,9 +45,11 @@ def closest_range(image: Tensor, radar: StripmapRadar, frame_hz: Tensor | float,
 
 
 class ClosestRange(Stage):
-    """Turn the range axis of a focused image into the range of closest approach (zero-Doppler range); azimuth stays the beam crossing.
+    """Turn the range axis of a focused image into the range of closest approach (zero-Doppler
+    range); azimuth stays the beam crossing.
 
-    frame: the radar's nominal pointing where it is known, else the centroid `doppler_hz` that the image was focused with.
+    frame: the radar's nominal pointing where it is known, else the centroid `doppler_hz` that the
+    image was focused with.
     """
 
     works_on = ("azimuth", "range")
@@ -48,15 +63,20 @@ class ClosestRange(Stage):
         pointing = self.radar.pointing_doppler_hz
         frame = pointing if pointing is not None else doppler_hz
         if frame is None:
-            raise ValueError("ClosestRange needs the doppler_hz that the image was focused with; connect it: use(ClosestRange(radar), doppler_hz='doppler')")
+            raise ValueError(
+                "ClosestRange needs the doppler_hz that the image was focused with; connect it: "
+                "use(ClosestRange(radar), doppler_hz='doppler')"
+            )
         return signal.with_data(closest_range(signal.data, self.radar, frame, velocity_m_s, self.eps))
 
 
 class PaddedLines(Stage):
-    """Focus with empty lines behind the record, so that apertures cut by its ends do not wrap round into the other end.
+    """Focus with empty lines behind the record, so that apertures cut by its ends do not wrap round
+    into the other end.
 
-    lines: how many; None adds one aperture, the time in which a target sweeps one PRF (or the nominal dwell). The image keeps the record's
-    lines. Costs the share of added lines in time and memory.
+    lines: how many; None adds one aperture, the time in which a target sweeps one PRF (or the
+    nominal dwell). The image keeps the record's lines. Costs the share of added lines in time and
+    memory.
     """
 
     def __init__(self, focuser: Focuser, lines: int | None = None) -> None:

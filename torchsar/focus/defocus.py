@@ -1,7 +1,8 @@
 """The way back from an image to lines: bulk + refocus omega-K as an invertible operator.
 
-Every filter of `omega_k` but the range reference has unit modulus, so that with an all-pass reference the operator is unitary: its
-inverse is its adjoint, the conjugate filters in reverse order. Repairs that model the scene stand on this.
+Every filter of `omega_k` but the range reference has unit modulus, so that with an all-pass
+reference the operator is unitary: its inverse is its adjoint, the conjugate filters in reverse
+order. Repairs that model the scene stand on this.
 """
 
 from __future__ import annotations
@@ -15,17 +16,21 @@ from torchsar.radar import StripmapRadar
 
 
 def all_pass(reference: Tensor) -> Tensor:
-    """The phase of a range reference spectrum, unit modulus, (range,); 1 where the reference is zero."""
+    """The phase of a range reference spectrum, unit modulus, (range,); 1 where the reference is
+    zero.
+    """
     size = reference.abs()
     return torch.where(size > 0, reference / torch.where(size > 0, size, 1), 1)
 
 
 class InvertibleOmegaK:
-    """Bulk + refocus omega-K with stored filters, forwards and backwards, for one geometry (one per trial). (..., pulse, range).
+    """Bulk + refocus omega-K with stored filters, forwards and backwards, for one geometry (one per
+    trial). (..., pulse, range).
 
-    Exact inverse where |reference| = 1 or reference is None (range-compressed data); otherwise `defocus` is the adjoint of `focus`.
-    The Doppler-range domain between the two halves is public, for models of the azimuth spectrum: focus = from_doppler(to_doppler).
-    Holds one complex number per sample of the lines. Geometry arguments as in `omega_k`; neglects what it neglects.
+    Exact inverse where |reference| = 1 or reference is None (range-compressed data); otherwise
+    `defocus` is the adjoint of `focus`. The Doppler-range domain between the two halves is public,
+    for models of the azimuth spectrum: focus = from_doppler(to_doppler). Holds one complex number
+    per sample of the lines. Geometry arguments as in `omega_k`; neglects what it neglects.
     """
 
     def __init__(
@@ -74,6 +79,10 @@ def defocus_omega_k(
     frame_hz: Tensor | float | None = None,
     reference: Tensor | None = None,
 ) -> Tensor:
-    """Lines whose bulk + refocus image is `image` (adjoint of `omega_k`; exact inverse for an all-pass reference or None)."""
-    operator = InvertibleOmegaK(radar, image, doppler_hz=doppler_hz, velocity_m_s=velocity_m_s, frame_hz=frame_hz, reference=reference)
+    """Lines whose bulk + refocus image is `image` (adjoint of `omega_k`; exact inverse for an
+    all-pass reference or None).
+    """
+    operator = InvertibleOmegaK(
+        radar, image, doppler_hz=doppler_hz, velocity_m_s=velocity_m_s, frame_hz=frame_hz, reference=reference
+    )
     return operator.defocus(image)

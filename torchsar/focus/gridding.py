@@ -1,9 +1,12 @@
-"""A non-uniform FFT along pulses whose points are shared by all range cells: range stays contiguous, and only short tables depend on the points.
+"""A non-uniform FFT along pulses whose points are shared by all range cells: range stays
+contiguous, and only short tables depend on the points.
 
-Spreading, interpolating and the derivative of either in the tap weights are the three partial derivatives of one trilinear form, so that they are
-each other's gradients to any order: sum over m, tap and column of weights[m, tap] * values[m, column] * grid[first[m] + tap, column].
-Each is one bag of weighted rows (`embedding_bag`), which on a CPU core takes a tenth of the time of adding complex rows by index.
-Source: Fessler and Sutton 2003 (gridding), Barnett et al. 2019 (kernel, error against width and oversampling); own code.
+Spreading, interpolating and the derivative of either in the tap weights are the three partial
+derivatives of one trilinear form, so that they are each other's gradients to any order: sum over m,
+tap and column of weights[m, tap] * values[m, column] * grid[first[m] + tap, column]. Each is one
+bag of weighted rows (`embedding_bag`), which on a CPU core takes a tenth of the time of adding
+complex rows by index. Source: Fessler and Sutton 2003 (gridding), Barnett et al. 2019 (kernel,
+error against width and oversampling); own code.
 """
 
 from __future__ import annotations
@@ -23,25 +26,34 @@ _PARTS = ("weights", "values", "grid")
 
 
 def spread_rows(weights: Tensor, values: Tensor, first: Tensor, length: int) -> Tensor:
-    """Add weights[m, tap] * values[m] onto row first[m] + tap of a grid. Real (b, m, tap), (b, m, column), int64 (b, m) -> (b, length, column).
+    """Add weights[m, tap] * values[m] onto row first[m] + tap of a grid.
 
-    Fastest where `first` rises along m. Differentiable any number of times in weights and values, as the other two.
+    Real (b, m, tap), (b, m, column), int64 (b, m) -> (b, length, column).
+
+    Fastest where `first` rises along m. Differentiable any number of times in weights and values,
+    as the other two.
     """
     return _Trilinear.apply("grid", length, first, weights, values)
 
 
 def interpolate_rows(weights: Tensor, grid: Tensor, first: Tensor) -> Tensor:
-    """Adjoint of spread_rows in the values: sum over taps of weights[m, tap] * grid[first[m] + tap], (b, m, column)."""
+    """Adjoint of spread_rows in the values: sum over taps of weights[m, tap] * grid[first[m] +
+    tap], (b, m, column).
+    """
     return _Trilinear.apply("values", 0, first, weights, grid)
 
 
 def correlate_rows(values: Tensor, grid: Tensor, first: Tensor, taps: int) -> Tensor:
-    """Adjoint of spread_rows in the weights: sum over columns of values[m] * grid[first[m] + tap], (b, m, tap)."""
+    """Adjoint of spread_rows in the weights: sum over columns of values[m] * grid[first[m] + tap],
+    (b, m, tap).
+    """
     return _Trilinear.apply("weights", taps, first, values, grid)
 
 
 class _Trilinear(torch.autograd.Function):
-    """One partial derivative of the trilinear form; a and b are the other two parts, in the order of _PARTS. size: taps or grid rows, where wanted."""
+    """One partial derivative of the trilinear form; a and b are the other two parts, in the order
+    of _PARTS. size: taps or grid rows, where wanted.
+    """
 
     @staticmethod
     def forward(wanted: str, size: int, first: Tensor, a: Tensor, b: Tensor) -> Tensor:
@@ -64,7 +76,9 @@ class _Trilinear(torch.autograd.Function):
         return None, None, None, *slopes
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple, wanted: str, size: int, first: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, int]:
+    def vmap(
+        info: Any, in_dims: tuple, wanted: str, size: int, first: Tensor, a: Tensor, b: Tensor
+    ) -> tuple[Tensor, int]:
         joined = [_in_front(x, dim, info.batch_size) for x, dim in zip((first, a, b), in_dims[2:])]
         return _Trilinear.apply(wanted, size, *joined).unflatten(0, (info.batch_size, -1)), 0
 
@@ -90,24 +104,33 @@ def _rows(first: Tensor, taps: int, length: int) -> Tensor:
 
 def _interpolate(weights: Tensor, grid: Tensor, first: Tensor) -> Tensor:
     rows = _rows(first, weights.shape[-1], grid.shape[-2])
-    return embedding_bag(rows, grid.flatten(0, 1), mode="sum", per_sample_weights=weights.flatten(0, 1)).unflatten(0, first.shape)
+    return embedding_bag(rows, grid.flatten(0, 1), mode="sum", per_sample_weights=weights.flatten(0, 1)).unflatten(
+        0, first.shape
+    )
 
 
 def _correlate(values: Tensor, grid: Tensor, first: Tensor, taps: int) -> Tensor:
-    """The derivative of the bags in their weights: torch has it as one operation, gathering all taps of all rows first takes four times as long."""
+    """The derivative of the bags in their weights: torch has it as one operation, gathering all
+    taps of all rows first takes four times as long.
+    """
     count = first.numel()
     starts = torch.arange(0, count * taps, taps, device=first.device)
     bag = torch.arange(count, device=first.device).repeat_interleave(taps)
     rows = _rows(first, taps, grid.shape[-2]).flatten()
-    slopes = torch.ops.aten._embedding_bag_per_sample_weights_backward(values.flatten(0, 1), grid.flatten(0, 1), rows, starts, bag, 0)
+    slopes = torch.ops.aten._embedding_bag_per_sample_weights_backward(
+        values.flatten(0, 1), grid.flatten(0, 1), rows, starts, bag, 0
+    )
     return slopes.view(*first.shape, taps)
 
 
 def _spread(weights: Tensor, values: Tensor, first: Tensor, length: int) -> Tensor:
-    """Every grid row gathers the values that reach it: the entries of a row follow one another in `source`, from `starts` on."""
+    """Every grid row gathers the values that reach it: the entries of a row follow one another in
+    `source`, from `starts` on.
+    """
     b, m, taps = weights.shape
     rank, start = _ranks(first), _rows(first, 1, length).flatten()
-    below = torch.bincount(start, minlength=b * length).cumsum(0)  # how many points start at or before a row
+    # how many points start at or before a row
+    below = torch.bincount(start, minlength=b * length).cumsum(0)
     before = torch.cat([below.new_zeros(taps), below[:-taps]])
     entries = below - before
     starts = entries.cumsum(0) - entries
@@ -116,7 +139,9 @@ def _spread(weights: Tensor, values: Tensor, first: Tensor, length: int) -> Tens
     point = torch.arange(b * m, device=first.device).repeat_interleave(taps)
     source = torch.empty_like(point).scatter_(0, place, point)
     ordered = torch.empty_like(weights).flatten().scatter_(0, place, weights.flatten())
-    return embedding_bag(source, values.flatten(0, 1), starts, mode="sum", per_sample_weights=ordered).unflatten(0, (b, length))
+    return embedding_bag(source, values.flatten(0, 1), starts, mode="sum", per_sample_weights=ordered).unflatten(
+        0, (b, length)
+    )
 
 
 def _ranks(first: Tensor) -> Tensor:
@@ -131,7 +156,9 @@ def _ranks(first: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class PulsePoints:
-    """Where pulses lie on the grid: index of the first row, int64 (..., m), tap weights (..., m, tap), and the number of rows that they reach."""
+    """Where pulses lie on the grid: index of the first row, int64 (..., m), tap weights (..., m,
+    tap), and the number of rows that they reach.
+    """
 
     first: Tensor
     weights: Tensor
@@ -139,24 +166,37 @@ class PulsePoints:
 
 
 class PulseNufft:
-    """Sums of pulses at points of their own into uniform lines, and the adjoint: for data (..., pulse, range) and points (..., pulse) in cycles a line.
+    """Sums of pulses at points of their own into uniform lines, and the adjoint: for data (...,
+    pulse, range) and points (..., pulse) in cycles a line.
 
-    lines: output lines, of which number `lines // 2` is frequency zero. kernel: width and oversampling, `Kernel.of(eps)` or `Kernel(taps, oversampling)`.
-    Built for one dtype and device; no points are kept. scale: factor on all results of type1 and type2.
+    lines: output lines, of which number `lines // 2` is frequency zero. kernel: width and
+    oversampling, `Kernel.of(eps)` or `Kernel(taps, oversampling)`. Built for one dtype and device;
+    no points are kept. scale: factor on all results of type1 and type2.
     """
 
-    def __init__(self, lines: int, kernel: Kernel, dtype: torch.dtype, device: torch.device | str | None = None, scale: float = 1.0) -> None:
+    def __init__(
+        self,
+        lines: int,
+        kernel: Kernel,
+        dtype: torch.dtype,
+        device: torch.device | str | None = None,
+        scale: float = 1.0,
+    ) -> None:
         self.lines, self.kernel, self.dtype = lines, kernel, dtype
         self.length = smooth_length(max(math.ceil(kernel.oversampling * lines), 2 * kernel.taps))
         line = torch.arange(lines, dtype=torch.float64, device=device) - lines // 2
-        # taps start at the row of their point, half a width late; so a point on a row has its taps about the middle of the kernel at any width
+        # taps start at the row of their point, half a width late; so a point on a row has its taps
+        # about the middle of the kernel at any width
         late = (kernel.taps - 1) / 2 / self.length
         self._factor = torch.polar(scale / kernel.spectrum(line / self.length), -2 * math.pi * late * line).to(dtype)
 
     def points(self, cycles_per_line: Tensor) -> PulsePoints:
-        """Prepare points, float64 (..., m), any real numbers (periodic in 1). Differentiable. Raises TypeError unless float64.
+        """Prepare points, float64 (..., m), any real numbers (periodic in 1). Differentiable.
 
-        A trial with points that are not finite transforms into NaN, its neighbours do not: searches try any warp.
+        Raises TypeError unless float64.
+
+        A trial with points that are not finite transforms into NaN, its neighbours do not: searches
+        try any warp.
         """
         if cycles_per_line.dtype != torch.float64:
             raise TypeError(f"points of a non-uniform FFT are float64 cycles, got {cycles_per_line.dtype}")
@@ -167,22 +207,32 @@ class PulseNufft:
         return PulsePoints(first.to(torch.int64), weights.movedim(0, -1), self._reach(first))
 
     def _reach(self, first: Tensor) -> int:
-        """Rows that the taps reach, so that what lies behind is never handled; all of them inside vmap, where a value cannot be looked at."""
+        """Rows that the taps reach, so that what lies behind is never handled; all of them inside
+        vmap, where a value cannot be looked at.
+        """
         try:
             return int(first.max()) + self.kernel.taps
         except RuntimeError:
             return self.length + self.kernel.taps + 1
 
     def type1(self, y: Tensor, points: PulsePoints) -> Tensor:
-        """sum_m y[m] exp(+2j pi p[m] (q - lines // 2)), q = 0..lines - 1. y: (..., m, range) -> (..., lines, range). Differentiable in y and points."""
+        """sum_m y[m] exp(+2j pi p[m] (q - lines // 2)), q = 0..lines - 1.
+
+        y: (..., m, range) -> (..., lines, range). Differentiable in y and points.
+        """
         trials = torch.broadcast_shapes(y.shape[:-2], points.first.shape[:-1])
         first, weights = _joined(points.first, trials, 1), _joined(points.weights, trials, 2)
-        grid = spread_rows(weights, _joined(torch.view_as_real(y.resolve_conj()).flatten(-2), trials, 2), first, points.rows)
+        grid = spread_rows(
+            weights, _joined(torch.view_as_real(y.resolve_conj()).flatten(-2), trials, 2), first, points.rows
+        )
         image = _Lines.apply(torch.view_as_complex(grid.unflatten(-1, (-1, 2))), self._factor, self.length, 0)
         return image.view(*trials, *image.shape[-2:])
 
     def type2(self, x: Tensor, points: PulsePoints) -> Tensor:
-        """Adjoint of type1: sum_q x[q] exp(-2j pi p[m] (q - lines // 2)). x: (..., lines, range) -> (..., m, range)."""
+        """Adjoint of type1: sum_q x[q] exp(-2j pi p[m] (q - lines // 2)).
+
+        x: (..., lines, range) -> (..., m, range).
+        """
         trials = torch.broadcast_shapes(x.shape[:-2], points.first.shape[:-1])
         first, weights = _joined(points.first, trials, 1), _joined(points.weights, trials, 2)
         grid = _Lines.apply(_joined(x, trials, 2), self._factor, self.length, points.rows)
@@ -196,9 +246,11 @@ def _joined(x: Tensor, trials: torch.Size, trailing: int) -> Tensor:
 
 
 class _Lines(torch.autograd.Function):
-    """Grid rows to lines, (b, row, range) -> (b, line, range): inverse FFT along rows, crop, factor; with rows > 0 its adjoint, onto so many rows.
+    """Grid rows to lines, (b, row, range) -> (b, line, range): inverse FFT along rows, crop,
+    factor; with rows > 0 its adjoint, onto so many rows.
 
-    Works on blocks of columns that stay in the cache and lie along memory while they are transformed. Lines come back with range strided.
+    Works on blocks of columns that stay in the cache and lie along memory while they are
+    transformed. Lines come back with range strided.
     """
 
     @staticmethod
@@ -217,11 +269,15 @@ class _Lines(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple, x: Tensor, factor: Tensor, length: int, rows: int) -> tuple[Tensor, int]:
-        return _Lines.apply(_in_front(x, in_dims[0], info.batch_size), factor, length, rows).unflatten(0, (info.batch_size, -1)), 0
+        return _Lines.apply(_in_front(x, in_dims[0], info.batch_size), factor, length, rows).unflatten(
+            0, (info.batch_size, -1)
+        ), 0
 
 
 def _blocks(x: Tensor, length: int) -> list[tuple[slice, slice]]:
-    """Parts (trial, column) of x (b, n, column) whose transforms stay in the cache: trials where several fit, else columns of one."""
+    """Parts (trial, column) of x (b, n, column) whose transforms stay in the cache: trials where
+    several fit, else columns of one.
+    """
     b, _, columns = x.shape
     room = max(8, 4 * block_bytes_of(x.device) // (length * x.element_size()))
     if columns <= room:

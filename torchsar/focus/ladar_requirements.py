@@ -1,6 +1,8 @@
-"""What a triangular ladar allows and what its scene requires: limits of its estimators, and the phase that each simplification neglects.
+"""What a triangular ladar allows and what its scene requires: limits of its estimators, and the
+phase that each simplification neglects.
 
-Both are predicted from the radar and from bounds of the motion before anything runs. Brief 000, sections 7 (limits) and 10 (fidelity).
+Both are predicted from the radar and from bounds of the motion before anything runs. Brief 000,
+sections 7 (limits) and 10 (fidelity).
 """
 
 from __future__ import annotations
@@ -18,7 +20,9 @@ Verdict = Literal["ok", "warn", "refuse"]
 
 @dataclass(frozen=True)
 class Limit:
-    """One limit: a value that the scene has, the limit of the method, both in `unit`; what happens beyond it and what helps."""
+    """One limit: a value that the scene has, the limit of the method, both in `unit`; what happens
+    beyond it and what helps.
+    """
 
     name: str
     value: float
@@ -41,7 +45,10 @@ class Limit:
     def sentence(self) -> str:
         """One sentence with the figures, what follows and what to do."""
         relation = "at least" if self.at_least else "below"
-        figures = f"{self.name} is {f'{self.value:.4g} {self.unit}'.strip()}, and must be {relation} {f'{self.limit:.4g} {self.unit}'.strip()}"
+        figures = (
+            f"{self.name} is {f'{self.value:.4g} {self.unit}'.strip()}, and must be {relation} "
+            f"{f'{self.limit:.4g} {self.unit}'.strip()}"
+        )
         return figures if self.ok else f"{figures}: {self.consequence}; {self.remedy}"
 
 
@@ -57,18 +64,34 @@ def ladar_limits(
     spacing_m: float | None = None,
     lit_share: float = 1.0,
 ) -> tuple[Limit, ...]:
-    """Limits of section 7 of brief 000 for motion within the given bounds; rows that need a figure not given (snr_db, spacing_m) are absent.
+    """Limits of section 7 of brief 000 for motion within the given bounds; rows that need a figure
+    not given (snr_db, spacing_m) are absent.
 
-    ranges_m: least and largest relative range RD of scatterers; speed, acceleration, jerk: largest absolute radial values. snr_db: of a sample before
-    compression. azimuth_extent_m: of the scatterers. spacing_m: least distance in range of scatterers of one gate. lit_share: share of periods
-    in which a reference scatterer is lit. Raises ValueError for what is no finite number, and for ranges out of order.
+    ranges_m: least and largest relative range RD of scatterers; speed, acceleration, jerk: largest
+    absolute radial values. snr_db: of a sample before compression. azimuth_extent_m: of the
+    scatterers. spacing_m: least distance in range of scatterers of one gate. lit_share: share of
+    periods in which a reference scatterer is lit. Raises ValueError for what is no finite number,
+    and for ranges out of order.
     """
     near, far = ranges_m
     _refuse_odd({"ranges_m[0]": near, "ranges_m[1]": far}, least=-math.inf)
-    _refuse_odd({"n_period": n_period, "speed_m_s": speed_m_s, "acceleration_m_s2": acceleration_m_s2, "jerk_m_s3": jerk_m_s3, "azimuth_extent_m": azimuth_extent_m, "lit_share": lit_share})
+    _refuse_odd(
+        {
+            "n_period": n_period,
+            "speed_m_s": speed_m_s,
+            "acceleration_m_s2": acceleration_m_s2,
+            "jerk_m_s3": jerk_m_s3,
+            "azimuth_extent_m": azimuth_extent_m,
+            "lit_share": lit_share,
+        }
+    )
     if near > far:
         raise ValueError(f"ranges_m must be (least, largest) relative range, got {ranges_m}")
-    rows = (*_band_limits(radar, near, far, speed_m_s), *_motion_limits(radar, acceleration_m_s2, jerk_m_s3, snr_db), *_scene_limits(radar, azimuth_extent_m, spacing_m, lit_share))
+    rows = (
+        *_band_limits(radar, near, far, speed_m_s),
+        *_motion_limits(radar, acceleration_m_s2, jerk_m_s3, snr_db),
+        *_scene_limits(radar, azimuth_extent_m, spacing_m, lit_share),
+    )
     return rows if snr_db is None else rows + _noise_limits(radar, n_period, snr_db)
 
 
@@ -77,14 +100,38 @@ def _band_limits(radar: TriangularLadar, near: float, far: float, speed: float) 
     half, per_hz = radar.sample_rate_hz / 2, radar.wavelength_m / 2
     high = radar.beat_hz(max(abs(near), abs(far)))
     rows = [
-        Limit("speed in the beat band", speed, per_hz * (half - high), "m/s", "refuse", "beats beyond half the sampling rate alias", "raise the sampling rate or bring the reference range nearer"),
-        Limit("speed of the mirror tone", speed, per_hz * half / 2, "m/s", "refuse", "the tone 2 fd of the mirror product aliases", "demodulate by a coarse velocity first"),
+        Limit(
+            "speed in the beat band",
+            speed,
+            per_hz * (half - high),
+            "m/s",
+            "refuse",
+            "beats beyond half the sampling rate alias",
+            "raise the sampling rate or bring the reference range nearer",
+        ),
+        Limit(
+            "speed of the mirror tone",
+            speed,
+            per_hz * half / 2,
+            "m/s",
+            "refuse",
+            "the tone 2 fd of the mirror product aliases",
+            "demodulate by a coarse velocity first",
+        ),
     ]
     if radar.detection == "real":
         low = radar.beat_hz(min(abs(near), abs(far))) if near * far > 0 else 0.0
         rows.insert(
             1,
-            Limit("speed with real detection", speed, per_hz * low, "m/s", "refuse", "a beat folds at zero, and its sign is lost", "move the reference away from the scene or detect both quadratures"),
+            Limit(
+                "speed with real detection",
+                speed,
+                per_hz * low,
+                "m/s",
+                "refuse",
+                "a beat folds at zero, and its sign is lost",
+                "move the reference away from the scene or detect both quadratures",
+            ),
         )
     return tuple(rows)
 
@@ -103,18 +150,53 @@ def _motion_limits(radar: TriangularLadar, acceleration: float, jerk: float, snr
             "take the integer from each period by itself",
         ),
         Limit(
-            "velocity bias by jerk", bias, allowed, "m/s", "warn", "vibration inside a period biases every velocity", "shorten the period: the bandwidth of the motion must stay well under its inverse"
+            "velocity bias by jerk",
+            bias,
+            allowed,
+            "m/s",
+            "warn",
+            "vibration inside a period biases every velocity",
+            "shorten the period: the bandwidth of the motion must stay well under its inverse",
         ),
-        Limit("acceleration within a sweep", acceleration, wavelength / (2 * sweep**2), "m/s^2", "warn", "the beat smears over a range cell", "add a quadratic term or shorten the sweep"),
+        Limit(
+            "acceleration within a sweep",
+            acceleration,
+            wavelength / (2 * sweep**2),
+            "m/s^2",
+            "warn",
+            "the beat smears over a range cell",
+            "add a quadratic term or shorten the sweep",
+        ),
     )
 
 
 def _scene_limits(radar: TriangularLadar, extent: float, spacing: float | None, lit_share: float) -> tuple[Limit, ...]:
-    rows = [Limit("share of periods with a lit reference", lit_share, 1.0, "", "warn", "velocity is undefined in the others", "mark those as not estimated", at_least=True)]
+    rows = [
+        Limit(
+            "share of periods with a lit reference",
+            lit_share,
+            1.0,
+            "",
+            "warn",
+            "velocity is undefined in the others",
+            "mark those as not estimated",
+            at_least=True,
+        )
+    ]
     if radar.beam_rad is not None:
         cell = radar.wavelength_m / (2 * radar.beam_rad)
         drift = "the mean azimuth of lit scatterers drifts as they enter and leave the beam, and passes for motion"
-        rows.append(Limit("azimuth extent in a narrow beam", extent, cell, "m", "warn", drift, "combine scatterers by gradients, or polish the phase"))
+        rows.append(
+            Limit(
+                "azimuth extent in a narrow beam",
+                extent,
+                cell,
+                "m",
+                "warn",
+                drift,
+                "combine scatterers by gradients, or polish the phase",
+            )
+        )
     if spacing is not None:
         cell = radar.wave_speed_m_s / radar.bandwidth_hz
         rows.append(
@@ -134,7 +216,14 @@ def _scene_limits(radar: TriangularLadar, extent: float, spacing: float | None, 
 
 def _noise_limits(radar: TriangularLadar, n_period: int, snr_db: float) -> tuple[Limit, ...]:
     compressed = snr_db + 10 * math.log10(radar.sweep_samples)
-    drift = 4 * math.pi / radar.wavelength_m * _segmented_std_m_s(radar, snr_db) * radar.pulse_step_s * math.sqrt(n_period / 15)
+    drift = (
+        4
+        * math.pi
+        / radar.wavelength_m
+        * _segmented_std_m_s(radar, snr_db)
+        * radar.pulse_step_s
+        * math.sqrt(n_period / 15)
+    )
     return (
         Limit(
             "SNR after compression",
@@ -146,7 +235,15 @@ def _noise_limits(radar: TriangularLadar, n_period: int, snr_db: float) -> tuple
             "take the integer from each period by itself, or gate and average",
             at_least=True,
         ),
-        Limit("accumulated phase error", drift, DRIFT_RAD, "rad", "warn", "integrated velocity errors defocus the image", "polish the phase after compensation"),
+        Limit(
+            "accumulated phase error",
+            drift,
+            DRIFT_RAD,
+            "rad",
+            "warn",
+            "integrated velocity errors defocus the image",
+            "polish the phase after compensation",
+        ),
     )
 
 
@@ -165,13 +262,22 @@ def ladar_requirements(
     displacement_m: float | None = None,
     tolerance_rad: float = PHASE_RAD,
 ) -> tuple[Requirement, ...]:
-    """Table of simplifications of the echo and of the compensation, with the phase [rad] that each neglects at worst (brief 000, section 10).
+    """Table of simplifications of the echo and of the compensation, with the phase [rad] that each
+    neglects at worst (brief 000, section 10).
 
-    ranges_m: least and largest relative range. speed, acceleration: largest absolute radial values. displacement_m: of the range over the record, by
-    default speed times its length. Flight time and carrier are judged by what they leave after the whole record.
+    ranges_m: least and largest relative range. speed, acceleration: largest absolute radial values.
+    displacement_m: of the range over the record, by default speed times its length. Flight time and
+    carrier are judged by what they leave after the whole record.
     """
     near, far = ranges_m
-    _refuse_odd({"n_period": n_period, "speed_m_s": speed_m_s, "acceleration_m_s2": acceleration_m_s2, "tolerance_rad": tolerance_rad})
+    _refuse_odd(
+        {
+            "n_period": n_period,
+            "speed_m_s": speed_m_s,
+            "acceleration_m_s2": acceleration_m_s2,
+            "tolerance_rad": tolerance_rad,
+        }
+    )
     record_s = n_period * radar.pulse_step_s
     travel = speed_m_s * record_s if displacement_m is None else displacement_m
     per_m, c, sweep, cell = 4 * math.pi / radar.wavelength_m, radar.wave_speed_m_s, radar.sweep_s, radar.range_step_m
@@ -182,22 +288,69 @@ def ladar_requirements(
     band = 2 * math.pi * radar.bandwidth_hz * travel / c
     still = "form the range at every sample, or with a Doppler linear in the sweep"
 
-    def row(effect: str, neglects: str, phase_rad: float, range_cells: float, remedy: str, tolerance: float = tolerance_rad) -> Requirement:
+    def row(
+        effect: str, neglects: str, phase_rad: float, range_cells: float, remedy: str, tolerance: float = tolerance_rad
+    ) -> Requirement:
         return Requirement(effect, neglects, phase_rad, range_cells, tolerance, remedy)
 
     return (
-        row("Doppler linear in the sweep", "acceleration and envelope motion inside a sweep", bend, math.nan, "form the range at every sample"),
-        row("one range per sweep", "Doppler inside a sweep: velocity is invisible", per_m * speed_m_s * sweep / 2, speed_m_s / radar.wavelength_m * 2 * sweep, still),
-        row("one range per period", "Doppler inside a period, phase between up and down", per_m * speed_m_s * sweep, speed_m_s / radar.wavelength_m * 2 * sweep, still),
-        row("no residual video phase", "2 pi K (dtau1^2 - dtau2^2) between up and down over the gate", video, math.nan, "keep it in the echo and filter it out"),
-        row("parabola for hyperbola", "fourth order of the range history", _hyperbola_rad(radar, record_s), math.nan, "keep the hyperbola"),
-        row("flight time ignored", "reflection at t - tau / 2 over the record (a constant acceleration)", per_m * late * record_s / 2, math.nan, "shift the time axis of the motion by tau / 2"),
-        row("carrier for f(u) in compensation", "envelope motion over the record", band, travel / cell, "compensate every sample with f(u)", math.pi * CARRIER_CELLS),
+        row(
+            "Doppler linear in the sweep",
+            "acceleration and envelope motion inside a sweep",
+            bend,
+            math.nan,
+            "form the range at every sample",
+        ),
+        row(
+            "one range per sweep",
+            "Doppler inside a sweep: velocity is invisible",
+            per_m * speed_m_s * sweep / 2,
+            speed_m_s / radar.wavelength_m * 2 * sweep,
+            still,
+        ),
+        row(
+            "one range per period",
+            "Doppler inside a period, phase between up and down",
+            per_m * speed_m_s * sweep,
+            speed_m_s / radar.wavelength_m * 2 * sweep,
+            still,
+        ),
+        row(
+            "no residual video phase",
+            "2 pi K (dtau1^2 - dtau2^2) between up and down over the gate",
+            video,
+            math.nan,
+            "keep it in the echo and filter it out",
+        ),
+        row(
+            "parabola for hyperbola",
+            "fourth order of the range history",
+            _hyperbola_rad(radar, record_s),
+            math.nan,
+            "keep the hyperbola",
+        ),
+        row(
+            "flight time ignored",
+            "reflection at t - tau / 2 over the record (a constant acceleration)",
+            per_m * late * record_s / 2,
+            math.nan,
+            "shift the time axis of the motion by tau / 2",
+        ),
+        row(
+            "carrier for f(u) in compensation",
+            "envelope motion over the record",
+            band,
+            travel / cell,
+            "compensate every sample with f(u)",
+            math.pi * CARRIER_CELLS,
+        ),
     )
 
 
 def _hyperbola_rad(radar: TriangularLadar, record_s: float) -> float:
-    """pi X^4 / (2 lambda R^3) at the ends of the way in the beam, or of the record where that is shorter."""
+    """pi X^4 / (2 lambda R^3) at the ends of the way in the beam, or of the record where that is
+    shorter.
+    """
     reach = radar.speed_m_s * record_s / 2
     if radar.beam_rad is not None:
         reach = min(reach, radar.reference_range_m * radar.beam_rad / 2)
@@ -207,4 +360,6 @@ def _hyperbola_rad(radar: TriangularLadar, record_s: float) -> float:
 def _refuse_odd(numbers: dict[str, float], least: float = 0.0) -> None:
     for name, value in numbers.items():
         if not (math.isfinite(value) and value >= least):
-            raise ValueError(f"{name} must be a finite number{'' if least == -math.inf else ' of 0 or more'}, got {value}")
+            raise ValueError(
+                f"{name} must be a finite number{'' if least == -math.inf else ' of 0 or more'}, got {value}"
+            )

@@ -1,9 +1,12 @@
-"""Polar format by gridding: the image of plane waves as one two-dimensional non-uniform FFT, and its exact adjoint.
+"""Polar format by gridding: the image of plane waves as one two-dimensional non-uniform FFT, and
+its exact adjoint.
 
-image(x, y) = sum_k sum_f s_k(f) exp(+4j pi f / c (u_k . (x, y) + offset_k)), which is backprojection with `FarField` ranges. The samples lie on a
-polar raster of wave vectors 2 f / c u_k; a Kaiser-Bessel kernel spreads them onto a twice oversampled rectangular grid, an FFT makes
-the image, a division removes the kernel. Where the spreading goes is worked out once, as a sparse matrix.
-Source: Fessler and Sutton 2003 (gridding); Carrara, Goodman and Majewski 1995, ch. 3 (polar format); own code.
+image(x, y) = sum_k sum_f s_k(f) exp(+4j pi f / c (u_k . (x, y) + offset_k)), which is
+backprojection with `FarField` ranges. The samples lie on a polar raster of wave vectors 2 f / c
+u_k; a Kaiser-Bessel kernel spreads them onto a twice oversampled rectangular grid, an FFT makes the
+image, a division removes the kernel. Where the spreading goes is worked out once, as a sparse
+matrix. Source: Fessler and Sutton 2003 (gridding); Carrara, Goodman and Majewski 1995, ch. 3 (polar
+format); own code.
 """
 
 from __future__ import annotations
@@ -24,7 +27,10 @@ from torchsar.radar.spotlight import FarField, Spotlight, frequency_samples, ran
 
 @dataclass(frozen=True, eq=False)
 class SparseRows:
-    """A real sparse matrix of `size` by compressed rows. Plain tensors, so that it can be copied and pickled, which sparse ones cannot."""
+    """A real sparse matrix of `size` by compressed rows.
+
+    Plain tensors, so that it can be copied and pickled, which sparse ones cannot.
+    """
 
     starts: Tensor
     columns: Tensor
@@ -54,7 +60,9 @@ class SparsePair:
         starts = torch.cat([row.new_zeros(1), torch.bincount(row.reshape(-1), minlength=rows).cumsum(0)])
         every = entries * torch.arange(columns + 1, device=row.device)
         matrix = SparseRows(starts.to(kind), (order // entries).to(kind), weight.reshape(-1)[order], (rows, columns))
-        return SparsePair(matrix, SparseRows(every.to(kind), row.reshape(-1).to(kind), weight.reshape(-1), (columns, rows)))
+        return SparsePair(
+            matrix, SparseRows(every.to(kind), row.reshape(-1).to(kind), weight.reshape(-1), (columns, rows))
+        )
 
     def flipped(self) -> SparsePair:
         return SparsePair(self.transpose, self.matrix)
@@ -65,7 +73,9 @@ class SparsePair:
 
 
 class _Apply(torch.autograd.Function):
-    """A sparse matrix on complex vectors: real and imaginary parts of all trials are the columns of one product."""
+    """A sparse matrix on complex vectors: real and imaginary parts of all trials are the columns of
+    one product.
+    """
 
     @staticmethod
     def forward(x: Tensor, pair: SparsePair) -> Tensor:
@@ -93,7 +103,9 @@ class _Apply(torch.autograd.Function):
 
 
 class _GridAxis:
-    """One image axis: where wave numbers lie on its oversampled grid, and the crop and division that undo the oversampling."""
+    """One image axis: where wave numbers lie on its oversampled grid, and the crop and division
+    that undo the oversampling.
+    """
 
     def __init__(self, axis: Axis, kernel: Kernel, dtype: torch.dtype, device: torch.device) -> None:
         self.n, self.kernel, self.step_m, self.dtype = axis.n, kernel, axis.step, dtype
@@ -116,16 +128,22 @@ class _GridAxis:
         """Adjoint of crop."""
         half, shape = self.n // 2, list(image.shape)
         shape[dim] = self.length - self.n
-        return torch.cat([image.narrow(dim, half, self.n - half), image.new_zeros(shape), image.narrow(dim, 0, half)], dim)
+        return torch.cat(
+            [image.narrow(dim, half, self.n - half), image.new_zeros(shape), image.narrow(dim, 0, half)], dim
+        )
 
 
 class PolarOperator:
-    """The linear map from range profiles (..., pulse, range) to an image (..., azimuth, range), and its exact adjoint.
+    """The linear map from range profiles (..., pulse, range) to an image (..., azimuth, range), and
+    its exact adjoint.
 
-    geometry: plane waves; the image's range axis is the first ground direction (x), its azimuth axis the second (y): turn the geometry
-    (`FarField.turned`) for other directions. azimuth, range_: axes in metres. window: "none" or "hann", over pulses and over frequencies. eps:
-    relative error against the direct sum. Built for one dtype and device (that of the geometry) and one geometry, shared by all trials;
-    building takes under a second and 20 bytes x kernel taps^2 a sample (complex64). A unit point gives the sum of the window weights. Differentiable in its argument.
+    geometry: plane waves; the image's range axis is the first ground direction (x), its azimuth
+    axis the second (y): turn the geometry (`FarField.turned`) for other directions. azimuth,
+    range_: axes in metres. window: "none" or "hann", over pulses and over frequencies. eps:
+    relative error against the direct sum. Built for one dtype and device (that of the geometry) and
+    one geometry, shared by all trials; building takes under a second and 20 bytes x kernel taps^2 a
+    sample (complex64). A unit point gives the sum of the window weights. Differentiable in its
+    argument.
     """
 
     def __init__(
@@ -143,7 +161,9 @@ class PolarOperator:
         self._y, self._x = (_GridAxis(axis, Kernel.of(eps), real, device) for axis in (azimuth, range_))
         wave_number = 2 / geometry.wave_speed_m_s * geometry.frequency_hz  # cycles a metre
         self._spread = self._layout(geometry.direction[:, :, None] * wave_number)
-        centre = geometry.direction @ geometry.direction.new_tensor([self._x.centre_m, self._y.centre_m]) + geometry.offset_m
+        centre = (
+            geometry.direction @ geometry.direction.new_tensor([self._x.centre_m, self._y.centre_m]) + geometry.offset_m
+        )
         self._factor = aperture_weights(window, geometry).to(real) * unit_phasor(centre[:, None] * wave_number, dtype)
         self._unkernel = self._y.weight[:, None] * self._x.weight
 
@@ -152,7 +172,9 @@ class PolarOperator:
         column, across = self._x.taps(cycles_m[:, 0].reshape(-1))
         row, down = self._y.taps(cycles_m[:, 1].reshape(-1))
         cell = row[:, :, None] * self._x.length + column[:, None, :]
-        return SparsePair.of_columns(cell.flatten(1), (down[:, :, None] * across[:, None, :]).flatten(1), self._y.length * self._x.length)
+        return SparsePair.of_columns(
+            cell.flatten(1), (down[:, :, None] * across[:, None, :]).flatten(1), self._y.length * self._x.length
+        )
 
     def image(self, profiles: Tensor) -> Tensor:
         """Profiles (..., pulse, range) to the image (..., azimuth, range)."""
@@ -167,10 +189,15 @@ class PolarOperator:
         return self._x.crop(torch.fft.ifft(columns, norm="forward"), -1) * self._unkernel
 
     def adjoint(self, image: Tensor) -> Tensor:
-        """Image (..., azimuth, range) to profiles (..., pulse, range): <image(p), i> = <p, adjoint(i)> with <a, b> = sum a conj(b)."""
+        """Image (..., azimuth, range) to profiles (..., pulse, range): <image(p), i> = <p,
+        adjoint(i)> with <a, b> = sum a conj(b).
+        """
         self._refuse_other_dtype(image)
         if tuple(image.shape[-2:]) != (self.azimuth.n, self.range.n):
-            raise ValueError(f"image of shape {tuple(image.shape)} does not end in the (azimuth, range) = ({self.azimuth.n}, {self.range.n}) of the operator")
+            raise ValueError(
+                f"image of shape {tuple(image.shape)} does not end in the (azimuth, range) = "
+                f"({self.azimuth.n}, {self.range.n}) of the operator"
+            )
         return self._by_trials(self._adjoint, image)
 
     def _adjoint(self, image: Tensor) -> Tensor:
@@ -188,13 +215,18 @@ class PolarOperator:
 
     def _refuse_other_dtype(self, x: Tensor) -> None:
         if x.dtype != self.dtype:
-            raise TypeError(f"this polar operator was built for {self.dtype}, got {x.dtype}; build it with dtype={x.dtype}")
+            raise TypeError(
+                f"this polar operator was built for {self.dtype}, got {x.dtype}; build it with dtype={x.dtype}"
+            )
 
 
 class PolarFormat(GroundImager):
-    """Image the ground plane by polar format. Arguments as `GroundImager`; neglects the curvature of the wavefront (`plane_wave_loss`).
+    """Image the ground plane by polar format.
 
-    The operator of the last geometry is kept: `operator(profiles, geometry)` gives it to autofocus loops.
+    Arguments as `GroundImager`; neglects the curvature of the wavefront (`plane_wave_loss`).
+
+    The operator of the last geometry is kept: `operator(profiles, geometry)` gives it to autofocus
+    loops.
     """
 
     _kept: tuple[list[Tensor], PolarOperator] | None = None
@@ -205,7 +237,10 @@ class PolarFormat(GroundImager):
         key = [waves.frequency_hz, waves.direction, waves.offset_m]
         kept = self._kept
         if kept is None or kept[1].dtype != profiles.dtype or not _same(kept[0], key):
-            kept = self._kept = (key, PolarOperator(waves, *self.grid.axes(), window=self.window, eps=self.eps, dtype=profiles.dtype))
+            kept = self._kept = (
+                key,
+                PolarOperator(waves, *self.grid.axes(), window=self.window, eps=self.eps, dtype=profiles.dtype),
+            )
         return kept[1]
 
     def form(self, profiles: Tensor, geometry: FarField | Spotlight, azimuth: Axis, range_: Axis) -> Tensor:

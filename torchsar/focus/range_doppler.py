@@ -12,9 +12,11 @@ from torchsar.radar import StripmapRadar
 
 
 def migration(at: FrameGeometry) -> Tensor:
-    """Relative range migration of each Doppler row, cos(squint of the frame) / cos(squint of the row) - 1, float64 (..., d).
+    """Relative range migration of each Doppler row, cos(squint of the frame) / cos(squint of the
+    row) - 1, float64 (..., d).
 
-    A target at slant range R appears at R (1 + migration): the slope of the wavenumber mapping at the carrier. Formed as a difference.
+    A target at slant range R appears at R (1 + migration): the slope of the wavenumber mapping at
+    the carrier. Formed as a difference.
     """
     velocity, frame = at.velocity_m_s[..., None], at.frame_hz[..., None]
     sin, sin_frame = (at.radar.wavelength_m * f / (2 * velocity) for f in (at.doppler_hz, frame))
@@ -33,11 +35,14 @@ def range_doppler(
     band_hz: float | None = None,
     eps: float = 2e-4,
 ) -> Tensor:
-    """Range-Doppler algorithm: azimuth FFT, migration taken out by interpolation, hyperbolic azimuth phase per range, inverse FFT.
+    """Range-Doppler algorithm: azimuth FFT, migration taken out by interpolation, hyperbolic
+    azimuth phase per range, inverse FFT.
 
-    raw, result: (..., pulse, range) complex; arguments, coordinates and phases as `omega_k`. Exact for the whole swath in migration and
-    azimuth phase; neglects the coupling of range and azimuth beyond the carrier (no secondary range compression), which broadens wide
-    bands, long apertures and squinted beams: `focus.requirements` says by how much. eps: relative error of the interpolation.
+    raw, result: (..., pulse, range) complex; arguments, coordinates and phases as `omega_k`. Exact
+    for the whole swath in migration and azimuth phase; neglects the coupling of range and azimuth
+    beyond the carrier (no secondary range compression), which broadens wide bands, long apertures
+    and squinted beams: `focus.requirements` says by how much. eps: relative error of the
+    interpolation.
     """
     geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz, band_hz=band_hz)
     n, centre, real = raw.shape[-1], raw.shape[-1] // 2, real_dtype(raw.dtype)
@@ -50,7 +55,8 @@ def range_doppler(
     def focus_rows(rows: Tensor, part: slice) -> Tensor:
         at = geometry.rows(part)
         spectrum = rows if reference is None else rows * reference.to(rows.dtype)
-        # cell i of the image lies at cell i + range_cells * migration of the row; exp(+2j pi k q / n) asks for points of the other sign
+        # cell i of the image lies at cell i + range_cells * migration of the row; exp(+2j pi k q /
+        # n) asks for points of the other sign
         start = migration(at) * centre_cells
         shift = start[..., None] + migration(at)[..., None] * (range_cells - centre_cells)
         points = Points.of(plan.kernel, -per_sample * cell, plan.length, real, (-per_sample * shift).to(real))

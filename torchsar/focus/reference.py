@@ -10,16 +10,20 @@ from torchsar.radar import LinearFM, StripmapRadar
 
 
 def matched_reference(pulse: LinearFM, n: int, sampling_hz: float, device: torch.device | str | None = None) -> Tensor:
-    """Conjugate pulse spectrum in FFT order, complex128 (n,), scaled so that a unit echo compresses to a unit peak."""
+    """Conjugate pulse spectrum in FFT order, complex128 (n,), scaled so that a unit echo compresses
+    to a unit peak.
+    """
     spectrum = pulse.spectrum(n, sampling_hz, device)
     return spectrum.conj() * (n / spectrum.abs().square().sum())
 
 
 def flat_reference(pulse: LinearFM, n: int, sampling_hz: float, device: torch.device | str | None = None) -> Tensor:
-    """Inverse pulse spectrum inside the pulse bandwidth and zero outside, complex128 (n,): an exactly rectangular band.
+    """Inverse pulse spectrum inside the pulse bandwidth and zero outside, complex128 (n,): an
+    exactly rectangular band.
 
-    The response is a pure sinc (PSLR -13.26 dB) where the matched one carries the Fresnel ripple of a short pulse; noise outside the
-    band is removed. Costs 0.1 to 0.3 dB of signal-to-noise ratio at usual time-bandwidth products.
+    The response is a pure sinc (PSLR -13.26 dB) where the matched one carries the Fresnel ripple of
+    a short pulse; noise outside the band is removed. Costs 0.1 to 0.3 dB of signal-to-noise ratio
+    at usual time-bandwidth products.
     """
     spectrum = pulse.spectrum(n, sampling_hz, device)
     frequency = torch.fft.fftfreq(n, 1 / sampling_hz, dtype=torch.float64, device=device)
@@ -29,9 +33,11 @@ def flat_reference(pulse: LinearFM, n: int, sampling_hz: float, device: torch.de
 
 
 def phase_reference(pulse: LinearFM, n: int, sampling_hz: float, device: torch.device | str | None = None) -> Tensor:
-    """Conjugate phase of the pulse spectrum, modulus constant over the whole sampled band, complex128 (n,), unit peak for a unit echo.
+    """Conjugate phase of the pulse spectrum, modulus constant over the whole sampled band,
+    complex128 (n,), unit peak for a unit echo.
 
-    Keeps what little signal there is beyond the nominal band edges: a few percent sharper than matched where the noise allows it.
+    Keeps what little signal there is beyond the nominal band edges: a few percent sharper than
+    matched where the noise allows it.
     """
     spectrum = pulse.spectrum(n, sampling_hz, device)
     size = spectrum.abs().clamp_min(torch.finfo(torch.float64).tiny)
@@ -42,14 +48,20 @@ REFERENCES = {"matched": matched_reference, "flat": flat_reference, "phase": pha
 
 
 def range_compress(raw: Tensor, reference: Tensor) -> Tensor:
-    """Circular convolution along the last dim. raw: (..., pulse, range); reference: spectrum in FFT order, (range,) or (..., 1, range)."""
+    """Circular convolution along the last dim.
+
+    raw: (..., pulse, range); reference: spectrum in FFT order, (range,) or (..., 1, range).
+    """
     return torch.fft.ifft(torch.fft.fft(raw) * reference.to(raw.dtype))
 
 
 class RangeCompress(Stage):
-    """Range compression with the transmitted pulse (brief 004, item 6). reference: "matched", "flat" or "phase".
+    """Range compression with the transmitted pulse (brief 004, item 6).
 
-    Samples closer to the end of a line than one pulse length are compressed with the part of the echo that was recorded.
+    reference: "matched", "flat" or "phase".
+
+    Samples closer to the end of a line than one pulse length are compressed with the part of the
+    echo that was recorded.
     """
 
     def __init__(self, radar: StripmapRadar, reference: str = "matched") -> None:

@@ -1,6 +1,8 @@
-"""What an unevenly turning target allows and requires: limits of estimating its rotation, and the phase that each simplification neglects.
+"""What an unevenly turning target allows and requires: limits of estimating its rotation, and the
+phase that each simplification neglects.
 
-Both are predicted from radar, rotation and scatterers before anything runs. Brief 003, sections "Limits" and "What a scene needs".
+Both are predicted from radar, rotation and scatterers before anything runs. Brief 003, sections
+"Limits" and "What a scene needs".
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from torchsar.focus.requirements import Requirement
 from torchsar.radar import InverseRadar
 
 VISIBLE, RATE_BOUND_PERCENT, OFF_LINE, WALK_CELLS, DOPPLER = 1.0, 5.0, 0.05, 0.2, 0.95
-_PEAK_SNR = 20.0  # power of a focused scatterer over the noise of a line, of which the noise alone passes one in 5e8
+# power of a focused scatterer over the noise of a line, of which the noise alone passes one in 5e8
+_PEAK_SNR = 20.0
 _POINTS = 513
 _ORDERS = 4
 
@@ -37,27 +40,56 @@ def rotation_limits(
 ) -> tuple[Limit, ...]:
     """Limits of estimating and imaging a target that turns by omega_rad_s (t + k1 t^2 / 2! + ...).
 
-    cross_range_m, lever_m, amplitude: (target,), places of the scatterers, lever_m from the rotation centre (y + yc), and amplitudes of range-compressed samples;
-    noise_std: of the complex noise of a sample. rate_bound: Cramer-Rao bound of omega_rad_s (rad/s), see `metrics.rotation_bounds`; its row is absent where it is None.
-    Raises ValueError for places that do not fit together, or numbers that are not finite and positive where they must be.
+    cross_range_m, lever_m, amplitude: (target,), places of the scatterers, lever_m from the
+    rotation centre (y + yc), and amplitudes of range-compressed samples; noise_std: of the complex
+    noise of a sample. rate_bound: Cramer-Rao bound of omega_rad_s (rad/s), see
+    `metrics.rotation_bounds`; its row is absent where it is None. Raises ValueError for places that
+    do not fit together, or numbers that are not finite and positive where they must be.
     """
     _refuse(omega_rad_s, k, cross_range_m, lever_m, amplitude)
     warp_k, duration = torch.tensor(list(k), dtype=torch.float64), n_pulse / radar.prf_hz
     fastest = float(_rates(warp_k, duration).max())
     doppler = 4 * omega_rad_s * fastest * float(cross_range_m.abs().max()) / (radar.wavelength_m * radar.prf_hz)
     rows = (
-        Limit("pulses", n_pulse, MIN_PULSES, "", "refuse", "nothing can be told from fewer", "record more", at_least=True),
-        Limit("least rotation rate over the first", float(least_rate(warp_k, duration)), 1e-6, "", "refuse", "two times share an angle, and no image forms", "record fewer pulses", at_least=True),
-        Limit("Doppler over half the pulse rate", doppler, DOPPLER, "", _beyond(doppler), "the edges of the target alias", "raise the pulse rate, or take a narrower target"),
+        Limit(
+            "pulses", n_pulse, MIN_PULSES, "", "refuse", "nothing can be told from fewer", "record more", at_least=True
+        ),
+        Limit(
+            "least rotation rate over the first",
+            float(least_rate(warp_k, duration)),
+            1e-6,
+            "",
+            "refuse",
+            "two times share an angle, and no image forms",
+            "record fewer pulses",
+            at_least=True,
+        ),
+        Limit(
+            "Doppler over half the pulse rate",
+            doppler,
+            DOPPLER,
+            "",
+            _beyond(doppler),
+            "the edges of the target alias",
+            "raise the pulse rate, or take a narrower target",
+        ),
     )
-    return (*rows, *_scene_limits(radar, omega_rad_s * float(_whole(warp_k, duration)), cross_range_m, lever_m, amplitude, noise_std, n_pulse), *_bound_limit(omega_rad_s, rate_bound))
+    return (
+        *rows,
+        *_scene_limits(
+            radar, omega_rad_s * float(_whole(warp_k, duration)), cross_range_m, lever_m, amplitude, noise_std, n_pulse
+        ),
+        *_bound_limit(omega_rad_s, rate_bound),
+    )
 
 
 def _beyond(doppler: float) -> Verdict:
     return "refuse" if doppler > 1 else "warn"
 
 
-def _scene_limits(radar: InverseRadar, angle: float, x: Tensor, lever: Tensor, amplitude: Tensor, noise_std: float, n_pulse: int) -> tuple[Limit, ...]:
+def _scene_limits(
+    radar: InverseRadar, angle: float, x: Tensor, lever: Tensor, amplitude: Tensor, noise_std: float, n_pulse: int
+) -> tuple[Limit, ...]:
     """What the scatterers themselves allow."""
     power = amplitude.abs().square()
     cell = radar.wavelength_m / (2 * angle)
@@ -67,9 +99,36 @@ def _scene_limits(radar: InverseRadar, angle: float, x: Tensor, lever: Tensor, a
     alike = "range term and k1 look alike: the rate cannot be estimated"
     nothing: Verdict = "refuse" if not bool((lever.abs() > 0).any()) else "warn"
     return (
-        Limit("scatterers above the noise", above, 3, "", "refuse", "a rotation cannot be told from fewer", "raise the SNR or the number of pulses", at_least=True),
-        Limit("range term, pi lambda sigma_y / ra^2", visible, VISIBLE, "rad", nothing, no_rate, "lengthen the aperture", at_least=True),
-        Limit("scatterers off a line through the centre", _off_line(x, lever, power), OFF_LINE, "", "warn", alike, "scale by a rate from elsewhere", at_least=True),
+        Limit(
+            "scatterers above the noise",
+            above,
+            3,
+            "",
+            "refuse",
+            "a rotation cannot be told from fewer",
+            "raise the SNR or the number of pulses",
+            at_least=True,
+        ),
+        Limit(
+            "range term, pi lambda sigma_y / ra^2",
+            visible,
+            VISIBLE,
+            "rad",
+            nothing,
+            no_rate,
+            "lengthen the aperture",
+            at_least=True,
+        ),
+        Limit(
+            "scatterers off a line through the centre",
+            _off_line(x, lever, power),
+            OFF_LINE,
+            "",
+            "warn",
+            alike,
+            "scale by a rate from elsewhere",
+            at_least=True,
+        ),
     )
 
 
@@ -77,7 +136,17 @@ def _bound_limit(omega: float, bound: float | None) -> tuple[Limit, ...]:
     if bound is None:
         return ()
     consequence = "no estimator can scale the image well, while k1 and k2 still focus it"
-    return (Limit("Cramer-Rao bound of the rate", 100 * bound / omega, RATE_BOUND_PERCENT, "%", "warn", consequence, "raise the SNR or lengthen the aperture"),)
+    return (
+        Limit(
+            "Cramer-Rao bound of the rate",
+            100 * bound / omega,
+            RATE_BOUND_PERCENT,
+            "%",
+            "warn",
+            consequence,
+            "raise the SNR or lengthen the aperture",
+        ),
+    )
 
 
 def _weighted_rms(x: Tensor, weight: Tensor) -> Tensor:
@@ -85,7 +154,9 @@ def _weighted_rms(x: Tensor, weight: Tensor) -> Tensor:
 
 
 def _off_line(x: Tensor, y: Tensor, weight: Tensor) -> float:
-    """Share (0..1) of the ranges that no line y = s x through the centre explains, rms; 0 for a single scatterer."""
+    """Share (0..1) of the ranges that no line y = s x through the centre explains, rms; 0 for a
+    single scatterer.
+    """
     if int((weight > 0).sum()) < 2:
         return 0.0
     xx, yy, xy = ((a * b * weight).sum() for a, b in ((x, x), (y, y), (x, y)))
@@ -95,12 +166,21 @@ def _off_line(x: Tensor, y: Tensor, weight: Tensor) -> float:
 
 
 def rotation_requirements(
-    radar: InverseRadar, n_pulse: int, omega_rad_s: float, k: Sequence[float], cross_range_m: float, lever_m: float, tolerance_rad: float = math.pi / 4
+    radar: InverseRadar,
+    n_pulse: int,
+    omega_rad_s: float,
+    k: Sequence[float],
+    cross_range_m: float,
+    lever_m: float,
+    tolerance_rad: float = math.pi / 4,
 ) -> tuple[Requirement, ...]:
-    """Phase (rad) that each simplification neglects at worst, for scatterers out to cross_range_m and lever_m (m, from the rotation centre), against tolerance_rad.
+    """Phase (rad) that each simplification neglects at worst, for scatterers out to cross_range_m
+    and lever_m (m, from the rotation centre), against tolerance_rad.
 
-    Orders of the warp: the Legendre terms left out, which no lower order takes up. Azimuth only: the range term beyond a line in the warp, pi/4 at the depth of focus
-    2 ra^2 / lambda. Fixed envelopes: migration at the ends of the band, allowed to 0.2 range cells, where a peak loses 0.2 dB.
+    Orders of the warp: the Legendre terms left out, which no lower order takes up. Azimuth only:
+    the range term beyond a line in the warp, pi/4 at the depth of focus 2 ra^2 / lambda. Fixed
+    envelopes: migration at the ends of the band, allowed to 0.2 range cells, where a peak loses 0.2
+    dB.
     """
     warp_k, duration = torch.tensor(list(k), dtype=torch.float64), n_pulse / radar.prf_hz
     c4 = 4 * math.pi / radar.wavelength_m
@@ -109,29 +189,73 @@ def rotation_requirements(
     small = c4 * (cross_range_m * angle**3 / 6 + lever_m * angle**4 / 24)
     single = c4 * (radar.reference_range_m + lever_m) * 2.0**-24
     orders = [
-        Requirement(f"warp of order {order}", _ORDER_NEGLECTS[order], c4 * cross_range_m * omega_rad_s * left, math.nan, tolerance_rad, f"use order {order + 1} or more")
+        Requirement(
+            f"warp of order {order}",
+            _ORDER_NEGLECTS[order],
+            c4 * cross_range_m * omega_rad_s * left,
+            math.nan,
+            tolerance_rad,
+            f"use order {order + 1} or more",
+        )
         for order, left in enumerate(_legendre_left(warp_k, duration), start=1)
     ]
     return (
         *orders,
-        Requirement("azimuth only", "the range term, (c4/2) y omega^2 phi^2", c4 / 8 * lever_m * angle**2, math.nan, tolerance_rad, "take the range term out (range_phase)"),
-        Requirement("fixed envelopes (phase_only)", "migration through range cells", math.pi * walk, walk, math.pi * WALK_CELLS, "use the fidelity dechirped"),
-        Requirement("small angles", "sin theta - theta, cos theta - 1 + theta^2 / 2", small, math.nan, tolerance_rad, "use sine and cosine"),
-        Requirement("range in float32", "rounding of absolute ranges", single, math.nan, tolerance_rad, "form phases in float64 turns (always done here)"),
+        Requirement(
+            "azimuth only",
+            "the range term, (c4/2) y omega^2 phi^2",
+            c4 / 8 * lever_m * angle**2,
+            math.nan,
+            tolerance_rad,
+            "take the range term out (range_phase)",
+        ),
+        Requirement(
+            "fixed envelopes (phase_only)",
+            "migration through range cells",
+            math.pi * walk,
+            walk,
+            math.pi * WALK_CELLS,
+            "use the fidelity dechirped",
+        ),
+        Requirement(
+            "small angles",
+            "sin theta - theta, cos theta - 1 + theta^2 / 2",
+            small,
+            math.nan,
+            tolerance_rad,
+            "use sine and cosine",
+        ),
+        Requirement(
+            "range in float32",
+            "rounding of absolute ranges",
+            single,
+            math.nan,
+            tolerance_rad,
+            "form phases in float64 turns (always done here)",
+        ),
     )
 
 
-_ORDER_NEGLECTS = {1: "acceleration (range-Doppler)", 2: "jerk and all beyond", 3: "the fourth power of time and all beyond", 4: "the fifth power of time and all beyond"}
+_ORDER_NEGLECTS = {
+    1: "acceleration (range-Doppler)",
+    2: "jerk and all beyond",
+    3: "the fourth power of time and all beyond",
+    4: "the fifth power of time and all beyond",
+}
 
 
 def least_order(rows: Sequence[Requirement]) -> int:
-    """The least order of the warp that a table of `rotation_requirements` allows, one more than its last where none does."""
+    """The least order of the warp that a table of `rotation_requirements` allows, one more than its
+    last where none does.
+    """
     orders = [row for row in rows if row.effect.startswith("warp of order")]
     return next((i for i, row in enumerate(orders, start=1) if row.ok), len(orders) + 1)
 
 
 def _legendre_left(k: Tensor, duration_s: float) -> list[float]:
-    """Largest size (s) over the aperture of the Legendre terms of the warp beyond order 1, 2, 3, 4."""
+    """Largest size (s) over the aperture of the Legendre terms of the warp beyond order 1,
+    2, 3, 4.
+    """
     s = np.linspace(-1, 1, _POINTS)
     values = warp(torch.from_numpy((s + 1) * duration_s / 2), k).numpy()
     degree = max(_ORDERS + 1, k.shape[-1] + 1)
@@ -157,4 +281,7 @@ def _refuse(omega: float, k: Sequence[float], x: Tensor, lever: Tensor, amplitud
     if not (math.isfinite(omega) and omega > 0) or not all(math.isfinite(one) for one in k):
         raise ValueError(f"a rotation needs a positive rate and finite k, got omega_rad_s={omega} and k={list(k)}")
     if not x.shape == lever.shape == amplitude.shape or x.ndim != 1 or not len(x):
-        raise ValueError(f"cross_range_m, lever_m and amplitude are (target,) alike, got the shapes {tuple(x.shape)}, {tuple(lever.shape)} and {tuple(amplitude.shape)}")
+        raise ValueError(
+            "cross_range_m, lever_m and amplitude are (target,) alike, got the shapes "
+            f"{tuple(x.shape)}, {tuple(lever.shape)} and {tuple(amplitude.shape)}"
+        )

@@ -1,4 +1,6 @@
-"""Backprojection of spotlight and turntable recordings: exact at every point, the yardstick of polar format."""
+"""Backprojection of spotlight and turntable recordings: exact at every point, the yardstick of
+polar format.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ from torchsar.radar.spotlight import FarField, Spotlight, frequency_samples, fre
 
 
 def window_weights(name: str, n: int, device: torch.device | str | None = None) -> Tensor:
-    """Weights over an aperture or a band, float64 (n,): "none" is all ones, "hann" a raised cosine whose zeros lie just outside, so that all count."""
+    """Weights over an aperture or a band, float64 (n,): "none" is all ones, "hann" a raised cosine
+    whose zeros lie just outside, so that all count.
+    """
     if name not in ("none", "hann"):
         raise ValueError(f"window {name!r} is not known; choose 'none' or 'hann'")
     if name == "none":
@@ -30,11 +34,16 @@ def aperture_weights(window: str, geometry: FarField | Spotlight) -> Tensor:
 
 
 def refuse_other_size(profiles: Tensor, geometry: FarField | Spotlight) -> None:
-    """Raise where profiles (..., pulse, range) are not complex or of another size than the geometry describes."""
+    """Raise where profiles (..., pulse, range) are not complex or of another size than the geometry
+    describes.
+    """
     real_dtype(profiles.dtype)
     expected = (geometry.pulses, geometry.frequency_hz.shape[0])
     if tuple(profiles.shape[-2:]) != expected:
-        raise ValueError(f"profiles of shape {tuple(profiles.shape)} do not end in the (pulse, frequency) = {expected} of the geometry; crop both alike")
+        raise ValueError(
+            f"profiles of shape {tuple(profiles.shape)} do not end in the (pulse, frequency) = "
+            f"{expected} of the geometry; crop both alike"
+        )
 
 
 def backproject_spotlight(
@@ -47,16 +56,22 @@ def backproject_spotlight(
     eps: float = 1e-10,
     block_bytes: int = 1 << 23,
 ) -> Tensor:
-    """Sum over pulses and frequencies of s_k(f) exp(+4j pi f r_k / c), r_k the range of the pixel in pulse k. Complex (..., *pixels).
+    """Sum over pulses and frequencies of s_k(f) exp(+4j pi f r_k / c), r_k the range of the pixel
+    in pulse k. Complex (..., *pixels).
 
-    profiles: (..., pulse, range) as `read_inverse` gives them, whose frequency samples are s. geometry: `Spotlight` for exact ranges,
-    `FarField` for plane waves. x_m, y_m: float64 ground coordinates that broadcast to `pixels`. A point of unit amplitude gives the sum of the
-    window weights (their number without a window) with its own phase. Between range samples the profile comes from a non-uniform FFT of
-    relative error eps. Profiles are periodic in range: what lies c / (2 frequency step) farther appears in the same place. Costs pulses x
-    pixels x 40 operations. Differentiable in profiles, pixel and antenna positions; blocks of pulses take about block_bytes an array.
+    profiles: (..., pulse, range) as `read_inverse` gives them, whose frequency samples are s.
+    geometry: `Spotlight` for exact ranges, `FarField` for plane waves. x_m, y_m: float64 ground
+    coordinates that broadcast to `pixels`. A point of unit amplitude gives the sum of the window
+    weights (their number without a window) with its own phase. Between range samples the profile
+    comes from a non-uniform FFT of relative error eps. Profiles are periodic in range: what lies c
+    / (2 frequency step) farther appears in the same place. Costs pulses x pixels x 40 operations.
+    Differentiable in profiles, pixel and antenna positions; blocks of pulses take about block_bytes
+    an array.
     """
     refuse_other_size(profiles, geometry)
-    x, y = torch.broadcast_tensors(*(torch.as_tensor(v, dtype=torch.float64, device=profiles.device) for v in (x_m, y_m)))
+    x, y = torch.broadcast_tensors(
+        *(torch.as_tensor(v, dtype=torch.float64, device=profiles.device) for v in (x_m, y_m))
+    )
     shape, x, y = x.shape, x.reshape(-1), y.reshape(-1)
     if not x.numel():
         raise ValueError(f"backprojection needs at least one pixel, got coordinates of shape {tuple(shape)}")
@@ -66,7 +81,10 @@ def backproject_spotlight(
     # each of the about 20 working arrays of a block takes up to 16 bytes a pulse and pixel
     pixels_at_once = min(x.numel(), 4096)
     height = max(1, min(samples.shape[-2], block_bytes // (16 * trials * max(pixels_at_once, 2 * samples.shape[-1]))))
-    sums = [samples.new_zeros((*samples.shape[:-2], pixels.stop - pixels.start)) for pixels in _slices(x.numel(), pixels_at_once)]
+    sums = [
+        samples.new_zeros((*samples.shape[:-2], pixels.stop - pixels.start))
+        for pixels in _slices(x.numel(), pixels_at_once)
+    ]
     for pulses in _slices(samples.shape[-2], height):
         grid = between.grid(samples[..., pulses, :])
         for i, pixels in enumerate(_slices(x.numel(), pixels_at_once)):
@@ -91,9 +109,17 @@ class _BetweenSamples:
         return self.plan.grid(samples)
 
     def at(self, grid: Tensor, range_m: Tensor) -> Tensor:
-        """sum_f s(f) exp(+4j pi f r / c). grid: (..., pulse, length), range_m: float64 (pulse, pixel). Returns (..., pulse, pixel)."""
+        """sum_f s(f) exp(+4j pi f r / c).
+
+        grid: (..., pulse, length), range_m: float64 (pulse, pixel). Returns (..., pulse, pixel).
+        """
         # exp(+2j pi k q) asks for points of the other sign
-        points = Points.of(self.plan.kernel, -range_m * (self.step_cycles_m * self.plan.length), self.plan.length, real_dtype(grid.dtype))
+        points = Points.of(
+            self.plan.kernel,
+            -range_m * (self.step_cycles_m * self.plan.length),
+            self.plan.length,
+            real_dtype(grid.dtype),
+        )
         return interpolate(grid, points) * unit_phasor(self.carrier_cycles_m * range_m, grid.dtype)
 
 
@@ -101,8 +127,9 @@ class _BetweenSamples:
 class GroundGrid:
     """A square of the ground plane: extent_m wide, sampled every step_m, about centre_m = (x, y).
 
-    range_axis_rad: direction of the image's range axis, from x towards y; the azimuth axis lies a quarter turn further. At 0 the range axis is
-    x and the azimuth axis y. Centre and axes are in the turned coordinates.
+    range_axis_rad: direction of the image's range axis, from x towards y; the azimuth axis lies a
+    quarter turn further. At 0 the range axis is x and the azimuth axis y. Centre and axes are in
+    the turned coordinates.
     """
 
     extent_m: float
@@ -113,7 +140,9 @@ class GroundGrid:
     def __post_init__(self) -> None:
         numbers = (self.extent_m, self.step_m, *self.centre_m, self.range_axis_rad)
         if not (all(map(math.isfinite, numbers)) and len(self.centre_m) == 2 and 0 < self.step_m <= self.extent_m):
-            raise ValueError(f"a ground grid needs 0 < step_m <= extent_m, a centre (x, y) and a finite direction, got {self}")
+            raise ValueError(
+                f"a ground grid needs 0 < step_m <= extent_m, a centre (x, y) and a finite direction, got {self}"
+            )
 
     def axes(self) -> tuple[Axis, Axis]:
         """("azimuth", "range") axes in metres; the centre is sample n // 2."""
@@ -123,12 +152,15 @@ class GroundGrid:
 
 
 class GroundImager(Stage):
-    """Base of the stages that turn range profiles into an image of the ground plane, with the axes ("azimuth", "range").
+    """Base of the stages that turn range profiles into an image of the ground plane, with the axes
+    ("azimuth", "range").
 
-    extent_m, step_m, centre_m, range_axis_rad: see `GroundGrid`. height_m: z of the imaged plane. window: "none" or "hann", over pulses and over
-    frequencies. eps: relative error of the interpolation. geometry: where it is known beforehand; otherwise connect recorded side data:
-    `use(PolarFormat(100.0, 0.25), frequency_hz="aux.frequency_hz", position_m="aux.position_m", reference_m="aux.reference_m")`, or
-    frequency_hz and angle_rad for a turntable. One geometry serves all trials.
+    extent_m, step_m, centre_m, range_axis_rad: see `GroundGrid`. height_m: z of the imaged plane.
+    window: "none" or "hann", over pulses and over frequencies. eps: relative error of the
+    interpolation. geometry: where it is known beforehand; otherwise connect recorded side data:
+    `use(PolarFormat(100.0, 0.25), frequency_hz="aux.frequency_hz", position_m="aux.position_m",
+    reference_m="aux.reference_m")`, or frequency_hz and angle_rad for a turntable. One geometry
+    serves all trials.
     """
 
     def __init__(
@@ -144,7 +176,9 @@ class GroundImager(Stage):
     ) -> None:
         super().__init__()
         window_weights(window, 1)
-        self.grid = GroundGrid(float(extent_m), float(step_m), (float(centre_m[0]), float(centre_m[1])), float(range_axis_rad))
+        self.grid = GroundGrid(
+            float(extent_m), float(step_m), (float(centre_m[0]), float(centre_m[1])), float(range_axis_rad)
+        )
         self.height_m, self.window, self.eps, self.geometry = height_m, window, eps, geometry
 
     def form(self, profiles: Tensor, geometry: FarField | Spotlight, azimuth: Axis, range_: Axis) -> Tensor:
@@ -168,7 +202,10 @@ class GroundImager(Stage):
 
 
 class SpotlightBackprojection(GroundImager):
-    """Image the ground plane by backprojection with exact ranges. Arguments as `GroundImager`; the exact reference for `PolarFormat`."""
+    """Image the ground plane by backprojection with exact ranges.
+
+    Arguments as `GroundImager`; the exact reference for `PolarFormat`.
+    """
 
     def form(self, profiles: Tensor, geometry: FarField | Spotlight, azimuth: Axis, range_: Axis) -> Tensor:
         y, x = azimuth.values(profiles.device), range_.values(profiles.device)

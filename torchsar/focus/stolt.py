@@ -7,24 +7,45 @@ from torch import Tensor
 
 from torchsar.core import real_dtype
 from torchsar.focus.nufft import Nufft, Points
-from torchsar.focus.omega_k import Focuser, FrameGeometry, FrequencyBasis, bulk_filter, refocus, refocus_turns_per_sample, residual_frequency, through_doppler
+from torchsar.focus.omega_k import (
+    Focuser,
+    FrameGeometry,
+    FrequencyBasis,
+    bulk_filter,
+    refocus,
+    refocus_turns_per_sample,
+    residual_frequency,
+    through_doppler,
+)
 from torchsar.radar import StripmapRadar
 
 
 class StoltMap:
-    """Residual Stolt mapping of rows that the bulk filter has passed: the change of migration and of range focus over the swath.
+    """Residual Stolt mapping of rows that the bulk filter has passed: the change of migration and
+    of range focus over the swath.
 
-    After bulk filter and refocus only f(G(0) + h) - h is left of the mapping, a fraction of a frequency bin in most scenes; the spectrum
-    is evaluated there by a non-uniform FFT with points of its own in every Doppler row, so that it holds for large ones as well.
+    After bulk filter and refocus only f(G(0) + h) - h is left of the mapping, a fraction of a
+    frequency bin in most scenes; the spectrum is evaluated there by a non-uniform FFT with points
+    of its own in every Doppler row, so that it holds for large ones as well.
     """
 
-    def __init__(self, basis: FrequencyBasis, radar: StripmapRadar, n: int, eps: float, dtype: torch.dtype, device: torch.device | None = None) -> None:
+    def __init__(
+        self,
+        basis: FrequencyBasis,
+        radar: StripmapRadar,
+        n: int,
+        eps: float,
+        dtype: torch.dtype,
+        device: torch.device | None = None,
+    ) -> None:
         self.basis, self.plan = basis, Nufft(n, eps, dtype, device)
         self.step_hz = radar.sampling_hz / self.plan.length
         self.start = radar.range_frequency_hz(n, device) / self.step_hz
 
     def __call__(self, lines: Tensor, at: FrameGeometry) -> Tensor:
-        """lines: (..., d, range) azimuth spectra after the bulk filter; returns the same with the mapping applied, refocus still to come."""
+        """lines: (..., d, range) azimuth spectra after the bulk filter; returns the same with the
+        mapping applied, refocus still to come.
+        """
         residual = residual_frequency(at, self.basis.nodes_hz) / self.step_hz
         real = real_dtype(lines.dtype)
         points = Points.of(self.plan.kernel, self.start, self.plan.length, real, self.basis.evaluate(residual, real))
@@ -42,11 +63,14 @@ def omega_k_stolt(
     band_hz: float | None = None,
     eps: float = 2e-4,
 ) -> Tensor:
-    """Omega-K with Stolt interpolation (brief 004, item 7 ii). raw, result: (..., pulse, range) complex.
+    """Omega-K with Stolt interpolation (brief 004, item 7 ii).
 
-    Arguments, coordinates and phases are those of `omega_k`, to which it tends where the swath is narrow; the image of a target is exact
-    at every range. eps: relative error of the interpolation; the default keeps the image within -80 dB, 1e-12 suits complex128 references.
-    Two to three times the time of `omega_k`. Differentiable in raw, velocity and frame.
+    raw, result: (..., pulse, range) complex.
+
+    Arguments, coordinates and phases are those of `omega_k`, to which it tends where the swath is
+    narrow; the image of a target is exact at every range. eps: relative error of the interpolation;
+    the default keeps the image within -80 dB, 1e-12 suits complex128 references. Two to three times
+    the time of `omega_k`. Differentiable in raw, velocity and frame.
     """
     geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz, band_hz=band_hz)
     n, centre = raw.shape[-1], raw.shape[-1] // 2
@@ -63,6 +87,8 @@ def omega_k_stolt(
 
 
 class OmegaKStolt(Focuser):
-    """Focus by omega-K with Stolt interpolation, exact over the whole swath; arguments as `Focuser`."""
+    """Focus by omega-K with Stolt interpolation, exact over the whole swath; arguments as
+    `Focuser`.
+    """
 
     form = staticmethod(omega_k_stolt)

@@ -1,4 +1,6 @@
-"""From dechirped triangular sweeps to a focused image: range compression, azimuth deramp, azimuth matched filter."""
+"""From dechirped triangular sweeps to a focused image: range compression, azimuth deramp, azimuth
+matched filter.
+"""
 
 from __future__ import annotations
 
@@ -16,23 +18,33 @@ _EPOCH = {"up": 0.25, "down": 0.75}
 
 
 def video_filter(frequency_hz: Tensor, radar: TriangularLadar, ramp: Ramp = "up") -> Tensor:
-    """exp(+j pi f^2 / K) for beats of the up sweep, its conjugate for the down sweep, complex128: takes out the residual video phase (paper, Eq. 5, erratum 2)."""
+    """exp(+j pi f^2 / K) for beats of the up sweep, its conjugate for the down sweep, complex128:
+    takes out the residual video phase (paper, Eq. 5, erratum 2).
+    """
     turns = frequency_hz.square() / (2 * radar.chirp_rate_hz_s)
     return unit_phasor(turns if ramp == "up" else -turns, torch.complex128)
 
 
 def compress_sweeps(sweeps: Tensor, radar: TriangularLadar, ramp: Ramp = "up", video: bool = True) -> Tensor:
-    """Range profiles (..., pulse, N) of the up or the down sweeps, relative range rising from -(N // 2) cells.
+    """Range profiles (..., pulse, N) of the up or the down sweeps, relative range rising from -(N
+    // 2) cells.
 
-    sweeps: (..., 2, pulse, N) in the radar's dechirp sign; the result is in the sign of the paper, phase +4 pi RD / lambda. A scatterer of amplitude a has
-    a peak a. video: take out the residual video phase, -pi K dtau^2 of the up sweep; after motion compensation, not before (brief 000, section 3).
-    Spectra refer to the middle of the sweep. Differentiable. Raises TypeError or ValueError for other sweeps.
+    sweeps: (..., 2, pulse, N) in the radar's dechirp sign; the result is in the sign of the paper,
+    phase +4 pi RD / lambda. A scatterer of amplitude a has a peak a. video: take out the residual
+    video phase, -pi K dtau^2 of the up sweep; after motion compensation, not before (brief 000,
+    section 3). Spectra refer to the middle of the sweep. Differentiable. Raises TypeError or
+    ValueError for other sweeps.
     """
     n = radar.sweep_samples
     if not (isinstance(sweeps, Tensor) and sweeps.is_complex()):
-        raise TypeError(f"compress_sweeps works on complex sweeps (..., 2, pulse, {n}), got {getattr(sweeps, 'dtype', type(sweeps).__name__)}")
+        raise TypeError(
+            f"compress_sweeps works on complex sweeps (..., 2, pulse, {n}), got "
+            f"{getattr(sweeps, 'dtype', type(sweeps).__name__)}"
+        )
     if sweeps.ndim < 3 or sweeps.shape[-3] != 2 or sweeps.shape[-2] < 1 or sweeps.shape[-1] != n:
-        raise ValueError(f"compress_sweeps works on sweeps (..., 2, pulse, {n}), up before down, got shape {tuple(sweeps.shape)}")
+        raise ValueError(
+            f"compress_sweeps works on sweeps (..., 2, pulse, {n}), up before down, got shape {tuple(sweeps.shape)}"
+        )
     refuse_non_finite(sweeps, "compress_sweeps")
     if ramp not in _EPOCH:
         raise ValueError(f"ramp must be 'up' or 'down', got {ramp!r}")
@@ -53,60 +65,94 @@ def profile_axes(pulse: Axis, radar: TriangularLadar, ramp: Ramp = "up") -> tupl
     return middle, Axis("range", n, -(n // 2) * radar.range_step_m, radar.range_step_m, "m")
 
 
-def azimuth_turns(pulse: Axis, range_: Axis, radar: TriangularLadar, device: torch.device | str | None = None) -> Tensor:
-    """Turns 2 (sqrt(R^2 + (V t)^2) - R) / lambda of a scatterer at azimuth zero, (pulse, range) float64, R = reference + relative range."""
+def azimuth_turns(
+    pulse: Axis, range_: Axis, radar: TriangularLadar, device: torch.device | str | None = None
+) -> Tensor:
+    """Turns 2 (sqrt(R^2 + (V t)^2) - R) / lambda of a scatterer at azimuth zero, (pulse, range)
+    float64, R = reference + relative range.
+    """
     across = (radar.speed_m_s * pulse.values(device))[:, None].square()
     r = radar.reference_range_m + range_.values(device)
     if bool((r <= 0).any()):
-        raise ValueError(f"the range axis reaches {float(r.min()):.4g} m from the ladar; crop it to ranges in front of the ladar")
+        raise ValueError(
+            f"the range axis reaches {float(r.min()):.4g} m from the ladar; crop it to ranges in front of the ladar"
+        )
     return 2 / radar.wavelength_m * across / (torch.sqrt(r.square() + across) + r)
 
 
 def _refuse_other_profiles(data: Tensor, pulse: Axis, range_: Axis, what: str) -> None:
     """Raise TypeError or ValueError unless data are finite, complex and shaped as their axes."""
     if not (isinstance(data, Tensor) and data.is_complex()):
-        raise TypeError(f"{what} works on complex profiles (..., pulse, range), got {getattr(data, 'dtype', type(data).__name__)}")
+        raise TypeError(
+            f"{what} works on complex profiles (..., pulse, range), got {getattr(data, 'dtype', type(data).__name__)}"
+        )
     if data.ndim < 2 or tuple(data.shape[-2:]) != (pulse.n, range_.n):
-        raise ValueError(f"{what} works on profiles (..., {pulse.n}, {range_.n}) as their axes say, got shape {tuple(data.shape)}")
+        raise ValueError(
+            f"{what} works on profiles (..., {pulse.n}, {range_.n}) as their axes say, got shape {tuple(data.shape)}"
+        )
     refuse_non_finite(data, what)
 
 
 def deramp_azimuth(data: Tensor, radar: TriangularLadar, pulse: Axis, range_: Axis) -> Tensor:
-    """Profiles (..., pulse, range) without the azimuth phase of a scatterer at azimuth zero; one at x keeps a tone of -2 V x / (lambda R) Hz.
+    """Profiles (..., pulse, range) without the azimuth phase of a scatterer at azimuth zero; one at
+    x keeps a tone of -2 V x / (lambda R) Hz.
 
-    pulse: slow time of the samples (middles of the sweeps), zero abeam. What estimators of a phase per pulse need. Differentiable. Raises TypeError or
-    ValueError for data that are not complex, not finite, or do not fit their axes.
+    pulse: slow time of the samples (middles of the sweeps), zero abeam. What estimators of a phase
+    per pulse need. Differentiable. Raises TypeError or ValueError for data that are not complex,
+    not finite, or do not fit their axes.
     """
     _refuse_other_profiles(data, pulse, range_, "deramp_azimuth")
     return data * unit_phasor(-azimuth_turns(pulse, range_, radar, data.device), data.dtype)
 
 
-def azimuth_matched_filter(data: Tensor, radar: TriangularLadar, pulse: Axis, range_: Axis, beam_rad: float | None = None, weighting: float = 0.0) -> Tensor:
-    """Image (..., azimuth, range) of deramped profiles (..., pulse, range): sum over the aperture of s(t) exp(-j 2 pi (V t - x)^2 / (lambda R)) at x = V t.
+def azimuth_matched_filter(
+    data: Tensor,
+    radar: TriangularLadar,
+    pulse: Axis,
+    range_: Axis,
+    beam_rad: float | None = None,
+    weighting: float = 0.0,
+) -> Tensor:
+    """Image (..., azimuth, range) of deramped profiles (..., pulse, range): sum over the aperture
+    of s(t) exp(-j 2 pi (V t - x)^2 / (lambda R)) at x = V t.
 
-    beam_rad: azimuth angle of the aperture, beam_rad * R long about every x, by default the radar's, and the whole record where that is None. A
-    scatterer that is lit all over its aperture keeps its amplitude. weighting: a of the weights 1 - a + a cos(2 pi y / L) over the aperture L, which
-    lower the first side lobes (0: -13.27 dB; 0.03: -13.9 dB and 1 % wider; 0.46: Hamming). Exact phases of every range cell; no wrap-around. Differentiable.
-    Raises ValueError for a target that stands still, or a weighting outside 0..0.5.
+    beam_rad: azimuth angle of the aperture, beam_rad * R long about every x, by default the
+    radar's, and the whole record where that is None. A scatterer that is lit all over its aperture
+    keeps its amplitude. weighting: a of the weights 1 - a + a cos(2 pi y / L) over the aperture L,
+    which lower the first side lobes (0: -13.27 dB; 0.03: -13.9 dB and 1 % wider; 0.46: Hamming).
+    Exact phases of every range cell; no wrap-around. Differentiable. Raises ValueError for a target
+    that stands still, or a weighting outside 0..0.5.
     """
     _refuse_other_profiles(data, pulse, range_, "azimuth_matched_filter")
     if not 0 <= weighting <= 0.5:
         raise ValueError(f"weighting must lie in 0..0.5, got {weighting}")
     if not radar.speed_m_s > 0:
-        raise ValueError("radar.speed_m_s is 0; a target that does not move across the line of sight has no azimuth image")
+        raise ValueError(
+            "radar.speed_m_s is 0; a target that does not move across the line of sight has no azimuth image"
+        )
     n = data.shape[-2]
     half = _half_aperture(radar, pulse, range_, beam_rad)
     turns = azimuth_turns(pulse, range_, radar, data.device)
     lag = torch.arange(-(n - 1), n, device=data.device)
     across = (radar.speed_m_s * pulse.step * lag.to(torch.float64))[:, None].square()
     r = radar.reference_range_m + range_.values(data.device)
-    filter_ = unit_phasor(-2 / radar.wavelength_m * across / (torch.sqrt(r.square() + across) + r), data.dtype) * (lag[:, None].abs() <= half)
+    filter_ = unit_phasor(-2 / radar.wavelength_m * across / (torch.sqrt(r.square() + across) + r), data.dtype) * (
+        lag[:, None].abs() <= half
+    )
     length = 2 ** math.ceil(math.log2(2 * n - 1 + n - 1))
     lit = torch.minimum(2 * half + 1, torch.full_like(half, n))
     # the aperture goes with the pixel, but for that of the whole record, which stays where it is
-    weights, still = (_cosine(lag[:, None] / lit, weighting), 1.0) if int(half.max()) < n else (1.0, _cosine((lag[n - 1 :, None] - (n - 1) / 2) / n, weighting))
-    data, filter_ = (x * w.to(x.real.dtype) if isinstance(w, Tensor) else x for x, w in ((data, still), (filter_, weights)))
-    spectrum = torch.fft.fft(data * unit_phasor(turns, data.dtype), length, dim=-2) * torch.fft.fft(filter_, length, dim=-2)
+    weights, still = (
+        (_cosine(lag[:, None] / lit, weighting), 1.0)
+        if int(half.max()) < n
+        else (1.0, _cosine((lag[n - 1 :, None] - (n - 1) / 2) / n, weighting))
+    )
+    data, filter_ = (
+        x * w.to(x.real.dtype) if isinstance(w, Tensor) else x for x, w in ((data, still), (filter_, weights))
+    )
+    spectrum = torch.fft.fft(data * unit_phasor(turns, data.dtype), length, dim=-2) * torch.fft.fft(
+        filter_, length, dim=-2
+    )
     image = torch.fft.ifft(spectrum, dim=-2)[..., n - 1 : 2 * n - 1, :]
     return image / (lit * (1 - weighting)).to(data.real.dtype)
 
@@ -132,7 +178,13 @@ class CompressSweeps(Stage):
 
     works_on = ("ramp", "pulse", "fast_time")
 
-    def __init__(self, radar: TriangularLadar, ramp: Ramp = "up", video: bool = True, window_m: tuple[float, float] | list[float] | None = None) -> None:
+    def __init__(
+        self,
+        radar: TriangularLadar,
+        ramp: Ramp = "up",
+        video: bool = True,
+        window_m: tuple[float, float] | list[float] | None = None,
+    ) -> None:
         super().__init__()
         if ramp not in _EPOCH:
             raise ValueError(f"ramp must be 'up' or 'down', got {ramp!r}")
@@ -145,10 +197,15 @@ class CompressSweeps(Stage):
         if self.window_m is None:
             return out
         if len(self.window_m) != 2 or not self.window_m[0] < self.window_m[1]:
-            raise ValueError(f"window_m must be two relative ranges (low, high) in metres with low < high, got {list(self.window_m)}")
+            raise ValueError(
+                f"window_m must be two relative ranges (low, high) in metres with low < high, got {list(self.window_m)}"
+            )
         low, high = (round(float(axes[1].index_of(edge))) for edge in self.window_m)
         if not 0 <= low < high < axes[1].n:
-            raise ValueError(f"window_m {tuple(self.window_m)} does not lie in the relative ranges {axes[1].start:.4g}..{axes[1].stop:.4g} m")
+            raise ValueError(
+                f"window_m {tuple(self.window_m)} does not lie in the relative ranges "
+                f"{axes[1].start:.4g}..{axes[1].stop:.4g} m"
+            )
         return out.crop(range=(low, high + 1))
 
 

@@ -1,6 +1,8 @@
-"""Ways to form the sum of a matched Fourier transform over pulses, each with its exact adjoint: gridding, the sum itself, resampling, a compiled library.
+"""Ways to form the sum of a matched Fourier transform over pulses, each with its exact adjoint:
+gridding, the sum itself, resampling, a compiled library.
 
-Source: Greengard and Lee 2004 (non-uniform FFT), see `focus.gridding`; Remote Sens. 2025, 17, 3447, Eq. (9).
+Source: Greengard and Lee 2004 (non-uniform FFT), see `focus.gridding`; Remote Sens. 2025, 17, 3447,
+Eq. (9).
 """
 
 from __future__ import annotations
@@ -26,7 +28,10 @@ def slow_times(n_pulse: int, prf_hz: float, device: torch.device | str | None = 
 
 
 def normalised_warp(k: Tensor, n_pulse: int, prf_hz: float) -> tuple[Tensor, Tensor]:
-    """u = phi(t) / phi(T) and its rate du/d(t/T), 1 for even rotation. k: (..., order - 1). Returns two float64 (..., pulse). Differentiable."""
+    """u = phi(t) / phi(T) and its rate du/d(t/T), 1 for even rotation. k: (..., order - 1).
+
+    Returns two float64 (..., pulse). Differentiable.
+    """
     k = k.to(torch.float64)
     total = whole_warp(k, n_pulse / prf_hz)
     times = slow_times(n_pulse, prf_hz, k.device)
@@ -83,9 +88,14 @@ class Explicit:
 
 
 class Resampled:
-    """Pulses interpolated to times of even angle, then a transform over those: the classical way. Over du, so that a sum over pulses takes 1 / rate."""
+    """Pulses interpolated to times of even angle, then a transform over those: the classical way.
 
-    def __init__(self, k: Tensor, n_pulse: int, prf_hz: float, step: Tensor, lines: int, method: str, scale: float) -> None:
+    Over du, so that a sum over pulses takes 1 / rate.
+    """
+
+    def __init__(
+        self, k: Tensor, n_pulse: int, prf_hz: float, step: Tensor, lines: int, method: str, scale: float
+    ) -> None:
         self.step, self.lines, self.n_pulse = step, lines, n_pulse
         self.interpolate = {"linear": _linear, "spline": _spline}[method]
         time = times_of_even_angle(k, n_pulse, prf_hz)
@@ -106,11 +116,16 @@ class Resampled:
         trials = torch.broadcast_shapes(image.shape[:-2], self.position.shape[:-1])
         with torch.enable_grad():
             pulses = image.new_zeros(*trials, self.n_pulse, image.shape[-1]).requires_grad_()
-            return torch.autograd.grad(self.forward(pulses), pulses, image.expand(*trials, *image.shape[-2:]), create_graph=image.requires_grad)[0]
+            return torch.autograd.grad(
+                self.forward(pulses), pulses, image.expand(*trials, *image.shape[-2:]), create_graph=image.requires_grad
+            )[0]
 
 
 def times_of_even_angle(k: Tensor, n_pulse: int, prf_hz: float) -> Tensor:
-    """Times (s) at which the warp reaches j phi(T) / n_pulse, float64 (..., n_pulse). Differentiable twice: the last two Newton steps carry gradients."""
+    """Times (s) at which the warp reaches j phi(T) / n_pulse, float64 (..., n_pulse).
+
+    Differentiable twice: the last two Newton steps carry gradients.
+    """
     duration = n_pulse / prf_hz
     angle = torch.arange(n_pulse, dtype=torch.float64, device=k.device) / n_pulse * whole_warp(k, duration)
     time = _table_times(angle.detach(), k.detach(), n_pulse, prf_hz)
@@ -129,7 +144,10 @@ def _table_times(angle: Tensor, k: Tensor, n_pulse: int, prf_hz: float) -> Tenso
 
 
 def _linear(pulses: Tensor, position: Tensor) -> Tensor:
-    """Straight lines between pulses. pulses: (..., pulse, range), position in pulses (..., m). Returns (..., m, range); the end pieces go on."""
+    """Straight lines between pulses. pulses: (..., pulse, range), position in pulses (..., m).
+
+    Returns (..., m, range); the end pieces go on.
+    """
     piece, right = _piece(position, pulses)
     return (1 - right) * _pulses_at(pulses, piece) + right * _pulses_at(pulses, piece + 1)
 
@@ -146,7 +164,9 @@ def _spline(pulses: Tensor, position: Tensor) -> Tensor:
 
 
 def _piece(position: Tensor, pulses: Tensor) -> tuple[Tensor, Tensor]:
-    """Index of the pulse before each position, and how far it is behind, (..., m, 1) in the precision of the pulses."""
+    """Index of the pulse before each position, and how far it is behind, (..., m, 1) in the
+    precision of the pulses.
+    """
     piece = torch.floor(position.detach()).clamp(0, pulses.shape[-2] - 2)
     return piece.to(torch.int64), (position - piece).to(pulses.real.dtype)[..., None]
 
@@ -159,7 +179,9 @@ def _pulses_at(pulses: Tensor, index: Tensor) -> Tensor:
 
 
 class Compiled:
-    """The compiled library, in float64 whatever the data: its single-precision points lose a thousandth of a cell far from zero."""
+    """The compiled library, in float64 whatever the data: its single-precision points lose a
+    thousandth of a cell far from zero.
+    """
 
     def __init__(self, points: Tensor, lines: int, eps: float, scale: float) -> None:
         _library()
@@ -178,7 +200,9 @@ class Compiled:
 
 
 class _CompiledSum(torch.autograd.Function):
-    """Type 1 into `lines` for lines > 0, else its adjoint. First derivatives, in data and points."""
+    """Type 1 into `lines` for lines > 0, else its adjoint. First derivatives, in data and
+    points.
+    """
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, points: Tensor, lines: int, eps: float) -> Tensor:
@@ -201,7 +225,9 @@ def _compiled(x: Tensor, points: Tensor, lines: int, eps: float) -> Tensor:
     """One plan a trial: the library takes one set of points at a time."""
     library, n, columns = _library(), lines or points.shape[-1], x.shape[-1]
     rows = x.detach().mT.reshape(-1, columns, x.shape[-2]).contiguous().cpu().numpy()
-    angles = (2 * math.pi * torch.remainder(points.detach() + 0.5, 1) - math.pi).reshape(-1, points.shape[-1]).cpu().numpy()
+    angles = (
+        (2 * math.pi * torch.remainder(points.detach() + 0.5, 1) - math.pi).reshape(-1, points.shape[-1]).cpu().numpy()
+    )
     options = {"eps": eps, "isign": 1 if lines else -1, "nthreads": torch.get_num_threads()}
     out = torch.empty(len(rows), columns, n, dtype=x.dtype)
     for row, angle, target in zip(rows, angles, out):
@@ -214,4 +240,6 @@ def _library() -> Any:
     try:
         return importlib.import_module("finufft")
     except ModuleNotFoundError:
-        raise ModuleNotFoundError("method 'finufft' needs the package finufft: pip install 'torchsar-lab[nufft]', or choose method 'nufft'") from None
+        raise ModuleNotFoundError(
+            "method 'finufft' needs the package finufft: pip install 'torchsar-lab[nufft]', or choose method 'nufft'"
+        ) from None

@@ -1,4 +1,6 @@
-"""Recorded inverse and spotlight data from `.npz` files: range profiles of a target in flight, turntable sweeps, phase histories."""
+"""Recorded inverse and spotlight data from `.npz` files: range profiles of a target in flight,
+turntable sweeps, phase histories.
+"""
 
 from __future__ import annotations
 
@@ -23,20 +25,25 @@ UNSTATED_CARRIER_HZ = 5.52e9
 
 
 def read_inverse(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording:
-    """Read range profiles, a turntable sweep or a spotlight phase history from a numpy archive without pickles.
+    """Read range profiles, a turntable sweep or a spotlight phase history from a numpy archive
+    without pickles.
 
-    Schema, known by its keys: (a) target in flight: `profiles` complex (range, pulse), range growing away from the radar, with the numbers
-    `range_step_m`, `bandwidth_hz`, `prf_hz`, and optionally `f0_hz` (5.52e9 where it is not stated; it only scales cross range);
-    (b) turntable: `sig` complex (frequency, pulse), `freq_hz` (frequency,) rising in equal steps, `angle_deg` (pulse,), phase
-    -4 pi f (x cos a + y sin a) / c; (c) spotlight: `fp` complex (frequency, pulse), `freq_hz`, antenna position `x_m`, `y_m`, `z_m` (pulse,) about
-    the scene centre, and reference range `r0_m` (pulse,), phase -4 pi f (|antenna - p| - r0) / c. (b) and (c) may state `prf_hz`, 1 by
-    default, so that slow time counts pulses. Other keys are ignored.
+    Schema, known by its keys: (a) target in flight: `profiles` complex (range, pulse), range
+    growing away from the radar, with the numbers `range_step_m`, `bandwidth_hz`, `prf_hz`, and
+    optionally `f0_hz` (5.52e9 where it is not stated; it only scales cross range); (b) turntable:
+    `sig` complex (frequency, pulse), `freq_hz` (frequency,) rising in equal steps, `angle_deg`
+    (pulse,), phase -4 pi f (x cos a + y sin a) / c; (c) spotlight: `fp` complex (frequency, pulse),
+    `freq_hz`, antenna position `x_m`, `y_m`, `z_m` (pulse,) about the scene centre, and reference
+    range `r0_m` (pulse,), phase -4 pi f (|antenna - p| - r0) / c. (b) and (c) may state `prf_hz`, 1
+    by default, so that slow time counts pulses. Other keys are ignored.
 
-    Returns a Recording of range profiles with the axes (pulse, range) and an InverseRadar; range is zero at cell n // 2, the scene centre.
-    For (b) and (c) profiles are the centred unitary transform of the frequency samples (`radar.frequency_samples` takes it back), and aux holds,
-    in float64, `frequency_hz` (range,) and `angle_rad` (pulse,), or `position_m` (pulse, 3) and `reference_m` (pulse,): what `PolarFormat` and
-    `SpotlightBackprojection` connect to. radar.rotation_rad_s is the mean turn of the line of sight, unknown for (a).
-    Raises FileNotFoundError, or ValueError naming the file and the key.
+    Returns a Recording of range profiles with the axes (pulse, range) and an InverseRadar; range is
+    zero at cell n // 2, the scene centre. For (b) and (c) profiles are the centred unitary
+    transform of the frequency samples (`radar.frequency_samples` takes it back), and aux holds, in
+    float64, `frequency_hz` (range,) and `angle_rad` (pulse,), or `position_m` (pulse, 3) and
+    `reference_m` (pulse,): what `PolarFormat` and `SpotlightBackprojection` connect to.
+    radar.rotation_rad_s is the mean turn of the line of sight, unknown for (a). Raises
+    FileNotFoundError, or ValueError naming the file and the key.
     """
     path = Path(path)
     arrays = _load(path)
@@ -49,7 +56,9 @@ def read_inverse(path: str | Path, dtype: torch.dtype = torch.complex64) -> Reco
 
 def _load(path: Path) -> dict[str, np.ndarray]:
     if not path.is_file():
-        raise FileNotFoundError(f"data.file: {path} does not exist; give the path of an .npz file with range profiles or phase history")
+        raise FileNotFoundError(
+            f"data.file: {path} does not exist; give the path of an .npz file with range profiles or phase history"
+        )
     try:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
@@ -58,14 +67,23 @@ def _load(path: Path) -> dict[str, np.ndarray]:
 
 
 def _kind(arrays: dict[str, np.ndarray], path: Path) -> str:
-    """Which schema: the one whose sample array is there. Raises where none or several are, or where keys of it lack."""
+    """Which schema: the one whose sample array is there.
+
+    Raises where none or several are, or where keys of it lack.
+    """
     found = [kind for kind in _SCHEMAS if kind in arrays]
     if len(found) != 1:
         choices = "; ".join(f"{kind} with {', '.join(keys)}" for kind, keys in _SCHEMAS.items())
-        raise ValueError(f"{path} holds {found or 'none'} of the sample arrays; an archive of this sort holds exactly one: {choices} (this one: {sorted(arrays)})")
+        raise ValueError(
+            f"{path} holds {found or 'none'} of the sample arrays; an archive of this sort holds "
+            f"exactly one: {choices} (this one: {sorted(arrays)})"
+        )
     missing = [key for key in _SCHEMAS[found[0]] if key not in arrays]
     if missing:
-        raise ValueError(f"{path} lacks {missing}; beside {found[0]!r} there must be {list(_SCHEMAS[found[0]])} (this one: {sorted(arrays)})")
+        raise ValueError(
+            f"{path} lacks {missing}; beside {found[0]!r} there must be "
+            f"{list(_SCHEMAS[found[0]])} (this one: {sorted(arrays)})"
+        )
     return found[0]
 
 
@@ -76,29 +94,43 @@ def _samples(value: np.ndarray, key: str, path: Path) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(value))
 
 
-def _profiles_radar(arrays: dict[str, np.ndarray], shape: torch.Size, path: Path) -> tuple[InverseRadar, dict[str, Any]]:
-    """The radar's bandwidth is the sampled one, c / (2 step), so that its range cell is the step of the file."""
+def _profiles_radar(
+    arrays: dict[str, np.ndarray], shape: torch.Size, path: Path
+) -> tuple[InverseRadar, dict[str, Any]]:
+    """The radar's bandwidth is the sampled one, c / (2 step), so that its range cell is the step of
+    the file.
+    """
     step, bandwidth = _number(arrays, "range_step_m", path), _number(arrays, "bandwidth_hz", path)
     sampled = LIGHT_M_S / (2 * step)
     if bandwidth > 1.01 * sampled:
-        raise ValueError(f"{path}: range_step_m {step:g} holds a bandwidth of {sampled:g} Hz, less than bandwidth_hz {bandwidth:g}; the step must be c / (2 B) or finer")
+        raise ValueError(
+            f"{path}: range_step_m {step:g} holds a bandwidth of {sampled:g} Hz, less than "
+            f"bandwidth_hz {bandwidth:g}; the step must be c / (2 B) or finer"
+        )
     carrier = _number(arrays, "f0_hz", path) if "f0_hz" in arrays else UNSTATED_CARRIER_HZ
     return InverseRadar(carrier, sampled, _number(arrays, "prf_hz", path)), {}
 
 
-def _turntable_radar(arrays: dict[str, np.ndarray], shape: torch.Size, path: Path) -> tuple[InverseRadar, dict[str, Any]]:
+def _turntable_radar(
+    arrays: dict[str, np.ndarray], shape: torch.Size, path: Path
+) -> tuple[InverseRadar, dict[str, Any]]:
     frequency = _frequency(arrays, shape[0], path)
     angle = torch.deg2rad(_vector(arrays, "angle_deg", shape[1], path))
     turn = float((angle[-1] - angle[0]).abs())
     return _radar(arrays, frequency, shape, turn, 0.0, path), {"frequency_hz": frequency, "angle_rad": angle}
 
 
-def _spotlight_radar(arrays: dict[str, np.ndarray], shape: torch.Size, path: Path) -> tuple[InverseRadar, dict[str, Any]]:
+def _spotlight_radar(
+    arrays: dict[str, np.ndarray], shape: torch.Size, path: Path
+) -> tuple[InverseRadar, dict[str, Any]]:
     frequency = _frequency(arrays, shape[0], path)
     position = torch.stack([_vector(arrays, key, shape[1], path) for key in ("x_m", "y_m", "z_m")], -1)
     reference = _vector(arrays, "r0_m", shape[1], path)
     if not bool((reference > 0).all() and (torch.linalg.vector_norm(position, dim=-1) > 0).all()):
-        raise ValueError(f"{path}: r0_m must be positive and the antenna must not stand at the scene centre, got r0_m down to {float(reference.min()):g}")
+        raise ValueError(
+            f"{path}: r0_m must be positive and the antenna must not stand at the scene centre, "
+            f"got r0_m down to {float(reference.min()):g}"
+        )
     aux = {"frequency_hz": frequency, "position_m": position, "reference_m": reference}
     return _radar(arrays, frequency, shape, _turn_rad(position), float(reference.mean()), path), aux
 
@@ -106,7 +138,9 @@ def _spotlight_radar(arrays: dict[str, np.ndarray], shape: torch.Size, path: Pat
 _READERS = {"profiles": _profiles_radar, "sig": _turntable_radar, "fp": _spotlight_radar}
 
 
-def _radar(arrays: dict[str, np.ndarray], frequency: Tensor, shape: torch.Size, turn_rad: float, reference_m: float, path: Path) -> InverseRadar:
+def _radar(
+    arrays: dict[str, np.ndarray], frequency: Tensor, shape: torch.Size, turn_rad: float, reference_m: float, path: Path
+) -> InverseRadar:
     """turn_rad: of the line of sight between the first and the last pulse."""
     prf = _number(arrays, "prf_hz", path) if "prf_hz" in arrays else 1.0
     n = shape[0]

@@ -1,4 +1,6 @@
-"""Recorded stripmap data from `.npz` files; a user's own arrays become a Recording by `Recording.from_arrays`."""
+"""Recorded stripmap data from `.npz` files; a user's own arrays become a Recording by
+`Recording.from_arrays`.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +20,15 @@ _AUX = ("agc_db", "line_number", "pilot")
 def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording:
     """Read a raw stripmap recording from a numpy archive without pickles.
 
-    Schema: `iq` integer or float (line, sample, 2) or complex (line, sample); numbers `fs_hz`, `prf_hz`, `f0_hz`,
-    `chirp_rate_hz_s` (negative: down-chirp), `pulse_s`, `slant_range_cell1_m` (slant range of cell 1, leading edge of the echo),
-    `v_eff_m_s` (nominal effective velocity); optional `first_line`, `first_cell` (1-based position of the block, default 1), `c_m_s`,
-    `agc_db` (line,) receiver attenuation, undone here, `line_number` (line,), and `pilot` (sample,) a recorded pilot tone.
-    A Doppler ambiguity in the file is ignored: the processor finds it.
+    Schema: `iq` integer or float (line, sample, 2) or complex (line, sample); numbers `fs_hz`,
+    `prf_hz`, `f0_hz`, `chirp_rate_hz_s` (negative: down-chirp), `pulse_s`, `slant_range_cell1_m`
+    (slant range of cell 1, leading edge of the echo), `v_eff_m_s` (nominal effective velocity);
+    optional `first_line`, `first_cell` (1-based position of the block, default 1), `c_m_s`,
+    `agc_db` (line,) receiver attenuation, undone here, `line_number` (line,), and `pilot` (sample,)
+    a recorded pilot tone. A Doppler ambiguity in the file is ignored: the processor finds it.
 
-    Returns a Recording with the axes (pulse, range). Raises FileNotFoundError, or ValueError naming the file and the key.
+    Returns a Recording with the axes (pulse, range). Raises FileNotFoundError, or ValueError naming
+    the file and the key.
     """
     path = Path(path)
     if not path.is_file():
@@ -36,7 +40,9 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Rec
         raise ValueError(f"{path} is not a numpy archive without pickles ({error})") from None
     missing = [key for key in _REQUIRED if key not in arrays]
     if missing:
-        raise ValueError(f"{path} lacks {missing}; a raw stripmap archive holds {list(_REQUIRED)} (this one: {sorted(arrays)})")
+        raise ValueError(
+            f"{path} lacks {missing}; a raw stripmap archive holds {list(_REQUIRED)} (this one: {sorted(arrays)})"
+        )
     number = {key: _number(arrays, key, path) for key in _REQUIRED[1:]}
     c = _number(arrays, "c_m_s", path) if "c_m_s" in arrays else LIGHT_M_S
     first_cell = _first_cell(arrays, path)
@@ -67,7 +73,10 @@ def _number(arrays: dict[str, np.ndarray], key: str, path: Path) -> float:
     signed = key == "chirp_rate_hz_s"
     plain = value.ndim == 0 and value.dtype.kind in "iuf"
     if not (plain and np.isfinite(value) and (value != 0 if signed else value > 0)):
-        raise ValueError(f"{path}: {key} must be one {'number other than zero' if signed else 'positive number'}, got {_shown(value)}")
+        raise ValueError(
+            f"{path}: {key} must be one "
+            f"{'number other than zero' if signed else 'positive number'}, got {_shown(value)}"
+        )
     return float(value)
 
 
@@ -87,4 +96,6 @@ def _complex(iq: np.ndarray, path: Path) -> np.ndarray:
         return iq
     if iq.ndim == 3 and iq.shape[-1] == 2 and iq.dtype.kind in "iuf":
         return iq[..., 0].astype(np.float32) + 1j * iq[..., 1].astype(np.float32)
-    raise ValueError(f"{path}: iq must be complex (line, sample) or (line, sample, 2), got {iq.dtype} of shape {iq.shape}")
+    raise ValueError(
+        f"{path}: iq must be complex (line, sample) or (line, sample, 2), got {iq.dtype} of shape {iq.shape}"
+    )

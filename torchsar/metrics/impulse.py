@@ -21,30 +21,46 @@ def impulse_response(
     search_m: float | None = None,
     centre_turns: tuple[float | None, float | None] = (None, None),
 ) -> dict[str, Tensor]:
-    """Measure the responses nearest to the given places of an image with two axes, the first before the second.
+    """Measure the responses nearest to the given places of an image with two axes, the first before
+    the second.
 
-    at_m: coordinates on the two axes, each (...,) one target per trial or (..., target). The strongest sample within search_m (default
-    8 samples) is taken. centre_turns: centre of the spectrum along each axis in turns per sample, None to estimate it from the neighbourhood,
-    where other scatterers may mislead it; a full band, which leaves no gap, should be told. sidelobe_nulls: extent of the side lobes in null
-    spacings of a rectangular band; 10 give ISLR -10.17 dB for a sinc.
+    at_m: coordinates on the two axes, each (...,) one target per trial or (..., target). The
+    strongest sample within search_m (default 8 samples) is taken. centre_turns: centre of the
+    spectrum along each axis in turns per sample, None to estimate it from the neighbourhood, where
+    other scatterers may mislead it; a full band, which leaves no gap, should be told.
+    sidelobe_nulls: extent of the side lobes in null spacings of a rectangular band; 10 give ISLR
+    -10.17 dB for a sinc.
 
-    Returns for each axis A of the image: irw_A_m (-3 dB width), pslr_A_db (strongest side lobe in the extent), islr_A_db (side-lobe over
-    main-lobe energy, null to null), position_A_m; and peak, the complex interpolated peak. Shapes as at_m broadcast with the trials.
-    Slices are band-limited about their own spectral centre and zero-padded by two before interpolation, so that full-band images and
-    squinted spectra are read correctly. Raises ValueError for an image without two axes or a place outside of it.
+    Returns for each axis A of the image: irw_A_m (-3 dB width), pslr_A_db (strongest side lobe in
+    the extent), islr_A_db (side-lobe over main-lobe energy, null to null), position_A_m; and peak,
+    the complex interpolated peak. Shapes as at_m broadcast with the trials. Slices are band-limited
+    about their own spectral centre and zero-padded by two before interpolation, so that full-band
+    images and squinted spectra are read correctly. Raises ValueError for an image without two axes
+    or a place outside of it.
     """
     if not isinstance(signal, Signal) or len(signal.axes) != 2:
-        raise ValueError(f"impulse_response works on a Signal with two axes, got {signal.names if isinstance(signal, Signal) else type(signal).__name__}")
+        raise ValueError(
+            "impulse_response works on a Signal with two axes, got "
+            f"{signal.names if isinstance(signal, Signal) else type(signal).__name__}"
+        )
     if len(at_m) != 2:
         raise ValueError(f"at_m holds one coordinate for each of the axes {signal.names}, got {len(at_m)}")
     if sidelobe_nulls < 1 or (search_m is not None and not search_m > 0):
-        raise ValueError(f"impulse_response needs sidelobe_nulls of 1 or more and search_m above 0, got {sidelobe_nulls} and {search_m}")
+        raise ValueError(
+            "impulse_response needs sidelobe_nulls of 1 or more and search_m above 0, got "
+            f"{sidelobe_nulls} and {search_m}"
+        )
     refuse_non_finite(signal.data, "impulse_response")
     per_target = any(torch.as_tensor(a).ndim > len(signal.trials) for a in at_m)
-    places = torch.broadcast_tensors(*(torch.as_tensor(a, dtype=torch.float64, device=signal.data.device) for a in at_m))
+    places = torch.broadcast_tensors(
+        *(torch.as_tensor(a, dtype=torch.float64, device=signal.data.device) for a in at_m)
+    )
     places = [p if per_target else p[..., None] for p in places]
     shape = torch.broadcast_shapes(places[0].shape, (*signal.trials, 1))
-    centre = [_nearest(axis.index_of(p.cpu()).to(p.device), axis.n, axis.name).expand(shape) for axis, p in zip(signal.axes, places, strict=True)]
+    centre = [
+        _nearest(axis.index_of(p.cpu()).to(p.device), axis.n, axis.name).expand(shape)
+        for axis, p in zip(signal.axes, places, strict=True)
+    ]
     reach = [_reach(search_m, axis.step) for axis in signal.axes]
     data = signal.data.to(torch.complex128)
     rows, cols = _brightest(data, centre, reach)
@@ -52,7 +68,10 @@ def impulse_response(
     azimuth = _slice_through(_patch(data, rows, cols, min(_SLICE, signal.axes[0].n), _PATCH), tone_r, dr, -1)
     range_ = _slice_through(_patch(data, rows, cols, _PATCH, min(_SLICE, signal.axes[1].n)), tone_a, da, -2)
     out: dict[str, Tensor] = {}
-    for axis, cut, tone, index, offset in ((signal.axes[0], azimuth, tone_a, rows, da), (signal.axes[1], range_, tone_r, cols, dr)):
+    for axis, cut, tone, index, offset in (
+        (signal.axes[0], azimuth, tone_a, rows, da),
+        (signal.axes[1], range_, tone_r, cols, dr),
+    ):
         figures, peak = cut_figures(cut, tone, offset, sidelobe_nulls)
         out[f"irw_{axis.name}_m"] = figures["irw"] * axis.step
         out[f"pslr_{axis.name}_db"], out[f"islr_{axis.name}_db"] = figures["pslr"], figures["islr"]
@@ -63,7 +82,10 @@ def impulse_response(
 
 def _nearest(index: Tensor, n: int, name: str) -> Tensor:
     if not bool(((index >= -0.5) & (index <= n - 0.5)).all()):
-        raise ValueError(f"a place given to impulse_response lies outside the {name} axis (sample {float(index.min()):.1f} to {float(index.max()):.1f} of {n})")
+        raise ValueError(
+            f"a place given to impulse_response lies outside the {name} axis (sample "
+            f"{float(index.min()):.1f} to {float(index.max()):.1f} of {n})"
+        )
     return index.round().long().clamp(0, n - 1)
 
 
@@ -72,7 +94,9 @@ def _reach(search_m: float | None, step: float) -> int:
 
 
 def _patch(data: Tensor, rows: Tensor, cols: Tensor, height: int, width: int) -> Tensor:
-    """Neighbourhoods (..., target, height, width) about (rows, cols), sample height//2, width//2 being the centre; zero outside the image."""
+    """Neighbourhoods (..., target, height, width) about (rows, cols), sample height//2, width//2
+    being the centre; zero outside the image.
+    """
     n_a, n_r = data.shape[-2:]
     i = rows[..., None, None] + torch.arange(height, device=data.device)[:, None] - height // 2
     j = cols[..., None, None] + torch.arange(width, device=data.device) - width // 2
@@ -89,10 +113,14 @@ def _brightest(data: Tensor, centre: list[Tensor], reach: list[int]) -> tuple[Te
     return centre[0] + best // width - reach[0], centre[1] + best % width - reach[1]
 
 
-def _climb(data: Tensor, rows: Tensor, cols: Tensor, centre_turns: tuple[float | None, float | None], rounds: int = 3) -> tuple[Tensor, ...]:
-    """From the strongest sample to the interpolated maximum: (row, column, spectral centres in turns per sample, offsets in samples).
+def _climb(
+    data: Tensor, rows: Tensor, cols: Tensor, centre_turns: tuple[float | None, float | None], rounds: int = 3
+) -> tuple[Tensor, ...]:
+    """From the strongest sample to the interpolated maximum: (row, column, spectral centres in
+    turns per sample, offsets in samples).
 
-    A skewed response that is sampled finely in one axis and coarsely in the other has its maximum more than a sample away from its strongest sample.
+    A skewed response that is sampled finely in one axis and coarsely in the other has its maximum
+    more than a sample away from its strongest sample.
     """
     for _ in range(rounds):
         _, _, da, dr = _refined(data, rows, cols, centre_turns)
@@ -100,17 +128,26 @@ def _climb(data: Tensor, rows: Tensor, cols: Tensor, centre_turns: tuple[float |
     return rows, cols, *_refined(data, rows, cols, centre_turns)
 
 
-def _refined(data: Tensor, rows: Tensor, cols: Tensor, centre_turns: tuple[float | None, float | None]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Spectral centres in turns per sample, and offsets of the interpolated maximum from (row, column) in samples."""
+def _refined(
+    data: Tensor, rows: Tensor, cols: Tensor, centre_turns: tuple[float | None, float | None]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Spectral centres in turns per sample, and offsets of the interpolated maximum from (row,
+    column) in samples.
+    """
     patch = _patch(data, rows, cols, _PATCH, _PATCH)
     tone_a, tone_r = (
-        _centre_turns(patch, dim) if told is None else torch.full(patch.shape[:-2], told, dtype=torch.float64, device=patch.device) for dim, told in zip((-2, -1), centre_turns, strict=True)
+        _centre_turns(patch, dim)
+        if told is None
+        else torch.full(patch.shape[:-2], told, dtype=torch.float64, device=patch.device)
+        for dim, told in zip((-2, -1), centre_turns, strict=True)
     )
     return tone_a, tone_r, *_fine_peak(patch, tone_a, tone_r)
 
 
 def cut_offset(cut: Tensor, tone: Tensor) -> Tensor:
-    """Offset (...,) in samples of the interpolated maximum of cuts (..., n) from their strongest sample n//2. tone: as for `cut_figures`."""
+    """Offset (...,) in samples of the interpolated maximum of cuts (..., n) from their strongest
+    sample n//2. tone: as for `cut_figures`.
+    """
     grid = torch.linspace(-1, 1, 2 * _FINE + 1, dtype=torch.float64, device=cut.device).expand(*tone.shape, -1)
     fine = (_kernel(grid, cut.shape[-1], tone) @ cut[..., None])[..., 0].abs().square()
     best = fine.argmax(-1)
@@ -118,20 +155,26 @@ def cut_offset(cut: Tensor, tone: Tensor) -> Tensor:
 
 
 def _centre_turns(patch: Tensor, dim: int) -> Tensor:
-    """Centre of the spectrum along dim in turns per sample, from the phase of the lag-one product, (..., target)."""
+    """Centre of the spectrum along dim in turns per sample, from the phase of the lag-one product,
+    (..., target).
+    """
     n = patch.shape[dim]
     lag = (patch.narrow(dim, 1, n - 1) * patch.narrow(dim, 0, n - 1).conj()).sum((-2, -1))
     return torch.angle(lag) / (2 * math.pi)
 
 
 def _kernel(offsets: Tensor, n: int, tone: Tensor) -> Tensor:
-    """Weights (..., offset, n) that read a band about `tone` at fractional offsets from sample n//2. offsets: (..., offset)."""
+    """Weights (..., offset, n) that read a band about `tone` at fractional offsets from sample
+    n//2. offsets: (..., offset).
+    """
     distance = offsets[..., None] - (torch.arange(n, dtype=torch.float64, device=offsets.device) - n // 2)
     return torch.sinc(distance) * cis(2 * math.pi * tone[..., None, None] * distance)
 
 
 def _fine_peak(patch: Tensor, tone_a: Tensor, tone_r: Tensor) -> tuple[Tensor, Tensor]:
-    """Offset of the interpolated maximum from the central sample, along each dim, in samples, (..., target)."""
+    """Offset of the interpolated maximum from the central sample, along each dim, in samples, (...,
+    target).
+    """
     grid = torch.linspace(-1, 1, 2 * _FINE + 1, dtype=torch.float64, device=patch.device)
     grid = grid.expand(*tone_a.shape, -1)
     fine = (_kernel(grid, patch.shape[-2], tone_a) @ patch @ _kernel(grid, patch.shape[-1], tone_r).mT).abs().square()
@@ -157,9 +200,11 @@ def _slice_through(patch: Tensor, tone: Tensor, offset: Tensor, dim: int) -> Ten
 
 
 def cut_figures(cut: Tensor, tone: Tensor, offset: Tensor, nulls: int) -> tuple[dict[str, Tensor], Tensor]:
-    """irw (samples), pslr and islr (dB), and the complex peak, (...,) each, of cuts (..., n) whose maxima lie `offset` (...,) samples from sample n//2.
+    """irw (samples), pslr and islr (dB), and the complex peak, (...,) each, of cuts (..., n) whose
+    maxima lie `offset` (...,) samples from sample n//2.
 
-    tone: centre of the spectrum in turns per sample, (...,). nulls: extent of the side lobes in null spacings of a rectangular band.
+    tone: centre of the spectrum in turns per sample, (...,). nulls: extent of the side lobes in
+    null spacings of a rectangular band.
     """
     n, factor = cut.shape[-1], 16
     base = torch.arange(n, dtype=torch.float64, device=cut.device) - n // 2
@@ -189,12 +234,18 @@ def cut_figures(cut: Tensor, tone: Tensor, offset: Tensor, nulls: int) -> tuple[
         strongest = torch.maximum(strongest, (side * inside_side).amax(-1))
     floor = torch.finfo(power.dtype).tiny
     peak = right[..., 0].clamp_min(floor)
-    figures = {"irw": irw / factor, "pslr": 10 * torch.log10((strongest / peak).clamp_min(1e-30)), "islr": 10 * torch.log10((side_energy / main.clamp_min(floor)).clamp_min(1e-30))}
+    figures = {
+        "irw": irw / factor,
+        "pslr": 10 * torch.log10((strongest / peak).clamp_min(1e-30)),
+        "islr": 10 * torch.log10((side_energy / main.clamp_min(floor)).clamp_min(1e-30)),
+    }
     return figures, fine[..., 0] * cis(2 * math.pi * tone * offset)
 
 
 def _crossing(side: Tensor) -> Tensor:
-    """Distance from the peak (index 0) to half its power, by linear interpolation, in fine samples."""
+    """Distance from the peak (index 0) to half its power, by linear interpolation, in fine
+    samples.
+    """
     below = side < side[..., :1] / 2
     i = torch.where(below.any(-1), below.to(torch.int8).argmax(-1), side.shape[-1] - 1).clamp_min(1)
     high, low = (side.gather(-1, (i - k)[..., None])[..., 0] for k in (1, 0))

@@ -1,4 +1,6 @@
-"""What no estimator of uneven rotation can beat: the Cramer-Rao bound of the motion that all scatterers of a turning target share (brief 003)."""
+"""What no estimator of uneven rotation can beat: the Cramer-Rao bound of the motion that all
+scatterers of a turning target share (brief 003).
+"""
 
 from __future__ import annotations
 
@@ -28,17 +30,24 @@ def rotation_bounds(
     n_pulse: int,
     free_centre: bool = True,
 ) -> dict[str, Tensor]:
-    """Least standard deviations of omega_rad_s, k1_per_s, k2_per_s2, ... and, with free_centre, yc_m: float64 (...,) each, infinite where the data tell nothing.
+    """Least standard deviations of omega_rad_s, k1_per_s, k2_per_s2, ...
 
-    cross_range_m, range_m, amplitude: (..., target), places (m) and amplitudes of resolved scatterers in range-compressed data, an amplitude being that of a sample at the
-    peak of the range response; range_m counts from where the processor takes the centre to be, so that range_m + yc_m is the distance from the rotation centre (the
-    `lever` of `echo.turntable_echo`). noise_std: of the complex noise, noise power = noise_std^2 a sample. warp_k: (..., order - 1) of any order, see `core.warp`. Trials broadcast.
+    and, with free_centre, yc_m: float64 (...,) each, infinite where the data tell nothing.
 
-    Noise known; complex amplitude and cross range of every scatterer unknown and its range known: what is left of phase derivatives once a constant and a line in
-    the warp phi are taken out tells about the motion, J_ij = (2 / noise_std^2) sum_p |s_p|^2 <P d_i, P d_j>, c4 = 4 pi / wavelength,
-    d_Om = c4 y Om phi^2, d_ki = c4 (-x Om + y Om^2 phi) t^(i+1) / (i+1)!, d_yc = (c4 / 2) Om^2 phi^2.
-    Neighbours that overlap only raise it. All scatterers at one range leave Om (and a free yc) infinite, k finite. Falls as 10^(-SNR / 20). Differentiable.
-    Raises ValueError for shapes that do not fit.
+    cross_range_m, range_m, amplitude: (..., target), places (m) and amplitudes of resolved
+    scatterers in range-compressed data, an amplitude being that of a sample at the peak of the
+    range response; range_m counts from where the processor takes the centre to be, so that range_m
+    + yc_m is the distance from the rotation centre (the `lever` of `echo.turntable_echo`).
+    noise_std: of the complex noise, noise power = noise_std^2 a sample. warp_k: (..., order - 1) of
+    any order, see `core.warp`. Trials broadcast.
+
+    Noise known; complex amplitude and cross range of every scatterer unknown and its range known:
+    what is left of phase derivatives once a constant and a line in the warp phi are taken out tells
+    about the motion, J_ij = (2 / noise_std^2) sum_p |s_p|^2 <P d_i, P d_j>, c4 = 4 pi / wavelength,
+    d_Om = c4 y Om phi^2, d_ki = c4 (-x Om + y Om^2 phi) t^(i+1) / (i+1)!, d_yc = (c4 / 2) Om^2
+    phi^2. Neighbours that overlap only raise it. All scatterers at one range leave Om (and a free
+    yc) infinite, k finite. Falls as 10^(-SNR / 20). Differentiable. Raises ValueError for shapes
+    that do not fit.
     """
     _refuse(cross_range_m, range_m, amplitude, warp_k)
     x, k = cross_range_m.to(torch.float64), warp_k.to(torch.float64)
@@ -50,7 +59,11 @@ def rotation_bounds(
     unit = _deviations(information)
     noise = per_trial(noise_std, 1, x) / math.sqrt(2)
     bounds = torch.where(torch.isinf(unit), unit, unit * noise)
-    names = ["omega_rad_s", *(f"k{i}_per_s{i if i > 1 else ''}" for i in range(1, k.shape[-1] + 1)), *(["yc_m"] if free_centre else [])]
+    names = [
+        "omega_rad_s",
+        *(f"k{i}_per_s{i if i > 1 else ''}" for i in range(1, k.shape[-1] + 1)),
+        *(["yc_m"] if free_centre else []),
+    ]
     return dict(zip(names, bounds.unbind(-1), strict=True))
 
 
@@ -58,13 +71,21 @@ def _refuse(cross_range_m: Tensor, range_m: Tensor, amplitude: Tensor, warp_k: T
     counts = [x.shape[-1] if x.ndim else None for x in (cross_range_m, range_m, amplitude)]
     if None in counts or len(set(counts)) > 1:
         shapes = ", ".join(str(tuple(x.shape)) for x in (cross_range_m, range_m, amplitude))
-        raise ValueError(f"rotation_bounds: cross_range_m, range_m and amplitude are (..., target) of as many targets, got the shapes {shapes}")
+        raise ValueError(
+            "rotation_bounds: cross_range_m, range_m and amplitude are (..., target) of as many "
+            f"targets, got the shapes {shapes}"
+        )
     if not warp_k.ndim:
-        raise ValueError("rotation_bounds: warp_k is (..., order - 1), got a tensor without dims; write torch.zeros(0) for an even rotation")
+        raise ValueError(
+            "rotation_bounds: warp_k is (..., order - 1), got a tensor without dims; write "
+            "torch.zeros(0) for an even rotation"
+        )
 
 
 def _slopes(x: Tensor, lever: Tensor, omega: Tensor, terms: int, free_centre: bool) -> Tensor:
-    """Coefficients of the curves of `_products` in the phase of each scatterer per unit of each unknown, less the factor c4: (..., unknown, curve, target)."""
+    """Coefficients of the curves of `_products` in the phase of each scatterer per unit of each
+    unknown, less the factor c4: (..., unknown, curve, target).
+    """
     zero = torch.zeros_like(x * lever * omega)
     turned, bent, square = zero - x * omega, lever * omega.square() + zero, 2 * terms
     rows = [{square: lever * omega + zero}]
@@ -74,7 +95,9 @@ def _slopes(x: Tensor, lever: Tensor, omega: Tensor, terms: int, free_centre: bo
 
 
 def _products(k: Tensor, n_pulse: int, prf_hz: float) -> Tensor:
-    """Inner products over the pulses of t^(i+1) / (i+1)!, of phi times each, and of phi^2, without their parts along 1 and phi. (..., curve, curve)."""
+    """Inner products over the pulses of t^(i+1) / (i+1)!, of phi times each, and of phi^2, without
+    their parts along 1 and phi. (..., curve, curve).
+    """
     time = torch.arange(n_pulse, dtype=torch.float64, device=k.device) / prf_hz
     phi = warp(time, k)
     powers = [(time ** (i + 2) / math.factorial(i + 2)).expand_as(phi) for i in range(k.shape[-1])]
@@ -88,7 +111,9 @@ def _products(k: Tensor, n_pulse: int, prf_hz: float) -> Tensor:
 
 
 def _deviations(information: Tensor) -> Tensor:
-    """Square roots of the diagonal of the inverse (..., n, n) -> (..., n), infinite for unknowns that a direction without information takes part in."""
+    """Square roots of the diagonal of the inverse (..., n, n) -> (..., n), infinite for unknowns
+    that a direction without information takes part in.
+    """
     size = information.diagonal(dim1=-2, dim2=-1)
     root = torch.where(size > 0, size, 1).rsqrt()
     unit = information * root[..., :, None] * root[..., None, :]

@@ -1,16 +1,35 @@
-"""Azimuth-multichannel data: reconstruction and focusing with the velocity of a target, velocities, movers in a scene, calibration of channels and clocks."""
+"""Azimuth-multichannel data: reconstruction and focusing with the velocity of a target, velocities,
+movers in a scene, calibration of channels and clocks.
+"""
 
 from torchsar.multichannel.azimuth import FocusAzimuth, azimuth_filter, focus_azimuth
 from torchsar.multichannel.balance import CorrectBalance, EstimateBalance, correct_balance, estimate_balance
 from torchsar.multichannel.body import Body, Extraction, body_echo, find_body
 from torchsar.multichannel.compress import CompressChannels
 from torchsar.multichannel.detection import Detection, detect
-from torchsar.multichannel.migration import CorrectMigration, Frame, Keystone, NoMigration, StaticBulk, ambiguity_number, correct_migration
+from torchsar.multichannel.migration import (
+    CorrectMigration,
+    Frame,
+    Keystone,
+    NoMigration,
+    StaticBulk,
+    ambiguity_number,
+    correct_migration,
+)
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.plan import AzimuthPlan, FocusPlan
 from torchsar.multichannel.reconstruct import Reconstruct, reconstruct, reconstruct_lines
 from torchsar.multichannel.requirements import MultichannelUse, multichannel_limits, multichannel_requirements
-from torchsar.multichannel.response import ElementPattern, FlatBand, LeastSquares, MinimumMeanSquare, band_matrix, condition_number, doppler_offsets, noise_gain_db
+from torchsar.multichannel.response import (
+    ElementPattern,
+    FlatBand,
+    LeastSquares,
+    MinimumMeanSquare,
+    band_matrix,
+    condition_number,
+    doppler_offsets,
+    noise_gain_db,
+)
 from torchsar.multichannel.scene_image import Detector, ImageMovers, SceneImage
 from torchsar.multichannel.stationary import StationaryImage, stationary_image
 from torchsar.multichannel.synchronise import EstimateSynchronisation, RemoveSynchronisation

@@ -1,6 +1,8 @@
-"""Azimuth focusing of a moving point by the exact range history of an airborne receiver, and the correction of its place.
+"""Azimuth focusing of a moving point by the exact range history of an airborne receiver, and the
+correction of its place.
 
-Source: brief 001, Algorithm 7 (the exact spectrum of a hyperbola with y0); Remote Sens. 2020, 12, 1703, Eq. (30) with the sign corrected.
+Source: brief 001, Algorithm 7 (the exact spectrum of a hyperbola with y0); Remote Sens. 2020, 12,
+1703, Eq. (30) with the sign corrected.
 """
 
 from __future__ import annotations
@@ -14,11 +16,15 @@ from torchsar.multichannel.response import doppler_centre_hz
 from torchsar.radar import BistaticRadar
 
 
-def azimuth_filter(offset_hz: Tensor, radar: BistaticRadar, motion: PointMotion, dtype: torch.dtype, centre_hz: Tensor | None = None) -> Tensor:
-    """exp(+j 2 pi / lambda (Rmin sqrt(1 - (lambda f / V)^2) - R_ref)), (..., bin) of `dtype`: takes the curvature out of the spectrum of a point with this motion.
+def azimuth_filter(
+    offset_hz: Tensor, radar: BistaticRadar, motion: PointMotion, dtype: torch.dtype, centre_hz: Tensor | None = None
+) -> Tensor:
+    """exp(+j 2 pi / lambda (Rmin sqrt(1 - (lambda f / V)^2) - R_ref)), (..., bin) of `dtype`: takes
+    the curvature out of the spectrum of a point with this motion.
 
-    offset_hz: float64 (bin,), Doppler against the centre; R_ref: the radar's reference range, against which phases of echoes are counted. centre_hz: (...,),
-    by default that of the motion. Zero at Doppler that no point of this speed has. Differentiable in the motion.
+    offset_hz: float64 (bin,), Doppler against the centre; R_ref: the radar's reference range,
+    against which phases of echoes are counted. centre_hz: (...,), by default that of the motion.
+    Zero at Doppler that no point of this speed has. Differentiable in the motion.
     """
     centre_hz = doppler_centre_hz(radar, motion) if centre_hz is None else centre_hz
     sine = radar.wavelength_m * (centre_hz[..., None] + offset_hz) / motion.square_m2_s2.sqrt()[..., None]
@@ -30,10 +36,14 @@ def azimuth_filter(offset_hz: Tensor, radar: BistaticRadar, motion: PointMotion,
     return unit_phasor(path / radar.wavelength_m, dtype) * real.to(real_dtype(dtype))
 
 
-def focus_azimuth(spectrum: Tensor, offset_hz: Tensor, radar: BistaticRadar, motion: PointMotion, bandwidth_hz: float | None = None) -> Tensor:
-    """Rebuilt spectra (..., bin) about the Doppler centre of the motion to images over slow time (..., bin), zero at bin n // 2, a point at `motion.image_s`.
+def focus_azimuth(
+    spectrum: Tensor, offset_hz: Tensor, radar: BistaticRadar, motion: PointMotion, bandwidth_hz: float | None = None
+) -> Tensor:
+    """Rebuilt spectra (..., bin) about the Doppler centre of the motion to images over slow time
+    (..., bin), zero at bin n // 2, a point at `motion.image_s`.
 
-    bandwidth_hz: processed Doppler bandwidth about the centre, None for all. Differentiable in spectrum and motion.
+    bandwidth_hz: processed Doppler bandwidth about the centre, None for all. Differentiable in
+    spectrum and motion.
     """
     matched = azimuth_filter(offset_hz, radar, motion, spectrum.dtype)
     if bandwidth_hz is not None:
@@ -42,11 +52,14 @@ def focus_azimuth(spectrum: Tensor, offset_hz: Tensor, radar: BistaticRadar, mot
 
 
 class FocusAzimuth(Stage):
-    """Spectra (doppler[, range]) of `Reconstruct` to the image (azimuth[, range]) of one target per trial with the velocities given, x = V_R t (m) in the frame of the scene.
+    """Spectra (doppler[, range]) of `Reconstruct` to the image (azimuth[, range]) of one target per
+    trial with the velocities given, x = V_R t (m) in the frame of the scene.
 
-    Along the track that the target itself sees, x = (speed - u_a) t, everything is (speed - u_a) / speed as wide. All lines are focused for one range, that of forward (...,), else
-    that of the strongest line, or the radar's reference range where there is no range axis: to focus each for its own would bend the range side lobes of the target. (A whole scene at
-    rest: `StationaryImage`.) bandwidth_hz: processed Doppler bandwidth about the centre, None for all.
+    Along the track that the target itself sees, x = (speed - u_a) t, everything is (speed - u_a) /
+    speed as wide. All lines are focused for one range, that of forward (...,), else that of the
+    strongest line, or the radar's reference range where there is no range axis: to focus each for
+    its own would bend the range side lobes of the target. (A whole scene at rest:
+    `StationaryImage`.) bandwidth_hz: processed Doppler bandwidth about the centre, None for all.
     """
 
     works_on = ("doppler",)
@@ -58,7 +71,14 @@ class FocusAzimuth(Stage):
         if bandwidth_hz is not None and not 0 < bandwidth_hz < float("inf"):
             raise ValueError(f"bandwidth_hz must be positive, or None for all that is rebuilt, got {bandwidth_hz}")
 
-    def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0, range_m: Number | None = None) -> Signal:
+    def forward(
+        self,
+        signal: Signal,
+        u_r_m_s: Number = 0.0,
+        u_a_m_s: Number = 0.0,
+        y0_m: Number = 0.0,
+        range_m: Number | None = None,
+    ) -> Signal:
         lines, doppler = "range" in signal.names, signal.axis("doppler")
         near = self._range(signal) if range_m is None else range_m
         u_r, u_a, y0, near = (per_trial(value, int(lines), signal.data) for value in (u_r_m_s, u_a_m_s, y0_m, near))

@@ -12,9 +12,12 @@ from torchsar.radar import BistaticRadar
 
 
 class CompressChannels(Stage):
-    """Range compression with the transmitted pulse, a unit echo to a unit peak at its range. reference: "matched", "flat" or "phase" (`focus.RangeCompress`).
+    """Range compression with the transmitted pulse, a unit echo to a unit peak at its range.
 
-    "flat" makes an exactly rectangular band, the response of simulated compressed data. Echoes whose pulse is cut by an end of the line are compressed with what there is.
+    reference: "matched", "flat" or "phase" (`focus.RangeCompress`).
+
+    "flat" makes an exactly rectangular band, the response of simulated compressed data. Echoes
+    whose pulse is cut by an end of the line are compressed with what there is.
     """
 
     works_on = ("channel", "pulse", "range")

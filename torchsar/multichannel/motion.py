@@ -1,4 +1,6 @@
-"""Uniform motion of a point before a receiver that flies past: what its range history comes to, per trial."""
+"""Uniform motion of a point before a receiver that flies past: what its range history comes to, per
+trial.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +18,12 @@ Number = Tensor | float
 
 @dataclass(frozen=True)
 class PointMotion:
-    """Velocity and place of one point per trial, float64 tensors that broadcast to (...,), against the receiver's speed.
+    """Velocity and place of one point per trial, float64 tensors that broadcast to (...,), against
+    the receiver's speed.
 
-    u_r_m_s: slant-range speed, closing positive; u_a_m_s: along track, positive with the receiver; y0_m: along-track place at t = 0; range_m: closest
-    range R0 of the track at rest. With v = speed - u_a and V^2 = v^2 + u_r^2 (brief 001, Symbols).
+    u_r_m_s: slant-range speed, closing positive; u_a_m_s: along track, positive with the receiver;
+    y0_m: along-track place at t = 0; range_m: closest range R0 of the track at rest. With v = speed
+    - u_a and V^2 = v^2 + u_r^2 (brief 001, Symbols).
     """
 
     u_r_m_s: Tensor
@@ -29,16 +33,33 @@ class PointMotion:
     speed_m_s: float
 
     @staticmethod
-    def of(radar: BistaticRadar, like: Tensor, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0, range_m: Number | None = None) -> PointMotion:
-        """From numbers or tensors (...,), on the device of `like`; range_m: None for the radar's reference range. Raises ValueError for a point as fast as the receiver."""
+    def of(
+        radar: BistaticRadar,
+        like: Tensor,
+        u_r_m_s: Number = 0.0,
+        u_a_m_s: Number = 0.0,
+        y0_m: Number = 0.0,
+        range_m: Number | None = None,
+    ) -> PointMotion:
+        """From numbers or tensors (...,), on the device of `like`; range_m: None for the radar's
+        reference range. Raises ValueError for a point as fast as the receiver.
+        """
         near = radar.reference_range_m if range_m is None else range_m
-        motion = PointMotion(per_trial(u_r_m_s, 0, like), per_trial(u_a_m_s, 0, like), per_trial(y0_m, 0, like), per_trial(near, 0, like), radar.speed_m_s)
+        motion = PointMotion(
+            per_trial(u_r_m_s, 0, like),
+            per_trial(u_a_m_s, 0, like),
+            per_trial(y0_m, 0, like),
+            per_trial(near, 0, like),
+            radar.speed_m_s,
+        )
         _refuse_overtaking(motion)
         return motion
 
     def each(self, change: Callable[[Tensor], Tensor]) -> PointMotion:
         """All four tensors changed alike, such as `lambda value: value[..., None]`."""
-        return PointMotion(change(self.u_r_m_s), change(self.u_a_m_s), change(self.y0_m), change(self.range_m), self.speed_m_s)
+        return PointMotion(
+            change(self.u_r_m_s), change(self.u_a_m_s), change(self.y0_m), change(self.range_m), self.speed_m_s
+        )
 
     @property
     def along_m_s(self) -> Tensor:
@@ -72,20 +93,33 @@ class PointMotion:
         return cross / self.square_m2_s2.sqrt()
 
     def place_m(self, image_s: Tensor) -> Tensor:
-        """Along-track place y0 at t = 0 of a point that appears at this slow time: the location correction, Eq. (30) with its sign put right (brief 001, erratum 7)."""
+        """Along-track place y0 at t = 0 of a point that appears at this slow time: the location
+        correction, Eq. (30) with its sign put right (brief 001, erratum 7).
+        """
         return (self.square_m2_s2 * image_s - self.u_r_m_s * self.range_m) / self.along_m_s
 
 
 def _refuse_overtaking(motion: PointMotion) -> None:
     try:
         slowest, nearest = float(motion.along_m_s.detach().min()), float(motion.range_m.detach().min())
-        wild = [name for name in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m") if not bool(torch.isfinite(getattr(motion, name)).all())]
+        wild = [
+            name
+            for name in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
+            if not bool(torch.isfinite(getattr(motion, name)).all())
+        ]
     except RuntimeError:  # inside vmap a value cannot be looked at
         return
     if wild:
-        raise ValueError(f"velocity and place of a point must be finite, got NaN or Inf in {', '.join(wild)}; replace estimates that failed before they are used")
+        raise ValueError(
+            f"velocity and place of a point must be finite, got NaN or Inf in {', '.join(wild)}; "
+            "replace estimates that failed before they are used"
+        )
     if not slowest > 0:
         fastest = motion.speed_m_s - slowest
-        raise ValueError(f"a point moves along track at {fastest:g} m/s, as fast as the receiver ({motion.speed_m_s:g} m/s) or faster, so that no aperture forms; give u_a_m_s below that")
+        raise ValueError(
+            f"a point moves along track at {fastest:g} m/s, as fast as the receiver "
+            f"({motion.speed_m_s:g} m/s) or faster, so that no aperture forms; give u_a_m_s below "
+            "that"
+        )
     if not nearest > 0:
         raise ValueError(f"the closest range of a point must be positive, got range_m={nearest:g}")

@@ -1,7 +1,10 @@
-"""Reconstruction and focusing for one motion as a plan: everything that does not depend on the data is formed once, and an image costs little more than its transforms.
+"""Reconstruction and focusing for one motion as a plan: everything that does not depend on the data
+is formed once, and an image costs little more than its transforms.
 
-Per alias frequency the chain of `reconstruct` and `focus_azimuth` is one small matrix from channels to Doppler bands, the exact filter and the places of time zero included.
-For Monte Carlo trials, for many range lines, and for whatever else shares its motion; where each trial has its own velocities the chain of two stages serves.
+Per alias frequency the chain of `reconstruct` and `focus_azimuth` is one small matrix from channels
+to Doppler bands, the exact filter and the places of time zero included. For Monte Carlo trials, for
+many range lines, and for whatever else shares its motion; where each trial has its own velocities
+the chain of two stages serves.
 """
 
 from __future__ import annotations
@@ -18,19 +21,32 @@ from torchsar.radar import BistaticRadar
 
 
 class AzimuthPlan:
-    """`image(data)`: channels (..., channel, pulse) to the focused image (..., bands * pulse) of points with one motion, slow time zero at sample bands * pulse // 2.
+    """`image(data)`: channels (..., channel, pulse) to the focused image (..., bands * pulse) of
+    points with one motion, slow time zero at sample bands * pulse // 2.
 
-    The image is that of `focus_azimuth(reconstruct(data))` times the carrier of its Doppler centre, exp(+j 2 pi f t), the centre taken to the nearest bin. motion: without trials.
-    Raises ValueError for a motion with trials, and where the bands cannot be told apart by so many channels.
+    The image is that of `focus_azimuth(reconstruct(data))` times the carrier of its Doppler centre,
+    exp(+j 2 pi f t), the centre taken to the nearest bin. motion: without trials. Raises ValueError
+    for a motion with trials, and where the bands cannot be told apart by so many channels.
     """
 
-    def __init__(self, radar: BistaticRadar, motion: PointMotion, n_pulse: int, rebuild: Rebuild | None = None, bandwidth_hz: float | None = None, dtype: torch.dtype = torch.complex64) -> None:
+    def __init__(
+        self,
+        radar: BistaticRadar,
+        motion: PointMotion,
+        n_pulse: int,
+        rebuild: Rebuild | None = None,
+        bandwidth_hz: float | None = None,
+        dtype: torch.dtype = torch.complex64,
+    ) -> None:
         rebuild = LeastSquares() if rebuild is None else rebuild
         why = rebuild.refusal(radar.channels)
         if why is not None:
             raise ValueError(why)
         if motion.u_r_m_s.ndim or motion.u_a_m_s.ndim or motion.y0_m.ndim or motion.range_m.ndim:
-            raise ValueError("a plan serves one motion, got one with trials; use Reconstruct and FocusAzimuth where each trial has its own velocities")
+            raise ValueError(
+                "a plan serves one motion, got one with trials; use Reconstruct and FocusAzimuth "
+                "where each trial has its own velocities"
+            )
         self.bands, self.n_pulse = rebuild.bands, n_pulse
         self.matrix = _matrix(radar, motion, n_pulse, rebuild, bandwidth_hz).to(dtype)
 
@@ -38,7 +54,9 @@ class AzimuthPlan:
         """data: complex (..., channel, pulse) of the plan's dtype. Differentiable in the data."""
         if data.dtype != self.matrix.dtype or data.shape[-2:] != self.matrix.shape[-2:]:
             expected = f"(..., {self.matrix.shape[-2]}, {self.matrix.shape[-1]}) of {self.matrix.dtype}"
-            raise ValueError(f"this plan works on channels and pulses {expected}, got {tuple(data.shape)} of {data.dtype}")
+            raise ValueError(
+                f"this plan works on channels and pulses {expected}, got {tuple(data.shape)} of {data.dtype}"
+            )
         if torch.is_grad_enabled() and data.requires_grad:
             spectrum = torch.fft.fft(data)
             return torch.fft.ifft(torch.einsum("bmp,...mp->...bp", self.matrix, spectrum).flatten(-2))
@@ -51,7 +69,9 @@ class AzimuthPlan:
         return image.view(*data.shape[:-2], -1)
 
     def _bands(self, spectrum: Tensor) -> Tensor:
-        """Spectra (trial, channel, pulse) to bands (trial, band, pulse), in place as far as it goes."""
+        """Spectra (trial, channel, pulse) to bands (trial, band, pulse), in place as far as it
+        goes.
+        """
         bands = spectrum.new_empty(len(spectrum), self.bands, self.n_pulse)
         for weights, band in zip(self.matrix, bands.unbind(1)):
             torch.mul(spectrum[:, 0], weights[0], out=band)
@@ -61,16 +81,28 @@ class AzimuthPlan:
 
 
 def _matrix(radar: BistaticRadar, motion: PointMotion, n: int, rebuild: Rebuild, bandwidth_hz: float | None) -> Tensor:
-    """Weights (band, channel, pulse), complex128, from the FFT of channels to that of the image, all bins in FFT order."""
+    """Weights (band, channel, pulse), complex128, from the FFT of channels to that of the image,
+    all bins in FFT order.
+    """
     bands, total, step = rebuild.bands, rebuild.bands * n, radar.prf_hz / n
     centre_hz = doppler_centre_hz(radar, motion)
     middle_hz = torch.round(centre_hz / step) * step
     offset = doppler_offsets(n, bands, radar.prf_hz, middle_hz.device)
     weights = rebuild.weights(radar, motion, n)
-    weights = (weights if weights.ndim == 3 else weights.expand(n, -1, -1)).transpose(0, 1).reshape(total, radar.channels)
+    weights = (
+        (weights if weights.ndim == 3 else weights.expand(n, -1, -1)).transpose(0, 1).reshape(total, radar.channels)
+    )
     delay = radar.channels_at(offset.device) / motion.effective_m_s
-    seen = shared_response(radar, motion, n, bands, torch.complex128) * unit_phasor(-(middle_hz - centre_hz) * delay, torch.complex128)[:, None]
-    found = bands * weights * seen.conj().mT.repeat(bands, 1) * azimuth_filter(offset, radar, motion, torch.complex128, middle_hz)[:, None]
+    seen = (
+        shared_response(radar, motion, n, bands, torch.complex128)
+        * unit_phasor(-(middle_hz - centre_hz) * delay, torch.complex128)[:, None]
+    )
+    found = (
+        bands
+        * weights
+        * seen.conj().mT.repeat(bands, 1)
+        * azimuth_filter(offset, radar, motion, torch.complex128, middle_hz)[:, None]
+    )
     if bandwidth_hz is not None:
         found = found * ((middle_hz + offset - centre_hz).abs() <= bandwidth_hz / 2)[:, None]
     bins = torch.remainder(torch.round((middle_hz + offset) / step), total)
@@ -82,10 +114,12 @@ def _matrix(radar: BistaticRadar, motion: PointMotion, n: int, rebuild: Rebuild,
 
 
 class FocusPlan(Stage):
-    """Channels (channel, pulse) to the image (azimuth,) of points with one motion told beforehand, x = V_R t (m): `AzimuthPlan` as a stage.
+    """Channels (channel, pulse) to the image (azimuth,) of points with one motion told beforehand,
+    x = V_R t (m): `AzimuthPlan` as a stage.
 
-    Its plan is kept as long as pulses, dtype and device of the data stay. Arguments as Reconstruct and FocusAzimuth have them, velocities as numbers. Refuses motions at which
-    channels sample the same places, and warns of poor ones.
+    Its plan is kept as long as pulses, dtype and device of the data stay. Arguments as Reconstruct
+    and FocusAzimuth have them, velocities as numbers. Refuses motions at which channels sample the
+    same places, and warns of poor ones.
     """
 
     works_on = ("channel", "pulse")
@@ -117,4 +151,7 @@ class FocusPlan(Stage):
     def forward(self, signal: Signal) -> Signal:
         pulse = signal.axis("pulse")
         refuse_shifted(self.radar, pulse)
-        return Signal(self.plan(signal.data).image(signal.data), (image_axis(self.radar, doppler_axis(self.radar, pulse.n, self.rebuild.bands)),))
+        return Signal(
+            self.plan(signal.data).image(signal.data),
+            (image_axis(self.radar, doppler_axis(self.radar, pulse.n, self.rebuild.bands)),),
+        )

@@ -1,7 +1,10 @@
-"""One picture of a scene at rest and of what moves in it, every target in its place: the whole flow of Remote Sens. 2020, 12, 1703, Fig. 13.
+"""One picture of a scene at rest and of what moves in it, every target in its place: the whole flow
+of Remote Sens. 2020, 12, 1703, Fig. 13.
 
-Conventional image, detection, then for each target, strongest first: extraction of its lines, velocity, removal from the data, picture by its own velocity, and relocation.
-Replicas of a target go with it, so that they are not taken for targets. Weaker targets are looked for in images with the sea suppressed.
+Conventional image, detection, then for each target, strongest first: extraction of its lines,
+velocity, removal from the data, picture by its own velocity, and relocation. Replicas of a target
+go with it, so that they are not taken for targets. Weaker targets are looked for in images with the
+sea suppressed.
 """
 
 from __future__ import annotations
@@ -27,14 +30,19 @@ from torchsar.radar import BistaticRadar
 
 Removal = Literal["subtract", "zero"]
 _ALIKE_M_S = 5.0
-_SIDE_LOBES = 20.0  # times those of one point: a body has many, and its brightest pixels stand above the mean
+# times those of one point: a body has many, and its brightest pixels stand above the mean
+_SIDE_LOBES = 20.0
 
 
 @dataclass(frozen=True)
 class Detector:
-    """When something is a target. threshold_db: of the mean intensity of extent_m (along track, range) over the median of the image; most: targets at most.
+    """When something is a target.
 
-    suppressed_m_s: slant-range speeds at which the sea is suppressed to look for more, none to leave that out.
+    threshold_db: of the mean intensity of extent_m (along track, range) over the median of the
+    image; most: targets at most.
+
+    suppressed_m_s: slant-range speeds at which the sea is suppressed to look for more, none to
+    leave that out.
     """
 
     threshold_db: float = 10.0
@@ -45,7 +53,10 @@ class Detector:
 
     def __post_init__(self) -> None:
         if not (self.threshold_db > 0 and all(x > 0 for x in (*self.extent_m, *self.apart_m)) and self.most >= 1):
-            raise ValueError(f"a detector needs a threshold_db above 0, positive extents and distances, and most of 1 or more, got {self}")
+            raise ValueError(
+                "a detector needs a threshold_db above 0, positive extents and distances, and most "
+                f"of 1 or more, got {self}"
+            )
 
     def found(self, image: Signal) -> list[Detection]:
         return detect(image, self.threshold_db, self.extent_m, self.apart_m, self.most)
@@ -53,9 +64,13 @@ class Detector:
 
 @dataclass(frozen=True)
 class SceneImage:
-    """conventional: the image of everything as if it were at rest. rest: of what is left without the movers. fused: rest with every mover in its place. bodies: all targets, strongest first.
+    """conventional: the image of everything as if it were at rest.
 
-    estimate: u_r_m_s, u_a_m_s, y0_m, range_m (target,), those of the detector's `most` that do not exist being zero and not ok. data: channels without the movers.
+    rest: of what is left without the movers. fused: rest with every mover in its place. bodies: all
+    targets, strongest first.
+
+    estimate: u_r_m_s, u_a_m_s, y0_m, range_m (target,), those of the detector's `most` that do not
+    exist being zero and not ok. data: channels without the movers.
     """
 
     conventional: Signal
@@ -67,10 +82,13 @@ class SceneImage:
 
 
 class ImageMovers(Stage):
-    """Channels (channel, pulse, range) of one frame, range compressed and without the transmit range, to a `SceneImage`.
+    """Channels (channel, pulse, range) of one frame, range compressed and without the transmit
+    range, to a `SceneImage`.
 
-    rebuild: for what is at rest. removal: "subtract" the echo that fits a mover, or "zero" all that lies in its lines and its extent, sea included (kept for comparison).
-    slowest_m_s: what a target must exceed in u_r, u_a to count as a mover; one at rest stays in the image. It takes one frame at a time, since the number of targets differs.
+    rebuild: for what is at rest. removal: "subtract" the echo that fits a mover, or "zero" all that
+    lies in its lines and its extent, sea included (kept for comparison). slowest_m_s: what a target
+    must exceed in u_r, u_a to count as a mover; one at rest stays in the image. It takes one frame
+    at a time, since the number of targets differs.
     """
 
     works_on = ("channel", "pulse", "range")
@@ -93,13 +111,21 @@ class ImageMovers(Stage):
         self.slowest_m_s, self.u_a_half_m_s = slowest_m_s, u_a_half_m_s
 
     def forward(self, signal: Signal, known: Sequence[PointMotion] | None = None) -> SceneImage:
-        """known: motions of all targets, strongest first, by their middles; nothing is looked for then. None to find targets."""
+        """known: motions of all targets, strongest first, by their middles; nothing is looked for
+        then. None to find targets.
+        """
         if signal.trials:
-            raise ValueError(f"ImageMovers works on one frame at a time, got trials {tuple(signal.trials)}; call it for each")
+            raise ValueError(
+                f"ImageMovers works on one frame at a time, got trials {tuple(signal.trials)}; call it for each"
+            )
         conventional = self.image(signal)
         axis = signal.axis("range")
         if known is None and not self._whole(Detection(0.0, axis.start + axis.step * (axis.n // 2), 0.0), signal):
-            warnings.warn(f"no target can be looked for in a swath of {axis.n} range lines: what it walks through leaves it; give more lines, or a smaller extraction", stacklevel=3)
+            warnings.warn(
+                f"no target can be looked for in a swath of {axis.n} range lines: what it walks "
+                "through leaves it; give more lines, or a smaller extraction",
+                stacklevel=3,
+            )
         left, bodies = signal, []
         if known is not None:
             left, bodies = self._told(left, known)
@@ -114,7 +140,9 @@ class ImageMovers(Stage):
         return SceneImage(conventional, rest, fused, bodies, self._estimate(bodies, signal.data), left)
 
     def _looks(self, signal: Signal):
-        """Ways to look at data, each until it finds nothing new: the conventional image, then images with the sea suppressed."""
+        """Ways to look at data, each until it finds nothing new: the conventional image, then
+        images with the sea suppressed.
+        """
         yield self.image
         if self.detector.suppressed_m_s:
             yield lambda data: suppressed_image(data, self.radar, self.image, self.detector.suppressed_m_s)
@@ -141,7 +169,10 @@ class ImageMovers(Stage):
     def _told(self, left: Signal, known: Sequence[PointMotion]) -> tuple[Signal, list[Body]]:
         """Bodies of known motions, and the data without those that move."""
         if len(known) > self.detector.most:
-            raise ValueError(f"{len(known)} motions are known, and the detector takes at most {self.detector.most} targets; raise its `most`")
+            raise ValueError(
+                f"{len(known)} motions are known, and the detector takes at most {self.detector.most} "
+                "targets; raise its `most`"
+            )
         bodies = []
         for motion in known:
             lines, frame = self._lines(left, float(motion.range_m))
@@ -152,30 +183,55 @@ class ImageMovers(Stage):
         return left, bodies
 
     def _whole(self, detection: Detection, signal: Signal) -> bool:
-        """A target here would lie in the swath whatever its velocity, and be abeam during the record."""
+        """A target here would lie in the swath whatever its velocity, and be abeam during the
+        record.
+        """
         axis, pulse = signal.axis("range"), signal.axis("pulse")
         abeam_s = detection.azimuth_m / self.radar.speed_m_s
-        walk = self.extraction.range_m + self.radar.ambiguous_velocity_m_s / 2 * (abs(abeam_s) + self.extraction.integration_s / 2)
+        walk = self.extraction.range_m + self.radar.ambiguous_velocity_m_s / 2 * (
+            abs(abeam_s) + self.extraction.integration_s / 2
+        )
         curvature = (self.extraction.integration_s * self.radar.speed_m_s) ** 2 / (8 * self.radar.reference_range_m)
-        return axis.start + walk <= detection.range_m <= axis.stop - walk - curvature and pulse.start < abeam_s < pulse.stop
+        return (
+            axis.start + walk <= detection.range_m <= axis.stop - walk - curvature
+            and pulse.start < abeam_s < pulse.stop
+        )
 
     def _same(self, a: Detection, b: Detection) -> bool:
-        return abs(a.azimuth_m - b.azimuth_m) < self.detector.apart_m[0] / 2 and abs(a.range_m - b.range_m) < self.detector.apart_m[1]
+        return (
+            abs(a.azimuth_m - b.azimuth_m) < self.detector.apart_m[0] / 2
+            and abs(a.range_m - b.range_m) < self.detector.apart_m[1]
+        )
 
     def _side_lobe(self, body: Body, other: Body) -> bool:
-        """What a body shows may be side lobes in range, beyond the lines that were removed, of another at the same place along track and of nearly the same velocity."""
+        """What a body shows may be side lobes in range, beyond the lines that were removed, of
+        another at the same place along track and of nearly the same velocity.
+        """
         away_m = float((body.motion.range_m - other.motion.range_m).abs())
-        moves_alike = abs(float(body.motion.u_r_m_s - other.motion.u_r_m_s)) < _ALIKE_M_S and abs(float(body.motion.u_a_m_s - other.motion.u_a_m_s)) < _ALIKE_M_S
+        moves_alike = (
+            abs(float(body.motion.u_r_m_s - other.motion.u_r_m_s)) < _ALIKE_M_S
+            and abs(float(body.motion.u_a_m_s - other.motion.u_a_m_s)) < _ALIKE_M_S
+        )
         beside = abs(self._shown(body).azimuth_m - self._shown(other).azimuth_m) < self.detector.apart_m[0] / 2
         cell_m = self.radar.wave_speed_m_s / self.radar.pulse.bandwidth_hz
-        return moves_alike and beside and float(body.level) < _SIDE_LOBES * float(other.level) * (cell_m / (math.pi * max(away_m, cell_m))) ** 2
+        return (
+            moves_alike
+            and beside
+            and float(body.level) < _SIDE_LOBES * float(other.level) * (cell_m / (math.pi * max(away_m, cell_m))) ** 2
+        )
 
     def _shown(self, body: Body) -> Detection:
         """Where an image of everything at rest shows a body."""
-        return Detection(self.radar.speed_m_s * float(body.motion.image_s), float(body.motion.closest_m), 10 * math.log10(max(float(body.level), 1e-30)))
+        return Detection(
+            self.radar.speed_m_s * float(body.motion.image_s),
+            float(body.motion.closest_m),
+            10 * math.log10(max(float(body.level), 1e-30)),
+        )
 
     def _moves(self, body: Body) -> bool:
-        return bool(body.motion.u_r_m_s.abs() > self.slowest_m_s[0]) or bool(body.motion.u_a_m_s.abs() > self.slowest_m_s[1])
+        return bool(body.motion.u_r_m_s.abs() > self.slowest_m_s[0]) or bool(
+            body.motion.u_a_m_s.abs() > self.slowest_m_s[1]
+        )
 
     def _lines(self, signal: Signal, near_m: float) -> tuple[slice, Frame]:
         """Lines about a range, enough of them to learn the sea from."""
@@ -188,7 +244,14 @@ class ImageMovers(Stage):
 
     def _body(self, signal: Signal, detection: Detection) -> Body:
         lines, frame = self._lines(signal, detection.range_m)
-        return find_body(signal.data[..., lines], frame, detection.azimuth_m / self.radar.speed_m_s, detection.range_m, self.extraction, u_a_half_m_s=self.u_a_half_m_s)
+        return find_body(
+            signal.data[..., lines],
+            frame,
+            detection.azimuth_m / self.radar.speed_m_s,
+            detection.range_m,
+            self.extraction,
+            u_a_half_m_s=self.u_a_half_m_s,
+        )
 
     def _without(self, signal: Signal, body: Body) -> Signal:
         lines, frame = self._lines(signal, float(body.motion.range_m))
@@ -202,26 +265,39 @@ class ImageMovers(Stage):
 
         def row(values: list[Tensor]) -> Tensor:
             kept = torch.stack(values) if values else like.real.new_zeros(0, dtype=torch.float64)
-            return torch.cat([kept.to(torch.float64), torch.zeros(most - len(kept), dtype=torch.float64, device=like.device)])
+            return torch.cat(
+                [kept.to(torch.float64), torch.zeros(most - len(kept), dtype=torch.float64, device=like.device)]
+            )
 
-        value = {name: row([getattr(body.motion, name) for body in bodies]) for name in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")}
+        value = {
+            name: row([getattr(body.motion, name) for body in bodies])
+            for name in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
+        }
         ok = row([body.ok.to(torch.float64) for body in bodies]) > 0
         level = row([body.level for body in bodies])
-        return Estimate(value, level / (100 + level), ok, {"u_r_m_s": row([body.u_r_std_m_s for body in bodies])}, {"level": level})
+        return Estimate(
+            value, level / (100 + level), ok, {"u_r_m_s": row([body.u_r_std_m_s for body in bodies])}, {"level": level}
+        )
 
 
-def suppressed_image(signal: Signal, radar: BistaticRadar, image: StationaryImage, speeds_m_s: Sequence[float]) -> Signal:
-    """Intensity root of images in which the sea is suppressed, the greatest over slant-range speeds, each over its own median: what moves stands out.
+def suppressed_image(
+    signal: Signal, radar: BistaticRadar, image: StationaryImage, speeds_m_s: Sequence[float]
+) -> Signal:
+    """Intensity root of images in which the sea is suppressed, the greatest over slant-range
+    speeds, each over its own median: what moves stands out.
 
-    The channels of every Doppler bin are weighted by the inverse covariance of all range lines, then by the response of a point of that speed: the Doppler
-    filter of the paper with the channels taken along. Real amplitudes on the axes of `image`.
+    The channels of every Doppler bin are weighted by the inverse covariance of all range lines,
+    then by the response of a point of that speed: the Doppler filter of the paper with the channels
+    taken along. Real amplitudes on the axes of `image`.
     """
     data = signal.data.movedim(-1, -3)
     whitening = line_whitening(data, radar, samples=4 * data.shape[-3])
     backed = whitening.expanded(data.shape[-3]).backed(data.to(torch.complex128)).movedim(-3, -1).to(signal.data.dtype)
     best, shown = None, None
     for speed in speeds_m_s:
-        matched = image.focused(_matched(backed, radar, PointMotion.of(radar, signal.data.real, speed), image.rebuild.bands), signal)
+        matched = image.focused(
+            _matched(backed, radar, PointMotion.of(radar, signal.data.real, speed), image.rebuild.bands), signal
+        )
         level = matched.data.abs().square()
         level = level / level.median().clamp_min(torch.finfo(level.dtype).tiny)
         best, shown = level if best is None else torch.maximum(best, level), matched
@@ -230,19 +306,29 @@ def suppressed_image(signal: Signal, radar: BistaticRadar, image: StationaryImag
 
 
 def _matched(data: Tensor, radar: BistaticRadar, motion: PointMotion, bands: int) -> Tensor:
-    """Doppler spectrum of what channels (channel, pulse, range) hold of points of this speed, bins about zero Doppler, (bands * pulse, range)."""
+    """Doppler spectrum of what channels (channel, pulse, range) hold of points of this speed, bins
+    about zero Doppler, (bands * pulse, range).
+    """
     n = data.shape[-2]
     spectrum = torch.roll(fft_lines(torch.fft.ifftshift(data, dim=-2)), -first_bin(n, bands), -2)
-    # bins lie about zero, not about the point's Doppler: its response at Doppler f is that at offset f - f_dc
+    # bins lie about zero, not about the point's Doppler: its response at Doppler f is that at
+    # offset f - f_dc
     turns = motion.u_r_m_s / radar.wavelength_m * radar.channels_at(data.device) / motion.effective_m_s
     shift = linear_phasor(-turns, 1, 1, data.dtype)
-    response = shared_response(radar, replace(motion, u_r_m_s=torch.zeros_like(motion.u_r_m_s)), n, bands, data.dtype) * shift.conj()
+    response = (
+        shared_response(radar, replace(motion, u_r_m_s=torch.zeros_like(motion.u_r_m_s)), n, bands, data.dtype)
+        * shift.conj()
+    )
     weights = band_matrix(radar, motion, bands).mH.to(data.dtype)
-    return (weights @ (spectrum * response.conj()[..., None]).flatten(-2)).unflatten(-1, spectrum.shape[-2:]).flatten(0, 1)
+    return (
+        (weights @ (spectrum * response.conj()[..., None]).flatten(-2)).unflatten(-1, spectrum.shape[-2:]).flatten(0, 1)
+    )
 
 
 def placed(image: Signal, body: Body, extraction: Extraction) -> Signal:
-    """The image (azimuth, range) with the picture of a body added in its place: along track at t = 0, at its closest ranges, scaled as points at rest are."""
+    """The image (azimuth, range) with the picture of a body added in its place: along track at t =
+    0, at its closest ranges, scaled as points at rest are.
+    """
     azimuth, range_ = image.axes
     chip, motion = body.chip, body.chip.motion
     place = azimuth.values(image.data.device)

@@ -8,4 +8,16 @@ from torchsar.optim.newton import newton
 from torchsar.optim.population import Searched
 from torchsar.optim.scalar import gradient_minimum, grid_minimum, parabola_minimum
 
-__all__ = ["Descent", "Searched", "adam", "differential_evolution", "genetic", "gradient_minimum", "grid_minimum", "grid_search", "lbfgs", "newton", "parabola_minimum"]
+__all__ = [
+    "Descent",
+    "Searched",
+    "adam",
+    "differential_evolution",
+    "genetic",
+    "gradient_minimum",
+    "grid_minimum",
+    "grid_search",
+    "lbfgs",
+    "newton",
+    "parabola_minimum",
+]

@@ -1,4 +1,6 @@
-"""Minimising a smooth function of a vector per trial, all trials at once: each trial has its own search, its own history and its own end."""
+"""Minimising a smooth function of a vector per trial, all trials at once: each trial has its own
+search, its own history and its own end.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-Objective = Callable[[Tensor], Any]  # (..., n) -> (...,), or with_gradient=True: -> ((...,), (..., n))
+# (..., n) -> (...,), or with_gradient=True: -> ((...,), (..., n))
+Objective = Callable[[Tensor], Any]
 
 _SUFFICIENT = 1e-4  # of the decrease that the slope promises (Armijo)
 _CURVATURE = 0.9  # of the slope at the start of the search (strong Wolfe)
@@ -20,9 +23,11 @@ _EDGE = 0.1  # of a bracket: no trial point closer to its ends
 class Descent:
     """What a descent found, per trial (...,).
 
-    x: (..., n) best point. cost: (...,) there, in the dtype of the objective. gradient_norm: (...,) Euclidean, there. steps: (...,) int64 steps taken.
-    evaluations: (...,) int64 calls of the objective in which the trial took part. converged: (...,) bool, a tolerance was met. ok: (...,) bool,
-    False where the start or the way was not finite: x is then the best finite point, or the start; a start that was not finite keeps its cost and gradient as they came.
+    x: (..., n) best point. cost: (...,) there, in the dtype of the objective. gradient_norm: (...,)
+    Euclidean, there. steps: (...,) int64 steps taken. evaluations: (...,) int64 calls of the
+    objective in which the trial took part. converged: (...,) bool, a tolerance was met. ok: (...,)
+    bool, False where the start or the way was not finite: x is then the best finite point, or the
+    start; a start that was not finite keeps its cost and gradient as they came.
     """
 
     x: Tensor
@@ -46,20 +51,29 @@ def lbfgs(
     search: int = 20,
     with_gradient: bool = False,
 ) -> Descent:
-    """Limited-memory BFGS with a strong Wolfe line search. start: (..., n) float32 or float64; objective: (..., n) -> (...,) costs, each of its own row alone.
+    """Limited-memory BFGS with a strong Wolfe line search.
 
-    Every call of the objective serves all trials, each at its own place of its own search: none waits for another, and no result depends on the others.
-    A finished trial is still evaluated (at its result), but neither changes nor counts. Gradients come from autograd, also under no_grad, or from
-    the objective itself (with_gradient=True: it returns costs (...,) and gradients (..., n)). Invariant to the scale and the offset of the cost, but for
-    value_tolerance. The result is detached. Trials are leading dims; it cannot be put inside vmap.
+    start: (..., n) float32 or float64; objective: (..., n) -> (...,) costs, each of its own row
+    alone.
 
-    steps: at most, per trial. history: pairs kept, those without positive curvature are dropped. gradient_tolerance: a trial has converged when its gradient norm is
-    at most this fraction of that at the start. value_tolerance: or when a step lowers the cost by at most this fraction of it (at least four units of rounding). first_step: length
-    of the first trial step in the units of x. search: evaluations of one line search at most; a search that finds nothing drops the history once, then ends the trial.
-    A step into non-finite cost or gradient counts as too long; a trial whose search ends at such a wall is not ok.
+    Every call of the objective serves all trials, each at its own place of its own search: none
+    waits for another, and no result depends on the others. A finished trial is still evaluated (at
+    its result), but neither changes nor counts. Gradients come from autograd, also under no_grad,
+    or from the objective itself (with_gradient=True: it returns costs (...,) and gradients (...,
+    n)). Invariant to the scale and the offset of the cost, but for value_tolerance. The result is
+    detached. Trials are leading dims; it cannot be put inside vmap.
 
-    Raises TypeError or ValueError for a start that is not real floating, an answer of the wrong shape, or limits that make no sense.
-    Nocedal and Wright 2006, Numerical Optimization, algorithms 7.4 (two loops), 3.5 and 3.6 (search), Eq. (3.59) (cubic).
+    steps: at most, per trial. history: pairs kept, those without positive curvature are dropped.
+    gradient_tolerance: a trial has converged when its gradient norm is at most this fraction of
+    that at the start. value_tolerance: or when a step lowers the cost by at most this fraction of
+    it (at least four units of rounding). first_step: length of the first trial step in the units of
+    x. search: evaluations of one line search at most; a search that finds nothing drops the history
+    once, then ends the trial. A step into non-finite cost or gradient counts as too long; a trial
+    whose search ends at such a wall is not ok.
+
+    Raises TypeError or ValueError for a start that is not real floating, an answer of the wrong
+    shape, or limits that make no sense. Nocedal and Wright 2006, Numerical Optimization, algorithms
+    7.4 (two loops), 3.5 and 3.6 (search), Eq. (3.59) (cubic).
     """
     _check_start(start)
     _check_limits("lbfgs", steps=steps, history=history, search=search, first_step=first_step)
@@ -86,13 +100,17 @@ def adam(
     patience: int = 50,
     with_gradient: bool = False,
 ) -> Descent:
-    """Adam at a constant rate, returning the best point visited. start, objective, gradients, result and errors as in `lbfgs`; one evaluation a step.
+    """Adam at a constant rate, returning the best point visited.
 
-    rate: length of the first step in each coordinate, in the units of x. betas: memory of the gradient and of its square, per step. A trial has converged when
-    its gradient norm is at most gradient_tolerance of that at the start, or when its best cost fell by at most value_tolerance of itself during
-    `patience` steps, which must outlast an overshoot. A trial that steps onto a non-finite cost or gradient ends there, not ok. For costs that are rough
-    on the scale of a step, or noisy; `lbfgs` goes further in fewer evaluations on a smooth one.
-    Kingma and Ba 2015, algorithm 1, with epsilon relative to the first gradient.
+    start, objective, gradients, result and errors as in `lbfgs`; one evaluation a step.
+
+    rate: length of the first step in each coordinate, in the units of x. betas: memory of the
+    gradient and of its square, per step. A trial has converged when its gradient norm is at most
+    gradient_tolerance of that at the start, or when its best cost fell by at most value_tolerance
+    of itself during `patience` steps, which must outlast an overshoot. A trial that steps onto a
+    non-finite cost or gradient ends there, not ok. For costs that are rough on the scale of a step,
+    or noisy; `lbfgs` goes further in fewer evaluations on a smooth one. Kingma and Ba 2015,
+    algorithm 1, with epsilon relative to the first gradient.
     """
     _check_start(start)
     _check_limits("adam", steps=steps, patience=patience, rate=rate)
@@ -107,7 +125,9 @@ def adam(
                 break
             walk = _walk(walk, scaled, count, rate, betas)
             walk = _ended(walk, scaled, gradient_tolerance, value_tolerance, patience)
-    return Descent(walk.best, walk.best_cost, walk.best_norm * scaled.scale, walk.steps, walk.steps + 1, walk.converged, walk.ok)
+    return Descent(
+        walk.best, walk.best_cost, walk.best_norm * scaled.scale, walk.steps, walk.steps + 1, walk.converged, walk.ok
+    )
 
 
 class _Rules(NamedTuple):
@@ -119,7 +139,9 @@ class _Rules(NamedTuple):
 
 
 class _Scaled:
-    """The objective with gradients divided by the largest element of the first one, per trial: no square of them leaves the range of the dtype."""
+    """The objective with gradients divided by the largest element of the first one, per trial: no
+    square of them leaves the range of the dtype.
+    """
 
     def __init__(self, objective: Objective, start: Tensor, with_gradient: bool) -> None:
         self._objective, self._with_gradient = objective, with_gradient
@@ -139,7 +161,9 @@ class _Scaled:
 
 
 class _Point(NamedTuple):
-    """A point of the search: step along the direction, rise of the cost since the search began and slope, both over the descent there (slope -1 at step 0)."""
+    """A point of the search: step along the direction, rise of the cost since the search began and
+    slope, both over the descent there (slope -1 at step 0).
+    """
 
     step: Tensor
     rise: Tensor
@@ -147,7 +171,10 @@ class _Point(NamedTuple):
 
 
 class _Search(NamedTuple):
-    """low: the lowest point with sufficient decrease, with its cost and gradient. high: the other end of the bracket, at step inf until there is one."""
+    """low: the lowest point with sufficient decrease, with its cost and gradient.
+
+    high: the other end of the bracket, at step inf until there is one.
+    """
 
     low: _Point
     high: _Point
@@ -158,7 +185,10 @@ class _Search(NamedTuple):
 
 
 class _Pairs(NamedTuple):
-    """The last moves and gradient changes (history, ..., n), newest last, and 1 / (move . change), (history, ...), 0 where there is none."""
+    """The last moves and gradient changes (history, ..., n), newest last, and 1 / (move .
+
+    change), (history, ...), 0 where there is none.
+    """
 
     move: Tensor
     change: Tensor
@@ -187,7 +217,20 @@ def _opening(scaled: _Scaled, history: int, rules: _Rules) -> _State:
     direction, descent, search = _aim(scaled.cost, scaled.gradient, pairs, rules)
     steps = torch.zeros_like(converged, dtype=torch.int64)
     active = scaled.finite & ~converged
-    return _State(scaled.start, scaled.cost, scaled.gradient, direction, descent, pairs, search, steps, steps + 1, active, converged, scaled.finite)
+    return _State(
+        scaled.start,
+        scaled.cost,
+        scaled.gradient,
+        direction,
+        descent,
+        pairs,
+        search,
+        steps,
+        steps + 1,
+        active,
+        converged,
+        scaled.finite,
+    )
 
 
 def _advance(state: _State, scaled: _Scaled, rules: _Rules) -> _State:
@@ -202,20 +245,29 @@ def _advance(state: _State, scaled: _Scaled, rules: _Rules) -> _State:
 
 
 def _probe(state: _State, scaled: _Scaled) -> tuple[_Search, Tensor]:
-    """Evaluate the next point of each search; the search that knows it, and whether the point is good enough."""
+    """Evaluate the next point of each search; the search that knows it, and whether the point is
+    good enough.
+    """
     search = state.search
     cost, gradient, finite = scaled(_where(state.active, _along(state, search.step), state.x))
     rise = _relative(cost - state.cost, state, scaled)
     slope = _dot(gradient, state.direction) / state.descent
     point = _Point(search.step, torch.where(finite, rise, torch.inf), slope)
-    # near the minimum the cost is rounded: a rise of some units in its last place is none, and the slope decides
+    # near the minimum the cost is rounded: a rise of some units in its last place is none, and the
+    # slope decides
     rounding = _relative(4 * torch.finfo(cost.dtype).eps * state.cost.abs(), state, scaled)
     low, high, step, higher, accepted = _narrow(search.low, search.high, point, rounding)
-    return _Search(low, high, _where(higher, search.cost, cost), _where(higher, search.gradient, gradient), step, search.tries + 1), accepted
+    return _Search(
+        low, high, _where(higher, search.cost, cost), _where(higher, search.gradient, gradient), step, search.tries + 1
+    ), accepted
 
 
-def _narrow(low: _Point, high: _Point, point: _Point, rounding: Tensor) -> tuple[_Point, _Point, Tensor, Tensor, Tensor]:
-    """One round of the strong Wolfe search: new ends, next step, whether the point is too high, and whether it is good enough."""
+def _narrow(
+    low: _Point, high: _Point, point: _Point, rounding: Tensor
+) -> tuple[_Point, _Point, Tensor, Tensor, Tensor]:
+    """One round of the strong Wolfe search: new ends, next step, whether the point is too high, and
+    whether it is good enough.
+    """
     higher = ~(point.rise <= torch.minimum(-_SUFFICIENT * point.step, low.rise) + rounding)
     accepted = ~higher & (point.slope.abs() <= _CURVATURE)
     turned = ~higher & (torch.sign(point.slope) * torch.sign(high.step - low.step) > 0)
@@ -246,10 +298,16 @@ def _cubic(a: _Point, b: _Point) -> Tensor:
 
 
 def _move(state: _State, ended: Tensor, wall: Tensor, scaled: _Scaled, rules: _Rules) -> _State:
-    """Take the lowest point of each search that has ended, remember the pair, and see who has finished."""
+    """Take the lowest point of each search that has ended, remember the pair, and see who has
+    finished.
+    """
     search = state.search
     moved = ended & (search.low.step > 0)
-    x, cost, gradient = _where(moved, _along(state, search.low.step), state.x), _where(moved, search.cost, state.cost), _where(moved, search.gradient, state.gradient)
+    x, cost, gradient = (
+        _where(moved, _along(state, search.low.step), state.x),
+        _where(moved, search.cost, state.cost),
+        _where(moved, search.gradient, state.gradient),
+    )
     # below a few units of rounding a search only chases noise
     tolerance = max(rules.value_tolerance, 4 * torch.finfo(cost.dtype).eps) if rules.value_tolerance else 0.0
     lowered = state.cost - cost <= tolerance * torch.maximum(cost.abs(), state.cost.abs())
@@ -259,17 +317,32 @@ def _move(state: _State, ended: Tensor, wall: Tensor, scaled: _Scaled, rules: _R
     pairs = _remember(state.pairs, x - state.x, gradient - state.gradient, moved)
     pairs = pairs._replace(inverse=torch.where(ended & ~moved, 0, pairs.inverse))
     active = state.active & ~(converged | stuck | wall | (steps >= rules.steps))
-    return state._replace(x=x, cost=cost, gradient=gradient, pairs=pairs, steps=steps, active=active, converged=state.converged | converged, ok=state.ok & (~wall | converged))
+    return state._replace(
+        x=x,
+        cost=cost,
+        gradient=gradient,
+        pairs=pairs,
+        steps=steps,
+        active=active,
+        converged=state.converged | converged,
+        ok=state.ok & (~wall | converged),
+    )
 
 
 def _turn(state: _State, ended: Tensor, rules: _Rules) -> _State:
     """Begin a new search where one has ended."""
     direction, descent, search = _aim(state.cost, state.gradient, state.pairs, rules)
-    return state._replace(direction=_where(ended, direction, state.direction), descent=_where(ended, descent, state.descent), search=_where(ended, search, state.search))
+    return state._replace(
+        direction=_where(ended, direction, state.direction),
+        descent=_where(ended, descent, state.descent),
+        search=_where(ended, search, state.search),
+    )
 
 
 def _aim(cost: Tensor, gradient: Tensor, pairs: _Pairs, rules: _Rules) -> tuple[Tensor, Tensor, _Search]:
-    """The quasi-Newton direction (steepest descent without pairs), the descent along it per unit step, and a search that has not begun."""
+    """The quasi-Newton direction (steepest descent without pairs), the descent along it per unit
+    step, and a search that has not begun.
+    """
     newton = _two_loops(gradient, pairs)
     promised = -_dot(gradient, newton)
     usable = (pairs.inverse[-1] > 0) & torch.isfinite(promised) & (promised > 0)
@@ -279,7 +352,13 @@ def _aim(cost: Tensor, gradient: Tensor, pairs: _Pairs, rules: _Rules) -> tuple[
     descent = torch.where(usable, promised, norm.square())
     zero = torch.zeros_like(step)
     low = _Point(zero, zero, zero - 1)
-    return direction, descent, _Search(low, low._replace(step=zero + torch.inf), cost, gradient, step, torch.zeros_like(step, dtype=torch.int64))
+    return (
+        direction,
+        descent,
+        _Search(
+            low, low._replace(step=zero + torch.inf), cost, gradient, step, torch.zeros_like(step, dtype=torch.int64)
+        ),
+    )
 
 
 def _two_loops(gradient: Tensor, pairs: _Pairs) -> Tensor:
@@ -301,7 +380,11 @@ def _remember(pairs: _Pairs, move: Tensor, change: Tensor, moved: Tensor) -> _Pa
     keep = moved & (curvature > torch.finfo(move.dtype).eps * _norm(move) * _norm(change))
     newest = _Pairs(move, change, 1 / torch.where(keep, curvature, 1))
     move, change, inverse = (torch.cat((old[1:], new[None])) for old, new in zip(pairs, newest, strict=True))
-    return _Pairs(torch.where(keep[..., None], move, pairs.move), torch.where(keep[..., None], change, pairs.change), torch.where(keep, inverse, pairs.inverse))
+    return _Pairs(
+        torch.where(keep[..., None], move, pairs.move),
+        torch.where(keep[..., None], change, pairs.change),
+        torch.where(keep, inverse, pairs.inverse),
+    )
 
 
 def _along(state: _State, step: Tensor) -> Tensor:
@@ -332,7 +415,21 @@ def _first_walk(scaled: _Scaled, gradient_tolerance: float) -> _Walk:
     none, count = torch.zeros_like(scaled.start), torch.zeros_like(scaled.finite, dtype=torch.int64)
     converged = scaled.finite & (scaled.norm == 0)
     active = scaled.finite & ~converged
-    return _Walk(scaled.start, scaled.gradient, none, none, scaled.start, scaled.cost, scaled.norm, scaled.cost, count, count, active, converged, scaled.finite)
+    return _Walk(
+        scaled.start,
+        scaled.gradient,
+        none,
+        none,
+        scaled.start,
+        scaled.cost,
+        scaled.norm,
+        scaled.cost,
+        count,
+        count,
+        active,
+        converged,
+        scaled.finite,
+    )
 
 
 def _walk(walk: _Walk, scaled: _Scaled, count: int, rate: float, betas: tuple[float, float]) -> _Walk:
@@ -359,11 +456,18 @@ def _walk(walk: _Walk, scaled: _Scaled, count: int, rate: float, betas: tuple[fl
 
 
 def _ended(walk: _Walk, scaled: _Scaled, gradient_tolerance: float, value_tolerance: float, patience: int) -> _Walk:
-    """Who has converged: a small gradient at the best point, or no gain worth the name for `patience` steps."""
+    """Who has converged: a small gradient at the best point, or no gain worth the name for
+    `patience` steps.
+    """
     gain = walk.mark - walk.best_cost > value_tolerance * torch.maximum(walk.mark.abs(), walk.best_cost.abs())
     waited = torch.where(gain, 0, walk.waited + 1)
     converged = walk.active & ((walk.best_norm <= gradient_tolerance * scaled.norm) | (waited >= patience))
-    return walk._replace(mark=torch.where(gain, walk.best_cost, walk.mark), waited=waited, active=walk.active & ~converged, converged=walk.converged | converged)
+    return walk._replace(
+        mark=torch.where(gain, walk.best_cost, walk.mark),
+        waited=waited,
+        active=walk.active & ~converged,
+        converged=walk.converged | converged,
+    )
 
 
 def _derived(objective: Objective, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -373,26 +477,40 @@ def _derived(objective: Objective, x: Tensor) -> tuple[Tensor, Tensor]:
         _check_cost(cost, x)
         (gradient,) = torch.autograd.grad(cost.sum(), x, allow_unused=True) if cost.requires_grad else (None,)
         if gradient is None:
-            raise ValueError("the objective returned costs that autograd cannot follow back to x; leave out detach and no_grad, or return (cost, gradient) with with_gradient=True")
+            raise ValueError(
+                "the objective returned costs that autograd cannot follow back to x; leave out "
+                "detach and no_grad, or return (cost, gradient) with with_gradient=True"
+            )
     return cost.detach(), gradient
 
 
 def _given(objective: Objective, x: Tensor) -> tuple[Tensor, Tensor]:
     answer = objective(x)
     if not (isinstance(answer, tuple) and len(answer) == 2):
-        raise TypeError(f"with_gradient=True needs an objective that returns (cost, gradient), this one returned {type(answer).__name__}; return the pair or leave with_gradient out")
+        raise TypeError(
+            "with_gradient=True needs an objective that returns (cost, gradient), this one "
+            f"returned {type(answer).__name__}; return the pair or leave with_gradient out"
+        )
     cost, gradient = answer
     _check_cost(cost, x)
     if not isinstance(gradient, Tensor) or gradient.shape != x.shape:
-        raise ValueError(f"the objective returned {_what(gradient)} as gradient at x of shape {tuple(x.shape)}; return the same shape as x")
+        raise ValueError(
+            f"the objective returned {_what(gradient)} as gradient at x of shape "
+            f"{tuple(x.shape)}; return the same shape as x"
+        )
     return cost.detach(), gradient.detach().to(x.dtype)
 
 
 def _check_start(start: Tensor) -> None:
     if start.dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"start is {start.dtype}; a descent needs float32 or float64, give complex unknowns as their real and imaginary parts")
+        raise TypeError(
+            f"start is {start.dtype}; a descent needs float32 or float64, give complex unknowns "
+            "as their real and imaginary parts"
+        )
     if start.ndim == 0 or start.shape[-1] == 0:
-        raise ValueError(f"start has shape {tuple(start.shape)}; give the unknowns in its last dim, (..., n) with n of at least 1")
+        raise ValueError(
+            f"start has shape {tuple(start.shape)}; give the unknowns in its last dim, (..., n) with n of at least 1"
+        )
 
 
 def _check_limits(method: str, **limits: float) -> None:
@@ -403,12 +521,18 @@ def _check_limits(method: str, **limits: float) -> None:
 
 def _check_tolerances(method: str, gradient_tolerance: float, value_tolerance: float) -> None:
     if not (gradient_tolerance >= 0 and value_tolerance >= 0):
-        raise ValueError(f"{method}: gradient_tolerance is {gradient_tolerance} and value_tolerance {value_tolerance}; choose relative tolerances of at least 0, such as 1e-6")
+        raise ValueError(
+            f"{method}: gradient_tolerance is {gradient_tolerance} and value_tolerance "
+            f"{value_tolerance}; choose relative tolerances of at least 0, such as 1e-6"
+        )
 
 
 def _check_cost(cost: Any, x: Tensor) -> None:
     if not isinstance(cost, Tensor) or cost.shape != x.shape[:-1] or not cost.is_floating_point():
-        raise ValueError(f"the objective returned {_what(cost)} for x of shape {tuple(x.shape)}; return one real cost per trial, shape {tuple(x.shape[:-1])}")
+        raise ValueError(
+            f"the objective returned {_what(cost)} for x of shape {tuple(x.shape)}; return one "
+            f"real cost per trial, shape {tuple(x.shape[:-1])}"
+        )
 
 
 def _what(value: Any) -> str:
@@ -416,7 +540,9 @@ def _what(value: Any) -> str:
 
 
 def _where(mask: Tensor, yes: Any, no: Any) -> Any:
-    """torch.where, in every tensor of named tuples; mask: (...,), also over tensors with a dim of unknowns (..., n)."""
+    """torch.where, in every tensor of named tuples; mask: (...,), also over tensors with a dim of
+    unknowns (..., n).
+    """
     if isinstance(yes, Tensor):
         return torch.where(mask[..., None] if yes.ndim > mask.ndim else mask, yes, no)
     return type(yes)(*(_where(mask, a, b) for a, b in zip(yes, no, strict=True)))

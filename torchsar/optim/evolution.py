@@ -26,12 +26,16 @@ def differential_evolution(
     weight: float = 0.7,
     crossover: float = 0.9,
 ) -> Searched:
-    """Least cost inside a box by differences of candidates. objective, low, high, draws, history and errors as in `genetic`.
+    """Least cost inside a box by differences of candidates.
 
-    Every candidate is challenged, generation by generation, by base + weight * (one - other), where base, one and other are three further candidates
-    ("rand1bin"; for "best1bin" the base is the best), of which each unknown is taken with the chance `crossover` and one at least; the better of the two stays. Challengers
-    outside the box are moved onto its edge. A trial costs population * (generations + 1) evaluations (888 by default). population: 4 at least.
-    Storn and Price 1997, DE/rand/1/bin and DE/best/1/bin.
+    objective, low, high, draws, history and errors as in `genetic`.
+
+    Every candidate is challenged, generation by generation, by base + weight * (one - other), where
+    base, one and other are three further candidates ("rand1bin"; for "best1bin" the base is the
+    best), of which each unknown is taken with the chance `crossover` and one at least; the better
+    of the two stays. Challengers outside the box are moved onto its edge. A trial costs population
+    * (generations + 1) evaluations (888 by default). population: 4 at least. Storn and Price 1997,
+    DE/rand/1/bin and DE/best/1/bin.
     """
     box = Box.of(low, high, "differential_evolution")
     _check(population, generations, strategy, weight, crossover)
@@ -73,7 +77,9 @@ class _Rule:
         return torch.where((chance[..., :n] < self.crossover) | forced, mutant, x)
 
     def _partners(self, purpose: str) -> tuple[Tensor, Tensor, Tensor]:
-        """Three candidates (..., population) for each, all different from it and from each other."""
+        """Three candidates (..., population) for each, all different from it and from each
+        other.
+        """
         order = self.dice.uniform(purpose, (self.population, self.population)).clone()
         order.diagonal(dim1=-2, dim2=-1).fill_(torch.inf)
         first = order.argsort(-1)[..., :3]
@@ -85,4 +91,7 @@ def _check(population: int, generations: int, strategy: str, weight: float, cros
     if strategy not in ("rand1bin", "best1bin"):
         raise ValueError(f"differential_evolution: strategy {strategy!r} is not known; choose 'rand1bin' or 'best1bin'")
     if not (0 < weight <= 2 and 0 <= crossover <= 1):
-        raise ValueError(f"differential_evolution: weight {weight} must be above 0 and at most 2, crossover {crossover} a chance in 0..1")
+        raise ValueError(
+            f"differential_evolution: weight {weight} must be above 0 and at most 2, crossover "
+            f"{crossover} a chance in 0..1"
+        )

@@ -1,4 +1,6 @@
-"""What searches by a population share: their result, the box they keep to, and random numbers at addresses."""
+"""What searches by a population share: their result, the box they keep to, and random numbers at
+addresses.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,9 @@ Population = Callable[[Tensor], Tensor]  # (..., candidate, n) -> (..., candidat
 class Searched:
     """What a search without gradients found, per trial (...,).
 
-    x: (..., n) best point. cost: (...,) there. evaluations: (...,) int64 candidates whose cost was computed. history: costs on the way; each search says which.
-    ok: (...,) bool, False where no candidate had a finite cost: x is then the first one and cost +inf.
+    x: (..., n) best point. cost: (...,) there. evaluations: (...,) int64 candidates whose cost was
+    computed. history: costs on the way; each search says which. ok: (...,) bool, False where no
+    candidate had a finite cost: x is then the first one and cost +inf.
     """
 
     x: Tensor
@@ -31,22 +34,35 @@ class Searched:
 
 @dataclass(frozen=True)
 class Box:
-    """Least and greatest values (*trials, n) of the unknowns, float64 or float32; equal ones hold an unknown fixed."""
+    """Least and greatest values (*trials, n) of the unknowns, float64 or float32; equal ones hold
+    an unknown fixed.
+    """
 
     low: Tensor
     high: Tensor
 
     @staticmethod
     def of(low: Tensor, high: Tensor, who: str) -> Box:
-        """Raises TypeError for what is no real floating tensor, ValueError for shapes that do not fit, bounds that are not finite, or low > high."""
+        """Raises TypeError for what is no real floating tensor, ValueError for shapes that do not
+        fit, bounds that are not finite, or low > high.
+        """
         for name, bound in (("low", low), ("high", high)):
             if not isinstance(bound, Tensor) or not bound.is_floating_point():
-                raise TypeError(f"{who}: {name} must be a float32 or float64 tensor (..., n), got {bound.dtype if isinstance(bound, Tensor) else type(bound).__name__}")
+                raise TypeError(
+                    f"{who}: {name} must be a float32 or float64 tensor (..., n), got "
+                    f"{bound.dtype if isinstance(bound, Tensor) else type(bound).__name__}"
+                )
         if low.ndim == 0 or high.ndim == 0 or not low.shape[-1] or low.shape[-1] != high.shape[-1]:
-            raise ValueError(f"{who}: low and high need the same number of unknowns in their last dim, got shapes {tuple(low.shape)} and {tuple(high.shape)}")
+            raise ValueError(
+                f"{who}: low and high need the same number of unknowns in their last dim, got shapes "
+                f"{tuple(low.shape)} and {tuple(high.shape)}"
+            )
         low, high = torch.broadcast_tensors(low.detach(), high.detach())
         if not bool((torch.isfinite(low) & torch.isfinite(high) & (low <= high)).all()):
-            raise ValueError(f"{who}: the box must be finite with low <= high in every unknown, got low {low.flatten()[:8].tolist()} and high {high.flatten()[:8].tolist()}")
+            raise ValueError(
+                f"{who}: the box must be finite with low <= high in every unknown, got low "
+                f"{low.flatten()[:8].tolist()} and high {high.flatten()[:8].tolist()}"
+            )
         return Box(low, high)
 
     @property
@@ -64,7 +80,9 @@ class Box:
 
 @dataclass(frozen=True)
 class Dice:
-    """Random numbers for all trials of a box: of each trial's own address, or, where the draws know no trials, the same ones in every trial."""
+    """Random numbers for all trials of a box: of each trial's own address, or, where the draws know
+    no trials, the same ones in every trial.
+    """
 
     draws: Draws
     box: Box
@@ -72,7 +90,10 @@ class Dice:
     def __post_init__(self) -> None:
         count, trials = None if self.draws.trials is None else len(self.draws.trials), math.prod(self.box.trials)
         if count is not None and count != trials:
-            raise ValueError(f"draws for {count} trials do not fit a box of {trials}; give Draws(seed, trials=range({trials})), or Draws(seed) for the same numbers in every trial")
+            raise ValueError(
+                f"draws for {count} trials do not fit a box of {trials}; give Draws(seed, "
+                f"trials=range({trials})), or Draws(seed) for the same numbers in every trial"
+            )
 
     def uniform(self, purpose: str, shape: Sequence[int]) -> Tensor:
         """0..1, (*trials, *shape)."""
@@ -88,12 +109,17 @@ class Dice:
 
 
 def costs_of(objective: Population, x: Tensor, who: str) -> Tensor:
-    """Costs (*trials, candidate) of candidates (*trials, candidate, n), +inf where one is not a number. Raises ValueError for an answer of another shape."""
+    """Costs (*trials, candidate) of candidates (*trials, candidate, n), +inf where one is not a
+    number. Raises ValueError for an answer of another shape.
+    """
     with torch.no_grad():
         cost = objective(x)
     if not isinstance(cost, Tensor) or cost.shape != x.shape[:-1] or not cost.is_floating_point():
         got = f"{cost.dtype} of shape {tuple(cost.shape)}" if isinstance(cost, Tensor) else type(cost).__name__
-        raise ValueError(f"{who}: the objective returned {got} for candidates of shape {tuple(x.shape)}; return one real cost each, shape {tuple(x.shape[:-1])}")
+        raise ValueError(
+            f"{who}: the objective returned {got} for candidates of shape {tuple(x.shape)}; "
+            f"return one real cost each, shape {tuple(x.shape[:-1])}"
+        )
     return torch.where(torch.isnan(cost), torch.inf, cost)
 
 
@@ -104,7 +130,10 @@ def ranked(x: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def pick(x: Tensor, index: Tensor) -> Tensor:
-    """Candidates of those numbers. x: (*trials, candidate, n); index: (*trials, m). Returns (*trials, m, n)."""
+    """Candidates of those numbers. x: (*trials, candidate, n); index: (*trials, m).
+
+    Returns (*trials, m, n).
+    """
     return x.gather(-2, index[..., None].expand(*index.shape, x.shape[-1]))
 
 

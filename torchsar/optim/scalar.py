@@ -13,7 +13,10 @@ Cost = Callable[[Tensor], Tensor]
 
 
 def grid_minimum(cost: Cost, centre: Tensor, reach: float, count: int) -> tuple[Tensor, Tensor]:
-    """The best of `count` equally spaced points of centre +- reach, per trial. cost: (...,) -> (...,). Returns it and all costs (..., count)."""
+    """The best of `count` equally spaced points of centre +- reach, per trial.
+
+    cost: (...,) -> (...,). Returns it and all costs (..., count).
+    """
     if count < 3:
         raise ValueError(f"a grid search needs at least 3 points, got {count}")
     offsets = torch.linspace(-reach, reach, count, dtype=centre.dtype, device=centre.device)
@@ -22,11 +25,15 @@ def grid_minimum(cost: Cost, centre: Tensor, reach: float, count: int) -> tuple[
     return centre + take(offsets.expand(costs.shape), costs.argmin(-1)), costs
 
 
-def parabola_minimum(cost: Cost, start: Tensor, step: float, tolerance: float, rounds: int = 12) -> tuple[Tensor, Tensor]:
-    """Successive parabolas about the best point so far; the step shrinks to a quarter when the vertex lies inside it.
+def parabola_minimum(
+    cost: Cost, start: Tensor, step: float, tolerance: float, rounds: int = 12
+) -> tuple[Tensor, Tensor]:
+    """Successive parabolas about the best point so far; the step shrinks to a quarter when the
+    vertex lies inside it.
 
-    start, result: (...,). step: first half-width, tolerance: a trial stops when its step is below it. Stays within start +- 2 steps. Returns the
-    minimiser and the second derivative there. Needs no gradient, two evaluations a round.
+    start, result: (...,). step: first half-width, tolerance: a trial stops when its step is below
+    it. Stays within start +- 2 steps. Returns the minimiser and the second derivative there. Needs
+    no gradient, two evaluations a round.
     """
     with torch.no_grad():
         x, half, best = start, torch.full_like(start, step), cost(start)
@@ -35,7 +42,9 @@ def parabola_minimum(cost: Cost, start: Tensor, step: float, tolerance: float, r
         for _ in range(rounds):
             low, high = cost(x - half), cost(x + half)
             bend = low - 2 * best + high
-            vertex = torch.where(bend > 0, 0.5 * (low - high) / torch.where(bend > 0, bend, 1), torch.sign(low - high)).clamp(-1, 1)
+            vertex = torch.where(
+                bend > 0, 0.5 * (low - high) / torch.where(bend > 0, bend, 1), torch.sign(low - high)
+            ).clamp(-1, 1)
             curvature = torch.where(active & (bend > 0), bend / half.square(), curvature)
             moved = torch.where(active, torch.clamp(x + vertex * half, start - 2 * step, start + 2 * step), x)
             value = cost(moved)
@@ -48,11 +57,15 @@ def parabola_minimum(cost: Cost, start: Tensor, step: float, tolerance: float, r
     return x, curvature
 
 
-def gradient_minimum(cost: Cost, start: Tensor, step: float, tolerance: float, rounds: int = 12) -> tuple[Tensor, Tensor]:
-    """Root of the derivative by secants kept inside a bracket start +- step, with autograd; a trial stops when its bracket or move is below tolerance.
+def gradient_minimum(
+    cost: Cost, start: Tensor, step: float, tolerance: float, rounds: int = 12
+) -> tuple[Tensor, Tensor]:
+    """Root of the derivative by secants kept inside a bracket start +- step, with autograd; a trial
+    stops when its bracket or move is below tolerance.
 
-    start, result: (...,). Returns the minimiser and the second derivative from the last two slopes. cost must be differentiable. Where
-    the slopes at the ends do not bracket a minimum the trial walks downhill, at most one more step.
+    start, result: (...,). Returns the minimiser and the second derivative from the last two slopes.
+    cost must be differentiable. Where the slopes at the ends do not bracket a minimum the trial
+    walks downhill, at most one more step.
     """
     left, right = start - step, start + step
     slope_left, slope_right = _slope(cost, left), _slope(cost, right)

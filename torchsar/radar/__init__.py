@@ -4,7 +4,15 @@ from torchsar.radar.bistatic import BistaticRadar, polynomial_range, receive_ran
 from torchsar.radar.inverse import InverseRadar
 from torchsar.radar.ladar import TriangularLadar, sweep_middles
 from torchsar.radar.orbit import Orbit, orbit_range, range_coefficients, seen_point
-from torchsar.radar.spotlight import FarField, PlaneWaveLoss, Spotlight, frequency_samples, geometry_of, plane_wave_loss, range_profiles
+from torchsar.radar.spotlight import (
+    FarField,
+    PlaneWaveLoss,
+    Spotlight,
+    frequency_samples,
+    geometry_of,
+    plane_wave_loss,
+    range_profiles,
+)
 from torchsar.radar.stripmap import LIGHT_M_S, StripmapRadar
 from torchsar.radar.timing import TimingDiagram, timing_diagram
 from torchsar.radar.waveform import LinearFM

@@ -1,4 +1,6 @@
-"""What an airborne receiver with several channels along track knows about itself and about the satellite that lights its scene, and ranges of moving points."""
+"""What an airborne receiver with several channels along track knows about itself and about the
+satellite that lights its scene, and ranges of moving points.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +18,18 @@ from torchsar.radar.waveform import LinearFM
 
 @dataclass(frozen=True)
 class BistaticRadar:
-    """A far transmitter with a low pulse rate and an airborne receiver with channels in a row along track.
+    """A far transmitter with a low pulse rate and an airborne receiver with channels in a row along
+    track.
 
-    speed_m_s: of the receiver, along its straight level track; reference_range_m: closest slant range R0 of the middle of the scene; height_m: of the receiver.
-    channel_m: along-track places dx_m of the channels against the reference of the track, in any order and spacing; element_m: along-track length of each.
-    transmit_range: coefficients k1, k2, ... (m/s, m/s^2, ...) of R_T(t) - R_T(0) = k1 t + k2 t^2 + ..., from the ephemeris (`radar.orbit.range_coefficients`).
-    The phase of an echo is -2 pi / lambda (R_T + R_m), once each way. A range axis holds the RECEIVE path R_m = c tau - R_T (m), step c / sampling_hz;
-    on the axis c tau / 2, on which resolutions are quoted, everything is half as long. Slow time zero is pulse n // 2.
-    Raises ValueError for parameters that make no instrument.
+    speed_m_s: of the receiver, along its straight level track; reference_range_m: closest slant
+    range R0 of the middle of the scene; height_m: of the receiver. channel_m: along-track places
+    dx_m of the channels against the reference of the track, in any order and spacing; element_m:
+    along-track length of each. transmit_range: coefficients k1, k2, ... (m/s, m/s^2, ...) of R_T(t)
+    - R_T(0) = k1 t + k2 t^2 + ..., from the ephemeris (`radar.orbit.range_coefficients`). The phase
+    of an echo is -2 pi / lambda (R_T + R_m), once each way. A range axis holds the RECEIVE path R_m
+    = c tau - R_T (m), step c / sampling_hz; on the axis c tau / 2, on which resolutions are quoted,
+    everything is half as long. Slow time zero is pulse n // 2. Raises ValueError for parameters
+    that make no instrument.
     """
 
     carrier_hz: float
@@ -39,17 +45,32 @@ class BistaticRadar:
     wave_speed_m_s: float = LIGHT_M_S
 
     def __post_init__(self) -> None:
-        for name in ("carrier_hz", "sampling_hz", "prf_hz", "speed_m_s", "reference_range_m", "element_m", "wave_speed_m_s"):
+        for name in (
+            "carrier_hz",
+            "sampling_hz",
+            "prf_hz",
+            "speed_m_s",
+            "reference_range_m",
+            "element_m",
+            "wave_speed_m_s",
+        ):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ValueError(f"radar.{name} must be a positive number, got {getattr(self, name)}")
         if not 0 <= self.height_m < self.reference_range_m:
-            raise ValueError(f"radar.height_m must lie in 0..reference_range_m ({self.reference_range_m:g} m), got {self.height_m}")
+            raise ValueError(
+                f"radar.height_m must lie in 0..reference_range_m ({self.reference_range_m:g} m), got {self.height_m}"
+            )
         if self.pulse.bandwidth_hz > self.sampling_hz:
-            raise ValueError(f"pulse bandwidth {self.pulse.bandwidth_hz:g} Hz exceeds the complex sampling rate {self.sampling_hz:g} Hz; sample at least as fast as the bandwidth")
+            raise ValueError(
+                f"pulse bandwidth {self.pulse.bandwidth_hz:g} Hz exceeds the complex sampling rate "
+                f"{self.sampling_hz:g} Hz; sample at least as fast as the bandwidth"
+            )
         object.__setattr__(self, "channel_m", tuple(self.channel_m))
         object.__setattr__(self, "transmit_range", tuple(self.transmit_range))
         if not self.channel_m or not all(math.isfinite(x) for x in self.channel_m):
-            raise ValueError(f"radar.channel_m needs the along-track place of at least one channel (m), got {self.channel_m}")
+            raise ValueError(
+                f"radar.channel_m needs the along-track place of at least one channel (m), got {self.channel_m}"
+            )
         if len(set(self.channel_m)) != len(self.channel_m):
             raise ValueError(f"radar.channel_m names a place twice, which gives no new samples: {self.channel_m}")
         if not all(math.isfinite(k) for k in self.transmit_range):
@@ -70,7 +91,9 @@ class BistaticRadar:
 
     @property
     def ambiguous_velocity_m_s(self) -> float:
-        """Slant-range velocity that turns Doppler by one pulse rate, lambda PRF: what the channels cannot tell apart (brief 001, Velocity)."""
+        """Slant-range velocity that turns Doppler by one pulse rate, lambda PRF: what the channels
+        cannot tell apart (brief 001, Velocity).
+        """
         return self.wavelength_m * self.prf_hz
 
     def channels_at(self, device: torch.device | str | None = None) -> Tensor:
@@ -82,19 +105,27 @@ class BistaticRadar:
         return Axis("pulse", n_pulse, -(n_pulse // 2) / self.prf_hz, 1 / self.prf_hz, "s")
 
     def axes(self, n_pulse: int, n_range: int | None = None) -> tuple[Axis, ...]:
-        """Axes (channel, pulse, range) of range-compressed data, the middle of the range axis, sample n_range // 2, at reference_range_m; (channel, pulse) without n_range."""
+        """Axes (channel, pulse, range) of range-compressed data, the middle of the range axis,
+        sample n_range // 2, at reference_range_m; (channel, pulse) without n_range.
+        """
         channel = Axis("channel", self.channels, 0.0, 1.0, "")
         if n_range is None:
             return channel, self.pulse_axis(n_pulse)
         step = self.range_step_m
-        return channel, self.pulse_axis(n_pulse), Axis("range", n_range, self.reference_range_m - (n_range // 2) * step, step, "m")
+        return (
+            channel,
+            self.pulse_axis(n_pulse),
+            Axis("range", n_range, self.reference_range_m - (n_range // 2) * step, step, "m"),
+        )
 
     def range_frequency_hz(self, n: int, device: torch.device | str | None = None) -> Tensor:
         """Baseband range frequencies of an n-point FFT, FFT order, float64 (n,)."""
         return torch.fft.fftfreq(n, 1 / self.sampling_hz, dtype=torch.float64, device=device)
 
     def band_weights(self, n: int, device: torch.device | str | None = None) -> Tensor:
-        """Spectrum of the range response, a rectangular band of the pulse's width with a peak of 1, float64 (n,) in FFT order; the bins at its edges have the share that lies inside."""
+        """Spectrum of the range response, a rectangular band of the pulse's width with a peak of 1,
+        float64 (n,) in FFT order; the bins at its edges have the share that lies inside.
+        """
         bins = self.range_frequency_hz(n, device).abs() * n / self.sampling_hz
         inside = (self.pulse.bandwidth_hz * n / self.sampling_hz / 2 - bins + 0.5).clamp(0, 1)
         return inside * (n / inside.sum())
@@ -112,11 +143,21 @@ def polynomial_range(coefficients: Sequence[float | Tensor], time_s: Tensor) -> 
     return total
 
 
-def receive_range(time_s: Tensor, u_r_m_s: Tensor | float, u_a_m_s: Tensor | float, y0_m: Tensor | float, range_m: Tensor | float, speed_m_s: float, channel_m: Tensor | float) -> Tensor:
-    """R_m(t) - R0 of a uniformly moving point, exact, float64 (m): sqrt((R0 - u_r t)^2 + (v t - y0 - dx_m)^2) - R0 with v = V_R - u_a, formed as a difference.
+def receive_range(
+    time_s: Tensor,
+    u_r_m_s: Tensor | float,
+    u_a_m_s: Tensor | float,
+    y0_m: Tensor | float,
+    range_m: Tensor | float,
+    speed_m_s: float,
+    channel_m: Tensor | float,
+) -> Tensor:
+    """R_m(t) - R0 of a uniformly moving point, exact, float64 (m): sqrt((R0 - u_r t)^2 + (v t - y0
+    - dx_m)^2) - R0 with v = V_R - u_a, formed as a difference.
 
-    u_r_m_s: slant-range speed, closing positive; u_a_m_s: along-track speed, positive with the receiver; y0_m: along-track place at t = 0; range_m: R0.
-    All arguments broadcast. Remote Sens. 2020, 12, 1703, Eqs. (1), (4) (brief 001, with y0).
+    u_r_m_s: slant-range speed, closing positive; u_a_m_s: along-track speed, positive with the
+    receiver; y0_m: along-track place at t = 0; range_m: R0. All arguments broadcast. Remote Sens.
+    2020, 12, 1703, Eqs. (1), (4) (brief 001, with y0).
     """
     along = (speed_m_s - u_a_m_s) * time_s - y0_m - channel_m
     closing = u_r_m_s * time_s

@@ -11,12 +11,14 @@ from torchsar.radar.stripmap import LIGHT_M_S
 
 @dataclass(frozen=True)
 class InverseRadar:
-    """Instrument description of an inverse synthetic aperture radar or ladar, whose range window follows the target.
+    """Instrument description of an inverse synthetic aperture radar or ladar, whose range window
+    follows the target.
 
-    carrier_hz: middle of the band; bandwidth_hz: of the range-compressed samples, whose cell is c / (2 B); prf_hz: pulse rate.
-    rotation_rad_s: rate at which the target is taken to turn, which scales cross range; None where it is not known, and images then keep a
-    Doppler axis in Hz. pulse_s: length of a pulse that is dechirped on receive, None for range-compressed data. reference_range_m: middle of
-    the range window, where range coordinates are zero.
+    carrier_hz: middle of the band; bandwidth_hz: of the range-compressed samples, whose cell is c /
+    (2 B); prf_hz: pulse rate. rotation_rad_s: rate at which the target is taken to turn, which
+    scales cross range; None where it is not known, and images then keep a Doppler axis in Hz.
+    pulse_s: length of a pulse that is dechirped on receive, None for range-compressed data.
+    reference_range_m: middle of the range window, where range coordinates are zero.
     """
 
     carrier_hz: float
@@ -55,17 +57,28 @@ class InverseRadar:
         return self.bandwidth_hz / self.pulse_s
 
     def cross_range_step_m(self, n_pulse: int) -> float:
-        """One cross-range cell, lambda / (2 omega T) with T = n_pulse / prf. Raises ValueError where the rotation is not known."""
+        """One cross-range cell, lambda / (2 omega T) with T = n_pulse / prf.
+
+        Raises ValueError where the rotation is not known.
+        """
         if self.rotation_rad_s is None:
-            raise ValueError("radar.rotation_rad_s is not set; without it images have a Doppler axis, not one in metres")
+            raise ValueError(
+                "radar.rotation_rad_s is not set; without it images have a Doppler axis, not one in metres"
+            )
         return self.wavelength_m * self.prf_hz / (2 * self.rotation_rad_s * n_pulse)
 
     def raw_axes(self, n_pulse: int, n_range: int, start_s: float = 0.0) -> tuple[Axis, Axis]:
-        """Slow time (s) and range relative to the middle of the window (m) of range-compressed pulses; the middle is sample n_range // 2."""
-        return Axis("pulse", n_pulse, start_s, 1 / self.prf_hz, "s"), Axis("range", n_range, -(n_range // 2) * self.range_step_m, self.range_step_m, "m")
+        """Slow time (s) and range relative to the middle of the window (m) of range-compressed
+        pulses; the middle is sample n_range // 2.
+        """
+        return Axis("pulse", n_pulse, start_s, 1 / self.prf_hz, "s"), Axis(
+            "range", n_range, -(n_range // 2) * self.range_step_m, self.range_step_m, "m"
+        )
 
     def image_axes(self, raw: tuple[Axis, ...]) -> tuple[Axis, Axis]:
-        """Cross range (m), or Doppler (Hz) where the rotation is not known, with zero at line n // 2; and range (m)."""
+        """Cross range (m), or Doppler (Hz) where the rotation is not known, with zero at line n //
+        2; and range (m).
+        """
         pulse, range_ = raw[-2:]
         if self.rotation_rad_s is None:
             step, unit = 1 / (pulse.n * pulse.step), "Hz"

@@ -18,18 +18,23 @@ Detection = Literal["complex", "real"]
 
 @dataclass(frozen=True)
 class TriangularLadar:
-    """Instrument description of a symmetric triangular FMCW ladar that is dechirped on receive (STLFMCW).
+    """Instrument description of a symmetric triangular FMCW ladar that is dechirped on receive
+    (STLFMCW).
 
-    carrier_hz: middle of the band; bandwidth_hz: swept by each half; period_s: the full triangle, up and down (the paper's PRT);
-    sample_rate_hz: of the beat signal, which must make a whole number of samples of a sweep. speed_m_s: along track, or of the target across the
-    line of sight. reference_range_m: delay of the local oscillator as a range; ranges of scatterers are relative to it.
-    beam_rad: azimuth angle that the beam lights, None where it lights the whole scene. keep_every: of so many periods one is recorded.
+    carrier_hz: middle of the band; bandwidth_hz: swept by each half; period_s: the full triangle,
+    up and down (the paper's PRT); sample_rate_hz: of the beat signal, which must make a whole
+    number of samples of a sweep. speed_m_s: along track, or of the target across the line of sight.
+    reference_range_m: delay of the local oscillator as a range; ranges of scatterers are relative
+    to it. beam_rad: azimuth angle that the beam lights, None where it lights the whole scene.
+    keep_every: of so many periods one is recorded.
 
-    detection: complex samples, or one real channel. dechirp_sign: "lo_conj_echo" (as the paper prints it: phase +2 pi fc dtau, a scatterer beyond the
-    reference has a positive beat in the up sweep) or its conjugate "echo_conj_lo".
+    detection: complex samples, or one real channel. dechirp_sign: "lo_conj_echo" (as the paper
+    prints it: phase +2 pi fc dtau, a scatterer beyond the reference has a positive beat in the up
+    sweep) or its conjugate "echo_conj_lo".
 
-    Of a period that starts at t: the up sweep has its middle at t + period/4, the TURNING POINT is at t + period/2, the middle of the down sweep at
-    t + 3 period/4. Raises ValueError for parameters that make no instrument.
+    Of a period that starts at t: the up sweep has its middle at t + period/4, the TURNING POINT is
+    at t + period/2, the middle of the down sweep at t + 3 period/4. Raises ValueError for
+    parameters that make no instrument.
     """
 
     carrier_hz: float
@@ -51,17 +56,25 @@ class TriangularLadar:
         if not (math.isfinite(self.speed_m_s) and self.speed_m_s >= 0):
             raise ValueError(f"radar.speed_m_s must be a number of 0 or more, got {self.speed_m_s}")
         if self.beam_rad is not None and not 0 < self.beam_rad < math.pi:
-            raise ValueError(f"radar.beam_rad must lie in 0..pi, or be None where the beam lights the whole scene, got {self.beam_rad}")
+            raise ValueError(
+                "radar.beam_rad must lie in 0..pi, or be None where the beam lights the whole scene, "
+                f"got {self.beam_rad}"
+            )
         if not (isinstance(self.keep_every, int) and self.keep_every >= 1):
             raise ValueError(f"radar.keep_every must be a whole number of 1 or more, got {self.keep_every}")
         if not self.bandwidth_hz < 2 * self.carrier_hz:
-            raise ValueError(f"radar.bandwidth_hz of {self.bandwidth_hz:g} Hz does not fit about a carrier of {self.carrier_hz:g} Hz")
+            raise ValueError(
+                f"radar.bandwidth_hz of {self.bandwidth_hz:g} Hz does not fit about a carrier of {self.carrier_hz:g} Hz"
+            )
         for name, kinds in (("detection", get_args(Detection)), ("dechirp_sign", get_args(DechirpSign))):
             if getattr(self, name) not in kinds:
                 raise ValueError(f"radar.{name} must be one of {', '.join(kinds)}, got {getattr(self, name)!r}")
         samples = self.sweep_s * self.sample_rate_hz
         if round(samples) < 16 or abs(samples - round(samples)) > 1e-6 * samples:
-            raise ValueError(f"a sweep of {self.sweep_s:g} s holds {samples:g} samples at {self.sample_rate_hz:g} Hz; choose a sample rate that makes it a whole number of 16 or more")
+            raise ValueError(
+                f"a sweep of {self.sweep_s:g} s holds {samples:g} samples at {self.sample_rate_hz:g} "
+                "Hz; choose a sample rate that makes it a whole number of 16 or more"
+            )
 
     @property
     def wavelength_m(self) -> float:
@@ -94,7 +107,9 @@ class TriangularLadar:
 
     @property
     def ambiguous_velocity_m_s(self) -> float:
-        """Change of velocity that turns the phase between half sweeps once, lambda / (2 sweep_s): what integers count (brief 000, erratum 8)."""
+        """Change of velocity that turns the phase between half sweeps once, lambda / (2 sweep_s):
+        what integers count (brief 000, erratum 8).
+        """
         return self.wavelength_m / (2 * self.sweep_s)
 
     def beat_hz(self, relative_range_m: float) -> float:
@@ -106,27 +121,42 @@ class TriangularLadar:
         return 2 * velocity_m_s / self.wavelength_m
 
     def fast_time_axis(self) -> Axis:
-        """Time u from the middle of a sweep, u_n = (n - (N - 1) / 2) / fs: symmetric, so that a sweep can be mirrored."""
+        """Time u from the middle of a sweep, u_n = (n - (N - 1) / 2) / fs: symmetric, so that a
+        sweep can be mirrored.
+        """
         n, step = self.sweep_samples, 1 / self.sample_rate_hz
         return Axis("fast_time", n, -(n - 1) / 2 * step, step, "s")
 
     def sweep_axes(self, n_period: int, start_s: float | None = None) -> tuple[Axis, Axis, Axis]:
-        """Axes of separated sweeps: ramp (0 up, 1 down), pulse (start of each period, s), fast time (s).
+        """Axes of separated sweeps: ramp (0 up, 1 down), pulse (start of each period, s), fast time
+        (s).
 
-        start_s: start of the first period; by default the TURNING POINT of period n_period // 2 lies at slow time zero, where a scatterer at azimuth zero is abeam.
+        start_s: start of the first period; by default the TURNING POINT of period n_period // 2
+        lies at slow time zero, where a scatterer at azimuth zero is abeam.
         """
         start = -(n_period // 2) * self.pulse_step_s - self.period_s / 2 if start_s is None else start_s
-        return Axis("ramp", 2, 0.0, 1.0, ""), Axis("pulse", n_period, start, self.pulse_step_s, "s"), self.fast_time_axis()
+        return (
+            Axis("ramp", 2, 0.0, 1.0, ""),
+            Axis("pulse", n_period, start, self.pulse_step_s, "s"),
+            self.fast_time_axis(),
+        )
 
     def record_axes(self, n_period: int, n_sample: int, start_s: float | None = None) -> tuple[Axis, Axis]:
-        """Axes of blocks of a continuous record, one block a recorded period: pulse (start of each block, s) and time within the block (s).
+        """Axes of blocks of a continuous record, one block a recorded period: pulse (start of each
+        block, s) and time within the block (s).
 
-        The first sample lies half a step after the start, so that samples of separated sweeps are samples of the record where the triangle starts with the block.
+        The first sample lies half a step after the start, so that samples of separated sweeps are
+        samples of the record where the triangle starts with the block.
         """
-        return self.sweep_axes(n_period, start_s)[1], Axis("time", n_sample, 0.5 / self.sample_rate_hz, 1 / self.sample_rate_hz, "s")
+        return self.sweep_axes(n_period, start_s)[1], Axis(
+            "time", n_sample, 0.5 / self.sample_rate_hz, 1 / self.sample_rate_hz, "s"
+        )
 
 
 def sweep_middles(radar: TriangularLadar, pulse: Axis, device: torch.device | str | None = None) -> Tensor:
-    """Slow times (s) of the middles of the up and the down sweeps, float64 (2, pulse). pulse: starts of the periods."""
+    """Slow times (s) of the middles of the up and the down sweeps, float64 (2, pulse).
+
+    pulse: starts of the periods.
+    """
     start = pulse.values(device)
     return torch.stack([start + 0.25 * radar.period_s, start + 0.75 * radar.period_s])

@@ -1,16 +1,50 @@
-"""Repairs of raw data: lost lines, interference, converter jitter, channel imbalance, channel response, triangular sweeps."""
+"""Repairs of raw data: lost lines, interference, converter jitter, channel imbalance, channel
+response, triangular sweeps.
+"""
 
 from torchsar.repair.channels import CorrectImbalance, EstimateImbalance, correct_imbalance, estimate_imbalance
-from torchsar.repair.fill import BandLimitedFill, LinearFill, SparseFill, ZeroFill, band_limited_fill, linear_fill, zero_fill
-from torchsar.repair.interference import DropInterference, NotchInterference, SubtractInterference, drop_interference, find_contamination, notch_interference, subtract_interference
-from torchsar.repair.jitter import BandLimited, CorrectJitter, Exact, Lagrange, correct_jitter, correct_jitter_band_limited, correct_jitter_exact, correct_jitter_lagrange
+from torchsar.repair.fill import (
+    BandLimitedFill,
+    LinearFill,
+    SparseFill,
+    ZeroFill,
+    band_limited_fill,
+    linear_fill,
+    zero_fill,
+)
+from torchsar.repair.interference import (
+    DropInterference,
+    NotchInterference,
+    SubtractInterference,
+    drop_interference,
+    find_contamination,
+    notch_interference,
+    subtract_interference,
+)
+from torchsar.repair.jitter import (
+    BandLimited,
+    CorrectJitter,
+    Exact,
+    Lagrange,
+    correct_jitter,
+    correct_jitter_band_limited,
+    correct_jitter_exact,
+    correct_jitter_lagrange,
+)
 from torchsar.repair.jitter_blind import BlindJitter, estimate_jitter_blind
 from torchsar.repair.jitter_pilot import PilotJitter, estimate_jitter_pilot
 from torchsar.repair.lines import LineIntegrity, line_integrity, place_lines
 from torchsar.repair.response import CorrectResponse, correct_response, estimate_amplitude_response
 from torchsar.repair.response_phase import EstimateResponse, estimate_response_points, estimate_response_sharpest
 from torchsar.repair.sparse import sparse_fill
-from torchsar.repair.triangle import BlankTurningPoints, CircularShift, SplitSweeps, blank_turning_points, circular_shift, split_record
+from torchsar.repair.triangle import (
+    BlankTurningPoints,
+    CircularShift,
+    SplitSweeps,
+    blank_turning_points,
+    circular_shift,
+    split_record,
+)
 from torchsar.repair.triangle_calibrate import CalibrateSweeps, calibrate_sweeps
 from torchsar.repair.trigger import find_trigger
 

@@ -9,9 +9,11 @@ from torchsar.core import linear_phasor
 
 
 def delayed(lines: Tensor, fraction: Tensor, analytic: bool = False) -> Tensor:
-    """Lines at the instants n + fraction, taken as periodic: (..., line, n), fraction (...,) or a number, -0.5..0.5 samples.
+    """Lines at the instants n + fraction, taken as periodic: (..., line, n), fraction (...,) or a
+    number, -0.5..0.5 samples.
 
-    analytic: keep positive frequencies only, doubled: of real lines the complex signal whose real part they are. Differentiable.
+    analytic: keep positive frequencies only, doubled: of real lines the complex signal whose real
+    part they are. Differentiable.
     """
     n = lines.shape[-1]
     if not analytic and _all_zero(fraction):
@@ -24,7 +26,9 @@ def delayed(lines: Tensor, fraction: Tensor, analytic: bool = False) -> Tensor:
 
 
 def _positive(n: int, device: torch.device) -> Tensor:
-    """2 at positive frequencies, 1 at zero and at half the sampling rate, 0 at negative ones, (n,) in FFT order."""
+    """2 at positive frequencies, 1 at zero and at half the sampling rate, 0 at negative ones, (n,)
+    in FFT order.
+    """
     order = torch.arange(n, device=device)
     return (2 * order < n).int() + ((2 * order <= n) & (order > 0)).int()
 

@@ -1,9 +1,10 @@
 """Gain and phase imbalance of channels that record the lines in turn (line i by channel i mod C).
 
-Channel c multiplies its lines by g_c exp(j phi_c). The product of a line with the one before it, averaged over a recording, has the
-phase phi_c - phi_(c-1) + rho, where rho is the phase increment that the Doppler centroid puts on every line; over all channels the phi
-cancel, so the C products give rho and all phi_c - phi_0. Gains follow from line powers. Source: data README (even and odd lines as
-two channels), brief 004, table of recorded data.
+Channel c multiplies its lines by g_c exp(j phi_c). The product of a line with the one before it,
+averaged over a recording, has the phase phi_c - phi_(c-1) + rho, where rho is the phase increment
+that the Doppler centroid puts on every line; over all channels the phi cancel, so the C products
+give rho and all phi_c - phi_0. Gains follow from line powers. Source: data README (even and odd
+lines as two channels), brief 004, table of recorded data.
 """
 
 from __future__ import annotations
@@ -17,10 +18,13 @@ from torchsar.core import Estimate, Signal, Stage, cis, real_dtype
 
 
 def lag_products(x: Tensor, channels: int) -> tuple[Tensor, Tensor]:
-    """Mean over range and over the lines of each channel of s[i] conj(s[i - 1]), and of |s[i]|^2. (..., pulse, range) -> (..., C) each.
+    """Mean over range and over the lines of each channel of s[i] conj(s[i - 1]), and of |s[i]|^2.
 
-    The power of a channel is a geometric mean over its lines relative to their neighbours, so that neither a slow change of the scene
-    nor a few very bright lines passes for a gain: the value returned is 0 for channel 0 and ln(power / power of channel 0) for others.
+    (..., pulse, range) -> (..., C) each.
+
+    The power of a channel is a geometric mean over its lines relative to their neighbours, so that
+    neither a slow change of the scene nor a few very bright lines passes for a gain: the value
+    returned is 0 for channel 0 and ln(power / power of channel 0) for others.
     """
     lines = x.shape[-2]
     product = (x[..., 1:, :] * x[..., :-1, :].conj()).mean(-1).to(torch.complex128)
@@ -32,7 +36,10 @@ def lag_products(x: Tensor, channels: int) -> tuple[Tensor, Tensor]:
 
 
 def _relative_log_power(power: Tensor, channels: int) -> Tensor:
-    """ln of each channel's power over that of channel 0 interpolated to the same lines. (..., pulse) -> (..., C)."""
+    """ln of each channel's power over that of channel 0 interpolated to the same lines.
+
+    (..., pulse) -> (..., C).
+    """
     last = (power.shape[-1] - 1) // channels
     reference, after = power[..., : last * channels : channels], power[..., channels : last * channels + 1 : channels]
     ratios = [torch.zeros_like(power[..., 0])]
@@ -44,16 +51,23 @@ def _relative_log_power(power: Tensor, channels: int) -> Tensor:
 
 
 def estimate_imbalance(x: Tensor, channels: int = 2, doppler_cycles: Tensor | float | None = None) -> Estimate:
-    """Gain and phase of every channel relative to channel 0, which has the lines 0, C, 2C, ... x: raw (..., pulse, range).
+    """Gain and phase of every channel relative to channel 0, which has the lines 0, C, 2C, ...
 
-    Gives `gain` (..., C), 1 for channel 0, and `phase_rad` (..., C), 0 for channel 0; to be divided out. The lag products leave rho, and
-    with it the phases, ambiguous by 2 pi / C (for two channels: phi against phi + pi, which is a spectrum displaced by PRF / 2).
-    doppler_cycles (...,): baseband Doppler centroid over PRF, good to 1 / (2 C), settles that; without it the phases of least mean
-    square are taken (for two channels |phi| <= 90 degrees). std assumes a Gaussian scene and independent lines. quality is the
-    coherence of neighbouring lines. Not ok, with gains 1 and phases 0: a channel without power, or a coherence within its chance.
+    x: raw (..., pulse, range).
+
+    Gives `gain` (..., C), 1 for channel 0, and `phase_rad` (..., C), 0 for channel 0; to be divided
+    out. The lag products leave rho, and with it the phases, ambiguous by 2 pi / C (for two
+    channels: phi against phi + pi, which is a spectrum displaced by PRF / 2). doppler_cycles
+    (...,): baseband Doppler centroid over PRF, good to 1 / (2 C), settles that; without it the
+    phases of least mean square are taken (for two channels |phi| <= 90 degrees). std assumes a
+    Gaussian scene and independent lines. quality is the coherence of neighbouring lines. Not ok,
+    with gains 1 and phases 0: a channel without power, or a coherence within its chance.
     """
     if channels < 2 or x.shape[-2] < 2 * channels + 1:
-        raise ValueError(f"channel imbalance needs 2 or more channels and at least {2 * max(channels, 2) + 1} lines, got {channels} channels and {x.shape[-2]} lines")
+        raise ValueError(
+            f"channel imbalance needs 2 or more channels and at least {2 * max(channels, 2) + 1} "
+            f"lines, got {channels} channels and {x.shape[-2]} lines"
+        )
     x = x / x.detach().abs().amax((-2, -1), keepdim=True).clamp_min(torch.finfo(real_dtype(x.dtype)).tiny)
     lag, log_power = lag_products(x, channels)
     angle = torch.angle(lag)
@@ -85,15 +99,27 @@ def _judge(x: Tensor, lag: Tensor, phase: Tensor, gain: Tensor) -> Estimate:
     order = torch.arange(channels, dtype=torch.float64, device=x.device)
     phase_std = one[..., None] * torch.sqrt(order * (channels - order) / channels)
     gain_std = (gain * math.sqrt(0.5 / looks)) * (order > 0)
-    ok = torch.isfinite(gain).all(-1) & (power > 0) & (gain > 1e-3).all(-1) & (gain < 1e3).all(-1) & (coherence > 5 / math.sqrt(looks))
+    ok = (
+        torch.isfinite(gain).all(-1)
+        & (power > 0)
+        & (gain > 1e-3).all(-1)
+        & (gain < 1e3).all(-1)
+        & (coherence > 5 / math.sqrt(looks))
+    )
     value = {"gain": torch.where(ok[..., None], gain, 1), "phase_rad": torch.where(ok[..., None], phase, 0)}
     return Estimate(value, torch.where(ok, coherence, 0), ok, {"gain": gain_std, "phase_rad": phase_std})
 
 
 def correct_imbalance(x: Tensor, gain: Tensor, phase_rad: Tensor) -> Tensor:
-    """Divide the lines of channel c by gain[c] exp(j phase[c]). x: (..., pulse, range); gain, phase_rad: (..., C) float64. Differentiable."""
+    """Divide the lines of channel c by gain[c] exp(j phase[c]).
+
+    x: (..., pulse, range); gain, phase_rad: (..., C) float64. Differentiable.
+    """
     if gain.shape != phase_rad.shape:
-        raise ValueError(f"gain and phase need one number per channel each, got shapes {tuple(gain.shape)} and {tuple(phase_rad.shape)}")
+        raise ValueError(
+            f"gain and phase need one number per channel each, got shapes {tuple(gain.shape)} and "
+            f"{tuple(phase_rad.shape)}"
+        )
     real = real_dtype(x.dtype)
     factor = cis(-phase_rad.to(real)) / gain.to(real)
     channel = torch.arange(x.shape[-2], device=x.device) % gain.shape[-1]
@@ -101,7 +127,9 @@ def correct_imbalance(x: Tensor, gain: Tensor, phase_rad: Tensor) -> Tensor:
 
 
 class EstimateImbalance(Stage):
-    """Imbalance of channels that record the lines in turn; run it after the lines are on a regular grid. doppler_hz settles the branch."""
+    """Imbalance of channels that record the lines in turn; run it after the lines are on a regular
+    grid. doppler_hz settles the branch.
+    """
 
     provides = ("gain", "phase_rad")
 

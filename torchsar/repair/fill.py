@@ -1,8 +1,10 @@
-"""Lines that are missing: zeros, linear interpolation, the azimuth spectrum, or a model of the scene (brief 004, item 2).
+"""Lines that are missing: zeros, linear interpolation, the azimuth spectrum, or a model of the
+scene (brief 004, item 2).
 
-All four keep the received lines bit for bit and replace only the missing ones, whatever those hold. Errors of the image: zero fill errs by the
-share of missing lines; the azimuth spectrum (a stationary model) gains little where azimuth oversampling is low; only a model of
-the scene, which knows where the image is dark, gains much. Source: brief 004, item 2; Tsvetkov 2017.
+All four keep the received lines bit for bit and replace only the missing ones, whatever those hold.
+Errors of the image: zero fill errs by the share of missing lines; the azimuth spectrum (a
+stationary model) gains little where azimuth oversampling is low; only a model of the scene, which
+knows where the image is dark, gains much. Source: brief 004, item 2; Tsvetkov 2017.
 """
 
 from __future__ import annotations
@@ -17,14 +19,22 @@ from torchsar.repair.sparse import conjugate_fill, sparse_fill, unit_level
 
 
 def _mask(lines: Tensor, missing: Tensor) -> Tensor:
-    """missing as a bool mask that broadcasts against the lines, (..., pulse, 1). Raises ValueError where it does not fit."""
+    """missing as a bool mask that broadcasts against the lines, (..., pulse, 1).
+
+    Raises ValueError where it does not fit.
+    """
     if missing.shape[-1:] != lines.shape[-2:-1]:
-        raise ValueError(f"mask of missing lines of shape {tuple(missing.shape)} does not fit {lines.shape[-2]} lines; give one entry per line, as LineIntegrity does")
+        raise ValueError(
+            f"mask of missing lines of shape {tuple(missing.shape)} does not fit "
+            f"{lines.shape[-2]} lines; give one entry per line, as LineIntegrity does"
+        )
     return missing.bool()[..., None]
 
 
 def _nothing_missing(missing: Tensor) -> bool:
-    """Whether all the work can be saved; inside vmap a value cannot be looked at, and the work leaves the lines alone anyway."""
+    """Whether all the work can be saved; inside vmap a value cannot be looked at, and the work
+    leaves the lines alone anyway.
+    """
     try:
         return not bool(missing.any())
     except RuntimeError:
@@ -32,15 +42,20 @@ def _nothing_missing(missing: Tensor) -> bool:
 
 
 def zero_fill(lines: Tensor, missing: Tensor) -> Tensor:
-    """Missing lines set to zero: the baseline. lines: (..., pulse, range); missing: bool (..., pulse)."""
+    """Missing lines set to zero: the baseline.
+
+    lines: (..., pulse, range); missing: bool (..., pulse).
+    """
     return torch.where(_mask(lines, missing), 0, lines)
 
 
 def linear_fill(lines: Tensor, missing: Tensor, doppler_turns: Tensor | float = 0.0) -> Tensor:
-    """Straight line between the nearest received lines, about a Doppler centroid of doppler_turns cycles per line, (...,).
+    """Straight line between the nearest received lines, about a Doppler centroid of doppler_turns
+    cycles per line, (...,).
 
-    Before the first and behind the last received line that line is held. Worse than zeros where adjacent lines correlate less than 0.25
-    about the centroid, and inside gaps of several lines of data with low azimuth oversampling.
+    Before the first and behind the last received line that line is held. Worse than zeros where
+    adjacent lines correlate less than 0.25 about the centroid, and inside gaps of several lines of
+    data with low azimuth oversampling.
     """
     mask, n = _mask(lines, missing), lines.shape[-2]
     row = torch.arange(n, device=lines.device)
@@ -59,10 +74,11 @@ def linear_fill(lines: Tensor, missing: Tensor, doppler_turns: Tensor | float = 
 
 
 def azimuth_spectrum(lines: Tensor, received: Tensor, lags: int = 24) -> Tensor:
-    """Azimuth power spectrum from lag products of the received lines, averaged over range, unit mean, (..., pulse) in FFT order.
+    """Azimuth power spectrum from lag products of the received lines, averaged over range, unit
+    mean, (..., pulse) in FFT order.
 
-    lines: (..., range, pulse), azimuth last, zero where not received; received: bool (..., pulse). Smoothed over about 2 / lags of the
-    PRF; may be slightly negative.
+    lines: (..., range, pulse), azimuth last, zero where not received; received: bool (..., pulse).
+    Smoothed over about 2 / lags of the PRF; may be slightly negative.
     """
     n = lines.shape[-1]
     lags = min(lags, max(1, n // 4))
@@ -76,10 +92,12 @@ def azimuth_spectrum(lines: Tensor, received: Tensor, lags: int = 24) -> Tensor:
 
 
 def band_limited_fill(lines: Tensor, missing: Tensor, rounds: int = 2, steps: int = 8) -> Tensor:
-    """Least squares over the azimuth band: the missing lines that fit the azimuth spectrum of the received ones best (Wiener).
+    """Least squares over the azimuth band: the missing lines that fit the azimuth spectrum of the
+    received ones best (Wiener).
 
-    The spectrum, with the Doppler centroid in it, is estimated here from the received lines, then once more from the filled ones. Minimises
-    sum |D(f)|^2 / S(f) over the missing lines by conjugate gradients. lines: (..., pulse, range); missing: bool (..., pulse).
+    The spectrum, with the Doppler centroid in it, is estimated here from the received lines, then
+    once more from the filled ones. Minimises sum |D(f)|^2 / S(f) over the missing lines by
+    conjugate gradients. lines: (..., pulse, range); missing: bool (..., pulse).
     """
     # azimuth last: its FFTs then run along contiguous samples
     mask = _mask(lines, missing).mT
@@ -88,7 +106,9 @@ def band_limited_fill(lines: Tensor, missing: Tensor, rounds: int = 2, steps: in
     for _ in range(rounds):
         weight = (1 / spectrum)[..., None, :]
         filled = conjugate_fill(lambda x, w=weight: torch.fft.ifft(torch.fft.fft(x) * w), filled, mask, steps)
-        spectrum = azimuth_spectrum(filled.detach(), torch.ones_like(filled[..., 0, :], dtype=torch.bool), 96).clamp_min(2e-3)
+        spectrum = azimuth_spectrum(
+            filled.detach(), torch.ones_like(filled[..., 0, :], dtype=torch.bool), 96
+        ).clamp_min(2e-3)
     return torch.where(mask.mT, (filled * level).mT, lines)
 
 
@@ -102,8 +122,8 @@ class ZeroFill(Stage):
 class LinearFill(Stage):
     """Linear interpolation over missing lines about the Doppler centroid; see linear_fill.
 
-    doppler_hz: by default the radar's nominal pointing, else 0; a chain may connect an estimate, which wins. Only its fraction of the
-    PRF matters.
+    doppler_hz: by default the radar's nominal pointing, else 0; a chain may connect an estimate,
+    which wins. Only its fraction of the PRF matters.
     """
 
     doppler_hz: Tensor
@@ -118,12 +138,17 @@ class LinearFill(Stage):
 
 
 class BandLimitedFill(Stage):
-    """Least squares over the azimuth band; see band_limited_fill. Needs no Doppler: the spectrum that it estimates holds the centroid."""
+    """Least squares over the azimuth band; see band_limited_fill.
+
+    Needs no Doppler: the spectrum that it estimates holds the centroid.
+    """
 
     def __init__(self, rounds: int = 2, steps: int = 8) -> None:
         super().__init__()
         if rounds < 1 or steps < 1:
-            raise ValueError(f"band-limited fill needs at least one round of one step, got rounds={rounds}, steps={steps}")
+            raise ValueError(
+                f"band-limited fill needs at least one round of one step, got rounds={rounds}, steps={steps}"
+            )
         self.rounds, self.steps = rounds, steps
 
     def forward(self, signal: Signal, missing: Tensor) -> Signal:
@@ -135,8 +160,9 @@ class BandLimitedFill(Stage):
 class SparseFill(Stage):
     """Missing lines from a model of the focused scene; see sparse_fill.
 
-    reference: "matched" for raw lines, None for range-compressed ones. doppler_hz and velocity_m_s as in OmegaK: given here, or by a chain
-    at every call, which wins. The Doppler must be absolute (ambiguity resolved) where range migration exceeds a cell.
+    reference: "matched" for raw lines, None for range-compressed ones. doppler_hz and velocity_m_s
+    as in OmegaK: given here, or by a chain at every call, which wins. The Doppler must be absolute
+    (ambiguity resolved) where range migration exceeds a cell.
     """
 
     doppler_hz: Tensor
@@ -154,19 +180,31 @@ class SparseFill(Stage):
     ) -> None:
         super().__init__()
         if reference is not None and reference not in REFERENCES:
-            raise ValueError(f"range reference {reference!r} is unknown; choose one of {sorted(REFERENCES)}, or None for compressed lines")
+            raise ValueError(
+                f"range reference {reference!r} is unknown; choose one of {sorted(REFERENCES)}, or "
+                "None for compressed lines"
+            )
         if min(looks, rounds, steps) < 1:
-            raise ValueError(f"sparse fill needs at least one look, round and step, got looks={looks}, rounds={rounds}, steps={steps}")
+            raise ValueError(
+                f"sparse fill needs at least one look, round and step, got looks={looks}, "
+                f"rounds={rounds}, steps={steps}"
+            )
         self.radar, self.reference = radar, reference
         self.looks, self.rounds, self.steps = looks, rounds, steps
         self.hold("velocity_m_s", radar.velocity_m_s if velocity_m_s is None else velocity_m_s)
         self.hold("doppler_hz", (radar.pointing_doppler_hz or 0.0) if doppler_hz is None else doppler_hz)
 
-    def forward(self, signal: Signal, missing: Tensor, doppler_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Signal:
+    def forward(
+        self, signal: Signal, missing: Tensor, doppler_hz: Tensor | None = None, velocity_m_s: Tensor | None = None
+    ) -> Signal:
         lines, radar = signal.data, self.radar
         if _nothing_missing(missing):
             return signal
-        reference = None if self.reference is None else REFERENCES[self.reference](radar.pulse, lines.shape[-1], radar.sampling_hz, lines.device)
+        reference = (
+            None
+            if self.reference is None
+            else REFERENCES[self.reference](radar.pulse, lines.shape[-1], radar.sampling_hz, lines.device)
+        )
         filled = sparse_fill(
             lines,
             missing,

@@ -1,8 +1,9 @@
 """External narrowband interference: three repairs with one interface.
 
-Each function takes raw lines (..., pulse, range) and returns a Repaired; each stage returns the signal and an Estimate that says how
-many lines and cells were touched and which lines are missing now (for the stage that fills lines). Lines without interference pass
-bit by bit. Recommended: `subtract_interference`. Source: brief 004, item 3; Tsvetkov 2017.
+Each function takes raw lines (..., pulse, range) and returns a Repaired; each stage returns the
+signal and an Estimate that says how many lines and cells were touched and which lines are missing
+now (for the stage that fills lines). Lines without interference pass bit by bit. Recommended:
+`subtract_interference`. Source: brief 004, item 3; Tsvetkov 2017.
 """
 
 from __future__ import annotations
@@ -23,10 +24,12 @@ _BAND_ROUNDS = 3
 
 @dataclass(frozen=True)
 class Repaired:
-    """data (..., pulse, range); touched, missing: lines that were changed and lines given up, bool (..., pulse).
+    """data (..., pulse, range); touched, missing: lines that were changed and lines given up, bool
+    (..., pulse).
 
-    cells: number of range-frequency cells of each line that stood above the threshold, int64 (..., pulse). tone_cycles: frequency of
-    the strongest tone of each line in cycles per sample, 0 where there is none, float64 (..., pulse).
+    cells: number of range-frequency cells of each line that stood above the threshold, int64 (...,
+    pulse). tone_cycles: frequency of the strongest tone of each line in cycles per sample, 0 where
+    there is none, float64 (..., pulse).
     """
 
     data: Tensor
@@ -38,7 +41,9 @@ class Repaired:
 
 @dataclass(frozen=True)
 class Contamination:
-    """Suspected lines and cells: excess (..., pulse, range) of the range spectra over the robust level, FFT order, and what exceeds."""
+    """Suspected lines and cells: excess (..., pulse, range) of the range spectra over the robust
+    level, FFT order, and what exceeds.
+    """
 
     level: Level
     excess: Tensor
@@ -47,9 +52,11 @@ class Contamination:
 
 
 def find_contamination(raw: Tensor, threshold: float = THRESHOLD) -> Contamination:
-    """Cells whose tapered range spectrum exceeds `threshold` times the robust level, and lines where that is in few places. raw: (..., pulse, range).
+    """Cells whose tapered range spectrum exceeds `threshold` times the robust level, and lines
+    where that is in few places. raw: (..., pulse, range).
 
-    A first look: the repairs also test that what they see lasts the whole line, since regularly spaced targets make spectral lines too.
+    A first look: the repairs also test that what they see lasts the whole line, since regularly
+    spaced targets make spectral lines too.
     """
     with torch.no_grad():
         power = line_spectra(raw)
@@ -60,21 +67,27 @@ def find_contamination(raw: Tensor, threshold: float = THRESHOLD) -> Contaminati
 
 
 def notch_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
-    """The baseline: in contaminated lines, zero every cell of the range spectrum above the threshold. Differentiable in raw.
+    """The baseline: in contaminated lines, zero every cell of the range spectrum above the
+    threshold. Differentiable in raw.
 
-    Takes the clutter of those cells with it and leaves the skirts of the tone that lie below the threshold.
+    Takes the clutter of those cells with it and leaves the skirts of the tone that lie below the
+    threshold.
     """
     found = find_contamination(raw, threshold)
     touched = _interfered(raw.detach(), found, threshold)
     spectrum = torch.fft.fft(raw)
     with torch.no_grad():
-        hit = (found.level.excess((spectrum.real.square() + spectrum.imag.square()) / raw.shape[-1]) > threshold) & touched[..., None]
+        hit = (
+            found.level.excess((spectrum.real.square() + spectrum.imag.square()) / raw.shape[-1]) > threshold
+        ) & touched[..., None]
     data = torch.where(touched[..., None], torch.fft.ifft(spectrum.masked_fill(hit, 0)), raw)
     return Repaired(data, touched, torch.zeros_like(touched), hit.sum(-1), _no_tone(touched))
 
 
 def drop_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
-    """Give contaminated lines up: they are set to zero and marked missing, for the stage that fills lines. Differentiable in raw."""
+    """Give contaminated lines up: they are set to zero and marked missing, for the stage that fills
+    lines. Differentiable in raw.
+    """
     found = find_contamination(raw, threshold)
     touched = _interfered(raw.detach(), found, threshold)
     data = raw.masked_fill(touched[..., None], 0)
@@ -82,12 +95,15 @@ def drop_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
 
 
 def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones: int = 4) -> Repaired:
-    """Subtract tones by maximum likelihood and what is wider as a narrowband process; give up lines that neither can save.
+    """Subtract tones by maximum likelihood and what is wider as a narrowband process; give up lines
+    that neither can save.
 
-    raw: (..., pulse, range) complex. Up to `most_tones` tones a line, each with its own frequency and drift, amplitude and phase; up to
-    three bands, each narrower than about 1/40 of the sampling rate. A tone costs a line of n samples 1 / n to 2 / n of the clutter's power
-    at that frequency; a band of width B about B n / fs cells. A line is missing where interference stronger than its clutter is left. Differentiable
-    in raw, with frequencies and spectra of the interferers held. Works on the contaminated lines only; the others pass bit by bit.
+    raw: (..., pulse, range) complex. Up to `most_tones` tones a line, each with its own frequency
+    and drift, amplitude and phase; up to three bands, each narrower than about 1/40 of the sampling
+    rate. A tone costs a line of n samples 1 / n to 2 / n of the clutter's power at that frequency;
+    a band of width B about B n / fs cells. A line is missing where interference stronger than its
+    clutter is left. Differentiable in raw, with frequencies and spectra of the interferers held.
+    Works on the contaminated lines only; the others pass bit by bit.
     """
     found = find_contamination(raw, threshold)
     if not anything(found.lines):
@@ -122,7 +138,9 @@ def _interfered(raw: Tensor, found: Contamination, threshold: float) -> Tensor:
 
 
 def _selection(lines: Tensor) -> Tensor:
-    """Indices of marked lines in rising order, (..., count) int64, count the largest of any trial; unmarked lines fill up behind."""
+    """Indices of marked lines in rising order, (..., count) int64, count the largest of any trial;
+    unmarked lines fill up behind.
+    """
     try:
         count = int(lines.sum(-1).max())
     except RuntimeError:  # inside vmap a value cannot be looked at
@@ -135,7 +153,9 @@ def _take_lines(raw: Tensor, index: Tensor) -> Tensor:
 
 
 def _ruined(lines: Tensor, level: Level, threshold: float) -> Tensor:
-    """Lines where the cells still above the threshold hold more power than the clutter of the whole line, (..., pulse) bool."""
+    """Lines where the cells still above the threshold hold more power than the clutter of the whole
+    line, (..., pulse) bool.
+    """
     power = line_spectra(lines)
     left = (power * (level.excess(power) > threshold)).sum(-1)
     return left > level.density.sum(-1)
@@ -156,9 +176,10 @@ def _strongest(tones: list[Tone], index: Tensor) -> Tensor:
 class _InterferenceRepair(Stage):
     """Common part of the three stages: a repaired signal, and how much of it was touched.
 
-    Estimate: value `missing` (..., pulse) bool, lines given up, joined with those that were missing before where a chain connects
-    them (`missing`), so that one fill serves both; info `lines_touched`, `cells_touched` (...,) counts, `touched` (..., pulse),
-    `tone_cycles_per_sample` (..., pulse); quality is the share of lines kept, ok False where fewer than half are.
+    Estimate: value `missing` (..., pulse) bool, lines given up, joined with those that were missing
+    before where a chain connects them (`missing`), so that one fill serves both; info
+    `lines_touched`, `cells_touched` (...,) counts, `touched` (..., pulse), `tone_cycles_per_sample`
+    (..., pulse); quality is the share of lines kept, ok False where fewer than half are.
     """
 
     provides = ("missing",)
@@ -167,7 +188,10 @@ class _InterferenceRepair(Stage):
     def __init__(self, threshold: float = THRESHOLD) -> None:
         super().__init__()
         if not threshold > 1:
-            raise ValueError(f"threshold {threshold} is not above the mean level of clutter (1); choose 20 to 50, by default {THRESHOLD:g}")
+            raise ValueError(
+                f"threshold {threshold} is not above the mean level of clutter (1); choose 20 to 50, "
+                f"by default {THRESHOLD:g}"
+            )
         self.threshold = float(threshold)
 
     def forward(self, signal: Signal, missing: Tensor | None = None) -> tuple[Signal, Estimate]:

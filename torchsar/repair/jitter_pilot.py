@@ -1,8 +1,9 @@
 """Periodic jitter from the record of a pilot tone through the same converter (brief 004, item 4).
 
-A tone f (cycles per sample) sampled at n + e[n mod M] has the phase 2 pi f (n + e[n mod M]) + constant: the mean phase of every M-th
-sample, after the tone itself is taken out, is 2 pi f e[m]. The frequency is found from the record, the period by a test of
-significance, so that a clean converter gives offsets of exactly zero.
+A tone f (cycles per sample) sampled at n + e[n mod M] has the phase 2 pi f (n + e[n mod M]) +
+constant: the mean phase of every M-th sample, after the tone itself is taken out, is 2 pi f e[m].
+The frequency is found from the record, the period by a test of significance, so that a clean
+converter gives offsets of exactly zero.
 """
 
 from __future__ import annotations
@@ -19,14 +20,20 @@ from torchsar.repair.jitter import MIN_GAP, smallest_gap
 ORIGINS = ("mean", "first")
 
 
-def estimate_jitter_pilot(pilot: Tensor, max_period: int = 16, period: int | None = None, origin: str = "mean") -> Estimate:
-    """Period and offsets of a converter from a tone. pilot: (..., n) complex, one tone of any frequency but zero, n >= 4 periods.
+def estimate_jitter_pilot(
+    pilot: Tensor, max_period: int = 16, period: int | None = None, origin: str = "mean"
+) -> Estimate:
+    """Period and offsets of a converter from a tone.
 
-    Gives `offset_samples` (..., P) and `period` (...,) int64, where P = max_period and offsets repeat beyond the period; with a
-    known `period` P = period. origin: "mean" puts the mean offset to zero, "first" the first one; the pilot cannot tell (the mean is a
-    delay). std of the offsets is the Cramer-Rao bound at the measured noise. quality is the share of the power that the tone explains.
-    Not ok, with zero offsets: a record that is not finite, all zero, without a tone above the noise, a tone too close to zero
-    frequency, or offsets that bring instants together. Raises ValueError for an empty or short record, TypeError for a real one.
+    pilot: (..., n) complex, one tone of any frequency but zero, n >= 4 periods.
+
+    Gives `offset_samples` (..., P) and `period` (...,) int64, where P = max_period and offsets
+    repeat beyond the period; with a known `period` P = period. origin: "mean" puts the mean offset
+    to zero, "first" the first one; the pilot cannot tell (the mean is a delay). std of the offsets
+    is the Cramer-Rao bound at the measured noise. quality is the share of the power that the tone
+    explains. Not ok, with zero offsets: a record that is not finite, all zero, without a tone above
+    the noise, a tone too close to zero frequency, or offsets that bring instants together. Raises
+    ValueError for an empty or short record, TypeError for a real one.
     """
     _check(pilot, max_period, period, origin)
     finite = torch.isfinite(torch.view_as_real(pilot)).flatten(-2).all(-1)
@@ -45,10 +52,15 @@ def _check(pilot: Tensor, max_period: int, period: int | None, origin: str) -> N
     if origin not in ORIGINS:
         raise ValueError(f"origin {origin!r} is unknown; choose one of {ORIGINS}")
     if not pilot.is_complex():
-        raise TypeError(f"a pilot record is complex samples (..., n), got {pilot.dtype}; form the analytic signal first")
+        raise TypeError(
+            f"a pilot record is complex samples (..., n), got {pilot.dtype}; form the analytic signal first"
+        )
     if pilot.ndim < 1 or pilot.shape[-1] < 4 * longest:
         held = pilot.shape[-1] if pilot.ndim else 0
-        raise ValueError(f"a pilot record needs at least {4 * longest} samples for periods up to {longest}, got {held}; record longer or lower max_period")
+        raise ValueError(
+            f"a pilot record needs at least {4 * longest} samples for periods up to {longest}, "
+            f"got {held}; record longer or lower max_period"
+        )
 
 
 def _peak_frequency(x: Tensor, oversampling: int = 4) -> Tensor:
@@ -73,13 +85,19 @@ class _Fit:
         return self.phasor.abs().square().mean(-1)
 
     def significance(self, noise: Tensor) -> Tensor:
-        """Sum over converters of (phase / its deviation)^2: chi-squared with M - 1 degrees of freedom where there is no jitter."""
-        information = 2 * self.count * self.phasor.abs().square() / noise.clamp_min(1e-30 * self.power + 1e-300)[..., None]
+        """Sum over converters of (phase / its deviation)^2: chi-squared with M - 1 degrees of
+        freedom where there is no jitter.
+        """
+        information = (
+            2 * self.count * self.phasor.abs().square() / noise.clamp_min(1e-30 * self.power + 1e-300)[..., None]
+        )
         return (information * self.phase_rad.square()).sum(-1)
 
 
 def _fit(x: Tensor, frequency: Tensor, m: int, steps: int = 5) -> _Fit:
-    """Refine the frequency jointly with M class phasors: each step demodulates, then fits the common phase slope that is left."""
+    """Refine the frequency jointly with M class phasors: each step demodulates, then fits the
+    common phase slope that is left.
+    """
     n = x.shape[-1]
     index = torch.arange(n, device=x.device) % m
     count = torch.bincount(index, minlength=m).to(torch.float64)
@@ -98,7 +116,10 @@ def _fit(x: Tensor, frequency: Tensor, m: int, steps: int = 5) -> _Fit:
 
 
 def _choose(fits: list[_Fit]) -> Tensor:
-    """Index of the shortest period that explains the record, (...,). 20 + 8 (M - 1) over chi-squared: false alarms below 1e-6 a trial."""
+    """Index of the shortest period that explains the record, (...,).
+
+    20 + 8 (M - 1) over chi-squared: false alarms below 1e-6 a trial.
+    """
     noise = torch.stack([fit.noise for fit in fits]).amin(0)
     gain = [fit.significance(noise) - (20 + 8 * i if i else 0) for i, fit in enumerate(fits)]
     return torch.stack(gain).argmax(0)
@@ -110,7 +131,11 @@ def _estimate(fits: list[_Fit], best: Tensor, finite: Tensor, n: int, origin: st
 
     def pick(parts: list[Tensor]) -> Tensor:
         stacked = torch.stack(torch.broadcast_tensors(*parts))
-        return torch.gather(stacked, 0, best.reshape(1, *best.shape, *(1,) * (stacked.ndim - 1 - best.ndim)).expand(1, *stacked.shape[1:]))[0]
+        return torch.gather(
+            stacked,
+            0,
+            best.reshape(1, *best.shape, *(1,) * (stacked.ndim - 1 - best.ndim)).expand(1, *stacked.shape[1:]),
+        )[0]
 
     frequency, noise, power = (pick([getattr(f, name) for f in fits]) for name in ("frequency", "noise", "power"))
     m = pick([torch.full_like(best, f.phasor.shape[-1]) for f in fits])
@@ -121,15 +146,25 @@ def _estimate(fits: list[_Fit], best: Tensor, finite: Tensor, n: int, origin: st
     deviation = (deviation * torch.sqrt((m - 1) / m))[..., None].expand(offsets.shape)
     if origin == "first":
         offsets = offsets - offsets[..., :1]
-        deviation = deviation * math.sqrt(2) * torch.sqrt(m / (m - 1).clamp_min(1))[..., None] * (tiled % m[..., None] != 0)
+        deviation = (
+            deviation * math.sqrt(2) * torch.sqrt(m / (m - 1).clamp_min(1))[..., None] * (tiled % m[..., None] != 0)
+        )
     ok = finite & (power * n > 50 * noise) & (power > 0) & torch.isfinite(radians) & (smallest_gap(offsets) >= MIN_GAP)
     offsets, m = torch.where(ok[..., None], offsets, 0), torch.where(ok, m, 1 if len(fits) > 1 else longest)
     quality = torch.where(ok, power / (power + noise).clamp_min(1e-300), 0)
-    return Estimate({"offset_samples": offsets, "period": m}, quality, ok, {"offset_samples": torch.where(ok[..., None], deviation, 0)}, {"frequency_cycles": frequency})
+    return Estimate(
+        {"offset_samples": offsets, "period": m},
+        quality,
+        ok,
+        {"offset_samples": torch.where(ok[..., None], deviation, 0)},
+        {"frequency_cycles": frequency},
+    )
 
 
 class PilotJitter(Stage):
-    """Jitter offsets from recorded side data: `use(PilotJitter(), pilot="aux.pilot")`. The signal is left alone.
+    """Jitter offsets from recorded side data: `use(PilotJitter(), pilot="aux.pilot")`.
+
+    The signal is left alone.
 
     One pilot (n,) may serve all trials. See estimate_jitter_pilot for the origin of the offsets.
     """
@@ -142,5 +177,10 @@ class PilotJitter(Stage):
 
     def forward(self, signal: Signal, pilot: Tensor) -> Estimate:
         if not pilot.ndim or (pilot.ndim > 1 and pilot.shape[:-1] != signal.trials):
-            raise ValueError(f"pilot record of shape {tuple(pilot.shape)} does not match the trial dims {tuple(signal.trials)}; give (n,) or (*trials, n)")
-        return estimate_jitter_pilot(pilot.expand(*signal.trials, pilot.shape[-1]), self.max_period, self.period, self.origin)
+            raise ValueError(
+                f"pilot record of shape {tuple(pilot.shape)} does not match the trial dims "
+                f"{tuple(signal.trials)}; give (n,) or (*trials, n)"
+            )
+        return estimate_jitter_pilot(
+            pilot.expand(*signal.trials, pilot.shape[-1]), self.max_period, self.period, self.origin
+        )

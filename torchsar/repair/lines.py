@@ -1,8 +1,10 @@
-"""Line integrity: every line on its place of a regular azimuth grid, by numbers that are verified before they are trusted.
+"""Line integrity: every line on its place of a regular azimuth grid, by numbers that are verified
+before they are trusted.
 
-A number is judged against its neighbours: of two lines in order the later has the larger number, by at least their distance (lines are
-lost, never invented). In terms of offset = number - row this says: offsets never fall. A number that contradicts most of its neighbours
-on either side is corrupted. Source: brief 004, item 1; Tsvetkov 2017.
+A number is judged against its neighbours: of two lines in order the later has the larger number, by
+at least their distance (lines are lost, never invented). In terms of offset = number - row this
+says: offsets never fall. A number that contradicts most of its neighbours on either side is
+corrupted. Source: brief 004, item 1; Tsvetkov 2017.
 """
 
 from __future__ import annotations
@@ -15,7 +17,8 @@ from torch import Tensor
 from torchsar.core import Estimate, Signal, Stage
 
 PADDING = -1
-# neighbours on each side that vote on a number: wide first, against clusters of corrupted numbers, then close ones, against small errors
+# neighbours on each side that vote on a number: wide first, against clusters of corrupted numbers,
+# then close ones, against small errors
 _REACHES = (16, 4, 2)
 
 
@@ -23,9 +26,11 @@ _REACHES = (16, 4, 2)
 class LinePlan:
     """Where the received lines belong. n: rows of the regular grid; all per trial.
 
-    source (..., n): received row for each row of the grid, -1 where there is none. number (..., received): verified number of each
-    received row, -1 for padding, repeats and lines that could not be placed. missing: bool (..., n). corrected, repeated, unplaced:
-    bool (..., received). first_number (...,): number of row 0 of the grid. trusted (...,): share of numbers that stood. ok: bool (...,).
+    source (..., n): received row for each row of the grid, -1 where there is none. number (...,
+    received): verified number of each received row, -1 for padding, repeats and lines that could
+    not be placed. missing: bool (..., n). corrected, repeated, unplaced: bool (..., received).
+    first_number (...,): number of row 0 of the grid. trusted (...,): share of numbers that stood.
+    ok: bool (...,).
     """
 
     source: Tensor
@@ -46,7 +51,9 @@ def _shifted(x: Tensor, by: int, fill: int | bool) -> Tensor:
 
 
 def _votes(offset: Tensor, trusted: Tensor, reach: int, longest_gap: int, sign: int) -> tuple[Tensor, Tensor]:
-    """How many trusted neighbours on one side (sign +1: later) contradict each line, and how many there are."""
+    """How many trusted neighbours on one side (sign +1: later) contradict each line, and how many
+    there are.
+    """
     against, asked = torch.zeros_like(offset), torch.zeros_like(offset)
     for distance in range(1, min(reach, offset.shape[-1] - 1) + 1):
         there = _shifted(trusted, sign * distance, False)
@@ -57,7 +64,9 @@ def _votes(offset: Tensor, trusted: Tensor, reach: int, longest_gap: int, sign: 
 
 
 def _lonely_ends(offset: Tensor, trusted: Tensor) -> Tensor:
-    """The first and the last trusted line where a jump parts them from the rest that is larger than any inside: nothing on their far side speaks for them."""
+    """The first and the last trusted line where a jump parts them from the rest that is larger than
+    any inside: nothing on their far side speaks for them.
+    """
     before, after = _nearest(offset, trusted)
     first = trusted & (trusted.cumsum(-1) == 1)
     last = trusted & (trusted.flip(-1).cumsum(-1).flip(-1) == 1)
@@ -72,7 +81,9 @@ def _inner_before(inner: Tensor) -> Tensor:
 
 
 def _nearest(offset: Tensor, trusted: Tensor) -> tuple[Tensor, Tensor]:
-    """Offset of the nearest trusted line before and behind each row; where there is none on one side, that of the other side."""
+    """Offset of the nearest trusted line before and behind each row; where there is none on one
+    side, that of the other side.
+    """
     n = offset.shape[-1]
     row = torch.arange(n, device=offset.device).expand(offset.shape)
     before = _shifted(torch.where(trusted, row, -1).cummax(-1).values, -1, -1)
@@ -90,7 +101,10 @@ def _disputed(offset: Tensor, trusted: Tensor) -> Tensor:
 
 
 def trusted_numbers(offset: Tensor, candidate: Tensor, longest_gap: int) -> Tensor:
-    """Lines whose number stands. offset: number - row, int64 (..., line); candidate: lines that take part, bool (..., line)."""
+    """Lines whose number stands.
+
+    offset: number - row, int64 (..., line); candidate: lines that take part, bool (..., line).
+    """
     trusted = candidate
     for reach in _REACHES:
         against = [_votes(offset, trusted, reach, longest_gap, sign) for sign in (-1, 1)]
@@ -101,28 +115,46 @@ def trusted_numbers(offset: Tensor, candidate: Tensor, longest_gap: int) -> Tens
 
 
 def _repeats(lines: Tensor, number: Tensor, present: Tensor) -> Tensor:
-    """Lines that are the line before them once more, sample by sample, bool (..., line). Lines of zeros are none."""
+    """Lines that are the line before them once more, sample by sample, bool (..., line).
+
+    Lines of zeros are none.
+    """
     same = (lines[..., 1:, :] == lines[..., :-1, :]).all(-1) & (lines[..., 1:, :] != 0).any(-1)
     first = torch.zeros_like(same[..., :1])
     return torch.cat([first, same], -1) & present
 
 
 def _dead(lines: Tensor, present: Tensor) -> Tensor:
-    """Lines of zeros between lines that are none: a dead receiver. Silence before the first and behind the last echo is left alone."""
+    """Lines of zeros between lines that are none: a dead receiver.
+
+    Silence before the first and behind the last echo is left alone.
+    """
     lit = (lines != 0).any(-1)
     return present & ~lit & (lit.cumsum(-1) > 0) & (lit.flip(-1).cumsum(-1).flip(-1) > 0)
 
 
-def line_integrity(lines: Tensor, line_number: Tensor, *, first_number: int | None = None, n_lines: int | None = None, longest_gap: int = 1000) -> LinePlan:
-    """Verify line numbers and plan the regular grid. lines: (..., line, range); line_number: integer (..., line), -1 for padding at the end.
+def line_integrity(
+    lines: Tensor,
+    line_number: Tensor,
+    *,
+    first_number: int | None = None,
+    n_lines: int | None = None,
+    longest_gap: int = 1000,
+) -> LinePlan:
+    """Verify line numbers and plan the regular grid.
 
-    Repeated lines (equal samples) are dropped, numbers that contradict their neighbours are corrected where the lines beside them leave one
-    place only, and a line that could stand in several places of a gap is left out and counted, rather than put where it may do
-    harm. Lines of zeros amid others hold nothing and count as missing; rows behind the last received line do not (trials of different
-    lengths are padded there). first_number: number of row 0 of the grid; None: that of the first received line, per trial. n_lines: rows
-    of the grid; None: as many as there are lines, more where the numbers need more. longest_gap: a larger step between neighbours is
-    taken for a corrupted number. A trial with fewer than half of its numbers standing has ok = False and stays as it came.
-    Raises ValueError where shapes disagree, a number is no integer, or no trial at all can be reconciled.
+    lines: (..., line, range); line_number: integer (..., line), -1 for padding at the end.
+
+    Repeated lines (equal samples) are dropped, numbers that contradict their neighbours are
+    corrected where the lines beside them leave one place only, and a line that could stand in
+    several places of a gap is left out and counted, rather than put where it may do harm. Lines of
+    zeros amid others hold nothing and count as missing; rows behind the last received line do not
+    (trials of different lengths are padded there). first_number: number of row 0 of the grid; None:
+    that of the first received line, per trial. n_lines: rows of the grid; None: as many as there
+    are lines, more where the numbers need more. longest_gap: a larger step between neighbours is
+    taken for a corrupted number. A trial with fewer than half of its numbers standing has ok =
+    False and stays as it came. Raises ValueError where shapes disagree, a number is no integer, or
+    no trial at all can be reconciled.
     """
     _check(lines, line_number, longest_gap)
     n = lines.shape[-2]
@@ -163,7 +195,10 @@ def line_integrity(lines: Tensor, line_number: Tensor, *, first_number: int | No
 
 def _check(lines: Tensor, line_number: Tensor, longest_gap: int) -> None:
     if line_number.shape[-1:] != lines.shape[-2:-1]:
-        raise ValueError(f"line numbers of shape {tuple(line_number.shape)} do not fit {lines.shape[-2]} lines; give one number per line, {PADDING} for padding at the end")
+        raise ValueError(
+            f"line numbers of shape {tuple(line_number.shape)} do not fit {lines.shape[-2]} "
+            f"lines; give one number per line, {PADDING} for padding at the end"
+        )
     if line_number.is_floating_point() or line_number.is_complex() or line_number.dtype == torch.bool:
         raise ValueError(f"line numbers must be integers, got {line_number.dtype}; round them before the call")
     if longest_gap < 1:
@@ -178,7 +213,10 @@ def _refuse_hopeless(ok: Tensor, trusted: Tensor, single: Tensor) -> None:
         stand, of = int(trusted.sum()), int(single.sum())
     except RuntimeError:
         return
-    raise ValueError(f"the line numbers cannot be reconciled: only {stand} of {of} agree with their neighbours; check that they rise with the lines, and longest_gap")
+    raise ValueError(
+        f"the line numbers cannot be reconciled: only {stand} of {of} agree with their "
+        "neighbours; check that they rise with the lines, and longest_gap"
+    )
 
 
 def _first(verified: Tensor) -> Tensor:
@@ -196,14 +234,19 @@ def _rows(slot: Tensor, verified: Tensor, n: int) -> int:
 
 
 def _sources(slot: Tensor, inside: Tensor, rows: int) -> Tensor:
-    """Received row for each row of the grid, -1 where none. Lines outside go into a row that is cut off again."""
+    """Received row for each row of the grid, -1 where none.
+
+    Lines outside go into a row that is cut off again.
+    """
     row = torch.arange(slot.shape[-1], device=slot.device).expand(slot.shape)
     plan = slot.new_full((*slot.shape[:-1], rows + 1), -1)
     return plan.scatter(-1, torch.where(inside, slot, rows), row)[..., :rows]
 
 
 def place_lines(x: Tensor, source: Tensor, fill: float = 0.0) -> Tensor:
-    """Received lines (..., received, range) on the grid of LinePlan.source (..., n); `fill` where there is none. Differentiable."""
+    """Received lines (..., received, range) on the grid of LinePlan.source (..., n); `fill` where
+    there is none. Differentiable.
+    """
     index = source.clamp_min(0)[..., None].expand(*source.shape, x.shape[-1])
     return torch.where(source[..., None] >= 0, x.expand(*source.shape[:-1], *x.shape[-2:]).gather(-2, index), fill)
 
@@ -214,12 +257,15 @@ def place_per_line(x: Tensor, source: Tensor, fill: float = 0.0) -> Tensor:
 
 
 class LineIntegrity(Stage):
-    """Put every line on its place of a regular azimuth grid; see line_integrity. forward(signal, line_number).
+    """Put every line on its place of a regular azimuth grid; see line_integrity.
 
-    Returns the signal on the grid, missing lines zero, and an Estimate: `missing` (..., pulse) bool; quality: share of numbers that stood;
-    info: `source`, `number`, masks `corrected`, `repeated`, `unplaced` of the received lines, and per-trial counts `received`, `placed`,
-    `repeated_count`, `corrected_count`, `unplaced_count`, `missing_count`: received = placed + repeated + unplaced, always.
-    Regular input passes bit for bit.
+    forward(signal, line_number).
+
+    Returns the signal on the grid, missing lines zero, and an Estimate: `missing` (..., pulse)
+    bool; quality: share of numbers that stood; info: `source`, `number`, masks `corrected`,
+    `repeated`, `unplaced` of the received lines, and per-trial counts `received`, `placed`,
+    `repeated_count`, `corrected_count`, `unplaced_count`, `missing_count`: received = placed +
+    repeated + unplaced, always. Regular input passes bit for bit.
     """
 
     provides = ("missing",)
@@ -229,7 +275,9 @@ class LineIntegrity(Stage):
         self.first_number, self.n_lines, self.longest_gap = first_number, n_lines, longest_gap
 
     def forward(self, signal: Signal, line_number: Tensor) -> tuple[Signal, Estimate]:
-        plan = line_integrity(signal.data, line_number, first_number=self.first_number, n_lines=self.n_lines, longest_gap=self.longest_gap)
+        plan = line_integrity(
+            signal.data, line_number, first_number=self.first_number, n_lines=self.n_lines, longest_gap=self.longest_gap
+        )
         axis = signal.axis("pulse").part(0, plan.source.shape[-1])
         counts = {
             "received": (line_number.expand(signal.data.shape[:-1]) != PADDING).flip(-1).cumsum(-1).gt(0).sum(-1),
@@ -239,6 +287,9 @@ class LineIntegrity(Stage):
             "unplaced_count": plan.unplaced.sum(-1),
             "missing_count": plan.missing.sum(-1),
         }
-        masks = {name: getattr(plan, name) for name in ("source", "number", "corrected", "repeated", "unplaced", "first_number")}
+        masks = {
+            name: getattr(plan, name)
+            for name in ("source", "number", "corrected", "repeated", "unplaced", "first_number")
+        }
         estimate = Estimate({"missing": plan.missing}, quality=plan.trusted, ok=plan.ok, info={**masks, **counts})
         return signal.with_axis(place_lines(signal.data, plan.source), pulse=axis), estimate

@@ -1,12 +1,14 @@
 """Missing lines from a model of the scene: where the focused image is dark, and when.
 
-Model: the image, split by Doppler into a few sub-looks, is independent zero-mean noise of slowly varying power v(look, pixel). The most probable
-missing lines minimise sum |image|^2 / v, a linear system in the missing lines alone, solved by conjugate gradients; v is then
-estimated from the repaired image, and again. It begins from "focus, keep the bright part, defocus, take the missing lines" (brief 004,
-item 2), which alone finds points but no texture, and goes on with three changes that each lower the error on recorded data: the threshold
-becomes a local power estimate (a soft decision that follows texture), plain iteration becomes conjugate gradients, and sub-looks add
-what the azimuth spectrum knows: band edges, noise floor, drift of the Doppler centroid over the scene, apertures cut by the ends of
-the recording.
+Model: the image, split by Doppler into a few sub-looks, is independent zero-mean noise of slowly
+varying power v(look, pixel). The most probable missing lines minimise sum |image|^2 / v, a linear
+system in the missing lines alone, solved by conjugate gradients; v is then estimated from the
+repaired image, and again. It begins from "focus, keep the bright part, defocus, take the missing
+lines" (brief 004, item 2), which alone finds points but no texture, and goes on with three changes
+that each lower the error on recorded data: the threshold becomes a local power estimate (a soft
+decision that follows texture), plain iteration becomes conjugate gradients, and sub-looks add what
+the azimuth spectrum knows: band edges, noise floor, drift of the Doppler centroid over the scene,
+apertures cut by the ends of the recording.
 """
 
 from __future__ import annotations
@@ -23,7 +25,9 @@ from torchsar.radar import StripmapRadar
 
 
 def unit_level(lines: Tensor) -> tuple[Tensor, Tensor]:
-    """Lines over their largest sample, per trial, and that level (..., 1, 1): neither 1e-25 nor 1e19 may under- or overflow when squared."""
+    """Lines over their largest sample, per trial, and that level (..., 1, 1): neither 1e-25 nor
+    1e19 may under- or overflow when squared.
+    """
     level = lines.detach().abs().amax((-2, -1), keepdim=True)
     level = torch.where(level > 0, level, 1)
     return lines / level, level
@@ -34,9 +38,11 @@ def power_of(x: Tensor) -> Tensor:
 
 
 def conjugate_fill(quadratic: Callable[[Tensor], Tensor], lines: Tensor, mask: Tensor, steps: int) -> Tensor:
-    """Change lines under the mask so that <lines, quadratic(lines)> becomes least, by conjugate gradients from where they are.
+    """Change lines under the mask so that <lines, quadratic(lines)> becomes least, by conjugate
+    gradients from where they are.
 
-    quadratic: Hermitian, positive, (..., pulse, range) -> same. mask: bool (..., pulse, 1). Step lengths are per trial.
+    quadratic: Hermitian, positive, (..., pulse, range) -> same. mask: bool (..., pulse, 1). Step
+    lengths are per trial.
     """
 
     def dot(a: Tensor, b: Tensor) -> Tensor:
@@ -57,7 +63,9 @@ def conjugate_fill(quadratic: Callable[[Tensor], Tensor], lines: Tensor, mask: T
 
 
 def smooth(power: Tensor, azimuth: float, range_: float) -> Tensor:
-    """Local mean of (..., range, azimuth) with Gaussian weights of these standard deviations; circular in azimuth, edges held in range."""
+    """Local mean of (..., range, azimuth) with Gaussian weights of these standard deviations;
+    circular in azimuth, edges held in range.
+    """
     return _smooth_last(_smooth_last(power, azimuth, "circular").mT, range_, "replicate").mT
 
 
@@ -70,21 +78,27 @@ def _smooth_last(x: Tensor, sigma: float, edges: str) -> Tensor:
 
 
 def look_windows(n: int, looks: int, doppler_turns: Tensor) -> Tensor:
-    """Overlapping cosine windows over the Doppler axis, squares summing to 1, centred evenly about the centroid. (look, ..., n), float64.
+    """Overlapping cosine windows over the Doppler axis, squares summing to 1, centred evenly about
+    the centroid. (look, ..., n), float64.
 
     doppler_turns: centroid in cycles per line, (...,).
     """
     axis = torch.arange(n, dtype=torch.float64, device=doppler_turns.device) / n - doppler_turns[..., None]
-    centre = ((torch.arange(looks, dtype=torch.float64, device=axis.device) + 0.5) / looks - 0.5).reshape(-1, *(1,) * axis.ndim)
+    centre = ((torch.arange(looks, dtype=torch.float64, device=axis.device) + 0.5) / looks - 0.5).reshape(
+        -1, *(1,) * axis.ndim
+    )
     distance = torch.remainder(axis - centre + 0.5, 1) - 0.5
     window = torch.where(distance.abs() * looks < 1, torch.cos(torch.pi / 2 * looks * distance), 0)
     return window / window.square().sum(0).sqrt()
 
 
 class SubLooks:
-    """The precision (inverse covariance) of lines under the scene model. windows: (look, ..., n) amplitude weights over Doppler.
+    """The precision (inverse covariance) of lines under the scene model.
 
-    Powers and weights of sub-looks are held with azimuth last, (look, ..., range, pulse), where azimuth FFTs take half the time.
+    windows: (look, ..., n) amplitude weights over Doppler.
+
+    Powers and weights of sub-looks are held with azimuth last, (look, ..., range, pulse), where
+    azimuth FFTs take half the time.
     """
 
     def __init__(self, operator: InvertibleOmegaK, windows: Tensor) -> None:
@@ -93,9 +107,11 @@ class SubLooks:
         self.share = windows.square().mean(-1)[..., None, None]
 
     def power(self, lines: Tensor, unexplained: Tensor) -> Tensor:
-        """v: local power of each sub-look, the geometric mean of its own and of what the whole image says of it.
+        """v: local power of each sub-look, the geometric mean of its own and of what the whole
+        image says of it.
 
-        unexplained: power that errors of the filled lines may have in every pixel, broadcast against (..., range, pulse).
+        unexplained: power that errors of the filled lines may have in every pixel, broadcast
+        against (..., range, pulse).
         """
         spectra = self.operator.to_doppler(lines).mT.contiguous()
         whole = power_of(torch.fft.ifft(spectra))
@@ -118,18 +134,32 @@ class SubLooks:
         return self.operator.from_doppler(total.mT)
 
 
-def bright_fill(lines: Tensor, mask: Tensor, operator: InvertibleOmegaK, steps: int = 20, first: float = 0.7, fall: float = 0.75, last: float = 2.0) -> Tensor:
-    """Focus, keep the bright part, defocus, take the missing lines from it, again and again: the iteration of brief 004 as it stands.
+def bright_fill(
+    lines: Tensor,
+    mask: Tensor,
+    operator: InvertibleOmegaK,
+    steps: int = 20,
+    first: float = 0.7,
+    fall: float = 0.75,
+    last: float = 2.0,
+) -> Tensor:
+    """Focus, keep the bright part, defocus, take the missing lines from it, again and again: the
+    iteration of brief 004 as it stands.
 
-    The threshold falls from `first` of the strongest pixel by the factor `fall` a step, down to `last` times the rms of the image, per trial.
-    Finds isolated bright points however long the gap; leaves texture to the model of powers. lines: zero under the mask (..., pulse, 1).
+    The threshold falls from `first` of the strongest pixel by the factor `fall` a step, down to
+    `last` times the rms of the image, per trial. Finds isolated bright points however long the gap;
+    leaves texture to the model of powers. lines: zero under the mask (..., pulse, 1).
     """
     filled, threshold = lines, None
     for _ in range(steps):
         image = operator.focus(filled)
         size = image.detach().abs()
         rms = size.square().mean((-2, -1), keepdim=True).sqrt()
-        threshold = first * size.amax((-2, -1), keepdim=True) if threshold is None else torch.maximum(fall * threshold, last * rms)
+        threshold = (
+            first * size.amax((-2, -1), keepdim=True)
+            if threshold is None
+            else torch.maximum(fall * threshold, last * rms)
+        )
         filled = torch.where(mask, operator.defocus(torch.where(size > threshold, image, 0)), lines)
     return filled
 
@@ -146,14 +176,17 @@ def sparse_fill(
     rounds: int = 2,
     steps: int = 4,
 ) -> Tensor:
-    """Missing lines that make the focused image most probable under a model of locally varying power. lines: (..., pulse, range).
+    """Missing lines that make the focused image most probable under a model of locally varying
+    power. lines: (..., pulse, range).
 
-    missing: bool (..., pulse). doppler_hz, velocity_m_s: absolute centroid and effective velocity, (...,); errors of a few Hz and a small
-    fraction of the velocity cost little, since the model only asks where the image is dark. reference: range reference spectrum
-    (range,) of raw lines, of which the phase is used; None for range-compressed lines. Begins from bright_fill. Two looks are enough for
-    point-like scenes; more (4) pay for speckle that fills the PRF band; rounds beyond 2 and steps beyond 4 pay only in long gaps.
-    Costs about 110 two-dimensional FFTs by default. Received lines are kept bit for bit. Differentiable in lines, with thresholds
-    and local powers held fixed.
+    missing: bool (..., pulse). doppler_hz, velocity_m_s: absolute centroid and effective velocity,
+    (...,); errors of a few Hz and a small fraction of the velocity cost little, since the model
+    only asks where the image is dark. reference: range reference spectrum (range,) of raw lines, of
+    which the phase is used; None for range-compressed lines. Begins from bright_fill. Two looks are
+    enough for point-like scenes; more (4) pay for speckle that fills the PRF band; rounds beyond 2
+    and steps beyond 4 pay only in long gaps. Costs about 110 two-dimensional FFTs by default.
+    Received lines are kept bit for bit. Differentiable in lines, with thresholds and local powers
+    held fixed.
     """
     mask = missing.bool().expand(lines.shape[:-1])[..., None]
     x, level = unit_level(torch.where(mask, 0, lines))

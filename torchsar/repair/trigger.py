@@ -1,17 +1,23 @@
 """Where a triangular sweep starts in a record whose timing is unknown, from the record itself.
 
-1. Turning points: a short-time transform is least concentrated in frequency where its window straddles one; folded over half a period and
-   averaged. 2. They are refined by cutting whole sweeps: their spectra are sharpest, on either side falling alike, at the middle of the
-   transient, 2 RD / c long, that begins at the turning point. 3. Finer than a sample: the tones of the strongest scatterer in up and down
-   sweep have one phase at that middle; of the fringes 1 / (2 f+) near the result of step 2 the one counts where samples go over from the
-   strongest tones of one sweep to those of the next. 4. Order: which half is the up sweep.
+1. Turning points: a short-time transform is least concentrated in frequency where its window
+straddles one; folded over half a period and
+   averaged. 2. They are refined by cutting whole sweeps: their spectra are sharpest, on either side
+   falling alike, at the middle of the transient, 2 RD / c long, that begins at the turning point.
+   3. Finer than a sample: the tones of the strongest scatterer in up and down sweep have one phase
+   at that middle; of the fringes 1 / (2 f+) near the result of step 2 the one counts where samples
+   go over from the strongest tones of one sweep to those of the next. 4. Order: which half is the
+   up sweep.
 
-Errors measured: complex record, RD 1.5 m, 24 periods: 0.02, 0.2, 0.6 ns without noise, at 10, at 0 dB (a sample is 16 ns); real records of
-the ground ladar 0.01 to 0.04 ns at 10 dB, 64 periods. Cost of 960 blocks of 9600 real samples: 6 s and 1.2 GB on one core.
+Errors measured: complex record, RD 1.5 m, 24 periods: 0.02, 0.2, 0.6 ns without noise, at 10, at 0
+dB (a sample is 16 ns); real records of the ground ladar 0.01 to 0.04 ns at 10 dB, 64 periods. Cost
+of 960 blocks of 9600 real samples: 6 s and 1.2 GB on one core.
 
-Complex detection tells the order by the beat, which is higher in the up sweep where RD > 0. A real record is the same, sample by sample, for
-a motion v in one order and -v in the other, but for the envelope: the range read from the beats must follow the integrated velocity and
-not its mirror image. That is what focusing verifies, done here on range profiles alone. Brief 000, sections 4 (16) and 5; paper 000, Fig. 15.
+Complex detection tells the order by the beat, which is higher in the up sweep where RD > 0. A real
+record is the same, sample by sample, for a motion v in one order and -v in the other, but for the
+envelope: the range read from the beats must follow the integrated velocity and not its mirror
+image. That is what focusing verifies, done here on range profiles alone. Brief 000, sections 4 (16)
+and 5; paper 000, Fig. 15.
 """
 
 from __future__ import annotations
@@ -33,7 +39,9 @@ ORDER_SIGMAS, FRINGE_SIGMAS = 5.0, 3.0
 
 @dataclass(frozen=True)
 class _Windows:
-    """Lines (..., line, n) of complex samples, and the sweeps that can be cut out of them: starts o + j N for o in 0..N + 2 margin."""
+    """Lines (..., line, n) of complex samples, and the sweeps that can be cut out of them: starts o
+    + j N for o in 0..N + 2 margin.
+    """
 
     lines: Tensor
     radar: TriangularLadar
@@ -46,7 +54,9 @@ class _Windows:
         return ((self.lines.shape[-1] - 2 * self.margin) // n - 1) // 2 * 2
 
     def chosen(self, every: bool) -> tuple[Tensor, Tensor]:
-        """Lines, and of them numbers j of sweeps in pairs (even, odd): all, or about MAX_WINDOWS sweeps spread over the record."""
+        """Lines, and of them numbers j of sweeps in pairs (even, odd): all, or about MAX_WINDOWS
+        sweeps spread over the record.
+        """
         pairs, n_line = self.count // 2, self.lines.shape[-2]
         step = 1 if every else max(1, pairs * n_line * 2 // MAX_WINDOWS)
         line_step = min(step, n_line)
@@ -54,31 +64,47 @@ class _Windows:
         return self.lines[..., ::line_step, :], torch.stack([j, j + 1], -1).flatten()
 
     def cut(self, start: Tensor, every: bool = False) -> Tensor:
-        """Sweeps from integer starts (..., o) on: (..., o, line, sweep, N); beyond the end of a line its last sample."""
+        """Sweeps from integer starts (..., o) on: (..., o, line, sweep, N); beyond the end of a
+        line its last sample.
+        """
         n, (lines, j) = self.radar.sweep_samples, self.chosen(every)
-        place = (start[..., None, None] + (j[:, None] * n + torch.arange(n, device=lines.device))).clamp_max(lines.shape[-1] - 1)
+        place = (start[..., None, None] + (j[:, None] * n + torch.arange(n, device=lines.device))).clamp_max(
+            lines.shape[-1] - 1
+        )
         source = lines[..., None, :, :].expand(*start.shape, *lines.shape[-2:])
         index = place.flatten(-2)[..., None, :].expand(*start.shape, lines.shape[-2], j.numel() * n)
         return source.gather(-1, index).unflatten(-1, (j.numel(), n))
 
 
 def refuse_no_samples(record: Tensor) -> None:
-    """Raise TypeError or ValueError unless record is a finite record (..., pulse, time), real or complex."""
+    """Raise TypeError or ValueError unless record is a finite record (..., pulse, time), real or
+    complex.
+    """
     if not (isinstance(record, Tensor) and (record.is_complex() or record.is_floating_point())):
-        raise TypeError(f"find_trigger works on a real or complex record (..., pulse, time), got {getattr(record, 'dtype', type(record).__name__)}; convert the samples first")
+        raise TypeError(
+            "find_trigger works on a real or complex record (..., pulse, time), got "
+            f"{getattr(record, 'dtype', type(record).__name__)}; convert the samples first"
+        )
     if record.ndim < 2 or not record.numel():
-        raise ValueError(f"find_trigger works on a record (..., pulse, time) with samples in it, got shape {tuple(record.shape)}")
+        raise ValueError(
+            f"find_trigger works on a record (..., pulse, time) with samples in it, got shape {tuple(record.shape)}"
+        )
     refuse_non_finite(record, "find_trigger")
 
 
-def find_trigger(record: Tensor, radar: TriangularLadar, contiguous: bool | None = None, nearer: bool = False) -> Estimate:
-    """Start of the up sweep in the blocks of a record. record: (..., pulse, time) complex or real. Gives `trigger_s` (...,) after the
-    first sample of a block, -1 sample..period - 1 sample.
+def find_trigger(
+    record: Tensor, radar: TriangularLadar, contiguous: bool | None = None, nearer: bool = False
+) -> Estimate:
+    """Start of the up sweep in the blocks of a record. record: (..., pulse, time) complex or real.
 
-    contiguous: as in split_record; other blocks need 1.7 periods of samples or more. nearer: whether the scene lies nearer than the reference.
-    info: `order_sigmas` (...,), by how many deviations the order is certain (below 5: not ok), `fringe_sigmas`, the same of the fringe
-    (below 3: not ok), and `coarse_s`, modulo half a period. quality is the drop of concentration at turning points, 0..1. A scene on both
-    sides of the reference has no sign of beat: not ok. Raises ValueError for short records.
+    Gives `trigger_s` (...,) after the first sample of a block, -1 sample..period - 1 sample.
+
+    contiguous: as in split_record; other blocks need 1.7 periods of samples or more. nearer:
+    whether the scene lies nearer than the reference. info: `order_sigmas` (...,), by how many
+    deviations the order is certain (below 5: not ok), `fringe_sigmas`, the same of the fringe
+    (below 3: not ok), and `coarse_s`, modulo half a period. quality is the drop of concentration at
+    turning points, 0..1. A scene on both sides of the reference has no sign of beat: not ok. Raises
+    ValueError for short records.
     """
     refuse_no_samples(record)
     n = radar.sweep_samples
@@ -86,7 +112,10 @@ def find_trigger(record: Tensor, radar: TriangularLadar, contiguous: bool | None
     lines = record.flatten(-2)[..., None, :] if joined else record
     windows = _Windows(_scaled(lines), radar, n // 8)
     if windows.count < 2 or windows.count * windows.lines.shape[-2] < 4:
-        raise ValueError(f"lines of {lines.shape[-1]} samples are too short to find turning points every {n} samples in; give 3 periods without a gap, or 2 blocks of 1.7 periods or more")
+        raise ValueError(
+            f"lines of {lines.shape[-1]} samples are too short to find turning points every {n} "
+            "samples in; give 3 periods without a gap, or 2 blocks of 1.7 periods or more"
+        )
     coarse, depth = _turning_by_stft(windows)
     middle = _apex(windows, coarse, windows.margin)
     middle = _apex(windows, torch.round(middle).long(), max(n // 32, 6))
@@ -98,21 +127,31 @@ def _scaled(lines: Tensor) -> Tensor:
     """Complex lines, analytic where real, with a peak of one."""
     peak = lines.abs().amax((-2, -1), keepdim=True)
     lines = lines / torch.where(peak > 0, peak, 1)
-    return lines if lines.is_complex() else delayed(lines, torch.zeros((), dtype=torch.float64, device=lines.device), analytic=True)
+    return (
+        lines
+        if lines.is_complex()
+        else delayed(lines, torch.zeros((), dtype=torch.float64, device=lines.device), analytic=True)
+    )
 
 
 def _turning_by_stft(windows: _Windows) -> tuple[Tensor, Tensor]:
-    """Sample of the turning points modulo N, in margin..margin + N, (...,) int64, and the relative drop of concentration there."""
+    """Sample of the turning points modulo N, in margin..margin + N, (...,) int64, and the relative
+    drop of concentration there.
+    """
     n = windows.radar.sweep_samples
     hop, width = max(1, n // 32), max(8, n // 8)
     lines, _ = windows.chosen(False)
     lines = lines[..., : min(lines.shape[-1] // n, max(4, MAX_WINDOWS // lines.shape[-2])) * n]
     window = torch.hann_window(width, dtype=real_dtype(lines.dtype), device=lines.device)
-    spectra = torch.stft(lines.reshape(-1, lines.shape[-1]), width, hop, window=window, center=False, onesided=False, return_complex=True)
+    spectra = torch.stft(
+        lines.reshape(-1, lines.shape[-1]), width, hop, window=window, center=False, onesided=False, return_complex=True
+    )
     power = spectra.abs().square()
     sharp = power.square().sum(-2) / power.sum(-2).square().clamp_min(1e-30)
     sharp = sharp.reshape(*lines.shape[:-1], -1).mean(-2)
-    frame = torch.round((torch.arange(sharp.shape[-1], device=lines.device) * hop + width / 2) % n / hop).long() % round(n / hop)
+    frame = torch.round(
+        (torch.arange(sharp.shape[-1], device=lines.device) * hop + width / 2) % n / hop
+    ).long() % round(n / hop)
     bins = int(frame.max()) + 1
     total = torch.zeros((*sharp.shape[:-1], bins), dtype=sharp.dtype, device=sharp.device).index_add(-1, frame, sharp)
     mean = total / torch.bincount(frame, minlength=bins).clamp_min(1)
@@ -129,12 +168,16 @@ def _sharpness(sweeps: Tensor) -> Tensor:
 
 
 def _apex(windows: _Windows, near: Tensor, reach: int) -> Tensor:
-    """First sample (...,) of the sweeps that are sharpest: sharpness is a tent over it, and the lines through its slopes meet at the top."""
+    """First sample (...,) of the sweeps that are sharpest: sharpness is a tent over it, and the
+    lines through its slopes meet at the top.
+    """
     step = max(1, reach // 8)
     offset = torch.arange(-8, 9, device=near.device) * step
     start = (near[..., None] + offset).clamp(0, windows.radar.sweep_samples + 2 * windows.margin)
     mean = torch.stack([_sharpness(windows.cut(start[..., i : i + 1])).mean((-3, -2, -1)) for i in range(17)], -1)
-    left, right = (_line_through(offset[part].to(torch.float64), mean[..., part]) for part in (slice(0, 6), slice(11, 17)))
+    left, right = (
+        _line_through(offset[part].to(torch.float64), mean[..., part]) for part in (slice(0, 6), slice(11, 17))
+    )
     top = (right[0] - left[0]) / (left[1] - right[1]).clamp_min(1e-300)
     return start[..., 8].to(torch.float64) + top.clamp(-8 * step, 8 * step)
 
@@ -148,7 +191,9 @@ def _line_through(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class _Tones:
-    """Strongest tones of sweeps (..., pair), even and odd: frequency (cycles per sample) and phase (turns) at the middle of the sweep."""
+    """Strongest tones of sweeps (..., pair), even and odd: frequency (cycles per sample) and phase
+    (turns) at the middle of the sweep.
+    """
 
     even_cycles: Tensor
     odd_cycles: Tensor
@@ -163,7 +208,8 @@ def _tones(cycles: Tensor, value: Tensor) -> _Tones:
 
 
 def _found_tones(sweeps: Tensor, skip: int, count: int = TONES) -> tuple[Tensor, Tensor]:
-    """Frequencies (cycles per sample) and complex amplitudes at the middle of the `count` strongest tones, (..., count), one taken out after the other.
+    """Frequencies (cycles per sample) and complex amplitudes at the middle of the `count` strongest
+    tones, (..., count), one taken out after the other.
 
     sweeps: (..., N), of which `skip` samples at each end are left out.
     """
@@ -181,16 +227,22 @@ def _found_tones(sweeps: Tensor, skip: int, count: int = TONES) -> tuple[Tensor,
 
 
 def _peak_cycles(x: Tensor) -> Tensor:
-    """Frequency of the strongest tone of windowed samples (..., m), by a parabola through the logarithms of three bins of a fourfold spectrum."""
+    """Frequency of the strongest tone of windowed samples (..., m), by a parabola through the
+    logarithms of three bins of a fourfold spectrum.
+    """
     n = 4 * x.shape[-1]
     power = torch.fft.fft(x, n).abs().square()
     peak = power.argmax(-1)
-    low, top, high = (torch.log(power.gather(-1, ((peak + i) % n)[..., None])[..., 0].clamp_min(1e-300)) for i in (-1, 0, 1))
+    low, top, high = (
+        torch.log(power.gather(-1, ((peak + i) % n)[..., None])[..., 0].clamp_min(1e-300)) for i in (-1, 0, 1)
+    )
     cycles = (peak + ((high - low) / (2 * (2 * top - low - high).clamp_min(1e-12))).clamp(-0.5, 0.5)) / n
     return cycles - torch.round(cycles)
 
 
-def _judge(windows: _Windows, middle: Tensor, depth: Tensor, nearer: bool, is_complex: bool, joined: bool, block: int) -> Estimate:
+def _judge(
+    windows: _Windows, middle: Tensor, depth: Tensor, nearer: bool, is_complex: bool, joined: bool, block: int
+) -> Estimate:
     """Fringe, order and verdict from the middle of the transients."""
     radar, n = windows.radar, windows.radar.sweep_samples
     base = torch.round(middle).long().clamp(0, n + 2 * windows.margin)
@@ -207,30 +259,45 @@ def _judge(windows: _Windows, middle: Tensor, depth: Tensor, nearer: bool, is_co
         apart = (tones.even_turns + tones.odd_turns) + n / 2 * (tones.even_cycles - tones.odd_cycles)
         lean = torch.ones_like(plus)
     fine, fringe = _fringe(windows, base, (cycles, value), _meeting(apart, plus * lean, middle - base), plus)
-    # the tones meet half a transient, f+ / (2 K), after the turning point of the reference; before it where the scene is nearer
-    half_transient = plus * radar.sample_rate_hz / radar.chirp_rate_hz_s / 2 * radar.sample_rate_hz * (-1 if nearer else 1)
+    # the tones meet half a transient, f+ / (2 K), after the turning point of the reference; before
+    # it where the scene is nearer
+    half_transient = (
+        plus * radar.sample_rate_hz / radar.chirp_rate_hz_s / 2 * radar.sample_rate_hz * (-1 if nearer else 1)
+    )
     start = base + fine - 0.5 - half_transient + torch.where(even_is_up, 0, n)
     start = torch.remainder(start + 1, 2 * n) - 1
     ok = (order > ORDER_SIGMAS) & (fringe > FRINGE_SIGMAS) & (depth > 0.05) & torch.isfinite(start)
     if not joined:
         ok = ok & (start > -0.5) & (start + 2 * n <= block)
     start = torch.where(torch.isfinite(start), start, 0)
-    info = {"order_sigmas": order, "fringe_sigmas": fringe, "coarse_s": torch.nan_to_num(middle - 0.5 - half_transient) / radar.sample_rate_hz}
+    info = {
+        "order_sigmas": order,
+        "fringe_sigmas": fringe,
+        "coarse_s": torch.nan_to_num(middle - 0.5 - half_transient) / radar.sample_rate_hz,
+    }
     return Estimate({"trigger_s": start / radar.sample_rate_hz}, torch.where(ok, depth.clamp(0, 1), 0), ok, info=info)
 
 
 def _meeting(apart: Tensor, plus_cycles: Tensor, expected: Tensor) -> Tensor:
-    """Sample offset (...,) at which even and odd tones have one phase, the fringe nearest to the expected offset. apart: turns (..., line, pair)."""
+    """Sample offset (...,) at which even and odd tones have one phase, the fringe nearest to the
+    expected offset. apart: turns (..., line, pair).
+    """
     ring = torch.polar(torch.ones_like(apart), 2 * math.pi * apart).mean((-2, -1))
     turns, twice = torch.angle(ring) / (2 * math.pi), 2 * plus_cycles
     known = twice.abs() > 1e-6
-    return torch.where(known, -(turns + torch.round(-turns - expected * twice)) / torch.where(known, twice, 1), expected)
+    return torch.where(
+        known, -(turns + torch.round(-turns - expected * twice)) / torch.where(known, twice, 1), expected
+    )
 
 
-def _fringe(windows: _Windows, base: Tensor, tones: tuple[Tensor, Tensor], found: Tensor, plus_cycles: Tensor) -> tuple[Tensor, Tensor]:
-    """Of the fringes around `found` (sample offset from base) the one at which samples change from the even tones to the odd ones; and by how many deviations (...,).
+def _fringe(
+    windows: _Windows, base: Tensor, tones: tuple[Tensor, Tensor], found: Tensor, plus_cycles: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Of the fringes around `found` (sample offset from base) the one at which samples change from
+    the even tones to the odd ones; and by how many deviations (...,).
 
-    The sum of |x - odd|^2 - |x - even|^2 up to a boundary is largest at the true one; scatter between pairs of sweeps tells its deviation.
+    The sum of |x - odd|^2 - |x - even|^2 up to a boundary is largest at the true one; scatter
+    between pairs of sweeps tells its deviation.
     """
     n, reach = windows.radar.sweep_samples, windows.margin
     around = windows.cut((base - reach)[..., None], every=True).squeeze(-4)[..., 1::2, : 2 * reach]
@@ -253,7 +320,13 @@ def _fringe(windows: _Windows, base: Tensor, tones: tuple[Tensor, Tensor], found
 
 def _extrapolated(cycles: Tensor, value: Tensor, place: Tensor) -> Tensor:
     """Sum of tones (..., tone) at samples `place` (m,) from the middle of their sweep: (..., m)."""
-    return sum((value[..., i, None] * unit_phasor(cycles[..., i, None] * place, torch.complex128) for i in range(cycles.shape[-1])), start=torch.zeros_like(value[..., :1]))
+    return sum(
+        (
+            value[..., i, None] * unit_phasor(cycles[..., i, None] * place, torch.complex128)
+            for i in range(cycles.shape[-1])
+        ),
+        start=torch.zeros_like(value[..., :1]),
+    )
 
 
 def _interpolated(x: Tensor, place: Tensor) -> Tensor:
@@ -265,7 +338,9 @@ def _interpolated(x: Tensor, place: Tensor) -> Tensor:
 
 
 def _order_by_beat(tones: _Tones, nearer: bool, radar: TriangularLadar) -> tuple[Tensor, Tensor]:
-    """Whether even sweeps are up, and how many deviations that is certain by: the beat of the up sweep is the higher one."""
+    """Whether even sweeps are up, and how many deviations that is certain by: the beat of the up
+    sweep is the higher one.
+    """
     gap = (tones.even_cycles - tones.odd_cycles).flatten(-2)
     up_higher = (radar.dechirp_sign == "lo_conj_echo") != nearer
     middle = gap.median(-1).values
@@ -274,15 +349,22 @@ def _order_by_beat(tones: _Tones, nearer: bool, radar: TriangularLadar) -> tuple
 
 
 def _order_by_envelope(tones: _Tones, radar: TriangularLadar) -> tuple[Tensor, Tensor]:
-    """The same for a real record: does the range of the beats rise with the velocity that taking even sweeps for up gives?
+    """The same for a real record: does the range of the beats rise with the velocity that taking
+    even sweeps for up gives?
 
-    Range changes by plus or minus the integrated velocity; single wrong peaks are replaced by medians. The certainty is the correlation of the
-    two over what the scatter of the range from period to period makes of it.
+    Range changes by plus or minus the integrated velocity; single wrong peaks are replaced by
+    medians. The certainty is the correlation of the two over what the scatter of the range from
+    period to period makes of it.
     """
     plus, shift = (tones.even_cycles + tones.odd_cycles) / 2, (tones.even_cycles - tones.odd_cycles) / 2
     per_cycle = radar.sample_rate_hz * radar.wave_speed_m_s / (2 * radar.chirp_rate_hz_s)
     range_m = _settled(plus.flatten(-2) if plus.shape[-2] == 1 else plus[..., 0]) * per_cycle
-    velocity = _settled(shift.flatten(-2) if shift.shape[-2] == 1 else shift[..., 0]) * radar.sample_rate_hz * radar.wavelength_m / 2
+    velocity = (
+        _settled(shift.flatten(-2) if shift.shape[-2] == 1 else shift[..., 0])
+        * radar.sample_rate_hz
+        * radar.wavelength_m
+        / 2
+    )
     if range_m.shape[-1] < 4:
         return torch.ones_like(range_m[..., 0], dtype=torch.bool), torch.zeros_like(range_m[..., 0])
     moved = torch.cumulative_trapezoid(velocity, dx=radar.pulse_step_s)
@@ -294,9 +376,13 @@ def _order_by_envelope(tones: _Tones, radar: TriangularLadar) -> tuple[Tensor, T
 
 
 def _settled(x: Tensor, sigmas: float = 6.0) -> Tensor:
-    """Values (..., k) more than so many deviations from a running median replaced by it: wrong peaks."""
+    """Values (..., k) more than so many deviations from a running median replaced by it: wrong
+    peaks.
+    """
     width = min(9, x.shape[-1] // 2 * 2 - 1)
-    padded = torch.cat([x[..., :1].expand(*x.shape[:-1], width // 2), x, x[..., -1:].expand(*x.shape[:-1], width // 2)], -1)
+    padded = torch.cat(
+        [x[..., :1].expand(*x.shape[:-1], width // 2), x, x[..., -1:].expand(*x.shape[:-1], width // 2)], -1
+    )
     middle = padded.unfold(-1, width, 1).median(-1).values
     apart = (x - middle).abs()
     return torch.where(apart > sigmas * 1.5 * apart.median(-1, keepdim=True).values, middle, x)

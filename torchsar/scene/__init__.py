@@ -1,18 +1,67 @@
 """The truth: targets, path, beam."""
 
 from torchsar.scene.aircraft import Aircraft, SpreadRows
-from torchsar.scene.bistatic import BandLimited, BistaticWorld, Gate, OrbitTransmit, Pattern, PolynomialTransmit, TransmitRange
-from torchsar.scene.fluctuation import LogAmplitude, MeasuredTrack, PathFluctuation, RandomMotion, Tones, VibrationSpectrum, drawn_motion
-from torchsar.scene.ladar import CalibrationFibre, Effect, EverySample, Extremes, Fidelity, LadarWorld, LinearInSweep, OnePerPeriod, OnePerSweep, QuadraticInSweep, RangeHistory, SweepError
+from torchsar.scene.bistatic import (
+    BandLimited,
+    BistaticWorld,
+    Gate,
+    OrbitTransmit,
+    Pattern,
+    PolynomialTransmit,
+    TransmitRange,
+)
+from torchsar.scene.fluctuation import (
+    LogAmplitude,
+    MeasuredTrack,
+    PathFluctuation,
+    RandomMotion,
+    Tones,
+    VibrationSpectrum,
+    drawn_motion,
+)
+from torchsar.scene.ladar import (
+    CalibrationFibre,
+    Effect,
+    EverySample,
+    Extremes,
+    Fidelity,
+    LadarWorld,
+    LinearInSweep,
+    OnePerPeriod,
+    OnePerSweep,
+    QuadraticInSweep,
+    RangeHistory,
+    SweepError,
+)
 from torchsar.scene.ladar_targets import LetterE, RetroAndBrokenLine
-from torchsar.scene.moving import Bend, ExactRange, Fleet, GroundMovers, Movers, MovingPoints, MovingScene, ReceiveRange, Ship, TaylorRange
+from torchsar.scene.moving import (
+    Bend,
+    ExactRange,
+    Fleet,
+    GroundMovers,
+    Movers,
+    MovingPoints,
+    MovingScene,
+    ReceiveRange,
+    Ship,
+    TaylorRange,
+)
 from torchsar.scene.path import AlwaysLit, Antenna, Beam, Dwell, Hyperbola, Parabola, Path
 from torchsar.scene.rotation import PolynomialRotation
 from torchsar.scene.satellite import Satellite
 from torchsar.scene.sea import ImageReflectivity, KSea, Sea, gamma_from_normal
 from torchsar.scene.targets import Points, RandomPoints, Scatterers, Scene, Speckle, Together
 from torchsar.scene.turntable import Dechirped, PhaseOnly, TurntableWorld
-from torchsar.scene.vibration import Motion, Polynomial, PulsePhase, Sinusoid, StartPhase, UniformStartPhase, displacement_m, start_phase_rad
+from torchsar.scene.vibration import (
+    Motion,
+    Polynomial,
+    PulsePhase,
+    Sinusoid,
+    StartPhase,
+    UniformStartPhase,
+    displacement_m,
+    start_phase_rad,
+)
 from torchsar.scene.world import StripmapWorld
 
 __all__ = [

@@ -24,7 +24,9 @@ class Gate(Protocol):
 
 @dataclass(frozen=True)
 class BandLimited:
-    """Each target is seen for duration_s about the time y0 / v at which it is abreast, alike in all channels: its band is limited."""
+    """Each target is seen for duration_s about the time y0 / v at which it is abreast, alike in all
+    channels: its band is limited.
+    """
 
     duration_s: float
 
@@ -40,7 +42,8 @@ class BandLimited:
 
 @dataclass(frozen=True)
 class Pattern:
-    """One-way pattern of a uniformly lit element, sin(pi q) / (pi q) with q = element_m sin(look) / wavelength, seen over the whole record.
+    """One-way pattern of a uniformly lit element, sin(pi q) / (pi q) with q = element_m sin(look) /
+    wavelength, seen over the whole record.
 
     sin(look) = (v t - y0 - dx_m) / R_m. element_m: None for that of the radar.
     """
@@ -49,7 +52,9 @@ class Pattern:
 
     def __post_init__(self) -> None:
         if self.element_m is not None and not 0 < self.element_m < math.inf:
-            raise ValueError(f"element_m of a pattern must be a positive length, or None for that of the radar, got {self.element_m}")
+            raise ValueError(
+                f"element_m of a pattern must be a positive length, or None for that of the radar, got {self.element_m}"
+            )
 
     def weight(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
         """Amplitude gain of the receive pattern, float64 (..., channel, pulse, target)."""
@@ -72,9 +77,14 @@ class PolynomialTransmit:
     order: int | None = None
 
     def __post_init__(self) -> None:
-        refuse_unless_finite("coefficients of a transmit range", torch.tensor(list(self.coefficients), dtype=torch.float64))
+        refuse_unless_finite(
+            "coefficients of a transmit range", torch.tensor(list(self.coefficients), dtype=torch.float64)
+        )
         if self.order is not None and not 0 <= self.order <= len(self.coefficients):
-            raise ValueError(f"order of a transmit range must lie in 0..{len(self.coefficients)}, the number of its coefficients, got {self.order}")
+            raise ValueError(
+                f"order of a transmit range must lie in 0..{len(self.coefficients)}, the number of "
+                f"its coefficients, got {self.order}"
+            )
 
     def range_m(self, time_s: Tensor) -> Tensor:
         """R_T(t) - R_T(0) (m), float64, shape of time_s."""
@@ -84,14 +94,20 @@ class PolynomialTransmit:
         """Largest phase (rad) of the dropped terms within duration_s about t = 0."""
         kept = len(self.coefficients) if self.order is None else self.order
         half = duration_s / 2
-        return 2 * math.pi / radar.wavelength_m * sum(abs(k) * half ** (kept + 1 + i) for i, k in enumerate(self.coefficients[kept:]))
+        return (
+            2
+            * math.pi
+            / radar.wavelength_m
+            * sum(abs(k) * half ** (kept + 1 + i) for i, k in enumerate(self.coefficients[kept:]))
+        )
 
 
 @dataclass(frozen=True)
 class OrbitTransmit:
     """The exact range from a satellite to a point of the scene, which turns with the Earth.
 
-    point_m: the point at the epoch in the inertial frame (m), as of `radar.seen_point`; epoch_s: time of the orbit at slow time zero.
+    point_m: the point at the epoch in the inertial frame (m), as of `radar.seen_point`; epoch_s:
+    time of the orbit at slow time zero.
     """
 
     orbit: Orbit
@@ -104,16 +120,21 @@ class OrbitTransmit:
 
     def range_m(self, time_s: Tensor) -> Tensor:
         """R_T(t) - R_T(0) (m), float64, shape of time_s, behind the trial dims of the orbit."""
-        return orbit_range(self.orbit, torch.as_tensor(self.point_m, dtype=torch.float64, device=time_s.device), self.epoch_s, time_s)
+        return orbit_range(
+            self.orbit, torch.as_tensor(self.point_m, dtype=torch.float64, device=time_s.device), self.epoch_s, time_s
+        )
 
 
 @dataclass(frozen=True)
 class BistaticWorld:
     """Moving targets, what the receiver sees of them, the sea under them, and the noise.
 
-    scene: None for no moving target. gate: `BandLimited` or `Pattern`. sea: such as `KSea`, None for none. snr_db: power of a target of amplitude 1 over noise variance in a
-    sample of one channel after range compression, at the peak line of the target (in one pulse of raw echoes it is B tau_p less), a number or per-trial
-    tensor (...,); None for no noise. receive: how finely ranges are followed. transmit: the true range to the transmitter; None for that of the ephemeris.
+    scene: None for no moving target. gate: `BandLimited` or `Pattern`. sea: such as `KSea`, None
+    for none. snr_db: power of a target of amplitude 1 over noise variance in a sample of one
+    channel after range compression, at the peak line of the target (in one pulse of raw echoes it
+    is B tau_p less), a number or per-trial tensor (...,); None for no noise. receive: how finely
+    ranges are followed. transmit: the true range to the transmitter; None for that of the
+    ephemeris.
     """
 
     scene: MovingScene | None
@@ -125,7 +146,9 @@ class BistaticWorld:
 
     def __post_init__(self) -> None:
         if self.scene is not None and not hasattr(self.scene, "movers"):
-            raise TypeError(f"scene must be an object with movers, such as MovingPoints or Ship, or None, got {self.scene!r}")
+            raise TypeError(
+                f"scene must be an object with movers, such as MovingPoints or Ship, or None, got {self.scene!r}"
+            )
         if isinstance(self.gate, type) or not hasattr(self.gate, "weight"):
             raise TypeError(f"gate must be BandLimited(duration_s) or Pattern(), got {self.gate!r}")
         if isinstance(self.receive, type) or not hasattr(self.receive, "range_m"):

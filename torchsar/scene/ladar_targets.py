@@ -14,10 +14,12 @@ from torchsar.scene.vibration import refuse_unless_finite
 
 @dataclass(frozen=True)
 class LetterE:
-    """A letter E of 62 points of amplitude 1: a spine of 17 along range, 5 cm apart, and arms of 15 along azimuth, 1 cm apart, at spine points 0, 8, 16.
+    """A letter E of 62 points of amplitude 1: a spine of 17 along range, 5 cm apart, and arms of 15
+    along azimuth, 1 cm apart, at spine points 0, 8, 16.
 
-    The arms begin 1 cm beside the spine, towards positive azimuth. first_range_m: range of the spine's first point; spine_azimuth_m: azimuth of
-    the spine. random_phase=False gives all points the same phase, which makes entropy prefer wrong images (brief 000, section 7).
+    The arms begin 1 cm beside the spine, towards positive azimuth. first_range_m: range of the
+    spine's first point; spine_azimuth_m: azimuth of the spine. random_phase=False gives all points
+    the same phase, which makes entropy prefer wrong images (brief 000, section 7).
     """
 
     first_range_m: float = -0.4
@@ -32,16 +34,24 @@ class LetterE:
         spine, along = torch.arange(17, dtype=torch.float64), torch.arange(1, 16, dtype=torch.float64)
         azimuth = torch.cat([torch.zeros(17, dtype=torch.float64), along, along, along])
         row = torch.cat([spine, *(torch.full((15,), float(at), dtype=torch.float64) for at in (0, 8, 16))])
-        turns = draws.uniform("scene.letter.phase", (62,)) if self.random_phase else torch.zeros(62, dtype=torch.float64)
-        return Scatterers(self.spine_azimuth_m + 0.01 * azimuth, self.first_range_m + 0.05 * row, torch.polar(torch.ones_like(turns), 2 * math.pi * turns))
+        turns = (
+            draws.uniform("scene.letter.phase", (62,)) if self.random_phase else torch.zeros(62, dtype=torch.float64)
+        )
+        return Scatterers(
+            self.spine_azimuth_m + 0.01 * azimuth,
+            self.first_range_m + 0.05 * row,
+            torch.polar(torch.ones_like(turns), 2 * math.pi * turns),
+        )
 
 
 @dataclass(frozen=True)
 class RetroAndBrokenLine:
-    """A retro-reflector and beyond it a broken line of 9 points of random phases: the stand-in for the ground experiment (brief 000, section 8 C).
+    """A retro-reflector and beyond it a broken line of 9 points of random phases: the stand-in for
+    the ground experiment (brief 000, section 8 C).
 
-    The retro lies at (azimuth_m, range_m) with amplitude 10^(retro_db / 20), so that at `snr_db` zero it has retro_db per sample. The line runs obliquely
-    from line_m[0] to line_m[1] beyond it while azimuth runs over line_azimuth_m about it, in three dashes of three points, each line_db
+    The retro lies at (azimuth_m, range_m) with amplitude 10^(retro_db / 20), so that at `snr_db`
+    zero it has retro_db per sample. The line runs obliquely from line_m[0] to line_m[1] beyond it
+    while azimuth runs over line_azimuth_m about it, in three dashes of three points, each line_db
     relative to the retro. Layout chosen here, as the paper has none.
     """
 
@@ -55,8 +65,14 @@ class RetroAndBrokenLine:
     def __post_init__(self) -> None:
         for name in ("range_m", "azimuth_m", "retro_db", "line_db", "line_azimuth_m"):
             refuse_unless_finite(f"{name} of a retro-reflector with a line", getattr(self, name))
-        if not isinstance(self.line_m, tuple | list) or len(self.line_m) != 2 or not all(math.isfinite(v) for v in self.line_m):
-            raise ValueError(f"line_m must be the first and last distance of the line beyond the retro-reflector, got {self.line_m}")
+        if (
+            not isinstance(self.line_m, tuple | list)
+            or len(self.line_m) != 2
+            or not all(math.isfinite(v) for v in self.line_m)
+        ):
+            raise ValueError(
+                f"line_m must be the first and last distance of the line beyond the retro-reflector, got {self.line_m}"
+            )
 
     def scatterers(self, draws: Draws) -> Scatterers:
         along = torch.tensor([0, 1, 2, 4, 5, 6, 8, 9, 10], dtype=torch.float64) / 10

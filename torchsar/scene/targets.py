@@ -15,9 +15,11 @@ from torchsar.core import Draws
 
 @dataclass(frozen=True)
 class Scatterers:
-    """Point scatterers where the beam centre meets them, relative to the middle of the recorded frame.
+    """Point scatterers where the beam centre meets them, relative to the middle of the recorded
+    frame.
 
-    azimuth_m, range_m: float64 (..., target); amplitude: complex128 (..., target). Leading dims are trials. May require gradients.
+    azimuth_m, range_m: float64 (..., target); amplitude: complex128 (..., target). Leading dims are
+    trials. May require gradients.
     """
 
     azimuth_m: Tensor
@@ -26,15 +28,25 @@ class Scatterers:
 
     def __post_init__(self) -> None:
         shapes = {tuple(x.shape) for x in (self.azimuth_m, self.range_m, self.amplitude)}
-        if self.azimuth_m.dtype != torch.float64 or self.range_m.dtype != torch.float64 or not self.amplitude.is_complex():
-            raise TypeError(f"scatterers need float64 positions and complex amplitudes, got {self.azimuth_m.dtype}, {self.range_m.dtype}, {self.amplitude.dtype}")
+        if (
+            self.azimuth_m.dtype != torch.float64
+            or self.range_m.dtype != torch.float64
+            or not self.amplitude.is_complex()
+        ):
+            raise TypeError(
+                "scatterers need float64 positions and complex amplitudes, got "
+                f"{self.azimuth_m.dtype}, {self.range_m.dtype}, {self.amplitude.dtype}"
+            )
         if len({s[-1] for s in shapes}) != 1:
             raise ValueError(f"scatterers need as many ranges and amplitudes as azimuths, got shapes {sorted(shapes)}")
 
 
 def _refuse_empty(count: int, *extents_m: float) -> None:
     if count < 1 or not all(math.isfinite(e) and e >= 0 for e in extents_m):
-        raise ValueError(f"a random scene needs at least one scatterer and extents of 0 m or more, got count={count} and extents {extents_m}")
+        raise ValueError(
+            "a random scene needs at least one scatterer and extents of 0 m or more, got "
+            f"count={count} and extents {extents_m}"
+        )
 
 
 class Scene(Protocol):
@@ -45,7 +57,10 @@ class Scene(Protocol):
 
 @dataclass(frozen=True)
 class Points:
-    """Explicit points. azimuth_m, range_m, amplitude: one entry a target; random_phase gives each trial its own phases."""
+    """Explicit points.
+
+    azimuth_m, range_m, amplitude: one entry a target; random_phase gives each trial its own phases.
+    """
 
     azimuth_m: Sequence[float]
     range_m: Sequence[float]
@@ -59,14 +74,20 @@ class Points:
 
     def scatterers(self, draws: Draws) -> Scatterers:
         x, r = (torch.tensor(list(v), dtype=torch.float64) for v in (self.azimuth_m, self.range_m))
-        level = torch.ones_like(x) if self.amplitude is None else torch.tensor(list(self.amplitude), dtype=torch.float64)
+        level = (
+            torch.ones_like(x) if self.amplitude is None else torch.tensor(list(self.amplitude), dtype=torch.float64)
+        )
         turns = draws.uniform("scene.points.phase", x.shape) if self.random_phase else torch.zeros_like(x)
-        return Scatterers(x.expand(turns.shape), r.expand(turns.shape), torch.polar(level.expand(turns.shape), 2 * math.pi * turns))
+        return Scatterers(
+            x.expand(turns.shape), r.expand(turns.shape), torch.polar(level.expand(turns.shape), 2 * math.pi * turns)
+        )
 
 
 @dataclass(frozen=True)
 class RandomPoints:
-    """count points at random places of a rectangle about (azimuth_m, range_m), levels spread evenly over spread_db, random phases."""
+    """count points at random places of a rectangle about (azimuth_m, range_m), levels spread evenly
+    over spread_db, random phases.
+    """
 
     count: int
     azimuth_extent_m: float
@@ -87,7 +108,8 @@ class RandomPoints:
 
 @dataclass(frozen=True)
 class Speckle:
-    """A rectangle of fully developed speckle: count circular Gaussian scatterers at random places, mean power level_db together.
+    """A rectangle of fully developed speckle: count circular Gaussian scatterers at random places,
+    mean power level_db together.
 
     Give at least about three scatterers per resolution cell for the statistics of clutter.
     """
@@ -119,5 +141,12 @@ class Together:
 
     def scatterers(self, draws: Draws) -> Scatterers:
         all_parts = [scene.scatterers(draws.part(name)) for name, scene in self.parts.items()]
-        trials = torch.broadcast_shapes(*(p.amplitude.shape[:-1] for p in all_parts), *(p.azimuth_m.shape[:-1] for p in all_parts))  # what is not random is the same in all trials
-        return Scatterers(*(torch.cat([getattr(p, field).expand(*trials, -1) for p in all_parts], -1) for field in ("azimuth_m", "range_m", "amplitude")))
+        trials = torch.broadcast_shapes(
+            *(p.amplitude.shape[:-1] for p in all_parts), *(p.azimuth_m.shape[:-1] for p in all_parts)
+        )  # what is not random is the same in all trials
+        return Scatterers(
+            *(
+                torch.cat([getattr(p, field).expand(*trials, -1) for p in all_parts], -1)
+                for field in ("azimuth_m", "range_m", "amplitude")
+            )
+        )

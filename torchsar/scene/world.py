@@ -12,10 +12,13 @@ from torchsar.scene.targets import Scene
 
 @dataclass(frozen=True)
 class StripmapWorld:
-    """A scene seen from a straight path. Numbers or per-trial tensors (...,) for velocity, Doppler and SNR.
+    """A scene seen from a straight path.
 
-    velocity_m_s: true effective velocity, None for the radar's nominal one. doppler_hz: true Doppler of the beam centre, None for the
-    nominal pointing. snr_db: mean signal power per lit raw sample over noise variance, None for no noise.
+    Numbers or per-trial tensors (...,) for velocity, Doppler and SNR.
+
+    velocity_m_s: true effective velocity, None for the radar's nominal one. doppler_hz: true
+    Doppler of the beam centre, None for the nominal pointing. snr_db: mean signal power per lit raw
+    sample over noise variance, None for no noise.
     """
 
     scene: Scene

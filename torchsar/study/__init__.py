@@ -1,6 +1,7 @@
 """Experiments from a config: run, sweep, judge, store and report. Needs the extra `study`.
 
-From a script: `torchsar.study.sweep(trial, grid, ...)` runs any function over a grid of parameters (torchsar.study.montecarlo).
+From a script: `torchsar.study.sweep(trial, grid, ...)` runs any function over a grid of parameters
+(torchsar.study.montecarlo).
 """
 
 from __future__ import annotations

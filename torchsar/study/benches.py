@@ -18,7 +18,9 @@ Bench = TypeVar("Bench", bound=_Built)
 
 
 class Benches(Generic[Bench]):
-    """Base of the trials of a system: `build` makes all that one case needs, which stays in the process and does not travel to workers."""
+    """Base of the trials of a system: `build` makes all that one case needs, which stays in the
+    process and does not travel to workers.
+    """
 
     def __init__(self, loaded: Loaded, device: str = "cpu") -> None:
         self.loaded, self.device = loaded, device

@@ -19,7 +19,8 @@ from torchsar.study.registry import DAMAGES, stages
 
 @dataclass(frozen=True)
 class Case:
-    """What the methods get (recording; clean is the same without damage), and what only metrics may see.
+    """What the methods get (recording; clean is the same without damage), and what only metrics may
+    see.
 
     targets: names of the point targets and their indices among the scatterers of the truth.
     """
@@ -34,23 +35,35 @@ def precision(config: Config) -> torch.dtype:
     return {"complex64": torch.complex64, "complex128": torch.complex128}[config.precision]
 
 
-def build_damages(entries: Mapping[str, dict[str, Any]], where: str, file: str, catalogue: Catalogue = DAMAGES) -> dict[str, Any]:
+def build_damages(
+    entries: Mapping[str, dict[str, Any]], where: str, file: str, catalogue: Catalogue = DAMAGES
+) -> dict[str, Any]:
     return {name: catalogue.make(entry, f"{where}.{name}", file) for name, entry in entries.items()}
 
 
 def build_chain(method: Method, where: str, file: str, **given: Any) -> Chain:
-    """The chain of a method; `given` (such as radar) is what stages take from the recording. Raises ConfigError for an unknown stage, key or connection."""
+    """The chain of a method; `given` (such as radar) is what stages take from the recording.
+
+    Raises ConfigError for an unknown stage, key or connection.
+    """
     assert method.stages is not None
     built = {}
     for name, entry in method.stages.items():
         place = f"{where}.stages.{name}"
         if not name.isidentifier():
-            raise ConfigError(f"{file}: {place}: a stage name is a word of letters, digits and '_', not starting with a digit")
+            raise ConfigError(
+                f"{file}: {place}: a stage name is a word of letters, digits and '_', not starting with a digit"
+            )
         uses = entry.get("uses", {}) if isinstance(entry, dict) else {}
         if not (isinstance(uses, dict) and all(isinstance(v, str) for v in uses.values())):
             raise ConfigError(f"{file}: {place}.uses must map values of the stage to 'stage.value', got {uses!r}")
         try:
-            stage = stages().make({k: v for k, v in entry.items() if k != "uses"} if isinstance(entry, dict) else entry, place, file, **given)
+            stage = stages().make(
+                {k: v for k, v in entry.items() if k != "uses"} if isinstance(entry, dict) else entry,
+                place,
+                file,
+                **given,
+            )
         except AttributeError as error:
             raise ConfigError(f"{file}: {place}: {foreign(error)}") from None
         built[name] = use(stage, **uses)
@@ -61,10 +74,16 @@ def build_chain(method: Method, where: str, file: str, **given: Any) -> Chain:
 
 
 def foreign(error: AttributeError) -> str:
-    """The sentence for a stage that asks its radar for what only another system's has. Any other AttributeError is a fault of the program and goes on."""
+    """The sentence for a stage that asks its radar for what only another system's has.
+
+    Any other AttributeError is a fault of the program and goes on.
+    """
     if not isinstance(error.obj, (StripmapRadar, InverseRadar, TriangularLadar, BistaticRadar)):
         raise error
-    return f"this stage needs radar.{error.name}, which a radar of this system does not have; it is a stage of another system"
+    return (
+        f"this stage needs radar.{error.name}, which a radar of this system does not have; it "
+        "is a stage of another system"
+    )
 
 
 def check_given(chain: Chain, method: Method, where: str, file: str) -> None:
@@ -73,7 +92,9 @@ def check_given(chain: Chain, method: Method, where: str, file: str) -> None:
     offered = {f"{name}.{key}" for name, stage in chain.stages.items() for key in getattr(stage, "provides", ())}
     for name in method.rerun.given:
         if name not in offered:
-            raise ConfigError(f"{file}: {where}.rerun.given.{name} is no value of that chain{did_you_mean(name, offered)}")
+            raise ConfigError(
+                f"{file}: {where}.rerun.given.{name} is no value of that chain{did_you_mean(name, offered)}"
+            )
 
 
 def resolved(loaded: Loaded) -> dict[str, Any]:
@@ -87,10 +108,14 @@ def resolved(loaded: Loaded) -> dict[str, Any]:
                 world[section] = _full(catalogue, world[section], f"world.{section}", file)
         for section, catalogue in loaded.config.world.named.items():
             world[section] = {k: _full(catalogue, v, f"world.{section}.{k}", file) for k, v in world[section].items()}
-    tree["data"]["damages"] = {k: _full(DAMAGES, v, f"data.damages.{k}", file) for k, v in tree["data"]["damages"].items()}
+    tree["data"]["damages"] = {
+        k: _full(DAMAGES, v, f"data.damages.{k}", file) for k, v in tree["data"]["damages"].items()
+    }
     for name, method in tree["processor"].items():
         for stage, entry in (method["stages"] or {}).items():
-            full = _full(stages(), {k: v for k, v in entry.items() if k != "uses"}, f"processor.{name}.stages.{stage}", file)
+            full = _full(
+                stages(), {k: v for k, v in entry.items() if k != "uses"}, f"processor.{name}.stages.{stage}", file
+            )
             method["stages"][stage] = {**full, **({"uses": entry["uses"]} if entry.get("uses") else {})}
     return tree
 
@@ -101,17 +126,26 @@ def _full(catalogue: Catalogue, entry: dict[str, Any], where: str, file: str) ->
 
 
 def refuse_oversize(lines: int, samples: int, file: str, smaller: str) -> None:
-    """A raw matrix larger than the memory of the machine is a slip of the pen. smaller: the keys to make smaller."""
+    """A raw matrix larger than the memory of the machine is a slip of the pen.
+
+    smaller: the keys to make smaller.
+    """
     try:
         memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):  # not told on every system
         return
     if 8 * lines * samples > memory:
-        raise ConfigError(f"{file}: world: {lines} lines of {samples} samples take {8 * lines * samples / 1e9:.3g} GB, and this machine has {memory / 1e9:.3g} GB; make {smaller} smaller")
+        raise ConfigError(
+            f"{file}: world: {lines} lines of {samples} samples take "
+            f"{8 * lines * samples / 1e9:.3g} GB, and this machine has {memory / 1e9:.3g} GB; "
+            f"make {smaller} smaller"
+        )
 
 
 def carried(radar: Mapping[str, Any]) -> dict[str, Any]:
-    """Values of a section `radar` with carrier_hz in place of the wavelength_m that it may give instead."""
+    """Values of a section `radar` with carrier_hz in place of the wavelength_m that it may give
+    instead.
+    """
     values = dict(radar)
     wavelength = values.pop("wavelength_m")
     return values if wavelength is None else {**values, "carrier_hz": LIGHT_M_S / wavelength}

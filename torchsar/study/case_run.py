@@ -1,4 +1,6 @@
-"""What the runs over cases and the tables of requirements have in common: the folder that they are written into, and errors that name the case."""
+"""What the runs over cases and the tables of requirements have in common: the folder that they are
+written into, and errors that name the case.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ Result = TypeVar("Result", bound="CaseArrays")
 
 
 class CaseArrays(Protocol):
-    """What of a case goes into arrays.zarr: images by method, named truths, and estimates by method and name."""
+    """What of a case goes into arrays.zarr: images by method, named truths, and estimates by method
+    and name.
+    """
 
     @property
     def images(self) -> Mapping[str, Signal]: ...
@@ -43,10 +47,11 @@ def run_cases(
     draw: Callable[[Mapping[str, Result], Path], list[Picture]],
     write_report: Callable[..., None],
 ) -> Path:
-    """Run every case and write config.yaml, metrics.json, arrays.zarr, figures/ and report.html into OUT, which appears whole or not at all.
+    """Run every case and write config.yaml, metrics.json, arrays.zarr, figures/ and report.html
+    into OUT, which appears whole or not at all.
 
-    prepare: checks that come before any computing; one(case, its name or ""): the result of a case. What a case refuses is a ConfigError that
-    names it. Returns the path of the report.
+    prepare: checks that come before any computing; one(case, its name or ""): the result of a case.
+    What a case refuses is a ConfigError that names it. Returns the path of the report.
     """
     began = time.perf_counter()
     with fresh_folder(out) as folder:
@@ -56,9 +61,16 @@ def run_cases(
         config_text = loaded.text(resolved(loaded))
         (folder / "config.yaml").write_text(config_text, encoding="utf-8")
         write_json(folder / "metrics.json", metrics)
-        write_arrays(folder / "arrays.zarr", _keyed(results, lambda r: r.images), _keyed(results, lambda r: r.truths()), _estimates(results))
+        write_arrays(
+            folder / "arrays.zarr",
+            _keyed(results, lambda r: r.images),
+            _keyed(results, lambda r: r.truths()),
+            _estimates(results),
+        )
         pictures = draw(results, folder / "figures")
-        write_report(folder / "report.html", loaded.config.title, metrics, pictures, folder / "figures", config_text, command)
+        write_report(
+            folder / "report.html", loaded.config.title, metrics, pictures, folder / "figures", config_text, command
+        )
     log.info("finished in %.0f s", time.perf_counter() - began)
     return out / "report.html"
 
@@ -88,7 +100,9 @@ def _estimates(results: Mapping[str, CaseArrays]) -> dict[str, dict[str, Tensor]
 
 
 def write_requirements(loaded: Loaded, out: Path | None, find: Callable[[], tuple[str, Mapping[str, Any]]]) -> str:
-    """The text of the tables that `find` gives; with `out` also config.yaml, requires.txt and requires.json (its tree) in that folder."""
+    """The text of the tables that `find` gives; with `out` also config.yaml, requires.txt and
+    requires.json (its tree) in that folder.
+    """
     if out is None:
         return find()[0]
     with fresh_folder(out) as folder:

@@ -23,7 +23,10 @@ class Strict(BaseModel):
 
 
 def _plain(hint: Any) -> Any | None:
-    """The part of a type that YAML can hold, None where there is nothing. Tensors become numbers or lists of numbers."""
+    """The part of a type that YAML can hold, None where there is nothing.
+
+    Tensors become numbers or lists of numbers.
+    """
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if hint in _SCALARS or origin is typing.Literal:
         return hint
@@ -42,9 +45,14 @@ def _plain(hint: Any) -> Any | None:
 
 
 class Catalogue:
-    """Names to classes or factories. `what` and `key` make the messages: Catalogue("stage", "stage", {...})."""
+    """Names to classes or factories.
 
-    def __init__(self, what: str, key: str, entries: Mapping[str, Callable[..., Any]], given: Sequence[str] = ()) -> None:
+    `what` and `key` make the messages: Catalogue("stage", "stage", {...}).
+    """
+
+    def __init__(
+        self, what: str, key: str, entries: Mapping[str, Callable[..., Any]], given: Sequence[str] = ()
+    ) -> None:
         self.what, self.key, self.entries, self.given = what, key, dict(entries), frozenset(given)
         self._models: dict[str, type[BaseModel]] = {}
 
@@ -65,21 +73,37 @@ class Catalogue:
             plain = _plain(hints.get(parameter.name, Any))
             required = parameter.default is inspect.Parameter.empty
             if plain is None and required:
-                raise TypeError(f"{self.what} {name!r}: its parameter {parameter.name!r} of type {hints.get(parameter.name)} cannot be written in a config; register a factory instead")
+                raise TypeError(
+                    f"{self.what} {name!r}: its parameter {parameter.name!r} of type "
+                    f"{hints.get(parameter.name)} cannot be written in a config; register a factory "
+                    "instead"
+                )
             if plain is not None:
-                default = ... if required else list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
+                default = (
+                    ...
+                    if required
+                    else list(parameter.default)
+                    if isinstance(parameter.default, tuple)
+                    else parameter.default
+                )
                 fields[parameter.name] = (plain, default)
         return fields
 
     def check(self, entry: Any, where: str, file: str) -> tuple[str, dict[str, Any]]:
-        """Name and complete keys of an entry {key: name, ...}. Raises ConfigError naming file, key and what is accepted."""
+        """Name and complete keys of an entry {key: name, ...}.
+
+        Raises ConfigError naming file, key and what is accepted.
+        """
         if not isinstance(entry, dict):
             raise ConfigError(f"{file}: {where} must be a mapping with the key {self.key!r}, got {entry!r}")
         if self.key not in entry:
             raise ConfigError(f"{file}: {where} lacks the key {self.key!r}{did_you_mean('', self.entries)}")
         name = entry[self.key]
         if not isinstance(name, str) or name not in self.entries:
-            raise ConfigError(f"{file}: {where}.{self.key} names an unknown {self.what} {name!r}{did_you_mean(str(name), self.entries)}")
+            raise ConfigError(
+                f"{file}: {where}.{self.key} names an unknown {self.what} "
+                f"{name!r}{did_you_mean(str(name), self.entries)}"
+            )
         try:
             parameters = self.model(name).model_validate({k: v for k, v in entry.items() if k != self.key})
         except ValidationError as error:
@@ -87,7 +111,9 @@ class Catalogue:
         return name, parameters.model_dump()
 
     def make(self, entry: Any, where: str, file: str, **given: Any) -> Any:
-        """The object that an entry describes; `given` are the values that do not come from the config."""
+        """The object that an entry describes; `given` are the values that do not come from the
+        config.
+        """
         name, parameters = self.check(entry, where, file)
         target = self.entries[name]
         accepted = inspect.signature(target).parameters
@@ -98,7 +124,9 @@ class Catalogue:
 
 
 def _converted(target: Callable[..., Any], parameters: dict[str, Any]) -> dict[str, Any]:
-    """Lists become tuples, or float64 tensors where the signature asks for a tensor and for no sequence."""
+    """Lists become tuples, or float64 tensors where the signature asks for a tensor and for no
+    sequence.
+    """
     hints = typing.get_type_hints(target.__init__ if inspect.isclass(target) else target)
 
     def convert(value: Any, hint: Any) -> Any:
@@ -110,8 +138,14 @@ def _converted(target: Callable[..., Any], parameters: dict[str, Any]) -> dict[s
 
 
 def sentence(error: ValidationError, model: type[BaseModel], file: str, where: str = "") -> str:
-    """One sentence from the most telling of pydantic's errors: an unknown key first, then a missing one, then a wrong value."""
-    rank = {"extra_forbidden": 0, "missing": 1, "list_type": 3}  # a number or a list of them: what is wrong with the number tells more
+    """One sentence from the most telling of pydantic's errors: an unknown key first, then a missing
+    one, then a wrong value.
+    """
+    rank = {
+        "extra_forbidden": 0,
+        "missing": 1,
+        "list_type": 3,
+    }  # a number or a list of them: what is wrong with the number tells more
     worst = min(error.errors(), key=lambda e: rank.get(e["type"], 2))
     path = [str(part) for part in worst["loc"]]
     names, section = _descend(model, path)
@@ -123,17 +157,30 @@ def sentence(error: ValidationError, model: type[BaseModel], file: str, where: s
     text = worst["msg"].removeprefix("Value error, ").removeprefix("Input ")
     if worst["type"] in ("too_short", "too_long") and isinstance(worst["input"], list | tuple):
         limits = worst.get("ctx", {})
-        text = f"should be a list of {'at least' if 'min_length' in limits else 'at most'} {limits.get('min_length', limits.get('max_length'))} entries"
+        text = (
+            f"should be a list of {'at least' if 'min_length' in limits else 'at most'} "
+            f"{limits.get('min_length', limits.get('max_length'))} entries"
+        )
     elif worst["type"] in ("dict_type", "model_type", "too_short"):
-        text = "should be a mapping of keys, and not an empty one" if worst["type"] == "too_short" else "should be a mapping of keys"
+        text = (
+            "should be a mapping of keys, and not an empty one"
+            if worst["type"] == "too_short"
+            else "should be a mapping of keys"
+        )
     if not key:  # what a whole config contradicts, not one key of it
         return f"{file}: {text}"
     shown = repr(worst["input"])
-    return f"{file}: key {key!r} has the value {shown if len(shown) < 80 else shown[:77] + '...'}; it {text}" if text.startswith("should") else f"{file}: key {key!r}: {text}"
+    return (
+        f"{file}: key {key!r} has the value {shown if len(shown) < 80 else shown[:77] + '...'}; it {text}"
+        if text.startswith("should")
+        else f"{file}: key {key!r}: {text}"
+    )
 
 
 def _descend(model: type[BaseModel], path: list[str]) -> tuple[list[str], type[BaseModel] | None]:
-    """The real keys of a pydantic location (union tags dropped), and the section in which the last of them was looked up."""
+    """The real keys of a pydantic location (union tags dropped), and the section in which the last
+    of them was looked up.
+    """
     names: list[str] = []
     section, hint = None, model
     for part in path:
@@ -149,5 +196,9 @@ def _descend(model: type[BaseModel], path: list[str]) -> tuple[list[str], type[B
 
 def _without_none(hint: Any) -> Any:
     """X for X | None; unions of several types stay, since their members are scalars here."""
-    arms = [arm for arm in typing.get_args(hint) if arm is not type(None)] if typing.get_origin(hint) in (typing.Union, types.UnionType) else []
+    arms = (
+        [arm for arm in typing.get_args(hint) if arm is not type(None)]
+        if typing.get_origin(hint) in (typing.Union, types.UnionType)
+        else []
+    )
     return arms[0] if len(arms) == 1 else hint

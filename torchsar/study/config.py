@@ -38,7 +38,9 @@ class Rerun(Strict):
 
 
 class Method(Strict):
-    """One chain: a title for the report, the input (damaged, or the undamaged `clean`), and either stages by name or a rerun."""
+    """One chain: a title for the report, the input (damaged, or the undamaged `clean`), and either
+    stages by name or a rerun.
+    """
 
     title: str = ""
     input: Literal["damaged", "clean"] = "damaged"
@@ -55,7 +57,9 @@ class Method(Strict):
 
 
 class EarlyStop(Strict):
-    """Ends a point once half of the 95 % interval of a statistic is below `relative` times the statistic."""
+    """Ends a point once half of the 95 % interval of a statistic is below `relative` times the
+    statistic.
+    """
 
     metric: str
     relative: float = Field(gt=0, lt=1)
@@ -70,11 +74,13 @@ class Save(Strict):
 
 
 class Sweep(Strict):
-    """A Monte Carlo sweep: settings, and every other key is a key of the config with the values it takes.
+    """A Monte Carlo sweep: settings, and every other key is a key of the config with the values it
+    takes.
 
-    grid: dotted key -> list of values, or mapping of labels to values. trials: per point, or the limit where points end early. chunk: trials
-    a batch, chosen by bytes where it is not given. success: metric -> limit of its magnitude below which a trial counts as a success.
-    show: metrics to draw, by default all errors. save: trials whose images are kept.
+    grid: dotted key -> list of values, or mapping of labels to values. trials: per point, or the
+    limit where points end early. chunk: trials a batch, chosen by bytes where it is not given.
+    success: metric -> limit of its magnitude below which a trial counts as a success. show: metrics
+    to draw, by default all errors. save: trials whose images are kept.
     """
 
     grid: dict[str, Any] = {}
@@ -96,7 +102,9 @@ class Sweep(Strict):
 
 
 class Config(Strict):
-    """A whole experiment; a system gives the sections radar, world, metrics and trade their keys."""
+    """A whole experiment; a system gives the sections radar, world, metrics and trade their
+    keys.
+    """
 
     recording: ClassVar[str] = "recorded"
 
@@ -121,8 +129,14 @@ class Config(Strict):
         for name in RESERVED:
             if name in self.processor:
                 raise ValueError(f"processor.{name}: this name is taken by a group of the results; choose another")
-        if self.metrics is not None and self.metrics.reference is not None and self.metrics.reference not in self.processor:
-            raise ValueError(f"metrics.reference names the method {self.metrics.reference!r}; there is {', '.join(self.processor)}")
+        if (
+            self.metrics is not None
+            and self.metrics.reference is not None
+            and self.metrics.reference not in self.processor
+        ):
+            raise ValueError(
+                f"metrics.reference names the method {self.metrics.reference!r}; there is {', '.join(self.processor)}"
+            )
         return self
 
 
@@ -135,9 +149,14 @@ class Loaded:
     name: str
 
     def changed(self, values: Mapping[str, Any], where: str = "sweep") -> Loaded:
-        """The same config with other values at dotted keys, which stand at `where`. Raises ConfigError where a key leads nowhere or a value is not accepted."""
+        """The same config with other values at dotted keys, which stand at `where`.
+
+        Raises ConfigError where a key leads nowhere or a value is not accepted.
+        """
         tree = self.config.model_dump()
-        for key, value in sorted(values.items(), key=lambda item: item[0].count(".")):  # a part of a section after the section itself
+        for key, value in sorted(
+            values.items(), key=lambda item: item[0].count(".")
+        ):  # a part of a section after the section itself
             tree = _placed(tree, key.split("."), value, f"{self.file}: {where}: the key {key!r}")
         return replace(self, config=_checked(tree, f"{self.file}: {where}"))
 
@@ -150,14 +169,21 @@ def _placed(tree: Any, path: list[str], value: Any, what: str) -> dict[str, Any]
     """The tree with one value changed; all but the last part of the path must be there."""
     head, rest = path[0], path[1:]
     if not isinstance(tree, dict) or (rest and head not in tree):
-        raise ConfigError(f"{what} leads nowhere at {head!r}{did_you_mean(head, tree if isinstance(tree, dict) else ())}")
+        raise ConfigError(
+            f"{what} leads nowhere at {head!r}{did_you_mean(head, tree if isinstance(tree, dict) else ())}"
+        )
     return {**tree, head: _placed(tree[head], rest, value, what) if rest else value}
 
 
 def load(name: str, assignments: Sequence[str] = ()) -> Loaded:
-    """Read, override and check a config. Raises ConfigError: file, key, value, and what is accepted."""
+    """Read, override and check a config.
+
+    Raises ConfigError: file, key, value, and what is accepted.
+    """
     path = find_config(name)
-    tree = override(read_tree(path), assignments, literal=("sweep", "grid", [name for name in Sweep.model_fields if name != "grid"]))
+    tree = override(
+        read_tree(path), assignments, literal=("sweep", "grid", [name for name in Sweep.model_fields if name != "grid"])
+    )
     file = str(path) + (f" with {' '.join(assignments)}" if assignments else "")
     return Loaded(_checked(tree, file), file, path.stem)
 
@@ -178,12 +204,21 @@ def _check_source(config: Config, file: str) -> None:
     if config.data.file is not None:
         path = Path(config.data.file)
         if not path.is_file():
-            raise ConfigError(f"{file}: data.file: {config.data.file!r} {'is no file' if path.exists() else 'does not exist'}; give the path of a {config.recording} .npz file")
+            raise ConfigError(
+                f"{file}: data.file: {config.data.file!r} "
+                f"{'is no file' if path.exists() else 'does not exist'}; give the path of a "
+                f"{config.recording} .npz file"
+            )
     elif config.world is None and config.radar is None:
-        raise ConfigError(f"{file}: data.file is not set; add data.file=PATH with the path of a {config.recording} .npz file")
+        raise ConfigError(
+            f"{file}: data.file is not set; add data.file=PATH with the path of a {config.recording} .npz file"
+        )
     elif config.world is None or config.radar is None:
         missing = "world" if config.world is None else "radar"
-        raise ConfigError(f"{file}: section {missing!r} is missing; a simulation needs both 'radar' and 'world', recorded data needs data.file")
+        raise ConfigError(
+            f"{file}: section {missing!r} is missing; a simulation needs both 'radar' and "
+            "'world', recorded data needs data.file"
+        )
 
 
 def check_methods(config: Config, file: str) -> None:
@@ -193,7 +228,13 @@ def check_methods(config: Config, file: str) -> None:
         if method.rerun is not None:
             of = earlier.get(method.rerun.method)
             if of is None or of.stages is None:
-                raise ConfigError(f"{file}: processor.{name}.rerun.method names {method.rerun.method!r}, which is no earlier method with stages{did_you_mean(method.rerun.method, earlier)}")
+                raise ConfigError(
+                    f"{file}: processor.{name}.rerun.method names {method.rerun.method!r}, which is no "
+                    f"earlier method with stages{did_you_mean(method.rerun.method, earlier)}"
+                )
             if method.rerun.start not in of.stages:
-                raise ConfigError(f"{file}: processor.{name}.rerun.start names {method.rerun.start!r}, which is no stage of {method.rerun.method!r}{did_you_mean(method.rerun.start, of.stages)}")
+                raise ConfigError(
+                    f"{file}: processor.{name}.rerun.start names {method.rerun.start!r}, which is no "
+                    f"stage of {method.rerun.method!r}{did_you_mean(method.rerun.start, of.stages)}"
+                )
         earlier[name] = method

@@ -14,9 +14,11 @@ _REACH, _FACTOR = 32, 16
 
 
 def impulse_cuts(image: Signal, at_m: tuple[float, float]) -> dict[str, tuple[Tensor, Tensor]]:
-    """Per axis of an unbatched image: offsets (m) from the peak nearest to at_m, and the interpolated complex cut through it.
+    """Per axis of an unbatched image: offsets (m) from the peak nearest to at_m, and the
+    interpolated complex cut through it.
 
-    Band-limited interpolation by 16 about the centre of the local spectrum, over 32 samples to each side (less at the edges).
+    Band-limited interpolation by 16 about the centre of the local spectrum, over 32 samples to each
+    side (less at the edges).
     """
     measured = impulse_response(image, at_m)
     places = [float(axis.index_of(measured[f"position_{axis.name}_m"])) for axis in image.axes]

@@ -7,7 +7,9 @@ from collections.abc import Iterable
 
 
 class ConfigError(ValueError):
-    """A mistake in a config, a command line or an input file; its text is one sentence that names the offender."""
+    """A mistake in a config, a command line or an input file; its text is one sentence that names
+    the offender.
+    """
 
 
 def did_you_mean(word: str, accepted: Iterable[str]) -> str:

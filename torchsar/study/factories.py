@@ -33,7 +33,9 @@ def effective_velocity(
     refine: Literal["gradient", "parabola"] = "gradient",
     tolerance_m_s: float = 0.01,
 ) -> EffectiveVelocity:
-    """Minimum-entropy velocity of range lines that are compressed with `reference` (None: compressed already)."""
+    """Minimum-entropy velocity of range lines that are compressed with `reference` (None:
+    compressed already).
+    """
     return EffectiveVelocity(OmegaK(radar, reference), reach_m_s, lines, _REFINE[refine], tolerance_m_s)
 
 
@@ -44,16 +46,32 @@ def omega_k_padded(
     doppler_hz: float | None = None,
     lines: int | None = None,
 ) -> PaddedLines:
-    """omega_k with empty lines behind the record, one aperture by default, so that cut apertures do not wrap round."""
+    """omega_k with empty lines behind the record, one aperture by default, so that cut apertures do
+    not wrap round.
+    """
     return PaddedLines(OmegaK(radar, reference, velocity_m_s, doppler_hz), lines)
 
 
-def rotation_and_phase(radar: InverseRadar, order: int = 3, yc_m: float = 0.0, rounds: int = 3, scatterers: int | None = None, search: int = 60, polish: int = 20) -> Alternate:
-    """A phase per pulse and the rotation in turn (`RotationAutofocus`, `UnevenRotation`), each on the recorded data without what the other has found.
+def rotation_and_phase(
+    radar: InverseRadar,
+    order: int = 3,
+    yc_m: float = 0.0,
+    rounds: int = 3,
+    scatterers: int | None = None,
+    search: int = 60,
+    polish: int = 20,
+) -> Alternate:
+    """A phase per pulse and the rotation in turn (`RotationAutofocus`, `UnevenRotation`), each on
+    the recorded data without what the other has found.
 
-    yc_m is held: a phase that is free in every pulse takes all of the range centre deviation with it.
+    yc_m is held: a phase that is free in every pulse takes all of the range centre deviation with
+    it.
     """
-    return Alternate(rounds, phase=Turn(RotationAutofocus(radar, search, polish), CorrectPulsePhase()), rotation=Turn(UnevenRotation(radar, order, yc_m, scatterers)))
+    return Alternate(
+        rounds,
+        phase=Turn(RotationAutofocus(radar, search, polish), CorrectPulsePhase()),
+        rotation=Turn(UnevenRotation(radar, order, yc_m, scatterers)),
+    )
 
 
 def jitter_lagrange(points: int = 4, offset_samples: list[float] | None = None) -> CorrectJitter:
@@ -61,7 +79,9 @@ def jitter_lagrange(points: int = 4, offset_samples: list[float] | None = None) 
     return CorrectJitter(_tensor(offset_samples), Lagrange(points))
 
 
-def jitter_band_limited(points: int = 8, band: float = 0.95, offset_samples: list[float] | None = None) -> CorrectJitter:
+def jitter_band_limited(
+    points: int = 8, band: float = 0.95, offset_samples: list[float] | None = None
+) -> CorrectJitter:
     """Jitter correction by the best local weights for a signal of this band."""
     return CorrectJitter(_tensor(offset_samples), BandLimited(points, band))
 
@@ -83,9 +103,11 @@ def channel_response(
     slope_db: float = 0.0,
     amplitude_ripple_db: float = 0.0,
 ) -> ChannelResponse:
-    """Damage: phase quadratic u^2 + cubic u^3 + ripple sin(pi cycles u), and gain slope u / 2 + ripple cos(pi cycles u) in dB, u = -1..1 over the band.
+    """Damage: phase quadratic u^2 + cubic u^3 + ripple sin(pi cycles u), and gain slope u / 2 +
+    ripple cos(pi cycles u) in dB, u = -1..1 over the band.
 
-    The phase is taken without its constant and linear parts: these are a phase and a shift of the whole scene, which nothing can tell from the scene's own.
+    The phase is taken without its constant and linear parts: these are a phase and a shift of the
+    whole scene, which nothing can tell from the scene's own.
     """
 
     def curve(u: Tensor) -> Tensor:
@@ -106,7 +128,9 @@ _RESPONSE = {"sharpest": estimate_response_sharpest, "points": estimate_response
 
 
 class FlatBandResponse(Stage):
-    """EstimateResponse for images made with the `flat` reference: a clean one fills the pulse band evenly, so the amplitude is found as well."""
+    """EstimateResponse for images made with the `flat` reference: a clean one fills the pulse band
+    evenly, so the amplitude is found as well.
+    """
 
     works_on = EstimateResponse.works_on
     provides = EstimateResponse.provides
@@ -121,12 +145,16 @@ class FlatBandResponse(Stage):
 
 
 def estimate_response(radar: StripmapRadar, method: Literal["sharpest", "points"] = "sharpest") -> EstimateResponse:
-    """Phase response of the channel from bright places of the focused image; the amplitude is left alone."""
+    """Phase response of the channel from bright places of the focused image; the amplitude is left
+    alone.
+    """
     return EstimateResponse(radar, _RESPONSE[method])
 
 
 def vibration(name: str, unit: Literal["mm", "um"]) -> Sinusoid:
-    """Sinusoidal vibration by its published name amplitude_frequency_phase (1_100_90), the amplitude in `unit`."""
+    """Sinusoidal vibration by its published name amplitude_frequency_phase (1_100_90), the
+    amplitude in `unit`.
+    """
     return Sinusoid.named(name, unit=unit)
 
 
@@ -141,14 +169,19 @@ def measured_track(file: str) -> MeasuredTrack:
 
 
 def dechirped(track_m: list[float] | None = None) -> Dechirped:
-    """Dechirped pulses with the motion inside them; track_m: velocity, half the acceleration, ... that the range window follows."""
+    """Dechirped pulses with the motion inside them; track_m: velocity, half the acceleration, ...
+
+    that the range window follows.
+    """
     return Dechirped((Polynomial(track_m),) if track_m else ())
 
 
 class AutofocusOfImage(Autofocus):
     """`autofocus`, through polar format where the recording tells where the antenna was."""
 
-    def __init__(self, radar: InverseRadar, geometry: FarField | Spotlight | None = None, search: int = 120, polish: int = 20) -> None:
+    def __init__(
+        self, radar: InverseRadar, geometry: FarField | Spotlight | None = None, search: int = 120, polish: int = 20
+    ) -> None:
         super().__init__(search, polish)
         self.target = None if geometry is None else TargetImage(radar, geometry)
 
@@ -158,15 +191,33 @@ class AutofocusOfImage(Autofocus):
         return super().forward(signal, start)
 
 
-def k_sea(cnr_db: float = 30.0, shape: float = 1.5, cell_m: tuple[float, float] = (20.0, 20.0), margin_s: float | None = None, lobes: int = 1) -> KSea:
+def k_sea(
+    cnr_db: float = 30.0,
+    shape: float = 1.5,
+    cell_m: tuple[float, float] = (20.0, 20.0),
+    margin_s: float | None = None,
+    lobes: int = 1,
+) -> KSea:
     """K-distributed sea, cnr_db over the noise in a range-compressed sample."""
     return KSea(power_db=cnr_db, shape=shape, cell_m=cell_m, margin_s=margin_s, lobes=lobes)
 
 
-def image_sea(file: str, azimuth_extent_m: float, range_extent_m: float, cnr_db: float = 30.0, key: str | None = None, margin_s: float | None = None, lobes: int = 1) -> ImageReflectivity:
-    """A surface whose mean intensity is the image in a .npy or .npz file (array `key`), cnr_db over the noise in a range-compressed sample."""
+def image_sea(
+    file: str,
+    azimuth_extent_m: float,
+    range_extent_m: float,
+    cnr_db: float = 30.0,
+    key: str | None = None,
+    margin_s: float | None = None,
+    lobes: int = 1,
+) -> ImageReflectivity:
+    """A surface whose mean intensity is the image in a .npy or .npz file (array `key`), cnr_db over
+    the noise in a range-compressed sample.
+    """
     try:
-        return ImageReflectivity.from_file(file, azimuth_extent_m, range_extent_m, key, power_db=cnr_db, margin_s=margin_s, lobes=lobes)
+        return ImageReflectivity.from_file(
+            file, azimuth_extent_m, range_extent_m, key, power_db=cnr_db, margin_s=margin_s, lobes=lobes
+        )
     except OSError as error:
         raise ValueError(f"the image {file!r} cannot be read: {error.strerror or error}") from None
 
@@ -181,8 +232,15 @@ def clock_errors(
     direct_snr_db: float | None = 40.0,
     direct_samples: int = 64,
 ) -> SynchronisationError:
-    """Clocks that drift apart: polynomials c0, c1, ... over seconds, sinusoids and a random walk from pulse to pulse; recorded beside a direct path that shows them."""
-    phase, delay = _drifts(phase_rad, phase_sinusoid_rad, sinusoid_hz, phase_walk_rad), _drifts(delay_s, delay_sinusoid_s, sinusoid_hz, 0.0)
+    """Clocks that drift apart: polynomials c0, c1, ...
+
+    over seconds, sinusoids and a random walk from pulse to pulse; recorded beside a direct path
+    that shows them.
+    """
+    phase, delay = (
+        _drifts(phase_rad, phase_sinusoid_rad, sinusoid_hz, phase_walk_rad),
+        _drifts(delay_s, delay_sinusoid_s, sinusoid_hz, 0.0),
+    )
     return SynchronisationError(phase, delay, direct_snr_db, direct_samples)
 
 

@@ -23,15 +23,19 @@ _RESULT = "config.yaml"
 
 @contextmanager
 def fresh_folder(out: Path) -> Iterator[Path]:
-    """A folder OUT.tmp to write into; it becomes OUT when the block ends well and is removed when it does not.
+    """A folder OUT.tmp to write into; it becomes OUT when the block ends well and is removed when
+    it does not.
 
-    An earlier result at OUT is replaced only then. Anything else at OUT is refused with a ConfigError, before any work is done.
+    An earlier result at OUT is replaced only then. Anything else at OUT is refused with a
+    ConfigError, before any work is done.
     """
     if out.exists() and not (out.is_dir() and ((out / _RESULT).is_file() or not any(out.iterdir()))):
         raise ConfigError(f"--out {out} exists and is not a result of torchsar; choose another folder")
     partial, old = out.with_name(out.name + ".tmp"), out.with_name(out.name + ".old")
     if partial.exists() and not (partial / _PARTIAL).exists():
-        raise ConfigError(f"--out {out}: {partial} is in the way and was not left by torchsar; remove it or choose another folder")
+        raise ConfigError(
+            f"--out {out}: {partial} is in the way and was not left by torchsar; remove it or choose another folder"
+        )
     try:
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
@@ -65,8 +69,12 @@ def _finite(x: Any) -> Any:
     return None if isinstance(x, float) and not math.isfinite(x) else x
 
 
-def write_arrays(path: Path, images: Mapping[str, Signal], truth: Mapping[str, Tensor], estimates: Mapping[str, Mapping[str, Tensor]]) -> None:
-    """arrays.zarr (version 3): one group per method with `image` and its axes; `truth`; `estimate/METHOD/STAGE.VALUE`."""
+def write_arrays(
+    path: Path, images: Mapping[str, Signal], truth: Mapping[str, Tensor], estimates: Mapping[str, Mapping[str, Tensor]]
+) -> None:
+    """arrays.zarr (version 3): one group per method with `image` and its axes; `truth`;
+    `estimate/METHOD/STAGE.VALUE`.
+    """
     root = zarr.open_group(str(path), mode="w", zarr_format=3)
     for name, signal in images.items():
         group = root.create_group(name)
@@ -88,5 +96,7 @@ def write_arrays(path: Path, images: Mapping[str, Signal], truth: Mapping[str, T
 def _put(group: zarr.Group, name: str, value: Tensor, dims: tuple[str, ...] | None = None, **attributes: Any) -> None:
     data = torch.as_tensor(value).detach().cpu().resolve_conj().numpy()
     chunks = tuple(min(n, 1024) for n in data.shape)
-    array = group.create_array(name, shape=data.shape, dtype=data.dtype, chunks=chunks or "auto", dimension_names=dims, attributes=attributes)
+    array = group.create_array(
+        name, shape=data.shape, dtype=data.dtype, chunks=chunks or "auto", dimension_names=dims, attributes=attributes
+    )
     array[...] = data

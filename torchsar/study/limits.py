@@ -31,25 +31,34 @@ class Needs(Protocol):
 
 
 def write_needs(loaded: Loaded, out: Path | None, needs_of: Callable[[Loaded], Needs]) -> str:
-    """The tables of every case of a config as text. With `out`: config.yaml, requires.json and requires.txt there."""
+    """The tables of every case of a config as text.
+
+    With `out`: config.yaml, requires.json and requires.txt there.
+    """
 
     def find() -> tuple[str, dict[str, object]]:
         found = {name or loaded.name: needs_of(case) for name, case in cases_of(loaded).items()}
-        return "\n\n".join(needs.text(name) for name, needs in found.items()), {name: needs.tree() for name, needs in found.items()}
+        return "\n\n".join(needs.text(name) for name, needs in found.items()), {
+            name: needs.tree() for name, needs in found.items()
+        }
 
     return write_requirements(loaded, out, find)
 
 
 def heed(loaded: Loaded, case: str, limits: Sequence[Limit], stopped: Callable[[Limit], Sequence[str]]) -> None:
-    """Refuse a case beyond a limit that stops a method, unless the config shows the method beyond its limits on purpose; warn of the other limits.
+    """Refuse a case beyond a limit that stops a method, unless the config shows the method beyond
+    its limits on purpose; warn of the other limits.
 
-    stopped: the methods that a limit stops. Raises ConfigError with the limit, what it comes to and what helps.
+    stopped: the methods that a limit stops. Raises ConfigError with the limit, what it comes to and
+    what helps.
     """
     where = f"cases.{case}: " if case else ""
     for limit in limits:
         methods = stopped(limit) if limit.verdict == "refuse" else []
         if methods:
-            raise ConfigError(f"{loaded.file}: {where}processor.{methods[0]}: {limit.sentence} (or name the method in beyond_limits)")
+            raise ConfigError(
+                f"{loaded.file}: {where}processor.{methods[0]}: {limit.sentence} (or name the method in beyond_limits)"
+            )
         if limit.verdict != "ok":
             log.warning("warning: %s%s", where, limit.sentence)
 
@@ -59,7 +68,12 @@ def warn_of_doubt(case: str, metrics: Mapping[str, Mapping[str, Tensor]], count:
     verdicts = metrics["recommended"].get(OK)
     doubted = 0 if verdicts is None else int((~verdicts).sum())
     if doubted:
-        log.warning("warning: %srecommended does not trust its estimate in %d of %d trials", f"{case}: " if case else "", doubted, count)
+        log.warning(
+            "warning: %srecommended does not trust its estimate in %d of %d trials",
+            f"{case}: " if case else "",
+            doubted,
+            count,
+        )
 
 
 def limit_rows(limits: Sequence[Limit]) -> list[dict[str, Any]]:
@@ -78,7 +92,13 @@ def limit_lines(limits: Sequence[Limit]) -> list[str]:
     lines = [f"{'limit':<{wide}}{'value':>12}{'limit':>14} {'unit':<8}{'verdict':<9}what then"]
     for row in limits:
         then = "" if row.ok else f"{row.consequence}; {row.remedy}"
-        lines.append(f"{row.name:<{wide}}{row.value:>12.4g}{('>= ' if row.at_least else '< ') + format(row.limit, '.4g'):>14} {row.unit:<8}{row.verdict:<9}{then}".rstrip())
+        lines.append(
+            (
+                f"{row.name:<{wide}}{row.value:>12.4g}"
+                f"{('>= ' if row.at_least else '< ') + format(row.limit, '.4g'):>14} "
+                f"{row.unit:<8}{row.verdict:<9}{then}"
+            ).rstrip()
+        )
     return lines
 
 

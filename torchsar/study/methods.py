@@ -24,7 +24,10 @@ log = logging.getLogger("torchsar")
 
 @dataclass(frozen=True)
 class Result:
-    """What one method gave. trace is kept where figures or reruns need it; used: what the focusing stage worked with."""
+    """What one method gave.
+
+    trace is kept where figures or reruns need it; used: what the focusing stage worked with.
+    """
 
     name: str
     title: str
@@ -38,7 +41,9 @@ class Result:
 
 
 def build_chains(loaded: Loaded, **given: Any) -> dict[str, Chain]:
-    """All chains, before anything is computed, so that a mistake in the last method costs no waiting. given: what stages take from the recording, such as radar."""
+    """All chains, before anything is computed, so that a mistake in the last method costs no
+    waiting. given: what stages take from the recording, such as radar.
+    """
     check_methods(loaded.config, loaded.file)
     chains: dict[str, Chain] = {}
     for name, method in loaded.config.processor.items():
@@ -51,7 +56,9 @@ def build_chains(loaded: Loaded, **given: Any) -> dict[str, Chain]:
 
 
 def run_methods(loaded: Loaded, case: Case, chains: Mapping[str, Chain]) -> dict[str, Result]:
-    """Every method in the order of the config; the traces that reruns and the report need are kept, the others dropped."""
+    """Every method in the order of the config; the traces that reruns and the report need are kept,
+    the others dropped.
+    """
     methods = loaded.config.processor
     keep = {"recommended"} | {m.rerun.method for m in methods.values() if m.rerun is not None}
     steps = sum(len(m.stages) if m.stages else 1 for m in methods.values())
@@ -63,7 +70,12 @@ def run_methods(loaded: Loaded, case: Case, chains: Mapping[str, Chain]) -> dict
                     results[name] = _run_one(name, method, chains[name], case, results)
             except AttributeError as error:
                 raise ConfigError(f"{loaded.file}: processor.{name}: {foreign(error)}") from None
-            except (ValueError, TypeError, KeyError, RuntimeError) as error:  # RuntimeError: what torch itself refuses, too little memory among it
+            except (
+                ValueError,
+                TypeError,
+                KeyError,
+                RuntimeError,
+            ) as error:  # RuntimeError: what torch itself refuses, too little memory among it
                 if os.environ.get("TORCHSAR_DEBUG"):
                     raise
                 text = error.args[0] if isinstance(error, KeyError) and error.args else error
@@ -77,10 +89,17 @@ def run_methods(loaded: Loaded, case: Case, chains: Mapping[str, Chain]) -> dict
 
 
 def _warn_of_doubt(result: Result) -> None:
-    """Name the estimators that do not stand for their values, such as those of an empty pilot record."""
+    """Name the estimators that do not stand for their values, such as those of an empty pilot
+    record.
+    """
     for stage, estimate in result.estimates.items():
         if not bool(estimate.ok.all()):
-            log.warning("warning: %s: stage %r found nothing to trust in the data; its values %s are a fallback", result.name, stage, ", ".join(estimate.value))
+            log.warning(
+                "warning: %s: stage %r found nothing to trust in the data; its values %s are a fallback",
+                result.name,
+                stage,
+                ", ".join(estimate.value),
+            )
 
 
 def run_recommended(loaded: Loaded, case: Case) -> Result:
@@ -98,13 +117,20 @@ def _run_one(name: str, method: Method, chain: Chain, case: Case, earlier: Mappi
         given = {key: torch.tensor(value, dtype=torch.float64) for key, value in method.rerun.given.items()}
         image = chain.rerun(source, method.rerun.start, given=given)
         used = _used(chain, {**source.values, **given}, case.recording.radar)
-        return Result(name, method.title, chain, image, {}, {"rerun": time.perf_counter() - began}, _bytes(image), used, None)
+        return Result(
+            name, method.title, chain, image, {}, {"rerun": time.perf_counter() - began}, _bytes(image), used, None
+        )
     trace = chain.trace(case.clean if method.input == "clean" else case.recording)
     image = trace.signal
     if image.names != ("azimuth", "range") or image.trials:
-        raise ValueError(f"the last stage gives the axes {image.names}, not an image ('azimuth', 'range'); end the chain with a focusing stage (a sweep needs none)")
+        raise ValueError(
+            f"the last stage gives the axes {image.names}, not an image ('azimuth', 'range'); end "
+            "the chain with a focusing stage (a sweep needs none)"
+        )
     used = _used(chain, trace.values, case.recording.radar)
-    return Result(name, method.title, chain, image, trace.estimates, dict(trace.seconds), max(trace.bytes.values()), used, trace)
+    return Result(
+        name, method.title, chain, image, trace.estimates, dict(trace.seconds), max(trace.bytes.values()), used, trace
+    )
 
 
 def _bytes(signal: Signal) -> int:

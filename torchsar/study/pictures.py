@@ -22,7 +22,10 @@ class Picture:
 
 
 def draw_all(makers: Iterable[Callable[[], Drawn]], folder: Path) -> list[Picture]:
-    """Every picture that the makers have the material for, as PNG files in the folder. A maker yields (name, title, caption, figure)."""
+    """Every picture that the makers have the material for, as PNG files in the folder.
+
+    A maker yields (name, title, caption, figure).
+    """
     folder.mkdir()
     pictures = []
     for make in makers:

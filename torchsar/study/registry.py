@@ -1,6 +1,7 @@
 """Every name that a config may use: stages, scenes, beams, paths and damages.
 
-A user's own stage joins through the entry point group `torchsar.stages` (name = "package.module:Class"); a config has no other way to run code.
+A user's own stage joins through the entry point group `torchsar.stages` (name =
+"package.module:Class"); a config has no other way to run code.
 """
 
 from __future__ import annotations
@@ -15,7 +16,17 @@ from torchsar.compensate.doppler import EnergyCentre, PhaseIncrement, RangeDepen
 from torchsar.compensate.envelope import AlignEnvelopes, ShiftRange
 from torchsar.compensate.point import PointDoppler
 from torchsar.compensate.pulse_phase.stages import CorrectPulsePhase, EntropyFixedPoint, Pga, PgaSca, Sca, SharpestPhase
-from torchsar.compensate.radial import CompensateMotion, EqualisePulses, MirrorProduct, MlPeak, PhasePolish, PulseGain, RadialMotion, SegmentedInterference, SpectrumCorrelation
+from torchsar.compensate.radial import (
+    CompensateMotion,
+    EqualisePulses,
+    MirrorProduct,
+    MlPeak,
+    PhasePolish,
+    PulseGain,
+    RadialMotion,
+    SegmentedInterference,
+    SpectrumCorrelation,
+)
 from torchsar.compensate.rotation import (
     ChirpletClean,
     CoarseRotation,
@@ -36,7 +47,17 @@ from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedL
 from torchsar.echo.pulse_phase import PhaseSinusoid, PhaseWalk, WhitePhase
 from torchsar.echo.sweep_error import PolynomialSweepError, SinusoidSweepError
 from torchsar.echo.turntable import LostPulses
-from torchsar.focus import AzimuthTransform, Backproject, ClosestRange, CompressDechirped, OmegaK, OmegaKStolt, RangeCompress, RangeDoppler, TargetImage
+from torchsar.focus import (
+    AzimuthTransform,
+    Backproject,
+    ClosestRange,
+    CompressDechirped,
+    OmegaK,
+    OmegaKStolt,
+    RangeCompress,
+    RangeDoppler,
+    TargetImage,
+)
 from torchsar.focus.matched_fourier import MatchedFourier, RangePhase
 from torchsar.focus.triangular import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
 from torchsar.multichannel.azimuth import FocusAzimuth
@@ -108,7 +129,9 @@ SCENES = Catalogue(
 )
 BEAMS = Catalogue("beam", "kind", {"always_lit": AlwaysLit, "dwell": Dwell, "antenna": Antenna})
 PATHS = Catalogue("path", "kind", {"hyperbola": Hyperbola, "parabola": Parabola})
-MOTIONS = Catalogue("motion", "kind", {"vibration": factories.vibration, "sinusoid": Sinusoid, "polynomial": Polynomial})
+MOTIONS = Catalogue(
+    "motion", "kind", {"vibration": factories.vibration, "sinusoid": Sinusoid, "polynomial": Polynomial}
+)
 RADIAL_MOTIONS = Catalogue(
     "motion of the line of sight",
     "kind",
@@ -139,7 +162,11 @@ CALIBRATIONS = Catalogue("calibration", "kind", {"fibre": CalibrationFibre})
 GATES = Catalogue("gate", "kind", {"band_limited": BandLimited, "pattern": Pattern})
 SEAS = Catalogue("sea", "kind", {"k_sea": factories.k_sea, "image": factories.image_sea})
 RECEIVE_RANGES = Catalogue("receive range", "kind", {"exact": ExactRange, "taylor": TaylorRange})
-MULTICHANNEL_DAMAGES = Catalogue("damage of a multichannel recording", "kind", {"channel_errors": ChannelErrors, "clock_errors": factories.clock_errors})
+MULTICHANNEL_DAMAGES = Catalogue(
+    "damage of a multichannel recording",
+    "kind",
+    {"channel_errors": ChannelErrors, "clock_errors": factories.clock_errors},
+)
 DAMAGES = Catalogue(
     "damage",
     "kind",
@@ -268,7 +295,9 @@ def stages() -> Catalogue:
     entries = {name: target for group in GROUPS.values() for name, target in group.items()}
     for point in entry_points(group="torchsar.stages"):
         if point.name in entries:
-            raise ValueError(f"the entry point {point.value!r} takes the stage name {point.name!r}, which is in use; rename it")
+            raise ValueError(
+                f"the entry point {point.value!r} takes the stage name {point.name!r}, which is in use; rename it"
+            )
         entries[point.name] = point.load()
     return Catalogue("stage", "stage", entries, given=("radar", "geometry"))
 

@@ -1,4 +1,6 @@
-"""The report: one HTML file with its pictures inside, made only from metrics.json, the figures and the resolved config."""
+"""The report: one HTML file with its pictures inside, made only from metrics.json, the figures and
+the resolved config.
+"""
 
 from __future__ import annotations
 
@@ -52,13 +54,22 @@ def number(value: Any, digits: int = 4) -> str:
 
 
 def figure_table(metrics: Mapping[str, Any]) -> tuple[list[str], list[dict[str, Any]]]:
-    """Column names (the methods, then 'published') and rows of text for every metric that any method has."""
+    """Column names (the methods, then 'published') and rows of text for every metric that any
+    method has.
+    """
     methods, published = metrics["methods"], metrics["published"]
     rows = []
     for key, (label, unit, digits) in _LABELS.items():
         if any(key in m["metrics"] for m in methods.values()):
             cells = [number(m["metrics"].get(key), digits) for m in methods.values()]
-            rows.append({"label": label, "unit": unit, "cells": cells, "published": number(published.get(key), digits) if key in published else ""})
+            rows.append(
+                {
+                    "label": label,
+                    "unit": unit,
+                    "cells": cells,
+                    "published": number(published.get(key), digits) if key in published else "",
+                }
+            )
     return [*methods], rows
 
 
@@ -76,10 +87,17 @@ def installed_version() -> str:
 def write_page(path: Path, template: str, pictures: Sequence[Picture], figures: Path, **fields: Any) -> None:
     """Write one HTML file with its pictures inside, which asks for nothing from outside.
 
-    template: a file beside this module that extends base.html.j2. figures: the folder of the pictures. fields: what the template shows;
-    the base itself shows `title`, `command`, `definitions` (name -> text) and `config` (text).
+    template: a file beside this module that extends base.html.j2. figures: the folder of the
+    pictures. fields: what the template shows; the base itself shows `title`, `command`,
+    `definitions` (name -> text) and `config` (text).
     """
-    environment = jinja2.Environment(loader=jinja2.PackageLoader("torchsar.study", "."), autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("torchsar.study", "."),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
     environment.filters["number"] = number
     text = environment.get_template(template).render(
         pictures=[{"title": p.title, "caption": p.caption, "source": _embedded(figures / p.file)} for p in pictures],
@@ -89,8 +107,26 @@ def write_page(path: Path, template: str, pictures: Sequence[Picture], figures: 
     path.write_text(text, encoding="utf-8")
 
 
-def write_report(path: Path, title: str, metrics: Mapping[str, Any], pictures: Sequence[Picture], figures: Path, config_text: str, command: str) -> None:
+def write_report(
+    path: Path,
+    title: str,
+    metrics: Mapping[str, Any],
+    pictures: Sequence[Picture],
+    figures: Path,
+    config_text: str,
+    command: str,
+) -> None:
     """Write the report of one run; it asks for nothing from outside."""
     columns, rows = figure_table(metrics)
     fields = {"metrics": metrics, "best": metrics["methods"]["recommended"], "columns": columns, "rows": rows}
-    write_page(path, "report.html.j2", pictures, figures, title=title, command=command, definitions=metrics["definitions"], config=config_text, **fields)
+    write_page(
+        path,
+        "report.html.j2",
+        pictures,
+        figures,
+        title=title,
+        command=command,
+        definitions=metrics["definitions"],
+        config=config_text,
+        **fields,
+    )

@@ -40,16 +40,29 @@ def sweep_config(
     device: str = "cpu",
     command: str = "torchsar sweep",
 ) -> Path:
-    """Run the sweep of a config and write results.zarr, config.yaml, summary.json, figures/ and report.html into OUT; returns the report's path.
+    """Run the sweep of a config and write results.zarr, config.yaml, summary.json, figures/ and
+    report.html into OUT; returns the report's path.
 
-    results.zarr grows while it runs and is never replaced; the other files appear at the end. Raises ConfigError for what the user can put right,
-    Interrupted after Ctrl-C with a sentence that says how to go on.
+    results.zarr grows while it runs and is never replaced; the other files appear at the end.
+    Raises ConfigError for what the user can put right, Interrupted after Ctrl-C with a sentence
+    that says how to go on.
     """
     settings = loaded.config.sweep
     grid = sweep_grid(loaded)
     stop = None if settings.stop is None else Stop(**settings.stop.model_dump())
-    needs = [(f"{loaded.file}: sweep.success", metric) for metric in settings.success] + [(f"{loaded.file}: sweep.show", metric) for metric in settings.show]
-    plan = Plan(grid, settings.trials, loaded.config.seed, settings.chunk, stop, frozenset(settings.save.trials), device, tuple(needs))
+    needs = [(f"{loaded.file}: sweep.success", metric) for metric in settings.success] + [
+        (f"{loaded.file}: sweep.show", metric) for metric in settings.show
+    ]
+    plan = Plan(
+        grid,
+        settings.trials,
+        loaded.config.seed,
+        settings.chunk,
+        stop,
+        frozenset(settings.save.trials),
+        device,
+        tuple(needs),
+    )
     store = open_store(out, plan, identity(loaded), resume)
     config_text = loaded.text(resolved(loaded))
     about = {"title": loaded.config.title, "config": config_text, "dtype": loaded.config.precision}
@@ -57,7 +70,9 @@ def sweep_config(
     _announce(grid, settings.trials)
     try:
         with _terminated_like_interrupted():
-            record = run_plan(plan, system_of(loaded).trials(loaded, device), store, engine(workers, cluster, threads), loaded.name)
+            record = run_plan(
+                plan, system_of(loaded).trials(loaded, device), store, engine(workers, cluster, threads), loaded.name
+            )
             record.about = {**record.about, **about}
             return report(record.select(grid.labels), loaded, out, config_text, command)
     except Interrupted as stopped:
@@ -65,17 +80,28 @@ def sweep_config(
     except KeyboardInterrupt:  # a second Ctrl-C, or one while the report was made
         raise Interrupted(f"what is marked done is in {out}; go on with --resume") from None
     except OSError as error:
-        raise ConfigError(f"{out}: the report cannot be written ({error.strerror or error}); the trials are recorded, make it with --resume") from error
+        raise ConfigError(
+            f"{out}: the report cannot be written ({error.strerror or error}); the trials are "
+            "recorded, make it with --resume"
+        ) from error
 
 
 def sweep_grid(loaded: Loaded) -> Grid:
-    """The grid of a config's sweep, every key and value checked and every case built once. Raises ConfigError."""
+    """The grid of a config's sweep, every key and value checked and every case built once.
+
+    Raises ConfigError.
+    """
     given, trials = loaded.config.sweep.grid, system_of(loaded).trials(loaded)
     if loaded.config.world is None or loaded.config.data.file is not None:
-        raise ConfigError(f"{loaded.file}: a sweep simulates its trials; give the sections 'radar' and 'world' and no data.file")
+        raise ConfigError(
+            f"{loaded.file}: a sweep simulates its trials; give the sections 'radar' and 'world' and no data.file"
+        )
     taken = [name for name in loaded.config.processor if name in (BOUNDS, SAVED)]
     if taken:
-        raise ConfigError(f"{loaded.file}: processor.{taken[0]}: in a sweep this name is taken by a part of the results; choose another")
+        raise ConfigError(
+            f"{loaded.file}: processor.{taken[0]}: in a sweep this name is taken by a part of the "
+            "results; choose another"
+        )
     for key in given:
         _refuse_fixed(key, loaded)
     grid = make_grid(given, [key for key in given if key in trials.batched], f"{loaded.file}: sweep")
@@ -92,24 +118,37 @@ def _refuse_fixed(key: str, loaded: Loaded) -> None:
     if key.split(".")[0] in _FIXED:
         raise ConfigError(f"{loaded.file}: sweep: the key {key!r} cannot be swept")
     if "." not in key and key not in Config.model_fields:
-        raise ConfigError(f"{loaded.file}: sweep.{key} is neither a setting of the sweep nor a key of the config{did_you_mean(key, (*Sweep.model_fields, *Config.model_fields))}")
+        raise ConfigError(
+            f"{loaded.file}: sweep.{key} is neither a setting of the sweep nor a key of the "
+            f"config{did_you_mean(key, (*Sweep.model_fields, *Config.model_fields))}"
+        )
 
 
 def _refuse_missing_taps(trials: Trials, fixed: Mapping[str, Any], loaded: Loaded) -> None:
     there = trials.stages(fixed)
     for tap in loaded.config.sweep.save.taps:
         if tap not in there:
-            raise ConfigError(f"{loaded.file}: sweep.save.taps names {tap!r}, which is no stage of a method{did_you_mean(tap, there)}")
+            raise ConfigError(
+                f"{loaded.file}: sweep.save.taps names {tap!r}, which is no stage of a method{did_you_mean(tap, there)}"
+            )
 
 
 def identity(loaded: Loaded) -> dict[str, Any]:
-    """What the results depend on besides the grid: the resolved config without what only says how much is computed or shown."""
+    """What the results depend on besides the grid: the resolved config without what only says how
+    much is computed or shown.
+    """
     tree = resolved(loaded)
-    return {"seed": loaded.config.seed, "config": {key: value for key, value in tree.items() if key not in _NOT_IDENTITY}}
+    return {
+        "seed": loaded.config.seed,
+        "config": {key: value for key, value in tree.items() if key not in _NOT_IDENTITY},
+    }
 
 
 def report(record: Record, loaded: Loaded, out: Path, config_text: str, command: str) -> Path:
-    """summary.json, figures/, config.yaml and report.html of a record. The summary and the report, which is last, are replaced whole."""
+    """summary.json, figures/, config.yaml and report.html of a record.
+
+    The summary and the report, which is last, are replaced whole.
+    """
     titles = {f"method {name}": method.title for name, method in loaded.config.processor.items() if method.title}
     summary = summary_tree(record, loaded.config.sweep.success, {"snr": system_of(loaded).definitions["snr"], **titles})
     figures = out / "figures"
@@ -127,7 +166,13 @@ def report(record: Record, loaded: Loaded, out: Path, config_text: str, command:
 def _announce(grid: Grid, trials: int) -> None:
     together = [f"{p.name} ({len(p.labels)})" for p in grid.parameters if p.batched]
     apart = [f"{p.name} ({len(p.labels)})" for p in grid.parameters if not p.batched]
-    log.info("%d points of %d trials; per-trial tensors, which share batches: %s; cases of their own: %s", len(grid.points()), trials, ", ".join(together) or "none", ", ".join(apart) or "none")
+    log.info(
+        "%d points of %d trials; per-trial tensors, which share batches: %s; cases of their own: %s",
+        len(grid.points()),
+        trials,
+        ", ".join(together) or "none",
+        ", ".join(apart) or "none",
+    )
 
 
 @contextmanager

@@ -1,4 +1,6 @@
-"""The systems that a config may choose by its key `system`, and what each brings: sections, experiments, trials, tables."""
+"""The systems that a config may choose by its key `system`, and what each brings: sections,
+experiments, trials, tables.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ from torchsar.study.errors import ConfigError, did_you_mean
 
 
 class Trials(Protocol):
-    """One batch of Monte Carlo trials of a config, as `torchsar.study.sweep` takes it, and what is asked of it before."""
+    """One batch of Monte Carlo trials of a config, as `torchsar.study.sweep` takes it, and what is
+    asked of it before.
+    """
 
     @property
     def batched(self) -> Collection[str]: ...
@@ -32,8 +36,9 @@ class Trials(Protocol):
 class System:
     """What a system brings.
 
-    config: its sections. check(loaded): builds all that the config of a simulation names. run(loaded, out, command), requires(loaded, out) and
-    trade(loaded, out): the commands. trials(loaded, device): its Monte Carlo. definitions: of the figures, by name.
+    config: its sections. check(loaded): builds all that the config of a simulation names.
+    run(loaded, out, command), requires(loaded, out) and trade(loaded, out): the commands.
+    trials(loaded, device): its Monte Carlo. definitions: of the figures, by name.
     """
 
     config: type[Config]
@@ -87,18 +92,39 @@ def systems() -> dict[str, System]:
 
     return {
         "geo": System(GeoConfig, geo_run.check, geo_run.run, geo_requires, geo_trade, GeoTrials, GEO),
-        "geo_ocean": System(OceanConfig, ocean_run.check, ocean_run.run, ocean_requires, ocean_trade, OceanTrials, OCEAN),
+        "geo_ocean": System(
+            OceanConfig, ocean_run.check, ocean_run.run, ocean_requires, ocean_trade, OceanTrials, OCEAN
+        ),
         "isal": System(IsalConfig, isal_run.check, isal_run.run, isal_requires, isal_trade, IsalTrials, ISAL),
-        "isal_rotation": System(RotationConfig, rotation_run.check, rotation_run.run, rotation_requires, rotation_trade, RotationTrials, ROTATION),
+        "isal_rotation": System(
+            RotationConfig,
+            rotation_run.check,
+            rotation_run.run,
+            rotation_requires,
+            rotation_trade,
+            RotationTrials,
+            ROTATION,
+        ),
         "sal": System(SalConfig, sal_run.check, sal_run.run, sal_requires, sal_trade, SalTrials, SAL),
-        "stripmap": System(StripmapConfig, stripmap_run.check, stripmap_run.run, stripmap_requires, stripmap_trade, StripmapTrials, STRIPMAP),
+        "stripmap": System(
+            StripmapConfig,
+            stripmap_run.check,
+            stripmap_run.run,
+            stripmap_requires,
+            stripmap_trade,
+            StripmapTrials,
+            STRIPMAP,
+        ),
     }
 
 
 def system_named(name: Any, file: str) -> System:
     """The system of that name. Raises ConfigError naming those there are."""
     if not isinstance(name, str) or name not in systems():
-        raise ConfigError(f"{file}: key 'system' has the value {name!r}; it should be one of {', '.join(systems())}{did_you_mean(str(name), systems())}")
+        raise ConfigError(
+            f"{file}: key 'system' has the value {name!r}; it should be one of "
+            f"{', '.join(systems())}{did_you_mean(str(name), systems())}"
+        )
     return systems()[name]
 
 

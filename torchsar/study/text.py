@@ -13,16 +13,25 @@ from torchsar.study.errors import ConfigError, did_you_mean
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe YAML that reads 1e-6 as a number (YAML 1.2), only true/false as booleans, and refuses a key given twice."""
+    """Safe YAML that reads 1e-6 as a number (YAML 1.2), only true/false as booleans, and refuses a
+    key given twice.
+    """
 
 
-_Loader.yaml_implicit_resolvers = {first: [(tag, rule) for tag, rule in rules if not tag.endswith((":float", ":bool"))] for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()}
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, rule) for tag, rule in rules if not tag.endswith((":float", ":bool"))]
+    for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?(?:(?:[0-9][0-9_]*\.[0-9_]*|\.[0-9][0-9_]*)(?:[eE][-+]?[0-9]+)?|[0-9][0-9_]*[eE][-+]?[0-9]+|\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"),
+    re.compile(
+        r"^[-+]?(?:(?:[0-9][0-9_]*\.[0-9_]*|\.[0-9][0-9_]*)(?:[eE][-+]?[0-9]+)?|[0-9][0-9_]*[eE][-+]?[0-9]+|\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+    ),
     list("-+0123456789."),
 )
-_Loader.add_implicit_resolver("tag:yaml.org,2002:bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF"))
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF")
+)
 
 
 def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[str, Any]:
@@ -43,7 +52,12 @@ class _Dumper(yaml.SafeDumper):
     """Mappings in their own order, lists of numbers on one line."""
 
 
-_Dumper.add_representer(list, lambda dumper, items: dumper.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=all(not isinstance(i, (dict, list)) for i in items)))
+_Dumper.add_representer(
+    list,
+    lambda dumper, items: dumper.represent_sequence(
+        "tag:yaml.org,2002:seq", items, flow_style=all(not isinstance(i, (dict, list)) for i in items)
+    ),
+)
 _Dumper.add_representer(tuple, lambda dumper, items: dumper.represent_list(list(items)))
 
 
@@ -65,27 +79,43 @@ def dump(tree: Mapping[str, Any]) -> str:
 
 
 def config_folders() -> list[Path]:
-    """Where configs are found by name: inside an installed package, or beside the package in a checkout."""
+    """Where configs are found by name: inside an installed package, or beside the package in a
+    checkout.
+    """
     package = Path(__file__).resolve().parents[1]
     return [folder for folder in (package / "configs", package.parent / "configs") if folder.is_dir()]
 
 
 def packaged_configs() -> dict[str, Path]:
-    """Names of the configs that come with torchsar, and their files; those of sweeps lie in a folder of their own."""
-    return {path.stem: path for folder in reversed(config_folders()) for path in (*sorted(folder.glob("*.yaml")), *sorted(folder.glob("sweeps/*.yaml")))}
+    """Names of the configs that come with torchsar, and their files; those of sweeps lie in a
+    folder of their own.
+    """
+    return {
+        path.stem: path
+        for folder in reversed(config_folders())
+        for path in (*sorted(folder.glob("*.yaml")), *sorted(folder.glob("sweeps/*.yaml")))
+    }
 
 
 def find_config(name: str) -> Path:
-    """A file by its path, else a packaged config by its name, 'stripmap_damaged' or 'configs/stripmap_damaged.yaml'."""
+    """A file by its path, else a packaged config by its name, 'stripmap_damaged' or
+    'configs/stripmap_damaged.yaml'.
+    """
     path = Path(name)
     if path.is_file():
         return path
     packaged = packaged_configs()
-    if path.parent in (Path("."), Path("configs"), Path("sweeps"), Path("configs/sweeps")) and path.suffix in ("", ".yaml") and path.stem in packaged:
+    if (
+        path.parent in (Path("."), Path("configs"), Path("sweeps"), Path("configs/sweeps"))
+        and path.suffix in ("", ".yaml")
+        and path.stem in packaged
+    ):
         return packaged[path.stem]
     if path.is_dir():
         raise ConfigError(f"{name} is a folder, not a config file")
-    raise ConfigError(f"there is no config file {name!r} and no packaged config of that name{did_you_mean(path.stem, packaged)}")
+    raise ConfigError(
+        f"there is no config file {name!r} and no packaged config of that name{did_you_mean(path.stem, packaged)}"
+    )
 
 
 def read_tree(path: Path) -> dict[str, Any]:
@@ -100,16 +130,22 @@ def read_tree(path: Path) -> dict[str, Any]:
     return tree
 
 
-def override(tree: dict[str, Any], assignments: Sequence[str], literal: tuple[str, str, Sequence[str]] = ("", "", ())) -> dict[str, Any]:
+def override(
+    tree: dict[str, Any], assignments: Sequence[str], literal: tuple[str, str, Sequence[str]] = ("", "", ())
+) -> dict[str, Any]:
     """The tree with key=value assignments applied, the keys as dotted paths and the values as YAML.
 
-    literal: a section whose keys are dotted themselves, the mapping in it that may hold them too, and those of its keys that are not
-    dotted: `sweep.world.noise.snr_db=[0, 10]` and `sweep.grid.world.noise.snr_db=[0, 10]` set the key "world.noise.snr_db".
+    literal: a section whose keys are dotted themselves, the mapping in it that may hold them too,
+    and those of its keys that are not dotted: `sweep.world.noise.snr_db=[0, 10]` and
+    `sweep.grid.world.noise.snr_db=[0, 10]` set the key "world.noise.snr_db".
     """
     for assignment in assignments:
         key, equals, value = assignment.partition("=")
         if not equals or not all(part.strip() for part in key.split(".")):
-            raise ConfigError(f"command line: {assignment!r} is not an override; write key=value with a dotted key, such as world.noise.snr_db=10")
+            raise ConfigError(
+                f"command line: {assignment!r} is not an override; write key=value with a dotted key, "
+                "such as world.noise.snr_db=10"
+            )
         path = key.strip().split(".")
         if path[0] == literal[0] and len(path) > 2 and path[1] not in literal[2]:
             path = [path[0], ".".join(path[1:]).removeprefix(f"{literal[1]}.")]
@@ -121,6 +157,9 @@ def _assigned(tree: Any, path: list[str], value: Any, key: str) -> dict[str, Any
     if tree is None:
         tree = {}
     if not isinstance(tree, dict):
-        raise ConfigError(f"command line: {key} cannot be set, because the part before {'.'.join(path)!r} holds the value {tree!r}, not a section")
+        raise ConfigError(
+            f"command line: {key} cannot be set, because the part before {'.'.join(path)!r} holds "
+            f"the value {tree!r}, not a section"
+        )
     head, rest = path[0], path[1:]
     return {**tree, head: _assigned(tree.get(head), rest, value, key) if rest else value}

@@ -17,7 +17,10 @@ IMAGE = ("azimuth", "range")
 
 
 def traced(chain: Chain, recording: Recording, name: str, given: Mapping[str, Tensor] | None = None) -> Trace:
-    """The trace of a method, whose name goes before whatever its stages refuse. given: values to hold, see `Chain.trace`."""
+    """The trace of a method, whose name goes before whatever its stages refuse.
+
+    given: values to hold, see `Chain.trace`.
+    """
     try:
         return chain.trace(recording, given)
     except AttributeError as error:
@@ -38,7 +41,10 @@ def refuse_no_image(name: str, signal: Signal, ending: str) -> None:
         raise ConfigError(f"processor.{name}, {not_an_image(signal, ending)} (a sweep needs none)")
     for axis in signal.axes:
         if not math.isfinite(axis.step * axis.n):
-            raise ConfigError(f"processor.{name}: the image has cells of {axis.step:g} {axis.unit} along {axis.name}; check the carrier, the pulse rate and the rotation of the radar")
+            raise ConfigError(
+                f"processor.{name}: the image has cells of {axis.step:g} {axis.unit} along "
+                f"{axis.name}; check the carrier, the pulse rate and the rotation of the radar"
+            )
 
 
 def image_of(signal: Signal, trial: int = 0) -> Signal:
@@ -48,17 +54,27 @@ def image_of(signal: Signal, trial: int = 0) -> Signal:
 
 def saved_of(traces: Mapping[str, Trace], taps: Sequence[str]) -> dict[str, dict[str, Tensor]]:
     """The last signal of every method, and the outputs of the stages that `taps` names."""
-    return {name: {"last": trace.signal.data, **{stage: trace.outputs[stage].data for stage in taps if stage in trace.outputs}} for name, trace in traces.items()}
+    return {
+        name: {
+            "last": trace.signal.data,
+            **{stage: trace.outputs[stage].data for stage in taps if stage in trace.outputs},
+        }
+        for name, trace in traces.items()
+    }
 
 
 def verdict(estimates: Mapping[str, Estimate], trials: Sequence[int]) -> dict[str, Tensor]:
-    """Whether all estimators of a method trust their results, (...,) bool under `ok`; nothing where there are none."""
+    """Whether all estimators of a method trust their results, (...,) bool under `ok`; nothing where
+    there are none.
+    """
     found = [estimate.ok.expand(tuple(trials)) for estimate in estimates.values()]
     return {OK: torch.stack(found).all(0)} if found else {}
 
 
 def summary(values: Mapping[str, Mapping[str, Tensor]]) -> dict[str, dict[str, float]]:
-    """Mean over trials of every metric by method, with `<metric>_sd` where there are several; `<metric>` of ok is a share."""
+    """Mean over trials of every metric by method, with `<metric>_sd` where there are several;
+    `<metric>` of ok is a share.
+    """
     out: dict[str, dict[str, float]] = {}
     for method, metrics in values.items():
         row: dict[str, float] = {}

@@ -1,4 +1,6 @@
-"""What the tables of `torchsar trade` have in common: timing, and the folder that they are written into."""
+"""What the tables of `torchsar trade` have in common: timing, and the folder that they are written
+into.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ def written(
     text: Callable[[Mapping[str, Sequence[Any]]], str],
     figures: Callable[[Mapping[str, Sequence[Any]]], Mapping[str, plot.Figure]],
 ) -> str:
-    """The text of the tables; with `out` also config.yaml, trade.json, trade.txt and figures/trade_NAME.png in that folder. Rows are dataclasses."""
+    """The text of the tables; with `out` also config.yaml, trade.json, trade.txt and
+    figures/trade_NAME.png in that folder. Rows are dataclasses.
+    """
     if out is None:
         return text(tables())
     with fresh_folder(out) as folder:
@@ -50,8 +54,16 @@ def written(
         said = text(found)
         (folder / "config.yaml").write_text(loaded.text(resolved(loaded)), encoding="utf-8")
         (folder / "trade.txt").write_text(said + "\n", encoding="utf-8")
-        machine = {"machine": platform.processor() or platform.machine(), "torch": torch.__version__, "threads": torch.get_num_threads(), "seed": loaded.config.seed}
-        write_json(folder / "trade.json", {**{key: [asdict(row) for row in rows] for key, rows in found.items()}, "made_on": machine})
+        machine = {
+            "machine": platform.processor() or platform.machine(),
+            "torch": torch.__version__,
+            "threads": torch.get_num_threads(),
+            "seed": loaded.config.seed,
+        }
+        write_json(
+            folder / "trade.json",
+            {**{key: [asdict(row) for row in rows] for key, rows in found.items()}, "made_on": machine},
+        )
         (folder / "figures").mkdir()
         for name, figure in figures(found).items():
             plot.save(figure, folder / "figures" / f"trade_{name}.png")
@@ -67,7 +79,9 @@ def traded(
     columns: Mapping[str, tuple[str, str]],
     figures: Callable[[Tables], Mapping[str, plot.Figure]],
 ) -> str:
-    """The tables of the first case of a config that simulates, as `table_text` and `written` have them. Raises ConfigError for what the config, or then the simulation or a stage, refuses."""
+    """The tables of the first case of a config that simulates, as `table_text` and `written` have
+    them. Raises ConfigError for what the config, or then the simulation or a stage, refuses.
+    """
     refuse_recordings(loaded)
     check(loaded)
     name, case = next(iter(cases_of(loaded).items()))
@@ -82,12 +96,22 @@ def traded(
 
 
 def table_text(case: str, tables: Tables, titles: Mapping[str, str], columns: Mapping[str, tuple[str, str]]) -> str:
-    """Tables for the screen: a line an alternative, columns (field -> heading and format) that any row of a table has. -inf reads "exact"."""
+    """Tables for the screen: a line an alternative, columns (field -> heading and format) that any
+    row of a table has. -inf reads "exact".
+    """
     parts = [f"case {case!r}" if case else "one case"]
     for key, rows in tables.items():
         kept = [name for name in columns if any(getattr(row, name) is not None for row in rows)]
-        parts += ["", titles[key], f"{'alternative':<36}{'ms a trial':>12}{'spread':>9}" + "".join(f"{columns[name][0]:>18}" for name in kept)]
-        parts += [f"{row.name:<36}{1e3 * row.seconds:>12.2f}{1e3 * row.spread_s:>9.2f}" + "".join(f"{_cell(getattr(row, name), columns[name][1]):>18}" for name in kept) for row in rows]
+        parts += [
+            "",
+            titles[key],
+            f"{'alternative':<36}{'ms a trial':>12}{'spread':>9}" + "".join(f"{columns[name][0]:>18}" for name in kept),
+        ]
+        parts += [
+            f"{row.name:<36}{1e3 * row.seconds:>12.2f}{1e3 * row.spread_s:>9.2f}"
+            + "".join(f"{_cell(getattr(row, name), columns[name][1]):>18}" for name in kept)
+            for row in rows
+        ]
     return "\n".join(parts)
 
 

@@ -1,4 +1,6 @@
-"""The phase of every pulse as the minimum of a figure of the image: descent on entropy, contrast, or any differentiable cost."""
+"""The phase of every pulse as the minimum of a figure of the image: descent on entropy, contrast,
+or any differentiable cost.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +27,15 @@ Objective = Literal["power_entropy", "amplitude_entropy", "contrast"] | Cost
 Method = Literal["lbfgs", "adam"]
 
 _STEP_RAD = 0.05  # rms length of the first step
-_COSTS: dict[str, Callable[..., Tensor]] = {"power_entropy": entropy, "amplitude_entropy": partial(entropy, of="amplitude"), "contrast": lambda image, mask: -contrast(image, mask=mask)}
-_METHODS: dict[str, tuple[Callable[..., Descent], dict[str, Any]]] = {"lbfgs": (lbfgs, {"steps": 100, "value_tolerance": 1e-7}), "adam": (adam, {"steps": 500, "rate": _STEP_RAD})}
+_COSTS: dict[str, Callable[..., Tensor]] = {
+    "power_entropy": entropy,
+    "amplitude_entropy": partial(entropy, of="amplitude"),
+    "contrast": lambda image, mask: -contrast(image, mask=mask),
+}
+_METHODS: dict[str, tuple[Callable[..., Descent], dict[str, Any]]] = {
+    "lbfgs": (lbfgs, {"steps": 100, "value_tolerance": 1e-7}),
+    "adam": (adam, {"steps": 500, "rate": _STEP_RAD}),
+}
 
 
 def sharpest_phase(
@@ -41,24 +50,33 @@ def sharpest_phase(
     tolerance: float = 1e-3,
     imaging: Imaging | None = None,
 ) -> Estimate:
-    """The phase that minimises a figure of the image, with value["phase_rad"] (..., pulse) to be removed. data: (..., pulse, range) complex, range-compressed and aligned.
+    """The phase that minimises a figure of the image, with value["phase_rad"] (..., pulse) to be
+    removed. data: (..., pulse, range) complex, range-compressed and aligned.
 
-    Each trial descends by itself from `start` (..., pulse) rad, by default that of `sca`, into a minimum near by.
+    Each trial descends by itself from `start` (..., pulse) rad, by default that of `sca`, into a
+    minimum near by.
 
-    objective: "power_entropy", "amplitude_entropy" or "contrast" (maximised) of `torchsar.metrics`, or a function of images (trial, azimuth, range) ->
-    (trial,) that autograd can follow; it is called with some of the trials at a time. Prefer the power entropy, whose minimum on a target of many
-    scatterers is the same from any start at 0 dB and above (0.066 rad off the truth at 0 dB, 0.032 at 20 dB; `autofocus` has 0.053 and 0.018). Contrast
-    follows a few bright cells away from the truth, the amplitude entropy the many cells of noise unless a mask leaves them out.
-    mask: weights of the pixels that count, (azimuth, range) or with the trials in front. imaging: any object with `image` of (..., pulse, range)
-    profiles, as in `entropy_fixed_point`, differentiable; by default the image is that of `torchsar.focus.azimuth_transform`. It may be told the place of
-    the image by its migration: start from the phase that `autofocus` finds with it.
-    basis: (coefficient, pulse) or (..., coefficient, pulse), real: the phase is then a sum of these functions, such as
-    `torchsar.core.legendre(u, 5).mT[2:]`, beginning with the least-squares fit to the start.
-    method: "lbfgs", or "adam" for rough costs. steps: at most, by default 100 and 500. tolerance: of the gradient against that at the start; a trial also ends when a step gains 1e-7 of the cost.
+    objective: "power_entropy", "amplitude_entropy" or "contrast" (maximised) of `torchsar.metrics`,
+    or a function of images (trial, azimuth, range) -> (trial,) that autograd can follow; it is
+    called with some of the trials at a time. Prefer the power entropy, whose minimum on a target of
+    many scatterers is the same from any start at 0 dB and above (0.066 rad off the truth at 0 dB,
+    0.032 at 20 dB; `autofocus` has 0.053 and 0.018). Contrast follows a few bright cells away from
+    the truth, the amplitude entropy the many cells of noise unless a mask leaves them out. mask:
+    weights of the pixels that count, (azimuth, range) or with the trials in front. imaging: any
+    object with `image` of (..., pulse, range) profiles, as in `entropy_fixed_point`,
+    differentiable; by default the image is that of `torchsar.focus.azimuth_transform`. It may be
+    told the place of the image by its migration: start from the phase that `autofocus` finds with
+    it. basis: (coefficient, pulse) or (..., coefficient, pulse), real: the phase is then a sum of
+    these functions, such as `torchsar.core.legendre(u, 5).mT[2:]`, beginning with the least-squares
+    fit to the start. method: "lbfgs", or "adam" for rough costs. steps: at most, by default 100 and
+    500. tolerance: of the gradient against that at the start; a trial also ends when a step gains
+    1e-7 of the cost.
 
-    info["iterations"]: steps taken. std and ok as in `entropy_fixed_point`, that is by entropy, whatever the objective. The result is detached; pulses without
-    samples keep the phase of the start, or have that of the basis. Raises TypeError or ValueError for samples that are not finite and complex, a start,
-    mask or basis of another shape, functions that depend on each other, an unknown objective or method.
+    info["iterations"]: steps taken. std and ok as in `entropy_fixed_point`, that is by entropy,
+    whatever the objective. The result is detached; pulses without samples keep the phase of the
+    start, or have that of the basis. Raises TypeError or ValueError for samples that are not finite
+    and complex, a start, mask or basis of another shape, functions that depend on each other, an
+    unknown objective or method.
     """
     name = "sharpest_phase"
     pulses = prepare(data, name)
@@ -72,9 +90,14 @@ def sharpest_phase(
         first = pair_phase(rows, present) if begin is None else begin[which]
         found = descend(_Steep(cost(rows, which), own), own.coordinates(first))
         moved = own.phase(found.x) if basis is not None else torch.where(present, found.x, first)
-        return moved, found.steps, lambda some, there, at: at + own.phase(own.coordinates(on_the_circle(settled(some, there, at) - at)))
+        return (
+            moved,
+            found.steps,
+            lambda some, there, at: at + own.phase(own.coordinates(on_the_circle(settled(some, there, at) - at))),
+        )
 
-    # what `find` begins with says which trials a block holds: masks, starts and functions may differ between trials
+    # what `find` begins with says which trials a block holds: masks, starts and functions may
+    # differ between trials
     return estimated(pulses, torch.arange(len(pulses.rows), device=pulses.rows.device), find)
 
 
@@ -118,7 +141,9 @@ class _Free:
 
 @dataclass(frozen=True)
 class _Spanned:
-    """Sums of functions (coordinate, pulse) or (trial, coordinate, pulse), orthogonal over the pulses and of unit mean square each."""
+    """Sums of functions (coordinate, pulse) or (trial, coordinate, pulse), orthogonal over the
+    pulses and of unit mean square each.
+    """
 
     functions: Tensor
 
@@ -138,11 +163,22 @@ class _Spanned:
 def _space_of(basis: Tensor | None, pulses: Pulses) -> _Space:
     if basis is None:
         return _Free()
-    if _tensor(basis, "basis").is_complex() or basis.ndim < 2 or basis.shape[-1] != pulses.n or not 1 <= basis.shape[-2] <= pulses.n:
-        raise ValueError(f"sharpest_phase: basis needs real functions (coefficient, pulse) over {pulses.n} pulses, got {basis.dtype} of shape {tuple(basis.shape)}")
+    if (
+        _tensor(basis, "basis").is_complex()
+        or basis.ndim < 2
+        or basis.shape[-1] != pulses.n
+        or not 1 <= basis.shape[-2] <= pulses.n
+    ):
+        raise ValueError(
+            f"sharpest_phase: basis needs real functions (coefficient, pulse) over {pulses.n} "
+            f"pulses, got {basis.dtype} of shape {tuple(basis.shape)}"
+        )
     wide = _by_trial(basis.to(device=pulses.rows.device, dtype=torch.float64), pulses, "basis")
     if not torch.isfinite(wide).all() or bool((torch.linalg.matrix_rank(wide) < wide.shape[-2]).any()):
-        raise ValueError(f"sharpest_phase: the {wide.shape[-2]} functions of the basis must be finite and none a sum of the others; orthogonal ones such as torchsar.core.legendre are")
+        raise ValueError(
+            f"sharpest_phase: the {wide.shape[-2]} functions of the basis must be finite and none "
+            "a sum of the others; orthogonal ones such as torchsar.core.legendre are"
+        )
     return _Spanned((torch.linalg.qr(wide.mT).Q.mT * math.sqrt(pulses.n)).to(pulses.rows.real.dtype).contiguous())
 
 
@@ -159,10 +195,14 @@ def _by_trial(x: Tensor, pulses: Pulses, what: str) -> Tensor:
     try:
         return x.expand(*pulses.trials, *x.shape[-2:]).reshape(-1, *x.shape[-2:])
     except RuntimeError:
-        raise ValueError(f"sharpest_phase: {what} of shape {tuple(x.shape)} does not fit {tuple(pulses.trials)} trials; give two dims for all of them, or the trials in front") from None
+        raise ValueError(
+            f"sharpest_phase: {what} of shape {tuple(x.shape)} does not fit "
+            f"{tuple(pulses.trials)} trials; give two dims for all of them, or the trials in front"
+        ) from None
 
 
-_Figure = Callable[[Tensor], tuple[Tensor, Tensor]]  # phase (trial, pulse) -> cost (trial,), gradient (trial, pulse)
+# phase (trial, pulse) -> cost (trial,), gradient (trial, pulse)
+_Figure = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
@@ -177,12 +217,23 @@ class _Steep:
         return cost, self.space.pulled(gradient)
 
 
-def _cost_of(objective: Objective, mask: Tensor | None, imaging: Imaging | None, pulses: Pulses) -> Callable[[Tensor, Tensor], _Figure]:
-    """(rows, which trials) -> the figure of their phases. Raises ValueError for an unknown objective, or a mask that none would use."""
+def _cost_of(
+    objective: Objective, mask: Tensor | None, imaging: Imaging | None, pulses: Pulses
+) -> Callable[[Tensor, Tensor], _Figure]:
+    """(rows, which trials) -> the figure of their phases.
+
+    Raises ValueError for an unknown objective, or a mask that none would use.
+    """
     if isinstance(objective, str) and objective not in _COSTS:
-        raise ValueError(f"sharpest_phase: objective {objective!r} is not known; choose one of {', '.join(_COSTS)}, or give a function of images")
+        raise ValueError(
+            f"sharpest_phase: objective {objective!r} is not known; choose one of "
+            f"{', '.join(_COSTS)}, or give a function of images"
+        )
     if mask is not None and not isinstance(objective, str):
-        raise ValueError("sharpest_phase: a mask belongs to the objectives known by name; let your own function of images use its mask itself")
+        raise ValueError(
+            "sharpest_phase: a mask belongs to the objectives known by name; let your own "
+            "function of images use its mask itself"
+        )
     if objective == "power_entropy" and mask is None and imaging is None:
         return lambda rows, _: _PowerEntropy(rows, rows.conj().resolve_conj())
     operator = _Centred() if imaging is None else Through(imaging)
@@ -192,7 +243,9 @@ def _cost_of(objective: Objective, mask: Tensor | None, imaging: Imaging | None,
     figure = _COSTS[objective]
 
     def of_trials(rows: Tensor, which: Tensor) -> _Figure:
-        return _Derived(rows, operator, partial(figure, mask=weights if weights is None or weights.ndim < 3 else weights[which]))
+        return _Derived(
+            rows, operator, partial(figure, mask=weights if weights is None or weights.ndim < 3 else weights[which])
+        )
 
     return of_trials
 
@@ -203,7 +256,9 @@ def _descent_of(method: Method, steps: int | None, tolerance: float) -> Callable
     run, options = _METHODS[method]
     if steps is not None:
         options = {**options, "steps": steps}
-    return lambda steep, start: run(steep, start, with_gradient=True, gradient_tolerance=tolerance, **options, **_first_step(method, start))
+    return lambda steep, start: run(
+        steep, start, with_gradient=True, gradient_tolerance=tolerance, **options, **_first_step(method, start)
+    )
 
 
 def _first_step(method: Method, start: Tensor) -> dict[str, float]:
@@ -211,7 +266,9 @@ def _first_step(method: Method, start: Tensor) -> dict[str, float]:
 
 
 class _Centred:
-    """Image (trial, azimuth, range) of rows (trial, range, pulse), as `torchsar.focus.azimuth_transform` makes it."""
+    """Image (trial, azimuth, range) of rows (trial, range, pulse), as
+    `torchsar.focus.azimuth_transform` makes it.
+    """
 
     def image(self, rows: Tensor) -> Tensor:
         return (centred_ifft(rows) * math.sqrt(rows.shape[-1])).mT
@@ -235,13 +292,22 @@ class _Derived:
 
 def _refuse_other_answer(cost: Any, phase: Tensor) -> None:
     if not isinstance(cost, Tensor) or cost.shape != phase.shape[:-1] or not cost.requires_grad:
-        got = f"{'' if cost.requires_grad else 'detached '}{cost.dtype} of shape {tuple(cost.shape)}" if isinstance(cost, Tensor) else type(cost).__name__
-        raise ValueError(f"sharpest_phase: the objective returned {got} for {len(phase)} images; return one real cost an image, differentiable in its samples")
+        got = (
+            f"{'' if cost.requires_grad else 'detached '}{cost.dtype} of shape {tuple(cost.shape)}"
+            if isinstance(cost, Tensor)
+            else type(cost).__name__
+        )
+        raise ValueError(
+            f"sharpest_phase: the objective returned {got} for {len(phase)} images; return one "
+            "real cost an image, differentiable in its samples"
+        )
 
 
 @dataclass(frozen=True)
 class _PowerEntropy:
-    """Entropy of the image and dE/dpsi_k = -(2 / F) Im sum_n x conj(IFFT((1 + ln p) f)), F the energy; (1 + ln p) may lack any constant. mirrored: the conjugate of rows."""
+    """Entropy of the image and dE/dpsi_k = -(2 / F) Im sum_n x conj(IFFT((1 + ln p) f)), F the
+    energy; (1 + ln p) may lack any constant. mirrored: the conjugate of rows.
+    """
 
     rows: Tensor
     mirrored: Tensor

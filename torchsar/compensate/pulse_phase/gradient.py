@@ -1,7 +1,9 @@
-"""Phase gradient autofocus (PGA): the phase of the strongest scatterer of every row, isolated by a window that narrows.
+"""Phase gradient autofocus (PGA): the phase of the strongest scatterer of every row, isolated by a
+window that narrows.
 
-The window acts on an image of twice as many cells, that is on pulses padded with as many zeros. On the plain image a narrow window joins the last
-pulses to the first, and iterations then drift away from their optimum without end: from 0.07 rad at the best iterate to 0.4 rad after 20 on images of
+The window acts on an image of twice as many cells, that is on pulses padded with as many zeros. On
+the plain image a narrow window joins the last pulses to the first, and iterations then drift away
+from their optimum without end: from 0.07 rad at the best iterate to 0.4 rad after 20 on images of
 1024 x 1024 cells, where padded pulses stay at 0.03 rad.
 """
 
@@ -15,7 +17,14 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.data import prepare, refuse_odd_counts, rotate, safe_angle, starting_phase, without_line
+from torchsar.compensate.pulse_phase.data import (
+    prepare,
+    refuse_odd_counts,
+    rotate,
+    safe_angle,
+    starting_phase,
+    without_line,
+)
 from torchsar.compensate.pulse_phase.pairs import pair_phase, pair_products, running_sum
 from torchsar.compensate.pulse_phase.sharpen import settled
 from torchsar.compensate.pulse_phase.verdict import Found, estimated
@@ -37,7 +46,9 @@ class Windows(Protocol):
 
 @dataclass(frozen=True)
 class Shrinking:
-    """A window that starts with a share of the pulses and narrows by a factor an iteration, down to a floor (brief 002: 1/2, 0.8, 5 cells)."""
+    """A window that starts with a share of the pulses and narrows by a factor an iteration, down to
+    a floor (brief 002: 1/2, 0.8, 5 cells).
+    """
 
     first: float = 0.5
     factor: float = 0.8
@@ -45,7 +56,9 @@ class Shrinking:
 
     def __post_init__(self) -> None:
         if not (0 < self.first <= 1 and 0 < self.factor <= 1 and self.floor >= 1):
-            raise ValueError(f"a shrinking window needs first in 0..1, factor in 0..1 and a floor of 1 cell or more, got {self}")
+            raise ValueError(
+                f"a shrinking window needs first in 0..1, factor in 0..1 and a floor of 1 cell or more, got {self}"
+            )
 
     def width(self, iteration: int, n: int, profile: Callable[[], Tensor]) -> Tensor:
         return torch.tensor([max(self.floor, self.first * n * self.factor**iteration)])
@@ -53,7 +66,8 @@ class Shrinking:
 
 @dataclass(frozen=True)
 class Measured:
-    """A window as wide as the blur itself: `margin` times the width over which the mean centred power stays within `level_db` of its peak.
+    """A window as wide as the blur itself: `margin` times the width over which the mean centred
+    power stays within `level_db` of its peak.
 
     The classical rule (Wahl et al. 1994: 10 dB and half as much again).
     """
@@ -93,16 +107,22 @@ def pga(
     iterations: int = 20,
     patience: int = 6,
 ) -> Estimate:
-    """Phase gradient autofocus, with value["phase_rad"] (..., pulse) to be removed. data: (..., pulse, range) complex, range-compressed and aligned.
+    """Phase gradient autofocus, with value["phase_rad"] (..., pulse) to be removed.
 
-    Every iteration works on the original data turned by the phase so far: the strongest cell of each row to zero Doppler, a window about it, back to
-    pulses, the phase by the kernel, without its constant and linear part. kernel: "lumv" (linear unbiased minimum variance, Eichel and
-    Jakowatz 1989; understates steps beyond a radian), "ml" (maximum likelihood of pairs, Jakowatz and Wahl 1993), or coherent over the aperture,
-    with peaks found to a fraction of a cell: "synchronised" (unit phasors) and "eigenvector" (of the windowed covariance, Jakowatz and Wahl
-    1993). start: (..., pulse) rad, by default zero, from which PGA is not equivariant and large or white errors defeat it. windows: `Shrinking()`
-    by default. A trial ends after `patience` iterations without a lower image entropy under a window that narrows no more, and
-    returns its sharpest iterate: narrow windows drift away.
-    Differentiable but for the choice of peaks and iterates. Raises TypeError or ValueError for samples that are not finite and complex, a start of another shape, an unknown kernel.
+    data: (..., pulse, range) complex, range-compressed and aligned.
+
+    Every iteration works on the original data turned by the phase so far: the strongest cell of
+    each row to zero Doppler, a window about it, back to pulses, the phase by the kernel, without
+    its constant and linear part. kernel: "lumv" (linear unbiased minimum variance, Eichel and
+    Jakowatz 1989; understates steps beyond a radian), "ml" (maximum likelihood of pairs, Jakowatz
+    and Wahl 1993), or coherent over the aperture, with peaks found to a fraction of a cell:
+    "synchronised" (unit phasors) and "eigenvector" (of the windowed covariance, Jakowatz and Wahl
+    1993). start: (..., pulse) rad, by default zero, from which PGA is not equivariant and large or
+    white errors defeat it. windows: `Shrinking()` by default. A trial ends after `patience`
+    iterations without a lower image entropy under a window that narrows no more, and returns its
+    sharpest iterate: narrow windows drift away. Differentiable but for the choice of peaks and
+    iterates. Raises TypeError or ValueError for samples that are not finite and complex, a start of
+    another shape, an unknown kernel.
     """
     pulses = prepare(data, "pga")
     search = _Search(_solver(kernel), windows or Shrinking(), iterations, patience)
@@ -113,8 +133,13 @@ def pga(
     return estimated(pulses, starting_phase(start, pulses, "pga"), find)
 
 
-def pga_sca(data: Tensor, *, kernel: Kernel = "ml", windows: Windows | None = None, iterations: int = 20, patience: int = 6) -> Estimate:
-    """PGA with the kernel of SCA, started from SCA (Ruan et al. 2013, Eqs. 11-16); arguments and result as `pga`. Equivariant, as `sca` is."""
+def pga_sca(
+    data: Tensor, *, kernel: Kernel = "ml", windows: Windows | None = None, iterations: int = 20, patience: int = 6
+) -> Estimate:
+    """PGA with the kernel of SCA, started from SCA (Ruan et al. 2013, Eqs.
+
+    11-16); arguments and result as `pga`. Equivariant, as `sca` is.
+    """
     search = _Search(_solver(kernel), windows or Shrinking(), iterations, patience)
 
     def find(rows: Tensor, present: Tensor, _: Tensor | None) -> Found:
@@ -128,9 +153,11 @@ Solver = Callable[[Tensor, "_View", Tensor], Tensor]
 
 @dataclass(frozen=True)
 class _Search:
-    """The iterations of PGA: (rows, present, start) -> the phase of the sharpest iterate (trial, pulse), and how many were made (trial,).
+    """The iterations of PGA: (rows, present, start) -> the phase of the sharpest iterate (trial,
+    pulse), and how many were made (trial,).
 
-    Patience is counted only while the window narrows no more: in clutter wide windows blur for many iterations what narrow ones then sharpen.
+    Patience is counted only while the window narrows no more: in clutter wide windows blur for many
+    iterations what narrow ones then sharpen.
     """
 
     solve: Solver
@@ -141,7 +168,10 @@ class _Search:
     def __post_init__(self) -> None:
         refuse_odd_counts("pga", 1, iterations=self.iterations, patience=self.patience)
         if not hasattr(self.windows, "width"):
-            raise TypeError(f"pga: windows must be a schedule such as Shrinking(), Measured() or Listed((99.0, 33.0, 11.0)), got {self.windows!r}")
+            raise TypeError(
+                "pga: windows must be a schedule such as Shrinking(), Measured() or Listed((99.0, "
+                f"33.0, 11.0)), got {self.windows!r}"
+            )
 
     def __call__(self, rows: Tensor, present: Tensor, phase: Tensor) -> tuple[Tensor, Tensor]:
         best, lowest = phase, torch.full_like(phase[:, 0], torch.inf)
@@ -156,7 +186,11 @@ class _Search:
             active = idle < self.patience
             if iteration == self.iterations or not bool(active.any()):
                 break
-            width = self.windows.width(iteration, rows.shape[-1], lambda view=view: _profile(view)).to(phase).expand(len(phase))
+            width = (
+                self.windows.width(iteration, rows.shape[-1], lambda view=view: _profile(view))
+                .to(phase)
+                .expand(len(phase))
+            )
             narrows, last = width < last, width
             phase = torch.where(active[:, None], phase + _step(view, width, present, self.solve), phase)
             made = made + active
@@ -165,7 +199,9 @@ class _Search:
 
 @dataclass(frozen=True)
 class _View:
-    """A padded image (trial, range, 2 n), its detached power, and the strongest cell of each row."""
+    """A padded image (trial, range, 2 n), its detached power, and the strongest cell of
+    each row.
+    """
 
     image: Tensor
     power: Tensor
@@ -180,13 +216,18 @@ def _view(rows: Tensor, phase: Tensor) -> _View:
 
 
 def _step(view: _View, width: Tensor, present: Tensor, solve: Solver) -> Tensor:
-    """Phase step (trial, pulse) from the windowed rows, their peaks at zero Doppler; width: (trial,) in cells of the plain image."""
+    """Phase step (trial, pulse) from the windowed rows, their peaks at zero Doppler; width:
+    (trial,) in cells of the plain image.
+    """
     g = torch.fft.ifft(_windowed(view, (_PADDING * width / 2).floor().long()), norm="ortho")[..., : present.shape[-1]]
     return without_line(solve(g, view, present), present)
 
 
 def _windowed(view: _View, half: Tensor) -> Tensor:
-    """The cells within `half` (trial,) of the peak of each row, the peak in front, zeros elsewhere. (trial, range, 2 n)."""
+    """The cells within `half` (trial,) of the peak of each row, the peak in front, zeros elsewhere.
+
+    (trial, range, 2 n).
+    """
     padded = view.image.shape[-1]
     reach = min(int(half.max()), padded // 2 - 1)
     offsets = torch.arange(-reach, reach + 1, device=view.peak.device)
@@ -195,27 +236,37 @@ def _windowed(view: _View, half: Tensor) -> Tensor:
     near = view.image.gather(-1, cells)
     if bool((half < reach).any()):
         near = near * (offsets.abs() <= half[:, None, None])
-    return torch.cat([near[..., reach:], near.new_zeros((*near.shape[:-1], padded - 2 * reach - 1)), near[..., :reach]], -1)
+    return torch.cat(
+        [near[..., reach:], near.new_zeros((*near.shape[:-1], padded - 2 * reach - 1)), near[..., :reach]], -1
+    )
 
 
 def _entropy(power: Tensor) -> Tensor:
     """Entropy of images by their powers (trial, range, Doppler), (trial,)."""
     total = power.sum((-2, -1))
     tiny = torch.finfo(power.dtype).tiny
-    return torch.log(total.clamp_min(tiny)) - (power * torch.log(power.clamp_min(tiny))).sum((-2, -1)) / torch.where(total > 0, total, 1)
+    return torch.log(total.clamp_min(tiny)) - (power * torch.log(power.clamp_min(tiny))).sum((-2, -1)) / torch.where(
+        total > 0, total, 1
+    )
 
 
 def _profile(view: _View) -> Tensor:
-    """Power about the peaks summed over rows and over the cells of the padding, peak first, (trial, n)."""
+    """Power about the peaks summed over rows and over the cells of the padding, peak first, (trial,
+    n).
+    """
     padded = view.power.shape[-1]
     index = torch.remainder(torch.arange(0, padded, _PADDING, device=view.peak.device) + view.peak[..., None], padded)
     return view.power.gather(-1, index).sum(-2)
 
 
 def _fraction(view: _View) -> Tensor:
-    """Offset of the interpolated peak from the strongest cell, in cells of the padded image, (trial, range): a parabola through three amplitudes."""
+    """Offset of the interpolated peak from the strongest cell, in cells of the padded image,
+    (trial, range): a parabola through three amplitudes.
+    """
     padded = view.power.shape[-1]
-    low, top, high = (view.power.gather(-1, torch.remainder(view.peak[..., None] + d, padded))[..., 0].sqrt() for d in (-1, 0, 1))
+    low, top, high = (
+        view.power.gather(-1, torch.remainder(view.peak[..., None] + d, padded))[..., 0].sqrt() for d in (-1, 0, 1)
+    )
     bend = low - 2 * top + high
     return torch.where(bend < 0, 0.5 * (low - high) / torch.where(bend < 0, bend, -1), 0).clamp(-0.5, 0.5)
 
@@ -239,7 +290,9 @@ def _lumv(g: Tensor, view: _View, present: Tensor) -> Tensor:
 
 
 def _eigenvector(g: Tensor, view: _View, present: Tensor) -> Tensor:
-    """Phase of the first eigenvector of the sum over rows of g g^H, by power steps from the flat phase."""
+    """Phase of the first eigenvector of the sum over rows of g g^H, by power steps from the flat
+    phase.
+    """
     g = _centred(g, view, present)
     v = torch.ones_like(g[:, 0])
     for _ in range(_POWER_STEPS):
@@ -248,7 +301,9 @@ def _eigenvector(g: Tensor, view: _View, present: Tensor) -> Tensor:
 
 
 def _synchronised(g: Tensor, view: _View, present: Tensor) -> Tensor:
-    """As the eigenvector, but of unit modulus in every step: the phases that make the rows most coherent over the aperture."""
+    """As the eigenvector, but of unit modulus in every step: the phases that make the rows most
+    coherent over the aperture.
+    """
     g = _centred(g, view, present)
     v = torch.ones_like(g[:, 0])
     for _ in range(_POWER_STEPS):
@@ -258,9 +313,15 @@ def _synchronised(g: Tensor, view: _View, present: Tensor) -> Tensor:
 
 
 def _centred(g: Tensor, view: _View, present: Tensor) -> Tensor:
-    """The rows with their interpolated peaks at zero Doppler: kernels that are coherent over the aperture need it. Lost pulses are left out."""
+    """The rows with their interpolated peaks at zero Doppler: kernels that are coherent over the
+    aperture need it. Lost pulses are left out.
+    """
     k = torch.arange(g.shape[-1], dtype=torch.float64, device=g.device)
-    return g * unit_phasor(-(_fraction(view) / view.power.shape[-1])[..., None].double() * k, g.dtype) * present[:, None, :]
+    return (
+        g
+        * unit_phasor(-(_fraction(view) / view.power.shape[-1])[..., None].double() * k, g.dtype)
+        * present[:, None, :]
+    )
 
 
 def _covariance_times(g: Tensor, v: Tensor) -> Tensor:

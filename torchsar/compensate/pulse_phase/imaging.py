@@ -1,4 +1,6 @@
-"""Linear image formation as an autofocus sees it: forward, adjoint, and how a phase per pulse enters."""
+"""Linear image formation as an autofocus sees it: forward, adjoint, and how a phase per pulse
+enters.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,10 @@ from torch import Tensor
 
 
 class Imaging(Protocol):
-    """A linear operator from pulses (trial, range, pulse) to an image, with its adjoint. Scale is of no account."""
+    """A linear operator from pulses (trial, range, pulse) to an image, with its adjoint.
+
+    Scale is of no account.
+    """
 
     def image(self, rows: Tensor, /) -> Tensor: ...
 
@@ -17,9 +22,11 @@ class Imaging(Protocol):
 
 
 class AlongPulses:
-    """Fourier transform along pulses, each range cell for itself: the image of a target that turns by little.
+    """Fourier transform along pulses, each range cell for itself: the image of a target that turns
+    by little.
 
-    oversampling: zero-padding of the transform. Image: (trial, range, Doppler) in FFT order; with oversampling 1 the operator is unitary.
+    oversampling: zero-padding of the transform. Image: (trial, range, Doppler) in FFT order; with
+    oversampling 1 the operator is unitary.
     """
 
     def __init__(self, oversampling: int = 1) -> None:
@@ -34,11 +41,16 @@ class AlongPulses:
 
 
 class Through:
-    """Any linear image formation of (..., pulse, range) profiles, such as `torchsar.focus.PolarOperator`, given as an object with image and adjoint."""
+    """Any linear image formation of (..., pulse, range) profiles, such as
+    `torchsar.focus.PolarOperator`, given as an object with image and adjoint.
+    """
 
     def __init__(self, operator: Imaging) -> None:
         if not (hasattr(operator, "image") and hasattr(operator, "adjoint")):
-            raise TypeError(f"imaging must have `image` and `adjoint`, as torchsar.focus.PolarOperator, got {type(operator).__name__}")
+            raise TypeError(
+                "imaging must have `image` and `adjoint`, as torchsar.focus.PolarOperator, got "
+                f"{type(operator).__name__}"
+            )
         self.operator = operator
 
     def image(self, rows: Tensor) -> Tensor:

@@ -32,30 +32,49 @@ def autofocus(
     tolerance_rad: float = 1e-3,
     imaging: Imaging | None = None,
 ) -> Estimate:
-    """The recommended autofocus, with value["phase_rad"] (..., pulse) to be removed. data: (..., pulse, range) complex, range-compressed and aligned.
+    """The recommended autofocus, with value["phase_rad"] (..., pulse) to be removed.
 
-    Adjacent pulses (`sca`), then the entropy fixed point with one low floor (for six iterations a higher one, where noise is weak) until a trial stands
-    still (at most about `search` iterations: hard cases of low SNR use them), then at most `polish` iterations against a Wiener estimate of the scene on
-    an image of twice as many cells, which lowers the floor that the entropy leaves by half and more. start: (..., pulse) rad, by default that of
-    `sca`, with which the result is equivariant: any phase per pulse is removed, whatever its size.
+    data: (..., pulse, range) complex, range-compressed and aligned.
 
-    imaging: an image formation in which scatterers keep still where they migrate through range cells here, see `entropy_fixed_point`. It tells
-    the slope of the phase over pulses as well, since an image in a wrong place migrates wrongly: after the steps above, 48 slopes over one turn a pulse are
-    tried, the best refined, and both kinds of iterations run through `imaging`. Its image must cover the whole unambiguous cross range.
+    Adjacent pulses (`sca`), then the entropy fixed point with one low floor (for six iterations a
+    higher one, where noise is weak) until a trial stands still (at most about `search` iterations:
+    hard cases of low SNR use them), then at most `polish` iterations against a Wiener estimate of
+    the scene on an image of twice as many cells, which lowers the floor that the entropy leaves by
+    half and more. start: (..., pulse) rad, by default that of `sca`, with which the result is
+    equivariant: any phase per pulse is removed, whatever its size.
 
-    std: from two halves of the rows, close to the true error on targets of points. ok is False for noise, for images no sharper than
-    noise can be made, and for one row alone. Differentiable without `imaging`. Raises TypeError or ValueError for samples that are not finite and complex, or a start of another shape.
+    imaging: an image formation in which scatterers keep still where they migrate through range
+    cells here, see `entropy_fixed_point`. It tells the slope of the phase over pulses as well,
+    since an image in a wrong place migrates wrongly: after the steps above, 48 slopes over one turn
+    a pulse are tried, the best refined, and both kinds of iterations run through `imaging`. Its
+    image must cover the whole unambiguous cross range.
+
+    std: from two halves of the rows, close to the true error on targets of points. ok is False for
+    noise, for images no sharper than noise can be made, and for one row alone. Differentiable
+    without `imaging`. Raises TypeError or ValueError for samples that are not finite and complex,
+    or a start of another shape.
     """
     pulses = prepare(data, "autofocus")
     refuse_odd_counts("autofocus", 0, search=search, polish=polish)
     again = Run(Wiener(), AlongPulses(2), 6, 1.0, tolerance_rad)
 
     def runs(coarse: Imaging, fine: Imaging) -> list[Run]:
-        return [Run(LogAbove(_FLOOR), coarse, search, _RELAXATION, search_tolerance_rad), Run(Wiener(), fine, polish, 1.0, tolerance_rad)]
+        return [
+            Run(LogAbove(_FLOOR), coarse, search, _RELAXATION, search_tolerance_rad),
+            Run(Wiener(), fine, polish, 1.0, tolerance_rad),
+        ]
 
     def find(rows: Tensor, present: Tensor, begin: Tensor | None) -> Found:
-        first = Run(LogAbove(_first_floor(rows)), AlongPulses(), min(search, _FIRST_ITERATIONS), _RELAXATION, search_tolerance_rad)
-        phase, taken = in_turn(rows, pair_phase(rows, present) if begin is None else begin, [first, *runs(AlongPulses(), AlongPulses(2))])
+        first = Run(
+            LogAbove(_first_floor(rows)),
+            AlongPulses(),
+            min(search, _FIRST_ITERATIONS),
+            _RELAXATION,
+            search_tolerance_rad,
+        )
+        phase, taken = in_turn(
+            rows, pair_phase(rows, present) if begin is None else begin, [first, *runs(AlongPulses(), AlongPulses(2))]
+        )
         if imaging is not None:
             through = Through(imaging)
             phase, more = _Placed(through, runs(through, through))(rows, phase)
@@ -66,9 +85,11 @@ def autofocus(
 
 
 def _first_floor(rows: Tensor) -> Tensor:
-    """Floor of the first iterations, (trial, 1, 1): higher where less than half of the range cells hold the energy, that is little of it is noise.
+    """Floor of the first iterations, (trial, 1, 1): higher where less than half of the range cells
+    hold the energy, that is little of it is noise.
 
-    From there, a low floor ends in a wrong minimum in one scene of two hundred; in much noise, a high one hides the target.
+    From there, a low floor ends in a wrong minimum in one scene of two hundred; in much noise, a
+    high one hides the target.
     """
     energy = (rows.detach().real.square() + rows.detach().imag.square()).sum(-1)
     share = energy / energy.sum(-1, keepdim=True).clamp_min(torch.finfo(energy.dtype).tiny)
@@ -78,7 +99,9 @@ def _first_floor(rows: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class _Placed:
-    """Slope and phase through an image formation in which scatterers do not migrate: the slope over a turn, the phase, the slope again, the phase."""
+    """Slope and phase through an image formation in which scatterers do not migrate: the slope over
+    a turn, the phase, the slope again, the phase.
+    """
 
     through: Through
     runs: list[Run]
@@ -95,7 +118,9 @@ class _Placed:
 
     @torch.no_grad()
     def _best_slope(self, rows: Tensor, phase: Tensor, step_rad: float, count: int) -> Tensor:
-        """The phase with the one of `count` slopes (rad per pulse) about its own that gives the least entropy, per trial."""
+        """The phase with the one of `count` slopes (rad per pulse) about its own that gives the
+        least entropy, per trial.
+        """
         n = rows.shape[-1]
         ramp = torch.arange(n, dtype=phase.dtype, device=phase.device) - (n - 1) / 2
         best, least = phase, torch.full_like(phase[:, 0], torch.inf)

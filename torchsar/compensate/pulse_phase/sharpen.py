@@ -1,4 +1,6 @@
-"""Fixed points that sharpen the image: entropy (EFP), and the phase of each pulse against a Wiener estimate of the scene from the others."""
+"""Fixed points that sharpen the image: entropy (EFP), and the phase of each pulse against a Wiener
+estimate of the scene from the others.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +21,11 @@ Weights = Callable[[Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Run:
-    """Fixed-point iterations with one kind of weights: weights(power, its mean) -> real weights of the cells.
+    """Fixed-point iterations with one kind of weights: weights(power, its mean) -> real weights of
+    the cells.
 
-    relaxation: share of the phase step that is taken. A trial ends after `iterations`, or once its step is below tolerance_rad (rms over its pulses).
+    relaxation: share of the phase step that is taken. A trial ends after `iterations`, or once its
+    step is below tolerance_rad (rms over its pulses).
     """
 
     weights: Weights
@@ -32,7 +36,10 @@ class Run:
 
 
 def fixed_point(rows: Tensor, phase: Tensor, run: Run) -> tuple[Tensor, Tensor]:
-    """psi <- psi + relaxation * arg sum_n x conj(A^H (w A x)), x = rows exp(-j psi). Phase (trial, pulse) and iterations taken (trial,)."""
+    """psi <- psi + relaxation * arg sum_n x conj(A^H (w A x)), x = rows exp(-j psi).
+
+    Phase (trial, pulse) and iterations taken (trial,).
+    """
     active = torch.ones_like(phase[:, 0], dtype=torch.bool)
     taken = torch.zeros_like(active, dtype=torch.int64)
     mirrored = rows.conj().resolve_conj()
@@ -47,7 +54,10 @@ def fixed_point(rows: Tensor, phase: Tensor, run: Run) -> tuple[Tensor, Tensor]:
 
 
 def _phase_step(rows: Tensor, mirrored: Tensor, phase: Tensor, run: Run) -> Tensor:
-    """arg sum_n x conj(model), with the turn of x taken out of the sum over rows. mirrored: the conjugate of rows."""
+    """arg sum_n x conj(model), with the turn of x taken out of the sum over rows.
+
+    mirrored: the conjugate of rows.
+    """
     image = run.imaging.image(rotate(rows, phase))
     model = run.imaging.adjoint(weighted(image, run.weights))
     products = mirrored * model if model.requires_grad else model.mul_(mirrored)
@@ -55,7 +65,9 @@ def _phase_step(rows: Tensor, mirrored: Tensor, phase: Tensor, run: Run) -> Tens
 
 
 def weighted(image: Tensor, weights: Weights) -> Tensor:
-    """w(p / mean p) * image with p = |image|^2: real and imaginary parts apart, which on a CPU is three times as fast as complex by real."""
+    """w(p / mean p) * image with p = |image|^2: real and imaginary parts apart, which on a CPU is
+    three times as fast as complex by real.
+    """
     real, imag = image.real.contiguous(), image.imag.contiguous()
     power = torch.addcmul(real * real, imag, imag)
     mean = power.mean((-2, -1), keepdim=True)
@@ -67,7 +79,9 @@ def weighted(image: Tensor, weights: Weights) -> Tensor:
 
 @dataclass(frozen=True)
 class LogAbove:
-    """ln(max(p, floor) / floor): the gradient of the entropy for cells above the floor (times the mean power; a number or (trial, 1, 1)), nothing below it."""
+    """ln(max(p, floor) / floor): the gradient of the entropy for cells above the floor (times the
+    mean power; a number or (trial, 1, 1)), nothing below it.
+    """
 
     floor: float | Tensor
 
@@ -77,10 +91,12 @@ class LogAbove:
 
 @dataclass(frozen=True)
 class Wiener:
-    """(p / (p + level * mean p))^2 of powers averaged over three range cells, less the mean of its row.
+    """(p / (p + level * mean p))^2 of powers averaged over three range cells, less the mean of its
+    row.
 
-    Small where a cell holds no more than noise, constant where it holds much: a Wiener filter with the local power as its prior. Without its mean the
-    filter leaves a pulse out of the scene that it is compared with, to first order, and steps need no relaxation.
+    Small where a cell holds no more than noise, constant where it holds much: a Wiener filter with
+    the local power as its prior. Without its mean the filter leaves a pulse out of the scene that
+    it is compared with, to first order, and steps need no relaxation.
     """
 
     level: float = 2.0
@@ -102,18 +118,25 @@ def entropy_fixed_point(
     tolerance_rad: float = 1e-3,
     imaging: Imaging | None = None,
 ) -> Estimate:
-    """Entropy fixed point (brief 002, section 7), with value["phase_rad"] (..., pulse) to be removed. data: (..., pulse, range) complex.
+    """Entropy fixed point (brief 002, section 7), with value["phase_rad"] (..., pulse) to be
+    removed. data: (..., pulse, range) complex.
 
-    Image, weights ln(max(p, floor) / floor) of its cells (p over its mean), back to pulses, phase of each pulse against that: two transforms an
-    iteration, no peaks, no windows. start: (..., pulse) rad, by default that of `sca`, with which the result is equivariant. floors: (floor,
-    iterations) one after another; a trial passes on to the next once its steps are below tolerance_rad rms. relaxation: over 1 it helps past local
-    minima, 2 or more need not converge. imaging: the image formation to sharpen, by default a transform along pulses; any object with `image` and
-    `adjoint` of (..., pulse, range) profiles, such as `torchsar.focus.PolarOperator`. Differentiable. Raises TypeError or ValueError for samples
-    that are not finite and complex, a start of another shape, floors that are not positive.
+    Image, weights ln(max(p, floor) / floor) of its cells (p over its mean), back to pulses, phase
+    of each pulse against that: two transforms an iteration, no peaks, no windows. start: (...,
+    pulse) rad, by default that of `sca`, with which the result is equivariant. floors: (floor,
+    iterations) one after another; a trial passes on to the next once its steps are below
+    tolerance_rad rms. relaxation: over 1 it helps past local minima, 2 or more need not converge.
+    imaging: the image formation to sharpen, by default a transform along pulses; any object with
+    `image` and `adjoint` of (..., pulse, range) profiles, such as `torchsar.focus.PolarOperator`.
+    Differentiable. Raises TypeError or ValueError for samples that are not finite and complex, a
+    start of another shape, floors that are not positive.
     """
     pulses = prepare(data, "entropy_fixed_point")
     if not floors or not all(floor > 0 and count >= 1 for floor, count in floors) or not 0 < relaxation < 2:
-        raise ValueError(f"entropy_fixed_point needs floors above 0 with one iteration or more each and a relaxation in 0..2, got {list(floors)} and {relaxation}")
+        raise ValueError(
+            "entropy_fixed_point needs floors above 0 with one iteration or more each and a "
+            f"relaxation in 0..2, got {list(floors)} and {relaxation}"
+        )
     operator = AlongPulses() if imaging is None else Through(imaging)
     runs = [Run(LogAbove(floor), operator, count, relaxation, tolerance_rad) for floor, count in floors]
 

@@ -1,4 +1,6 @@
-"""The autofocus family as stages: estimators of `phase_rad` that leave the signal alone, and the corrector that takes it out."""
+"""The autofocus family as stages: estimators of `phase_rad` that leave the signal alone, and the
+corrector that takes it out.
+"""
 
 from __future__ import annotations
 
@@ -18,19 +20,27 @@ from torchsar.core import Estimate, Signal, Stage, real_dtype, refuse_non_finite
 
 
 def correct_pulse_phase(data: Tensor, phase_rad: Tensor) -> Tensor:
-    """data * exp(-j phase). data: (..., pulse, range) complex; phase_rad: (..., pulse) or (pulse,), whole turns of which are dropped in float64.
+    """data * exp(-j phase).
 
-    Differentiable in both (Ruan et al. 2013, text after Eq. 6). Raises ValueError where there is not one phase a pulse.
+    data: (..., pulse, range) complex; phase_rad: (..., pulse) or (pulse,), whole turns of which are
+    dropped in float64.
+
+    Differentiable in both (Ruan et al. 2013, text after Eq. 6). Raises ValueError where there is
+    not one phase a pulse.
     """
     if not isinstance(phase_rad, Tensor) or phase_rad.shape[-1:] != data.shape[-2:-1]:
         got = tuple(phase_rad.shape) if isinstance(phase_rad, Tensor) else type(phase_rad).__name__
-        raise ValueError(f"correct_pulse_phase needs a tensor of one phase per pulse, (..., {data.shape[-2]}), got {got}")
+        raise ValueError(
+            f"correct_pulse_phase needs a tensor of one phase per pulse, (..., {data.shape[-2]}), got {got}"
+        )
     refuse_non_finite(phase_rad, "correct_pulse_phase")
     return rotate(data.mT, on_the_circle(phase_rad.to(torch.float64)).to(real_dtype(data.dtype))).mT
 
 
 class CorrectPulsePhase(Stage):
-    """Takes a phase per pulse out of the data; the value `phase_rad` (..., pulse) comes from an estimator before it."""
+    """Takes a phase per pulse out of the data; the value `phase_rad` (..., pulse) comes from an
+    estimator before it.
+    """
 
     def forward(self, signal: Signal, phase_rad: Tensor) -> Signal:
         return signal.with_data(correct_pulse_phase(signal.data, phase_rad).contiguous())
@@ -53,27 +63,50 @@ def windows_of(windows: Literal["shrinking", "measured"] | list[float]) -> Windo
 
 
 class Pga(Stage):
-    """`pga`: phase gradient autofocus from the data as they are, or from the value `start` (..., pulse) where one is connected."""
+    """`pga`: phase gradient autofocus from the data as they are, or from the value `start` (...,
+    pulse) where one is connected.
+    """
 
     provides = ("phase_rad",)
 
-    def __init__(self, kernel: Kernel = "lumv", windows: Literal["shrinking", "measured"] | list[float] = "shrinking", iterations: int = 20, patience: int = 6) -> None:
+    def __init__(
+        self,
+        kernel: Kernel = "lumv",
+        windows: Literal["shrinking", "measured"] | list[float] = "shrinking",
+        iterations: int = 20,
+        patience: int = 6,
+    ) -> None:
         super().__init__()
         self.kernel: Kernel = kernel
         self.windows, self.iterations, self.patience = windows_of(windows), iterations, patience
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
-        return pga(signal.data, kernel=self.kernel, start=start, windows=self.windows, iterations=self.iterations, patience=self.patience)
+        return pga(
+            signal.data,
+            kernel=self.kernel,
+            start=start,
+            windows=self.windows,
+            iterations=self.iterations,
+            patience=self.patience,
+        )
 
 
 class PgaSca(Pga):
     """`pga_sca`: phase gradient autofocus started from SCA."""
 
-    def __init__(self, kernel: Kernel = "ml", windows: Literal["shrinking", "measured"] | list[float] = "shrinking", iterations: int = 20, patience: int = 6) -> None:
+    def __init__(
+        self,
+        kernel: Kernel = "ml",
+        windows: Literal["shrinking", "measured"] | list[float] = "shrinking",
+        iterations: int = 20,
+        patience: int = 6,
+    ) -> None:
         super().__init__(kernel, windows, iterations, patience)
 
     def forward(self, signal: Signal) -> Estimate:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return pga_sca(signal.data, kernel=self.kernel, windows=self.windows, iterations=self.iterations, patience=self.patience)
+        return pga_sca(
+            signal.data, kernel=self.kernel, windows=self.windows, iterations=self.iterations, patience=self.patience
+        )
 
 
 class EntropyFixedPoint(Stage):
@@ -81,18 +114,31 @@ class EntropyFixedPoint(Stage):
 
     provides = ("phase_rad",)
 
-    def __init__(self, floors: list[float] | tuple[float, ...] = (5.0, 2.0), iterations: list[int] | tuple[int, ...] = (12, 12), relaxation: float = 1.8, imaging: Imaging | None = None) -> None:
+    def __init__(
+        self,
+        floors: list[float] | tuple[float, ...] = (5.0, 2.0),
+        iterations: list[int] | tuple[int, ...] = (12, 12),
+        relaxation: float = 1.8,
+        imaging: Imaging | None = None,
+    ) -> None:
         super().__init__()
         if len(floors) != len(iterations):
-            raise ValueError(f"entropy_fixed_point needs a number of iterations for each floor, got {list(floors)} and {list(iterations)}")
+            raise ValueError(
+                f"entropy_fixed_point needs a number of iterations for each floor, got {list(floors)} "
+                f"and {list(iterations)}"
+            )
         self.schedule, self.relaxation, self.imaging = tuple(zip(floors, iterations)), relaxation, imaging
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
-        return entropy_fixed_point(signal.data, start=start, floors=self.schedule, relaxation=self.relaxation, imaging=self.imaging)
+        return entropy_fixed_point(
+            signal.data, start=start, floors=self.schedule, relaxation=self.relaxation, imaging=self.imaging
+        )
 
 
 class Autofocus(Stage):
-    """`autofocus`, the recommended estimator: adjacent pulses, entropy fixed point, Wiener estimate of the scene."""
+    """`autofocus`, the recommended estimator: adjacent pulses, entropy fixed point, Wiener estimate
+    of the scene.
+    """
 
     provides = ("phase_rad",)
 
@@ -105,11 +151,18 @@ class Autofocus(Stage):
 
 
 class SharpestPhase(Stage):
-    """`sharpest_phase`: the phases of least power or amplitude entropy, or of most contrast, by descent from SCA or the value `start`."""
+    """`sharpest_phase`: the phases of least power or amplitude entropy, or of most contrast, by
+    descent from SCA or the value `start`.
+    """
 
     provides = ("phase_rad",)
 
-    def __init__(self, objective: Literal["power_entropy", "amplitude_entropy", "contrast"] = "power_entropy", method: Literal["lbfgs", "adam"] = "lbfgs", steps: int = 100) -> None:
+    def __init__(
+        self,
+        objective: Literal["power_entropy", "amplitude_entropy", "contrast"] = "power_entropy",
+        method: Literal["lbfgs", "adam"] = "lbfgs",
+        steps: int = 100,
+    ) -> None:
         super().__init__()
         self.objective: Literal["power_entropy", "amplitude_entropy", "contrast"] = objective
         self.method: Literal["lbfgs", "adam"] = method

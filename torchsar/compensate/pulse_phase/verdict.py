@@ -1,4 +1,6 @@
-"""Whether an estimated phase can be believed: how sharp the image became beyond what noise allows, and how well halves of the rows agree."""
+"""Whether an estimated phase can be believed: how sharp the image became beyond what noise allows,
+and how well halves of the rows agree.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,8 @@ from torchsar.compensate.pulse_phase.data import Pulses, rotate
 from torchsar.core import Estimate, block_bytes_of, over_blocks
 from torchsar.metrics.phase import phase_rmse
 
-SPECKLE_NATS = 1 - 0.5772156649015329  # entropy that the exponential distribution of a speckle cell's power lacks
+# entropy that the exponential distribution of a speckle cell's power lacks
+SPECKLE_NATS = 1 - 0.5772156649015329
 LEAST_STREHL = 0.8
 _MARGIN = 1.5
 _LEAST_ROWS = 1.5
@@ -25,10 +28,12 @@ Find = Callable[[Tensor, Tensor, Tensor | None], Found]
 
 
 def sharpness_beyond_speckle(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Entropy (nats) that an image (..., range, Doppler) lacks against speckle of the same row energies, (...,).
+    """Entropy (nats) that an image (..., range, Doppler) lacks against speckle of the same row
+    energies, (...,).
 
-    An image whose rows are circular noise has 0 before any phase is fitted to it. Also returns over how many rows its energy is spread, and over
-    how many rows the sharpness is (1 where one bright row makes all of it).
+    An image whose rows are circular noise has 0 before any phase is fitted to it. Also returns over
+    how many rows its energy is spread, and over how many rows the sharpness is (1 where one bright
+    row makes all of it).
     """
     real, imag = image.real.contiguous(), image.imag.contiguous()
     power = real * real + imag * imag
@@ -44,30 +49,38 @@ def sharpness_beyond_speckle(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def sharpness_of_noise(rows: Tensor) -> Tensor:
-    """The same lack of entropy (nats) that the sharpest image of pure noise reaches, for an effective number of rows.
+    """The same lack of entropy (nats) that the sharpest image of pure noise reaches, for an
+    effective number of rows.
 
-    Measured with the entropy fixed point on circular noise of 4 to 1024 rows and 64 to 1600 pulses (0.94, 0.29, 0.10, 0.045, 0.019 nats at 4, 16,
-    64, 256, 1024 rows; the number of pulses hardly matters); this fit is within 15 %.
+    Measured with the entropy fixed point on circular noise of 4 to 1024 rows and 64 to 1600 pulses
+    (0.94, 0.29, 0.10, 0.045, 0.019 nats at 4, 16, 64, 256, 1024 rows; the number of pulses hardly
+    matters); this fit is within 15 %.
     """
     return 0.62 / torch.sqrt(rows) + 2.1 / rows
 
 
 def occupied_band(rows: Tensor) -> Tensor:
-    """Share of the range band that rows (trial, range, pulse) fill, (trial,): 1 / 4 of them are independent in noise that is sampled four times too finely."""
+    """Share of the range band that rows (trial, range, pulse) fill, (trial,): 1 / 4 of them are
+    independent in noise that is sampled four times too finely.
+    """
     spectrum = torch.fft.fft(rows, dim=-2)
     density = (spectrum.real.square() + spectrum.imag.square()).mean(-1, dtype=torch.float64)
     return torch.where(density.sum(-1) > 0, density.mean(-1).square() / _or_one(density.square().mean(-1)), 1)
 
 
 def estimated(pulses: Pulses, start: Tensor | None, find: Find, at_rest: bool = False) -> Estimate:
-    """Find a phase and judge it, by blocks of trials that stay in the cache (all at once where gradients are wanted).
+    """Find a phase and judge it, by blocks of trials that stay in the cache (all at once where
+    gradients are wanted).
 
-    find(rows, present, start): phase (trial, pulse), iterations taken (trial,), and `again`: what a method finds from some of the rows beginning with
-    a phase. It is run on two halves of the rows, dealt out by their energy, whose noise is independent (less so where range is sampled finer than the band
-    asks for, which `occupied_band` makes up for): half of the difference of both, and how far
-    it moves away on all rows (nothing where the phase is at_rest under it), make the predicted deviation. ok: the image is 1.5 times sharper
-    than noise can be made, more than one row carries it, and the deviation promises a Strehl ratio of 0.8. quality: that ratio, times the share
-    of the sharpness that noise does not explain. A pulse without samples has no phase of its own and is marked in info["present"].
+    find(rows, present, start): phase (trial, pulse), iterations taken (trial,), and `again`: what a
+    method finds from some of the rows beginning with a phase. It is run on two halves of the rows,
+    dealt out by their energy, whose noise is independent (less so where range is sampled finer than
+    the band asks for, which `occupied_band` makes up for): half of the difference of both, and how
+    far it moves away on all rows (nothing where the phase is at_rest under it), make the predicted
+    deviation. ok: the image is 1.5 times sharper than noise can be made, more than one row carries
+    it, and the deviation promises a Strehl ratio of 0.8. quality: that ratio, times the share of
+    the sharpness that noise does not explain. A pulse without samples has no phase of its own and
+    is marked in info["present"].
     """
     rows, present = pulses.rows, pulses.present
     if not len(rows) or pulses.n < 3:
@@ -87,7 +100,9 @@ def estimated(pulses: Pulses, start: Tensor | None, find: Find, at_rest: bool = 
 
 
 def _judged(rows: Tensor, present: Tensor, start: Tensor | None, find: Find, at_rest: bool) -> tuple[Tensor, ...]:
-    """Phase, iterations, sharpness, rows of the energy and of the sharpness, deviation of every trial."""
+    """Phase, iterations, sharpness, rows of the energy and of the sharpness, deviation of every
+    trial.
+    """
     phase, taken, again = find(rows, present, start)
     with torch.no_grad():
         sharp, effective, telling = sharpness_beyond_speckle(torch.fft.fft(rotate(rows, phase), norm="ortho"))
@@ -113,31 +128,46 @@ def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
     quality = torch.where(learnable, promised * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1)), 0)
     ok = learnable & (sharp > _MARGIN * noise) & (telling > _LEAST_ROWS) & (promised > LEAST_STREHL)
     phase = torch.where(learnable[:, None], phase, 0)
-    info = {"iterations": taken, "sharpness_nats": sharp, "noise_sharpness_nats": noise, "effective_rows": effective, "telling_rows": telling}
+    info = {
+        "iterations": taken,
+        "sharpness_nats": sharp,
+        "noise_sharpness_nats": noise,
+        "effective_rows": effective,
+        "telling_rows": telling,
+    }
     std = deviation[:, None].expand(-1, pulses.n).to(phase.dtype)
     return Estimate(
         value={"phase_rad": phase.reshape(*shape, pulses.n)},
         std={"phase_rad": std.reshape(*shape, pulses.n)},
         quality=quality.reshape(shape).to(phase.dtype),
         ok=ok.reshape(shape),
-        info={"present": present.reshape(*shape, pulses.n), **{name: value.reshape(shape) for name, value in info.items()}},
+        info={
+            "present": present.reshape(*shape, pulses.n),
+            **{name: value.reshape(shape) for name, value in info.items()},
+        },
     )
 
 
 def _disagreement(rows: Tensor, present: Tensor, phase: Tensor, again: Again) -> Tensor:
-    """Half of the rms difference (rad) between the phases from two halves of the rows, (trial,); pi / sqrt(3) where there is but one."""
+    """Half of the rms difference (rad) between the phases from two halves of the rows, (trial,); pi
+    / sqrt(3) where there is but one.
+    """
     if rows.shape[-2] < 2:
         return torch.full(rows.shape[:1], math.pi / math.sqrt(3), dtype=torch.float64, device=rows.device)
     order = (rows.real.square() + rows.imag.square()).sum(-1).argsort(-1, descending=True)
     halves = (order[:, part::2].sort(-1).values for part in (0, 1))
-    one, other = (again(rows.gather(1, half[..., None].expand(-1, -1, rows.shape[-1])), present, phase) for half in halves)
+    one, other = (
+        again(rows.gather(1, half[..., None].expand(-1, -1, rows.shape[-1])), present, phase) for half in halves
+    )
     return phase_rmse(one, other, present) / 2
 
 
 def _drift(rows: Tensor, present: Tensor, phase: Tensor, again: Again) -> Tensor:
-    """How far (rad rms) `again` moves a phase on all rows, (trial,): once, then on while it goes far and the phase might still pass as good.
+    """How far (rad rms) `again` moves a phase on all rows, (trial,): once, then on while it goes
+    far and the phase might still pass as good.
 
-    Dense targets move slowly: PGA on 256 scatterers a row errs by 0.8 rad, of which the first round shows 0.3.
+    Dense targets move slowly: PGA on 256 scatterers a row errs by 0.8 rad, of which the first round
+    shows 0.3.
     """
     place, total = phase, torch.zeros(len(phase), dtype=torch.float64, device=phase.device)
     going = torch.ones_like(total, dtype=torch.bool)

@@ -1,4 +1,6 @@
-"""Radial motion of a triangular-FMCW ladar: velocities at turning points from up and down sweeps, and what takes the motion out (system 000)."""
+"""Radial motion of a triangular-FMCW ladar: velocities at turning points from up and down sweeps,
+and what takes the motion out (system 000).
+"""
 
 from torchsar.compensate.radial.bands import Bands, bands_of
 from torchsar.compensate.radial.compensate import compensate_motion
@@ -9,7 +11,17 @@ from torchsar.compensate.radial.peak import ml_peak
 from torchsar.compensate.radial.polish import phase_polish
 from torchsar.compensate.radial.recommended import radial_motion, range_error
 from torchsar.compensate.radial.segmented import segmented_interference
-from torchsar.compensate.radial.stages import CompensateMotion, EqualisePulses, MirrorProduct, MlPeak, PhasePolish, PulseGain, RadialMotion, SegmentedInterference, SpectrumCorrelation
+from torchsar.compensate.radial.stages import (
+    CompensateMotion,
+    EqualisePulses,
+    MirrorProduct,
+    MlPeak,
+    PhasePolish,
+    PulseGain,
+    RadialMotion,
+    SegmentedInterference,
+    SpectrumCorrelation,
+)
 from torchsar.compensate.radial.trajectory import geometric_velocity_m_s, integrated_range, sweep_motion, turning_points
 
 __all__ = [

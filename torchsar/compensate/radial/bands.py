@@ -1,4 +1,6 @@
-"""Up sweeps and mirrored down sweeps of a window of ranges, on few samples and with the bulk of the Doppler shift taken out."""
+"""Up sweeps and mirrored down sweeps of a window of ranges, on few samples and with the bulk of the
+Doppler shift taken out.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,8 @@ from torchsar.core import Axis, cis, real_dtype, refuse_non_finite
 from torchsar.radar import TriangularLadar
 
 _BLOCK = 8
-# likeness of envelopes that noise alone does not reach, and share of the usual energy below which a period shows no echo
+# likeness of envelopes that noise alone does not reach, and share of the usual energy below which a
+# period shows no echo
 _ALIKE, _FAINT = 0.35, 0.3
 # likeness of the envelopes of one period that is trusted against that of its neighbours
 _SURELY_ALIKE = 0.7
@@ -22,14 +25,18 @@ _FURTHEST = 14
 
 @dataclass(frozen=True)
 class Bands:
-    """Both sweeps of every period as the window of ranges makes them, without the Doppler shift of a whole number of bins.
+    """Both sweeps of every period as the window of ranges makes them, without the Doppler shift of
+    a whole number of bins.
 
-    up, down: (..., pulse, m) samples over the sweep at `time_s` (m,), symmetric about its middle. up is up(u) exp(-2j pi s u / T) and down is the
-    MIRRORED sweep down(-u) exp(+2j pi s u / T), in the sign of the paper ("lo_conj_echo"), each filtered to the lines of the window, times a power of two
-    of the trial that brings samples to about one. Both then have the beat of the range plus and minus what is left of the Doppler shift, within about a bin of it, and the residual video phase is
-    removed unless it was to be kept. shift: (..., pulse) int64, s. lit: (..., pulse) bool, False where no echo is
-    seen and the shift is that of the neighbours. lines: number of kept bins; first: beat of the first of them in bins of 1 / T; noise_lines: how
-    many unfiltered lines let as much noise through.
+    up, down: (..., pulse, m) samples over the sweep at `time_s` (m,), symmetric about its middle.
+    up is up(u) exp(-2j pi s u / T) and down is the MIRRORED sweep down(-u) exp(+2j pi s u / T), in
+    the sign of the paper ("lo_conj_echo"), each filtered to the lines of the window, times a power
+    of two of the trial that brings samples to about one. Both then have the beat of the range plus
+    and minus what is left of the Doppler shift, within about a bin of it, and the residual video
+    phase is removed unless it was to be kept. shift: (..., pulse) int64, s. lit: (..., pulse) bool,
+    False where no echo is seen and the shift is that of the neighbours. lines: number of kept bins;
+    first: beat of the first of them in bins of 1 / T; noise_lines: how many unfiltered lines let as
+    much noise through.
     """
 
     up: Tensor
@@ -59,41 +66,69 @@ class Bands:
 
 
 def canonical(sweeps: Tensor, radar: TriangularLadar) -> Tensor:
-    """The sweeps in the sign of the paper: a scatterer beyond the reference has a positive beat in the up sweep."""
+    """The sweeps in the sign of the paper: a scatterer beyond the reference has a positive beat in
+    the up sweep.
+    """
     return sweeps.conj() if radar.dechirp_sign == "echo_conj_lo" else sweeps
 
 
 def refuse_other_sweeps(sweeps: Tensor, radar: TriangularLadar, what: str, pulse: Axis | None = None) -> None:
-    """Raise TypeError or ValueError unless sweeps is finite and complex (..., 2, pulse, N) with the N of the radar, and as many periods as the axis."""
+    """Raise TypeError or ValueError unless sweeps is finite and complex (..., 2, pulse, N) with the
+    N of the radar, and as many periods as the axis.
+    """
     n = radar.sweep_samples
     if not (isinstance(sweeps, Tensor) and sweeps.is_complex()):
-        raise TypeError(f"{what} works on complex sweeps (..., 2, pulse, {n}), got {getattr(sweeps, 'dtype', type(sweeps).__name__)}; split the record of a real detector first")
+        raise TypeError(
+            f"{what} works on complex sweeps (..., 2, pulse, {n}), got "
+            f"{getattr(sweeps, 'dtype', type(sweeps).__name__)}; split the record of a real "
+            "detector first"
+        )
     if sweeps.ndim < 3 or sweeps.shape[-3] != 2 or sweeps.shape[-1] != n or sweeps.shape[-2] < 1:
-        raise ValueError(f"{what} works on sweeps (..., 2, pulse, {n}), up before down, got shape {tuple(sweeps.shape)}")
+        raise ValueError(
+            f"{what} works on sweeps (..., 2, pulse, {n}), up before down, got shape {tuple(sweeps.shape)}"
+        )
     if pulse is not None and pulse.n != sweeps.shape[-2]:
-        raise ValueError(f"{what}: the axis has {pulse.n} periods, the sweeps have {sweeps.shape[-2]}; take the pulse axis of the signal")
+        raise ValueError(
+            f"{what}: the axis has {pulse.n} periods, the sweeps have {sweeps.shape[-2]}; take "
+            "the pulse axis of the signal"
+        )
     refuse_non_finite(sweeps, what)
 
 
 def window_lines(radar: TriangularLadar, window_m: tuple[float, float] | None) -> tuple[int, int]:
-    """First beat bin and number of bins of a window of relative ranges; the whole band for None. Raises ValueError for a window that is none."""
+    """First beat bin and number of bins of a window of relative ranges; the whole band for None.
+
+    Raises ValueError for a window that is none.
+    """
     n = radar.sweep_samples
     if window_m is None:
         return -(n // 2), n
     low, high = (float(edge) for edge in window_m)
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise ValueError(f"window_m must be two relative ranges (low, high) in metres with low < high, got {tuple(window_m)}")
+        raise ValueError(
+            f"window_m must be two relative ranges (low, high) in metres with low < high, got {tuple(window_m)}"
+        )
     first, last = round(low / radar.range_step_m), round(high / radar.range_step_m)
     limit = n // 2
     if first < -limit or last >= limit:
-        raise ValueError(f"window_m {tuple(window_m)} reaches beyond the beat band of +-{limit * radar.range_step_m:.4g} m; make it smaller")
+        raise ValueError(
+            f"window_m {tuple(window_m)} reaches beyond the beat band of "
+            f"+-{limit * radar.range_step_m:.4g} m; make it smaller"
+        )
     if last - first + 1 < 4:
-        raise ValueError(f"window_m {tuple(window_m)} holds {last - first + 1} range cells of {radar.range_step_m:.3g} m; make it 4 cells or wider")
+        raise ValueError(
+            f"window_m {tuple(window_m)} holds {last - first + 1} range cells of "
+            f"{radar.range_step_m:.3g} m; make it 4 cells or wider"
+        )
     return first, last - first + 1
 
 
-def inside(radar: TriangularLadar, window_m: tuple[float, float] | None, bins: int, per_line: float, device: torch.device) -> Tensor:
-    """Mask (bins,) of a transform's bins, `per_line` of them a range cell and zero frequency first, that lie in a window of relative ranges."""
+def inside(
+    radar: TriangularLadar, window_m: tuple[float, float] | None, bins: int, per_line: float, device: torch.device
+) -> Tensor:
+    """Mask (bins,) of a transform's bins, `per_line` of them a range cell and zero frequency first,
+    that lie in a window of relative ranges.
+    """
     first, lines = window_lines(radar, window_m)
     at = torch.arange(bins, device=device)
     at = torch.where(at >= bins // 2, at - bins, at) / per_line
@@ -101,11 +136,14 @@ def inside(radar: TriangularLadar, window_m: tuple[float, float] | None, bins: i
 
 
 def bulk_shift(blocks: Tensor, pulses: int) -> tuple[Tensor, Tensor]:
-    """Doppler shift of every period in whole bins, and whether an echo is there to tell it: (..., pulse) int64 and bool.
+    """Doppler shift of every period in whole bins, and whether an echo is there to tell it: (...,
+    pulse) int64 and bool.
 
-    blocks: (..., 2, block, N) power spectra, zero frequency first, the down sweep as recorded, mean over 8 periods each (the last over what is left). The lag that
-    makes up and down envelopes meet is 2 fd (brief 000, section 5.4). Lags beyond half the band, which a circular correlation
-    would wrap, are told apart. Periods in which the envelopes do not resemble each other take the shift of their neighbours.
+    blocks: (..., 2, block, N) power spectra, zero frequency first, the down sweep as recorded, mean
+    over 8 periods each (the last over what is left). The lag that makes up and down envelopes meet
+    is 2 fd (brief 000, section 5.4). Lags beyond half the band, which a circular correlation would
+    wrap, are told apart. Periods in which the envelopes do not resemble each other take the shift
+    of their neighbours.
     """
     n = blocks.shape[-1]
     blocks = torch.stack([blocks[..., 0, :, :], blocks[..., 1, :, :].roll(-1, -1).flip(-1)], -3)
@@ -119,11 +157,15 @@ def bulk_shift(blocks: Tensor, pulses: int) -> tuple[Tensor, Tensor]:
     lag = torch.where(lag >= n, lag - 2 * n, lag).to(torch.float64)
     alike = likeness > _ALIKE
     lag = filled(_median_of_three(filled(lag, alike)), alike)
-    return torch.round(_through_blocks(lag, pulses) / 2).to(torch.int64), alike.repeat_interleave(_BLOCK, -1)[..., :pulses]
+    return torch.round(_through_blocks(lag, pulses) / 2).to(torch.int64), alike.repeat_interleave(_BLOCK, -1)[
+        ..., :pulses
+    ]
 
 
 def filled(values: Tensor, known: Tensor) -> Tensor:
-    """values (..., n) with those that are not known interpolated between their known neighbours, held at the ends; as they are where none is known."""
+    """values (..., n) with those that are not known interpolated between their known neighbours,
+    held at the ends; as they are where none is known.
+    """
     n = values.shape[-1]
     index = torch.arange(n, device=values.device).expand(values.shape)
     known = torch.where(known.any(-1, keepdim=True), known, True)
@@ -143,7 +185,9 @@ def _median_of_three(x: Tensor) -> Tensor:
 
 
 def _through_blocks(values: Tensor, pulses: int) -> Tensor:
-    """Values (..., block) in the middles of blocks of periods as straight lines over the periods, (..., pulse): the first and the last line go on to the ends."""
+    """Values (..., block) in the middles of blocks of periods as straight lines over the periods,
+    (..., pulse): the first and the last line go on to the ends.
+    """
     if values.shape[-1] == 1:
         return values.expand(*values.shape[:-1], pulses)
     first = torch.arange(0, pulses, _BLOCK, dtype=torch.float64, device=values.device)
@@ -154,12 +198,23 @@ def _through_blocks(values: Tensor, pulses: int) -> Tensor:
     return values[..., low] * (1 - share) + values[..., low + 1] * share
 
 
-def bands_of(sweeps: Tensor, radar: TriangularLadar, window_m: tuple[float, float] | None = None, taper: float = 1.0, oversampling: int = 1, video: bool = False) -> Bands:
-    """Bands of a window of relative ranges (m), the whole band for None. sweeps: (..., 2, pulse, N) as recorded. Differentiable but for the shift.
+def bands_of(
+    sweeps: Tensor,
+    radar: TriangularLadar,
+    window_m: tuple[float, float] | None = None,
+    taper: float = 1.0,
+    oversampling: int = 1,
+    video: bool = False,
+) -> Bands:
+    """Bands of a window of relative ranges (m), the whole band for None.
 
-    taper: share of the window that its raised-cosine edges take; 0 cuts sharply, which leaves ringing at the ends of the sweep (the error floor
-    of a mirror product at high SNR), 1 makes them meet in the middle. oversampling: samples a line, rounded up to a power of two; products need 2. video: keep the residual
-    video phase, which single scatterers do not mind, and whose filter rings at the ends of the sweep.
+    sweeps: (..., 2, pulse, N) as recorded. Differentiable but for the shift.
+
+    taper: share of the window that its raised-cosine edges take; 0 cuts sharply, which leaves
+    ringing at the ends of the sweep (the error floor of a mirror product at high SNR), 1 makes them
+    meet in the middle. oversampling: samples a line, rounded up to a power of two; products need 2.
+    video: keep the residual video phase, which single scatterers do not mind, and whose filter
+    rings at the ends of the sweep.
     """
     first, lines = window_lines(radar, window_m)
     n = radar.sweep_samples
@@ -170,40 +225,61 @@ def bands_of(sweeps: Tensor, radar: TriangularLadar, window_m: tuple[float, floa
     m = 2 ** max(3, math.ceil(math.log2(oversampling * lines)))
     line = torch.arange(lines, device=sweeps.device)
     sides = torch.stack([shift, -shift], -2)
-    mirror = torch.tensor([1, -1], device=sweeps.device)[:, None, None]  # a mirrored sweep has the mirrored spectrum
+    # a mirrored sweep has the mirrored spectrum
+    mirror = torch.tensor([1, -1], device=sweeps.device)[:, None, None]
     kept = spectrum.gather(-1, mirror * (first + line + sides[..., None]) % n)
     shape = _raised_cosine(line.to(torch.float64), lines, taper if window_m is not None else 0.0)
-    filters = torch.stack([shape.to(kept.dtype) * _line_phase(first, lines, m, sign, not video, radar, kept) for sign in (1, -1)])
-    middle = mirror[..., 0] * (first + sides).to(torch.float64)  # phases refer to the middle of the sweep
+    filters = torch.stack(
+        [shape.to(kept.dtype) * _line_phase(first, lines, m, sign, not video, radar, kept) for sign in (1, -1)]
+    )
+    # phases refer to the middle of the sweep
+    middle = mirror[..., 0] * (first + sides).to(torch.float64)
     turned = cis((math.pi * middle * ((n - 1) / n) % (2 * math.pi)).to(real_dtype(kept.dtype)))
     series = torch.fft.ifft(kept * filters[:, None, :] * (turned * scale[..., 0])[..., None], m) * (m / n)
     beat = _beat_of_first(first, m, sweeps)
     series = series * beat.to(series.dtype)
     time_s = (torch.arange(m, dtype=torch.float64, device=sweeps.device) - (m - 1) / 2) * (radar.sweep_s / m)
     up, down = series[..., 0, :, :], series[..., 1, :, :]
-    return Bands(up, down, time_s, shift, alike & (certain | ~_faint(up, down, alike)), lines, first, float(shape.square().sum()), radar)
+    return Bands(
+        up,
+        down,
+        time_s,
+        shift,
+        alike & (certain | ~_faint(up, down, alike)),
+        lines,
+        first,
+        float(shape.square().sum()),
+        radar,
+    )
 
 
 def _faint(up: Tensor, down: Tensor, alike: Tensor) -> Tensor:
-    """Periods with a sweep of much less energy in the window than others have, (..., pulse) bool: no scatterer is lit in it."""
+    """Periods with a sweep of much less energy in the window than others have, (..., pulse) bool:
+    no scatterer is lit in it.
+    """
     both = torch.stack([(x.detach().real.square() + x.detach().imag.square()).sum(-1) for x in (up, down)])
     usual = torch.where(alike, both.mean(0), torch.nan).nanmedian(-1, keepdim=True).values
     return both.amin(0) < _FAINT * usual
 
 
 def _scale(sweeps: Tensor) -> Tensor:
-    """Power of two (..., 1, 1, 1) that brings samples of a trial to about one, so that their squares neither under- nor overflow. The middle of every sweep tells."""
+    """Power of two (..., 1, 1, 1) that brings samples of a trial to about one, so that their
+    squares neither under- nor overflow. The middle of every sweep tells.
+    """
     middle = sweeps.shape[-1] // 2
     level = torch.view_as_real(sweeps[..., middle - 4 : middle + 4]).abs().amax((-4, -3, -2, -1))[..., None, None, None]
     return torch.where(level > 0, torch.exp2(-torch.round(torch.log2(torch.where(level > 0, level, 1)))), 1)
 
 
 def _block_power(spectrum: Tensor, scale: Tensor) -> Tensor:
-    """Power spectra of Hann-windowed sweeps, mean over blocks of periods: (..., 2, pulse, N) -> (..., 2, block, N).
+    """Power spectra of Hann-windowed sweeps, mean over blocks of periods: (..., 2, pulse, N) ->
+    (..., 2, block, N).
 
     On the bins of a rectangular window, a peak between two of them loses more than half.
     """
-    parts = torch.view_as_real(spectrum).flatten(-2)  # real and imaginary parts in turn: the window is the same for both
+    parts = torch.view_as_real(spectrum).flatten(
+        -2
+    )  # real and imaginary parts in turn: the window is the same for both
     inner = _windowed_power(parts[..., :-4], parts[..., 2:-2], parts[..., 4:], scale)
     first, second, last_but_one, last = parts[..., :2], parts[..., 2:4], parts[..., -4:-2], parts[..., -2:]
     ends = _windowed_power(last, first, second, scale), _windowed_power(last_but_one, last, first, scale)
@@ -217,7 +293,8 @@ def _windowed_power(before: Tensor, here: Tensor, after: Tensor, scale: Tensor) 
 
 
 def _followed(spectrum: Tensor, scale: Tensor, shift: Tensor, first: int, lines: int) -> tuple[Tensor, Tensor]:
-    """The shift of every period corrected by the period's own envelopes, where these resemble each other and meet two bins or more from where they should; and where they do.
+    """The shift of every period corrected by the period's own envelopes, where these resemble each
+    other and meet two bins or more from where they should; and where they do.
 
     Eight periods together see more, one alone follows vibration of a few periods.
     """
@@ -238,8 +315,12 @@ def _followed(spectrum: Tensor, scale: Tensor, shift: Tensor, first: int, lines:
     return shift + torch.where(certain & (lag.abs() >= 2), torch.round(lag / 2).to(torch.int64), 0), certain
 
 
-def _line_phase(first: int, lines: int, m: int, sign: int, remove_video: bool, radar: TriangularLadar, like: Tensor) -> Tensor:
-    """Per line of the up (sign 1) or mirrored down sweep (-1): removal of the residual video phase, and the half-sample offset between the grids of n and of m samples."""
+def _line_phase(
+    first: int, lines: int, m: int, sign: int, remove_video: bool, radar: TriangularLadar, like: Tensor
+) -> Tensor:
+    """Per line of the up (sign 1) or mirrored down sweep (-1): removal of the residual video phase,
+    and the half-sample offset between the grids of n and of m samples.
+    """
     j = torch.arange(lines, dtype=torch.float64, device=like.device)
     beat_hz = (first + j) / radar.sweep_s
     video = sign * remove_video * math.pi * beat_hz.square() / radar.chirp_rate_hz_s
@@ -248,7 +329,9 @@ def _line_phase(first: int, lines: int, m: int, sign: int, remove_video: bool, r
 
 
 def _raised_cosine(j: Tensor, lines: int, taper: float) -> Tensor:
-    """Window over lines 0..lines-1 whose edges of `taper` times half the window fall as a cosine."""
+    """Window over lines 0..lines-1 whose edges of `taper` times half the window fall as a
+    cosine.
+    """
     if not taper:
         return torch.ones_like(j)
     distance = (j - (lines - 1) / 2).abs() / ((lines + 1) / 2)

@@ -9,13 +9,16 @@ from torch import Tensor
 
 from torchsar.core import Estimate, block_bytes_of, over_blocks, refuse_non_finite
 
-_BLOCKS = 16  # a block of sweeps is so many times what one operation likes best: work on few trials costs more in calls than it gains
+# a block of sweeps is so many times what one operation likes best: work on few trials costs more in
+# calls than it gains
+_BLOCKS = 16
 
 Estimator = Callable[[Tensor, Tensor | float], Estimate]
 
 
 def by_trials(estimator: Estimator, sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
-    """estimator(sweeps, azimuth_m) by blocks of trials where no gradients are asked for, in as many threads as torch uses: less time, less memory, the same values.
+    """estimator(sweeps, azimuth_m) by blocks of trials where no gradients are asked for, in as many
+    threads as torch uses: less time, less memory, the same values.
 
     sweeps: (..., 2, pulse, N); azimuth_m: a number or one per trial (...,).
     """
@@ -40,5 +43,7 @@ def by_trials(estimator: Estimator, sweeps: Tensor, azimuth_m: Tensor | float) -
 def _refuse_other_places(azimuth_m: Tensor, trials: torch.Size) -> None:
     """Raise ValueError unless there is one finite azimuth, or one a trial."""
     if azimuth_m.ndim and azimuth_m.shape != trials:
-        raise ValueError(f"azimuth_m must be one number (m) or one a trial {tuple(trials)}, got shape {tuple(azimuth_m.shape)}")
+        raise ValueError(
+            f"azimuth_m must be one number (m) or one a trial {tuple(trials)}, got shape {tuple(azimuth_m.shape)}"
+        )
     refuse_non_finite(azimuth_m, "azimuth_m")

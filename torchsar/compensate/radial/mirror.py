@@ -17,7 +17,9 @@ from torchsar.radar import TriangularLadar
 
 Intercept = Literal["known", "record", "free"]
 _PAD, _NEWTON = 2, 3
-_REACH = 6  # bins of 1 / T about the shift, which is known to a bin or two, in which the tone of the product is sought
+# bins of 1 / T about the shift, which is known to a bin or two, in which the tone of the product is
+# sought
+_REACH = 6
 
 
 def mirror_product(
@@ -30,16 +32,22 @@ def mirror_product(
     taper: float = 1.0,
     azimuth_m: Tensor | float = 0.0,
 ) -> Estimate:
-    """Radial velocity at the turning points, value["velocity_m_s"] (..., pulse), for any scene in range (brief 000, section 5a).
+    """Radial velocity at the turning points, value["velocity_m_s"] (..., pulse), for any scene in
+    range (brief 000, section 5a).
 
-    sweeps: (..., 2, pulse, N). z(u) = up(u) conj(down(-u)) pairs equal optical frequencies: z = |scene(u)|^2 exp(-j 4 pi / c (fc + K u) (T - 2u) v),
-    whatever lies in the window; acceleration cancels about the turning point, jerk is left. intercept: "known" uses that z is real at the
-    turning point, which needs the trigger timing and lowers the variance four times; "free" takes the slope alone; "record" estimates one constant
-    offset for the whole record, for timing that is not known but stands still. window_m: relative ranges (low, high), None for the whole
-    band; it follows the Doppler shift. taper: see `bands_of`. azimuth_m: x of the scene's centre, whose geometric velocity is taken out.
+    sweeps: (..., 2, pulse, N). z(u) = up(u) conj(down(-u)) pairs equal optical frequencies: z =
+    |scene(u)|^2 exp(-j 4 pi / c (fc + K u) (T - 2u) v), whatever lies in the window; acceleration
+    cancels about the turning point, jerk is left. intercept: "known" uses that z is real at the
+    turning point, which needs the trigger timing and lowers the variance four times; "free" takes
+    the slope alone; "record" estimates one constant offset for the whole record, for timing that is
+    not known but stands still. window_m: relative ranges (low, high), None for the whole band; it
+    follows the Doppler shift. taper: see `bands_of`. azimuth_m: x of the scene's centre, whose
+    geometric velocity is taken out.
 
-    std: predicted from the measured SNR with the squaring loss. info: snr_db (post-compression), shift, intercept_rad (...,) with "record".
-    Differentiable: the peak search is detached, Newton steps refine around it. Raises TypeError or ValueError for other sweeps or a window that is none.
+    std: predicted from the measured SNR with the squaring loss. info: snr_db (post-compression),
+    shift, intercept_rad (...,) with "record". Differentiable: the peak search is detached, Newton
+    steps refine around it. Raises TypeError or ValueError for other sweeps or a window that is
+    none.
     """
     refuse_other_sweeps(sweeps, radar, "mirror_product", pulse)
     refuse_other_intercept(intercept)
@@ -59,7 +67,15 @@ def refuse_other_intercept(intercept: str) -> None:
 def mirror_estimate(bands: Bands, pulse: Axis, intercept: Intercept, azimuth_m: Tensor | float) -> Estimate:
     """The estimate from bands of two samples a line."""
     velocity, info = mirror_velocity(bands, intercept)
-    return velocity_estimate(velocity, bands, pulse, factor=3.0 if intercept == "free" else 0.75, azimuth_m=azimuth_m, squared=True, info=info)
+    return velocity_estimate(
+        velocity,
+        bands,
+        pulse,
+        factor=3.0 if intercept == "free" else 0.75,
+        azimuth_m=azimuth_m,
+        squared=True,
+        info=info,
+    )
 
 
 def mirror_velocity(bands: Bands, intercept: Intercept) -> tuple[Tensor, dict[str, Tensor]]:
@@ -80,7 +96,9 @@ def mirror_velocity(bands: Bands, intercept: Intercept) -> tuple[Tensor, dict[st
 
 
 def _of_shift(bands: Bands, u: Tensor, like: Tensor) -> Tensor:
-    """What the shift of whole bins leaves in the product beyond its line: exp(2j pi s K u / fc (1 - 2u / T)), see brief 000, erratum 8."""
+    """What the shift of whole bins leaves in the product beyond its line: exp(2j pi s K u / fc (1 -
+    2u / T)), see brief 000, erratum 8.
+    """
     radar = bands.radar
     small = 2 * math.pi * radar.chirp_rate_hz_s * u / radar.carrier_hz * (1 - 2 * u / radar.sweep_s)
     return cis((bands.shift.to(torch.float64)[..., None] * small).to(like.real.dtype))
@@ -89,7 +107,9 @@ def _of_shift(bands: Bands, u: Tensor, like: Tensor) -> Tensor:
 def _weights(u: Tensor, bands: Bands) -> Tensor:
     """rad per m/s that a velocity turns the product by, (m,): -4 pi / c (fc + K u) (T - 2u)."""
     radar = bands.radar
-    return -4 * math.pi / radar.wave_speed_m_s * (radar.carrier_hz + radar.chirp_rate_hz_s * u) * (radar.sweep_s - 2 * u)
+    return (
+        -4 * math.pi / radar.wave_speed_m_s * (radar.carrier_hz + radar.chirp_rate_hz_s * u) * (radar.sweep_s - 2 * u)
+    )
 
 
 def _turned(z: Tensor, u: Tensor, v: Tensor, bands: Bands) -> Tensor:
@@ -97,7 +117,9 @@ def _turned(z: Tensor, u: Tensor, v: Tensor, bands: Bands) -> Tensor:
 
 
 def _slope(z: Tensor, u: Tensor, bands: Bands, steps: int) -> Tensor:
-    """The velocity of greatest |sum z exp(-j w v)|, (..., pulse): the peak of a padded transform, then Newton steps."""
+    """The velocity of greatest |sum z exp(-j w v)|, (..., pulse): the peak of a padded transform,
+    then Newton steps.
+    """
     n, per = z.shape[-1], 4 * bands.radar.carrier_hz / bands.radar.wave_speed_m_s
     spectrum = torch.fft.fft(z.detach(), _PAD * n)
     power = spectrum.real.square() + spectrum.imag.square()
@@ -116,7 +138,9 @@ def _parabola(power: Tensor, best: Tensor) -> Tensor:
 
 
 def _through_zero(z: Tensor, u: Tensor, v: Tensor, bands: Bands) -> Tensor:
-    """The velocity of greatest Re sum z exp(-j w v) next to v: the line through zero phase at the turning point."""
+    """The velocity of greatest Re sum z exp(-j w v) next to v: the line through zero phase at the
+    turning point.
+    """
     w = _weights(u, bands).to(z.real.dtype)
     for _ in range(_NEWTON):
         turned = _turned(z, u, v, bands)

@@ -35,25 +35,36 @@ def segmented_interference(
     window_m: tuple[float, float] | None = None,
     azimuth_m: Tensor | float = 0.0,
 ) -> Estimate:
-    """Radial velocity at the turning points, value["velocity_m_s"] (..., pulse), from the phase between half sweeps (paper, Eqs. 14 to 20, corrected).
+    """Radial velocity at the turning points, value["velocity_m_s"] (..., pulse), from the phase
+    between half sweeps (paper, Eqs. 14 to 20, corrected).
 
-    sweeps: (..., 2, pulse, N). phi = arg{U1 conj(D1) conj(U2 conj(D2))} of centre-referenced spectra of the halves, the down sweep conjugated before its
-    transform, is -2 pi T fd (brief 000, errata 6 to 8). bins: "peak" reads it where up and down have their own peaks, for each of so many
-    `scatterers` apart by c / B or more, and adds their azimuth GRADIENTS with weights from contrast (Eqs. 18, 19); "sum" adds the complex
-    products of all bins, for dense scenes. padding: zero-padding of the halves; hann: a Hann window over each half, where other scatterers are in the window.
+    sweeps: (..., 2, pulse, N). phi = arg{U1 conj(D1) conj(U2 conj(D2))} of centre-referenced
+    spectra of the halves, the down sweep conjugated before its transform, is -2 pi T fd (brief 000,
+    errata 6 to 8). bins: "peak" reads it where up and down have their own peaks, for each of so
+    many `scatterers` apart by c / B or more, and adds their azimuth GRADIENTS with weights from
+    contrast (Eqs. 18, 19); "sum" adds the complex products of all bins, for dense scenes. padding:
+    zero-padding of the halves; hann: a Hann window over each half, where other scatterers are in
+    the window.
 
-    unwrap: "gradient" as in the paper, the integer of the first period from the envelopes and wrapped differences from there on, which slips
-    where the velocity changes by lambda / (4 T) a period or the SNR after compression is below 14 dB; "per_pulse" takes every integer from the envelopes.
-    info: phase_rad (..., pulse), integer (..., pulse), slips (...,), the periods where gradient and envelopes disagree by a turn, dispersion (...,) and weights (..., scatterers), means over
-    the periods. A scatterer counts where it is lit.
+    unwrap: "gradient" as in the paper, the integer of the first period from the envelopes and
+    wrapped differences from there on, which slips where the velocity changes by lambda / (4 T) a
+    period or the SNR after compression is below 14 dB; "per_pulse" takes every integer from the
+    envelopes. info: phase_rad (..., pulse), integer (..., pulse), slips (...,), the periods where
+    gradient and envelopes disagree by a turn, dispersion (...,) and weights (..., scatterers),
+    means over the periods. A scatterer counts where it is lit.
 
-    Differentiable around the detached peaks and integers. Raises TypeError or ValueError for other sweeps, options or windows.
+    Differentiable around the detached peaks and integers. Raises TypeError or ValueError for other
+    sweeps, options or windows.
     """
     refuse_other_sweeps(sweeps, radar, "segmented_interference", pulse)
     if bins not in ("peak", "sum") or unwrap not in ("gradient", "per_pulse"):
-        raise ValueError(f"bins must be 'peak' or 'sum' and unwrap 'gradient' or 'per_pulse', got {bins!r} and {unwrap!r}")
+        raise ValueError(
+            f"bins must be 'peak' or 'sum' and unwrap 'gradient' or 'per_pulse', got {bins!r} and {unwrap!r}"
+        )
     if not (isinstance(scatterers, int) and scatterers >= 1 and isinstance(padding, int) and 1 <= padding <= 16):
-        raise ValueError(f"scatterers must be 1 or more and padding 1..16, both whole numbers, got {scatterers} and {padding}")
+        raise ValueError(
+            f"scatterers must be 1 or more and padding 1..16, both whole numbers, got {scatterers} and {padding}"
+        )
     window_lines(radar, window_m)
 
     def estimator(sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
@@ -62,23 +73,42 @@ def segmented_interference(
         coarse = envelope_lag(windowed, _SUM_UPSAMPLING if bins == "sum" else 4) / 2 + (windowed.shift - bands.shift)
         spectra = _halves(_shifted(bands, coarse) if bins == "sum" else bands, padding, hann)
         sought = inside(radar, window_m, spectra[0].shape[-1], padding / 2, sweeps.device)
-        phases, weights = _summed(spectra, sought, coarse) if bins == "sum" else _at_peaks(spectra, sought, padding, scatterers)
+        phases, weights = (
+            _summed(spectra, sought, coarse) if bins == "sum" else _at_peaks(spectra, sought, padding, scatterers)
+        )
         bands = replace(bands, lit=bands.lit & (weights > 0).any(-2))
         phase, integer, slips = _unwrapped(phases, weights, coarse, bands, unwrap)
         doppler = (integer - phase / (2 * math.pi)) / radar.sweep_s
-        info = {"phase_rad": phase, "integer": integer + bands.shift, "slips": slips, "weights": weights.mean(-1), "dispersion": _dispersion(bands)}
-        return velocity_estimate(from_beats(doppler, -doppler, bands), bands, pulse, factor=4.0, azimuth_m=azimuth_m, window_m=window_m, info=info)
+        info = {
+            "phase_rad": phase,
+            "integer": integer + bands.shift,
+            "slips": slips,
+            "weights": weights.mean(-1),
+            "dispersion": _dispersion(bands),
+        }
+        return velocity_estimate(
+            from_beats(doppler, -doppler, bands),
+            bands,
+            pulse,
+            factor=4.0,
+            azimuth_m=azimuth_m,
+            window_m=window_m,
+            info=info,
+        )
 
     return by_trials(estimator, sweeps, azimuth_m)
 
 
 def _halves(bands: Bands, padding: int, hann: bool) -> tuple[Tensor, ...]:
-    """Spectra of the first and second halves of up and mirrored down sweeps, each (..., pulse, bin), phases referenced alike."""
+    """Spectra of the first and second halves of up and mirrored down sweeps, each (..., pulse,
+    bin), phases referenced alike.
+    """
     h = bands.time_s.shape[-1] // 2
     window = torch.hann_window(h, periodic=False, dtype=bands.up.real.dtype, device=bands.up.device) if hann else None
     parts = [x[..., half] for x in (bands.up, bands.down) for half in (slice(0, h), slice(h, 2 * h))]
     up1, up2, down1, down2 = (torch.fft.fft(x if window is None else x * window, padding * h) for x in parts)
-    # halves of the conjugated down sweep are the conjugate halves of the mirrored one in the other order
+    # halves of the conjugated down sweep are the conjugate halves of the mirrored one in the other
+    # order
     return up1, up2, down2, down1
 
 
@@ -97,10 +127,12 @@ def _shifted(bands: Bands, shift: Tensor) -> Bands:
 
 
 def _summed(halves: tuple[Tensor, ...], sought: Tensor, coarse: Tensor) -> tuple[Tensor, Tensor]:
-    """Phase (..., 1, pulse) between the products of up and down spectra, each summed over the bins sought, of the two halves, and its weight, one everywhere.
+    """Phase (..., 1, pulse) between the products of up and down spectra, each summed over the bins
+    sought, of the two halves, and its weight, one everywhere.
 
-    Summed before the halves meet: each product is the power spectrum of the scene times one phasor, whatever the scene, once the Doppler shift
-    `coarse` (bins) is out; that of a dense scene would else decide where in its half the phase is read. The phase is given back what was taken out.
+    Summed before the halves meet: each product is the power spectrum of the scene times one phasor,
+    whatever the scene, once the Doppler shift `coarse` (bins) is out; that of a dense scene would
+    else decide where in its half the phase is read. The phase is given back what was taken out.
     """
     up1, up2, down1, down2 = (x[..., sought] for x in halves)
     product = (up1 * down2.conj()).sum(-1) * (up2 * down1.conj()).sum(-1).conj()
@@ -109,7 +141,10 @@ def _summed(halves: tuple[Tensor, ...], sought: Tensor, coarse: Tensor) -> tuple
 
 
 def _at_peaks(halves: tuple[Tensor, ...], sought: Tensor, padding: int, scatterers: int) -> tuple[Tensor, Tensor]:
-    """Phases at the own peaks of up and down spectra, and the weights of Eq. (18), zero in periods where a scatterer is dark, (..., scatterer, pulse) each."""
+    """Phases at the own peaks of up and down spectra, and the weights of Eq.
+
+    (18), zero in periods where a scatterer is dark, (..., scatterer, pulse) each.
+    """
     up1, up2, down1, down2 = halves
     up, down = _power(up1, up2), _power(down1, down2)
     places = _strongest(torch.where(sought, (up + down).detach().mean(-2), -1), scatterers, padding)
@@ -125,7 +160,9 @@ def _at_peaks(halves: tuple[Tensor, ...], sought: Tensor, padding: int, scattere
 
 
 def _strongest(profile: Tensor, count: int, apart: int) -> Tensor:
-    """Bins (..., count) of the greatest values of a circular profile (..., n), `apart` bins or more from each other."""
+    """Bins (..., count) of the greatest values of a circular profile (..., n), `apart` bins or more
+    from each other.
+    """
     n = profile.shape[-1]
     left, found = profile.clone(), []
     index = torch.arange(n, device=profile.device)
@@ -138,7 +175,9 @@ def _strongest(profile: Tensor, count: int, apart: int) -> Tensor:
 
 
 def _own_peak(power: Tensor, place: Tensor, reach: int) -> Tensor:
-    """Bin (..., pulse) of the greatest power (..., pulse, n) within `reach` bins of a place (...,)."""
+    """Bin (..., pulse) of the greatest power (..., pulse, n) within `reach` bins of a place
+    (...,).
+    """
     n = power.shape[-1]
     near = (place[..., None] + torch.arange(-reach, reach + 1, device=power.device)) % n
     near = near[..., None, :].expand(*power.shape[:-1], -1)
@@ -151,7 +190,9 @@ def _picked(x: Tensor, index: Tensor) -> Tensor:
 
 
 def _contrast_about(amplitude: Tensor, place: Tensor, reach: int) -> Tensor:
-    """Standard deviation over mean of the amplitudes (..., pulse, n) in a window about a place (...,): Eq. (18) made scale invariant (erratum 10)."""
+    """Standard deviation over mean of the amplitudes (..., pulse, n) in a window about a place
+    (...,): Eq. (18) made scale invariant (erratum 10).
+    """
     n = amplitude.shape[-1]
     near = (place[..., None] + torch.arange(-4 * reach, 4 * reach + 1, device=amplitude.device)) % n
     part = amplitude.gather(-1, near[..., None, :].expand(*amplitude.shape[:-1], -1))
@@ -160,14 +201,20 @@ def _contrast_about(amplitude: Tensor, place: Tensor, reach: int) -> Tensor:
     return torch.where(mean > 0, spread / torch.where(mean > 0, mean, 1), 0)
 
 
-def _unwrapped(phases: Tensor, weights: Tensor, coarse: Tensor, bands: Bands, unwrap: Unwrap) -> tuple[Tensor, Tensor, Tensor]:
-    """One phase and its integer a period, (..., pulse) each, and the count of disagreements (...,). coarse: fd T of the envelopes beyond the shift."""
+def _unwrapped(
+    phases: Tensor, weights: Tensor, coarse: Tensor, bands: Bands, unwrap: Unwrap
+) -> tuple[Tensor, Tensor, Tensor]:
+    """One phase and its integer a period, (..., pulse) each, and the count of disagreements (...,).
+
+    coarse: fd T of the envelopes beyond the shift.
+    """
     turn = 2 * math.pi
     integer = torch.round(coarse[..., None, :] + phases.detach() / turn)
     own = _weighted(phases - turn * integer, weights)  # phase less whole turns: fd T = -own / 2 pi
     pairs = torch.minimum(weights[..., 1:], weights[..., :-1])
     step = _weighted(_wrapped(_steps(phases)), pairs)
-    beyond = own - turn * bands.shift.to(torch.float64)  # with the shift, which the gradient does not see
+    # with the shift, which the gradient does not see
+    beyond = own - turn * bands.shift.to(torch.float64)
     both = bands.lit[..., 1:] & bands.lit[..., :-1] & (pairs > 0).any(-2)
     step = torch.where(both, step, _steps(beyond))
     gradient = torch.cat([torch.zeros_like(own[..., :1]), step.cumsum(-1)], -1)
@@ -194,7 +241,9 @@ def _wrapped(x: Tensor) -> Tensor:
 
 
 def _dispersion(bands: Bands) -> Tensor:
-    """Standard deviation over mean, over periods, of the amplitude in the window: how unsteady the echo is, (...,)."""
+    """Standard deviation over mean, over periods, of the amplitude in the window: how unsteady the
+    echo is, (...,).
+    """
     level = bands.up.detach().abs().mean(-1).to(torch.float64)
     mean = level.mean(-1)
     return torch.where(mean > 0, level.std(-1, correction=0) / torch.where(mean > 0, mean, 1), 0)

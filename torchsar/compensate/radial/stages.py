@@ -1,4 +1,6 @@
-"""Radial motion as stages: estimators of `velocity_m_s` that leave the sweeps alone, and what takes the motion out."""
+"""Radial motion as stages: estimators of `velocity_m_s` that leave the sweeps alone, and what takes
+the motion out.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ def _window(window_m: Window) -> tuple[float, float] | None:
 
 
 class _OfSweeps(Stage):
-    """An estimator of the radial velocity at the turning points, from both sweeps of a window of relative ranges."""
+    """An estimator of the radial velocity at the turning points, from both sweeps of a window of
+    relative ranges.
+    """
 
     works_on = SWEEPS
     provides = ("velocity_m_s",)
@@ -43,17 +47,34 @@ class _OfSweeps(Stage):
 class MirrorProduct(_OfSweeps):
     """`mirror_product`."""
 
-    def __init__(self, radar: TriangularLadar, window_m: Window = None, intercept: Intercept = "known", taper: float = 1.0, azimuth_m: float = 0.0) -> None:
+    def __init__(
+        self,
+        radar: TriangularLadar,
+        window_m: Window = None,
+        intercept: Intercept = "known",
+        taper: float = 1.0,
+        azimuth_m: float = 0.0,
+    ) -> None:
         super().__init__(radar, window_m, azimuth_m)
         self.intercept: Intercept = intercept
         self.taper = taper
 
     def forward(self, signal: Signal) -> Estimate:
-        return mirror_product(signal.data, self.radar, signal.axis("pulse"), window_m=self.window_m, intercept=self.intercept, taper=self.taper, azimuth_m=self.azimuth_m)
+        return mirror_product(
+            signal.data,
+            self.radar,
+            signal.axis("pulse"),
+            window_m=self.window_m,
+            intercept=self.intercept,
+            taper=self.taper,
+            azimuth_m=self.azimuth_m,
+        )
 
 
 class RadialMotion(MirrorProduct):
-    """`radial_motion`, the recommended estimator: `velocity_m_s` for `CompensateMotion`, then `phase_rad` for `CorrectPulsePhase`."""
+    """`radial_motion`, the recommended estimator: `velocity_m_s` for `CompensateMotion`, then
+    `phase_rad` for `CorrectPulsePhase`.
+    """
 
     provides = ("velocity_m_s", "phase_rad")
 
@@ -97,12 +118,21 @@ class MlPeak(_OfSweeps):
 class SpectrumCorrelation(_OfSweeps):
     """`spectrum_correlation`."""
 
-    def __init__(self, radar: TriangularLadar, upsampling: int = 20, window_m: Window = None, azimuth_m: float = 0.0) -> None:
+    def __init__(
+        self, radar: TriangularLadar, upsampling: int = 20, window_m: Window = None, azimuth_m: float = 0.0
+    ) -> None:
         super().__init__(radar, window_m, azimuth_m)
         self.upsampling = upsampling
 
     def forward(self, signal: Signal) -> Estimate:
-        return spectrum_correlation(signal.data, self.radar, signal.axis("pulse"), upsampling=self.upsampling, window_m=self.window_m, azimuth_m=self.azimuth_m)
+        return spectrum_correlation(
+            signal.data,
+            self.radar,
+            signal.axis("pulse"),
+            upsampling=self.upsampling,
+            window_m=self.window_m,
+            azimuth_m=self.azimuth_m,
+        )
 
 
 class SegmentedInterference(_OfSweeps):
@@ -140,7 +170,9 @@ class SegmentedInterference(_OfSweeps):
 
 
 class CompensateMotion(Stage):
-    """`compensate_motion` by a connected value `velocity_m_s` (..., pulse) at the turning points."""
+    """`compensate_motion` by a connected value `velocity_m_s` (..., pulse) at the turning
+    points.
+    """
 
     works_on = SWEEPS
 
@@ -149,7 +181,9 @@ class CompensateMotion(Stage):
         self.radar, self.carrier_only = radar, carrier_only
 
     def forward(self, signal: Signal, velocity_m_s: Tensor) -> Signal:
-        return signal.with_data(compensate_motion(signal.data, velocity_m_s, self.radar, signal.axis("pulse"), self.carrier_only))
+        return signal.with_data(
+            compensate_motion(signal.data, velocity_m_s, self.radar, signal.axis("pulse"), self.carrier_only)
+        )
 
 
 class PhasePolish(Stage):

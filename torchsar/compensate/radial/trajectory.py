@@ -1,4 +1,6 @@
-"""From radial velocities at turning points to the range error at any time, and the geometry that an estimate contains."""
+"""From radial velocities at turning points to the range error at any time, and the geometry that an
+estimate contains.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +19,18 @@ def turning_points(radar: TriangularLadar, pulse: Axis) -> Axis:
     return Axis("pulse", pulse.n, pulse.start + radar.period_s / 2, pulse.step, "s")
 
 
-def geometric_velocity_m_s(radar: TriangularLadar, pulse: Axis, azimuth_m: Tensor | float = 0.0, relative_range_m: float = 0.0, device: torch.device | str | None = None) -> Tensor:
-    """Radial velocity V (V t - x) / R at the turning points of a scatterer that does not move, (..., pulse) float64 (brief 000, erratum 14).
+def geometric_velocity_m_s(
+    radar: TriangularLadar,
+    pulse: Axis,
+    azimuth_m: Tensor | float = 0.0,
+    relative_range_m: float = 0.0,
+    device: torch.device | str | None = None,
+) -> Tensor:
+    """Radial velocity V (V t - x) / R at the turning points of a scatterer that does not move,
+    (..., pulse) float64 (brief 000, erratum 14).
 
-    azimuth_m: x, a number or one per trial. An estimate from the echo contains it; taken out as motion it would remove the azimuth phase history.
+    azimuth_m: x, a number or one per trial. An estimate from the echo contains it; taken out as
+    motion it would remove the azimuth phase history.
     """
     t = turning_points(radar, pulse).values(device)
     x = per_trial(azimuth_m, 1, t)
@@ -28,9 +38,11 @@ def geometric_velocity_m_s(radar: TriangularLadar, pulse: Axis, azimuth_m: Tenso
 
 
 def integrated_range(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis, at_s: Tensor) -> Tensor:
-    """Range error DR (m) at slow times at_s, any shape: the antiderivative of the cubic spline through velocities (..., pulse) at turning points.
+    """Range error DR (m) at slow times at_s, any shape: the antiderivative of the cubic spline
+    through velocities (..., pulse) at turning points.
 
-    Zero at the first turning point; (..., *at_s.shape) float64. A sum of rectangles instead is wrong by micrometres (brief 000, section 5.5). Differentiable.
+    Zero at the first turning point; (..., *at_s.shape) float64. A sum of rectangles instead is
+    wrong by micrometres (brief 000, section 5.5). Differentiable.
     """
     grid = turning_points(radar, pulse)
     v = velocity_m_s.to(torch.float64)
@@ -40,9 +52,11 @@ def integrated_range(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis, 
 
 
 def sweep_motion(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis) -> Tensor:
-    """Coefficients (..., 2, pulse, 5) of DR(u) = sum_k c_k u^k over the up and the down sweep of every period, u from the middle of the sweep.
+    """Coefficients (..., 2, pulse, 5) of DR(u) = sum_k c_k u^k over the up and the down sweep of
+    every period, u from the middle of the sweep.
 
-    Exact for the spline: its knots are the turning points, so that each sweep lies in one piece. velocity_m_s: (..., pulse) at the turning points.
+    Exact for the spline: its knots are the turning points, so that each sweep lies in one piece.
+    velocity_m_s: (..., pulse) at the turning points.
     """
     v = velocity_m_s.to(torch.float64)
     middles = sweep_middles(radar, pulse, v.device)

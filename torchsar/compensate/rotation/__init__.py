@@ -1,4 +1,6 @@
-"""Rotation of a target that turns unevenly: searches for the least entropy, and maximum likelihood without a start."""
+"""Rotation of a target that turns unevenly: searches for the least entropy, and maximum likelihood
+without a start.
+"""
 
 from torchsar.compensate.rotation.chirplet import ChirpletClean, Chirplets, chirplet_clean
 from torchsar.compensate.rotation.entropy_search import (
@@ -15,7 +17,13 @@ from torchsar.compensate.rotation.entropy_search import (
 )
 from torchsar.compensate.rotation.image_entropy import ImageEntropy
 from torchsar.compensate.rotation.recommended import coarse_rotation, phase_fit_rotation, uneven_rotation
-from torchsar.compensate.rotation.stages import CoarseRotation, PhaseFitRotation, RotationAutofocus, UnevenRotation, rotating_autofocus
+from torchsar.compensate.rotation.stages import (
+    CoarseRotation,
+    PhaseFitRotation,
+    RotationAutofocus,
+    UnevenRotation,
+    rotating_autofocus,
+)
 
 __all__ = [
     "ChirpletClean",

@@ -1,4 +1,6 @@
-"""Adaptive chirplet imaging in the manner of CLEAN: every range bin as a sum of chirps, the strongest taken out first (the 'ACL' of brief 003)."""
+"""Adaptive chirplet imaging in the manner of CLEAN: every range bin as a sum of chirps, the
+strongest taken out first (the 'ACL' of brief 003).
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,10 @@ _PAD = 2
 class Chirplets:
     """Chirps found per range bin, strongest first as they came.
 
-    image: (..., lines, range). doppler_hz, rate_hz_s (Hz and Hz/s in the middle of the aperture, positive where the phase falls, as in exp(-2j pi f t)) and the complex
-    amplitude: (..., atom, range); only atoms above the floor are in the image. residual_share: (...,) energy left over that of the data.
+    image: (..., lines, range). doppler_hz, rate_hz_s (Hz and Hz/s in the middle of the aperture,
+    positive where the phase falls, as in exp(-2j pi f t)) and the complex amplitude: (..., atom,
+    range); only atoms above the floor are in the image. residual_share: (...,) energy left over
+    that of the data.
     """
 
     image: Tensor
@@ -31,18 +35,32 @@ class Chirplets:
     residual_share: Tensor
 
 
-def chirplet_clean(data: Tensor, prf_hz: float, *, atoms: int = 16, sweep: float = 0.25, floor_db: float = 40.0, oversampling: float = 2.0, lines: int | None = None) -> Chirplets:
+def chirplet_clean(
+    data: Tensor,
+    prf_hz: float,
+    *,
+    atoms: int = 16,
+    sweep: float = 0.25,
+    floor_db: float = 40.0,
+    oversampling: float = 2.0,
+    lines: int | None = None,
+) -> Chirplets:
     """Image of the chirps that make up range-compressed pulses. data: (..., pulse, range) complex.
 
-    For each bin by itself: find the chirp a exp(-2j pi (f t + r t^2 / 2)) that carries most energy, t from the middle of the aperture; take it out; again, `atoms` times. The image
-    is what unchirped tones a exp(-2j pi f t) give, of the Doppler in the middle of the aperture, with lines as `torchsar.focus.matched_fourier` has them.
-    sweep: largest |r| searched, as the share of the pulse rate that a chirp sweeps during the aperture. floor_db: atoms this far below the strongest of their trial are left out of the image.
+    For each bin by itself: find the chirp a exp(-2j pi (f t + r t^2 / 2)) that carries most energy,
+    t from the middle of the aperture; take it out; again, `atoms` times. The image is what
+    unchirped tones a exp(-2j pi f t) give, of the Doppler in the middle of the aperture, with lines
+    as `torchsar.focus.matched_fourier` has them. sweep: largest |r| searched, as the share of the
+    pulse rate that a chirp sweeps during the aperture. floor_db: atoms this far below the strongest
+    of their trial are left out of the image.
 
-    A baseline: chirps have no cubic phase and scatterers of one bin are not told apart by what the rotation says about all of them, so a target that turns
-    with jerk leaves remains of its strong scatterers, on which atoms are spent before weak scatterers are reached: the image is sparse. It needs no model of the rotation, gives none, and costs
-    two transforms of each bin per atom and rate. Detached. Raises TypeError or ValueError for samples that are not complex and finite, fewer than 16
-    pulses, or settings that make no sense.
-    Remote Sens. 2025, 17, 3447, Fig. 6; the search is ours: rates by segments without their phases, then on the whole aperture.
+    A baseline: chirps have no cubic phase and scatterers of one bin are not told apart by what the
+    rotation says about all of them, so a target that turns with jerk leaves remains of its strong
+    scatterers, on which atoms are spent before weak scatterers are reached: the image is sparse. It
+    needs no model of the rotation, gives none, and costs two transforms of each bin per atom and
+    rate. Detached. Raises TypeError or ValueError for samples that are not complex and finite,
+    fewer than 16 pulses, or settings that make no sense. Remote Sens. 2025, 17, 3447, Fig. 6; the
+    search is ours: rates by segments without their phases, then on the whole aperture.
     """
     _check(data, prf_hz, atoms, sweep, floor_db)
     n = data.shape[-2]
@@ -63,14 +81,20 @@ def chirplet_clean(data: Tensor, prf_hz: float, *, atoms: int = 16, sweep: float
         tones = tones + a[..., None] * linear_phasor(-f, -search.middle, n, rows.dtype)
     even = torch.zeros(0, dtype=torch.float64, device=rows.device)
     image = matched_fourier(tones.mT.contiguous(), even, prf_hz, oversampling=oversampling, lines=lines)
-    return Chirplets(image, frequency * prf_hz, rate * prf_hz**2, amplitude, _energy(rows) / torch.where(energy > 0, energy, 1))
+    return Chirplets(
+        image, frequency * prf_hz, rate * prf_hz**2, amplitude, _energy(rows) / torch.where(energy > 0, energy, 1)
+    )
 
 
 @dataclass(frozen=True)
 class _Search:
-    """Finds the strongest chirp of each row (..., pulse). Frequencies in cycles a pulse, rates in cycles a pulse squared, times from the middle of the aperture.
+    """Finds the strongest chirp of each row (..., pulse).
 
-    step: between coarse rates, so that a chirp half of it away drifts by half a Doppler cell of the segments.
+    Frequencies in cycles a pulse, rates in cycles a pulse squared, times from the middle of the
+    aperture.
+
+    step: between coarse rates, so that a chirp half of it away drifts by half a Doppler cell of the
+    segments.
     """
 
     n: int
@@ -126,14 +150,18 @@ class _Search:
         return frequency, rate
 
     def _fine(self, rows: Tensor, frequency: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
-        """Adds what the rows, freed from their coarse chirp and thinned out, still turn: the strongest of a grid of chirps over the whole aperture, and its vertex."""
+        """Adds what the rows, freed from their coarse chirp and thinned out, still turn: the
+        strongest of a grid of chirps over the whole aperture, and its vertex.
+        """
         count = _PARTS * self.segments
         thin = self._segmented(rows, count).sum(-1)
         t = (torch.arange(count, dtype=torch.float64, device=rows.device) + 0.5) * self.part - 0.5 - self.middle
         width = math.ceil(0.375 * self.segments)
         rates = (2.0 / self.n**2) * torch.arange(-width, width + 1, dtype=torch.float64, device=rows.device)
         bins = 2 * _PAD * count
-        spectrum = torch.fft.ifft(thin[..., None, :] * unit_phasor(rates[:, None] * (0.5 * t.square()), rows.dtype), bins, norm="forward")
+        spectrum = torch.fft.ifft(
+            thin[..., None, :] * unit_phasor(rates[:, None] * (0.5 * t.square()), rows.dtype), bins, norm="forward"
+        )
         power = spectrum.real.square() + spectrum.imag.square()
         flat = power.flatten(-2).argmax(-1)
         row, column = flat // bins, flat % bins
@@ -149,9 +177,13 @@ def _signed(index: Tensor, n: int) -> Tensor:
 
 
 def _vertex(values: Tensor, index: Tensor, circular: bool) -> Tensor:
-    """Offset -0.5..0.5 of the parabola through the greatest value (..., n) and its neighbours; 0 at an end that is none."""
+    """Offset -0.5..0.5 of the parabola through the greatest value (..., n) and its neighbours; 0 at
+    an end that is none.
+    """
     n = values.shape[-1]
-    left, middle, right = (take(values, (index + i) % n if circular else (index + i).clamp(0, n - 1)).to(torch.float64) for i in (-1, 0, 1))
+    left, middle, right = (
+        take(values, (index + i) % n if circular else (index + i).clamp(0, n - 1)).to(torch.float64) for i in (-1, 0, 1)
+    )
     bend = left - 2 * middle + right
     inside = (bend < 0) & (circular | ((index > 0) & (index < n - 1)))
     return torch.where(inside, 0.5 * (left - right) / torch.where(bend < 0, bend, -1), 0).clamp(-0.5, 0.5)
@@ -165,18 +197,39 @@ def _check(data: Tensor, prf_hz: float, atoms: int, sweep: float, floor_db: floa
     real_dtype(data.dtype)
     refuse_non_finite(data, "chirplet_clean")
     if data.ndim < 2 or data.shape[-2] < 16 or not data.shape[-1]:
-        raise ValueError(f"chirplet_clean needs data (..., pulse, range) of at least 16 pulses, got shape {tuple(data.shape)}")
+        raise ValueError(
+            f"chirplet_clean needs data (..., pulse, range) of at least 16 pulses, got shape {tuple(data.shape)}"
+        )
     if not (prf_hz > 0 and atoms >= 1 and 0 < sweep <= 1 and floor_db > 0):
-        raise ValueError(f"chirplet_clean needs a positive prf_hz and floor_db, one atom at least and a sweep in 0..1, got {prf_hz}, {floor_db}, {atoms} and {sweep}")
+        raise ValueError(
+            "chirplet_clean needs a positive prf_hz and floor_db, one atom at least and a sweep "
+            f"in 0..1, got {prf_hz}, {floor_db}, {atoms} and {sweep}"
+        )
 
 
 class ChirpletClean(Stage):
-    """`chirplet_clean` as image formation: (pulse, range) to (azimuth, range), azimuth in Hz, Doppler in the middle of the aperture."""
+    """`chirplet_clean` as image formation: (pulse, range) to (azimuth, range), azimuth in Hz,
+    Doppler in the middle of the aperture.
+    """
 
-    def __init__(self, radar: InverseRadar, atoms: int = 16, sweep: float = 0.25, floor_db: float = 40.0, oversampling: float = 2.0, lines: int | None = None) -> None:
+    def __init__(
+        self,
+        radar: InverseRadar,
+        atoms: int = 16,
+        sweep: float = 0.25,
+        floor_db: float = 40.0,
+        oversampling: float = 2.0,
+        lines: int | None = None,
+    ) -> None:
         super().__init__()
         self.radar = radar
-        self.options = {"atoms": atoms, "sweep": sweep, "floor_db": floor_db, "oversampling": oversampling, "lines": lines}
+        self.options = {
+            "atoms": atoms,
+            "sweep": sweep,
+            "floor_db": floor_db,
+            "oversampling": oversampling,
+            "lines": lines,
+        }
 
     def forward(self, signal: Signal) -> Signal:
         image = chirplet_clean(signal.data, self.radar.prf_hz, **self.options).image

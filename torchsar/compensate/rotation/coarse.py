@@ -1,8 +1,9 @@
 """Uneven rotation from short sections of the aperture, without a start and without a box.
 
-In a section the target turns evenly, at the rate of its middle: the Doppler axis of its spectrum is that of any other section, stretched by the ratio of
-their rates. On a logarithmic Doppler axis a stretch is a shift. Magnitude spectra of all pairs of sections are correlated there, summed over range cells, and
-a global search finds the course of the rate at which all pairs agree.
+In a section the target turns evenly, at the rate of its middle: the Doppler axis of its spectrum is
+that of any other section, stretched by the ratio of their rates. On a logarithmic Doppler axis a
+stretch is a shift. Magnitude spectra of all pairs of sections are correlated there, summed over
+range cells, and a global search finds the course of the rate at which all pairs agree.
 """
 
 from __future__ import annotations
@@ -29,7 +30,10 @@ _LEAST_RATE = 0.1
 
 @dataclass(frozen=True)
 class _Agreement:
-    """How well pairs of sections agree at a shift. table: (trial, pair, shift) for shifts of -reach..reach steps; first, second: the sections."""
+    """How well pairs of sections agree at a shift.
+
+    table: (trial, pair, shift) for shifts of -reach..reach steps; first, second: the sections.
+    """
 
     table: Tensor
     first: Tensor
@@ -49,17 +53,23 @@ class _Agreement:
 
 
 def coarse_warp(data: Tensor, prf_hz: float, sections: int | None = None) -> Tensor:
-    """(k1, k2) of data (trial, pulse, range), good to about a percent of the rate. Returns float64 (trial, 2).
+    """(k1, k2) of data (trial, pulse, range), good to about a percent of the rate.
 
-    Looks at all rates between a quarter and four times that of the first pulse. Needs scatterers off the axis in at least one range cell.
-    sections: half-overlapping, by default half the root of the number of pulses, 8 to 28: the Doppler of a section then changes by about as much as it resolves.
+    Returns float64 (trial, 2).
+
+    Looks at all rates between a quarter and four times that of the first pulse. Needs scatterers
+    off the axis in at least one range cell. sections: half-overlapping, by default half the root of
+    the number of pulses, 8 to 28: the Doppler of a section then changes by about as much as it
+    resolves.
     """
     pulses = data.shape[1]
     wanted = min(MOST_SECTIONS, max(LEAST_SECTIONS, round(math.sqrt(pulses) / 2))) if sections is None else sections
     sections = max(4, min(wanted, pulses // 8))
     length = 2 * (pulses // (sections + 1))
     spectra = _log_spectra(_brightest(data, _ROWS), length)
-    middles = (torch.arange(spectra.shape[1], dtype=torch.float64, device=data.device) * (length // 2) + (length - 1) / 2) / prf_hz
+    middles = (
+        torch.arange(spectra.shape[1], dtype=torch.float64, device=data.device) * (length // 2) + (length - 1) / 2
+    ) / prf_hz
     duration = pulses / prf_hz
     course = _Course(middles, duration)
     step = torch.arange(-_WIDEST, _WIDEST + 1e-9, _GRID, dtype=torch.float64, device=data.device)
@@ -78,7 +88,9 @@ def coarse_warp(data: Tensor, prf_hz: float, sections: int | None = None) -> Ten
 
 @dataclass(frozen=True)
 class _Course:
-    """Rates of third order, told by the logarithms of the rate at the middle and at the end of the aperture over that at its start."""
+    """Rates of third order, told by the logarithms of the rate at the middle and at the end of the
+    aperture over that at its start.
+    """
 
     middles_s: Tensor
     duration_s: float
@@ -89,7 +101,9 @@ class _Course:
         return torch.stack([(end - 1) / self.duration_s - k2 * self.duration_s / 2, k2], -1)
 
     def log_rate(self, logs: Tensor) -> tuple[Tensor, Tensor]:
-        """Logarithm of the rate in every section (..., section), and whether the target always turns on (...,)."""
+        """Logarithm of the rate in every section (..., section), and whether the target always
+        turns on (...,).
+        """
         k = self.warp_k(logs)
         ends = torch.linspace(0, self.duration_s, 33, dtype=torch.float64, device=logs.device)
         return torch.log(warp_rate(self.middles_s, k).clamp_min(_LEAST_RATE)), warp_rate(ends, k).amin(-1) > _LEAST_RATE
@@ -111,7 +125,9 @@ def _brightest(data: Tensor, count: int) -> Tensor:
 
 
 def _log_spectra(data: Tensor, length: int) -> Tensor:
-    """Magnitude spectra of half-overlapping sections on logarithmic axes of negative and positive Doppler, without their means: (trial, section, row, step)."""
+    """Magnitude spectra of half-overlapping sections on logarithmic axes of negative and positive
+    Doppler, without their means: (trial, section, row, step).
+    """
     window = torch.hann_window(length, periodic=False, dtype=data.real.dtype, device=data.device)
     spectrum = torch.fft.fft(data.unfold(1, length, length // 2) * window, 2 * length).abs()
     steps = math.ceil(_OCTAVES * math.log(2) * _STEPS_PER_UNIT)
@@ -120,13 +136,17 @@ def _log_spectra(data: Tensor, length: int) -> Tensor:
     whole = place.floor().long().clamp(0, length - 2)
     rest = (place - whole).to(spectrum.dtype)
     positive = spectrum[..., whole] * (1 - rest) + spectrum[..., whole + 1] * rest
-    negative = spectrum[..., (2 * length - whole) % (2 * length)] * (1 - rest) + spectrum[..., 2 * length - whole - 1] * rest
+    negative = (
+        spectrum[..., (2 * length - whole) % (2 * length)] * (1 - rest) + spectrum[..., 2 * length - whole - 1] * rest
+    )
     both = torch.cat([positive, negative], 2)
     return both - both.mean(-1, keepdim=True)
 
 
 def _products(spectra: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Transforms of the correlations of all pairs of sections that share no pulse, (trial, pair, frequency), and the sections of each pair."""
+    """Transforms of the correlations of all pairs of sections that share no pulse, (trial, pair,
+    frequency), and the sections of each pair.
+    """
     transform = torch.fft.rfft(spectra, 2 * spectra.shape[-1]).permute(0, 3, 1, 2).contiguous()
     first, second = torch.tril_indices(transform.shape[2], transform.shape[2], -2, device=spectra.device)
     return (transform @ transform.mH)[..., second, first].mT, first, second

@@ -1,4 +1,6 @@
-"""How echoes of scatterers next to each other overlap: the sparse couplings of a joint least-squares step."""
+"""How echoes of scatterers next to each other overlap: the sparse couplings of a joint
+least-squares step.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +15,17 @@ from torchsar.compensate.rotation.motion import Sampling
 from torchsar.core import linear_phasor
 from torchsar.focus.matched_fourier import matched_fourier
 
-_NEAR_CELLS, _TABLE = 64, 16  # scatterers further apart in Doppler do not couple; steps of the table per cell
+# scatterers further apart in Doppler do not couple; steps of the table per cell
+_NEAR_CELLS, _TABLE = 64, 16
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """Scatterers close enough in Doppler to couple, each with itself among them: trial, first and second of each pair (pair,).
+    """Scatterers close enough in Doppler to couple, each with itself among them: trial, first and
+    second of each pair (pair,).
 
-    products: for bases n and m, conj(s_p) s_q sum over pulses of b_n b_m conj(e_p) e_q of unit echoes e, (pair,), from tables over their distance.
+    products: for bases n and m, conj(s_p) s_q sum over pulses of b_n b_m conj(e_p) e_q of unit
+    echoes e, (pair,), from tables over their distance.
     """
 
     trial: Tensor
@@ -31,7 +36,9 @@ class Pairs:
 
     @staticmethod
     def find(sampling: Sampling, k: Tensor, amplitude: Tensor, cell: Tensor, bases: Tensor) -> Pairs:
-        """Of scatterers (trial, scatterer) of this amplitude and Doppler cell; bases: (trial, base, pulse), zero in pulses that are not there."""
+        """Of scatterers (trial, scatterer) of this amplitude and Doppler cell; bases: (trial, base,
+        pulse), zero in pulses that are not there.
+        """
         apart = cell[:, :, None] - cell[:, None]
         live = amplitude != 0
         trial, first, second = ((apart.abs() < _NEAR_CELLS) & live[:, :, None] & live[:, None]).nonzero(as_tuple=True)
@@ -50,7 +57,9 @@ class Pairs:
         return values[self.trial, self.second if side else self.first]
 
     def matrix(self, blocks: list[list[Tensor]]) -> Tensor:
-        """Dense matrix of blocks of values of pairs, (trial, blocks * scatterer, blocks * scatterer)."""
+        """Dense matrix of blocks of values of pairs, (trial, blocks * scatterer, blocks *
+        scatterer).
+        """
         count, n = self.shape[1], len(blocks)
         result = blocks[0][0].new_zeros(self.shape[0], n * count, n * count)
         for i, row in enumerate(blocks):
@@ -69,20 +78,26 @@ class Pairs:
 
 
 def _product_tables(sampling: Sampling, k: Tensor, bases: Tensor, index: list[tuple[int, int]]) -> Tensor:
-    """Sums over pulses of b_n b_m exp(2j pi c u) at steps of 1 / _TABLE cell c, (trial, step, product)."""
+    """Sums over pulses of b_n b_m exp(2j pi c u) at steps of 1 / _TABLE cell c, (trial, step,
+    product).
+    """
     first, second = (torch.tensor(side, device=bases.device) for side in zip(*index))
     scale = bases.abs().amax(-1, keepdim=True).clamp_min(1e-300)
     unit = bases / scale
     products = (unit[:, first] * unit[:, second]).mT.to(torch.complex128)
     lines = 2 * _NEAR_CELLS * _TABLE + 2
-    table = matched_fourier(products, k, sampling.prf_hz, oversampling=_TABLE, lines=lines, taps=6) * math.sqrt(sampling.pulses)
+    table = matched_fourier(products, k, sampling.prf_hz, oversampling=_TABLE, lines=lines, taps=6) * math.sqrt(
+        sampling.pulses
+    )
     return table[:, 1:] * (scale[:, first] * scale[:, second]).mT
 
 
 def band_response(x: Tensor, cells: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Response of range cells to a scatterer x cells away, its band being the `cells` frequencies that FFTs make of so many samples, and its first two derivatives.
+    """Response of range cells to a scatterer x cells away, its band being the `cells` frequencies
+    that FFTs make of so many samples, and its first two derivatives.
 
-    x: float64, any shape. The sinc of the signal model, periodic in the window as compressed pulses are; complex128, unit peak.
+    x: float64, any shape. The sinc of the signal model, periodic in the window as compressed pulses
+    are; complex128, unit peak.
     """
     cycles = (torch.arange(cells, dtype=torch.float64, device=x.device) - cells // 2) / cells
     turn = 2j * math.pi * cycles

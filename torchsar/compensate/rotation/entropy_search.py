@@ -1,4 +1,6 @@
-"""The rotation of least image entropy, by every search that a paper has used: grid, genetic, differential evolution, Newton, quasi-Newton."""
+"""The rotation of least image entropy, by every search that a paper has used: grid, genetic,
+differential evolution, Newton, quasi-Newton.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +20,17 @@ Vector = Sequence[float] | Tensor
 
 _EDGE = 1e-3  # of the width of a box: nearer to its edge a minimum is taken to lie outside
 _GAIN_NATS = 0.01  # by which compensation must lower the entropy at least
-_STILL = {torch.complex64: 1e-8, torch.complex128: 1e-9}  # relative changes of the entropy that are left to rounding
+# relative changes of the entropy that are left to rounding
+_STILL = {torch.complex64: 1e-8, torch.complex128: 1e-9}
 _FIRST_STEP = 0.3  # in units of the unknowns, of about a radian each
 
 
 def search_rotation(figure: ImageEntropy, axes: Sequence[Vector], *, limit: int = 100_000) -> Estimate:
-    """The best of a full grid: one list of values per unknown of the figure, (m,) or (..., m) per trial. Paper's size: 5 x 21 x 201.
+    """The best of a full grid: one list of values per unknown of the figure, (m,) or (..., m) per
+    trial. Paper's size: 5 x 21 x 201.
 
-    Estimates as `genetic_rotation`; a best point at the end of an axis of several values is not ok. info["entropy_grid_nats"]: (..., m_1, m_2, ...), the landscape.
+    Estimates as `genetic_rotation`; a best point at the end of an axis of several values is not ok.
+    info["entropy_grid_nats"]: (..., m_1, m_2, ...), the landscape.
     """
     _same_number(figure, axes, "search_rotation")
     values = [torch.as_tensor(axis, dtype=torch.float64, device=figure.range_m.device) for axis in axes]
@@ -36,15 +41,21 @@ def search_rotation(figure: ImageEntropy, axes: Sequence[Vector], *, limit: int 
 
 
 def genetic_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: Draws, **options: Any) -> Estimate:
-    """The rotation that a genetic algorithm finds in a box: the published estimator (Remote Sens. 2025, 17, 3447, section 3.3).
+    """The rotation that a genetic algorithm finds in a box: the published estimator (Remote Sens.
 
-    figure: the entropy as a function of its unknowns. low, high: one value per unknown (`figure.unknowns.names`), (n,) or (..., n). draws and options: as in `torchsar.optim.genetic`.
+    2025, 17, 3447, section 3.3).
 
-    value: omega_rad_s (...,) >= 0 (its sign cannot be seen: the image may be mirrored in cross range) and yc_m (...,), where the range term is compensated; warp_k (..., order - 1)
-    and its entries k1_per_s, k2_per_s2, ... There are no predicted deviations: an entropy is no likelihood. quality: by which share the exp(entropy) of the image, the
-    cells it fills, falls against no compensation. ok: it falls, and the minimum does not lie on the edge of the box. A figure of coarse lines has its minimum at a wrong
-    place (see `ImageEntropy`): ok does not say that the value is free of bias.
-    info: evaluations, entropy_nats, uncompensated_entropy_nats, on_edge (..., n) and best_entropy_nats (..., generation).
+    figure: the entropy as a function of its unknowns. low, high: one value per unknown
+    (`figure.unknowns.names`), (n,) or (..., n). draws and options: as in `torchsar.optim.genetic`.
+
+    value: omega_rad_s (...,) >= 0 (its sign cannot be seen: the image may be mirrored in cross
+    range) and yc_m (...,), where the range term is compensated; warp_k (..., order - 1) and its
+    entries k1_per_s, k2_per_s2, ... There are no predicted deviations: an entropy is no likelihood.
+    quality: by which share the exp(entropy) of the image, the cells it fills, falls against no
+    compensation. ok: it falls, and the minimum does not lie on the edge of the box. A figure of
+    coarse lines has its minimum at a wrong place (see `ImageEntropy`): ok does not say that the
+    value is free of bias. info: evaluations, entropy_nats, uncompensated_entropy_nats, on_edge
+    (..., n) and best_entropy_nats (..., generation).
     """
     low, high = _box(figure, low, high)
     found = genetic(figure, low, high, draws=draws, **options)
@@ -59,23 +70,38 @@ def evolve_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: D
 
 
 def newton_rotation(figure: ImageEntropy, start: Tensor, *, damped: bool = True, steps: int = 20) -> Estimate:
-    """The same by Newton's method from `start` (..., n), see `figure.start`: what the paper calls Gauss-Newton, of which its Table 2 shows that it depends on the start.
+    """The same by Newton's method from `start` (..., n), see `figure.start`: what the paper calls
+    Gauss-Newton, of which its Table 2 shows that it depends on the start.
 
-    damped=False diverges on most targets, from the truth as well: one direction is nearly flat. Such trials are not ok and keep their last finite point, nor are
-    those that use up their steps. info["iterations"]: steps taken.
+    damped=False diverges on most targets, from the truth as well: one direction is nearly flat.
+    Such trials are not ok and keep their last finite point, nor are those that use up their steps.
+    info["iterations"]: steps taken.
     """
     scaled = _Scaled(figure, _started(figure, start))
-    return _of_descent(figure, scaled, newton(scaled.single, scaled.start, damped=damped, steps=steps), steps, trusted=True)
+    return _of_descent(
+        figure, scaled, newton(scaled.single, scaled.start, damped=damped, steps=steps), steps, trusted=True
+    )
 
 
 def descend_rotation(figure: ImageEntropy, start: Tensor, *, steps: int = 60, tolerance: float = 1e-4) -> Estimate:
-    """The same by L-BFGS with exact gradients from `start` (..., n): the minimum next to it. Best in the variables "shape".
+    """The same by L-BFGS with exact gradients from `start` (..., n): the minimum next to it.
 
-    tolerance: of the gradient against that at the start. Not ok where the steps run out. A figure of order 2 without range term makes this the
-    second-order method 'SM' of the paper, whose k1 is not that of the target but about k1 + k2 T / 2.
+    Best in the variables "shape".
+
+    tolerance: of the gradient against that at the start. Not ok where the steps run out. A figure
+    of order 2 without range term makes this the second-order method 'SM' of the paper, whose k1 is
+    not that of the target but about k1 + k2 T / 2.
     """
     scaled = _Scaled(figure, _started(figure, start))
-    found = lbfgs(scaled.with_gradient, scaled.start, steps=steps, first_step=_FIRST_STEP, gradient_tolerance=tolerance, value_tolerance=_STILL[figure.dtype], with_gradient=True)
+    found = lbfgs(
+        scaled.with_gradient,
+        scaled.start,
+        steps=steps,
+        first_step=_FIRST_STEP,
+        gradient_tolerance=tolerance,
+        value_tolerance=_STILL[figure.dtype],
+        with_gradient=True,
+    )
     return _of_descent(figure, scaled, found, steps, trusted=False)
 
 
@@ -98,13 +124,29 @@ def _of_box(figure: ImageEntropy, found: Searched, low: Tensor, high: Tensor, **
     width = high - low
     near = torch.minimum(found.x - low, high - found.x) <= _EDGE * width
     edge = near & (width > 0)
-    return _estimate(figure, found.x, found.cost, found.ok & ~edge.any(-1), {"evaluations": found.evaluations, "on_edge": edge, **info})
+    return _estimate(
+        figure,
+        found.x,
+        found.cost,
+        found.ok & ~edge.any(-1),
+        {"evaluations": found.evaluations, "on_edge": edge, **info},
+    )
 
 
 def _of_descent(figure: ImageEntropy, scaled: _Scaled, found: Descent, steps: int, trusted: bool) -> Estimate:
-    """Not ok where the steps ran out. trusted: whether the descent's own verdict counts; that of L-BFGS is about walls on its way, which infeasible candidates are, too."""
+    """Not ok where the steps ran out.
+
+    trusted: whether the descent's own verdict counts; that of L-BFGS is about walls on its way,
+    which infeasible candidates are, too.
+    """
     ok = (found.ok if trusted else torch.isfinite(found.cost)) & (found.converged | (found.steps < steps))
-    return _estimate(figure, found.x * scaled.unit, found.cost, ok, {"evaluations": found.evaluations, "iterations": found.steps, "converged": found.converged})
+    return _estimate(
+        figure,
+        found.x * scaled.unit,
+        found.cost,
+        ok,
+        {"evaluations": found.evaluations, "iterations": found.steps, "converged": found.converged},
+    )
 
 
 def _estimate(figure: ImageEntropy, x: Tensor, cost: Tensor, ok: Tensor, info: dict[str, Tensor]) -> Estimate:
@@ -115,7 +157,12 @@ def _estimate(figure: ImageEntropy, x: Tensor, cost: Tensor, ok: Tensor, info: d
     if figure.unknowns.range_term:
         value |= {"omega_rad_s": turn.omega_rad_s.abs(), "yc_m": turn.yc_m.clone()}
     quality = (1 - torch.exp(-gain)).clamp(0, 1)
-    return Estimate(value, quality, ok & finite & turn.feasible & (gain > _GAIN_NATS), info={**info, "entropy_nats": cost, "uncompensated_entropy_nats": before})
+    return Estimate(
+        value,
+        quality,
+        ok & finite & turn.feasible & (gain > _GAIN_NATS),
+        info={**info, "entropy_nats": cost, "uncompensated_entropy_nats": before},
+    )
 
 
 def _box(figure: ImageEntropy, low: Vector, high: Vector) -> tuple[Tensor, Tensor]:
@@ -123,7 +170,9 @@ def _box(figure: ImageEntropy, low: Vector, high: Vector) -> tuple[Tensor, Tenso
 
 
 def _started(figure: ImageEntropy, start: Tensor) -> Tensor:
-    """A start (..., n) for every trial; where its own warp is not monotonic that of even rotation takes its place."""
+    """A start (..., n) for every trial; where its own warp is not monotonic that of even rotation
+    takes its place.
+    """
     x = figure.spread(figure.unknowns.vector(start, "start").detach())
     turn = figure.turn(x)
     return torch.where(turn.feasible[..., None], x, 0)
@@ -132,18 +181,41 @@ def _started(figure: ImageEntropy, start: Tensor) -> Tensor:
 def _same_number(figure: ImageEntropy, axes: Sequence[Any], who: str) -> None:
     names = figure.unknowns.names
     if len(axes) != len(names):
-        raise ValueError(f"{who} needs the values of the {len(names)} unknowns {', '.join(names)}, got {len(axes)} lists")
+        raise ValueError(
+            f"{who} needs the values of the {len(names)} unknowns {', '.join(names)}, got {len(axes)} lists"
+        )
 
 
 class _Search(Stage):
     """What every search for the rotation is told about the image; see `ImageEntropy`."""
 
-    def __init__(self, radar: InverseRadar, order: int, range_term: bool, yc_m: float | None, variables: Variables, oversampling: float, lines: int | None, taps: int) -> None:
+    def __init__(
+        self,
+        radar: InverseRadar,
+        order: int,
+        range_term: bool,
+        yc_m: float | None,
+        variables: Variables,
+        oversampling: float,
+        lines: int | None,
+        taps: int,
+    ) -> None:
         super().__init__()
         self.radar, self.order, self.range_term = radar, order, range_term
-        self.options = {"order": order, "range_term": range_term, "variables": variables, "oversampling": oversampling, "lines": lines, "taps": taps}
+        self.options = {
+            "order": order,
+            "range_term": range_term,
+            "variables": variables,
+            "oversampling": oversampling,
+            "lines": lines,
+            "taps": taps,
+        }
         self.yc_m = yc_m
-        self.provides = ("warp_k", *(k_name(i) for i in range(1, order)), *(("omega_rad_s", "yc_m") if range_term else ()))
+        self.provides = (
+            "warp_k",
+            *(k_name(i) for i in range(1, order)),
+            *(("omega_rad_s", "yc_m") if range_term else ()),
+        )
 
     def figure(self, signal: Signal, yc_m: Tensor | None) -> ImageEntropy:
         """yc_m: a connected value is that of the centre deviation, unless it is searched for."""
@@ -152,7 +224,8 @@ class _Search(Stage):
 
 
 class RotationSearch(_Search):
-    """`search_rotation` on counts[i] values from low[i] to high[i], one entry per unknown: omega (rad/s), k1, k2, ... and yc where it is None (see `Unknowns`).
+    """`search_rotation` on counts[i] values from low[i] to high[i], one entry per unknown: omega
+    (rad/s), k1, k2, ... and yc where it is None (see `Unknowns`).
 
     yc_m: the known centre deviation; a connected value goes before it; None searches for it.
     """
@@ -174,7 +247,10 @@ class RotationSearch(_Search):
     ) -> None:
         super().__init__(radar, order, range_term, yc_m, variables, oversampling, lines, taps)
         if not len(low) == len(high) == len(counts) or any(count < 1 for count in counts):
-            raise ValueError(f"a grid needs as many values in low, high and counts, and counts of at least 1, got {list(low)}, {list(high)} and {list(counts)}")
+            raise ValueError(
+                "a grid needs as many values in low, high and counts, and counts of at least 1, got "
+                f"{list(low)}, {list(high)} and {list(counts)}"
+            )
         self.axes = [torch.linspace(a, b, n, dtype=torch.float64) for a, b, n in zip(low, high, counts, strict=True)]
         self.limit = limit
 
@@ -183,7 +259,10 @@ class RotationSearch(_Search):
 
 
 class RotationGenetic(_Search):
-    """`genetic_rotation` in the box low..high, one entry per unknown as in `RotationSearch`. All trials see the random numbers of `seed`."""
+    """`genetic_rotation` in the box low..high, one entry per unknown as in `RotationSearch`.
+
+    All trials see the random numbers of `seed`.
+    """
 
     def __init__(
         self,
@@ -212,7 +291,10 @@ class RotationGenetic(_Search):
 
 
 class RotationEvolution(_Search):
-    """`evolve_rotation` in the box low..high, one entry per unknown as in `RotationSearch`. All trials see the random numbers of `seed`."""
+    """`evolve_rotation` in the box low..high, one entry per unknown as in `RotationSearch`.
+
+    All trials see the random numbers of `seed`.
+    """
 
     def __init__(
         self,
@@ -240,25 +322,40 @@ class RotationEvolution(_Search):
 
 
 class _Descending(_Search):
-    """A search from a start [omega (rad/s), k1, k2, ...], without omega where there is no range term; connected values go before its entries."""
+    """A search from a start [omega (rad/s), k1, k2, ...], without omega where there is no range
+    term; connected values go before its entries.
+    """
 
     def __init__(self, start: list[float] | None, *image: Any) -> None:
         super().__init__(*image)
         wanted = self.order - 1 + self.range_term
         if start is not None and len(start) != wanted:
-            raise ValueError(f"a start needs the {wanted} values {'omega, ' if self.range_term else ''}k1, k2, ..., got {list(start)}")
+            raise ValueError(
+                f"a start needs the {wanted} values {'omega, ' if self.range_term else ''}k1, k2, "
+                f"..., got {list(start)}"
+            )
         self.begin = None if start is None else torch.tensor(start, dtype=torch.float64)
 
-    def started(self, figure: ImageEntropy, omega_rad_s: Tensor | None, warp_k: Tensor | None, yc_m: Tensor | None) -> Tensor:
-        """The vector to start from. Raises ValueError where a value is neither connected nor in the start."""
+    def started(
+        self, figure: ImageEntropy, omega_rad_s: Tensor | None, warp_k: Tensor | None, yc_m: Tensor | None
+    ) -> Tensor:
+        """The vector to start from.
+
+        Raises ValueError where a value is neither connected nor in the start.
+        """
         omega = self._given()[0] if omega_rad_s is None else omega_rad_s
         k = self._given()[1] if warp_k is None else warp_k
         if omega is None or k is None:
-            raise ValueError(f"{type(self).__name__} needs a start: give start=[omega, k1, k2, ...], or connect omega_rad_s and warp_k from an estimator before it")
+            raise ValueError(
+                f"{type(self).__name__} needs a start: give start=[omega, k1, k2, ...], or connect "
+                "omega_rad_s and warp_k from an estimator before it"
+            )
         return figure.start(omega, k, yc_m)
 
     def _given(self) -> tuple[Tensor | float | None, Tensor | None]:
-        """Rate and warp of the start, or what stands in for them: the rate that the radar is told; nothing where there is nothing to know."""
+        """Rate and warp of the start, or what stands in for them: the rate that the radar is told;
+        nothing where there is nothing to know.
+        """
         rate = self.radar.rotation_rad_s if self.range_term else 0.0
         if self.begin is None:
             return rate, torch.zeros(0, dtype=torch.float64) if self.order == 1 else None
@@ -267,10 +364,12 @@ class _Descending(_Search):
 
 
 class RotationNewton(_Descending):
-    """`newton_rotation` from `start`, [omega (rad/s), k1, k2, ...] (no omega without range term), in raw or well-conditioned variables.
+    """`newton_rotation` from `start`, [omega (rad/s), k1, k2, ...] (no omega without range term),
+    in raw or well-conditioned variables.
 
-    Values connected (omega_rad_s, warp_k, yc_m) go before the entries of the start, and rotation_rad_s of the radar stands in for an omega that is missing. yc_m: as in `RotationSearch`; where it is
-    searched for, it starts from the connected value or 0.
+    Values connected (omega_rad_s, warp_k, yc_m) go before the entries of the start, and
+    rotation_rad_s of the radar stands in for an omega that is missing. yc_m: as in
+    `RotationSearch`; where it is searched for, it starts from the connected value or 0.
     """
 
     def __init__(
@@ -290,13 +389,24 @@ class RotationNewton(_Descending):
         super().__init__(start, radar, order, range_term, yc_m, variables, oversampling, lines, taps)
         self.damped, self.steps = damped, steps
 
-    def forward(self, signal: Signal, omega_rad_s: Tensor | None = None, warp_k: Tensor | None = None, yc_m: Tensor | None = None) -> Estimate:
+    def forward(
+        self,
+        signal: Signal,
+        omega_rad_s: Tensor | None = None,
+        warp_k: Tensor | None = None,
+        yc_m: Tensor | None = None,
+    ) -> Estimate:
         figure = self.figure(signal, yc_m)
-        return newton_rotation(figure, self.started(figure, omega_rad_s, warp_k, yc_m), damped=self.damped, steps=self.steps)
+        return newton_rotation(
+            figure, self.started(figure, omega_rad_s, warp_k, yc_m), damped=self.damped, steps=self.steps
+        )
 
 
 class RotationDescent(_Descending):
-    """`descend_rotation` from a start, given or connected as in `RotationNewton`. With order=2 and range_term=False: the second-order method 'SM'."""
+    """`descend_rotation` from a start, given or connected as in `RotationNewton`.
+
+    With order=2 and range_term=False: the second-order method 'SM'.
+    """
 
     def __init__(
         self,
@@ -314,6 +424,12 @@ class RotationDescent(_Descending):
         super().__init__(start, radar, order, range_term, yc_m, variables, oversampling, lines, taps)
         self.steps = steps
 
-    def forward(self, signal: Signal, omega_rad_s: Tensor | None = None, warp_k: Tensor | None = None, yc_m: Tensor | None = None) -> Estimate:
+    def forward(
+        self,
+        signal: Signal,
+        omega_rad_s: Tensor | None = None,
+        warp_k: Tensor | None = None,
+        yc_m: Tensor | None = None,
+    ) -> Estimate:
         figure = self.figure(signal, yc_m)
         return descend_rotation(figure, self.started(figure, omega_rad_s, warp_k, yc_m), steps=self.steps)

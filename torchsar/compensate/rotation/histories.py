@@ -1,8 +1,11 @@
-"""Phase least squares: the phase histories of bright isolated scatterers, fitted by what an error of the motion does to each of them.
+"""Phase least squares: the phase histories of bright isolated scatterers, fitted by what an error
+of the motion does to each of them.
 
-A window about a focused scatterer, transformed back, is its history over the aperture. What is left in it beyond a constant and a line is -2 pi c du/dk dk at
-Doppler cell c, and (c4/2) (y dw + dv) phi^2 at range y. Products of a history with itself a sixth of the aperture later need no unwrapping, and start
-from any rate: even the range term of a motion that is not known at all, w = 0, bends phases by little in that time.
+A window about a focused scatterer, transformed back, is its history over the aperture. What is left
+in it beyond a constant and a line is -2 pi c du/dk dk at Doppler cell c, and (c4/2) (y dw + dv)
+phi^2 at range y. Products of a history with itself a sixth of the aperture later need no
+unwrapping, and start from any rate: even the range term of a motion that is not known at all, w =
+0, bends phases by little in that time.
 """
 
 from __future__ import annotations
@@ -25,10 +28,21 @@ _NOTHING = 1e-7  # of an eigenvalue of a normal matrix of unit diagonal
 _SHARE_LOST = 0.01  # of an unknown in a direction
 
 
-def refined_by_histories(data: Tensor, sampling: Sampling, motion: Motion, *, free_centre: bool = True, count: int = 128, half_cells: int = 24) -> tuple[Motion, Tensor]:
-    """One step of phase least squares from `motion`, on data (trial, pulse, range). Returns the motion and the number of scatterers used (trial,).
+def refined_by_histories(
+    data: Tensor,
+    sampling: Sampling,
+    motion: Motion,
+    *,
+    free_centre: bool = True,
+    count: int = 128,
+    half_cells: int = 24,
+) -> tuple[Motion, Tensor]:
+    """One step of phase least squares from `motion`, on data (trial, pulse, range).
 
-    count: scatterers at most; half_cells: half width of a window in Doppler cells, wide enough for the error of the start.
+    Returns the motion and the number of scatterers used (trial,).
+
+    count: scatterers at most; half_cells: half width of a window in Doppler cells, wide enough for
+    the error of the start.
     """
     image = image_of(data, sampling, motion, oversampling=_OVERSAMPLING)
     power = image.abs().square()
@@ -46,19 +60,25 @@ def refined_by_histories(data: Tensor, sampling: Sampling, motion: Motion, *, fr
 
 
 def _histories(image: Tensor, peaks: Peaks, half_cells: int) -> tuple[Tensor, Tensor]:
-    """Histories (trial, peak, 2 half_cells) of windows about peaks, and where on the aperture their samples lie, u (sample,)."""
+    """Histories (trial, peak, 2 half_cells) of windows about peaks, and where on the aperture their
+    samples lie, u (sample,).
+    """
     lines = torch.arange(2 * half_cells * _OVERSAMPLING, device=image.device) - half_cells * _OVERSAMPLING
     row = peaks.line[..., None] + lines
     inside = (row >= 0) & (row < image.shape[1])
     index = row.clamp(0, image.shape[1] - 1) * image.shape[2] + peaks.cell[..., None]
-    window = torch.where(inside, torch.gather(image.flatten(1), 1, index.flatten(1)).view(index.shape), 0).to(torch.complex128)
+    window = torch.where(inside, torch.gather(image.flatten(1), 1, index.flatten(1)).view(index.shape), 0).to(
+        torch.complex128
+    )
     u = (torch.arange(2 * half_cells, dtype=torch.float64, device=image.device) + 0.5) / (2 * half_cells)
     angle = -2 * math.pi / _OVERSAMPLING * lines[:, None] * u
     return window @ torch.polar(torch.ones_like(angle), angle), u
 
 
 def _bases(motion: Motion, sampling: Sampling, cells: Tensor, range_m: Tensor, u: Tensor, free_centre: bool) -> Tensor:
-    """Phase (rad) per unit of each unknown, (trial, peak, unknown, sample): k1, k2, ..., w, then v where it is free."""
+    """Phase (rad) per unit of each unknown, (trial, peak, unknown, sample): k1, k2, ..., w, then v
+    where it is free.
+    """
     warped = Warped.of(motion.k, _times_at(u, motion.k, sampling.duration_s), sampling.duration_s)
     square = 2 * math.pi * sampling.turns_per_square * warped.phi.square()[:, None]
     rows = [-2 * math.pi * cells[..., None] * slope[:, None] for slope in warped.slopes.unbind(1)]
@@ -78,7 +98,10 @@ def _times_at(u: Tensor, k: Tensor, duration_s: float) -> Tensor:
 
 
 def _fitted(history: Tensor, bases: Tensor, used: Tensor) -> Tensor:
-    """Robust weighted least squares on phases between samples a sixth of the histories apart. (trial, unknown)."""
+    """Robust weighted least squares on phases between samples a sixth of the histories apart.
+
+    (trial, unknown).
+    """
     lag = max(1, history.shape[-1] // 6)
     product = history[..., lag:] * history[..., :-lag].conj()
     whole = product.sum(-1, keepdim=True)
@@ -91,7 +114,9 @@ def _fitted(history: Tensor, bases: Tensor, used: Tensor) -> Tensor:
     change = angle.new_zeros(bases.shape[0], bases.shape[2])
     for _ in range(_ROBUST_ROUNDS):
         weighted = difference * weight[..., None, :]
-        change = solved(torch.einsum("bpij,bpkj->bik", weighted, difference), torch.einsum("bpij,bpj->bi", weighted, angle))
+        change = solved(
+            torch.einsum("bpij,bpkj->bik", weighted, difference), torch.einsum("bpij,bpj->bi", weighted, angle)
+        )
         rest = angle - torch.einsum("bi,bpij->bpj", change, difference)
         scale = 3 * rest.abs().flatten(1).median(-1).values[:, None, None].clamp_min(1e-12)
         weight = weight / (1 + (rest / scale).square())
@@ -99,13 +124,17 @@ def _fitted(history: Tensor, bases: Tensor, used: Tensor) -> Tensor:
 
 
 def solved(normal: Tensor, right: Tensor) -> Tensor:
-    """Solution of small normal equations (trial, n, n), (trial, n); directions that nothing is known about stay at zero."""
+    """Solution of small normal equations (trial, n, n), (trial, n); directions that nothing is
+    known about stay at zero.
+    """
     inverse, _ = inverted(normal)
     return (inverse @ right[..., None])[..., 0]
 
 
 def inverted(normal: Tensor) -> tuple[Tensor, Tensor]:
-    """Inverse of small normal matrices (trial, n, n) without the directions that nothing is known about, and which unknowns have a part in those, (trial, n) bool."""
+    """Inverse of small normal matrices (trial, n, n) without the directions that nothing is known
+    about, and which unknowns have a part in those, (trial, n) bool.
+    """
     scale = normal.diagonal(dim1=-2, dim2=-1)
     root = torch.where(scale > 0, scale, 1).rsqrt()
     value, vector = torch.linalg.eigh(normal * root[:, :, None] * root[:, None])

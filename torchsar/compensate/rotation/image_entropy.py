@@ -1,8 +1,11 @@
-"""Entropy of the image as a function of the rotation: range phase, matched Fourier transform, entropy; many candidates at once."""
+"""Entropy of the image as a function of the rotation: range phase, matched Fourier transform,
+entropy; many candidates at once.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,20 +17,27 @@ from torchsar.radar import InverseRadar
 
 
 class ImageEntropy:
-    """Entropy (nats) of the image of range-compressed pulses by the rotation taken out of them: the objective of every search for the rotation.
+    """Entropy (nats) of the image of range-compressed pulses by the rotation taken out of them: the
+    objective of every search for the rotation.
 
-    figure(x): costs (..., candidate) of candidates x (..., candidate, n), the unknowns of `figure.unknowns`; +inf, never NaN, where the warp is not monotonic. Differentiable twice
-    in x. figure.single(x): the same of one vector per trial, (..., n) -> (...,); figure.with_gradient(x): cost and gradient by blocks, for `torchsar.optim.lbfgs`.
+    figure(x): costs (..., candidate) of candidates x (..., candidate, n), the unknowns of
+    `figure.unknowns`; +inf, never NaN, where the warp is not monotonic. Differentiable twice in x.
+    figure.single(x): the same of one vector per trial, (..., n) -> (...,); figure.with_gradient(x):
+    cost and gradient by blocks, for `torchsar.optim.lbfgs`.
 
-    data: (..., pulse, range) complex. wavelength_m, prf_hz: of the instrument; range_m: (range,) coordinates y_n, zero in the middle of the window. order, range_term,
-    variables: see `Unknowns`. yc_m: the deviation of the rotation centre (m), a number or (...,), that y_n + yc is the range from it; None searches for it.
-    oversampling: of the image lines. At 1 peaks fall between lines and displace the minimum: by 2 % of k and 24 % of omega on a target of 120 points at 20 dB, at 2 by 0.2 and 1 %, at 4 by
-    0.07 and 0.2 %; more on smaller targets. lines: computed about zero Doppler, by default all that the pulse rate holds. taps: of the kernel of the transform; 4 of them err
-    by 2e-6 in entropy, 6 by 1e-7.
+    data: (..., pulse, range) complex. wavelength_m, prf_hz: of the instrument; range_m: (range,)
+    coordinates y_n, zero in the middle of the window. order, range_term, variables: see `Unknowns`.
+    yc_m: the deviation of the rotation centre (m), a number or (...,), that y_n + yc is the range
+    from it; None searches for it. oversampling: of the image lines. At 1 peaks fall between lines
+    and displace the minimum: by 2 % of k and 24 % of omega on a target of 120 points at 20 dB, at 2
+    by 0.2 and 1 %, at 4 by 0.07 and 0.2 %; more on smaller targets. lines: computed about zero
+    Doppler, by default all that the pulse rate holds. taps: of the kernel of the transform; 4 of
+    them err by 2e-6 in entropy, 6 by 1e-7.
 
-    Memory: candidates go through in blocks; derivatives keep what all their candidates need. Raises TypeError or ValueError for samples that are not complex and
-    finite, fewer than 8 pulses, numbers that are not positive, or a range axis of another length.
-    Remote Sens. 2025, 17, 3447, Eqs. (7)-(12), the entropy of |I|^2 over all pixels.
+    Memory: candidates go through in blocks; derivatives keep what all their candidates need. Raises
+    TypeError or ValueError for samples that are not complex and finite, fewer than 8 pulses,
+    numbers that are not positive, or a range axis of another length. Remote Sens. 2025, 17, 3447,
+    Eqs. (7)-(12), the entropy of |I|^2 over all pixels.
     """
 
     def __init__(
@@ -46,7 +56,11 @@ class ImageEntropy:
         taps: int = 4,
     ) -> None:
         _check(data, wavelength_m, prf_hz, range_m)
-        self.wavelength_m, self.prf_hz, self.range_m = wavelength_m, prf_hz, range_m.to(device=data.device, dtype=torch.float64)
+        self.wavelength_m, self.prf_hz, self.range_m = (
+            wavelength_m,
+            prf_hz,
+            range_m.to(device=data.device, dtype=torch.float64),
+        )
         self.oversampling, self.lines, self.taps = oversampling, lines, taps
         self.unknowns = Unknowns(data.shape[-2] / prf_hz, order, range_term, yc_m is None, variables)
         self.trials, self.dtype = data.shape[:-2], data.dtype
@@ -55,9 +69,15 @@ class ImageEntropy:
         self._yc = known.expand(self.trials).reshape(-1)
 
     @staticmethod
-    def of(signal: Signal, radar: InverseRadar, **options: object) -> ImageEntropy:
+    def of(signal: Signal, radar: InverseRadar, **options: Any) -> ImageEntropy:
         """Of a signal (pulse, range) of an instrument; options as in the constructor."""
-        return ImageEntropy(signal.data, wavelength_m=radar.wavelength_m, prf_hz=radar.prf_hz, range_m=signal.axis("range").values(signal.data.device), **options)  # pyright: ignore[reportArgumentType]
+        return ImageEntropy(
+            signal.data,
+            wavelength_m=radar.wavelength_m,
+            prf_hz=radar.prf_hz,
+            range_m=signal.axis("range").values(signal.data.device),
+            **options,
+        )
 
     def __call__(self, x: Tensor) -> Tensor:
         rows, count = x.reshape(-1, x.shape[-1]), x.shape[-2]
@@ -71,7 +91,10 @@ class ImageEntropy:
     def with_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Costs (...,) and gradients (..., n) of one vector per trial, block by block."""
         rows = x.detach().reshape(-1, x.shape[-1])
-        pairs = [_steep(lambda part_x, part=part: self._cost(part, part_x, 1), rows[part]) for part in self._blocks(len(rows), 1)]
+        pairs = [
+            _steep(lambda part_x, part=part: self._cost(part, part_x, 1), rows[part])
+            for part in self._blocks(len(rows), 1)
+        ]
         cost, gradient = (torch.cat(parts) for parts in zip(*pairs, strict=True))
         return cost.reshape(x.shape[:-1]), gradient.reshape(x.shape)
 
@@ -80,11 +103,16 @@ class ImageEntropy:
         return self.unknowns.turn(x, self._yc.reshape(self.trials))
 
     def start(self, omega_rad_s: Tensor | float, warp_k: Tensor, yc_m: Tensor | float | None = None) -> Tensor:
-        """The vector (..., n) of a rotation, one per trial; yc_m: by default the known one, or 0."""
+        """The vector (..., n) of a rotation, one per trial; yc_m: by default the known one,
+        or 0.
+        """
         like = {"dtype": torch.float64, "device": self._data.device}
         omega, k = torch.as_tensor(omega_rad_s, **like), torch.as_tensor(warp_k, **like)
         if k.shape[-1:] != (self.unknowns.order - 1,):
-            raise ValueError(f"a rotation of order {self.unknowns.order} starts from warp_k with {self.unknowns.order - 1} entries in its last dim, got shape {tuple(k.shape)}")
+            raise ValueError(
+                f"a rotation of order {self.unknowns.order} starts from warp_k with "
+                f"{self.unknowns.order - 1} entries in its last dim, got shape {tuple(k.shape)}"
+            )
         yc = self._yc.reshape(self.trials) if yc_m is None else torch.as_tensor(yc_m, **like)
         return self.spread(self.unknowns.at(omega, k, yc))
 
@@ -105,14 +133,18 @@ class ImageEntropy:
         return torch.cat(costs).reshape(self.trials)
 
     def _blocks(self, rows: int, count: int) -> Iterator[slice]:
-        """Rows of candidates that stay in the cache together, `count` of them for each trial; a block does not cross trials where there are several candidates."""
+        """Rows of candidates that stay in the cache together, `count` of them for each trial; a
+        block does not cross trials where there are several candidates.
+        """
         size = self._data[0].numel() * self._data.element_size() * max(1.0, self.oversampling)
         height = max(1, int(4 * block_bytes_of(self._data.device) // size))
         if count == 1:
             yield from (slice(first, min(first + height, rows)) for first in range(0, rows, height))
             return
         for trial in range(0, rows, count):
-            yield from (slice(first, min(first + height, trial + count)) for first in range(trial, trial + count, height))
+            yield from (
+                slice(first, min(first + height, trial + count)) for first in range(trial, trial + count, height)
+            )
 
     def _cost(self, part: slice, x: Tensor, count: int) -> Tensor:
         """Costs (row,) of a block of vectors (row, n)."""
@@ -120,16 +152,22 @@ class ImageEntropy:
         turn = self.unknowns.turn(x.to(torch.float64), self._yc[own])
         pulses = self._data[own]
         if self.unknowns.range_term:
-            pulses = range_phase(pulses, self.range_m, self.wavelength_m, self.prf_hz, turn.omega_rad_s, turn.warp_k, turn.yc_m)
+            pulses = range_phase(
+                pulses, self.range_m, self.wavelength_m, self.prf_hz, turn.omega_rad_s, turn.warp_k, turn.yc_m
+            )
         return torch.where(turn.feasible, self._entropy(pulses, turn.warp_k), torch.inf)
 
     def _entropy(self, pulses: Tensor, k: Tensor) -> Tensor:
-        image = matched_fourier(pulses, k, self.prf_hz, oversampling=self.oversampling, lines=self.lines, taps=self.taps)
+        image = matched_fourier(
+            pulses, k, self.prf_hz, oversampling=self.oversampling, lines=self.lines, taps=self.taps
+        )
         return _entropy(image)
 
 
 def _entropy(image: Tensor) -> Tensor:
-    """-sum p ln p, p = |I|^2 / sum |I|^2, of images of about unit level, (..., line, range) -> (...,) float64."""
+    """-sum p ln p, p = |I|^2 / sum |I|^2, of images of about unit level, (..., line, range) ->
+    (...,) float64.
+    """
     power = torch.view_as_real(image).square().sum(-1)
     total = power.sum((-2, -1), dtype=torch.float64)
     inner = (power * torch.log(power.clamp_min(torch.finfo(power.dtype).tiny))).sum((-2, -1), dtype=torch.float64)
@@ -156,10 +194,16 @@ def _levelled(data: Tensor) -> Tensor:
 def _check(data: Tensor, wavelength_m: float, prf_hz: float, range_m: Tensor) -> None:
     real_dtype(data.dtype)
     if data.ndim < 2 or data.shape[-2] < 8 or not data.shape[-1]:
-        raise ValueError(f"the entropy of an image needs data (..., pulse, range) of at least 8 pulses, got shape {tuple(data.shape)}")
+        raise ValueError(
+            "the entropy of an image needs data (..., pulse, range) of at least 8 pulses, got "
+            f"shape {tuple(data.shape)}"
+        )
     refuse_non_finite(data, "ImageEntropy")
     for name, value in (("wavelength_m", wavelength_m), ("prf_hz", prf_hz)):
         if not value > 0:
             raise ValueError(f"ImageEntropy: {name} must be positive, got {value}")
     if range_m.shape != data.shape[-1:]:
-        raise ValueError(f"ImageEntropy: range_m needs the {data.shape[-1]} coordinates of the range axis, got shape {tuple(range_m.shape)}")
+        raise ValueError(
+            f"ImageEntropy: range_m needs the {data.shape[-1]} coordinates of the range axis, got "
+            f"shape {tuple(range_m.shape)}"
+        )

@@ -1,4 +1,6 @@
-"""What estimators of uneven rotation share: how the data are sampled, the motion in the form in which it enters phases, and its removal."""
+"""What estimators of uneven rotation share: how the data are sampled, the motion in the form in
+which it enters phases, and its removal.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,11 @@ LEAST_PULSES = 8
 
 @dataclass(frozen=True)
 class Sampling:
-    """Where the samples of a recording lie. first_m, step_m: range of cell 0 and of one cell, from where the processor takes the centre to be."""
+    """Where the samples of a recording lie.
+
+    first_m, step_m: range of cell 0 and of one cell, from where the processor takes the centre to
+    be.
+    """
 
     wavelength_m: float
     prf_hz: float
@@ -46,10 +52,12 @@ class Sampling:
 
 @dataclass(frozen=True)
 class Motion:
-    """Rotation in the form in which phases are linear in it: the warp k (trial, order - 1), w = Om^2 and v (trial,), float64.
+    """Rotation in the form in which phases are linear in it: the warp k (trial, order - 1), w =
+    Om^2 and v (trial,), float64.
 
-    The range term of a scatterer at y_n is (c4/2) (w (y_n + centre_m) + v) phi^2: centre_m (trial,) is the range centre deviation that is known, v what is found
-    beyond it. Only w and v show in data; both may start at zero, and may come out negative where noise is all there is.
+    The range term of a scatterer at y_n is (c4/2) (w (y_n + centre_m) + v) phi^2: centre_m (trial,)
+    is the range centre deviation that is known, v what is found beyond it. Only w and v show in
+    data; both may start at zero, and may come out negative where noise is all there is.
     """
 
     k: Tensor
@@ -78,7 +86,9 @@ class Motion:
         return self.centre_m + torch.where(self.w > 0, self.v / torch.where(self.w > 0, self.w, 1), 0)
 
     def possible(self, sampling: Sampling) -> Tensor:
-        """Whether the numbers are finite and the range term changes by less than half a turn from pulse to pulse in every cell, as in data it must, (trial,)."""
+        """Whether the numbers are finite and the range term changes by less than half a turn from
+        pulse to pulse in every cell, as in data it must, (trial,).
+        """
         ends = sampling.range_m(torch.tensor([0.0, sampling.cells - 1.0], dtype=torch.float64, device=self.w.device))
         whole = warp(torch.tensor([sampling.duration_s], dtype=torch.float64, device=self.w.device), self.k)
         turns = sampling.turns_per_square * (self.w[:, None] * ends + self.offset[:, None]).abs() * whole.square()
@@ -92,7 +102,9 @@ class Motion:
 
 @dataclass(frozen=True)
 class Warped:
-    """The warp at some times (trial, m): phi (s), u = phi / phi(T), and du/dk_i (trial, order - 1, m)."""
+    """The warp at some times (trial, m): phi (s), u = phi / phi(T), and du/dk_i (trial, order - 1,
+    m).
+    """
 
     phi: Tensor
     u: Tensor
@@ -104,19 +116,36 @@ class Warped:
         end = torch.tensor([duration_s], dtype=torch.float64, device=k.device)
         whole, phi = warp(end, k), warp(times_s, k)
         u = phi / whole
-        rows = [(times_s ** (i + 2) - u * duration_s ** (i + 2)) / (math.factorial(i + 2) * whole) for i in range(k.shape[-1])]
+        rows = [
+            (times_s ** (i + 2) - u * duration_s ** (i + 2)) / (math.factorial(i + 2) * whole)
+            for i in range(k.shape[-1])
+        ]
         slopes = torch.stack(rows, -2) if rows else u.new_zeros((*u.shape[:-1], 0, u.shape[-1]))
         return Warped(phi, u, slopes)
 
 
 def without_range_term(data: Tensor, sampling: Sampling, motion: Motion, phi: Tensor) -> Tensor:
-    """data (trial, pulse, range) times exp(-j (c4/2) (w y_n + offset) phi^2). phi: (trial, pulse)."""
+    """data (trial, pulse, range) times exp(-j (c4/2) (w y_n + offset) phi^2). phi: (trial,
+    pulse).
+    """
     square = -sampling.turns_per_square * phi.square()
-    fine, coarse = phasor_tables(square * (motion.w[:, None] * sampling.step_m), sampling.first_m / sampling.step_m, sampling.cells, data.dtype)
-    return data * outer_phasor(fine, coarse * unit_phasor(square * motion.offset[:, None], data.dtype)[..., None], sampling.cells)
+    fine, coarse = phasor_tables(
+        square * (motion.w[:, None] * sampling.step_m), sampling.first_m / sampling.step_m, sampling.cells, data.dtype
+    )
+    return data * outer_phasor(
+        fine, coarse * unit_phasor(square * motion.offset[:, None], data.dtype)[..., None], sampling.cells
+    )
 
 
 def image_of(data: Tensor, sampling: Sampling, motion: Motion, oversampling: float = 2.0) -> Tensor:
-    """Image (trial, line, range) of data (trial, pulse, range) with this motion taken out, lines of 1 / oversampling Doppler cells about zero."""
+    """Image (trial, line, range) of data (trial, pulse, range) with this motion taken out, lines of
+    1 / oversampling Doppler cells about zero.
+    """
     phi = warp(sampling.times(data.device), motion.k)
-    return matched_fourier(without_range_term(data, sampling, motion, phi), motion.k, sampling.prf_hz, oversampling=oversampling, eps=SEARCH_EPS)
+    return matched_fourier(
+        without_range_term(data, sampling, motion, phi),
+        motion.k,
+        sampling.prf_hz,
+        oversampling=oversampling,
+        eps=SEARCH_EPS,
+    )

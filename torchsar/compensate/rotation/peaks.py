@@ -1,4 +1,6 @@
-"""Bright scatterers of an image: local maxima that stand out of the noise and of the side lobes about them."""
+"""Bright scatterers of an image: local maxima that stand out of the noise and of the side lobes
+about them.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ _CANDIDATES = 4  # looked at for each peak that is wanted
 
 @dataclass(frozen=True)
 class Peaks:
-    """Brightest first, (trial, peak): power (0 where there is none), line and range cell (int64)."""
+    """Brightest first, (trial, peak): power (0 where there is none), line and range cell
+    (int64).
+    """
 
     power: Tensor
     line: Tensor
@@ -29,7 +33,9 @@ class Peaks:
 
 
 def noise_power(power: Tensor) -> Tensor:
-    """Mean power of circular Gaussian noise from the median over an image (trial, line, range) that scatterers leave mostly empty. (trial,)."""
+    """Mean power of circular Gaussian noise from the median over an image (trial, line, range) that
+    scatterers leave mostly empty. (trial,).
+    """
     every = power.flatten(1)
     return every[:, :: max(1, every.shape[-1] // _SAMPLED)].median(-1).values / math.log(2)
 
@@ -40,18 +46,24 @@ def threshold(power: Tensor) -> float:
 
 
 def find_peaks(power: Tensor, floor: Tensor, count: int, share: float, lines: int, cells: int) -> Peaks:
-    """Up to `count` local maxima above `floor` (trial,), each at least share^2 of the largest power within +-lines and +-cells.
+    """Up to `count` local maxima above `floor` (trial,), each at least share^2 of the largest power
+    within +-lines and +-cells.
 
-    power: (trial, line, range). Strong scatterers hide weaker ones and their own side lobes; those come out once the strong ones are removed.
+    power: (trial, line, range). Strong scatterers hide weaker ones and their own side lobes; those
+    come out once the strong ones are removed.
     """
     n_line, n_cell = power.shape[1:]
     maxima = torch.where(_local_maximum(power) & (power > floor[:, None, None]), power, 0).flatten(1)
     level, index = maxima.topk(min(_CANDIDATES * count, maxima.shape[-1]), -1)
     line, cell = index // n_cell, index % n_cell
-    offsets = torch.cartesian_prod(torch.arange(-lines, lines + 1, device=power.device), torch.arange(-cells, cells + 1, device=power.device))
+    offsets = torch.cartesian_prod(
+        torch.arange(-lines, lines + 1, device=power.device), torch.arange(-cells, cells + 1, device=power.device)
+    )
     near_line, near_cell = line[..., None] + offsets[:, 0], cell[..., None] + offsets[:, 1]
     inside = (near_line >= 0) & (near_line < n_line) & (near_cell >= 0) & (near_cell < n_cell)
-    near = torch.gather(power.flatten(1), 1, (near_line.clamp(0, n_line - 1) * n_cell + near_cell.clamp(0, n_cell - 1)).flatten(1)).view(inside.shape)
+    near = torch.gather(
+        power.flatten(1), 1, (near_line.clamp(0, n_line - 1) * n_cell + near_cell.clamp(0, n_cell - 1)).flatten(1)
+    ).view(inside.shape)
     around = torch.where(inside, near, 0).amax(-1)
     kept = torch.where((level > 0) & (level >= share**2 * around), level, 0)
     found, order = kept.topk(min(count, kept.shape[-1]), -1)

@@ -1,4 +1,6 @@
-"""The recommended estimator of uneven rotation: without a start and without a box, from short sections to maximum likelihood."""
+"""The recommended estimator of uneven rotation: without a start and without a box, from short
+sections to maximum likelihood.
+"""
 
 from __future__ import annotations
 
@@ -23,40 +25,71 @@ MOST_RATE_ERROR = 0.05  # predicted, of omega, beyond which images cannot be sca
 _LEAST_EXPLAINED = 0.4  # of the energy above the noise
 _ENTROPY_ROUNDING = 1e-3
 _BLOCKS = 8  # a block of trials is so many times what one operation likes best
-_STANDING_STILL, _STILL_RAD = 3.0, 0.02  # deviations, or phase of the scatterers: the last step of a fit that has come to an end
+_STANDING_STILL, _STILL_RAD = (
+    3.0,
+    0.02,
+)  # deviations, or phase of the scatterers: the last step of a fit that has come to an end
 _HISTORY_STEPS = 4
 
 Part = Callable[[Tensor, Sampling, Tensor | None], Estimate]
 
 
 def uneven_rotation(
-    data: Tensor, *, wavelength_m: float, prf_hz: float, range_m: Tensor, order: int = 3, yc_m: Tensor | float | None = None, scatterers: int | None = None, rounds: int = ROUNDS
+    data: Tensor,
+    *,
+    wavelength_m: float,
+    prf_hz: float,
+    range_m: Tensor,
+    order: int = 3,
+    yc_m: Tensor | float | None = None,
+    scatterers: int | None = None,
+    rounds: int = ROUNDS,
 ) -> Estimate:
-    """Rotation of a target that turns unevenly, (Om, k1, k2, ...) at the first pulse, and the range centre deviation yc, from range-compressed pulses.
+    """Rotation of a target that turns unevenly, (Om, k1, k2, ...) at the first pulse, and the range
+    centre deviation yc, from range-compressed pulses.
 
-    data: complex (..., pulse, range); range_m: y_n, float64 (range,), evenly spaced; yc_m: the known deviation (m), a number or (...,), or None to estimate it. order: of the
-    warp, 1 (even), 2, 3 or more. Three steps: correlation of spectra of short sections (`coarse_warp`), phase least squares of bright scatterers
-    (`refined_by_histories`), and maximum likelihood of the motion and every scatterer (`fit_scatterers`: `scatterers` at most, in `rounds` steps; both buy accuracy with time).
+    data: complex (..., pulse, range); range_m: y_n, float64 (range,), evenly spaced; yc_m: the
+    known deviation (m), a number or (...,), or None to estimate it. order: of the warp, 1 (even),
+    2, 3 or more. Three steps: correlation of spectra of short sections (`coarse_warp`), phase least
+    squares of bright scatterers (`refined_by_histories`), and maximum likelihood of the motion and
+    every scatterer (`fit_scatterers`: `scatterers` at most, in `rounds` steps; both buy accuracy
+    with time).
 
-    value: omega_rad_s (its sign cannot be seen: images may be mirrored in cross range), warp_k (..., order - 1) and its entries k1_per_s, k2_per_s2, ..., and yc_m. std: the
-    deviations that the Fisher information of the scatterers found predicts. quality: share of the energy above the noise that these scatterers explain. ok: at least
-    3 of them, 40 % of the energy explained, entropy no higher than without compensation, and Om known to 5 %. info: focused (k and yc serve to form an image, whose
-    scale is unknown where ok is False all the same), scatterers, noise_power, steps, entropy_nats, uncompensated_entropy_nats.
-    Needs scatterers apart in range: Om shows only in the curvature that grows with range, and not at all where all lie in one range cell and yc is unknown.
-    Raises TypeError or ValueError for data that are not finite, complex, of 8 pulses at least.
+    value: omega_rad_s (its sign cannot be seen: images may be mirrored in cross range), warp_k
+    (..., order - 1) and its entries k1_per_s, k2_per_s2, ..., and yc_m. std: the deviations that
+    the Fisher information of the scatterers found predicts. quality: share of the energy above the
+    noise that these scatterers explain. ok: at least 3 of them, 40 % of the energy explained,
+    entropy no higher than without compensation, and Om known to 5 %. info: focused (k and yc serve
+    to form an image, whose scale is unknown where ok is False all the same), scatterers,
+    noise_power, steps, entropy_nats, uncompensated_entropy_nats. Needs scatterers apart in range:
+    Om shows only in the curvature that grows with range, and not at all where all lie in one range
+    cell and yc is unknown. Raises TypeError or ValueError for data that are not finite, complex, of
+    8 pulses at least.
     """
     _refuse_less("uneven_rotation", 1, order=order, rounds=rounds, scatterers=1 if scatterers is None else scatterers)
 
     def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Estimate:
-        motion, _ = refined_by_histories(rows, sampling, _start(rows, sampling, order, known), free_centre=known is None)
+        motion, _ = refined_by_histories(
+            rows, sampling, _start(rows, sampling, order, known), free_centre=known is None
+        )
         fit = fit_scatterers(rows, sampling, motion, free_centre=known is None, count=scatterers, rounds=rounds)
         return _estimate(rows, sampling, fit, known is None)
 
     return _over_trials("uneven_rotation", find, data, wavelength_m, prf_hz, range_m, yc_m)
 
 
-def coarse_rotation(data: Tensor, *, wavelength_m: float, prf_hz: float, range_m: Tensor, order: int = 3, yc_m: Tensor | float | None = None) -> Estimate:
-    """The first step of `uneven_rotation` alone, `coarse_warp`: k1 and k2 to about a percent; omega is not looked at and stays 0. ok: entropy lower than without compensation."""
+def coarse_rotation(
+    data: Tensor,
+    *,
+    wavelength_m: float,
+    prf_hz: float,
+    range_m: Tensor,
+    order: int = 3,
+    yc_m: Tensor | float | None = None,
+) -> Estimate:
+    """The first step of `uneven_rotation` alone, `coarse_warp`: k1 and k2 to about a percent; omega
+    is not looked at and stays 0. ok: entropy lower than without compensation.
+    """
     _refuse_less("coarse_rotation", 1, order=order)
 
     def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Estimate:
@@ -66,9 +99,19 @@ def coarse_rotation(data: Tensor, *, wavelength_m: float, prf_hz: float, range_m
 
 
 def phase_fit_rotation(
-    data: Tensor, *, wavelength_m: float, prf_hz: float, range_m: Tensor, order: int = 3, yc_m: Tensor | float | None = None, steps: int = _HISTORY_STEPS, half_cells: int = 24
+    data: Tensor,
+    *,
+    wavelength_m: float,
+    prf_hz: float,
+    range_m: Tensor,
+    order: int = 3,
+    yc_m: Tensor | float | None = None,
+    steps: int = _HISTORY_STEPS,
+    half_cells: int = 24,
 ) -> Estimate:
-    """The first two steps of `uneven_rotation` alone: coarse, then `steps` of phase least squares on windows of half_cells to either side. Half of the time, two to twenty times the error."""
+    """The first two steps of `uneven_rotation` alone: coarse, then `steps` of phase least squares
+    on windows of half_cells to either side. Half of the time, two to twenty times the error.
+    """
     _refuse_less("phase_fit_rotation", 1, order=order, steps=steps)
     _refuse_less("phase_fit_rotation", 4, half_cells=half_cells)
 
@@ -83,26 +126,46 @@ def phase_fit_rotation(
 
 def _start(rows: Tensor, sampling: Sampling, order: int, known: Tensor | None) -> Motion:
     """The coarse warp in `order` terms, and no rate yet."""
-    k = coarse_warp(rows, sampling.prf_hz) if order > 1 else torch.zeros(rows.shape[0], 0, dtype=torch.float64, device=rows.device)
+    k = (
+        coarse_warp(rows, sampling.prf_hz)
+        if order > 1
+        else torch.zeros(rows.shape[0], 0, dtype=torch.float64, device=rows.device)
+    )
     if order == 2:
         k = k_of_shape(shape_of(k, sampling.duration_s)[:, :1], sampling.duration_s)
     return Motion.still(torch.nn.functional.pad(k, (0, max(0, order - 3))), known)
 
 
-def _over_trials(name: str, find: Part, data: Tensor, wavelength_m: float, prf_hz: float, range_m: Tensor, yc_m: Tensor | float | None) -> Estimate:
+def _over_trials(
+    name: str,
+    find: Part,
+    data: Tensor,
+    wavelength_m: float,
+    prf_hz: float,
+    range_m: Tensor,
+    yc_m: Tensor | float | None,
+) -> Estimate:
     """find(rows, sampling, known centre) by blocks of trials, each over its own largest sample."""
     sampling = _checked(name, data, wavelength_m, prf_hz, range_m)
     trials, rows = data.shape[:-2], data.detach().reshape(-1, *data.shape[-2:])
-    known = None if yc_m is None else _centre(name, torch.as_tensor(yc_m, dtype=torch.float64, device=data.device), trials)
+    known = (
+        None if yc_m is None else _centre(name, torch.as_tensor(yc_m, dtype=torch.float64, device=data.device), trials)
+    )
     height = max(1, _BLOCKS * block_bytes_of(data.device) // (rows[0].numel() * rows.element_size()))
     parts: dict[int, Estimate] = {}
 
     @torch.no_grad()
     def work(first: int) -> None:
         part = slice(first, first + height)
-        peak = torch.maximum(rows[part].real.abs(), rows[part].imag.abs()).amax((-2, -1), keepdim=True)  # |z| itself may overflow
+        peak = torch.maximum(rows[part].real.abs(), rows[part].imag.abs()).amax(
+            (-2, -1), keepdim=True
+        )  # |z| itself may overflow
         found = find(rows[part] / torch.where(peak > 0, peak, 1), sampling, None if known is None else known[part])
-        scaled = {"noise_power": found.info["noise_power"] * peak[:, 0, 0].double().square()} if "noise_power" in found.info else {}
+        scaled = (
+            {"noise_power": found.info["noise_power"] * peak[:, 0, 0].double().square()}
+            if "noise_power" in found.info
+            else {}
+        )
         parts[first] = replace(found, info={**found.info, **scaled})
 
     starts = range(0, rows.shape[0], height)
@@ -120,27 +183,40 @@ def _centre(name: str, yc_m: Tensor, trials: torch.Size) -> Tensor:
     """The known deviation of every trial, (trial,)."""
     refuse_non_finite(yc_m, f"{name}: yc_m")
     if yc_m.ndim and yc_m.shape != trials:
-        raise ValueError(f"{name}: yc_m must be one number (m) or one a trial {tuple(trials)}, got shape {tuple(yc_m.shape)}")
+        raise ValueError(
+            f"{name}: yc_m must be one number (m) or one a trial {tuple(trials)}, got shape {tuple(yc_m.shape)}"
+        )
     return yc_m.expand(trials).reshape(-1)
 
 
 def _checked(name: str, data: Tensor, wavelength_m: float, prf_hz: float, range_m: Tensor) -> Sampling:
     if not isinstance(data, Tensor) or not data.is_complex():
-        raise TypeError(f"{name} works on complex range-compressed samples (..., pulse, range), got {data.dtype if isinstance(data, Tensor) else type(data).__name__}")
+        raise TypeError(
+            f"{name} works on complex range-compressed samples (..., pulse, range), got "
+            f"{data.dtype if isinstance(data, Tensor) else type(data).__name__}"
+        )
     if data.ndim < 2 or data.shape[-2] < LEAST_PULSES or not data.numel():
-        raise ValueError(f"{name} works on samples (..., pulse, range) of at least {LEAST_PULSES} pulses and one range cell, got the shape {tuple(data.shape)}")
+        raise ValueError(
+            f"{name} works on samples (..., pulse, range) of at least {LEAST_PULSES} pulses and "
+            f"one range cell, got the shape {tuple(data.shape)}"
+        )
     for what, value in (("wavelength_m", wavelength_m), ("prf_hz", prf_hz)):
         if not (math.isfinite(value) and value > 0):
             raise ValueError(f"{name}: {what} must be a positive number, got {value}")
     if not isinstance(range_m, Tensor) or range_m.shape != data.shape[-1:]:
         got = f"the shape {tuple(range_m.shape)}" if isinstance(range_m, Tensor) else type(range_m).__name__
-        raise ValueError(f"{name}: range_m needs the {data.shape[-1]} coordinates of the range axis as a tensor, got {got}")
+        raise ValueError(
+            f"{name}: range_m needs the {data.shape[-1]} coordinates of the range axis as a tensor, got {got}"
+        )
     refuse_non_finite(data, name)
     refuse_non_finite(range_m, f"{name}: range_m")
     steps = torch.diff(range_m.to(torch.float64))
     step = float(steps.mean()) if len(steps) else 1.0
     if step == 0 or bool(((steps - step).abs() > 1e-6 * abs(step)).any()):
-        raise ValueError(f"{name}: range_m must be evenly spaced, got steps of {float(steps.min()):g} to {float(steps.max()):g} m; resample range first")
+        raise ValueError(
+            f"{name}: range_m must be evenly spaced, got steps of {float(steps.min()):g} to "
+            f"{float(steps.max()):g} m; resample range first"
+        )
     return Sampling(wavelength_m, prf_hz, data.shape[-2], data.shape[-1], float(range_m[0]), step)
 
 
@@ -152,7 +228,9 @@ def _estimate(rows: Tensor, sampling: Sampling, fit: Fit, free_centre: bool) -> 
     present = (rows != 0).any(-1).sum(-1)
     energy = fit.scatterers.amplitude.abs().square().sum(-1) * present
     explained = energy / _energy(rows, fit.noise, present)
-    resting = (fit.last_step <= _STANDING_STILL) | (fit.last_step * (fit.noise / (2 * energy.clamp_min(torch.finfo(torch.float64).tiny))).sqrt() <= _STILL_RAD)
+    resting = (fit.last_step <= _STANDING_STILL) | (
+        fit.last_step * (fit.noise / (2 * energy.clamp_min(torch.finfo(torch.float64).tiny))).sqrt() <= _STILL_RAD
+    )
     quality = settle(explained.clamp(0, 1), 0.0)[0]
     std = _deviations(fit, free_centre)
     focused = found.ok & (count >= LEAST_SCATTERERS) & (quality >= _LEAST_EXPLAINED) & resting
@@ -168,7 +246,9 @@ def _energy(rows: Tensor, noise: Tensor, present: Tensor) -> Tensor:
 
 
 def _deviations(fit: Fit, free_centre: bool) -> dict[str, Tensor]:
-    """From the covariance of (k, w, v) to that of what is reported; infinite where nothing is known."""
+    """From the covariance of (k, w, v) to that of what is reported; infinite where nothing is
+    known.
+    """
     motion, order = fit.motion, fit.motion.k.shape[-1]
     known = (fit.scatterers.amplitude != 0).any(-1)
     covariance = torch.where(known[:, None, None], fit.covariance * fit.noise[:, None, None], math.inf)
@@ -179,17 +259,33 @@ def _deviations(fit: Fit, free_centre: bool) -> dict[str, Tensor]:
     yc = torch.zeros_like(w)
     if free_centre:
         found = motion.yc_m - motion.centre_m
-        yc = (covariance[:, -1, -1] - 2 * found * covariance[:, order, -1] + found.square() * ww).clamp_min(0).sqrt() / w
-    named = {"warp_k": k, **{k_name(i + 1): column for i, column in enumerate(k.unbind(-1))}, "omega_rad_s": omega, "yc_m": yc}
+        yc = (covariance[:, -1, -1] - 2 * found * covariance[:, order, -1] + found.square() * ww).clamp_min(
+            0
+        ).sqrt() / w
+    named = {
+        "warp_k": k,
+        **{k_name(i + 1): column for i, column in enumerate(k.unbind(-1))},
+        "omega_rad_s": omega,
+        "yc_m": yc,
+    }
     return {name: torch.where(torch.isnan(value), math.inf, value) for name, value in named.items()}
 
 
 def _judged(rows: Tensor, sampling: Sampling, motion: Motion) -> Estimate:
-    """A motion as an estimate, ok where its image has no more entropy than that of even rotation without compensation."""
+    """A motion as an estimate, ok where its image has no more entropy than that of even rotation
+    without compensation.
+    """
     motion = replace(motion, k=settle(motion.k, 0.0)[0], w=settle(motion.w, 0.0)[0], v=settle(motion.v, 0.0)[0])
     before = entropy(torch.fft.fft(rows, 2 * sampling.pulses, dim=-2))
     after = entropy(image_of(rows, sampling, motion))
-    value = {"warp_k": motion.k, **{k_name(i + 1): k for i, k in enumerate(motion.k.unbind(-1))}, "omega_rad_s": motion.omega_rad_s, "yc_m": motion.yc_m}
+    value = {
+        "warp_k": motion.k,
+        **{k_name(i + 1): k for i, k in enumerate(motion.k.unbind(-1))},
+        "omega_rad_s": motion.omega_rad_s,
+        "yc_m": motion.yc_m,
+    }
     gained = (before - after).double()
     quality = (1 - torch.exp(-gained)).clamp(0, 1)
-    return Estimate(value, quality, gained > -_ENTROPY_ROUNDING, info={"entropy_nats": after, "uncompensated_entropy_nats": before})
+    return Estimate(
+        value, quality, gained > -_ENTROPY_ROUNDING, info={"entropy_nats": after, "uncompensated_entropy_nats": before}
+    )

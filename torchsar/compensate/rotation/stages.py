@@ -1,4 +1,6 @@
-"""Estimators of uneven rotation as stages, and the uniform autofocus of a target that turns unevenly."""
+"""Estimators of uneven rotation as stages, and the uniform autofocus of a target that turns
+unevenly.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ _SEARCH_TOLERANCE_RAD, _TOLERANCE_RAD = 0.01, 1e-3
 
 
 class _Rotation(Stage):
-    """yc_m: the known range centre deviation (m), or None to estimate it; a connected value goes before it."""
+    """yc_m: the known range centre deviation (m), or None to estimate it; a connected value goes
+    before it.
+    """
 
     def __init__(self, radar: InverseRadar, order: int, yc_m: float | None) -> None:
         super().__init__()
@@ -39,13 +43,29 @@ class _Rotation(Stage):
         """What the function is told about the signal."""
         place = signal.axis("range").values(signal.data.device)
         centre = self.yc_m if yc_m is None else yc_m
-        return {"wavelength_m": self.radar.wavelength_m, "prf_hz": 1 / signal.axis("pulse").step, "range_m": place, "order": self.order, "yc_m": centre}
+        return {
+            "wavelength_m": self.radar.wavelength_m,
+            "prf_hz": 1 / signal.axis("pulse").step,
+            "range_m": place,
+            "order": self.order,
+            "yc_m": centre,
+        }
 
 
 class UnevenRotation(_Rotation):
-    """`uneven_rotation`, the recommended estimator. scatterers, rounds: what it may spend, see there."""
+    """`uneven_rotation`, the recommended estimator.
 
-    def __init__(self, radar: InverseRadar, order: int = 3, yc_m: float | None = None, scatterers: int | None = None, rounds: int = ROUNDS) -> None:
+    scatterers, rounds: what it may spend, see there.
+    """
+
+    def __init__(
+        self,
+        radar: InverseRadar,
+        order: int = 3,
+        yc_m: float | None = None,
+        scatterers: int | None = None,
+        rounds: int = ROUNDS,
+    ) -> None:
         super().__init__(radar, order, yc_m)
         self.scatterers, self.rounds = scatterers, rounds
 
@@ -66,7 +86,9 @@ class CoarseRotation(_Rotation):
 class PhaseFitRotation(_Rotation):
     """`phase_fit_rotation`: coarse, then phase least squares of bright scatterers."""
 
-    def __init__(self, radar: InverseRadar, order: int = 3, yc_m: float | None = None, steps: int = 4, half_cells: int = 24) -> None:
+    def __init__(
+        self, radar: InverseRadar, order: int = 3, yc_m: float | None = None, steps: int = 4, half_cells: int = 24
+    ) -> None:
         super().__init__(radar, order, yc_m)
         self.steps, self.half_cells = steps, half_cells
 
@@ -75,10 +97,13 @@ class PhaseFitRotation(_Rotation):
 
 
 class RotationAutofocus(Stage):
-    """A phase per pulse that all scatterers share, sharpened on the image with the rotation taken out; by `autofocus` where no rotation is connected yet.
+    """A phase per pulse that all scatterers share, sharpened on the image with the rotation taken
+    out; by `autofocus` where no rotation is connected yet.
 
-    Connected: omega_rad_s, warp_k, yc_m, and phase_rad (..., pulse) to start from. search, polish: iterations of the entropy fixed point and of the Wiener estimate.
-    A phase that is free in every pulse takes all of the range centre deviation with it: fix yc in estimators that take turns with this one.
+    Connected: omega_rad_s, warp_k, yc_m, and phase_rad (..., pulse) to start from. search, polish:
+    iterations of the entropy fixed point and of the Wiener estimate. A phase that is free in every
+    pulse takes all of the range centre deviation with it: fix yc in estimators that take turns with
+    this one.
     """
 
     provides = ("phase_rad",)
@@ -87,29 +112,58 @@ class RotationAutofocus(Stage):
         super().__init__()
         self.radar, self.search, self.polish = radar, search, polish
 
-    def forward(self, signal: Signal, phase_rad: Tensor | None = None, omega_rad_s: Tensor | None = None, warp_k: Tensor | None = None, yc_m: Tensor | None = None) -> Estimate:
+    def forward(
+        self,
+        signal: Signal,
+        phase_rad: Tensor | None = None,
+        omega_rad_s: Tensor | None = None,
+        warp_k: Tensor | None = None,
+        yc_m: Tensor | None = None,
+    ) -> Estimate:
         if warp_k is None:
             return autofocus(signal.data, start=phase_rad)
         prf_hz, data = 1 / signal.axis("pulse").step, signal.data
         if omega_rad_s is not None:
-            data = range_phase(data, signal.axis("range").values(data.device), self.radar.wavelength_m, prf_hz, omega_rad_s, warp_k, 0.0 if yc_m is None else yc_m)
+            data = range_phase(
+                data,
+                signal.axis("range").values(data.device),
+                self.radar.wavelength_m,
+                prf_hz,
+                omega_rad_s,
+                warp_k,
+                0.0 if yc_m is None else yc_m,
+            )
         k = warp_k.expand(*signal.trials, warp_k.shape[-1]).reshape(-1, warp_k.shape[-1])
         return rotating_autofocus(data, prf_hz, k, phase_rad, self.search, self.polish)
 
 
-def rotating_autofocus(data: Tensor, prf_hz: float, warp_k: Tensor, start: Tensor | None = None, search: int = 60, polish: int = 20) -> Estimate:
-    """Phase per pulse (..., pulse) of data (..., pulse, range) without its range term, judged by the matched Fourier transform with warp_k (trial, order - 1).
+def rotating_autofocus(
+    data: Tensor, prf_hz: float, warp_k: Tensor, start: Tensor | None = None, search: int = 60, polish: int = 20
+) -> Estimate:
+    """Phase per pulse (..., pulse) of data (..., pulse, range) without its range term, judged by
+    the matched Fourier transform with warp_k (trial, order - 1).
 
-    start: (..., pulse) rad, by default that of adjacent pulses. quality: by which share the cells that the image fills fall; ok: they do not grow.
+    start: (..., pulse) rad, by default that of adjacent pulses. quality: by which share the cells
+    that the image fills fall; ok: they do not grow.
     """
     pulses = prepare(data, "rotating_autofocus")
-    through = Through(MatchedFourierOperator(warp_k, pulses.n, prf_hz, dtype=data.dtype, oversampling=1.0, eps=SEARCH_EPS))
+    through = Through(
+        MatchedFourierOperator(warp_k, pulses.n, prf_hz, dtype=data.dtype, oversampling=1.0, eps=SEARCH_EPS)
+    )
     begin = starting_phase(start, pulses, "rotating_autofocus")
     begin = pair_phase(pulses.rows, pulses.present) if begin is None else begin
-    runs = [Run(LogAbove(_FLOOR), through, search, _RELAXATION, _SEARCH_TOLERANCE_RAD), Run(Wiener(), through, polish, 1.0, _TOLERANCE_RAD)]
+    runs = [
+        Run(LogAbove(_FLOOR), through, search, _RELAXATION, _SEARCH_TOLERANCE_RAD),
+        Run(Wiener(), through, polish, 1.0, _TOLERANCE_RAD),
+    ]
     with torch.no_grad():
         phase, taken = in_turn(pulses.rows, begin, runs)
         before, after = (entropy(through.image(x)) for x in (pulses.rows, rotate(pulses.rows, phase)))
     quality = (1 - torch.exp(after - before)).clamp(0, 1)
     value = {"phase_rad": phase.reshape(*pulses.trials, pulses.n)}
-    return Estimate(value, quality.reshape(pulses.trials), (after <= before).reshape(pulses.trials), info={"iterations": taken.reshape(pulses.trials)})
+    return Estimate(
+        value,
+        quality.reshape(pulses.trials),
+        (after <= before).reshape(pulses.trials),
+        info={"iterations": taken.reshape(pulses.trials)},
+    )

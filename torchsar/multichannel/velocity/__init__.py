@@ -8,7 +8,13 @@ from torchsar.multichannel.velocity.interferometry import interferometry
 from torchsar.multichannel.velocity.likelihood import maximum_likelihood
 from torchsar.multichannel.velocity.recommended import moving_point_velocity
 from torchsar.multichannel.velocity.sir import SignalIntensityRatio
-from torchsar.multichannel.velocity.stages import AlongTrackAutofocus, GradientVelocity, Interferometry, LikelihoodVelocity, MovingPointVelocity
+from torchsar.multichannel.velocity.stages import (
+    AlongTrackAutofocus,
+    GradientVelocity,
+    Interferometry,
+    LikelihoodVelocity,
+    MovingPointVelocity,
+)
 from torchsar.multichannel.velocity.walk import WalkAmbiguity
 from torchsar.multichannel.velocity.whitening import Whitening, line_whitening, sample_whitening
 

@@ -1,6 +1,8 @@
-"""Along-track velocity of a moving point by the power of its deramped tone: autofocus for one known phase history, no reconstruction needed.
+"""Along-track velocity of a moving point by the power of its deramped tone: autofocus for one known
+phase history, no reconstruction needed.
 
-Source: brief 001, Velocity (u_a): tone power over a grid, coarse to fine. It never inverts a band matrix, so that speeds at which channels sample the same places do it no harm.
+Source: brief 001, Velocity (u_a): tone power over a grid, coarse to fine. It never inverts a band
+matrix, so that speeds at which channels sample the same places do it no harm.
 """
 
 from __future__ import annotations
@@ -22,15 +24,31 @@ from torchsar.radar import BistaticRadar
 _TINY = torch.finfo(torch.float64).tiny
 
 
-def along_track_velocity(data: Tensor, radar: BistaticRadar, start: PointMotion, aperture: Aperture, half_m_s: float = 20.0, step_m_s: float = 0.5, fine: int = 3) -> Estimate:
-    """u_a within +-half_m_s of the start, u_r and y0 being those of the start. data: complex (..., channel, pulse), transmit range removed.
+def along_track_velocity(
+    data: Tensor,
+    radar: BistaticRadar,
+    start: PointMotion,
+    aperture: Aperture,
+    half_m_s: float = 20.0,
+    step_m_s: float = 0.5,
+    fine: int = 3,
+) -> Estimate:
+    """u_a within +-half_m_s of the start, u_r and y0 being those of the start.
 
-    A grid of step_m_s, then `fine` grids of five, each a fifth as wide, and a parabola. std: from the curvature of the likelihood of the tone. ok: not at the end of the search, and
-    the tone stands above the threshold. What is measured is the curvature of the phase: an acceleration along the line of sight looks the same (brief 001: 0.05 m/s^2 as 0.42 m/s).
+    data: complex (..., channel, pulse), transmit range removed.
+
+    A grid of step_m_s, then `fine` grids of five, each a fifth as wide, and a parabola. std: from
+    the curvature of the likelihood of the tone. ok: not at the end of the search, and the tone
+    stands above the threshold. What is measured is the curvature of the phase: an acceleration
+    along the line of sight looks the same (brief 001: 0.05 m/s^2 as 0.42 m/s).
     """
     if not half_m_s > 0:
-        raise ValueError(f"half_m_s of a search along track must be positive, got {half_m_s}; where u_a is known there is nothing to search")
-    PointMotion.of(radar, data, 0.0, start.u_a_m_s + half_m_s)  # refuses a search up to the receiver's speed
+        raise ValueError(
+            f"half_m_s of a search along track must be positive, got {half_m_s}; where u_a is "
+            "known there is nothing to search"
+        )
+    # refuses a search up to the receiver's speed
+    PointMotion.of(radar, data, 0.0, start.u_a_m_s + half_m_s)
     data = data.to(torch.complex128)
     centre = start.u_a_m_s.expand(data.shape[:-2])
     count = 2 * max(1, round(half_m_s / step_m_s)) + 1
@@ -40,13 +58,22 @@ def along_track_velocity(data: Tensor, radar: BistaticRadar, start: PointMotion,
     ended = top.edge
     for _ in range(fine):
         step = 2 * step / 5
-        top = _best(data, radar, start, aperture, top.u_a_m_s, step * torch.arange(-2, 3, dtype=torch.float64, device=data.device))
+        top = _best(
+            data,
+            radar,
+            start,
+            aperture,
+            top.u_a_m_s,
+            step * torch.arange(-2, 3, dtype=torch.float64, device=data.device),
+        )
     found = torch.where(top.energy > 0, top.u_a_m_s.clamp(centre - half_m_s, centre + half_m_s), centre)
     return _judged(data, radar, replace(start, u_a_m_s=found), aperture, top.energy, top.curvature, ended)
 
 
 class _Top(NamedTuple):
-    """Of tone energies over a grid, per trial: where they peak, how high, how sharply, and whether that is an end of the grid."""
+    """Of tone energies over a grid, per trial: where they peak, how high, how sharply, and whether
+    that is an end of the grid.
+    """
 
     u_a_m_s: Tensor
     energy: Tensor
@@ -54,9 +81,15 @@ class _Top(NamedTuple):
     edge: Tensor
 
 
-def _best(data: Tensor, radar: BistaticRadar, start: PointMotion, aperture: Aperture, centre: Tensor, offsets: Tensor) -> _Top:
-    """By the greatest of the grid centre + offsets (even steps) and a parabola through its neighbours."""
-    power = torch.stack([tone_power(data, radar, replace(start, u_a_m_s=centre + offset), aperture) for offset in offsets])
+def _best(
+    data: Tensor, radar: BistaticRadar, start: PointMotion, aperture: Aperture, centre: Tensor, offsets: Tensor
+) -> _Top:
+    """By the greatest of the grid centre + offsets (even steps) and a parabola through its
+    neighbours.
+    """
+    power = torch.stack(
+        [tone_power(data, radar, replace(start, u_a_m_s=centre + offset), aperture) for offset in offsets]
+    )
     at, step = power.argmax(0), offsets[1] - offsets[0]
     inner = at.clamp(1, len(offsets) - 2)
     low, middle, high = (power.gather(0, (inner + shift)[None])[0] for shift in (-1, 0, 1))
@@ -67,7 +100,9 @@ def _best(data: Tensor, radar: BistaticRadar, start: PointMotion, aperture: Aper
 
 
 def tone_power(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture) -> Tensor:
-    """Greatest energy of a tone in the deramped data, summed over channels, (...,): energy of the point where the curvature is right."""
+    """Greatest energy of a tone in the deramped data, summed over channels, (...,): energy of the
+    point where the curvature is right.
+    """
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
     weight = aperture.weight(radar, motion, time_s)
     deramped = data * point_phasor(radar, motion, time_s, data.dtype).conj() * weight[..., None, :]
@@ -75,7 +110,15 @@ def tone_power(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture
     return spectrum.amax(-1) / weight.square().sum(-1).clamp_min(_TINY)
 
 
-def _judged(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture, energy: Tensor, bend: Tensor, ended: Tensor) -> Estimate:
+def _judged(
+    data: Tensor,
+    radar: BistaticRadar,
+    motion: PointMotion,
+    aperture: Aperture,
+    energy: Tensor,
+    bend: Tensor,
+    ended: Tensor,
+) -> Estimate:
     weight = aperture.weight(radar, motion, radar.pulse_axis(data.shape[-1]).values(data.device))[..., None, :]
     shines = (weight != 0).expand(data.shape)
     noise = ((data.abs().square() * shines).sum((-2, -1)) - energy).clamp_min(0) / shines.sum((-2, -1)).clamp_min(1)
@@ -83,9 +126,15 @@ def _judged(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: A
     value = {"u_a_m_s": motion.u_a_m_s}
     ok = (snr >= DETECTED_DB) & ~ended
     std = torch.where(energy > 0, torch.sqrt(noise / bend.clamp_min(_TINY)), torch.inf)
-    return Estimate(value, torch.sigmoid((snr - DETECTED_DB) / 3), ok, {"u_a_m_s": std}, {"snr_db": snr, "at_the_end": ended})
+    return Estimate(
+        value, torch.sigmoid((snr - DETECTED_DB) / 3), ok, {"u_a_m_s": std}, {"snr_db": snr, "at_the_end": ended}
+    )
 
 
-def motion_from(radar: BistaticRadar, data: Tensor, u_r_m_s: Number, u_a_m_s: Number, y0_m: Number, range_m: Number | None) -> PointMotion:
+def motion_from(
+    radar: BistaticRadar, data: Tensor, u_r_m_s: Number, u_a_m_s: Number, y0_m: Number, range_m: Number | None
+) -> PointMotion:
     """A motion of the data's trials from values that a chain may connect."""
-    return PointMotion.of(radar, data, u_r_m_s, u_a_m_s, y0_m, range_m).each(lambda value: value.expand(data.shape[:-2]))
+    return PointMotion.of(radar, data, u_r_m_s, u_a_m_s, y0_m, range_m).each(
+        lambda value: value.expand(data.shape[:-2])
+    )

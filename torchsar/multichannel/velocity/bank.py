@@ -1,7 +1,9 @@
 """A bank of matched filters over velocities: where a moving point may be, without a start.
 
-Data are taken against the exact phase of each hypothesis; what is left of a point near it is one tone in all channels. The cubic phase of the range history, and not
-only the direction that the channels measure, tells slant-range velocities that differ by whole pulse rates (brief 001: modulo lambda PRF otherwise).
+Data are taken against the exact phase of each hypothesis; what is left of a point near it is one
+tone in all channels. The cubic phase of the range history, and not only the direction that the
+channels measure, tells slant-range velocities that differ by whole pulse rates (brief 001: modulo
+lambda PRF otherwise).
 """
 
 from __future__ import annotations
@@ -26,9 +28,11 @@ _TINY = torch.finfo(torch.float32).tiny
 
 @dataclass(frozen=True)
 class Search:
-    """What a bank covers: steps of velocities (m/s) and half widths about zero, and how far (m) along track from the middle a point may lie.
+    """What a bank covers: steps of velocities (m/s) and half widths about zero, and how far (m)
+    along track from the middle a point may lie.
 
-    u_r_m_s: half width; u_a_m_s: half width, 0 where the along-track speed is told. Steps suit apertures of about 4.5 s at 300 m/s and 5 km.
+    u_r_m_s: half width; u_a_m_s: half width, 0 where the along-track speed is told. Steps suit
+    apertures of about 4.5 s at 300 m/s and 5 km.
     """
 
     u_r_m_s: float = 21.6
@@ -55,10 +59,13 @@ def bank_search(
     whitening: Whitening | None = None,
     image_s: Number | None = None,
 ) -> tuple[PointMotion, Tensor]:
-    """The hypothesis that explains most, per trial, and the energy that it explains (...,) by the normalised correlation: zero velocity for trials of zeros.
+    """The hypothesis that explains most, per trial, and the energy that it explains (...,) by the
+    normalised correlation: zero velocity for trials of zeros.
 
-    data: complex (..., channel, pulse). u_a_m_s: (...,) middle of the search along track. The place along track is read from the tone left, within +-search.y0_m of zero, or of
-    where a point of each velocity lies that appears at the slow time image_s (...,) in an image: what a detection knows.
+    data: complex (..., channel, pulse). u_a_m_s: (...,) middle of the search along track. The place
+    along track is read from the tone left, within +-search.y0_m of zero, or of where a point of
+    each velocity lies that appears at the slow time image_s (...,) in an image: what a detection
+    knows.
     """
     n = data.shape[-1]
     time_s = radar.pulse_axis(n).values(data.device)
@@ -75,8 +82,14 @@ def bank_search(
             if image_s is not None:
                 there = replace(there, y0_m=there.place_m(per_trial(image_s, 1, data)))
             # what all trials search alike needs the pulses of its aperture alone
-            lit = _lit(aperture.weight(radar, there, time_s)) if there.y0_m.ndim <= 1 and whitening is None else slice(None)
-            found, place, along = _best_tone(taken[..., lit], radar, there, aperture, time_s[lit], search.y0_m, whitening)
+            lit = (
+                _lit(aperture.weight(radar, there, time_s))
+                if there.y0_m.ndim <= 1 and whitening is None
+                else slice(None)
+            )
+            found, place, along = _best_tone(
+                taken[..., lit], radar, there, aperture, time_s[lit], search.y0_m, whitening
+            )
             better = found > energy
             energy = torch.where(better, found, energy)
             best = chosen(replace(best, u_r_m_s=u_r.expand(found.shape), u_a_m_s=along, y0_m=place), best, better)
@@ -84,17 +97,33 @@ def bank_search(
 
 
 def tone_energy(data: Tensor, radar: BistaticRadar, motions: PointMotion, aperture: Aperture, reach_m: float) -> Tensor:
-    """The greatest energy (...,) that any of the motions (..., hypothesis) explains of data (..., channel, pulse), its place along track within reach_m of where the motion has it."""
+    """The greatest energy (...,) that any of the motions (..., hypothesis) explains of data (...,
+    channel, pulse), its place along track within reach_m of where the motion has it.
+    """
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
-    motions, taken = motions.each(lambda value: torch.broadcast_to(value, motions.u_a_m_s.shape)), data.to(torch.complex64)
+    motions, taken = (
+        motions.each(lambda value: torch.broadcast_to(value, motions.u_a_m_s.shape)),
+        data.to(torch.complex64),
+    )
     size = max(1, _BLOCK_BYTES // (32 * data.numel()))
     parts = [slice(at, at + size) for at in range(0, motions.u_a_m_s.shape[-1], size)]
-    return torch.stack([_best_tone(taken, radar, motions.each(lambda value, part=part: value[..., part]), aperture, time_s, reach_m, None)[0] for part in parts]).amax(0)
+    return torch.stack(
+        [
+            _best_tone(
+                taken, radar, motions.each(lambda value, part=part: value[..., part]), aperture, time_s, reach_m, None
+            )[0]
+            for part in parts
+        ]
+    ).amax(0)
 
 
 def _steps(half: float, step: float, device: torch.device) -> Tensor:
     count = 2 * round(half / step) + 1
-    return torch.linspace(-half, half, count, dtype=torch.float64, device=device) if count > 1 else torch.zeros(1, dtype=torch.float64, device=device)
+    return (
+        torch.linspace(-half, half, count, dtype=torch.float64, device=device)
+        if count > 1
+        else torch.zeros(1, dtype=torch.float64, device=device)
+    )
 
 
 def _blocks(offsets: Tensor, data: Tensor) -> Iterator[Tensor]:
@@ -103,9 +132,21 @@ def _blocks(offsets: Tensor, data: Tensor) -> Iterator[Tensor]:
     yield from offsets.split(size)
 
 
-def _best_tone(taken: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture, time_s: Tensor, reach_m: float, whitening: Whitening | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Of motions (..., hypothesis) the greatest normalised correlation per trial (...,), the place y0 that its tone means, and its u_a."""
-    model = aperture.weight(radar, motion, time_s)[..., None, :].to(taken.dtype) * point_phasor(radar, motion, time_s, taken.dtype)
+def _best_tone(
+    taken: Tensor,
+    radar: BistaticRadar,
+    motion: PointMotion,
+    aperture: Aperture,
+    time_s: Tensor,
+    reach_m: float,
+    whitening: Whitening | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Of motions (..., hypothesis) the greatest normalised correlation per trial (...,), the place
+    y0 that its tone means, and its u_a.
+    """
+    model = aperture.weight(radar, motion, time_s)[..., None, :].to(taken.dtype) * point_phasor(
+        radar, motion, time_s, taken.dtype
+    )
     slowest = float(motion.along_m_s.max()) * reach_m / (radar.wavelength_m * radar.reference_range_m)
     tones, rate_hz = _decimated(model.conj() * taken[..., None, :, :], radar.prf_hz, slowest)
     length = smooth_length(2 * tones.shape[-1])
@@ -113,12 +154,18 @@ def _best_tone(taken: Tensor, radar: BistaticRadar, motion: PointMotion, apertur
     tone_hz = (torch.arange(length, dtype=torch.float64, device=taken.device) - length // 2) * (rate_hz / length)
     shift = tone_hz * radar.wavelength_m * radar.reference_range_m / motion.along_m_s[..., None]
     aligned = _aligned(spectrum, radar, shift)
-    power = aligned.abs().square().to(torch.float64) / _norm(model, whitening).to(torch.float64).clamp_min(_TINY)[..., None]
+    power = (
+        aligned.abs().square().to(torch.float64) / _norm(model, whitening).to(torch.float64).clamp_min(_TINY)[..., None]
+    )
     power = torch.where(shift.abs() <= reach_m, power, -torch.inf).flatten(-2)
     at = power.argmax(-1, keepdim=True)
     wide = torch.broadcast_to(motion.y0_m[..., None] + shift, (*aligned.shape[:-1], length)).flatten(-2)
     along = torch.broadcast_to(motion.u_a_m_s[..., None], aligned.shape).flatten(-2)
-    return power.gather(-1, at)[..., 0], wide.expand(power.shape).gather(-1, at)[..., 0], along.expand(power.shape).gather(-1, at)[..., 0]
+    return (
+        power.gather(-1, at)[..., 0],
+        wide.expand(power.shape).gather(-1, at)[..., 0],
+        along.expand(power.shape).gather(-1, at)[..., 0],
+    )
 
 
 def _lit(weight: Tensor) -> slice:
@@ -128,7 +175,9 @@ def _lit(weight: Tensor) -> slice:
 
 
 def _decimated(tones: Tensor, prf_hz: float, highest_hz: float) -> tuple[Tensor, float]:
-    """Sums of neighbouring pulses, as many as leave tones up to highest_hz with most of their energy, and the rate of the sums."""
+    """Sums of neighbouring pulses, as many as leave tones up to highest_hz with most of their
+    energy, and the rate of the sums.
+    """
     factor = max(1, int(prf_hz / (3 * highest_hz))) if highest_hz > 0 else 1
     if factor == 1:
         return tones, prf_hz
@@ -137,7 +186,9 @@ def _decimated(tones: Tensor, prf_hz: float, highest_hz: float) -> tuple[Tensor,
 
 
 def _aligned(spectrum: Tensor, radar: BistaticRadar, place: Tensor) -> Tensor:
-    """Channels (..., channel, bin) added with the phases of a point at `place` (..., bin), against those of the model at zero."""
+    """Channels (..., channel, bin) added with the phases of a point at `place` (..., bin), against
+    those of the model at zero.
+    """
     slope = place / (radar.wavelength_m * radar.reference_range_m)
     total = torch.zeros_like(spectrum[..., 0, :])
     for i, dx in enumerate(radar.channel_m):
@@ -146,8 +197,15 @@ def _aligned(spectrum: Tensor, radar: BistaticRadar, place: Tensor) -> Tensor:
 
 
 def _norm(model: Tensor, whitening: Whitening | None) -> Tensor:
-    """Energy of the models in the metric of the data, (..., hypothesis or 1): of white noise exactly, in clutter that of the middle one, as it hardly depends on the speed along track."""
+    """Energy of the models in the metric of the data, (..., hypothesis or 1): of white noise
+    exactly, in clutter that of the middle one, as it hardly depends on the speed along track.
+    """
     if whitening is None:
         return model.abs().square().sum((-2, -1))
     middle = model[..., model.shape[-3] // 2, :, :].to(torch.complex128)
-    return whitening.applied(middle.expand(*whitening.factor.shape[:-3], *middle.shape[-2:])).abs().square().sum((-2, -1))[..., None]
+    return (
+        whitening.applied(middle.expand(*whitening.factor.shape[:-3], *middle.shape[-2:]))
+        .abs()
+        .square()
+        .sum((-2, -1))[..., None]
+    )

@@ -1,6 +1,8 @@
-"""Along-track interferometry: slant-range velocity from the Doppler of a deramped point, corrected by the direction that the phase across the channels gives.
+"""Along-track interferometry: slant-range velocity from the Doppler of a deramped point, corrected
+by the direction that the phase across the channels gives.
 
-Source: brief 001, Velocity (ATI): a tone F and a phase slope -2 pi dx dy / (lambda R0) over the channels' places; u_r <- u_r + lambda F - v dy / R0, y0 <- y0 + dy.
+Source: brief 001, Velocity (ATI): a tone F and a phase slope -2 pi dx dy / (lambda R0) over the
+channels' places; u_r <- u_r + lambda F - v dy / R0, y0 <- y0 + dy.
 """
 
 from __future__ import annotations
@@ -23,14 +25,23 @@ _TINY = torch.finfo(torch.float64).tiny
 DETECTED_DB = 19.0
 
 
-def interferometry(data: Tensor, radar: BistaticRadar, start: PointMotion, aperture: Aperture, passes: int = 4) -> Estimate:
-    """u_r and y0 of one point per trial; u_a stays that of the start. data: complex (..., channel, pulse), transmit range removed.
+def interferometry(
+    data: Tensor, radar: BistaticRadar, start: PointMotion, aperture: Aperture, passes: int = 4
+) -> Estimate:
+    """u_r and y0 of one point per trial; u_a stays that of the start.
 
-    The first pass takes all pulses, later ones the aperture about the place found. u_r is known modulo lambda PRF and comes within half of that about the start. ok: the
-    tone stands above the threshold of 19 dB over all samples (brief 001). std: of the estimator's own phases, from the noise that is left. Raises ValueError for one channel.
+    data: complex (..., channel, pulse), transmit range removed.
+
+    The first pass takes all pulses, later ones the aperture about the place found. u_r is known
+    modulo lambda PRF and comes within half of that about the start. ok: the tone stands above the
+    threshold of 19 dB over all samples (brief 001). std: of the estimator's own phases, from the
+    noise that is left. Raises ValueError for one channel.
     """
     if radar.channels < 2:
-        raise ValueError("interferometry needs two channels or more: one channel cannot tell a place from a velocity; use the reconstruction with velocities that are told")
+        raise ValueError(
+            "interferometry needs two channels or more: one channel cannot tell a place from a "
+            "velocity; use the reconstruction with velocities that are told"
+        )
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
     motion, data = start, data.to(torch.complex128)
     for number in range(passes):
@@ -59,7 +70,9 @@ def _improved(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: T
 
 
 def tone_frequency(tones: Tensor, rate_hz: float) -> Tensor:
-    """Frequency (Hz) at which the power summed over channels is greatest, (..., channel, sample) -> (...,): padded FFT and a parabola."""
+    """Frequency (Hz) at which the power summed over channels is greatest, (..., channel, sample) ->
+    (...,): padded FFT and a parabola.
+    """
     n = tones.shape[-1]
     length = smooth_length(_PAD * n)
     power = torch.fft.fft(tones, length).abs().square().sum(-2)
@@ -72,7 +85,9 @@ def tone_frequency(tones: Tensor, rate_hz: float) -> Tensor:
 
 
 def _slope(values: Tensor, place_m: Tensor) -> Tensor:
-    """Phase slope (rad/m) of complex values (..., channel) over their places, by the phases of neighbours in place, weighted by power and spacing."""
+    """Phase slope (rad/m) of complex values (..., channel) over their places, by the phases of
+    neighbours in place, weighted by power and spacing.
+    """
     order = place_m.argsort()
     values, place_m = values[..., order], place_m[order]
     step = values[..., 1:] * values[..., :-1].conj()
@@ -99,11 +114,15 @@ def _judged(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: Ten
     weight = weight[..., None, :]
     shines = (weight != 0).expand(data.shape)
     energy_of_weight = weight.square().expand(data.shape).sum((-2, -1)).clamp_min(_TINY)
-    amplitude = (weight * data * point_phasor(radar, motion, time_s, data.dtype).conj()).sum((-2, -1)) / energy_of_weight
+    amplitude = (weight * data * point_phasor(radar, motion, time_s, data.dtype).conj()).sum(
+        (-2, -1)
+    ) / energy_of_weight
     energy = amplitude.abs().square() * energy_of_weight
     noise = ((data.abs().square() * shines).sum((-2, -1)) - energy).clamp_min(0) / shines.sum((-2, -1)).clamp_min(1)
     slopes = phase_slopes(radar, motion, time_s, ("u_r_m_s", "y0_m")) * weight[..., None, :, :]
     total = (weight.square()[..., None, :, :] * torch.ones_like(slopes)).sum((-2, -1), keepdim=True).clamp_min(_TINY)
-    flat = (slopes - weight[..., None, :, :] * (slopes * weight[..., None, :, :]).sum((-2, -1), keepdim=True) / total).flatten(-2)
+    flat = (
+        slopes - weight[..., None, :, :] * (slopes * weight[..., None, :, :]).sum((-2, -1), keepdim=True) / total
+    ).flatten(-2)
     normal = amplitude.abs().square()[..., None, None] * (flat @ flat.mT)
     return Found(motion, amplitude, noise, covariance_of(normal, noise), energy, ("u_r_m_s", "y0_m"))

@@ -1,4 +1,6 @@
-"""Velocity and place of a moving point told nothing: a bank over velocities, then maximum likelihood, in white noise or in clutter whose covariance the data give."""
+"""Velocity and place of a moving point told nothing: a bank over velocities, then maximum
+likelihood, in white noise or in clutter whose covariance the data give.
+"""
 
 from __future__ import annotations
 
@@ -33,20 +35,28 @@ def moving_point_velocity(
 ) -> Estimate:
     """u_r, u_a and y0 of the strongest moving point per trial, no start needed.
 
-    data: complex (..., channel, pulse), slow time zero at pulse n // 2, transmit range removed. aperture: expected amplitude over slow time. search: what the bank covers, by default
-    three pulse rates of u_r, whose ambiguity modulo lambda PRF the cubic phase of the range history resolves. u_a_m_s: where it is known, None to estimate it.
-    whitening: covariance of the clutter, from neighbouring lines, say; None to take it from what the point leaves of the data themselves: the point is sought in white noise and
-    in the covariance of the data, both are refined against what they leave, and the more likely one is taken, per trial.
-    ok: found above the threshold of 19 dB over all samples, inside of the search, and with a predicted deviation of u_r below its half width (one channel cannot).
-    info: snr_db, noise_power, coloured (clutter was found).
+    data: complex (..., channel, pulse), slow time zero at pulse n // 2, transmit range removed.
+    aperture: expected amplitude over slow time. search: what the bank covers, by default three
+    pulse rates of u_r, whose ambiguity modulo lambda PRF the cubic phase of the range history
+    resolves. u_a_m_s: where it is known, None to estimate it. whitening: covariance of the clutter,
+    from neighbouring lines, say; None to take it from what the point leaves of the data themselves:
+    the point is sought in white noise and in the covariance of the data, both are refined against
+    what they leave, and the more likely one is taken, per trial. ok: found above the threshold of
+    19 dB over all samples, inside of the search, and with a predicted deviation of u_r below its
+    half width (one channel cannot). info: snr_db, noise_power, coloured (clutter was found).
     """
     search = search or Search(u_r_m_s=1.5 * radar.ambiguous_velocity_m_s)
     unknowns = UNKNOWNS if u_a_m_s is None else ("u_r_m_s", "y0_m")
     if u_a_m_s is not None:
         search = replace(search, u_a_m_s=0.0)
-    job = _Job(data.to(torch.complex128), radar, aperture, search, 0.0 if u_a_m_s is None else u_a_m_s, range_m, unknowns)
+    job = _Job(
+        data.to(torch.complex128), radar, aperture, search, 0.0 if u_a_m_s is None else u_a_m_s, range_m, unknowns
+    )
     if whitening is not None:
-        return job.estimate(job.centred(job.found(whitening), whitening), torch.ones(data.shape[:-2], dtype=torch.bool, device=data.device))
+        return job.estimate(
+            job.centred(job.found(whitening), whitening),
+            torch.ones(data.shape[:-2], dtype=torch.bool, device=data.device),
+        )
     plain = job.refined(job.found(None))
     if not bool(plain.coloured.any()):
         return job.estimate(plain.found, plain.coloured)
@@ -57,7 +67,9 @@ def moving_point_velocity(
 
 @dataclass(frozen=True)
 class _Refined:
-    """A point fitted in the covariance of what it leaves; log_det: of that covariance, (...,): the less, the likelier; coloured: it is not white."""
+    """A point fitted in the covariance of what it leaves; log_det: of that covariance, (...,): the
+    less, the likelier; coloured: it is not white.
+    """
 
     found: Found
     log_det: Tensor
@@ -84,13 +96,19 @@ class _Job:
         return maximum_likelihood(self.data, self.radar, near.motion, self.aperture, self.unknowns, whitening)
 
     def centred(self, found: Found, whitening: Whitening) -> Found:
-        """The fit again with the aperture about the place found: in clutter an expected amplitude that lies off drags the place along, to a third in each round."""
+        """The fit again with the aperture about the place found: in clutter an expected amplitude
+        that lies off drags the place along, to a third in each round.
+        """
         for _ in range(_CENTRED):
-            found = maximum_likelihood(self.data, self.radar, found.motion, self.aperture, self.unknowns, whitening, _FEW)
+            found = maximum_likelihood(
+                self.data, self.radar, found.motion, self.aperture, self.unknowns, whitening, _FEW
+            )
         return found
 
     def refined(self, found: Found) -> _Refined:
-        """The fit again in the covariance of what it left, twice: where that is white nothing changes."""
+        """The fit again in the covariance of what it left, twice: where that is white nothing
+        changes.
+        """
         whitening = sample_whitening(self.left(found), self.radar)
         for _ in range(_ROUNDS):
             if not bool(whitening.coloured.any()):
@@ -104,15 +122,23 @@ class _Job:
         """Data without the point."""
         time_s = self.radar.pulse_axis(self.data.shape[-1]).values(self.data.device)
         weight = self.aperture.weight(self.radar, found.motion, time_s)[..., None, :]
-        return self.data - found.amplitude[..., None, None] * weight * point_phasor(self.radar, found.motion, time_s, self.data.dtype)
+        return self.data - found.amplitude[..., None, None] * weight * point_phasor(
+            self.radar, found.motion, time_s, self.data.dtype
+        )
 
     def estimate(self, found: Found, coloured: Tensor) -> Estimate:
         snr = found.snr_db
         inside = found.motion.u_r_m_s.abs() <= self.search.u_r_m_s + self.search.u_r_step_m_s
         if "u_a_m_s" in self.unknowns:
-            inside = inside & ((found.motion.u_a_m_s - self.u_a_m_s).abs() <= self.search.u_a_m_s + self.search.u_a_step_m_s)
-        told = found.covariance[..., 0, 0].sqrt() <= self.search.u_r_m_s + self.search.u_r_step_m_s  # one channel tells no velocity from a place
-        return estimate_of(found, inside & told & (snr >= DETECTED_DB), torch.sigmoid((snr - DETECTED_DB) / 3), coloured=coloured)
+            inside = inside & (
+                (found.motion.u_a_m_s - self.u_a_m_s).abs() <= self.search.u_a_m_s + self.search.u_a_step_m_s
+            )
+        told = (
+            found.covariance[..., 0, 0].sqrt() <= self.search.u_r_m_s + self.search.u_r_step_m_s
+        )  # one channel tells no velocity from a place
+        return estimate_of(
+            found, inside & told & (snr >= DETECTED_DB), torch.sigmoid((snr - DETECTED_DB) / 3), coloured=coloured
+        )
 
 
 def _either(a: Found, b: Found, first: Tensor) -> Found:
@@ -121,5 +147,7 @@ def _either(a: Found, b: Found, first: Tensor) -> Found:
     def pick(x: Tensor, y: Tensor) -> Tensor:
         return torch.where(first[(...,) + (None,) * (x.ndim - first.ndim)], x, y)
 
-    tensors = {name: pick(getattr(a, name), getattr(b, name)) for name in ("amplitude", "noise_power", "covariance", "energy")}
+    tensors = {
+        name: pick(getattr(a, name), getattr(b, name)) for name in ("amplitude", "noise_power", "covariance", "energy")
+    }
     return Found(chosen(a.motion, b.motion, first), **tensors, unknowns=a.unknowns)

@@ -1,7 +1,10 @@
-"""Slant-range velocity by the signal intensity ratio: a spectrum rebuilt with the right velocity gathers inside the processed band.
+"""Slant-range velocity by the signal intensity ratio: a spectrum rebuilt with the right velocity
+gathers inside the processed band.
 
-Source: Remote Sens. 2020, 12, 1703, Eqs. (37)-(39). Data are demodulated by the Doppler centre of each candidate before they are rebuilt (see `reconstruct`), so that
-the band edges do not jump from bin to bin, and the ratio is continuous in the velocity. A stationary scene beside the target, which gathers at u_r = 0, misleads it.
+Source: Remote Sens. 2020, 12, 1703, Eqs. (37)-(39). Data are demodulated by the Doppler centre of
+each candidate before they are rebuilt (see `reconstruct`), so that the band edges do not jump from
+bin to bin, and the ratio is continuous in the velocity. A stationary scene beside the target, which
+gathers at u_r = 0, misleads it.
 """
 
 from __future__ import annotations
@@ -28,7 +31,9 @@ _GROUPS = 16
 
 @dataclass(frozen=True)
 class Intensity:
-    """Energies and summed amplitudes of a rebuilt spectrum inside and outside of the processed band, (...,) each, and how many samples either has."""
+    """Energies and summed amplitudes of a rebuilt spectrum inside and outside of the processed
+    band, (...,) each, and how many samples either has.
+    """
 
     energy_in: Tensor
     energy_out: Tensor
@@ -47,7 +52,14 @@ class Intensity:
         return self._each(lambda x: x @ weight)
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> Intensity:
-        return Intensity(change(self.energy_in), change(self.energy_out), change(self.amplitude_in), change(self.amplitude_out), self.bins_in, self.bins_out)
+        return Intensity(
+            change(self.energy_in),
+            change(self.energy_out),
+            change(self.amplitude_in),
+            change(self.amplitude_out),
+            self.bins_in,
+            self.bins_out,
+        )
 
     @property
     def power_ratio(self) -> Tensor:
@@ -66,16 +78,22 @@ class Intensity:
         return self.power_ratio * self.amplitude_ratio
 
 
-def signal_intensity(data: Tensor, radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, bandwidth_hz: float) -> Intensity:
-    """Inside and outside of bandwidth_hz about the Doppler centre of the motion that the spectrum is rebuilt with, (...,).
+def signal_intensity(
+    data: Tensor, radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, bandwidth_hz: float
+) -> Intensity:
+    """Inside and outside of bandwidth_hz about the Doppler centre of the motion that the spectrum
+    is rebuilt with, (...,).
 
-    data: complex (..., channel, pulse, range), lines of a target together, transmit range removed. Differentiable in data and motion.
-    Raises ValueError where the rebuilt band does not exceed bandwidth_hz, or the bands cannot be told apart by so many channels.
+    data: complex (..., channel, pulse, range), lines of a target together, transmit range removed.
+    Differentiable in data and motion. Raises ValueError where the rebuilt band does not exceed
+    bandwidth_hz, or the bands cannot be told apart by so many channels.
     """
     return _intensity_of_bins(data, radar, motion, rebuild, bandwidth_hz).total
 
 
-def _intensity_of_bins(data: Tensor, radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, bandwidth_hz: float) -> Intensity:
+def _intensity_of_bins(
+    data: Tensor, radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, bandwidth_hz: float
+) -> Intensity:
     """As `signal_intensity`, of each alias frequency: (..., pulse)."""
     refuse_full_band(radar, rebuild, bandwidth_hz)
     n = data.shape[-2]
@@ -93,21 +111,28 @@ def refuse_full_band(radar: BistaticRadar, rebuild: Rebuild, bandwidth_hz: float
     if not 0 < bandwidth_hz < rebuild.bands * radar.prf_hz:
         band = f"{rebuild.bands} bands of {radar.prf_hz:g} Hz"
         raise ValueError(
-            f"the intensity ratio compares what lies inside bandwidth_hz with what lies outside, but {band} leave nothing outside {bandwidth_hz:g} Hz; rebuild more bands, or integrate less"
+            "the intensity ratio compares what lies inside bandwidth_hz with what lies outside, "
+            f"but {band} leave nothing outside {bandwidth_hz:g} Hz; rebuild more bands, or "
+            "integrate less"
         )
 
 
 class SignalIntensityRatio(Stage):
-    """u_r_m_s that maximises Gamma over search_m_s, per trial, from a grid and parabolas about its best point: axes (channel, pulse[, range]).
+    """u_r_m_s that maximises Gamma over search_m_s, per trial, from a grid and parabolas about its
+    best point: axes (channel, pulse[, range]).
 
-    bandwidth_hz: processed Doppler bandwidth V^2 T / (lambda R0). rebuild: LeastSquares(3) by default, since two bands leave little outside. search_m_s: least and largest
-    velocity, None for all that is unambiguous, +-lambda PRF / 2. step_m_s: of the grid. Values of forward: u_a_m_s and y0_m, what is known of the rest of the motion.
+    bandwidth_hz: processed Doppler bandwidth V^2 T / (lambda R0). rebuild: LeastSquares(3) by
+    default, since two bands leave little outside. search_m_s: least and largest velocity, None for
+    all that is unambiguous, +-lambda PRF / 2. step_m_s: of the grid. Values of forward: u_a_m_s and
+    y0_m, what is known of the rest of the motion.
 
-    std: of noise, from how the maximum moves as parts of the spectrum are left out. quality: 1 - median / largest Gamma over the grid. Not ok: trials
-    without data, whose value is the middle of the search, with the best point at an end of it, and of a quality below `least_quality`.
-    Its threshold lies at about 0 to +7 dB a sample, 15 dB above interferometry between the channels; below it estimates are biased by more than std says. Without noise
-    it errs by up to 0.06 m/s: what a gate leaves beyond the rebuilt bands aliases into them. Records that end inside the target's gate disturb it. Raises ValueError as
-    `signal_intensity`.
+    std: of noise, from how the maximum moves as parts of the spectrum are left out. quality: 1 -
+    median / largest Gamma over the grid. Not ok: trials without data, whose value is the middle of
+    the search, with the best point at an end of it, and of a quality below `least_quality`. Its
+    threshold lies at about 0 to +7 dB a sample, 15 dB above interferometry between the channels;
+    below it estimates are biased by more than std says. Without noise it errs by up to 0.06 m/s:
+    what a gate leaves beyond the rebuilt bands aliases into them. Records that end inside the
+    target's gate disturb it. Raises ValueError as `signal_intensity`.
     """
 
     works_on = ("channel", "pulse")
@@ -126,11 +151,19 @@ class SignalIntensityRatio(Stage):
     ) -> None:
         super().__init__()
         half = radar.ambiguous_velocity_m_s / 2
-        self.radar, self.bandwidth_hz, self.rebuild, self.range_m = radar, bandwidth_hz, rebuild or LeastSquares(3), range_m
+        self.radar, self.bandwidth_hz, self.rebuild, self.range_m = (
+            radar,
+            bandwidth_hz,
+            rebuild or LeastSquares(3),
+            range_m,
+        )
         self.search_m_s, self.step_m_s, self.least_quality = search_m_s or (-half, half), step_m_s, least_quality
         low, high = self.search_m_s
         if not (low < high and 0 < step_m_s <= (high - low) / 2):
-            raise ValueError(f"search_m_s is (least, largest) velocity with two steps of step_m_s between, got {self.search_m_s} and {step_m_s}")
+            raise ValueError(
+                "search_m_s is (least, largest) velocity with two steps of step_m_s between, got "
+                f"{self.search_m_s} and {step_m_s}"
+            )
         why = self.rebuild.refusal(radar.channels)
         if why is not None:
             raise ValueError(why)
@@ -143,7 +176,9 @@ class SignalIntensityRatio(Stage):
         mind_condition(self.radar, self._motion(lines, start, u_a_m_s, y0_m), self.rebuild, lines.dtype)
 
         def intensity(u_r_m_s: Tensor) -> Intensity:
-            return _intensity_of_bins(lines, self.radar, self._motion(lines, u_r_m_s, u_a_m_s, y0_m), self.rebuild, self.bandwidth_hz)
+            return _intensity_of_bins(
+                lines, self.radar, self._motion(lines, u_r_m_s, u_a_m_s, y0_m), self.rebuild, self.bandwidth_hz
+            )
 
         def cost(u_r_m_s: Tensor) -> Tensor:
             return -torch.log(intensity(u_r_m_s).total.ratio.clamp_min(torch.finfo(torch.float64).tiny))
@@ -155,7 +190,9 @@ class SignalIntensityRatio(Stage):
         return self._minding_ambiguity(found, lines, u_a_m_s, y0_m)
 
     def _minding_ambiguity(self, found: Estimate, lines: Tensor, u_a_m_s: Number, y0_m: Number) -> Estimate:
-        """Not ok, with a warning, where the strongest line shows that the velocity lies whole pulse rates off."""
+        """Not ok, with a warning, where the strongest line shows that the velocity lies whole pulse
+        rates off.
+        """
         motion = self._motion(lines, found["u_r_m_s"], u_a_m_s, y0_m)
         line = take(lines.movedim(-1, -3), lines.detach().abs().square().sum((-3, -2)).argmax(-1), -3)
         dwell_s = self.bandwidth_hz * self.radar.wavelength_m * self.radar.reference_range_m / self.radar.speed_m_s**2
@@ -170,11 +207,19 @@ class SignalIntensityRatio(Stage):
         value = torch.where(there, fine.clamp(low, high), (low + high) / 2)
         quality = torch.where(there, 1 - torch.exp(costs.amin(-1) - costs.median(-1).values), 0.0).clamp(0, 1)
         inside = (coarse - low).abs().minimum((coarse - high).abs()) > self.step_m_s / 2
-        return Estimate({"u_r_m_s": value}, quality, there & inside & (quality >= self.least_quality), {"u_r_m_s": std}, {"log_ratio": -costs})
+        return Estimate(
+            {"u_r_m_s": value},
+            quality,
+            there & inside & (quality >= self.least_quality),
+            {"u_r_m_s": std},
+            {"log_ratio": -costs},
+        )
 
 
 def _deviation(intensity: Callable[[Tensor], Intensity], value: Tensor) -> Tensor:
-    """Deviation (...,) of the maximum of log Gamma from how much it moves as each of _GROUPS interleaved groups of alias frequencies, of independent noise, is left out (jackknife)."""
+    """Deviation (...,) of the maximum of log Gamma from how much it moves as each of _GROUPS
+    interleaved groups of alias frequencies, of independent noise, is left out (jackknife).
+    """
     low, middle, high = (_left_out(intensity(value + shift)) for shift in (-_CURVE_M_S, 0.0, _CURVE_M_S))
     slope, bend = (high - low) / (2 * _CURVE_M_S), (low - 2 * middle + high).mean(-1) / _CURVE_M_S**2
     spread = (slope - slope.mean(-1, keepdim=True)).square().sum(-1) * (_GROUPS - 1) / _GROUPS

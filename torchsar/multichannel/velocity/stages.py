@@ -1,4 +1,6 @@
-"""Estimators of a moving point's velocity as stages on (channel, pulse) or, on the strongest line of each trial, (channel, pulse, range) signals."""
+"""Estimators of a moving point's velocity as stages on (channel, pulse) or, on the strongest line
+of each trial, (channel, pulse, range) signals.
+"""
 
 from __future__ import annotations
 
@@ -25,13 +27,20 @@ _LEAST_PULSES = 4
 
 
 def strongest_line(data: Tensor) -> tuple[Tensor, Tensor]:
-    """The range line of most energy of each trial, (..., channel, pulse), and its index (...,). data: (..., channel, pulse, range), migration corrected."""
+    """The range line of most energy of each trial, (..., channel, pulse), and its index (...,).
+
+    data: (..., channel, pulse, range), migration corrected.
+    """
     index = data.detach().abs().square().sum((-3, -2)).argmax(-1)
     return take(data.movedim(-1, -3), index, -3), index
 
 
 class _Velocity(Stage):
-    """An estimator on one line. radar, aperture (expected amplitude over slow time), range_m: closest range of the points, None for the line's own, else the reference range."""
+    """An estimator on one line.
+
+    radar, aperture (expected amplitude over slow time), range_m: closest range of the points, None
+    for the line's own, else the reference range.
+    """
 
     works_on = ("channel", "pulse")
     also_on = (("channel", "pulse", "range"),)
@@ -42,12 +51,17 @@ class _Velocity(Stage):
         self.radar, self.aperture, self.range_m = radar, aperture, range_m
 
     def line(self, signal: Signal) -> tuple[Tensor, Tensor | float | None]:
-        """The data (..., channel, pulse) to work on, and the closest range of their points. Raises ValueError for other channels than the radar's, shifted slow time and too few pulses."""
+        """The data (..., channel, pulse) to work on, and the closest range of their points.
+
+        Raises ValueError for other channels than the radar's, shifted slow time and too few pulses.
+        """
         refuse_shifted(self.radar, signal.axis("pulse"))
         channels, pulses = signal.axes[0].n, signal.axes[1].n
         if channels != self.radar.channels or pulses < _LEAST_PULSES:
             raise ValueError(
-                f"{type(self).__name__} expects {self.radar.channels} channels by the radar's channel_m and at least {_LEAST_PULSES} pulses, got {channels} and {pulses}; select the channels of both"
+                f"{type(self).__name__} expects {self.radar.channels} channels by the radar's "
+                f"channel_m and at least {_LEAST_PULSES} pulses, got {channels} and {pulses}; select "
+                "the channels of both"
             )
         if "range" not in signal.names:
             return signal.data, self.range_m
@@ -55,16 +69,24 @@ class _Velocity(Stage):
         near = signal.axis("range")
         return data, near.start + near.step * index.to(torch.float64) if self.range_m is None else self.range_m
 
-    def begin(self, signal: Signal, u_r_m_s: Number, u_a_m_s: Number, y0_m: Number) -> tuple[Tensor, BistaticRadar, PointMotion, Aperture]:
+    def begin(
+        self, signal: Signal, u_r_m_s: Number, u_a_m_s: Number, y0_m: Number
+    ) -> tuple[Tensor, BistaticRadar, PointMotion, Aperture]:
         """What estimators near a start take first: data, radar, start, aperture."""
         data, range_m = self.line(signal)
         return data, self.radar, motion_from(self.radar, data, u_r_m_s, u_a_m_s, y0_m, range_m), self.aperture
 
 
 class Interferometry(_Velocity):
-    """Along-track interferometry (see `interferometry`), u_a as given. mind_ambiguity: warn, and say not ok, where the velocity lies whole pulse rates off (some 10 ms a trial)."""
+    """Along-track interferometry (see `interferometry`), u_a as given.
 
-    def __init__(self, radar: BistaticRadar, aperture: Aperture, range_m: float | None = None, mind_ambiguity: bool = True) -> None:
+    mind_ambiguity: warn, and say not ok, where the velocity lies whole pulse rates off (some 10 ms
+    a trial).
+    """
+
+    def __init__(
+        self, radar: BistaticRadar, aperture: Aperture, range_m: float | None = None, mind_ambiguity: bool = True
+    ) -> None:
         super().__init__(radar, aperture, range_m)
         self.mind_ambiguity = mind_ambiguity
 
@@ -76,11 +98,15 @@ class Interferometry(_Velocity):
 
 
 class AlongTrackAutofocus(_Velocity):
-    """Along-track velocity by the power of the deramped tone (see `along_track_velocity`); u_r and y0 as given. half_m_s: half width of the search about u_a = 0."""
+    """Along-track velocity by the power of the deramped tone (see `along_track_velocity`); u_r and
+    y0 as given. half_m_s: half width of the search about u_a = 0.
+    """
 
     provides = ("u_a_m_s",)
 
-    def __init__(self, radar: BistaticRadar, aperture: Aperture, range_m: float | None = None, half_m_s: float = 20.0) -> None:
+    def __init__(
+        self, radar: BistaticRadar, aperture: Aperture, range_m: float | None = None, half_m_s: float = 20.0
+    ) -> None:
         super().__init__(radar, aperture, range_m)
         self.half_m_s = half_m_s
 
@@ -89,9 +115,18 @@ class AlongTrackAutofocus(_Velocity):
 
 
 class LikelihoodVelocity(_Velocity):
-    """Maximum likelihood near the values given (see `maximum_likelihood`). unknowns: what is estimated of u_r_m_s, u_a_m_s, y0_m."""
+    """Maximum likelihood near the values given (see `maximum_likelihood`).
 
-    def __init__(self, radar: BistaticRadar, aperture: Aperture, range_m: float | None = None, unknowns: tuple[str, ...] = UNKNOWNS) -> None:
+    unknowns: what is estimated of u_r_m_s, u_a_m_s, y0_m.
+    """
+
+    def __init__(
+        self,
+        radar: BistaticRadar,
+        aperture: Aperture,
+        range_m: float | None = None,
+        unknowns: tuple[str, ...] = UNKNOWNS,
+    ) -> None:
         super().__init__(radar, aperture, range_m)
         self.unknowns = tuple(unknowns)
         refuse_unknowns(self.unknowns)
@@ -104,7 +139,13 @@ class LikelihoodVelocity(_Velocity):
 class GradientVelocity(_Velocity):
     """The same by a descent on autograd's gradients (see `gradient_likelihood`)."""
 
-    def __init__(self, radar: BistaticRadar, aperture: Aperture, range_m: float | None = None, unknowns: tuple[str, ...] = UNKNOWNS) -> None:
+    def __init__(
+        self,
+        radar: BistaticRadar,
+        aperture: Aperture,
+        range_m: float | None = None,
+        unknowns: tuple[str, ...] = UNKNOWNS,
+    ) -> None:
         super().__init__(radar, aperture, range_m)
         self.unknowns = tuple(unknowns)
         refuse_unknowns(self.unknowns)
@@ -114,10 +155,20 @@ class GradientVelocity(_Velocity):
 
 
 class MovingPointVelocity(_Velocity):
-    """The recommended estimator (see `moving_point_velocity`). search: what its bank covers (where that is less than one pulse rate
-    of u_r, velocities that lie beyond are warned of); u_a_m_s: the along-track velocity where it is known, None to estimate it."""
+    """The recommended estimator (see `moving_point_velocity`).
 
-    def __init__(self, radar: BistaticRadar, aperture: Aperture, range_m: float | None = None, search: Search | None = None, u_a_m_s: float | None = None) -> None:
+    search: what its bank covers (where that is less than one pulse rate of u_r, velocities that lie
+    beyond are warned of); u_a_m_s: the along-track velocity where it is known, None to estimate it.
+    """
+
+    def __init__(
+        self,
+        radar: BistaticRadar,
+        aperture: Aperture,
+        range_m: float | None = None,
+        search: Search | None = None,
+        u_a_m_s: float | None = None,
+    ) -> None:
         super().__init__(radar, aperture, range_m)
         self.search, self.u_a_m_s = search, u_a_m_s
 

@@ -1,7 +1,9 @@
-"""How many pulse rates the Doppler of a moving point exceeds its samples by, from its walk through range: what the channels cannot say.
+"""How many pulse rates the Doppler of a moving point exceeds its samples by, from its walk through
+range: what the channels cannot say.
 
-One ambiguity is lambda PRF of slant-range velocity, which walks through lambda PRF T metres of range: far more than a range cell. The number with which the migration
-is taken out gathers the point in one line. Source: brief 001, Velocity (unambiguous interval).
+One ambiguity is lambda PRF of slant-range velocity, which walks through lambda PRF T metres of
+range: far more than a range cell. The number with which the migration is taken out gathers the
+point in one line. Source: brief 001, Velocity (unambiguous interval).
 """
 
 from __future__ import annotations
@@ -17,14 +19,25 @@ from torchsar.radar import BistaticRadar
 _TINY = torch.finfo(torch.float64).tiny
 
 
-def walk_ambiguity(data: Tensor, frame: Frame, reference: PointMotion, most: int = 2, migration: Migration | None = None) -> tuple[Tensor, Tensor, Tensor]:
-    """The number of -most..most with which the strongest point of each trial stands still. data: (..., channel, pulse, range), range compressed, transmit range removed.
+def walk_ambiguity(
+    data: Tensor, frame: Frame, reference: PointMotion, most: int = 2, migration: Migration | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The number of -most..most with which the strongest point of each trial stands still.
 
-    Returns (ambiguity, contrast, line), each (...,): the whole number, float64; how far, in deviations of what noise does, its strongest line stands above that of the
-    next best number; the index of its line. Judged by the energy of the strongest line, so that neither phase nor aliasing matter.
+    data: (..., channel, pulse, range), range compressed, transmit range removed.
+
+    Returns (ambiguity, contrast, line), each (...,): the whole number, float64; how far, in
+    deviations of what noise does, its strongest line stands above that of the next best number; the
+    index of its line. Judged by the energy of the strongest line, so that neither phase nor
+    aliasing matter.
     """
     numbers = torch.arange(-most, most + 1, dtype=torch.float64, device=data.device)
-    energies = torch.stack([_line_energy(correct_migration(data, frame, reference, migration or Keystone(whole_swath=False), number)) for number in numbers])
+    energies = torch.stack(
+        [
+            _line_energy(correct_migration(data, frame, reference, migration or Keystone(whole_swath=False), number))
+            for number in numbers
+        ]
+    )
     strongest, line = energies.max(-1)
     best, margin = best_of(-strongest, numbers[(...,) + (None,) * (strongest.ndim - 1)].expand(strongest.shape))
     deviation = _typical_deviation(energies[most])
@@ -42,9 +55,12 @@ def _typical_deviation(energy: Tensor) -> Tensor:
 
 
 class WalkAmbiguity(Stage):
-    """`walk_ambiguity` as an estimator of `ambiguity`, what `CorrectMigration` takes. most: pulse rates to either side; range_m: of the reference, None for the radar's.
+    """`walk_ambiguity` as an estimator of `ambiguity`, what `CorrectMigration` takes.
 
-    ok: the best number stands out by five deviations of noise. With a wrong number a point keeps the walk of so many pulse rates.
+    most: pulse rates to either side; range_m: of the reference, None for the radar's.
+
+    ok: the best number stands out by five deviations of noise. With a wrong number a point keeps
+    the walk of so many pulse rates.
     """
 
     works_on = ("channel", "pulse", "range")
@@ -59,4 +75,9 @@ class WalkAmbiguity(Stage):
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
         reference = PointMotion.of(self.radar, signal.data, u_r_m_s, u_a_m_s, y0_m, self.range_m)
         number, contrast, line = walk_ambiguity(signal.data, Frame.of(self.radar, signal), reference, self.most)
-        return Estimate({"ambiguity": number}, contrast / (5 + contrast), contrast > 5, info={"line": line.to(torch.float64), "contrast": contrast})
+        return Estimate(
+            {"ambiguity": number},
+            contrast / (5 + contrast),
+            contrast > 5,
+            info={"line": line.to(torch.float64), "contrast": contrast},
+        )

@@ -27,7 +27,9 @@ _TOLD = ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
 
 @dataclass(frozen=True)
 class Recorded:
-    """Rows of trials, each of all targets in turn: recordings with noise and sea, the same of the target alone (clean), both damaged, the undamaged echo, and the truth (row,)."""
+    """Rows of trials, each of all targets in turn: recordings with noise and sea, the same of the
+    target alone (clean), both damaged, the undamaged echo, and the truth (row,).
+    """
 
     noisy: Recording
     clean: Recording
@@ -37,7 +39,11 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Echoes:
-    """All that simulates the trials of one case. snr_db: of a range-compressed sample, a number or one per trial; sea: its power_db counts from the noise."""
+    """All that simulates the trials of one case.
+
+    snr_db: of a range-compressed sample, a number or one per trial; sea: its power_db counts from
+    the noise.
+    """
 
     radar: BistaticRadar
     targets: Mapping[str, Target]
@@ -59,7 +65,12 @@ class Echoes:
         config, file = loaded.config, loaded.file
         assert isinstance(config, GeoConfig) and config.world is not None
         world, radar = config.world, build_radar(loaded)
-        refuse_oversize(world.pulses * radar.channels * len(world.targets), world.samples or 1, file, "world.pulses or world.samples")
+        refuse_oversize(
+            world.pulses * radar.channels * len(world.targets),
+            world.samples or 1,
+            file,
+            "world.pulses or world.samples",
+        )
         gate = GATES.make(world.gate, "world.gate", file)
         sea_gate = gate if world.sea_gate is None else GATES.make(world.sea_gate, "world.sea_gate", file)
         sea = None if world.sea is None else SEAS.make(world.sea, "world.sea", file)
@@ -68,8 +79,24 @@ class Echoes:
         damages = build_damages(world.damages, "world.damages", file, MULTICHANNEL_DAMAGES)
         snr = snr_db_of(world.noise, compression_gain_db(config), sea)
         if sea is not None and snr is None:
-            raise ConfigError(f"{file}: world.noise: the level of a sea counts from the noise; give snr_db, raw_scnr_db or scr_db")
-        return Echoes(radar, world.targets, gate, sea, sea_gate, receive, transmit, snr, damages, world.pulses, world.samples, world.kind, precision(config))
+            raise ConfigError(
+                f"{file}: world.noise: the level of a sea counts from the noise; give snr_db, raw_scnr_db or scr_db"
+            )
+        return Echoes(
+            radar,
+            world.targets,
+            gate,
+            sea,
+            sea_gate,
+            receive,
+            transmit,
+            snr,
+            damages,
+            world.pulses,
+            world.samples,
+            world.kind,
+            precision(config),
+        )
 
     @property
     def integration_s(self) -> float | None:
@@ -81,10 +108,14 @@ class Echoes:
         rows = row_draws(draws, self.targets)
         snr = self._per_row(len(rows.trials or ()))
         world = BistaticWorld(self._points(len(rows.trials or ())), self.gate, None, snr, self.receive, self.transmit)
-        noisy, truth = simulate_bistatic(self.radar, world, self.pulses, self.samples, rows, kind=self.kind, dtype=dtype or self.dtype, device=device)
+        noisy, truth = simulate_bistatic(
+            self.radar, world, self.pulses, self.samples, rows, kind=self.kind, dtype=dtype or self.dtype, device=device
+        )
         assert truth.clean is not None
         if self.sea is not None:
-            noisy = replace(noisy, signal=noisy.signal.with_data(noisy.signal.data + self._sea(rows, snr, truth, noisy)))
+            noisy = replace(
+                noisy, signal=noisy.signal.with_data(noisy.signal.data + self._sea(rows, snr, truth, noisy))
+            )
         values = {name: value[..., 0] for name, value in truth.values.items() if name in _TOLD}
         told = {f"{TOLD}{name}": values[name] for name in _TOLD}
         noisy, clean, undamaged = (replace(one, aux={**one.aux, **told}) for one in (noisy, truth.clean, truth.clean))
@@ -95,7 +126,9 @@ class Echoes:
 
     def _points(self, rows: int) -> MovingPoints:
         def column(name: str) -> Tensor:
-            return torch.tensor([getattr(target, name) for target in self.targets.values()], dtype=torch.float64).repeat(rows // len(self.targets))[:, None]
+            return torch.tensor(
+                [getattr(target, name) for target in self.targets.values()], dtype=torch.float64
+            ).repeat(rows // len(self.targets))[:, None]
 
         return MovingPoints(column("u_r_m_s"), column("u_a_m_s"), column("azimuth_m"), column("range_m"))
 
@@ -110,16 +143,24 @@ class Echoes:
         assert self.sea is not None and snr is not None
         data, signal = recording.signal.data, recording.signal
         sea = replace(self.sea, power_db=self.sea.power_db - snr)
-        echo = sea_echo(sea, self.radar, self.pulses, self.samples, self.sea_gate, rows.part("sea"), data.dtype, data.device)
+        echo = sea_echo(
+            sea, self.radar, self.pulses, self.samples, self.sea_gate, rows.part("sea"), data.dtype, data.device
+        )
         turned = unit_phasor(-truth.values["transmit_range_m"] / self.radar.wavelength_m, data.dtype)
         return echo * (turned[..., None] if "range" in signal.names else turned)
 
 
 def row_draws(draws: Draws, names: Mapping[str, Any]) -> Draws:
-    """One address for each trial and target, trials outermost; a target keeps its draws whatever others there are."""
+    """One address for each trial and target, trials outermost; a target keeps its draws whatever
+    others there are.
+    """
     trials = list(draws.trials if draws.trials is not None else [0])
     cases = draws.case if isinstance(draws.case, tuple) else (draws.case,) * len(trials)
-    return Draws(draws.seed, tuple(f"{case}/{name}" for case in cases for name in names), [trial for trial in trials for _ in names])
+    return Draws(
+        draws.seed,
+        tuple(f"{case}/{name}" for case in cases for name in names),
+        [trial for trial in trials for _ in names],
+    )
 
 
 def snr_db_of(noise: Noise, gain_db: float, sea: Sea | None) -> float | None:
@@ -133,7 +174,10 @@ def snr_db_of(noise: Noise, gain_db: float, sea: Sea | None) -> float | None:
 
 
 def build_radar(loaded: Loaded) -> BistaticRadar:
-    """The instrument, its range to the transmitter from the orbit where there is one. Raises ConfigError."""
+    """The instrument, its range to the transmitter from the orbit where there is one.
+
+    Raises ConfigError.
+    """
     given = loaded.config.radar.model_dump()
     orbit, bandwidth, pulse_s = (given.pop(name) for name in ("orbit", "bandwidth_hz", "pulse_s"))
     try:
@@ -149,7 +193,9 @@ def transmit_coefficients(ephemeris: Ephemeris) -> tuple[float, ...]:
     names = ("eccentricity", "inclination_deg", "raan_deg", "argument_of_perigee_deg", "mean_anomaly_deg")
     orbit = Orbit.at_height(ephemeris.height_m, **{name: getattr(ephemeris, name) for name in names})
     time_s = torch.tensor([ephemeris.time_s], dtype=torch.float64)
-    point = seen_point(*orbit.state(time_s), ephemeris.off_nadir_deg, ephemeris.squint_deg, 1.0 if ephemeris.side == "right" else -1.0)
+    point = seen_point(
+        *orbit.state(time_s), ephemeris.off_nadir_deg, ephemeris.squint_deg, 1.0 if ephemeris.side == "right" else -1.0
+    )
     return tuple(range_coefficients(orbit, point, time_s, ephemeris.order)[0].tolist())
 
 
@@ -158,7 +204,9 @@ def refuse_unfit(loaded: Loaded) -> None:
     check_judged(loaded)
     assert isinstance(loaded.config, GeoConfig)
     if loaded.config.metrics.reference is not None:
-        raise ConfigError(f"{loaded.file}: metrics.reference: system geo judges by the truth and by theory; leave it out")
+        raise ConfigError(
+            f"{loaded.file}: metrics.reference: system geo judges by the truth and by theory; leave it out"
+        )
 
 
 def check(loaded: Loaded) -> None:

@@ -1,4 +1,6 @@
-"""The report of a run of moving targets: their figures as the source prints them, with theory beside, and conditioning."""
+"""The report of a run of moving targets: their figures as the source prints them, with theory
+beside, and conditioning.
+"""
 
 from __future__ import annotations
 
@@ -34,19 +36,46 @@ _FACTS = ("irw_azimuth_m", "pslr_azimuth_db", "mfta_db", "irw_range_m", "conditi
 def _target_tables(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
     """A row a target, a column a method, and theory as the last column."""
     of_methods = {name: {"cases": method["targets"]} for name, method in metrics["methods"].items()}
-    return tables({"methods": {**of_methods, "theory": {"cases": metrics["theory"]}}}, TARGETS, metrics["published"]["targets"])
+    return tables(
+        {"methods": {**of_methods, "theory": {"cases": metrics["theory"]}}}, TARGETS, metrics["published"]["targets"]
+    )
 
 
 def level_note(definitions: Mapping[str, Any]) -> dict[str, str]:
     """How strong the targets are, both ways."""
     if "snr_db" not in definitions:
         return {"title": "No noise", "text": "Echoes are free of noise."}
-    text = f"A target stands {definitions['snr_db']:.4g} dB above the noise in a range-compressed sample of one channel, {definitions['raw_scnr_db']:.4g} dB before compression."
+    text = (
+        f"A target stands {definitions['snr_db']:.4g} dB above the noise in a "
+        f"range-compressed sample of one channel, {definitions['raw_scnr_db']:.4g} dB before "
+        "compression."
+    )
     return {"title": "Signal to noise", "text": text}
 
 
-def write_report(path: Path, title: str, metrics: Mapping[str, Any], pictures: Sequence[Picture], figures: Path, config_text: str, command: str) -> None:
+def write_report(
+    path: Path,
+    title: str,
+    metrics: Mapping[str, Any],
+    pictures: Sequence[Picture],
+    figures: Path,
+    config_text: str,
+    command: str,
+) -> None:
     """Write the report of one run; it asks for nothing from outside."""
     facts = {key: TARGETS[key] for key in _FACTS}
     notes = [level_note(metrics["definitions"])]
-    write_case_report(path, "geo.html.j2", title, metrics, facts, {}, pictures, figures, config_text, command, notes=notes, tables=_target_tables(metrics))
+    write_case_report(
+        path,
+        "geo.html.j2",
+        title,
+        metrics,
+        facts,
+        {},
+        pictures,
+        figures,
+        config_text,
+        command,
+        notes=notes,
+        tables=_target_tables(metrics),
+    )

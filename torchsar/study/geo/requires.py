@@ -1,4 +1,6 @@
-"""`torchsar requires` for moving targets before several channels: limits of each method, and what the scene requires of its model."""
+"""`torchsar requires` for moving targets before several channels: limits of each method, and what
+the scene requires of its model.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +13,21 @@ from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Requirement
 from torchsar.multichannel.migration import Keystone
 from torchsar.multichannel.reconstruct import Reconstruct
-from torchsar.multichannel.requirements import Estimator, MultichannelUse, multichannel_limits, multichannel_requirements
+from torchsar.multichannel.requirements import (
+    Estimator,
+    MultichannelUse,
+    multichannel_limits,
+    multichannel_requirements,
+)
 from torchsar.multichannel.response import LeastSquares
 from torchsar.multichannel.velocity.sir import SignalIntensityRatio
-from torchsar.multichannel.velocity.stages import AlongTrackAutofocus, GradientVelocity, Interferometry, LikelihoodVelocity, MovingPointVelocity
+from torchsar.multichannel.velocity.stages import (
+    AlongTrackAutofocus,
+    GradientVelocity,
+    Interferometry,
+    LikelihoodVelocity,
+    MovingPointVelocity,
+)
 from torchsar.study.cases import refuse_recordings
 from torchsar.study.config import Loaded
 from torchsar.study.errors import ConfigError
@@ -36,7 +49,10 @@ _PATTERN_S = 4.5
 
 
 def requires(loaded: Loaded, out: Path | None) -> str:
-    """Both tables of every case of a simulation as text, predicted from the config alone. With `out`: config.yaml, requires.json and requires.txt there."""
+    """Both tables of every case of a simulation as text, predicted from the config alone.
+
+    With `out`: config.yaml, requires.json and requires.txt there.
+    """
     refuse_recordings(loaded)
     check(loaded)
     return write_needs(loaded, out, Needs.of)
@@ -52,7 +68,9 @@ def heed_limits(loaded: Loaded, case: str) -> None:
 
 @dataclass(frozen=True)
 class Needs:
-    """Limits of one case, each with the methods that it concerns, and fidelity rows of the recommended method."""
+    """Limits of one case, each with the methods that it concerns, and fidelity rows of the
+    recommended method.
+    """
 
     limits: Mapping[Limit, list[str]]
     rows: tuple[Requirement, ...]
@@ -72,7 +90,16 @@ class Needs:
     def text(self, name: str) -> str:
         concerned = [f"  {limit.name}: {', '.join(names)}" for limit, names in self.limits.items() if not limit.ok]
         beyond = ["", "beyond a limit:", *concerned] if concerned else []
-        return "\n".join([name, *limit_lines(list(self.limits)), *beyond, "", *requirement_lines(self.rows), f"the simplest chain that this scene allows: {self.fidelity}"])
+        return "\n".join(
+            [
+                name,
+                *limit_lines(list(self.limits)),
+                *beyond,
+                "",
+                *requirement_lines(self.rows),
+                f"the simplest chain that this scene allows: {self.fidelity}",
+            ]
+        )
 
     @property
     def fidelity(self) -> str:
@@ -80,10 +107,25 @@ class Needs:
         ok = {row.effect: row.ok for row in self.rows}
         if not ok:
             return "none"
-        transmit = "transmit range of order 1" if ok["transmit range of order 1"] else "order 2" if ok["transmit range of order 2"] else "all orders"
-        migration = "none" if ok["no range migration correction"] else "static bulk" if ok["static bulk correction"] else "deramp and keystone"
+        transmit = (
+            "transmit range of order 1"
+            if ok["transmit range of order 1"]
+            else "order 2"
+            if ok["transmit range of order 2"]
+            else "all orders"
+        )
+        migration = (
+            "none"
+            if ok["no range migration correction"]
+            else "static bulk"
+            if ok["static bulk correction"]
+            else "deramp and keystone"
+        )
         path = "parabola" if ok["parabolic receive range"] else "hyperbola"
-        return f"transmit range {transmit.removeprefix('transmit range of ')}, receive range by the {path}, range migration: {migration}"
+        return (
+            f"transmit range {transmit.removeprefix('transmit range of ')}, receive range by the "
+            f"{path}, range migration: {migration}"
+        )
 
 
 def _needs(loaded: Loaded) -> Needs:
@@ -93,7 +135,8 @@ def _needs(loaded: Loaded) -> Needs:
     for name, use in uses.items():
         for limit in multichannel_limits(echoes.radar, use):
             limits.setdefault(limit, []).append(name)
-    moves = echoes.radar.speed_m_s > uses["recommended"].u_a_m_s[1]  # without an aperture there is nothing to simplify
+    # without an aperture there is nothing to simplify
+    moves = echoes.radar.speed_m_s > uses["recommended"].u_a_m_s[1]
     return Needs(limits, multichannel_requirements(echoes.radar, uses["recommended"]) if moves else ())
 
 
@@ -102,14 +145,34 @@ def use_of(chain: Chain, echoes: Echoes) -> MultichannelUse:
     stages = list(_stages(chain))
     rebuilds = [stage.rebuild for stage in _rebuilding(stages)]
     estimators = tuple(dict.fromkeys(_ESTIMATORS[type(stage)] for stage in stages if type(stage) in _ESTIMATORS))
-    told = {"estimators": estimators, "deramped": all(isinstance(s.correct.migration, Keystone) for s in stages if isinstance(s, MigrationOfLines))}
+    told = {
+        "estimators": estimators,
+        "deramped": all(isinstance(s.correct.migration, Keystone) for s in stages if isinstance(s, MigrationOfLines)),
+    }
     targets = echoes.targets.values()
-    speeds = {name: (min(getattr(t, name) for t in targets), max(getattr(t, name) for t in targets)) for name in ("u_r_m_s", "u_a_m_s")}
+    speeds = {
+        name: (min(getattr(t, name) for t in targets), max(getattr(t, name) for t in targets))
+        for name in ("u_r_m_s", "u_a_m_s")
+    }
     offset = 0.0 if echoes.samples is None else max(abs(t.range_m) for t in targets)
     snr = None if echoes.snr_db is None else float(echoes.snr_db)
-    scene = {"y0_m": max(abs(t.azimuth_m) for t in targets), "swath_m": offset, "snr_db": snr, "clutter": echoes.sea is not None, "dtype": echoes.dtype}
+    scene = {
+        "y0_m": max(abs(t.azimuth_m) for t in targets),
+        "swath_m": offset,
+        "snr_db": snr,
+        "clutter": echoes.sea is not None,
+        "dtype": echoes.dtype,
+    }
     rebuild = rebuilds[-1] if rebuilds else LeastSquares(1)
-    return MultichannelUse(echoes.pulses, echoes.integration_s or _PATTERN_S, rebuild, echoes.integration_s is None, **speeds, **scene, **told)
+    return MultichannelUse(
+        echoes.pulses,
+        echoes.integration_s or _PATTERN_S,
+        rebuild,
+        echoes.integration_s is None,
+        **speeds,
+        **scene,
+        **told,
+    )
 
 
 def _stages(chain: Chain) -> Iterable[object]:
@@ -120,5 +183,9 @@ def _stages(chain: Chain) -> Iterable[object]:
 
 
 def _rebuilding(stages: list[object]) -> list[Reconstruct | SignalIntensityRatio]:
-    """Stages that tell bands apart: the reconstruction itself, or that of the intensity ratio where there is none."""
-    return [s for s in stages if isinstance(s, Reconstruct)] or [s for s in stages if isinstance(s, SignalIntensityRatio)]
+    """Stages that tell bands apart: the reconstruction itself, or that of the intensity ratio where
+    there is none.
+    """
+    return [s for s in stages if isinstance(s, Reconstruct)] or [
+        s for s in stages if isinstance(s, SignalIntensityRatio)
+    ]

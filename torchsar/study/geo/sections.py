@@ -14,7 +14,9 @@ from torchsar.study.registry import GATES, MULTICHANNEL_DAMAGES, RECEIVE_RANGES,
 
 
 class Ephemeris(Strict):
-    """Orbit of the transmitter over a turning spherical Earth, and what it looks at; see torchsar.radar.Orbit and seen_point. time_s: of slow time zero since the mean anomaly given."""
+    """Orbit of the transmitter over a turning spherical Earth, and what it looks at; see
+    torchsar.radar.Orbit and seen_point. time_s: of slow time zero since the mean anomaly given.
+    """
 
     height_m: float = Field(default=36_500e3, gt=0)
     eccentricity: float = Field(default=0.0, ge=0, le=0.9)
@@ -30,7 +32,10 @@ class Ephemeris(Strict):
 
 
 class Radar(Strict):
-    """What the instrument knows about itself; see torchsar.radar.BistaticRadar. The range to the transmitter comes from transmit_range, k1, k2, ..., or from an orbit."""
+    """What the instrument knows about itself; see torchsar.radar.BistaticRadar.
+
+    The range to the transmitter comes from transmit_range, k1, k2, ..., or from an orbit.
+    """
 
     carrier_hz: float = Field(gt=0)
     bandwidth_hz: float = Field(gt=0)
@@ -54,8 +59,11 @@ class Radar(Strict):
 
 
 class Target(Strict):
-    """A point of amplitude 1 in uniform motion. u_r_m_s: closing slant-range speed; u_a_m_s: along track, positive with the receiver; azimuth_m: place at t = 0;
-    range_m: of its closest range beyond the reference range."""
+    """A point of amplitude 1 in uniform motion.
+
+    u_r_m_s: closing slant-range speed; u_a_m_s: along track, positive with the receiver; azimuth_m:
+    place at t = 0; range_m: of its closest range beyond the reference range.
+    """
 
     u_r_m_s: float = 0.0
     u_a_m_s: float = 0.0
@@ -64,8 +72,12 @@ class Target(Strict):
 
 
 class Noise(Strict):
-    """Receiver noise; at most one is given. snr_db: target over noise in a sample of one channel after range compression; raw_scnr_db: the same before it, 10 log10(B tau_p) less;
-    scr_db: target over sea in a sample after range compression."""
+    """Receiver noise; at most one is given.
+
+    snr_db: target over noise in a sample of one channel after range compression; raw_scnr_db: the
+    same before it, 10 log10(B tau_p) less; scr_db: target over sea in a sample after range
+    compression.
+    """
 
     snr_db: float | None = None
     raw_scnr_db: float | None = None
@@ -79,11 +91,14 @@ class Noise(Strict):
 
 
 class World(Strict):
-    """What is true and no processor may see. Every target is recorded alone, with noise and sea of its own, which follow its name.
+    """What is true and no processor may see.
 
-    samples: range lines, null for the peak line alone (azimuth only); kind: range-compressed data, or full chirps (which need samples of two pulses
-    more). sea_gate: what lights the sea, null for the gate of the targets.
-    transmit_range: true k1, k2, ..., null for those of the radar's ephemeris. trials: noise draws of each case of a run; a sweep has its own number.
+    Every target is recorded alone, with noise and sea of its own, which follow its name.
+
+    samples: range lines, null for the peak line alone (azimuth only); kind: range-compressed data,
+    or full chirps (which need samples of two pulses more). sea_gate: what lights the sea, null for
+    the gate of the targets. transmit_range: true k1, k2, ..., null for those of the radar's
+    ephemeris. trials: noise draws of each case of a run; a sweep has its own number.
     """
 
     single: ClassVar[dict[str, Catalogue]] = {"gate": GATES, "sea": SEAS, "sea_gate": GATES, "receive": RECEIVE_RANGES}
@@ -109,12 +124,18 @@ class World(Strict):
         if self.sea is not None and self.kind == "full":
             raise ValueError("a sea is added to range-compressed echoes; take kind: compressed")
         if self.samples is None and (self.kind == "full" or any(target.range_m for target in self.targets.values())):
-            raise ValueError("azimuth-only data (samples: null) know one range, the radar's reference_range_m; give samples, or leave range_m and kind: full out")
+            raise ValueError(
+                "azimuth-only data (samples: null) know one range, the radar's reference_range_m; "
+                "give samples, or leave range_m and kind: full out"
+            )
         return self
 
 
 class Metrics(Strict):
-    """How results are judged. orders: how many pulse rates away replicas are looked for. published_targets: metric -> target (case/target) -> method -> figure of the source."""
+    """How results are judged. orders: how many pulse rates away replicas are looked for.
+
+    published_targets: metric -> target (case/target) -> method -> figure of the source.
+    """
 
     reference: str | None = None
     orders: int = Field(default=3, ge=1)
@@ -122,7 +143,11 @@ class Metrics(Strict):
 
 
 class Trade(Strict):
-    """What `torchsar trade` compares on the first target. samples: range lines of the two-dimensional chains; bands: of least squares; transmit_orders, receive_orders: of the range series."""
+    """What `torchsar trade` compares on the first target.
+
+    samples: range lines of the two-dimensional chains; bands: of least squares; transmit_orders,
+    receive_orders: of the range series.
+    """
 
     samples: int = Field(default=128, ge=16)
     bands: list[Annotated[int, Field(ge=1)]] = Field(default=[1, 2, 3], min_length=1)

@@ -1,4 +1,6 @@
-"""`torchsar trade` for moving targets before several channels: time against what each simplification does to the image of a target whose velocities are known."""
+"""`torchsar trade` for moving targets before several channels: time against what each
+simplification does to the image of a target whose velocities are known.
+"""
 
 from __future__ import annotations
 
@@ -37,8 +39,10 @@ _TOLD_AS = {name: f"aux.{TOLD}{name}" for name in ("u_r_m_s", "u_a_m_s", "y0_m")
 
 @dataclass(frozen=True)
 class Row:
-    """One alternative: median seconds a trial over the repeats and their spread; figures of the image of a clean echo as `torchsar run` measures them, means over trials; peak over that
-    of the first row; image_error_db: difference of the image from the first row's. None where it has none."""
+    """One alternative: median seconds a trial over the repeats and their spread; figures of the
+    image of a clean echo as `torchsar run` measures them, means over trials; peak over that of the
+    first row; image_error_db: difference of the image from the first row's. None where it has none.
+    """
 
     name: str
     seconds: float
@@ -55,9 +59,11 @@ class Row:
 
 
 def trade(loaded: Loaded, out: Path | None) -> str:
-    """Tables of range-history orders, dimensions, migration corrections, reconstructions and precisions on the first target of the first case; returns them as text.
+    """Tables of range-history orders, dimensions, migration corrections, reconstructions and
+    precisions on the first target of the first case; returns them as text.
 
-    Velocities are the true ones, echoes free of noise and damage. With `out`: config.yaml, trade.json, trade.txt and figures/ in that folder.
+    Velocities are the true ones, echoes free of noise and damage. With `out`: config.yaml,
+    trade.json, trade.txt and figures/ in that folder.
     """
     return traded(loaded, out, check, _tables, _TITLES, _COLUMNS, _figures)
 
@@ -93,13 +99,24 @@ class _Target:
         stages = build_chains(loaded, radar=echoes.radar)["recommended"].stages.values()
         band = next((stage.bandwidth_hz for stage in stages if isinstance(stage, FocusAzimuth)), None)
         alone = replace(echoes, targets=first, sea=None, damages={}, snr_db=None, samples=None, kind="compressed")
-        return _Target(alone, config.trade, config.metrics.orders, band, Draws(config.seed, "trade", range(config.trade.trials)))
+        return _Target(
+            alone, config.trade, config.metrics.orders, band, Draws(config.seed, "trade", range(config.trade.trials))
+        )
 
     def _recorded(self, samples: int | None = None, dtype: torch.dtype | None = None, **changes: Any) -> Recorded:
         return replace(self.echoes, samples=samples, **changes).recorded(self.draws, dtype=dtype)
 
-    def _chain(self, rebuild: Rebuild = _REBUILD, migration: Migration | None = None, order: int | None = None, full: bool = False, followed: bool = True) -> Chain:
-        """The chain with velocities told; migration: None for azimuth-only data; followed: it takes out that of the target, else that of a point at rest."""
+    def _chain(
+        self,
+        rebuild: Rebuild = _REBUILD,
+        migration: Migration | None = None,
+        order: int | None = None,
+        full: bool = False,
+        followed: bool = True,
+    ) -> Chain:
+        """The chain with velocities told; migration: None for azimuth-only data; followed: it takes
+        out that of the target, else that of a point at rest.
+        """
         radar = self.echoes.radar
         stages: dict[str, nn.Module] = {"compress": CompressChannels(radar, "flat")} if full else {}
         stages["remove"] = RemoveTransmitRange(radar, order)
@@ -110,7 +127,9 @@ class _Target:
         return Chain(**stages)
 
     def histories(self) -> Iterator[Row]:
-        """Orders of the transmit range that the processor takes out, and range series of the echo, against what is exact."""
+        """Orders of the transmit range that the processor takes out, and range series of the echo,
+        against what is exact.
+        """
         recorded = self._recorded()
         first = self._made("exact", self._chain(), recorded)
         yield first.row
@@ -118,21 +137,42 @@ class _Target:
             if order < len(self.echoes.radar.transmit_range):
                 yield self._made(f"transmit range of order {order}", self._chain(order=order), recorded, first).row
         for order in self.settings.receive_orders:
-            yield self._made(f"echo with a receive range of order {order}", self._chain(), self._recorded(receive=TaylorRange(order)), first).row
+            yield self._made(
+                f"echo with a receive range of order {order}",
+                self._chain(),
+                self._recorded(receive=TaylorRange(order)),
+                first,
+            ).row
 
     def dimensions(self) -> Iterator[Row]:
         """Azimuth alone, range-compressed lines, full chirps."""
         samples = self.settings.samples
         yield self._made("azimuth only", self._chain(), self._recorded()).row
         yield self._made(f"{samples} range lines", self._chain(migration=Keystone()), self._recorded(samples)).row
-        longer = samples + 2 * self.echoes.radar.pulse.n_samples(self.echoes.radar.sampling_hz)  # echoes begin at the middle of the axis
-        yield self._made(f"full chirps, {longer} samples", self._chain(migration=Keystone(), full=True), self._recorded(longer, kind="full")).row
+        longer = samples + 2 * self.echoes.radar.pulse.n_samples(
+            self.echoes.radar.sampling_hz
+        )  # echoes begin at the middle of the axis
+        yield self._made(
+            f"full chirps, {longer} samples",
+            self._chain(migration=Keystone(), full=True),
+            self._recorded(longer, kind="full"),
+        ).row
 
     def migrations(self) -> Iterator[Row]:
-        """Corrections of range migration by the target's own motion, and by that of a point at rest."""
+        """Corrections of range migration by the target's own motion, and by that of a point at
+        rest.
+        """
         recorded = self._recorded(self.settings.samples)
-        kinds = {"keystone": (Keystone(), True), "keystone, one reference range": (Keystone(False), True), "static bulk": (StaticBulk(True), True)}
-        kinds |= {"keystone, as if at rest": (Keystone(), False), "static bulk, as if at rest": (StaticBulk(True), False), "none": (NoMigration(), False)}
+        kinds = {
+            "keystone": (Keystone(), True),
+            "keystone, one reference range": (Keystone(False), True),
+            "static bulk": (StaticBulk(True), True),
+        }
+        kinds |= {
+            "keystone, as if at rest": (Keystone(), False),
+            "static bulk, as if at rest": (StaticBulk(True), False),
+            "none": (NoMigration(), False),
+        }
         first = None
         for name, (migration, followed) in kinds.items():
             made = self._made(name, self._chain(migration=migration, followed=followed), recorded, first)
@@ -142,7 +182,11 @@ class _Target:
     def rebuilds(self) -> Iterator[Row]:
         """Reconstructions by inverses of several bands and by priors."""
         recorded, channels = self._recorded(), self.echoes.radar.channels
-        kinds: dict[str, Rebuild] = {f"least squares, {bands} band{'s' if bands > 1 else ''}": LeastSquares(bands) for bands in self.settings.bands if bands <= channels}
+        kinds: dict[str, Rebuild] = {
+            f"least squares, {bands} band{'s' if bands > 1 else ''}": LeastSquares(bands)
+            for bands in self.settings.bands
+            if bands <= channels
+        }
         kinds["least mean square, pattern, 5 bands"] = MinimumMeanSquare(5)
         if self.bandwidth_hz is not None:
             kinds["least mean square, flat band, 5"] = MinimumMeanSquare(5, prior=FlatBand(self.bandwidth_hz))
@@ -164,13 +208,18 @@ class _Target:
         trace, times = timed(lambda: chain.trace(recorded.undamaged), self.settings.repeats)
         focused = Focused.of(chain, trace, self.echoes.radar)
         assert focused is not None
-        figures = {**focused.metrics(), **response_metrics(trace.signal, focused, recorded.truth, self.echoes.integration_s, self.orders)}
+        figures = {
+            **focused.metrics(),
+            **response_metrics(trace.signal, focused, recorded.truth, self.echoes.integration_s, self.orders),
+        }
         level = _peak(trace.signal)
         compared = {} if first is None else {"peak_db": float((level - first.level).mean())}
         if first is not None and first.image.data.shape == trace.signal.data.shape:
             compared["image_error_db"] = _error_db(trace.signal, first.image)
         count = len(self.draws.trials or ())
-        row = Row(name, statistics.median(times) / count, (max(times) - min(times)) / count, **compared, **_kept(figures))
+        row = Row(
+            name, statistics.median(times) / count, (max(times) - min(times)) / count, **compared, **_kept(figures)
+        )
         log.info("%s: %.1f ms", name, 1e3 * row.seconds)
         return _Made(row, level, trace.signal)
 
@@ -183,7 +232,11 @@ class _Made:
 
 
 def _kept(figures: Mapping[str, Tensor]) -> dict[str, float]:
-    return {key: float(value.mean()) for key, value in figures.items() if key in Row.__dataclass_fields__ and bool(torch.isfinite(value).all())}
+    return {
+        key: float(value.mean())
+        for key, value in figures.items()
+        if key in Row.__dataclass_fields__ and bool(torch.isfinite(value).all())
+    }
 
 
 def _peak(image: Signal) -> Tensor:
@@ -193,7 +246,10 @@ def _peak(image: Signal) -> Tensor:
 
 
 def _error_db(image: Signal, truth: Signal) -> float:
-    two = [x.data.to(torch.complex128) if "range" in x.names else x.data.to(torch.complex128)[..., None] for x in (image, truth)]
+    two = [
+        x.data.to(torch.complex128) if "range" in x.names else x.data.to(torch.complex128)[..., None]
+        for x in (image, truth)
+    ]
     return float(error_db(*two).mean())
 
 
@@ -230,4 +286,6 @@ def _figures(tables: Tables) -> dict[str, plot.Figure]:
 
 def _figure(rows: Sequence[Row], name: str, label: str, title: str) -> plot.Figure:
     kept = [row for row in rows if getattr(row, name) is not None]
-    return plot.trade([row.name for row in kept], [row.seconds for row in kept], [getattr(row, name) for row in kept], label, title)
+    return plot.trade(
+        [row.name for row in kept], [row.seconds for row in kept], [getattr(row, name) for row in kept], label, title
+    )

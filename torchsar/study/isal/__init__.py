@@ -1,1 +1,4 @@
-"""System 002: inverse synthetic aperture ladar, phase errors from pulse to pulse (Ruan et al. 2013), simulated and recorded."""
+"""System 002: inverse synthetic aperture ladar, phase errors from pulse to pulse (Ruan et al.
+
+2013), simulated and recorded.
+"""

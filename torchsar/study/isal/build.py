@@ -57,7 +57,9 @@ def read_recording(loaded: Loaded) -> Recording:
     try:
         return read_inverse(loaded.config.data.file, precision(loaded.config))
     except (ValueError, OSError) as error:
-        raise ConfigError(f"{loaded.file}: data.file: {' '.join(str(error).split()).removeprefix('data.file: ')}") from None
+        raise ConfigError(
+            f"{loaded.file}: data.file: {' '.join(str(error).split()).removeprefix('data.file: ')}"
+        ) from None
 
 
 def recorded_chains(loaded: Loaded, recording: Recording) -> dict[str, Chain]:

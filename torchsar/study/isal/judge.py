@@ -14,27 +14,48 @@ from torchsar.study.tracing import verdict
 DEFINITIONS: dict[str, Any] = {
     "snr": "mean power of all range-compressed samples over noise variance, dB",
     "entropy": "-sum p ln p, p = |I|^2 / sum |I|^2 over the whole image, nats",
-    "entropy_above_ideal_nats": "entropy less that of the error-free image of the same scene and noise; it depends on the position of the image between cells by some 0.03",
+    "entropy_above_ideal_nats": (
+        "entropy less that of the error-free image of the same scene and noise; it depends "
+        "on the position of the image between cells by some 0.03"
+    ),
     "contrast": "standard deviation over mean of the intensity |I|^2",
-    "residual_phase_rms_rad": "rms over pulses of what was taken out, all corrections together, minus truth, constant and linear term removed on the circle; lost pulses do not count",
+    "residual_phase_rms_rad": (
+        "rms over pulses of what was taken out, all corrections together, minus truth, "
+        "constant and linear term removed on the circle; lost pulses do not count"
+    ),
     "residual_phase_std_rad": "what the method itself predicts for it",
     "strehl": "|mean exp(j residual)|^2 over pulses; success is 0.8 and more, about 0.47 rad rms",
-    "entropy_above_clean_nats": "entropy less that which the same method reaches on the recording without the injected phases",
-    "agreement_rad": "rms of (estimate - injected phase) less the estimate on the recording without injected phases: 0 for a method that errors cannot influence",
+    "entropy_above_clean_nats": (
+        "entropy less that which the same method reaches on the recording without the injected phases"
+    ),
+    "agreement_rad": (
+        "rms of (estimate - injected phase) less the estimate on the recording without "
+        "injected phases: 0 for a method that errors cannot influence"
+    ),
     "ok": "whether the method itself trusts its estimate",
     "seconds": "wall time of the chain of the method per trial",
-    "published": "figures of Ruan et al. 2013, Table 1, less the entropy that the paper implies for the error-free image",
+    "published": (
+        "figures of Ruan et al. 2013, Table 1, less the entropy that the paper implies for the error-free image"
+    ),
 }
 
 
 def estimated_phase(chain: Chain, trace: Trace, like: Tensor) -> Tensor:
-    """Phase that the chain takes out of each pulse, (..., pulse) float64 shaped as `like`: the sum over its correctors.
+    """Phase that the chain takes out of each pulse, (..., pulse) float64 shaped as `like`: the sum
+    over its correctors.
 
-    Of a chain without a corrector the last estimate of a phase, which it would take out; zero where there is none. A phase that only starts
-    another estimator does not count.
+    Of a chain without a corrector the last estimate of a phase, which it would take out; zero where
+    there is none. A phase that only starts another estimator does not count.
     """
-    taken = [trace.values[uses["phase_rad"]] for name, uses in chain.uses.items() if "phase_rad" in uses and name in trace.outputs]
-    found = taken or [estimate.value["phase_rad"] for estimate in trace.estimates.values() if "phase_rad" in estimate.value][-1:]
+    taken = [
+        trace.values[uses["phase_rad"]]
+        for name, uses in chain.uses.items()
+        if "phase_rad" in uses and name in trace.outputs
+    ]
+    found = (
+        taken
+        or [estimate.value["phase_rad"] for estimate in trace.estimates.values() if "phase_rad" in estimate.value][-1:]
+    )
     return sum((phase.to(torch.float64) for phase in found), torch.zeros_like(like, dtype=torch.float64))
 
 

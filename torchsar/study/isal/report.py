@@ -1,4 +1,6 @@
-"""The report of a run of a turning target: one table of entropies as the source prints it, one of all figures."""
+"""The report of a run of a turning target: one table of entropies as the source prints it, one of
+all figures.
+"""
 
 from __future__ import annotations
 
@@ -28,9 +30,23 @@ def _published(metrics: Mapping[str, Any]) -> Published:
     ideal, entropies = metrics["published"]["ideal_entropy_nats"], metrics["published"]["entropy_nats"]
     if ideal is None:
         return {}
-    return {"entropy_above_ideal_nats": {case: {name: value - ideal for name, value in row.items()} for case, row in entropies.items()}}
+    return {
+        "entropy_above_ideal_nats": {
+            case: {name: value - ideal for name, value in row.items()} for case, row in entropies.items()
+        }
+    }
 
 
-def write_report(path: Path, title: str, metrics: Mapping[str, Any], pictures: Sequence[Picture], figures: Path, config_text: str, command: str) -> None:
+def write_report(
+    path: Path,
+    title: str,
+    metrics: Mapping[str, Any],
+    pictures: Sequence[Picture],
+    figures: Path,
+    config_text: str,
+    command: str,
+) -> None:
     """Write the report of one run; it asks for nothing from outside."""
-    write_case_report(path, "isal.html.j2", title, metrics, _SHOWN, _published(metrics), pictures, figures, config_text, command)
+    write_case_report(
+        path, "isal.html.j2", title, metrics, _SHOWN, _published(metrics), pictures, figures, config_text, command
+    )

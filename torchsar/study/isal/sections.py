@@ -27,13 +27,21 @@ class Radar(Strict):
 
 
 class World(Strict):
-    """What is true and no processor may see. scene, motion, start_phase, fidelity and damages name entries of the catalogues (`torchsar list`).
+    """What is true and no processor may see.
+
+    scene, motion, start_phase, fidelity and damages name entries of the catalogues (`torchsar
+    list`).
 
     trials: scenes and noise draws of each case of a run; a sweep has its own number.
     """
 
     single: ClassVar[dict[str, Catalogue]] = {"fidelity": FIDELITIES}
-    named: ClassVar[dict[str, Catalogue]] = {"scene": SCENES, "motion": MOTIONS, "start_phase": START_PHASES, "damages": TARGET_DAMAGES}
+    named: ClassVar[dict[str, Catalogue]] = {
+        "scene": SCENES,
+        "motion": MOTIONS,
+        "start_phase": START_PHASES,
+        "damages": TARGET_DAMAGES,
+    }
 
     pulses: int = Field(gt=0)
     samples: int = Field(gt=0)
@@ -50,7 +58,8 @@ class World(Strict):
 class Metrics(Strict):
     """How images are judged. reference: the method whose image of the same scene is the ideal one.
 
-    published: case -> method -> entropy (nats); published_ideal: entropy of the error-free image of the source, from which they are counted.
+    published: case -> method -> entropy (nats); published_ideal: entropy of the error-free image of
+    the source, from which they are counted.
     """
 
     reference: str | None = None
@@ -59,7 +68,9 @@ class Metrics(Strict):
 
 
 class Trade(Strict):
-    """What `torchsar trade` compares: methods of the processor, iterations of the recommended one, precisions; over so many trials, repeated."""
+    """What `torchsar trade` compares: methods of the processor, iterations of the recommended one,
+    precisions; over so many trials, repeated.
+    """
 
     precisions: list[Literal["complex64", "complex128"]] = ["complex64", "complex128"]
     search: list[Annotated[int, Field(ge=0)]] = Field(default=[0, 10, 30, 120], min_length=1)

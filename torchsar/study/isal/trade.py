@@ -1,4 +1,6 @@
-"""`torchsar trade` for turning targets: time against phase error of methods, iterations, precisions and echo models."""
+"""`torchsar trade` for turning targets: time against phase error of methods, iterations, precisions
+and echo models.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ log = logging.getLogger("torchsar")
 
 @dataclass(frozen=True)
 class Row:
-    """One alternative: median seconds a trial over the repeats, their spread, rms phase error (rad) and entropy above the ideal image (nats), means over trials."""
+    """One alternative: median seconds a trial over the repeats, their spread, rms phase error (rad)
+    and entropy above the ideal image (nats), means over trials.
+    """
 
     name: str
     seconds: float
@@ -47,12 +51,17 @@ class Row:
 
 
 def trade(loaded: Loaded, out: Path | None) -> str:
-    """Tables of methods, of iterations of `autofocus`, of precisions, and of the echo models, on the last case of a config; returns them as text.
+    """Tables of methods, of iterations of `autofocus`, of precisions, and of the echo models, on
+    the last case of a config; returns them as text.
 
-    With `out`: config.yaml, trade.json, trade.txt and figures/ in that folder. Raises ConfigError for recordings, whose phases are not known.
+    With `out`: config.yaml, trade.json, trade.txt and figures/ in that folder. Raises ConfigError
+    for recordings, whose phases are not known.
     """
     if loaded.config.data.file is not None or loaded.config.world is None:
-        raise ConfigError(f"{loaded.file}: trade compares with true phases, which a recording does not tell; take a config that simulates")
+        raise ConfigError(
+            f"{loaded.file}: trade compares with true phases, which a recording does not tell; "
+            "take a config that simulates"
+        )
     check(loaded)
     name, case = list(cases_of(loaded).items())[-1]
     return written(loaded, out, lambda: _tables(case), lambda tables: _text(name, tables), _figures)
@@ -60,7 +69,16 @@ def trade(loaded: Loaded, out: Path | None) -> str:
 
 def _figures(tables: Tables) -> dict[str, plot.Figure]:
     label = "residual phase (rad rms)"
-    return {key: plot.trade([r.name for r in tables[key]], [r.seconds for r in tables[key]], [r.error_rad for r in tables[key]], label, key) for key in ("methods", "iterations", "precision")}
+    return {
+        key: plot.trade(
+            [r.name for r in tables[key]],
+            [r.seconds for r in tables[key]],
+            [r.error_rad for r in tables[key]],
+            label,
+            key,
+        )
+        for key in ("methods", "iterations", "precision")
+    }
 
 
 @dataclass(frozen=True)
@@ -79,17 +97,27 @@ class _Trials:
         """Dechirped pulses after range compression, the clean ones likewise."""
         stage = CompressDechirped(self.radar)
         clean = None if self.truth.clean is None else replace(self.truth.clean, signal=stage(self.truth.clean.signal))
-        return _Trials(self.radar, replace(self.recording, signal=stage(self.recording.signal)), replace(self.truth, clean=clean))
+        return _Trials(
+            self.radar, replace(self.recording, signal=stage(self.recording.signal)), replace(self.truth, clean=clean)
+        )
 
     def row(self, name: str, data: Tensor, work: Callable[[Tensor], Tensor], repeats: int) -> Row:
         """The alternative `work`: data to phases."""
         phase, times = timed(lambda: work(data), repeats)
         assert self.truth.clean is not None
         error = phase_rmse(phase, whole_phase(self.truth), received(self.truth))
-        gained = entropy(azimuth_transform(correct_pulse_phase(data, phase))) - entropy(azimuth_transform(self.truth.clean.signal.data.to(data.dtype)))
+        gained = entropy(azimuth_transform(correct_pulse_phase(data, phase))) - entropy(
+            azimuth_transform(self.truth.clean.signal.data.to(data.dtype))
+        )
         count = max(1, error.numel())
         log.info("%s: %.1f ms, %.3f rad", name, 1e3 * statistics.median(times) / count, float(error.mean()))
-        return Row(name, statistics.median(times) / count, (max(times) - min(times)) / count, float(error.mean()), float(gained.mean()))
+        return Row(
+            name,
+            statistics.median(times) / count,
+            (max(times) - min(times)) / count,
+            float(error.mean()),
+            float(gained.mean()),
+        )
 
 
 def _tables(loaded: Loaded) -> dict[str, list[Row]]:
@@ -106,7 +134,11 @@ def _made_tables(loaded: Loaded) -> dict[str, list[Row]]:
     still = replace(world, fidelity=PhaseOnly())
     made = _simulate(loaded, world, torch.complex64)
     flat = made if isinstance(world.fidelity, PhaseOnly) else _simulate(loaded, still, torch.complex64)
-    tables = {"methods": list(_methods(loaded, made)), "iterations": list(_iterations(loaded, flat)), "precision": list(_precisions(loaded, still))}
+    tables = {
+        "methods": list(_methods(loaded, made)),
+        "iterations": list(_iterations(loaded, flat)),
+        "precision": list(_precisions(loaded, still)),
+    }
     if loaded.config.radar.pulse_s is not None:
         tables["echo"] = list(_echoes(loaded))
     return tables
@@ -115,12 +147,22 @@ def _made_tables(loaded: Loaded) -> dict[str, list[Row]]:
 def _simulate(loaded: Loaded, world: TurntableWorld, dtype: torch.dtype, count: int | None = None) -> _Trials:
     size, radar = loaded.config.world, build_radar(loaded)
     damages = build_damages(size.damages, "world.damages", loaded.file, TARGET_DAMAGES)
-    recording, truth = simulate_turntable(radar, world, size.pulses, size.samples, Draws(loaded.config.seed, "trade", range(count or loaded.config.trade.trials)), damages, dtype)
+    recording, truth = simulate_turntable(
+        radar,
+        world,
+        size.pulses,
+        size.samples,
+        Draws(loaded.config.seed, "trade", range(count or loaded.config.trade.trials)),
+        damages,
+        dtype,
+    )
     return _Trials(radar, recording, truth)
 
 
 def _methods(loaded: Loaded, made: _Trials) -> Iterator[Row]:
-    """Every method of the processor that works on the recording as it is, beside the image of those that see the clean one."""
+    """Every method of the processor that works on the recording as it is, beside the image of those
+    that see the clean one.
+    """
     chains = build_chains(loaded, radar=made.radar)
     assert made.truth.clean is not None
     clean = [name for name in chains if loaded.config.processor[name].input == "clean"]
@@ -137,7 +179,13 @@ def _method_row(name: str, chain: Chain, made: _Trials, ideal: Tensor, repeats: 
     gained = entropy(trace.signal) - ideal if trace.signal.names == ("azimuth", "range") else torch.tensor(math.nan)
     count = max(1, error.numel())
     log.info("%s: %.1f ms, %.3f rad", name, 1e3 * statistics.median(times) / count, float(error.mean()))
-    return Row(name, statistics.median(times) / count, (max(times) - min(times)) / count, float(error.mean()), float(gained.mean()))
+    return Row(
+        name,
+        statistics.median(times) / count,
+        (max(times) - min(times)) / count,
+        float(error.mean()),
+        float(gained.mean()),
+    )
 
 
 def _iterations(loaded: Loaded, made: _Trials) -> Iterator[Row]:
@@ -145,27 +193,43 @@ def _iterations(loaded: Loaded, made: _Trials) -> Iterator[Row]:
     settings = loaded.config.trade
     deepest = max(settings.search)
     for search in settings.search:
-        yield made.row(f"search {search}, polish 0", made.data, lambda x, s=search: autofocus(x, search=s, polish=0)["phase_rad"], settings.repeats)
+        yield made.row(
+            f"search {search}, polish 0",
+            made.data,
+            lambda x, s=search: autofocus(x, search=s, polish=0)["phase_rad"],
+            settings.repeats,
+        )
     for polish in settings.polish:
-        yield made.row(f"search {deepest}, polish {polish}", made.data, lambda x, p=polish: autofocus(x, search=deepest, polish=p)["phase_rad"], settings.repeats)
+        yield made.row(
+            f"search {deepest}, polish {polish}",
+            made.data,
+            lambda x, p=polish: autofocus(x, search=deepest, polish=p)["phase_rad"],
+            settings.repeats,
+        )
 
 
 def _precisions(loaded: Loaded, world: TurntableWorld) -> Iterator[Row]:
     made = _simulate(loaded, world, torch.complex128)
     for name in loaded.config.trade.precisions:
-        yield made.row(name, made.data.to(getattr(torch, name)), lambda x: autofocus(x)["phase_rad"], loaded.config.trade.repeats)
+        yield made.row(
+            name, made.data.to(getattr(torch, name)), lambda x: autofocus(x)["phase_rad"], loaded.config.trade.repeats
+        )
 
 
 def _echoes(loaded: Loaded) -> Iterator[Row]:
-    """Phases alone against dechirped pulses with the motion inside them: seconds of one echo, and what can be made of it.
+    """Phases alone against dechirped pulses with the motion inside them: seconds of one echo, and
+    what can be made of it.
 
-    Of a dechirped config that is the recommended method's; else `autofocus` of the compressed pulses, without alignment of envelopes.
+    Of a dechirped config that is the recommended method's; else `autofocus` of the compressed
+    pulses, without alignment of envelopes.
     """
     world = build_world(loaded)
     for name in ("phase_only", "dechirped"):
         own = isinstance(world.fidelity, Dechirped)
         fidelity = PhaseOnly() if name == "phase_only" else world.fidelity if own else Dechirped()
-        made, times = timed(lambda fidelity=fidelity: _simulate(loaded, replace(world, fidelity=fidelity), torch.complex64, 2), 1)
+        made, times = timed(
+            lambda fidelity=fidelity: _simulate(loaded, replace(world, fidelity=fidelity), torch.complex64, 2), 1
+        )
         if name == "dechirped" and own:
             row = next(r for r in _methods(loaded, made) if r.name == "recommended")
         else:
@@ -185,10 +249,18 @@ _TITLES = {
 def _text(case: str, tables: Tables) -> str:
     parts = [f"case {case!r}" if case else "one case"]
     for key, rows in tables.items():
-        parts += ["", _TITLES[key], f"{'alternative':<30}{'ms a trial':>12}{'spread':>9}{'error (rad rms)':>17}{'entropy above ideal':>21}"]
+        parts += [
+            "",
+            _TITLES[key],
+            f"{'alternative':<30}{'ms a trial':>12}{'spread':>9}{'error (rad rms)':>17}{'entropy above ideal':>21}",
+        ]
         parts += _lines(rows)
     return "\n".join(parts)
 
 
 def _lines(rows: Sequence[Row]) -> list[str]:
-    return [f"{r.name:<30}{1e3 * r.seconds:>12.2f}{1e3 * r.spread_s:>9.2f}{r.error_rad:>17.4f}{r.entropy_above_ideal_nats:>21.3f}" for r in rows]
+    return [
+        f"{r.name:<30}{1e3 * r.seconds:>12.2f}{1e3 * r.spread_s:>9.2f}{r.error_rad:>17.4f}"
+        f"{r.entropy_above_ideal_nats:>21.3f}"
+        for r in rows
+    ]

@@ -52,7 +52,9 @@ class Bench:
 
 @dataclass(frozen=True)
 class Batch:
-    """What one batch of trials gave: the recording, the truth, and the trace and the seconds per trial of every method."""
+    """What one batch of trials gave: the recording, the truth, and the trace and the seconds per
+    trial of every method.
+    """
 
     recording: Recording
     truth: Truth
@@ -82,10 +84,12 @@ def received(truth: Truth) -> Tensor | None:
 
 
 class IsalTrials(Benches[Bench]):
-    """`trial(parameters, draws)` of a config: {method: {metric: (rows,)}}, bounds of the residual phase, and images of the trials to keep.
+    """`trial(parameters, draws)` of a config: {method: {metric: (rows,)}}, bounds of the residual
+    phase, and images of the trials to keep.
 
-    Metrics of a method: `residual_phase_rms_rad`, `strehl`, the predicted `residual_phase_std_rad`, `entropy_nats`, `contrast`, and
-    `entropy_above_ideal_nats` where metrics.reference names a method of undamaged input; `seconds` per trial; `ok`.
+    Metrics of a method: `residual_phase_rms_rad`, `strehl`, the predicted `residual_phase_std_rad`,
+    `entropy_nats`, `contrast`, and `entropy_above_ideal_nats` where metrics.reference names a
+    method of undamaged input; `seconds` per trial; `ok`.
     """
 
     batched = (_SNR,)
@@ -102,7 +106,9 @@ class IsalTrials(Benches[Bench]):
         return Bench(loaded.config, radar, build_world(loaded), damages, chains)
 
     def bytes_per_trial(self, fixed: Mapping[str, Any]) -> int:
-        """Of the largest tensors that a trial needs, from the axes: data, image, and what an iteration makes of them."""
+        """Of the largest tensors that a trial needs, from the axes: data, image, and what an
+        iteration makes of them.
+        """
         config = self.bench(fixed).config
         return _PEAK_BYTES * config.world.pulses * config.world.samples * precision(config).itemsize
 
@@ -117,9 +123,20 @@ class IsalTrials(Benches[Bench]):
 
 
 def run_batch(bench: Bench, draws: Draws, device: str = "cpu", world: TurntableWorld | None = None) -> Batch:
-    """Simulate the trials of the draws, of another world than the bench's where one is given, and run every method on them."""
+    """Simulate the trials of the draws, of another world than the bench's where one is given, and
+    run every method on them.
+    """
     size = bench.config.world
-    recording, truth = simulate_turntable(bench.radar, world or bench.world, size.pulses, size.samples, draws, bench.damages, precision(bench.config), device)
+    recording, truth = simulate_turntable(
+        bench.radar,
+        world or bench.world,
+        size.pulses,
+        size.samples,
+        draws,
+        bench.damages,
+        precision(bench.config),
+        device,
+    )
     assert truth.clean is not None
     traces, seconds = {}, {}
     count = max(1, recording.signal.trials.numel())
@@ -149,7 +166,9 @@ def judged(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
 
 
 def _bounds(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
-    """Of the residual phase: scene known, and amplitudes unknown; the latter's ratio to the former comes from one scene of the case, they differ by a percent."""
+    """Of the residual phase: scene known, and amplitudes unknown; the latter's ratio to the former
+    comes from one scene of the case, they differ by a percent.
+    """
     std = batch.truth.values["noise_std"]
     if not bool((std > 0).all()):
         return {}
@@ -158,25 +177,44 @@ def _bounds(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
     power = (torch.view_as_real(data).double().square().sum(-1).mean((-2, -1)) - std.square()).clamp_min(1e-300)
     known = pulse_phase_bound_rad(power / std.square(), data.shape[-1])
     ratio = bench.bound_ratio
-    return {"residual_phase_rms_rad": {"scene known": known, **({"amplitudes unknown (Cramer-Rao)": known * ratio} if ratio else {})}}
+    return {
+        "residual_phase_rms_rad": {
+            "scene known": known,
+            **({"amplitudes unknown (Cramer-Rao)": known * ratio} if ratio else {}),
+        }
+    }
 
 
 def _bound_ratio(bench: Bench) -> float | None:
-    """Bound of unknown amplitudes over that of a known scene, from the scene of an address of its own; None where it would take too long."""
+    """Bound of unknown amplitudes over that of a known scene, from the scene of an address of its
+    own; None where it would take too long.
+    """
     size, scene = bench.config.world, bench.world.scene.scatterers(Draws(bench.config.seed, "bound"))
-    if not isinstance(bench.world.fidelity, PhaseOnly) or scene.amplitude.shape[-1] > _MOST_SCATTERERS or not 2 < size.pulses <= _MOST_PULSES:
+    if (
+        not isinstance(bench.world.fidelity, PhaseOnly)
+        or scene.amplitude.shape[-1] > _MOST_SCATTERERS
+        or not 2 < size.pulses <= _MOST_PULSES
+    ):
         return None
     azimuth, response = _scene_matrices(bench, scene.azimuth_m, scene.range_m, size.pulses, size.samples)
     power = ((azimuth * scene.amplitude) @ response).abs().square().mean()
-    return float(pulse_phase_bound_of_scene_rad(azimuth, response, scene.amplitude, 1.0) / pulse_phase_bound_rad(power, size.samples))
+    return float(
+        pulse_phase_bound_of_scene_rad(azimuth, response, scene.amplitude, 1.0)
+        / pulse_phase_bound_rad(power, size.samples)
+    )
 
 
 def _scene_matrices(bench: Bench, x: Tensor, y: Tensor, n_pulse: int, n_range: int) -> tuple[Tensor, Tensor]:
-    """Azimuth phasors (pulse, target) and range responses (target, range) of scatterers at the level of phases."""
+    """Azimuth phasors (pulse, target) and range responses (target, range) of scatterers at the
+    level of phases.
+    """
     rate = bench.radar.rotation_rad_s if bench.world.rotation_rad_s is None else bench.world.rotation_rad_s
     theta = float(rate or 0.0) * (torch.arange(n_pulse, dtype=torch.float64) - n_pulse // 2) / bench.radar.prf_hz
     ways = x * torch.sin(theta)[:, None] + y * (torch.cos(theta)[:, None] - 1)
     azimuth = torch.polar(torch.ones_like(ways), -4 * math.pi / bench.radar.wavelength_m * ways)
     cells = torch.arange(n_range, dtype=torch.float64) - n_range // 2
-    shifts, back = -2 * math.pi / n_range * (y / bench.radar.range_step_m)[:, None] * cells, 2 * math.pi / n_range * cells[:, None] * cells
+    shifts, back = (
+        -2 * math.pi / n_range * (y / bench.radar.range_step_m)[:, None] * cells,
+        2 * math.pi / n_range * cells[:, None] * cells,
+    )
     return azimuth, torch.polar(torch.ones_like(shifts), shifts) @ torch.polar(torch.ones_like(back), back) / n_range

@@ -1,4 +1,6 @@
-"""Monte Carlo sweeps: `sweep(trial, grid, ...)` runs any callable over a grid of parameters, vectorised, resumable, in one process or many."""
+"""Monte Carlo sweeps: `sweep(trial, grid, ...)` runs any callable over a grid of parameters,
+vectorised, resumable, in one process or many.
+"""
 
 from torchsar.study.montecarlo.compare import Difference, differences
 from torchsar.study.montecarlo.loop import Interrupted, sweep

@@ -1,4 +1,6 @@
-"""How many trials run at once: by bytes, so that a batch stays in the cache of a CPU or in the memory of a GPU."""
+"""How many trials run at once: by bytes, so that a batch stays in the cache of a CPU or in the
+memory of a GPU.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ class _Largest(TorchDispatchMode):
 
 
 def probed_bytes(work: Work, case: int) -> int:
-    """Bytes of the largest tensor of one trial, found by running it once; the trial's own `bytes_per_trial(fixed)` saves that run."""
+    """Bytes of the largest tensor of one trial, found by running it once; the trial's own
+    `bytes_per_trial(fixed)` saves that run.
+    """
     told = getattr(work.trial, "bytes_per_trial", None)
     if told is not None:
         return max(1, int(told(work.cases[case].fixed)))
@@ -43,8 +47,8 @@ def probed_bytes(work: Work, case: int) -> int:
 def rows_by_bytes(bytes_per_trial: int, device: str) -> int:
     """Trials a batch, from the bytes of the largest tensor of one trial.
 
-    On a CPU that tensor of the whole batch fills CACHE_BYTES: larger batches leave the cache and cost more per trial. On a GPU about a dozen
-    of its kind fill half of the free memory.
+    On a CPU that tensor of the whole batch fills CACHE_BYTES: larger batches leave the cache and
+    cost more per trial. On a GPU about a dozen of its kind fill half of the free memory.
     """
     if torch.device(device).type == "cuda":
         free, _ = torch.cuda.mem_get_info(device)
@@ -53,9 +57,11 @@ def rows_by_bytes(bytes_per_trial: int, device: str) -> int:
 
 
 def cut(case: int, whole: Case, active: set[int], first: int, last: int, rows: int) -> Iterator[Chunk]:
-    """Chunks of at most `rows` rows: trials first..last-1 of the active points of a case, point by point.
+    """Chunks of at most `rows` rows: trials first..last-1 of the active points of a case, point by
+    point.
 
-    The cuts depend on these arguments alone, never on what has already been done, so that a resumed sweep runs the same batches.
+    The cuts depend on these arguments alone, never on what has already been done, so that a resumed
+    sweep runs the same batches.
     """
     order = [(p, t) for p in range(len(whole.points)) if p in active for t in range(first, last)]
     if order:

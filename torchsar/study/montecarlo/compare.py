@@ -22,21 +22,34 @@ class Difference:
 
 
 def differences(a: Record, b: Record, tolerance: float) -> list[Difference]:
-    """Trials that both records hold and whose metrics differ by more than tolerance times the larger magnitude, or whose `ok` differs.
+    """Trials that both records hold and whose metrics differ by more than tolerance times the
+    larger magnitude, or whose `ok` differs.
 
-    Two runs in batches of other sizes or with other threads differ by rounding alone, but for trials in which a choice (a peak, a candidate, an
-    end of iterations) hung on less than that; those are what this finds. Errors are compared on the scale of the largest error of their metric and
-    point: each is a small difference of two large numbers. Raises ConfigError where the records are not of one grid.
+    Two runs in batches of other sizes or with other threads differ by rounding alone, but for
+    trials in which a choice (a peak, a candidate, an end of iterations) hung on less than that;
+    those are what this finds. Errors are compared on the scale of the largest error of their metric
+    and point: each is a small difference of two large numbers. Raises ConfigError where the records
+    are not of one grid.
     """
     if a.labels != b.labels or a.algorithms != b.algorithms:
-        raise ConfigError(f"records of different sweeps cannot be compared: {a.algorithms} over {a.labels} and {b.algorithms} over {b.labels}")
+        raise ConfigError(
+            f"records of different sweeps cannot be compared: {a.algorithms} over {a.labels} and "
+            f"{b.algorithms} over {b.labels}"
+        )
     trials = min(a.trials, b.trials)
     both = a.done[..., :trials] & b.done[..., :trials]
-    found = [d for name in a.metrics if name in b.metrics for d in _of(name, a.metrics[name][..., :trials], b.metrics[name][..., :trials], both, a, tolerance)]
+    found = [
+        d
+        for name in a.metrics
+        if name in b.metrics
+        for d in _of(name, a.metrics[name][..., :trials], b.metrics[name][..., :trials], both, a, tolerance)
+    ]
     return found + _of(OK, a.ok[..., :trials].astype(float), b.ok[..., :trials].astype(float), both, a, 0.0)
 
 
-def _of(name: str, x: np.ndarray, y: np.ndarray, both: np.ndarray, record: Record, tolerance: float) -> list[Difference]:
+def _of(
+    name: str, x: np.ndarray, y: np.ndarray, both: np.ndarray, record: Record, tolerance: float
+) -> list[Difference]:
     magnitude = np.fmax(np.abs(x), np.abs(y))
     scale = np.fmax.reduce(magnitude, axis=-1, keepdims=True, initial=0.0) if "error" in name else magnitude
     apart = both & ~((np.abs(x - y) <= tolerance * scale) | (np.isnan(x) & np.isnan(y)) | (x == y))

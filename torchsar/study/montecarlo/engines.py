@@ -20,7 +20,10 @@ log = logging.getLogger("torchsar")
 Task = tuple[Chunk, int | None]
 _QUEUE = 4
 _DEATHS = 10
-_UNGUARDED = "a script that starts workers is read again by each of them; put its call of sweep(...) below the line: if __name__ == '__main__':"
+_UNGUARDED = (
+    "a script that starts workers is read again by each of them; put its call of "
+    "sweep(...) below the line: if __name__ == '__main__':"
+)
 
 
 class Engine(Protocol):
@@ -64,7 +67,8 @@ _PLUGIN = "torchsar-work"
 
 
 def _plugin(work: Work, threads: int, own: bool) -> Any:
-    """Gives every worker, a restarted one too, the work, its torch threads, and the GPU of its number.
+    """Gives every worker, a restarted one too, the work, its torch threads, and the GPU of its
+    number.
 
     own: workers that this program started leave Ctrl-C, which reaches all of them, to it.
     """
@@ -74,7 +78,9 @@ def _plugin(work: Work, threads: int, own: bool) -> Any:
         name = _PLUGIN
 
         def setup(self, worker: Any) -> None:
-            logging.getLogger("distributed.worker").setLevel(logging.CRITICAL)  # a failed trial reaches the user once, as its own sentence
+            logging.getLogger("distributed.worker").setLevel(
+                logging.CRITICAL
+            )  # a failed trial reaches the user once, as its own sentence
             torch.set_num_threads(threads)
             if own and threading.current_thread() is threading.main_thread():
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -91,7 +97,9 @@ def _on_own_gpu(work: Work, worker: Any) -> Work:
 
 @dataclass(frozen=True)
 class Distributed:
-    """Workers of a dask.distributed client. A chunk whose worker dies is run again on another one."""
+    """Workers of a dask.distributed client. A chunk whose worker dies is run again on
+    another one.
+    """
 
     client: Any
     workers: int
@@ -135,33 +143,48 @@ def _refuse_unsendable(work: Work) -> None:
     try:
         cloudpickle.dumps(work)
     except Exception as error:  # objects raise what they like when they are pickled
-        raise ConfigError(f"the trial function and its grid cannot be sent to other processes ({' '.join(str(error).split())}); make such objects inside the function") from error
+        raise ConfigError(
+            "the trial function and its grid cannot be sent to other processes "
+            f"({' '.join(str(error).split())}); make such objects inside the function"
+        ) from error
 
 
 def refuse_unguarded() -> None:
-    """A worker process that is just starting reads the user's script again; workers of its own are the mark of a script without the usual guard.
+    """A worker process that is just starting reads the user's script again; workers of its own are
+    the mark of a script without the usual guard.
 
-    SystemExit ends it with a sentence and without a traceback; the process that started it then says that its workers did not come.
+    SystemExit ends it with a sentence and without a traceback; the process that started it then
+    says that its workers did not come.
     """
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         raise SystemExit(_UNGUARDED)
 
 
 def _after_deaths(chunk: Chunk) -> Iterator[Chunk]:
-    """Halves of a chunk whose workers died one after the other: the system kills a process that takes too much memory, without an error."""
+    """Halves of a chunk whose workers died one after the other: the system kills a process that
+    takes too much memory, without an error.
+    """
     if len(chunk) == 1:
-        raise ConfigError(f"every worker that ran trial {chunk.trials[0]} died, most likely for want of memory; use fewer workers, or make the scene smaller")
-    log.warning("warning: the workers that ran %d trials at once died, most likely for want of memory; trying halves", len(chunk))
+        raise ConfigError(
+            f"every worker that ran trial {chunk.trials[0]} died, most likely for want of memory; "
+            "use fewer workers, or make the scene smaller"
+        )
+    log.warning(
+        "warning: the workers that ran %d trials at once died, most likely for want of memory; trying halves",
+        len(chunk),
+    )
     yield from chunk.pieces(-(-len(chunk) // 2))
 
 
 @contextmanager
 def engine(workers: int | None = None, cluster: str | None = None, threads: int = 1) -> Iterator[Engine]:
-    """In this process by default; `workers` local processes; or the workers of a running scheduler at `cluster`.
+    """In this process by default; `workers` local processes; or the workers of a running scheduler
+    at `cluster`.
 
-    threads: of torch in each process. One is the default: batches that fit the cache gain nothing from more (two took 1.4 times as long on two
-    cores), and results then do not depend on the number of cores.
-    Raises ConfigError where dask.distributed is missing or the address does not answer.
+    threads: of torch in each process. One is the default: batches that fit the cache gain nothing
+    from more (two took 1.4 times as long on two cores), and results then do not depend on the
+    number of cores. Raises ConfigError where dask.distributed is missing or the address does not
+    answer.
     """
     for name, value in (("workers", workers), ("threads", threads)):
         if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
@@ -170,17 +193,29 @@ def engine(workers: int | None = None, cluster: str | None = None, threads: int 
         yield InProcess(threads)
         return
     if workers is not None and cluster is not None:
-        raise ConfigError("--workers starts processes on this machine and --cluster uses running ones; give one of them")
+        raise ConfigError(
+            "--workers starts processes on this machine and --cluster uses running ones; give one of them"
+        )
     try:
         import distributed
     except ImportError:
-        raise ConfigError("several processes need dask.distributed; install the extra: pip install 'torchsar-lab[cluster]'") from None
-    with _local(distributed, workers, threads) if workers is not None else _remote(distributed, str(cluster), threads) as chosen:
+        raise ConfigError(
+            "several processes need dask.distributed; install the extra: pip install 'torchsar-lab[cluster]'"
+        ) from None
+    with (
+        _local(distributed, workers, threads)
+        if workers is not None
+        else _remote(distributed, str(cluster), threads) as chosen
+    ):
         yield chosen
 
 
 def _settings(threads: int) -> dict[str, Any]:
-    """Of local workers. dask lets malloc hand memory back at once, which doubled the time of these chains: every operation faulted its pages in anew."""
+    """Of local workers.
+
+    dask lets malloc hand memory back at once, which doubled the time of these chains: every
+    operation faulted its pages in anew.
+    """
     kept = dict.fromkeys(("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_"), 256 << 20)
     environment = {**dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads), **kept}
     return {"distributed.nanny.pre-spawn-environ": environment, "distributed.scheduler.allowed-failures": _DEATHS}
@@ -200,9 +235,18 @@ def _local(distributed: Any, workers: int, threads: int) -> Iterator[Engine]:
 
 def _cluster(distributed: Any, workers: int) -> Any:
     try:
-        return distributed.LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=50, memory_limit=0)
+        return distributed.LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=":0",
+            silence_logs=50,
+            memory_limit=0,
+        )
     except RuntimeError as error:
-        raise ConfigError(f"the worker processes did not start ({' '.join(str(error).split())}); {_UNGUARDED}") from None
+        raise ConfigError(
+            f"the worker processes did not start ({' '.join(str(error).split())}); {_UNGUARDED}"
+        ) from None
 
 
 @contextmanager
@@ -210,7 +254,10 @@ def _remote(distributed: Any, address: str, threads: int) -> Iterator[Engine]:
     try:
         client = distributed.Client(address, timeout=20)
     except (OSError, ValueError) as error:
-        raise ConfigError(f"--cluster {address} does not answer ({' '.join(str(error).split())}); start a scheduler there, or leave --cluster out") from None
+        raise ConfigError(
+            f"--cluster {address} does not answer ({' '.join(str(error).split())}); start a "
+            "scheduler there, or leave --cluster out"
+        ) from None
     with client:
         client.wait_for_workers(1, timeout=600)
         yield Distributed(client, len(client.scheduler_info()["workers"]), threads)

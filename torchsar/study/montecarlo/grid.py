@@ -1,4 +1,6 @@
-"""The grid of a sweep: named parameters and their values, the points they span, and the address of each."""
+"""The grid of a sweep: named parameters and their values, the points they span, and the address of
+each.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +20,13 @@ _LONGEST = 200  # bytes: file systems end at 255, and bounds and figures add wor
 
 @dataclass(frozen=True)
 class Parameter:
-    """One dimension of a sweep. labels: numbers or words that name the values in results; values: what the trial is given.
+    """One dimension of a sweep.
 
-    batched: the values reach the trial as one tensor with an entry per row, so that one batch may hold several of them; others are given
-    as they are, and each of their values is a case of its own.
+    labels: numbers or words that name the values in results; values: what the trial is given.
+
+    batched: the values reach the trial as one tensor with an entry per row, so that one batch may
+    hold several of them; others are given as they are, and each of their values is a case of its
+    own.
     """
 
     name: str
@@ -65,8 +70,13 @@ class Grid:
         return {p.name: p.labels for p in self.parameters}
 
     def points(self) -> list[Point]:
-        """Every point, each with an address made of names and values alone: it stays when the grid grows."""
-        return [Point(index, address({p.name: p.values[i] for p, i in zip(self.parameters, index)})) for index in itertools.product(*map(range, self.shape))]
+        """Every point, each with an address made of names and values alone: it stays when the grid
+        grows.
+        """
+        return [
+            Point(index, address({p.name: p.values[i] for p, i in zip(self.parameters, index)}))
+            for index in itertools.product(*map(range, self.shape))
+        ]
 
     def cases(self) -> list[Case]:
         """The points in groups of equal fixed parameters, in the order of the grid."""
@@ -74,7 +84,9 @@ class Grid:
         for point in self.points():
             groups.setdefault(tuple(i for p, i in zip(self.parameters, point.index) if not p.batched), []).append(point)
         fixed = [p for p in self.parameters if not p.batched]
-        return [Case({p.name: p.values[i] for p, i in zip(fixed, key)}, tuple(points)) for key, points in groups.items()]
+        return [
+            Case({p.name: p.values[i] for p, i in zip(fixed, key)}, tuple(points)) for key, points in groups.items()
+        ]
 
     def labels_at(self, point: Point) -> dict[str, float | str]:
         """What a point is called, by parameter."""
@@ -82,7 +94,9 @@ class Grid:
 
 
 def address(parameters: Mapping[str, Any]) -> str:
-    """A hash of parameters by name: equal parameters give equal random numbers in every grid, in any order."""
+    """A hash of parameters by name: equal parameters give equal random numbers in every grid, in
+    any order.
+    """
     return hashlib.blake2b(canonical(parameters).encode(), digest_size=12).hexdigest()
 
 
@@ -105,11 +119,15 @@ def _plain(x: Any) -> Any:
     return _plain(x.tolist()) if hasattr(x, "tolist") else repr(x)
 
 
-def make_grid(values: Mapping[str, Sequence[Any] | Mapping[str, Any]], batched: Sequence[str] = (), where: str = "grid") -> Grid:
-    """A grid from {name: values}; a mapping {label: value} names values that are no numbers or words themselves.
+def make_grid(
+    values: Mapping[str, Sequence[Any] | Mapping[str, Any]], batched: Sequence[str] = (), where: str = "grid"
+) -> Grid:
+    """A grid from {name: values}; a mapping {label: value} names values that are no numbers or
+    words themselves.
 
-    batched: names whose values reach the trial as per-row tensors. Raises ConfigError for a parameter without values, a value given
-    twice, a reserved name, or a batched parameter that is no number.
+    batched: names whose values reach the trial as per-row tensors. Raises ConfigError for a
+    parameter without values, a value given twice, a reserved name, or a batched parameter that is
+    no number.
     """
     if not isinstance(values, Mapping):
         raise ConfigError(f"{where} must be a mapping of names to lists of values, got {values!r}")
@@ -117,18 +135,37 @@ def make_grid(values: Mapping[str, Sequence[Any] | Mapping[str, Any]], batched: 
         raise ConfigError(f"{where}: batched must be a list of names, got {batched!r}; write [{batched!r}]")
     unknown = [name for name in batched if name not in values]
     if unknown:
-        raise ConfigError(f"{where}: batched names {unknown[0]!r}, which is no parameter of the grid ({', '.join(values) or 'it has none'})")
+        raise ConfigError(
+            f"{where}: batched names {unknown[0]!r}, which is no parameter of the grid "
+            f"({', '.join(values) or 'it has none'})"
+        )
     return Grid(tuple(_parameter(name, given, name in batched, f"{where}: {name}") for name, given in values.items()))
 
 
 def check_name(name: Any, taken: Sequence[str], where: str, kind: str) -> None:
-    """Raise ConfigError for a name under which the store could not keep an array: each is a folder of its own."""
+    """Raise ConfigError for a name under which the store could not keep an array: each is a folder
+    of its own.
+    """
     if name in taken:
-        raise ConfigError(f"{where}: a {kind} cannot be called {name!r}, which names a dimension or a part of the results; choose another name")
-    if not isinstance(name, str) or not name or "/" in name or "\0" in name or name in (".", "..", "zarr.json") or name.startswith("__"):
-        raise ConfigError(f"{where}: a {kind} cannot be called {name!r}; its name is a word without '/' that does not begin with '__'")
+        raise ConfigError(
+            f"{where}: a {kind} cannot be called {name!r}, which names a dimension or a part of "
+            "the results; choose another name"
+        )
+    if (
+        not isinstance(name, str)
+        or not name
+        or "/" in name
+        or "\0" in name
+        or name in (".", "..", "zarr.json")
+        or name.startswith("__")
+    ):
+        raise ConfigError(
+            f"{where}: a {kind} cannot be called {name!r}; its name is a word without '/' that does not begin with '__'"
+        )
     if len(name.encode()) > _LONGEST:
-        raise ConfigError(f"{where}: the name of the {kind} {name[:40]!r}... has {len(name.encode())} bytes; use {_LONGEST} at most")
+        raise ConfigError(
+            f"{where}: the name of the {kind} {name[:40]!r}... has {len(name.encode())} bytes; use {_LONGEST} at most"
+        )
 
 
 def _pairs(given: Any, where: str) -> list[tuple[float | str, Any]]:
@@ -154,7 +191,10 @@ def _parameter(name: str, given: Any, batched: bool, where: str) -> Parameter:
     labels, values = tuple(label for label, _ in pairs), tuple(value for _, value in pairs)
     nameless = next((value for value in values if " at 0x" in canonical(value)), None)
     if nameless is not None:
-        raise ConfigError(f"{where} holds {nameless!r}, whose text is another in every process, and random numbers follow it; give numbers, words, lists, mappings or dataclasses")
+        raise ConfigError(
+            f"{where} holds {nameless!r}, whose text is another in every process, and random "
+            "numbers follow it; give numbers, words, lists, mappings or dataclasses"
+        )
     for known in (labels, tuple(map(canonical, values))):
         twice = next((label for i, label in enumerate(known) if label in known[:i]), None)
         if twice is not None:
@@ -162,7 +202,10 @@ def _parameter(name: str, given: Any, batched: bool, where: str) -> Parameter:
     if len({isinstance(label, str) for label in labels}) > 1:
         raise ConfigError(f"{where} mixes numbers and words; name all of its values: {{label: value, ...}}")
     if batched and not all(_is_number(v) for v in values):
-        raise ConfigError(f"{where} becomes a tensor with an entry per trial, so its values must be finite numbers, got {list(values)}")
+        raise ConfigError(
+            f"{where} becomes a tensor with an entry per trial, so its values must be finite "
+            f"numbers, got {list(values)}"
+        )
     return Parameter(name, labels, values, batched)
 
 

@@ -36,9 +36,12 @@ class Interrupted(KeyboardInterrupt):
 
 @dataclass(frozen=True)
 class Plan:
-    """What a sweep is to compute, apart from where. chunk: rows a batch, None to choose by bytes; save: trials whose arrays are kept.
+    """What a sweep is to compute, apart from where.
 
-    needs: (where it is said, metric) of what something after the sweep asks for; the first batch must give it.
+    chunk: rows a batch, None to choose by bytes; save: trials whose arrays are kept.
+
+    needs: (where it is said, metric) of what something after the sweep asks for; the first batch
+    must give it.
     """
 
     grid: Grid
@@ -54,13 +57,20 @@ class Plan:
         for name, value, least in (("trials", self.trials, 1), ("chunk", self.chunk, 1), ("seed", self.seed, 0)):
             if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < least):
                 raise ConfigError(f"sweep: {name} must be a whole number of at least {least}, got {value!r}")
-        absent = next((t for t in self.save if isinstance(t, bool) or not isinstance(t, int) or not 0 <= t < self.trials), None)
+        absent = next(
+            (t for t in self.save if isinstance(t, bool) or not isinstance(t, int) or not 0 <= t < self.trials), None
+        )
         if absent is not None:
-            raise ConfigError(f"sweep: save names trial {absent!r}, and a point has the trials 0 to {self.trials - 1}; name some of these")
+            raise ConfigError(
+                f"sweep: save names trial {absent!r}, and a point has the trials 0 to "
+                f"{self.trials - 1}; name some of these"
+            )
         try:
             torch.empty(0, device=torch.device(self.device))
         except (RuntimeError, AssertionError, TypeError) as error:
-            raise ConfigError(f"sweep: the device {self.device!r} cannot be used here: {str(error).splitlines()[0]}") from None
+            raise ConfigError(
+                f"sweep: the device {self.device!r} cannot be used here: {str(error).splitlines()[0]}"
+            ) from None
 
 
 def sweep(
@@ -81,24 +91,34 @@ def sweep(
     device: str = "cpu",
     config: Mapping[str, Any] | None = None,
 ) -> Record:
-    """Run `trial(parameters, draws)` over a grid of parameters, many trials at once, and return the labelled results.
+    """Run `trial(parameters, draws)` over a grid of parameters, many trials at once, and return the
+    labelled results.
 
-    trial: gets the parameters of a batch by name, and `Draws` whose trials are the rows of that batch; returns {metric: (rows,) tensor},
-    or {algorithm: {metric: tensor}} to compare algorithms on the same noise. `ok` (bool) is an algorithm's own verdict. Two further keys:
-    "bounds" {metric: {name: (rows,) tensor}}, and "saved" {algorithm: {name: (rows, ...) tensor}}, kept for the trials in `save`.
-    grid: {name: values}, or {name: {label: value}} for values that are no numbers or words. batched: names whose values come as one float64
-    tensor (rows,); any other value comes as it is, one case after the other.
-    trials: per point; more trials on a finished sweep extend it. stop: ends a point early. chunk: rows a batch (default: by bytes).
-    out: folder for results.zarr; None keeps the results in memory only. resume: go on with what is there. workers, cluster: processes of
-    this machine, or the address of a dask scheduler; threads: of torch in each process. config: whatever else the results depend on; resuming with another one is refused.
+    trial: gets the parameters of a batch by name, and `Draws` whose trials are the rows of that
+    batch; returns {metric: (rows,) tensor}, or {algorithm: {metric: tensor}} to compare algorithms
+    on the same noise. `ok` (bool) is an algorithm's own verdict. Two further keys: "bounds"
+    {metric: {name: (rows,) tensor}}, and "saved" {algorithm: {name: (rows, ...) tensor}}, kept for
+    the trials in `save`. grid: {name: values}, or {name: {label: value}} for values that are no
+    numbers or words. batched: names whose values come as one float64 tensor (rows,); any other
+    value comes as it is, one case after the other. trials: per point; more trials on a finished
+    sweep extend it. stop: ends a point early. chunk: rows a batch (default: by bytes). out: folder
+    for results.zarr; None keeps the results in memory only. resume: go on with what is there.
+    workers, cluster: processes of this machine, or the address of a dask scheduler; threads: of
+    torch in each process. config: whatever else the results depend on; resuming with another one is
+    refused.
 
-    Random numbers depend on (seed, purpose, parameters, trial) alone. Raises ConfigError for bad input, Interrupted after Ctrl-C.
+    Random numbers depend on (seed, purpose, parameters, trial) alone. Raises ConfigError for bad
+    input, Interrupted after Ctrl-C.
     """
     if workers is not None:
         refuse_unguarded()
     _refuse_types(trial, stop, save, config, out)
     plan = Plan(make_grid(grid, batched), trials, seed, chunk, stop, frozenset(save), device)
-    identity = {"seed": seed, "trial": getattr(trial, "__qualname__", type(trial).__qualname__), "config": dict(config or {})}
+    identity = {
+        "seed": seed,
+        "trial": getattr(trial, "__qualname__", type(trial).__qualname__),
+        "config": dict(config or {}),
+    }
     store = None if out is None else open_store(Path(out), plan, identity, resume)
     return run_plan(plan, trial, store, engine(workers, cluster, threads)).select(plan.grid.labels)
 
@@ -117,7 +137,9 @@ def _refuse_types(trial: Any, stop: Any, save: Any, config: Any, out: Any) -> No
 
 
 def open_store(out: Path, plan: Plan, identity: Mapping[str, Any], resume: bool) -> Store:
-    """results.zarr in the folder: a new one, or with `resume` the one that is there. Raises ConfigError where that would lose results.
+    """results.zarr in the folder: a new one, or with `resume` the one that is there.
+
+    Raises ConfigError where that would lose results.
 
     A sweep that ended before its first mark holds nothing to lose and is begun anew.
     """
@@ -126,17 +148,35 @@ def open_store(out: Path, plan: Plan, identity: Mapping[str, Any], resume: bool)
     if there and resume:
         return Store.resume(path, plan.grid, plan.trials, identity)
     if there and read_sweep(path).done.any():
-        raise ConfigError(f"{out} holds a sweep already; add --resume (resume=True) to go on with it, or choose another folder")
-    if not path.exists() and out.exists() and (not out.is_dir() or any(p for p in out.iterdir() if not p.name.startswith(".results.zarr"))):
+        raise ConfigError(
+            f"{out} holds a sweep already; add --resume (resume=True) to go on with it, or choose another folder"
+        )
+    if (
+        not path.exists()
+        and out.exists()
+        and (not out.is_dir() or any(p for p in out.iterdir() if not p.name.startswith(".results.zarr")))
+    ):
         raise ConfigError(f"{out} exists and is not the folder of a sweep; choose another one")
     return Store.create(path, plan.grid, plan.trials, identity)
 
 
-def run_plan(plan: Plan, trial: Trial, store: Store | None, engine: AbstractContextManager[Engine], title: str = "sweep") -> Record:
-    """Compute what is missing and return the whole record, which may hold more labels than the plan's grid after a resume."""
+def run_plan(
+    plan: Plan, trial: Trial, store: Store | None, engine: AbstractContextManager[Engine], title: str = "sweep"
+) -> Record:
+    """Compute what is missing and return the whole record, which may hold more labels than the
+    plan's grid after a resume.
+    """
     record = empty(plan.grid.labels, plan.trials) if store is None else store.record
     cases = tuple(plan.grid.cases())
-    work = Work(trial, cases, {p.name: p.values for p in plan.grid.parameters if p.batched}, plan.grid.names, plan.seed, plan.device, plan.save)
+    work = Work(
+        trial,
+        cases,
+        {p.name: p.values for p in plan.grid.parameters if p.batched},
+        plan.grid.names,
+        plan.seed,
+        plan.device,
+        plan.save,
+    )
     run = _Run(plan, work, record, store)
     try:
         with engine as chosen:
@@ -168,8 +208,17 @@ class _Run:
     def all_levels(self, engine: Engine, title: str) -> None:
         if self.record.algorithms:
             self._refuse_missing(self.record.metrics)
-        levels = sorted({*looks(self.plan.trials, self.plan.stop), *(n for n in self.record.about.get("finished", []) if n < self.plan.trials)})
-        progress, began, first = Progress(title, self._expected(levels[-1]), self._recorded(levels[-1])), time.perf_counter(), 0
+        levels = sorted(
+            {
+                *looks(self.plan.trials, self.plan.stop),
+                *(n for n in self.record.about.get("finished", []) if n < self.plan.trials),
+            }
+        )
+        progress, began, first = (
+            Progress(title, self._expected(levels[-1]), self._recorded(levels[-1])),
+            time.perf_counter(),
+            0,
+        )
         session = self._session(engine)
         try:
             for last in levels:
@@ -184,31 +233,59 @@ class _Run:
                 first = last
         finally:
             progress.close()
-            self._note({**session, "seconds": time.perf_counter() - began, "trials": progress.done - progress.began_with, "chunk_rows": {str(k): v for k, v in self.rows.items()}})
+            self._note(
+                {
+                    **session,
+                    "seconds": time.perf_counter() - began,
+                    "trials": progress.done - progress.began_with,
+                    "chunk_rows": {str(k): v for k, v in self.rows.items()},
+                }
+            )
 
     def _expected(self, trials: int) -> int:
         """Trials that the sweep will hold if no further point ends early."""
-        return sum(self.settled_at.get((case, p), trials) for case, places in enumerate(self.places) for p in range(len(places)))
+        return sum(
+            self.settled_at.get((case, p), trials)
+            for case, places in enumerate(self.places)
+            for p in range(len(places))
+        )
 
     def _finished(self, trials: int) -> None:
-        """Remember that all points got this far: batches never reach across, so that an extension of a sweep runs the same ones however often it is resumed."""
+        """Remember that all points got this far: batches never reach across, so that an extension
+        of a sweep runs the same ones however often it is resumed.
+        """
         finished = sorted({*self.record.about.get("finished", []), trials})
         self._about(finished=finished)
 
     def _recorded(self, trials: int) -> int:
-        return sum(int(self.record.done[(*place, slice(0, trials))].sum()) for places in self.places for place in places)
+        return sum(
+            int(self.record.done[(*place, slice(0, trials))].sum()) for places in self.places for place in places
+        )
 
     def _tasks(self, first: int, last: int) -> Iterator[Task]:
         """Chunks of one level without the rows that are done."""
         for number, case in enumerate(self.work.cases):
-            missing = any(not self.record.done[(*self.places[number][p], slice(first, last))].all() for p in self.active[number])
+            missing = any(
+                not self.record.done[(*self.places[number][p], slice(first, last))].all() for p in self.active[number]
+            )
             if not missing:
                 continue
-            self.rows[number] = self.plan.chunk or self.rows.get(number) or rows_by_bytes(probed_bytes(self.work, number), self.plan.device)
+            self.rows[number] = (
+                self.plan.chunk
+                or self.rows.get(number)
+                or rows_by_bytes(probed_bytes(self.work, number), self.plan.device)
+            )
             for whole in cut(number, case, self.active[number], first, last, self.rows[number]):
-                keep = [i for i, (p, t) in enumerate(zip(whole.points, whole.trials)) if not self.record.done[(*self.places[number][p], t)]]
+                keep = [
+                    i
+                    for i, (p, t) in enumerate(zip(whole.points, whole.trials))
+                    if not self.record.done[(*self.places[number][p], t)]
+                ]
                 if keep:
-                    yield Chunk(number, tuple(whole.points[i] for i in keep), tuple(whole.trials[i] for i in keep)), self.fits.get(number)
+                    yield (
+                        Chunk(number, tuple(whole.points[i] for i in keep), tuple(whole.trials[i] for i in keep)),
+                        self.fits.get(number),
+                    )
 
     def _enter(self, chunk: Chunk, outcome: Outcome) -> None:
         """Take in a chunk; it waits with others until writing them together is cheap."""
@@ -224,7 +301,8 @@ class _Run:
     def settle(self) -> None:
         """Enter what waits into the record and the store.
 
-        The store is told first: a second Ctrl-C in between may then leave rows that are announced and not done, never the reverse.
+        The store is told first: a second Ctrl-C in between may then leave rows that are announced
+        and not done, never the reverse.
         """
         while self.waiting:
             chunk, outcome = self.waiting.pop(0)
@@ -253,7 +331,11 @@ class _Run:
             active -= ended
 
     def _session(self, engine: Engine) -> dict[str, Any]:
-        gpu = {"gpu": torch.cuda.get_device_name(self.plan.device)} if torch.device(self.plan.device).type == "cuda" else {}
+        gpu = (
+            {"gpu": torch.cuda.get_device_name(self.plan.device)}
+            if torch.device(self.plan.device).type == "cuda"
+            else {}
+        )
         return {
             "began": datetime.now(UTC).isoformat(timespec="seconds"),
             "device": self.plan.device,
@@ -261,7 +343,12 @@ class _Run:
             "workers": engine.workers,
             "threads": engine.threads,
             "machine": platform.machine(),
-            "versions": {"torchsar-lab": installed_version(), "torch": torch.__version__, "numpy": np.__version__, "python": platform.python_version()},
+            "versions": {
+                "torchsar-lab": installed_version(),
+                "torch": torch.__version__,
+                "numpy": np.__version__,
+                "python": platform.python_version(),
+            },
         }
 
     def _note(self, session: Mapping[str, Any]) -> None:

@@ -16,12 +16,43 @@ from torchsar.study.montecarlo.statistics import LEVEL
 from torchsar.study.pictures import Picture
 
 PANELS = 6
-_UNITS = {"_rad_s": "rad/s", "_m_s2": "m/s²", "_m_s": "m/s", "_hz": "Hz", "_db": "dB", "_nats": "nats", "_rad": "rad", "_deg": "deg", "_m": "m", "_s": "s"}
-_ACRONYMS = {word.lower(): word for word in ("Doppler", "SNR", "PRF", "RMS", "IRW", "PSLR", "ISLR", "RCS", "SIR", "CNR", "SCR", "SCNR", "MFTA", "ADC")}
+_UNITS = {
+    "_rad_s": "rad/s",
+    "_m_s2": "m/s²",
+    "_m_s": "m/s",
+    "_hz": "Hz",
+    "_db": "dB",
+    "_nats": "nats",
+    "_rad": "rad",
+    "_deg": "deg",
+    "_m": "m",
+    "_s": "s",
+}
+_ACRONYMS = {
+    word.lower(): word
+    for word in (
+        "Doppler",
+        "SNR",
+        "PRF",
+        "RMS",
+        "IRW",
+        "PSLR",
+        "ISLR",
+        "RCS",
+        "SIR",
+        "CNR",
+        "SCR",
+        "SCNR",
+        "MFTA",
+        "ADC",
+    )
+}
 
 
 def name_and_unit(name: str) -> tuple[str, str]:
-    """What the last part of a dotted name says, and its unit: 'world.noise.snr_db' -> ('SNR', 'dB')."""
+    """What the last part of a dotted name says, and its unit: 'world.noise.snr_db' -> ('SNR',
+    'dB').
+    """
     last = name.rpartition(".")[2]
     suffix = next((suffix for suffix in _UNITS if last.endswith(suffix) and last != suffix), "")
     words = last.removesuffix(suffix).strip("_").split("_")
@@ -60,7 +91,8 @@ class Quantity:
 
 
 def main_quantity(metric: str, bounded: bool = False) -> Quantity:
-    """RMSE on a logarithmic axis for errors about zero; the median of everything else, errors that are ratios in dB among them.
+    """RMSE on a logarithmic axis for errors about zero; the median of everything else, errors that
+    are ratios in dB among them.
 
     bounded: whether the metric has bounds, which make a logarithmic axis of their own right.
     """
@@ -71,7 +103,9 @@ def main_quantity(metric: str, bounded: bool = False) -> Quantity:
 
 @dataclass(frozen=True)
 class Panel:
-    """One place along the parameters that are not axes of a figure: its title and index by parameter."""
+    """One place along the parameters that are not axes of a figure: its title and index by
+    parameter.
+    """
 
     title: str
     index: Mapping[str, int]
@@ -79,7 +113,11 @@ class Panel:
 
 @dataclass(frozen=True)
 class Cube:
-    """A summary as arrays. figures: metric -> field -> (algorithm, *parameters, ...); bounds: metric -> name -> (*parameters)."""
+    """A summary as arrays.
+
+    figures: metric -> field -> (algorithm, *parameters, ...); bounds: metric -> name ->
+    (*parameters).
+    """
 
     algorithms: list[str]
     labels: dict[str, list[float | str]]
@@ -102,7 +140,10 @@ class Cube:
         return np.arange(len(labels)) if isinstance(labels[0], str) else np.argsort(np.asarray(labels, dtype=float))
 
     def cut(self, array: np.ndarray, panel: Panel, over: str, lead: int = 1) -> np.ndarray:
-        """Along one sorted parameter, the others at the panel's place. lead: dims before the parameters."""
+        """Along one sorted parameter, the others at the panel's place.
+
+        lead: dims before the parameters.
+        """
         place = tuple(self.order(name) if name == over else panel.index[name] for name in self.labels)
         return array[(slice(None),) * lead + place]
 
@@ -121,7 +162,9 @@ def read_summary(summary: Mapping[str, Any]) -> Cube:
                 fields.setdefault(name, np.full((len(algorithms), *shape, *number.shape), np.nan))[at] = number
     for bound in summary["bounds"]:
         known = cube.bounds.setdefault(bound["metric"], {})
-        known.setdefault(bound["bound"], np.full(shape, np.nan))[_index(labels, bound["parameters"])] = np.array(bound["rms"], dtype=np.float64)
+        known.setdefault(bound["bound"], np.full(shape, np.nan))[_index(labels, bound["parameters"])] = np.array(
+            bound["rms"], dtype=np.float64
+        )
     return cube
 
 
@@ -133,9 +176,11 @@ Drawn = Iterator[tuple[str, str, str, Any]]
 
 
 def draw_sweep(summary: Mapping[str, Any], folder: Path, show: Sequence[str] = ()) -> list[Picture]:
-    """The pictures of a sweep as PNG files in the folder (made if need be), in the order of reading.
+    """The pictures of a sweep as PNG files in the folder (made if need be), in the order of
+    reading.
 
-    show: the metrics to draw, in this order; by default the errors, and where nothing is called an error everything that was measured.
+    show: the metrics to draw, in this order; by default the errors, and where nothing is called an
+    error everything that was measured.
     """
     folder.mkdir(parents=True, exist_ok=True)
     cube, pictures = read_summary(summary), []
@@ -155,19 +200,26 @@ def _all(cube: Cube, wanted: Sequence[str]) -> Drawn:
         yield from _curves(cube, quantity)
         if "success_share" in fields:
             limit = np.nanmax(fields["success_limit"])
-            words = f"share of trials with {name_and_unit(metric)[0]} within {limit:g} {name_and_unit(metric)[1]}".rstrip()
+            words = (
+                f"share of trials with {name_and_unit(metric)[0]} within {limit:g} {name_and_unit(metric)[1]}".rstrip()
+            )
             yield from _curves(cube, Quantity(metric, "success_share", "success_interval", words))
         for x, y in itertools.combinations(cube.numeric, 2):
             yield from _heat_maps(cube, quantity, x, y)
     if cube.figures:
-        yield from _curves(cube, Quantity(next(iter(cube.figures)), "ok_share", "ok_interval", "share of trusted trials"))
+        yield from _curves(
+            cube, Quantity(next(iter(cube.figures)), "ok_share", "ok_interval", "share of trusted trials")
+        )
 
 
-# --- curves -------------------------------------------------------------------------------------------------------------------------------
+# --- curves
+# --------------------------------------------------------------------------------------------------
 
 
 def _curves(cube: Cube, quantity: Quantity) -> Drawn:
-    """Over every parameter with two numbers or more; without any, over the one with the most words."""
+    """Over every parameter with two numbers or more; without any, over the one with the
+    most words.
+    """
     values = cube.figures[quantity.metric][quantity.field]
     if not np.isfinite(values).any():
         return
@@ -178,7 +230,11 @@ def _curves(cube: Cube, quantity: Quantity) -> Drawn:
         for page, some in enumerate(pages, 1):
             name = quantity.field if quantity.field == "ok_share" else f"{quantity.metric}_{quantity.field}"
             name += f"_over_{over.rpartition('.')[2]}" if over else ""
-            title = quantity.title + (f" over {name_and_unit(over)[0]}" if over else "") + (f" ({page} of {len(pages)})" if len(pages) > 1 else "")
+            title = (
+                quantity.title
+                + (f" over {name_and_unit(over)[0]}" if over else "")
+                + (f" ({page} of {len(pages)})" if len(pages) > 1 else "")
+            )
             yield name, title, _caption(cube, quantity) + note, _curve_figure(cube, quantity, over, some)
 
 
@@ -187,7 +243,9 @@ def _curve_figure(cube: Cube, quantity: Quantity, over: str | None, panels: list
     ylim = (-0.04, 1.04) if quantity.field.endswith("share") else None
     make = _part_over_algorithms if over is None else _part
     parts = [make(cube, quantity, panel, over or "") for panel in panels]
-    return plot.error_curves(parts, axis_label(over) if over else "", quantity.label, _is_logarithmic(cube, over), log_y, ylim)
+    return plot.error_curves(
+        parts, axis_label(over) if over else "", quantity.label, _is_logarithmic(cube, over), log_y, ylim
+    )
 
 
 def _part(cube: Cube, quantity: Quantity, panel: Panel, over: str) -> dict[str, Any]:
@@ -209,7 +267,12 @@ def _part_over_algorithms(cube: Cube, quantity: Quantity, panel: Panel, over: st
     place = (slice(None), *(panel.index[name] for name in cube.labels))
     y, interval = (cube.figures[quantity.metric][name][place] for name in (quantity.field, quantity.interval))
     bounds = cube.bounds.get(quantity.metric, {}) if quantity.log else {}
-    return {"title": "", "x": cube.algorithms, "series": {quantity.title: (y, interval)}, "bounds": {name: np.full(len(y), values[place[1:]]) for name, values in bounds.items()}}
+    return {
+        "title": "",
+        "x": cube.algorithms,
+        "series": {quantity.title: (y, interval)},
+        "bounds": {name: np.full(len(y), values[place[1:]]) for name, values in bounds.items()},
+    }
 
 
 def _has_positive(cube: Cube, quantity: Quantity) -> bool:
@@ -225,9 +288,11 @@ def _is_logarithmic(cube: Cube, over: str | None) -> bool:
 
 
 def panels_beside(cube: Cube, over: set[Any]) -> tuple[list[Panel], str]:
-    """A panel for every place along the other parameters, words first, and a sentence on what is left out or fixed.
+    """A panel for every place along the other parameters, words first, and a sentence on what is
+    left out or fixed.
 
-    Beyond six panels each other parameter of numbers shows its first, middle and last value, then first and last, then the middle one.
+    Beyond six panels each other parameter of numbers shows its first, middle and last value, then
+    first and last, then the middle one.
     """
     others = [name for name in (*cube.worded, *cube.numeric) if name not in over]
     fixed = {name: 0 for name, labels in cube.labels.items() if len(labels) == 1}
@@ -236,7 +301,10 @@ def panels_beside(cube: Cube, over: set[Any]) -> tuple[list[Panel], str]:
         places = [dict(zip(others, index, strict=True)) for index in itertools.product(*chosen.values())]
         if len(places) <= PANELS:
             break
-    panels = [Panel(", ".join(value_label(name, cube.labels[name][i]) for name, i in place.items()), fixed | place) for place in places]
+    panels = [
+        Panel(", ".join(value_label(name, cube.labels[name][i]) for name, i in place.items()), fixed | place)
+        for place in places
+    ]
     return panels, _left_out(cube, chosen) + _held(cube, fixed)
 
 
@@ -250,7 +318,11 @@ def _some(indices: np.ndarray, keep: int) -> list[int]:
 
 def _left_out(cube: Cube, chosen: Mapping[str, list[int]]) -> str:
     thinned = [name for name, shown in chosen.items() if len(shown) < len(cube.labels[name])]
-    sentences = (f" Of {len(cube.labels[n])} values of {name_and_unit(n)[0]} this shows {', '.join(f'{cube.labels[n][i]:g}' for i in chosen[n])}; the table holds all." for n in thinned)
+    sentences = (
+        f" Of {len(cube.labels[n])} values of {name_and_unit(n)[0]} this shows "
+        f"{', '.join(f'{cube.labels[n][i]:g}' for i in chosen[n])}; the table holds all."
+        for n in thinned
+    )
     return "".join(sentences)
 
 
@@ -262,14 +334,28 @@ def _caption(cube: Cube, quantity: Quantity) -> str:
     """What a reader should see, the interval's level and the number of trials."""
     trials = _trials(cube, quantity.metric)
     if quantity.field.endswith("share"):
-        success = " Success means trusted by the algorithm and within the limit." if quantity.field == "success_share" else " Trusted is what the algorithm itself says of a trial, right or wrong."
+        success = (
+            " Success means trusted by the algorithm and within the limit."
+            if quantity.field == "success_share"
+            else " Trusted is what the algorithm itself says of a trial, right or wrong."
+        )
         return f"Share of {trials}, with exact {LEVEL:.0%} intervals.{success}"
     below = "" if quantity.field == "median" else " Lower is better."
-    bounds = " Dark lines are bounds: a curve that lies on one cannot be improved without bias, and where it departs from it the algorithm has its threshold."
+    bounds = (
+        " Dark lines are bounds: a curve that lies on one cannot be improved without bias, "
+        "and where it departs from it the algorithm has its threshold."
+    )
     has_bounds = quantity.log and bool(cube.bounds.get(quantity.metric))
-    some_zero = quantity.log and _has_positive(cube, quantity) and bool((cube.figures[quantity.metric][quantity.field] == 0).any())
+    some_zero = (
+        quantity.log
+        and _has_positive(cube, quantity)
+        and bool((cube.figures[quantity.metric][quantity.field] == 0).any())
+    )
     zeros = " Zeros have no place on the logarithmic axis." if some_zero else ""
-    return f"{quantity.title[:1].upper() + quantity.title[1:]} over {trials}, trusted or not, with {LEVEL:.0%} intervals.{below}{zeros}{bounds if has_bounds else ''}"
+    return (
+        f"{quantity.title[:1].upper() + quantity.title[1:]} over {trials}, trusted or not, "
+        f"with {LEVEL:.0%} intervals.{below}{zeros}{bounds if has_bounds else ''}"
+    )
 
 
 def _trials(cube: Cube, metric: str) -> str:
@@ -278,11 +364,14 @@ def _trials(cube: Cube, metric: str) -> str:
     return f"{many} trials a point" if few == many else f"{few} to {many} trials a point"
 
 
-# --- heat maps ----------------------------------------------------------------------------------------------------------------------------
+# --- heat maps
+# --------------------------------------------------------------------------------------------------
 
 
 def _heat_maps(cube: Cube, quantity: Quantity, x: str, y: str) -> Drawn:
-    """One panel an algorithm and place along the other parameters; all pages share one colour scale."""
+    """One panel an algorithm and place along the other parameters; all pages share one colour
+    scale.
+    """
     values = cube.figures[quantity.metric][quantity.field]
     log = quantity.log and _has_positive(cube, quantity)
     known = values[np.isfinite(values) & ((values > 0) | (not log))]
@@ -292,10 +381,20 @@ def _heat_maps(cube: Cube, quantity: Quantity, x: str, y: str) -> Drawn:
     per_page = max(1, PANELS // len(cube.algorithms))
     pages = [panels[i : i + per_page] for i in range(0, len(panels), per_page)]
     for page, some in enumerate(pages, 1):
-        parts = [_heat_part(cube, values[i], panel, x, y, name) for panel in some for i, name in enumerate(cube.algorithms)]
-        title = f"{quantity.title} over {name_and_unit(x)[0]} and {name_and_unit(y)[0]}" + (f" ({page} of {len(pages)})" if len(pages) > 1 else "")
-        caption = f"{quantity.title[:1].upper() + quantity.title[1:]} over {_trials(cube, quantity.metric)}, all panels on one{' logarithmic' if log else ''} colour scale, dark for small.{note}"
-        figure = plot.heat_map(parts, axis_label(x), axis_label(y), quantity.label, log, (float(known.min()), float(known.max())))
+        parts = [
+            _heat_part(cube, values[i], panel, x, y, name) for panel in some for i, name in enumerate(cube.algorithms)
+        ]
+        title = f"{quantity.title} over {name_and_unit(x)[0]} and {name_and_unit(y)[0]}" + (
+            f" ({page} of {len(pages)})" if len(pages) > 1 else ""
+        )
+        caption = (
+            f"{quantity.title[:1].upper() + quantity.title[1:]} over "
+            f"{_trials(cube, quantity.metric)}, all panels on one{' logarithmic' if log else ''} "
+            f"colour scale, dark for small.{note}"
+        )
+        figure = plot.heat_map(
+            parts, axis_label(x), axis_label(y), quantity.label, log, (float(known.min()), float(known.max()))
+        )
         yield f"{quantity.metric}_map_{x.rpartition('.')[2]}_{y.rpartition('.')[2]}", title, caption, figure
 
 
@@ -303,6 +402,13 @@ def _heat_part(cube: Cube, values: np.ndarray, panel: Panel, x: str, y: str, alg
     """values: (*parameters)."""
     names = list(cube.labels)
     z = np.moveaxis(values, (names.index(y), names.index(x)), (0, 1))
-    z = z[(slice(None), slice(None), *(panel.index[name] for name in names if name not in (x, y)))][np.ix_(cube.order(y), cube.order(x))]
+    z = z[(slice(None), slice(None), *(panel.index[name] for name in names if name not in (x, y)))][
+        np.ix_(cube.order(y), cube.order(x))
+    ]
     sorted_labels = {name: [cube.labels[name][i] for i in cube.order(name)] for name in (x, y)}
-    return {"title": f"{algorithm}; {panel.title}" if panel.title else algorithm, "x": sorted_labels[x], "y": sorted_labels[y], "z": z}
+    return {
+        "title": f"{algorithm}; {panel.title}" if panel.title else algorithm,
+        "x": sorted_labels[x],
+        "y": sorted_labels[y],
+        "z": z,
+    }

@@ -13,12 +13,18 @@ _QUIET_S = 1.0
 
 
 class Progress:
-    """Counts trials. Without a terminal each chunk is a line of the log, but not more than one line a second; DEBUG shows all of them."""
+    """Counts trials.
+
+    Without a terminal each chunk is a line of the log, but not more than one line a second; DEBUG
+    shows all of them.
+    """
 
     def __init__(self, title: str, total: int, done: int) -> None:
         self.total, self.done, self.began_with, self.began, self._said = total, done, done, time.perf_counter(), 0.0
         self.chunks = 0
-        self._bar = tqdm(total=total, initial=done, unit="trial", desc=title, leave=False) if sys.stderr.isatty() else None
+        self._bar = (
+            tqdm(total=total, initial=done, unit="trial", desc=title, leave=False) if sys.stderr.isatty() else None
+        )
 
     def expect(self, total: int) -> None:
         """The number of trials turned out to be another."""
@@ -37,7 +43,17 @@ class Progress:
         level = logging.DEBUG if quiet else logging.INFO
         if not log.isEnabledFor(level):
             return
-        log.log(level, "chunk %d, %d trials in %.2f s: %d of %d, %.3g trials/s, %s left", self.chunks, trials, seconds, self.done, self.total, self.rate, _clock(self.left_s))
+        log.log(
+            level,
+            "chunk %d, %d trials in %.2f s: %d of %d, %.3g trials/s, %s left",
+            self.chunks,
+            trials,
+            seconds,
+            self.done,
+            self.total,
+            self.rate,
+            _clock(self.left_s),
+        )
         self._said = self._said if quiet else now
 
     @property

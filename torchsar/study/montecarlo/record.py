@@ -19,10 +19,11 @@ Labels = dict[str, tuple[float | str, ...]]
 class Record:
     """Results of a sweep. A trial that has not run is NaN in every metric and False in `done`.
 
-    labels: values of every parameter, numbers or words, in the order of the dims. metrics: name -> float64 (algorithm, *parameters,
-    trial). ok: bool of the same shape, what the algorithm itself says of the trial. bounds: metric -> name of the bound ->
-    float64 (*parameters, trial). done: bool (*parameters, trial); points that ended early have fewer trials than others.
-    about: what the run was: title, resolved config, hash, seed, versions, device, dtype, timings.
+    labels: values of every parameter, numbers or words, in the order of the dims. metrics: name ->
+    float64 (algorithm, *parameters, trial). ok: bool of the same shape, what the algorithm itself
+    says of the trial. bounds: metric -> name of the bound -> float64 (*parameters, trial). done:
+    bool (*parameters, trial); points that ended early have fewer trials than others. about: what
+    the run was: title, resolved config, hash, seed, versions, device, dtype, timings.
     """
 
     algorithms: tuple[str, ...]
@@ -50,15 +51,33 @@ class Record:
         """Index of a point, from its labels by parameter."""
         return tuple(known.index(labels[name]) for name, known in self.labels.items())
 
-    def add(self, places: Sequence[tuple[int, ...]], trials: Sequence[int], values: Mapping[str, Mapping[str, Sequence[float]]], bounds: Mapping[str, Mapping[str, Sequence[float]]]) -> None:
-        """Enter rows: values by algorithm and metric, bounds by metric and name, each (rows,). An algorithm without `ok` stands for all it gives."""
+    def add(
+        self,
+        places: Sequence[tuple[int, ...]],
+        trials: Sequence[int],
+        values: Mapping[str, Mapping[str, Sequence[float]]],
+        bounds: Mapping[str, Mapping[str, Sequence[float]]],
+    ) -> None:
+        """Enter rows: values by algorithm and metric, bounds by metric and name, each (rows,).
+
+        An algorithm without `ok` stands for all it gives.
+        """
         if not self.algorithms:
             self.algorithms, self.ok = tuple(values), np.zeros((len(values), *self.done.shape), bool)
         if set(values) != set(self.algorithms):
             foreign = next((a for a in values if a not in self.algorithms), None)
-            gave = f"results of the algorithm {foreign!r}" if foreign is not None else f"results of {', '.join(values)} alone"
-            raise ConfigError(f"a trial gave {gave}, those before it of {', '.join(self.algorithms)}; return the same algorithms in every trial")
-        rows = np.ravel_multi_index(tuple(zip(*((*place, trial) for place, trial in zip(places, trials)))), self.done.shape)
+            gave = (
+                f"results of the algorithm {foreign!r}"
+                if foreign is not None
+                else f"results of {', '.join(values)} alone"
+            )
+            raise ConfigError(
+                f"a trial gave {gave}, those before it of {', '.join(self.algorithms)}; return the "
+                "same algorithms in every trial"
+            )
+        rows = np.ravel_multi_index(
+            tuple(zip(*((*place, trial) for place, trial in zip(places, trials)))), self.done.shape
+        )
         for algorithm, metrics in values.items():
             number = self.algorithms.index(algorithm)
             self.ok[number].reshape(-1)[rows] = metrics.get(OK, True)
@@ -99,23 +118,45 @@ class Record:
 
     def _mapped(self, change: Any, labels: Labels) -> Record:
         bounds = {metric: {name: change(x) for name, x in named.items()} for metric, named in self.bounds.items()}
-        return replace(self, labels=labels, done=change(self.done), ok=change(self.ok), metrics={name: change(x) for name, x in self.metrics.items()}, bounds=bounds)
+        return replace(
+            self,
+            labels=labels,
+            done=change(self.done),
+            ok=change(self.ok),
+            metrics={name: change(x) for name, x in self.metrics.items()},
+            bounds=bounds,
+        )
 
     def to_xarray(self) -> Any:
-        """An xarray.Dataset with the dims (algorithm, *parameters, trial); bounds carry the attributes `bound_of` and `bound`. Needs the extra `xarray`."""
+        """An xarray.Dataset with the dims (algorithm, *parameters, trial); bounds carry the
+        attributes `bound_of` and `bound`. Needs the extra `xarray`.
+        """
         try:
             import xarray
         except ImportError:
             raise ImportError("labelled reading needs xarray: pip install 'torchsar-lab[xarray]'") from None
-        arrays: dict[str, Any] = {OK: (self.dims, self.ok), "done": (self.dims[1:], self.done), **{name: (self.dims, x) for name, x in self.metrics.items()}}
+        arrays: dict[str, Any] = {
+            OK: (self.dims, self.ok),
+            "done": (self.dims[1:], self.done),
+            **{name: (self.dims, x) for name, x in self.metrics.items()},
+        }
         for metric, named in self.bounds.items():
             for name, x in named.items():
                 arrays[bound_name(metric, name)] = (self.dims[1:], x, {"bound_of": metric, "bound": name})
-        return xarray.Dataset(arrays, {"algorithm": list(self.algorithms), **{k: list(v) for k, v in self.labels.items()}, "trial": np.arange(self.trials)})
+        return xarray.Dataset(
+            arrays,
+            {
+                "algorithm": list(self.algorithms),
+                **{k: list(v) for k, v in self.labels.items()},
+                "trial": np.arange(self.trials),
+            },
+        )
 
 
 def bound_name(metric: str, bound: str) -> str:
-    """Name of a bound's array: 'doppler_error_hz' and 'Cramer-Rao bound' give doppler_error_hz_bound_cramer_rao_bound."""
+    """Name of a bound's array: 'doppler_error_hz' and 'Cramer-Rao bound' give
+    doppler_error_hz_bound_cramer_rao_bound.
+    """
     return f"{metric}_bound_{''.join(c if c.isalnum() else '_' for c in bound.lower())}"
 
 

@@ -1,4 +1,6 @@
-"""The report of a sweep: one HTML file with its pictures inside, made only from the summary, the pictures and the resolved config."""
+"""The report of a sweep: one HTML file with its pictures inside, made only from the summary, the
+pictures and the resolved config.
+"""
 
 from __future__ import annotations
 
@@ -15,14 +17,40 @@ MISSING = "–"
 _NOT_SHOWN = ("title", "config", "identity", "sessions", "chunk_rows")
 
 
-def write_sweep_report(path: Path, summary: Mapping[str, Any], pictures: Sequence[Picture], figures_folder: Path, config_text: str, command: str) -> None:
-    """Write the report; it asks for nothing from outside. summary: of `summary_tree`, or read from its file."""
-    fields = {"facts": facts(summary), "tables": [*metric_tables(summary), *bound_tables(summary)], "origin": list(origin(summary["about"]))}
-    write_page(path, "sweep.html.j2", pictures, figures_folder, title=summary["title"], command=command, definitions=summary["definitions"], config=config_text, **fields)
+def write_sweep_report(
+    path: Path,
+    summary: Mapping[str, Any],
+    pictures: Sequence[Picture],
+    figures_folder: Path,
+    config_text: str,
+    command: str,
+) -> None:
+    """Write the report; it asks for nothing from outside.
+
+    summary: of `summary_tree`, or read from its file.
+    """
+    fields = {
+        "facts": facts(summary),
+        "tables": [*metric_tables(summary), *bound_tables(summary)],
+        "origin": list(origin(summary["about"])),
+    }
+    write_page(
+        path,
+        "sweep.html.j2",
+        pictures,
+        figures_folder,
+        title=summary["title"],
+        command=command,
+        definitions=summary["definitions"],
+        config=config_text,
+        **fields,
+    )
 
 
 def figure(value: float | None) -> str:
-    """Four significant digits, or all before the point up to ten million; what is unknown is a dash."""
+    """Four significant digits, or all before the point up to ten million; what is unknown is a
+    dash.
+    """
     if value is None or not math.isfinite(value):
         return MISSING
     return f"{value:,.0f}" if 1e4 <= abs(value) < 1e7 else f"{value:.4g}"
@@ -34,7 +62,8 @@ def with_interval(value: float | None, interval: Sequence[float | None]) -> str:
     return figure(value) if MISSING in (low, high) else f"{figure(value)} [{low}, {high}]"
 
 
-# --- facts --------------------------------------------------------------------------------------------------------------------------------
+# --- facts
+# --------------------------------------------------------------------------------------------------
 
 
 def facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -56,7 +85,9 @@ def _key(point: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def _time(about: Mapping[str, Any], trials: int) -> tuple[float | None, float | None]:
-    """Seconds, and trials per second, over all sessions of a sweep that was taken up again; None where nobody measured."""
+    """Seconds, and trials per second, over all sessions of a sweep that was taken up again; None
+    where nobody measured.
+    """
     sessions = [session for session in about.get("sessions", [about]) if session.get("seconds")]
     seconds = sum(session["seconds"] for session in sessions)
     return (seconds, sum(session.get("trials", trials) for session in sessions) / seconds) if seconds else (None, None)
@@ -69,7 +100,8 @@ def _duration(seconds: float | None) -> str:
     return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60:02} min"
 
 
-# --- tables -------------------------------------------------------------------------------------------------------------------------------
+# --- tables
+# --------------------------------------------------------------------------------------------------
 
 
 def metric_tables(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -82,9 +114,22 @@ def metric_tables(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def _metric_table(summary: Mapping[str, Any], metric: str, points: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     limit = points[0].get("success_limit")
-    columns = ["algorithm", *map(axis_label, summary["parameters"]), "n of trials", "RMSE", "median", "mean", "std", "ok share"]
+    columns = [
+        "algorithm",
+        *map(axis_label, summary["parameters"]),
+        "n of trials",
+        "RMSE",
+        "median",
+        "mean",
+        "std",
+        "ok share",
+    ]
     rows = [_row(point) for point in points]
-    return {"title": axis_label(metric), "columns": columns + ([f"success (within {limit:g})"] if limit is not None else []), "rows": rows}
+    return {
+        "title": axis_label(metric),
+        "columns": columns + ([f"success (within {limit:g})"] if limit is not None else []),
+        "rows": rows,
+    }
 
 
 def _row(point: Mapping[str, Any]) -> list[str]:
@@ -92,7 +137,9 @@ def _row(point: Mapping[str, Any]) -> list[str]:
     pairs = [("rmse", "interval"), ("median", "median_interval"), ("mean", "mean_interval")]
     cells += [with_interval(point[value], point[interval]) for value, interval in pairs]
     cells += [figure(point["std"]), with_interval(point["ok_share"], point["ok_interval"])]
-    return cells + ([with_interval(point["success_share"], point["success_interval"])] if "success_share" in point else [])
+    return cells + (
+        [with_interval(point["success_share"], point["success_interval"])] if "success_share" in point else []
+    )
 
 
 def _label(label: float | str) -> str:
@@ -101,16 +148,22 @@ def _label(label: float | str) -> str:
 
 def bound_tables(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
     """One table of all bounds, if there are any."""
-    rows = [[bound["bound"], axis_label(bound["metric"]), *map(_label, bound["parameters"].values()), figure(bound["rms"])] for bound in summary["bounds"]]
+    rows = [
+        [bound["bound"], axis_label(bound["metric"]), *map(_label, bound["parameters"].values()), figure(bound["rms"])]
+        for bound in summary["bounds"]
+    ]
     columns = ["bound", "metric", *map(axis_label, summary["parameters"]), "rms"]
     return [{"title": "bounds", "columns": columns, "rows": rows}] if rows else []
 
 
-# --- where it was made --------------------------------------------------------------------------------------------------------------------
+# --- where it was made
+# --------------------------------------------------------------------------------------------------
 
 
 def origin(about: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Names and text of seed, hash, versions, device and the like; of every session where there were several."""
+    """Names and text of seed, hash, versions, device and the like; of every session where there
+    were several.
+    """
     yield from _flat(about)
     sessions = about.get("sessions", [])
     for number, session in enumerate(sessions, 1):

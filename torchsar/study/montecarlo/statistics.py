@@ -1,4 +1,7 @@
-"""Statistics of trials, every figure with its interval. Arrays in and out: (..., trial) -> (...,); trials that are missing are NaN."""
+"""Statistics of trials, every figure with its interval.
+
+Arrays in and out: (..., trial) -> (...,); trials that are missing are NaN.
+"""
 
 from __future__ import annotations
 
@@ -17,16 +20,21 @@ _COLUMNS = 512  # trials whose resampling weights are held at a time: 4 MB
 
 
 def statistics(values: np.ndarray, seed: int, level: float = LEVEL) -> dict[str, np.ndarray]:
-    """n, mean, median, rmse, std and the intervals of the first three of them over the last dim. values: (..., trial) float64.
+    """n, mean, median, rmse, std and the intervals of the first three of them over the last dim.
 
-    What is not finite takes no part, and n says how many are left. rmse is the root mean square about zero (the metrics are errors);
-    std has n - 1 below it. mean_interval and rmse_interval, (..., 2), are percentiles of a bootstrap; median_interval lies between two
-    order statistics and holds the median of any distribution with at least the given probability. The bootstrap is too narrow for few
-    trials: of Gaussian errors, at 95 %, it holds the rmse in 81 % of cases for n = 10, 92 % for 50, 95 % for 200. Rare outliers that
-    few trials have not met are not foreseen: it holds the rmse of log-normal errors in 69 % (n = 50) and 80 % (200), with one error in a hundred
-    100 times as large in 28 % and 62 %, while the median keeps 95 % or more and the mean 89 % or more. Fewer than two have no
-    interval, and fewer than log2(2 / (1 - level)) (six at 95 %) none for the median: NaN.
-    The bootstrap draws from (seed, number of trials) alone: a point's interval is the same, to rounding, whatever stands beside it.
+    values: (..., trial) float64.
+
+    What is not finite takes no part, and n says how many are left. rmse is the root mean square
+    about zero (the metrics are errors); std has n - 1 below it. mean_interval and rmse_interval,
+    (..., 2), are percentiles of a bootstrap; median_interval lies between two order statistics and
+    holds the median of any distribution with at least the given probability. The bootstrap is too
+    narrow for few trials: of Gaussian errors, at 95 %, it holds the rmse in 81 % of cases for n =
+    10, 92 % for 50, 95 % for 200. Rare outliers that few trials have not met are not foreseen: it
+    holds the rmse of log-normal errors in 69 % (n = 50) and 80 % (200), with one error in a hundred
+    100 times as large in 28 % and 62 %, while the median keeps 95 % or more and the mean 89 % or
+    more. Fewer than two have no interval, and fewer than log2(2 / (1 - level)) (six at 95 %) none
+    for the median: NaN. The bootstrap draws from (seed, number of trials) alone: a point's interval
+    is the same, to rounding, whatever stands beside it.
     """
     rows = _rows(values)
     found = _moments(rows, level)
@@ -35,9 +43,11 @@ def statistics(values: np.ndarray, seed: int, level: float = LEVEL) -> dict[str,
 
 
 def half_width_ratio(values: np.ndarray, statistic: str, seed: int, level: float = LEVEL) -> np.ndarray:
-    """Half the width of a statistic's interval over its magnitude, (..., trial) -> (...,): what more trials could still change.
+    """Half the width of a statistic's interval over its magnitude, (..., trial) -> (...,): what
+    more trials could still change.
 
-    statistic: "rmse", "mean" or "median". NaN where there is no interval; 0 where all trials agree; infinite about zero.
+    statistic: "rmse", "mean" or "median". NaN where there is no interval; 0 where all trials agree;
+    infinite about zero.
     """
     if statistic not in ("rmse", "mean", "median"):
         raise ValueError(f"no interval is known for the statistic {statistic!r}; choose rmse, mean or median")
@@ -48,9 +58,11 @@ def half_width_ratio(values: np.ndarray, statistic: str, seed: int, level: float
 
 
 def share(hits: np.ndarray, of: np.ndarray, level: float = LEVEL) -> tuple[np.ndarray, np.ndarray]:
-    """Share of hits among the trials of `of`, both bool (..., trial) after broadcasting, and its exact interval (Clopper-Pearson).
+    """Share of hits among the trials of `of`, both bool (..., trial) after broadcasting, and its
+    exact interval (Clopper-Pearson).
 
-    Returns (...,) and (..., 2), NaN where no trial counts. The interval is conservative: it covers with at least the given probability.
+    Returns (...,) and (..., 2), NaN where no trial counts. The interval is conservative: it covers
+    with at least the given probability.
     """
     hits, of = np.broadcast_arrays(hits, of)
     k, n = (hits & of).sum(-1), of.sum(-1)
@@ -74,14 +86,19 @@ def _blocks(count: int, size: int) -> Iterator[slice]:
     return (slice(start, min(start + size, count)) for start in range(0, count, size))
 
 
-# --- moments and order statistics ---------------------------------------------------------------------------------------------------------
+# --- moments and order statistics
+# --------------------------------------------------------------------------------------------------
 
 
 def _moments(rows: np.ndarray, level: float) -> dict[str, np.ndarray]:
     """rows: (point, trial). Everything but the bootstrap, in blocks of rows."""
     table = _log_factorials(rows.shape[-1])
     parts = [_moments_of(rows[block], table, level) for block in _blocks(len(rows), _BLOCK // rows.shape[-1])]
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else _moments_of(rows, table, level)
+    return (
+        {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        if parts
+        else _moments_of(rows, table, level)
+    )
 
 
 def _moments_of(rows: np.ndarray, table: np.ndarray, level: float) -> dict[str, np.ndarray]:
@@ -95,17 +112,30 @@ def _moments_of(rows: np.ndarray, table: np.ndarray, level: float) -> dict[str, 
         centred = np.where(here, unit - mean[:, None], 0.0)
         std = np.sqrt(np.square(centred).sum(-1) / np.where(n > 1, n - 1, np.nan))
     median, interval = _median(np.sort(np.where(here, rows, np.nan), axis=-1), n, table, level)
-    return {"n": n, "mean": mean * scale, "median": median, "rmse": rmse * scale, "std": std * scale, "median_interval": interval}
+    return {
+        "n": n,
+        "mean": mean * scale,
+        "median": median,
+        "rmse": rmse * scale,
+        "std": std * scale,
+        "median_interval": interval,
+    }
 
 
 def _scale(rows: np.ndarray) -> np.ndarray:
-    """Largest finite magnitude of each row, so that no square overflows; 1 for rows of zeros. (point, trial) -> (point,)."""
+    """Largest finite magnitude of each row, so that no square overflows; 1 for rows of zeros.
+
+    (point, trial) -> (point,).
+    """
     peak = np.abs(rows).max(-1, where=np.isfinite(rows), initial=0.0)
     return np.where(peak > 0, peak, 1.0)
 
 
 def _median(ordered: np.ndarray, n: np.ndarray, table: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
-    """Median (point,) and its interval (point, 2). ordered: (point, trial), ascending, NaN last; n: how many are not NaN."""
+    """Median (point,) and its interval (point, 2).
+
+    ordered: (point, trial), ascending, NaN last; n: how many are not NaN.
+    """
     rank = np.zeros_like(n)
     for count in np.unique(n):
         rank[n == count] = _median_rank(int(count), table, level)
@@ -116,9 +146,11 @@ def _median(ordered: np.ndarray, n: np.ndarray, table: np.ndarray, level: float)
 
 
 def _median_rank(n: int, table: np.ndarray, level: float) -> int:
-    """The largest r for which the r-th smallest and the r-th largest of n enclose the median with the given probability; 0: none.
+    """The largest r for which the r-th smallest and the r-th largest of n enclose the median with
+    the given probability; 0: none.
 
-    They miss it with the probability 2 P(Binomial(n, 1/2) < r). Terms further than 5 sqrt(n) below n / 2 sum to less than exp(-50).
+    They miss it with the probability 2 P(Binomial(n, 1/2) < r). Terms further than 5 sqrt(n) below
+    n / 2 sum to less than exp(-50).
     """
     first = max(0, math.floor(n / 2 - 5 * math.sqrt(n)))
     j = np.arange(first, n // 2)
@@ -127,11 +159,15 @@ def _median_rank(n: int, table: np.ndarray, level: float) -> int:
     return first + inside if inside else 0
 
 
-# --- bootstrap ----------------------------------------------------------------------------------------------------------------------------
+# --- bootstrap
+# --------------------------------------------------------------------------------------------------
 
 
 def _bootstrap(rows: np.ndarray, n: np.ndarray, seed: int, level: float) -> tuple[np.ndarray, np.ndarray]:
-    """Percentile intervals of mean and rmse, (point, 2) each. rows: (point, trial); n: finite trials of each."""
+    """Percentile intervals of mean and rmse, (point, 2) each.
+
+    rows: (point, trial); n: finite trials of each.
+    """
     intervals = np.full((2, len(rows), 2), np.nan)
     enough = np.flatnonzero(n > 1)
     tails = [(1 - level) / 2, (1 + level) / 2]
@@ -143,9 +179,11 @@ def _bootstrap(rows: np.ndarray, n: np.ndarray, seed: int, level: float) -> tupl
 
 
 def _resampled(rows: np.ndarray, chosen: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and rmse of every resample, (resample, point) each, for the chosen rows: matrix products of weights and powers.
+    """Mean and rmse of every resample, (resample, point) each, for the chosen rows: matrix products
+    of weights and powers.
 
-    A resample that holds none of a row's trials (there may be few among many that are missing) is NaN.
+    A resample that holds none of a row's trials (there may be few among many that are missing) is
+    NaN.
     """
     sums = np.zeros((3, RESAMPLES, len(chosen)))
     scale = np.concatenate([_scale(rows[chosen[block]]) for block in _blocks(len(chosen), _BLOCK // rows.shape[-1])])
@@ -157,13 +195,17 @@ def _resampled(rows: np.ndarray, chosen: np.ndarray, seed: int) -> tuple[np.ndar
 
 
 def _weights(seed: int, trials: int) -> Iterator[tuple[slice, np.ndarray]]:
-    """How often each resample holds each trial, (resample, some trials), for one slice of trials after another.
+    """How often each resample holds each trial, (resample, some trials), for one slice of trials
+    after another.
 
-    Multinomial with equal chances, drawn in two steps so that all resamples of few trials are at hand together: first how many of a
-    resample's draws fall into each slice, then where in it. Addressed by (seed, trials, slice) alone.
+    Multinomial with equal chances, drawn in two steps so that all resamples of few trials are at
+    hand together: first how many of a resample's draws fall into each slice, then where in it.
+    Addressed by (seed, trials, slice) alone.
     """
     slices = list(_blocks(trials, _COLUMNS))
-    counts = generator_at(seed, "bootstrap", trials, -1).multinomial(trials, [(s.stop - s.start) / trials for s in slices], RESAMPLES)
+    counts = generator_at(seed, "bootstrap", trials, -1).multinomial(
+        trials, [(s.stop - s.start) / trials for s in slices], RESAMPLES
+    )
     for i, s in enumerate(slices):
         width = s.stop - s.start
         place = generator_at(seed, "bootstrap", trials, i).integers(0, width, counts[:, i].sum())
@@ -178,7 +220,8 @@ def _powers(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return here.astype(np.float64), first, np.square(first)
 
 
-# --- binomial -----------------------------------------------------------------------------------------------------------------------------
+# --- binomial
+# --------------------------------------------------------------------------------------------------
 
 
 def _log_factorials(n: int) -> np.ndarray:
@@ -195,7 +238,9 @@ def _binomial_limit(k: np.ndarray, n: np.ndarray, tail: float) -> np.ndarray:
 
 
 def _bisect(k: np.ndarray, n: np.ndarray, table: np.ndarray, reach: int, tail: float) -> np.ndarray:
-    """Bisection between 0 and k / n, where terms further than 5 sqrt(n) above k sum to less than exp(-50) (Hoeffding)."""
+    """Bisection between 0 and k / n, where terms further than 5 sqrt(n) above k sum to less than
+    exp(-50) (Hoeffding).
+    """
     j = k[:, None] + np.arange(reach)
     inside = j <= n[:, None]
     j = np.minimum(j, n[:, None])

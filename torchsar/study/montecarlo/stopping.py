@@ -1,4 +1,7 @@
-"""When a point has seen enough trials: looked at after 50, 100, 200, 400, ... of them in the order of their numbers, and never in between."""
+"""When a point has seen enough trials: looked at after 50, 100, 200, 400, ...
+
+of them in the order of their numbers, and never in between.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +19,12 @@ FIRST_LOOK = 50
 
 @dataclass(frozen=True)
 class Stop:
-    """A point ends when half of the 95 % interval of a statistic is below `relative` times the statistic, for every algorithm that has the metric.
+    """A point ends when half of the 95 % interval of a statistic is below `relative` times the
+    statistic, for every algorithm that has the metric.
 
-    An rmse that rare outliers make up is settled before they come: with one error in a hundred 100 times as large and relative = 0.19, four
-    points of ten end at 50 trials and never saw one. Below a threshold SNR take the median, or a smaller relative (0.1 sees 100 trials or more).
+    An rmse that rare outliers make up is settled before they come: with one error in a hundred 100
+    times as large and relative = 0.19, four points of ten end at 50 trials and never saw one. Below
+    a threshold SNR take the median, or a smaller relative (0.1 sees 100 trials or more).
     """
 
     metric: str

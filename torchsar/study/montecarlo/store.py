@@ -1,7 +1,9 @@
-"""The store of a sweep: labelled arrays in zarr version 3, and markers of what is done, written last.
+"""The store of a sweep: labelled arrays in zarr version 3, and markers of what is done, written
+last.
 
-One process writes, and every file of a zarr store is replaced whole, so a sweep that is killed at any moment leaves arrays that may
-hold more than is marked done, never less; what is not marked is ignored and computed again.
+One process writes, and every file of a zarr store is replaced whole, so a sweep that is killed at
+any moment leaves arrays that may hold more than is marked done, never less; what is not marked is
+ignored and computed again.
 """
 
 from __future__ import annotations
@@ -33,11 +35,14 @@ _DONE, _SAVED = "done", "saved"
 
 
 class Store:
-    """results.zarr of one sweep, open for writing. Made by `create` or `resume`; `record` is what it holds.
+    """results.zarr of one sweep, open for writing.
 
-    Root attributes: format, identity and hash (what the results depend on), labels and values of the parameters, algorithms, trials, about,
-    sessions. Arrays: one a metric, `ok`, one a bound, the coordinates. Group `done`: by index of the point, the ranges of trials that are
-    recorded. Group `saved`: images and taps of chosen trials.
+    Made by `create` or `resume`; `record` is what it holds.
+
+    Root attributes: format, identity and hash (what the results depend on), labels and values of
+    the parameters, algorithms, trials, about, sessions. Arrays: one a metric, `ok`, one a bound,
+    the coordinates. Group `done`: by index of the point, the ranges of trials that are recorded.
+    Group `saved`: images and taps of chosen trials.
     """
 
     def __init__(self, root: zarr.Group, lock: Any, record: Record) -> None:
@@ -60,19 +65,30 @@ class Store:
 
     @classmethod
     def resume(cls, path: Path, grid: Grid, trials: int, identity: Mapping[str, Any]) -> Store:
-        """The store that is there, with room for new labels and trials. Raises ConfigError where it belongs to another config."""
+        """The store that is there, with room for new labels and trials.
+
+        Raises ConfigError where it belongs to another config.
+        """
         lock = _locked(path)
         root = _opened(path, "r+")
         held = attributes(root)
         refuse_another(path, held["identity"], _plain(identity), held["values"], _values(grid))
         record = _loaded(root, path)
-        labels = {name: (*known, *(label for label in grid.labels[name] if label not in known)) for name, known in record.labels.items()}
+        labels = {
+            name: (*known, *(label for label in grid.labels[name] if label not in known))
+            for name, known in record.labels.items()
+        }
         with _writing(path):
             return cls(root, lock, record.grown(labels, max(trials, record.trials)))._begun(grid, identity)
 
     def _begun(self, grid: Grid, identity: Mapping[str, Any]) -> Store:
-        values = {name: {**attributes(self.root).get("values", {}).get(name, {}), **named} for name, named in _values(grid).items()}
-        self.root.update_attributes({"format": FORMAT, "identity": _plain(identity), "hash": hash_of(identity), "values": values})
+        values = {
+            name: {**attributes(self.root).get("values", {}).get(name, {}), **named}
+            for name, named in _values(grid).items()
+        }
+        self.root.update_attributes(
+            {"format": FORMAT, "identity": _plain(identity), "hash": hash_of(identity), "values": values}
+        )
         self.record.about = _about(self.root)
         self._describe()
         for name, labels in self.record.labels.items():
@@ -83,7 +99,13 @@ class Store:
         return self
 
     def _describe(self) -> None:
-        self.root.update_attributes({"labels": {k: list(v) for k, v in self.record.labels.items()}, "trials": self.record.trials, "algorithms": list(self.record.algorithms)})
+        self.root.update_attributes(
+            {
+                "labels": {k: list(v) for k, v in self.record.labels.items()},
+                "trials": self.record.trials,
+                "algorithms": list(self.record.algorithms),
+            }
+        )
 
     def note(self, **about: Any) -> None:
         """Root attributes: what the run was."""
@@ -95,7 +117,8 @@ class Store:
         """Where it lies."""
         return Path(str(self.root.store_path).removeprefix("file://"))
 
-    # writing -----------------------------------------------------------------------------------------------------
+    # writing
+    # ----------------------------------------------------------------------------------------------
 
     @property
     def due(self) -> bool:
@@ -106,7 +129,9 @@ class Store:
         """Rows have entered the record, to be written by the next `flush`."""
         self._dirty.update(places)
         first, last = min(trials), max(trials) + 1
-        self._window = (first, last) if self._window is None else (min(first, self._window[0]), max(last, self._window[1]))
+        self._window = (
+            (first, last) if self._window is None else (min(first, self._window[0]), max(last, self._window[1]))
+        )
 
     def save(self, labels: Mapping[str, float | str], trial: int, arrays: Mapping[str, np.ndarray]) -> None:
         """Keep arrays of one trial, to be written before it is marked done."""
@@ -120,7 +145,11 @@ class Store:
             self._flush(*self._window)
 
     def _flush(self, first: int, last: int) -> None:
-        """The trials first..last-1. The list of arrays comes after them and before the marks: whoever reads knows what must be there."""
+        """The trials first..last-1.
+
+        The list of arrays comes after them and before the marks: whoever reads knows what must be
+        there.
+        """
         began = time.perf_counter()
         if list(self.record.algorithms) != self.root.attrs.get("algorithms"):
             self._describe()
@@ -146,20 +175,34 @@ class Store:
 
     def _variables(self) -> dict[str, tuple[np.ndarray, tuple[str, ...], dict[str, Any]]]:
         record = self.record
-        found = {OK: (record.ok, record.dims, {"kind": OK}), **{name: (x, record.dims, {"kind": "metric"}) for name, x in record.metrics.items()}}
+        found = {
+            OK: (record.ok, record.dims, {"kind": OK}),
+            **{name: (x, record.dims, {"kind": "metric"}) for name, x in record.metrics.items()},
+        }
         for metric, named in record.bounds.items():
-            found.update({bound_name(metric, name): (x, record.dims[1:], {"kind": "bound", "bound_of": metric, "bound": name}) for name, x in named.items()})
+            found.update(
+                {
+                    bound_name(metric, name): (x, record.dims[1:], {"kind": "bound", "bound_of": metric, "bound": name})
+                    for name, x in named.items()
+                }
+            )
         return found
 
-    def _write(self, name: str, data: np.ndarray, dims: tuple[str, ...], about: dict[str, Any], first: int, last: int) -> None:
-        """The trials first..last-1 of all points, widened to whole chunks of the array, so that nothing is read back."""
+    def _write(
+        self, name: str, data: np.ndarray, dims: tuple[str, ...], about: dict[str, Any], first: int, last: int
+    ) -> None:
+        """The trials first..last-1 of all points, widened to whole chunks of the array, so that
+        nothing is read back.
+        """
         array = self._array(name, data, dims, about)
         step = array.chunks[-1]
         window = (..., slice(first // step * step, min(-(-last // step) * step, data.shape[-1])))
         array[window] = data[window]
 
     def _array(self, name: str, data: np.ndarray, dims: tuple[str, ...], about: dict[str, Any]) -> zarr.Array:
-        """The array of that name, made or grown as needed, and remembered: looking it up costs as much as writing it."""
+        """The array of that name, made or grown as needed, and remembered: looking it up costs as
+        much as writing it.
+        """
         if name not in self._arrays:
             self._arrays[name] = self._opened_array(name, data, dims, about)
         if self._arrays[name].shape != data.shape:
@@ -172,15 +215,34 @@ class Store:
         leading = tuple(max(1, min(n, 64)) for n in data.shape[:-1])
         chunk = max(1, min(data.shape[-1], 1024, _CHUNK_NUMBERS // max(1, int(np.prod(leading)))))
         fill = False if data.dtype == bool else np.nan
-        return self.root.create_array(name, shape=data.shape, dtype=data.dtype, chunks=(*leading, chunk), dimension_names=dims, attributes=about, fill_value=fill, compressors=None)
+        return self.root.create_array(
+            name,
+            shape=data.shape,
+            dtype=data.dtype,
+            chunks=(*leading, chunk),
+            dimension_names=dims,
+            attributes=about,
+            fill_value=fill,
+            compressors=None,
+        )
 
     def _put(self, name: str, values: np.ndarray, dims: tuple[str, ...]) -> None:
         """A coordinate, whole."""
         if values.dtype.kind == "U":
-            values = values.astype(np.dtypes.StringDType()) if hasattr(np.dtypes, "StringDType") else values.astype(object)
+            values = (
+                values.astype(np.dtypes.StringDType()) if hasattr(np.dtypes, "StringDType") else values.astype(object)
+            )
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # zarr warns that texts are not in version 3 of the specification yet
-            array = self.root.create_array(name, shape=values.shape, dtype=str if values.dtype.kind in "TO" else values.dtype, chunks=values.shape, dimension_names=dims, overwrite=True)
+            # zarr warns that texts are not in version 3 of the specification yet
+            warnings.simplefilter("ignore")
+            array = self.root.create_array(
+                name,
+                shape=values.shape,
+                dtype=str if values.dtype.kind in "TO" else values.dtype,
+                chunks=values.shape,
+                dimension_names=dims,
+                overwrite=True,
+            )
             array[...] = values
 
     def _write_saved(self) -> None:
@@ -198,11 +260,17 @@ def empty(labels: Labels, trials: int) -> Record:
     try:
         return Record((), dict(labels), np.zeros(shape, bool), np.zeros((0, *shape), bool))
     except (MemoryError, ValueError):
-        raise ConfigError(f"sweep: the results of {' x '.join(map(str, shape))} trials do not fit into memory; ask for fewer trials or points") from None
+        raise ConfigError(
+            f"sweep: the results of {' x '.join(map(str, shape))} trials do not fit into memory; "
+            "ask for fewer trials or points"
+        ) from None
 
 
 def read_sweep(path: Path | str) -> Record:
-    """The record in a results.zarr, or in the folder of a sweep, finished or not. Raises ConfigError where there is none."""
+    """The record in a results.zarr, or in the folder of a sweep, finished or not.
+
+    Raises ConfigError where there is none.
+    """
     path = Path(path) / "results.zarr" if (Path(path) / "results.zarr").exists() else Path(path)
     return _loaded(_opened(path, "r"), path)
 
@@ -213,11 +281,15 @@ def attributes(node: Any) -> dict[str, Any]:
 
 
 def cut_off(path: Path) -> bool:
-    """Whether a sweep of ours was killed while it made this store, before there was anything in it."""
+    """Whether a sweep of ours was killed while it made this store, before there was
+    anything in it.
+    """
     made = {p.name for p in path.iterdir() if not p.name.endswith(".partial")} if path.is_dir() else {""}
     if not _lock_of(path).exists() or not made <= {"zarr.json", _DONE}:
         return False
-    return "zarr.json" not in made or "labels" not in json.loads((path / "zarr.json").read_text(encoding="utf-8")).get("attributes", {})
+    return "zarr.json" not in made or "labels" not in json.loads((path / "zarr.json").read_text(encoding="utf-8")).get(
+        "attributes", {}
+    )
 
 
 def _lock_of(path: Path) -> Path:
@@ -230,7 +302,9 @@ def _opened(path: Path, mode: Any) -> zarr.Group:
     except (FileNotFoundError, ValueError, OSError):
         raise ConfigError(f"{path} holds no results of a sweep; choose another folder") from None
     if root.attrs.get("format") != FORMAT or not {"labels", "identity"} <= set(root.attrs):
-        raise ConfigError(f"{path} was not left by a sweep of this version of torchsar; remove it or choose another folder")
+        raise ConfigError(
+            f"{path} was not left by a sweep of this version of torchsar; remove it or choose another folder"
+        )
     return root
 
 
@@ -240,17 +314,26 @@ def _writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise ConfigError(f"{path} cannot be written ({error.strerror or error}); what is marked done there is safe, go on with --resume once it can be") from error
+        raise ConfigError(
+            f"{path} cannot be written ({error.strerror or error}); what is marked done there is "
+            "safe, go on with --resume once it can be"
+        ) from error
 
 
 def _loaded(root: zarr.Group, path: Path) -> Record:
-    """Everything on disk, without what is not marked done. Raises ConfigError where files are missing or spoilt."""
+    """Everything on disk, without what is not marked done.
+
+    Raises ConfigError where files are missing or spoilt.
+    """
     try:
         missing = [name for name in (_DONE, *attributes(root).get("arrays", [])) if name not in root]
         if not missing:
             return _read(root)
     except (KeyError, ValueError, IndexError, TypeError, OSError) as error:
-        raise ConfigError(f"{path} is damaged ({type(error).__name__}: {' '.join(str(error).split())}); restore it, or begin anew in another folder") from error
+        raise ConfigError(
+            f"{path} is damaged ({type(error).__name__}: {' '.join(str(error).split())}); restore "
+            "it, or begin anew in another folder"
+        ) from error
     raise ConfigError(f"{path} is damaged: {missing[0]!r} is missing; restore it, or begin anew in another folder")
 
 
@@ -263,9 +346,12 @@ def _read(root: zarr.Group) -> Record:
     record.algorithms = tuple(held["algorithms"])
     record.ok = np.zeros((len(record.algorithms), *record.done.shape), bool)
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Object at")  # a process that was killed while it wrote leaves half a file beside the old one
+        warnings.filterwarnings(
+            "ignore", message="Object at"
+        )  # a process that was killed while it wrote leaves half a file beside the old one
         arrays = list(root.arrays())
-    place = {name: i for i, name in enumerate(held.get("arrays", []))}  # a folder lists its files in any order
+    # a folder lists its files in any order
+    place = {name: i for i, name in enumerate(held.get("arrays", []))}
     for name, array in sorted(arrays, key=lambda pair: place.get(pair[0], -1)):
         kind = array.attrs.get("kind")
         if kind == OK:
@@ -280,11 +366,17 @@ def _read(root: zarr.Group) -> Record:
 
 
 def _about(root: zarr.Group) -> dict[str, Any]:
-    return {key: value for key, value in attributes(root).items() if key not in ("labels", "values", "trials", "algorithms", "arrays", "format")}
+    return {
+        key: value
+        for key, value in attributes(root).items()
+        if key not in ("labels", "values", "trials", "algorithms", "arrays", "format")
+    }
 
 
 def _restore(target: np.ndarray, array: zarr.Array, done: np.ndarray) -> None:
-    """Put an array of the same or a smaller shape where it belongs; a sweep may have been killed while its arrays grew."""
+    """Put an array of the same or a smaller shape where it belongs; a sweep may have been killed
+    while its arrays grew.
+    """
     part = tuple(map(slice, array.shape))
     target[part] = np.where(done[part[-done.ndim :]], np.asarray(array[...]), target[part])
 
@@ -299,24 +391,41 @@ def hash_of(identity: Mapping[str, Any]) -> str:
     return address(identity)
 
 
-def refuse_another(path: Path, was: Mapping[str, Any], now: Mapping[str, Any], values_were: Mapping[str, Any], values: Mapping[str, Any]) -> None:
+def refuse_another(
+    path: Path,
+    was: Mapping[str, Any],
+    now: Mapping[str, Any],
+    values_were: Mapping[str, Any],
+    values: Mapping[str, Any],
+) -> None:
     """Raise ConfigError where results of two configs would mix; names what differs."""
     if list(values_were) != list(values):
-        raise ConfigError(f"{path} holds a sweep over {', '.join(values_were) or 'nothing'}, not over {', '.join(values) or 'nothing'}; choose another folder for the other sweep")
+        raise ConfigError(
+            f"{path} holds a sweep over {', '.join(values_were) or 'nothing'}, not over "
+            f"{', '.join(values) or 'nothing'}; choose another folder for the other sweep"
+        )
     for name, named in values.items():
         for label, value in named.items():
             if values_were[name].get(label, value) != value:
-                raise ConfigError(f"{path} holds a sweep where {name} {label!r} is {_short(values_were[name][label])}, and now it is {_short(value)}; give the new value a name of its own")
+                raise ConfigError(
+                    f"{path} holds a sweep where {name} {label!r} is {_short(values_were[name][label])}, "
+                    f"and now it is {_short(value)}; give the new value a name of its own"
+                )
     differing = list(_differences(was, now))
     if differing:
         more = f", and {len(differing) - 3} more" if len(differing) > 3 else ""
-        raise ConfigError(f"{path} holds a sweep of another config ({hash_of(was)}, now {hash_of(now)}): {'; '.join(differing[:3])}{more}; choose another folder, or set these back")
+        raise ConfigError(
+            f"{path} holds a sweep of another config ({hash_of(was)}, now {hash_of(now)}): "
+            f"{'; '.join(differing[:3])}{more}; choose another folder, or set these back"
+        )
 
 
 def _differences(was: Any, now: Any, where: str = "") -> Iterable[str]:
     if isinstance(was, Mapping) and isinstance(now, Mapping):
         for key in dict.fromkeys((*was, *now)):
-            yield from _differences(was.get(key, "absent"), now.get(key, "absent"), f"{where}.{key}" if where else str(key))
+            yield from _differences(
+                was.get(key, "absent"), now.get(key, "absent"), f"{where}.{key}" if where else str(key)
+            )
     elif was != now:
         yield f"{where} was {_short(was)} and is {_short(now)}"
 
@@ -340,7 +449,9 @@ def _plain_values(tree: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _locked(path: Path) -> Any:
-    """An open file that this process alone holds; it is let go of when the process ends, however it ends."""
+    """An open file that this process alone holds; it is let go of when the process ends, however it
+    ends.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         file = _lock_of(path).open("w")
@@ -350,5 +461,7 @@ def _locked(path: Path) -> Any:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            raise ConfigError(f"another sweep is writing to {path}; wait for its end, or choose another folder") from None
+            raise ConfigError(
+                f"another sweep is writing to {path}; wait for its end, or choose another folder"
+            ) from None
     return file

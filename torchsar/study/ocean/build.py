@@ -29,7 +29,9 @@ _MOTION = ("u_r_m_s", "u_a_m_s", "azimuth_m", "range_m")
 
 @dataclass(frozen=True)
 class Vouched:
-    """The truth of one ship: the motion of its middle, its scatterers, and its echo alone, with the transmit range, as recorded."""
+    """The truth of one ship: the motion of its middle, its scatterers, and its echo alone, with the
+    transmit range, as recorded.
+    """
 
     motion: PointMotion
     movers: Movers
@@ -42,7 +44,9 @@ class Vouched:
 
 @dataclass(frozen=True)
 class Sighted:
-    """One scene: the recording, with the motions of ships as aux `true_*` (ship,), the truth by ship, and what is recorded without those that move."""
+    """One scene: the recording, with the motions of ships as aux `true_*` (ship,), the truth by
+    ship, and what is recorded without those that move.
+    """
 
     recording: Recording
     ships: Mapping[str, Vouched]
@@ -51,7 +55,9 @@ class Sighted:
 
 @dataclass(frozen=True)
 class Ocean:
-    """All that simulates one case. The unit is the mean power of the sea; cnr_db: over the noise."""
+    """All that simulates one case. The unit is the mean power of the sea; cnr_db: over the
+    noise.
+    """
 
     radar: BistaticRadar
     ships: Mapping[str, Vessel]
@@ -72,25 +78,46 @@ class Ocean:
         sea = SEAS.make(world.sea, "world.sea", file)
         for name, vessel in world.targets.items():
             if vessel.range_cells > vessel.count:
-                raise ConfigError(f"{file}: world.targets.{name}: {vessel.range_cells} range cells need as many scatterers, and count is {vessel.count}")
-        return Ocean(radar, world.targets, GATES.make(world.gate, "world.gate", file), replace(sea, power_db=0.0), float(sea.power_db), world.pulses, world.samples, precision(config))
+                raise ConfigError(
+                    f"{file}: world.targets.{name}: {vessel.range_cells} range cells need as many "
+                    f"scatterers, and count is {vessel.count}"
+                )
+        return Ocean(
+            radar,
+            world.targets,
+            GATES.make(world.gate, "world.gate", file),
+            replace(sea, power_db=0.0),
+            float(sea.power_db),
+            world.pulses,
+            world.samples,
+            precision(config),
+        )
 
     def sighted(self, draws: Draws, dtype: torch.dtype | None = None) -> Sighted:
-        """The scene of one trial, which stands in `draws` alone; noise and sea follow seed and trial, and each ship its name."""
+        """The scene of one trial, which stands in `draws` alone; noise and sea follow seed and
+        trial, and each ship its name.
+        """
         fleet = Fleet({name: _ship(vessel) for name, vessel in self.ships.items()})
         world = BistaticWorld(fleet, self.gate, self.sea, snr_db=self.cnr_db)
         recording, _ = simulate_bistatic(self.radar, world, self.pulses, self.samples, draws, dtype=dtype or self.dtype)
         ships = {name: self._vouched(name, part, draws, recording.signal) for name, part in fleet.parts.items()}
         moving = [ship.echo.data for ship in ships.values() if ship.moves]
         still = recording.signal.with_data(recording.signal.data - sum(moving)) if moving else recording.signal
-        told = {f"{TOLD}{name}": torch.stack([getattr(ship.motion, name) for ship in ships.values()]) for name in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")}
+        told = {
+            f"{TOLD}{name}": torch.stack([getattr(ship.motion, name) for ship in ships.values()])
+            for name in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
+        }
         return Sighted(replace(recording, aux={**recording.aux, **told}), ships, still)
 
     def _vouched(self, name: str, ship: Any, draws: Draws, like: Signal) -> Vouched:
         movers = ship.movers(self.radar, draws.part(name))
         echo = bistatic_echo(movers, self.radar, self.pulses, self.samples, gate=self.gate, dtype=like.data.dtype)
         u_r, u_a, y0, beyond = (getattr(self.ships[name], key) for key in _MOTION)
-        return Vouched(PointMotion.of(self.radar, like.data.real, u_r, u_a, y0, self.radar.reference_range_m + beyond), movers, like.with_data(echo))
+        return Vouched(
+            PointMotion.of(self.radar, like.data.real, u_r, u_a, y0, self.radar.reference_range_m + beyond),
+            movers,
+            like.with_data(echo),
+        )
 
 
 def _ship(vessel: Vessel) -> Ship:

@@ -1,4 +1,6 @@
-"""The pictures of a run: whole scenes as every method shows them, the recommended one step by step, ships, and errors over ships."""
+"""The pictures of a run: whole scenes as every method shows them, the recommended one step by step,
+ships, and errors over ships.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ NAMES = ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
 
 @dataclass(frozen=True)
 class CaseResult:
-    """One case: metrics of ships (trial, ship) by method, of scenes (trial,); places of the truth and of what was found (trial, ship); what the first scene looks like."""
+    """One case: metrics of ships (trial, ship) by method, of scenes (trial,); places of the truth
+    and of what was found (trial, ship); what the first scene looks like.
+    """
 
     metrics: Mapping[str, Mapping[str, Tensor]]
     whole: Mapping[str, Mapping[str, Tensor]]
@@ -40,13 +44,25 @@ class CaseResult:
     def of(bench: Bench, scene: Scene, pictured: bool) -> CaseResult:
         """Of one scene."""
         names = list(bench.ocean.ships)
-        metrics = {way: {key: value[None] for key, value in stacked([dict(of.ships[name]) for name in names]).items()} for way, of in scene.judged.items()}
+        metrics = {
+            way: {key: value[None] for key, value in stacked([dict(of.ships[name]) for name in names]).items()}
+            for way, of in scene.judged.items()
+        }
         whole = {way: stacked([dict(of.whole)]) for way, of in scene.judged.items()}
-        truth = {key: torch.stack([getattr(scene.reference.ships[name].centre, key) for name in names])[None] for key in NAMES}
+        truth = {
+            key: torch.stack([getattr(scene.reference.ships[name].centre, key) for name in names])[None]
+            for key in NAMES
+        }
         found = {}
         for way, of in scene.judged.items():
             if bench.ways[way].estimates:
-                found[way] = {key: torch.tensor([[np.nan if body is None else float(getattr(body.motion, key)) for body in of.bodies.values()]], dtype=torch.float64) for key in NAMES}
+                found[way] = {
+                    key: torch.tensor(
+                        [[np.nan if body is None else float(getattr(body.motion, key)) for body in of.bodies.values()]],
+                        dtype=torch.float64,
+                    )
+                    for key in NAMES
+                }
         return CaseResult(metrics, whole, names, truth, found, scene.reference.ships, scene.made if pictured else {})
 
     @staticmethod
@@ -54,30 +70,54 @@ class CaseResult:
         """All scenes of a case."""
 
         def cat(tables: list[Mapping[str, Mapping[str, Tensor]]]) -> dict[str, dict[str, Tensor]]:
-            return {way: {key: torch.cat([table[way][key] for table in tables if key in table[way]]) for key in of} for way, of in tables[0].items()}
+            return {
+                way: {key: torch.cat([table[way][key] for table in tables if key in table[way]]) for key in of}
+                for way, of in tables[0].items()
+            }
 
         first = parts[0]
         truth = {key: torch.cat([part.truth[key] for part in parts]) for key in first.truth}
-        return replace(first, metrics=cat([p.metrics for p in parts]), whole=cat([p.whole for p in parts]), truth=truth, found=cat([p.found for p in parts]))
+        return replace(
+            first,
+            metrics=cat([p.metrics for p in parts]),
+            whole=cat([p.whole for p in parts]),
+            truth=truth,
+            found=cat([p.found for p in parts]),
+        )
 
     def measured(self, target: str | None = None) -> dict[str, dict[str, Tensor]]:
         """By method the finite metrics of one ship, or of all with those of scenes."""
         chosen = slice(None) if target is None else slice(self.targets.index(target), self.targets.index(target) + 1)
-        rows = {way: {key: value[:, chosen][torch.isfinite(value[:, chosen])] for key, value in of.items()} for way, of in self.metrics.items()}
+        rows = {
+            way: {key: value[:, chosen][torch.isfinite(value[:, chosen])] for key, value in of.items()}
+            for way, of in self.metrics.items()
+        }
         of_scenes = self.whole if target is None else {way: {} for way in rows}
-        return {way: {**{key: value for key, value in of.items() if len(value)}, **of_scenes[way]} for way, of in rows.items()}
+        return {
+            way: {**{key: value for key, value in of.items() if len(value)}, **of_scenes[way]}
+            for way, of in rows.items()
+        }
 
     @property
     def images(self) -> dict[str, Signal]:
-        return {f"{way}/{name}": getattr(made, name) for way, made in self.made.items() for name in (("fused", "rest") if made.bodies else ("fused",))}
+        return {
+            f"{way}/{name}": getattr(made, name)
+            for way, made in self.made.items()
+            for name in (("fused", "rest") if made.bodies else ("fused",))
+        }
 
     def truths(self) -> dict[str, Tensor]:
         """By ship and name, (trial,)."""
-        return {f"{target}.{key}": value[:, i] for key, value in self.truth.items() for i, target in enumerate(self.targets)}
+        return {
+            f"{target}.{key}": value[:, i] for key, value in self.truth.items() for i, target in enumerate(self.targets)
+        }
 
     def estimates(self) -> dict[str, dict[str, Tensor]]:
         """By method, then by ship and name, (trial,): NaN where a ship was not found."""
-        return {way: {f"{target}.{key}": value[:, i] for key, value in of.items() for i, target in enumerate(self.targets)} for way, of in self.found.items()}
+        return {
+            way: {f"{target}.{key}": value[:, i] for key, value in of.items() for i, target in enumerate(self.targets)}
+            for way, of in self.found.items()
+        }
 
 
 def draw(results: Mapping[str, CaseResult], folder: Path) -> list[Picture]:
@@ -112,7 +152,9 @@ def _boxes(places: Sequence[tuple[float, float]]) -> tuple[np.ndarray, np.ndarra
 
 
 def _marked(result: CaseResult, title: str, image: Signal, shown: bool) -> dict:
-    """An image with outlines about true places, and about where an image of everything at rest shows ships and their replicas."""
+    """An image with outlines about true places, and about where an image of everything at rest
+    shows ships and their replicas.
+    """
     sights = list(result.sights.values())
     lines = {"true place": _boxes([(float(s.centre.y0_m), float(s.centre.range_m)) for s in sights])}
     if shown:
@@ -125,17 +167,41 @@ def _marked(result: CaseResult, title: str, image: Signal, shown: bool) -> dict:
 def _flow(case: str, result: CaseResult) -> Drawn:
     made = result.made.get("recommended")
     if made is not None:
-        parts = [_marked(result, title, image, title != "fused") for title, image in (("everything at rest", made.conventional), ("without movers", made.rest), ("fused", made.fused))]
-        caption = "Azimuth (m, up) over range (m), root mean square over blocks, 35 dB. Left: everything focused as if at rest; closing ships appear beside their places, with false targets. "
+        parts = [
+            _marked(result, title, image, title != "fused")
+            for title, image in (
+                ("everything at rest", made.conventional),
+                ("without movers", made.rest),
+                ("fused", made.fused),
+            )
+        ]
+        caption = (
+            "Azimuth (m, up) over range (m), root mean square over blocks, 35 dB. Left: "
+            "everything focused as if at rest; closing ships appear beside their places, with "
+            "false targets. "
+        )
         caption += "Middle: the echo of what moves subtracted. Right: every mover put in its place."
-        yield f"flow_{word_of(case)}", _titled("The recommended flow", case), caption, plot.overlays(parts, 3, _UP_DB - _DOWN_DB)
+        yield (
+            f"flow_{word_of(case)}",
+            _titled("The recommended flow", case),
+            caption,
+            plot.overlays(parts, 3, _UP_DB - _DOWN_DB),
+        )
 
 
 def _methods(case: str, result: CaseResult) -> Drawn:
     parts = [_marked(result, name, made.fused, False) for name, made in result.made.items()]
     if parts:
-        caption = "The final image of every method. The inverse of three bands lifts the floor of the whole scene; zeroing leaves holes in the sea."
-        yield f"methods_{word_of(case)}", _titled("Final images", case), caption, plot.overlays(parts, 3, _UP_DB - _DOWN_DB)
+        caption = (
+            "The final image of every method. The inverse of three bands lifts the floor of the "
+            "whole scene; zeroing leaves holes in the sea."
+        )
+        yield (
+            f"methods_{word_of(case)}",
+            _titled("Final images", case),
+            caption,
+            plot.overlays(parts, 3, _UP_DB - _DOWN_DB),
+        )
 
 
 def _chips(case: str, result: CaseResult) -> Drawn:
@@ -148,7 +214,10 @@ def _chips(case: str, result: CaseResult) -> Drawn:
                 place = (at.azimuth_m, at.range_m) if at else (float(sight.centre.y0_m), float(sight.centre.range_m))
                 parts.append({"title": f"{name}, {way}", "signal": _cut(made.fused, place), "lines": {}})
     if parts:
-        caption = "Each ship where the image of everything at rest shows it (conventional) and in its place (recommended), in dB of its own peak."
+        caption = (
+            "Each ship where the image of everything at rest shows it (conventional) and in its "
+            "place (recommended), in dB of its own peak."
+        )
         yield f"ships_{word_of(case)}", _titled("Ships", case), caption, plot.overlays(parts, 2, 40.0)
 
 
@@ -163,22 +232,41 @@ def _cut(image: Signal, place: tuple[float, float]) -> Signal:
     return Signal(image.data[slices[0], slices[1]], tuple(axes))
 
 
-_COMPARED = {"u_r_error_m_s": "error of u_r (m/s)", "u_a_error_m_s": "error of u_a (m/s)", "position_error_m": "error of the place (m)", "replica_db": "false target over the sea (dB)"}
+_COMPARED = {
+    "u_r_error_m_s": "error of u_r (m/s)",
+    "u_a_error_m_s": "error of u_a (m/s)",
+    "position_error_m": "error of the place (m)",
+    "replica_db": "false target over the sea (dB)",
+}
 _COMPARED |= {"sea_error_db": "error of the sea (dB)", "contrast_db": "ship over the sea (dB)"}
 
 
 def _comparison(results: Mapping[str, CaseResult]) -> Drawn:
     """Figures of all methods over ships."""
     for key, label in _COMPARED.items():
-        rows = {(f"{case}/" if case != "all" else "") + target: result.measured(target) for case, result in results.items() for target in result.targets}
+        rows = {
+            (f"{case}/" if case != "all" else "") + target: result.measured(target)
+            for case, result in results.items()
+            for target in result.targets
+        }
         rows = {target: by for target, by in rows.items() if any(key in of for of in by.values())}
         names = list(dict.fromkeys(way for by in rows.values() for way, of in by.items() if key in of))
         if not names:
             continue
         level = {way: np.array([_typical(by[way].get(key), key) for by in rows.values()]) for way in names}
-        part = {"title": "", "x": list(rows), "series": {way: (y, np.stack([y, y], -1)) for way, y in level.items()}, "bounds": {}}
+        part = {
+            "title": "",
+            "x": list(rows),
+            "series": {way: (y, np.stack([y, y], -1)) for way, y in level.items()},
+            "bounds": {},
+        }
         said = "Mean" if key.endswith("_db") else "Root mean square"
-        yield key, label.split(" (")[0].capitalize(), f"{said} over scenes, by ship and method.", plot.error_curves([part], "", label, log_y=not key.endswith("_db"))
+        yield (
+            key,
+            label.split(" (")[0].capitalize(),
+            f"{said} over scenes, by ship and method.",
+            plot.error_curves([part], "", label, log_y=not key.endswith("_db")),
+        )
 
 
 def _typical(values: Tensor | None, key: str) -> float:

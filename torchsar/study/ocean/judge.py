@@ -1,4 +1,6 @@
-"""Figures of one scene: bodies against ships, the sea that is left, replicas, and where images of everything at rest show ships."""
+"""Figures of one scene: bodies against ships, the sea that is left, replicas, and where images of
+everything at rest show ships.
+"""
 
 from __future__ import annotations
 
@@ -20,25 +22,49 @@ from torchsar.radar import BistaticRadar
 from torchsar.study.ocean.build import Sighted, Vouched, centroid
 
 DEFINITIONS: dict[str, Any] = {
-    "snr": "the sea has unit mean power in a range-compressed sample of one channel; scr_db: mean power of a sample of a ship's lines over it; cnr_db: sea over noise",
-    "velocities": "u_r: closing slant-range speed; u_a: along track, positive with the receiver; y0: place along track at t = 0, middle pulse; range: closest one of the track at rest",
-    "matching": "a target that was found belongs to the nearest ship in the image of everything at rest, within metrics.match_m; found: share of ships with one. A ship that is not found "
-    "counts as at rest where that image shows it: its errors are minus its velocities and its displacement, ok is False. false_targets: targets that belong to no ship",
+    "snr": (
+        "the sea has unit mean power in a range-compressed sample of one channel; scr_db: "
+        "mean power of a sample of a ship's lines over it; cnr_db: sea over noise"
+    ),
+    "velocities": (
+        "u_r: closing slant-range speed; u_a: along track, positive with the receiver; y0: "
+        "place along track at t = 0, middle pulse; range: closest one of the track at rest"
+    ),
+    "matching": "a target that was found belongs to the nearest ship in the image of everything at rest, within "
+    "metrics.match_m; found: share of ships with one. A ship that is not found "
+    "counts as at rest where that image shows it: its errors are minus its velocities and its "
+    "displacement, ok is False. false_targets: targets that belong to no ship",
     "u_r_error_m_s": "estimated minus true u_r; u_a_error_m_s alike",
-    "position_error_m": "distance, along track and range together, of the place given to a ship from the intensity centroid of the ship's own echo, without sea and noise, pictured in the same way "
-    "by its true velocities: its scatterers have random phases and interfere, and no image shows the centroid of their powers. along_error_m, range_error_m: its parts, signed",
+    "position_error_m": "distance, along track and range together, of the place given to a ship from the intensity "
+    "centroid of the ship's own echo, without sea and noise, pictured in the same way "
+    "by its true velocities: its scatterers have random phases and interfere, and no image shows "
+    "the centroid of their powers. along_error_m, range_error_m: its parts, signed",
     "scatterers_error_m": "the same distance from the centroid of the scatterers' powers",
-    "image_position_m": "intensity centroid along x = V_R t, near the predicted place, of the image of the ship's own echo as if it were at rest; displacement_m: that minus the true place y0; "
+    "image_position_m": "intensity centroid along x = V_R t, near the predicted place, of the image of the ship's own "
+    "echo as if it were at rest; displacement_m: that minus the true place y0; "
     "displacement_vt_m: what the motion predicts on the axis x = (V_R - u_a) t, which the source prints",
-    "replica_distance_m": "distance on x = V_R t of the stronger first replica from the image itself, centroids of the same image; replica_distance_vt_m: "
-    "PRF lambda R0 / (V_R - u_a), on the axis of the source. A blurred ship that reaches beyond the rebuilt band loses one end to its replica: measured centroids then lie nearer than predicted",
-    "replica_db": "mean power of the final image within 100 m along track and 40 m in range of the strongest replica one or two pulse rates away, over the sea's in the same lines; the sea "
-    "itself has 0 dB, spread by its texture by about 1 dB. replica_before_db: of the image of everything at rest; replica_left_db: of the difference from the image of what does not move",
-    "sea_error_db": "power of the difference of the image without movers from the image of what does not move, over the power of the latter, within 400 m along track and 30 m in range of where the "
+    "replica_distance_m": "distance on x = V_R t of the stronger first replica from the image itself, centroids of the "
+    "same image; replica_distance_vt_m: "
+    "PRF lambda R0 / (V_R - u_a), on the axis of the source. A blurred ship that reaches beyond the "
+    "rebuilt band loses one end to its replica: measured centroids then lie nearer than predicted",
+    "replica_db": "mean power of the final image within 100 m along track and 40 m in range of the strongest "
+    "replica one or two pulse rates away, over the sea's in the same lines; the sea "
+    "itself has 0 dB, spread by its texture by about 1 dB. replica_before_db: of the image of "
+    "everything at rest; replica_left_db: of the difference from the image of what does not move",
+    "sea_error_db": "power of the difference of the image without movers from the image of what does not move, over "
+    "the power of the latter, within 400 m along track and 30 m in range of where the "
     "image at rest showed the ship; sea_error_before_db: the same without removal. Of ships that move",
-    "hole_db": "power of the image without movers within 60 m and 12 m of where the image at rest showed the ship, over that of the sea there: 0 dB is untouched",
-    "contrast_db": "mean power of the final image within 60 m and 12 m of the true place over the sea's in the same lines",
-    "condition_number": "of the band matrix that rebuilds what is at rest (absent for mmse, which inverts no such matrix); noise_gain_db: noise of a rebuilt bin against ideal uniform sampling",
+    "hole_db": (
+        "power of the image without movers within 60 m and 12 m of where the image at rest "
+        "showed the ship, over that of the sea there: 0 dB is untouched"
+    ),
+    "contrast_db": (
+        "mean power of the final image within 60 m and 12 m of the true place over the sea's in the same lines"
+    ),
+    "condition_number": (
+        "of the band matrix that rebuilds what is at rest (absent for mmse, which inverts no "
+        "such matrix); noise_gain_db: noise of a rebuilt bin against ideal uniform sampling"
+    ),
     "seconds": "wall time of the chain of the method a scene",
     "published": "figures of Remote Sens. 2020, 12, 1703, Fig. 18, whose azimuth is x = (V_R - u_a) t",
 }
@@ -56,7 +82,10 @@ class Place:
     def window(self, image: Signal, reach_m: tuple[float, float]) -> tuple[Tensor, Tensor]:
         """Rows (row, 1) and columns of an image within reach_m."""
         azimuth, range_ = (axis.values(image.data.device) for axis in image.axes)
-        rows, columns = ((azimuth - self.azimuth_m).abs() < reach_m[0]).nonzero(), ((range_ - self.range_m).abs() < reach_m[1]).nonzero()[:, 0]
+        rows, columns = (
+            ((azimuth - self.azimuth_m).abs() < reach_m[0]).nonzero(),
+            ((range_ - self.range_m).abs() < reach_m[1]).nonzero()[:, 0],
+        )
         return rows, columns
 
     def power(self, image: Signal, reach_m: tuple[float, float]) -> float:
@@ -72,7 +101,10 @@ class Place:
         if not float(total) > 0:
             return self
         azimuth, range_ = (axis.values(image.data.device) for axis in image.axes)
-        return Place(float((power.sum(1) * azimuth[rows[:, 0]]).sum() / total), float((power.sum(0) * range_[columns]).sum() / total))
+        return Place(
+            float((power.sum(1) * azimuth[rows[:, 0]]).sum() / total),
+            float((power.sum(0) * range_[columns]).sum() / total),
+        )
 
 
 def shown_at(motion: PointMotion) -> Place:
@@ -82,8 +114,12 @@ def shown_at(motion: PointMotion) -> Place:
 
 @dataclass(frozen=True)
 class Sight:
-    """What a ship looks like without sea and noise. centre: motion of the centroid of its own picture; image, replica: places of the image at rest; replica: the strongest of one and two
-    pulse rates; away_m: distance of that of one, measured on x = V_R t, and predicted on x = (V_R - u_a) t; scatterers: centroid of powers, y0 and range."""
+    """What a ship looks like without sea and noise.
+
+    centre: motion of the centroid of its own picture; image, replica: places of the image at rest;
+    replica: the strongest of one and two pulse rates; away_m: distance of that of one, measured on
+    x = V_R t, and predicted on x = (V_R - u_a) t; scatterers: centroid of powers, y0 and range.
+    """
 
     ship: Vouched
     centre: PointMotion
@@ -95,14 +131,20 @@ class Sight:
     def metrics(self) -> dict[str, float]:
         """What only the echo decides."""
         y0, along = float(self.centre.y0_m), float(self.centre.along_m_s)
-        places = {"image_position_m": self.image.azimuth_m, "displacement_m": self.image.azimuth_m - y0, "displacement_vt_m": along * float(self.centre.image_s) - y0}
+        places = {
+            "image_position_m": self.image.azimuth_m,
+            "displacement_m": self.image.azimuth_m - y0,
+            "displacement_vt_m": along * float(self.centre.image_s) - y0,
+        }
         away = {"replica_distance_m": self.away_m[0], "replica_distance_vt_m": self.away_m[1]}
         return {**places, **away} if self.ship.moves else places
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What every method is compared with: images of what does not move, rebuilt by least squares of two bands, and what ships look like."""
+    """What every method is compared with: images of what does not move, rebuilt by least squares of
+    two bands, and what ships look like.
+    """
 
     radar: BistaticRadar
     ships: Mapping[str, Sight]
@@ -112,7 +154,9 @@ class Reference:
     def of(radar: BistaticRadar, sighted: Sighted, remove: Any, extraction: Extraction) -> Reference:
         """remove: takes the transmit range out of channels."""
         data = remove(sighted.recording.signal)
-        sights = {name: _sight(radar, ship, data, remove(ship.echo), extraction) for name, ship in sighted.ships.items()}
+        sights = {
+            name: _sight(radar, ship, data, remove(ship.echo), extraction) for name, ship in sighted.ships.items()
+        }
         return Reference(radar, sights, remove(sighted.still))
 
 
@@ -126,16 +170,27 @@ def _sight(radar: BistaticRadar, ship: Vouched, data: Signal, echo: Signal, extr
     strongest = max(places, key=lambda place: place.power(image, REPLICA_M))
     away = abs(first.azimuth_m - shown.azimuth_m)
     y0, near = centroid(ship.movers, radar)
-    return Sight(ship, _own_centre(radar, ship.motion, data, echo, extraction), shown, strongest, (away, off_vt), (float(y0), float(near)))
+    return Sight(
+        ship,
+        _own_centre(radar, ship.motion, data, echo, extraction),
+        shown,
+        strongest,
+        (away, off_vt),
+        (float(y0), float(near)),
+    )
 
 
 def _repeated(image: Signal, shown: Place, off_m: float) -> Place:
-    """Where a replica lies so far to either side of the image itself, on the side where it is stronger: it is wide in range, since its migration is that of another band."""
+    """Where a replica lies so far to either side of the image itself, on the side where it is
+    stronger: it is wide in range, since its migration is that of another band.
+    """
     sides = [replace(shown, azimuth_m=shown.azimuth_m + side * off_m) for side in (-1, 1)]
     return max(sides, key=lambda place: place.power(image, _SPREAD_M)).centroid(image, _SPREAD_M)
 
 
-def _own_centre(radar: BistaticRadar, motion: PointMotion, data: Signal, echo: Signal, extraction: Extraction) -> PointMotion:
+def _own_centre(
+    radar: BistaticRadar, motion: PointMotion, data: Signal, echo: Signal, extraction: Extraction
+) -> PointMotion:
     """By the picture of the echo alone, weighted against the sea that lies in the data."""
     frame = Frame.of(radar, data)
     chip = chip_about(data.data, frame, motion, extraction)
@@ -144,23 +199,34 @@ def _own_centre(radar: BistaticRadar, motion: PointMotion, data: Signal, echo: S
 
 @dataclass(frozen=True)
 class Judged:
-    """Metrics of one scene by one method: of each ship, and of the whole; and the body of each ship, None where it was not found."""
+    """Metrics of one scene by one method: of each ship, and of the whole; and the body of each
+    ship, None where it was not found.
+    """
 
     ships: Mapping[str, Mapping[str, float]]
     whole: Mapping[str, float]
     bodies: Mapping[str, Body | None]
 
 
-def judged(made: SceneImage, still: Signal, reference: Reference, match_m: tuple[float, float], estimates: bool) -> Judged:
-    """still: the image, rebuilt as the method rebuilds, of what does not move; estimates: whether the method looks for movers."""
+def judged(
+    made: SceneImage, still: Signal, reference: Reference, match_m: tuple[float, float], estimates: bool
+) -> Judged:
+    """still: the image, rebuilt as the method rebuilds, of what does not move; estimates: whether
+    the method looks for movers.
+    """
     found = matched([body for body in made.bodies if bool(body.ok)], reference.ships, match_m)
-    ships = {name: {**sight.metrics(), **_errors(sight, found[name], estimates), **_levels(sight, made, still)} for name, sight in reference.ships.items()}
+    ships = {
+        name: {**sight.metrics(), **_errors(sight, found[name], estimates), **_levels(sight, made, still)}
+        for name, sight in reference.ships.items()
+    }
     false = len(made.bodies) - sum(body is not None for body in found.values())
     return Judged(ships, {"false_targets": float(false)} if estimates else {}, found)
 
 
 def matched(bodies: Sequence[Body], ships: Mapping[str, Sight], match_m: tuple[float, float]) -> dict[str, Body | None]:
-    """By ship the body that appears nearest to where the ship does, in units of match_m; each body belongs to one ship."""
+    """By ship the body that appears nearest to where the ship does, in units of match_m; each body
+    belongs to one ship.
+    """
     pairs = []
     for name, sight in ships.items():
         for i, body in enumerate(bodies):
@@ -184,12 +250,23 @@ def _errors(sight: Sight, body: Body | None, estimates: bool) -> dict[str, float
         u_r, u_a, y0, near = 0.0, 0.0, sight.image.azimuth_m, sight.image.range_m
     along, across = y0 - float(true.y0_m), near - float(true.range_m)
     of_scatterers = math.hypot(y0 - sight.scatterers[0], near - sight.scatterers[1])
-    places = {"position_error_m": math.hypot(along, across), "along_error_m": along, "range_error_m": across, "scatterers_error_m": of_scatterers}
+    places = {
+        "position_error_m": math.hypot(along, across),
+        "along_error_m": along,
+        "range_error_m": across,
+        "scatterers_error_m": of_scatterers,
+    }
     if not estimates:
         return places
     errors = {"u_r_error_m_s": u_r - float(true.u_r_m_s), "u_a_error_m_s": u_a - float(true.u_a_m_s)}
     std = {} if body is None or not float(body.u_r_std_m_s) > 0 else {"u_r_std_m_s": float(body.u_r_std_m_s)}
-    return {**errors, **places, **std, "found": float(body is not None), "ok": float(body is not None and bool(body.ok))}
+    return {
+        **errors,
+        **places,
+        **std,
+        "found": float(body is not None),
+        "ok": float(body is not None and bool(body.ok)),
+    }
 
 
 def _db(power: float, reference: float) -> float:
@@ -210,7 +287,10 @@ def _levels(sight: Sight, made: SceneImage, still: Signal) -> dict[str, float]:
     left, before = (still.with_data(image.data - still.data) for image in (made.rest, made.conventional))
     shown, again = shown_at(sight.centre), sight.replica
     sea, floor = shown.power(still, NEAR_M), _of_lines(again, still, REPLICA_M[1])
-    levels |= {"sea_error_db": _db(shown.power(left, NEAR_M), sea), "sea_error_before_db": _db(shown.power(before, NEAR_M), sea)}
+    levels |= {
+        "sea_error_db": _db(shown.power(left, NEAR_M), sea),
+        "sea_error_before_db": _db(shown.power(before, NEAR_M), sea),
+    }
     levels |= {"hole_db": _db(shown.power(made.rest, GATE_M), shown.power(still, GATE_M))}
     replicas = {"replica_db": made.fused, "replica_before_db": made.conventional, "replica_left_db": left}
     return {**levels, **{name: _db(again.power(image, REPLICA_M), floor) for name, image in replicas.items()}}

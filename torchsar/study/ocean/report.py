@@ -1,4 +1,6 @@
-"""The report of a run of ships on a sea: a table a figure, ships below each other, methods side by side."""
+"""The report of a run of ships on a sea: a table a figure, ships below each other, methods side by
+side.
+"""
 
 from __future__ import annotations
 
@@ -39,10 +41,39 @@ SCENES = {
 _FACTS = ("u_r_error_m_s", "u_a_error_m_s", "position_error_m", "replica_db", "sea_error_db", "contrast_db")
 
 
-def write_report(path: Path, title: str, metrics: Mapping[str, Any], pictures: Sequence[Picture], figures: Path, config_text: str, command: str) -> None:
+def write_report(
+    path: Path,
+    title: str,
+    metrics: Mapping[str, Any],
+    pictures: Sequence[Picture],
+    figures: Path,
+    config_text: str,
+    command: str,
+) -> None:
     """Write the report of one run; it asks for nothing from outside."""
     of_ships = {"methods": {name: {"cases": method["targets"]} for name, method in metrics["methods"].items()}}
     shown = [*tables(of_ships, SHIPS, metrics["published"]["targets"]), *tables(metrics, SCENES, {})]
     facts = {key: SHIPS[key] for key in _FACTS}
-    notes = [{"title": "Places", "text": "Errors of places count from what the image of the ship's own echo would show: its scatterers interfere, and no image shows the middle of their powers."}]
-    write_case_report(path, "geo.html.j2", title, metrics, facts, {}, pictures, figures, config_text, command, notes=notes, tables=shown)
+    notes = [
+        {
+            "title": "Places",
+            "text": (
+                "Errors of places count from what the image of the ship's own echo would show: its "
+                "scatterers interfere, and no image shows the middle of their powers."
+            ),
+        }
+    ]
+    write_case_report(
+        path,
+        "geo.html.j2",
+        title,
+        metrics,
+        facts,
+        {},
+        pictures,
+        figures,
+        config_text,
+        command,
+        notes=notes,
+        tables=shown,
+    )

@@ -13,7 +13,10 @@ from torchsar.study.registry import GATES, SEAS
 
 
 class Vessel(Strict):
-    """A ship of random scatterers; see torchsar.scene.Ship. u_r_m_s: closing; u_a_m_s: along track, with the receiver; azimuth_m, range_m: its middle at t = 0, range beyond the reference range.
+    """A ship of random scatterers; see torchsar.scene.Ship.
+
+    u_r_m_s: closing; u_a_m_s: along track, with the receiver; azimuth_m, range_m: its middle at t =
+    0, range beyond the reference range.
 
     scr_db: mean power of a sample of one of its lines over that of the sea.
     """
@@ -30,7 +33,11 @@ class Vessel(Strict):
 
 
 class World(Strict):
-    """What is true and no processor may see: all ships in one scene. The gate lights ships and sea; the sea's cnr_db is its power over the noise. trials: scenes drawn for each case of a run."""
+    """What is true and no processor may see: all ships in one scene.
+
+    The gate lights ships and sea; the sea's cnr_db is its power over the noise. trials: scenes
+    drawn for each case of a run.
+    """
 
     single: ClassVar[dict[str, Catalogue]] = {"gate": GATES, "sea": SEAS}
     named: ClassVar[dict[str, Catalogue]] = {}
@@ -44,7 +51,11 @@ class World(Strict):
 
 
 class Metrics(Strict):
-    """How results are judged. match_m: how far, along track and in range, what was found may appear from where a ship appears. published_targets: metric -> ship -> method -> figure of the source."""
+    """How results are judged.
+
+    match_m: how far, along track and in range, what was found may appear from where a ship appears.
+    published_targets: metric -> ship -> method -> figure of the source.
+    """
 
     reference: str | None = None
     match_m: tuple[float, float] = (150.0, 40.0)
@@ -52,7 +63,10 @@ class Metrics(Strict):
 
 
 class Trade(Strict):
-    """What `torchsar trade` compares on the recommended flow. segments_s: of slow time; half_ranges_m: of the lines of a body; precisions: of samples."""
+    """What `torchsar trade` compares on the recommended flow.
+
+    segments_s: of slow time; half_ranges_m: of the lines of a body; precisions: of samples.
+    """
 
     segments_s: list[Annotated[float, Field(gt=0)]] = Field(default=[0.3, 0.6, 1.2], min_length=1)
     half_ranges_m: list[Annotated[float, Field(gt=0)]] = Field(default=[30.0, 60.0], min_length=1)

@@ -1,4 +1,6 @@
-"""`torchsar trade` for ships on a sea: time against errors of segments, lines, removal and precision, on the first scene of the recommended flow."""
+"""`torchsar trade` for ships on a sea: time against errors of segments, lines, removal and
+precision, on the first scene of the recommended flow.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ log = logging.getLogger("torchsar")
 
 @dataclass(frozen=True)
 class Row:
-    """One alternative: median seconds a scene and their spread; root mean squares of errors over ships that move, means of levels. None where no ship has them."""
+    """One alternative: median seconds a scene and their spread; root mean squares of errors over
+    ships that move, means of levels. None where no ship has them.
+    """
 
     name: str
     seconds: float
@@ -42,7 +46,8 @@ class Row:
 
 
 def trade(loaded: Loaded, out: Path | None) -> str:
-    """Tables of the recommended flow with one setting changed at a time, on the first scene of the first case; returns them as text.
+    """Tables of the recommended flow with one setting changed at a time, on the first scene of the
+    first case; returns them as text.
 
     With `out`: config.yaml, trade.json, trade.txt and figures/ in that folder.
     """
@@ -52,7 +57,12 @@ def trade(loaded: Loaded, out: Path | None) -> str:
 @torch.no_grad()
 def _tables(loaded: Loaded) -> dict[str, list[Row]]:
     made = _Flow.of(loaded)
-    return {"segment": list(made.segments()), "lines": list(made.lines()), "removal": list(made.removals()), "precision": list(made.precisions())}
+    return {
+        "segment": list(made.segments()),
+        "lines": list(made.lines()),
+        "removal": list(made.removals()),
+        "precision": list(made.precisions()),
+    }
 
 
 @dataclass(frozen=True)
@@ -69,9 +79,17 @@ class _Flow:
         bench = Bench.of(loaded)
         image = bench.ways["recommended"].image
         if not isinstance(image, MoversImage):
-            raise ValueError("trade compares flows, and the method 'recommended' makes an image of everything at rest; end its chain with movers_image")
+            raise ValueError(
+                "trade compares flows, and the method 'recommended' makes an image of everything at "
+                "rest; end its chain with movers_image"
+            )
         sighted = bench.ocean.sighted(Draws(loaded.config.seed, "trade"))
-        return _Flow(bench, image.flow, sighted, Reference.of(bench.ocean.radar, sighted, RemoveTransmitRange(bench.ocean.radar), bench.extraction))
+        return _Flow(
+            bench,
+            image.flow,
+            sighted,
+            Reference.of(bench.ocean.radar, sighted, RemoveTransmitRange(bench.ocean.radar), bench.extraction),
+        )
 
     def segments(self) -> Iterator[Row]:
         for length in self.bench.config.trade.segments_s:
@@ -92,7 +110,13 @@ class _Flow:
     def _row(self, name: str, dtype: torch.dtype | None = None, **changes: Any) -> Row:
         """The flow with other settings."""
         flow, radar = self.flow, self.bench.ocean.radar
-        kept: dict[str, Any] = {"extraction": flow.extraction, "detector": flow.detector, "rebuild": flow.image.rebuild, "removal": flow.removal, "u_a_half_m_s": flow.u_a_half_m_s}
+        kept: dict[str, Any] = {
+            "extraction": flow.extraction,
+            "detector": flow.detector,
+            "rebuild": flow.image.rebuild,
+            "removal": flow.removal,
+            "u_a_half_m_s": flow.u_a_half_m_s,
+        }
         other, remove = ImageMovers(radar, **{**kept, **changes}), RemoveTransmitRange(radar)
         recorded = self.sighted.recording.signal
         data = remove(recorded if dtype is None else recorded.with_data(recorded.data.to(dtype)))
@@ -100,7 +124,12 @@ class _Flow:
         made, times = timed(lambda: other(data), self.bench.config.trade.repeats)
         log.info("%s: %.1f s", name, time.perf_counter() - began)
         still = other.image(self.reference.still)
-        return _row_of(name, times, judged(made, still, self.reference, self.bench.config.metrics.match_m, True), [n for n, ship in self.sighted.ships.items() if ship.moves])
+        return _row_of(
+            name,
+            times,
+            judged(made, still, self.reference, self.bench.config.metrics.match_m, True),
+            [n for n, ship in self.sighted.ships.items() if ship.moves],
+        )
 
 
 def _row_of(name: str, times: Sequence[float], of: Judged, moving: Sequence[str]) -> Row:
@@ -108,11 +137,18 @@ def _row_of(name: str, times: Sequence[float], of: Judged, moving: Sequence[str]
     for key in _COLUMNS:
         values = [of.ships[ship][key] for ship in moving if key in of.ships[ship]]
         if values:
-            row[key] = math.sqrt(sum(v * v for v in values) / len(values)) if "error_m" in key else sum(values) / len(values)
+            row[key] = (
+                math.sqrt(sum(v * v for v in values) / len(values)) if "error_m" in key else sum(values) / len(values)
+            )
     return Row(name, sorted(times)[len(times) // 2], max(times) - min(times), **row)
 
 
-_TITLES = {"segment": "LENGTH OF SEGMENTS", "lines": "LINES OF A BODY", "removal": "REMOVAL", "precision": "PRECISION OF SAMPLES"}
+_TITLES = {
+    "segment": "LENGTH OF SEGMENTS",
+    "lines": "LINES OF A BODY",
+    "removal": "REMOVAL",
+    "precision": "PRECISION OF SAMPLES",
+}
 _COLUMNS = {
     "u_r_error_m_s": ("u_r error (m/s)", ".3f"),
     "u_a_error_m_s": ("u_a error (m/s)", ".3f"),
@@ -126,4 +162,14 @@ _COLUMNS = {
 def _figures(tables: Tables) -> Mapping[str, plot.Figure]:
     """Time against the error of the sea, where ships move."""
     shown = {key: [row for row in rows if row.sea_error_db is not None] for key, rows in tables.items()}
-    return {key: plot.trade([r.name for r in rows], [r.seconds for r in rows], [r.sea_error_db for r in rows], "error of the sea (dB)", _TITLES[key].lower()) for key, rows in shown.items() if rows}
+    return {
+        key: plot.trade(
+            [r.name for r in rows],
+            [r.seconds for r in rows],
+            [r.sea_error_db for r in rows],
+            "error of the sea (dB)",
+            _TITLES[key].lower(),
+        )
+        for key, rows in shown.items()
+        if rows
+    }

@@ -36,7 +36,9 @@ ENDING = "movers_image or stationary_image"
 
 @dataclass(frozen=True)
 class Way:
-    """A method: the stages before the image, and the last one, which makes it, with where it takes its values from."""
+    """A method: the stages before the image, and the last one, which makes it, with where it takes
+    its values from.
+    """
 
     before: Mapping[str, nn.Module]
     uses: Mapping[str, Mapping[str, str]]
@@ -44,17 +46,27 @@ class Way:
 
     @staticmethod
     def of(name: str, chain: Chain) -> Way:
-        """Raises ConfigError for a chain that does not end with a picture of a scene, or estimates something on the way there."""
+        """Raises ConfigError for a chain that does not end with a picture of a scene, or estimates
+        something on the way there.
+        """
         *before, last = chain.stages
         image = chain.stages[last]
         if not isinstance(image, (StationaryImage, MoversImage)):
-            raise ConfigError(f"processor.{name}: system geo_ocean pictures scenes; end the chain with {ENDING}, not with {last!r}")
+            raise ConfigError(
+                f"processor.{name}: system geo_ocean pictures scenes; end the chain with {ENDING}, not with {last!r}"
+            )
         for stage in before:
             if chain.uses[stage] or getattr(chain.stages[stage], "provides", ()):
-                raise ConfigError(f"processor.{name}.stages.{stage}: stages before {last!r} may neither estimate nor use values; leave it out")
+                raise ConfigError(
+                    f"processor.{name}.stages.{stage}: stages before {last!r} may neither estimate nor "
+                    "use values; leave it out"
+                )
         wrong = [source for source in chain.uses[last].values() if not source.startswith("aux.")]
         if wrong:
-            raise ConfigError(f"processor.{name}.stages.{last}.uses: {wrong[0]!r} is nothing recorded; there is aux.true_u_r_m_s, aux.true_u_a_m_s, aux.true_y0_m, aux.true_range_m")
+            raise ConfigError(
+                f"processor.{name}.stages.{last}.uses: {wrong[0]!r} is nothing recorded; there is "
+                "aux.true_u_r_m_s, aux.true_u_a_m_s, aux.true_y0_m, aux.true_range_m"
+            )
         return Way({stage: chain.stages[stage] for stage in before}, chain.uses, image)
 
     @property
@@ -82,7 +94,9 @@ class Way:
             image = self.image(signal)
             return SceneImage(image, image, image, data=signal)
         uses = list(self.uses.values())[-1]
-        return self.image.scene(signal, **{parameter: recording.aux[source.removeprefix("aux.")] for parameter, source in uses.items()})
+        return self.image.scene(
+            signal, **{parameter: recording.aux[source.removeprefix("aux.")] for parameter, source in uses.items()}
+        )
 
 
 @dataclass(frozen=True)
@@ -119,7 +133,10 @@ class Scene:
 
 
 class OceanTrials(Benches[Bench]):
-    """`trial(parameters, draws)` of a config: {method: {"SHIP.metric": (trial,)}} with ok, false_targets, condition_number, noise_gain_db and seconds of each scene. Scenes are worked on in turn."""
+    """`trial(parameters, draws)` of a config: {method: {"SHIP.metric": (trial,)}} with ok,
+    false_targets, condition_number, noise_gain_db and seconds of each scene. Scenes are worked on
+    in turn.
+    """
 
     batched = ()
 
@@ -141,8 +158,15 @@ class OceanTrials(Benches[Bench]):
         bench = self.bench(parameters)
         trials = list(draws.trials if draws.trials is not None else [0])
         cases = draws.case if isinstance(draws.case, tuple) else (draws.case,) * len(trials)
-        scenes = [scene_of(bench, Draws(draws.seed, case, None), trial).judged for case, trial in zip(cases, trials, strict=True)]
-        return {**{name: stacked([flat(scene[name]) for scene in scenes]) for name in bench.ways}, BOUNDS: {}, SAVED: {}}
+        scenes = [
+            scene_of(bench, Draws(draws.seed, case, None), trial).judged
+            for case, trial in zip(cases, trials, strict=True)
+        ]
+        return {
+            **{name: stacked([flat(scene[name]) for scene in scenes]) for name in bench.ways},
+            BOUNDS: {},
+            SAVED: {},
+        }
 
 
 def flat(one: Judged) -> dict[str, float]:
@@ -185,4 +209,8 @@ def conditioning(bench: Bench, way: Way) -> dict[str, float]:
     radar = bench.ocean.radar
     motion = PointMotion.of(radar, torch.zeros((), dtype=torch.float64))
     gain = {"noise_gain_db": float(noise_gain_db(radar, motion, way.rebuild))}
-    return {"condition_number": float(condition_number(radar, motion, way.rebuild.bands)), **gain} if isinstance(way.rebuild, LeastSquares) else gain
+    return (
+        {"condition_number": float(condition_number(radar, motion, way.rebuild.bands)), **gain}
+        if isinstance(way.rebuild, LeastSquares)
+        else gain
+    )

@@ -47,7 +47,9 @@ class Turntable:
         """Raises ConfigError for what radar, world or damages refuse."""
         size = loaded.config.world
         damages = build_damages(size.damages, "world.damages", loaded.file, TARGET_DAMAGES)
-        return Turntable(build_radar(loaded), build_world(loaded), damages, size.pulses, size.samples, precision(loaded.config))
+        return Turntable(
+            build_radar(loaded), build_world(loaded), damages, size.pulses, size.samples, precision(loaded.config)
+        )
 
     @property
     def duration_s(self) -> float:
@@ -60,7 +62,9 @@ class Turntable:
 
     def recorded(self, draws: Draws, device: str = "cpu", dtype: torch.dtype | None = None) -> tuple[Recording, Truth]:
         """The trials of the draws; dtype: of the samples, by default that of the config."""
-        return simulate_turntable(self.radar, self.world, self.pulses, self.samples, draws, self.damages, dtype or self.dtype, device)
+        return simulate_turntable(
+            self.radar, self.world, self.pulses, self.samples, draws, self.damages, dtype or self.dtype, device
+        )
 
 
 def build_radar(loaded: Loaded) -> InverseRadar:
@@ -72,7 +76,10 @@ def build_radar(loaded: Loaded) -> InverseRadar:
 
 
 def build_world(loaded: Loaded) -> TurntableWorld:
-    """The world of a simulation. Raises ConfigError, for a rotation that turns back during the record too."""
+    """The world of a simulation.
+
+    Raises ConfigError, for a rotation that turns back during the record too.
+    """
     world, file = loaded.config.world, loaded.file
     refuse_oversize(world.pulses, world.samples, file, "world.pulses or world.samples")
     scenes = Together({name: SCENES.make(entry, f"world.scene.{name}", file) for name, entry in world.scene.items()})
@@ -83,13 +90,17 @@ def build_world(loaded: Loaded) -> TurntableWorld:
     try:
         rotation = PolynomialRotation(world.rotation.omega_rad_s, tuple(world.rotation.k))
         rotation.refuse_turning_back(world.pulses / loaded.config.radar.prf_hz)
-        return TurntableWorld(scene, None, motion, phases, world.noise.snr_db, fidelity, rotation, world.centre_deviation_m)
+        return TurntableWorld(
+            scene, None, motion, phases, world.noise.snr_db, fidelity, rotation, world.centre_deviation_m
+        )
     except (ValueError, TypeError) as error:
         raise ConfigError(f"{file}: world: {' '.join(str(error).split())}") from None
 
 
 def named_targets(world: TurntableWorld) -> dict[str, int]:
-    """Names `part.number` of explicit points, whose response is worth measuring, and their places among all scatterers."""
+    """Names `part.number` of explicit points, whose response is worth measuring, and their places
+    among all scatterers.
+    """
     scene = world.scene.scene if isinstance(world.scene, OneScene) else world.scene
     assert isinstance(scene, Together)
     names: dict[str, int] = {}

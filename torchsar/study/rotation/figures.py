@@ -1,4 +1,6 @@
-"""The pictures of a run: the target, figures by case, images in metres with an enlarged tip, cuts through point targets."""
+"""The pictures of a run: the target, figures by case, images in metres with an enlarged tip, cuts
+through point targets.
+"""
 
 from __future__ import annotations
 
@@ -37,8 +39,10 @@ Metrics = Mapping[str, Mapping[str, Tensor]]
 
 @dataclass(frozen=True)
 class CaseResult:
-    """One case: metrics (trial,) by method, and of each point target; what the methods found, by name with std and ok, and the truth, by trial; of the first trial
-    images in metres, cuts and scatterers: range and cross range (m), amplitude."""
+    """One case: metrics (trial,) by method, and of each point target; what the methods found, by
+    name with std and ok, and the truth, by trial; of the first trial images in metres, cuts and
+    scatterers: range and cross range (m), amplitude.
+    """
 
     metrics: Metrics
     targets: Mapping[str, Metrics]
@@ -52,39 +56,86 @@ class CaseResult:
     def of(bench: Bench, batch: Batch) -> CaseResult:
         """Of one batch of trials."""
         truth, wavelength = batch.truth.values, bench.table.radar.wavelength_m
-        images = {name: in_metres(image_of(o.trace.signal), wavelength, scale_rate(o.found, bench.table, batch.truth, 0)) for name, o in batch.outcomes.items()}
-        cuts = {name: {target: of_trials[0] for target, of_trials in outcome.cuts.items()} for name, outcome in batch.outcomes.items()}
-        scalars = {"omega_rad_s": truth["omega_rad_s"], "yc_m": truth["yc_m"], **{k_name(i + 1): k for i, k in enumerate(truth["warp_k"].unbind(-1))}}
-        along, across, amplitude = (truth[name].reshape(-1, truth[name].shape[-1])[0] for name in ("range_m", "cross_range_m", "amplitude"))
+        images = {
+            name: in_metres(image_of(o.trace.signal), wavelength, scale_rate(o.found, bench.table, batch.truth, 0))
+            for name, o in batch.outcomes.items()
+        }
+        cuts = {
+            name: {target: of_trials[0] for target, of_trials in outcome.cuts.items()}
+            for name, outcome in batch.outcomes.items()
+        }
+        scalars = {
+            "omega_rad_s": truth["omega_rad_s"],
+            "yc_m": truth["yc_m"],
+            **{k_name(i + 1): k for i, k in enumerate(truth["warp_k"].unbind(-1))},
+        }
+        along, across, amplitude = (
+            truth[name].reshape(-1, truth[name].shape[-1])[0] for name in ("range_m", "cross_range_m", "amplitude")
+        )
         found = {name: _estimates(outcome.found, outcome.metrics) for name, outcome in batch.outcomes.items()}
-        return CaseResult(batch.metrics, target_figures(batch, bench.config.metrics.reference), found, scalars, images, cuts, (along, across, amplitude))
+        return CaseResult(
+            batch.metrics,
+            target_figures(batch, bench.config.metrics.reference),
+            found,
+            scalars,
+            images,
+            cuts,
+            (along, across, amplitude),
+        )
 
     @staticmethod
     def joined(parts: Sequence[CaseResult]) -> CaseResult:
         """All trials of a case, and the pictures of the first."""
         first = parts[0]
         metrics = {name: _joined([part.metrics[name] for part in parts]) for name in first.metrics}
-        targets = {name: {target: _joined([part.targets[name][target] for part in parts]) for target in of} for name, of in first.targets.items()}
-        found = {name: {key: _listed([part.found[name][key] for part in parts]) for key in of} for name, of in first.found.items()}
-        return replace(first, metrics=metrics, targets=targets, found=found, truth=_joined([part.truth for part in parts]))
+        targets = {
+            name: {target: _joined([part.targets[name][target] for part in parts]) for target in of}
+            for name, of in first.targets.items()
+        }
+        found = {
+            name: {key: _listed([part.found[name][key] for part in parts]) for key in of}
+            for name, of in first.found.items()
+        }
+        return replace(
+            first, metrics=metrics, targets=targets, found=found, truth=_joined([part.truth for part in parts])
+        )
 
     def truths(self) -> Mapping[str, Tensor]:
         return self.truth
 
     def estimates(self) -> dict[str, dict[str, Tensor]]:
         """Rotations by method and name."""
-        return {name: {key: torch.tensor(entry["value"], dtype=torch.float64) for key, entry in values.items()} for name, values in self.found.items() if values}
+        return {
+            name: {key: torch.tensor(entry["value"], dtype=torch.float64) for key, entry in values.items()}
+            for name, values in self.found.items()
+            if values
+        }
 
 
 def _estimates(found: Turned, metrics: Mapping[str, Tensor]) -> dict[str, dict[str, Any]]:
-    """The scalars that metrics.json names, each with predicted deviation and verdict, lists over trials."""
-    named = {name: (value, found.std.get(name)) for name, value in (("omega_rad_s", found.omega_rad_s), ("yc_m", found.yc_m)) if value is not None}
+    """The scalars that metrics.json names, each with predicted deviation and verdict, lists over
+    trials.
+    """
+    named = {
+        name: (value, found.std.get(name))
+        for name, value in (("omega_rad_s", found.omega_rad_s), ("yc_m", found.yc_m))
+        if value is not None
+    }
     if found.warp_k is not None:
         std = found.std.get("warp_k")
-        named.update({k_name(i + 1): (k, None if std is None else std[..., i]) for i, k in enumerate(found.warp_k.unbind(-1))})
+        named.update(
+            {k_name(i + 1): (k, None if std is None else std[..., i]) for i, k in enumerate(found.warp_k.unbind(-1))}
+        )
     trials = metrics["seconds"].shape
     ok = metrics["ok"].reshape(-1).tolist() if "ok" in metrics else None
-    return {name: {"value": value.expand(trials).reshape(-1).tolist(), "std": None if s is None else s.expand(trials).reshape(-1).tolist(), "ok": ok} for name, (value, s) in named.items()}
+    return {
+        name: {
+            "value": value.expand(trials).reshape(-1).tolist(),
+            "std": None if s is None else s.expand(trials).reshape(-1).tolist(),
+            "ok": ok,
+        }
+        for name, (value, s) in named.items()
+    }
 
 
 def _joined(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
@@ -108,13 +159,22 @@ def _titled(title: str, case: str) -> str:
 
 def _target(result: CaseResult) -> Drawn:
     along, across, amplitude = (plot.array(v) for v in result.scatterers)
-    yield "target", "Target", "Scatterers of the first scene; the area of a point is its power.", plot.places(along, across, np.abs(amplitude) ** 2, "range (m)", "cross range (m)", aspect="auto")
+    yield (
+        "target",
+        "Target",
+        "Scatterers of the first scene; the area of a point is its power.",
+        plot.places(along, across, np.abs(amplitude) ** 2, "range (m)", "cross range (m)", aspect="auto"),
+    )
 
 
 def _comparison(results: Mapping[str, CaseResult]) -> Drawn:
     """Figures of all methods, by case where there are several, else by method."""
     for key, label in _COMPARED.items():
-        names = [name for name in next(iter(results.values())).metrics if any(key in result.metrics[name] for result in results.values())]
+        names = [
+            name
+            for name in next(iter(results.values())).metrics
+            if any(key in result.metrics[name] for result in results.values())
+        ]
         if not names:
             continue
         means = {name: np.array([_mean(result.metrics[name], key) for result in results.values()]) for name in names}
@@ -125,7 +185,12 @@ def _comparison(results: Mapping[str, CaseResult]) -> Drawn:
         parts = [{"title": "", "x": x, "series": series, "bounds": {}}]
         log = key != "entropy_nats" and any(bool((y > 0).any()) for y, _ in series.values())
         said = "rms over trials of the" if key != "entropy_nats" else "mean over trials of the"
-        yield key, label.split(" (")[0].capitalize(), f"{said.capitalize()} {label}, by method{'' if len(results) == 1 else ' and case'}.", plot.error_curves(parts, "", label, log_y=log)
+        yield (
+            key,
+            label.split(" (")[0].capitalize(),
+            f"{said.capitalize()} {label}, by method{'' if len(results) == 1 else ' and case'}.",
+            plot.error_curves(parts, "", label, log_y=log),
+        )
 
 
 def _mean(metrics: Mapping[str, Tensor], key: str) -> float:
@@ -142,7 +207,9 @@ def _first_named(result: CaseResult) -> dict[str, Signal]:
 
 
 def _within(image: Signal, low: tuple[float, float], high: tuple[float, float]) -> Signal:
-    """The part of an image between two places (cross range, range), at least two lines and cells."""
+    """The part of an image between two places (cross range, range), at least two lines and
+    cells.
+    """
     bounds = {}
     for axis, a, b in zip(image.axes, low, high):
         first, last = (round(float(axis.index_of(v))) for v in (a, b))
@@ -157,8 +224,16 @@ def _images(case: str, result: CaseResult) -> Drawn:
     cell = result.images[next(iter(result.images))].axes[1].step
     low, high = (-reach, float(along.min()) - 2 * cell), (reach, float(along.max()) + 2 * cell)
     shown = {name: _within(image, low, high) for name, image in _first_named(result).items()}
-    caption = "The first trial, all on one scale, that of the first, in dB. Cross range by each method's own rate, by the true mean rate where it finds none; it may be mirrored."
-    yield f"images_{word_of(case)}", _titled("Images by every method", case), caption, plot.images(shown, dynamic_range_db=35.0, columns=4)
+    caption = (
+        "The first trial, all on one scale, that of the first, in dB. Cross range by each "
+        "method's own rate, by the true mean rate where it finds none; it may be mirrored."
+    )
+    yield (
+        f"images_{word_of(case)}",
+        _titled("Images by every method", case),
+        caption,
+        plot.images(shown, dynamic_range_db=35.0, columns=4),
+    )
 
 
 def _tips(case: str, result: CaseResult) -> Drawn:
@@ -173,9 +248,20 @@ def _tips(case: str, result: CaseResult) -> Drawn:
     half = _TIP_SHARE * reach
     cell = result.images[next(iter(result.images))].axes[1].step
     beside = max(4 * cell, _TIP_SHARE * float(along.abs().max()))
-    shown = {name: _within(image, (x - half, y - beside), (x + half, y + beside)) for name, image in _first_named(result).items()}
-    caption = f"About the scatterer at {x:.2f} m of cross range and {y:.2f} m of range. An error of the rate moves it, one of k1 and k2 smears it."
-    yield f"tip_{word_of(case)}", _titled("The tip, enlarged", case), caption, plot.images(shown, dynamic_range_db=35.0, columns=4, percentile=100)
+    shown = {
+        name: _within(image, (x - half, y - beside), (x + half, y + beside))
+        for name, image in _first_named(result).items()
+    }
+    caption = (
+        f"About the scatterer at {x:.2f} m of cross range and {y:.2f} m of range. An error of "
+        "the rate moves it, one of k1 and k2 smears it."
+    )
+    yield (
+        f"tip_{word_of(case)}",
+        _titled("The tip, enlarged", case),
+        caption,
+        plot.images(shown, dynamic_range_db=35.0, columns=4, percentile=100),
+    )
 
 
 def _slices(case: str, result: CaseResult) -> Drawn:
@@ -185,8 +271,16 @@ def _slices(case: str, result: CaseResult) -> Drawn:
     for target in result.cuts[names[0]]:
         parts += _slice_panels(target, {name: result.cuts[name][target] for name in names})
     if parts:
-        caption = "Cuts through the range cell of each point target, offsets from the true place; 0 dB is the peak of the first method."
-        yield f"slices_{word_of(case)}", _titled("Responses of point targets", case), caption, plot.panels(parts, columns=2)
+        caption = (
+            "Cuts through the range cell of each point target, offsets from the true place; 0 dB "
+            "is the peak of the first method."
+        )
+        yield (
+            f"slices_{word_of(case)}",
+            _titled("Responses of point targets", case),
+            caption,
+            plot.panels(parts, columns=2),
+        )
 
 
 def _slice_panels(target: str, cuts: Mapping[str, Cut]) -> list[dict[str, Any]]:
@@ -200,5 +294,13 @@ def _slice_panels(target: str, cuts: Mapping[str, Cut]) -> list[dict[str, Any]]:
             cut = cuts[name]
             kept = cut.offset_m.abs() <= near
             series[name] = (plot.array(cut.offset_m[kept]), plot.decibel(cut.line[kept], top))
-        parts.append({"series": series, "xlabel": "cross range from the true place (m)", "ylabel": "dB", "title": target, "ylim": (-50.0, 3.0)})
+        parts.append(
+            {
+                "series": series,
+                "xlabel": "cross range from the true place (m)",
+                "ylabel": "dB",
+                "title": target,
+                "ylim": (-50.0, 3.0),
+            }
+        )
     return parts

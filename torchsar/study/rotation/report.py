@@ -38,15 +38,29 @@ _TRAP_NATS, _TRAP_PERCENT = 0.005, 1.0
 
 
 def entropy_traps(metrics: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Where an image of a wrong rotation has less entropy than the right one: a sentence for every such case."""
+    """Where an image of a wrong rotation has less entropy than the right one: a sentence for every
+    such case.
+    """
     methods, reference = metrics["methods"], metrics["definitions"]["reference"]
     notes = []
     for case in methods[reference]["cases"] if reference else ():
         rows = {name: method["cases"][case] for name, method in methods.items()}
-        trapped = [name for name, row in rows.items() if row.get("entropy_above_ideal_nats", 0.0) < -_TRAP_NATS and abs(row.get("k1_error_percent", 0.0)) > _TRAP_PERCENT]
+        trapped = [
+            name
+            for name, row in rows.items()
+            if row.get("entropy_above_ideal_nats", 0.0) < -_TRAP_NATS
+            and abs(row.get("k1_error_percent", 0.0)) > _TRAP_PERCENT
+        ]
         if trapped:
-            figures = ", ".join(f"{name} ({rows[name]['entropy_above_ideal_nats']:.3f} nats, k1 {rows[name]['k1_error_percent']:.2g} % off)" for name in trapped)
-            text = f"Wrong rotations give less entropy here than the right one, on the grid of its image: {figures}. A finer grid takes this away."
+            figures = ", ".join(
+                f"{name} ({rows[name]['entropy_above_ideal_nats']:.3f} nats, k1 "
+                f"{rows[name]['k1_error_percent']:.2g} % off)"
+                for name in trapped
+            )
+            text = (
+                "Wrong rotations give less entropy here than the right one, on the grid of its "
+                f"image: {figures}. A finer grid takes this away."
+            )
             notes.append({"title": f"Entropy trap, case {case}", "text": text})
     return notes
 
@@ -55,11 +69,36 @@ def _target_tables(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Tables of point targets: a row each, as those of the cases."""
     if not any(method["targets"] for method in metrics["methods"].values()):
         return []
-    return tables({"methods": {name: {"cases": method["targets"]} for name, method in metrics["methods"].items()}}, TARGETS, metrics["published"]["targets"])
+    return tables(
+        {"methods": {name: {"cases": method["targets"]} for name, method in metrics["methods"].items()}},
+        TARGETS,
+        metrics["published"]["targets"],
+    )
 
 
-def write_report(path: Path, title: str, metrics: Mapping[str, Any], pictures: Sequence[Picture], figures: Path, config_text: str, command: str) -> None:
+def write_report(
+    path: Path,
+    title: str,
+    metrics: Mapping[str, Any],
+    pictures: Sequence[Picture],
+    figures: Path,
+    config_text: str,
+    command: str,
+) -> None:
     """Write the report of one run; it asks for nothing from outside."""
     shown = [*_target_tables(metrics), *tables(metrics, SHOWN, metrics["published"])]
     # the page of triangular ladars: figures of the first case, and notes below them
-    write_case_report(path, "sal.html.j2", title, metrics, SHOWN, {}, pictures, figures, config_text, command, notes=entropy_traps(metrics), tables=shown)
+    write_case_report(
+        path,
+        "sal.html.j2",
+        title,
+        metrics,
+        SHOWN,
+        {},
+        pictures,
+        figures,
+        config_text,
+        command,
+        notes=entropy_traps(metrics),
+        tables=shown,
+    )

@@ -1,4 +1,6 @@
-"""`torchsar requires` for targets that turn unevenly: limits of their estimators, and what the scene requires of its model."""
+"""`torchsar requires` for targets that turn unevenly: limits of their estimators, and what the
+scene requires of its model.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,10 @@ _OF_ESTIMATORS = {"scatterers above the noise": "warp_k", "range term, pi lambda
 
 
 def requires(loaded: Loaded, out: Path | None) -> str:
-    """Both tables of every case of a simulation as text, predicted from the config alone. With `out`: config.yaml, requires.json and requires.txt there."""
+    """Both tables of every case of a simulation as text, predicted from the config alone.
+
+    With `out`: config.yaml, requires.json and requires.txt there.
+    """
     refuse_recordings(loaded)
     check(loaded)
     return write_needs(loaded, out, Needs.of)
@@ -54,7 +59,12 @@ def _estimated(loaded: Loaded, name: str) -> set[str]:
     """Values that the stages of a method estimate."""
     radar, found = Turntable.of(loaded).radar, set()
     for stage, entry in (loaded.config.processor[name].stages or {}).items():
-        made = stages().make({key: value for key, value in entry.items() if key != "uses"}, f"processor.{name}.stages.{stage}", loaded.file, radar=radar)
+        made = stages().make(
+            {key: value for key, value in entry.items() if key != "uses"},
+            f"processor.{name}.stages.{stage}",
+            loaded.file,
+            radar=radar,
+        )
         found |= set(getattr(made, "provides", ()))
     return found
 
@@ -68,24 +78,38 @@ class Needs:
 
     @staticmethod
     def of(loaded: Loaded) -> Needs:
-        """Predicted from the first trial of a run. Raises ConfigError for what the world refuses."""
+        """Predicted from the first trial of a run. Raises ConfigError for what the world
+        refuses.
+        """
         try:
             return _needs(Turntable.of(loaded), loaded.config.seed)
         except ValueError as error:
             raise ConfigError(f"{loaded.file}: {' '.join(str(error).split())}") from None
 
     def tree(self) -> dict[str, object]:
-        return {"limits": limit_rows(self.limits), "order": least_order(self.rows), "fidelity": self.fidelity, "requirements": requirement_rows(self.rows)}
+        return {
+            "limits": limit_rows(self.limits),
+            "order": least_order(self.rows),
+            "fidelity": self.fidelity,
+            "requirements": requirement_rows(self.rows),
+        }
 
     def text(self, name: str) -> str:
         order = least_order(self.rows)
-        simplest = f"the simplest model that this scene allows: order {order}{'' if order <= 4 else ' or more'}, {self.fidelity}"
+        simplest = (
+            "the simplest model that this scene allows: order "
+            f"{order}{'' if order <= 4 else ' or more'}, {self.fidelity}"
+        )
         return "\n".join([name, *limit_lines(self.limits), "", *requirement_lines(self.rows), simplest])
 
     @property
     def fidelity(self) -> str:
         """The simplest echo model that the scene allows."""
-        return "phase_only" if next(row for row in self.rows if row.effect.startswith("fixed envelopes")).ok else "dechirped"
+        return (
+            "phase_only"
+            if next(row for row in self.rows if row.effect.startswith("fixed envelopes")).ok
+            else "dechirped"
+        )
 
 
 def _needs(table: Turntable, seed: int) -> Needs:
@@ -102,11 +126,31 @@ def _needs(table: Turntable, seed: int) -> Needs:
 def _noise_std(table: Turntable, amplitude: Tensor) -> float:
     """Of the noise of a sample, from the mean power of scatterers spread over the range cells."""
     snr_db = table.world.snr_db
-    return 0.0 if snr_db is None else math.sqrt(float(amplitude.abs().square().sum()) / table.samples) * 10 ** (-float(snr_db) / 20)
+    return (
+        0.0
+        if snr_db is None
+        else math.sqrt(float(amplitude.abs().square().sum()) / table.samples) * 10 ** (-float(snr_db) / 20)
+    )
 
 
 def _rate_bound(table: Turntable, x: Tensor, y: Tensor, amplitude: Tensor, noise_std: float) -> float:
     """The centre known: with a free one it is larger where the ranges are few."""
     k = torch.tensor(true_k(table), dtype=torch.float64)
-    told = {"wavelength_m": table.radar.wavelength_m, "prf_hz": table.radar.prf_hz, "n_pulse": table.pulses, "free_centre": False}
-    return float(rotation_bounds(x, y, amplitude, noise_std, float(table.rotation.omega_rad_s), k, float(table.world.centre_deviation_m), **told)["omega_rad_s"])
+    told = {
+        "wavelength_m": table.radar.wavelength_m,
+        "prf_hz": table.radar.prf_hz,
+        "n_pulse": table.pulses,
+        "free_centre": False,
+    }
+    return float(
+        rotation_bounds(
+            x,
+            y,
+            amplitude,
+            noise_std,
+            float(table.rotation.omega_rad_s),
+            k,
+            float(table.world.centre_deviation_m),
+            **told,
+        )["omega_rad_s"]
+    )

@@ -12,7 +12,10 @@ from torchsar.study.isal import sections
 
 
 class Radar(sections.Radar):
-    """What the instrument knows about itself; see torchsar.radar.InverseRadar. One of wavelength_m and carrier_hz."""
+    """What the instrument knows about itself; see torchsar.radar.InverseRadar.
+
+    One of wavelength_m and carrier_hz.
+    """
 
     wavelength_m: float | None = Field(default=None, gt=0)
     carrier_hz: float | None = Field(default=None, gt=0)
@@ -25,17 +28,24 @@ class Radar(sections.Radar):
 
 
 class Rotation(Strict):
-    """theta(t) = omega_rad_s (t + k1 t^2 / 2! + k2 t^3 / 3! + ...), t = 0 at the first pulse; k = [k1, k2, ...], true derivatives of the rate over the rate."""
+    """theta(t) = omega_rad_s (t + k1 t^2 / 2! + k2 t^3 / 3!
+
+    + ...), t = 0 at the first pulse; k = [k1, k2, ...], true derivatives of the rate over the rate.
+    """
 
     omega_rad_s: float = Field(gt=0)
     k: list[float] = []
 
 
 class World(sections.World):
-    """What is true and no processor may see. rotation: of the target; centre_deviation_m: yc, how much farther from the rotation centre scatterers are than the range axis says.
+    """What is true and no processor may see.
 
-    scene_seed: None for scenes that follow `seed` and differ from trial to trial; a number for ONE scene, that of this seed, in all trials, which then differ in noise alone.
-    An even rotation is one without k; the rotation_rad_s of other turning targets stays null.
+    rotation: of the target; centre_deviation_m: yc, how much farther from the rotation centre
+    scatterers are than the range axis says.
+
+    scene_seed: None for scenes that follow `seed` and differ from trial to trial; a number for ONE
+    scene, that of this seed, in all trials, which then differ in noise alone. An even rotation is
+    one without k; the rotation_rad_s of other turning targets stays null.
     """
 
     rotation: Rotation
@@ -47,8 +57,9 @@ class World(sections.World):
 class Metrics(Strict):
     """How results are judged. reference: the method whose image of the same scene is the ideal one.
 
-    search_m: how far along cross range from its place the response of a point target is looked for. published: metric -> case -> method -> figure of the source;
-    published_targets: metric -> target -> method -> the same of point targets.
+    search_m: how far along cross range from its place the response of a point target is looked for.
+    published: metric -> case -> method -> figure of the source; published_targets: metric -> target
+    -> method -> the same of point targets.
     """
 
     reference: str | None = None
@@ -60,8 +71,9 @@ class Metrics(Strict):
 class Trade(Strict):
     """What `torchsar trade` compares, over so many trials, repeated.
 
-    orders: of the warp. taps, kernel_oversamplings: of the gridding. scatterers, rounds: what the recommended estimator may spend; population, generations: of the genetic search.
-    lines: of the images on which the gridding is judged, None for twice the pulses.
+    orders: of the warp. taps, kernel_oversamplings: of the gridding. scatterers, rounds: what the
+    recommended estimator may spend; population, generations: of the genetic search. lines: of the
+    images on which the gridding is judged, None for twice the pulses.
     """
 
     orders: list[Annotated[int, Field(ge=1)]] = Field(default=[1, 2, 3, 4], min_length=1)
@@ -79,7 +91,9 @@ class Trade(Strict):
 
 
 class RotationConfig(LimitedConfig):
-    """An experiment with a target that turns unevenly; beyond_limits: methods that it shows beyond their limits on purpose, of which it only warns."""
+    """An experiment with a target that turns unevenly; beyond_limits: methods that it shows beyond
+    their limits on purpose, of which it only warns.
+    """
 
     system: Literal["isal_rotation"] = "isal_rotation"
     radar: Radar | None = None

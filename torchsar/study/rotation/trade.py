@@ -1,4 +1,6 @@
-"""`torchsar trade` for targets that turn unevenly: time against accuracy of model orders, gridding, estimators and precisions."""
+"""`torchsar trade` for targets that turn unevenly: time against accuracy of model orders, gridding,
+estimators and precisions.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,14 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.compensate.rotation import ImageEntropy, coarse_rotation, descend_rotation, genetic_rotation, phase_fit_rotation, uneven_rotation
+from torchsar.compensate.rotation import (
+    ImageEntropy,
+    coarse_rotation,
+    descend_rotation,
+    genetic_rotation,
+    phase_fit_rotation,
+    uneven_rotation,
+)
 from torchsar.core import Draws, Estimate, Truth
 from torchsar.core.warp import k_of_shape, shape_of
 from torchsar.focus.matched_fourier import matched_fourier, range_phase
@@ -33,8 +42,11 @@ _EXPLICIT_SAMPLES = 3e8  # pulses * lines * range cells, up to which the sum its
 
 @dataclass(frozen=True)
 class Row:
-    """One alternative: median seconds a trial over the repeats and their spread; entropy (nats), and its difference from the yardstick's; difference of the image from the
-    yardstick's (dB); rms errors over trials (%) of the rate, k1 and k2 (of a true k of 0 in 1/s and 1/s^2). None where it has none."""
+    """One alternative: median seconds a trial over the repeats and their spread; entropy (nats),
+    and its difference from the yardstick's; difference of the image from the yardstick's (dB); rms
+    errors over trials (%) of the rate, k1 and k2 (of a true k of 0 in 1/s and 1/s^2). None where it
+    has none.
+    """
 
     name: str
     seconds: float
@@ -48,9 +60,11 @@ class Row:
 
 
 def trade(loaded: Loaded, out: Path | None) -> str:
-    """Tables of orders of the warp, of the gridding knob, of estimators and of precisions on the first case of a config; returns them as text.
+    """Tables of orders of the warp, of the gridding knob, of estimators and of precisions on the
+    first case of a config; returns them as text.
 
-    Orders and gridding form images with the true rotation; phase errors of pulses are left out of all of them. With `out`: config.yaml, trade.json, trade.txt and figures/ in that folder.
+    Orders and gridding form images with the true rotation; phase errors of pulses are left out of
+    all of them. With `out`: config.yaml, trade.json, trade.txt and figures/ in that folder.
     """
     return traded(loaded, out, check, _tables, _TITLES, _COLUMNS, _figures)
 
@@ -58,12 +72,20 @@ def trade(loaded: Loaded, out: Path | None) -> str:
 @torch.no_grad()
 def _tables(loaded: Loaded) -> dict[str, list[Row]]:
     made = _Trials.of(loaded)
-    return {"order": list(made.orders()), "gridding": list(made.griddings()), "estimators": list(made.estimators()), "precision": list(made.precisions())}
+    return {
+        "order": list(made.orders()),
+        "gridding": list(made.griddings()),
+        "estimators": list(made.estimators()),
+        "precision": list(made.precisions()),
+    }
 
 
 @dataclass(frozen=True)
 class _Trials:
-    """Simulated trials in double precision, and what is to be compared on them. yc_m: what estimators are told, None where the recommended one of the config looks for it."""
+    """Simulated trials in double precision, and what is to be compared on them.
+
+    yc_m: what estimators are told, None where the recommended one of the config looks for it.
+    """
 
     table: Turntable
     settings: Trade
@@ -83,7 +105,9 @@ class _Trials:
             raise ValueError("trade compares range-compressed pulses; choose the fidelity phase_only")
         stages = (loaded.config.processor["recommended"].stages or {}).values()
         given = next((entry for entry in stages if str(entry["stage"]).startswith("rotation")), {})
-        return _Trials(table, settings, signal.data, signal.axis("range").values(), truth, given.get("yc_m"), table.dtype)
+        return _Trials(
+            table, settings, signal.data, signal.axis("range").values(), truth, given.get("yc_m"), table.dtype
+        )
 
     @property
     def prf_hz(self) -> float:
@@ -101,7 +125,9 @@ class _Trials:
     def _compensated(self, data: Tensor, k: Tensor) -> Tensor:
         """Data without the true range term, of the true warp or of its parts."""
         v = self.truth.values
-        return range_phase(data, self.range_m, self.table.radar.wavelength_m, self.prf_hz, v["omega_rad_s"], k, v["yc_m"])
+        return range_phase(
+            data, self.range_m, self.table.radar.wavelength_m, self.prf_hz, v["omega_rad_s"], k, v["yc_m"]
+        )
 
     def orders(self) -> Iterator[Row]:
         """Images by the true warp cut to each order, without and with the range term."""
@@ -114,19 +140,33 @@ class _Trials:
                     return matched_fourier(data if flat else self._compensated(data, k), k, self.prf_hz)
 
                 made, seconds = self._timed(image)
-                row = Row(f"order {order}, {'azimuth and range' if two_dimensional else 'azimuth only'}", entropy_nats=float(entropy(made).mean()), **seconds)
+                row = Row(
+                    f"order {order}, {'azimuth and range' if two_dimensional else 'azimuth only'}",
+                    entropy_nats=float(entropy(made).mean()),
+                    **seconds,
+                )
                 log.info("%s: %.3f nats", row.name, row.entropy_nats)
                 yield row
 
     def griddings(self) -> Iterator[Row]:
-        """The matched Fourier transform by kernels and precisions against the sum itself, or where that would take long against gridding to 1e-12."""
+        """The matched Fourier transform by kernels and precisions against the sum itself, or where
+        that would take long against gridding to 1e-12.
+        """
         k, lines = self.truth.values["warp_k"], self.settings.lines or 2 * self.table.pulses
         exact = self._compensated(self.data, k)
         grid = {"oversampling": lines / self.table.pulses} if self.settings.lines is None else {"lines": lines}
         explicit = self.data.numel() * lines <= _EXPLICIT_SAMPLES
-        choice: dict[str, Any] = {"method": "explicit"} if explicit else {"eps": _YARDSTICK_EPS, "kernel_oversampling": 2.0}
+        choice: dict[str, Any] = (
+            {"method": "explicit"} if explicit else {"eps": _YARDSTICK_EPS, "kernel_oversampling": 2.0}
+        )
         truth, seconds = self._timed(lambda: matched_fourier(exact, k, self.prf_hz, **grid, **choice))
-        yield Row("the sum itself" if explicit else "gridding to 1e-12", entropy_nats=float(entropy(truth).mean()), entropy_error_nats=0.0, image_error_db=-math.inf, **seconds)
+        yield Row(
+            "the sum itself" if explicit else "gridding to 1e-12",
+            entropy_nats=float(entropy(truth).mean()),
+            entropy_error_nats=0.0,
+            image_error_db=-math.inf,
+            **seconds,
+        )
         for precision in self.settings.precisions:
             data = exact.to(getattr(torch, precision))
             for finer in self.settings.kernel_oversamplings:
@@ -134,15 +174,26 @@ class _Trials:
                     work = partial(matched_fourier, data, k, self.prf_hz, taps=taps, kernel_oversampling=finer, **grid)
                     yield self._gridded(f"{taps} taps, grid x{finer:g}, {precision}", work, truth)
             for method in ("spline", "linear"):
-                yield self._gridded(f"{method} interpolation, {precision}", partial(matched_fourier, data, k, self.prf_hz, method=method, **grid), truth)
+                yield self._gridded(
+                    f"{method} interpolation, {precision}",
+                    partial(matched_fourier, data, k, self.prf_hz, method=method, **grid),
+                    truth,
+                )
 
     def _gridded(self, name: str, work: Callable[[], Tensor], truth: Tensor) -> Row:
         image, seconds = self._timed(work)
         off = entropy(image.to(torch.complex128)) - entropy(truth)
-        return Row(name, entropy_error_nats=float(off.abs().mean()), image_error_db=float(error_db(image.to(torch.complex128), truth).mean()), **seconds)
+        return Row(
+            name,
+            entropy_error_nats=float(off.abs().mean()),
+            image_error_db=float(error_db(image.to(torch.complex128), truth).mean()),
+            **seconds,
+        )
 
     def estimators(self) -> Iterator[Row]:
-        """Every estimator without a start, and searches: descent from the truth times 0.95, and a short genetic one in a box about the truth."""
+        """Every estimator without a start, and searches: descent from the truth times 0.95, and a
+        short genetic one in a box about the truth.
+        """
         data = self.data.to(self.dtype)
         for name, work in self._alternatives(data).items():
             estimate, seconds = self._timed(work)
@@ -150,20 +201,36 @@ class _Trials:
 
     def _alternatives(self, data: Tensor) -> Mapping[str, Callable[[], Estimate]]:
         settings, told = self.settings, {**self._told, "yc_m": self.yc_m, "order": max(2, len(true_k(self.table)) + 1)}
-        found: dict[str, Callable[[], Estimate]] = {"coarse": partial(coarse_rotation, data, **told), "phase fit": partial(phase_fit_rotation, data, **told)}
+        found: dict[str, Callable[[], Estimate]] = {
+            "coarse": partial(coarse_rotation, data, **told),
+            "phase fit": partial(phase_fit_rotation, data, **told),
+        }
         for count in settings.scatterers:
             found[f"recommended, {count} scatterers"] = partial(uneven_rotation, data, **told, scatterers=count)
         for rounds in settings.rounds:
-            found[f"recommended, {rounds} round{'s' if rounds > 1 else ''}"] = partial(uneven_rotation, data, **told, rounds=rounds)
+            found[f"recommended, {rounds} round{'s' if rounds > 1 else ''}"] = partial(
+                uneven_rotation, data, **told, rounds=rounds
+            )
         found["recommended"] = partial(uneven_rotation, data, **told)
         known = 0.0 if self.yc_m is None else self.yc_m
-        raw, shape = (ImageEntropy(data, **{**told, "yc_m": known}, variables=variables) for variables in ("raw", "shape"))
+        raw, shape = (
+            ImageEntropy(data, **{**told, "yc_m": known}, variables=variables) for variables in ("raw", "shape")
+        )
         v = self.truth.values
-        found["descent from 0.95 of the truth"] = lambda: descend_rotation(shape, shape.start(0.95 * v["omega_rad_s"], 0.95 * v["warp_k"], None))
+        found["descent from 0.95 of the truth"] = lambda: descend_rotation(
+            shape, shape.start(0.95 * v["omega_rad_s"], 0.95 * v["warp_k"], None)
+        )
         centre = torch.cat([v["omega_rad_s"][..., None], v["warp_k"]], -1)
         box = settings.box * torch.where(centre != 0, centre.abs(), 1)
         name = f"genetic {settings.population} x {settings.generations}, +-{100 * settings.box:g} %"
-        found[name] = lambda: genetic_rotation(raw, centre - box, centre + box, draws=Draws(1), population=settings.population, generations=settings.generations)
+        found[name] = lambda: genetic_rotation(
+            raw,
+            centre - box,
+            centre + box,
+            draws=Draws(1),
+            population=settings.population,
+            generations=settings.generations,
+        )
         return found
 
     def _errors(self, name: str, estimate: Estimate, seconds: Mapping[str, float]) -> Row:
@@ -174,7 +241,9 @@ class _Trials:
         for i, k in enumerate(estimate["warp_k"].unbind(-1)[:2]):
             of = true[i] if i < len(true) else 0.0
             errors[f"k{i + 1}_error_percent"] = _rms((k - of) * (100 / abs(of) if of else 1.0))
-        log.info("%s: %.2f s a trial, %s", name, seconds["seconds"], ", ".join(f"{value:.3g}" for value in errors.values()))
+        log.info(
+            "%s: %.2f s a trial, %s", name, seconds["seconds"], ", ".join(f"{value:.3g}" for value in errors.values())
+        )
         return Row(name, **errors, **seconds)
 
     def precisions(self) -> Iterator[Row]:
@@ -190,8 +259,16 @@ def _rms(x: Tensor) -> float:
 
 
 def _cut(k: Tensor, order: int, duration_s: float) -> Tensor:
-    """The warp of this order that lies nearest, in least squares over the aperture: its first Legendre terms, or itself where it has no more."""
-    return k if order > k.shape[-1] else k_of_shape(shape_of(k, duration_s)[..., : order - 1], duration_s) if order > 1 else k[..., :0]
+    """The warp of this order that lies nearest, in least squares over the aperture: its first
+    Legendre terms, or itself where it has no more.
+    """
+    return (
+        k
+        if order > k.shape[-1]
+        else k_of_shape(shape_of(k, duration_s)[..., : order - 1], duration_s)
+        if order > 1
+        else k[..., :0]
+    )
 
 
 _TITLES = {
@@ -211,7 +288,10 @@ _COLUMNS = {
 
 
 def _figures(tables: Tables) -> dict[str, plot.Figure]:
-    shown = {"order": ("entropy_nats", "entropy (nats)", False), "gridding": ("image_error_db", "image error (dB)", False)}
+    shown = {
+        "order": ("entropy_nats", "entropy (nats)", False),
+        "gridding": ("image_error_db", "image error (dB)", False),
+    }
     shown |= dict.fromkeys(("estimators", "precision"), ("k1_error_percent", "error of k1 (dB over 1 %)", True))
     return {key: _figure(tables[key], *shown[key], key) for key in tables}
 

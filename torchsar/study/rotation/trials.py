@@ -1,4 +1,6 @@
-"""One batch of trials of an unevenly turning target: simulate, run every method, compare with the truth."""
+"""One batch of trials of an unevenly turning target: simulate, run every method, compare with the
+truth.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,16 @@ from torchsar.study.errors import ConfigError
 from torchsar.study.methods import build_chains
 from torchsar.study.montecarlo.work import BOUNDS, SAVED
 from torchsar.study.rotation.build import Turntable, named_targets
-from torchsar.study.rotation.judge import Cut, Turned, cut_through, image_metrics, in_metres, k_metric, rotation_metrics, told_metrics
+from torchsar.study.rotation.judge import (
+    Cut,
+    Turned,
+    cut_through,
+    image_metrics,
+    in_metres,
+    k_metric,
+    rotation_metrics,
+    told_metrics,
+)
 from torchsar.study.tracing import IMAGE, image_of, not_an_image, saved_of, traced
 
 ENDING = "matched_fourier"
@@ -45,7 +56,11 @@ class Bench:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one method gave in a batch. metrics: (trial,) each; found: the rotation it estimated; cuts: of each point target, of each trial."""
+    """What one method gave in a batch.
+
+    metrics: (trial,) each; found: the rotation it estimated; cuts: of each point target, of each
+    trial.
+    """
 
     metrics: dict[str, Tensor]
     found: Turned
@@ -66,9 +81,11 @@ class Batch:
 
 
 class RotationTrials(Benches[Bench]):
-    """`trial(parameters, draws)` of a config: {method: {metric: (rows,)}}, Cramer-Rao bounds of the errors, and images of the trials to keep.
+    """`trial(parameters, draws)` of a config: {method: {metric: (rows,)}}, Cramer-Rao bounds of the
+    errors, and images of the trials to keep.
 
-    Metrics of a method are those of `torchsar.study.rotation.judge.DEFINITIONS`; of the image only where the chain makes one.
+    Metrics of a method are those of `torchsar.study.rotation.judge.DEFINITIONS`; of the image only
+    where the chain makes one.
     """
 
     batched = (_SNR,)
@@ -85,7 +102,9 @@ class RotationTrials(Benches[Bench]):
         return Bench(loaded.config, table, chains)
 
     def bytes_per_trial(self, fixed: Mapping[str, Any]) -> int:
-        """Of the largest tensors that a trial needs, from the axes: data, image of twice the lines, and what an estimator makes of them."""
+        """Of the largest tensors that a trial needs, from the axes: data, image of twice the lines,
+        and what an estimator makes of them.
+        """
         table = self.bench(fixed).table
         return _PEAK_BYTES * table.pulses * table.samples * table.dtype.itemsize
 
@@ -93,15 +112,23 @@ class RotationTrials(Benches[Bench]):
     def __call__(self, parameters: Mapping[str, Any], draws: Draws) -> dict[str, Any]:
         bench = self.bench({k: v for k, v in parameters.items() if k != _SNR})
         if _SNR in parameters:
-            bench = replace(bench, table=replace(bench.table, world=replace(bench.table.world, snr_db=parameters[_SNR])))
+            bench = replace(
+                bench, table=replace(bench.table, world=replace(bench.table.world, snr_db=parameters[_SNR]))
+            )
         batch = run_batch(bench, draws, self.device)
         save = bench.config.sweep.save
         traces = {name: outcome.trace for name, outcome in batch.outcomes.items()}
-        return {**batch.metrics, BOUNDS: error_bounds(bench.table, batch.truth, _any_centre(bench)), SAVED: saved_of(traces, save.taps) if save.trials else {}}
+        return {
+            **batch.metrics,
+            BOUNDS: error_bounds(bench.table, batch.truth, _any_centre(bench)),
+            SAVED: saved_of(traces, save.taps) if save.trials else {},
+        }
 
 
 def run_batch(bench: Bench, draws: Draws, device: str = "cpu", cuts: bool = False) -> Batch:
-    """Simulate the trials of the draws, and run and judge every method; cuts: through point targets as well."""
+    """Simulate the trials of the draws, and run and judge every method; cuts: through point targets
+    as well.
+    """
     recording, truth = bench.table.recorded(draws, device)
     assert truth.clean is not None
     outcomes: dict[str, Outcome] = {}
@@ -133,7 +160,9 @@ def _compare(bench: Bench, outcomes: Mapping[str, Outcome]) -> None:
     ideal = outcomes[reference].metrics.get("entropy_nats")
     for name, outcome in outcomes.items():
         if ideal is None and outcome.trace.signal.names == IMAGE:
-            raise ConfigError(f"metrics.reference names {reference!r}, {not_an_image(outcomes[reference].trace.signal, ENDING)}")
+            raise ConfigError(
+                f"metrics.reference names {reference!r}, {not_an_image(outcomes[reference].trace.signal, ENDING)}"
+            )
         if ideal is not None and name != reference and "entropy_nats" in outcome.metrics:
             outcome.metrics["entropy_above_ideal_nats"] = outcome.metrics["entropy_nats"] - ideal
 
@@ -144,7 +173,9 @@ def true_k(table: Turntable) -> tuple[float, ...]:
 
 
 def scale_rate(found: Turned, table: Turntable, truth: Truth, trial: int) -> float:
-    """Mean rate (rad/s) by which the image of a trial is drawn in metres: the method's own, the radar's, else the true one."""
+    """Mean rate (rad/s) by which the image of a trial is drawn in metres: the method's own, the
+    radar's, else the true one.
+    """
     own = found.rate(table.duration_s)
     own = float(own.reshape(-1)[trial]) if own is not None else float("nan")
     told = table.radar.rotation_rad_s or float(truth.values["rotation_rad_s"].reshape(-1)[trial])
@@ -156,25 +187,43 @@ def _cuts(bench: Bench, name: str, image: Signal, found: Turned, truth: Truth) -
     lines = [stage.oversampling for stage in bench.chains[name].stages.values() if isinstance(stage, MatchedFourier)]
     turns = 0.5 / lines[-1] if lines else 0.0
     rows = range(max(1, image.trials.numel()))
-    images = [in_metres(image_of(image, i), bench.table.radar.wavelength_m, scale_rate(found, bench.table, truth, i)) for i in rows]
+    images = [
+        in_metres(image_of(image, i), bench.table.radar.wavelength_m, scale_rate(found, bench.table, truth, i))
+        for i in rows
+    ]
 
     def one(target: int, row: int) -> Cut:
-        x, y = (truth.values[key].expand(*image.trials, -1).reshape(-1, truth.values[key].shape[-1])[row, target] for key in ("cross_range_m", "range_m"))
+        x, y = (
+            truth.values[key].expand(*image.trials, -1).reshape(-1, truth.values[key].shape[-1])[row, target]
+            for key in ("cross_range_m", "range_m")
+        )
         return cut_through(images[row], float(x), float(y), bench.config.metrics.search_m, turns)
 
     return {target: [one(i, row) for row in rows] for target, i in bench.targets.items()}
 
 
 def target_figures(batch: Batch, reference: str | None) -> dict[str, dict[str, dict[str, Tensor]]]:
-    """By method and target: peak_db against the reference (else against 1), irw_azimuth_m and pslr_azimuth_db, (trial,) each."""
-    rows = {name: {target: [cut.figures for cut in cuts] for target, cuts in outcome.cuts.items()} for name, outcome in batch.outcomes.items()}
+    """By method and target: peak_db against the reference (else against 1), irw_azimuth_m and
+    pslr_azimuth_db, (trial,) each.
+    """
+    rows = {
+        name: {target: [cut.figures for cut in cuts] for target, cuts in outcome.cuts.items()}
+        for name, outcome in batch.outcomes.items()
+    }
     out: dict[str, dict[str, dict[str, Tensor]]] = {}
     for name, targets in rows.items():
         out[name] = {}
         for target, figures in targets.items():
-            level = _column(rows[reference][target], "peak") if reference is not None and target in rows[reference] else torch.ones((), dtype=torch.float64)
+            level = (
+                _column(rows[reference][target], "peak")
+                if reference is not None and target in rows[reference]
+                else torch.ones((), dtype=torch.float64)
+            )
             peak_db = 20 * torch.log10((_column(figures, "peak") / level).clamp_min(1e-15))
-            out[name][target] = {"peak_db": peak_db, **{key: _column(figures, key) for key in ("irw_azimuth_m", "pslr_azimuth_db")}}
+            out[name][target] = {
+                "peak_db": peak_db,
+                **{key: _column(figures, key) for key in ("irw_azimuth_m", "pslr_azimuth_db")},
+            }
     return out
 
 
@@ -184,7 +233,11 @@ def _column(figures: list[dict[str, float]], key: str) -> Tensor:
 
 def _any_centre(bench: Bench) -> bool:
     """Whether any estimator of the config looks for the range centre deviation."""
-    return any(getattr(stage, "yc_m", 0.0) is None and "yc_m" in getattr(stage, "provides", ()) for chain in bench.chains.values() for stage in chain.stages.values())
+    return any(
+        getattr(stage, "yc_m", 0.0) is None and "yc_m" in getattr(stage, "provides", ())
+        for chain in bench.chains.values()
+        for stage in chain.stages.values()
+    )
 
 
 def error_bounds(table: Turntable, truth: Truth, free_centre: bool) -> dict[str, dict[str, Tensor]]:

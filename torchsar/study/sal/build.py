@@ -19,7 +19,15 @@ from torchsar.study.catalogue import Catalogue
 from torchsar.study.config import Loaded
 from torchsar.study.errors import ConfigError, did_you_mean
 from torchsar.study.methods import build_chains
-from torchsar.study.registry import CALIBRATIONS, LOG_AMPLITUDES, RADIAL_MOTIONS, SCENES, SWEEP_ERRORS, SWEEP_FIDELITIES, group_of
+from torchsar.study.registry import (
+    CALIBRATIONS,
+    LOG_AMPLITUDES,
+    RADIAL_MOTIONS,
+    SCENES,
+    SWEEP_ERRORS,
+    SWEEP_FIDELITIES,
+    group_of,
+)
 from torchsar.study.sal.sections import LADAR_DAMAGES, Record
 
 log = logging.getLogger("torchsar")
@@ -39,7 +47,10 @@ def build_world(loaded: Loaded) -> LadarWorld:
     """The world of a simulation."""
     world, file = loaded.config.world, loaded.file
     if abs(world.noise.snr_db or 0.0) > 300:
-        raise ConfigError(f"{file}: world.noise.snr_db is {world.noise.snr_db:g}, beyond what numbers hold; give -300 to 300 dB, or null for no noise")
+        raise ConfigError(
+            f"{file}: world.noise.snr_db is {world.noise.snr_db:g}, beyond what numbers hold; "
+            "give -300 to 300 dB, or null for no noise"
+        )
     scenes = {name: SCENES.make(entry, f"world.scene.{name}", file) for name, entry in world.scene.items()}
     motion = [RADIAL_MOTIONS.make(entry, f"world.motion.{name}", file) for name, entry in world.motion.items()]
     try:
@@ -65,7 +76,10 @@ def _made(catalogue: Catalogue, entry: dict[str, Any] | None, key: str, file: st
 
 @dataclass(frozen=True)
 class Ladar:
-    """An instrument and the world that it looks at, ready to record. record: how, None for separated sweeps."""
+    """An instrument and the world that it looks at, ready to record.
+
+    record: how, None for separated sweeps.
+    """
 
     radar: TriangularLadar
     world: LadarWorld
@@ -86,11 +100,24 @@ class Ladar:
         if self.record is None:
             return simulate_ladar(self.radar, self.world, self.periods, draws, self.damages, self.dtype, device)
         how = self.record
-        return simulate_ladar_record(self.radar, self.world, self.periods, draws, how.block_s, how.trigger_s, how.told, self.damages, self.dtype, device)
+        return simulate_ladar_record(
+            self.radar,
+            self.world,
+            self.periods,
+            draws,
+            how.block_s,
+            how.trigger_s,
+            how.told,
+            self.damages,
+            self.dtype,
+            device,
+        )
 
 
 def named_targets(world: LadarWorld) -> dict[str, int]:
-    """Names `part.number` of targets whose response is worth measuring, points and retro-reflectors, and their places among all scatterers."""
+    """Names `part.number` of targets whose response is worth measuring, points and
+    retro-reflectors, and their places among all scatterers.
+    """
     assert isinstance(world.scene, Together)
     names: dict[str, int] = {}
     first = 0
@@ -105,7 +132,10 @@ def check_target(loaded: Loaded, world: LadarWorld) -> None:
     """The target that metrics.target names is there. Raises ConfigError."""
     target, names = loaded.config.metrics.target, named_targets(world)
     if target is not None and target not in names:
-        raise ConfigError(f"{loaded.file}: metrics.target names {target!r}, which is no point target of the scene{did_you_mean(target, names)}")
+        raise ConfigError(
+            f"{loaded.file}: metrics.target names {target!r}, which is no point target of the "
+            f"scene{did_you_mean(target, names)}"
+        )
 
 
 def check(loaded: Loaded) -> None:
@@ -117,16 +147,25 @@ def check(loaded: Loaded) -> None:
         build_chains(case, radar=ladar.radar)
         check_deramped(case)
         if ladar.record is None and ladar.radar.detection == "real":
-            log.warning("warning: %s: radar.detection is 'real', but separated sweeps are complex; give world.record for what a real detector records", case.file)
+            log.warning(
+                "warning: %s: radar.detection is 'real', but separated sweeps are complex; give "
+                "world.record for what a real detector records",
+                case.file,
+            )
 
 
 def check_deramped(loaded: Loaded) -> None:
-    """Stages of deramped profiles, whose axes are those of others, follow one `deramp_azimuth`, or a stage from outside. Raises ConfigError."""
+    """Stages of deramped profiles, whose axes are those of others, follow one `deramp_azimuth`, or
+    a stage from outside. Raises ConfigError.
+    """
     for name, method in loaded.config.processor.items():
         before: list[str] = []
         for key, entry in (method.stages or {}).items():
             stage, times = entry["stage"], before.count("deramp_azimuth")
             foreign = any(group_of(other) == "own" for other in before)
             if stage in _OF_DERAMPED and times != 1 and not foreign:
-                raise ConfigError(f"{loaded.file}: processor.{name}.stages.{key}: {stage} works on profiles deramped once, here {times} times; put one deramp_azimuth between compress_sweeps and it")
+                raise ConfigError(
+                    f"{loaded.file}: processor.{name}.stages.{key}: {stage} works on profiles deramped "
+                    f"once, here {times} times; put one deramp_azimuth between compress_sweeps and it"
+                )
             before.append(stage)

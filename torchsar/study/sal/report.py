@@ -35,14 +35,44 @@ def entropy_traps(metrics: Mapping[str, Any]) -> list[dict[str, str]]:
     notes = []
     for case, ideal in (methods[reference]["cases"] if reference else {}).items():
         rows = {name: method["cases"][case] for name, method in methods.items() if name != reference}
-        trapped = [name for name, row in rows.items() if row["entropy_nats"] < ideal["entropy_nats"] - 0.02 and row["residual_phase_rms_rad"] > _TRAPPED_RAD]
+        trapped = [
+            name
+            for name, row in rows.items()
+            if row["entropy_nats"] < ideal["entropy_nats"] - 0.02 and row["residual_phase_rms_rad"] > _TRAPPED_RAD
+        ]
         if trapped:
-            figures = ", ".join(f"{name} {rows[name]['entropy_nats']:.2f} nats with {rows[name]['residual_phase_rms_rad']:.3g} rad left" for name in trapped)
-            text = f"Wrong images have less entropy here than the right one ({ideal['entropy_nats']:.2f} nats): {figures}. Judge by what is left of the motion, by entropy second."
+            figures = ", ".join(
+                f"{name} {rows[name]['entropy_nats']:.2f} nats with {rows[name]['residual_phase_rms_rad']:.3g} rad left"
+                for name in trapped
+            )
+            text = (
+                f"Wrong images have less entropy here than the right one ({ideal['entropy_nats']:.2f} "
+                f"nats): {figures}. Judge by what is left of the motion, by entropy second."
+            )
             notes.append({"title": f"Entropy trap, case {case}", "text": text})
     return notes
 
 
-def write_report(path: Path, title: str, metrics: Mapping[str, Any], pictures: Sequence[Picture], figures: Path, config_text: str, command: str) -> None:
+def write_report(
+    path: Path,
+    title: str,
+    metrics: Mapping[str, Any],
+    pictures: Sequence[Picture],
+    figures: Path,
+    config_text: str,
+    command: str,
+) -> None:
     """Write the report of one run; it asks for nothing from outside."""
-    write_case_report(path, "sal.html.j2", title, metrics, SHOWN, metrics["published"], pictures, figures, config_text, command, notes=entropy_traps(metrics))
+    write_case_report(
+        path,
+        "sal.html.j2",
+        title,
+        metrics,
+        SHOWN,
+        metrics["published"],
+        pictures,
+        figures,
+        config_text,
+        command,
+        notes=entropy_traps(metrics),
+    )

@@ -9,13 +9,26 @@ from pydantic import Field, model_validator
 from torchsar.study.cases import LimitedConfig
 from torchsar.study.catalogue import Catalogue, Strict
 from torchsar.study.config import Noise
-from torchsar.study.registry import CALIBRATIONS, DAMAGES, LOG_AMPLITUDES, RADIAL_MOTIONS, SCENES, SWEEP_ERRORS, SWEEP_FIDELITIES
+from torchsar.study.registry import (
+    CALIBRATIONS,
+    DAMAGES,
+    LOG_AMPLITUDES,
+    RADIAL_MOTIONS,
+    SCENES,
+    SWEEP_ERRORS,
+    SWEEP_FIDELITIES,
+)
 
-LADAR_DAMAGES = Catalogue("damage of a ladar recording", "kind", {name: DAMAGES.entries[name] for name in ("quantiser",)})
+LADAR_DAMAGES = Catalogue(
+    "damage of a ladar recording", "kind", {name: DAMAGES.entries[name] for name in ("quantiser",)}
+)
 
 
 class Radar(Strict):
-    """What the instrument knows about itself; see torchsar.radar.TriangularLadar. One of wavelength_m and carrier_hz."""
+    """What the instrument knows about itself; see torchsar.radar.TriangularLadar.
+
+    One of wavelength_m and carrier_hz.
+    """
 
     wavelength_m: float | None = Field(default=None, gt=0)
     carrier_hz: float | None = Field(default=None, gt=0)
@@ -39,7 +52,9 @@ class Radar(Strict):
 
 
 class Record(Strict):
-    """A continuous record instead of separated sweeps. trigger_s: where in a block an up sweep starts; told: whether the recording says it.
+    """A continuous record instead of separated sweeps.
+
+    trigger_s: where in a block an up sweep starts; told: whether the recording says it.
 
     block_s: length of a block; by default one period where every period is kept, else two.
     """
@@ -50,12 +65,21 @@ class Record(Strict):
 
 
 class World(Strict):
-    """What is true and no processor may see. scene, motion, fidelity, log_amplitude, sweep_error, calibration and damages name entries of catalogues.
+    """What is true and no processor may see.
 
-    record: None for sweeps that an ideal splitter hands over. trials: scenes and noise draws of each case of a run; a sweep has its own number.
+    scene, motion, fidelity, log_amplitude, sweep_error, calibration and damages name entries of
+    catalogues.
+
+    record: None for sweeps that an ideal splitter hands over. trials: scenes and noise draws of
+    each case of a run; a sweep has its own number.
     """
 
-    single: ClassVar[dict[str, Catalogue]] = {"fidelity": SWEEP_FIDELITIES, "log_amplitude": LOG_AMPLITUDES, "sweep_error": SWEEP_ERRORS, "calibration": CALIBRATIONS}
+    single: ClassVar[dict[str, Catalogue]] = {
+        "fidelity": SWEEP_FIDELITIES,
+        "log_amplitude": LOG_AMPLITUDES,
+        "sweep_error": SWEEP_ERRORS,
+        "calibration": CALIBRATIONS,
+    }
     named: ClassVar[dict[str, Catalogue]] = {"scene": SCENES, "motion": RADIAL_MOTIONS, "damages": LADAR_DAMAGES}
 
     periods: int = Field(gt=0)
@@ -73,9 +97,13 @@ class World(Strict):
 
 
 class Metrics(Strict):
-    """How results are judged. reference: the method whose image of the same scene is the ideal one; target: the point target whose response is shown.
+    """How results are judged.
 
-    search_m: how far from its predicted place a response is looked for. published: metric -> case -> method -> figure of the source.
+    reference: the method whose image of the same scene is the ideal one; target: the point target
+    whose response is shown.
+
+    search_m: how far from its predicted place a response is looked for. published: metric -> case
+    -> method -> figure of the source.
     """
 
     reference: str | None = None
@@ -86,7 +114,9 @@ class Metrics(Strict):
 
 
 class Trade(Strict):
-    """What `torchsar trade` compares beside the estimators of the processor and the fidelity ladder; over so many trials, repeated."""
+    """What `torchsar trade` compares beside the estimators of the processor and the fidelity
+    ladder; over so many trials, repeated.
+    """
 
     precisions: list[Literal["complex64", "complex128"]] = ["complex64", "complex128"]
     tapers: list[Annotated[float, Field(ge=0, le=1)]] = [0.0, 0.5, 1.0]
@@ -97,7 +127,9 @@ class Trade(Strict):
 
 
 class SalConfig(LimitedConfig):
-    """An experiment with a triangular-sweep ladar; beyond_limits: methods that it shows beyond their limits on purpose, of which it only warns."""
+    """An experiment with a triangular-sweep ladar; beyond_limits: methods that it shows beyond
+    their limits on purpose, of which it only warns.
+    """
 
     recording: ClassVar[str] = "ladar"
 

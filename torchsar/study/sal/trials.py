@@ -1,4 +1,6 @@
-"""One batch of trials of a triangular-sweep ladar: simulate, run every method, compare with the truth."""
+"""One batch of trials of a triangular-sweep ladar: simulate, run every method, compare with the
+truth.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,12 @@ from torch import Tensor
 
 from torchsar.compensate.radial import SpectrumCorrelation
 from torchsar.core import Chain, Draws, Recording, Signal, Trace, Truth
-from torchsar.metrics import range_per_sweep_bound_m, velocity_free_offset_bound_m_s, velocity_known_offset_bound_m_s, velocity_segmented_bound_m_s
+from torchsar.metrics import (
+    range_per_sweep_bound_m,
+    velocity_free_offset_bound_m_s,
+    velocity_known_offset_bound_m_s,
+    velocity_segmented_bound_m_s,
+)
 from torchsar.scene import Points, Together
 from torchsar.study.benches import Benches
 from torchsar.study.cases import check_judged, check_sweep, refuse_recordings
@@ -43,8 +50,11 @@ class Bench:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one method gave in a batch. metrics: (trial,) each; targets: the same of each point target; last: its last signal; profiles: the last
-    range profiles before the image, None where it makes none; kept: what the store keeps."""
+    """What one method gave in a batch.
+
+    metrics: (trial,) each; targets: the same of each point target; last: its last signal; profiles:
+    the last range profiles before the image, None where it makes none; kept: what the store keeps.
+    """
 
     metrics: dict[str, Tensor]
     targets: dict[str, dict[str, Tensor]]
@@ -71,9 +81,11 @@ class Batch:
 
 
 class SalTrials(Benches[Bench]):
-    """`trial(parameters, draws)` of a config: {method: {metric: (rows,)}}, bounds of scenes of one point, and arrays of the trials to keep.
+    """`trial(parameters, draws)` of a config: {method: {metric: (rows,)}}, bounds of scenes of one
+    point, and arrays of the trials to keep.
 
-    Metrics of a method are those of `torchsar.study.sal.judge.DEFINITIONS`; of the image and of responses only where the chain makes an image.
+    Metrics of a method are those of `torchsar.study.sal.judge.DEFINITIONS`; of the image and of
+    responses only where the chain makes an image.
     """
 
     batched = (_SNR,)
@@ -92,25 +104,47 @@ class SalTrials(Benches[Bench]):
         return Bench(loaded.config, ladar, chains, named_targets(ladar.world))
 
     def bytes_per_trial(self, fixed: Mapping[str, Any]) -> int:
-        """Of the largest tensor that a trial needs, from the axes: noise in double precision, or spectra that are upsampled over the whole band."""
+        """Of the largest tensor that a trial needs, from the axes: noise in double precision, or
+        spectra that are upsampled over the whole band.
+        """
         bench = self.bench(fixed)
         radar, record = bench.ladar.radar, bench.ladar.record
-        block = 2 * radar.sweep_samples if record is None else round((record.block_s or (1 if radar.keep_every == 1 else 2) * radar.period_s) * radar.sample_rate_hz)
-        finest = max((stage.upsampling / 2 for chain in bench.chains.values() for stage in chain.stages.values() if isinstance(stage, SpectrumCorrelation) and stage.window_m is None), default=0)
-        return int(max(_PEAK * block, finest * 2 * radar.sweep_samples) * bench.ladar.periods * torch.complex128.itemsize)
+        block = (
+            2 * radar.sweep_samples
+            if record is None
+            else round((record.block_s or (1 if radar.keep_every == 1 else 2) * radar.period_s) * radar.sample_rate_hz)
+        )
+        finest = max(
+            (
+                stage.upsampling / 2
+                for chain in bench.chains.values()
+                for stage in chain.stages.values()
+                if isinstance(stage, SpectrumCorrelation) and stage.window_m is None
+            ),
+            default=0,
+        )
+        return int(
+            max(_PEAK * block, finest * 2 * radar.sweep_samples) * bench.ladar.periods * torch.complex128.itemsize
+        )
 
     @torch.no_grad()
     def __call__(self, parameters: Mapping[str, Any], draws: Draws) -> dict[str, Any]:
         bench = self.bench({k: v for k, v in parameters.items() if k != _SNR})
         if _SNR in parameters:
-            bench = replace(bench, ladar=replace(bench.ladar, world=replace(bench.ladar.world, snr_db=parameters[_SNR])))
+            bench = replace(
+                bench, ladar=replace(bench.ladar, world=replace(bench.ladar.world, snr_db=parameters[_SNR]))
+            )
         batch = run_batch(bench, draws, self.device)
-        saved = {name: outcome.kept for name, outcome in batch.outcomes.items()} if bench.config.sweep.save.trials else {}
+        saved = (
+            {name: outcome.kept for name, outcome in batch.outcomes.items()} if bench.config.sweep.save.trials else {}
+        )
         return {**batch.metrics, BOUNDS: _bounds(bench, batch.truth), SAVED: saved}
 
 
 def run_batch(bench: Bench, draws: Draws, device: str = "cpu") -> Batch:
-    """Simulate the trials of the draws, and run and judge every method; traces are dropped one by one."""
+    """Simulate the trials of the draws, and run and judge every method; traces are dropped one by
+    one.
+    """
     recording, truth = bench.ladar.recorded(draws, device)
     assert truth.clean is not None
     outcomes = {name: _outcome(bench, name, recording, truth) for name in bench.chains}
@@ -149,7 +183,10 @@ def _outcome(bench: Bench, name: str, recording: Recording, truth: Truth) -> Out
 def _responses(bench: Bench, image: Signal, course: Course, truth: Truth) -> dict[str, dict[str, Tensor]]:
     """Figures of the point targets of the batch."""
     trials, settings = image.trials, bench.config.metrics
-    places = {target: tuple(truth.values[key][..., i].expand(trials) for key in ("azimuth_m", "range_m")) for target, i in bench.targets.items()}
+    places = {
+        target: tuple(truth.values[key][..., i].expand(trials) for key in ("azimuth_m", "range_m"))
+        for target, i in bench.targets.items()
+    }
     return target_metrics(image, places, course, bench.ladar.radar, settings.sidelobe_nulls, settings.search_m)  # pyright: ignore[reportArgumentType]
 
 
@@ -162,7 +199,11 @@ def _bounds(bench: Bench, truth: Truth) -> dict[str, dict[str, Tensor]]:
     """Of scenes of one point, whose energy every estimator can use."""
     world, radar, std = bench.ladar.world, bench.ladar.radar, truth.values["noise_std"]
     assert isinstance(world.scene, Together)
-    if truth.values["range_m"].shape[-1] != 1 or not all(isinstance(scene, Points) for scene in world.scene.parts.values()) or not bool((std > 0).all()):
+    if (
+        truth.values["range_m"].shape[-1] != 1
+        or not all(isinstance(scene, Points) for scene in world.scene.parts.values())
+        or not bool((std > 0).all())
+    ):
         return {}
     snr = truth.values["amplitude"][..., 0].abs().square() / std.square()
     of_sweep = (snr, radar.sweep_samples, radar.wavelength_m)

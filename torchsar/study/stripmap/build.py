@@ -32,7 +32,11 @@ def true_doppler_hz(loaded: Loaded) -> float | None:
     """Doppler of the beam centre, from world.doppler_hz or from the squint at the true velocity."""
     world = loaded.config.world
     assert world is not None
-    return world.doppler_hz if world.squint_deg is None else float(squint_doppler_hz(build_radar(loaded), world.squint_deg, world.velocity_m_s))
+    return (
+        world.doppler_hz
+        if world.squint_deg is None
+        else float(squint_doppler_hz(build_radar(loaded), world.squint_deg, world.velocity_m_s))
+    )
 
 
 def build_world(loaded: Loaded) -> StripmapWorld:
@@ -51,9 +55,13 @@ def build_world(loaded: Loaded) -> StripmapWorld:
 
 
 def squint_doppler_hz(radar: StripmapRadar, squint_deg: Tensor | float, velocity_m_s: Tensor | float | None) -> Tensor:
-    """Doppler of the beam centre at a squint, 2 v sin(squint) / lambda; the velocity is the true one, by default the nominal."""
+    """Doppler of the beam centre at a squint, 2 v sin(squint) / lambda; the velocity is the true
+    one, by default the nominal.
+    """
     velocity = radar.velocity_m_s if velocity_m_s is None else velocity_m_s
-    return 2 * velocity * torch.sin(torch.deg2rad(torch.as_tensor(squint_deg, dtype=torch.float64))) / radar.wavelength_m
+    return (
+        2 * velocity * torch.sin(torch.deg2rad(torch.as_tensor(squint_deg, dtype=torch.float64))) / radar.wavelength_m
+    )
 
 
 def point_targets(scenes: Mapping[str, Scene]) -> dict[str, int]:
@@ -74,11 +82,16 @@ def read_recording(loaded: Loaded) -> Recording:
     try:
         return read_stripmap(loaded.config.data.file, precision(loaded.config))
     except (ValueError, OSError) as error:
-        raise ConfigError(f"{loaded.file}: data.file: {' '.join(str(error).split()).removeprefix('data.file: ')}") from None
+        raise ConfigError(
+            f"{loaded.file}: data.file: {' '.join(str(error).split()).removeprefix('data.file: ')}"
+        ) from None
 
 
 def build_case(loaded: Loaded) -> Case:
-    """Simulate, or read and optionally damage a recording. Everything that the config says about it is checked first."""
+    """Simulate, or read and optionally damage a recording.
+
+    Everything that the config says about it is checked first.
+    """
     config = loaded.config
     draws = Draws(config.seed)
     if config.data.file is not None:
@@ -94,7 +107,9 @@ def build_case(loaded: Loaded) -> Case:
     refuse_oversize(config.world.lines, config.world.samples, loaded.file, "world.lines or world.samples")
     damages = build_damages(config.world.damages, "world.damages", loaded.file)
     try:
-        recording, truth = simulate(radar, world, config.world.lines, config.world.samples, draws, damages, precision(config))
+        recording, truth = simulate(
+            radar, world, config.world.lines, config.world.samples, draws, damages, precision(config)
+        )
     except ValueError as error:
         raise ConfigError(f"{loaded.file}: world: {' '.join(str(error).split())}") from None
     assert truth.clean is not None and isinstance(world.scene, Together)

@@ -41,8 +41,14 @@ class Scene:
 
     @property
     def scale(self) -> dict[str, Any]:
-        """Scenes of known points are shown below their peak; of recordings the brightest thousandth saturates."""
-        return {"percentile": 100.0, "dynamic_range_db": 60.0} if self.case.targets else {"percentile": 99.9, "dynamic_range_db": 50.0}
+        """Scenes of known points are shown below their peak; of recordings the brightest thousandth
+        saturates.
+        """
+        return (
+            {"percentile": 100.0, "dynamic_range_db": 60.0}
+            if self.case.targets
+            else {"percentile": 99.9, "dynamic_range_db": 50.0}
+        )
 
     @property
     def radar(self) -> StripmapRadar:
@@ -50,22 +56,47 @@ class Scene:
 
 
 def draw(scene: Scene, folder: Path) -> list[Picture]:
-    """Every picture that this run has the material for, as PNG files in the folder, in the order of reading."""
-    makers = (_image, _comparison, _cuts, _squint, _doppler_spectrum, _increments, _repairs, _contaminated_line, _response, _velocity)
+    """Every picture that this run has the material for, as PNG files in the folder, in the order of
+    reading.
+    """
+    makers = (
+        _image,
+        _comparison,
+        _cuts,
+        _squint,
+        _doppler_spectrum,
+        _increments,
+        _repairs,
+        _contaminated_line,
+        _response,
+        _velocity,
+    )
     return draw_all([partial(make, scene) for make in makers], folder)
 
 
 def _image(scene: Scene) -> Drawn:
     image = scene.best.image.crop(**scene.window)
-    caption = "The image of the recommended method over the judged window: range to the right, azimuth upward, in metres; amplitude in dB."
+    caption = (
+        "The image of the recommended method over the judged window: range to the right, "
+        "azimuth upward, in metres; amplitude in dB."
+    )
     yield "image", "Focused image", caption, plot.image(image, title=scene.best.title or "recommended", **scene.scale)
 
 
 def _comparison(scene: Scene) -> Drawn:
-    shown = {name: result.image.crop(**scene.window) for name, result in scene.results.items() if not scene.config.processor[name].rerun}
+    shown = {
+        name: result.image.crop(**scene.window)
+        for name, result in scene.results.items()
+        if not scene.config.processor[name].rerun
+    }
     if len(shown) > 1:
         first = next(iter(shown))
-        yield "methods", "The same scene by every method", f"All images on one scale, that of '{first}'.", plot.images(shown, **scene.scale)
+        yield (
+            "methods",
+            "The same scene by every method",
+            f"All images on one scale, that of '{first}'.",
+            plot.images(shown, **scene.scale),
+        )
 
 
 def _cuts(scene: Scene) -> Drawn:
@@ -83,8 +114,21 @@ def _cuts(scene: Scene) -> Drawn:
             series[result.name] = (plot.array(offset), plot.decibel(level))
         step = scene.best.image.axis(axis).step
         reach = 24 * step
-        parts.append({"series": {k: _within(x, y, reach) for k, (x, y) in series.items()}, "xlabel": f"{axis} from the peak (m)", "ylabel": "dB", "title": f"{axis}", "ylim": (-50, 3)})
-    yield "cuts", "Impulse-response cuts", f"Cuts through {label}, band-limited interpolation by 16; 0 dB is each curve's own peak.", plot.panels(parts)
+        parts.append(
+            {
+                "series": {k: _within(x, y, reach) for k, (x, y) in series.items()},
+                "xlabel": f"{axis} from the peak (m)",
+                "ylabel": "dB",
+                "title": f"{axis}",
+                "ylim": (-50, 3),
+            }
+        )
+    yield (
+        "cuts",
+        "Impulse-response cuts",
+        f"Cuts through {label}, band-limited interpolation by 16; 0 dB is each curve's own peak.",
+        plot.panels(parts),
+    )
 
 
 def _within(x: np.ndarray, y: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
@@ -96,21 +140,34 @@ def _strongest(scene: Scene) -> tuple[str, float, float] | None:
     names, azimuth, slant = expected_places(scene.case, scene.best, scene.radar)
     if names:
         image = scene.best.image
-        at = [torch.as_tensor(axis.index_of(x)).round().long().clamp(0, axis.n - 1) for axis, x in zip(image.axes, (azimuth, slant))]
+        at = [
+            torch.as_tensor(axis.index_of(x)).round().long().clamp(0, axis.n - 1)
+            for axis, x in zip(image.axes, (azimuth, slant))
+        ]
         best = int(image.data[at[0], at[1]].abs().argmax())
         return f"target {names[best]}", float(azimuth[best]), float(slant[best])
     part = scene.best.image.crop(**scene.window)
     flat = int(part.data.abs().argmax())
     row, column = divmod(flat, part.axes[1].n)
-    return "the brightest point of the window", part.axes[0].start + row * part.axes[0].step, part.axes[1].start + column * part.axes[1].step
+    return (
+        "the brightest point of the window",
+        part.axes[0].start + row * part.axes[0].step,
+        part.axes[1].start + column * part.axes[1].step,
+    )
 
 
 def _squint(scene: Scene) -> Drawn:
     """The recommended image beside the rerun that ignores the Doppler centroid."""
     for name, method in scene.config.processor.items():
         if method.rerun is not None and any(key.endswith("doppler_hz") for key in method.rerun.given):
-            shown = {"squint taken into account": scene.best.image.crop(**scene.window), method.title or name: scene.results[name].image.crop(**scene.window)}
-            caption = "Left: focused about the estimated Doppler centroid. Right: the same data focused as if the beam looked straight to the side: displaced, smeared, with ghosts."
+            shown = {
+                "squint taken into account": scene.best.image.crop(**scene.window),
+                method.title or name: scene.results[name].image.crop(**scene.window),
+            }
+            caption = (
+                "Left: focused about the estimated Doppler centroid. Right: the same data focused as "
+                "if the beam looked straight to the side: displaced, smeared, with ghosts."
+            )
             yield "squint", "With and without the squint", caption, plot.images(shown, **scene.scale)
 
 
@@ -119,7 +176,9 @@ def _focus_input(result: Result) -> Signal | None:
 
 
 def azimuth_spectrum(signal: Signal, bins: int = 256) -> tuple[Tensor, Tensor]:
-    """Baseband Doppler (Hz) and mean azimuth power spectrum over range, averaged over segments of `bins` lines (raised-cosine window)."""
+    """Baseband Doppler (Hz) and mean azimuth power spectrum over range, averaged over segments of
+    `bins` lines (raised-cosine window).
+    """
     data, pulse = signal.data, signal.axes[-2]
     bins = min(bins, pulse.n)
     segments = data[: pulse.n // bins * bins].unflatten(0, (-1, bins))
@@ -138,19 +197,43 @@ def _doppler_spectrum(scene: Scene) -> Drawn:
     frequency, power = azimuth_spectrum(signal)
     prf, centroid = scene.radar.prf_hz, scene.best.used["doppler_hz"]
     baseband = centroid - prf * round(centroid / prf)
-    series = {"mean over range": (plot.array(frequency), 10 * np.log10(np.maximum(plot.array(power), np.finfo(np.float32).tiny)))}
-    title = f"centroid {centroid:.1f} Hz = {baseband:.1f} Hz {'-' if centroid < baseband else '+'} {abs(round(centroid / prf))} PRF"
-    caption = "Azimuth power spectrum of the data that is focused, averaged over range. The dashed line is the Doppler centroid inside one PRF; the ambiguity is found from range migration."
-    yield "doppler_spectrum", "Doppler spectrum", caption, plot.curves(series, "baseband Doppler (Hz)", "power (dB)", title, {"centroid": baseband})
+    series = {
+        "mean over range": (
+            plot.array(frequency),
+            10 * np.log10(np.maximum(plot.array(power), np.finfo(np.float32).tiny)),
+        )
+    }
+    title = (
+        f"centroid {centroid:.1f} Hz = {baseband:.1f} Hz "
+        f"{'-' if centroid < baseband else '+'} {abs(round(centroid / prf))} PRF"
+    )
+    caption = (
+        "Azimuth power spectrum of the data that is focused, averaged over range. The dashed "
+        "line is the Doppler centroid inside one PRF; the ambiguity is found from range "
+        "migration."
+    )
+    yield (
+        "doppler_spectrum",
+        "Doppler spectrum",
+        caption,
+        plot.curves(series, "baseband Doppler (Hz)", "power (dB)", title, {"centroid": baseband}),
+    )
 
 
 def phase_increments(signal: Signal, blocks: int = 64) -> tuple[Tensor, Tensor]:
-    """Slow time (s) of blocks of lines and the mean phase increment between their adjacent lines (rad)."""
+    """Slow time (s) of blocks of lines and the mean phase increment between their adjacent lines
+    (rad).
+    """
     pulse = signal.axes[-2]
     blocks = min(blocks, max(1, (pulse.n - 1) // 2))
     product = (signal.data[:-1].conj() * signal.data[1:]).sum(-1).to(torch.complex128).cpu()
     parts = product.tensor_split(blocks)
-    centres = torch.stack([pulse.start + pulse.step * (t.float().mean().double() + 0.5) for t in torch.arange(pulse.n - 1).tensor_split(blocks)])
+    centres = torch.stack(
+        [
+            pulse.start + pulse.step * (t.float().mean().double() + 0.5)
+            for t in torch.arange(pulse.n - 1).tensor_split(blocks)
+        ]
+    )
     return centres, torch.stack([torch.angle(part.sum()) for part in parts])
 
 
@@ -166,8 +249,17 @@ def _increments(scene: Scene) -> Drawn:
         base = scene.best.used["doppler_hz"] - prf * round(scene.best.used["doppler_hz"] / prf)
         doppler -= prf * np.round((doppler - base) / prf)
         series["estimate"] = (plot.array(time_s), np.full(len(doppler), base))
-    caption = "Mean phase increment between adjacent lines, in Hz (PRF times increment over 2 pi), for blocks of lines along the strip. The scene makes it fluctuate; the estimate averages it."
-    yield "phase_increments", "Phase increments along the strip", caption, plot.curves(series, "slow time (s)", "increment (Hz)")
+    caption = (
+        "Mean phase increment between adjacent lines, in Hz (PRF times increment over 2 pi), "
+        "for blocks of lines along the strip. The scene makes it fluctuate; the estimate "
+        "averages it."
+    )
+    yield (
+        "phase_increments",
+        "Phase increments along the strip",
+        caption,
+        plot.curves(series, "slow time (s)", "increment (Hz)"),
+    )
 
 
 def _repair_stages(scene: Scene) -> Iterator[tuple[str, Signal, Signal]]:
@@ -179,7 +271,11 @@ def _repair_stages(scene: Scene) -> Iterator[tuple[str, Signal, Signal]]:
     for name, entry in stages.items():
         before, after = trace.inputs[name], trace.outputs[name]
         raw = before.names == after.names == ("pulse", "range")
-        if raw and group_of(entry["stage"]) in ("repair", "own") and (before.data.shape != after.data.shape or not torch.equal(before.data, after.data)):
+        if (
+            raw
+            and group_of(entry["stage"]) in ("repair", "own")
+            and (before.data.shape != after.data.shape or not torch.equal(before.data, after.data))
+        ):
             yield name, before, after
 
 
@@ -213,12 +309,25 @@ def _repairs(scene: Scene) -> Drawn:
     for name, before, after in _repair_stages(scene):
         old, top = _mean_spectrum_db(before)
         new, _ = _mean_spectrum_db(after, top)
-        lines = {"before": (np.arange(before.axes[0].n), _line_power_db(before, before)), "after": (np.arange(after.axes[0].n), _line_power_db(after, before))}
+        lines = {
+            "before": (np.arange(before.axes[0].n), _line_power_db(before, before)),
+            "after": (np.arange(after.axes[0].n), _line_power_db(after, before)),
+        }
         spectra = {"before": (_frequency_mhz(scene, len(old)), old), "after": (_frequency_mhz(scene, len(new)), new)}
         stage = (scene.config.processor["recommended"].stages or {})[name]["stage"]
         parts = [
-            {"series": lines, "xlabel": "line", "ylabel": "power (dB over the median line)", "title": "power of the lines"},
-            {"series": spectra, "xlabel": "range frequency (MHz)", "ylabel": "power (dB)", "title": "mean range spectrum"},
+            {
+                "series": lines,
+                "xlabel": "line",
+                "ylabel": "power (dB over the median line)",
+                "title": "power of the lines",
+            },
+            {
+                "series": spectra,
+                "xlabel": "range frequency (MHz)",
+                "ylabel": "power (dB)",
+                "title": "mean range spectrum",
+            },
         ]
         caption = f"Stage '{name}' ({stage}): left, power of every line; right, range spectrum averaged over the lines."
         yield f"repair_{name}", f"Repair: {name}", caption, plot.panels(parts)
@@ -233,13 +342,29 @@ def _contaminated_line(scene: Scene) -> Drawn:
         removed = (before.data - after.data).abs().square().sum(-1)
         line = int(removed.argmax())
         top = float(torch.fft.fft(before.data[line]).abs().max()) or 1.0
-        series = {label: (_frequency_mhz(scene, s.axes[1].n), plot.decibel(torch.fft.fftshift(torch.fft.fft(s.data[line])), top)) for label, s in (("before", before), ("after", after))}
-        caption = f"Range spectrum of line {line}, the one from which most was removed ({int((removed > 0).sum())} of {len(removed)} lines were changed)."
-        yield "contaminated_line", "Spectrum of a contaminated line", caption, plot.curves(series, "range frequency (MHz)", "dB", f"line {line}")
+        series = {
+            label: (
+                _frequency_mhz(scene, s.axes[1].n),
+                plot.decibel(torch.fft.fftshift(torch.fft.fft(s.data[line])), top),
+            )
+            for label, s in (("before", before), ("after", after))
+        }
+        caption = (
+            f"Range spectrum of line {line}, the one from which most was removed "
+            f"({int((removed > 0).sum())} of {len(removed)} lines were changed)."
+        )
+        yield (
+            "contaminated_line",
+            "Spectrum of a contaminated line",
+            caption,
+            plot.curves(series, "range frequency (MHz)", "dB", f"line {line}"),
+        )
 
 
 def _response(scene: Scene) -> Drawn:
-    """Estimated phase and amplitude response of the channel over range frequency, beside the truth where it is known."""
+    """Estimated phase and amplitude response of the channel over range frequency, beside the truth
+    where it is known.
+    """
     band_mhz = plot.array(band_grid()) * scene.radar.pulse.bandwidth_hz / 2e6
     parts = []
     for estimate in scene.best.estimates.values():
@@ -251,7 +376,12 @@ def _response(scene: Scene) -> Drawn:
                     series["truth"] = (band_mhz, plot.array(true))
                 parts.append({"series": series, "xlabel": "range frequency (MHz)", "ylabel": label, "title": label})
     if parts:
-        yield "response", "Response of the whole channel", "Phase and amplitude over the band of the pulse, as found from bright places of the image.", plot.panels(parts)
+        yield (
+            "response",
+            "Response of the whole channel",
+            "Phase and amplitude over the band of the pulse, as found from bright places of the image.",
+            plot.panels(parts),
+        )
     yield from _image_repairs(scene)
 
 
@@ -260,15 +390,27 @@ def _image_repairs(scene: Scene) -> Drawn:
     place, trace = _strongest(scene), scene.best.trace
     stages = scene.config.processor["recommended"].stages or {}
     for name, entry in stages.items():
-        if place is None or trace is None or group_of(entry["stage"]) != "repair" or trace.outputs[name].names != ("azimuth", "range"):
+        if (
+            place is None
+            or trace is None
+            or group_of(entry["stage"]) != "repair"
+            or trace.outputs[name].names != ("azimuth", "range")
+        ):
             continue
         before, after = trace.inputs[name], trace.outputs[name]
         if torch.equal(before.data, after.data):
             continue
-        cuts = {label: impulse_cuts(image, place[1:])["range"] for label, image in (("before", before), ("after", after))}
+        cuts = {
+            label: impulse_cuts(image, place[1:])["range"] for label, image in (("before", before), ("after", after))
+        }
         series = {label: (plot.array(offset), plot.decibel(level)) for label, (offset, level) in cuts.items()}
         caption = f"Stage '{name}' ({entry['stage']}): range cut through {place[0]} before and after."
-        yield f"repair_{name}", f"Repair: {name}", caption, plot.curves(series, "range from the peak (m)", "dB", ylim=(-50, 3))
+        yield (
+            f"repair_{name}",
+            f"Repair: {name}",
+            caption,
+            plot.curves(series, "range from the peak (m)", "dB", ylim=(-50, 3)),
+        )
 
 
 def _true_curve(truth: Truth | None, key: str, n: int) -> Tensor | None:
@@ -284,6 +426,15 @@ def _velocity(scene: Scene) -> Drawn:
         if "grid_velocity_m_s" in estimate.info and "grid_entropy" in estimate.info:
             grid, cost = (plot.array(estimate.info[key]) for key in ("grid_velocity_m_s", "grid_entropy"))
             value = float(estimate.value["velocity_m_s"])
-            caption = "Entropy of a small group of range lines over effective velocity; the dashed line is the refined minimum."
-            figure = plot.curves({"entropy": (grid, cost)}, "effective velocity (m/s)", "entropy (nats)", f"{value:.2f} m/s", {"estimate": value})
+            caption = (
+                "Entropy of a small group of range lines over effective velocity; the dashed line is "
+                "the refined minimum."
+            )
+            figure = plot.curves(
+                {"entropy": (grid, cost)},
+                "effective velocity (m/s)",
+                "entropy (nats)",
+                f"{value:.2f} m/s",
+                {"estimate": value},
+            )
             yield f"{name}_entropy", "Effective velocity by minimum entropy", caption, figure

@@ -25,9 +25,11 @@ log = logging.getLogger("torchsar")
 
 
 def run(loaded: Loaded, out: Path, command: str = "torchsar run") -> Path:
-    """Run every method of the config and write config.yaml, metrics.json, arrays.zarr, figures/ and report.html into OUT.
+    """Run every method of the config and write config.yaml, metrics.json, arrays.zarr, figures/ and
+    report.html into OUT.
 
-    OUT appears whole or not at all. Returns the path of the report. Raises ConfigError for whatever the user can put right.
+    OUT appears whole or not at all. Returns the path of the report. Raises ConfigError for whatever
+    the user can put right.
     """
     began = time.perf_counter()
     with fresh_folder(out) as folder:
@@ -38,17 +40,26 @@ def run(loaded: Loaded, out: Path, command: str = "torchsar run") -> Path:
         (folder / "config.yaml").write_text(config_text, encoding="utf-8")
         write_json(folder / "metrics.json", metrics)
         wrote = time.perf_counter()
-        write_arrays(folder / "arrays.zarr", {name: r.image for name, r in results.items()}, _truth_arrays(case), _estimate_arrays(results))
+        write_arrays(
+            folder / "arrays.zarr",
+            {name: r.image for name, r in results.items()},
+            _truth_arrays(case),
+            _estimate_arrays(results),
+        )
         log.info("arrays: %.1f s", time.perf_counter() - wrote)
         scene = Scene(loaded.config, case, results, metrics["definitions"]["window"])
         pictures = draw(scene, folder / "figures")
-        write_report(folder / "report.html", loaded.config.title, metrics, pictures, folder / "figures", config_text, command)
+        write_report(
+            folder / "report.html", loaded.config.title, metrics, pictures, folder / "figures", config_text, command
+        )
     log.info("finished in %.0f s", time.perf_counter() - began)
     return out / "report.html"
 
 
 def check(loaded: Loaded) -> None:
-    """Build all that the config of a simulation names, without computing anything: echoes take long, mistakes should not."""
+    """Build all that the config of a simulation names, without computing anything: echoes take
+    long, mistakes should not.
+    """
     build_world(loaded)
     assert loaded.config.world is not None
     build_damages(loaded.config.world.damages, "world.damages", loaded.file)
@@ -72,7 +83,9 @@ def prepare(loaded: Loaded) -> tuple[Case, dict[str, Chain]]:
 
 
 def _warn_of_aliasing(loaded: Loaded, case: Case) -> None:
-    """A Doppler band of the nominal aperture beyond the PRF is named with both figures, by `requirements`."""
+    """A Doppler band of the nominal aperture beyond the PRF is named with both figures, by
+    `requirements`.
+    """
     world, radar = loaded.config.world, case.recording.radar
     assert world is not None
     if radar.integration_s is not None:
@@ -84,5 +97,11 @@ def _truth_arrays(case: Case) -> dict[str, Tensor]:
 
 
 def _estimate_arrays(results: Mapping[str, Result]) -> dict[str, dict[str, Tensor]]:
-    """Values of all estimates by method, `stage.value`; those of methods without any are left out."""
-    return {name: {f"{stage}.{key}": value for stage, e in r.estimates.items() for key, value in e.value.items()} for name, r in results.items() if r.estimates}
+    """Values of all estimates by method, `stage.value`; those of methods without any are
+    left out.
+    """
+    return {
+        name: {f"{stage}.{key}": value for stage, e in r.estimates.items() for key, value in e.value.items()}
+        for name, r in results.items()
+        if r.estimates
+    }

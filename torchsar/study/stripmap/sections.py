@@ -33,7 +33,10 @@ class Radar(Strict):
 
 
 class World(Strict):
-    """What is true and no processor may see. scene, beam, path and damages name entries of the catalogues (`torchsar list`)."""
+    """What is true and no processor may see.
+
+    scene, beam, path and damages name entries of the catalogues (`torchsar list`).
+    """
 
     single: ClassVar[dict[str, Catalogue]] = {"beam": BEAMS, "path": PATHS}
     named: ClassVar[dict[str, Catalogue]] = {"scene": SCENES, "damages": DAMAGES}
@@ -66,7 +69,10 @@ class Margin(Strict):
 
 
 class Metrics(Strict):
-    """How images are judged. margin: None leaves out lines without a full aperture and samples without a full pulse."""
+    """How images are judged.
+
+    margin: None leaves out lines without a full aperture and samples without a full pulse.
+    """
 
     margin: Margin | None = None
     reference: str | None = None

@@ -33,7 +33,9 @@ _PEAK_BYTES = 2  # the largest tensor of these chains is about twice the raw mat
 
 @dataclass(frozen=True)
 class Bench:
-    """All that one case needs, built once in a process: values that differ between trials come with each batch."""
+    """All that one case needs, built once in a process: values that differ between trials come with
+    each batch.
+    """
 
     config: Config
     radar: StripmapRadar
@@ -58,16 +60,24 @@ def _snr(bench: Bench, value: Tensor) -> StripmapWorld:
     return replace(bench.world, snr_db=value)
 
 
-# Keys that are per-trial tensors of the world, in the order in which they are set: a squint needs the velocity.
-BATCHED = {"world.velocity_m_s": _velocity, "world.doppler_hz": _doppler, "world.squint_deg": _squint, "world.noise.snr_db": _snr}
+# Keys that are per-trial tensors of the world, in the order in which they are set: a squint needs
+# the velocity.
+BATCHED = {
+    "world.velocity_m_s": _velocity,
+    "world.doppler_hz": _doppler,
+    "world.squint_deg": _squint,
+    "world.noise.snr_db": _snr,
+}
 
 
 class StripmapTrials(Benches[Bench]):
-    """`trial(parameters, draws)` of a config: {method: {metric: (rows,)}}, bounds, and images of the trials to keep.
+    """`trial(parameters, draws)` of a config: {method: {metric: (rows,)}}, bounds, and images of
+    the trials to keep.
 
-    Metrics of a method: every scalar estimate under its name (`doppler_hz`); its error against the truth (`doppler_error_hz`, and
-    `doppler_baseband_error_hz` within half a PRF); of an image entropy, contrast, and error and correlation against the reference method.
-    `ok` where all estimators of the method are. Built chains are kept in the process and do not travel to workers.
+    Metrics of a method: every scalar estimate under its name (`doppler_hz`); its error against the
+    truth (`doppler_error_hz`, and `doppler_baseband_error_hz` within half a PRF); of an image
+    entropy, contrast, and error and correlation against the reference method. `ok` where all
+    estimators of the method are. Built chains are kept in the process and do not travel to workers.
     """
 
     batched = tuple(BATCHED)
@@ -75,7 +85,10 @@ class StripmapTrials(Benches[Bench]):
     def check(self, grid: Mapping[str, Any]) -> None:
         """Refuse a grid that contradicts itself. Raises ConfigError."""
         if "world.doppler_hz" in grid and "world.squint_deg" in grid:
-            raise ConfigError(f"{self.loaded.file}: sweep: world.doppler_hz and world.squint_deg both say where the beam looks; sweep one of them")
+            raise ConfigError(
+                f"{self.loaded.file}: sweep: world.doppler_hz and world.squint_deg both say where the "
+                "beam looks; sweep one of them"
+            )
 
     def build(self, loaded: Loaded) -> Bench:
         radar, world = build_radar(loaded), loaded.config.world
@@ -98,7 +111,16 @@ class StripmapTrials(Benches[Bench]):
                 bench = replace(bench, world=change(bench, parameters[key]))
         size = bench.config.world
         assert size is not None
-        recording, truth = simulate(bench.radar, bench.world, size.lines, size.samples, draws, bench.damages, precision(bench.config), self.device)
+        recording, truth = simulate(
+            bench.radar,
+            bench.world,
+            size.lines,
+            size.samples,
+            draws,
+            bench.damages,
+            precision(bench.config),
+            self.device,
+        )
         assert truth.clean is not None
         clean, _ = apply_damages(truth.clean, {}, draws)
         traces = _traces(bench, recording, clean)
@@ -116,12 +138,17 @@ def _traces(bench: Bench, recording: Recording, clean: Recording) -> dict[str, t
         else:
             source = found[method.rerun.method][1]
             assert source is not None
-            given = {key: torch.tensor(value, dtype=torch.float64, device=recording.signal.data.device) for key, value in method.rerun.given.items()}
+            given = {
+                key: torch.tensor(value, dtype=torch.float64, device=recording.signal.data.device)
+                for key, value in method.rerun.given.items()
+            }
             found[name] = bench.chains[name].rerun(source, method.rerun.start, given=given), None
     return found
 
 
-def _judged(bench: Bench, name: str, traces: Mapping[str, tuple[Signal, Trace | None]], truth: Truth) -> dict[str, Tensor]:
+def _judged(
+    bench: Bench, name: str, traces: Mapping[str, tuple[Signal, Trace | None]], truth: Truth
+) -> dict[str, Tensor]:
     signal, trace = traces[name]
     metrics = {} if trace is None else estimation_metrics(trace, truth, bench.radar.prf_hz)
     if signal.names == ("azimuth", "range"):
@@ -136,7 +163,9 @@ def _judged(bench: Bench, name: str, traces: Mapping[str, tuple[Signal, Trace | 
 
 
 def estimation_metrics(trace: Trace, truth: Truth, prf_hz: float) -> dict[str, Tensor]:
-    """Scalar estimates by name, their errors, and `ok`; a name that two stages give is the later one's."""
+    """Scalar estimates by name, their errors, and `ok`; a name that two stages give is the later
+    one's.
+    """
     trials = trace.signal.trials
     values = {key: v for estimate in trace.estimates.values() for key, v in estimate.value.items() if v.shape == trials}
     metrics = dict(values)
@@ -165,18 +194,29 @@ def _bounds(bench: Bench, truth: Truth, lines: int) -> dict[str, dict[str, Tenso
     range_m = truth.values["closest_range_m"].mean(-1)
     seconds = radar.aperture_s(float(range_m.mean()))
     velocity = truth.values["velocity_m_s"].to(q)
-    doppler = {"Cramer-Rao bound of a point of known place": tone_frequency_bound_hz(q, seconds), "1/(T sqrt q), Tsvetkov 2017": reference_doppler_std_hz(q, seconds)}
+    doppler = {
+        "Cramer-Rao bound of a point of known place": tone_frequency_bound_hz(q, seconds),
+        "1/(T sqrt q), Tsvetkov 2017": reference_doppler_std_hz(q, seconds),
+    }
     bound = velocity_bound_m_s(q, seconds, velocity, radar.wavelength_m, range_m)
-    return {"doppler_error_hz": doppler, "doppler_baseband_error_hz": doppler, "velocity_error_m_s": {"Cramer-Rao bound": bound}}
+    return {
+        "doppler_error_hz": doppler,
+        "doppler_baseband_error_hz": doppler,
+        "velocity_error_m_s": {"Cramer-Rao bound": bound},
+    }
 
 
 def _saved(bench: Bench, traces: Mapping[str, tuple[Signal, Trace | None]]) -> dict[str, dict[str, Tensor]]:
-    """The last signal of every method, and the outputs of the stages that `sweep.save.taps` names."""
+    """The last signal of every method, and the outputs of the stages that `sweep.save.taps`
+    names.
+    """
     save = bench.config.sweep.save
     if not save.trials:
         return {}
     found = {}
     for name, (signal, trace) in traces.items():
-        taps = {} if trace is None else {stage: trace.outputs[stage].data for stage in save.taps if stage in trace.outputs}
+        taps = (
+            {} if trace is None else {stage: trace.outputs[stage].data for stage in save.taps if stage in trace.outputs}
+        )
         found[name] = {"last": signal.data, **taps}
     return found
