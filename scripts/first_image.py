@@ -1,5 +1,5 @@
-"""The shortest way to an image: simulate a damaged strip, find its Doppler and velocity, focus it,
-look at it.
+"""The shortest way to an image: simulate an impaired strip, find its Doppler and velocity, focus
+it, look at it.
 """
 
 import torchsar

@@ -30,9 +30,9 @@ from torchsar.echo import (
     Quantiser,
     Tone,
     WideInterferer,
-    apply_damages,
+    apply_impairments,
 )
-from torchsar.echo.stripmap import Damage
+from torchsar.echo.stripmap import Impairment
 from torchsar.focus import OmegaK
 from torchsar.io import read_stripmap
 from torchsar.metrics import correlation
@@ -78,54 +78,54 @@ class Bench:
         return float(correlation(self.window(image), self.window(self.clean)))
 
 
-def fill_sparse(bench: Bench, damaged: Recording) -> Signal:
-    signal, lines = LineIntegrity()(damaged.signal, damaged.aux["line_number"])
+def fill_sparse(bench: Bench, impaired: Recording) -> Signal:
+    signal, lines = LineIntegrity()(impaired.signal, impaired.aux["line_number"])
     stage = SparseFill(bench.recording.radar, velocity_m_s=bench.velocity_m_s)
     return bench.focus(stage(signal, lines["missing"], doppler_hz=bench.doppler_hz))
 
 
-def fill_zero(bench: Bench, damaged: Recording) -> Signal:
-    signal, lines = LineIntegrity()(damaged.signal, damaged.aux["line_number"])
+def fill_zero(bench: Bench, impaired: Recording) -> Signal:
+    signal, lines = LineIntegrity()(impaired.signal, impaired.aux["line_number"])
     return bench.focus(ZeroFill()(signal, lines["missing"]))
 
 
-def subtract(bench: Bench, damaged: Recording) -> Signal:
-    return bench.focus(SubtractInterference()(damaged.signal)[0])
+def subtract(bench: Bench, impaired: Recording) -> Signal:
+    return bench.focus(SubtractInterference()(impaired.signal)[0])
 
 
-def notch(bench: Bench, damaged: Recording) -> Signal:
-    return bench.focus(NotchInterference()(damaged.signal)[0])
+def notch(bench: Bench, impaired: Recording) -> Signal:
+    return bench.focus(NotchInterference()(impaired.signal)[0])
 
 
-def jitter_pilot(bench: Bench, damaged: Recording) -> Signal:
-    found = PilotJitter()(damaged.signal, damaged.aux["pilot"])
-    return bench.focus(CorrectJitter()(damaged.signal, found["offset_samples"], found["period"]))
+def jitter_pilot(bench: Bench, impaired: Recording) -> Signal:
+    found = PilotJitter()(impaired.signal, impaired.aux["pilot"])
+    return bench.focus(CorrectJitter()(impaired.signal, found["offset_samples"], found["period"]))
 
 
-def jitter_blind(bench: Bench, damaged: Recording) -> Signal:
-    found = BlindJitter()(damaged.signal)
-    return bench.focus(CorrectJitter()(damaged.signal, found["offset_samples"], found["period"]))
+def jitter_blind(bench: Bench, impaired: Recording) -> Signal:
+    found = BlindJitter()(impaired.signal)
+    return bench.focus(CorrectJitter()(impaired.signal, found["offset_samples"], found["period"]))
 
 
-def response(bench: Bench, damaged: Recording) -> Signal:
-    image = bench.focus(damaged.signal)
+def response(bench: Bench, impaired: Recording) -> Signal:
+    image = bench.focus(impaired.signal)
     found = EstimateResponse(bench.recording.radar)(image)
     return CorrectResponse(bench.recording.radar)(image, found["phase_rad"])
 
 
-def amplitude(bench: Bench, damaged: Recording) -> Signal:
-    image = bench.focus(damaged.signal)
+def amplitude(bench: Bench, impaired: Recording) -> Signal:
+    image = bench.focus(impaired.signal)
     found = EstimateResponse(bench.recording.radar, expected_power=band_power(bench.clean.data))(image)
     return CorrectResponse(bench.recording.radar)(image, torch.zeros_like(found["phase_rad"]), found["amplitude"])
 
 
-def imbalance(bench: Bench, damaged: Recording) -> Signal:
-    found = EstimateImbalance()(damaged.signal)
-    return bench.focus(CorrectImbalance()(damaged.signal, found["gain"], found["phase_rad"]))
+def imbalance(bench: Bench, impaired: Recording) -> Signal:
+    found = EstimateImbalance()(impaired.signal)
+    return bench.focus(CorrectImbalance()(impaired.signal, found["gain"], found["phase_rad"]))
 
 
-def nothing(bench: Bench, damaged: Recording) -> Signal:
-    return bench.focus(damaged.signal)
+def nothing(bench: Bench, impaired: Recording) -> Signal:
+    return bench.focus(impaired.signal)
 
 
 def without_shift(curve: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
@@ -140,13 +140,13 @@ def without_shift(curve: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tenso
 @dataclass(frozen=True)
 class Row:
     name: str
-    damages: Mapping[str, Damage]
+    impairments: Mapping[str, Impairment]
     repair: Callable[[Bench, Recording], Signal]
     at_least: float
 
 
 def rows(radar_band_hz: float, fs_hz: float) -> list[Row]:
-    def tone(level: float, **more: float) -> dict[str, Damage]:
+    def tone(level: float, **more: float) -> dict[str, Impairment]:
         return {"tone": Tone(level, 0.17 * radar_band_hz, drift_hz=0.02 * radar_band_hz, **more)}  # type: ignore[arg-type]
 
     period_8 = (
@@ -212,12 +212,12 @@ def main() -> None:
     for row in rows(recording.radar.pulse.bandwidth_hz, recording.radar.sampling_hz):
         if not any(word in row.name for word in args.only):
             continue
-        damaged, _ = apply_damages(recording, row.damages, Draws(args.seed, case=row.name))
+        impaired, _ = apply_impairments(recording, row.impairments, Draws(args.seed, case=row.name))
         start = time.perf_counter()
-        repaired = row.repair(bench, damaged)
+        repaired = row.repair(bench, impaired)
         seconds = time.perf_counter() - start
         print(
-            f"{row.name:36s} {bench.rho(nothing(bench, damaged)):9.4f} {bench.rho(repaired):9.4f} "
+            f"{row.name:36s} {bench.rho(nothing(bench, impaired)):9.4f} {bench.rho(repaired):9.4f} "
             f"{row.at_least:9.4f} {seconds:8.1f}",
             flush=True,
         )

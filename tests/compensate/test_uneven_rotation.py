@@ -274,15 +274,15 @@ def pulse_phases() -> Tensor:
 
 def test_the_autofocus_takes_the_rotation_out() -> None:
     walk, data = pulse_phases(), target(0)
-    damaged = data * torch.exp(1j * walk)[:, None]
+    impaired = data * torch.exp(1j * walk)[:, None]
     phi = warp(torch.arange(PULSES, dtype=F64) / PRF, K)
-    flat = damaged * torch.exp(-2j * math.pi / WAVELENGTH * RANGE_M * (OMEGA * phi[:, None]).square())
+    flat = impaired * torch.exp(-2j * math.pi / WAVELENGTH * RANGE_M * (OMEGA * phi[:, None]).square())
     found = rotating_autofocus(flat, PRF, K[None])
     assert found.ok and off_the_warp(found["phase_rad"] - walk, phi) < 0.1
-    blind = RotationAutofocus(RADAR)(signal_of(damaged))
+    blind = RotationAutofocus(RADAR)(signal_of(impaired))
     assert off_the_warp(blind["phase_rad"] - walk, phi) > 0.3, "an autofocus that knows of no rotation leaves more"
     told = RotationAutofocus(RADAR)(
-        signal_of(damaged), omega_rad_s=torch.tensor(OMEGA, dtype=F64), warp_k=K, yc_m=torch.tensor(0.0, dtype=F64)
+        signal_of(impaired), omega_rad_s=torch.tensor(OMEGA, dtype=F64), warp_k=K, yc_m=torch.tensor(0.0, dtype=F64)
     )
     torch.testing.assert_close(told["phase_rad"], found["phase_rad"], atol=1e-6, rtol=0)
 
@@ -301,14 +301,14 @@ def test_phase_and_rotation_in_turn() -> None:
     """A phase that is free in every pulse and a rotation: the autofocus takes yc with it, so the
     estimator holds it.
     """
-    damaged = target(0) * torch.exp(1j * pulse_phases())[:, None]
+    impaired = target(0) * torch.exp(1j * pulse_phases())[:, None]
     stage = Alternate(
         3,
         phase=Turn(RotationAutofocus(RADAR), CorrectPulsePhase()),
         rotation=Turn(UnevenRotation(RADAR, yc_m=0.0), RangePhase(RADAR)),
     )
-    alone = UnevenRotation(RADAR)(signal_of(damaged))
-    found = Chain(fit=stage, out=use(CorrectPulsePhase(), phase_rad="fit")).trace(signal_of(damaged)).estimates["fit"]
+    alone = UnevenRotation(RADAR)(signal_of(impaired))
+    found = Chain(fit=stage, out=use(CorrectPulsePhase(), phase_rad="fit")).trace(signal_of(impaired)).estimates["fit"]
     assert (found["warp_k"] / K - 1).abs().max() < 0.05
     assert found.info["rotation.entropy_nats"] < alone.info["entropy_nats"] - 0.3
 

@@ -62,7 +62,7 @@ def simulated(
     dtype=torch.complex128,
     **options,
 ):
-    simulate = {name: options.pop(name) for name in ("kind", "damages") if name in options}
+    simulate = {name: options.pop(name) for name in ("kind", "impairments") if name in options}
     world = BistaticWorld(scene, gate or Pattern(), **options)
     return simulate_bistatic(radar, world, n_pulse, n_range, Draws(3, trials=trials), dtype=dtype, **simulate)
 

@@ -19,16 +19,16 @@ CELL_S = 1 / 60e6
 
 def test_each_channel_gets_its_phase_gain_and_delay():
     errors = ChannelErrors([0.3, 0.0, -2.0], [0.0, 1.5, -3.0], [0.0, 2 * CELL_S, -3 * CELL_S])
-    recording, truth = simulated(damages={"imbalance": errors})
+    recording, truth = simulated(impairments={"imbalance": errors})
     assert truth.clean is not None
-    clean, damaged = truth.clean.signal.data, recording.signal.data
+    clean, impaired = truth.clean.signal.data, recording.signal.data
     factors = torch.polar(
         torch.tensor([1.0, 10**0.075, 10**-0.15], dtype=torch.float64),
         torch.tensor([0.3, 0.0, -2.0], dtype=torch.float64),
     )
     for channel, shift in enumerate((0, 2, -3)):
         torch.testing.assert_close(
-            damaged[channel], factors[channel] * clean[channel].roll(shift, -1), rtol=0, atol=1e-11
+            impaired[channel], factors[channel] * clean[channel].roll(shift, -1), rtol=0, atol=1e-11
         )
     assert truth.values["imbalance.delay_s"].tolist() == [0.0, 2 * CELL_S, -3 * CELL_S]
 
@@ -36,7 +36,7 @@ def test_each_channel_gets_its_phase_gain_and_delay():
 def test_a_part_of_a_cell_moves_the_envelope_and_not_the_carrier():
     scene = MovingPoints([0.0], [0.0], [0.0], [0.0])
     later = ChannelErrors(delay_s=[0.4 * CELL_S] * 3)
-    recording, _ = simulated(scene, n_pulse=1, damages={"late": later})
+    recording, _ = simulated(scene, n_pulse=1, impairments={"late": later})
     moved = simulated(MovingPoints([0.0], [0.0], [0.0], [0.4 * 5.0]), n_pulse=1)[0].signal.data
     phase = torch.exp(2j * torch.tensor(math.pi / 0.24 * 0.4 * 5.0))
     torch.testing.assert_close(recording.signal.data[..., 34:94], (moved * phase)[..., 34:94], rtol=0, atol=3e-3)
@@ -45,7 +45,7 @@ def test_a_part_of_a_cell_moves_the_envelope_and_not_the_carrier():
 def test_errors_may_differ_between_trials_and_spare_azimuth_only_data_delays():
     phase = torch.tensor([[0.1, 0.2, 0.3], [1.0, 2.0, 3.0]], dtype=torch.float64)
     recording, truth = simulated(
-        n_range=None, trials=range(2), damages={"p": ChannelErrors(phase)}, dtype=torch.complex64
+        n_range=None, trials=range(2), impairments={"p": ChannelErrors(phase)}, dtype=torch.complex64
     )
     assert truth.clean is not None and recording.signal.data.dtype == torch.complex64
     torch.testing.assert_close(
@@ -62,7 +62,7 @@ def synchronised(**options):
 
 
 def test_all_channels_of_a_pulse_share_its_phase_and_delay():
-    recording, truth = simulated(trials=range(2), damages={"clock": synchronised()})
+    recording, truth = simulated(trials=range(2), impairments={"clock": synchronised()})
     phase, delay = truth.values["clock.phase_rad"], truth.values["clock.delay_s"]
     time = RADAR.pulse_axis(90).values()
     torch.testing.assert_close(
@@ -76,7 +76,7 @@ def test_all_channels_of_a_pulse_share_its_phase_and_delay():
 
 
 def test_the_direct_path_shows_phase_and_delay_of_every_pulse():
-    recording, truth = simulated(damages={"clock": synchronised(direct_snr_db=None, direct_samples=96)})
+    recording, truth = simulated(impairments={"clock": synchronised(direct_snr_db=None, direct_samples=96)})
     path = recording.aux["direct_path"]
     assert path.shape == (90, 96)
     time = (torch.arange(96, dtype=torch.float64) - 48) * CELL_S
@@ -88,7 +88,9 @@ def test_the_direct_path_shows_phase_and_delay_of_every_pulse():
 def test_the_direct_path_has_noise_of_its_own():
     clean, noisy = (
         simulated(
-            n_range=None, trials=range(2), damages={"clock": SynchronisationError([WalkDrift(0.1)], direct_snr_db=snr)}
+            n_range=None,
+            trials=range(2),
+            impairments={"clock": SynchronisationError([WalkDrift(0.1)], direct_snr_db=snr)},
         )[0].aux["direct_path"]
         for snr in (None, 20.0)
     )
@@ -105,21 +107,21 @@ def test_drifts_of_one_kind_differ_and_trials_do_not_depend_on_their_batch():
     both = simulated(
         trials=range(3),
         n_range=None,
-        damages={"c": SynchronisationError([SinusoidDrift(1.0, 2.0), SinusoidDrift(1.0, 2.0)])},
+        impairments={"c": SynchronisationError([SinusoidDrift(1.0, 2.0), SinusoidDrift(1.0, 2.0)])},
     )[1].values["c.phase_rad"]
-    one = simulated(trials=[2], n_range=None, damages={"c": SynchronisationError([SinusoidDrift(1.0, 2.0)])})[1].values[
-        "c.phase_rad"
-    ]
+    one = simulated(trials=[2], n_range=None, impairments={"c": SynchronisationError([SinusoidDrift(1.0, 2.0)])})[
+        1
+    ].values["c.phase_rad"]
     alone = simulated(
         trials=[2],
         n_range=None,
-        damages={"c": SynchronisationError([SinusoidDrift(1.0, 2.0), SinusoidDrift(1.0, 2.0)])},
+        impairments={"c": SynchronisationError([SinusoidDrift(1.0, 2.0), SinusoidDrift(1.0, 2.0)])},
     )[1].values["c.phase_rad"]
     assert torch.equal(both[2], alone[0]) and not torch.allclose(both[2], 2 * one[0], atol=1e-3)
 
 
 @pytest.mark.parametrize(
-    ("damage", "n_range", "says"),
+    ("impairment", "n_range", "says"),
     [
         (ChannelErrors([0.0, 1.0]), None, "each of the 3 channels"),
         (ChannelErrors(delay_s=[0.0, 1e-9, 0.0]), None, "no range axis"),
@@ -127,9 +129,9 @@ def test_drifts_of_one_kind_differ_and_trials_do_not_depend_on_their_batch():
         (SynchronisationError(delay_s=[PolynomialDrift([1e-6])]), 128, "a quarter of the 64"),
     ],
 )
-def test_errors_that_do_not_fit_the_recording_are_refused(damage, n_range, says):
+def test_errors_that_do_not_fit_the_recording_are_refused(impairment, n_range, says):
     with pytest.raises(ValueError, match=says):
-        simulated(n_range=n_range, n_pulse=10, damages={"e": damage})
+        simulated(n_range=n_range, n_pulse=10, impairments={"e": impairment})
 
 
 @pytest.mark.parametrize(

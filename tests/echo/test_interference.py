@@ -26,28 +26,28 @@ def power(x: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(
-    "damage", [Tone(20.0, 4e6, 1e5), Tone(20.0, 4e6, rate_hz_s=1e9, coherent=True), WideInterferer(20.0, -3e6, 1e6)]
+    "impairment", [Tone(20.0, 4e6, 1e5), Tone(20.0, 4e6, rate_hz_s=1e9, coherent=True), WideInterferer(20.0, -3e6, 1e6)]
 )
-def test_level_is_what_was_asked(damage) -> None:
+def test_level_is_what_was_asked(impairment) -> None:
     clean = clutter()
-    damaged, _ = damage(clean, Draws(1))
-    ratio = power(damaged.signal.data - clean.signal.data) / power(clean.signal.data)
-    assert float(10 * torch.log10(ratio)) == pytest.approx(20.0, abs=0.01 if isinstance(damage, Tone) else 1.0)
+    impaired, _ = impairment(clean, Draws(1))
+    ratio = power(impaired.signal.data - clean.signal.data) / power(clean.signal.data)
+    assert float(10 * torch.log10(ratio)) == pytest.approx(20.0, abs=0.01 if isinstance(impairment, Tone) else 1.0)
 
 
 def test_share_of_lines_and_untouched_rest() -> None:
     clean = clutter(trials=3)
-    damaged, told = Tone(30.0, 4e6, share=0.25)(clean, Draws(2, trials=range(3)))
+    impaired, told = Tone(30.0, 4e6, share=0.25)(clean, Draws(2, trials=range(3)))
     assert told["contaminated"].sum(-1).tolist() == [16, 16, 16]
-    same = (damaged.signal.data == clean.signal.data).all(-1)
+    same = (impaired.signal.data == clean.signal.data).all(-1)
     assert torch.equal(same, ~told["contaminated"])
     assert not torch.equal(told["contaminated"][0], told["contaminated"][1])
 
 
 def test_tone_stands_at_its_frequency_and_drifts() -> None:
     clean = clutter()
-    damaged, told = Tone(30.0, torch.tensor(4e6), drift_hz=2e6)(clean, Draws(1))
-    cell = torch.fft.fft(damaged.signal.data).abs().argmax(-1)
+    impaired, told = Tone(30.0, torch.tensor(4e6), drift_hz=2e6)(clean, Draws(1))
+    cell = torch.fft.fft(impaired.signal.data).abs().argmax(-1)
     seen = cell * RADAR.sampling_hz / 1024
     assert float((seen - told["frequency_hz"]).abs().max()) <= RADAR.sampling_hz / 1024
     assert float(told["frequency_hz"][-1] - told["frequency_hz"][0]) == pytest.approx(2e6)
@@ -69,18 +69,20 @@ def test_phase_is_random_or_coherent() -> None:
 
 def test_wide_interferer_keeps_to_its_band() -> None:
     clean = clutter()
-    damaged, _ = WideInterferer(20.0, 5e6, 2e6)(clean, Draws(1))
-    spectrum = torch.fft.fft((damaged.signal.data - clean.signal.data) * torch.hann_window(1024)).abs().square().mean(0)
+    impaired, _ = WideInterferer(20.0, 5e6, 2e6)(clean, Draws(1))
+    spectrum = (
+        torch.fft.fft((impaired.signal.data - clean.signal.data) * torch.hann_window(1024)).abs().square().mean(0)
+    )
     inside = (RADAR.range_frequency_hz(1024) - 5e6).abs() < 1.2e6
     assert float(spectrum[inside].sum() / spectrum.sum()) > 0.999
 
 
 def test_quantiser_has_odd_levels_and_clips() -> None:
     clean = clutter(trials=2)
-    damaged, told = Quantiser(4)(clean, Draws(1, trials=range(2)))
-    levels = torch.view_as_real(damaged.signal.data) * told["gain"][:, None, None, None].float()
+    impaired, told = Quantiser(4)(clean, Draws(1, trials=range(2)))
+    levels = torch.view_as_real(impaired.signal.data) * told["gain"][:, None, None, None].float()
     assert set(torch.unique(torch.round(levels)).int().tolist()) == set(range(-15, 16, 2))
-    error = power(damaged.signal.data - clean.signal.data) / power(clean.signal.data)
+    error = power(impaired.signal.data - clean.signal.data) / power(clean.signal.data)
     assert bool((error < 10**-1.8).all())  # 4 bits at 7 levels rms: about -20 dB
     assert bool(
         (

@@ -1,4 +1,4 @@
-"""Damages of the range converter, the channel response and the channel balance."""
+"""Impairments of the range converter, the channel response and the channel balance."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def test_jitter_samples_the_fourier_series_at_the_true_instants(n):
 
 def test_jitter_leaves_a_pilot_of_the_stated_tone_and_noise():
     recording, _ = small_recording(trials=2)
-    damaged, truth = PeriodicJitter(OFFSETS, pilot_cycles=0.2, pilot_snr_db=20.0, pilot_samples=2000)(
+    impaired, truth = PeriodicJitter(OFFSETS, pilot_cycles=0.2, pilot_snr_db=20.0, pilot_samples=2000)(
         recording, Draws(1, trials=[0, 1])
     )
-    pilot = damaged.aux["pilot"].to(torch.complex128)
+    pilot = impaired.aux["pilot"].to(torch.complex128)
     tone = torch.exp(2j * math.pi * 0.2 * (torch.arange(2000) + OFFSETS[torch.arange(2000) % 4]))
     phase = torch.exp(1j * torch.angle((pilot * tone.conj()).sum(-1, keepdim=True)))
     noise = (pilot - tone * phase).abs().square().mean(-1)
@@ -48,11 +48,11 @@ def test_jitter_refuses_crossing_instants():
 
 def test_response_multiplies_the_spectrum_and_holds_its_edges():
     recording, _ = small_recording()
-    damaged, truth = ChannelResponse(lambda u: 2 * u**2, lambda u: 1 + 0.5 * u)(recording, Draws(0))
+    impaired, truth = ChannelResponse(lambda u: 2 * u**2, lambda u: 1 + 0.5 * u)(recording, Draws(0))
     n, radar = recording.signal.data.shape[-1], recording.radar
     u = (torch.fft.fftfreq(n, 1 / radar.sampling_hz, dtype=torch.float64) / (radar.pulse.bandwidth_hz / 2)).clamp(-1, 1)
     expected = torch.fft.ifft(torch.fft.fft(recording.signal.data) * torch.polar(1 + 0.5 * u, 2 * u**2))
-    assert bool(error_db(damaged.signal.data, expected) < -100)
+    assert bool(error_db(impaired.signal.data, expected) < -100)
     assert truth["phase_rad"].shape == truth["amplitude"].shape == (1025,)
     with pytest.raises(ValueError, match="positive"):
         ChannelResponse(amplitude=lambda u: u)(recording, Draws(0))
@@ -61,8 +61,8 @@ def test_response_multiplies_the_spectrum_and_holds_its_edges():
 def test_imbalance_differs_per_trial_and_line():
     recording, _ = small_recording(trials=2)
     gain = torch.tensor([[1.0, 1.2], [1.0, 0.8]], dtype=torch.float64)
-    damaged, _ = ChannelImbalance(gain, (0.0, math.pi / 3))(recording, Draws(0, trials=[0, 1]))
-    ratio = damaged.signal.data / recording.signal.data
+    impaired, _ = ChannelImbalance(gain, (0.0, math.pi / 3))(recording, Draws(0, trials=[0, 1]))
+    ratio = impaired.signal.data / recording.signal.data
     torch.testing.assert_close(ratio[:, 0::2], torch.ones_like(ratio[:, 0::2]))
     expected = torch.tensor([1.2, 0.8])[:, None, None] * torch.exp(torch.tensor(1j * math.pi / 3))
     torch.testing.assert_close(ratio[:, 1::2], expected.expand(ratio[:, 1::2].shape).to(ratio.dtype))

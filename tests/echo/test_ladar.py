@@ -343,7 +343,7 @@ def test_gradients(level) -> None:
     )
 
 
-def test_damages_are_told() -> None:
+def test_impairments_are_told() -> None:
     def louder(recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         gain = draws.uniform("gain", (), 2.0, 3.0)
         return replace(

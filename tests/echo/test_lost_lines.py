@@ -1,4 +1,4 @@
-"""Damage to the sequence of lines: what is lost is really gone, and the truth says where."""
+"""Impairment to the sequence of lines: what is lost is really gone, and the truth says where."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import torch
 
 from tests.helpers import small_radar
 from torchsar.core import Draws, Recording, Signal
-from torchsar.echo import apply_damages
+from torchsar.echo import apply_impairments
 from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedLines
 
 N = 200
@@ -25,10 +25,10 @@ def recording(trials: int | None = 3) -> Recording:
 
 
 @pytest.mark.parametrize(
-    "damage, count", [(LostLines(count=7), 7), (LostLines(fraction=0.2), 40), (LostGaps(3, 8), 24)]
+    "impairment, count", [(LostLines(count=7), 7), (LostLines(fraction=0.2), 40), (LostGaps(3, 8), 24)]
 )
-def test_lost_lines_close_up_and_the_end_is_padded(damage, count: int) -> None:
-    out, told = apply_damages(recording(), {"lost": damage}, Draws(1, trials=range(3)))
+def test_lost_lines_close_up_and_the_end_is_padded(impairment, count: int) -> None:
+    out, told = apply_impairments(recording(), {"lost": impairment}, Draws(1, trials=range(3)))
     number, lost = out.aux["line_number"], told["lost.lost"]
     assert (lost.sum(-1) == count).all() and not lost[:, 0].any()
     for trial in range(3):
@@ -44,7 +44,7 @@ def test_lost_lines_close_up_and_the_end_is_padded(damage, count: int) -> None:
 
 def test_gaps_have_their_length_and_stay_apart() -> None:
     for seed in range(5):
-        _, told = apply_damages(recording(None), {"gap": LostGaps(5, 8)}, Draws(seed))
+        _, told = apply_impairments(recording(None), {"gap": LostGaps(5, 8)}, Draws(seed))
         edges = torch.diff(
             told["gap.lost"].int(), prepend=torch.zeros(1, dtype=torch.int32), append=torch.zeros(1, dtype=torch.int32)
         )
@@ -53,7 +53,7 @@ def test_gaps_have_their_length_and_stay_apart() -> None:
 
 
 def test_repeated_lines_come_twice() -> None:
-    out, told = apply_damages(recording(), {"again": RepeatedLines(6)}, Draws(2, trials=range(3)))
+    out, told = apply_impairments(recording(), {"again": RepeatedLines(6)}, Draws(2, trials=range(3)))
     number = out.aux["line_number"]
     assert torch.equal(told["again.repeated"][:, 1:], number[:, 1:] == number[:, :-1])
     assert ((number[:, 1:] - number[:, :-1]) >= 0).all()
@@ -63,15 +63,15 @@ def test_repeated_lines_come_twice() -> None:
 @pytest.mark.parametrize("bits", [None, 3])
 def test_corrupted_numbers_leave_samples_alone(bits: int | None) -> None:
     source = recording()
-    out, told = apply_damages(source, {"number": CorruptedNumbers(9, bits)}, Draws(3, trials=range(3)))
+    out, told = apply_impairments(source, {"number": CorruptedNumbers(9, bits)}, Draws(3, trials=range(3)))
     wrong = out.aux["line_number"] != told["number.true_number"]
     assert torch.equal(wrong, told["number.corrupted"]) and (wrong.sum(-1) == 9).all()
     assert torch.equal(out.signal.data, source.signal.data)
 
 
-def test_damage_depends_on_its_address_alone() -> None:
-    together, _ = apply_damages(recording(3), {"lost": LostLines(count=7)}, Draws(4, trials=range(3)))
-    alone, _ = apply_damages(recording(1), {"lost": LostLines(count=7)}, Draws(4, trials=[2]))
+def test_impairment_depends_on_its_address_alone() -> None:
+    together, _ = apply_impairments(recording(3), {"lost": LostLines(count=7)}, Draws(4, trials=range(3)))
+    alone, _ = apply_impairments(recording(1), {"lost": LostLines(count=7)}, Draws(4, trials=[2]))
     assert torch.equal(together.aux["line_number"][2], alone.aux["line_number"][0])
 
 

@@ -287,10 +287,10 @@ def test_batches_equal_singles_and_any_chunk(fidelity) -> None:
     world = TurntableWorld(
         scene, motion=motion, start_phase=[StartPhase(1.0), UniformStartPhase()], snr_db=5.0, fidelity=fidelity
     )
-    damages = {"lost": LostPulses(count=3)}
-    whole, told = simulate_turntable(QUICK, world, 24, 64, Draws(2, trials=range(4)), damages, DOUBLE)
-    part, _ = simulate_turntable(QUICK, world, 24, 64, Draws(2, trials=[3, 1]), damages, DOUBLE)
-    alone, said = simulate_turntable(QUICK, world, 24, 64, Draws(2), damages, DOUBLE)
+    impairments = {"lost": LostPulses(count=3)}
+    whole, told = simulate_turntable(QUICK, world, 24, 64, Draws(2, trials=range(4)), impairments, DOUBLE)
+    part, _ = simulate_turntable(QUICK, world, 24, 64, Draws(2, trials=[3, 1]), impairments, DOUBLE)
+    alone, said = simulate_turntable(QUICK, world, 24, 64, Draws(2), impairments, DOUBLE)
     torch.testing.assert_close(part.signal.data, whole.signal.data[[3, 1]], atol=1e-12, rtol=0)
     torch.testing.assert_close(alone.signal.data, whole.signal.data[0], atol=1e-12, rtol=0)
     assert torch.equal(said.values["phase_rad"], told.values["phase_rad"][0]) and torch.equal(

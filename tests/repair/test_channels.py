@@ -82,14 +82,14 @@ def test_too_few_lines_are_refused():
 @pytest.mark.parametrize("name, hz", [("radarsat1_english_bay.npz", 488.0), ("radarsat1_squamish.npz", 549.0)])
 def test_even_and_odd_lines_of_recorded_data(recorded, name, hz):
     clean = read_stripmap(recorded(name))
-    damaged, _ = ChannelImbalance((1, 1.2), (0, 60 * DEGREE))(clean, Draws(0))
+    impaired, _ = ChannelImbalance((1, 1.2), (0, 60 * DEGREE))(clean, Draws(0))
     chain = Chain(
         imbalance=EstimateImbalance(), equalise=use(CorrectImbalance(), gain="imbalance", phase_rad="imbalance")
     )
-    trace = chain.trace(damaged)
-    assert isinstance(damaged, Recording)
+    trace = chain.trace(impaired)
+    assert isinstance(impaired, Recording)
     assert abs(float(trace.values["imbalance.gain"][1]) - 1.2) < 0.0036
     assert abs(float(trace.values["imbalance.phase_rad"][1]) / DEGREE - 60) < 0.2
     assert float(correlation(trace.signal.data.to(torch.complex128), clean.signal.data.to(torch.complex128))) > 0.99999
-    told = EstimateImbalance()(damaged.signal, doppler_hz=torch.tensor(hz, dtype=torch.float64))
+    told = EstimateImbalance()(impaired.signal, doppler_hz=torch.tensor(hz, dtype=torch.float64))
     torch.testing.assert_close(told["phase_rad"], trace.values["imbalance.phase_rad"])

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tests.helpers import small_radar, small_recording
 from torchsar.core import Chain, Draws, Recording, Signal, use
-from torchsar.echo import apply_damages, simulate
+from torchsar.echo import apply_impairments, simulate
 from torchsar.echo.lines import LostGaps, LostLines
 from torchsar.focus import OmegaK, matched_reference, omega_k
 from torchsar.focus.defocus import InvertibleOmegaK, all_pass, defocus_omega_k
@@ -177,7 +177,7 @@ def test_geometry_need_not_be_exact() -> None:
 
 
 def test_chain_from_line_numbers_to_filled_lines() -> None:
-    recording, truth = small_recording(trials=2, damages={"loss": LostLines(count=3)})
+    recording, truth = small_recording(trials=2, impairments={"loss": LostLines(count=3)})
     chain = Chain(
         lines=use(LineIntegrity(), line_number="aux.line_number"),
         fill=use(SparseFill(RADAR), missing="lines.missing"),
@@ -262,15 +262,15 @@ def test_recorded_lines(recorded, name: str, loss, reach: float) -> None:
     """Brief 004, table on recorded data.
 
     Squamish (mountains, few dark or very bright places) stays below the figures of the brief, which
-    even the local powers of the undamaged image, averaged over 3 x 3 pixels, would not reach there
+    even the local powers of the unimpaired image, averaged over 3 x 3 pixels, would not reach there
     (0.9900 at 5 %, 0.957 at 20 %).
     """
     doppler, rows, columns = BLOCKS[name]
     clean = recorded_block(recorded(name), columns)
-    damaged, _ = apply_damages(clean, {"loss": loss}, Draws(7))
+    impaired, _ = apply_impairments(clean, {"loss": loss}, Draws(7))
     focus = OmegaK(clean.radar, None, doppler_hz=doppler)
     truth = focus(clean.signal).data
-    signal, found = LineIntegrity()(damaged.signal, damaged.aux["line_number"])
+    signal, found = LineIntegrity()(impaired.signal, impaired.aux["line_number"])
     filled = SparseFill(clean.radar, None, doppler_hz=doppler)(signal, found["missing"])
     reached, zero = (rho(focus(x).data, truth, rows) for x in (filled, signal))
     assert zero < reached and reached >= reach, f"rho {reached:.5f}, zeros {zero:.5f}"

@@ -95,9 +95,9 @@ def test_figures_of_the_brief(kind: str) -> None:
     figures: dict[str, list[float]] = {"raw": [], "notch": [], "subtract": []}
     for seed, frequency_hz in enumerate((20e6, -47e6, 70e6, -80e6, 3e6, -15e6)):
         clean = acquire(kind, 20.0, seed, n_pulse=256)
-        damaged, told = Tone(20.0, frequency_hz, 1e6, share=SHARE)(clean, Draws(seed))
-        subtracted, notched = subtract_interference(damaged.signal.data), notch_interference(damaged.signal.data)
-        for name, data in (("raw", damaged.signal.data), ("notch", notched.data), ("subtract", subtracted.data)):
+        impaired, told = Tone(20.0, frequency_hz, 1e6, share=SHARE)(clean, Draws(seed))
+        subtracted, notched = subtract_interference(impaired.signal.data), notch_interference(impaired.signal.data)
+        for name, data in (("raw", impaired.signal.data), ("notch", notched.data), ("subtract", subtracted.data)):
             figures[name].append(image_error_db(data, clean))
         assert torch.equal(subtracted.touched, told["contaminated"]) and torch.equal(
             notched.touched, told["contaminated"]
@@ -111,15 +111,15 @@ def test_figures_of_the_brief(kind: str) -> None:
 
 def test_drop_gives_the_contaminated_lines_to_the_fill() -> None:
     clean = acquire("speckle", 20.0, 1)
-    damaged, told = Tone(20.0, 20e6, 1e6, share=SHARE)(clean, Draws(1))
-    dropped = drop_interference(damaged.signal.data)
+    impaired, told = Tone(20.0, 20e6, 1e6, share=SHARE)(clean, Draws(1))
+    dropped = drop_interference(impaired.signal.data)
     assert torch.equal(dropped.missing, told["contaminated"])
     assert float(dropped.data[dropped.missing].abs().max()) == 0
-    assert not bool(subtract_interference(damaged.signal.data).missing.any())
+    assert not bool(subtract_interference(impaired.signal.data).missing.any())
 
 
 @pytest.mark.parametrize(
-    "damages, loss_db",
+    "impairments, loss_db",
     [
         ([Tone(10.0, 15e6, 5e5, rate_hz_s=3e11)], -27.5),
         ([Tone(20.0, 124.9e6)], -30.0),
@@ -130,17 +130,17 @@ def test_drop_gives_the_contaminated_lines_to_the_fill() -> None:
     ],
     ids=["sweeping", "band_edge", "coherent", "two", "wide", "wide_and_tone"],
 )
-def test_kinds_of_interferers_on_all_lines(damages, loss_db: float) -> None:
+def test_kinds_of_interferers_on_all_lines(impairments, loss_db: float) -> None:
     """All lines contaminated.
 
     A tone costs 1 to 2.5 of 2048 samples, at 1.25 of the mean density in the pulse band (-32 to -28
     dB); a band its degrees of freedom (8 cells here) and as many again for each edge.
     """
     clean = acquire("speckle", 20.0, seed=5, n_pulse=160)
-    damaged = clean
-    for i, damage in enumerate(damages):
-        damaged, _ = damage(damaged, Draws(4).part(str(i)))
-    result = subtract_interference(damaged.signal.data)
+    impaired = clean
+    for i, impairment in enumerate(impairments):
+        impaired, _ = impairment(impaired, Draws(4).part(str(i)))
+    result = subtract_interference(impaired.signal.data)
     assert bool(result.touched.all()) and not bool(result.missing.any())
     assert image_error_db(result.data, clean) < loss_db
 
@@ -148,10 +148,10 @@ def test_kinds_of_interferers_on_all_lines(damages, loss_db: float) -> None:
 def test_lines_beyond_repair_are_reported_missing() -> None:
     """More bands on a line than can be modelled: the line is given up, no other is harmed."""
     clean = acquire("speckle", 20.0, seed=6, n_pulse=96)
-    damaged, told = clean, {}
+    impaired, told = clean, {}
     for frequency in (-80e6, -50e6, -20e6, 20e6, 50e6, 75e6):
-        damaged, told = WideInterferer(10.0, frequency, 1e6, share=4 / 96)(damaged, Draws(3))
-    result = subtract_interference(damaged.signal.data)
+        impaired, told = WideInterferer(10.0, frequency, 1e6, share=4 / 96)(impaired, Draws(3))
+    result = subtract_interference(impaired.signal.data)
     assert torch.equal(result.missing, told["contaminated"])
     assert torch.equal(result.data[~result.missing], clean.signal.data[~result.missing])
 
@@ -159,8 +159,8 @@ def test_lines_beyond_repair_are_reported_missing() -> None:
 def test_batch_equals_singles_and_quiet_trials_stay_quiet() -> None:
     clean, _ = small_recording(96, 512, trials=3, dtype=torch.complex128)
     tone = Tone(torch.tensor([20.0, -400.0, 5.0]), torch.tensor([5e6, 0.0, -9e6]), share=0.3)
-    damaged, _ = tone(clean, Draws(2, trials=range(3)))
-    data = damaged.signal.data * torch.tensor([1.0, 1e-3, 1e3], dtype=torch.complex128)[:, None, None]
+    impaired, _ = tone(clean, Draws(2, trials=range(3)))
+    data = impaired.signal.data * torch.tensor([1.0, 1e-3, 1e3], dtype=torch.complex128)[:, None, None]
     together = subtract_interference(data)
     for i in range(3):
         alone = subtract_interference(data[i])
@@ -173,9 +173,9 @@ def test_batch_equals_singles_and_quiet_trials_stay_quiet() -> None:
 
 def test_complex64_follows_complex128() -> None:
     clean = acquire("speckle", 20.0, seed=7, n_pulse=64)
-    damaged, _ = Tone(30.0, 22e6, 1e6)(clean.to(torch.complex128), Draws(1))
-    exact = subtract_interference(damaged.signal.data)
-    single = subtract_interference(damaged.signal.data.to(torch.complex64))
+    impaired, _ = Tone(30.0, 22e6, 1e6)(clean.to(torch.complex128), Draws(1))
+    exact = subtract_interference(impaired.signal.data)
+    single = subtract_interference(impaired.signal.data.to(torch.complex64))
     assert single.data.dtype == torch.complex64
     assert float(error_db(single.data.to(torch.complex128), exact.data)) < -60
 
@@ -200,14 +200,14 @@ def test_gradient_through_the_subtraction() -> None:
 
 def test_stages_in_a_chain_report_what_they_touched() -> None:
     clean = acquire("speckle", 20.0, seed=8, n_pulse=96)
-    damaged, told = Tone(20.0, 20e6, share=0.1)(clean, Draws(1))
+    impaired, told = Tone(20.0, 20e6, share=0.1)(clean, Draws(1))
     for stage in (SubtractInterference(), NotchInterference(), DropInterference()):
-        trace = Chain(interference=stage, focus=use(OmegaK(RADAR, doppler_hz=0.0))).trace(damaged)
+        trace = Chain(interference=stage, focus=use(OmegaK(RADAR, doppler_hz=0.0))).trace(impaired)
         estimate = trace.estimates["interference"]
         assert int(estimate.info["lines_touched"]) == int(told["contaminated"].sum()) == 10
         assert int(estimate.info["cells_touched"]) > 0 and bool(estimate.ok)
     assert trace.values["interference.missing"].shape == (96,)
-    found = SubtractInterference()(damaged.signal)[1].info["tone_cycles_per_sample"][told["contaminated"]]
+    found = SubtractInterference()(impaired.signal)[1].info["tone_cycles_per_sample"][told["contaminated"]]
     assert float((found * RADAR.sampling_hz - 20e6).abs().max()) < 0.05 * RADAR.sampling_hz / 2048
 
 
@@ -227,7 +227,9 @@ def test_threshold_below_the_clutter_is_refused() -> None:
 
 
 class Bench:
-    """A recording with the AGC undone last, so that damage is put into what the converter saw."""
+    """A recording with the AGC undone last, so that impairment is put into what the
+    converter saw.
+    """
 
     def __init__(self, name: str, path) -> None:
         self.recording = read_stripmap(path)
@@ -239,11 +241,11 @@ class Bench:
     def image(self, data: torch.Tensor) -> torch.Tensor:
         return self.focus(self.recording.signal.with_data(data)).data[self.window].to(torch.complex128)
 
-    def repaired(self, damages) -> float:
+    def repaired(self, impairments) -> float:
         raw = self.recording
         raw = replace(raw, signal=raw.signal.with_data(raw.signal.data / self.gain))
-        for i, damage in enumerate(damages):
-            raw, _ = damage(raw, Draws(11).part(str(i)))
+        for i, impairment in enumerate(impairments):
+            raw, _ = impairment(raw, Draws(11).part(str(i)))
         image = self.image(subtract_interference(raw.signal.data * self.gain).data)
         product = (image * self.clean.conj()).sum().abs()
         return float(product / torch.linalg.vector_norm(image) / torch.linalg.vector_norm(self.clean))
@@ -274,7 +276,7 @@ class Bench:
 )
 def test_recorded_data_reach_the_brief(name: str, cases: dict, recorded) -> None:
     bench = Bench(name, recorded(name))
-    reached = {case: bench.repaired(damages) for case, (damages, _) in cases.items()}
+    reached = {case: bench.repaired(impairments) for case, (impairments, _) in cases.items()}
     assert all(reached[case] >= least for case, (_, least) in cases.items()), reached
 
 

@@ -94,8 +94,8 @@ def test_coinciding_instants_are_refused(bad, method):
 @pytest.mark.parametrize("snr_db, cycles, period", [(60.0, 0.2137, 4), (30.0, -0.37, 4), (40.0, 0.11, 13)])
 def test_pilot_reaches_the_predicted_error(snr_db, cycles, period):
     true = OFFSETS if period == 4 else offsets(period)
-    damage = PeriodicJitter(true, pilot_cycles=cycles, pilot_snr_db=snr_db, pilot_samples=2000)
-    pilot = damage.pilot(true, Draws(3, trials=range(60)), torch.zeros(1, dtype=torch.complex64))
+    impairment = PeriodicJitter(true, pilot_cycles=cycles, pilot_snr_db=snr_db, pilot_samples=2000)
+    pilot = impairment.pilot(true, Draws(3, trials=range(60)), torch.zeros(1, dtype=torch.complex64))
     for origin, expected in (("mean", true - true.mean()), ("first", true - true[0])):
         estimate = estimate_jitter_pilot(pilot, origin=origin)
         assert bool(estimate.ok.all()) and bool((estimate["period"] == period).all())
@@ -152,7 +152,7 @@ def test_chain_from_pilot_to_correction(small_jittered):
 def small_jittered():
     from tests.helpers import small_recording
 
-    recording, truth = small_recording(trials=2, damages={"jitter": PeriodicJitter(OFFSETS)})
+    recording, truth = small_recording(trials=2, impairments={"jitter": PeriodicJitter(OFFSETS)})
     return recording, truth.clean.signal
 
 

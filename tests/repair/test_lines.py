@@ -8,7 +8,7 @@ from torch import Tensor
 
 from tests.helpers import small_radar
 from torchsar.core import Draws, Estimate, Recording, Signal
-from torchsar.echo import apply_damages
+from torchsar.echo import apply_impairments
 from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedLines
 from torchsar.repair.lines import LineIntegrity, line_integrity, place_per_line
 
@@ -20,9 +20,9 @@ def lines(trials: int | None = 2, n: int = N) -> Tensor:
     return torch.randn(shape, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
 
 
-def damaged(seed: int, trials: int = 2, **damages) -> tuple[Recording, Recording, dict]:
+def impaired(seed: int, trials: int = 2, **impairments) -> tuple[Recording, Recording, dict]:
     clean = Recording(Signal(lines(trials), small_radar().raw_axes(N, 3)), small_radar())
-    out, told = apply_damages(clean, damages, Draws(seed, trials=range(trials)))
+    out, told = apply_impairments(clean, impairments, Draws(seed, trials=range(trials)))
     return clean, out, told
 
 
@@ -54,7 +54,7 @@ def test_shorter_trials_stay_padded() -> None:
     "loss", [LostLines(count=6), LostLines(fraction=0.05), LostLines(fraction=0.2), LostGaps(5, 8), LostGaps(2, 60)]
 )
 def test_every_line_returns_to_its_place(seed: int, loss) -> None:
-    clean, out, told = damaged(seed, loss=loss)
+    clean, out, told = impaired(seed, loss=loss)
     repaired, estimate = LineIntegrity()(out.signal, out.aux["line_number"])
     lost = told["loss.lost"]
     # lost behind the last received line: nothing tells of them
@@ -67,7 +67,7 @@ def test_every_line_returns_to_its_place(seed: int, loss) -> None:
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.05])
 def test_corrupted_and_repeated_numbers(seed: int, share: float) -> None:
-    _, out, told = damaged(seed, loss=LostLines(fraction=share), again=RepeatedLines(5), wrong=CorruptedNumbers(12))
+    _, out, told = impaired(seed, loss=LostLines(fraction=share), again=RepeatedLines(5), wrong=CorruptedNumbers(12))
     _, estimate = LineIntegrity()(out.signal, out.aux["line_number"])
     placed = estimate.info["number"] != -1
     assert torch.equal(estimate.info["number"][placed], told["wrong.true_number"][placed])

@@ -11,7 +11,7 @@ import torch
 
 from tests.helpers import kondor_radar
 from torchsar.core import Draws
-from torchsar.echo import ChannelResponse, apply_damages, simulate
+from torchsar.echo import ChannelResponse, apply_impairments, simulate
 from torchsar.focus import OmegaK
 from torchsar.metrics import error_db
 from torchsar.repair import CorrectResponse, EstimateResponse, correct_response, estimate_response_points
@@ -55,12 +55,12 @@ def scene():
 
 def test_known_response_is_removed_exactly(scene):
     radar, recording = scene
-    damaged, truth = apply_damages(
+    impaired, truth = apply_impairments(
         recording, {"r": ChannelResponse(brief_phase, lambda u: 10 ** (3 * u / 20))}, Draws(0)
     )
     u = band_grid()
     back = correct_response(
-        damaged.signal.data, brief_phase(u), 10 ** (3 * u / 20), radar.pulse.bandwidth_hz / radar.sampling_hz
+        impaired.signal.data, brief_phase(u), 10 ** (3 * u / 20), radar.pulse.bandwidth_hz / radar.sampling_hz
     )
     assert error_db(back, recording.signal.data) < -60
     assert set(truth) == {"r.phase_rad", "r.amplitude"}
@@ -70,8 +70,8 @@ def test_phase_of_the_brief_is_found_and_corrected(scene):
     radar, recording = scene
     focus = OmegaK(radar, "flat")
     clean = focus(recording.signal)
-    damaged, _ = apply_damages(recording, {"r": ChannelResponse(brief_phase)}, Draws(0))
-    image = focus(damaged.signal)
+    impaired, _ = apply_impairments(recording, {"r": ChannelResponse(brief_phase)}, Draws(0))
+    image = focus(impaired.signal)
     found = EstimateResponse(radar)(image)
     assert bool(found.ok) and rms(without_line(found["phase_rad"] - brief_phase(band_grid()))) < 0.06
     repaired = CorrectResponse(radar)(image, found["phase_rad"])
@@ -90,8 +90,8 @@ def test_amplitude_against_an_expected_spectrum(scene):
     radar, recording = scene
     focus = OmegaK(radar, "flat")
     clean = focus(recording.signal)
-    damaged, _ = apply_damages(recording, {"r": ChannelResponse(None, lambda u: 10 ** (3 * u / 20))}, Draws(0))
-    image = focus(damaged.signal)
+    impaired, _ = apply_impairments(recording, {"r": ChannelResponse(None, lambda u: 10 ** (3 * u / 20))}, Draws(0))
+    image = focus(impaired.signal)
     found = EstimateResponse(radar, expected_power=band_power(clean.data))(image)
     repaired = CorrectResponse(radar)(image, torch.zeros_like(found["phase_rad"]), found["amplitude"])
     # the mean gain is no part of the response

@@ -108,7 +108,7 @@ def test_unknown_config_names_what_there_is() -> None:
         (["world.beam.dwels=1"], ["world.beam.dwels", "not known", "did you mean 'dwell_s'"]),
         (["world.scene.points.azimuth_m=[1,x]"], ["world.scene.points.azimuth_m", "'x'"]),
         (["world.scene.points.kind=null"], ["world.scene.points.kind", "unknown scene None"]),
-        (["world.damages.x.kind=nothing"], ["world.damages.x.kind", "unknown damage 'nothing'"]),
+        (["world.impairments.x.kind=nothing"], ["world.impairments.x.kind", "unknown impairment 'nothing'"]),
         (
             ["processor.recommended.stages.focus.stage=omega"],
             ["processor.recommended.stages.focus.stage", "unknown stage 'omega'", "did you mean 'omega_k'"],
@@ -154,8 +154,8 @@ def test_unknown_config_names_what_there_is() -> None:
         (["world.doppler_hz=3000.0"], ["world", "Doppler", "squint beyond 90 degrees"]),
         (["radar.pulse.duration_s=1.0"], ["world", "a line of 128 samples does not hold the pulse of 50000000"]),
         (
-            ["world.damages={x: {kind: periodic_jitter, offset_samples: []}}"],
-            ["world.damages.x", "at least one offset"],
+            ["world.impairments={x: {kind: periodic_jitter, offset_samples: []}}"],
+            ["world.impairments.x", "at least one offset"],
         ),
         (["processor.recommended.stages.keys.stage=omega_k"], ["processor.recommended", "cannot be called 'keys'"]),
         (

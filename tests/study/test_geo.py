@@ -194,17 +194,17 @@ def test_targets_keep_their_noise_and_trials_their_rows(tmp_path: Path) -> None:
     assert moved.truth["u_r_m_s"].tolist() == [0, 12, 0, 12]
 
 
-def test_damage_stays_in_the_clean_image(tmp_path: Path) -> None:
-    damages = {"channels": {"kind": "channel_errors", "phase_rad": [0.1, -0.2, 0.1]}}
+def test_impairment_stays_in_the_clean_image(tmp_path: Path) -> None:
+    impairments = {"channels": {"kind": "channel_errors", "phase_rad": [0.1, -0.2, 0.1]}}
     given = {"processor": {"recommended": TINY["processor"]["oracle"]}, "metrics": None}
     level = [
         float(
             run_batch(
-                GeoTrials(load(write(tmp_path, **given, world=world(trials=1, damages=one)))).bench({}),
+                GeoTrials(load(write(tmp_path, **given, world=world(trials=1, impairments=one)))).bench({}),
                 Draws(1, "run", [0]),
             ).metrics["recommended"]["mfta_db"][1]
         )
-        for one in ({}, damages)
+        for one in ({}, impairments)
     ]
     assert level[0] < -60 and level[1] > -35
 

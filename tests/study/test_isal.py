@@ -77,7 +77,7 @@ def test_a_run_compares_methods_over_cases_and_scenes(tmp_path: Path) -> None:
         tmp_path,
         cases={
             "noisy": {"world.noise.snr_db": 5.0},
-            "lost": {"world.damages": {"lost": {"kind": "lost_pulses", "count": 4}}},
+            "lost": {"world.impairments": {"lost": {"kind": "lost_pulses", "count": 4}}},
         },
     )
     metrics = run(config, tmp_path / "out")
@@ -258,7 +258,7 @@ def test_injected_phases_are_found_in_recordings(tmp_path: Path, made) -> None:
         ),
         ({"radar": {**TINY["radar"], "rotation_rad_s": None}}, "rotation"),
         (
-            {"world": {**TINY["world"], "damages": {"lost": {"kind": "lost_pulses", "count": 96}}}},
+            {"world": {**TINY["world"], "impairments": {"lost": {"kind": "lost_pulses", "count": 96}}}},
             "lost pulses leave nothing",
         ),
     ],
@@ -367,13 +367,13 @@ def _method(**stages: dict) -> dict:
             {
                 "world": {
                     **TINY["world"],
-                    "damages": {"hum": {"kind": "tone", "over_signal_db": 9.0, "frequency_hz": 1e6}},
+                    "impairments": {"hum": {"kind": "tone", "over_signal_db": 9.0, "frequency_hz": 1e6}},
                 }
             },
-            "unknown damage of a turning target 'tone'",
+            "unknown impairment of a turning target 'tone'",
         ),
         (
-            {"world": {**TINY["world"], "damages": {"lost": {"kind": "lost_lines", "count": 3}}}},
+            {"world": {**TINY["world"], "impairments": {"lost": {"kind": "lost_lines", "count": 3}}}},
             "did you mean 'lost_pulses'",
         ),
         ({"radar": {**TINY["radar"], "carrier_hz": 1e-300}}, "check the carrier"),
@@ -395,8 +395,8 @@ def test_what_would_mislead_is_refused(
             "system isal runs no part of a chain again",
         ),
         (
-            ["cases={white: {data.damages: {hum: {kind: tone, over_signal_db: 9, frequency_hz: 1e6}}}}"],
-            "unknown damage of a turning target",
+            ["cases={white: {data.impairments: {hum: {kind: tone, over_signal_db: 9, frequency_hz: 1e6}}}}"],
+            "unknown impairment of a turning target",
         ),
         (["cases={white: {seed: 2}}", "processor.sca={stages: {phase: {stage: sca}}}"], "not an image"),
     ],
@@ -469,11 +469,11 @@ def test_trade_compares_methods_that_compress_pulses_themselves(tmp_path: Path) 
     )
 
 
-def test_trade_knows_the_phases_of_damages(tmp_path: Path) -> None:
-    damages = {"phase": {"kind": "white_phase"}, "lost": {"kind": "lost_pulses", "count": 6}}
+def test_trade_knows_the_phases_of_impairments(tmp_path: Path) -> None:
+    impairments = {"phase": {"kind": "white_phase"}, "lost": {"kind": "lost_pulses", "count": 6}}
     config = write(
         tmp_path,
-        world={**TINY["world"], "damages": damages},
+        world={**TINY["world"], "impairments": impairments},
         trade={"trials": 2, "repeats": 1, "search": [0], "polish": [0]},
     )
     assert main(["trade", config, "--out", str(tmp_path / "trade")]) == 0

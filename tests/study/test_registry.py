@@ -13,7 +13,7 @@ import torch
 from torchsar.core import Stage
 from torchsar.study.catalogue import Catalogue
 from torchsar.study.errors import ConfigError
-from torchsar.study.registry import BEAMS, DAMAGES, GROUPS, PATHS, SCENES, group_of, stages
+from torchsar.study.registry import BEAMS, GROUPS, IMPAIRMENTS, PATHS, SCENES, group_of, stages
 
 OWN = '''
 from torchsar.core import Stage
@@ -28,7 +28,7 @@ class Louder(Stage):
 '''
 
 
-@pytest.mark.parametrize("catalogue", [stages(), SCENES, BEAMS, PATHS, DAMAGES], ids=lambda c: c.what)
+@pytest.mark.parametrize("catalogue", [stages(), SCENES, BEAMS, PATHS, IMPAIRMENTS], ids=lambda c: c.what)
 def test_every_entry_has_keys_that_yaml_can_hold(catalogue: Catalogue) -> None:
     for name in catalogue.entries:
         assert catalogue.model(name).model_fields is not None

@@ -357,7 +357,7 @@ def test_everything_that_a_world_may_hold_is_built(tmp_path: Path) -> None:
         sweep_error=errors,
         calibration={"kind": "fibre", "delay_s": 5e-8},
         gate_m=[1.0, 2.0],
-        damages={"adc": {"kind": "quantiser", "bits": 8}},
+        impairments={"adc": {"kind": "quantiser", "bits": 8}},
     )
     chain = {
         "calibrate": {

@@ -226,7 +226,7 @@ def remove(*parts: str) -> Callable[[Path], Any]:
     )
 
 
-DAMAGES = {
+FAULTS = {
     "metric": (remove("error_m"), "'error_m' is missing"),
     "verdicts": (remove("ok"), "'ok' is missing"),
     "bound": (remove("error_m_bound_x"), "'error_m_bound_x' is missing"),
@@ -240,10 +240,10 @@ DAMAGES = {
 }
 
 
-@pytest.mark.parametrize("damage, said", DAMAGES.values(), ids=DAMAGES)
-def test_a_damaged_store_is_not_taken_for_results(damage: Callable[[Path], Any], said: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("fault, said", FAULTS.values(), ids=FAULTS)
+def test_a_damaged_store_is_not_taken_for_results(fault: Callable[[Path], Any], said: str, tmp_path: Path) -> None:
     run(tmp_path / "s")
-    damage(tmp_path / "s" / "results.zarr")
+    fault(tmp_path / "s" / "results.zarr")
     for options in ({"resume": True}, {}):
         with pytest.raises(ConfigError, match=said):
             run(tmp_path / "s", **options)

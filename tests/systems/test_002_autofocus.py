@@ -46,10 +46,10 @@ def simulated(
     snr_db: float | None = None,
     trials: int = 4,
     dtype: torch.dtype = torch.complex64,
-    damages=None,
+    impairments=None,
 ) -> tuple[Recording, Truth]:
     world = TurntableWorld(scene, motion=motion, start_phase=start, snr_db=snr_db)
-    return simulate_turntable(RADAR, world, 400, 256, Draws(3, trials=range(trials)), damages, dtype=dtype)
+    return simulate_turntable(RADAR, world, 400, 256, Draws(3, trials=range(trials)), impairments, dtype=dtype)
 
 
 def image_entropy(data: Tensor, phase_rad: Tensor | None = None) -> Tensor:
@@ -294,15 +294,15 @@ def test_pga_ends_near_its_best_iterate(name):
     assert error < 1.1 * best + 1e-4 and best < 0.5 * float(phase_rmse(begin, true))
 
 
-# damages put into any range-compressed recording
+# impairments put into any range-compressed recording
 
 
 @pytest.mark.parametrize(
-    "damage", [WhitePhase(), PhaseWalk(0.5), PhaseSinusoid(30.0, 12.0)], ids=["white", "walk", "sinusoid"]
+    "impairment", [WhitePhase(), PhaseWalk(0.5), PhaseSinusoid(30.0, 12.0)], ids=["white", "walk", "sinusoid"]
 )
-def test_damages_turn_pulses_by_what_they_say(damage):
+def test_impairments_turn_pulses_by_what_they_say(impairment):
     recording, truth = simulated(
-        Aircraft(), start=(), snr_db=20.0, trials=2, damages={"phase": damage}, dtype=torch.complex128
+        Aircraft(), start=(), snr_db=20.0, trials=2, impairments={"phase": impairment}, dtype=torch.complex128
     )
     assert truth.clean is not None
     said = truth.values["phase.phase_rad"]
@@ -317,7 +317,7 @@ def test_damages_turn_pulses_by_what_they_say(damage):
 @pytest.mark.parametrize(
     "make", [lambda: WhitePhase(-1.0), lambda: PhaseWalk(math.nan), lambda: PhaseSinusoid(cycles=math.inf)]
 )
-def test_damages_that_make_no_sense(make):
+def test_impairments_that_make_no_sense(make):
     with pytest.raises(ValueError):
         make()
 

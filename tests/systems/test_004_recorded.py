@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from torchsar.core import Draws
-from torchsar.echo import apply_damages
+from torchsar.echo import apply_impairments
 from torchsar.io import read_stripmap
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "recorded_impairments.py"
@@ -48,7 +48,7 @@ def bench(recorded):
 )
 def test_row_reaches_its_figure(bench, name):
     row = ROWS[name]
-    damaged, _ = apply_damages(bench.recording, row.damages, Draws(11, case=name))
-    assert bench.rho(row.repair(bench, damaged)) >= row.at_least
-    if row.damages:
-        assert bench.rho(table.nothing(bench, damaged)) < row.at_least
+    impaired, _ = apply_impairments(bench.recording, row.impairments, Draws(11, case=name))
+    assert bench.rho(row.repair(bench, impaired)) >= row.at_least
+    if row.impairments:
+        assert bench.rho(table.nothing(bench, impaired)) < row.at_least

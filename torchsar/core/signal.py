@@ -192,7 +192,7 @@ def _refuse_other_lines(side: Tensor, samples: Tensor, what: str) -> None:
 
 @dataclass(frozen=True)
 class Truth:
-    """What the world knows and no processor may see: named per-trial tensors, and the undamaged
+    """What the world knows and no processor may see: named per-trial tensors, and the unimpaired
     recording where there is one.
     """
 

@@ -1,4 +1,4 @@
-"""Radar and scene to recordings: echoes, noise and receiver damage."""
+"""Radar and scene to recordings: echoes, noise and receiver impairment."""
 
 from torchsar.echo.bistatic import bistatic_echo, simulate_bistatic
 from torchsar.echo.channel_errors import ChannelErrors, PolynomialDrift, SinusoidDrift, SynchronisationError, WalkDrift
@@ -12,7 +12,7 @@ from torchsar.echo.pairs import SimulatedPairs
 from torchsar.echo.pulse_phase import PhaseSinusoid, PhaseWalk, WhitePhase
 from torchsar.echo.response import ChannelResponse
 from torchsar.echo.sea import sea_echo
-from torchsar.echo.stripmap import Damage, apply_damages, simulate, stripmap_echo, target_energy
+from torchsar.echo.stripmap import Impairment, apply_impairments, simulate, stripmap_echo, target_energy
 from torchsar.echo.sweep_error import PolynomialSweepError, SinusoidSweepError, calibration_channel
 from torchsar.echo.turntable import LostPulses, dechirped_echo, simulate_turntable, turntable_echo
 
@@ -21,7 +21,7 @@ __all__ = [
     "ChannelImbalance",
     "ChannelResponse",
     "CorruptedNumbers",
-    "Damage",
+    "Impairment",
     "LostGaps",
     "LostLines",
     "LostPulses",
@@ -40,7 +40,7 @@ __all__ = [
     "WalkDrift",
     "WhitePhase",
     "WideInterferer",
-    "apply_damages",
+    "apply_impairments",
     "bistatic_echo",
     "calibration_channel",
     "dechirped_echo",

@@ -16,7 +16,7 @@ from torchsar.core import Axis, Draws, Recording, Signal, Truth, per_trial, real
 from torchsar.echo.ladar_course import refuse_trials
 from torchsar.echo.pulsed import echo_spectrum
 from torchsar.echo.sea import sea_echo
-from torchsar.echo.stripmap import Damage
+from torchsar.echo.stripmap import Impairment
 from torchsar.radar import BistaticRadar
 from torchsar.scene import BandLimited, BistaticWorld, ExactRange, Gate, Movers, ReceiveRange, TransmitRange
 
@@ -154,7 +154,7 @@ def simulate_bistatic(
     draws: Draws,
     *,
     kind: Kind = "compressed",
-    damages: Mapping[str, Damage] | None = None,
+    impairments: Mapping[str, Impairment] | None = None,
     dtype: torch.dtype = torch.complex64,
     device: torch.device | str | None = None,
 ) -> tuple[Recording, Truth]:
@@ -162,13 +162,14 @@ def simulate_bistatic(
     the trials of `draws`.
 
     n_range: None for azimuth-only data, on which every target lies on the one recorded line. kind:
-    see `bistatic_echo`; azimuth-only data are compressed. damages: applied in order, by name. The
-    truth, float64 (..., target): `u_r_m_s`, `u_a_m_s`, `y0_m` (also as `azimuth_m`), `range_m`
+    see `bistatic_echo`; azimuth-only data are compressed. impairments: applied in order, by name.
+    The truth, float64 (..., target): `u_r_m_s`, `u_a_m_s`, `y0_m` (also as `azimuth_m`), `range_m`
     (R0), `amplitude`, and `u_t_m_s`, the closing speed towards the transmitter, where there is one;
     `transmit_range_m` (pulse,), the true R_T(t) - R_T(0); `noise_std` of a sample of this kind
-    (...,); what each damage says under "<damage>.<name>". `clean` is the recording without noise
-    and damages. Warns of targets that shine at no pulse. Raises ValueError for targets as fast as
-    the receiver or far outside the range axis, no pulses, or lines that do not hold the pulse.
+    (...,); what each impairment says under "<impairment>.<name>". `clean` is the recording without
+    noise and impairments. Warns of targets that shine at no pulse. Raises ValueError for targets as
+    fast as the receiver or far outside the range axis, no pulses, or lines that do not hold the
+    pulse.
     """
     _refuse_impossible(radar, world, n_pulse, n_range, kind, draws)
     movers = _movers(radar, world, n_range, draws, device)
@@ -204,8 +205,8 @@ def simulate_bistatic(
         clean if world.snr_db is None else Recording(Signal(echo + _noise(std, axes, draws, dtype), axes), radar)
     )
     told: dict[str, Tensor] = {}
-    for name, damage in (damages or {}).items():
-        recording, said = damage(recording, draws.part(name))
+    for name, impairment in (impairments or {}).items():
+        recording, said = impairment(recording, draws.part(name))
         told.update({f"{name}.{key}": value for key, value in said.items()})
     return recording, Truth({**values, **told}, clean)
 

@@ -80,8 +80,8 @@ class ChannelErrors:
         factor = unit_phasor(phase / (2 * math.pi), signal.data.dtype) * (10 ** (gain / 20)).to(
             real_dtype(signal.data.dtype)
         )
-        damaged = signal.with_data(signal.data * factor[(..., *tail)])
-        return replace(recording, signal=damaged), {"phase_rad": phase, "gain_db": gain, "delay_s": delay}
+        impaired = signal.with_data(signal.data * factor[(..., *tail)])
+        return replace(recording, signal=impaired), {"phase_rad": phase, "gain_db": gain, "delay_s": delay}
 
 
 class Drift(Protocol):
@@ -189,9 +189,9 @@ class SynchronisationError:
             _refuse_delay(recording, "a synchronisation error")
             signal = delayed(signal, delay[..., None, :], radar)
         turn = unit_phasor(phase / (2 * math.pi), signal.data.dtype)
-        damaged = signal.with_data(signal.data * turn[(..., None, slice(None), *tail)])
+        impaired = signal.with_data(signal.data * turn[(..., None, slice(None), *tail)])
         aux = {**recording.aux, "direct_path": self._direct_path(turn, delay, radar, draws)}
-        return replace(recording, signal=damaged, aux=aux), {"phase_rad": phase, "delay_s": delay}
+        return replace(recording, signal=impaired, aux=aux), {"phase_rad": phase, "delay_s": delay}
 
     def _direct_path(self, turn: Tensor, delay_s: Tensor, radar: BistaticRadar, draws: Draws) -> Tensor:
         n = self.direct_samples

@@ -31,5 +31,5 @@ class ChannelImbalance:
             )
         factor = torch.polar(*torch.broadcast_tensors(gain, phase))
         channel = torch.arange(data.shape[-2], device=data.device) % gain.shape[-1]
-        damaged = data * factor[..., channel, None].to(data.dtype)
-        return replace(recording, signal=recording.signal.with_data(damaged)), {"gain": gain, "phase_rad": phase}
+        impaired = data * factor[..., channel, None].to(data.dtype)
+        return replace(recording, signal=recording.signal.with_data(impaired)), {"gain": gain, "phase_rad": phase}

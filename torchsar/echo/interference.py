@@ -52,8 +52,8 @@ class Tone:
             + self._phase_turns(frequency, recording, draws)[..., None]
         )
         wave = cis((2 * math.pi * reduced_turns(turns)).to(real_dtype(data.dtype)))
-        damaged = _add(recording, wave, lines, self.over_signal_db)
-        return damaged, {"contaminated": lines, "frequency_hz": frequency.expand(lines.shape)}
+        impaired = _add(recording, wave, lines, self.over_signal_db)
+        return impaired, {"contaminated": lines, "frequency_hz": frequency.expand(lines.shape)}
 
     def _frequency_hz(self, n_pulse: int, draws: Draws, like: Tensor) -> Tensor:
         """Frequency at the middle of each line, (..., pulse)."""

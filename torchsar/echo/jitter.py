@@ -59,10 +59,10 @@ class PeriodicJitter:
                 f"jitter offsets {offsets.tolist()} make sample instants coincide or cross; keep "
                 "neighbouring offsets less than one sample apart"
             )
-        damaged = replace(recording, signal=recording.signal.with_data(sample_unevenly(data, offsets)))
+        impaired = replace(recording, signal=recording.signal.with_data(sample_unevenly(data, offsets)))
         if self.pilot_samples:
-            damaged = replace(damaged, aux={**damaged.aux, "pilot": self.pilot(offsets, draws, data)})
-        return damaged, {
+            impaired = replace(impaired, aux={**impaired.aux, "pilot": self.pilot(offsets, draws, data)})
+        return impaired, {
             "offset_samples": offsets,
             "pilot_cycles": torch.tensor(self.pilot_cycles, dtype=torch.float64),
         }

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchsar.core import Draws, Recording, Truth, linear_phasor, real_dtype, unit_phasor
 from torchsar.echo.ladar_course import LadarCourse, calibration_aux, hand_over
-from torchsar.echo.stripmap import Damage
+from torchsar.echo.stripmap import Impairment
 from torchsar.radar import TriangularLadar, sweep_middles
 from torchsar.scene import (
     EverySample,
@@ -219,7 +219,7 @@ def simulate_ladar(
     world: LadarWorld,
     n_period: int,
     draws: Draws,
-    damages: Mapping[str, Damage] | None = None,
+    impairments: Mapping[str, Impairment] | None = None,
     dtype: torch.dtype = torch.complex64,
     device: torch.device | str | None = None,
 ) -> tuple[Recording, Truth]:
@@ -232,9 +232,10 @@ def simulate_ladar(
     pulse) at the turning points t_k + period / 2 (with the flight time R / c earlier):
     `velocity_m_s` of the motion alone, receding positive; `range_error_m`, and `range_error_up_m`,
     `range_error_down_m` in the middles of sweeps; `log_amplitude` where modelled; `azimuth_m`,
-    `range_m`, `amplitude` of the scatterers; `noise_std` of a sample; what each damage says under
-    "<damage>.<name>". `clean` is the same world without motion and damages, with the same noise and
-    scintillation. Raises ValueError for beats beyond the sampling rate, an empty scene or gate.
+    `range_m`, `amplitude` of the scatterers; `noise_std` of a sample; what each impairment says
+    under "<impairment>.<name>". `clean` is the same world without motion and impairments, with the
+    same noise and scintillation. Raises ValueError for beats beyond the sampling rate, an empty
+    scene or gate.
     """
     course = LadarCourse.of(radar, world, n_period, draws, device)
     axes = radar.sweep_axes(n_period)
@@ -249,7 +250,14 @@ def simulate_ladar(
     clean = echo_of(()) * level + noise
     data = echo_of(course.motion) * level + noise if course.motion else clean
     return hand_over(
-        data, clean, axes, radar, calibration_aux(radar, world, n_period, draws, dtype, device), values, damages, draws
+        data,
+        clean,
+        axes,
+        radar,
+        calibration_aux(radar, world, n_period, draws, dtype, device),
+        values,
+        impairments,
+        draws,
     )
 
 

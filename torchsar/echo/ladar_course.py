@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Axis, Draws, Recording, Signal, Truth, per_trial
-from torchsar.echo.stripmap import Damage, apply_damages
+from torchsar.echo.stripmap import Impairment, apply_impairments
 from torchsar.echo.sweep_error import calibration_channel
 from torchsar.radar import TriangularLadar
 from torchsar.scene import LadarWorld, Motion, Scatterers, Tones, displacement_m, drawn_motion
@@ -169,10 +169,10 @@ def hand_over(
     radar: TriangularLadar,
     aux: dict[str, Tensor],
     values: dict[str, Tensor],
-    damages: Mapping[str, Damage] | None,
+    impairments: Mapping[str, Impairment] | None,
     draws: Draws,
 ) -> tuple[Recording, Truth]:
-    """Recording and truth with the trial dims of `draws`, the recording damaged."""
+    """Recording and truth with the trial dims of `draws`, the recording impaired."""
     tail = len(axes)
     trials = torch.broadcast_shapes(
         data.shape[:-tail], clean.shape[:-tail], () if draws.trials is None else (len(draws.trials),)
@@ -183,6 +183,6 @@ def hand_over(
             values[name] = values[name].expand(*trials, -1)
     recording = Recording(Signal(data, axes), radar, aux)
     told: dict[str, Tensor] = {}
-    if damages:
-        recording, told = apply_damages(recording, damages, draws)
+    if impairments:
+        recording, told = apply_impairments(recording, impairments, draws)
     return recording, Truth({**values, **told}, Recording(Signal(clean, axes), radar, aux))

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchsar.core import Draws, Recording, Truth, UniformSpline, cis, per_trial, real_dtype, reduced_turns
 from torchsar.echo.ladar import SweepLines, lit_by, refuse_beats, shared
 from torchsar.echo.ladar_course import LadarCourse, calibration_aux, hand_over, noise_std, refuse_trials
-from torchsar.echo.stripmap import Damage
+from torchsar.echo.stripmap import Impairment
 from torchsar.echo.sweep_error import wound_turns
 from torchsar.radar import TriangularLadar, sweep_middles
 from torchsar.scene import (
@@ -266,7 +266,7 @@ def simulate_ladar_record(
     block_s: float | None = None,
     trigger_s: Tensor | float = 0.0,
     told_trigger: bool = False,
-    damages: Mapping[str, Damage] | None = None,
+    impairments: Mapping[str, Impairment] | None = None,
     dtype: torch.dtype = torch.complex64,
     device: torch.device | str | None = None,
 ) -> tuple[Recording, Truth]:
@@ -319,7 +319,14 @@ def simulate_ladar_record(
     data = echo_of(course.motion) + noise if course.motion else clean + noise
     aux = calibration_aux(radar, world, n_period, draws, dtype, device)
     return hand_over(
-        data, clean + noise, axes, radar, {**aux, "trigger_s": trigger} if told_trigger else aux, values, damages, draws
+        data,
+        clean + noise,
+        axes,
+        radar,
+        {**aux, "trigger_s": trigger} if told_trigger else aux,
+        values,
+        impairments,
+        draws,
     )
 
 

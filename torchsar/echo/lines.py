@@ -1,4 +1,4 @@
-"""Damage to the sequence of lines: lost, repeated and misnumbered ones (brief 004, item 1).
+"""Impairment to the sequence of lines: lost, repeated and misnumbered ones (brief 004, item 1).
 
 A lost line is really gone: the later lines move up and the end of the matrix is filled with zero
 lines of number -1, as in recordings of different lengths. Recorded side data that has one entry a
@@ -72,7 +72,7 @@ def _drop(recording: Recording, lost: Tensor) -> tuple[Recording, dict[str, Tens
     order = lost.to(torch.int8).argsort(dim=-1, stable=True)
     row = torch.arange(n, device=lost.device)
     kept = n - lost.sum(-1, keepdim=True)
-    # the grid of line numbers starts where the undamaged numbers do
+    # the grid of line numbers starts where the unimpaired numbers do
     slot = (number - number[..., :1]).clamp(0, n - 1)
     return take_lines(recording, torch.where(row < kept, order, -1)), {
         "lost": torch.zeros_like(lost).scatter(-1, slot, lost),
@@ -147,7 +147,7 @@ class RepeatedLines:
     """`count` lines that a buffer hands over twice, number and samples alike; the last lines of a
     full matrix fall off its end.
 
-    Truth: `repeated` (..., pulse), the second copies in the damaged matrix.
+    Truth: `repeated` (..., pulse), the second copies in the impaired matrix.
     """
 
     count: int
@@ -203,5 +203,5 @@ class CorruptedNumbers:
         true = number.gather(-1, index)
         wrong = (65536 * drawn).long() if self.bits is None else true ^ (1 << (self.bits * drawn).long())
         wrong = torch.where(wrong == true, true + 1, wrong)
-        damaged = replace(recording, aux={**recording.aux, "line_number": number.scatter(-1, index, wrong)})
-        return damaged, {"corrupted": _at(index, number.shape[-1]), "true_number": number}
+        impaired = replace(recording, aux={**recording.aux, "line_number": number.scatter(-1, index, wrong)})
+        return impaired, {"corrupted": _at(index, number.shape[-1]), "true_number": number}

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import torch
 
 from torchsar.core import Draws, Recording, Truth
-from torchsar.echo.stripmap import Damage, simulate
+from torchsar.echo.stripmap import Impairment, simulate
 from torchsar.radar import StripmapRadar
 from torchsar.scene import StripmapWorld
 
@@ -21,9 +21,9 @@ class SimulatedPairs:
 
     (b + 1) * batch - 1 of `seed`.
 
-    Every trial draws its own scene, phases, noise and damage, and is the same in any batch size.
-    count: trials in all; the last batch may be smaller. World values that are given per trial must
-    be numbers here, as a batch holds any of the trials.
+    Every trial draws its own scene, phases, noise and impairment, and is the same in any batch
+    size. count: trials in all; the last batch may be smaller. World values that are given per trial
+    must be numbers here, as a batch holds any of the trials.
     """
 
     radar: StripmapRadar
@@ -33,7 +33,7 @@ class SimulatedPairs:
     seed: int
     count: int
     batch: int = 1
-    damages: Mapping[str, Damage] = field(default_factory=dict)
+    impairments: Mapping[str, Impairment] = field(default_factory=dict)
     dtype: torch.dtype = torch.complex64
     device: torch.device | str | None = None
 
@@ -44,5 +44,5 @@ class SimulatedPairs:
         for first in range(0, self.count, self.batch):
             draws = Draws(self.seed, trials=range(first, min(first + self.batch, self.count)))
             yield simulate(
-                self.radar, self.world, self.n_pulse, self.n_range, draws, self.damages, self.dtype, self.device
+                self.radar, self.world, self.n_pulse, self.n_range, draws, self.impairments, self.dtype, self.device
             )

@@ -1,5 +1,5 @@
-"""Phase errors put into range-compressed pulses, simulated or recorded: damages that an autofocus
-has to find again.
+"""Phase errors put into range-compressed pulses, simulated or recorded: impairments that an
+autofocus has to find again.
 """
 
 from __future__ import annotations

@@ -35,9 +35,9 @@ class ChannelResponse:
         )
         phase, amplitude = self.curves(u.clamp(-1, 1))
         response = torch.polar(amplitude, phase).to(data.dtype)
-        damaged = torch.fft.ifft(torch.fft.fft(data) * response[..., None, :])
+        impaired = torch.fft.ifft(torch.fft.fft(data) * response[..., None, :])
         phase, amplitude = self.curves(torch.linspace(-1, 1, 1025, dtype=torch.float64, device=data.device))
-        return replace(recording, signal=recording.signal.with_data(damaged)), {
+        return replace(recording, signal=recording.signal.with_data(impaired)), {
             "phase_rad": phase,
             "amplitude": amplitude,
         }

@@ -18,9 +18,9 @@ from torchsar.scene import Scatterers, StripmapWorld
 _TABLE_BYTES = 8 << 20
 
 
-class Damage(Protocol):
-    """Something that happens to a recording on its way: returns the damaged recording and what is
-    true about the damage.
+class Impairment(Protocol):
+    """Something that happens to a recording on its way: returns the impaired recording and what is
+    true about the impairment.
     """
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, Mapping[str, Tensor]]: ...
@@ -220,17 +220,18 @@ def simulate(
     n_pulse: int,
     n_range: int,
     draws: Draws,
-    damages: Mapping[str, Damage] | None = None,
+    impairments: Mapping[str, Impairment] | None = None,
     dtype: torch.dtype = torch.complex64,
     device: torch.device | str | None = None,
 ) -> tuple[Recording, Truth]:
     """A recording of the world and the truth about it, batched over the trials of `draws`.
 
-    Noise follows `world.snr_db`: mean signal power per lit raw sample over noise variance. damages:
-    applied in order, by name. The truth holds target positions (zero-Doppler time, closest range),
-    velocity, beam Doppler, noise deviation, what each damage says under "<damage>.<name>", and the
-    undamaged recording with the same noise as `clean`. Raises ValueError for what no radar can
-    record: a squint beyond 90 degrees, targets behind it, a pulse longer than a line.
+    Noise follows `world.snr_db`: mean signal power per lit raw sample over noise variance.
+    impairments: applied in order, by name. The truth holds target positions (zero-Doppler time,
+    closest range), velocity, beam Doppler, noise deviation, what each impairment says under
+    "<impairment>.<name>", and the unimpaired recording with the same noise as `clean`. Raises
+    ValueError for what no radar can record: a squint beyond 90 degrees, targets behind it, a pulse
+    longer than a line.
     """
     velocity = radar.velocity_m_s if world.velocity_m_s is None else world.velocity_m_s
     doppler = _true_doppler(world, radar)
@@ -262,7 +263,7 @@ def simulate(
         "doppler_hz": torch.as_tensor(doppler, dtype=torch.float64),
         "noise_std": std,
     }
-    recording, told = apply_damages(clean, damages or {}, draws)
+    recording, told = apply_impairments(clean, impairments or {}, draws)
     return recording, Truth({**values, **told}, clean)
 
 
@@ -282,12 +283,12 @@ def _refuse_impossible(scatterers: Scatterers, radar: StripmapRadar, n_range: in
         )
 
 
-def apply_damages(
-    recording: Recording, damages: Mapping[str, Damage], draws: Draws
+def apply_impairments(
+    recording: Recording, impairments: Mapping[str, Impairment], draws: Draws
 ) -> tuple[Recording, dict[str, Tensor]]:
-    """Damage a recording, simulated or real, in the order of the mapping.
+    """Impairment a recording, simulated or real, in the order of the mapping.
 
-    Returns it with the truth under "<damage>.<name>".
+    Returns it with the truth under "<impairment>.<name>".
     """
     if "line_number" not in recording.aux:
         lines = torch.arange(recording.signal.data.shape[-2], device=recording.signal.data.device)
@@ -295,7 +296,7 @@ def apply_damages(
             recording, aux={**recording.aux, "line_number": lines.expand(recording.signal.data.shape[:-1])}
         )
     told: dict[str, Tensor] = {}
-    for name, damage in damages.items():
-        recording, values = damage(recording, draws.part(name))
+    for name, impairment in impairments.items():
+        recording, values = impairment(recording, draws.part(name))
         told.update({f"{name}.{key}": value for key, value in values.items()})
     return recording, told

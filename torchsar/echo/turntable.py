@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Axis, Draws, Recording, Signal, Truth, linear_phasor, per_trial, unit_phasor
-from torchsar.echo.stripmap import Damage, apply_damages
+from torchsar.echo.stripmap import Impairment, apply_impairments
 from torchsar.radar import InverseRadar
 from torchsar.scene import (
     Dechirped,
@@ -411,7 +411,7 @@ def simulate_turntable(
     n_pulse: int,
     n_range: int,
     draws: Draws,
-    damages: Mapping[str, Damage] | None = None,
+    impairments: Mapping[str, Impairment] | None = None,
     dtype: torch.dtype = torch.complex64,
     device: torch.device | str | None = None,
 ) -> tuple[Recording, Truth]:
@@ -422,14 +422,15 @@ def simulate_turntable(
     went. The truth holds `phase_rad` (..., pulse), psi = delta - 4 pi d / lambda with start phase
     delta and displacement d at the middle of the pulse, less the reference's; `displacement_m`
     (..., pulse), the whole of it; `noise_std` of the samples; `cross_range_m`, `range_m`,
-    `amplitude` of the scatterers; `rotation_rad_s`; what each damage says under "<damage>.<name>".
-    Where the world has a polynomial rotation: `omega_rad_s` (...,), `warp_k` (..., order - 1),
-    `yc_m` (...,), and `rotation_rad_s` is its mean rate over the record. `clean` is the recording
-    without motion, start phases and damages, with the same noise. At PhaseOnly the undamaged
-    recording is clean * exp(j psi) EXACTLY, noise included: circular Gaussian noise is as good
-    after a turn, and tests of equivariance are exact. Noise follows `world.snr_db`, the same before
-    and after range compression. Raises ValueError for a target outside the range window, an empty
-    scene, no rotation rate, one that turns back, or a dechirped pulse of unknown length.
+    `amplitude` of the scatterers; `rotation_rad_s`; what each impairment says under
+    "<impairment>.<name>". Where the world has a polynomial rotation: `omega_rad_s` (...,), `warp_k`
+    (..., order - 1), `yc_m` (...,), and `rotation_rad_s` is its mean rate over the record. `clean`
+    is the recording without motion, start phases and impairments, with the same noise. At PhaseOnly
+    the unimpaired recording is clean * exp(j psi) EXACTLY, noise included: circular Gaussian noise
+    is as good after a turn, and tests of equivariance are exact. Noise follows `world.snr_db`, the
+    same before and after range compression. Raises ValueError for a target outside the range
+    window, an empty scene, no rotation rate, one that turns back, or a dechirped pulse of unknown
+    length.
     """
     course = _Course.of(radar, world, n_pulse, n_range, draws, device)
     record = _dechirped if isinstance(world.fidelity, Dechirped) else _phase_only
@@ -450,9 +451,9 @@ def simulate_turntable(
         "amplitude": course.scatterers.amplitude,
         **_rotation_truth(course.rotation, world.centre_deviation_m, n_pulse / radar.prf_hz, data.device, trials),
     }
-    recording, told = apply_damages(
+    recording, told = apply_impairments(
         Recording(Signal(data, axes), radar, {name: v.expand(*trials, -1) for name, v in aux.items()}),
-        damages or {},
+        impairments or {},
         draws,
     )
     return recording, Truth({**values, **told}, Recording(Signal(clean, axes), radar))

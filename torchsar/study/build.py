@@ -1,4 +1,4 @@
-"""From a checked config to chains and damages, whatever the system."""
+"""From a checked config to chains and impairments, whatever the system."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from torchsar.radar import LIGHT_M_S, BistaticRadar, InverseRadar, StripmapRadar
 from torchsar.study.catalogue import Catalogue
 from torchsar.study.config import Config, Loaded, Method
 from torchsar.study.errors import ConfigError, did_you_mean
-from torchsar.study.registry import DAMAGES, stages
+from torchsar.study.registry import IMPAIRMENTS, stages
 
 
 @dataclass(frozen=True)
 class Case:
-    """What the methods get (recording; clean is the same without damage), and what only metrics may
-    see.
+    """What the methods get (recording; clean is the same without impairment), and what only metrics
+    may see.
 
     targets: names of the point targets and their indices among the scatterers of the truth.
     """
@@ -35,8 +35,8 @@ def precision(config: Config) -> torch.dtype:
     return {"complex64": torch.complex64, "complex128": torch.complex128}[config.precision]
 
 
-def build_damages(
-    entries: Mapping[str, dict[str, Any]], where: str, file: str, catalogue: Catalogue = DAMAGES
+def build_impairments(
+    entries: Mapping[str, dict[str, Any]], where: str, file: str, catalogue: Catalogue = IMPAIRMENTS
 ) -> dict[str, Any]:
     return {name: catalogue.make(entry, f"{where}.{name}", file) for name, entry in entries.items()}
 
@@ -108,8 +108,8 @@ def resolved(loaded: Loaded) -> dict[str, Any]:
                 world[section] = _full(catalogue, world[section], f"world.{section}", file)
         for section, catalogue in loaded.config.world.named.items():
             world[section] = {k: _full(catalogue, v, f"world.{section}.{k}", file) for k, v in world[section].items()}
-    tree["data"]["damages"] = {
-        k: _full(DAMAGES, v, f"data.damages.{k}", file) for k, v in tree["data"]["damages"].items()
+    tree["data"]["impairments"] = {
+        k: _full(IMPAIRMENTS, v, f"data.impairments.{k}", file) for k, v in tree["data"]["impairments"].items()
     }
     for name, method in tree["processor"].items():
         for stage, entry in (method["stages"] or {}).items():

@@ -93,12 +93,12 @@ def _refuse_case(name: str, values: Mapping[str, Any], loaded: Loaded) -> None:
         if root == "data" and loaded.config.data.file is None:
             raise ConfigError(
                 f"{loaded.file}: cases.{name}: the key {key!r} is not used by a simulation, whose "
-                "damages are keys of the world; set data.file to work on a recording"
+                "impairments are keys of the world; set data.file to work on a recording"
             )
 
 
 def check_judged(loaded: Loaded) -> None:
-    """Methods have stages of their own, and the reference is one of undamaged input."""
+    """Methods have stages of their own, and the reference is one of unimpaired input."""
     for name, method in loaded.config.processor.items():
         if method.rerun is not None:
             raise ConfigError(

@@ -23,10 +23,10 @@ class Noise(Strict):
 
 
 class Data(Strict):
-    """Recorded data instead of a simulated world; damages are put into the recording."""
+    """Recorded data instead of a simulated world; impairments are put into the recording."""
 
     file: str | None = None
-    damages: dict[str, dict[str, Any]] = {}
+    impairments: dict[str, dict[str, Any]] = {}
 
 
 class Rerun(Strict):
@@ -38,12 +38,12 @@ class Rerun(Strict):
 
 
 class Method(Strict):
-    """One chain: a title for the report, the input (damaged, or the undamaged `clean`), and either
-    stages by name or a rerun.
+    """One chain: a title for the report, the input (impaired, or the unimpaired `clean`), and
+    either stages by name or a rerun.
     """
 
     title: str = ""
-    input: Literal["damaged", "clean"] = "damaged"
+    input: Literal["impaired", "clean"] = "impaired"
     stages: dict[str, dict[str, Any]] | None = None
     rerun: Rerun | None = None
 

@@ -1,4 +1,4 @@
-"""Stages and damages whose constructors take other objects or functions, from plain keys."""
+"""Stages and impairments whose constructors take other objects or functions, from plain keys."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def channel_response(
     slope_db: float = 0.0,
     amplitude_ripple_db: float = 0.0,
 ) -> ChannelResponse:
-    """Damage: phase quadratic u^2 + cubic u^3 + ripple sin(pi cycles u), and gain slope u / 2 +
+    """Impairment: phase quadratic u^2 + cubic u^3 + ripple sin(pi cycles u), and gain slope u / 2 +
     ripple cos(pi cycles u) in dB, u = -1..1 over the band.
 
     The phase is taken without its constant and linear parts: these are a phase and a shift of the

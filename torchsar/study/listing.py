@@ -7,16 +7,16 @@ import textwrap
 
 from torchsar.io import inverse, recorded
 from torchsar.study.catalogue import Catalogue
-from torchsar.study.isal.sections import TARGET_DAMAGES
+from torchsar.study.isal.sections import TARGET_IMPAIRMENTS
 from torchsar.study.registry import (
     BEAMS,
     CALIBRATIONS,
-    DAMAGES,
     FIDELITIES,
     GATES,
+    IMPAIRMENTS,
     LOG_AMPLITUDES,
     MOTIONS,
-    MULTICHANNEL_DAMAGES,
+    MULTICHANNEL_IMPAIRMENTS,
     PATHS,
     RADIAL_MOTIONS,
     RECEIVE_RANGES,
@@ -28,7 +28,7 @@ from torchsar.study.registry import (
     group_of,
     stages,
 )
-from torchsar.study.sal.sections import LADAR_DAMAGES
+from torchsar.study.sal.sections import LADAR_IMPAIRMENTS
 from torchsar.study.text import packaged_configs, read_tree
 
 _WORLD = {
@@ -46,10 +46,10 @@ _WORLD = {
     "GATES (geo)": GATES,
     "SEAS (geo)": SEAS,
     "RECEIVE RANGES (geo)": RECEIVE_RANGES,
-    "DAMAGES (stripmap)": DAMAGES,
-    "DAMAGES (isal)": TARGET_DAMAGES,
-    "DAMAGES (sal)": LADAR_DAMAGES,
-    "DAMAGES (geo)": MULTICHANNEL_DAMAGES,
+    "IMPAIRMENTS (stripmap)": IMPAIRMENTS,
+    "IMPAIRMENTS (isal)": TARGET_IMPAIRMENTS,
+    "IMPAIRMENTS (sal)": LADAR_IMPAIRMENTS,
+    "IMPAIRMENTS (geo)": MULTICHANNEL_IMPAIRMENTS,
 }
 
 

@@ -1,4 +1,4 @@
-"""Every name that a config may use: stages, scenes, beams, paths and damages.
+"""Every name that a config may use: stages, scenes, beams, paths and impairments.
 
 A user's own stage joins through the entry point group `torchsar.stages` (name =
 "package.module:Class"); a config has no other way to run code.
@@ -162,13 +162,13 @@ CALIBRATIONS = Catalogue("calibration", "kind", {"fibre": CalibrationFibre})
 GATES = Catalogue("gate", "kind", {"band_limited": BandLimited, "pattern": Pattern})
 SEAS = Catalogue("sea", "kind", {"k_sea": factories.k_sea, "image": factories.image_sea})
 RECEIVE_RANGES = Catalogue("receive range", "kind", {"exact": ExactRange, "taylor": TaylorRange})
-MULTICHANNEL_DAMAGES = Catalogue(
-    "damage of a multichannel recording",
+MULTICHANNEL_IMPAIRMENTS = Catalogue(
+    "impairment of a multichannel recording",
     "kind",
     {"channel_errors": ChannelErrors, "clock_errors": factories.clock_errors},
 )
-DAMAGES = Catalogue(
-    "damage",
+IMPAIRMENTS = Catalogue(
+    "impairment",
     "kind",
     {
         "channel_imbalance": ChannelImbalance,

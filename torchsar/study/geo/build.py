@@ -10,16 +10,16 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, Truth, unit_phasor
-from torchsar.echo import Damage, apply_damages, sea_echo, simulate_bistatic
+from torchsar.echo import Impairment, apply_impairments, sea_echo, simulate_bistatic
 from torchsar.radar import BistaticRadar, LinearFM, Orbit, range_coefficients, seen_point
 from torchsar.scene import BandLimited, BistaticWorld, Gate, MovingPoints, Pattern, PolynomialTransmit, Sea
-from torchsar.study.build import build_damages, precision, refuse_oversize
+from torchsar.study.build import build_impairments, precision, refuse_oversize
 from torchsar.study.cases import cases_of, check_judged
 from torchsar.study.config import Loaded
 from torchsar.study.errors import ConfigError
 from torchsar.study.geo.sections import Ephemeris, GeoConfig, Noise, Target, compression_gain_db
 from torchsar.study.methods import build_chains
-from torchsar.study.registry import GATES, MULTICHANNEL_DAMAGES, RECEIVE_RANGES, SEAS
+from torchsar.study.registry import GATES, MULTICHANNEL_IMPAIRMENTS, RECEIVE_RANGES, SEAS
 
 TOLD = "true_"
 _TOLD = ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
@@ -28,12 +28,12 @@ _TOLD = ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
 @dataclass(frozen=True)
 class Recorded:
     """Rows of trials, each of all targets in turn: recordings with noise and sea, the same of the
-    target alone (clean), both damaged, the undamaged echo, and the truth (row,).
+    target alone (clean), both impaired, the unimpaired echo, and the truth (row,).
     """
 
     noisy: Recording
     clean: Recording
-    undamaged: Recording
+    unimpaired: Recording
     truth: Mapping[str, Tensor]
 
 
@@ -53,7 +53,7 @@ class Echoes:
     receive: Any
     transmit: PolynomialTransmit | None
     snr_db: Tensor | float | None
-    damages: Mapping[str, Damage]
+    impairments: Mapping[str, Impairment]
     pulses: int
     samples: int | None
     kind: Any
@@ -76,7 +76,7 @@ class Echoes:
         sea = None if world.sea is None else SEAS.make(world.sea, "world.sea", file)
         receive = RECEIVE_RANGES.make(world.receive, "world.receive", file)
         transmit = None if world.transmit_range is None else PolynomialTransmit(world.transmit_range)
-        damages = build_damages(world.damages, "world.damages", file, MULTICHANNEL_DAMAGES)
+        impairments = build_impairments(world.impairments, "world.impairments", file, MULTICHANNEL_IMPAIRMENTS)
         snr = snr_db_of(world.noise, compression_gain_db(config), sea)
         if sea is not None and snr is None:
             raise ConfigError(
@@ -91,7 +91,7 @@ class Echoes:
             receive,
             transmit,
             snr,
-            damages,
+            impairments,
             world.pulses,
             world.samples,
             world.kind,
@@ -118,11 +118,11 @@ class Echoes:
             )
         values = {name: value[..., 0] for name, value in truth.values.items() if name in _TOLD}
         told = {f"{TOLD}{name}": values[name] for name in _TOLD}
-        noisy, clean, undamaged = (replace(one, aux={**one.aux, **told}) for one in (noisy, truth.clean, truth.clean))
-        if self.damages:
-            (noisy, said), (clean, _) = (apply_damages(one, self.damages, rows) for one in (noisy, clean))
+        noisy, clean, unimpaired = (replace(one, aux={**one.aux, **told}) for one in (noisy, truth.clean, truth.clean))
+        if self.impairments:
+            (noisy, said), (clean, _) = (apply_impairments(one, self.impairments, rows) for one in (noisy, clean))
             values.update(said)
-        return Recorded(noisy, clean, undamaged, {**values, "noise_std": truth.values["noise_std"]})
+        return Recorded(noisy, clean, unimpaired, {**values, "noise_std": truth.values["noise_std"]})
 
     def _points(self, rows: int) -> MovingPoints:
         def column(name: str) -> Tensor:

@@ -32,7 +32,7 @@ DEFINITIONS: dict[str, Any] = {
         "track, positive with the receiver; y0: place along track at t = 0, middle pulse"
     ),
     "responses": "irw, pslr, islr, mfta and noise-free places are measured on the image of the CLEAN echo (same "
-    "damage, no noise, no sea), rebuilt and focused with every value held that "
+    "impairment, no noise, no sea), rebuilt and focused with every value held that "
     "the method estimated from the NOISY one: image noise would hide false targets below about -60 dB",
     "irw_azimuth_m": (
         "3 dB width on the axis x = (V_R - u_a) t of the true target; theory 0.886 v / B, B "

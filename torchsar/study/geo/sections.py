@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from torchsar.radar import LIGHT_M_S
 from torchsar.study.cases import LimitedConfig
 from torchsar.study.catalogue import Catalogue, Strict
-from torchsar.study.registry import GATES, MULTICHANNEL_DAMAGES, RECEIVE_RANGES, SEAS
+from torchsar.study.registry import GATES, MULTICHANNEL_IMPAIRMENTS, RECEIVE_RANGES, SEAS
 
 
 class Ephemeris(Strict):
@@ -102,7 +102,7 @@ class World(Strict):
     """
 
     single: ClassVar[dict[str, Catalogue]] = {"gate": GATES, "sea": SEAS, "sea_gate": GATES, "receive": RECEIVE_RANGES}
-    named: ClassVar[dict[str, Catalogue]] = {"damages": MULTICHANNEL_DAMAGES}
+    named: ClassVar[dict[str, Catalogue]] = {"impairments": MULTICHANNEL_IMPAIRMENTS}
 
     pulses: int = Field(gt=0)
     samples: int | None = Field(default=None, gt=0)
@@ -115,7 +115,7 @@ class World(Strict):
     receive: dict[str, Any] = {"kind": "exact"}
     transmit_range: list[float] | None = None
     noise: Noise = Noise()
-    damages: dict[str, dict[str, Any]] = {}
+    impairments: dict[str, dict[str, Any]] = {}
 
     @model_validator(mode="after")
     def _fits(self) -> World:

@@ -62,7 +62,7 @@ def trade(loaded: Loaded, out: Path | None) -> str:
     """Tables of range-history orders, dimensions, migration corrections, reconstructions and
     precisions on the first target of the first case; returns them as text.
 
-    Velocities are the true ones, echoes free of noise and damage. With `out`: config.yaml,
+    Velocities are the true ones, echoes free of noise and impairment. With `out`: config.yaml,
     trade.json, trade.txt and figures/ in that folder.
     """
     return traded(loaded, out, check, _tables, _TITLES, _COLUMNS, _figures)
@@ -98,7 +98,7 @@ class _Target:
         first = dict(list(echoes.targets.items())[:1])
         stages = build_chains(loaded, radar=echoes.radar)["recommended"].stages.values()
         band = next((stage.bandwidth_hz for stage in stages if isinstance(stage, FocusAzimuth)), None)
-        alone = replace(echoes, targets=first, sea=None, damages={}, snr_db=None, samples=None, kind="compressed")
+        alone = replace(echoes, targets=first, sea=None, impairments={}, snr_db=None, samples=None, kind="compressed")
         return _Target(
             alone, config.trade, config.metrics.orders, band, Draws(config.seed, "trade", range(config.trade.trials))
         )
@@ -205,7 +205,7 @@ class _Target:
             yield made.row
 
     def _made(self, name: str, chain: Chain, recorded: Recorded, first: _Made | None = None) -> _Made:
-        trace, times = timed(lambda: chain.trace(recorded.undamaged), self.settings.repeats)
+        trace, times = timed(lambda: chain.trace(recorded.unimpaired), self.settings.repeats)
         focused = Focused.of(chain, trace, self.echoes.radar)
         assert focused is not None
         figures = {

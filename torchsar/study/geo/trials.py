@@ -159,7 +159,7 @@ def run_batch(bench: Bench, draws: Draws, device: str = "cpu") -> Batch:
 def _outcome(bench: Bench, name: str, recorded: Recorded, earlier: Mapping[str, Outcome]) -> Outcome:
     chain, clean_input = bench.chains[name], bench.config.processor[name].input == "clean"
     shared = _shared(bench.config, name, earlier)
-    trace = traced(chain, recorded.undamaged if clean_input else recorded.noisy, name, _held(shared.estimates))
+    trace = traced(chain, recorded.unimpaired if clean_input else recorded.noisy, name, _held(shared.estimates))
     trace = replace(
         trace, estimates={**shared.estimates, **trace.estimates}, seconds={**trace.seconds, **shared.seconds}
     )

@@ -9,11 +9,11 @@ from torchsar.core import Chain, Recording
 from torchsar.io import read_inverse
 from torchsar.radar import InverseRadar, geometry_of
 from torchsar.scene import Together, TurntableWorld
-from torchsar.study.build import build_damages, precision, refuse_oversize
+from torchsar.study.build import build_impairments, precision, refuse_oversize
 from torchsar.study.cases import cases_of, check_judged
 from torchsar.study.config import Loaded
 from torchsar.study.errors import ConfigError
-from torchsar.study.isal.sections import TARGET_DAMAGES
+from torchsar.study.isal.sections import TARGET_IMPAIRMENTS
 from torchsar.study.methods import build_chains
 from torchsar.study.registry import FIDELITIES, MOTIONS, SCENES, START_PHASES
 
@@ -47,7 +47,7 @@ def check(loaded: Loaded) -> None:
     for case in cases_of(loaded).values():
         build_world(case)
         check_judged(case)
-        build_damages(case.config.world.damages, "world.damages", case.file, TARGET_DAMAGES)
+        build_impairments(case.config.world.impairments, "world.impairments", case.file, TARGET_IMPAIRMENTS)
         build_chains(case, radar=build_radar(case))
 
 

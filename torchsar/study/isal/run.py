@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws
-from torchsar.echo import apply_damages
+from torchsar.echo import apply_impairments
 from torchsar.metrics import phase_rmse
-from torchsar.study.build import build_damages
+from torchsar.study.build import build_impairments
 from torchsar.study.case_run import run_cases
 from torchsar.study.cases import check_judged, methods_tree
 from torchsar.study.config import Loaded, check_methods
@@ -24,7 +24,7 @@ from torchsar.study.isal.build import check, read_recording, recorded_chains
 from torchsar.study.isal.figures import CaseResult, draw
 from torchsar.study.isal.judge import DEFINITIONS, estimated_phase, image_metrics, phase_metrics
 from torchsar.study.isal.report import write_report
-from torchsar.study.isal.sections import TARGET_DAMAGES
+from torchsar.study.isal.sections import TARGET_IMPAIRMENTS
 from torchsar.study.isal.trials import ENDING, Bench, IsalTrials, judged, run_batch
 from torchsar.study.montecarlo.record import OK
 from torchsar.study.tracing import image_of, refuse_no_image, summary, traced
@@ -105,8 +105,8 @@ def _recorded(loaded: Loaded, name: str) -> CaseResult:
     phases.
     """
     clean = read_recording(loaded)
-    damages = build_damages(loaded.config.data.damages, "data.damages", loaded.file, TARGET_DAMAGES)
-    dirty, told = apply_damages(clean, damages, Draws(loaded.config.seed))
+    impairments = build_impairments(loaded.config.data.impairments, "data.impairments", loaded.file, TARGET_IMPAIRMENTS)
+    dirty, told = apply_impairments(clean, impairments, Draws(loaded.config.seed))
     if not [name for name in told if name.endswith(".phase_rad")]:
         told = {**told, "none.phase_rad": torch.zeros(clean.signal.data.shape[-2], dtype=torch.float64)}
     true = sum(

@@ -9,10 +9,12 @@ from pydantic import Field
 from torchsar.study.cases import CasedConfig
 from torchsar.study.catalogue import Catalogue, Strict
 from torchsar.study.config import Noise
-from torchsar.study.registry import DAMAGES, FIDELITIES, MOTIONS, SCENES, START_PHASES
+from torchsar.study.registry import FIDELITIES, IMPAIRMENTS, MOTIONS, SCENES, START_PHASES
 
-_DAMAGES = ("lost_pulses", "white_phase", "phase_walk", "phase_sinusoid", "quantiser")
-TARGET_DAMAGES = Catalogue("damage of a turning target", "kind", {name: DAMAGES.entries[name] for name in _DAMAGES})
+_IMPAIRMENTS = ("lost_pulses", "white_phase", "phase_walk", "phase_sinusoid", "quantiser")
+TARGET_IMPAIRMENTS = Catalogue(
+    "impairment of a turning target", "kind", {name: IMPAIRMENTS.entries[name] for name in _IMPAIRMENTS}
+)
 
 
 class Radar(Strict):
@@ -29,7 +31,7 @@ class Radar(Strict):
 class World(Strict):
     """What is true and no processor may see.
 
-    scene, motion, start_phase, fidelity and damages name entries of the catalogues (`torchsar
+    scene, motion, start_phase, fidelity and impairments name entries of the catalogues (`torchsar
     list`).
 
     trials: scenes and noise draws of each case of a run; a sweep has its own number.
@@ -40,7 +42,7 @@ class World(Strict):
         "scene": SCENES,
         "motion": MOTIONS,
         "start_phase": START_PHASES,
-        "damages": TARGET_DAMAGES,
+        "impairments": TARGET_IMPAIRMENTS,
     }
 
     pulses: int = Field(gt=0)
@@ -52,7 +54,7 @@ class World(Strict):
     fidelity: dict[str, Any] = {"kind": "phase_only"}
     rotation_rad_s: float | None = None
     noise: Noise = Noise()
-    damages: dict[str, dict[str, Any]] = {}
+    impairments: dict[str, dict[str, Any]] = {}
 
 
 class Metrics(Strict):

@@ -22,13 +22,13 @@ from torchsar.focus import CompressDechirped, azimuth_transform
 from torchsar.metrics import entropy, phase_rmse
 from torchsar.radar import InverseRadar
 from torchsar.scene import Dechirped, PhaseOnly, TurntableWorld
-from torchsar.study.build import build_damages
+from torchsar.study.build import build_impairments
 from torchsar.study.cases import cases_of
 from torchsar.study.config import Loaded
 from torchsar.study.errors import ConfigError
 from torchsar.study.isal.build import build_radar, build_world, check
 from torchsar.study.isal.judge import estimated_phase
-from torchsar.study.isal.sections import TARGET_DAMAGES
+from torchsar.study.isal.sections import TARGET_IMPAIRMENTS
 from torchsar.study.isal.trials import received, whole_phase
 from torchsar.study.methods import build_chains
 from torchsar.study.tracing import traced
@@ -146,14 +146,14 @@ def _made_tables(loaded: Loaded) -> dict[str, list[Row]]:
 
 def _simulate(loaded: Loaded, world: TurntableWorld, dtype: torch.dtype, count: int | None = None) -> _Trials:
     size, radar = loaded.config.world, build_radar(loaded)
-    damages = build_damages(size.damages, "world.damages", loaded.file, TARGET_DAMAGES)
+    impairments = build_impairments(size.impairments, "world.impairments", loaded.file, TARGET_IMPAIRMENTS)
     recording, truth = simulate_turntable(
         radar,
         world,
         size.pulses,
         size.samples,
         Draws(loaded.config.seed, "trade", range(count or loaded.config.trade.trials)),
-        damages,
+        impairments,
         dtype,
     )
     return _Trials(radar, recording, truth)

@@ -13,18 +13,18 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Chain, Draws, Recording, Trace, Truth
-from torchsar.echo import Damage, simulate_turntable
+from torchsar.echo import Impairment, simulate_turntable
 from torchsar.metrics.bounds import pulse_phase_bound_of_scene_rad, pulse_phase_bound_rad
 from torchsar.radar import InverseRadar
 from torchsar.scene import PhaseOnly, TurntableWorld
 from torchsar.study.benches import Benches
-from torchsar.study.build import build_damages, precision
+from torchsar.study.build import build_impairments, precision
 from torchsar.study.cases import check_judged, check_sweep
 from torchsar.study.config import Config, Loaded
 from torchsar.study.errors import ConfigError
 from torchsar.study.isal.build import build_radar, build_world
 from torchsar.study.isal.judge import image_metrics, phase_metrics
-from torchsar.study.isal.sections import TARGET_DAMAGES
+from torchsar.study.isal.sections import TARGET_IMPAIRMENTS
 from torchsar.study.methods import build_chains
 from torchsar.study.montecarlo.work import BOUNDS, SAVED
 from torchsar.study.tracing import IMAGE, not_an_image, saved_of, traced
@@ -42,7 +42,7 @@ class Bench:
     config: Config
     radar: InverseRadar
     world: TurntableWorld
-    damages: Mapping[str, Damage]
+    impairments: Mapping[str, Impairment]
     chains: Mapping[str, Chain]
 
     @cached_property
@@ -73,12 +73,12 @@ class Batch:
 
 
 def whole_phase(truth: Truth) -> Tensor:
-    """The phase error of every pulse with those of the damages, (..., pulse)."""
+    """The phase error of every pulse with those of the impairments, (..., pulse)."""
     return truth.values["phase_rad"] + sum(value for name, value in truth.values.items() if name.endswith(".phase_rad"))
 
 
 def received(truth: Truth) -> Tensor | None:
-    """Pulses that no damage lost, (..., pulse), None where all were received."""
+    """Pulses that no impairment lost, (..., pulse), None where all were received."""
     lost = [value for name, value in truth.values.items() if name.endswith(".present")]
     return torch.stack(lost).all(0) if lost else None
 
@@ -89,7 +89,7 @@ class IsalTrials(Benches[Bench]):
 
     Metrics of a method: `residual_phase_rms_rad`, `strehl`, the predicted `residual_phase_std_rad`,
     `entropy_nats`, `contrast`, and `entropy_above_ideal_nats` where metrics.reference names a
-    method of undamaged input; `seconds` per trial; `ok`.
+    method of unimpaired input; `seconds` per trial; `ok`.
     """
 
     batched = (_SNR,)
@@ -102,8 +102,10 @@ class IsalTrials(Benches[Bench]):
         check_judged(loaded)
         radar = build_radar(loaded)
         chains = {name: chain.to(self.device) for name, chain in build_chains(loaded, radar=radar).items()}
-        damages = build_damages(loaded.config.world.damages, "world.damages", loaded.file, TARGET_DAMAGES)
-        return Bench(loaded.config, radar, build_world(loaded), damages, chains)
+        impairments = build_impairments(
+            loaded.config.world.impairments, "world.impairments", loaded.file, TARGET_IMPAIRMENTS
+        )
+        return Bench(loaded.config, radar, build_world(loaded), impairments, chains)
 
     def bytes_per_trial(self, fixed: Mapping[str, Any]) -> int:
         """Of the largest tensors that a trial needs, from the axes: data, image, and what an
@@ -133,7 +135,7 @@ def run_batch(bench: Bench, draws: Draws, device: str = "cpu", world: TurntableW
         size.pulses,
         size.samples,
         draws,
-        bench.damages,
+        bench.impairments,
         precision(bench.config),
         device,
     )

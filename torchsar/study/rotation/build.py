@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import torch
 
 from torchsar.core import Draws, Recording, Truth
-from torchsar.echo import Damage, simulate_turntable
+from torchsar.echo import Impairment, simulate_turntable
 from torchsar.radar import InverseRadar
 from torchsar.scene import Points, PolynomialRotation, Scatterers, Scene, Together, TurntableWorld
-from torchsar.study.build import build_damages, carried, precision, refuse_oversize
+from torchsar.study.build import build_impairments, carried, precision, refuse_oversize
 from torchsar.study.cases import cases_of, check_judged
 from torchsar.study.config import Loaded
 from torchsar.study.errors import ConfigError
-from torchsar.study.isal.sections import TARGET_DAMAGES
+from torchsar.study.isal.sections import TARGET_IMPAIRMENTS
 from torchsar.study.methods import build_chains
 from torchsar.study.registry import FIDELITIES, MOTIONS, SCENES, START_PHASES
 
@@ -37,18 +37,18 @@ class Turntable:
 
     radar: InverseRadar
     world: TurntableWorld
-    damages: Mapping[str, Damage]
+    impairments: Mapping[str, Impairment]
     pulses: int
     samples: int
     dtype: torch.dtype
 
     @staticmethod
     def of(loaded: Loaded) -> Turntable:
-        """Raises ConfigError for what radar, world or damages refuse."""
+        """Raises ConfigError for what radar, world or impairments refuse."""
         size = loaded.config.world
-        damages = build_damages(size.damages, "world.damages", loaded.file, TARGET_DAMAGES)
+        impairments = build_impairments(size.impairments, "world.impairments", loaded.file, TARGET_IMPAIRMENTS)
         return Turntable(
-            build_radar(loaded), build_world(loaded), damages, size.pulses, size.samples, precision(loaded.config)
+            build_radar(loaded), build_world(loaded), impairments, size.pulses, size.samples, precision(loaded.config)
         )
 
     @property
@@ -63,7 +63,7 @@ class Turntable:
     def recorded(self, draws: Draws, device: str = "cpu", dtype: torch.dtype | None = None) -> tuple[Recording, Truth]:
         """The trials of the draws; dtype: of the samples, by default that of the config."""
         return simulate_turntable(
-            self.radar, self.world, self.pulses, self.samples, draws, self.damages, dtype or self.dtype, device
+            self.radar, self.world, self.pulses, self.samples, draws, self.impairments, dtype or self.dtype, device
         )
 
 

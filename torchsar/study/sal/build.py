@@ -10,10 +10,10 @@ from typing import Any
 import torch
 
 from torchsar.core import Draws, Recording, Truth
-from torchsar.echo import Damage, simulate_ladar, simulate_ladar_record
+from torchsar.echo import Impairment, simulate_ladar, simulate_ladar_record
 from torchsar.radar import TriangularLadar
 from torchsar.scene import LadarWorld, Points, RetroAndBrokenLine, Together
-from torchsar.study.build import build_damages, carried, precision, refuse_oversize
+from torchsar.study.build import build_impairments, carried, precision, refuse_oversize
 from torchsar.study.cases import cases_of, check_judged
 from torchsar.study.catalogue import Catalogue
 from torchsar.study.config import Loaded
@@ -28,7 +28,7 @@ from torchsar.study.registry import (
     SWEEP_FIDELITIES,
     group_of,
 )
-from torchsar.study.sal.sections import LADAR_DAMAGES, Record
+from torchsar.study.sal.sections import LADAR_IMPAIRMENTS, Record
 
 log = logging.getLogger("torchsar")
 # stages that work on deramped profiles, and cannot tell whether they are
@@ -85,20 +85,20 @@ class Ladar:
     world: LadarWorld
     periods: int
     record: Record | None
-    damages: Mapping[str, Damage]
+    impairments: Mapping[str, Impairment]
     dtype: torch.dtype
 
     @staticmethod
     def of(loaded: Loaded) -> Ladar:
         world, radar = loaded.config.world, build_radar(loaded)
         refuse_oversize(2 * world.periods, radar.sweep_samples, loaded.file, "world.periods or radar.sample_rate_hz")
-        damages = build_damages(world.damages, "world.damages", loaded.file, LADAR_DAMAGES)
-        return Ladar(radar, build_world(loaded), world.periods, world.record, damages, precision(loaded.config))
+        impairments = build_impairments(world.impairments, "world.impairments", loaded.file, LADAR_IMPAIRMENTS)
+        return Ladar(radar, build_world(loaded), world.periods, world.record, impairments, precision(loaded.config))
 
     def recorded(self, draws: Draws, device: torch.device | str | None = None) -> tuple[Recording, Truth]:
         """A recording and the truth about it, batched over the trials of the draws."""
         if self.record is None:
-            return simulate_ladar(self.radar, self.world, self.periods, draws, self.damages, self.dtype, device)
+            return simulate_ladar(self.radar, self.world, self.periods, draws, self.impairments, self.dtype, device)
         how = self.record
         return simulate_ladar_record(
             self.radar,
@@ -108,7 +108,7 @@ class Ladar:
             how.block_s,
             how.trigger_s,
             how.told,
-            self.damages,
+            self.impairments,
             self.dtype,
             device,
         )

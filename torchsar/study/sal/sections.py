@@ -11,7 +11,7 @@ from torchsar.study.catalogue import Catalogue, Strict
 from torchsar.study.config import Noise
 from torchsar.study.registry import (
     CALIBRATIONS,
-    DAMAGES,
+    IMPAIRMENTS,
     LOG_AMPLITUDES,
     RADIAL_MOTIONS,
     SCENES,
@@ -19,8 +19,8 @@ from torchsar.study.registry import (
     SWEEP_FIDELITIES,
 )
 
-LADAR_DAMAGES = Catalogue(
-    "damage of a ladar recording", "kind", {name: DAMAGES.entries[name] for name in ("quantiser",)}
+LADAR_IMPAIRMENTS = Catalogue(
+    "impairment of a ladar recording", "kind", {name: IMPAIRMENTS.entries[name] for name in ("quantiser",)}
 )
 
 
@@ -67,7 +67,7 @@ class Record(Strict):
 class World(Strict):
     """What is true and no processor may see.
 
-    scene, motion, fidelity, log_amplitude, sweep_error, calibration and damages name entries of
+    scene, motion, fidelity, log_amplitude, sweep_error, calibration and impairments name entries of
     catalogues.
 
     record: None for sweeps that an ideal splitter hands over. trials: scenes and noise draws of
@@ -80,7 +80,11 @@ class World(Strict):
         "sweep_error": SWEEP_ERRORS,
         "calibration": CALIBRATIONS,
     }
-    named: ClassVar[dict[str, Catalogue]] = {"scene": SCENES, "motion": RADIAL_MOTIONS, "damages": LADAR_DAMAGES}
+    named: ClassVar[dict[str, Catalogue]] = {
+        "scene": SCENES,
+        "motion": RADIAL_MOTIONS,
+        "impairments": LADAR_IMPAIRMENTS,
+    }
 
     periods: int = Field(gt=0)
     trials: int = Field(default=1, ge=1)
@@ -93,7 +97,7 @@ class World(Strict):
     calibration: dict[str, Any] | None = None
     record: Record | None = None
     noise: Noise = Noise()
-    damages: dict[str, dict[str, Any]] = {}
+    impairments: dict[str, dict[str, Any]] = {}
 
 
 class Metrics(Strict):

@@ -1,1 +1,1 @@
-"""System 004: continuous stripmap, from damaged raw data to a focused image (Tsvetkov 2017)."""
+"""System 004: continuous stripmap, from impaired raw data to a focused image (Tsvetkov 2017)."""

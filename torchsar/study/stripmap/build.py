@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, Truth
-from torchsar.echo import apply_damages, simulate
+from torchsar.echo import apply_impairments, simulate
 from torchsar.io import read_stripmap
 from torchsar.radar import LinearFM, StripmapRadar
 from torchsar.scene import Points, RandomPoints, Scene, StripmapWorld, Together
-from torchsar.study.build import Case, build_damages, precision, refuse_oversize
+from torchsar.study.build import Case, build_impairments, precision, refuse_oversize
 from torchsar.study.config import Loaded
 from torchsar.study.errors import ConfigError
 from torchsar.study.registry import BEAMS, PATHS, SCENES
@@ -88,30 +88,30 @@ def read_recording(loaded: Loaded) -> Recording:
 
 
 def build_case(loaded: Loaded) -> Case:
-    """Simulate, or read and optionally damage a recording.
+    """Simulate, or read and optionally impairment a recording.
 
     Everything that the config says about it is checked first.
     """
     config = loaded.config
     draws = Draws(config.seed)
     if config.data.file is not None:
-        damages = build_damages(config.data.damages, "data.damages", loaded.file)
+        impairments = build_impairments(config.data.impairments, "data.impairments", loaded.file)
         clean = read_recording(loaded)
         try:
-            recording, told = apply_damages(clean, damages, draws)
+            recording, told = apply_impairments(clean, impairments, draws)
         except ValueError as error:
-            raise ConfigError(f"{loaded.file}: data.damages: {' '.join(str(error).split())}") from None
-        return Case(recording, clean, Truth(told, clean) if damages else None, {})
+            raise ConfigError(f"{loaded.file}: data.impairments: {' '.join(str(error).split())}") from None
+        return Case(recording, clean, Truth(told, clean) if impairments else None, {})
     world, radar = build_world(loaded), build_radar(loaded)
     assert config.world is not None
     refuse_oversize(config.world.lines, config.world.samples, loaded.file, "world.lines or world.samples")
-    damages = build_damages(config.world.damages, "world.damages", loaded.file)
+    impairments = build_impairments(config.world.impairments, "world.impairments", loaded.file)
     try:
         recording, truth = simulate(
-            radar, world, config.world.lines, config.world.samples, draws, damages, precision(config)
+            radar, world, config.world.lines, config.world.samples, draws, impairments, precision(config)
         )
     except ValueError as error:
         raise ConfigError(f"{loaded.file}: world: {' '.join(str(error).split())}") from None
     assert truth.clean is not None and isinstance(world.scene, Together)
-    clean, _ = apply_damages(truth.clean, {}, draws)
+    clean, _ = apply_impairments(truth.clean, {}, draws)
     return Case(recording, clean, truth, point_targets(world.scene.parts))

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchsar.core import Chain
 from torchsar.focus.requirements import requirements
-from torchsar.study.build import Case, build_damages, resolved
+from torchsar.study.build import Case, build_impairments, resolved
 from torchsar.study.config import Loaded
 from torchsar.study.folder import fresh_folder, write_arrays, write_json
 from torchsar.study.methods import Result, build_chains, run_methods
@@ -62,7 +62,7 @@ def check(loaded: Loaded) -> None:
     """
     build_world(loaded)
     assert loaded.config.world is not None
-    build_damages(loaded.config.world.damages, "world.damages", loaded.file)
+    build_impairments(loaded.config.world.impairments, "world.impairments", loaded.file)
     build_chains(loaded, radar=build_radar(loaded))
 
 

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from torchsar.study.catalogue import Catalogue, Strict
 from torchsar.study.config import Config, Noise
-from torchsar.study.registry import BEAMS, DAMAGES, PATHS, SCENES
+from torchsar.study.registry import BEAMS, IMPAIRMENTS, PATHS, SCENES
 
 
 class Pulse(Strict):
@@ -35,11 +35,11 @@ class Radar(Strict):
 class World(Strict):
     """What is true and no processor may see.
 
-    scene, beam, path and damages name entries of the catalogues (`torchsar list`).
+    scene, beam, path and impairments name entries of the catalogues (`torchsar list`).
     """
 
     single: ClassVar[dict[str, Catalogue]] = {"beam": BEAMS, "path": PATHS}
-    named: ClassVar[dict[str, Catalogue]] = {"scene": SCENES, "damages": DAMAGES}
+    named: ClassVar[dict[str, Catalogue]] = {"scene": SCENES, "impairments": IMPAIRMENTS}
 
     lines: int = Field(gt=1)
     samples: int = Field(gt=1)
@@ -50,7 +50,7 @@ class World(Strict):
     doppler_hz: float | None = None
     squint_deg: float | None = Field(default=None, gt=-90, lt=90)
     noise: Noise = Noise()
-    damages: dict[str, dict[str, Any]] = {}
+    impairments: dict[str, dict[str, Any]] = {}
 
     @model_validator(mode="after")
     def _one_direction(self) -> World:

@@ -62,8 +62,8 @@ class SmoothBand:
 
 
 def trade(loaded: Loaded, out: Path | None) -> str:
-    """Compare focusers, precisions and jitter correctors on the undamaged data of a config; returns
-    the tables as text.
+    """Compare focusers, precisions and jitter correctors on the unimpaired data of a config;
+    returns the tables as text.
 
     With `out`: config.yaml, trade.json, trade.txt and figures/ in that folder.
     """

@@ -12,13 +12,13 @@ from torch import Tensor
 
 from torchsar.compensate.doppler import wrap_hz
 from torchsar.core import Chain, Draws, Recording, Signal, Trace, Truth
-from torchsar.echo import Damage, apply_damages, simulate, target_energy
+from torchsar.echo import Impairment, apply_impairments, simulate, target_energy
 from torchsar.metrics import contrast, correlation, entropy, error_db
 from torchsar.metrics.bounds import reference_doppler_std_hz, tone_frequency_bound_hz, velocity_bound_m_s
 from torchsar.radar import StripmapRadar
 from torchsar.scene import Points, RandomPoints, StripmapWorld, Together
 from torchsar.study.benches import Benches
-from torchsar.study.build import build_damages, precision
+from torchsar.study.build import build_impairments, precision
 from torchsar.study.config import Config, Loaded
 from torchsar.study.errors import ConfigError
 from torchsar.study.methods import build_chains
@@ -40,7 +40,7 @@ class Bench:
     config: Config
     radar: StripmapRadar
     world: StripmapWorld
-    damages: Mapping[str, Damage]
+    impairments: Mapping[str, Impairment]
     chains: Mapping[str, Chain]
 
 
@@ -93,9 +93,9 @@ class StripmapTrials(Benches[Bench]):
     def build(self, loaded: Loaded) -> Bench:
         radar, world = build_radar(loaded), loaded.config.world
         assert world is not None
-        damages = build_damages(world.damages, "world.damages", loaded.file)
+        impairments = build_impairments(world.impairments, "world.impairments", loaded.file)
         chains = {name: chain.to(self.device) for name, chain in build_chains(loaded, radar=radar).items()}
-        return Bench(loaded.config, radar, build_world(loaded), damages, chains)
+        return Bench(loaded.config, radar, build_world(loaded), impairments, chains)
 
     def bytes_per_trial(self, fixed: Mapping[str, Any]) -> int:
         """Of the largest tensor that a trial needs, from the axes."""
@@ -117,12 +117,12 @@ class StripmapTrials(Benches[Bench]):
             size.lines,
             size.samples,
             draws,
-            bench.damages,
+            bench.impairments,
             precision(bench.config),
             self.device,
         )
         assert truth.clean is not None
-        clean, _ = apply_damages(truth.clean, {}, draws)
+        clean, _ = apply_impairments(truth.clean, {}, draws)
         traces = _traces(bench, recording, clean)
         found: dict[str, Any] = {name: _judged(bench, name, traces, truth) for name in bench.chains}
         return {**found, BOUNDS: _bounds(bench, truth, size.lines), SAVED: _saved(bench, traces)}
