@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     options = _parse(given)
     try:
-        from torchsar.study.errors import ConfigError
+        from torchsar.study.settings.errors import ConfigError
     except ImportError as error:
         return _fail(f"{error}; install the extra: pip install 'torchsar-lab[study]'")
     try:
@@ -153,7 +153,7 @@ def _fail(sentence: str) -> int:
 
 
 def _log_to_stderr() -> None:
-    from torchsar.study.errors import ConfigError
+    from torchsar.study.settings.errors import ConfigError
 
     log = logging.getLogger("torchsar")
     if not log.handlers:

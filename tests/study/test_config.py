@@ -9,11 +9,11 @@ import pytest
 from tests.study.tiny import TINY, write_tiny
 from torchsar.study.build import build_chain, resolved
 from torchsar.study.config import load
-from torchsar.study.errors import ConfigError
+from torchsar.study.settings.errors import ConfigError
+from torchsar.study.settings.text import dump, override, packaged_configs, parse
 from torchsar.study.stripmap.build import build_radar
 from torchsar.study.stripmap.run import prepare
 from torchsar.study.systems import system_of
-from torchsar.study.text import dump, override, packaged_configs, parse
 
 
 def refused(tmp_path: Path, *assignments: str, **changes: object) -> str:

@@ -15,11 +15,11 @@ from torchsar.focus import TargetImage
 from torchsar.io import read_inverse
 from torchsar.radar import geometry_of
 from torchsar.study.config import load
-from torchsar.study.errors import ConfigError
 from torchsar.study.isal.trials import IsalTrials
 from torchsar.study.montecarlo import sweep
+from torchsar.study.settings.errors import ConfigError
+from torchsar.study.settings.text import find_config, read_tree
 from torchsar.study.systems import system_of
-from torchsar.study.text import find_config, read_tree
 
 PHASES = {"sca": {"stage": "sca"}, "pga": {"stage": "pga", "kernel": "ml"}, "recommended": {"stage": "autofocus"}}
 TINY: dict = {

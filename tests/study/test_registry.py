@@ -12,8 +12,8 @@ import torch
 
 from torchsar.core import Stage
 from torchsar.study.catalogue import Catalogue
-from torchsar.study.errors import ConfigError
 from torchsar.study.registry import BEAMS, GROUPS, IMPAIRMENTS, PATHS, SCENES, group_of, stages
+from torchsar.study.settings.errors import ConfigError
 
 OWN = '''
 from torchsar.core import Stage

@@ -18,11 +18,11 @@ from torchsar.core import Axis, Draws, Signal
 from torchsar.focus.rotation_requirements import least_order, rotation_limits, rotation_requirements
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.study.config import load
-from torchsar.study.errors import ConfigError
 from torchsar.study.montecarlo import sweep
 from torchsar.study.rotation.judge import cut_through
 from torchsar.study.rotation.requires import heed_limits
 from torchsar.study.rotation.trials import RotationTrials, run_batch
+from torchsar.study.settings.errors import ConfigError
 from torchsar.study.systems import system_of
 
 TRUE = {"omega_rad_s": 0.02, "warp_k": [10.0, 1000.0]}

@@ -12,8 +12,7 @@ import zarr
 
 from tests.study.tiny import write_tiny
 from torchsar.study.config import load
-from torchsar.study.errors import ConfigError
-from torchsar.study.folder import fresh_folder
+from torchsar.study.settings.errors import ConfigError
 from torchsar.study.stripmap.run import run
 
 
@@ -26,13 +25,13 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_folder_holds_what_is_promised(out: Path) -> None:
     assert sorted(path.name for path in out.iterdir()) == [
+        ".torchsar",
         "arrays.zarr",
         "config.yaml",
         "figures",
         "metrics.json",
         "report.html",
     ]
-    assert not list(out.parent.glob("*.tmp")) and not list(out.parent.glob("*.old"))
     for png in (out / "figures").iterdir():
         assert png.read_bytes().startswith(b"\x89PNG")
     assert len(list((out / "figures").iterdir())) >= 5
@@ -120,30 +119,3 @@ def test_a_failed_run_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="processor.recommended: doppler_hz of shape"):
         run(loaded, tmp_path / "result")
     assert [path.name for path in tmp_path.iterdir()] == ["tiny.yaml"]
-
-
-def test_an_earlier_result_survives_a_failed_run_and_is_replaced_by_a_good_one(tmp_path: Path) -> None:
-    out = tmp_path / "result"
-    for text in ("first", "second"):
-        with fresh_folder(out) as folder:
-            (folder / "config.yaml").write_text(text)
-    with pytest.raises(ZeroDivisionError), fresh_folder(out) as folder:
-        (folder / "config.yaml").write_text("third")
-        raise ZeroDivisionError
-    assert (out / "config.yaml").read_text() == "second"
-    assert [path.name for path in tmp_path.iterdir()] == ["result"]
-
-
-def test_foreign_folders_are_never_touched(tmp_path: Path) -> None:
-    for name in ("mine", "out.tmp"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "precious.txt").write_text("x")
-    for out in (tmp_path / "mine", tmp_path / "out"):
-        with pytest.raises(ConfigError, match="not"), fresh_folder(out):
-            pytest.fail("must not begin")
-    (tmp_path / "file").write_text("x")
-    with pytest.raises(ConfigError, match="not a result"), fresh_folder(tmp_path / "file"):
-        pytest.fail("must not begin")
-    with pytest.raises(ConfigError, match="cannot be written"), fresh_folder(tmp_path / "file" / "below"):
-        pytest.fail("must not begin")
-    assert (tmp_path / "mine" / "precious.txt").exists() and (tmp_path / "out.tmp" / "precious.txt").exists()

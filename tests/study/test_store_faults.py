@@ -14,6 +14,7 @@ from zarr.storage import LocalStore
 from tests.study import toy
 from torchsar.study.montecarlo import Record, read_sweep
 from torchsar.study.montecarlo import store as store_module
+from torchsar.study.output import folder as folder_module
 
 SMALL = {"grid": {"snr_db": [0.0, 20.0], "law": ["flat"]}, "trials": 8, "chunk": 6, "save": [1], "resume": True}
 LARGE = {**SMALL, "grid": {"snr_db": [0.0, 10.0, 20.0], "law": ["flat", "tilted"]}, "trials": 12}
@@ -49,7 +50,7 @@ def writes(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
     # every chunk is written at once
     monkeypatch.setattr(store_module.Store, "due", property(lambda store: True))
     # the lock of a dead process is gone, that of an exception is not
-    monkeypatch.setattr(store_module, "fcntl", None)
+    monkeypatch.setattr(folder_module, "fcntl", None)
     return state
 
 
@@ -111,7 +112,8 @@ def test_dying_before_the_store_says_whose_it_is_begins_anew(writes: dict, tmp_p
 def test_a_store_that_was_killed_while_it_was_made_is_begun_anew(left: list[str], resume: bool, tmp_path: Path) -> None:
     store = tmp_path / "s" / "results.zarr"
     store.mkdir(parents=True)
-    (tmp_path / "s" / ".results.zarr.lock").touch()
+    with folder_module.opened(tmp_path / "s", "sweep") as folder:
+        folder.claim()
     for name in left:
         if name == "done":
             (store / name).mkdir()

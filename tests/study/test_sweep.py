@@ -14,12 +14,12 @@ import zarr
 
 from tests.study import toy
 from torchsar.core import Draws
-from torchsar.study.errors import ConfigError
 from torchsar.study.montecarlo import Record, Stop, differences, read_sweep, sweep
 from torchsar.study.montecarlo.chunks import CACHE_BYTES, cut, probed_bytes, rows_by_bytes
 from torchsar.study.montecarlo.grid import address, make_grid
 from torchsar.study.montecarlo.stopping import looks
 from torchsar.study.montecarlo.work import Work
+from torchsar.study.settings.errors import ConfigError
 
 
 def same(a: Record, b: Record, rtol: float = 0.0) -> None:
@@ -236,12 +236,11 @@ def test_foreign_folders_are_never_touched(tmp_path: Path) -> None:
     (tmp_path / "mine" / "precious.txt").write_text("x")
     (tmp_path / "mine2" / "results.zarr").mkdir(parents=True)
     (tmp_path / "file").write_text("x")
-    for name in ("mine", "mine2", "file"):
+    for name in ("mine2", "file"):
         for resume in (False, True):
-            with pytest.raises(
-                ConfigError, match="not the folder of a sweep|already|no results|not left by|cannot be written"
-            ):
+            with pytest.raises(ConfigError, match="no results|not left by|cannot be written"):
                 toy.run(tmp_path / name, resume=resume)
+    assert toy.run(tmp_path / "mine", trials=2).done.all()
     assert (tmp_path / "mine" / "precious.txt").read_text() == "x"
 
 
@@ -281,7 +280,7 @@ def test_resuming_another_sweep_is_refused_with_what_differs(tmp_path: Path, cha
 
 def test_two_writers_are_refused(tmp_path: Path) -> None:
     def second(parameters, draws):
-        with pytest.raises(ConfigError, match="another sweep is writing"):
+        with pytest.raises(ConfigError, match="another torchsar command is writing"):
             toy.run(tmp_path / "s", resume=True)
         return toy.trial(parameters, draws)
 

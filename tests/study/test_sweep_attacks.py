@@ -19,13 +19,13 @@ import torch
 from tests.study.tiny import write_tiny
 from torchsar.cli import main
 from torchsar.study.config import load
-from torchsar.study.errors import ConfigError
 from torchsar.study.montecarlo import Stop, read_sweep, sweep
 from torchsar.study.montecarlo.engines import _refuse_unsendable, engine, refuse_unguarded
 from torchsar.study.montecarlo.grid import address, check_name, make_grid
 from torchsar.study.montecarlo.store import Store
 from torchsar.study.montecarlo.summary import summary_tree
 from torchsar.study.montecarlo.work import Work
+from torchsar.study.settings.errors import ConfigError
 
 
 def level(rows: int) -> torch.Tensor:

@@ -12,10 +12,10 @@ import pytest
 from tests.study.tiny import TINY, write_tiny
 from torchsar.cli import main
 from torchsar.study.config import load
-from torchsar.study.errors import ConfigError
 from torchsar.study.montecarlo import Record, differences, read_sweep
 from torchsar.study.montecarlo.engines import InProcess
 from torchsar.study.montecarlo.loop import Plan, run_plan
+from torchsar.study.settings.errors import ConfigError
 from torchsar.study.stripmap.trials import StripmapTrials, error_name
 from torchsar.study.sweeping import sweep_grid
 

@@ -18,9 +18,9 @@ import pytest
 from tests.helpers import mind_interrupts
 from tests.study import toy
 from tests.study.tiny import write_tiny
-from torchsar.study.errors import ConfigError
 from torchsar.study.montecarlo import Record, engines, read_sweep
 from torchsar.study.montecarlo.engines import engine
+from torchsar.study.settings.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[2]
 needs_dask = pytest.mark.skipif(

@@ -13,8 +13,8 @@ from torchsar.core import Chain, Recording, Truth, use
 from torchsar.radar import LIGHT_M_S, BistaticRadar, InverseRadar, StripmapRadar, TriangularLadar
 from torchsar.study.catalogue import Catalogue
 from torchsar.study.config import Config, Loaded, Method
-from torchsar.study.errors import ConfigError, did_you_mean
 from torchsar.study.registry import IMPAIRMENTS, stages
+from torchsar.study.settings.errors import ConfigError, did_you_mean
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,13 @@ from torchsar.core import Signal
 from torchsar.study.build import resolved
 from torchsar.study.cases import cases_of, key_of
 from torchsar.study.config import Loaded
-from torchsar.study.errors import ConfigError
-from torchsar.study.folder import fresh_folder, write_arrays, write_json
+from torchsar.study.output.arrays import write_arrays, write_json
+from torchsar.study.output.folder import fresh_result
 from torchsar.study.pictures import Picture
+from torchsar.study.settings.errors import ConfigError
 
 log = logging.getLogger("torchsar")
+RUN_FILES = ("config.yaml", "metrics.json", "arrays.zarr", "figures", "report.html")
 Result = TypeVar("Result", bound="CaseArrays")
 
 
@@ -54,7 +56,7 @@ def run_cases(
     What a case refuses is a ConfigError that names it. Returns the path of the report.
     """
     began = time.perf_counter()
-    with fresh_folder(out) as folder:
+    with fresh_result(out, "run", RUN_FILES) as folder:
         prepare()
         results = {name or "all": _one(loaded, case, name, one) for name, case in cases_of(loaded).items()}
         metrics = metrics_tree(loaded, results)
@@ -105,7 +107,7 @@ def write_requirements(loaded: Loaded, out: Path | None, find: Callable[[], tupl
     """
     if out is None:
         return find()[0]
-    with fresh_folder(out) as folder:
+    with fresh_result(out, "requires", ("config.yaml", "requires.json", "requires.txt")) as folder:
         text, tree = find()
         (folder / "config.yaml").write_text(loaded.text(resolved(loaded)), encoding="utf-8")
         (folder / "requires.txt").write_text(text + "\n", encoding="utf-8")

@@ -8,7 +8,7 @@ from typing import Any, Self
 from pydantic import model_validator
 
 from torchsar.study.config import RESERVED, Config, Loaded, check_methods
-from torchsar.study.errors import ConfigError
+from torchsar.study.settings.errors import ConfigError
 
 _OF_ALL_CASES = ("system", "title", "cases", "metrics", "trade", "sweep")
 

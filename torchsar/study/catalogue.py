@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
-from torchsar.study.errors import ConfigError, did_you_mean
+from torchsar.study.settings.errors import ConfigError, did_you_mean
 
 _SCALARS = (float, int, str, bool, type(None))
 

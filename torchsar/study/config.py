@@ -10,8 +10,8 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, ValidationError, model_validator
 
 from torchsar.study.catalogue import Strict, sentence
-from torchsar.study.errors import ConfigError, did_you_mean
-from torchsar.study.text import dump, find_config, override, read_tree
+from torchsar.study.settings.errors import ConfigError, did_you_mean
+from torchsar.study.settings.text import dump, find_config, override, read_tree
 
 RESERVED = ("truth", "estimate")
 

@@ -16,8 +16,8 @@ from torchsar.focus.requirements import Requirement
 from torchsar.study.case_run import write_requirements
 from torchsar.study.cases import cases_of
 from torchsar.study.config import Loaded
-from torchsar.study.errors import ConfigError
 from torchsar.study.montecarlo.record import OK
+from torchsar.study.settings.errors import ConfigError
 
 log = logging.getLogger("torchsar")
 

@@ -29,7 +29,7 @@ from torchsar.study.registry import (
     stages,
 )
 from torchsar.study.sal.sections import LADAR_IMPAIRMENTS
-from torchsar.study.text import packaged_configs, read_tree
+from torchsar.study.settings.text import packaged_configs, read_tree
 
 _WORLD = {
     "SCENES": SCENES,

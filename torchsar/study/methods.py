@@ -17,7 +17,7 @@ from torchsar.core import Chain, Estimate, Signal, Trace
 from torchsar.radar import StripmapRadar
 from torchsar.study.build import Case, build_chain, check_given, foreign
 from torchsar.study.config import Loaded, Method, check_methods
-from torchsar.study.errors import ConfigError
+from torchsar.study.settings.errors import ConfigError
 
 log = logging.getLogger("torchsar")
 

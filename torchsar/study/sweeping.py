@@ -12,17 +12,18 @@ from typing import Any
 
 from torchsar.study.build import resolved
 from torchsar.study.config import Config, Loaded, Sweep
-from torchsar.study.errors import ConfigError, did_you_mean
-from torchsar.study.folder import write_json
 from torchsar.study.montecarlo.engines import engine
 from torchsar.study.montecarlo.grid import Grid, make_grid
-from torchsar.study.montecarlo.loop import Interrupted, Plan, open_store, run_plan
+from torchsar.study.montecarlo.loop import SWEEP_FILES, Interrupted, Plan, open_store, run_plan
 from torchsar.study.montecarlo.pictures import draw_sweep
 from torchsar.study.montecarlo.record import Record
 from torchsar.study.montecarlo.report import write_sweep_report
 from torchsar.study.montecarlo.stopping import Stop
 from torchsar.study.montecarlo.summary import summary_tree
 from torchsar.study.montecarlo.work import BOUNDS, SAVED
+from torchsar.study.output.arrays import write_json
+from torchsar.study.output.folder import opened
+from torchsar.study.settings.errors import ConfigError, did_you_mean
 from torchsar.study.systems import Trials, system_of
 
 log = logging.getLogger("torchsar")
@@ -63,18 +64,18 @@ def sweep_config(
         device,
         tuple(needs),
     )
-    store = open_store(out, plan, identity(loaded), resume)
     config_text = loaded.text(resolved(loaded))
     about = {"title": loaded.config.title, "config": config_text, "dtype": loaded.config.precision}
-    store.note(**about)
     _announce(grid, settings.trials)
     try:
-        with _terminated_like_interrupted():
-            record = run_plan(
-                plan, system_of(loaded).trials(loaded, device), store, engine(workers, cluster, threads), loaded.name
-            )
+        with opened(out, "sweep", SWEEP_FILES) as folder, _terminated_like_interrupted():
+            store = open_store(folder, plan, identity(loaded), resume)
+            store.note(**about)
+            trials = system_of(loaded).trials(loaded, device)
+            record = run_plan(plan, trials, store, engine(workers, cluster, threads), loaded.name)
             record.about = {**record.about, **about}
-            return report(record.select(grid.labels), loaded, out, config_text, command)
+            with folder.staged() as new:
+                report(record.select(grid.labels), loaded, new, config_text, command)
     except Interrupted as stopped:
         raise Interrupted(f"{stopped} in {out}; go on with --resume") from None
     except KeyboardInterrupt:  # a second Ctrl-C, or one while the report was made
@@ -84,6 +85,7 @@ def sweep_config(
             f"{out}: the report cannot be written ({error.strerror or error}); the trials are "
             "recorded, make it with --resume"
         ) from error
+    return out / "report.html"
 
 
 def sweep_grid(loaded: Loaded) -> Grid:
@@ -144,23 +146,14 @@ def identity(loaded: Loaded) -> dict[str, Any]:
     }
 
 
-def report(record: Record, loaded: Loaded, out: Path, config_text: str, command: str) -> Path:
-    """summary.json, figures/, config.yaml and report.html of a record.
-
-    The summary and the report, which is last, are replaced whole.
-    """
+def report(record: Record, loaded: Loaded, out: Path, config_text: str, command: str) -> None:
+    """Write config.yaml, summary.json, figures/ and report.html of a record into a folder."""
     titles = {f"method {name}": method.title for name, method in loaded.config.processor.items() if method.title}
     summary = summary_tree(record, loaded.config.sweep.success, {"snr": system_of(loaded).definitions["snr"], **titles})
-    figures = out / "figures"
-    figures.mkdir(exist_ok=True)
-    for old in figures.glob("*.png"):
-        old.unlink()
-    pictures = draw_sweep(summary, figures, loaded.config.sweep.show)
+    pictures = draw_sweep(summary, out / "figures", loaded.config.sweep.show)
     (out / "config.yaml").write_text(config_text, encoding="utf-8")
-    write_json(out / "summary.json.tmp", summary)
-    (out / "summary.json.tmp").replace(out / "summary.json")
-    write_sweep_report(out / "report.html.tmp", summary, pictures, figures, config_text, command)
-    return (out / "report.html.tmp").replace(out / "report.html")
+    write_json(out / "summary.json", summary)
+    write_sweep_report(out / "report.html", summary, pictures, out / "figures", config_text, command)
 
 
 def _announce(grid: Grid, trials: int) -> None:

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from torchsar.core import Draws
 from torchsar.study.config import Config, Loaded
-from torchsar.study.errors import ConfigError, did_you_mean
+from torchsar.study.settings.errors import ConfigError, did_you_mean
 
 
 class Trials(Protocol):

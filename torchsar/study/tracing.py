@@ -10,8 +10,8 @@ from torch import Tensor
 
 from torchsar.core import Chain, Estimate, Recording, Signal, Trace
 from torchsar.study.build import foreign
-from torchsar.study.errors import ConfigError
 from torchsar.study.montecarlo.record import OK
+from torchsar.study.settings.errors import ConfigError
 
 IMAGE = ("azimuth", "range")
 

@@ -18,8 +18,9 @@ from torchsar import plot
 from torchsar.study.build import resolved
 from torchsar.study.cases import cases_of, refuse_recordings
 from torchsar.study.config import Loaded
-from torchsar.study.errors import ConfigError
-from torchsar.study.folder import fresh_folder, write_json
+from torchsar.study.output.arrays import write_json
+from torchsar.study.output.folder import fresh_result
+from torchsar.study.settings.errors import ConfigError
 
 Result = TypeVar("Result")
 Tables = Mapping[str, Sequence[Any]]
@@ -49,7 +50,7 @@ def written(
     """
     if out is None:
         return text(tables())
-    with fresh_folder(out) as folder:
+    with fresh_result(out, "trade", ("config.yaml", "trade.json", "trade.txt", "figures")) as folder:
         found = tables()
         said = text(found)
         (folder / "config.yaml").write_text(loaded.text(resolved(loaded)), encoding="utf-8")

@@ -16,10 +16,10 @@ from torchsar.scene import BandLimited, BistaticWorld, Gate, MovingPoints, Patte
 from torchsar.study.build import build_impairments, precision, refuse_oversize
 from torchsar.study.cases import cases_of, check_judged
 from torchsar.study.config import Loaded
-from torchsar.study.errors import ConfigError
 from torchsar.study.geo.sections import Ephemeris, GeoConfig, Noise, Target, compression_gain_db
 from torchsar.study.methods import build_chains
 from torchsar.study.registry import GATES, MULTICHANNEL_IMPAIRMENTS, RECEIVE_RANGES, SEAS
+from torchsar.study.settings.errors import ConfigError
 
 TOLD = "true_"
 _TOLD = ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")

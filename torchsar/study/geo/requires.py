@@ -30,12 +30,12 @@ from torchsar.multichannel.velocity.stages import (
 )
 from torchsar.study.cases import refuse_recordings
 from torchsar.study.config import Loaded
-from torchsar.study.errors import ConfigError
 from torchsar.study.geo.build import Echoes, check
 from torchsar.study.geo.sections import GeoConfig
 from torchsar.study.geo.stages import MigrationOfLines, Stilled
 from torchsar.study.limits import heed, limit_lines, limit_rows, requirement_lines, requirement_rows, write_needs
 from torchsar.study.methods import build_chains
+from torchsar.study.settings.errors import ConfigError
 
 _ESTIMATORS: dict[type, Estimator] = {
     SignalIntensityRatio: "sir",

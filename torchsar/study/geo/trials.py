@@ -28,12 +28,12 @@ from torchsar.scene import BandLimited, Gate
 from torchsar.study.benches import Benches
 from torchsar.study.cases import check_sweep, refuse_recordings
 from torchsar.study.config import Loaded, Method
-from torchsar.study.errors import ConfigError
 from torchsar.study.geo.build import Echoes, Recorded, refuse_unfit, snr_db_of
 from torchsar.study.geo.judge import IMAGES, Focused, Found, error_name, response_metrics, told_metrics
 from torchsar.study.geo.sections import GeoConfig, Noise, compression_gain_db
 from torchsar.study.methods import build_chains
 from torchsar.study.montecarlo.work import BOUNDS, SAVED
+from torchsar.study.settings.errors import ConfigError
 from torchsar.study.tracing import saved_of, traced
 
 _LEVELS = tuple(f"world.noise.{name}" for name in Noise.model_fields)

@@ -17,9 +17,9 @@ from torchsar.scene import Sinusoid, displacement_m
 from torchsar.study.case_run import write_requirements
 from torchsar.study.cases import cases_of
 from torchsar.study.config import Loaded
-from torchsar.study.errors import ConfigError
 from torchsar.study.isal.build import build_radar, build_world, check
 from torchsar.study.limits import requirement_lines
+from torchsar.study.settings.errors import ConfigError
 
 _SAMPLING = ("vibration followed by pulses", "cross range unambiguous", "range unambiguous")
 

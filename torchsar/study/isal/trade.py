@@ -25,12 +25,12 @@ from torchsar.scene import Dechirped, PhaseOnly, TurntableWorld
 from torchsar.study.build import build_impairments
 from torchsar.study.cases import cases_of
 from torchsar.study.config import Loaded
-from torchsar.study.errors import ConfigError
 from torchsar.study.isal.build import build_radar, build_world, check
 from torchsar.study.isal.judge import estimated_phase
 from torchsar.study.isal.sections import TARGET_IMPAIRMENTS
 from torchsar.study.isal.trials import received, whole_phase
 from torchsar.study.methods import build_chains
+from torchsar.study.settings.errors import ConfigError
 from torchsar.study.tracing import traced
 from torchsar.study.trading import Tables, timed, written
 

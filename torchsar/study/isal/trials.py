@@ -21,12 +21,12 @@ from torchsar.study.benches import Benches
 from torchsar.study.build import build_impairments, precision
 from torchsar.study.cases import check_judged, check_sweep
 from torchsar.study.config import Config, Loaded
-from torchsar.study.errors import ConfigError
 from torchsar.study.isal.build import build_radar, build_world
 from torchsar.study.isal.judge import image_metrics, phase_metrics
 from torchsar.study.isal.sections import TARGET_IMPAIRMENTS
 from torchsar.study.methods import build_chains
 from torchsar.study.montecarlo.work import BOUNDS, SAVED
+from torchsar.study.settings.errors import ConfigError
 from torchsar.study.tracing import IMAGE, not_an_image, saved_of, traced
 
 ENDING = "azimuth_transform or target_image"

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchsar.study.errors import ConfigError
 from torchsar.study.montecarlo.record import OK, Record
+from torchsar.study.settings.errors import ConfigError
 
 
 @dataclass(frozen=True)

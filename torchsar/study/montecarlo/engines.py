@@ -13,8 +13,8 @@ from typing import Any, Protocol
 
 import torch
 
-from torchsar.study.errors import ConfigError
 from torchsar.study.montecarlo.work import Chunk, Outcome, Work
+from torchsar.study.settings.errors import ConfigError
 
 log = logging.getLogger("torchsar")
 Task = tuple[Chunk, int | None]

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from torchsar.study.errors import ConfigError
+from torchsar.study.settings.errors import ConfigError
 
 RESERVED = ("algorithm", "trial", "method", "ok", "done", "saved")
 _LONGEST = 200  # bytes: file systems end at 255, and bounds and figures add words

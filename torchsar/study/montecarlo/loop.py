@@ -6,7 +6,7 @@ import logging
 import platform
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchsar.study.errors import ConfigError, did_you_mean
 from torchsar.study.montecarlo.chunks import cut, probed_bytes, rows_by_bytes
 from torchsar.study.montecarlo.engines import Engine, Task, engine, refuse_unguarded
 from torchsar.study.montecarlo.grid import Grid, make_grid
@@ -24,7 +23,9 @@ from torchsar.study.montecarlo.record import OK, Record
 from torchsar.study.montecarlo.stopping import Stop, looks
 from torchsar.study.montecarlo.store import Store, cut_off, empty, read_sweep
 from torchsar.study.montecarlo.work import Chunk, Outcome, Trial, Work
+from torchsar.study.output.folder import ResultFolder, opened
 from torchsar.study.report import installed_version
+from torchsar.study.settings.errors import ConfigError, did_you_mean
 
 log = logging.getLogger("torchsar")
 _WAITING = 256
@@ -119,8 +120,9 @@ def sweep(
         "trial": getattr(trial, "__qualname__", type(trial).__qualname__),
         "config": dict(config or {}),
     }
-    store = None if out is None else open_store(Path(out), plan, identity, resume)
-    return run_plan(plan, trial, store, engine(workers, cluster, threads)).select(plan.grid.labels)
+    with nullcontext() if out is None else opened(Path(out), "sweep", SWEEP_FILES) as folder:
+        store = None if folder is None else open_store(folder, plan, identity, resume)
+        return run_plan(plan, trial, store, engine(workers, cluster, threads)).select(plan.grid.labels)
 
 
 def _refuse_types(trial: Any, stop: Any, save: Any, config: Any, out: Any) -> None:
@@ -136,27 +138,27 @@ def _refuse_types(trial: Any, stop: Any, save: Any, config: Any, out: Any) -> No
         raise ConfigError(f"sweep: config must be a mapping of whatever else the results depend on, got {config!r}")
 
 
-def open_store(out: Path, plan: Plan, identity: Mapping[str, Any], resume: bool) -> Store:
-    """results.zarr in the folder: a new one, or with `resume` the one that is there.
+SWEEP_FILES = ("config.yaml", "summary.json", "figures", "report.html")
 
-    Raises ConfigError where that would lose results.
+
+def open_store(folder: ResultFolder, plan: Plan, identity: Mapping[str, Any], resume: bool) -> Store:
+    """The file results.zarr of a sweep: a new one, or with `resume` the one that is there.
 
     A sweep that ended before its first mark holds nothing to lose and is begun anew.
+
+    Raises:
+        ConfigError: If results would be lost, or the store that is there belongs to another sweep.
     """
-    path = out / "results.zarr"
-    there = path.exists() and not cut_off(path)
+    path = folder.path / "results.zarr"
+    there = path.exists() and not (folder.claimed and cut_off(path))
     if there and resume:
         return Store.resume(path, plan.grid, plan.trials, identity)
     if there and read_sweep(path).done.any():
         raise ConfigError(
-            f"{out} holds a sweep already; add --resume (resume=True) to go on with it, or choose another folder"
+            f"{folder.path} holds a sweep already; add --resume (resume=True) to go on with it, or choose another "
+            "folder"
         )
-    if (
-        not path.exists()
-        and out.exists()
-        and (not out.is_dir() or any(p for p in out.iterdir() if not p.name.startswith(".results.zarr")))
-    ):
-        raise ConfigError(f"{out} exists and is not the folder of a sweep; choose another one")
+    folder.claim()
     return Store.create(path, plan.grid, plan.trials, identity)
 
 
@@ -185,11 +187,7 @@ def run_plan(
         run.settle()
         raise Interrupted(f"{int(record.done.sum())} trials are recorded") from None
     finally:
-        try:
-            run.settle()
-        finally:
-            if store is not None:
-                store.close()
+        run.settle()
     return record
 
 

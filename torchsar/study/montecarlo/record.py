@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from torchsar.study.errors import ConfigError
 from torchsar.study.montecarlo.grid import RESERVED, check_name
+from torchsar.study.settings.errors import ConfigError
 
 OK = "ok"
 Labels = dict[str, tuple[float | str, ...]]

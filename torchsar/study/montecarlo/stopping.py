@@ -10,9 +10,9 @@ from typing import Literal
 
 import numpy as np
 
-from torchsar.study.errors import ConfigError
 from torchsar.study.montecarlo.record import Record
 from torchsar.study.montecarlo.statistics import half_width_ratio
+from torchsar.study.settings.errors import ConfigError
 
 FIRST_LOOK = 50
 

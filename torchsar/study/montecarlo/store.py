@@ -19,14 +19,9 @@ from typing import Any
 import numpy as np
 import zarr
 
-from torchsar.study.errors import ConfigError
 from torchsar.study.montecarlo.grid import Grid, address, canonical
 from torchsar.study.montecarlo.record import OK, Labels, Record, bound_name
-
-try:
-    import fcntl
-except ImportError:  # not on every system; there, two writers at once are the user's own care
-    fcntl = None
+from torchsar.study.settings.errors import ConfigError
 
 FORMAT = 1
 _CHUNK_NUMBERS = 1 << 16
@@ -45,8 +40,8 @@ class Store:
     Group `saved`: images and taps of chosen trials.
     """
 
-    def __init__(self, root: zarr.Group, lock: Any, record: Record) -> None:
-        self.root, self._lock, self.record = root, lock, record
+    def __init__(self, root: zarr.Group, record: Record) -> None:
+        self.root, self.record = root, record
         self._marks = attributes(root[_DONE])
         self._dirty: set[tuple[int, ...]] = set()
         self._window: tuple[int, int] | None = None
@@ -57,11 +52,11 @@ class Store:
     @classmethod
     def create(cls, path: Path, grid: Grid, trials: int, identity: Mapping[str, Any]) -> Store:
         """A new store. Raises ConfigError where the folder cannot be written."""
-        record, lock = empty(grid.labels, trials), _locked(path)
+        record = empty(grid.labels, trials)
         with _writing(path):
             root = zarr.open_group(str(path), mode="w", zarr_format=3)
             root.create_group(_DONE)
-            return cls(root, lock, record)._begun(grid, identity)
+            return cls(root, record)._begun(grid, identity)
 
     @classmethod
     def resume(cls, path: Path, grid: Grid, trials: int, identity: Mapping[str, Any]) -> Store:
@@ -69,7 +64,6 @@ class Store:
 
         Raises ConfigError where it belongs to another config.
         """
-        lock = _locked(path)
         root = _opened(path, "r+")
         held = attributes(root)
         refuse_another(path, held["identity"], _plain(identity), held["values"], _values(grid))
@@ -79,7 +73,7 @@ class Store:
             for name, known in record.labels.items()
         }
         with _writing(path):
-            return cls(root, lock, record.grown(labels, max(trials, record.trials)))._begun(grid, identity)
+            return cls(root, record.grown(labels, max(trials, record.trials)))._begun(grid, identity)
 
     def _begun(self, grid: Grid, identity: Mapping[str, Any]) -> Store:
         values = {
@@ -165,13 +159,6 @@ class Store:
         self._dirty, self._window = set(), None
         self._last = time.perf_counter()
         self._cost = self._last - began
-
-    def close(self) -> None:
-        """Write the rest and let others write."""
-        try:
-            self.flush()
-        finally:
-            self._lock.close()
 
     def _variables(self) -> dict[str, tuple[np.ndarray, tuple[str, ...], dict[str, Any]]]:
         record = self.record
@@ -285,15 +272,11 @@ def cut_off(path: Path) -> bool:
     anything in it.
     """
     made = {p.name for p in path.iterdir() if not p.name.endswith(".partial")} if path.is_dir() else {""}
-    if not _lock_of(path).exists() or not made <= {"zarr.json", _DONE}:
+    if not made <= {"zarr.json", _DONE}:
         return False
     return "zarr.json" not in made or "labels" not in json.loads((path / "zarr.json").read_text(encoding="utf-8")).get(
         "attributes", {}
     )
-
-
-def _lock_of(path: Path) -> Path:
-    return path.with_name(f".{path.name}.lock")
 
 
 def _opened(path: Path, mode: Any) -> zarr.Group:
@@ -446,22 +429,3 @@ def _plain(identity: Mapping[str, Any]) -> dict[str, Any]:
 
 def _plain_values(tree: Mapping[str, Any]) -> dict[str, Any]:
     return json.loads(json.dumps(dict(tree), default=str))
-
-
-def _locked(path: Path) -> Any:
-    """An open file that this process alone holds; it is let go of when the process ends, however it
-    ends.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        file = _lock_of(path).open("w")
-    except OSError as error:
-        raise ConfigError(f"{path.parent} cannot be written: {error.strerror}") from None
-    if fcntl is not None:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise ConfigError(
-                f"another sweep is writing to {path}; wait for its end, or choose another folder"
-            ) from None
-    return file

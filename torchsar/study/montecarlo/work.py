@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws
-from torchsar.study.errors import ConfigError
 from torchsar.study.montecarlo.grid import Case
 from torchsar.study.montecarlo.record import OK
+from torchsar.study.settings.errors import ConfigError
 
 Trial = Callable[[Mapping[str, Any], Draws], Mapping[str, Any]]
 BOUNDS, SAVED = "bounds", "saved"

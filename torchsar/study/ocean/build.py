@@ -17,11 +17,11 @@ from torchsar.scene import BistaticWorld, Fleet, Movers, Sea, Ship
 from torchsar.study.build import precision, refuse_oversize
 from torchsar.study.cases import cases_of, check_judged
 from torchsar.study.config import Loaded
-from torchsar.study.errors import ConfigError
 from torchsar.study.geo.build import TOLD, build_radar
 from torchsar.study.methods import build_chains
 from torchsar.study.ocean.sections import OceanConfig, Vessel
 from torchsar.study.registry import GATES, SEAS
+from torchsar.study.settings.errors import ConfigError
 
 SLOWEST_M_S = (0.3, 1.0)
 _MOTION = ("u_r_m_s", "u_a_m_s", "azimuth_m", "range_m")

@@ -12,13 +12,13 @@ from torchsar.multichannel.requirements import MultichannelUse, multichannel_lim
 from torchsar.scene import BandLimited
 from torchsar.study.cases import refuse_recordings
 from torchsar.study.config import Loaded
-from torchsar.study.errors import ConfigError
 from torchsar.study.geo.requires import Needs
 from torchsar.study.limits import heed, write_needs
 from torchsar.study.ocean.build import check
 from torchsar.study.ocean.sections import OceanConfig
 from torchsar.study.ocean.stages import MoversImage
 from torchsar.study.ocean.trials import Bench, Way
+from torchsar.study.settings.errors import ConfigError
 
 _PATTERN_S = 4.5
 # no keystone transform, and bands are told apart only of what is at rest: movers are pictured

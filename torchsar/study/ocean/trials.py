@@ -21,7 +21,6 @@ from torchsar.multichannel.transmit import RemoveTransmitRange
 from torchsar.study.benches import Benches
 from torchsar.study.cases import check_sweep, refuse_recordings
 from torchsar.study.config import Loaded
-from torchsar.study.errors import ConfigError
 from torchsar.study.methods import build_chains
 from torchsar.study.montecarlo.record import OK
 from torchsar.study.montecarlo.work import BOUNDS, SAVED
@@ -29,6 +28,7 @@ from torchsar.study.ocean.build import Ocean, Sighted, check
 from torchsar.study.ocean.judge import Judged, Reference, judged
 from torchsar.study.ocean.sections import OceanConfig
 from torchsar.study.ocean.stages import MoversImage
+from torchsar.study.settings.errors import ConfigError
 
 _COPIES = 40
 ENDING = "movers_image or stationary_image"

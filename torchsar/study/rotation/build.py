@@ -14,10 +14,10 @@ from torchsar.scene import Points, PolynomialRotation, Scatterers, Scene, Togeth
 from torchsar.study.build import build_impairments, carried, precision, refuse_oversize
 from torchsar.study.cases import cases_of, check_judged
 from torchsar.study.config import Loaded
-from torchsar.study.errors import ConfigError
 from torchsar.study.isal.sections import TARGET_IMPAIRMENTS
 from torchsar.study.methods import build_chains
 from torchsar.study.registry import FIDELITIES, MOTIONS, SCENES, START_PHASES
+from torchsar.study.settings.errors import ConfigError
 
 
 @dataclass(frozen=True)

@@ -19,12 +19,12 @@ from torchsar.focus.rotation_requirements import least_order, rotation_limits, r
 from torchsar.metrics.rotation_bounds import rotation_bounds
 from torchsar.study.cases import refuse_recordings
 from torchsar.study.config import Loaded
-from torchsar.study.errors import ConfigError
 from torchsar.study.limits import heed, limit_lines, limit_rows, requirement_lines, requirement_rows, write_needs
 from torchsar.study.registry import stages
 from torchsar.study.rotation.build import Turntable, check
 from torchsar.study.rotation.sections import RotationConfig
 from torchsar.study.rotation.trials import true_k
+from torchsar.study.settings.errors import ConfigError
 
 log = logging.getLogger("torchsar")
 # limits that stop only methods which estimate something

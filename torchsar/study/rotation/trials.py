@@ -20,7 +20,6 @@ from torchsar.metrics.rotation_bounds import rotation_bounds
 from torchsar.study.benches import Benches
 from torchsar.study.cases import check_judged, check_sweep, refuse_recordings
 from torchsar.study.config import Config, Loaded
-from torchsar.study.errors import ConfigError
 from torchsar.study.methods import build_chains
 from torchsar.study.montecarlo.work import BOUNDS, SAVED
 from torchsar.study.rotation.build import Turntable, named_targets
@@ -34,6 +33,7 @@ from torchsar.study.rotation.judge import (
     rotation_metrics,
     told_metrics,
 )
+from torchsar.study.settings.errors import ConfigError
 from torchsar.study.tracing import IMAGE, image_of, not_an_image, saved_of, traced
 
 ENDING = "matched_fourier"

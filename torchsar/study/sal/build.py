@@ -17,7 +17,6 @@ from torchsar.study.build import build_impairments, carried, precision, refuse_o
 from torchsar.study.cases import cases_of, check_judged
 from torchsar.study.catalogue import Catalogue
 from torchsar.study.config import Loaded
-from torchsar.study.errors import ConfigError, did_you_mean
 from torchsar.study.methods import build_chains
 from torchsar.study.registry import (
     CALIBRATIONS,
@@ -29,6 +28,7 @@ from torchsar.study.registry import (
     group_of,
 )
 from torchsar.study.sal.sections import LADAR_IMPAIRMENTS, Record
+from torchsar.study.settings.errors import ConfigError, did_you_mean
 
 log = logging.getLogger("torchsar")
 # stages that work on deramped profiles, and cannot tell whether they are

@@ -20,11 +20,11 @@ from torchsar.scene import Extremes, Fidelity, LinearInSweep, QuadraticInSweep, 
 from torchsar.scene.vibration import displacement_m
 from torchsar.study.cases import refuse_recordings
 from torchsar.study.config import Loaded
-from torchsar.study.errors import ConfigError
 from torchsar.study.limits import heed, limit_lines, limit_rows, requirement_lines, requirement_rows, write_needs
 from torchsar.study.sal.build import Ladar, check
 from torchsar.study.sal.judge import leading, lit_periods
 from torchsar.study.sal.sections import SalConfig
+from torchsar.study.settings.errors import ConfigError
 
 log = logging.getLogger("torchsar")
 _TIMES_A_PERIOD, _MOST_TIMES = 16, 1 << 22

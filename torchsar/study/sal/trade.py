@@ -24,11 +24,11 @@ from torchsar.radar import TriangularLadar
 from torchsar.scene import EverySample, Fidelity, LinearInSweep, OnePerPeriod, OnePerSweep, QuadraticInSweep
 from torchsar.study.cases import cases_of, refuse_recordings
 from torchsar.study.config import Loaded
-from torchsar.study.errors import ConfigError
 from torchsar.study.methods import build_chains
 from torchsar.study.sal.build import Ladar, check
 from torchsar.study.sal.judge import SWEEPS, course_of, motion_metrics
 from torchsar.study.sal.sections import Trade
+from torchsar.study.settings.errors import ConfigError
 from torchsar.study.tracing import traced
 from torchsar.study.trading import Tables, timed, written
 

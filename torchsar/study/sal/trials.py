@@ -24,11 +24,11 @@ from torchsar.scene import Points, Together
 from torchsar.study.benches import Benches
 from torchsar.study.cases import check_judged, check_sweep, refuse_recordings
 from torchsar.study.config import Config, Loaded
-from torchsar.study.errors import ConfigError
 from torchsar.study.methods import build_chains
 from torchsar.study.montecarlo.work import BOUNDS, SAVED
 from torchsar.study.sal.build import Ladar, check_deramped, check_target, named_targets
 from torchsar.study.sal.judge import Course, course_of, image_metrics, motion_metrics, target_metrics
+from torchsar.study.settings.errors import ConfigError
 from torchsar.study.tracing import IMAGE, not_an_image, saved_of, traced, verdict
 
 PROFILES = ("pulse", "range")

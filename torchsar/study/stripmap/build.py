@@ -14,8 +14,8 @@ from torchsar.radar import LinearFM, StripmapRadar
 from torchsar.scene import Points, RandomPoints, Scene, StripmapWorld, Together
 from torchsar.study.build import Case, build_impairments, precision, refuse_oversize
 from torchsar.study.config import Loaded
-from torchsar.study.errors import ConfigError
 from torchsar.study.registry import BEAMS, PATHS, SCENES
+from torchsar.study.settings.errors import ConfigError
 
 
 def build_radar(loaded: Loaded) -> StripmapRadar:

@@ -13,9 +13,11 @@ from torch import Tensor
 from torchsar.core import Chain
 from torchsar.focus.requirements import requirements
 from torchsar.study.build import Case, build_impairments, resolved
+from torchsar.study.case_run import RUN_FILES
 from torchsar.study.config import Loaded
-from torchsar.study.folder import fresh_folder, write_arrays, write_json
 from torchsar.study.methods import Result, build_chains, run_methods
+from torchsar.study.output.arrays import write_arrays, write_json
+from torchsar.study.output.folder import fresh_result
 from torchsar.study.report import write_report
 from torchsar.study.stripmap.build import build_case, build_radar, build_world, true_doppler_hz
 from torchsar.study.stripmap.figures import Scene, draw
@@ -32,7 +34,7 @@ def run(loaded: Loaded, out: Path, command: str = "torchsar run") -> Path:
     the user can put right.
     """
     began = time.perf_counter()
-    with fresh_folder(out) as folder:
+    with fresh_result(out, "run", RUN_FILES) as folder:
         case, chains = prepare(loaded)
         results = run_methods(loaded, case, chains)
         metrics = metrics_tree(loaded.config, case, results)

@@ -21,9 +21,9 @@ from torchsar.focus.omega_k import Focuser
 from torchsar.metrics import error_db
 from torchsar.repair.jitter import BandLimited, Exact, Lagrange
 from torchsar.study.config import Loaded
-from torchsar.study.errors import ConfigError, did_you_mean
 from torchsar.study.methods import run_recommended
 from torchsar.study.registry import FOCUS
+from torchsar.study.settings.errors import ConfigError, did_you_mean
 from torchsar.study.stripmap.build import build_case
 from torchsar.study.trading import Tables, timed, written
 

@@ -20,10 +20,10 @@ from torchsar.scene import Points, RandomPoints, StripmapWorld, Together
 from torchsar.study.benches import Benches
 from torchsar.study.build import build_impairments, precision
 from torchsar.study.config import Config, Loaded
-from torchsar.study.errors import ConfigError
 from torchsar.study.methods import build_chains
 from torchsar.study.montecarlo.record import OK
 from torchsar.study.montecarlo.work import BOUNDS, SAVED
+from torchsar.study.settings.errors import ConfigError
 from torchsar.study.stripmap.build import build_radar, build_world, squint_doppler_hz
 from torchsar.study.stripmap.judge import window
 

@@ -1,12 +1,10 @@
-"""Result folders that appear whole or not at all."""
+"""Numbers and arrays of a result as files."""
 
 from __future__ import annotations
 
 import json
 import math
-import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,43 +13,6 @@ import zarr
 from torch import Tensor
 
 from torchsar.core import Signal
-from torchsar.study.errors import ConfigError
-
-_PARTIAL = ".torchsar-partial"
-_RESULT = "config.yaml"
-
-
-@contextmanager
-def fresh_folder(out: Path) -> Iterator[Path]:
-    """A folder OUT.tmp to write into; it becomes OUT when the block ends well and is removed when
-    it does not.
-
-    An earlier result at OUT is replaced only then. Anything else at OUT is refused with a
-    ConfigError, before any work is done.
-    """
-    if out.exists() and not (out.is_dir() and ((out / _RESULT).is_file() or not any(out.iterdir()))):
-        raise ConfigError(f"--out {out} exists and is not a result of torchsar; choose another folder")
-    partial, old = out.with_name(out.name + ".tmp"), out.with_name(out.name + ".old")
-    if partial.exists() and not (partial / _PARTIAL).exists():
-        raise ConfigError(
-            f"--out {out}: {partial} is in the way and was not left by torchsar; remove it or choose another folder"
-        )
-    try:
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
-        (partial / _PARTIAL).touch()
-    except OSError as error:
-        raise ConfigError(f"--out {out} cannot be written: {error.strerror}") from None
-    try:
-        yield partial
-        (partial / _PARTIAL).unlink()
-        if out.exists():
-            shutil.rmtree(old, ignore_errors=True)
-            out.rename(old)
-        partial.rename(out)
-        shutil.rmtree(old, ignore_errors=True)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def write_json(path: Path, tree: Mapping[str, Any]) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from torchsar.study.errors import ConfigError, did_you_mean
+from torchsar.study.settings.errors import ConfigError, did_you_mean
 
 
 class _Loader(yaml.SafeLoader):
@@ -82,7 +82,7 @@ def config_folders() -> list[Path]:
     """Where configs are found by name: inside an installed package, or beside the package in a
     checkout.
     """
-    package = Path(__file__).resolve().parents[1]
+    package = Path(__file__).resolve().parents[2]
     return [folder for folder in (package / "configs", package.parent / "configs") if folder.is_dir()]
 
 

@@ -1,0 +1,202 @@
+"""Result folders: what the program did not write survives whatever happens."""
+
+from __future__ import annotations
+
+import io
+import os
+import random
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from torchsar.study.output.folder import STATE, fresh_result, opened
+from torchsar.study.settings.errors import ConfigError
+
+NAMES = ("metrics.json", "figures", "report.html")
+MINE = {"notes.txt": "mine", "figures.bak/old.png": "mine too", "OUT.old": "a name close to the result's"}
+
+
+def write(folder: Path, text: str, pictures: int = 2) -> None:
+    (folder / "figures").mkdir()
+    for i in range(pictures):
+        (folder / "figures" / f"{i}.png").write_text(text)
+    for name in ("metrics.json", "report.html"):
+        (folder / name).write_text(text)
+
+
+def result(out: Path) -> dict[str, str]:
+    """The files of the result, without those of the user and of the state."""
+    files = {path.relative_to(out).as_posix(): path for path in out.rglob("*") if path.is_file()}
+    return {name: path.read_text() for name, path in files.items() if name not in MINE and not name.startswith(STATE)}
+
+
+def whole(text: str, pictures: int = 2) -> dict[str, str]:
+    return dict.fromkeys(("metrics.json", "report.html", *(f"figures/{i}.png" for i in range(pictures))), text)
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    """A folder in which a user keeps files, with a first result in it."""
+    out = tmp_path / "out"
+    for name, text in MINE.items():
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text(text)
+    with fresh_result(out, "run", NAMES) as folder:
+        write(folder, "first", 3)
+    return out
+
+
+def assert_mine(out: Path) -> None:
+    for name, text in MINE.items():
+        assert (out / name).read_text() == text, name
+
+
+def test_a_result_replaces_the_earlier_one_and_nothing_else(out: Path) -> None:
+    assert result(out) == whole("first", 3)
+    with fresh_result(out, "run", NAMES) as folder:
+        write(folder, "second")
+    assert result(out) == whole("second")
+    assert_mine(out)
+
+
+def test_a_failure_leaves_the_earlier_result(out: Path) -> None:
+    with pytest.raises(ZeroDivisionError), fresh_result(out, "run", NAMES) as folder:
+        write(folder, "second")
+        raise ZeroDivisionError
+    assert result(out) == whole("first", 3)
+
+
+def test_where_nothing_is_written_nothing_is_left(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError), fresh_result(tmp_path / "a" / "b", "run", NAMES):
+        raise ZeroDivisionError
+    assert not list(tmp_path.iterdir())
+
+
+def linked(to: Path, link: Path) -> None:
+    link.symlink_to(to)
+
+
+CONFLICTS: dict[str, Callable[[Path], object]] = {
+    "a file of the user under a name of the result": lambda out: (out / "report.html").write_text("mine"),
+    "a result that the user changed": lambda out: (out / "metrics.json").write_text("my own figures"),
+    "a file of the user among the pictures": lambda out: (out / "figures" / "my.png").write_text("mine"),
+    "pictures behind a link": lambda out: linked((out / "figures").rename(out / "kept"), out / "figures"),
+}
+
+
+@pytest.mark.parametrize("change", CONFLICTS.values(), ids=CONFLICTS)
+def test_files_of_the_user_are_refused_before_any_work(change: Callable[[Path], object], out: Path) -> None:
+    change(out)
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file() and path.name != "lock"}
+    with pytest.raises(ConfigError, match="torchsar did not write"), fresh_result(out, "run", NAMES):
+        pytest.fail("must not begin")
+    assert before == {path: path.read_bytes() for path in out.rglob("*") if path.is_file() and path.name != "lock"}
+
+
+def test_files_that_come_while_a_command_works_are_kept_and_so_is_the_result(out: Path) -> None:
+    with pytest.raises(ConfigError, match="was kept in") as error, fresh_result(out, "run", NAMES) as folder:
+        write(folder, "second")
+        (out / "figures" / "my.png").write_text("mine")
+    kept = Path(str(error.value).split("was kept in ")[1])
+    assert result(kept) == whole("second")
+    assert (out / "figures" / "my.png").read_text() == "mine"
+
+
+def test_a_folder_belongs_to_one_kind_of_command(out: Path) -> None:
+    with pytest.raises(ConfigError, match="result of another command, run"), opened(out, "trade"):
+        pytest.fail("must not begin")
+    assert result(out) == whole("first", 3)
+
+
+REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
+    "a file": (lambda tmp: touched(tmp / "file"), "cannot be written"),
+    "below a file": (lambda tmp: touched(tmp / "file") / "below", "cannot be written"),
+    "a state of somebody else": (lambda tmp: touched(tmp / "mine" / STATE / "x").parents[1], "was not made by"),
+    "no name": (lambda tmp: tmp / "a\0b", "cannot be written"),
+    "a long name": (lambda tmp: tmp / ("x" * 400), "cannot be written"),
+}
+
+
+def touched(path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("mine")
+    return path
+
+
+@pytest.mark.parametrize("make, said", REFUSED.values(), ids=REFUSED)
+def test_what_is_no_result_folder_is_refused(make: Callable[[Path], Path], said: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=said), fresh_result(make(tmp_path), "run", NAMES):
+        pytest.fail("must not begin")
+
+
+def test_one_writer_at_a_time(out: Path) -> None:
+    program = f"""
+from pathlib import Path
+from torchsar.study.output.folder import opened
+with opened(Path({str(out)!r}), "run"):
+    print("in", flush=True); input()
+"""
+    with subprocess.Popen([sys.executable, "-c", program], stdin=-1, stdout=-1, text=True) as other:
+        assert other.stdout is not None and other.stdin is not None and other.stdout.readline() == "in\n"
+        with pytest.raises(ConfigError, match="another torchsar command is writing there"), opened(out, "run"):
+            pytest.fail("must not begin")
+        other.kill()
+    with fresh_result(out, "run", NAMES) as folder:
+        write(folder, "second")
+    assert result(out) == whole("second")
+
+
+CALLS = [(os, name) for name in ("rename", "replace", "mkdir", "rmdir", "unlink")] + [(io, "open")]
+
+
+def dying_at(moment: int, out: Path, text: str) -> bool:
+    """Write a result in a process that dies at the n-th call that changes the disk."""
+    child = os.fork()
+    if child:
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 0
+    left = moment
+
+    def counting(call: Callable) -> Callable:
+        def counted(*given, **named):
+            nonlocal left
+            left -= 1
+            if left < 0:
+                os._exit(9)
+            return call(*given, **named)
+
+        return counted
+
+    for module, name in CALLS:
+        setattr(module, name, counting(getattr(module, name)))
+    try:
+        with fresh_result(out, "run", NAMES) as folder:
+            write(folder, text)
+    except BaseException:
+        os._exit(7)
+    os._exit(0)
+
+
+def test_dying_at_any_moment_loses_nothing(out: Path) -> None:
+    """At every call that changes the disk, some of them twice in a row; the next command finishes
+    what was decided, or finds the earlier result.
+    """
+    source, moment, died = random.Random(0), 0, True
+    earlier = {"first": 3}
+    while died:
+        text = f"result {moment}"
+        died = dying_at(moment, out, text)
+        if died and source.random() < 0.5:
+            dying_at(source.randrange(30), out, text)
+        assert_mine(out)
+        with opened(out, "run", NAMES):
+            pass
+        accepted = [whole(text), *(whole(*known) for known in earlier.items())]
+        assert result(out) in accepted, f"died at {moment}"
+        if result(out) == whole(text):
+            earlier = {text: 2}
+        moment += 1
+    assert moment > 50, moment
+    assert result(out) == whole(text)

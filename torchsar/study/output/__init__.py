@@ -1,0 +1,1 @@
+"""Result folders, arrays, pictures and reports of experiments."""

@@ -1,0 +1,1 @@
+"""Configs: YAML, sections read from constructors, cases, and errors in one sentence."""
