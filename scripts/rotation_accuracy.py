@@ -17,7 +17,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -26,7 +25,9 @@ from torch import Tensor
 from torchsar import plot
 from torchsar.core import Draws, Signal
 from torchsar.echo import simulate_turntable
+from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier, range_phase
+from torchsar.focus.transforms import CompiledNufft, ExplicitSum, Gridding, Resampling, Transform
 from torchsar.metrics import entropy
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
@@ -48,10 +49,10 @@ EXPECTED = {
 
 @dataclass(frozen=True)
 class Way:
-    """One way to compute the image, and what it cost. options: of `matched_fourier`."""
+    """One way to compute the image, and what it cost."""
 
     name: str
-    options: dict[str, Any]
+    transform: Transform
 
 
 @dataclass
@@ -65,14 +66,10 @@ class Cost:
 
 
 def ways() -> list[Way]:
-    kernels = [
-        Way(f"{taps} taps, grid {grid:g}", {"taps": taps, "kernel_oversampling": grid})
-        for grid in GRIDS
-        for taps in TAPS
-    ]
+    kernels = [Way(f"{taps} taps, grid {grid:g}", Gridding(taps, oversampling=grid)) for grid in GRIDS for taps in TAPS]
     others = [
-        Way("linear resampling + FFT", {"method": "linear"}),
-        Way("spline resampling + FFT", {"method": "spline"}),
+        Way("linear resampling + FFT", Resampling("linear")),
+        Way("spline resampling + FFT", Resampling("spline")),
     ]
     return [*kernels, *others, *compiled()]
 
@@ -84,7 +81,7 @@ def compiled() -> list[Way]:
     except ModuleNotFoundError:
         print("finufft is not installed (pip install 'torchsar-lab[nufft]'): no comparison with the compiled library")
         return []
-    return [Way(f"finufft, eps {eps:g}", {"method": "finufft", "eps": eps}) for eps in (1e-3, 1e-6)]
+    return [Way(f"finufft, eps {eps:g}", CompiledNufft(eps)) for eps in (1e-3, 1e-6)]
 
 
 @dataclass(frozen=True)
@@ -105,7 +102,7 @@ class Objective:
         )
 
     def image(self, flat: Tensor, way: Way) -> Tensor:
-        return matched_fourier(flat, WARP_K, self.radar.prf_hz, oversampling=1.0, **way.options)
+        return matched_fourier(flat, WARP_K, self.radar.prf_hz, lines=DopplerLines(1.0), transform=way.transform)
 
     def value(self, way: Way) -> Tensor:
         return entropy(self.image(self.flat(), way))
@@ -206,7 +203,7 @@ def main(arguments: list[str] | None = None) -> None:
 
     torch.set_num_threads(1)
     double, choices = simulated("tiny" if options.small else "mid"), ways()
-    exact = double.image(double.flat(), Way("exact", {"method": "explicit"}))
+    exact = double.image(double.flat(), Way("exact", ExplicitSum()))
     tables = {}
     for precision, dtype in (("float32", torch.complex64), ("float64", torch.complex128)):
         objective = Objective(double.signal.to(dtype), double.radar)

@@ -23,6 +23,7 @@ from torch import Tensor
 from torchsar import plot
 from torchsar.compensate import autofocus, correct_pulse_phase
 from torchsar.compensate.rotation import (
+    EntropyObjective,
     ImageEntropy,
     coarse_rotation,
     descend_rotation,
@@ -31,7 +32,8 @@ from torchsar.compensate.rotation import (
 )
 from torchsar.core import Axis, Draws, Estimate, Signal, Truth
 from torchsar.echo import simulate_turntable
-from torchsar.focus.matched_fourier import MatchedFourier, RangePhase, mean_rate
+from torchsar.focus.image_lines import mean_rate
+from torchsar.focus.matched_fourier import MatchedFourier, RangePhase
 from torchsar.metrics import contrast, entropy
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.scene import Points, PolynomialRotation, TurntableWorld
@@ -82,7 +84,7 @@ def focused(signal: Signal, rotation: Mapping[str, Tensor] | None = None) -> Sig
 
 def second_order(signal: Signal) -> Estimate:
     """SM: one number, without a range term, by least entropy."""
-    figure = ImageEntropy.of(signal, RADAR, order=2, range_term=False)
+    figure = ImageEntropy.of(signal, RADAR, EntropyObjective(order=2, range_term=False))
     return descend_rotation(figure, figure.start(0.0, coarse_rotation(signal.data, order=2, **told(signal))["warp_k"]))
 
 

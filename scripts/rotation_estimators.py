@@ -26,6 +26,7 @@ import torch
 
 from torchsar import plot
 from torchsar.compensate.rotation import (
+    EntropyObjective,
     ImageEntropy,
     coarse_rotation,
     descend_rotation,
@@ -88,7 +89,9 @@ class Bench:
     runs: dict[str, Run] = field(default_factory=dict)
 
     def figure(self, oversampling: float, variables: str = "raw") -> ImageEntropy:
-        return ImageEntropy.of(self.signal, self.radar, oversampling=oversampling, variables=variables)
+        return ImageEntropy.of(
+            self.signal, self.radar, EntropyObjective(oversampling=oversampling, variables=variables)
+        )
 
     def add(self, name: str, find: Callable[[], Estimate], rounds: int = 1) -> None:
         """Run, keep and print."""

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.compensate.rotation import ImageEntropy
+from torchsar.compensate.rotation import EntropyObjective, ImageEntropy
 from torchsar.core import Draws, Signal
 from torchsar.echo import simulate_turntable
 from torchsar.radar import LIGHT_M_S, InverseRadar
@@ -91,7 +91,7 @@ def cuts(signal: Signal, radar: InverseRadar, points: int) -> dict[tuple[str, fl
     found = {}
     for name, (variables, entry, reach) in CUTS.items():
         for oversampling in OVERSAMPLINGS:
-            figure = ImageEntropy.of(signal, radar, variables=variables, oversampling=oversampling)
+            figure = ImageEntropy.of(signal, radar, EntropyObjective(variables=variables, oversampling=oversampling))
             found[name, oversampling] = Cut.through(figure, entry, reach, points)
     return found
 
@@ -188,7 +188,7 @@ def main(arguments: list[str] | None = None) -> None:
         f"\nalong the valley dk1 / dk2 is {1e3 * lean(ratio, grid):.2f} ms, -T / 2 is "
         f"{-5e2 * signal.axis('pulse').n / radar.prf_hz:.2f} ms"
     )
-    fine = ImageEntropy.of(signal.with_data(signal.data.to(torch.complex128)), radar, taps=12)
+    fine = ImageEntropy.of(signal.with_data(signal.data.to(torch.complex128)), radar, EntropyObjective(taps=12))
     for x in (0.99, 1.01):
         for name, auto, difference in zip(("Om", "k1", "k2"), *gradients(fine, x), strict=True):
             print(

@@ -22,7 +22,8 @@ from torchsar import plot
 from torchsar.compensate.rotation import uneven_rotation
 from torchsar.core import Axis, Draws, Signal
 from torchsar.echo import simulate_turntable
-from torchsar.focus.matched_fourier import cross_range_of, matched_fourier, range_phase
+from torchsar.focus.image_lines import DopplerLines, cross_range_of
+from torchsar.focus.matched_fourier import matched_fourier, range_phase
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.scene import Points, PolynomialRotation, Satellite, TurntableWorld
 
@@ -114,7 +115,7 @@ def compensated(signal: Signal, radar: InverseRadar) -> dict[str, Profile]:
 
     def profile(pulses: Tensor, *k: float) -> Profile:
         image = matched_fourier(
-            pulses[:, cell, None], torch.tensor(k, dtype=torch.float64), radar.prf_hz, oversampling=FINE
+            pulses[:, cell, None], torch.tensor(k, dtype=torch.float64), radar.prf_hz, lines=DopplerLines(FINE)
         )
         return Profile.of(image[:, 0], pulse, radar.wavelength_m)
 

@@ -22,6 +22,7 @@ from torch import Tensor
 from torchsar import plot
 from torchsar.compensate import autofocus, correct_pulse_phase
 from torchsar.compensate.rotation import (
+    EntropyObjective,
     ImageEntropy,
     chirplet_clean,
     coarse_rotation,
@@ -30,7 +31,8 @@ from torchsar.compensate.rotation import (
 )
 from torchsar.core import Axis, Draws, Estimate, Signal, Truth
 from torchsar.echo import simulate_turntable
-from torchsar.focus.matched_fourier import MatchedFourier, RangePhase, mean_rate
+from torchsar.focus.image_lines import mean_rate
+from torchsar.focus.matched_fourier import MatchedFourier, RangePhase
 from torchsar.metrics import contrast, entropy, impulse_response
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
@@ -63,7 +65,7 @@ def second_order(signal: Signal, radar: InverseRadar) -> Estimate:
     """The second-order method, azimuth only: its one number from short sections, then by least
     entropy. It is not k1 of the target but about k1 + k2 T / 2.
     """
-    figure = ImageEntropy.of(signal, radar, order=2, range_term=False)
+    figure = ImageEntropy.of(signal, radar, EntropyObjective(order=2, range_term=False))
     start = coarse_rotation(signal.data, order=2, **told(signal, radar))
     return descend_rotation(figure, figure.start(0.0, start["warp_k"]))
 

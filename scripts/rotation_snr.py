@@ -24,10 +24,11 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.compensate.rotation import ImageEntropy, genetic_rotation, uneven_rotation
+from torchsar.compensate.rotation import EntropyObjective, ImageEntropy, genetic_rotation, uneven_rotation
 from torchsar.core import Axis, Draws, Estimate, Signal, Truth
 from torchsar.echo import simulate_turntable
-from torchsar.focus.matched_fourier import MatchedFourier, RangePhase, mean_rate
+from torchsar.focus.image_lines import mean_rate
+from torchsar.focus.matched_fourier import MatchedFourier, RangePhase
 from torchsar.metrics import impulse_response
 from torchsar.metrics.rotation_bounds import rotation_bounds
 from torchsar.radar import LIGHT_M_S, InverseRadar
@@ -88,7 +89,7 @@ def genetic(oversampling: float, generations: int) -> Finder:
 
     def find(signal: Signal, radar: InverseRadar) -> Estimate:
         return genetic_rotation(
-            ImageEntropy.of(signal, radar, oversampling=oversampling),
+            ImageEntropy.of(signal, radar, EntropyObjective(oversampling=oversampling)),
             LOW,
             HIGH,
             draws=Draws(1),

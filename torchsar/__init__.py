@@ -1,11 +1,11 @@
-"""Synthetic aperture radar and ladar in torch: every algorithm a stage on complex batched tensors.
+"""Synthetic aperture radar and ladar in torch: stages that process batches of complex tensors.
 
     recording = torchsar.io.read_stripmap("raw.npz")
     chain = torchsar.Chain(focus=torchsar.focus.OmegaK(recording.radar))
     image = chain(recording)
 
-Needs torch and numpy alone; `torchsar.plot` adds matplotlib and `torchsar.study` what the extra
-`study` installs, both on first use.
+Only torch and numpy are required. `torchsar.plot` also needs matplotlib, and `torchsar.study` the
+packages of the extra `study`; both are imported on first use.
 """
 
 from __future__ import annotations

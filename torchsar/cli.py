@@ -12,53 +12,42 @@ from collections.abc import Sequence
 from pathlib import Path
 
 EXIT_BAD_INPUT = 2
+_COMMANDS = {
+    "run": "run an experiment and write its images, figures and report",
+    "sweep": "run the Monte Carlo sweep of a config: many trials of every point of its grid",
+    "requires": "show what the scene of a config requires of its models and methods",
+    "trade": "measure speed against loss of the alternatives, beside an exact yardstick",
+}
 
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     top = argparse.ArgumentParser(prog="torchsar", description="Synthetic aperture radar experiments from a config.")
+    top.add_argument("--version", action="store_true", help="print the version and end")
     top.add_argument(
         "--threads",
         type=_positive,
         metavar="N",
-        help="threads of torch (default: all cores; of a sweep, one in each process)",
+        help="threads of torch (default: all cores; one in a sweep's processes)",
     )
-    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name, text in (
-        ("run", "run an experiment and write its images, figures and report"),
-        ("sweep", "run the Monte Carlo sweep of a config: many trials of every point of its grid"),
-        ("requires", "what the scene of a config requires of its models"),
-        ("trade", "speed against accuracy of the alternatives, beside the exact yardstick"),
-    ):
+    commands = top.add_subparsers(dest="command", metavar="COMMAND")
+    for name, text in _COMMANDS.items():
         one = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         one.add_argument("config", help="a YAML file, or the name of a packaged config (see `torchsar list`)")
-        one.add_argument(
-            "overrides",
-            nargs="*",
-            metavar="key=value",
-            help="overrides with dotted keys, such as world.noise.snr_db=10",
-        )
-        one.add_argument(
-            "--out",
-            type=Path,
-            metavar="DIR",
-            help="result folder" + (" (default: out/<config name>)" if name in ("run", "sweep") else ""),
-        )
+        one.add_argument("overrides", nargs="*", metavar="key=value", help="overrides, such as world.noise.snr_db=10")
+        one.add_argument("--out", type=Path, metavar="DIR", help=f"result folder (default: {_folder(name, 'CONFIG')})")
+        one.add_argument("--device", default="cpu", metavar="NAME", help="cpu (default), cuda, cuda:1, ...")
     sweep = commands.choices["sweep"]
-    sweep.add_argument(
-        "--resume", action="store_true", help="go on with the sweep in the folder; on an empty folder it simply starts"
-    )
-    sweep.add_argument(
-        "--workers", type=_positive, metavar="N", help="compute in N processes of this machine (extra `cluster`)"
-    )
-    sweep.add_argument(
-        "--cluster",
-        metavar="ADDRESS",
-        help="compute on the workers of a running dask scheduler, such as tcp://host:8786",
-    )
-    sweep.add_argument("--device", default="cpu", metavar="NAME", help="cpu (default), cuda, cuda:1, ...")
-    commands.add_parser("list", help="experiments, stages and data keys")
+    sweep.add_argument("--resume", action="store_true", help="go on with the sweep in the folder, if there is one")
+    sweep.add_argument("--workers", type=_positive, metavar="N", help="compute in N processes (extra `cluster`)")
+    sweep.add_argument("--cluster", metavar="ADDRESS", help="compute on a running dask scheduler, tcp://host:8786")
+    commands.add_parser("list", help="experiments, systems, stages and data keys")
     return top
+
+
+def _folder(command: str, config: str) -> Path:
+    """The default result folder: each command has its own."""
+    return Path("out") / (config if command == "run" else f"{config}_{command}")
 
 
 def _positive(text: str) -> int:
@@ -70,10 +59,21 @@ def _positive(text: str) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command.
 
-    Returns 0, or 2 after one sentence on stderr for bad input, or 130 when interrupted.
+    Args:
+        arguments: Words after the name of the program; those of this process by default.
+
+    Returns:
+        0, or 2 after one sentence on stderr for bad input, or 130 if interrupted.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     options = _parse(given)
+    if options.version:
+        from importlib.metadata import version
+
+        print(f"torchsar-lab {version('torchsar-lab')}")
+        return 0
+    if options.command != "list":  # before torch is imported, which takes seconds
+        print(f"torchsar: {options.command} {options.config}", file=sys.stderr, flush=True)
     try:
         from torchsar.study.settings.errors import ConfigError
     except ImportError as error:
@@ -84,8 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             warnings.showwarning = _show_warning
             return _dispatch(options, "torchsar " + shlex.join(given))
     except ImportError as error:
-        # a fault of the program, not of the installation
-        if (error.name or "").startswith("torchsar"):
+        if (error.name or "").startswith("torchsar"):  # a fault of the program, not of the installation
             raise
         return _fail(f"{error.name or error} is not installed; install the extra: pip install 'torchsar-lab[study]'")
     except ConfigError as error:
@@ -96,54 +95,52 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parse(given: Sequence[str]) -> argparse.Namespace:
-    """Overrides may stand before and after options; anything else that is left over is refused by
-    argparse.
-    """
+    """Overrides may stand before and after options; argparse refuses anything else left over."""
     top = parser()
     options, rest = top.parse_known_args(given)
     if rest and (not hasattr(options, "overrides") or any(word.startswith("-") for word in rest)):
         top.error(f"unrecognized arguments: {' '.join(rest)}")
+    if options.command is None and not options.version:
+        top.error(f"a command is missing: choose one of {', '.join((*_COMMANDS, 'list'))}")
     if rest:
         options.overrides = [*options.overrides, *rest]
     return options
 
 
 def _dispatch(options: argparse.Namespace, command: str) -> int:
-    from torchsar.study.config import load
+    import torch
+
+    from torchsar.study.settings.errors import ConfigError
+    from torchsar.study.table import load, systems
 
     if options.threads is not None:
-        import torch
-
         torch.set_num_threads(options.threads)
     if options.command == "list":
-        from torchsar.study.listing import listing
+        from torchsar.study.commands.listing import listing
 
-        print(listing())
+        print(listing(systems))
         return 0
-    from torchsar.study.systems import system_of
-
+    try:
+        torch.empty(0, device=options.device)
+    except (RuntimeError, AssertionError) as error:
+        raise ConfigError(f"--device {options.device} cannot be used here: {str(error).splitlines()[0]}") from None
     loaded = load(options.config, options.overrides)
+    out = options.out or _folder(options.command, loaded.name)
     if options.command == "run":
-        print(system_of(loaded).run(loaded, options.out or Path("out") / loaded.name, command))
-    elif options.command == "sweep":
-        from torchsar.study.sweeping import sweep_config
+        from torchsar.study.commands.run import run
 
-        print(
-            sweep_config(
-                loaded,
-                options.out or Path("out") / loaded.name,
-                options.resume,
-                options.workers,
-                options.cluster,
-                options.threads or 1,
-                options.device,
-                command,
-            )
-        )
-    elif options.command == "requires":
-        print(system_of(loaded).requires(loaded, options.out))
+        print(run(loaded, out, command, options.device))
+    elif options.command == "sweep":
+        from torchsar.study.commands.sweep import sweep
+
+        engine = (options.resume, options.workers, options.cluster, options.threads or 1, options.device)
+        print(sweep(loaded, out, *engine, command))
     else:
-        print(system_of(loaded).trade(loaded, options.out))
+        from torchsar.study.commands.requires import requires
+        from torchsar.study.commands.trade import trade
+
+        print((requires if options.command == "requires" else trade)(loaded, out, options.device))
+        print(out)
     return 0
 
 

@@ -1,6 +1,6 @@
-"""Pictures: the only importer of the plotting library.
+"""Figures of images, curves and sweeps; the only module that imports the plotting library.
 
-Every function takes signals or arrays and returns a matplotlib Figure.
+Each function that draws takes signals or arrays and returns a matplotlib Figure.
 """
 
 from __future__ import annotations
@@ -27,10 +27,14 @@ try:
 except ImportError as error:
     raise ImportError("torchsar.plot needs matplotlib: pip install 'torchsar-lab[study]'") from error
 
+# palette by choice: text and frames, then colours of curves in their order
 INK, ACCENT, SECOND, THIRD, FAINT = "#1f2933", "#0b6e99", "#d1495b", "#e09f3e", "#9aa5b1"
 COLOURS = (ACCENT, SECOND, THIRD, "#4f7942", "#6a4c93", FAINT, "#8d5524", "#1aa6a6")
+# seven markers beside eight colours: more than eight curves still differ
 MARKERS, DASHES = "osD^vPX", ("--", ":", "-.")
-_WORDS_FIT = 90  # letters of words beside each other under one panel
+# letters of all words that fit side by side under one panel, found by trial; more are turned
+_WORDS_FIT = 90
+# appearance by choice
 _STYLE: Any = {
     "font.size": 9,
     "axes.titlesize": 10,
@@ -53,7 +57,7 @@ _STYLE: Any = {
 
 
 def _styled(draw: Callable[..., Figure]) -> Callable[..., Figure]:
-    """Draw in the house style without touching the user's."""
+    """Run a drawing function in the style of this module, without a change of global settings."""
 
     @functools.wraps(draw)
     def styled(*args: Any, **options: Any) -> Figure:
@@ -64,20 +68,36 @@ def _styled(draw: Callable[..., Figure]) -> Callable[..., Figure]:
 
 
 def _panels(rows: int, columns: int, size: tuple[float, float], sharey: bool = False) -> tuple[Figure, list[Axes]]:
+    """Figure with a grid of axes."""
     figure = Figure(figsize=size, layout="constrained")
     return figure, list(figure.subplots(rows, columns, squeeze=False, sharey=sharey).flat)
 
 
 def decibel(x: Tensor | np.ndarray, reference: float | None = None) -> np.ndarray:
-    """20 lg |x| relative to the reference amplitude, by default the largest."""
+    """Convert amplitudes to decibels, 20 lg |x / reference|.
+
+    Args:
+        x: Amplitudes, any shape, real or complex.
+        reference: Amplitude of 0 dB; by default the largest one.
+
+    Returns:
+        Levels in dB, same shape, limited to -300 dB.
+    """
     amplitude = np.abs(x.detach().cpu().numpy() if isinstance(x, Tensor) else x)
     top = reference if reference is not None else float(amplitude.max(initial=0.0))
     return 20 * np.log10(np.maximum(amplitude, 1e-15 * (top or 1.0)) / (top or 1.0))
 
 
 def quicklook(signal: Signal, largest: int = 900) -> Signal:
-    """Root mean square amplitude over blocks, so that no side has more than `largest` samples;
-    unbatched, the axes follow.
+    """Average an image in blocks, so that no side has more than a given number of samples.
+
+    Args:
+        signal: Image or raw data with two axes, shape (..., azimuth, range).
+        largest: Largest number of samples of a side.
+
+    Returns:
+        Root mean square amplitude of each block, on axes of the block centres. Samples at the end
+        that do not fill a block are dropped.
     """
     data, axes = signal.data.detach(), []
     for dim, axis in zip((-2, -1), signal.axes, strict=True):
@@ -91,6 +111,7 @@ def quicklook(signal: Signal, largest: int = 900) -> Signal:
 
 
 def _extent(signal: Signal, origin: Sequence[float]) -> tuple[float, float, float, float]:
+    """Edges of an image for imshow, relative to an origin of the axes."""
     vertical, horizontal = signal.axes
     v, h = vertical.start - origin[0], horizontal.start - origin[1]
     return (
@@ -140,12 +161,16 @@ def _show(
 
 @_styled
 def image(signal: Signal, dynamic_range_db: float = 50.0, title: str = "", percentile: float = 99.9) -> Figure:
-    """An image or a raw matrix in dB, range horizontal, azimuth vertical, axes in their units.
+    """Draw an image or raw data in dB, range horizontal, azimuth or slow time vertical.
 
-    The first trial of a batch.
+    0 dB is a high percentile of the amplitude, so that a few bright ships do not darken the land;
+    100, the peak, suits scenes of points. The first trial of a batch is drawn.
 
-    0 dB is a high percentile of the amplitude, so that one bright ship does not hide the land; 100,
-    the peak, suits scenes of points.
+    Args:
+        signal: Signal with two axes, shape (..., azimuth, range).
+        dynamic_range_db: Lowest level, in dB below 0 dB.
+        title: Title of the figure.
+        percentile: Percentile of the amplitude that is 0 dB.
     """
     figure, (axes,) = _panels(1, 1, (7.2, 6.2))
     shown = _show(axes, _first(signal), dynamic_range_db, title, percentile=percentile)
@@ -168,8 +193,14 @@ def images(
     percentile: float = 99.9,
     reference: str | None = None,
 ) -> Figure:
-    """Several images side by side on one scale, taken from the first of them or from the one that
-    `reference` names; other arguments as `image`.
+    """Draw several images side by side on one scale.
+
+    Args:
+        signals: Signals with two axes, by title; the first trial of each is drawn.
+        dynamic_range_db: Lowest level, in dB below 0 dB.
+        columns: Number of images in a row.
+        percentile: Percentile of the amplitude that is 0 dB.
+        reference: Title of the image whose percentile counts; by default the first.
     """
     rows = math.ceil(len(signals) / columns)
     figure, panels = _panels(rows, min(columns, len(signals)), (4.6 * min(columns, len(signals)), 3.9 * rows))
@@ -188,8 +219,12 @@ def images(
 def contours(
     signals: Mapping[str, Signal], levels_db: Sequence[float] = (-30, -20, -13, -3), columns: int = 3
 ) -> Figure:
-    """Lines of equal amplitude of images side by side, in dB of the peak of each; range horizontal,
-    azimuth vertical. The first trial of a batch.
+    """Draw lines of equal amplitude of several images, range horizontal, azimuth vertical.
+
+    Args:
+        signals: Signals with two axes, by title; the first trial of each is drawn.
+        levels_db: Levels of the lines, in dB relative to the peak of each image, rising.
+        columns: Number of images in a row.
     """
     rows = math.ceil(len(signals) / columns)
     figure, panels = _panels(rows, min(columns, len(signals)), (3.3 * min(columns, len(signals)), 3.1 * rows))
@@ -213,6 +248,7 @@ def contours(
 
 
 def _legend_levels(figure: Figure, drawn: Any, levels_db: Sequence[float], once: bool) -> None:
+    """One legend of the levels for all panels."""
     if once:
         figure.legend(
             drawn.legend_elements()[0],
@@ -223,11 +259,18 @@ def _legend_levels(figure: Figure, drawn: Any, levels_db: Sequence[float], once:
 
 
 def short_time_spectrum(samples: Tensor, rate_hz: float, width: int = 64, hop: int = 4) -> Signal:
-    """Amplitude of a line of samples over frequency (MHz) and time (us): spectra of Hann windows of
-    `width` samples, `hop` apart.
+    """Compute a spectrogram of one line of samples, with Hann windows.
 
-    samples: (n,) complex, frequencies from -rate / 2 on, or real, frequencies from 0 on. Time
-    counts from the first sample, to the middle of a window; beyond its ends the line is zero.
+    Args:
+        samples: Samples, shape (n,), real or complex.
+        rate_hz: Sampling rate in Hz.
+        width: Length of the windows in samples.
+        hop: Distance between windows in samples.
+
+    Returns:
+        Amplitudes with the axes `frequency` (MHz; from -rate / 2 on for complex samples, from 0 on
+        for real ones) and `time` (us; that of the middle of a window, counted from the first
+        sample). The samples are continued by zeros at both ends.
     """
     n = 8 * width
     window = torch.hann_window(width, dtype=samples.real.dtype, device=samples.device)
@@ -244,10 +287,13 @@ def short_time_spectrum(samples: Tensor, rate_hz: float, width: int = 64, hop: i
 
 @_styled
 def overlays(parts: Sequence[Mapping[str, Any]], columns: int = 2, dynamic_range_db: float = 40.0) -> Figure:
-    """Images, each in dB of its own peak, with lines over them.
+    """Draw images, each in dB of its own peak, with dashed lines over them.
 
-    Each part holds `title`; `signal`, with two axes; `lines`, name -> (x, y), may be empty; and may
-    hold `ylim`. A part without a signal holds the arguments of `curves`.
+    Args:
+        parts: Panels. Each has `title`, `signal` with two axes, `lines`, a mapping from names to
+            (x, y), and may have `ylim`. A panel without `signal` has the arguments of `curves`.
+        columns: Number of panels in a row.
+        dynamic_range_db: Lowest level, in dB below the peak.
     """
     rows = math.ceil(len(parts) / columns)
     figure, panels = _panels(rows, min(columns, len(parts)), (4.4 * min(columns, len(parts)), 3.2 * rows))
@@ -268,7 +314,7 @@ def overlays(parts: Sequence[Mapping[str, Any]], columns: int = 2, dynamic_range
 def _draw_over(
     axes: Axes, lines: Mapping[str, tuple[np.ndarray, np.ndarray]], ylim: tuple[float, float] | None
 ) -> None:
-    """Dashed lines over an image, which keeps its limits."""
+    """Draw dashed lines over an image without a change of its limits."""
     limits = axes.get_xlim(), axes.get_ylim()
     for i, (name, (x, y)) in enumerate(lines.items()):
         axes.plot(
@@ -280,6 +326,7 @@ def _draw_over(
 
 
 def _first(signal: Signal) -> Signal:
+    """First trial of a signal."""
     return signal.with_data(signal.data.flatten(0, -3)[0]) if signal.trials else signal
 
 
@@ -292,7 +339,16 @@ def curves(
     marks: Mapping[str, float] | None = None,
     ylim: tuple[float, float] | None = None,
 ) -> Figure:
-    """Lines by name in one panel; marks: vertical lines by name."""
+    """Draw curves into one panel.
+
+    Args:
+        series: Curves (x, y) by name, each a pair of arrays of shape (n,).
+        xlabel: Label of the horizontal axis, with unit.
+        ylabel: Label of the vertical axis, with unit.
+        title: Title of the panel.
+        marks: Positions of vertical lines by name, in the unit of x.
+        ylim: Limits of the vertical axis.
+    """
     figure, (axes,) = _panels(1, 1, (7.2, 3.2))
     draw_curves(axes, series, xlabel, ylabel, title, marks, ylim)
     return figure
@@ -308,8 +364,16 @@ def places(
     title: str = "",
     aspect: Literal["equal", "auto"] = "equal",
 ) -> Figure:
-    """Points of a scene by their places, on one scale for both axes where aspect is "equal"; size:
-    the area of each point, relative to the largest.
+    """Draw the points of a scene by their positions.
+
+    Args:
+        x: Horizontal positions, shape (n,).
+        y: Vertical positions, shape (n,).
+        size: Relative areas of the points, shape (n,).
+        xlabel: Label of the horizontal axis, with unit.
+        ylabel: Label of the vertical axis, with unit.
+        title: Title of the figure.
+        aspect: "equal" for one scale on both axes, "auto" otherwise.
     """
     figure, (axes,) = _panels(1, 1, (5.4, 5.0))
     axes.scatter(x, y, s=14 * size / max(float(size.max()), 1e-300), color=COLOURS[0], linewidths=0)
@@ -319,7 +383,12 @@ def places(
 
 @_styled
 def panels(parts: Sequence[Mapping[str, Any]], columns: int = 2) -> Figure:
-    """Several curve panels; each part holds the arguments of `curves`."""
+    """Draw several panels of curves.
+
+    Args:
+        parts: Panels, each with the arguments of `curves`.
+        columns: Number of panels in a row.
+    """
     rows = math.ceil(len(parts) / columns)
     figure, axes = _panels(rows, min(columns, len(parts)), (4.6 * min(columns, len(parts)), 3.0 * rows))
     for one, part in zip(axes, parts, strict=False):
@@ -338,8 +407,18 @@ def draw_curves(
     marks: Mapping[str, float] | None = None,
     ylim: tuple[float, float] | None = None,
 ) -> None:
-    """Draw lines by name into existing axes; the first is the widest, so that others which lie on
-    it are seen.
+    """Draw curves into existing axes.
+
+    The first curve is the widest, so that it stays visible under others.
+
+    Args:
+        axes: Axes of matplotlib.
+        series: As in `curves`.
+        xlabel: As in `curves`.
+        ylabel: As in `curves`.
+        title: As in `curves`.
+        marks: As in `curves`.
+        ylim: As in `curves`.
     """
     for i, (name, (x, y)) in enumerate(series.items()):
         axes.plot(
@@ -349,8 +428,8 @@ def draw_curves(
             color=COLOURS[i % len(COLOURS)],
             linewidth=max(0.9, 2.0 - 0.45 * i) if len(series) > 1 else 1.2,
         )
-    for i, (name, place) in enumerate((marks or {}).items()):
-        axes.axvline(place, color=COLOURS[(len(series) + i) % len(COLOURS)], linestyle="--", linewidth=1, label=name)
+    for i, (name, position) in enumerate((marks or {}).items()):
+        axes.axvline(position, color=COLOURS[(len(series) + i) % len(COLOURS)], linestyle="--", linewidth=1, label=name)
     axes.set(xlabel=xlabel, ylabel=ylabel, title=title)
     if ylim is not None:
         axes.set_ylim(*ylim)
@@ -359,12 +438,31 @@ def draw_curves(
 
 
 @_styled
-def trade(names: Sequence[str], seconds: Sequence[float], error_db: Sequence[float], ylabel: str, title: str) -> Figure:
-    """Time against accuracy: one labelled point an alternative, faster to the left, better at the
-    bottom.
+def trade(
+    names: Sequence[str],
+    seconds: Sequence[float],
+    loss: Sequence[float],
+    ylabel: str,
+    title: str,
+    tolerance: float | None = None,
+) -> Figure:
+    """Draw loss over computing time: a labelled point for each alternative and the Pareto front.
+
+    Args:
+        names: Names of the alternatives.
+        seconds: Computing time of each, in seconds.
+        loss: Loss of each, in the unit of `ylabel`; less is better.
+        ylabel: Label of the vertical axis, with unit.
+        title: Title of the figure.
+        tolerance: Largest acceptable loss, drawn as a dashed line.
     """
     figure, (axes,) = _panels(1, 1, (7.2, 4.2))
-    for i, (name, s, e) in enumerate(zip(names, seconds, error_db, strict=True)):
+    points = sorted(zip(seconds, loss, strict=True))
+    front = [(s, e) for i, (s, e) in enumerate(points) if all(e < other for _, other in points[:i])]
+    axes.step([s for s, _ in front], [e for _, e in front], where="post", color=FAINT, linewidth=1, zorder=0)
+    if tolerance is not None:
+        axes.axhline(tolerance, color=FAINT, linestyle="--", linewidth=1, zorder=0)
+    for i, (name, s, e) in enumerate(zip(names, seconds, loss, strict=True)):
         axes.plot([s], [e], "o", color=COLOURS[i % len(COLOURS)], markersize=7)
         axes.annotate(name, (s, e), textcoords="offset points", xytext=(7, 4 if i % 2 else -10), fontsize=8, color=INK)
     axes.set(xscale="log", xlabel="time (s)", ylabel=ylabel, title=title)
@@ -381,12 +479,20 @@ def error_curves(
     log_y: bool = False,
     ylim: tuple[float, float] | None = None,
 ) -> Figure:
-    """Figures of algorithms with their intervals, over numbers (lines with bands) or words (dots
-    with bars), in panels with one y axis.
+    """Draw errors of algorithms with their intervals over one parameter.
 
-    Each part holds `title`; `x`, an array or a sequence of words; `series`, name -> (values (x,),
-    interval (x, 2)); and `bounds`, name -> values (x,), drawn dark and dashed. What is not finite,
-    or not positive on a logarithmic axis, is left out.
+    Numbers give lines with bands, words dots with bars; all panels share the vertical axis. Values
+    that are not finite, or not positive on a logarithmic axis, are left out.
+
+    Args:
+        parts: Panels. Each has `title`; `x`, numbers (n,) or words; `series`, a mapping from names
+            to values (n,) and intervals (n, 2); and `bounds`, a mapping from names to values (n,),
+            drawn dark and dashed.
+        xlabel: Label of the horizontal axes, with unit.
+        ylabel: Label of the vertical axes, with unit.
+        log_x: Whether the horizontal axes are logarithmic.
+        log_y: Whether the vertical axes are logarithmic.
+        ylim: Limits of the vertical axes.
     """
     figure, axes = _grid(len(parts), (7.2, 3.6), 3.0)
     for one, part in zip(axes, parts, strict=False):
@@ -402,12 +508,12 @@ def error_curves(
 
 
 def _columns(count: int) -> int:
-    """Rows of up to three panels; four stand two by two."""
+    """Number of panels in a row: up to three, two if there are four panels."""
     return count if count < 4 else 2 if count == 4 else 3
 
 
 def _grid(count: int, single: tuple[float, float], height: float) -> tuple[Figure, list[Axes]]:
-    """Axes for so many panels; those beyond the count are hidden."""
+    """Axes for a number of panels; further axes of the grid are hidden."""
     rows = math.ceil(count / _columns(count))
     figure, axes = _panels(rows, _columns(count), single if count == 1 else (9.6, height * rows + 0.5), sharey=True)
     for one in axes[count:]:
@@ -416,9 +522,7 @@ def _grid(count: int, single: tuple[float, float], height: float) -> tuple[Figur
 
 
 def _name_axes(axes: Sequence[Axes], titles: Sequence[str], xlabel: str, ylabel: str) -> None:
-    """Titles broken to the width of their panels; labels only where nothing stands below or to the
-    left.
-    """
+    """Set titles, wrapped to the width of a panel, and labels at the outer edges of the grid."""
     columns = _columns(len(titles))
     for i, title in enumerate(titles):
         axes[i].set_title(textwrap.fill(title, {1: 84, 2: 46}.get(columns, 30)))
@@ -427,7 +531,7 @@ def _name_axes(axes: Sequence[Axes], titles: Sequence[str], xlabel: str, ylabel:
 
 
 def _drawable(y: Any, log: bool) -> np.ndarray:
-    """Float64 with NaN for what the axis cannot show."""
+    """Values in float64, with NaN where the axis cannot show them."""
     y = np.asarray(y, dtype=np.float64)
     return np.where(np.isfinite(y) & ((y > 0) | (not log)), y, np.nan)
 
@@ -439,6 +543,7 @@ def _draw_bands(
     bounds: Mapping[str, np.ndarray],
     log: bool,
 ) -> None:
+    """Draw lines with bands for their intervals, and dashed bounds."""
     for i, (name, (y, interval)) in enumerate(series.items()):
         low, high = np.moveaxis(_drawable(interval, log), -1, 0)
         colour, line = COLOURS[i % len(COLOURS)], "-" if i < len(COLOURS) else (0, (6, 2))
@@ -463,13 +568,14 @@ def _draw_dots(
     bounds: Mapping[str, np.ndarray],
     log: bool,
 ) -> None:
+    """Draw dots with bars for their intervals over words, and dashed bounds."""
     step = min(0.16, 0.6 / len(series))
     for i, (name, (y, interval)) in enumerate(series.items()):
-        place = np.arange(len(x)) + (i - (len(series) - 1) / 2) * step
+        position = np.arange(len(x)) + (i - (len(series) - 1) / 2) * step
         low, high = np.moveaxis(_drawable(interval, log), -1, 0)
-        axes.vlines(place, low, high, color=COLOURS[i % len(COLOURS)], linewidth=1.6, alpha=0.6)
+        axes.vlines(position, low, high, color=COLOURS[i % len(COLOURS)], linewidth=1.6, alpha=0.6)
         axes.plot(
-            place,
+            position,
             _drawable(y, log),
             color=COLOURS[i % len(COLOURS)],
             marker=MARKERS[i % len(MARKERS)],
@@ -497,10 +603,11 @@ def _draw_dots(
 
 
 def _scale_axes(axes: Axes, x: np.ndarray, log_x: bool, log_y: bool, ylim: tuple[float, float] | None) -> None:
+    """Set scales, ticks and limits."""
     if x.dtype.kind != "U":
         axes.set_xscale("log" if log_x else "linear")
-        place = np.log(x) if log_x else x
-        if len(x) <= 8 and np.diff(place).min(initial=np.inf) > 0.08 * np.ptp(place):
+        position = np.log(x) if log_x else x
+        if len(x) <= 8 and np.diff(position).min(initial=np.inf) > 0.08 * np.ptp(position):
             axes.set_xticks(x, [f"{value:g}" for value in x])
             axes.xaxis.set_minor_formatter(NullFormatter())
     if log_y:
@@ -520,7 +627,7 @@ def _scale_axes(axes: Axes, x: np.ndarray, log_x: bool, log_y: bool, ylim: tuple
 
 
 def _legend_below(figure: Figure, axes: Sequence[Axes]) -> None:
-    """One legend for all panels, under them, where more than one thing is drawn."""
+    """One legend for all panels below them, if there are several entries."""
     found = {label: handle for one in axes for handle, label in zip(*one.get_legend_handles_labels(), strict=True)}
     if len(found) > 1:
         fitting = int(12 * figure.get_figwidth() / (6 + max(map(len, found))))
@@ -538,11 +645,18 @@ def heat_map(
     log: bool = False,
     limits: tuple[float, float] | None = None,
 ) -> Figure:
-    """Cells over two parameters, one panel a part, all on one colour scale; few enough cells carry
-    their numbers.
+    """Draw coloured cells over two parameters, all panels on one colour scale.
 
-    Each part holds `title`, `x`, `y` and `z` (y, x). limits: ends of the colour scale, by default
-    those of what is drawn. What is not finite, or not positive on a logarithmic scale, stays white.
+    Panels of up to 48 cells show their numbers. Values that are not finite, or not positive on a
+    logarithmic scale, stay white.
+
+    Args:
+        parts: Panels. Each has `title`, `x` (n,), `y` (m,) and `z` (m, n).
+        xlabel: Label of the horizontal axes, with unit.
+        ylabel: Label of the vertical axes, with unit.
+        label: Label of the colour scale, with unit.
+        log: Whether the colour scale is logarithmic.
+        limits: Ends of the colour scale; by default those of the values.
     """
     shown = [_drawable(part["z"], log) for part in parts]
     norm = _norm(np.stack(shown) if limits is None else np.asarray(limits), log)
@@ -557,15 +671,14 @@ def heat_map(
 
 
 def _norm(z: np.ndarray, log: bool) -> Normalize:
+    """Colour scale from the lowest to the highest finite value."""
     known = z[np.isfinite(z)]
     low, high = (float(known.min()), float(known.max())) if known.size else (1.0, 1.0)
     return (LogNorm if log else Normalize)(low, high if high > low else low + (abs(low) or 1.0) * 0.01)
 
 
 def _label_cells(axes: Axes, part: Mapping[str, Any], z: np.ndarray, norm: Normalize) -> None:
-    """Ticks at the values of the parameters (every so many of them), and the numbers of up to 48
-    cells.
-    """
+    """Set ticks at values of the parameters and, for up to 48 cells, write their numbers."""
     for axis, values in ((axes.xaxis, part["x"]), (axes.yaxis, part["y"])):
         step = math.ceil(len(values) / 8)
         axis.set_ticks(np.arange(0, len(values), step), [f"{value:g}" for value in values[::step]])
@@ -585,10 +698,20 @@ def _label_cells(axes: Axes, part: Mapping[str, Any], z: np.ndarray, norm: Norma
 
 
 def save(figure: Figure, path: Any, dpi: int = 110) -> None:
-    """Write a PNG."""
+    """Write a figure to a file.
+
+    Args:
+        figure: Figure to write.
+        path: Path of the file; its suffix gives the format.
+        dpi: Resolution in dots per inch.
+    """
     figure.savefig(path, dpi=dpi)
 
 
 def array(x: Tensor) -> np.ndarray:
-    """A tensor as a numpy array."""
+    """Convert a tensor to a numpy array on the CPU, without gradient.
+
+    Args:
+        x: Tensor, any shape.
+    """
     return torch.as_tensor(x).detach().cpu().resolve_conj().numpy()

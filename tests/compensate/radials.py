@@ -1,6 +1,4 @@
-"""What tests of radial motion share: ladars in the motions of brief 000, estimators by name,
-figures of merit.
-"""
+"""Common parts of the tests of radial motion: ladars, motions, estimators by name, errors."""
 
 from __future__ import annotations
 
@@ -49,8 +47,10 @@ def seen(
     fidelity=None,
     seed=1,
 ) -> tuple[Tensor, Axis, Truth]:
-    """Sweeps, pulse axis and truth of a world, with the range at every sample unless told
-    otherwise.
+    """Simulate a world; the range is evaluated at every sample unless `fidelity` is given.
+
+    Returns:
+        The sweeps, the axis of the periods and the truth.
     """
     radar = table1() if radar is None else radar
     world = LadarWorld(scene, motion=motion, snr_db=snr_db, fidelity=EverySample() if fidelity is None else fidelity)
@@ -61,20 +61,23 @@ def seen(
 
 
 def rms(x: Tensor) -> Tensor:
+    """Compute the root mean square over the last dimension."""
     return x.square().mean(-1).sqrt()
 
 
 def velocity_rms(estimate: Estimate, truth: Truth) -> Tensor:
+    """Compute the rms error of the radial velocity in m/s."""
     return rms(estimate["velocity_m_s"] - truth.values["velocity_m_s"])
 
 
 def without_line(x: Tensor) -> Tensor:
+    """Subtract the straight line fitted by least squares along the last dimension."""
     k = torch.arange(x.shape[-1], dtype=torch.float64) - (x.shape[-1] - 1) / 2
     x = x - x.mean(-1, keepdim=True)
     return x - (x * k).sum(-1, keepdim=True) / k.square().sum() * k
 
 
 def range_rms(estimate: Estimate, truth: Truth, radar: TriangularLadar, pulse: Axis) -> Tensor:
-    """Detrended rms error of the range at the middles of the up sweeps, m."""
+    """Compute the detrended rms error of the range in metres, at the middles of the up sweeps."""
     found = range_error(estimate, radar, pulse, sweep_middles(radar, pulse)[0])
     return rms(without_line(found - truth.values["range_error_up_m"]))

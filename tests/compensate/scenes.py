@@ -1,4 +1,4 @@
-"""Range-compressed pulses of point targets with phases of their own, made by plain formulas."""
+"""Range-compressed pulses of point targets with random phases, made by plain formulas."""
 
 from __future__ import annotations
 
@@ -25,8 +25,18 @@ EQUIVARIANT = ("sca", "pga_sca", "entropy_fixed_point", "autofocus")
 def still(
     trials: int, n_pulse: int = 128, n_range: int = 64, per_row: int = 3, width: float = 0.5, seed: int = 3
 ) -> Tensor:
-    """Points at random places in every range cell, no phase error, (trial, pulse, range)
-    complex128. width: share of the Doppler band they fill.
+    """Make points at random positions in every range cell, without a phase error.
+
+    Args:
+        trials: Number of trials.
+        n_pulse: Number of pulses.
+        n_range: Number of range cells.
+        per_row: Points per range cell.
+        width: Share of the Doppler band that the points occupy.
+        seed: Seed of the random numbers.
+
+    Returns:
+        Pulses, shape (trial, pulse, range), complex128.
     """
     draws = Draws(seed, trials=range(trials))
     shape = (n_range, per_row)
@@ -37,24 +47,26 @@ def still(
 
 
 def noisy(x: Tensor, snr_db: float, seed: int = 4) -> Tensor:
-    """Circular noise; SNR: mean power of all samples over the noise variance."""
+    """Add circular noise; the SNR is the mean power of all samples over the noise variance."""
     noise = Draws(seed, trials=range(len(x))).normal("noise", tuple(x.shape[1:]), DOUBLE)
     return x + noise * (x.abs().square().mean((-2, -1), keepdim=True) * 10 ** (-snr_db / 10)).sqrt()
 
 
 def white(trials: int, n_pulse: int = 128, seed: int = 5) -> Tensor:
-    """Uniform phases of every pulse, (trial, pulse)."""
+    """Draw a uniform phase for every pulse, (trial, pulse)."""
     return Draws(seed, trials=range(trials)).uniform("white", (n_pulse,), 0.0, 2 * math.pi)
 
 
 def turned(x: Tensor, phase_rad: Tensor) -> Tensor:
+    """Multiply pulses by exp(j phase)."""
     return x * unit_phasor(phase_rad / (2 * math.pi), DOUBLE)[..., None].to(x.dtype)
 
 
 def doppler_image(x: Tensor, phase_rad: Tensor) -> Tensor:
-    """Image of the pulses less their phases, (..., Doppler, range)."""
+    """Form the image of pulses with their phases removed, (..., Doppler, range)."""
     return torch.fft.fft(turned(x, -phase_rad), dim=-2, norm="ortho")
 
 
 def noise(trials: int, n_pulse: int, n_range: int, dtype: torch.dtype = torch.complex64, seed: int = 6) -> Tensor:
+    """Draw circular noise, (trial, pulse, range)."""
     return Draws(seed, trials=range(trials)).normal("alone", (n_pulse, n_range), dtype)

@@ -1,6 +1,4 @@
-"""Adaptive chirplets: exact on chirps, sparse on a target that turns unevenly, and losing its weak
-scatterers.
-"""
+"""Adaptive chirplets: exact on chirps; on a target with jerk they lose its weak scatterers."""
 
 from __future__ import annotations
 
@@ -10,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchsar.compensate.rotation.chirplet import ChirpletClean, chirplet_clean
+from torchsar.compensate.rotation import ChirpletClean, chirplet_clean
 from torchsar.core import Signal
 from torchsar.core.warp import warp
 from torchsar.focus.matched_fourier import matched_fourier
@@ -23,14 +21,15 @@ TIME = (torch.arange(PULSES, dtype=F64) - (PULSES - 1) / 2) / PRF
 
 
 def chirps(doppler_hz: Tensor, rate_hz_s: Tensor, amplitude: Tensor) -> Tensor:
-    """Sum over the first dim of chirps (chirp, range), (pulse, range) complex128."""
+    """Sum over the first dimension of chirps (chirp, range), (pulse, range) complex128."""
     turns = doppler_hz[:, None] * TIME[:, None] + rate_hz_s[:, None] * TIME[:, None].square() / 2
     return (amplitude[:, None] * torch.exp(-2j * math.pi * turns)).sum(0)
 
 
 def turning(cells: Tensor, amplitude: Tensor, k: tuple[float, float]) -> Tensor:
-    """One bin of scatterers at those Doppler cells of the middle of the aperture, turning with the
-    warp of k.
+    """One range cell of scatterers with warp k.
+
+    cells: their Doppler cells in the middle of the aperture.
     """
     time = torch.arange(PULSES, dtype=F64) / PRF
     middle = PULSES / 2 / PRF
@@ -64,9 +63,9 @@ def test_the_image_is_that_of_tones() -> None:
 
 
 def test_weak_scatterers_are_lost_on_a_target_with_jerk() -> None:
-    """Two strong and six weak scatterers a bin.
+    """Two strong and six weak scatterers per range cell.
 
-    Without jerk all eight are imaged; with it the remains of the strong ones take the atoms.
+    Without jerk all eight are imaged. With jerk the residuals of the strong ones use up the atoms.
     """
     cells = torch.tensor([-220.0, -150.5, -90.2, -31.0, 43.7, 100.0, 161.5, 214.0], dtype=F64)
     amplitude = torch.full((8,), 0.07, dtype=torch.complex128)
@@ -92,7 +91,7 @@ def test_atoms_below_the_floor_are_not_shown() -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.complex64, torch.complex128])
-def test_a_batch_equals_its_singles(dtype: torch.dtype) -> None:
+def test_a_batch_equals_single_trials(dtype: torch.dtype) -> None:
     data = torch.stack([chirps(DOPPLER, RATE * s, AMPLITUDE) * 10**i for i, s in enumerate((1.0, 0.3, -1.0))]).to(dtype)
     together = chirplet_clean(data, PRF, atoms=3, floor_db=20.0)
     assert together.image.dtype == dtype
@@ -121,7 +120,7 @@ def test_the_stage_forms_an_image_in_hertz() -> None:
     torch.testing.assert_close(peak, torch.tensor([1000.0, 9000.0], dtype=F64), atol=PRF / PULSES / 4, rtol=0)
 
 
-def test_refusals() -> None:
+def test_invalid_input_is_rejected() -> None:
     data = chirps(DOPPLER, RATE, AMPLITUDE)
     with pytest.raises(ValueError, match="at least 16 pulses"):
         chirplet_clean(data[:15], PRF)

@@ -1,6 +1,4 @@
-"""Phases as the minimum of a figure of the image: gradients, regions, bases, and minima that do not
-depend on the start.
-"""
+"""Phases that minimise a cost of the image: gradients, masks, bases, independence of the start."""
 
 from __future__ import annotations
 
@@ -11,10 +9,15 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate import CorrectPulsePhase, Sca
+from torchsar.compensate.pulse_phase import (
+    entropy_fixed_point,
+    maximum_contrast,
+    minimum_entropy,
+    sharpest_phase,
+)
 from torchsar.compensate.pulse_phase.data import prepare
-from torchsar.compensate.pulse_phase.descent import _PowerEntropy, maximum_contrast, minimum_entropy, sharpest_phase
+from torchsar.compensate.pulse_phase.descent import _PowerEntropy
 from torchsar.compensate.pulse_phase.imaging import AlongPulses
-from torchsar.compensate.pulse_phase.sharpen import entropy_fixed_point
 from torchsar.core import Chain, Draws, Signal, legendre, unit_phasor, use
 from torchsar.focus import AzimuthTransform, azimuth_transform
 from torchsar.metrics import contrast, entropy, phase_rmse
@@ -27,7 +30,7 @@ DOUBLE = torch.complex128
 def points(
     trials: int = 2, n_pulse: int = 48, n_range: int = 24, noise: float = 0.05, dtype: torch.dtype = DOUBLE
 ) -> Tensor:
-    """A few points a row at random places, in focus, (trial, pulse, range)."""
+    """A few points per range cell at random positions, in focus, (trial, pulse, range)."""
     draws = Draws(5, trials=range(trials))
     cycles = draws.uniform("cycles", (3, n_range), -0.35, 0.35)
     k = torch.arange(n_pulse, dtype=torch.float64)
@@ -49,7 +52,7 @@ def smooth(n_pulse: int = 48) -> Tensor:
     return legendre(torch.linspace(-1, 1, n_pulse, dtype=torch.float64), 5).mT[2:]
 
 
-def test_the_entropy_and_its_analytic_gradient_are_those_of_autograd():
+def test_entropy_and_analytic_gradient_equal_autograd():
     pulses = prepare(turned(points(), white()), "test")
     phase = white(2).flip(0).requires_grad_()
     direct = entropy(azimuth_transform((pulses.rows * torch.polar(torch.ones_like(phase), -phase)[:, None]).mT))
@@ -92,13 +95,13 @@ def test_all_starts_reach_one_minimum():
     assert (phase_rmse(adam, first) < 1e-2).all()
 
 
-def test_any_phase_is_removed_alike():
+def test_the_estimate_is_equivariant():
     data = points()
     plain, after = minimum_entropy(data)["phase_rad"], minimum_entropy(turned(data, 100 * white()))["phase_rad"]
     assert (phase_rmse(after - 100 * white(), plain) < 1e-3).all()
 
 
-def test_own_costs_see_the_image_and_equal_the_named_ones():
+def test_user_defined_costs_equal_the_named_ones():
     data = turned(points(), white())
     seen = []
 
@@ -115,9 +118,9 @@ def test_own_costs_see_the_image_and_equal_the_named_ones():
     torch.testing.assert_close(seen[0], azimuth_transform(turned(data, -start)) / scale)
 
 
-def test_any_image_formation_is_served():
+def test_any_image_formation_can_be_used():
     class Transposed:
-        """Along pulses, given (..., pulse, range)."""
+        """Transform along pulses of profiles of shape (..., pulse, range)."""
 
         def image(self, rows: Tensor) -> Tensor:
             return AlongPulses().image(rows.mT).mT
@@ -130,9 +133,10 @@ def test_any_image_formation_is_served():
     assert (phase_rmse(through, minimum_entropy(data, tolerance=1e-6)["phase_rad"]) < 1e-3).all()
 
 
-def test_a_mask_keeps_a_moving_neighbour_out():
-    """Half of the range cells hold a target with phases of its own; each trial watches its own
-    half.
+def test_a_mask_excludes_a_moving_neighbour():
+    """Each half of the range cells contains a target with its own phases.
+
+    Each trial masks one of them.
     """
     mine, its = white(2), white(2).flip(-1)
     data = turned(points(), mine)
@@ -154,7 +158,7 @@ def test_a_mask_keeps_a_moving_neighbour_out():
         assert float(phase_rmse(alone, masked[i])) < 1e-3
 
 
-def test_a_basis_finds_few_coefficients_where_free_phases_drown():
+def test_a_basis_succeeds_in_noise_where_free_phases_fail():
     basis = smooth()
     truth = torch.tensor([[6.0, -3.0, 1.0, 0.5], [-9.0, 2.0, -1.5, 1.0]], dtype=torch.float64) @ basis
     data = turned(points(noise=2.0), truth)
@@ -164,7 +168,7 @@ def test_a_basis_finds_few_coefficients_where_free_phases_drown():
     assert (
         found.ok.all() and (found.std["phase_rad"][:, 0] > 0.05).all() and (found.std["phase_rad"][:, 0] < 0.25).all()
     )
-    # it stays within the span, whatever the functions are scaled by and whether trials share them
+    # the phase stays in the span of the functions, whatever their scale, shared by trials or not
     phase = found["phase_rad"]
     torch.testing.assert_close(phase @ torch.linalg.pinv(basis) @ basis, phase, atol=1e-9, rtol=0)
     own = minimum_entropy(data, basis=(basis * torch.tensor([1e3, 1.0, 1e-3, 7.0])[:, None]).expand(2, 4, 48))[
@@ -178,7 +182,7 @@ def test_a_basis_finds_few_coefficients_where_free_phases_drown():
     [{}, {"objective": "contrast"}, {"basis": smooth()}, {"method": "adam", "steps": 30}],
     ids=["free", "contrast", "basis", "adam"],
 )
-def test_batch_equals_singles_at_any_level(options: dict):
+def test_a_batch_equals_single_trials_at_any_scale(options: dict):
     data = turned(points(3), white(3)) * torch.tensor([1.0, 1e-150, 1e150], dtype=torch.float64)[:, None, None]
     data[1, 7] = 0
     together = sharpest_phase(data, **options)
@@ -189,7 +193,7 @@ def test_batch_equals_singles_at_any_level(options: dict):
         assert alone["phase_rad"].shape == (48,)
 
 
-def test_blocks_of_trials_keep_what_is_each_trials_own(monkeypatch: pytest.MonkeyPatch):
+def test_start_mask_and_basis_follow_their_trials(monkeypatch: pytest.MonkeyPatch):
     """Start, mask and basis follow their trials when the batch is cut."""
     data, start = turned(points(4), white(4)), white(4) + 0.2
     own = {
@@ -217,7 +221,7 @@ def test_small_recordings_stay_finite(shape: tuple[int, ...], options: dict):
     assert torch.isfinite(found["phase_rad"]).all() and not found.ok.any()
 
 
-def test_silence_and_noise_are_not_ok():
+def test_zeros_and_noise_are_not_ok():
     noise = Draws(1, trials=range(3)).normal("noise", (48, 24), DOUBLE)
     noise[2] = 0
     for objective in ("power_entropy", "amplitude_entropy", "contrast"):
@@ -228,8 +232,8 @@ def test_silence_and_noise_are_not_ok():
     assert maximum_contrast(noise)["phase_rad"].equal(sharpest_phase(noise, objective="contrast")["phase_rad"])
 
 
-def test_values_of_a_chain_are_found_in_three_lines():
-    """What a user writes for values of any chain: rerun its tail, descend."""
+def test_values_of_a_chain_are_optimised_in_three_lines():
+    """What a user writes to optimise values of any chain: run its last part again, and descend."""
     radar = InverseRadar(2e14, 150e9, 2000.0, 0.005, 100e-6, 20e3)
     truth = torch.tensor([[3.0, -2.0, 1.0, 0.5], [-4.0, 1.0, 0.0, 1.0]], dtype=torch.float64)
     signal = Signal(turned(points(), truth @ smooth()), radar.raw_axes(48, 24))
@@ -242,7 +246,7 @@ def test_values_of_a_chain_are_found_in_three_lines():
     assert (phase_rmse(found.x @ smooth(), truth @ smooth()) < 0.08).all()
 
 
-def test_mistakes_are_named():
+def test_invalid_arguments_are_rejected():
     data = points()
     cases: list[tuple[dict, str]] = [
         (
@@ -250,14 +254,14 @@ def test_mistakes_are_named():
             "objective 'sharpness' is not known; choose one of power_entropy, amplitude_entropy, contrast",
         ),
         ({"method": "newton"}, "method 'newton' is not known; choose one of lbfgs, adam"),
-        ({"objective": entropy, "mask": torch.ones(24)}, "a mask belongs to the objectives known by name"),
+        ({"objective": entropy, "mask": torch.ones(24)}, "a mask applies only to objectives given by name"),
         ({"mask": torch.ones(3, 48, 24)}, r"mask of shape \(3, 48, 24\) does not fit \(2,\) trials"),
         ({"mask": torch.ones(24, 48)}, r"mask of shape \(24, 48\) does not broadcast"),
         (
             {"basis": torch.ones(47)},
             r"real functions \(coefficient, pulse\) over 48 pulses, got torch.float32 of shape \(47,\)",
         ),
-        ({"basis": torch.ones(2, 48)}, "none a sum of the others"),
+        ({"basis": torch.ones(2, 48)}, "linearly independent"),
         ({"basis": torch.ones(3, 2, 48)}, r"basis of shape \(3, 2, 48\) does not fit"),
         ({"start": torch.ones(47)}, r"start has the shape \(47,\)"),
         (

@@ -1,4 +1,4 @@
-"""Doppler centroid, ambiguity and velocity: known answers and the figures of brief 004."""
+"""Doppler centroid, ambiguity and velocity: known answers and the required accuracies."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def strip(
 def coloured(
     seed: int, centre_hz: float, shape: tuple[int, int] = (2048, 1024), band_hz: float = 500.0
 ) -> torch.Tensor:
-    """Uniform speckle with a rectangular azimuth band about centre_hz and noise 20 dB below."""
+    """Uniform speckle with a rectangular azimuth band about centre_hz, and noise 20 dB below."""
     generator = torch.Generator().manual_seed(seed)
     x = torch.fft.fft(torch.randn(shape, generator=generator, dtype=torch.complex64), dim=0)
     frequency = torch.fft.fftfreq(shape[0], 1 / PRF, dtype=torch.float64)
@@ -74,7 +74,7 @@ def coloured(
 
 
 @pytest.mark.parametrize(("seed", "centre"), [(0, 120.0), (1, 490.0), (2, -377.0)])
-def test_both_estimators_within_one_hertz_on_uniform_scenes_also_where_the_band_wraps(seed: int, centre: float) -> None:
+def test_both_estimators_are_within_one_hertz_on_uniform_scenes(seed: int, centre: float) -> None:
     x = coloured(seed, centre)
     increment, energy = phase_increment(x, PRF), energy_centre(x, PRF)
     for estimate in (increment, energy):
@@ -91,7 +91,7 @@ def test_plain_centre_of_mass_is_wrong_where_the_band_wraps() -> None:
     assert abs(float(estimate.info["plain_baseband_hz"]) - 490) > 300
 
 
-def test_block_increments_are_offered_along_the_strip() -> None:
+def test_block_increments_are_returned_along_the_strip() -> None:
     estimate = phase_increment(coloured(0, 120.0, (512, 256)), PRF, blocks=(8, 4))
     assert estimate.info["block_hz"].shape == (8, 4)
     assert (estimate.info["block_hz"] - 120).abs().max() < 60
@@ -112,7 +112,7 @@ def test_predicted_std_covers_the_scatter_over_seeds() -> None:
     assert 0.6 < float(errors.std() / predicted) < 1.6
 
 
-def test_silent_trial_and_extreme_scales_leave_the_neighbours_alone() -> None:
+def test_an_empty_trial_and_extreme_scales_do_not_affect_other_trials() -> None:
     x = torch.stack(
         [
             coloured(0, 120.0, (256, 64)),
@@ -128,7 +128,7 @@ def test_silent_trial_and_extreme_scales_leave_the_neighbours_alone() -> None:
     assert abs(float(estimate["doppler_baseband_hz"][2]) + 200) < 10
 
 
-def test_range_dependent_centroid_follows_a_slope_past_a_bright_outlier() -> None:
+def test_range_dependent_centroid_follows_a_slope_despite_a_bright_outlier() -> None:
     radar = replace(kondor(), prf_hz=PRF)
     t, u = torch.arange(512, dtype=torch.float64) / PRF, torch.linspace(-1, 1, 512, dtype=torch.float64)
     turn = torch.polar(torch.ones(512, 512, dtype=torch.float64), 2 * math.pi * t[:, None] * 60 * u)
@@ -143,7 +143,7 @@ def test_range_dependent_centroid_follows_a_slope_past_a_bright_outlier() -> Non
 
 @pytest.mark.parametrize("rate", [0.0, 1494.0])
 @pytest.mark.parametrize("snr_db", [-8.0, 10.0])
-def test_point_doppler_lies_between_the_bound_and_the_papers_curve(rate: float, snr_db: float) -> None:
+def test_point_doppler_error_lies_between_the_bound_and_the_papers_curve(rate: float, snr_db: float) -> None:
     n, prf, trials = 1024, 4000.0, 300
     generator = torch.Generator().manual_seed(5)
     t = (torch.arange(n, dtype=torch.float64) - (n - 1) / 2) / prf
@@ -167,7 +167,7 @@ def test_bounds_have_the_known_values() -> None:
 
 
 @pytest.mark.parametrize("refine", [parabola_minimum, gradient_minimum])
-def test_optimisers_find_each_trials_minimum(refine) -> None:
+def test_scalar_optimisers_find_the_minimum_of_each_trial(refine) -> None:
     target = torch.tensor([-3.3, 0.02, 4.1], dtype=torch.float64)
 
     def cost(x: torch.Tensor) -> torch.Tensor:
@@ -229,7 +229,7 @@ def test_gradient_of_the_objective_is_the_slope_and_both_refinements_agree() -> 
     torch.testing.assert_close(by_gradient, by_parabola, atol=0.05, rtol=0)
 
 
-def test_batch_equals_singles_and_a_silent_trial_is_not_ok() -> None:
+def test_a_batch_equals_single_trials_and_an_empty_trial_is_not_ok() -> None:
     radar = kondor()
     recording, _ = strip(radar, 1536, 800)
     data = torch.cat([recording.signal.data, torch.zeros_like(recording.signal.data[:1])])
@@ -255,7 +255,7 @@ BLOCKS = [
 
 
 @pytest.mark.parametrize(("name", "lines", "columns", "baseband"), BLOCKS)
-def test_recorded_blocks_told_nothing(
+def test_recorded_blocks_without_prior_knowledge(
     recorded, name: str, lines: tuple[int, int], columns: tuple[int, int], baseband: float | None
 ) -> None:
     recording = read_stripmap(recorded(name))
@@ -278,7 +278,7 @@ def test_recorded_blocks_told_nothing(
     assert bool(velocity.ok)
 
 
-def test_misuse_is_refused_in_one_sentence() -> None:
+def test_invalid_arguments_are_rejected() -> None:
     radar = kondor()
     with pytest.raises(ValueError, match="mean"):
         PhaseIncrement(radar, over="mode")

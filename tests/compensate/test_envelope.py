@@ -1,6 +1,4 @@
-"""Alignment of envelopes: against direct sums, injected shifts, and what it costs and saves on an
-aircraft (brief 002, section 9).
-"""
+"""Alignment of envelopes: direct sums, injected shifts, and effect on the image of an aircraft."""
 
 from __future__ import annotations
 
@@ -22,7 +20,7 @@ from torchsar.compensate.envelope import (
     shift_range,
 )
 from torchsar.compensate.envelope_fit import Envelopes, robust_fit
-from torchsar.compensate.pulse_phase.stages import correct_pulse_phase
+from torchsar.compensate.pulse_phase import correct_pulse_phase
 from torchsar.core import Axis, Chain, Draws, Signal, use
 from torchsar.echo import simulate_turntable
 from torchsar.focus import CompressDechirped, azimuth_transform
@@ -55,7 +53,7 @@ def aircraft(
 
 
 def rigid(n_pulse: int = 60, n_range: int = 64, trials: int = 2) -> Tensor:
-    """The same band-limited profile in every pulse, at a random phase."""
+    """The same band-limited profile in every pulse, with a random phase."""
     profile = circular(trials, 1, n_range) * torch.exp(-(((torch.arange(n_range) - n_range / 2) / (n_range / 8)) ** 2))
     return profile * torch.polar(
         torch.ones(trials, n_pulse, 1, dtype=torch.float64),
@@ -64,7 +62,7 @@ def rigid(n_pulse: int = 60, n_range: int = 64, trials: int = 2) -> Tensor:
 
 
 def off(found: Tensor, true: Tensor, n: int = 256) -> Tensor:
-    """Difference on the circle of n cells without its middle, (..., pulse)."""
+    """Difference on the circle of n cells without its mean, (..., pulse)."""
     difference = found - true
     difference = difference - difference.median(-1, keepdim=True).values
     return difference - n * torch.round(difference / n)
@@ -90,7 +88,7 @@ def test_shift_equals_direct_sums(n: int) -> None:
     torch.testing.assert_close(shift_range(x, shift), expected, atol=1e-12, rtol=0)
 
 
-def test_shift_is_unitary_exact_for_whole_cells_and_undone() -> None:
+def test_shift_is_unitary_reversible_and_exact_for_whole_cells() -> None:
     x, shift = circular(2, 5, 32), 40 * circular(2, 5, seed=1).real
     moved = shift_range(x, shift)
     torch.testing.assert_close(moved.abs().square().sum(-1), x.abs().square().sum(-1), rtol=1e-12, atol=0)
@@ -123,7 +121,7 @@ def test_correlations_equal_direct_sums() -> None:
 
 
 def test_parabola_finds_the_peak_between_samples() -> None:
-    """Of a smooth envelope to 0.001 cell, wherever it lies."""
+    """The peak of a smooth envelope is found to 0.001 cell at any position."""
     place = torch.linspace(-31.9, 31.9, 301, dtype=torch.float64)
     lines = torch.exp(-(((torch.arange(64) - 32) / 2.0) ** 2)).to(DOUBLE).expand(1, 301, -1)
     pulses = Envelopes.of(shift_range(lines, place))
@@ -140,7 +138,7 @@ def test_recovers_shifts_of_a_rigid_profile(method) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS.values(), ids=list(METHODS))
-def test_batch_equals_singles(method) -> None:
+def test_a_batch_equals_single_trials(method) -> None:
     x = (
         shift_range(aircraft(5.0, 3, 60)[0], 30 * unit_time(60))
         * torch.logspace(0, 6, 3, dtype=torch.float64)[:, None, None]
@@ -154,7 +152,7 @@ def test_batch_equals_singles(method) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS.values(), ids=list(METHODS))
-def test_phases_and_gains_of_pulses_change_nothing(method) -> None:
+def test_phases_and_gains_of_pulses_have_no_effect(method) -> None:
     x = shift_range(aircraft(0.0, 2, 60)[0], 30 * unit_time(60))
     turned = x * torch.polar(
         torch.rand(2, 60, 1, dtype=torch.float64) + 0.5, 1e4 * torch.rand(2, 60, 1, dtype=torch.float64)
@@ -170,8 +168,8 @@ def test_single_precision_and_any_scale() -> None:
         torch.testing.assert_close(found, expected, atol=2e-3, rtol=0)
 
 
-def test_perfect_data_are_not_harmed() -> None:
-    """Raw shifts of |s| cost 0.1 nats, those of the likelihood 0.02, a polynomial nothing."""
+def test_noise_free_data_are_not_degraded() -> None:
+    """Shifts by |s| cost 0.1 nats, those by the likelihood 0.02 nats, a polynomial nothing."""
     x, phase = aircraft(n_pulse=400)
     ideal = entropy(azimuth_transform(correct_pulse_phase(x, phase)))
 
@@ -185,7 +183,7 @@ def test_perfect_data_are_not_harmed() -> None:
 
 
 @pytest.mark.parametrize("snr_db", [None, 0.0, -10.0])
-def test_a_course_over_several_windows_is_found(snr_db: float | None) -> None:
+def test_a_shift_history_over_several_windows_is_found(snr_db: float | None) -> None:
     x, _ = aircraft(snr_db, 3, 400)
     u = unit_time(400)
     true = torch.stack([0 * u, 50 * u + 20 * u**2, 340 * u - 60 * u**2])
@@ -196,7 +194,7 @@ def test_a_course_over_several_windows_is_found(snr_db: float | None) -> None:
     torch.testing.assert_close(drift_cells(found["shift_cells"]), drift_cells(true), atol=1e-3, rtol=0)
 
 
-def test_vibration_is_a_tone() -> None:
+def test_vibration_is_found_as_a_tone() -> None:
     x, _ = aircraft(10.0, 2, 400)
     k = torch.arange(400, dtype=torch.float64)
     true = (
@@ -206,8 +204,8 @@ def test_vibration_is_a_tone() -> None:
     assert error[1] < 0.05 < 0.4 < error[0]
 
 
-def test_low_signal_is_admitted() -> None:
-    """Single pulses fail at -5 dB and say so; the course is found there and fails at -25 dB."""
+def test_failure_at_low_snr_is_reported() -> None:
+    """Single pulses fail at -5 dB, the polynomial at -25 dB; both are then not ok."""
     x, _ = aircraft(-5.0, 2, 300)
     for method in SINGLE.values():
         found = method(x)
@@ -234,7 +232,7 @@ def test_lost_pulses_are_bridged() -> None:
 
 
 @pytest.mark.parametrize("method", METHODS.values(), ids=list(METHODS))
-def test_nothing_stays_finite(method) -> None:
+def test_empty_data_give_finite_values(method) -> None:
     x = aircraft(10.0, 2, 40)[0]
     found = method(torch.stack([x[0], 0 * x[0]]))
     assert not found.ok[1] and torch.equal(found["shift_cells"][1], torch.zeros(40, dtype=torch.float64))
@@ -251,7 +249,7 @@ def test_nothing_stays_finite(method) -> None:
 @pytest.mark.parametrize(
     "method", [*METHODS.values(), lambda x: refine_alignment(x, torch.zeros(5))], ids=[*METHODS, "refine"]
 )
-def test_bad_input_is_refused(method) -> None:
+def test_invalid_data_are_rejected(method) -> None:
     x = circular(2, 5, 16)
     x[1, 3, 4] = float("nan")
     with pytest.raises(ValueError, match=r"1 of 160 samples are NaN or Inf, the first at index \(1, 3, 4\)"):
@@ -273,7 +271,7 @@ def test_bad_input_is_refused(method) -> None:
         lambda x: refine_alignment(x, torch.zeros(5), degree=0),
     ],
 )
-def test_bad_settings_are_refused(call) -> None:
+def test_invalid_settings_are_rejected(call) -> None:
     with pytest.raises(ValueError, match=r"(align|refine)_\w+: "):
         call(circular(5, 16))
 
@@ -289,7 +287,7 @@ def test_robust_fit_ignores_outliers() -> None:
     )
 
 
-def test_refinement_by_the_image_finds_a_bent_course() -> None:
+def test_refinement_by_the_image_finds_a_curved_shift_history() -> None:
     x, _ = aircraft(None, 2, 120)
     u = unit_time(120)
     wrong = 0.5 * (1.5 * u**2 - 0.5) * torch.tensor([[1.0], [-0.6]], dtype=torch.float64)
@@ -297,9 +295,11 @@ def test_refinement_by_the_image_finds_a_bent_course() -> None:
     assert float(rms(off(refined["shift_cells"], torch.zeros(2, 120))).max()) < 0.5 * float(rms(wrong).min())
 
 
-def test_stages_follow_a_target_that_is_tracked_badly() -> None:
-    """Compressed with 100 m/s, flying 100.3 m/s and vibrating: the chain removes the drift and
-    gives the velocity back, with that of the coupling.
+def test_stages_align_a_target_with_a_tracking_error() -> None:
+    """The target flies at 100.3 m/s, was compressed for 100 m/s, and vibrates.
+
+    The chain removes the drift and returns the velocity, with the part due to range-Doppler
+    coupling.
     """
     world = TurntableWorld(
         Aircraft(),
@@ -326,13 +326,13 @@ def test_stages_follow_a_target_that_is_tracked_badly() -> None:
     )
     drift_m = truth.values["displacement_m"] - 100 * torch.arange(200) / 2000
     residual = trace.values["align.shift_m"] - drift_m
-    # what is left is the coupling of range and Doppler: acceleration and vibration times f0 / gamma
+    # the residual is the range-Doppler coupling: acceleration and vibration times f0 / gamma
     assert float((residual - residual.mean(-1, keepdim=True)).abs().max()) < 3e-3
     aligned = align_envelopes(trace.signal.data)["shift_cells"]
     assert float(rms(aligned).max()) < 0.05
 
 
-def test_stages_count_in_metres() -> None:
+def test_stages_work_in_metres() -> None:
     x = shift_range(aircraft(20.0, 2, 60)[0], 10 * unit_time(60))
     axes = (Axis("pulse", 60, 0.0, 1 / 2000, "s"), Axis("range", 256, 0.0, 0.5, "m"))
     signal = Signal(x, axes)
@@ -351,6 +351,6 @@ def test_no_trials_give_no_shifts(settings: dict) -> None:
     assert found["shift_cells"].shape == (0, 5) and found.ok.shape == (0,)
 
 
-def test_a_shift_that_is_no_number_is_refused() -> None:
+def test_a_non_finite_shift_is_rejected() -> None:
     with pytest.raises(ValueError, match="shift_range: .*NaN"):
         shift_range(torch.ones(3, 8, dtype=torch.complex64), torch.tensor([0.0, math.nan, 0.0]))

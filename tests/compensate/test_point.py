@@ -1,4 +1,4 @@
-"""The beam's Doppler from the place of one point in the image."""
+"""Doppler centroid of the beam from the position of one point in the image."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def observed(snr_db: float, doppler_hz: float, trials: int = 60, seed: int = 1):
 
 
 @pytest.mark.parametrize("snr_db, doppler_hz", [(-20.0, 391.0), (-10.0, 652.0), (0.0, 913.0)])
-def test_it_stands_on_the_bound_of_a_tone_and_below_the_papers_curve(snr_db: float, doppler_hz: float) -> None:
+def test_error_reaches_the_bound_of_a_tone_below_the_papers_curve(snr_db: float, doppler_hz: float) -> None:
     found, q = observed(snr_db, doppler_hz)
     rmse = float((found["doppler_hz"] - doppler_hz).square().mean().sqrt())
     bound = float(tone_frequency_bound_hz(q, 0.3))
@@ -39,7 +39,7 @@ def test_it_stands_on_the_bound_of_a_tone_and_below_the_papers_curve(snr_db: flo
     assert bool(found.ok.all()) and float(found.std["doppler_hz"].median()) == pytest.approx(bound, rel=0.35)
 
 
-def test_noise_alone_is_not_trusted() -> None:
+def test_noise_alone_is_not_ok() -> None:
     noise = Draws(4, trials=range(20)).normal("n", (512, 192), torch.complex64)
     found = PointDoppler(RADAR)(Signal(noise, RADAR.image_axes(RADAR.raw_axes(512, 192))))
     assert int(found.ok.sum()) == 0
@@ -49,7 +49,7 @@ def test_noise_alone_is_not_trusted() -> None:
     assert not bool(silent.ok.any()) and bool(torch.isfinite(silent["doppler_hz"]).all())
 
 
-def test_doppler_at_inverts_the_place_in_the_image() -> None:
+def test_doppler_at_inverts_the_image_position() -> None:
     zero_s, closest_m, velocity = 0.7, 701e3, 7003.0
     for crossing_s in (-0.4, 0.2, 0.6):
         ahead = velocity * (zero_s - crossing_s)
@@ -64,7 +64,7 @@ def test_doppler_at_inverts_the_place_in_the_image() -> None:
             assert float(doppler_at(RADAR, *place, frame_hz, velocity, crossing_s)) == pytest.approx(doppler, abs=1e-7)
 
 
-def test_a_frame_is_needed() -> None:
+def test_a_frame_is_required() -> None:
     from dataclasses import replace
 
     radar = replace(RADAR, pointing_doppler_hz=None)
@@ -73,9 +73,10 @@ def test_a_frame_is_needed() -> None:
 
 
 @pytest.mark.parametrize("at_m, inside", [(40.0, True), (140.0, True), (-145.0, True), (165.0, False)])
-def test_an_aperture_that_the_record_cuts_is_measured_by_what_is_left_of_it(at_m: float, inside: bool) -> None:
-    """An airborne radar, 307 m of track, 120 m of aperture; the image holds the point at 140 m
-    beyond its end, circularly.
+def test_the_std_of_a_cut_aperture_follows_its_observed_part(at_m: float, inside: bool) -> None:
+    """An airborne radar with 307 m of track and 120 m of aperture.
+
+    The image contains the point, circularly, 140 m beyond its end.
     """
     radar = StripmapRadar(
         9.6e9, LinearFM(60e6, 1.5e-6), 75e6, 400.0, 120.0, 5000.0, pointing_doppler_hz=0.0, integration_s=1.0

@@ -1,4 +1,4 @@
-"""The autofocus family against direct evaluation, and the properties it has exactly."""
+"""The autofocus functions against direct evaluation, and their exact properties."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ RADAR = InverseRadar(2e14, 150e9, 2000.0, 0.005)
 
 
 def constant_apart(a: Tensor, b: Tensor) -> float:
-    """Largest difference (rad, on the circle) of phases once their common constant is gone."""
+    """Largest difference (rad, on the circle) of phases after their common constant is removed."""
     turn = torch.exp(1j * (a - b))
     return float(torch.angle(turn / turn[..., :1]).abs().max())
 
 
-# properties of section 5
+# exact properties
 
 
 @pytest.mark.parametrize("name", EQUIVARIANT)
-def test_the_size_of_the_error_is_of_no_account(name):
+def test_the_size_of_the_phase_error_has_no_effect(name):
     x = noisy(still(2), 10.0)
     a = 1e4 * torch.randn(2, 128, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     plain, moved = METHODS[name](x)["phase_rad"], METHODS[name](turned(x, a))["phase_rad"]
@@ -64,10 +64,8 @@ def test_pga_and_a_start_at_zero_are_not_equivariant():
 
 
 @pytest.mark.parametrize("name", EQUIVARIANT)
-def test_constant_and_linear_phases_cannot_be_seen(name):
-    """A constant changes nothing; a line of whole cells moves the image, and the estimate follows
-    it.
-    """
+def test_constant_and_linear_phases_are_unobservable(name):
+    """A constant has no effect; a line of whole cells shifts the image and is in the estimate."""
     x = noisy(still(1), 20.0)
     line = 1.3 + 2 * math.pi * 7 / 128 * torch.arange(128, dtype=torch.float64)
     plain, moved = METHODS[name](x), METHODS[name](turned(x, line[None]))
@@ -85,8 +83,9 @@ def test_white_phases_are_found(name):
 
 
 def test_methods_rank_as_measured():
-    """SCA leaves much, PGA from it less, the entropy less, the Wiener estimate least; PGA from zero
-    does not find white phases.
+    """The error falls in the order SCA, PGA from it, entropy fixed point, Wiener estimate.
+
+    PGA from zero does not find white phases.
     """
     x, a = noisy(still(4, per_row=5), 20.0), white(4)
     error = {name: float(phase_rmse(method(turned(x, a))["phase_rad"], a).median()) for name, method in METHODS.items()}
@@ -184,10 +183,10 @@ def test_pga_sca_is_pga_with_its_kernel_from_sca():
     )
 
 
-def test_patience_waits_for_the_window():
-    """Wide windows over clutter blur the image for many iterations; narrow ones then sharpen it.
+def test_patience_counts_only_after_the_window_stops_narrowing():
+    """Over clutter, wide windows blur the image for many iterations; narrow ones then sharpen it.
 
-    No patience may end the search before.
+    The search must not end before.
     """
     a = 0.5 * smooth(256)
     x = turned(noisy(still(1, 256, 100, per_row=1, width=0.9), -8.0), a[None])
@@ -198,8 +197,9 @@ def test_patience_waits_for_the_window():
 
 @pytest.mark.parametrize("kernel", ["eigenvector", "synchronised"])
 def test_coherent_kernels_find_the_first_eigenvector(kernel):
-    """One point a row: every row, its peak at zero Doppler, is nearly the same vector of phases
-    times a number; both kernels must say that vector.
+    """With one point per row, every row with its peak at zero Doppler is nearly the same vector.
+
+    Both kernels must return that vector of phases.
     """
     a = smooth(64)
     x = noisy(turned(still(1, 64, 32, per_row=1), a[None]), 30.0)
@@ -227,7 +227,7 @@ def test_windows():
     assert [float(Listed((9.0, 4.0)).width(i, 100, lambda: flat)) for i in (0, 1, 2)] == [9.0, 4.0, 4.0]
 
 
-def test_a_constant_and_a_line_are_taken_from_pulses_that_are_there():
+def test_constant_and_line_are_fitted_to_present_pulses():
     present = torch.ones(2, 20, dtype=torch.bool)
     present[1, 3:9] = False
     p = torch.where(present, 4.0 - 0.3 * torch.arange(20, dtype=torch.float64), 99.0)
@@ -238,7 +238,7 @@ def test_a_constant_and_a_line_are_taken_from_pulses_that_are_there():
 
 
 def slow_entropy_fixed_point(x: np.ndarray, psi: np.ndarray) -> np.ndarray:
-    """Section 7 of brief 002, cell by cell: x (pulse, range)."""
+    """The entropy fixed point evaluated cell by cell; x (pulse, range)."""
     n_pulse, n_range = x.shape
     for floor in [5.0] * 12 + [2.0] * 12:
         f = np.stack([np.fft.fft(x[:, n] * np.exp(-1j * psi)) for n in range(n_range)])
@@ -267,9 +267,10 @@ def _one_step(x: Tensor, psi: Tensor, weights) -> Tensor:
 
 
 @pytest.mark.parametrize("floor", [1e-9, 2.0])
-def test_the_step_points_down_the_entropy(floor):
-    """gradient = -(2 / mean power) |S| sin(step), with S the sum over range that the step is the
-    angle of. floor 1e-9: the entropy itself.
+def test_the_step_follows_the_gradient_of_the_entropy(floor):
+    """gradient = -(2 / mean power) |S| sin(step), with S the sum whose angle is the step.
+
+    With the floor 1e-9 the cost is the entropy itself.
     """
     x, psi = noisy(still(1, 40, 12), 10.0), white(1, 40).requires_grad_()
     f = doppler_image(x, psi)
@@ -289,9 +290,7 @@ def test_the_step_points_down_the_entropy(floor):
 
 
 def test_weights_of_the_wrong_sign_blur():
-    """ln p of powers that add up to one is negative, and the iteration then seeks the most
-    entropy.
-    """
+    """ln p is negative for powers that add up to one; the iteration then maximises the entropy."""
     x = still(1, 64, 32)
     psi = 0.3 * white(1, 64)
     cells = x[0].numel()
@@ -339,7 +338,7 @@ def test_transform_along_pulses_and_its_adjoint(oversampling):
     torch.testing.assert_close((a.image(x) * y.conj()).sum(), (x * a.adjoint(y).conj()).sum(), atol=1e-12, rtol=0)
 
 
-def test_steps_taken_are_counted_and_a_quiet_trial_rests():
+def test_iterations_are_counted_and_a_converged_trial_stops():
     x = still(2)
     x = torch.stack([x[0], turned(x, white(2))[1]])
     found = autofocus(
@@ -351,7 +350,7 @@ def test_steps_taken_are_counted_and_a_quiet_trial_rests():
 # corrector and stages
 
 
-def test_corrector_takes_out_the_phase_and_drops_whole_turns_in_float64():
+def test_the_corrector_removes_the_phase_and_reduces_whole_turns_in_float64():
     x, a = still(2), white(2)
     torch.testing.assert_close(correct_pulse_phase(turned(x, a), a), x, atol=1e-12, rtol=0)
     # a displacement of metres, 1.6e8 rad
@@ -405,6 +404,6 @@ def test_a_start_connects_to_pga():
         (lambda x: sca(x[0, 0]), "at least one pulse and one range cell"),
     ],
 )
-def test_mistakes_get_one_clear_sentence(call, message):
+def test_invalid_arguments_are_rejected(call, message):
     with pytest.raises(ValueError, match=message):
         call(still(1, 16, 4))

@@ -1,6 +1,4 @@
-"""The autofocus family on data of any scale, with holes, too small, too strong, or of nothing but
-noise.
-"""
+"""The autofocus functions on data of any scale, with gaps, too small, too strong, or pure noise."""
 
 from __future__ import annotations
 
@@ -39,7 +37,7 @@ def scene(trials: int = 2, snr_db: float = 10.0, **kwargs) -> tuple[Tensor, Tens
     ],
 )
 @pytest.mark.parametrize("name", NAMES)
-def test_scale_is_of_no_account(name, dtype, scale):
+def test_scale_has_no_effect(name, dtype, scale):
     x, _ = scene(2, n_pulse=64, n_range=32)
     plain, scaled = METHODS[name](x.to(dtype)), METHODS[name]((x * scale).to(dtype))
     assert float(residual_phase(scaled["phase_rad"], plain["phase_rad"]).abs().max()) < (
@@ -58,12 +56,12 @@ def test_single_precision_estimates_as_well(name):
     )
 
 
-# what is refused
+# rejected input
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, complex(0, -math.inf)])
 @pytest.mark.parametrize("name", NAMES)
-def test_non_finite_samples_are_refused_with_their_place(name, bad):
+def test_non_finite_samples_are_rejected_with_their_position(name, bad):
     x, _ = scene(2, n_pulse=16, n_range=8)
     x[1, 3, 5] = bad
     with pytest.raises(ValueError, match=r"1 of 256 samples are NaN or Inf, the first at index \(1, 3, 5\)"):
@@ -71,17 +69,17 @@ def test_non_finite_samples_are_refused_with_their_place(name, bad):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_is_not_complex_is_refused(name):
+def test_real_data_are_rejected(name):
     for bad in (torch.ones(8, 4), torch.ones(8, 4, dtype=torch.int64), [[1j, 2.0]]):
         with pytest.raises(TypeError, match="complex"):
             METHODS[name](bad)  # pyright: ignore[reportArgumentType]
 
 
-# nothing in it
+# empty data
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_an_empty_trial_is_zero_and_leaves_its_neighbours_alone(name):
+def test_an_empty_trial_gives_zero_and_does_not_affect_others(name):
     x, _ = scene(3, n_pulse=64, n_range=32)
     x[1] = 0
     found, rest = METHODS[name](x), METHODS[name](x[[0, 2]])
@@ -95,7 +93,7 @@ def test_an_empty_trial_is_zero_and_leaves_its_neighbours_alone(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_no_trials_make_an_estimate_of_none(name):
+def test_zero_trials_give_an_empty_estimate(name):
     found = METHODS[name](torch.zeros(0, 3, 16, 8, dtype=torch.complex64))
     assert found["phase_rad"].shape == found.info["present"].shape == (
         0,
@@ -113,13 +111,13 @@ def test_rows_of_zeros_are_harmless(name):
     assert bool((wider < 1.3 * error + 0.02).all())
 
 
-# too small
+# too few pulses or range cells
 
 
 @pytest.mark.parametrize("n_pulse", [1, 2])
 @pytest.mark.parametrize("name", NAMES)
 def test_too_few_pulses_give_zero_and_a_warning(name, n_pulse):
-    with pytest.warns(UserWarning, match=rf"{n_pulse} pulse\(s\) carry no phase error"):
+    with pytest.warns(UserWarning, match=rf"phase error of {n_pulse} pulse\(s\) cannot be distinguished"):
         found = METHODS[name](noise(3, n_pulse, 8))
     assert (
         found["phase_rad"].shape == (3, n_pulse)
@@ -130,9 +128,9 @@ def test_too_few_pulses_give_zero_and_a_warning(name, n_pulse):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_one_row_warns_and_is_never_believed(name):
+def test_one_row_warns_and_is_not_ok(name):
     x, _ = scene(4, 30.0, n_range=1)
-    with pytest.warns(UserWarning, match="one range cell cannot tell"):
+    with pytest.warns(UserWarning, match="with one range cell, phase errors cannot be distinguished"):
         found = METHODS[name](x)
     assert torch.isfinite(found["phase_rad"]).all() and not found.ok.any()
 
@@ -140,7 +138,7 @@ def test_one_row_warns_and_is_never_believed(name):
 @pytest.mark.parametrize("shape", [(3, 2), (3, 7), (4, 4), (5, 1, 3, 3), (7, 5)])
 @pytest.mark.filterwarnings("ignore:.*one range cell")
 @pytest.mark.parametrize("name", NAMES)
-def test_tiny_shapes_keep_theirs(name, shape):
+def test_tiny_shapes_are_kept(name, shape):
     found = METHODS[name](torch.randn(shape, dtype=torch.complex64, generator=torch.Generator().manual_seed(0)))
     assert (
         found["phase_rad"].shape == shape[:-1]
@@ -152,7 +150,7 @@ def test_tiny_shapes_keep_theirs(name, shape):
 
 def test_one_pulse_or_two_still_carry_gradients():
     x = torch.randn(2, 2, 4, dtype=DOUBLE, requires_grad=True)
-    with pytest.warns(UserWarning, match="carry no phase error"):
+    with pytest.warns(UserWarning, match="cannot be distinguished from a shift"):
         sca(x)["phase_rad"].sum().backward()
     assert x.grad is not None and not x.grad.any()
 
@@ -192,9 +190,9 @@ def test_lost_pulses_are_bridged(name, where):
 
 
 def test_sca_bridges_where_the_scene_is_coherent_over_the_gap():
-    """The scene fills a fifth of the Doppler band: pulses two apart still look alike.
+    """The scene occupies a fifth of the Doppler band, so pulses two apart are still coherent.
 
-    At half of the band they do not, and no product of two pulses bridges.
+    With half of the band they are not, and no product of two pulses bridges the gap.
     """
     x, a = scene(6, 20.0, n_pulse=200, width=0.2)
     whole = float(phase_rmse(sca(x)["phase_rad"], a).median())
@@ -203,7 +201,7 @@ def test_sca_bridges_where_the_scene_is_coherent_over_the_gap():
     assert float(phase_rmse(sca(x)["phase_rad"], a, present).median()) < 1.5 * whole
 
 
-def test_pulses_of_one_trial_may_be_lost_in_another_place():
+def test_lost_pulses_may_differ_between_trials():
     x, _ = scene(3, 10.0)
     x[0, 10:14], x[2, ::5] = 0, 0
     together = autofocus(x)
@@ -216,13 +214,13 @@ def test_pulses_of_one_trial_may_be_lost_in_another_place():
 
 @pytest.mark.parametrize("shape", [(128, 16), (64, 48), (96, 2), (96, 3), (128, 5), (16, 16), (6, 64), (32, 100)])
 @pytest.mark.parametrize("name", NAMES)
-def test_noise_is_never_believed(name, shape):
+def test_noise_is_not_ok(name, shape):
     assert not METHODS[name](noise(40, *shape)).ok.any()
 
 
 @pytest.mark.parametrize("oversampling", [2, 4, 8])
 @pytest.mark.parametrize("name", ["sca", "entropy_fixed_point", "autofocus"])
-def test_noise_sampled_too_finely_in_range_is_not_believed(name, oversampling):
+def test_oversampled_noise_is_not_ok(name, oversampling):
     spectrum = torch.zeros(8, 96, 160, dtype=torch.complex64)
     spectrum[..., : 160 // oversampling] = noise(8, 96, 160 // oversampling)
     x = torch.fft.ifft(spectrum, dim=-1)
@@ -244,7 +242,7 @@ def test_noise_sampled_too_finely_in_range_is_not_believed(name, oversampling):
     ],
 )
 @pytest.mark.parametrize("name", NAMES)
-def test_uneven_noise_is_not_believed(name, kind):
+def test_nonuniform_noise_is_not_ok(name, kind):
     x = noise(10, 96, 64)
     g = torch.Generator().manual_seed(2)
     if kind == "rows of many levels":
@@ -263,8 +261,8 @@ def test_uneven_noise_is_not_believed(name, kind):
 
 
 @pytest.mark.parametrize("rows", [4, 16, 64])
-def test_sharpness_that_noise_is_given(rows):
-    """The fitted figure against what the entropy fixed point makes of noise."""
+def test_fitted_sharpness_of_noise_equals_the_measured_one(rows):
+    """The fit agrees with the sharpness that the entropy fixed point reaches on noise."""
     found = entropy_fixed_point(noise(12, 128, rows, DOUBLE), floors=((2.5, 120),))
     assert float(found.info["sharpness_nats"].mean() / sharpness_of_noise(torch.tensor(float(rows)))) == pytest.approx(
         1, abs=0.35
@@ -277,8 +275,8 @@ def test_sharpness_that_noise_is_given(rows):
 
 @pytest.mark.parametrize("above_db", [20, 60, 100])
 @pytest.mark.parametrize("name", ["sca", "pga_sca", "entropy_fixed_point", "autofocus"])
-def test_a_strong_scatterer_gives_the_phase_away(name, above_db):
-    """It also carries all sharpness by itself, so that nothing confirms it: not ok."""
+def test_a_strong_scatterer_determines_the_phase_but_is_not_ok(name, above_db):
+    """It also makes all of the sharpness, so no other row confirms it: not ok."""
     x, a = still(2, width=0.8), white(2)
     k = torch.arange(128, dtype=torch.float64)
     x[..., 20] += 10 ** (above_db / 20) * x.abs().amax() * torch.exp(2j * math.pi * 0.1371 * k)
@@ -290,7 +288,7 @@ def test_a_strong_scatterer_gives_the_phase_away(name, above_db):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_layout_is_of_no_account(name):
+def test_memory_layout_has_no_effect(name):
     x, _ = scene(2, n_pulse=48, n_range=24)
     expected = METHODS[name](x)["phase_rad"]
     for other in (
@@ -308,7 +306,7 @@ def test_layout_is_of_no_account(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_trial_knows_nothing_of_its_batch(name):
+def test_a_trial_does_not_depend_on_its_batch(name):
     x, _ = scene(5, 5.0, n_pulse=100, n_range=48)
     x = x * torch.logspace(-3, 3, 5)[:, None, None]
     together = METHODS[name](x)
@@ -322,7 +320,7 @@ def test_a_trial_knows_nothing_of_its_batch(name):
 
 
 @pytest.mark.parametrize("name", ["sca", "pga_sca", "autofocus"])
-def test_threads_change_nothing(name):
+def test_threads_have_no_effect(name):
     x, _ = scene(24, 5.0, n_pulse=64, n_range=96)
     threads = torch.get_num_threads()
     try:

@@ -1,6 +1,4 @@
-"""The window of ranges that estimators work on, the shift that is taken out of it, and the periods
-that hold an echo.
-"""
+"""Filtering to a range window, the removed shift, and the periods that contain an echo."""
 
 from __future__ import annotations
 
@@ -11,8 +9,7 @@ import torch
 
 from tests.compensate.radials import ESTIMATORS, GATE, seen
 from tests.echo.ladars import COMMON, table1
-from torchsar.compensate.radial import bands_of
-from torchsar.compensate.radial.bands import filled, window_lines
+from torchsar.compensate.radial.bands import bands_of, filled, window_lines
 from torchsar.scene import LinearInSweep, Points, Polynomial
 
 RADAR = table1()
@@ -31,9 +28,10 @@ def test_window_lines() -> None:
             window_lines(RADAR, window)
 
 
-def test_bands_are_the_tone_less_its_shift() -> None:
-    """A scatterer whose velocity is a whole number of bins is the tone of its range in both sweeps,
-    whole powers of two apart.
+def test_bands_are_the_tone_without_its_shift() -> None:
+    """A scatterer with a velocity of whole bins is the tone of its range in both sweeps.
+
+    Its level differs by a power of two.
     """
     step = RADAR.ambiguous_velocity_m_s
     sweeps, _, _ = seen(
@@ -64,9 +62,10 @@ def test_filled() -> None:
 
 @pytest.mark.parametrize("snr_db", [None, 20.0])
 @pytest.mark.parametrize("name", list(ESTIMATORS))
-def test_periods_without_a_lit_scatterer_are_marked(name, snr_db) -> None:
-    """A beam of 12 urad lights the point for 37 periods; there the velocity is found, elsewhere it
-    is a neighbour's and finite.
+def test_periods_without_an_illuminated_scatterer_are_marked(name, snr_db) -> None:
+    """A beam of 12 urad illuminates the point for 37 periods, in which the velocity is found.
+
+    In the other periods it is interpolated and finite.
     """
     radar = table1(beam_rad=12e-6)
     sweeps, pulse, truth = seen(radar, n=96, snr_db=snr_db, fidelity=LinearInSweep())

@@ -1,4 +1,4 @@
-"""Range error from velocities, and its exact removal from sweeps."""
+"""Range error from velocities, and its exact compensation in sweeps."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from torchsar.compensate.radial import (
     integrated_range,
     radial_motion,
     range_error,
-    sweep_motion,
     turning_points,
 )
 from torchsar.compensate.radial.compensate import polynomial_phasor
+from torchsar.compensate.radial.trajectory import sweep_motion
 from torchsar.core import Axis, Estimate
 from torchsar.focus import compress_sweeps
 from torchsar.radar import sweep_middles
@@ -27,9 +27,7 @@ RADAR = table1()
 
 
 def true_motion(radar, n, motion=COMMON):
-    """Velocity at the turning points by automatic differentiation of the displacement, and the
-    displacement at slow times.
-    """
+    """Velocity at the turning points by automatic differentiation, and the displacement."""
     pulse = radar.sweep_axes(n)[1]
     t = turning_points(radar, pulse).values() - pulse.start
     t.requires_grad_()
@@ -38,7 +36,7 @@ def true_motion(radar, n, motion=COMMON):
 
 
 def test_the_spline_integrates_to_picometres_and_rectangles_to_micrometres() -> None:
-    """Brief 000, section 5.5."""
+    """A cubic spline through the velocities is exact to picometres, a sum of rectangles is not."""
     pulse, v, place = true_motion(RADAR, 512)
     at = sweep_middles(RADAR, pulse)
     zero = turning_points(RADAR, pulse).values()[:1]
@@ -62,9 +60,10 @@ def test_sweep_motion_is_the_spline() -> None:
 
 @pytest.mark.parametrize("sign", ["lo_conj_echo", "echo_conj_lo"])
 @pytest.mark.parametrize("motion", [COMMON, (Polynomial([5.0, 100.0]),)])
-def test_moving_sweeps_become_those_at_rest(sign, motion) -> None:
-    """Against direct sums, the range of DR itself taken into account: what stays is the video term
-    2 K dtau DR / c, and that of DR alone.
+def test_compensated_sweeps_equal_static_ones(sign, motion) -> None:
+    """Compensated sweeps equal direct sums for a static target.
+
+    The residuals are the video terms 2 K dtau DR / c and that of DR alone.
     """
     radar = table1(dechirp_sign=sign)
     s = Scatterers(*(torch.tensor([x], dtype=torch.float64) for x in (0.0, 0.0)), torch.ones(1, dtype=torch.complex128))
@@ -80,7 +79,7 @@ def test_moving_sweeps_become_those_at_rest(sign, motion) -> None:
         * still.conj()
         * torch.polar(torch.ones(1, dtype=torch.float64), -torch.tensor([constant], dtype=torch.float64))
     )
-    # K (2 DR / c)^2 / 2 turns of video phase; f(u) of the offset at the first turning point
+    # video phase of K (2 DR / c)^2 / 2 turns, and f(u) times the offset at the first turning point
     moved = (place(sweep_middles(radar, pulse)) * 2 / radar.wave_speed_m_s).abs().max()
     video = math.pi * radar.chirp_rate_hz_s * float(moved) ** 2
     band = math.pi * radar.bandwidth_hz * 2 * float(place(zero).abs()) / radar.wave_speed_m_s
@@ -95,9 +94,11 @@ def test_moving_sweeps_become_those_at_rest(sign, motion) -> None:
     )
 
 
-def test_envelopes_come_along_only_with_f_of_u() -> None:
-    """Erratum 11: at 5 m/s the range moves by 4 cm in 512 periods; the carrier alone leaves the
-    envelopes where they went (peak 274 of 355, exact 352).
+def test_envelopes_are_corrected_only_with_f_of_u() -> None:
+    """At 5 m/s the range changes by 4 cm in 512 periods.
+
+    The phase of the carrier alone leaves the envelopes displaced: a peak of 274 of 355, 352 with
+    f(u).
     """
     sweeps, pulse, truth = seen(n=512, motion=(Polynomial([5.0, 100.0]),))
     v = truth.values["velocity_m_s"]
@@ -117,7 +118,7 @@ def curve(pulse: Axis) -> torch.Tensor:
 
 
 def sinc_of_bin() -> float:
-    """What the cell nearest to RD 1.5 m shows of a scatterer between two cells."""
+    """Response of the cell nearest to RD 1.5 m to a scatterer between two cells."""
     off = 1.5 / RADAR.range_step_m - round(1.5 / RADAR.range_step_m)
     return math.sin(math.pi * off) / (math.pi * off) if off else 1.0
 
@@ -137,7 +138,7 @@ def test_polynomial_phasor_in_both_precisions_and_under_vmap() -> None:
         assert float((mapped - true).abs().max()) < bound
 
 
-def test_a_loud_neighbour_does_not_spoil_small_bends() -> None:
+def test_a_large_trial_does_not_degrade_small_quadratic_terms() -> None:
     sweeps, pulse, truth = seen(n=12, dtype=torch.complex64)
     v = truth.values["velocity_m_s"]
     wild = 5.0 * (-1.0) ** torch.arange(12, dtype=torch.float64)
@@ -159,9 +160,7 @@ def test_range_error_adds_velocities_and_phases() -> None:
 
 
 def test_phase_has_the_sign_of_the_range() -> None:
-    """The chain with a wrong sign would double the noise of the velocities instead of
-    removing it.
-    """
+    """With the wrong sign the chain would double the noise of the velocities."""
     sweeps, pulse, truth = seen(n=128, trials=2, snr_db=0.0)
     found = radial_motion(sweeps, RADAR, pulse, window_m=GATE)
     middle = sweep_middles(RADAR, pulse)[0]
@@ -174,10 +173,10 @@ def test_phase_has_the_sign_of_the_range() -> None:
     assert error[0] < 0.3 * error[1] and error[2] > 1.7 * error[1]
 
 
-def test_refusals() -> None:
+def test_invalid_input_is_rejected() -> None:
     sweeps, pulse, truth = seen(n=4)
     v = truth.values["velocity_m_s"]
-    with pytest.raises(ValueError, match="one velocity a period"):
+    with pytest.raises(ValueError, match="one velocity per period"):
         compensate_motion(sweeps, v[:3], RADAR, pulse)
     with pytest.raises(ValueError, match="1 velocities are NaN or Inf"):
         compensate_motion(sweeps, torch.where(v == v[1], torch.nan, v), RADAR, pulse)

@@ -1,6 +1,4 @@
-"""What all estimators of the radial velocity have in common, without noise: brief 000, section 11,
-and its errata.
-"""
+"""Common properties of all estimators of the radial velocity, without noise."""
 
 from __future__ import annotations
 
@@ -14,7 +12,7 @@ from torchsar.compensate.radial.peak import from_beats
 from torchsar.scene import Points, Polynomial
 
 RADAR = table1()
-# rms error without noise, m/s: grids and summed bins leave something, the others next to nothing
+# rms error without noise in m/s: only grids and summed bins leave a noticeable one
 FLOOR = {
     "segmented": 5e-7,
     "segmented_sum": 1e-4,
@@ -38,10 +36,8 @@ def test_without_noise(name, window) -> None:
 
 
 @pytest.mark.parametrize("name", IDS)
-def test_rest_is_the_geometry(name) -> None:
-    """The echo of a target at rest has the velocity V (V t - x) / R, which azimuth_m takes out:
-    erratum 14.
-    """
+def test_a_static_target_has_the_geometric_velocity(name) -> None:
+    """The echo of a static target has the velocity V (V t - x) / R, which azimuth_m removes."""
     radar = table1(speed_m_s=600.0)
     sweeps, pulse, _ = seen(radar, motion=(), scene=Points([0.02], [1.5], [1.0]))
     found = ESTIMATORS[name](sweeps, radar, pulse, window_m=GATE, azimuth_m=0.02)
@@ -55,7 +51,7 @@ def test_rest_is_the_geometry(name) -> None:
 
 
 @pytest.mark.parametrize("name", IDS)
-def test_both_dechirp_signs_are_the_same(name) -> None:
+def test_both_dechirp_signs_give_the_same_velocity(name) -> None:
     first, pulse, _ = seen()
     second, _, _ = seen(table1(dechirp_sign="echo_conj_lo"))
     assert torch.equal(second, first.conj())
@@ -70,9 +66,9 @@ def test_both_dechirp_signs_are_the_same(name) -> None:
 @pytest.mark.parametrize("name", IDS)
 @pytest.mark.parametrize("speed", [0.01, 0.0484, 0.05, 3.0, 12.5, 19.5])
 def test_velocities_to_the_band_limit_and_their_sign(name, speed) -> None:
-    """RD 1.5 m beats at 6.25 MHz; 20 m/s add 25.8 MHz to it, and 32 are there.
+    """RD 1.5 m has a beat of 6.25 MHz; 20 m/s add 25.8 MHz to it, and the band ends at 32 MHz.
 
-    Beyond lambda fs / 8 = 12.4 m/s the tone of a mirror product would fold, but for the shift.
+    Beyond lambda fs / 8 = 12.4 m/s the tone of a mirror product would alias without the shift.
     """
     for sign in (1, -1):
         sweeps, pulse, truth = seen(motion=(Polynomial([sign * speed]),), n=16)
@@ -80,9 +76,10 @@ def test_velocities_to_the_band_limit_and_their_sign(name, speed) -> None:
 
 
 @pytest.mark.parametrize("name", ["segmented", "peak"])
-def test_the_factor_of_the_band(name) -> None:
-    """Without 1 + B / 2 fc the error is 1.29e-5 of the velocity: below 1e-5 m/s here, and below
-    2e-6 with it (erratum 8).
+def test_the_factor_of_the_bandwidth_removes_a_bias(name) -> None:
+    """Without the factor 1 + B / (2 fc) the relative error is 1.29e-5.
+
+    That is below 1e-5 m/s here; with the factor the error is below 2e-6 m/s.
     """
     sweeps, pulse, truth = seen()
     factor = 1 + RADAR.bandwidth_hz / (2 * RADAR.carrier_hz)
@@ -97,8 +94,8 @@ def test_the_factor_of_the_band(name) -> None:
 
 
 @pytest.mark.parametrize("name", IDS)
-def test_batch_equals_singles_and_ignores_loud_neighbours(name) -> None:
-    """Over blocks of trials, and beside trials of other levels, other velocities, and garbage."""
+def test_a_batch_equals_single_trials_beside_strong_neighbours(name) -> None:
+    """In blocks of trials, and beside trials of other levels, other velocities and noise."""
     sweeps, pulse, _ = seen(trials=3, snr_db=10.0, n=24, dtype=torch.complex64)
     g = torch.Generator().manual_seed(0)
     others = torch.stack(
@@ -135,7 +132,7 @@ def test_single_precision_is_enough(name) -> None:
 
 
 @pytest.mark.parametrize("name", IDS)
-def test_refusals(name) -> None:
+def test_invalid_input_is_rejected(name) -> None:
     sweeps, pulse, _ = seen(n=2)
     estimator = ESTIMATORS[name]
     with pytest.raises(TypeError, match="complex sweeps"):
@@ -154,8 +151,9 @@ def test_refusals(name) -> None:
 
 
 def test_a_velocity_that_rises_steeply_is_followed_to_the_ends() -> None:
-    """The shift of blocks of 8 periods goes on along a line to the ends of the record, whose last
-    block is short.
+    """The shift of blocks of 8 periods is extrapolated linearly to the ends of the record.
+
+    The last block is short.
     """
     sweeps, pulse, truth = seen(motion=(Polynomial([-1.5, 1500.0]),), n=69, scene=ONE)
     for name in ("segmented_sum", "mirror", "peak"):
@@ -169,7 +167,7 @@ def test_a_velocity_that_rises_steeply_is_followed_to_the_ends() -> None:
         ), name
 
 
-def test_common_motion_is_not_trivial() -> None:
+def test_the_common_motion_is_not_trivial() -> None:
     _, _, truth = seen(n=512, motion=COMMON, fidelity=None)
     v = truth.values["velocity_m_s"]
     assert 0.25 < float(v.min()) < 0.35 and 0.55 < float(v.max()) < 0.65

@@ -9,20 +9,21 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchsar.compensate.rotation.entropy_search import (
+from torchsar.compensate.rotation import (
+    EntropyObjective,
+    ImageEntropy,
     RotationDescent,
     RotationEvolution,
     RotationGenetic,
     RotationNewton,
     RotationSearch,
+    Unknowns,
     descend_rotation,
     evolve_rotation,
     genetic_rotation,
     newton_rotation,
     search_rotation,
 )
-from torchsar.compensate.rotation.image_entropy import ImageEntropy
-from torchsar.compensate.rotation.unknowns import Unknowns
 from torchsar.core import Chain, Draws, Estimate, Signal, use
 from torchsar.core.warp import shape_of, warp
 from torchsar.metrics.image import entropy
@@ -47,7 +48,7 @@ def echo(
     yc_m: float = 0.0,
     k: Tensor = K,
 ) -> Tensor:
-    """Eq. (3) of brief 003 with exact sine and cosine, (pulse, range)."""
+    """Remote Sens. 2025, 17, 3447, Eq. (3), with exact sine and cosine, (pulse, range)."""
     angle = OMEGA * warp(torch.arange(n_pulse, dtype=F64) / prf_hz, k)
     path = x[:, None] * torch.sin(angle) + (y + yc_m)[:, None] * (torch.cos(angle) - 1)
     phasor = torch.exp(-4j * math.pi / WAVELENGTH * path) * amplitude[:, None]
@@ -64,9 +65,8 @@ def target(seed: int = 0, yc_m: float = 0.0, k: Tensor = K, snr_db: float = 20.0
 
 
 def figure(data: Tensor, **options) -> ImageEntropy:
-    return ImageEntropy(
-        data, wavelength_m=WAVELENGTH, prf_hz=PRF, range_m=RANGE_M, **{"oversampling": 4.0, "taps": 8, **options}
-    )
+    objective = EntropyObjective(**{"oversampling": 4.0, "taps": 8, **options})
+    return ImageEntropy(data, objective, wavelength_m=WAVELENGTH, prf_hz=PRF, range_m=RANGE_M)
 
 
 def signal_of(data: Tensor) -> Signal:
@@ -95,7 +95,7 @@ def test_the_objective_is_the_entropy_of_the_image() -> None:
 
 
 @pytest.mark.parametrize("range_term", [True, False])
-def test_both_kinds_of_variables_mean_the_same_rotation(range_term: bool) -> None:
+def test_both_kinds_of_variables_describe_the_same_rotation(range_term: bool) -> None:
     raw, shape = (figure(target(), variables=variables, range_term=range_term) for variables in ("raw", "shape"))
     x, q = raw.start(OMEGA, K), shape.start(OMEGA, K)
     torch.testing.assert_close(shape(q[None]), raw(x[None]), atol=1e-9, rtol=0)
@@ -120,7 +120,7 @@ def test_gradients_against_differences(variables) -> None:
     torch.testing.assert_close(hessian, torch.stack(rows), atol=1e-4, rtol=1e-3)
 
 
-def test_impossible_candidates_cost_infinity() -> None:
+def test_infeasible_candidates_have_infinite_entropy() -> None:
     for variables in ("raw", "shape"):
         of = figure(target(), variables=variables)
         good = of.start(OMEGA, K)
@@ -146,7 +146,7 @@ def test_candidates_in_blocks_and_batches_equal_single_ones() -> None:
     torch.testing.assert_close(two(x.expand(2, 3, 40, 3))[0], together, atol=2e-5, rtol=0)
 
 
-def test_no_compensation_is_even_rotation_without_range_phase() -> None:
+def test_no_compensation_is_uniform_rotation_without_range_phase() -> None:
     of = figure(target())
     still = of(torch.tensor([[0.0, 0.0, 0.0]], dtype=F64))
     torch.testing.assert_close(of.uncompensated(), still[0], atol=1e-12, rtol=0)
@@ -154,7 +154,7 @@ def test_no_compensation_is_even_rotation_without_range_phase() -> None:
 
 @pytest.mark.parametrize("variables", ["raw", "shape"])
 @pytest.mark.parametrize("factor", [0.9, 1.0, 1.1])
-def test_descents_from_any_start_end_at_one_minimum(variables, factor: float) -> None:
+def test_descents_from_any_start_reach_one_minimum(variables, factor: float) -> None:
     of = figure(target(), variables=variables)
     start = of.start(factor * OMEGA, factor * K)
     descent, newton = descend_rotation(of, start), newton_rotation(of, start)
@@ -167,7 +167,7 @@ def test_descents_from_any_start_end_at_one_minimum(variables, factor: float) ->
     assert torch.equal(descent["warp_k"], torch.stack([descent["k1_per_s"], descent["k2_per_s2"]]))
 
 
-def test_plain_newton_diverges_and_says_so() -> None:
+def test_undamped_newton_diverges_and_is_not_ok() -> None:
     of = figure(target())
     for factor in (0.9, 1.1):
         found = newton_rotation(of, of.start(factor * OMEGA, factor * K), damped=False)
@@ -176,7 +176,7 @@ def test_plain_newton_diverges_and_says_so() -> None:
         assert newton_rotation(of, of.start(factor * OMEGA, factor * K)).ok
 
 
-def test_populations_find_the_same_minimum_and_keep_their_box() -> None:
+def test_population_searches_find_the_minimum_inside_their_box() -> None:
     of = figure(target(), oversampling=2.0, taps=4, lines=600)
     best = descend_rotation(of, of.start(OMEGA, K)).info["entropy_nats"]
     low, high = 0.7 * TRUTH, 1.3 * TRUTH
@@ -184,10 +184,10 @@ def test_populations_find_the_same_minimum_and_keep_their_box() -> None:
         assert found.ok and abs(float(found.info["entropy_nats"] - best)) < 0.02
     assert found.info["evaluations"] == 888 and found.info["best_entropy_nats"].shape == (37,)
     outside = evolve_rotation(of, 1.1 * TRUTH, 1.3 * TRUTH, draws=Draws(1), generations=8)
-    assert not outside.ok and outside.info["on_edge"].any(), "the minimum lies outside of this box"
+    assert not outside.ok and outside.info["on_edge"].any(), "the minimum lies outside this box"
 
 
-def test_the_grid_is_a_landscape() -> None:
+def test_the_grid_search_returns_the_entropy_on_the_grid() -> None:
     of = figure(target(), oversampling=2.0, taps=4)
     axes = [[OMEGA], [9.0, 9.5, 10.0, 10.5, 11.0], [900.0, 1000.0, 1100.0]]
     found = search_rotation(of, axes)
@@ -197,7 +197,7 @@ def test_the_grid_is_a_landscape() -> None:
     assert not edge.ok and edge.info["on_edge"].tolist() == [False, True, False]
 
 
-def test_the_centre_deviation_is_searched_for_jointly() -> None:
+def test_the_centre_deviation_is_found_jointly() -> None:
     data = target(yc_m=1.5)
     blind, told, joint = (
         descend_rotation(of, of.start(OMEGA, K))
@@ -208,7 +208,7 @@ def test_the_centre_deviation_is_searched_for_jointly() -> None:
 
 
 def test_second_order_finds_the_middle_rate() -> None:
-    """SM on the three points of experiment 1: not k1 = 10 but about k1 + k2 T / 2 = 20."""
+    """The second-order method on three points finds not k1 = 10 but about k1 + k2 T / 2 = 20."""
     one = torch.tensor([0.0], dtype=F64)
     data = echo(
         torch.tensor([-12.0, 0.0, 12.0], dtype=F64),
@@ -219,22 +219,24 @@ def test_second_order_finds_the_middle_rate() -> None:
         one + 12.0,
         1.0,
     )
-    of = ImageEntropy(data, wavelength_m=WAVELENGTH, prf_hz=1e6, range_m=one, order=2, range_term=False)
+    of = ImageEntropy(
+        data, EntropyObjective(order=2, range_term=False), wavelength_m=WAVELENGTH, prf_hz=1e6, range_m=one
+    )
     coarse = search_rotation(of, [torch.linspace(0, 40, 41, dtype=F64)])
     found = descend_rotation(of, of.start(0.0, coarse["warp_k"]))
     assert found.ok and abs(float(found["k1_per_s"]) - 20) < 0.6
     assert set(found.value) == {"warp_k", "k1_per_s"}
 
 
-def test_even_rotation_is_not_improved_upon() -> None:
+def test_uniform_rotation_is_not_improved() -> None:
     still = target(k=torch.zeros(2, dtype=F64))
     of = figure(still, range_term=False, oversampling=2.0)
     found = descend_rotation(of, of.start(0.0, torch.zeros(2, dtype=F64)))
     assert not found.ok and found.quality < 0.02
-    assert abs(float(found["k1_per_s"])) < 3, "24 points move the minimum by that much"
+    assert abs(float(found["k1_per_s"])) < 3, "24 points shift the minimum by less than this"
 
 
-def test_a_batch_equals_its_singles() -> None:
+def test_a_batch_equals_single_trials() -> None:
     data = torch.stack([target(0), 100 * target(1), target(2, k=torch.tensor([20.0, -500.0], dtype=F64))])
     kinds = {
         "descent": lambda of: descend_rotation(of, of.start(OMEGA, 0.95 * K), steps=5),
@@ -269,7 +271,7 @@ def stages() -> list:
 
 @pytest.mark.parametrize("stage", stages(), ids=lambda stage: type(stage).__name__)
 @pytest.mark.parametrize("dtype", [torch.complex64, torch.complex128])
-def test_stages_offer_what_they_promise(stage, dtype: torch.dtype) -> None:
+def test_stages_provide_what_they_declare(stage, dtype: torch.dtype) -> None:
     found = stage(signal_of(torch.stack([target(0), target(1)]).to(dtype)))
     assert set(found.value) == set(stage.provides) == {"omega_rad_s", "warp_k", "yc_m", "k1_per_s", "k2_per_s2"}
     assert found["warp_k"].shape == (2, 2) and found["omega_rad_s"].shape == (2,)
@@ -278,10 +280,17 @@ def test_stages_offer_what_they_promise(stage, dtype: torch.dtype) -> None:
     assert ((found.quality >= 0) & (found.quality <= 1)).all()
 
 
-def test_a_search_hands_its_result_to_a_descent() -> None:
+def test_a_descent_starts_from_the_result_of_a_search() -> None:
     chain = Chain(
-        coarse=RotationSearch(RADAR, [OMEGA, 8.0, 800.0], [OMEGA, 12.0, 1200.0], [1, 5, 5], oversampling=1.0),
-        fine=use(RotationDescent(RADAR, oversampling=4.0), omega_rad_s="coarse", warp_k="coarse", yc_m="coarse"),
+        coarse=RotationSearch(
+            RADAR, [OMEGA, 8.0, 800.0], [OMEGA, 12.0, 1200.0], [1, 5, 5], EntropyObjective(oversampling=1.0)
+        ),
+        fine=use(
+            RotationDescent(RADAR, objective=EntropyObjective(variables="shape", oversampling=4.0)),
+            omega_rad_s="coarse",
+            warp_k="coarse",
+            yc_m="coarse",
+        ),
     )
     trace = chain.trace(signal_of(target()))
     coarse, fine = trace.estimates["coarse"], trace.estimates["fine"]
@@ -289,7 +298,7 @@ def test_a_search_hands_its_result_to_a_descent() -> None:
     assert not torch.equal(coarse["warp_k"], fine["warp_k"])
 
 
-def test_refusals() -> None:
+def test_invalid_input_is_rejected() -> None:
     data = target()
     with pytest.raises(ValueError, match="at least 8 pulses"):
         figure(data[:7])
@@ -331,12 +340,12 @@ def test_any_order(order: int) -> None:
     assert turn.feasible and turn.yc_m == 1.0
 
 
-def test_sequences_are_vectors() -> None:
+def test_sequences_are_accepted_as_vectors() -> None:
     values: Sequence[float] = [0.02, 10.0, 1000.0]
     assert torch.equal(Unknowns(0.02).vector(values, "start"), TRUTH)
 
 
-def test_a_search_that_runs_out_of_steps_is_not_believed() -> None:
+def test_a_search_that_uses_up_its_steps_is_not_ok() -> None:
     of = figure(target(), variables="shape")
     start = of.start(0.9 * OMEGA, 0.9 * K)
     assert not descend_rotation(of, start, steps=2).ok and not newton_rotation(of, start, steps=2).ok

@@ -1,6 +1,4 @@
-"""The mathematics below the estimators of uneven rotation, against automatic differentiation and
-plain sums.
-"""
+"""The mathematics of the estimators of non-uniform rotation, against autograd and plain sums."""
 
 from __future__ import annotations
 
@@ -53,7 +51,7 @@ def test_slopes_of_the_normalised_warp(order: int) -> None:
         torch.testing.assert_close(warped.slopes[i], slopes.mT, rtol=1e-9, atol=1e-15)
 
 
-def test_the_range_term_is_taken_out() -> None:
+def test_the_range_term_is_removed() -> None:
     data, motion = target(0), Motion(K[None], *torch.tensor([[4e-4], [2e-4], [1.5]], dtype=F64))
     phi = warp(TIME, K)
     lever = RANGE_M + 1.5 + 0.5  # v = w / 2
@@ -82,7 +80,7 @@ def test_noise_power_and_threshold() -> None:
     found = noise_power(3.0 * power)
     torch.testing.assert_close(found, torch.full((20,), 3.0, dtype=F64), rtol=0.05, atol=0)
     above = (power > threshold(power)).flatten(1).any(1).sum()
-    assert above <= 6, "pixels of noise exceed the threshold once in some ten images"
+    assert above <= 6, "noise exceeds the threshold once in about ten images"
     power[0, :50] += 1e6
     assert abs(float(noise_power(3.0 * power)[0]) / 3 - 1) < 0.25, (
         "a tenth of the image full of scatterers moves the median a little"
@@ -119,10 +117,8 @@ def plain_peaks(power: Tensor, floor: float, share: float, lines: int, cells: in
 
 
 @pytest.mark.parametrize("error", [(1.0, -60.0), (-2.0, 60.0)])
-def test_histories_correct_an_error(error: tuple[float, float]) -> None:
-    """One step takes out most of an error as of the coarse warp, and finds a rate that was not
-    known.
-    """
+def test_phase_histories_correct_an_error_of_the_motion(error: tuple[float, float]) -> None:
+    """One step removes most of the error of a coarse warp, and finds an unknown rate."""
     data, motion = target(0)[None], Motion.still((K + torch.tensor(error, dtype=F64))[None])
     offset = (motion.k[0] - K).abs()
     once, found = refined_by_histories(data, SAMPLING, motion)
@@ -132,7 +128,7 @@ def test_histories_correct_an_error(error: tuple[float, float]) -> None:
     assert ((once.k[0] - K).abs() < 0.5 * offset).all() and ((thrice.k[0] - K).abs() < 0.3 * offset).all()
 
 
-def test_a_range_term_that_pulses_cannot_follow_is_impossible() -> None:
+def test_an_undersampled_range_term_is_impossible() -> None:
     still, wild, broken = Motion.still(K[None]), truth(), truth()
     assert still.possible(SAMPLING) and truth().possible(SAMPLING) and truth(centre_m=-50.0).possible(SAMPLING)
     for motion in (
@@ -143,14 +139,14 @@ def test_a_range_term_that_pulses_cannot_follow_is_impossible() -> None:
         assert not motion.possible(SAMPLING)
 
 
-def test_histories_of_nothing_leave_the_motion() -> None:
+def test_histories_of_empty_data_leave_the_motion_unchanged() -> None:
     start = Motion.still(K[None].expand(2, -1))
     for data in (torch.zeros(2, PULSES, 24, dtype=torch.complex128), 0 * noise(0, 2, PULSES, 24)):
         motion, found = refined_by_histories(data, SAMPLING, start)
         assert torch.equal(motion.k, start.k) and found.tolist() == [0, 0] and motion.w.tolist() == [0, 0]
 
 
-def test_small_equations_of_any_scale() -> None:
+def test_small_normal_equations_of_any_scale_are_solved() -> None:
     rows = torch.randn(3, 10, 4, dtype=F64, generator=torch.Generator().manual_seed(0)) * torch.tensor(
         [1e-9, 1.0, 1e6, 1e3], dtype=F64
     )
@@ -170,20 +166,20 @@ FEW = 6
 
 
 def few() -> tuple[Scatterers, Motion]:
-    """Six scatterers that overlap, their Doppler cells on the steps of the table of couplings."""
+    """Six overlapping scatterers, with Doppler cells on the steps of the table of couplings."""
     source = torch.Generator().manual_seed(3)
     level, phase, cell, row = (torch.rand(1, FEW, dtype=F64, generator=source) for _ in range(4))
-    motion = Motion(
-        K[None], *torch.tensor([[1e-7], [1e-4], [0.7]], dtype=F64)
-    )  # couplings leave out that range terms differ between cells
+    # a small range term, since couplings neglect that it differs between range cells
+    motion = Motion(K[None], *torch.tensor([[1e-7], [1e-4], [0.7]], dtype=F64))
     return Scatterers(torch.polar(0.5 + level, 6 * phase), (6 * 16 * (cell - 0.5)).round() / 16, 5 + 4 * row), motion
 
 
 def model(unknown: Tensor, found: Scatterers, motion: Motion) -> Tensor:
-    """Data of scatterers whose growth, turn, Doppler cell and row, and whose k, w and v, move by
-    `unknown`.
+    """Data of scatterers and a motion that are changed by `unknown`.
 
-    As a step takes it, the range term stays that of the first rows and of the first warp.
+    Its entries are relative amplitude, phase, Doppler cell and range cell of the scatterers, then
+    k, w and v. As a step assumes, the range term stays that of the first range cells and of the
+    first warp.
     """
     grow, turn, line, row = unknown[: 4 * FEW].view(4, FEW)
     k, w, v = (
@@ -260,7 +256,7 @@ def test_gradient_and_curvature_of_a_step_are_those_of_the_model(gaps: bool) -> 
     torch.testing.assert_close(mine / size / size[:, None], flat.mT @ flat / size / size[:, None], rtol=0, atol=2e-3)
 
 
-def test_steps_explain_all_of_clean_data() -> None:
+def test_steps_explain_all_energy_of_noise_free_data() -> None:
     found, motion = few()
     near = torch.zeros(4 * FEW + 4, dtype=F64)
     near[: 2 * FEW], near[2 * FEW : 3 * FEW], near[3 * FEW : 4 * FEW] = 0.03, 0.02, -0.01

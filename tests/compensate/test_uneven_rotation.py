@@ -1,6 +1,4 @@
-"""The recommended estimator of uneven rotation, its steps, and the stages about it, on targets of
-thirty points.
-"""
+"""The recommended estimator of non-uniform rotation, its steps and stages, on thirty points."""
 
 from __future__ import annotations
 
@@ -48,7 +46,7 @@ ESTIMATORS = {"coarse": coarse_rotation, "phase_fit": phase_fit_rotation, "uneve
 
 
 def z_scores(found: Estimate, k: Tensor, yc_m: float | None = 0.0) -> Tensor:
-    """Errors over predicted deviations, (trial, unknown)."""
+    """Errors over predicted standard deviations, (trial, unknown)."""
     truth = {"omega_rad_s": OMEGA, **{f"k{i + 1}_per_s{i + 1 if i else ''}": float(value) for i, value in enumerate(k)}}
     truth |= {} if yc_m is None else {"yc_m": yc_m}
     return torch.stack([(found[name] - value) / found.std[name] for name, value in truth.items()], -1)
@@ -58,8 +56,9 @@ def z_scores(found: Estimate, k: Tensor, yc_m: float | None = 0.0) -> Tensor:
     "k", [(10.0, 1000.0), (0.0, 0.0), (20.0, -500.0), (-5.0, 3000.0), (40.0, 0.0), (0.0, 5000.0)], ids=str
 )
 def test_any_rotation_is_found_without_a_start(k: tuple[float, float]) -> None:
-    """Far outside of any box about the truth; (0, 5000) is where the first step of the brief was
-    wrong. What is wrong is not ok.
+    """Rotations far outside of any box about the truth; what is wrong is not ok.
+
+    (0, 5000) is the hardest: the rate doubles over the aperture.
     """
     truth = torch.tensor(k, dtype=F64)
     found = uneven_rotation(targets(4, k=truth), **OPTIONS)
@@ -85,11 +84,11 @@ def test_a_known_centre_per_trial() -> None:
         assert torch.equal(found["yc_m"], centre)
         assert name == "coarse" or (found["omega_rad_s"] / OMEGA - 1).abs().max() < 0.05
     wrong = uneven_rotation(data, **OPTIONS, yc_m=0.0)
-    assert (wrong["omega_rad_s"] / OMEGA - 1).abs().tolist()[0] > 0.02, "a centre that is not there biases the rate"
+    assert (wrong["omega_rad_s"] / OMEGA - 1).abs().tolist()[0] > 0.02, "a wrong range centre biases the rate"
 
 
 @pytest.mark.parametrize("snr_db", [0.0, 20.0])
-def test_deviations_are_predicted_and_at_the_bound(snr_db: float) -> None:
+def test_predicted_std_matches_the_errors_and_the_bound(snr_db: float) -> None:
     data = torch.stack([target(0, snr_db, draw=draw) for draw in range(10)])
     found = uneven_rotation(data, **OPTIONS)
     x, y, amplitude = points(0)
@@ -102,7 +101,7 @@ def test_deviations_are_predicted_and_at_the_bound(snr_db: float) -> None:
     assert (rms > 0.5).all() and (rms < 1.5).all()
 
 
-def test_each_step_comes_closer() -> None:
+def test_each_step_reduces_the_error() -> None:
     data = targets(4)
     errors = {
         name: (estimator(data, **OPTIONS)["warp_k"] / K - 1).abs().median(0).values
@@ -115,8 +114,8 @@ def test_each_step_comes_closer() -> None:
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
-def test_a_batch_equals_its_singles(name: str) -> None:
-    """With neighbours that are louder, empty, noise alone, or settle at another step."""
+def test_a_batch_equals_single_trials(name: str) -> None:
+    """Beside trials that are stronger, empty, pure noise, or that converge after another step."""
     data = torch.stack(
         [target(0), 1e4 * target(1, -5.0), torch.zeros(PULSES, 24), noise(0, PULSES, 24), 1e-4 * target(2, 40.0)]
     ).to(torch.complex128)
@@ -160,8 +159,8 @@ def test_the_scale_of_the_data_does_not_matter(scale: float) -> None:
         torch.testing.assert_close(small["warp_k"], found["warp_k"], rtol=1e-4, atol=0)
 
 
-def test_where_the_range_axis_begins() -> None:
-    """An axis that is shifted as a whole is a centre deviation; one that is cropped is none."""
+def test_the_origin_of_the_range_axis_is_the_centre_deviation() -> None:
+    """A shift of the whole axis is a centre deviation; a cropped axis is not."""
     data = target(4)
     usual = uneven_rotation(data, **OPTIONS)
     shifted = uneven_rotation(data, **{**OPTIONS, "range_m": RANGE_M + 700.0})
@@ -183,7 +182,7 @@ def test_odd_and_missing_pulses() -> None:
 
 
 def with_gaps(data: Tensor, share: float) -> Tensor:
-    """Without a share of its pulses, at random places."""
+    """Without a share of its pulses, at random positions."""
     missing = torch.rand(len(data), generator=torch.Generator().manual_seed(5)) < share
     return torch.where(missing[:, None], 0, data)
 
@@ -206,7 +205,7 @@ def degenerate() -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("kind", degenerate())
-def test_what_cannot_be_known_is_not_ok_but_finite(kind: str) -> None:
+def test_undetermined_rotations_are_finite_and_not_ok(kind: str) -> None:
     data = degenerate()[kind]
     for estimator in ESTIMATORS.values():
         found = estimator(data, **OPTIONS)
@@ -216,21 +215,21 @@ def test_what_cannot_be_known_is_not_ok_but_finite(kind: str) -> None:
     assert not uneven_rotation(data, **OPTIONS).ok
 
 
-def test_the_same_again() -> None:
+def test_results_are_reproducible() -> None:
     data = targets(2, snr_db=0.0).to(torch.complex64)
     once, again = uneven_rotation(data, **OPTIONS), uneven_rotation(data.clone(), **OPTIONS)
     assert all(torch.equal(value, again[name]) for name, value in once.value.items())
 
 
-def test_the_coarse_warp_turns_on_and_on() -> None:
-    """Whatever the data: a warp that turns back has no image."""
+def test_the_coarse_warp_is_monotonic() -> None:
+    """On any data: a warp that is not monotonic has no image."""
     data = torch.cat([noise(0, 4, PULSES, 24), torch.zeros(1, PULSES, 24), torch.ones(1, PULSES, 24)])
     k = coarse_warp(data, PRF)
     assert torch.isfinite(k).all() and (least_rate(k, PULSES / PRF) > 0).all()
     assert coarse_warp(data[:, :8], PRF).shape == (6, 2) and torch.isfinite(coarse_warp(data[:, :9, :1], PRF)).all()
 
 
-def test_the_coarse_warp_does_not_see_the_rate_or_the_scale_of_the_pulse_rate() -> None:
+def test_the_coarse_warp_does_not_depend_on_the_rate_or_the_pulse_rate() -> None:
     data = target(0)
     k = coarse_warp(data[None], PRF)
     torch.testing.assert_close(
@@ -254,13 +253,13 @@ def signal_of(data: Tensor) -> Signal:
     ],
     ids=lambda s: type(s).__name__,
 )
-def test_stages_offer_what_they_promise(stage) -> None:
+def test_stages_provide_what_they_declare(stage) -> None:
     found = stage(signal_of(targets(2).to(torch.complex64)))
     assert set(found.value) == set(stage.provides)
     assert found["warp_k"].shape == (2, stage.order - 1) and torch.equal(found["warp_k"][:, 0], found["k1_per_s"])
 
 
-def test_stages_are_the_functions_on_axes() -> None:
+def test_stages_equal_the_functions() -> None:
     data = target(0, yc_m=0.7)
     found = UnevenRotation(RADAR)(signal_of(data), yc_m=torch.tensor(0.7, dtype=F64))
     assert torch.equal(found["warp_k"], uneven_rotation(data, **OPTIONS, yc_m=0.7)["warp_k"]) and found["yc_m"] == 0.7
@@ -272,7 +271,7 @@ def pulse_phases() -> Tensor:
     return torch.cumsum(0.15 * torch.randn(PULSES, dtype=F64, generator=torch.Generator().manual_seed(9)), 0)
 
 
-def test_the_autofocus_takes_the_rotation_out() -> None:
+def test_the_autofocus_compensates_the_rotation() -> None:
     walk, data = pulse_phases(), target(0)
     impaired = data * torch.exp(1j * walk)[:, None]
     phi = warp(torch.arange(PULSES, dtype=F64) / PRF, K)
@@ -280,7 +279,7 @@ def test_the_autofocus_takes_the_rotation_out() -> None:
     found = rotating_autofocus(flat, PRF, K[None])
     assert found.ok and off_the_warp(found["phase_rad"] - walk, phi) < 0.1
     blind = RotationAutofocus(RADAR)(signal_of(impaired))
-    assert off_the_warp(blind["phase_rad"] - walk, phi) > 0.3, "an autofocus that knows of no rotation leaves more"
+    assert off_the_warp(blind["phase_rad"] - walk, phi) > 0.3, "an autofocus without the rotation leaves a larger error"
     told = RotationAutofocus(RADAR)(
         signal_of(impaired), omega_rad_s=torch.tensor(OMEGA, dtype=F64), warp_k=K, yc_m=torch.tensor(0.0, dtype=F64)
     )
@@ -288,8 +287,9 @@ def test_the_autofocus_takes_the_rotation_out() -> None:
 
 
 def off_the_warp(error: Tensor, phi: Tensor) -> float:
-    """Rms of phases (rad), to the nearest turn, less the constant and the line in the warp that no
-    image shows: the brightest line of their spectrum over the warp.
+    """Rms of phases (rad), on the circle, without the constant and the line in the warp.
+
+    These do not show in an image; the line is the maximum of the spectrum over the warp.
     """
     cells = torch.linspace(-40, 40, 4001, dtype=F64)
     angle = error - 2 * math.pi * cells[:, None] * phi / phi[-1]
@@ -297,9 +297,10 @@ def off_the_warp(error: Tensor, phi: Tensor) -> float:
     return float(torch.angle(torch.exp(1j * best) / torch.exp(1j * best).mean()).square().mean().sqrt())
 
 
-def test_phase_and_rotation_in_turn() -> None:
-    """A phase that is free in every pulse and a rotation: the autofocus takes yc with it, so the
-    estimator holds it.
+def test_phase_and_rotation_are_estimated_in_turn() -> None:
+    """A free phase per pulse and a rotation.
+
+    The autofocus absorbs yc, so the estimator keeps it fixed.
     """
     impaired = target(0) * torch.exp(1j * pulse_phases())[:, None]
     stage = Alternate(
@@ -313,7 +314,7 @@ def test_phase_and_rotation_in_turn() -> None:
     assert found.info["rotation.entropy_nats"] < alone.info["entropy_nats"] - 0.3
 
 
-def test_refusals() -> None:
+def test_invalid_input_is_rejected() -> None:
     data = target(0)
     with pytest.raises(ValueError, match="at least 8 pulses"):
         uneven_rotation(data[:7], **OPTIONS)
@@ -331,3 +332,13 @@ def test_refusals() -> None:
         uneven_rotation(data, **OPTIONS, order=0)
     with pytest.raises(ValueError, match="an order of 1"):
         UnevenRotation(RADAR, 0)
+
+
+@pytest.mark.parametrize("snr_db", [60.0, 100.0, None])
+def test_noise_below_the_errors_of_the_model_spoils_nothing(snr_db: float | None) -> None:
+    """Residuals of the model are neither scatterers nor evidence against one."""
+    x, y = torch.tensor([-0.3, 0.0, 0.3], dtype=F64), torch.full((3,), 1.2, dtype=F64)
+    clean = echo(x, y, torch.ones(3, dtype=torch.complex128), yc_m=10.8)
+    data = clean if snr_db is None else clean + noise_std(clean, snr_db) * noise(0, *clean.shape)
+    found = uneven_rotation(data.to(torch.complex64), **OPTIONS, yc_m=10.8)
+    assert found.ok and abs(float(found["omega_rad_s"]) / OMEGA - 1) < 1e-3

@@ -1,5 +1,6 @@
-"""Range-compressed pulses of small targets that turn unevenly, made by plain formulas (brief 003,
-Eq. 3, with sine and cosine unabridged).
+"""Range-compressed pulses of small targets with non-uniform rotation, made by plain formulas.
+
+Remote Sens. 2025, 17, 3447, Eq. (3), with exact sine and cosine.
 """
 
 from __future__ import annotations
@@ -21,14 +22,14 @@ OPTIONS = {"wavelength_m": WAVELENGTH, "prf_hz": PRF, "range_m": RANGE_M}
 
 
 def points(seed: int = 0, count: int = 30) -> tuple[Tensor, Tensor, Tensor]:
-    """Cross range over 0.6 m, range over 5.6 m, complex amplitudes of levels 0.5 to 1.5."""
+    """Cross range over 0.6 m, range over 5.6 m, complex amplitudes of 0.5 to 1.5."""
     source = torch.Generator().manual_seed(seed)
     x, y, level, phase = (torch.rand(count, generator=source, dtype=F64) for _ in range(4))
     return 0.6 * (x - 0.5), 5.6 * (y - 0.5), torch.polar(0.5 + level, 2 * math.pi * phase)
 
 
 def echo(x: Tensor, y: Tensor, amplitude: Tensor, k: Tensor = K, yc_m: float = 0.0, n_pulse: int = PULSES) -> Tensor:
-    """(pulse, range) complex128."""
+    """Echo of points, (pulse, range) complex128."""
     angle = OMEGA * warp(torch.arange(n_pulse, dtype=F64) / PRF, k)
     way = x[:, None] * torch.sin(angle) - (y + yc_m)[:, None] * 2 * torch.sin(angle / 2).square()
     return (torch.exp(-4j * math.pi / WAVELENGTH * way) * amplitude[:, None]).mT @ response(
@@ -37,8 +38,9 @@ def echo(x: Tensor, y: Tensor, amplitude: Tensor, k: Tensor = K, yc_m: float = 0
 
 
 def response(x: Tensor, cells: int) -> Tensor:
-    """Of range cells x cells away from a scatterer: the mean of the `cells` frequencies that an FFT
-    of so many samples has.
+    """Response of range cells x cells away from a scatterer.
+
+    It is the mean of the `cells` frequencies of an FFT of so many samples.
     """
     frequency = (torch.arange(cells, dtype=F64) - cells // 2) / cells
     return torch.exp(2j * math.pi * x[..., None] * frequency).mean(-1)
@@ -49,18 +51,21 @@ def noise(seed: int, *shape: int) -> Tensor:
 
 
 def noise_std(clean: Tensor, snr_db: float) -> Tensor:
-    """SNR: mean power of all samples over the noise power."""
+    """Standard deviation of the noise.
+
+    The SNR is the mean power of all samples over the noise power.
+    """
     return (clean.abs().square().mean() * 10 ** (-snr_db / 10)).sqrt()
 
 
 def target(
     seed: int = 0, snr_db: float = 20.0, k: Tensor = K, yc_m: float = 0.0, n_pulse: int = PULSES, draw: int = 0
 ) -> Tensor:
-    """One scene, one draw of the noise."""
+    """One scene with one draw of the noise."""
     clean = echo(*points(seed), k, yc_m, n_pulse)
     return clean + noise_std(clean, snr_db) * noise(100 * seed + draw, *clean.shape)
 
 
 def targets(count: int, **options) -> Tensor:
-    """As many scenes, (trial, pulse, range)."""
+    """Several scenes, (trial, pulse, range)."""
     return torch.stack([target(seed, **options) for seed in range(count)])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import pytest
@@ -46,6 +46,7 @@ from torchsar.compensate import (
 from torchsar.compensate.rotation import (
     ChirpletClean,
     CoarseRotation,
+    EntropyObjective,
     PhaseFitRotation,
     RotationAutofocus,
     RotationDescent,
@@ -249,7 +250,7 @@ def _direct_path(signal: Signal) -> dict[str, Tensor]:
     return {"direct_path": (torch.polar(torch.ones_like(phase), phase)[..., None] * shape).to(signal.data.dtype)}
 
 
-SEARCH = {"oversampling": 1.0, "order": 2}
+SEARCH = EntropyObjective(oversampling=1.0, order=2)
 LIT = Dwell(1.4)
 FEW_VELOCITIES = Search(u_r_m_s=3.0, u_a_m_s=2.0, y0_m=20.0, u_a_step_m_s=1.0)
 
@@ -318,32 +319,32 @@ CASES = [
     Case("matched_fourier", lambda: MatchedFourier(TURNTABLE), _warp),
     Case(
         "rotation_search",
-        lambda: RotationSearch(TURNTABLE, [0.1, -2.0], [0.5, 2.0], [2, 3], **SEARCH),
+        lambda: RotationSearch(TURNTABLE, [0.1, -2.0], [0.5, 2.0], [2, 3], objective=SEARCH),
         differentiable=False,
         vmap=False,
     ),
     Case(
         "rotation_genetic",
-        lambda: RotationGenetic(TURNTABLE, [0.1, -2.0], [0.5, 2.0], population=6, generations=2, **SEARCH),
+        lambda: RotationGenetic(TURNTABLE, [0.1, -2.0], [0.5, 2.0], population=6, generations=2, objective=SEARCH),
         differentiable=False,
         vmap=False,
     ),
     Case(
         "rotation_evolution",
-        lambda: RotationEvolution(TURNTABLE, [0.1, -2.0], [0.5, 2.0], population=6, generations=2, **SEARCH),
+        lambda: RotationEvolution(TURNTABLE, [0.1, -2.0], [0.5, 2.0], population=6, generations=2, objective=SEARCH),
         differentiable=False,
         vmap=False,
     ),
     Case(
         "rotation_newton",
-        lambda: RotationNewton(TURNTABLE, [0.3, 0.5], steps=2, **SEARCH),
+        lambda: RotationNewton(TURNTABLE, [0.3, 0.5], steps=2, objective=replace(SEARCH, taps=6)),
         differentiable=False,
         vmap=False,
         tolerance=1e-3,
     ),
     Case(
         "rotation_descent",
-        lambda: RotationDescent(TURNTABLE, [0.3, 0.5], steps=2, **SEARCH),
+        lambda: RotationDescent(TURNTABLE, [0.3, 0.5], steps=2, objective=replace(SEARCH, variables="shape")),
         differentiable=False,
         vmap=False,
         tolerance=1e-3,

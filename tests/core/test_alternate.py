@@ -1,6 +1,4 @@
-"""Estimators in turn: what each of them sees, what it is handed, and what an alternation
-promises.
-"""
+"""Alternation of estimators: what each receives, what is returned, and invalid arguments."""
 
 from __future__ import annotations
 
@@ -14,18 +12,16 @@ F64 = torch.float64
 
 
 class Mean(Stage):
-    """Estimates a constant that is added to all samples: the mean of what it sees, less a part of
-    what `slope` makes of it.
-    """
+    """Estimator of a constant that is added to all samples; records its arguments."""
 
     provides = ("mean",)
 
     def __init__(self, ok: bool = True, quality: float = 0.5) -> None:
         super().__init__()
-        self.ok, self.quality, self.seen = ok, quality, []
+        self.ok, self.quality, self.received = ok, quality, []
 
     def forward(self, signal: Signal, mean: Tensor | None = None, slope: Tensor | None = None) -> Estimate:
-        self.seen.append((signal.data.clone(), mean, slope))
+        self.received.append((signal.data.clone(), mean, slope))
         found = signal.data.real.mean((-2, -1)).to(F64)
         return Estimate(
             {"mean": found},
@@ -37,9 +33,7 @@ class Mean(Stage):
 
 
 class Slope(Stage):
-    """Estimates a slope over pulses, by the first pulse and the last: a constant in the data would
-    go into it.
-    """
+    """Estimator of a slope over pulses, which a constant in the data biases."""
 
     provides = ("slope",)
 
@@ -50,26 +44,32 @@ class Slope(Stage):
 
 
 class WithoutMean(Stage):
+    """Corrector that subtracts the constant."""
+
     def forward(self, signal: Signal, mean: Tensor) -> Signal:
         return signal.with_data(signal.data - mean[..., None, None])
 
 
 class WithoutSlope(Stage):
+    """Corrector that subtracts the slope."""
+
     def forward(self, signal: Signal, slope: Tensor) -> Signal:
         return signal.with_data(
             signal.data - slope[..., None, None] * torch.arange(signal.data.shape[-2], dtype=F64)[:, None]
         )
 
 
-class Needy(Stage):
-    provides = ("offer",)
+class Dependent(Stage):
+    """Estimator that needs the value of another one."""
+
+    provides = ("copy",)
 
     def forward(self, signal: Signal, slope: Tensor) -> Estimate:
-        return Estimate({"offer": slope}, slope, slope > 0)
+        return Estimate({"copy": slope}, slope, slope > 0)
 
 
 def lines(mean: Tensor, slope: Tensor) -> Signal:
-    """mean + slope m in pulse m."""
+    """Signal with the sample mean + slope m in pulse m."""
     pulse = torch.arange(6, dtype=F64)
     data = (mean[..., None] + slope[..., None] * pulse)[..., None].expand(*mean.shape, 6, 4)
     return Signal(
@@ -81,13 +81,12 @@ MEAN, SLOPE = torch.tensor([1.0, -2.0, 5.0], dtype=F64), torch.tensor([0.5, 0.0,
 
 
 def both(rounds: int, mean: Mean | None = None) -> Alternate:
+    """Alternation between `Mean` and `Slope`."""
     return Alternate(rounds, mean=Turn(mean or Mean(), WithoutMean()), slope=Turn(Slope(), WithoutSlope()))
 
 
-def test_turns_agree_on_what_neither_finds_alone() -> None:
-    """Each turn takes the other's value out of the ORIGINAL data: this is block relaxation of least
-    squares, which converges to both.
-    """
+def test_alternation_converges_to_the_joint_least_squares_solution() -> None:
+    """The alternation is a block relaxation of least squares, which converges to both values."""
     signal = lines(MEAN, SLOPE)
     one, many = both(1)(signal), both(60)(signal)
     assert (one["mean"] - MEAN).abs().max() > 1
@@ -95,11 +94,11 @@ def test_turns_agree_on_what_neither_finds_alone() -> None:
     torch.testing.assert_close(many["slope"], SLOPE, atol=1e-6, rtol=0)
 
 
-def test_each_turn_sees_the_original_less_the_latest_of_the_others() -> None:
+def test_estimators_receive_the_original_signal_with_the_latest_corrections() -> None:
     mean, signal = Mean(), lines(MEAN, SLOPE)
     found = both(3, mean)(signal)
-    assert len(mean.seen) == 3
-    first, second, third = mean.seen
+    assert len(mean.received) == 3
+    first, second, third = mean.received
     assert torch.equal(first[0], signal.data) and first[1] is None and first[2] is None
     torch.testing.assert_close(second[0], WithoutSlope()(signal, second[2]).data, rtol=0, atol=0)
     assert second[1] is not None and third[1] is not None and not torch.equal(second[1], third[1])
@@ -107,13 +106,13 @@ def test_each_turn_sees_the_original_less_the_latest_of_the_others() -> None:
     assert torch.equal(signal.data, lines(MEAN, SLOPE).data)
 
 
-def test_a_turn_without_a_corrector_leaves_the_data() -> None:
+def test_a_turn_without_a_corrector_does_not_change_the_signal() -> None:
     mean, signal = Mean(), lines(MEAN, SLOPE)
     Alternate(2, mean=Turn(mean, WithoutMean()), slope=Turn(Slope()))(signal)
-    assert all(torch.equal(data, signal.data) for data, _, _ in mean.seen) and mean.seen[1][2] is not None
+    assert all(torch.equal(data, signal.data) for data, _, _ in mean.received) and mean.received[1][2] is not None
 
 
-def test_what_comes_back() -> None:
+def test_the_result_has_all_values_and_the_lowest_quality() -> None:
     stage = both(2, Mean(ok=False, quality=0.2))
     assert stage.provides == ("mean", "slope")
     found = stage(lines(MEAN, SLOPE))
@@ -135,30 +134,32 @@ def test_in_a_chain() -> None:
     torch.testing.assert_close(trace.signal.data, lines(0 * MEAN, SLOPE).data, atol=1e-5, rtol=0)
 
 
-def test_it_is_one_module() -> None:
+def test_estimators_are_submodules() -> None:
     stage = Alternate(1, linear=Turn(Holding(2.0)), mean=Turn(Mean(), WithoutMean()))
     assert list(stage.state_dict()) == ["estimators.linear.gain"]
     assert isinstance(stage.to("cpu"), nn.Module)
 
 
 class Holding(Mean):
+    """Estimator with a buffer."""
+
     def __init__(self, gain: float) -> None:
         super().__init__()
         self.hold("gain", gain)
 
 
-def test_refusals() -> None:
+def test_invalid_alternations_raise() -> None:
     with pytest.raises(ValueError, match=r"two turns or more and one round or more, got \['mean'\] and rounds=3"):
         Alternate(mean=Turn(Mean()))
     with pytest.raises(ValueError, match="rounds=0"):
         both(0)
     with pytest.raises(
         ValueError,
-        match=r"the turn 'needy' needs \['slope'\] in the first round, but the turns before it offer nothing",
+        match=r"the turn 'dependent' needs \['slope'\] in the first round, but the turns before it provide nothing",
     ):
-        Alternate(needy=Turn(Needy()), slope=Turn(Slope()))
+        Alternate(dependent=Turn(Dependent()), slope=Turn(Slope()))
     with pytest.raises(
-        ValueError, match=r"the corrector of the turn 'slope' needs \['mean'\], which its estimator does not offer"
+        ValueError, match=r"the corrector of the turn 'slope' needs \['mean'\], which its estimator does not provide"
     ):
         Alternate(slope=Turn(Slope(), WithoutMean()), mean=Turn(Mean()))
-    assert Alternate(slope=Turn(Slope()), needy=Turn(Needy())).provides == ("slope", "offer")
+    assert Alternate(slope=Turn(Slope()), dependent=Turn(Dependent())).provides == ("slope", "copy")

@@ -1,6 +1,4 @@
-"""Composition: named values, different in every trial, consumed inside one batched chain and
-refined by re-running its tail.
-"""
+"""Chains: values per trial, given values, reruns with gradients, and errors."""
 
 from __future__ import annotations
 
@@ -18,7 +16,7 @@ from torchsar.scene import AlwaysLit, Points, StripmapWorld
 
 
 class LagOneDoppler(Stage):
-    """A minimal estimator."""
+    """Minimal estimator of the Doppler centroid."""
 
     provides = ("doppler_hz",)
 
@@ -30,7 +28,7 @@ class LagOneDoppler(Stage):
 
 
 class GivenVelocity(Stage):
-    """An estimator that offers a constant, to be replaced by held values."""
+    """Estimator that returns a constant."""
 
     provides = ("velocity_m_s",)
 
@@ -47,7 +45,7 @@ def squinted_chain(radar):
     )
 
 
-def test_estimates_that_differ_per_trial_are_consumed_and_refined_with_autograd():
+def test_estimates_differ_by_trial_and_are_refined_with_autograd():
     radar = small_radar()
     velocity = torch.tensor([112.0, 120.0, 131.0], dtype=torch.float64)
     doppler = torch.tensor([-60.0, 10.0, 90.0], dtype=torch.float64)
@@ -57,12 +55,12 @@ def test_estimates_that_differ_per_trial_are_consumed_and_refined_with_autograd(
     chain = squinted_chain(radar)
     trace = chain.trace(recording)
     assert trace.values["doppler.doppler_hz"].shape == (3,)
-    # the scene has three points and noise, so the lag-one estimate is only roughly the beam centre
+    # with three points and noise the lag-one estimate is only near the Doppler centroid
     assert float((trace.values["doppler.doppler_hz"] - doppler).abs().max()) < 40
 
     guess = torch.tensor([114.0, 118.0, 128.0], dtype=torch.float64, requires_grad=True)
     step = torch.full((3,), 4.0, dtype=torch.float64)
-    # a per-trial sign step with halving: enough to show that the tail is an objective
+    # steps by the sign of the gradient, halved per trial where the cost rises
     for _ in range(14):
         cost = entropy(chain.rerun(trace, "focus", given={"velocity.velocity_m_s": guess}))
         (slope,) = torch.autograd.grad(cost.sum(), guess)
@@ -73,7 +71,7 @@ def test_estimates_that_differ_per_trial_are_consumed_and_refined_with_autograd(
     assert float((guess.detach() - velocity).abs().max()) < 0.3
 
 
-def test_chain_moves_and_shows_its_state():
+def test_state_dict_and_parameters_of_a_chain():
     chain = Chain(focus=OmegaK(small_radar(), velocity_m_s=nn.Parameter(torch.tensor(120.0, dtype=torch.float64))))
     assert set(chain.state_dict()) == {"stages.focus.velocity_m_s", "stages.focus.doppler_hz"}
     assert [name for name, _ in chain.named_parameters()] == ["stages.focus.velocity_m_s"]
@@ -83,7 +81,7 @@ def test_chain_moves_and_shows_its_state():
     assert float(other.stages["focus"].velocity_m_s.detach()) == 120.0
 
 
-def test_trace_keeps_time_bytes_and_every_intermediate():
+def test_trace_holds_times_sizes_and_every_intermediate_result():
     recording, _ = small_recording()
     trace = squinted_chain(small_radar()).trace(recording)
     assert list(trace.outputs) == ["doppler", "velocity", "focus"]
@@ -92,7 +90,7 @@ def test_trace_keeps_time_bytes_and_every_intermediate():
     assert trace.inputs["focus"] is recording.signal
 
 
-def test_held_values_skip_their_estimator():
+def test_an_estimator_whose_values_are_given_does_not_run():
     recording, _ = small_recording()
     chain = squinted_chain(small_radar())
     held = chain.trace(recording, given={"doppler.doppler_hz": torch.tensor(0.0, dtype=torch.float64)})
@@ -117,12 +115,12 @@ def test_held_values_skip_their_estimator():
         (lambda r: Chain(), "at least one stage"),
     ],
 )
-def test_wrong_connections_are_found_at_construction(build, match):
+def test_wrong_connections_raise_at_construction(build, match):
     with pytest.raises(ValueError, match=match):
         build(small_radar())
 
 
-def test_misuse_names_the_stage_and_what_it_got():
+def test_errors_name_the_stage_and_its_input():
     recording, _ = small_recording()
     image = OmegaK(small_radar())(recording.signal)
     with pytest.raises(ValueError, match=r"OmegaK works on the axes \('pulse', 'range'\), got \('azimuth', 'range'\)"):
@@ -134,9 +132,7 @@ def test_misuse_names_the_stage_and_what_it_got():
 
 
 def test_gradients_flow_from_entropy_to_velocity_and_positions():
-    """One differentiable batch through world, chain and metric, checked against finite
-    differences.
-    """
+    """Scene, chain and metric in one differentiable batch, against finite differences."""
     radar = small_radar()
     chain = Chain(focus=OmegaK(radar, "flat"))
 
@@ -159,7 +155,7 @@ def test_gradients_flow_from_entropy_to_velocity_and_positions():
     assert torch.autograd.gradcheck(cost, (azimuth, range_, velocity), eps=1e-5, atol=1e-6, rtol=1e-4)
 
 
-def test_axis_of_one_sample_step():
+def test_axis_rejects_a_step_of_zero():
     with pytest.raises(ValueError, match="positive step"):
         Axis("range", 3, 0.0, 0.0, "m")
 
@@ -177,18 +173,18 @@ def test_axis_of_one_sample_step():
         ),
     ],
 )
-def test_members_that_are_no_stages_are_refused_at_construction(stages, error, match):
+def test_members_that_are_not_stages_raise_at_construction(stages, error, match):
     with pytest.raises(error, match=match):
         Chain(**stages)
 
 
-def test_a_constant_is_no_connection():
+def test_use_rejects_a_constant():
     with pytest.raises(TypeError, match="doppler_hz=3.0: `use` connects values by name"):
         use(OmegaK(small_radar()), doppler_hz=3.0)
 
 
-def test_a_value_that_nobody_offers_is_refused() -> None:
+def test_a_given_value_with_an_unknown_name_raises() -> None:
     chain, (recording, _) = squinted_chain(small_radar()), small_recording()
     for run in (chain, chain.trace):
-        with pytest.raises(KeyError, match="doppler.doppler_h'.*the chain offers the values"):
+        with pytest.raises(KeyError, match="doppler.doppler_h'.*the chain has the values"):
             run(recording, given={"doppler.doppler_h": torch.tensor(0.0, dtype=torch.float64)})

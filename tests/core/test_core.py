@@ -1,4 +1,4 @@
-"""Axes, signals, transforms, phase, draws."""
+"""Axes, signals, transforms, phases and random draws."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from torchsar.core import (
 )
 
 
-def test_frequency_axis_and_data_move_together():
+def test_transform_changes_samples_and_axis_together():
     axis = Axis("pulse", 60, 3.0, 0.01, "s")
     tone_hz = 7 / 0.6
     x = torch.polar(torch.ones(60, dtype=torch.float64), 2 * math.pi * tone_hz * axis.values())
@@ -37,17 +37,17 @@ def test_frequency_axis_and_data_move_together():
     torch.testing.assert_close(back.data, signal.data)
 
 
-def test_signal_refuses_what_is_no_tensor():
+def test_signal_rejects_data_that_is_not_a_tensor():
     with pytest.raises(TypeError, match="holds a torch.Tensor, got list"):
         Signal([1j, 2j], (Axis("range", 2, 0.0, 1.0, "m"),))
 
 
-def test_signal_refuses_a_shape_that_does_not_end_in_its_axes():
+def test_signal_rejects_a_shape_that_does_not_end_in_its_axes():
     with pytest.raises(ValueError, match=r"pulse=4, range=5"):
         Signal(torch.zeros(5, 4), (Axis("pulse", 4, 0, 1, "s"), Axis("range", 5, 0, 1, "m")))
 
 
-def test_crop_moves_the_axis():
+def test_crop_shortens_samples_and_axis():
     signal = Signal(torch.arange(12.0).reshape(3, 4), (Axis("pulse", 3, 0, 1, "s"), Axis("range", 4, 100, 2, "m")))
     part = signal.crop(range=(1, 3))
     assert part.axis("range") == Axis("range", 2, 102, 2, "m")
@@ -56,7 +56,7 @@ def test_crop_moves_the_axis():
         signal.crop(range=(1, 9))
 
 
-def test_recording_moves_only_the_samples_dtype():
+def test_conversion_of_a_recording_changes_only_the_dtype_of_samples():
     recording = Recording(
         Signal(torch.zeros(2, 3, dtype=torch.complex64), (Axis("pulse", 2, 0, 1, "s"), Axis("range", 3, 0, 1, "m"))),
         None,
@@ -67,14 +67,13 @@ def test_recording_moves_only_the_samples_dtype():
 
 
 def test_phase_of_a_long_range_is_exact():
-    # 700 km at 3.2 GHz is 1.5e7 turns; an exact rational number of turns tells whether float64 was
-    # kept
+    # 700 km at 3.2 GHz is 1.5e7 turns; a quarter turn is exact only in float64
     turns = torch.tensor([15_000_000.25, -15_000_000.25, 123_456_789.5], dtype=torch.float64)
     expected = torch.tensor([1j, -1j, -1], dtype=torch.complex64)
     torch.testing.assert_close(unit_phasor(turns, torch.complex64), expected, atol=1e-6, rtol=0)
 
 
-def test_phase_refuses_single_precision_and_huge_turns():
+def test_phase_rejects_single_precision_and_huge_turns():
     with pytest.raises(TypeError, match="float64 turns"):
         unit_phasor(torch.zeros(3), torch.complex64)
     with pytest.raises(ValueError, match="reference range"):
@@ -116,16 +115,16 @@ class TestDraws:
         assert torch.equal(whole, parts)
         assert torch.equal(Draws(7, trials=[5, 0]).normal("noise", (4, 5), torch.complex64), whole[[5, 0]])
 
-    def test_another_draw_in_between_changes_nothing(self):
+    def test_earlier_draws_do_not_change_a_draw(self):
         a, b = Draws(7), Draws(7)
         b.uniform("something else", (1000,))
         assert torch.equal(a.normal("noise", (9,)), b.normal("noise", (9,)))
 
     @pytest.mark.parametrize("other", [Draws(8), Draws(7, case="snr=3"), Draws(7).part("sea"), Draws(7, trials=[1])])
-    def test_every_part_of_the_address_counts(self, other):
+    def test_every_part_of_the_address_changes_the_draw(self, other):
         assert not torch.equal(Draws(7).normal("noise", (9,)), other.normal("noise", (9,)).reshape(-1))
 
-    def test_precisions_see_the_same_noise(self):
+    def test_precisions_draw_the_same_noise(self):
         double = Draws(7).normal("noise", (99,), torch.complex128)
         assert torch.equal(double.to(torch.complex64), Draws(7).normal("noise", (99,), torch.complex64))
 
@@ -137,6 +136,14 @@ class TestDraws:
     def test_subset_has_no_repetition(self):
         picked = Draws(1, trials=range(3)).subset("lost", 50, 20)
         assert picked.shape == (3, 20) and all(len(set(row.tolist())) == 20 for row in picked)
+
+    def test_a_permutation_begins_with_the_subset(self):
+        draws = Draws(1, trials=range(3))
+        order = draws.permutation("lost", 50)
+        assert torch.equal(order[:, :20].sort(-1).values, draws.subset("lost", 50, 20))
+        uneven = draws.permutation("lost", [50, 7, 30])
+        assert torch.equal(uneven[0], order[0]) and uneven[1, 7:].tolist() == list(range(7, 50))
+        assert torch.equal(uneven[1, :7], Draws(1, trials=[1]).permutation("lost", 7)[0])
 
 
 def test_take_and_best_of_choose_per_trial():

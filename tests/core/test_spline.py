@@ -1,4 +1,4 @@
-"""Splines on a uniform grid against scipy, and what they promise beyond it."""
+"""Splines on a uniform grid against scipy, and their batches, gradients and errors."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_equals_scipy(n: int) -> None:
         torch.testing.assert_close(found(torch.tensor(t)), torch.tensor(known(t)), atol=2e-12, rtol=1e-12)
 
 
-def test_pieces_are_scipys() -> None:
+def test_pieces_equal_those_of_scipy() -> None:
     values = np.random.default_rng(0).standard_normal((2, 40))
     expected = CubicSpline(knots(40), values, axis=-1).c[::-1]
     torch.testing.assert_close(
@@ -65,7 +65,7 @@ def test_gradients(n: int) -> None:
     )
 
 
-def test_bad_input_is_refused() -> None:
+def test_invalid_input_raises() -> None:
     with pytest.raises(TypeError, match="float64 values, got torch.float32"):
         UniformSpline(torch.zeros(4), 0.0, 1.0)
     with pytest.raises(ValueError, match="at least two values"):

@@ -1,4 +1,4 @@
-"""The warp of slow time against integrals of the rate and against polynomials of numpy."""
+"""Warped slow time against integrals of the rotation rate and polynomials of numpy."""
 
 from __future__ import annotations
 
@@ -72,8 +72,9 @@ def test_the_shape_is_a_legendre_series(order: int) -> None:
 
 
 def test_the_shape_by_the_formulas_of_third_order() -> None:
-    """c1 = h + k1 h^2 + 0.6 k2 h^3, q2 = (h^2 / 3) (k1 + k2 h) / c1, q3 = k2 h^3 / (15 c1), h half
-    the aperture (brief 003, section c).
+    """Closed form for order 3, with h half the aperture.
+
+    c1 = h + k1 h^2 + 0.6 k2 h^3, q2 = (h^2 / 3) (k1 + k2 h) / c1, q3 = k2 h^3 / (15 c1).
     """
     (k1, k2), h = K[:2, :2].unbind(-1), DURATION / 2
     c1 = h + k1 * h**2 + 0.6 * k2 * h**3

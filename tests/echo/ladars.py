@@ -1,4 +1,4 @@
-"""Ladars, motions and direct float64 sums that the tests of ladar echoes share."""
+"""Ladars, motions and direct float64 sums for tests of ladar echoes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torchsar.scene import Points, Polynomial, RetroAndBrokenLine, Scatterers, S
 
 DOUBLE = torch.complex128
 THREE = Points([-0.06, 0.0, 0.06], [1.0, 1.5, 2.0], [0.7, 1.0, 0.7])
-# brief 000, section 8
+# motions of the simulation and of the ground experiment, chosen here
 COMMON = (
     Polynomial([0.35, 10.0]),
     Sinusoid(160e-6, 100.0, math.degrees(0.3)),
@@ -27,7 +27,7 @@ GROUND = (
 
 
 def table1(**changes) -> TriangularLadar:
-    """The simulated SAL of the paper's Table 1."""
+    """The simulated ladar of Remote Sens. 2024, 16, 793, Table 1."""
     values: dict = {
         "carrier_hz": LIGHT_M_S / 1.55e-6,
         "bandwidth_hz": 5e9,
@@ -40,7 +40,7 @@ def table1(**changes) -> TriangularLadar:
 
 
 def table4(**changes) -> TriangularLadar:
-    """The ground experiment of Table 4, real detection, every fourth period."""
+    """The ground experiment of Table 4: real detection, every fourth period."""
     values: dict = {
         "period_s": 32e-6,
         "sample_rate_hz": 150e6,
@@ -58,15 +58,14 @@ def unit_retro(draws) -> Scatterers:
 
 
 def unit(turns: Tensor) -> Tensor:
+    """Unit phasors of phases in cycles."""
     return torch.polar(torch.ones_like(turns), 2 * math.pi * (turns - torch.round(turns)))
 
 
 def direct_range(
     x: Tensor, r: Tensor, radar: TriangularLadar, time: Tensor, start: Tensor, motion, flight: bool = False
 ) -> Tensor:
-    """Relative range at every time; with the flight time the equation R = R(t - R / c) is solved by
-    repetition.
-    """
+    """Relative range at every time; with flight time R = R(t - R / c) is solved by iteration."""
 
     def history(t: Tensor) -> Tensor:
         across, near = radar.speed_m_s * t - x, radar.reference_range_m + r
@@ -107,7 +106,7 @@ def direct_sweeps(
 
 
 def triangle_turns(radar: TriangularLadar, position: Tensor) -> Tensor:
-    """Antiderivative of the triangle's frequency, period by period."""
+    """Antiderivative of the frequency of the triangle, period by period."""
     sweep, rate = radar.sweep_s, radar.chirp_rate_hz_s
     position = torch.remainder(position, 2 * sweep)
     return torch.where(

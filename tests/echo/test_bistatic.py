@@ -1,6 +1,4 @@
-"""Echoes of moving points in channels: against direct sums, the pulse against its compressed
-response, noise, sea, trials and gradients.
-"""
+"""Echoes of moving points in channels against direct sums, noise, sea, trials and gradients."""
 
 from __future__ import annotations
 
@@ -80,7 +78,7 @@ def direct_ranges(radar: BistaticRadar, movers: Movers, n_pulse: int) -> tuple[t
 
 
 def direct_peaks(radar: BistaticRadar, n_pulse: int) -> torch.Tensor:
-    """Carrier and pattern of each target, (channel, pulse, target)."""
+    """Carrier and antenna pattern of each target, (channel, pulse, target)."""
     movers = SCENE.movers(radar, Draws(3))
     ranges, sine = direct_ranges(radar, movers, n_pulse)
     time = ((torch.arange(n_pulse, dtype=torch.float64) - n_pulse // 2) / radar.prf_hz)[:, None]
@@ -106,7 +104,7 @@ def direct_lines(radar: BistaticRadar, n_pulse: int, n_range: int, late_m: torch
 
 
 def test_compressed_echo_is_a_sinc_on_the_receive_path():
-    """To the ripple of a line of finite length: -50 dB of the peak."""
+    """The ripple of a line of finite length is -50 dB of the peak."""
     recording, _ = simulated()
     torch.testing.assert_close(recording.signal.data, direct_lines(RADAR, 90, 128), rtol=0, atol=4e-3)
     longer = bistatic_echo(SCENE.movers(RADAR, Draws(3)), RADAR, 90, 4096, gate=Pattern(), dtype=torch.complex128)
@@ -122,7 +120,7 @@ def test_band_weights_peak_at_one_and_hold_the_band():
 
 @pytest.mark.parametrize(("reference", "within"), [(flat_reference, 2e-3), (matched_reference, 0.05)])
 def test_full_echoes_compress_to_the_compressed_ones(reference, within):
-    """Brief 001, Algorithm 1: the two ways of synthesis are equivalent."""
+    """Both ways of synthesis are equivalent."""
     radar = radar_of(pulse=LinearFM(50e6, 10e-6))
     raw = simulated(radar=radar, n_range=1500, n_pulse=12, kind="full")[0].signal
     data = range_compress(raw.data, reference(radar.pulse, 1500, radar.sampling_hz))
@@ -158,8 +156,9 @@ def test_echoes_beyond_the_line_do_not_come_back_at_its_other_end():
 
 
 def test_the_window_follows_the_ephemeris_and_the_carrier_the_truth():
-    """The envelope lies at R_m + what the truth has over the ephemeris; removing the ephemeris
-    leaves that same range on the carrier.
+    """The envelope lies at R_m plus the difference of the true range and the ephemeris.
+
+    Removal of the ephemeris leaves that same range on the carrier.
     """
     known = radar_of(transmit_range=(-243.0, 0.02))
     true = PolynomialTransmit((-223.0, 0.02))
@@ -182,7 +181,7 @@ def test_a_real_orbit_differs_from_its_ephemeris_by_less_than_a_milliradian():
 
 
 def test_motion_towards_the_transmitter_adds_to_doppler():
-    """Brief 001, Velocity: what is measured is the bistatic closing speed."""
+    """The Doppler frequency is that of the bistatic closing speed."""
     radar = radar_of(transmit_range=())
     still = GroundMovers([-12.5], [0.0], [0.0], [4000.0])
     moved = GroundMovers([-12.5], [0.0], [0.0], [4000.0], towards_transmitter=(-0.48, 0.0))
@@ -201,7 +200,7 @@ def test_fidelity_of_the_receive_range_reaches_the_echo():
 
 
 @pytest.mark.parametrize(("kind", "gain"), [("compressed", 1.0), ("full", 120.0)])
-def test_noise_has_the_variance_that_the_signal_to_noise_ratio_says(kind, gain):
+def test_noise_has_the_variance_of_the_signal_to_noise_ratio(kind, gain):
     levels = torch.tensor([0.0, 20.0])
     recording, truth = simulated(snr_db=levels, trials=range(2), kind=kind, n_range=200)
     assert truth.clean is not None
@@ -220,8 +219,8 @@ def test_noise_of_full_echoes_keeps_its_ratio_through_compression():
 
 
 @pytest.mark.parametrize("kind", ["compressed", "full"])
-def test_the_sea_joins_with_the_transmit_range_on_its_carrier(kind):
-    """A full sea, compressed, is the compressed sea where lines are whole."""
+def test_the_sea_has_the_transmit_range_on_its_carrier(kind):
+    """A full sea, compressed, is the compressed sea where lines are complete."""
     radar = radar_of(pulse=LinearFM(50e6, 4e-6))
     data = simulated(None, radar=radar, n_range=1000, n_pulse=12, sea=KSea(power_db=0.0, margin_s=0.0), kind=kind)[
         0
@@ -263,7 +262,7 @@ def test_a_scene_that_draws_nothing_has_all_trials():
     assert simulated(trials=range(4), n_pulse=5)[0].signal.data.shape == (4, 3, 5, 128)
 
 
-def test_single_precision_keeps_to_double():
+def test_single_precision_agrees_with_double():
     single = simulated(dtype=torch.complex64, n_pulse=200, snr_db=10.0)[0].signal.data
     assert single.dtype == torch.complex64
     torch.testing.assert_close(
@@ -272,7 +271,7 @@ def test_single_precision_keeps_to_double():
 
 
 @pytest.mark.parametrize("n_range", [None, 12])
-def test_gradients_of_speeds_places_and_amplitudes(n_range):
+def test_gradients_of_speeds_positions_and_amplitudes(n_range):
     values = [
         torch.tensor(v, dtype=torch.float64, requires_grad=True)
         for v in ([10.0, -4.0], [5.0, -8.0], [2.0, -6.0], [3.0, -2.0])
@@ -302,7 +301,7 @@ def test_channels_pass_through_vmap():
 
 
 @pytest.mark.parametrize(
-    ("options", "says"),
+    ("options", "message"),
     [
         ({"scene": MovingPoints([0.0], [300.0], [0.0], [0.0])}, "as fast as the receiver"),
         ({"scene": MovingPoints([0.0], [0.0], [0.0], [-5000.0])}, "positive range"),
@@ -315,6 +314,6 @@ def test_channels_pass_through_vmap():
         ({"snr_db": torch.zeros(3), "trials": range(2)}, "each of the 2 trials"),
     ],
 )
-def test_impossible_recordings_are_refused(options, says):
-    with pytest.raises(ValueError, match=says):
+def test_impossible_recordings_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
         simulated(**options)

@@ -1,6 +1,4 @@
-"""Channels that differ and clocks that drift: what they do to recordings, what the direct path
-shows, and what is refused.
-"""
+"""Unequal channels and drifting clocks: their effect, the direct path, and errors."""
 
 from __future__ import annotations
 
@@ -33,7 +31,7 @@ def test_each_channel_gets_its_phase_gain_and_delay():
     assert truth.values["imbalance.delay_s"].tolist() == [0.0, 2 * CELL_S, -3 * CELL_S]
 
 
-def test_a_part_of_a_cell_moves_the_envelope_and_not_the_carrier():
+def test_a_delay_of_part_of_a_cell_moves_the_envelope_and_not_the_carrier():
     scene = MovingPoints([0.0], [0.0], [0.0], [0.0])
     later = ChannelErrors(delay_s=[0.4 * CELL_S] * 3)
     recording, _ = simulated(scene, n_pulse=1, impairments={"late": later})
@@ -42,7 +40,7 @@ def test_a_part_of_a_cell_moves_the_envelope_and_not_the_carrier():
     torch.testing.assert_close(recording.signal.data[..., 34:94], (moved * phase)[..., 34:94], rtol=0, atol=3e-3)
 
 
-def test_errors_may_differ_between_trials_and_spare_azimuth_only_data_delays():
+def test_errors_may_differ_between_trials_and_apply_to_azimuth_only_data():
     phase = torch.tensor([[0.1, 0.2, 0.3], [1.0, 2.0, 3.0]], dtype=torch.float64)
     recording, truth = simulated(
         n_range=None, trials=range(2), impairments={"p": ChannelErrors(phase)}, dtype=torch.complex64
@@ -97,7 +95,7 @@ def test_the_direct_path_has_noise_of_its_own():
     assert float((noisy - clean).abs().square().mean()) == pytest.approx(0.01, rel=0.05)
 
 
-def test_walks_start_from_the_middle_and_have_the_step_asked_for():
+def test_walks_are_zero_in_the_middle_and_have_the_given_step():
     walk = WalkDrift(0.2).values(RADAR.pulse_axis(901).values(), Draws(1, trials=range(20)))
     assert bool((walk[:, 450] == 0).all())
     assert float(walk.diff().std()) == pytest.approx(0.2, rel=0.03)
@@ -121,7 +119,7 @@ def test_drifts_of_one_kind_differ_and_trials_do_not_depend_on_their_batch():
 
 
 @pytest.mark.parametrize(
-    ("impairment", "n_range", "says"),
+    ("impairment", "n_range", "message"),
     [
         (ChannelErrors([0.0, 1.0]), None, "each of the 3 channels"),
         (ChannelErrors(delay_s=[0.0, 1e-9, 0.0]), None, "no range axis"),
@@ -129,13 +127,13 @@ def test_drifts_of_one_kind_differ_and_trials_do_not_depend_on_their_batch():
         (SynchronisationError(delay_s=[PolynomialDrift([1e-6])]), 128, "a quarter of the 64"),
     ],
 )
-def test_errors_that_do_not_fit_the_recording_are_refused(impairment, n_range, says):
-    with pytest.raises(ValueError, match=says):
+def test_errors_that_do_not_fit_the_recording_are_refused(impairment, n_range, message):
+    with pytest.raises(ValueError, match=message):
         simulated(n_range=n_range, n_pulse=10, impairments={"e": impairment})
 
 
 @pytest.mark.parametrize(
-    ("build", "error", "says"),
+    ("build", "error", "message"),
     [
         (lambda: ChannelErrors([math.inf]), ValueError, "phase_rad of channels"),
         (lambda: SynchronisationError(PolynomialDrift([1.0])), TypeError, "in brackets"),  # pyright: ignore[reportArgumentType]
@@ -143,6 +141,6 @@ def test_errors_that_do_not_fit_the_recording_are_refused(impairment, n_range, s
         (lambda: WalkDrift(-1.0), ValueError, "0 or more"),
     ],
 )
-def test_errors_that_are_none_are_refused(build, error, says):
-    with pytest.raises(error, match=says):
+def test_invalid_errors_are_refused(build, error, message):
+    with pytest.raises(error, match=message):
         build()

@@ -1,4 +1,4 @@
-"""The echo speed script runs at reduced size, and its loss is what it says."""
+"""The echo speed script runs at reduced size and states its error correctly."""
 
 from __future__ import annotations
 

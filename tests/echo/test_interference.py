@@ -1,4 +1,4 @@
-"""Interference on the world side: levels, shares, phases, converter."""
+"""Interference: levels, shares, phases, converter."""
 
 from __future__ import annotations
 
@@ -28,29 +28,29 @@ def power(x: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize(
     "impairment", [Tone(20.0, 4e6, 1e5), Tone(20.0, 4e6, rate_hz_s=1e9, coherent=True), WideInterferer(20.0, -3e6, 1e6)]
 )
-def test_level_is_what_was_asked(impairment) -> None:
+def test_level_is_the_given_one(impairment) -> None:
     clean = clutter()
     impaired, _ = impairment(clean, Draws(1))
     ratio = power(impaired.signal.data - clean.signal.data) / power(clean.signal.data)
     assert float(10 * torch.log10(ratio)) == pytest.approx(20.0, abs=0.01 if isinstance(impairment, Tone) else 1.0)
 
 
-def test_share_of_lines_and_untouched_rest() -> None:
+def test_share_of_lines_and_unchanged_rest() -> None:
     clean = clutter(trials=3)
-    impaired, told = Tone(30.0, 4e6, share=0.25)(clean, Draws(2, trials=range(3)))
-    assert told["contaminated"].sum(-1).tolist() == [16, 16, 16]
+    impaired, truth = Tone(30.0, 4e6, share=0.25)(clean, Draws(2, trials=range(3)))
+    assert truth["contaminated"].sum(-1).tolist() == [16, 16, 16]
     same = (impaired.signal.data == clean.signal.data).all(-1)
-    assert torch.equal(same, ~told["contaminated"])
-    assert not torch.equal(told["contaminated"][0], told["contaminated"][1])
+    assert torch.equal(same, ~truth["contaminated"])
+    assert not torch.equal(truth["contaminated"][0], truth["contaminated"][1])
 
 
-def test_tone_stands_at_its_frequency_and_drifts() -> None:
+def test_tone_has_its_frequency_and_drift() -> None:
     clean = clutter()
-    impaired, told = Tone(30.0, torch.tensor(4e6), drift_hz=2e6)(clean, Draws(1))
+    impaired, truth = Tone(30.0, torch.tensor(4e6), drift_hz=2e6)(clean, Draws(1))
     cell = torch.fft.fft(impaired.signal.data).abs().argmax(-1)
-    seen = cell * RADAR.sampling_hz / 1024
-    assert float((seen - told["frequency_hz"]).abs().max()) <= RADAR.sampling_hz / 1024
-    assert float(told["frequency_hz"][-1] - told["frequency_hz"][0]) == pytest.approx(2e6)
+    measured = cell * RADAR.sampling_hz / 1024
+    assert float((measured - truth["frequency_hz"]).abs().max()) <= RADAR.sampling_hz / 1024
+    assert float(truth["frequency_hz"][-1] - truth["frequency_hz"][0]) == pytest.approx(2e6)
 
 
 def test_phase_is_random_or_coherent() -> None:
@@ -67,7 +67,7 @@ def test_phase_is_random_or_coherent() -> None:
     assert float((loose[1:] * loose[:-1].conj()).mean().abs()) < 0.5
 
 
-def test_wide_interferer_keeps_to_its_band() -> None:
+def test_wide_interferer_stays_within_its_band() -> None:
     clean = clutter()
     impaired, _ = WideInterferer(20.0, 5e6, 2e6)(clean, Draws(1))
     spectrum = (
@@ -79,8 +79,8 @@ def test_wide_interferer_keeps_to_its_band() -> None:
 
 def test_quantiser_has_odd_levels_and_clips() -> None:
     clean = clutter(trials=2)
-    impaired, told = Quantiser(4)(clean, Draws(1, trials=range(2)))
-    levels = torch.view_as_real(impaired.signal.data) * told["gain"][:, None, None, None].float()
+    impaired, truth = Quantiser(4)(clean, Draws(1, trials=range(2)))
+    levels = torch.view_as_real(impaired.signal.data) * truth["gain"][:, None, None, None].float()
     assert set(torch.unique(torch.round(levels)).int().tolist()) == set(range(-15, 16, 2))
     error = power(impaired.signal.data - clean.signal.data) / power(clean.signal.data)
     assert bool((error < 10**-1.8).all())  # 4 bits at 7 levels rms: about -20 dB
@@ -95,6 +95,6 @@ def test_quantiser_has_odd_levels_and_clips() -> None:
 @pytest.mark.parametrize(
     "wrong", [lambda: Tone(10.0, 0.0, share=0.0), lambda: WideInterferer(10.0, 0.0, 0.0), lambda: Quantiser(0)]
 )
-def test_mistakes_are_named(wrong) -> None:
+def test_invalid_parameters_are_refused(wrong) -> None:
     with pytest.raises(ValueError, match=r"share|bandwidth_hz|bits"):
         wrong()

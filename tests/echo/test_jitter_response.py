@@ -26,7 +26,7 @@ def test_jitter_samples_the_fourier_series_at_the_true_instants(n):
     torch.testing.assert_close(sample_unevenly(torch.fft.ifft(spectrum)[None], OFFSETS)[0], expected)
 
 
-def test_jitter_leaves_a_pilot_of_the_stated_tone_and_noise():
+def test_jitter_records_a_pilot_of_the_given_tone_and_noise():
     recording, _ = small_recording(trials=2)
     impaired, truth = PeriodicJitter(OFFSETS, pilot_cycles=0.2, pilot_snr_db=20.0, pilot_samples=2000)(
         recording, Draws(1, trials=[0, 1])

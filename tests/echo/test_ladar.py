@@ -1,6 +1,4 @@
-"""Sweeps of a triangular ladar: against direct sums, each level against the next, and what a world
-promises.
-"""
+"""Sweeps of a triangular ladar: against direct sums, each model against the next, and worlds."""
 
 from __future__ import annotations
 
@@ -40,8 +38,8 @@ from torchsar.scene import (
 FAST = (Polynomial([5.0, 100.0]),)
 
 
-def off(found: Tensor, expected: Tensor) -> float:
-    """Rms departure relative to the signal."""
+def difference(found: Tensor, expected: Tensor) -> float:
+    """Rms difference relative to the signal."""
     return float((found - expected).norm() / expected.norm())
 
 
@@ -51,21 +49,19 @@ def test_every_sample_equals_direct_sums(motion, flight: bool) -> None:
     s = RandomPoints(5, 0.2, 1.0, range_m=1.2, spread_db=10.0).scatterers(Draws(2))
     expected = direct_sweeps(s, table1(), 24, motion, flight)
     level = EverySample(() if flight else ("flight",))
-    assert off(ladar_echo(s, table1(), 24, motion, level, dtype=DOUBLE), expected) < (2e-5 if flight else 1e-8)
-    assert off(ladar_echo(s, table1(), 24, motion, level), expected) < (2e-5 if flight else 3e-7)
+    assert difference(ladar_echo(s, table1(), 24, motion, level, dtype=DOUBLE), expected) < (2e-5 if flight else 1e-8)
+    assert difference(ladar_echo(s, table1(), 24, motion, level), expected) < (2e-5 if flight else 3e-7)
 
 
-def test_levels_depart_by_the_published_figures() -> None:
-    """Brief 000, section 10: 0.17 to 0.46 percent for straight lines, nothing left of the signal's
-    phase below them.
-    """
+def test_models_differ_by_known_amounts() -> None:
+    """0.17 to 0.46 % of the signal, as measured with an independent float64 model."""
     s = THREE.scatterers(Draws(0))
     expected, fast = direct_sweeps(s, table1(), 512, COMMON), direct_sweeps(s, table1(), 128, FAST)
-    assert 0.0015 < off(ladar_echo(s, table1(), 512, COMMON, LinearInSweep()), expected) < 0.002
-    assert 0.004 < off(ladar_echo(s, table1(), 128, FAST, LinearInSweep()), fast) < 0.007
-    assert off(ladar_echo(s, table1(), 512, COMMON, QuadraticInSweep()), expected) < 3e-6
-    assert off(ladar_echo(s, table1(), 128, FAST, QuadraticInSweep()), fast) < 1e-6
-    assert off(ladar_echo(s, table1(), 128, FAST, OnePerSweep()), fast) > 1
+    assert 0.0015 < difference(ladar_echo(s, table1(), 512, COMMON, LinearInSweep()), expected) < 0.002
+    assert 0.004 < difference(ladar_echo(s, table1(), 128, FAST, LinearInSweep()), fast) < 0.007
+    assert difference(ladar_echo(s, table1(), 512, COMMON, QuadraticInSweep()), expected) < 3e-6
+    assert difference(ladar_echo(s, table1(), 128, FAST, QuadraticInSweep()), fast) < 1e-6
+    assert difference(ladar_echo(s, table1(), 128, FAST, OnePerSweep()), fast) > 1
 
 
 def worst_phase(a: Tensor, b: Tensor) -> float:
@@ -108,10 +104,10 @@ CASES = {
 
 
 @pytest.mark.parametrize("radar, level, motion, range_m, extremes", CASES.values(), ids=list(CASES))
-def test_levels_say_what_they_neglect(
+def test_models_predict_what_they_neglect(
     radar: TriangularLadar, level, motion, range_m: float, extremes: Extremes
 ) -> None:
-    """Against the sum that has it all; the bound is met to a few percent."""
+    """Against the sum with all effects: the prediction is met to a few percent."""
     s = Points([0.2 if extremes.across_m else 0.0], [range_m]).scatterers(Draws(0))
     full = EverySample(() if extremes.velocity_change_m_s else ("flight",))
     n_period = 3 if extremes.velocity_change_m_s else 1
@@ -119,14 +115,14 @@ def test_levels_say_what_they_neglect(
         ladar_echo(s, radar, n_period, motion, level, dtype=DOUBLE),
         ladar_echo(s, radar, n_period, motion, full, dtype=DOUBLE),
     )
-    said = sum(level.neglected_phase_rad(radar, extremes).values())
-    assert 0.9 * said <= worst <= 1.01 * said, (worst, said)
+    predicted = sum(level.neglected_phase_rad(radar, extremes).values())
+    assert 0.9 * predicted <= worst <= 1.01 * predicted, (worst, predicted)
 
 
-def test_what_is_not_left_out_is_not_neglected() -> None:
+def test_included_effects_are_not_predicted_as_neglected() -> None:
     assert EverySample(()).neglected_phase_rad(table1(), Extremes((1.0, 2.0), 0.2, 1.0, 1.0, 1.0, 1.0)) == {}
     assert set(LinearInSweep().neglected_phase_rad(table1(), Extremes())) == {"level", "flight"}
-    # brief 000, section 10: 0.7 rad between up and down, RD 10.5 +- 0.2 m, Table 4
+    # 0.7 rad between up-sweep and down-sweep at the relative range 10.5 +- 0.2 m of Table 4
     assert 2 * EverySample(("residual_video",)).neglected_phase_rad(table4(), Extremes((10.3, 10.7)))[
         "residual_video"
     ] == pytest.approx(0.7, abs=0.05)
@@ -150,9 +146,7 @@ def test_a_world_in_both_dechirp_signs_is_conjugate() -> None:
     "level", [LinearInSweep(), QuadraticInSweep(()), EverySample()], ids=["line", "parabola", "sample"]
 )
 def test_batch_equals_singles(level) -> None:
-    """Trials are addressed, whatever else is in the batch; every random part differs
-    between them.
-    """
+    """Trials depend on their address only; every random part differs between them."""
     snr = torch.tensor([0.0, 40.0, -10.0], dtype=torch.float64)
     amplitude = torch.tensor([1e-5, 2e-5, 3e-5], dtype=torch.float64)
 
@@ -171,15 +165,15 @@ def test_batch_equals_singles(level) -> None:
     together, truth = simulate_ladar(
         table1(beam_rad=114e-6), world(slice(None)), 6, Draws(5, trials=[4, 0, 7]), dtype=DOUBLE
     )
-    for place, trial in enumerate([4, 0, 7]):
+    for row, trial in enumerate([4, 0, 7]):
         alone, known = simulate_ladar(
-            table1(beam_rad=114e-6), world(slice(place, place + 1)), 6, Draws(5, trials=[trial]), dtype=DOUBLE
+            table1(beam_rad=114e-6), world(slice(row, row + 1)), 6, Draws(5, trials=[trial]), dtype=DOUBLE
         )
-        torch.testing.assert_close(together.signal.data[place], alone.signal.data[0], atol=1e-11, rtol=0)
+        torch.testing.assert_close(together.signal.data[row], alone.signal.data[0], atol=1e-11, rtol=0)
         torch.testing.assert_close(
-            truth.values["velocity_m_s"][place], known.values["velocity_m_s"][0], atol=1e-14, rtol=1e-12
+            truth.values["velocity_m_s"][row], known.values["velocity_m_s"][0], atol=1e-14, rtol=1e-12
         )
-        assert torch.equal(together.aux["calibration"][place], alone.aux["calibration"][0])
+        assert torch.equal(together.aux["calibration"][row], alone.aux["calibration"][0])
     plain = simulate_ladar(table1(), LadarWorld(LetterE(), COMMON, snr_db=10.0), 6, Draws(5), dtype=DOUBLE)[0].signal
     assert plain.data.shape == (2, 6, 512) and plain.names == ("ramp", "pulse", "fast_time")
 
@@ -225,7 +219,7 @@ def test_noise_is_per_sample_of_a_unit_point(snr_db: float) -> None:
 
 @pytest.mark.parametrize("reference_m", [10.0, 3000.0, 1e6])
 def test_phases_hold_from_ten_metres_to_a_thousand_kilometres(reference_m: float) -> None:
-    """Against fifty digits, at the ends of the record and of a sweep."""
+    """Against arithmetic of fifty digits, at the ends of the record and of a sweep."""
     getcontext().prec = 50
     radar = table1(reference_range_m=reference_m)
     s = Points([0.06], [1.7]).scatterers(Draws(0))
@@ -243,12 +237,12 @@ def test_phases_hold_from_ten_metres_to_a_thousand_kilometres(reference_m: float
             Decimal(radar.speed_m_s) * time - Decimal(float(s.azimuth_m[0])),
             Decimal(reference_m) + Decimal(float(s.range_m[0])),
         )
-        way = (
+        path = (
             (near * near + across * across).sqrt()
             - Decimal(reference_m)
             + Decimal("0.4") * (time - Decimal(float(start[0])))
         )
-        delay = 2 * way / c
+        delay = 2 * path / c
         turns = Decimal(radar.carrier_hz) * delay + (1 - 2 * ramp) * Decimal(radar.chirp_rate_hz_s) * (
             Decimal(float(u[sample])) * delay - delay * delay / 2
         )
@@ -259,8 +253,8 @@ def test_phases_hold_from_ten_metres_to_a_thousand_kilometres(reference_m: float
         )
 
 
-def test_the_beam_lights_its_share() -> None:
-    """Brief 000, section 2: 0.342 m lit, 356 periods of 60 m/s."""
+def test_the_beam_illuminates_its_width() -> None:
+    """The beam of 114 urad illuminates 0.342 m at 3 km, 356 periods at 60 m/s."""
     echo = ladar_echo(Points([0.0, 0.06], [1.5, 2.0], [1.0, 0.0]).scatterers(Draws(0)), table1(beam_rad=114e-6), 512)
     lit = (echo.abs() > 0.5).all(-1)
     assert 355 <= int(lit[0].sum()) <= 357 and bool((echo[0, ~lit[0]] == 0).all()) and bool(lit[:, 256].all())
@@ -285,16 +279,16 @@ ERRORS = {
 def test_sweep_errors_equal_direct_sums(error) -> None:
     s = THREE.scatterers(Draws(0))
     expected = direct_sweeps(s, table1(), 8, COMMON, error=error)
-    assert off(direct_sweeps(s, table1(), 8, COMMON), expected) > 0.04
-    assert off(ladar_echo(s, table1(), 8, COMMON, EverySample(), error, DOUBLE), expected) < 1e-8
-    lines = off(
+    assert difference(direct_sweeps(s, table1(), 8, COMMON), expected) > 0.04
+    assert difference(ladar_echo(s, table1(), 8, COMMON, EverySample(), error, DOUBLE), expected) < 1e-8
+    lines = difference(
         ladar_echo(s, table1(), 8, COMMON, LinearInSweep(), dtype=DOUBLE), direct_sweeps(s, table1(), 8, COMMON)
     )
-    assert off(ladar_echo(s, table1(), 8, COMMON, LinearInSweep(), error, DOUBLE), expected) < 1.2 * lines
+    assert difference(ladar_echo(s, table1(), 8, COMMON, LinearInSweep(), error, DOUBLE), expected) < 1.2 * lines
 
 
 @pytest.mark.parametrize("error", [None, *ERRORS.values()], ids=["none", *ERRORS])
-def test_the_fibre_shows_the_sweep(error) -> None:
+def test_the_fibre_records_the_sweep_error(error) -> None:
     radar, delay = table1(), 60e-9
     found = calibration_channel(radar, CalibrationFibre(delay), error, 5, Draws(0), DOUBLE)
     u = radar.fast_time_axis().values()
@@ -343,7 +337,7 @@ def test_gradients(level) -> None:
     )
 
 
-def test_impairments_are_told() -> None:
+def test_impairments_enter_the_truth() -> None:
     def louder(recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         gain = draws.uniform("gain", (), 2.0, 3.0)
         return replace(
@@ -359,9 +353,9 @@ def test_impairments_are_told() -> None:
     )
 
 
-def test_errors_are_sentences() -> None:
+def test_error_messages() -> None:
     with pytest.raises(
-        ValueError, match=r"beats at 33.3\d+ MHz, beyond half the sampling rate of 64 MHz; bring it nearer"
+        ValueError, match=r"beats at 33.3\d+ MHz, beyond half the sampling rate of 64 MHz; move it nearer"
     ):
         ladar_echo(Points([0.0], [8.0]).scatterers(Draws(0)), table1(), 4)
     with pytest.raises(ValueError, match="move it more slowly"):

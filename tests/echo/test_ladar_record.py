@@ -1,4 +1,4 @@
-"""Continuous records of a triangular ladar: turning points, blocks, triggers, real samples."""
+"""Continuous records of a triangular ladar: turning points, blocks, trigger times, real samples."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_equals_direct_sums_with_their_transients(side: float, trigger_s: float,
 
 
 def test_transients_last_as_long_as_the_delay() -> None:
-    """Brief 000, section 5: 70 ns, 11 samples of 150 MHz, after every turning point."""
+    """70 ns, 11 samples at 150 MHz, after every turning point."""
     radar = table4(detection="complex", keep_every=1, speed_m_s=0.0)
     found = ladar_record(Points([0.0], [10.5]).scatterers(Draws(0)), radar, 2, 4800, dtype=DOUBLE)
     step = torch.angle(found[:, 1:] * found[:, :-1].conj()) / (2 * math.pi) * radar.sample_rate_hz
@@ -70,9 +70,7 @@ def test_transients_last_as_long_as_the_delay() -> None:
 
 
 def test_inside_sweeps_a_record_is_the_separated_sweeps() -> None:
-    """Samples of a record whose triangle starts with the block lie on the symmetric grid of
-    sweeps.
-    """
+    """A record whose triangle starts with the block has its samples on the grid of sweeps."""
     radar, s = table1(), THREE.scatterers(Draws(0))
     record = ladar_record(s, radar, 9, 1024, COMMON, dtype=DOUBLE).unflatten(-1, (2, 512)).movedim(-2, 0)
     expected = direct_sweeps(s, radar, 9, COMMON)
@@ -103,7 +101,7 @@ def test_real_noise_gives_the_analytic_signal_its_snr() -> None:
     assert float(truth.values["noise_std"]) == pytest.approx(10**-0.15)
 
 
-def test_triggers_differ_between_trials_and_are_told_only_if_asked() -> None:
+def test_triggers_differ_between_trials_and_are_recorded_only_on_request() -> None:
     trigger = torch.tensor([0.0, 5.3e-6, 20e-6], dtype=torch.float64)
     world = LadarWorld(
         RetroAndBrokenLine(),
@@ -129,7 +127,7 @@ def test_triggers_differ_between_trials_and_are_told_only_if_asked() -> None:
         assert float((truth.values["range_error_m"][i] - still).abs().max()) < 1e-5
 
 
-def test_batch_equals_singles_and_keeps_memory_of_scintillation() -> None:
+def test_batch_equals_singles_with_scintillation() -> None:
     snr = torch.tensor([0.0, 30.0], dtype=torch.float64)
     world = LadarWorld(
         LetterE(2.0), (Sinusoid(torch.tensor([1e-5, 2e-5], dtype=torch.float64), 300.0),), LogAmplitude(0.3), snr
@@ -180,7 +178,7 @@ def wound_directly(error, radar: TriangularLadar, position: Tensor) -> Tensor:
     [SinusoidSweepError(2e6, 2.5e5, 20.0, -60.0), PolynomialSweepError([1e5, 3e11], [-2e5, 1e11, 5e16])],
     ids=["sinusoid", "polynomial"],
 )
-def test_sweep_errors_go_on_through_turning_points(error) -> None:
+def test_sweep_errors_are_continuous_at_turning_points(error) -> None:
     radar, s = table1(), Points([0.0], [1.5]).scatterers(Draws(0))
     position = torch.arange(0, 80000, 7, dtype=torch.float64) / 20000 * radar.sweep_s
     torch.testing.assert_close(
@@ -232,11 +230,11 @@ def test_gradients(detection) -> None:
     )
 
 
-def test_errors_are_sentences() -> None:
+def test_error_messages() -> None:
     world = LadarWorld(Points([0.0], [1.5]))
     with pytest.raises(ValueError, match="must hold a sweep of 8e-06 s and not overlap, being 1.6e-05 s apart"):
         simulate_ladar_record(table1(), world, 4, Draws(0), block_s=3.2e-5)
-    with pytest.raises(ValueError, match="which OnePerSweep does not; use simulate_ladar"):
+    with pytest.raises(ValueError, match="got OnePerSweep; use simulate_ladar"):
         simulate_ladar_record(table1(), LadarWorld(Points([0.0], [1.5]), fidelity=OnePerSweep()), 4, Draws(0))
     with pytest.raises(ValueError, match="fold at zero in real samples; move the reference range"):
         simulate_ladar_record(

@@ -1,4 +1,4 @@
-"""Impairment to the sequence of lines: what is lost is really gone, and the truth says where."""
+"""Impairments of the sequence of lines: samples, numbers and truth."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ N = 200
 
 
 def recording(trials: int | None = 3) -> Recording:
-    """Line i holds i + 1 in every sample, and so does its AGC."""
+    """Recording in which line i has i + 1 in every sample, and in its AGC."""
     shape = (N, 4) if trials is None else (trials, N, 4)
     lines = (torch.arange(N) + 1.0).to(torch.complex64)[:, None].expand(shape).contiguous()
     return Recording(
@@ -28,8 +28,8 @@ def recording(trials: int | None = 3) -> Recording:
     "impairment, count", [(LostLines(count=7), 7), (LostLines(fraction=0.2), 40), (LostGaps(3, 8), 24)]
 )
 def test_lost_lines_close_up_and_the_end_is_padded(impairment, count: int) -> None:
-    out, told = apply_impairments(recording(), {"lost": impairment}, Draws(1, trials=range(3)))
-    number, lost = out.aux["line_number"], told["lost.lost"]
+    out, truth = apply_impairments(recording(), {"lost": impairment}, Draws(1, trials=range(3)))
+    number, lost = out.aux["line_number"], truth["lost.lost"]
     assert (lost.sum(-1) == count).all() and not lost[:, 0].any()
     for trial in range(3):
         kept = (~lost[trial]).nonzero()[:, 0]
@@ -38,24 +38,24 @@ def test_lost_lines_close_up_and_the_end_is_padded(impairment, count: int) -> No
         assert torch.equal(out.signal.data[trial, : N - count, 0].real, kept + 1.0)
         assert torch.equal(out.aux["agc"][trial, : N - count], kept + 1.0)
     assert torch.equal(out.aux["pilot"], torch.ones(N))
-    assert torch.equal(told["lost.lost_number"], lost.nonzero()[:, 1].reshape(3, -1))
+    assert torch.equal(truth["lost.lost_number"], lost.nonzero()[:, 1].reshape(3, -1))
     assert not torch.equal(lost[0], lost[1])
 
 
 def test_gaps_have_their_length_and_stay_apart() -> None:
     for seed in range(5):
-        _, told = apply_impairments(recording(None), {"gap": LostGaps(5, 8)}, Draws(seed))
+        _, truth = apply_impairments(recording(None), {"gap": LostGaps(5, 8)}, Draws(seed))
         edges = torch.diff(
-            told["gap.lost"].int(), prepend=torch.zeros(1, dtype=torch.int32), append=torch.zeros(1, dtype=torch.int32)
+            truth["gap.lost"].int(), prepend=torch.zeros(1, dtype=torch.int32), append=torch.zeros(1, dtype=torch.int32)
         )
         begins, ends = (edges == 1).nonzero()[:, 0], (edges == -1).nonzero()[:, 0]
         assert (ends - begins).tolist() == [8] * 5
 
 
 def test_repeated_lines_come_twice() -> None:
-    out, told = apply_impairments(recording(), {"again": RepeatedLines(6)}, Draws(2, trials=range(3)))
+    out, truth = apply_impairments(recording(), {"again": RepeatedLines(6)}, Draws(2, trials=range(3)))
     number = out.aux["line_number"]
-    assert torch.equal(told["again.repeated"][:, 1:], number[:, 1:] == number[:, :-1])
+    assert torch.equal(truth["again.repeated"][:, 1:], number[:, 1:] == number[:, :-1])
     assert ((number[:, 1:] - number[:, :-1]) >= 0).all()
     assert torch.equal(out.signal.data[..., 0].real, number + 1.0)
 
@@ -63,13 +63,13 @@ def test_repeated_lines_come_twice() -> None:
 @pytest.mark.parametrize("bits", [None, 3])
 def test_corrupted_numbers_leave_samples_alone(bits: int | None) -> None:
     source = recording()
-    out, told = apply_impairments(source, {"number": CorruptedNumbers(9, bits)}, Draws(3, trials=range(3)))
-    wrong = out.aux["line_number"] != told["number.true_number"]
-    assert torch.equal(wrong, told["number.corrupted"]) and (wrong.sum(-1) == 9).all()
+    out, truth = apply_impairments(source, {"number": CorruptedNumbers(9, bits)}, Draws(3, trials=range(3)))
+    wrong = out.aux["line_number"] != truth["number.true_number"]
+    assert torch.equal(wrong, truth["number.corrupted"]) and (wrong.sum(-1) == 9).all()
     assert torch.equal(out.signal.data, source.signal.data)
 
 
-def test_impairment_depends_on_its_address_alone() -> None:
+def test_impairments_depend_on_their_address_only() -> None:
     together, _ = apply_impairments(recording(3), {"lost": LostLines(count=7)}, Draws(4, trials=range(3)))
     alone, _ = apply_impairments(recording(1), {"lost": LostLines(count=7)}, Draws(4, trials=[2]))
     assert torch.equal(together.aux["line_number"][2], alone.aux["line_number"][0])
@@ -86,6 +86,6 @@ def test_impairment_depends_on_its_address_alone() -> None:
         (lambda: LostLines(count=3)(recording(None), Draws(0, trials=range(2))), "draw one unbatched trial"),
     ],
 )
-def test_mistakes_are_named(build, message: str) -> None:
+def test_invalid_parameters_are_refused(build, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         build()

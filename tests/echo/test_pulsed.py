@@ -1,6 +1,4 @@
-"""Echo synthesis against direct summation, noise by its definition, and what a record may
-not do.
-"""
+"""Raw echoes against direct summation, noise, and errors."""
 
 from __future__ import annotations
 
@@ -29,9 +27,7 @@ from torchsar.scene import (
 
 
 def direct(radar, world, n_pulse, n_range, draws):
-    """Sum over targets, pulses and frequencies, one phase at a time, in complex128, on the same
-    band-limited grid.
-    """
+    """Sum over targets, pulses and frequencies in complex128, on the same band-limited grid."""
     s = world.scene.scatterers(draws)
     doppler = 0.0 if world.doppler_hz is None else world.doppler_hz
     v = radar.velocity_m_s if world.velocity_m_s is None else world.velocity_m_s
@@ -116,13 +112,13 @@ def test_echo_is_differentiable_in_positions_velocity_and_doppler():
     )
 
 
-def test_parabola_says_what_it_neglects():
+def test_the_parabola_predicts_what_it_neglects():
     radar = kondor_radar()
     for range_m, since in ((700e3, 0.75), (20e3, 0.5)):
         t, r, v = (torch.tensor(x, dtype=torch.float64) for x in (since, range_m, radar.velocity_m_s))
         measured = 4 * math.pi / radar.wavelength_m * float(Parabola().range_m(t, r, v) - Hyperbola().range_m(t, r, v))
         assert Parabola().neglected_phase_rad(radar, range_m, since) == pytest.approx(measured, rel=1e-4, abs=1e-6)
-    # at the sensor of the paper the parabola suffices, at twenty kilometres it does not
+    # the parabola suffices for the sensor of Tsvetkov 2017, but not at twenty kilometres
     assert (
         Parabola().neglected_phase_rad(radar, 700e3, 0.75)
         < math.pi / 4
@@ -151,7 +147,7 @@ def test_what_no_radar_can_record_is_refused():
     refused("line of 20 samples does not hold the pulse of 25", n_range=20)
 
 
-def test_worlds_that_make_no_sense_are_refused_at_construction():
+def test_invalid_worlds_are_refused_at_construction():
     with pytest.raises(ValueError, match=r"as many ranges.*\[2, 1\]"):
         Points([0.0, 1.0], [0.0])
     with pytest.raises(ValueError, match="count=0"):

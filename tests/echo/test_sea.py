@@ -1,6 +1,4 @@
-"""The echo of a stationary sea: against direct summation of its points, its power, its channels,
-its precision and its draws.
-"""
+"""Echo of a sea against direct summation; its power, channels, precision and draws."""
 
 from __future__ import annotations
 
@@ -21,7 +19,7 @@ from torchsar.scene.sea import Sea
 
 
 def geo_radar(**changes: Any) -> BistaticRadar:
-    """The receiver of brief 001, with a transmit range that no sea may know of."""
+    """The receiver of Remote Sens. 2020, 12, 1703, with a transmit range that a sea lacks."""
     values: dict = {
         "carrier_hz": 1.25e9,
         "pulse": LinearFM(50e6, 10e-6),
@@ -36,11 +34,9 @@ def geo_radar(**changes: Any) -> BistaticRadar:
 
 @dataclass(frozen=True)
 class Bright(Sea):
-    """A dark surface with bright cells next to the places asked for; `found` tells where
-    they are.
-    """
+    """A surface of zero with cells of one near given positions; `found` holds where they lie."""
 
-    places: tuple[tuple[float, float], ...] = ()
+    positions: tuple[tuple[float, float], ...] = ()
     found: list[tuple[float, float]] = field(default_factory=list)
 
     def texture(self, azimuth_m: Tensor, range_m: Tensor, draws: Draws) -> tuple[Tensor, Tensor, Tensor]:
@@ -50,7 +46,7 @@ class Bright(Sea):
         self, azimuth_m: Tensor, range_m: Tensor, draws: Draws, dtype: torch.dtype = torch.complex64
     ) -> Tensor:
         cells = torch.zeros(len(azimuth_m), len(range_m), dtype=dtype)
-        for azimuth, distance in self.places:
+        for azimuth, distance in self.positions:
             i, j = int((azimuth_m - azimuth).abs().argmin()), int((range_m - distance).abs().argmin())
             cells[i, j] = 1
             self.found.append((float(azimuth_m[i]), float(range_m[j])))
@@ -64,8 +60,9 @@ def direct(
     n_range: int | None,
     gate: BandLimited | Pattern,
 ) -> Tensor:
-    """One point after the other: carrier phase of the exact range, the band of the pulse in range
-    (on the same bins), the gate in time. complex128.
+    """Sum over points, one after the other, complex128.
+
+    The carrier has the phase of the exact range; the band of the pulse uses the same bins.
     """
     time_s, dx, wavelength = (
         radar.pulse_axis(n_pulse).values()[:, None],
@@ -94,24 +91,25 @@ def direct(
 
 
 def mismatch_db(x: Tensor, reference: Tensor) -> float:
-    """Error of x against a reference, both scaled by one complex number at most."""
+    """Error of x against a reference, after scaling by one complex number."""
     scale = (reference.conj() * x).sum() / reference.abs().square().sum()
     return float(
         20 * torch.log10(torch.linalg.vector_norm(x / scale - reference) / torch.linalg.vector_norm(reference))
     )
 
 
-PLACES = ((60.0, 35.0), (-110.0, -50.0), (3.0, 90.0))
+POSITIONS = ((60.0, 35.0), (-110.0, -50.0), (3.0, 90.0))
 GATES = {"pattern": (Pattern(), -100.0), "long element": (Pattern(1.0), -98.0), "band": (BandLimited(4.5), -36.0)}
 
 
 @pytest.mark.parametrize("gate, limit_db", GATES.values(), ids=list(GATES))
 @pytest.mark.parametrize("n_pulse, n_range", [(240, 64), (181, 51)])
 def test_points_lie_and_migrate_as_by_direct_summation(gate, limit_db, n_pulse, n_range):
-    """Three channels at uneven places: phases of the carrier, curved lines in range, the order of
-    the channels. The edges of the band leave a Fresnel ripple.
+    """Three unevenly spaced channels: carrier phases, range migration and the order of channels.
+
+    The edges of the band leave a Fresnel ripple.
     """
-    radar, sea = geo_radar(channel_m=(-0.8, 0.0, 1.1)), Bright(places=PLACES, margin_s=3.5)
+    radar, sea = geo_radar(channel_m=(-0.8, 0.0, 1.1)), Bright(positions=POSITIONS, margin_s=3.5)
     x = sea_echo(sea, radar, n_pulse, n_range, gate, Draws(1), torch.complex128)
     assert x.shape == (3, n_pulse, n_range)
     assert mismatch_db(x, direct(radar, sea.found, n_pulse, n_range, gate)) < limit_db
@@ -119,28 +117,32 @@ def test_points_lie_and_migrate_as_by_direct_summation(gate, limit_db, n_pulse, 
 
 @pytest.mark.parametrize("gate, limit_db", [(Pattern(), -100.0), (BandLimited(4.5), -36.0)])
 def test_a_line_agrees_with_direct_summation(gate, limit_db):
-    radar, sea = geo_radar(channel_m=(1.1, 0.0, -0.8)), Bright(places=((60.0, 0.0), (-110.0, 0.0)), margin_s=3.5)
+    radar, sea = geo_radar(channel_m=(1.1, 0.0, -0.8)), Bright(positions=((60.0, 0.0), (-110.0, 0.0)), margin_s=3.5)
     x = sea_echo(sea, radar, 240, None, gate, Draws(1), torch.complex128)
     assert mismatch_db(x, direct(radar, sea.found, 240, None, gate)) < limit_db
 
 
-def test_a_side_lobe_is_seen_where_direct_summation_puts_it():
-    """A point abreast 7 s after the record is lit by the first side lobe alone: dark for lobes=1,
-    there for lobes=2.
+def test_a_side_lobe_appears_where_direct_summation_puts_it():
+    """A point that is closest 7 s after the record is illuminated by the first side lobe only.
+
+    It is absent for lobes=1 and present for lobes=2.
     """
-    first, second = (Bright(places=((2200.0, 0.0),), margin_s=14.0, lobes=lobes) for lobes in (1, 2))
-    dark, lit = (sea_echo(sea, geo_radar(), 90, None, Pattern(), Draws(1), torch.complex128) for sea in (first, second))
-    assert float(dark.abs().max() / lit.abs().max()) < 1e-3
-    assert mismatch_db(lit, direct(geo_radar(), second.found, 90, None, Pattern())) < -50
+    first, second = (Bright(positions=((2200.0, 0.0),), margin_s=14.0, lobes=lobes) for lobes in (1, 2))
+    without, with_lobe = (
+        sea_echo(sea, geo_radar(), 90, None, Pattern(), Draws(1), torch.complex128) for sea in (first, second)
+    )
+    assert float(without.abs().max() / with_lobe.abs().max()) < 1e-3
+    assert mismatch_db(with_lobe, direct(geo_radar(), second.found, 90, None, Pattern())) < -50
 
 
 @pytest.mark.parametrize("gate", [BandLimited(4.5), Pattern()])
-def test_nothing_beyond_a_frame_comes_back_on_its_other_side(gate):
-    """Cells that migrate past the far end, or lie 12 samples beyond either while they are abreast,
-    leave side lobes at the most.
+def test_cells_beyond_a_frame_do_not_wrap(gate):
+    """Cells that migrate past the far end leave side lobes at most.
+
+    So do cells 12 samples beyond either end at their closest range.
     """
     inside, near, far = (
-        sea_echo(Bright(places=((0.0, m),), margin_s=3.5), geo_radar(), 900, 24, gate, Draws(1), torch.complex128)
+        sea_echo(Bright(positions=((0.0, m),), margin_s=3.5), geo_radar(), 900, 24, gate, Draws(1), torch.complex128)
         for m in (0.0, -120.0, 115.0)
     )
     assert float(far.abs().max() / inside.abs().max()) < 0.05
@@ -153,10 +155,8 @@ FRAMES = {"line": None, "frame": 24, "one sample": 1}
 
 @pytest.mark.parametrize("gate", [BandLimited(4.5), Pattern(), BandLimited(20.0)], ids=["band", "pattern", "wide band"])
 @pytest.mark.parametrize("n_range", FRAMES.values(), ids=list(FRAMES))
-def test_power_of_a_sample_is_as_promised(gate, n_range):
-    """Over trials at -30 and +20 dB; in a frame alike at both ends, in every channel, and at the
-    first pulses.
-    """
+def test_power_of_a_sample_is_the_given_one(gate, n_range):
+    """In all trials, at both ends of a frame, in every channel and at the first pulses."""
     power_db = torch.tensor([-30.0, 20.0], dtype=torch.float64).repeat_interleave(8)
     x = sea_echo(
         KSea(math.inf, power_db=power_db, margin_s=0.1), geo_radar(), 40, n_range, gate, Draws(2, trials=range(16))
@@ -174,9 +174,7 @@ def test_power_of_a_sample_is_as_promised(gate, n_range):
 
 
 def test_a_sea_lies_in_the_band_of_its_gate():
-    """A pulse rate above the band of 337.5 Hz shows nothing beside it; a ring has no leakage to
-    hide in.
-    """
+    """At a pulse rate above the band of 337.5 Hz a periodic sea has no power beside the band."""
     radar = geo_radar(prf_hz=450.0)
     x = sea_echo(KSea(margin_s=0.0), radar, 600, None, BandLimited(4.5), Draws(3), torch.complex128)
     power = torch.fft.fft(x).abs().square().mean(0)
@@ -187,9 +185,7 @@ def test_a_sea_lies_in_the_band_of_its_gate():
 
 
 def test_channels_are_one_delayed_signal():
-    """At a pulse rate above the band, channel m is the reference dx_m / V later, exactly on
-    a ring.
-    """
+    """At a pulse rate above the band channel m lags by dx_m / V, exactly for a periodic sea."""
     radar = geo_radar(prf_hz=450.0, channel_m=(-0.8, 0.0, 1.3))
     x = torch.fft.fft(
         sea_echo(KSea(margin_s=0.0), radar, 300, 20, BandLimited(4.5), Draws(3), torch.complex128), dim=-2
@@ -213,7 +209,7 @@ def test_single_precision_agrees_with_double(gate, n_range):
 
 
 @pytest.mark.parametrize("n_range", [None, 12])
-def test_trials_do_not_know_of_each_other(n_range):
+def test_trials_are_independent(n_range):
     power_db = torch.tensor([0.0, 30.0, -20.0, 5.0], dtype=torch.float64)
     args = (geo_radar(), 50, n_range, BandLimited(4.5))
     whole = sea_echo(KSea(power_db=power_db), *args, Draws(5, trials=range(4)), torch.complex128)
@@ -251,7 +247,7 @@ def test_gradients_reach_power_and_image():
     [
         (2100, Pattern(), ValueError, "a frame of 2100 samples about 5000 m begins at a range of -"),
         (None, BandLimited(30.0), ValueError, "a gate of 30 s at 5000 m ends at a look angle of sine 0.9, beyond 0.8"),
-        (None, "pattern", TypeError, "a sea is lit by BandLimited"),
+        (None, "pattern", TypeError, "gate of a sea must be BandLimited"),
     ],
 )
 def test_impossible_frames_and_gates_are_refused(n_range, gate, error, sentence):

@@ -1,6 +1,4 @@
-"""Echoes of turning targets against direct summation, each level against the next, and the figures
-of Ruan et al. 2013.
-"""
+"""Echoes of rotating targets against direct summation, and figures of Ruan et al. 2013."""
 
 from __future__ import annotations
 
@@ -38,7 +36,7 @@ SMALL = RandomPoints(9, 0.2, 0.05)
 
 
 def ladar(**changes) -> InverseRadar:
-    """The instrument of the paper, 400 pulses of 256 samples."""
+    """The instrument of Ruan et al. 2013, 400 pulses of 256 samples."""
     values: dict = {
         "carrier_hz": LIGHT_M_S / 1.55e-6,
         "bandwidth_hz": 150e9,
@@ -55,6 +53,7 @@ QUICK = ladar(prf_hz=200.0)
 
 
 def unit(turns: Tensor) -> Tensor:
+    """Unit phasors of phases in cycles."""
     return torch.polar(torch.ones_like(turns), 2 * math.pi * (turns - torch.round(turns)))
 
 
@@ -79,9 +78,7 @@ def direct_dechirped(
     track=(),
     curved: bool = False,
 ) -> Tensor:
-    """Scatterer by scatterer, the range at every sample; `curved`: the distance of points instead
-    of that of planes.
-    """
+    """Sum over scatterers with the range at every sample; `curved`: spherical wavefronts."""
     assert radar.pulse_s is not None
     fast = (torch.arange(n_fast, dtype=torch.float64) - n_fast // 2) * radar.pulse_s / n_fast
     pulse = torch.arange(n_pulse, dtype=torch.float64) / radar.prf_hz
@@ -105,7 +102,7 @@ def direct_dechirped(
 
 
 @pytest.mark.parametrize("n_pulse, n_range", [(40, 64), (21, 67), (1, 64)])
-def test_level_a_equals_direct_sums(n_pulse: int, n_range: int) -> None:
+def test_phase_only_equals_direct_sums(n_pulse: int, n_range: int) -> None:
     s = SMALL.scatterers(Draws(1))
     expected = direct_compressed(s, QUICK, n_pulse, n_range, 0.005)
     torch.testing.assert_close(turntable_echo(s, QUICK, n_pulse, n_range, 0.005, DOUBLE), expected, atol=1e-10, rtol=0)
@@ -123,7 +120,7 @@ MOTIONS = {
 
 
 @pytest.mark.parametrize("motion, track", MOTIONS.values(), ids=list(MOTIONS))
-def test_level_b_equals_direct_sums(motion, track) -> None:
+def test_dechirped_equals_direct_sums(motion, track) -> None:
     s = RandomPoints(9, 0.2, 0.2).scatterers(Draws(1))
     expected = direct_dechirped(s, QUICK, 40, 64, 0.005, motion, track)
     scale = float(expected.abs().max())
@@ -135,17 +132,15 @@ def test_level_b_equals_direct_sums(motion, track) -> None:
     )
 
 
-def test_level_b_of_a_slow_pulse_and_fast_turn() -> None:
-    """A microwave pulse of a millisecond and 40 times the rotation: the power series has terms to
-    add.
-    """
+def test_dechirped_with_a_long_pulse_and_a_fast_rotation() -> None:
+    """A pulse of a millisecond and 40 times the rotation need terms of the power series."""
     radar = InverseRadar(10e9, 2e9, 500.0, 0.2, 1e-3)
     s = RandomPoints(7, 8.0, 4.0).scatterers(Draws(2))
     expected = direct_dechirped(s, radar, 10, 64, 0.2)
     torch.testing.assert_close(dechirped_echo(s, radar, 10, 64, 0.2, dtype=DOUBLE), expected, atol=2e-6, rtol=0)
 
 
-def test_cross_range_and_range_lie_where_they_should() -> None:
+def test_scatterers_have_their_cross_range_and_range() -> None:
     recording, _ = simulate_turntable(
         ladar(), TurntableWorld(Points([0.062], [-0.04 * 0.9993082])), 400, 256, Draws(0), dtype=DOUBLE
     )
@@ -158,10 +153,10 @@ def test_cross_range_and_range_lie_where_they_should() -> None:
     torch.testing.assert_close(recording.signal.data[200, 88], torch.tensor(1 + 0j, dtype=DOUBLE), atol=1e-3, rtol=0)
 
 
-def test_levels_differ_by_the_published_figure() -> None:
-    """Brief 002, section 8: 5.6 percent rms, entropy within 0.006.
+def test_models_differ_by_a_known_amount() -> None:
+    """5.6 % rms and an entropy within 0.006, as measured with an independent float64 model.
 
-    The rest is rotation inside the pulse and the target's shape.
+    The rest is rotation within the pulse and the shape of the target.
     """
     s = Aircraft().scatterers(Draws(1))
     a = turntable_echo(s, ladar(), 400, 256, 0.005, DOUBLE)
@@ -177,7 +172,7 @@ def test_levels_differ_by_the_published_figure() -> None:
 
 
 @pytest.mark.parametrize("x, y, speed", [(0.1, 0.06, 0.0), (0.0, 0.12, 0.0), (-0.09, -0.03, -1e-3), (0.02, 0.01, 5e-3)])
-def test_level_a_says_what_it_neglects(x: float, y: float, speed: float) -> None:
+def test_phase_only_predicts_what_it_neglects(x: float, y: float, speed: float) -> None:
     s = Points([x], [y]).scatterers(Draws(0))
     b = direct_dechirped(
         s, QUICK, 41, 65, 0.005, (Polynomial([speed]),) if speed else (), (Polynomial([speed]),) if speed else ()
@@ -186,24 +181,24 @@ def test_level_a_says_what_it_neglects(x: float, y: float, speed: float) -> None
         torch.fft.fft(torch.fft.ifftshift(turntable_echo(s, QUICK, 41, 65, 0.005, DOUBLE), dim=-1), dim=-1), dim=-1
     )
     worst = float(torch.angle(b * a.conj()).abs().max())
-    said = PhaseOnly().neglected_phase_rad(QUICK, 41, x, y, speed)
-    assert 0.6 * said <= worst <= said
+    predicted = PhaseOnly().neglected_phase_rad(QUICK, 41, x, y, speed)
+    assert 0.6 * predicted <= worst <= predicted
 
 
 @pytest.mark.parametrize("x, y", [(0.1, 0.06), (0.1, -0.06), (0.0, 0.12)])
-def test_level_b_says_what_it_neglects(x: float, y: float) -> None:
+def test_dechirped_predicts_what_it_neglects(x: float, y: float) -> None:
     radar = ladar(prf_hz=20.0, reference_range_m=100.0)
     s = Points([x], [y]).scatterers(Draws(0))
     plane, curved = (direct_dechirped(s, radar, 41, 8, 0.005, curved=c) for c in (False, True))
     phase = torch.angle(curved * plane.conj() * (curved[20, 4] * plane[20, 4].conj()).conj())
-    said = Dechirped().neglected_phase_rad(radar, 41, x, y)
-    assert said > 0.01 or x == 0
-    assert float(phase.abs().max()) == pytest.approx(said, rel=0.05, abs=2e-6)
+    predicted = Dechirped().neglected_phase_rad(radar, 41, x, y)
+    assert predicted > 0.01 or x == 0
+    assert float(phase.abs().max()) == pytest.approx(predicted, rel=0.05, abs=2e-6)
     with pytest.raises(ValueError, match="reference_range_m is 0"):
         Dechirped().neglected_phase_rad(ladar(reference_range_m=0.0), 41, x, y)
 
 
-def test_recording_is_the_clean_one_turned_exactly() -> None:
+def test_recording_is_the_clean_one_times_a_phase_exactly() -> None:
     world = TurntableWorld(
         SMALL, motion=[Sinusoid(1e-3, 100.0, 60.0), Polynomial([100.0])], start_phase=[StartPhase(math.pi)], snr_db=3.0
     )
@@ -222,9 +217,10 @@ def test_recording_is_the_clean_one_turned_exactly() -> None:
     assert torch.equal(truth.clean.signal.data, free.signal.data)
 
 
-def test_level_b_carries_the_same_phase() -> None:
-    """Slow small motion neither shifts nor blurs: compressed pulses are those of a still target
-    times exp(j psi).
+def test_dechirped_has_the_same_phase() -> None:
+    """Slow small motion neither shifts nor defocuses.
+
+    Compressed pulses are those of a target at rest times exp(j psi).
     """
     effects = {"motion": [Sinusoid(20e-6, 0.5, 40.0), Polynomial([1e-5])], "start_phase": [UniformStartPhase()]}
     recording, truth = simulate_turntable(
@@ -288,15 +284,15 @@ def test_batches_equal_singles_and_any_chunk(fidelity) -> None:
         scene, motion=motion, start_phase=[StartPhase(1.0), UniformStartPhase()], snr_db=5.0, fidelity=fidelity
     )
     impairments = {"lost": LostPulses(count=3)}
-    whole, told = simulate_turntable(QUICK, world, 24, 64, Draws(2, trials=range(4)), impairments, DOUBLE)
+    whole, truth = simulate_turntable(QUICK, world, 24, 64, Draws(2, trials=range(4)), impairments, DOUBLE)
     part, _ = simulate_turntable(QUICK, world, 24, 64, Draws(2, trials=[3, 1]), impairments, DOUBLE)
-    alone, said = simulate_turntable(QUICK, world, 24, 64, Draws(2), impairments, DOUBLE)
+    alone, alone_truth = simulate_turntable(QUICK, world, 24, 64, Draws(2), impairments, DOUBLE)
     torch.testing.assert_close(part.signal.data, whole.signal.data[[3, 1]], atol=1e-12, rtol=0)
     torch.testing.assert_close(alone.signal.data, whole.signal.data[0], atol=1e-12, rtol=0)
-    assert torch.equal(said.values["phase_rad"], told.values["phase_rad"][0]) and torch.equal(
-        said.values["lost.present"], told.values["lost.present"][0]
+    assert torch.equal(alone_truth.values["phase_rad"], truth.values["phase_rad"][0]) and torch.equal(
+        alone_truth.values["lost.present"], truth.values["lost.present"][0]
     )
-    assert not torch.equal(told.values["phase_rad"][0], told.values["phase_rad"][1])
+    assert not torch.equal(truth.values["phase_rad"][0], truth.values["phase_rad"][1])
 
 
 def test_parameters_are_per_trial() -> None:
@@ -313,12 +309,12 @@ def test_parameters_are_per_trial() -> None:
         one = TurntableWorld(
             SMALL, float(rate[i]), [Sinusoid(float(amplitude[i]), 100.0, 90.0)], [StartPhase(float(i))], snr_db=30.0 * i
         )
-        single, said = simulate_turntable(QUICK, one, 24, 64, Draws(2, trials=[i]), dtype=DOUBLE)
+        single, alone_truth = simulate_turntable(QUICK, one, 24, 64, Draws(2, trials=[i]), dtype=DOUBLE)
         torch.testing.assert_close(single.signal.data[0], both.signal.data[i], atol=1e-12, rtol=0)
-        torch.testing.assert_close(said.values["phase_rad"][0], truth.values["phase_rad"][i])
+        torch.testing.assert_close(alone_truth.values["phase_rad"][0], truth.values["phase_rad"][i])
 
 
-def test_trials_that_share_everything_still_have_their_dim() -> None:
+def test_trials_without_random_numbers_have_their_dimension() -> None:
     recording, truth = simulate_turntable(QUICK, TurntableWorld(Points([0.0], [0.0])), 8, 16, Draws(0, trials=range(3)))
     assert (
         recording.signal.trials == (3,)
@@ -348,9 +344,7 @@ def test_echoes_are_differentiable(level: str) -> None:
 
 
 def test_single_precision_keeps_phases_of_kilometres() -> None:
-    """Brief 002, section 11: 3e-5 rad at most, 20 m of motion and the window at 20 km (plain
-    float32: 1.6 rad).
-    """
+    """3e-5 rad for 20 m of motion with the window at 20 km (1.6 rad with ranges in float32)."""
     motion = [Polynomial([100.0]), Sinusoid.named("1_100_90", unit="mm")]
     for fidelity in (PhaseOnly(), Dechirped([Polynomial([100.0])])):
         world = TurntableWorld(Points([0.09], [0.02]), motion=motion, fidelity=fidelity)
@@ -370,8 +364,9 @@ CASES = {
 
 
 def test_aircraft_reproduces_the_published_pattern() -> None:
-    """Brief 002, section 6: entropy of the ideal image, and of the polluted ones above it; 12
-    scenes.
+    """Entropy of the ideal image, and differences of the defocused images, over 12 scenes.
+
+    The differences are those of Ruan et al. 2013, Table 1.
     """
     draws, radar = Draws(3, trials=range(12)), ladar()
     recording, _ = simulate_turntable(radar, TurntableWorld(Aircraft()), 400, 256, draws)
@@ -404,7 +399,7 @@ def test_a_cosine_would_hardly_defocus() -> None:
     )
 
 
-def test_aircraft_fits_the_window_and_turns() -> None:
+def test_aircraft_fits_the_window_and_rotates() -> None:
     s = Aircraft().scatterers(Draws(1, trials=range(2)))
     assert 550 < s.azimuth_m.shape[-1] < 700 and s.azimuth_m.shape[0] == 2
     extent = [float(v.max() - v.min()) for v in (s.azimuth_m, s.range_m)]
@@ -468,7 +463,7 @@ def test_start_phases() -> None:
     assert float(twice.std()) == pytest.approx(math.sqrt(2), abs=0.05)
 
 
-def test_lost_pulses_keep_their_place() -> None:
+def test_lost_pulses_keep_their_position() -> None:
     draws = Draws(1, trials=range(3))
     recording, truth = simulate_turntable(
         QUICK, TurntableWorld(SMALL), 40, 16 * 4, draws, {"lost": LostPulses(fraction=0.1)}
@@ -514,7 +509,7 @@ REFUSED = {
         lambda: dechirped_echo(
             Points([4e3], [0.0]).scatterers(Draws(0)), InverseRadar(10e9, 5e9, 50.0, 4e-4, 1e-2), 4, 16, 4e-4
         ),
-        "phases bend by .* rad within a pulse; the dechirped model holds to 0.6 rad",
+        "the rotation curves phases by .* rad within a pulse, and the dechirped model holds to 0.6 rad",
     ),
     "snr": (
         lambda: TurntableWorld(SMALL, snr_db=math.nan),
@@ -544,7 +539,7 @@ REFUSED = {
     ),
     "jerk": (
         lambda: dechirped_echo(SMALL.scatterers(Draws(0)), QUICK, 4, 16, 0.005, [Sinusoid(1.0, 9000.0)]),
-        "the motion bends by .* m within a pulse",
+        "the motion departs by .* m from a straight line within a pulse",
     ),
 }
 

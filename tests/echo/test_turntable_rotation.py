@@ -1,5 +1,7 @@
-"""Echoes of targets whose rotation changes its rate, at both levels, against direct summation of
-Remote Sens. 2025, 17, 3447, Eq. (3).
+"""Echoes of targets with a changing rotation rate against direct summation.
+
+Reference:
+    Remote Sens. 2025, 17, 3447, Eq. (3).
 """
 
 from __future__ import annotations
@@ -27,18 +29,19 @@ CUBES = RandomPoints(7, 0.12, 0.3)
 def ladar(
     n_pulse: int, duration_s: float = 0.02, range_step_m: float = 0.015, pulse_s: float | None = 4e-6, **changes
 ) -> InverseRadar:
-    """The instrument of brief 003, with as many pulses over its 20 ms as a test can pay."""
+    """A ladar at 1.55 um over 20 ms, with as many pulses as a test affords."""
     return InverseRadar(
         LIGHT_M_S / LAMBDA, LIGHT_M_S / (2 * range_step_m), n_pulse / duration_s, pulse_s=pulse_s, **changes
     )
 
 
 def unit(turns: Tensor) -> Tensor:
+    """Unit phasors of phases in cycles."""
     return torch.polar(torch.ones_like(turns), 2 * math.pi * (turns - torch.round(turns)))
 
 
 def turned(time_s: Tensor, omega: float, k: tuple[float, ...]) -> Tensor:
-    """theta with its factorials spelled out."""
+    """theta with its factorials written out."""
     return omega * (time_s + sum(value * time_s ** (i + 2) / math.factorial(i + 2) for i, value in enumerate(k)))
 
 
@@ -65,9 +68,7 @@ def direct_dechirped(
     yc: float,
     curved: bool = False,
 ) -> Tensor:
-    """Scatterer by scatterer, the angle at every sample; `curved`: the distance of points instead
-    of that of planes.
-    """
+    """Sum over scatterers with the angle at every sample; `curved`: spherical wavefronts."""
     assert radar.pulse_s is not None
     fast = (torch.arange(n_fast, dtype=torch.float64) - n_fast // 2) * radar.pulse_s / n_fast
     theta = turned(torch.arange(n_pulse, dtype=torch.float64)[:, None] / radar.prf_hz + fast, omega, k)
@@ -89,7 +90,7 @@ def direct_dechirped(
 
 @pytest.mark.parametrize("yc", [0.0, -1.5, 0.7])
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
-def test_level_a_equals_direct_sums(order: int, yc: float) -> None:
+def test_phase_only_equals_direct_sums(order: int, yc: float) -> None:
     s, radar, k = CUBES.scatterers(Draws(order)), ladar(70), TRUE_K[: order - 1]
     expected = direct_compressed(s, radar, 70, 32, 0.1745, k, yc)
     rotation = PolynomialRotation(0.1745, k)
@@ -101,8 +102,8 @@ def test_level_a_equals_direct_sums(order: int, yc: float) -> None:
 
 @pytest.mark.parametrize("yc", [0.0, -1.5, 0.7])
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
-def test_level_b_equals_direct_sums(order: int, yc: float) -> None:
-    """Acceleration inside a pulse included: 4 us of it turn phases by 1e-5 rad here."""
+def test_dechirped_equals_direct_sums(order: int, yc: float) -> None:
+    """Angular acceleration within a pulse matters: in 4 us it changes phases by 1e-5 rad here."""
     s, radar, k = CUBES.scatterers(Draws(order)), ladar(70), TRUE_K[: order - 1]
     expected = direct_dechirped(s, radar, 70, 32, 0.1745, k, yc)
     rotation = PolynomialRotation(0.1745, k)
@@ -114,7 +115,7 @@ def test_level_b_equals_direct_sums(order: int, yc: float) -> None:
     )
 
 
-def test_an_order_of_one_is_the_even_rotation_from_the_first_pulse() -> None:
+def test_an_order_of_one_is_the_uniform_rotation_from_the_first_pulse() -> None:
     s, radar = CUBES.scatterers(Draws(1)), ladar(9)
     even, polynomial = (
         turntable_echo(s, radar, n, 32, rotation, DOUBLE) for n, rotation in ((9, 0.1), (5, PolynomialRotation(0.1)))
@@ -160,7 +161,7 @@ def test_batches_equal_singles(fidelity) -> None:
     world = TurntableWorld(
         CUBES, snr_db=snr, fidelity=fidelity, rotation=PolynomialRotation(omega, (k1, 1100.0)), centre_deviation_m=yc
     )
-    whole, told = simulate_turntable(radar, world, 66, 32, Draws(2, trials=range(3)), dtype=DOUBLE)
+    whole, truth = simulate_turntable(radar, world, 66, 32, Draws(2, trials=range(3)), dtype=DOUBLE)
     for i in range(3):
         one = TurntableWorld(
             CUBES,
@@ -169,14 +170,14 @@ def test_batches_equal_singles(fidelity) -> None:
             rotation=PolynomialRotation(float(omega[i]), (float(k1[i]), 1100.0)),
             centre_deviation_m=float(yc[i]),
         )
-        single, said = simulate_turntable(radar, one, 66, 32, Draws(2, trials=[i]), dtype=DOUBLE)
+        single, alone_truth = simulate_turntable(radar, one, 66, 32, Draws(2, trials=[i]), dtype=DOUBLE)
         torch.testing.assert_close(single.signal.data[0], whole.signal.data[i], atol=1e-11, rtol=0)
         for name in ("omega_rad_s", "warp_k", "yc_m", "rotation_rad_s", "noise_std"):
-            torch.testing.assert_close(said.values[name][0], told.values[name][i])
+            torch.testing.assert_close(alone_truth.values[name][0], truth.values[name][i])
 
 
 @pytest.mark.parametrize("fidelity", [PhaseOnly(), Dechirped()])
-def test_truth_names_the_rotation(fidelity) -> None:
+def test_the_truth_holds_the_rotation(fidelity) -> None:
     world = TurntableWorld(CUBES, fidelity=fidelity, rotation=ROTATION, centre_deviation_m=-1.5)
     _, truth = simulate_turntable(ladar(20), world, 20, 32, Draws(2, trials=range(3)))
     assert (
@@ -215,10 +216,10 @@ def test_echoes_are_differentiable_in_the_rotation(level: str) -> None:
 
 
 @pytest.mark.parametrize("width_m, difference", [(3.2, 4.5e-5), (12.86, 1.8e-4)])
-def test_angles_in_place_of_sines_never_matter(width_m: float, difference: float) -> None:
-    """Brief 003 measured 4.5e-5 of the data at A = 0.47 mrad: that of its small target.
+def test_angles_instead_of_sines_do_not_matter(width_m: float, difference: float) -> None:
+    """Angles instead of sines change 4.5e-5 of the data for a small target with A = 0.47 mrad.
 
-    It grows with the width, as x theta^3 / 6.
+    The difference grows with the width, as x theta^3 / 6.
     """
     s, radar = RandomPoints(60, width_m, 6.8).scatterers(Draws(1)), ladar(500, range_step_m=0.12)
     theta = ROTATION.angle(torch.arange(500, dtype=torch.float64) / radar.prf_hz)[:, None]
@@ -230,9 +231,10 @@ def test_angles_in_place_of_sines_never_matter(width_m: float, difference: float
 
 
 @pytest.mark.parametrize("cells, loss_db", [(0.012, 0.001), (0.075, 0.02), (0.19, 0.15), (0.37, 0.6), (0.75, 2.4)])
-def test_migration_costs_what_the_brief_says(cells: float, loss_db: float) -> None:
-    """Peak of the compensated echo against that of a fixed envelope, over cross range times the
-    total angle in range cells.
+def test_loss_by_migration(cells: float, loss_db: float) -> None:
+    """Peak loss of a migrating envelope over its migration x A in range cells.
+
+    The losses are those of an independent float64 model.
     """
     x, angle = 6.43, float(ROTATION.mean_rate(0.02, torch.zeros(0))) * 0.02
     radar = ladar(400, range_step_m=x * angle / cells, pulse_s=1e-9)
@@ -251,7 +253,7 @@ def test_migration_costs_what_the_brief_says(cells: float, loss_db: float) -> No
 
 
 @pytest.mark.parametrize("x, y, yc", [(0.1, 0.06, 0.0), (-0.09, -0.03, 0.4), (0.02, 0.1, -1.5)])
-def test_level_a_says_what_it_neglects(x: float, y: float, yc: float) -> None:
+def test_phase_only_predicts_what_it_neglects(x: float, y: float, yc: float) -> None:
     s, radar = Points([x], [y]).scatterers(Draws(0)), ladar(41, pulse_s=1e-7)
     rotation = PolynomialRotation(0.1745, (6.0, 1100.0))
     b = direct_dechirped(s, radar, 41, 33, 0.1745, (6.0, 1100.0), yc)
@@ -260,8 +262,8 @@ def test_level_a_says_what_it_neglects(x: float, y: float, yc: float) -> None:
         dim=-1,
     )
     worst = float(torch.angle(b * a.conj()).abs().max())
-    said = PhaseOnly().neglected_phase_rad(radar, 41, x, y, rotation_rad_s=rotation, centre_deviation_m=yc)
-    assert 0.6 * said <= worst <= said
+    predicted = PhaseOnly().neglected_phase_rad(radar, 41, x, y, rotation_rad_s=rotation, centre_deviation_m=yc)
+    assert 0.6 * predicted <= worst <= predicted
 
 
 def test_neglected_migration_is_pi_times_the_cells_of_the_whole_angle() -> None:
@@ -270,22 +272,22 @@ def test_neglected_migration_is_pi_times_the_cells_of_the_whole_angle() -> None:
         PolynomialRotation(torch.tensor([0.02, -0.04], dtype=torch.float64), TRUE_K[:2]),
     )
     angle = 2 * 0.467e-3
-    said = PhaseOnly().neglected_phase_rad(radar, 100, 6.43, 0.0, rotation_rad_s=rotation)
-    assert said == pytest.approx(math.pi * 6.43 * angle / radar.range_step_m, rel=0.03)
-    assert said == pytest.approx(
+    predicted = PhaseOnly().neglected_phase_rad(radar, 100, 6.43, 0.0, rotation_rad_s=rotation)
+    assert predicted == pytest.approx(math.pi * 6.43 * angle / radar.range_step_m, rel=0.03)
+    assert predicted == pytest.approx(
         2 * PhaseOnly().neglected_phase_rad(radar, 100, 6.43, 0.0, rotation_rad_s=angle / 0.02), rel=0.03
     )
 
 
-def test_level_b_says_what_it_neglects() -> None:
+def test_dechirped_predicts_what_it_neglects() -> None:
     radar, k = ladar(41, reference_range_m=2000.0), (6.0, 1100.0)
     s = Points([0.1], [0.06]).scatterers(Draws(0))
     plane, curved = (direct_dechirped(s, radar, 41, 8, 0.1745, k, 0.9, c) for c in (False, True))
     phase = torch.angle(curved * plane.conj() * (curved[0, 4] * plane[0, 4].conj()).conj())
-    said = Dechirped().neglected_phase_rad(radar, 41, 0.1, 0.06, PolynomialRotation(0.1745, k), 0.9)
+    predicted = Dechirped().neglected_phase_rad(radar, 41, 0.1, 0.06, PolynomialRotation(0.1745, k), 0.9)
     # the bound takes the worse of the two senses of rotation, and the angle at the end of the last
     # period
-    assert 1.0 < said < 3.0 and 0.85 * said < float(phase.abs().max()) < said
+    assert 1.0 < predicted < 3.0 and 0.85 * predicted < float(phase.abs().max()) < predicted
 
 
 REFUSED = {

@@ -17,8 +17,8 @@ from torchsar.scene import Dwell, Points, StripmapWorld
 
 @dataclass(frozen=True)
 class PointCase:
-    """Targets on one image line at several ranges; where they belong in the image, and the
-    arguments to focus them.
+    """Targets on one image line at several ranges, with their image positions and the focusing
+    arguments.
     """
 
     radar: StripmapRadar
@@ -98,7 +98,9 @@ def peak_offset(image: Tensor, line: float, cell: float, reach: float = 1.0, ste
 
 
 def phase_error_deg(image: Tensor, case: PointCase, cell: float) -> float:
-    """Phase of the image at a target's true place against -4 pi R / lambda."""
+    """Phase of the image at the true position of a target relative to -4 pi R / lambda, in
+    degrees.
+    """
     place = (torch.tensor([float(v)], dtype=torch.float64) for v in (case.line, cell))
     value = at_position(image, *place)[0, 0]
     return math.degrees(math.remainder(float(torch.angle(value)) - case.phase_rad(cell), 2 * math.pi))

@@ -1,4 +1,6 @@
-"""Chirp-z against the direct sum, and range walk taken out by the keystone transform."""
+"""Chirp-z transform against the direct sum, and correction of range walk by the keystone
+transform.
+"""
 
 from __future__ import annotations
 
@@ -69,13 +71,15 @@ def profiles(data):
 
 
 @pytest.mark.parametrize("cells, ambiguity", [(2.0, 0), (-4.0, 0), (26.0, -2)])
-def test_range_walk_is_taken_out(cells, ambiguity):
-    """A target of 26 cells' walk has 2.1 pulse rates of Doppler, of which its samples show 0.1."""
+def test_range_walk_is_removed(cells, ambiguity):
+    """A target that walks 26 cells has 2.1 pulse rates of Doppler, of which the samples show
+    0.1.
+    """
     data, frequency, carrier, still, doppler = walking(cells)
     assert (round(float(doppler[-1] - doppler[-2]) * -1) == ambiguity) or abs(cells) < 12
     out = keystone(data, frequency, carrier, ambiguity)
     inner = slice(12, -12)
-    assert (out - still)[inner].abs().max() < 0.1  # what is left is the cut of the aperture
+    assert (out - still)[inner].abs().max() < 0.1  # the rest is the cut of the aperture
     assert (profiles(out)[inner].argmax(-1) == profiles(still)[0].argmax()).all()
     assert len(profiles(data).argmax(-1).unique()) > abs(cells) - 1
 
@@ -92,7 +96,7 @@ def test_whole_doppler_bins_are_scaled_exactly():
     )
 
 
-def test_mistakes_are_named():
+def test_invalid_arguments_raise():
     data = noise(8, 3)
     with pytest.raises(ValueError, match="one frequency per"):
         keystone(data, torch.zeros(4, dtype=torch.float64), 1e3)

@@ -1,4 +1,4 @@
-"""Closest-approach coordinates and padded records."""
+"""Coordinates of closest approach, and padded records."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_a_point_appears_at_its_closest_range(doppler_hz):
         truth.values["zero_doppler_s"], truth.values["closest_range_m"], doppler_hz, radar.velocity_m_s
     )
     closest = truth.values["closest_range_m"]
-    # there is something to correct
+    # the correction is larger than two cells
     assert float((slant - closest).abs().min()) > 2 * radar.range_step_m
     found = impulse_response(image, (azimuth, closest))
     torch.testing.assert_close(found["position_range_m"], closest, atol=0.05 * radar.range_step_m, rtol=0)
@@ -35,23 +35,23 @@ def test_a_point_appears_at_its_closest_range(doppler_hz):
     )
 
 
-def test_without_squint_nothing_moves():
+def test_without_squint_the_image_is_unchanged():
     radar = small_radar()
     image = torch.randn(4, 64, dtype=torch.complex128)
     torch.testing.assert_close(closest_range(image, radar, 0.0, eps=1e-12), image, atol=1e-9, rtol=0)
 
 
-def test_the_centroid_is_asked_for_where_the_pointing_is_unknown():
+def test_a_missing_centroid_raises_where_the_pointing_is_unknown():
     radar = small_radar(pointing_doppler_hz=None)
     recording, _ = simulate(radar, StripmapWorld(Points([0.0], [0.0])), 8, 64, Draws(0))
     with pytest.raises(ValueError, match="needs the doppler_hz"):
         ClosestRange(radar)(OmegaK(radar)(recording.signal))
 
 
-def test_padding_keeps_cut_apertures_from_wrapping():
+def test_padding_prevents_wrap_around_of_cut_apertures():
     radar = small_radar()
-    # lit all the time and far beyond the end of the record: unpadded, its echo folds back into the
-    # image
+    # illuminated all the time and far beyond the end of the record: without padding its echo folds
+    # back into the image
     world = StripmapWorld(Points([25.0], [0.0]), AlwaysLit())
     recording, _ = simulate(radar, world, 128, 96, Draws(0), dtype=torch.complex128)
     plain, padded = OmegaK(radar, "flat")(recording.signal), PaddedLines(OmegaK(radar, "flat"))(recording.signal)

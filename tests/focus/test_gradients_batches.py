@@ -1,4 +1,4 @@
-"""Gradients and batches of every focuser, at a tiny size in complex128."""
+"""Gradients and batches of every focuser, for small data in complex128."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_gradcheck_in_raw_velocity_and_frame(form):
     assert torch.autograd.gradcheck(rows(form), (raw, velocity, frame), atol=1e-4)
 
 
-def test_gradcheck_of_backprojection_in_all_that_varies():
+def test_gradcheck_of_backprojection_in_all_arguments():
     torch.manual_seed(0)
     raw = torch.randn(5, 8, dtype=torch.complex128, requires_grad=True)
     x, r = (torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in ([0.5, 0.9], [2008.0, 2011.0]))
@@ -84,7 +84,7 @@ def test_apertures_limit_the_pulses():
     assert abs(backproject(raw, RADAR, x, r, doppler_hz=300.0, frame_hz=0.0, aperture=DopplerBand(50.0))) == 0
 
 
-def test_a_processed_band_removes_what_lies_outside_and_warns_beyond_the_prf():
+def test_a_processed_band_removes_other_doppler_and_warns_beyond_the_prf():
     n = 256
     tone = (
         torch.exp(2j * torch.pi * 90.625 / 400 * torch.arange(n, dtype=torch.float64))[:, None]

@@ -1,4 +1,4 @@
-"""Geometries that cannot be are refused by name."""
+"""Impossible geometries raise errors that name the value."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torchsar.focus import OmegaK
         ({"doppler_hz": float("nan")}, "squint of sine"),
     ],
 )
-def test_impossible_geometry_is_refused(given, match):
+def test_impossible_geometry_raises(given, match):
     recording, _ = small_recording(16, 64)
     values = {name: torch.tensor(value, dtype=torch.float64) for name, value in given.items()}
     with pytest.raises(ValueError, match=match):

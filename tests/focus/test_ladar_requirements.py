@@ -1,4 +1,4 @@
-"""Limits and fidelity of a triangular ladar: the figures of brief 000, sections 7 and 10."""
+"""Limits and fidelity of a triangular ladar against figures of an independent model."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_several_azimuths_in_a_narrow_beam():
         ({"jerk_m_s3": -1.0}, "jerk_m_s3"),
     ],
 )
-def test_odd_input_is_refused(bad, message):
+def test_invalid_input_raises(bad, message):
     with pytest.raises(ValueError, match=message):
         rows(**bad)
 
@@ -119,7 +119,7 @@ def test_fidelity_rows():
     )
 
 
-def test_flight_time_against_the_shift_it_is():
-    """0.2 mm/s at 20 m/s^2 and 3 km, over half the record from its middle."""
+def test_flight_time_is_a_shift_of_the_time_axis():
+    """The velocity error is 0.2 mm/s at 20 m/s^2 and 3 km, over half the record from its middle."""
     row = effects(acceleration_m_s2=20.0)["flight time ignored"]
     assert row.phase_rad == pytest.approx(4 * math.pi / 1.55e-6 * 2.0e-4 * 512 * 16e-6 / 2, rel=0.01)

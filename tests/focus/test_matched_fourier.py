@@ -1,5 +1,5 @@
-"""Matched Fourier transform: every method against the sum itself, adjoints, gradients, units, and
-what is refused.
+"""Matched Fourier transform: every transform against the sum itself, adjoints, gradients, units,
+and invalid arguments.
 """
 
 from __future__ import annotations
@@ -15,16 +15,21 @@ from torchsar.compensate.pulse_phase.imaging import Through
 from torchsar.core import Signal
 from torchsar.core.warp import warp, warp_rate
 from torchsar.focus import (
+    CompiledNufft,
+    CrossRangeLines,
+    DopplerLines,
+    ExplicitSum,
+    Gridding,
     MatchedFourier,
     MatchedFourierOperator,
     RangePhase,
+    Resampling,
     cross_range_of,
     lines_for,
     matched_fourier,
     mean_rate,
     range_phase,
 )
-from torchsar.focus.matched_fourier import kernel_of
 from torchsar.focus.warped_sums import times_of_even_angle
 from torchsar.metrics import entropy
 from torchsar.radar import LIGHT_M_S, InverseRadar
@@ -55,7 +60,9 @@ def direct(data, k, oversampling, lines, weight="matched"):
 
 
 def points(x_m, y_m, k=K, omega=OMEGA, n_range=1, step_m=0.25, yc_m=0.0):
-    """(trial, pulse, range) of scatterers at cross ranges and ranges, envelope of one cell."""
+    """Pulses (trial, pulse, range) of scatterers at cross ranges and ranges, with an envelope of
+    one cell.
+    """
     c4, theta = 4 * math.pi / LAMBDA, omega[..., None] * warp(TIMES, k)
     data = torch.zeros(*theta.shape, n_range, dtype=torch.complex128)
     for x, y in zip(x_m, y_m):
@@ -64,23 +71,24 @@ def points(x_m, y_m, k=K, omega=OMEGA, n_range=1, step_m=0.25, yc_m=0.0):
     return data
 
 
-METHODS = [
-    "nufft",
-    "explicit",
-    pytest.param(
-        "finufft", marks=pytest.mark.skipif(not importlib.util.find_spec("finufft"), reason="finufft is not installed")
-    ),
-]
+NO_FINUFFT = pytest.mark.skipif(not importlib.util.find_spec("finufft"), reason="finufft is not installed")
+
+
+def name_of(transform):
+    return type(transform).__name__
+
+
+def sums(eps=None):
+    """The transforms that evaluate the sum itself, to a relative error eps."""
+    return [Gridding(eps=eps), ExplicitSum(), pytest.param(CompiledNufft(eps), marks=NO_FINUFFT)]
 
 
 @pytest.mark.parametrize("weight", ["matched", "warped"])
 @pytest.mark.parametrize("oversampling, lines", [(1.0, None), (2.0, None), (1.3, 201), (4.0, 64)])
-@pytest.mark.parametrize("method", METHODS)
-def test_equals_the_sum(method, oversampling, lines, weight):
+@pytest.mark.parametrize("transform", sums(1e-9), ids=name_of)
+def test_equals_the_sum(transform, oversampling, lines, weight):
     data = noise(2, N, 3)
-    image = matched_fourier(
-        data, K, PRF, oversampling=oversampling, lines=lines, weight=weight, method=method, eps=1e-9
-    )
+    image = matched_fourier(data, K, PRF, lines=DopplerLines(oversampling, lines), transform=transform, weight=weight)
     assert image.shape == (2, lines or round(oversampling * N), 3)
     assert relative(image, direct(data, K, oversampling, image.shape[-2], weight)) < 1e-9
 
@@ -88,44 +96,46 @@ def test_equals_the_sum(method, oversampling, lines, weight):
 @pytest.mark.parametrize("eps", [1e-3, 1e-6])
 def test_eps_holds_in_single_precision(eps):
     data = noise(2, N, 3)
-    image = matched_fourier(data.to(torch.complex64), K, PRF, eps=eps)
+    image = matched_fourier(data.to(torch.complex64), K, PRF, transform=Gridding(eps=eps))
     assert image.dtype == torch.complex64 and relative(image, direct(data, K, 2.0, 2 * N)) < eps
 
 
 def test_kernel_choice():
-    assert kernel_of(4, None).oversampling == 2 and kernel_of(4, None, 1.25).oversampling == 1.25
-    assert kernel_of(None, 1e-6).oversampling == 1.5 and kernel_of(None, 1e-13).oversampling == 2
+    assert Gridding(4).kernel.oversampling == 2 and Gridding(4, oversampling=1.25).kernel.oversampling == 1.25
+    assert Gridding(eps=1e-6).kernel.oversampling == 1.5 and Gridding(eps=1e-13).kernel.oversampling == 2
+    assert Gridding().kernel == Gridding(eps=1e-6).kernel
     with pytest.raises(ValueError, match="not both"):
-        kernel_of(4, 1e-3)
+        Gridding(4, 1e-3)
 
 
 def edge(share=0.93):
-    """Points spread up to `share` of what the pulse rate carries at the fastest turn, and their
-    image by the sum.
+    """Points spread up to `share` of half the pulse rate at the fastest rotation, and their image
+    by the direct sum.
     """
     reach = share * LAMBDA * PRF / 4 / float((OMEGA[0] * warp_rate(TIMES, K[0])).max())
     data = points(torch.linspace(-reach, reach, 41).tolist(), [0.0] * 41)[:1]
-    return data, matched_fourier(data, K[:1], PRF, method="explicit")
+    return data, matched_fourier(data, K[:1], PRF, transform=ExplicitSum())
 
 
 @pytest.mark.parametrize(
-    "options, low, high",
+    "transform, low, high",
     [
-        ({"taps": 4, "kernel_oversampling": 1.25}, 1e-3, 1e-2),
-        ({"taps": 4}, 1e-4, 1e-3),
-        ({"taps": 6, "kernel_oversampling": 1.25}, 7e-5, 7e-4),
-        ({"taps": 6}, 1e-6, 1e-5),
-        ({"taps": 8}, 1e-8, 1e-7),
-        ({"method": "linear"}, 0.1, 0.5),
-        ({"method": "spline"}, 0.03, 0.2),
+        (Gridding(4, oversampling=1.25), 1e-3, 1e-2),
+        (Gridding(4), 1e-4, 1e-3),
+        (Gridding(6, oversampling=1.25), 7e-5, 7e-4),
+        (Gridding(6), 1e-6, 1e-5),
+        (Gridding(8), 1e-8, 1e-7),
+        (Resampling("linear"), 0.1, 0.5),
+        (Resampling("spline"), 0.03, 0.2),
     ],
+    ids=str,
 )
-def test_what_each_method_loses(options, low, high):
-    """Brief 003: 4e-3, 4e-4, 2e-4, 4e-6, 4e-8 of the kernels; 0.20 and 0.077 of resampling with
-    targets up to 93 % of half the pulse rate.
+def test_error_of_each_transform(transform, low, high):
+    """An independent float64 model gives 4e-3, 4e-4, 2e-4, 4e-6 and 4e-8 for the kernels, and 0.20
+    and 0.077 for resampling with targets up to 93 % of half the pulse rate.
     """
     data, exact = edge()
-    assert low < relative(matched_fourier(data, K[:1], PRF, **options), exact) < high
+    assert low < relative(matched_fourier(data, K[:1], PRF, transform=transform), exact) < high
 
 
 @pytest.mark.parametrize(
@@ -136,24 +146,24 @@ def test_entropy_follows_the_kernel(taps, oversampling, worst):
     assert (
         abs(
             float(
-                entropy(matched_fourier(data, K[:1], PRF, taps=taps, kernel_oversampling=oversampling)) - entropy(exact)
+                entropy(matched_fourier(data, K[:1], PRF, transform=Gridding(taps, oversampling=oversampling)))
+                - entropy(exact)
             )
         )
         < worst
     )
 
 
-@pytest.mark.parametrize("method", ["linear", "spline"])
-def test_resampling_is_right_well_inside_the_band(method):
-    """Tapered, because a sum over even angles weighs the outermost pulses differently, by some
-    hundredths of an image.
+@pytest.mark.parametrize("interpolation, worst", [("linear", 0.01), ("spline", 2e-4)])
+def test_resampling_is_right_well_inside_the_band(interpolation, worst):
+    """The pulses are tapered, because a sum over equal steps of angle weights the outermost pulses
+    differently, which changes the image by some hundredths.
     """
     data = edge(0.1)[0] * torch.sin(math.pi * TIMES / DURATION).square()[:, None]
-    for options in ({}, {"oversampling": 1.3, "lines": 300}):
-        exact = matched_fourier(data, K[:1], PRF, method="explicit", **options)
-        assert relative(matched_fourier(data, K[:1], PRF, method=method, **options), exact) < (
-            0.01 if method == "linear" else 2e-4
-        )
+    for lines in (DopplerLines(), DopplerLines(1.3, 300)):
+        exact = matched_fourier(data, K[:1], PRF, lines=lines, transform=ExplicitSum())
+        found = matched_fourier(data, K[:1], PRF, lines=lines, transform=Resampling(interpolation))
+        assert relative(found, exact) < worst
 
 
 def test_times_of_even_angle():
@@ -166,30 +176,24 @@ def test_times_of_even_angle():
     )
 
 
-@pytest.mark.parametrize("metres", [{}, {"cross_range_m": (1e-4, 120), "omega_rad_s": OMEGA, "wavelength_m": LAMBDA}])
-@pytest.mark.parametrize("method", [*METHODS, "linear", "spline"])
-def test_adjoint(method, metres):
+@pytest.mark.parametrize(
+    "lines", [DopplerLines(1.3, 120), CrossRangeLines(1e-4, 120, OMEGA, LAMBDA)], ids=["doppler", "metres"]
+)
+@pytest.mark.parametrize("transform", [*sums(), Resampling("linear"), Resampling("spline")], ids=str)
+def test_adjoint(transform, lines):
     operator = MatchedFourierOperator(
-        K,
-        N,
-        PRF,
-        dtype=torch.complex128,
-        oversampling=1.3,
-        lines=None if metres else 120,
-        weight="warped",
-        method=method,
-        **metres,
+        K, N, PRF, dtype=torch.complex128, lines=lines, transform=transform, weight="warped"
     )
     pulses, image = noise(3, 2, N, 4), noise(3, 2, 120, 4, seed=2)
     torch.testing.assert_close(
         (operator.image(pulses) * image.conj()).sum(),
         (pulses * operator.adjoint(image).conj()).sum(),
-        rtol=1e-7 if method == "finufft" else 1e-11,
+        rtol=1e-7 if isinstance(transform, CompiledNufft) else 1e-11,
         atol=1e-9,
     )
 
 
-def test_operator_serves_autofocus():
+def test_operator_is_an_imaging_of_autofocus():
     imaging = Through(MatchedFourierOperator(K, N, PRF, dtype=torch.complex128))
     rows, image = noise(2, 3, N), noise(2, 3, 2 * N, seed=2)
     torch.testing.assert_close(
@@ -206,11 +210,11 @@ SMALL = torch.tensor([[0.1, 0.01], [0.05, 0.03]], dtype=torch.float64)
 @pytest.mark.parametrize(
     "options",
     [
-        {"taps": 5},
-        {"taps": 4, "kernel_oversampling": 1.25, "weight": "warped"},
-        {"method": "explicit"},
-        {"method": "spline"},
-        {"method": "linear", "oversampling": 1.1},
+        {"transform": Gridding(5)},
+        {"transform": Gridding(4, oversampling=1.25), "weight": "warped"},
+        {"transform": ExplicitSum()},
+        {"transform": Resampling("spline")},
+        {"transform": Resampling("linear"), "lines": DopplerLines(1.1, 7)},
     ],
     ids=str,
 )
@@ -218,7 +222,7 @@ def test_two_derivatives(options):
     data, k = noise(2, 10, 2).requires_grad_(), SMALL.clone().requires_grad_()
 
     def image(data, k):
-        return matched_fourier(data, k, 10.0, lines=7, **options)
+        return matched_fourier(data, k, 10.0, **{"lines": DopplerLines(lines=7), **options})
 
     assert torch.autograd.gradcheck(image, (data, k), fast_mode=True) and torch.autograd.gradgradcheck(
         image, (data, k), fast_mode=True
@@ -234,45 +238,45 @@ def test_two_derivatives_in_metres():
 
     def image(data, k, omega, yc):
         data = range_phase(data, torch.tensor([-0.1, 0.3], dtype=torch.float64), 1.0, 10.0, omega, k, yc)
-        return matched_fourier(data, k, 10.0, cross_range_m=(0.1, 9), omega_rad_s=omega, wavelength_m=1.0)
+        return matched_fourier(data, k, 10.0, lines=CrossRangeLines(0.1, 9, omega, 1.0))
 
     assert torch.autograd.gradcheck(image, (data, k, omega, omega), fast_mode=True) and torch.autograd.gradgradcheck(
         image, (data, k, omega, omega), fast_mode=True
     )
 
 
-@pytest.mark.skipif(not importlib.util.find_spec("finufft"), reason="finufft is not installed")
+@NO_FINUFFT
 def test_first_derivative_through_the_compiled_library():
     data, k = noise(2, 10, 2).requires_grad_(), SMALL.clone().requires_grad_()
 
     def image(data, k):
-        return matched_fourier(data, k, 10.0, method="finufft", eps=1e-12)
+        return matched_fourier(data, k, 10.0, transform=CompiledNufft(1e-12))
 
     assert torch.autograd.gradcheck(image, (data, k))
-    operator = MatchedFourierOperator(SMALL, 10, 10.0, dtype=torch.complex128, method="finufft", eps=1e-12)
+    operator = MatchedFourierOperator(SMALL, 10, 10.0, dtype=torch.complex128, transform=CompiledNufft(1e-12))
     assert torch.autograd.gradcheck(operator.adjoint, (noise(2, 20, 2).requires_grad_(),))
 
 
-def test_missing_library_names_its_extra(monkeypatch):
+def test_error_for_the_missing_library_names_its_extra(monkeypatch):
     def missing(name):
         raise ModuleNotFoundError(name)
 
     monkeypatch.setattr(importlib, "import_module", missing)
     with pytest.raises(ModuleNotFoundError, match=r"torchsar-lab\[nufft\]"):
-        matched_fourier(noise(N, 1), K[0], PRF, method="finufft")
+        matched_fourier(noise(N, 1), K[0], PRF, transform=CompiledNufft())
 
 
-@pytest.mark.parametrize("method", ["nufft", "explicit", "spline"])
-def test_batch_equals_singles_and_broadcasts(method):
+@pytest.mark.parametrize("transform", [Gridding(), ExplicitSum(), Resampling("spline")], ids=name_of)
+def test_batch_equals_singles_and_broadcasts(transform):
     data = noise(2, N, 3) * torch.tensor([1.0, 1e4])[:, None, None]
-    together = matched_fourier(data, K, PRF, method=method)
+    together = matched_fourier(data, K, PRF, transform=transform)
     for i in range(2):
         torch.testing.assert_close(
-            together[i], matched_fourier(data[i], K[i], PRF, method=method), rtol=1e-12, atol=1e-12 * 1e4**i
+            together[i], matched_fourier(data[i], K[i], PRF, transform=transform), rtol=1e-12, atol=1e-12 * 1e4**i
         )
         torch.testing.assert_close(
-            matched_fourier(data[0], K, PRF, method=method)[i],
-            matched_fourier(data[0], K[i], PRF, method=method),
+            matched_fourier(data[0], K, PRF, transform=transform)[i],
+            matched_fourier(data[0], K[i], PRF, transform=transform),
             rtol=1e-12,
             atol=1e-11,
         )
@@ -282,7 +286,7 @@ def test_batch_equals_singles_and_broadcasts(method):
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_one_impossible_warp_spoils_its_own_trial_only(bad):
+def test_a_non_finite_warp_affects_its_own_trial_only(bad):
     k, data = K.clone(), noise(2, N, 3)
     k[0, 1] = bad
     image = matched_fourier(data, k, PRF)
@@ -293,16 +297,26 @@ def test_one_impossible_warp_spoils_its_own_trial_only(bad):
 def test_no_warp_is_a_plain_transform():
     data = noise(N, 2)
     want = torch.fft.fftshift(torch.fft.ifft(data, dim=0, norm="ortho"), dim=0)
-    assert relative(matched_fourier(data, torch.zeros(0), PRF, oversampling=1.0, eps=1e-12), want) < 1e-12
     assert (
-        relative(matched_fourier(data, torch.zeros(1, dtype=torch.float64), PRF, oversampling=1.0, eps=1e-12), want)
+        relative(
+            matched_fourier(data, torch.zeros(0), PRF, lines=DopplerLines(1.0), transform=Gridding(eps=1e-12)), want
+        )
+        < 1e-12
+    )
+    assert (
+        relative(
+            matched_fourier(
+                data, torch.zeros(1, dtype=torch.float64), PRF, lines=DopplerLines(1.0), transform=Gridding(eps=1e-12)
+            ),
+            want,
+        )
         < 1e-12
     )
 
 
 def test_any_order():
     k, data = torch.tensor([3.0, 200.0, 1e4, -5e5], dtype=torch.float64), noise(N, 1)
-    assert relative(matched_fourier(data, k, PRF, eps=1e-10), direct(data, k, 2.0, 2 * N)) < 1e-10
+    assert relative(matched_fourier(data, k, PRF, transform=Gridding(eps=1e-10)), direct(data, k, 2.0, 2 * N)) < 1e-10
 
 
 def test_lines_for():
@@ -315,7 +329,7 @@ def test_lines_for():
 
 def test_fewer_lines_are_the_middle_of_all():
     data = noise(N, 2)
-    few, every = matched_fourier(data, K[0], PRF, lines=300), matched_fourier(data, K[0], PRF)
+    few, every = matched_fourier(data, K[0], PRF, lines=DopplerLines(lines=300)), matched_fourier(data, K[0], PRF)
     assert relative(few, every[N - 150 : N + 150]) < 2e-6
 
 
@@ -331,8 +345,8 @@ def test_range_phase_is_the_factor_itself(yc_m):
 
 
 def test_a_point_is_focused_in_both_axes_and_scaled():
-    """8 mm to one side and 12 m from the centre, where the range term alone costs more than
-    2 dB.
+    """The point lies 8 mm to one side and 12 m from the centre, where the range term alone costs
+    more than 2 dB.
     """
     data = points([8e-3], [12.0], n_range=5, yc_m=12.0)
     signal = Signal(data, RADAR.raw_axes(N, 5))
@@ -359,7 +373,9 @@ def test_metre_mode_puts_all_trials_on_one_axis():
         and (at[:, 45] > 0.9 * math.sqrt(N)).all()
         and (at[:, 115] < 0.2 * math.sqrt(N)).all()
     )
-    explicit = MatchedFourier(RADAR, cross_range_m=(2e-4, 121), method="explicit")(signal, warp_k=K, omega_rad_s=OMEGA)
+    explicit = MatchedFourier(RADAR, cross_range_m=(2e-4, 121), transform=ExplicitSum())(
+        signal, warp_k=K, omega_rad_s=OMEGA
+    )
     assert relative(image.data, explicit.data) < 1e-6
     cells = (
         torch.exp(4j * math.pi / LAMBDA * axis.values()[:, None] * (OMEGA[:, None] * warp(TIMES, K))[:, None, :])
@@ -379,7 +395,7 @@ def test_doppler_axis_and_mean_rate():
     torch.testing.assert_close(cross_range_of(1 / DURATION, OMEGA, K, LAMBDA, DURATION), LAMBDA / (2 * OMEGA * total))
 
 
-def test_constants_serve_and_connected_values_win():
+def test_connected_values_take_precedence_over_constants():
     signal = Signal(noise(2, N, 3), RADAR.raw_axes(N, 3))
     held = MatchedFourier(RADAR, warp_k=K[0])
     torch.testing.assert_close(held(signal).data, matched_fourier(signal.data, K[0], PRF))
@@ -409,7 +425,7 @@ def test_tunable_warp_descends():
     assert torch.isfinite(k.grad).all() and (k.grad > 0).all()
 
 
-def test_refusals():
+def test_invalid_arguments_raise():
     signal = Signal(noise(2, N, 3), RADAR.raw_axes(N, 3))
     backwards = torch.tensor([[-100.0, 2000.0], [0.0, 0.0]], dtype=torch.float64)
     for stage in (MatchedFourier(RADAR), RangePhase(RADAR, 0.02)):
@@ -424,14 +440,16 @@ def test_refusals():
     with pytest.raises(ValueError, match="at least 8 pulses"):
         matched_fourier(noise(7, 2), K[0], PRF)
     for options, message in (
-        ({"method": "fft"}, "method 'fft'"),
         ({"weight": "hann"}, "weight 'hann'"),
         ({"oversampling": 0.0}, "positive"),
         ({"lines": 0}, "at least 1"),
-        ({"taps": 3, "eps": 1e-3}, "not both"),
     ):
         with pytest.raises(ValueError, match=message):
             MatchedFourier(RADAR, **options)
+    with pytest.raises(ValueError, match="interpolation 'fft'"):
+        Resampling("fft")
+    with pytest.raises(ValueError, match="a positive step and at least one line"):
+        CrossRangeLines(0.0, 9, 0.02, LAMBDA)
     operator = MatchedFourierOperator(K, N, PRF)
     with pytest.raises(TypeError, match="built for torch.complex64"):
         operator.image(noise(2, N, 3))
@@ -439,7 +457,7 @@ def test_refusals():
         operator.image(noise(2, N + 1, 3, dtype=torch.complex64))
 
 
-def test_lines_in_metres_mind_the_pulse_rate():
+def test_lines_in_metres_are_checked_against_the_pulse_rate():
     signal = Signal(noise(2, N, 1), RADAR.raw_axes(N, 1))
     reach = LAMBDA * PRF / 4 / float((OMEGA[:, None] * warp_rate(TIMES, K)).max())
 

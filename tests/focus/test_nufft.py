@@ -1,4 +1,4 @@
-"""Non-uniform transforms against the direct sum, their adjoint, their gradients."""
+"""Non-uniform transforms against the direct sum, with adjoints and gradients."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_gradient_in_the_points_is_that_of_the_direct_sum():
     assert torch.linalg.vector_norm(got - want) < 1e-6 * torch.linalg.vector_norm(want)
 
 
-def test_mistakes_are_named():
+def test_invalid_arguments_raise():
     x = torch.zeros(4, dtype=torch.complex64)
     with pytest.raises(TypeError, match="float64 cycles per sample"):
         nufft_type2(x, torch.zeros(3))

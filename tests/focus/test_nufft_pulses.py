@@ -1,5 +1,5 @@
-"""The non-uniform FFT along pulses against the direct sum, its adjoint, its gradients, and the
-kernels behind it.
+"""Non-uniform FFT along pulses against the direct sum, with adjoint, gradients, and the gradients
+of the trilinear form.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ def noise(*shape, seed=1, dtype=torch.complex128):
 
 
 def warped(m=120):
-    """Points of two trials: even, and bent with some anywhere, on the grid, at its edges, and out
-    of order.
+    """Points of two trials: uniform, and warped with some anywhere, on the grid, at its edges, and
+    out of order.
     """
     p = torch.linspace(0, 1 - 1 / m, m, dtype=torch.float64) ** torch.tensor([[1.0], [1.3]], dtype=torch.float64)
     p[1, :8] = torch.tensor([-1.2, 5.3, 0.5, 0.9999999, 1e-12, 0.0, 1.0, 0.25])
@@ -46,7 +46,7 @@ def test_error_is_below_that_of_the_kernel(taps, oversampling, dtype, floor):
     assert relative(forward, exact.mT @ y) < max(kernel.error, floor) and relative(backward, exact.conj() @ x) < max(
         kernel.error, floor
     )
-    assert relative(forward, exact.mT @ y) > kernel.error / 30 or floor  # the bound says something
+    assert relative(forward, exact.mT @ y) > kernel.error / 30 or floor  # the bound is tight
 
 
 @pytest.mark.parametrize("eps", [1e-2, 1e-4, 1e-7, 1e-12])
@@ -56,7 +56,7 @@ def test_eps_chooses_the_narrowest_width(eps):
     assert Kernel.of(eps).taps % 2 and Kernel.of(eps).taps - kernel.taps in (0, 1)
 
 
-def test_impossible_kernels_are_refused():
+def test_invalid_kernels_raise():
     for taps in (1, 17, 3.5):
         with pytest.raises(ValueError, match="2 to 16 taps"):
             Kernel(taps)
@@ -77,7 +77,7 @@ def test_type1_is_the_adjoint_of_type2(taps):
     )
 
 
-def test_one_point_anywhere_loses_nothing():
+def test_a_single_point_is_exact_anywhere():
     """Also where the tap set changes, at rows and half rows, and at both ends of the circle."""
     plan = PulseNufft(32, Kernel(7), torch.complex128)
     points = torch.cat(

@@ -1,5 +1,5 @@
-"""Focused points against direct evaluation: place and phase over the swath, at several squints;
-precision; requirements.
+"""Focused points against direct evaluation: position and phase over the swath at several squints,
+precision, and requirements.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def test_bulk_and_refocus_is_enough_from_orbit(name):
         assert max(abs(x) for x in helpers.peak_offset(image, case.line, cell)) < 0.05
 
 
-def test_bulk_and_refocus_displaces_where_the_table_says_so():
+def test_bulk_and_refocus_displaces_where_the_requirements_predict_it():
     case = CASES["airborne"]()
     image = omega_k(case.raw, case.radar, **case.arguments)
     rows = requirements(case.radar, case.radar.raw_axes(*case.raw.shape), 0.0, integration_s=3.0)

@@ -148,7 +148,7 @@ def test_stage_on_a_turntable_recording():
     torch.testing.assert_close(image.data, exact.data, rtol=0, atol=1e-7 * float(exact.data.abs().max()))
 
 
-def test_a_point_lies_at_its_place_with_x_along_range():
+def test_a_point_appears_at_its_position_with_x_along_range():
     angle = torch.linspace(-0.2, 0.25, PULSES, dtype=torch.float64)
     geometry = FarField.turntable(FREQUENCY, angle)
     ranges = geometry.range_m(
@@ -167,7 +167,7 @@ def test_a_point_lies_at_its_place_with_x_along_range():
         assert (float(image.axes[0].values()[line]), float(image.axes[1].values()[cell])) == place
 
 
-def test_operator_is_kept_for_its_geometry_and_dtype_only():
+def test_operator_is_reused_for_its_geometry_and_dtype_only():
     stage, geometry = PolarFormat(6.0, 0.5, geometry=waves()), waves()
     first = stage.operator(profiles(), geometry)
     assert stage.operator(profiles(4), waves()) is first
@@ -180,7 +180,7 @@ def test_operator_is_kept_for_its_geometry_and_dtype_only():
 
 
 @pytest.mark.parametrize("build", [PolarFormat, SpotlightBackprojection])
-def test_stage_promises(build):
+def test_stage_checks_its_input(build):
     stage = build(6.0, 0.5, geometry=waves())
     signal = recording(profiles(2)).signal
     image = stage(signal).data
@@ -221,17 +221,16 @@ def test_recorded_car_park_agrees_with_backprojection(recorded):
     patch = {"extent_m": 12.0, "step_m": 0.25, "geometry": geometry}
     image, exact = (stage(**patch)(data.signal) for stage in (PolarFormat, SpotlightBackprojection))
     assert float(correlation(image.data.abs().to(torch.complex64), exact.data.abs().to(torch.complex64))) > 0.9999
-    # at the edge the picture is the same, but displaced: on apparent positions plane waves agree,
-    # phase and all
+    # at the edge the image is displaced: at apparent positions plane waves agree, including phase
     x, y = torch.meshgrid(
         torch.linspace(40, 46, 25, dtype=torch.float64),
         torch.linspace(-48, -42, 25, dtype=torch.float64),
         indexing="xy",
     )
-    place = (v.reshape(x.shape) for v in geometry.apparent(x.reshape(-1), y.reshape(-1)))
+    apparent = (v.reshape(x.shape) for v in geometry.apparent(x.reshape(-1), y.reshape(-1)))
     waves, sight = (
         backproject_spotlight(data.signal.data, g, *at, window="hann", eps=1e-5)
-        for g, at in ((geometry.far_field(), place), (geometry, (x, y)))
+        for g, at in ((geometry.far_field(), apparent), (geometry, (x, y)))
     )
     assert float(correlation(waves, sight)) > 0.9995
 

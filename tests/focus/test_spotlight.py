@@ -1,5 +1,5 @@
-"""Backprojection of spotlight and turntable data against the direct double sum, and what plane
-waves neglect.
+"""Backprojection of spotlight and turntable data against the direct double sum, and the error of
+plane waves.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ def test_gradients_in_profiles_pixels_and_antennas():
     )
 
 
-def test_plane_waves_touch_the_exact_ranges_at_the_centre():
+def test_plane_waves_match_the_exact_ranges_at_the_centre():
     geometry = spotlight(height_m=2.0)
     tiny = torch.tensor([0.0, 1e-3, 0.0], dtype=torch.float64)
     other = torch.tensor([0.0, 0.0, 1e-3], dtype=torch.float64)
@@ -176,7 +176,7 @@ def test_plane_wave_loss_bounds_the_exact_geometry_tightly():
     assert 0.95 * loss.total_rad < float(neglected.abs().max()) * 4 * math.pi / wavelength < 1.02 * loss.total_rad
 
 
-def test_apparent_positions_leave_only_defocus():
+def test_only_defocus_remains_at_apparent_positions():
     frequency = 9.3e9 + 2e6 * torch.arange(32, dtype=torch.float64)
     geometry = spotlight(64, 9000.0, 3.0, frequency)
     x, y = torch.meshgrid(
@@ -244,7 +244,7 @@ def test_stage_in_a_chain_takes_recorded_side_data():
     )
 
 
-def test_misuse_is_named():
+def test_invalid_arguments_raise():
     geometry, x = spotlight(), profiles()
     with pytest.raises(ValueError, match=r"need frequency_hz and either angle_rad or position_m .* got none of them"):
         SpotlightBackprojection(8.0, 2.0)(Signal(x, InverseRadar(9.3e9, 96e6, 1.0).raw_axes(9, 12)))

@@ -49,7 +49,7 @@ def strip_error_db(stage, reach, seed=0, memory_lines=2600):
 @pytest.mark.parametrize("form", [OmegaK, OmegaKStolt])
 @pytest.mark.parametrize("seed, doppler", [(0, -7050.0), (1, 0.0)])
 def test_blocks_equal_one_transform(form, seed, doppler):
-    """White noise is the hardest strip: it fills the band."""
+    """White noise gives the largest error, since it fills the band."""
     stage = form(RADAR, doppler_hz=doppler, band_hz=1000.0)
     reach = reach_lines(RADAR, RADAR.raw_axes(N_LINES, N_RANGE), (doppler, doppler), band_hz=1000.0)
     assert strip_error_db(stage, reach, seed) < -70
@@ -62,7 +62,7 @@ def test_blocks_follow_another_frame():
     assert strip_error_db(stage, reach) < -70
 
 
-def test_too_short_an_overlap_would_show():
+def test_a_shorter_overlap_gives_a_larger_error():
     stage = OmegaK(RADAR, doppler_hz=0.0, band_hz=1000.0)
     assert strip_error_db(stage, (-100, 100)) > -20
 
@@ -91,11 +91,11 @@ def test_values_are_given_per_block():
     assert len(asked) == len(plan.blocks) and all(part.stop - part.start == plan.height for part in asked)
 
 
-def test_a_memory_that_is_too_small_is_named():
+def test_a_memory_that_is_too_small_raises():
     with pytest.raises(ValueError, match="allow at least"):
         plan_strip((30000, 1000), (-400, 400), 1 << 20)
     assert plan_strip((300, 1000), (-400, 400), 1 << 30).blocks == [(slice(0, 300), slice(0, 300))]
-    with pytest.raises(ValueError, match="plan anew"):
+    with pytest.raises(ValueError, match="make a plan"):
         next(
             focus_strip(
                 torch.zeros(10, 4, dtype=torch.complex64), OmegaK(RADAR), RADAR, plan_strip((11, 4), (-1, 1), 1 << 20)
@@ -119,7 +119,7 @@ def test_multilook_averages_power_and_moves_the_axes():
 
 
 @pytest.mark.parametrize("level", [1e-25, 1.0, 1e19])
-def test_amplitude_survives_extreme_levels(level):
+def test_amplitude_at_extreme_levels(level):
     image = (torch.randn(2, 16, 16, dtype=torch.complex64) * level).requires_grad_()
     with torch.no_grad():
         image[1] = 0
@@ -143,9 +143,9 @@ def test_quicklook_is_small_and_square_in_metres():
     assert 0.4 < looked.axes[0].step / looked.axes[1].step < 2.6
 
 
-def test_requirements_of_the_brief():
-    """r0 = 700 km, T_c = 1.5 s, dr = 5 km: 0.14 m, a quarter of a cell, so that bulk + refocus is
-    enough; squint walks 80 to 90 cells.
+def test_requirements_of_the_published_radar():
+    """With r0 = 700 km, T_c = 1.5 s and dr = 5 km the migration differs by 0.14 m, a quarter of a
+    cell, so that bulk + refocus suffices; the squint walks 80 to 90 cells.
     """
     radar = StripmapRadar(
         3.2e9, LinearFM(200e6, 5e-6), 250e6, 4000.0, 7000.0, 695e3, pointing_doppler_hz=0.0, integration_s=1.5

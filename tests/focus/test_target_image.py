@@ -1,4 +1,4 @@
-"""Images of targets by what a recording tells of its geometry, and autofocus through them."""
+"""Images of targets with and without known geometry, and autofocus through them."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ def recorded_points(
     range_m: torch.Tensor, azimuth_m: torch.Tensor, amplitude: torch.Tensor, dtype=torch.complex128
 ) -> torch.Tensor:
     """Range profiles (pulse, range) of points given along and across the mean line of sight, by the
-    turntable's own formula.
+    formula of the turntable.
     """
     x = range_m * math.cos(0.6) - azimuth_m * math.sin(0.6)
     y = range_m * math.sin(0.6) + azimuth_m * math.cos(0.6)
-    way = x * torch.cos(ANGLE)[:, None] + y * torch.sin(ANGLE)[:, None]
-    phasors = unit_phasor(-2 * FREQUENCY[:, None] * way[:, None] / LIGHT_M_S, torch.complex128)
+    range_ = x * torch.cos(ANGLE)[:, None] + y * torch.sin(ANGLE)[:, None]
+    phasors = unit_phasor(-2 * FREQUENCY[:, None] * range_[:, None] / LIGHT_M_S, torch.complex128)
     return range_profiles((phasors * amplitude).sum(-1)).to(dtype)
 
 
@@ -85,7 +85,7 @@ def test_it_covers_the_unambiguous_extent():
     ] == pytest.approx(0, abs=1e-12)
 
 
-def test_the_operator_is_kept_and_follows_the_precision():
+def test_the_operator_is_reused_for_one_precision():
     stage, x = TargetImage(RADAR, GEOMETRY), many()
     first = stage.operator(x)
     assert first is not None and stage.operator(x[0]) is first and stage(as_signal(x)).data.dtype == torch.complex128
@@ -94,9 +94,9 @@ def test_the_operator_is_kept_and_follows_the_precision():
     assert float(correlation(single.data, stage(as_signal(x)).data.to(torch.complex64)).min()) > 0.999
 
 
-def test_autofocus_through_the_image_finds_what_migration_blurs():
-    """White phases: the transform along pulses cannot tell the place of the image, so that its
-    scatterers migrate wrongly; the polar image can.
+def test_autofocus_with_the_polar_image_handles_migration():
+    """With random phases the transform along pulses does not determine the position of the image,
+    so that its scatterers migrate wrongly; the polar image does.
     """
     x = many()
     a = 2 * math.pi * torch.rand(2, PULSES, dtype=torch.float64, generator=torch.Generator().manual_seed(9))
@@ -109,16 +109,16 @@ def test_autofocus_through_the_image_finds_what_migration_blurs():
     )
     clean, focused = (stage(as_signal(v)).data for v in (x, dirty * torch.exp(-1j * found["phase_rad"])[..., None]))
     assert float((entropy(focused) - entropy(clean)).abs().max()) < 0.05
-    # the slope is found as well, to a fraction of a cell: the image lies where it should, not
-    # anywhere in the unambiguous extent
+    # the slope is found as well, to a fraction of a cell: the image is at its true position in the
+    # unambiguous extent
     assert float(correlation(focused.abs().to(focused.dtype), clean.abs().to(clean.dtype)).min()) > 0.6
 
 
-def test_refusals():
+def test_invalid_arguments_raise():
     with pytest.raises(ValueError, match="step_cells must lie in 0..1"):
         TargetImage(RADAR, step_cells=1.5)
     still = geometry_of(frequency_hz=FREQUENCY, angle_rad=torch.zeros(PULSES, dtype=torch.float64))
-    with pytest.raises(ValueError, match="does not turn"):
+    with pytest.raises(ValueError, match="does not rotate"):
         TargetImage(RADAR, still)(as_signal(many()[0]))
     with pytest.raises(ValueError, match="azimuth window"):
         TargetImage(RADAR, window="taylor")

@@ -1,5 +1,5 @@
 """Image formation of the triangular ladar against direct sums: range compression, residual video
-phase, azimuth deramp and matched filter.
+phase, azimuth.
 """
 
 from __future__ import annotations
@@ -49,10 +49,9 @@ def test_a_scatterer_has_its_amplitude_and_the_phase_of_its_range(ramp, sign, ce
     assert off(torch.angle(profiles[:, at]), carrier_rad(range_m)) < 1e-6
 
 
-def test_the_residual_video_phase_and_the_sign_that_doubles_it() -> None:
-    """Erratum 2: -pi K dtau^2 in the up sweep, + in the down sweep. The printed sign of Eq.
-
-    (5) leaves twice that, 2.8 rad at RD 4 m.
+def test_the_wrong_sign_doubles_the_residual_video_phase() -> None:
+    """The phase is -pi K dtau^2 in the up-sweep and + in the down-sweep. The printed sign of Remote
+    Sens. 2024, 16, 793, Eq. (5) leaves twice that, 2.8 rad at RD 4 m.
     """
     range_m = 133 * RADAR.range_step_m
     data = direct_sweeps(scatterers(r=(range_m,)), RADAR, 1)
@@ -67,16 +66,16 @@ def test_the_residual_video_phase_and_the_sign_that_doubles_it() -> None:
 
 
 def test_the_filter_before_the_compensation_leaves_a_phase() -> None:
-    """Section 3: applied to the moved beat it leaves 2 pi fd 2 RD / c + pi fd^2 / K."""
+    """Applied to the shifted beat the filter leaves 2 pi fd 2 RD / c + pi fd^2 / K."""
     velocity = 3 * RADAR.ambiguous_velocity_m_s  # of three bins
     cell = 50
     data = direct_sweeps(scatterers(r=(cell * RADAR.range_step_m,)), RADAR, 1, (Polynomial([velocity]),))
     early = compress_sweeps(data, RADAR)[0, 256 + cell + 3]
     dtau = 2 * cell * RADAR.range_step_m / RADAR.wave_speed_m_s
     fd = RADAR.doppler_hz(velocity)
-    place = cell * RADAR.range_step_m + velocity * RADAR.period_s / 4
+    range_m = cell * RADAR.range_step_m + velocity * RADAR.period_s / 4
     left = 2 * math.pi * fd * dtau + math.pi * fd**2 / RADAR.chirp_rate_hz_s
-    assert off(torch.angle(early)[None], carrier_rad(place) + left) < 5e-3 and left > 0.02
+    assert off(torch.angle(early)[None], carrier_rad(range_m) + left) < 5e-3 and left > 0.02
 
 
 @pytest.mark.parametrize(
@@ -88,8 +87,8 @@ def test_the_filter_before_the_compensation_leaves_a_phase() -> None:
     ],
 )
 def test_azimuth_against_direct_sums(radar, n) -> None:
-    """At every pixel the sum over the aperture of the profile times the conjugate of the
-    hyperbola's phase, from 10 m to 1000 km.
+    """At every pixel the image is the sum over the aperture of the profile times the conjugate
+    phase of the hyperbola, from 10 m to 1000 km.
     """
     pulse, range_ = profile_axes(radar.sweep_axes(n)[1], radar)
     range_ = Axis("range", 3, 1.2, 0.3, "m")
@@ -111,7 +110,7 @@ def test_azimuth_against_direct_sums(radar, n) -> None:
         torch.testing.assert_close(image * count, direct, atol=2e-7 * n, rtol=0)
 
 
-def test_three_points_focus_where_they_are() -> None:
+def test_three_points_focus_at_their_positions() -> None:
     x = (-0.04, 0.0, 0.05)
     s = scatterers(x, (1.2, 1.5, 1.8), (0.7, 1.0, 0.5))
     signal = CompressSweeps(MOVING, window_m=(0.5, 2.5))(Signal(direct_sweeps(s, MOVING, 400), MOVING.sweep_axes(400)))
@@ -126,7 +125,7 @@ def test_three_points_focus_where_they_are() -> None:
         assert abs(int(near.amax(-1).argmax()) - 4) <= 1
 
 
-def test_window_and_refusals() -> None:
+def test_window_and_invalid_arguments() -> None:
     sweeps = Signal(torch.zeros(2, 3, 512, dtype=DOUBLE), MOVING.sweep_axes(3))
     out = CompressSweeps(MOVING, window_m=[0.0, 3.0])(sweeps)
     assert out.axis("range").start == pytest.approx(0.0, abs=1e-9) and out.axis("range").stop == pytest.approx(
@@ -142,7 +141,7 @@ def test_window_and_refusals() -> None:
         compress_sweeps(sweeps.data[..., :100], MOVING)
     with pytest.raises(TypeError, match="complex sweeps"):
         compress_sweeps(sweeps.data.real, MOVING)
-    with pytest.raises(ValueError, match="as their axes say"):
+    with pytest.raises(ValueError, match="that match their axes"):
         deramp_azimuth(out.data[..., :5], MOVING, *out.axes)
     with pytest.raises(ValueError, match="does not move across"):
         AzimuthMatchedFilter(RADAR)(out)

@@ -1,4 +1,4 @@
-"""Reading range profiles, turntable sweeps and phase histories, and clear refusals."""
+"""Reader of range profiles, turntable sweeps and phase histories, and its errors."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def profiles(**changes):
 
 def turntable(x_m=0.0, y_m=0.0, **changes):
     angle = np.deg2rad(ANGLE_DEG)
-    way = x_m * np.cos(angle) + y_m * np.sin(angle)
+    distance = x_m * np.cos(angle) + y_m * np.sin(angle)
     return {
-        "sig": np.exp(-4j * np.pi / LIGHT_M_S * FREQUENCY[:, None] * way),
+        "sig": np.exp(-4j * np.pi / LIGHT_M_S * FREQUENCY[:, None] * distance),
         "freq_hz": FREQUENCY,
         "angle_deg": ANGLE_DEG,
     } | changes
@@ -40,8 +40,8 @@ def spotlight(point=(0.0, 0.0, 0.0), **changes):
     azimuth = np.deg2rad(np.linspace(0, 3, 5))
     antenna = 7000.0 * np.stack([np.cos(azimuth), np.sin(azimuth), np.ones(5)], -1)
     r0 = np.linalg.norm(antenna, axis=-1)
-    way = np.linalg.norm(antenna - np.array(point), axis=-1) - r0
-    samples = np.exp(-4j * np.pi / LIGHT_M_S * FREQUENCY[:, None] * way)
+    distance = np.linalg.norm(antenna - np.array(point), axis=-1) - r0
+    samples = np.exp(-4j * np.pi / LIGHT_M_S * FREQUENCY[:, None] * distance)
     return {
         "fp": samples,
         "freq_hz": FREQUENCY,
@@ -59,7 +59,7 @@ def saved(tmp_path, values):
     return path
 
 
-def test_profiles_keep_their_samples_and_step(tmp_path):
+def test_profiles_have_the_samples_and_the_step_of_the_file(tmp_path):
     recording = read_inverse(saved(tmp_path, profiles()))
     pulse, range_ = recording.signal.axes
     assert (
@@ -74,7 +74,7 @@ def test_profiles_keep_their_samples_and_step(tmp_path):
 
 
 @pytest.mark.parametrize("make", [turntable, spotlight])
-def test_frequency_samples_can_be_had_back(tmp_path, make):
+def test_frequency_samples_are_recovered(tmp_path, make):
     rng = np.random.default_rng(0)
     values = make()
     key = "sig" if "sig" in values else "fp"
@@ -85,19 +85,19 @@ def test_frequency_samples_can_be_had_back(tmp_path, make):
     assert torch.equal(recording.aux["frequency_hz"], torch.from_numpy(FREQUENCY))
 
 
-def test_range_grows_away_from_the_radar(tmp_path):
+def test_range_increases_away_from_the_radar(tmp_path):
     cell = LIGHT_M_S / (2 * 16 * 2e6)
     far = read_inverse(saved(tmp_path, turntable(x_m=3 * cell))).signal
     assert far.axis("range").step == pytest.approx(cell)
     torch.testing.assert_close(
         far.axis("range").values()[far.data.abs().argmax(-1)], torch.full((5,), 3 * cell, dtype=torch.float64)
     )
-    # the antenna stands at +x and +z: a point that is lower or at -x is farther away
+    # the antenna is at +x and +z: a point that is lower or at -x is farther away
     behind = read_inverse(saved(tmp_path, spotlight((-3 * cell, 0.0, -3 * cell)))).signal
     assert behind.axis("range").values()[behind.data.abs().argmax(-1)].min() > 3 * cell
 
 
-def test_geometry_and_instrument_of_a_turntable(tmp_path):
+def test_geometry_and_radar_of_a_turntable(tmp_path):
     recording = read_inverse(saved(tmp_path, turntable()))
     torch.testing.assert_close(recording.aux["angle_rad"], torch.from_numpy(np.deg2rad(ANGLE_DEG)))
     radar = recording.radar
@@ -106,11 +106,11 @@ def test_geometry_and_instrument_of_a_turntable(tmp_path):
     assert read_inverse(saved(tmp_path, turntable(prf_hz=50.0))).radar.rotation_rad_s == pytest.approx(math.radians(25))
 
 
-def test_geometry_and_instrument_of_a_spotlight(tmp_path):
+def test_geometry_and_radar_of_a_spotlight(tmp_path):
     recording = read_inverse(saved(tmp_path, spotlight()))
     assert recording.aux["position_m"].shape == (5, 3) and recording.aux["position_m"].dtype == torch.float64
     assert recording.radar.reference_range_m == pytest.approx(7000 * math.sqrt(2))
-    # the line of sight turns by the azimuth times cos(elevation), up to the square of small angles
+    # for small angles the line of sight turns by the azimuth times cos(elevation)
     assert recording.radar.rotation_rad_s == pytest.approx(math.radians(3) / 4 * math.cos(math.pi / 4), rel=1e-3)
     assert set(recording.aux) == {"frequency_hz", "position_m", "reference_m"}
 
@@ -142,13 +142,13 @@ def test_geometry_and_instrument_of_a_spotlight(tmp_path):
         (turntable(sig=np.array([None], dtype=object)), "not a numpy archive without pickles"),
     ],
 )
-def test_bad_files_are_refused_with_one_sentence(tmp_path, values, match):
-    with pytest.raises(ValueError, match=match) as refusal:
+def test_invalid_files_raise_with_the_name_of_the_file(tmp_path, values, match):
+    with pytest.raises(ValueError, match=match) as raised:
         read_inverse(saved(tmp_path, values))
-    assert "target.npz" in str(refusal.value)
+    assert "target.npz" in str(raised.value)
 
 
-def test_missing_and_foreign_files(tmp_path):
+def test_missing_files_and_files_of_other_formats_raise(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"absent\.npz does not exist"):
         read_inverse(tmp_path / "absent.npz")
     (tmp_path / "text.npz").write_text("not an archive")

@@ -1,4 +1,4 @@
-"""Reading recordings, and clear refusals."""
+"""Reader of raw stripmap recordings, and its errors."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_axes_chirp_and_gain_come_from_the_file(tmp_path):
     assert recording.signal.names == ("pulse", "range") and recording.signal.data.dtype == torch.complex64
     assert recording.signal.axis("range").start == pytest.approx(9000 + 10 * 2.9979e8 / 100e6)
     assert recording.radar.pulse.direction == -1 and recording.radar.pulse.bandwidth_hz == pytest.approx(0.72e6)
-    assert recording.radar.pointing_doppler_hz is None  # the ambiguity in the file is not believed
+    assert recording.radar.pointing_doppler_hz is None  # the ambiguity in the file is ignored
     sample = values["iq"][1, 3]
     assert complex(recording.signal.data[1, 3]) == pytest.approx(10 * complex(sample[0], sample[1]))
 
@@ -67,13 +67,13 @@ def test_axes_chirp_and_gain_come_from_the_file(tmp_path):
         ({"line_number": np.zeros((2, 6), int)}, r"line_number is torch.int64 of shape \(2, 6\)"),
     ],
 )
-def test_bad_files_are_refused_with_one_sentence(tmp_path, changes, match):
+def test_invalid_files_raise_with_the_name_of_the_key(tmp_path, changes, match):
     path, _ = archive(tmp_path, **changes)
     with pytest.raises(ValueError, match=match):
         read_stripmap(path)
 
 
-def test_missing_and_foreign_files(tmp_path):
+def test_missing_files_and_files_of_other_formats_raise(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"absent\.npz does not exist"):
         read_stripmap(tmp_path / "absent.npz")
     (tmp_path / "text.npz").write_text("not an archive")
@@ -92,21 +92,21 @@ def test_own_arrays_in_batches():
         Recording.from_arrays(data.real, small_radar())
 
 
-def test_own_arrays_that_are_none():
+def test_own_data_that_are_not_arrays_raise():
     with pytest.raises(ValueError, match="data: expected numbers"):
         Recording.from_arrays(None, small_radar())
     with pytest.raises(ValueError, match="dtype must be complex64 or complex128, got torch.float32"):
         Recording.from_arrays(torch.ones(6, 80, dtype=torch.complex64), small_radar(), dtype=torch.float32)
 
 
-def test_lines_of_zeros_are_named():
+def test_lines_of_zeros_raise_a_warning():
     data = torch.ones(6, 80, dtype=torch.complex64)
     data[3:5] = 0
     with pytest.warns(UserWarning, match="data: 2 of 6 lines hold only zeros, the first is line 3"):
         Recording.from_arrays(data, small_radar())
 
 
-def test_recorded_blocks_read(recorded):
+def test_recorded_block_is_read(recorded):
     recording = read_stripmap(recorded("radarsat1_english_bay.npz"))
     assert recording.signal.data.shape == (1424, 2848)
     assert recording.radar.pulse.direction == -1

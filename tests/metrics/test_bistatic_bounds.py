@@ -1,5 +1,5 @@
-"""Bounds of a moving point against the closed form, the figures of brief 001, and Fisher
-information by numerical differences of the printed model.
+"""Bounds of a moving point against the closed form, figures of an independent float64 model, and
+Fisher information from numerical differences.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ def pattern(unknown, time, path):
 def brute_force(
     at: dict[str, float], names, snr: float, n_pulse: int, gate, differentiated_gate=None, covariance=None
 ) -> list[float]:
-    """Central differences of all samples by the unknowns and by both parts of the amplitude; the
-    gate held still unless told otherwise.
+    """Bounds from central differences of all samples by the unknowns and by both parts of the
+    amplitude; the gate is constant unless `differentiated_gate` is given.
     """
     held = lambda unknown, time, path: gate(at, time, range_of(RADAR, time, at["u_r_m_s"], at["u_a_m_s"], at["y0_m"]))  # noqa: E731
     moving = differentiated_gate or held
@@ -78,7 +78,7 @@ def test_published_figures_at_zero_db():
     )
 
 
-def test_bounds_fall_as_the_root_of_the_snr_and_are_made_per_trial():
+def test_bounds_fall_as_the_root_of_the_snr_in_each_trial():
     u_r, snr = torch.tensor([[-7.0], [0.0], [12.0]], dtype=F64), torch.tensor([1.0, 100.0], dtype=F64)
     found = bistatic_bounds(RADAR, 900, snr, u_r, 3.0, 20.0, integration_s=4.5)
     assert tuple(found) == UNKNOWNS
@@ -139,8 +139,8 @@ def test_clutter_against_numerical_differences_and_white_noise():
         assert float(found[name]) > 1.5 * float(white[name])
 
 
-def test_what_the_data_do_not_tell_is_infinite():
-    # lit after the record
+def test_bounds_of_unobservable_unknowns_are_infinite():
+    # illuminated after the record
     nowhere = bistatic_bounds(RADAR, 900, 1.0, 0.0, 0.0, 5000.0, integration_s=4.5)
     assert all(math.isinf(float(value)) for value in nowhere.values())
     single = published_radar(channel_m=(0.0,))
@@ -151,13 +151,13 @@ def test_what_the_data_do_not_tell_is_infinite():
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
-        ({"unknown": ("u_r",)}, "unknown names some of"),
-        ({"unknown": ()}, "unknown names some of"),
+        ({"unknown": ("u_r",)}, "unknown must name some of"),
+        ({"unknown": ()}, "unknown must name some of"),
         ({"integration_s": -1.0}, "must be positive"),
         ({"integration_s": 4.5, "gate_tells": True}, "edges of a rectangular gate"),
         ({"covariance": torch.eye(3)}, "n_pulse, channel, channel"),
     ],
 )
-def test_refusals(changes, match):
+def test_invalid_arguments_raise(changes, match):
     with pytest.raises(ValueError, match=match):
         bistatic_bounds(RADAR, 64, 1.0, **changes)

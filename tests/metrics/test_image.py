@@ -1,4 +1,4 @@
-"""Figures of merit with known answers."""
+"""Image metrics with known answers."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ def test_entropy_known_answers():
 
 @pytest.mark.parametrize("scale", [1e-25, 1.0, 1e19])
 @pytest.mark.parametrize("metric", [entropy, contrast])
-def test_extreme_levels_change_nothing_even_in_single_precision(metric, scale):
+def test_extreme_levels_change_nothing_in_single_precision(metric, scale):
     image = torch.randn(3, 16, 16, dtype=torch.complex64, generator=torch.Generator().manual_seed(1))
     torch.testing.assert_close(metric(image * scale), metric(image), rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("metric", [entropy, contrast])
-def test_gradients_pass_where_pixels_are_zero(metric):
+def test_gradients_are_finite_where_pixels_are_zero(metric):
     image = torch.randn(2, 3, 4, dtype=torch.complex128, generator=torch.Generator().manual_seed(1))
     assert torch.autograd.gradcheck(metric, (image.requires_grad_(),))
     zero = torch.zeros(2, 3, 4, dtype=torch.complex64, requires_grad=True)
@@ -49,7 +49,7 @@ FORM_IDS = [f"{metric.__name__}_{of}" for metric, of in FORMS]
 
 
 def direct(metric, of: str, levels: torch.Tensor) -> float:
-    """The figure from a plain list of amplitudes, pixel by pixel."""
+    """The metric from a plain list of amplitudes, pixel by pixel."""
     x = [float(a) ** {"intensity": 2, "amplitude": 1}[of] for a in levels]
     if metric is entropy:
         return -sum(v / sum(x) * math.log(v / sum(x)) for v in x if v)
@@ -58,7 +58,7 @@ def direct(metric, of: str, levels: torch.Tensor) -> float:
 
 
 @pytest.mark.parametrize(("metric", "of"), FORMS, ids=FORM_IDS)
-def test_figures_of_regions_are_those_of_their_pixels(metric, of):
+def test_metrics_of_a_mask_are_those_of_its_pixels(metric, of):
     image = (
         torch.randn(3, 5, 6, dtype=torch.complex128, generator=torch.Generator().manual_seed(4))
         * torch.tensor([1.0, 1e3, 1e-9])[:, None, None]
@@ -77,11 +77,11 @@ def test_figures_of_regions_are_those_of_their_pixels(metric, of):
 
 @pytest.mark.parametrize("scale", [1e-25, 1e19])
 @pytest.mark.parametrize(("metric", "of"), FORMS, ids=FORM_IDS)
-def test_extreme_levels_change_no_form(metric, of, scale):
+def test_extreme_levels_change_no_metric(metric, of, scale):
     image = torch.randn(3, 16, 16, dtype=torch.complex64, generator=torch.Generator().manual_seed(1))
     mask = torch.rand(16, 16, generator=torch.Generator().manual_seed(2)).mul(2).floor()
     torch.testing.assert_close(metric(image * scale, of), metric(image, of), rtol=1e-5, atol=1e-5)
-    beside = torch.where(mask > 0, image * 1e-25, 1e19)  # what does not count is 440 dB louder
+    beside = torch.where(mask > 0, image * 1e-25, 1e19)  # the excluded pixels are 440 dB stronger
     torch.testing.assert_close(metric(beside, of, mask=mask), metric(image, of, mask=mask), rtol=1e-5, atol=1e-5)
 
 
@@ -98,7 +98,7 @@ def test_gradients_of_regions_and_at_zeros(metric, of):
 
 
 @pytest.mark.parametrize(("metric", "of"), FORMS, ids=FORM_IDS)
-def test_nothing_that_counts_gives_nothing(metric, of):
+def test_an_empty_mask_gives_zero(metric, of):
     image = torch.randn(2, 3, 4, dtype=torch.complex64)
     assert torch.equal(metric(torch.zeros_like(image), of), torch.zeros(2))
     mask = torch.ones(2, 1, 1)
@@ -110,7 +110,7 @@ def test_nothing_that_counts_gives_nothing(metric, of):
 
 
 @pytest.mark.parametrize("metric", [entropy, contrast])
-def test_masks_that_do_not_fit_are_refused(metric):
+def test_invalid_masks_raise(metric):
     image = torch.ones(2, 3, 4)
     with pytest.raises(ValueError, match=r"mask of shape \(4, 3\) does not broadcast to the image \(2, 3, 4\)"):
         metric(image, mask=torch.ones(4, 3))
@@ -124,7 +124,7 @@ def test_masks_that_do_not_fit_are_refused(metric):
         metric(image, of="power")
 
 
-def test_correlation_is_blind_to_gain_and_phase_and_error_is_not():
+def test_correlation_ignores_gain_and_phase_and_error_does_not():
     a = torch.randn(2, 8, 8, dtype=torch.complex128, generator=torch.Generator().manual_seed(3))
     torch.testing.assert_close(correlation(a * (2 + 1j), a), torch.ones(2, dtype=torch.float64))
     torch.testing.assert_close(error_db(1.1 * a, a), torch.full((2,), -20.0, dtype=torch.float64))
@@ -164,12 +164,12 @@ def test_targets_and_trials_are_measured_side_by_side():
     torch.testing.assert_close(several["position_azimuth_m"][:, 1], m["position_azimuth_m"])
 
 
-def test_places_outside_the_image_are_refused():
+def test_positions_outside_the_image_raise():
     with pytest.raises(ValueError, match="outside the azimuth axis"):
         impulse_response(sinc_image(150, 140), (500.0, 1035.0))
 
 
-def test_what_is_no_image_is_refused():
+def test_invalid_images_raise():
     flat = torch.ones(8, dtype=torch.complex64)
     with pytest.raises(ValueError, match=r"at least one pixel, got the shape \(8,\)"):
         entropy(flat)
@@ -183,7 +183,7 @@ def test_what_is_no_image_is_refused():
         correlation(flat.expand(4, 8).real, flat.expand(4, 8))
 
 
-def test_what_has_no_impulse_response_is_refused():
+def test_invalid_arguments_of_impulse_response_raise():
     image = sinc_image(150, 140)
     with pytest.raises(ValueError, match="Signal with two axes, got Tensor"):
         impulse_response(image.data, (65.0, 1035.0))

@@ -22,9 +22,9 @@ U = (torch.arange(N, dtype=torch.float64) - (N - 1) / 2) * SWEEP / N
 ONE, NONE = torch.ones_like(U), torch.zeros_like(U)
 
 
-def deviation(*columns: tuple[torch.Tensor, torch.Tensor]) -> float:
-    """Least deviation of the first parameter; a column holds the derivative of the phase (rad) of
-    up and down sweep by each.
+def least_std(*columns: tuple[torch.Tensor, torch.Tensor]) -> float:
+    """Least standard deviation of the first parameter; a column holds the derivative of the phase
+    (rad) of up-sweep and down-sweep by each parameter.
     """
     derivative = torch.stack([torch.cat(column) for column in columns])
     return float(torch.linalg.inv(2 * SNR * derivative @ derivative.mT)[0, 0].sqrt())
@@ -38,8 +38,8 @@ def turning(per_m_s: float) -> tuple[torch.Tensor, torch.Tensor]:
 def test_velocity_bounds_are_inverse_fisher_information():
     beat = (2 * math.pi * U / SWEEP, -2 * math.pi * U / SWEEP)
     velocity = turning(2 / WAVELENGTH)
-    free = deviation(velocity, beat, (ONE, NONE), (NONE, ONE))
-    known = deviation(velocity, beat, (ONE, ONE))
+    free = least_std(velocity, beat, (ONE, NONE), (NONE, ONE))
+    known = least_std(velocity, beat, (ONE, ONE))
     assert float(velocity_free_offset_bound_m_s(SNR, N, WAVELENGTH, SWEEP)) == pytest.approx(free, rel=1e-4)
     assert float(velocity_known_offset_bound_m_s(SNR, N, WAVELENGTH, SWEEP)) == pytest.approx(known, rel=1e-4)
 
@@ -54,7 +54,7 @@ def test_segmented_bound_is_that_of_four_phases_of_half_sweeps():
 def test_range_of_one_sweep():
     per_m = 4 * math.pi / WAVELENGTH
     assert float(range_per_sweep_bound_m(SNR, N, WAVELENGTH)) == pytest.approx(
-        deviation((per_m * ONE, NONE)), rel=1e-12
+        least_std((per_m * ONE, NONE)), rel=1e-12
     )
 
 
@@ -62,7 +62,7 @@ def test_range_of_one_sweep():
     "db, free, known, phase_nm",
     [(-10, 3.73, 1.87, 12.2), (0, 1.18, 0.59, 3.85), (10, 0.373, 0.187, 1.22), (30, 0.037, 0.019, 0.122)],
 )
-def test_figures_of_the_brief(db, free, known, phase_nm):
+def test_figures_of_an_independent_model(db, free, known, phase_nm):
     snr = 10 ** (db / 10)
     assert 1e3 * float(velocity_free_offset_bound_m_s(snr, N, WAVELENGTH, SWEEP)) == pytest.approx(free, rel=0.02)
     assert 1e3 * float(velocity_known_offset_bound_m_s(snr, N, WAVELENGTH, SWEEP)) == pytest.approx(known, rel=0.02)

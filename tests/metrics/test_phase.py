@@ -1,4 +1,4 @@
-"""Phase errors compared on the circle, and the bounds they are judged by."""
+"""Phase errors modulo 2 pi, and bounds of phases per pulse."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def normal(*shape: int, seed: int = 0) -> torch.Tensor:
 
 @pytest.mark.parametrize("n", [3, 7, 64, 401])
 @pytest.mark.parametrize("cells", [0.0, 0.04, 0.3, 0.5, -0.49, 3.37, 1.5, -17.06, 31.9])
-def test_lines_of_any_fraction_of_a_cell_leave_nothing(n, cells):
+def test_a_linear_phase_of_any_fraction_of_a_cell_is_removed(n, cells):
     a, k = white(n), torch.arange(n, dtype=torch.float64)
     assert float(residual_phase(a + 5.0 + 2 * math.pi * cells / n * k, a).abs().max()) < 1e-9
 
@@ -33,17 +33,17 @@ def test_whole_turns_of_single_pulses_do_not_count():
     torch.testing.assert_close(residual_phase(a + error + turns, a), residual_phase(a + error, a), atol=1e-8, rtol=0)
 
 
-def test_errors_beyond_half_a_turn_are_not_unwrapped():
-    """A smooth error of many turns stays what it is on the circle; unwrapping would make it a large
-    number.
+def test_errors_beyond_pi_are_not_unwrapped():
+    """A smooth error of many turns is compared modulo 2 pi; unwrapping would make it a large
+    one.
     """
     t = torch.linspace(-1, 1, 300, dtype=torch.float64)
     residual = residual_phase(200 * t**2, torch.zeros(300))
     assert float(residual.abs().max()) <= math.pi and 1.4 < float(phase_rmse(200 * t**2, torch.zeros(300))) < 1.9
 
 
-def test_the_line_taken_out_is_the_one_of_most_coherence():
-    """Any other slope or constant makes the mean phasor smaller or turned."""
+def test_the_removed_line_maximises_the_coherence():
+    """Any other slope or constant makes the mean phasor smaller or rotates it."""
     residual = residual_phase(0.8 * normal(4, 60, seed=3) + 0.05 * torch.arange(60), torch.zeros(60))
     k = torch.arange(60, dtype=torch.float64) - 29.5
     best = strehl(residual)
@@ -61,7 +61,7 @@ def test_small_errors_equal_least_squares():
     torch.testing.assert_close(residual_phase(error + 0.3 + 0.7 * k, torch.zeros(80)), expected, atol=1e-9, rtol=0)
 
 
-def test_pulses_that_are_not_there_do_not_count():
+def test_missing_pulses_do_not_count():
     a, error = white(2, 40), 0.2 * normal(2, 40, seed=5)
     present = torch.ones(2, 40, dtype=torch.bool)
     present[0, 3:20], present[1, ::2] = False, False
@@ -74,7 +74,7 @@ def test_pulses_that_are_not_there_do_not_count():
     torch.testing.assert_close(
         phase_rmse(wild, a, present)[0], residual[0][present[0]].square().mean().sqrt(), atol=1e-12, rtol=0
     )
-    # the pulses that are there, on their own, say the same
+    # the present pulses alone give the same result
     alone = residual_phase(wild[1, 1::2], a[1, 1::2])
     torch.testing.assert_close(residual[1, 1::2], alone, atol=1e-9, rtol=0)
     assert phase_rmse(wild, a, torch.zeros(40, dtype=torch.bool)).tolist() == [0, 0]
@@ -99,11 +99,11 @@ def test_shapes_precision_and_batches():
 
 
 @pytest.mark.parametrize("n", [1, 2])
-def test_one_or_two_pulses_leave_nothing(n):
+def test_one_or_two_pulses_leave_no_residual(n):
     assert float(residual_phase(white(n), white(n, seed=1)).abs().max()) < 1e-9
 
 
-def test_non_finite_phases_are_refused():
+def test_non_finite_phases_raise():
     with pytest.raises(ValueError, match="nan turns"):
         residual_phase(torch.tensor([0.0, torch.nan, 0.0]), torch.zeros(3))
 
@@ -124,8 +124,8 @@ def tiny(trials: int = 1, n_pulse: int = 6, n_range: int = 4, targets: int = 5, 
 
 
 def fisher_bound(azimuth, range_, amplitude, std):
-    """All unknowns at once: free phases (no constant, no line), real and imaginary parts of all
-    amplitudes; derivatives by autograd.
+    """Bound with all unknowns at once: phases without constant and line, and the real and imaginary
+    parts of all amplitudes.
     """
     n, m = azimuth.shape
     k = torch.arange(n, dtype=torch.float64)
@@ -150,23 +150,25 @@ def test_bound_of_a_scene_equals_the_whole_fisher_matrix(seed):
     torch.testing.assert_close(bound, expected, rtol=1e-5, atol=0)
 
 
-def test_bound_scales_and_counts_equal_places_once():
+def test_bound_scales_and_counts_equal_positions_once():
     azimuth, range_, amplitude = tiny()
     bound = pulse_phase_bound_of_scene_rad(azimuth, range_, amplitude, 0.3)
     torch.testing.assert_close(
         pulse_phase_bound_of_scene_rad(azimuth, range_, 1e6 * amplitude, 0.15e6), bound / 2, rtol=1e-5, atol=0
     )
-    places, shapes, strengths = (
+    positions, shapes, strengths = (
         torch.cat([azimuth, azimuth[..., :1]], -1),
         torch.cat([range_, range_[:, :1]], 1),
         torch.cat([amplitude, 0 * amplitude[:, :1]], -1),
     )
-    torch.testing.assert_close(pulse_phase_bound_of_scene_rad(places, shapes, strengths, 0.3), bound, rtol=1e-4, atol=0)
+    torch.testing.assert_close(
+        pulse_phase_bound_of_scene_rad(positions, shapes, strengths, 0.3), bound, rtol=1e-4, atol=0
+    )
 
 
 def test_bound_of_a_known_scene():
-    """One pulse of known samples is known to 1 / sqrt(2 N SNR), as the phase of its correlation
-    with them; to less where amplitudes are not known.
+    """The phase of one pulse with known samples, estimated by correlation, reaches 1 / sqrt(2 N
+    SNR); unknown amplitudes raise the bound.
     """
     echo = torch.exp(1j * torch.arange(64))
     noise = torch.randn(20000, 64, dtype=DOUBLE, generator=torch.Generator().manual_seed(1)) / math.sqrt(10.0)

@@ -1,5 +1,5 @@
-"""Azimuth responses with known answers, and false targets of known level at places computed pulse
-by pulse.
+"""Azimuth responses with known answers, and false targets of known level at positions computed
+pulse by pulse.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ RADAR = published_radar()
 
 
 def sinc_profile(
-    n: int, places: list[float], amplitudes: list[float], band: float = 0.9, tone: float = 0.0
+    n: int, positions: list[float], amplitudes: list[float], band: float = 0.9, tone: float = 0.0
 ) -> torch.Tensor:
-    """Points of a rectangular band (turns per sample) about `tone`, places in samples."""
+    """Points of a rectangular band (turns per sample) about `tone`, positions in samples."""
     i = torch.arange(n, dtype=F64)
     return sum(
         a * torch.sinc(band * (i - p)) * torch.exp(2j * math.pi * tone * (i - p))
-        for p, a in zip(places, amplitudes, strict=True)
+        for p, a in zip(positions, amplitudes, strict=True)
     )  # type: ignore[return-value]
 
 
@@ -41,10 +41,10 @@ def test_response_of_a_sinc(nulls, islr):
     assert float(figures["peak"].abs()) == pytest.approx(2, rel=1e-3)
 
 
-def test_response_of_a_squinted_spectrum_needs_its_centre():
+def test_response_of_a_squinted_spectrum_uses_its_centre():
     profile = sinc_profile(512, [250.4], [1.0], tone=0.4)
-    told, found = (azimuth_response(profile, 1.0, centre_turns=turns) for turns in (0.4, None))
-    for figures in (told, found):
+    given, found = (azimuth_response(profile, 1.0, centre_turns=turns) for turns in (0.4, None))
+    for figures in (given, found):
         assert float(figures["pslr_db"]) == pytest.approx(-13.26, abs=0.1)
     assert abs(float(azimuth_response(profile, 1.0)["pslr_db"]) + 13.26) > 0.3
 
@@ -89,7 +89,8 @@ def image(u_r, u_a, bands, n_pulse=3600, focused=None, r0=5000.0):
     )
 
 
-# brief 001: Table 4 and Fig 17, trial
+# (u_r, u_a), bands, velocities focused with, and MFTA of an independent float64 model of Remote
+# Sens. 2020, 12, 1703, Table 4 and Figure 17
 CASES = [
     ((0, 10), 3, None, -61.7, 4),
     ((10, 0), 3, None, -56.0, 1),
@@ -118,7 +119,7 @@ def test_published_cases(velocity, bands, focused, level, within):
 
 
 @pytest.mark.parametrize("velocity", [(10, 0), (10, 5), (5, 10), (0, 10)])
-def test_two_bands_with_known_velocities_reach_what_the_brief_asks(velocity):
+def test_two_bands_with_known_velocities_have_the_response_of_theory(velocity):
     profile, step = image(velocity[0], velocity[1], 2)
     zones = replica_zones(RADAR, 2, velocity[0], velocity[1], integration_s=4.5, axis_speed_m_s=300.0 - velocity[1])
     assert float(replica_level(profile, step, zones)["mfta_db"]) < -65
@@ -129,9 +130,9 @@ def test_two_bands_with_known_velocities_reach_what_the_brief_asks(velocity):
     assert float(figures["islr_db"]) == pytest.approx(-9.8, abs=0.3)
 
 
-def test_zones_lie_where_a_hyperbola_puts_replicas():
-    """A point at 6490 m, u_r 10: 937.2 m in the trial of the brief, not 933.9 = PRF lambda R0 V_R /
-    V^2.
+def test_zones_contain_the_replicas_of_the_exact_hyperbola():
+    """For a point at 6490 m with u_r = 10 m/s an independent model has a replica at 937.2 m; the
+    approximation PRF lambda R0 V_R / V^2 gives 933.9 m.
     """
     zones = replica_zones(RADAR, 2, 10.0, range_m=6490.0, integration_s=4.5)
     assert zones.shape == (4, 2)
@@ -145,9 +146,9 @@ def test_zones_lie_where_a_hyperbola_puts_replicas():
     assert abs(float(replica_level(profile, step, blurred)["offset_m"])) == pytest.approx(937.2, abs=0.2)
 
 
-def test_replica_of_a_scene_lies_in_its_zone_at_the_measured_place():
-    """The largest false target of the conventional image is found where the whole profile
-    has it.
+def test_replica_is_found_in_its_zone_at_its_measured_position():
+    """The largest false target of the conventional image is found at its position in the whole
+    profile.
     """
     profile, step = image(10, 0, 2, focused=(0, 0))
     zones = replica_zones(RADAR, 2, 10.0, integration_s=4.5, focused_at=(0.0, 0.0))
@@ -157,7 +158,7 @@ def test_replica_of_a_scene_lies_in_its_zone_at_the_measured_place():
     assert abs(found) == pytest.approx(abs(float(((power * far).argmax() - power.argmax()) * step)), abs=1.0)
 
 
-def test_refusals():
+def test_invalid_arguments_raise():
     profile = sinc_profile(256, [128.0], [1.0])
     with pytest.raises(ValueError, match="record longer"):
         replica_level(profile, 1.0, torch.tensor([[700.0, 740.0]], dtype=F64))

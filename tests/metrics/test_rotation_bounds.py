@@ -1,5 +1,5 @@
-"""Bounds of uneven rotation against Fisher information of the whole model, by automatic
-differentiation with every nuisance written out.
+"""Bounds of non-uniform rotation against the Fisher information of the whole model by automatic
+differentiation.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ def brute_force(
     n_pulse: int,
     free_centre: bool,
 ) -> Tensor:
-    """Each scatterer in a row of its own: real and imaginary parts of all samples, differentiated
-    by motion, amplitudes and cross ranges.
+    """Bounds from the Jacobian of the real and imaginary parts of all samples by motion, amplitudes
+    and cross ranges; each scatterer has a row of its own.
     """
     time, c4, count, order = torch.arange(n_pulse, dtype=F64) / prf_hz, 4 * math.pi / WAVELENGTH, len(x), len(k)
 
     def samples(unknown: Tensor) -> Tensor:
         rate, terms, centre = unknown[0], unknown[1 : 1 + order], unknown[1 + order]
-        real, imaginary, place = unknown[2 + order :].view(3, count)
+        real, imaginary, cross_range = unknown[2 + order :].view(3, count)
         phi = warp(time, terms)
-        phase = -c4 * place[:, None] * rate * phi + c4 / 2 * (y + centre)[:, None] * (rate * phi).square()
+        phase = -c4 * cross_range[:, None] * rate * phi + c4 / 2 * (y + centre)[:, None] * (rate * phi).square()
         echo = torch.complex(real, imaginary)[:, None] * torch.polar(torch.ones_like(phase), phase)
         return torch.view_as_real(echo).flatten()
 
@@ -79,11 +79,11 @@ def test_equals_the_inverse_fisher_information_of_the_whole_model(order: int, fr
 
 
 def satellite(snr_db: float, n_pulse: int = 10000, trials: int = 4, **shape: float) -> Tensor:
-    """Relative bounds of Om, k1 and k2 and that of yc in m of the satellite of brief 003, averaged
+    """Relative bounds of Om, k1 and k2 and bound of yc in metres for the satellite scene, averaged
     over trials.
     """
     seen = Satellite(**{"count": 600, **shape}).scatterers(Draws(1, trials=range(trials)))  # pyright: ignore[reportArgumentType]
-    # mean power of the samples: each scatterer fills one cell's worth of 128
+    # mean power of the samples: each scatterer occupies one of 128 range cells
     noise_std = (seen.amplitude.abs().square().sum(-1) / 128 * 10 ** (-snr_db / 10)).sqrt()
     found = rotation_bounds(
         seen.azimuth_m,
@@ -100,22 +100,22 @@ def satellite(snr_db: float, n_pulse: int = 10000, trials: int = 4, **shape: flo
 
 
 def test_figures_of_the_satellite() -> None:
-    """1.25, 0.016 and 0.015 % of Om, k1 and k2, and 0.03 m of yc, at -10 dB; they fall as 10^(-SNR
-    / 20).
+    """An independent float64 model gives 1.25, 0.016 and 0.015 % for Om, k1 and k2, and 0.03 m for
+    yc, at -10 dB. The bounds fall as 10^(-SNR / 20).
     """
     low = satellite(-10.0)
     torch.testing.assert_close(low, torch.tensor([1.25e-2, 1.6e-4, 1.5e-4, 0.03], dtype=F64), rtol=0.35, atol=0)
     torch.testing.assert_close(satellite(20.0), low * 10**-1.5, rtol=1e-9, atol=0)
 
 
-def test_longer_apertures_tell_far_more() -> None:
-    """5, 10, 15, 20 and 30 ms: 32, 5.3, 1.8, 0.8 and 0.23 % of Om by the brief, whose scene is not
-    kept: their ratios are.
+def test_bounds_fall_with_the_aperture_time() -> None:
+    """An independent model of another scene gives 32, 5.3, 1.8, 0.8 and 0.23 % for Om at 5, 10, 15,
+    20 and 30 ms; only the ratios are compared.
     """
     found = torch.stack([satellite(0.0, n)[:2] for n in (2500, 5000, 7500, 10000, 15000)])
-    brief = torch.tensor([[32, 0.23], [5.3, 0.04], [1.8, 0.015], [0.8, 0.007], [0.23, 0.003]], dtype=F64)
+    model = torch.tensor([[32, 0.23], [5.3, 0.04], [1.8, 0.015], [0.8, 0.007], [0.23, 0.003]], dtype=F64)
     # a bound at a fixed SNR also falls with the root of the pulses
-    torch.testing.assert_close(found / found[3], brief / brief[3], rtol=0.25, atol=0)
+    torch.testing.assert_close(found / found[3], model / model[3], rtol=0.25, atol=0)
 
 
 def test_trials_broadcast() -> None:
@@ -137,7 +137,7 @@ def test_trials_broadcast() -> None:
     assert grid["k1_per_s"].shape == (3, 3) and grid["yc_m"].dtype == F64
 
 
-def test_what_the_data_do_not_tell_is_infinite() -> None:
+def test_bounds_of_unobservable_unknowns_are_infinite() -> None:
     x, y, amplitude = points()
     kind = {"wavelength_m": WAVELENGTH, "prf_hz": 4e3, "n_pulse": 80}
 
@@ -168,14 +168,14 @@ def test_what_the_data_do_not_tell_is_infinite() -> None:
     )
     assert infinite(cross_range_m=x[:1], range_m=y[:1], amplitude=amplitude[:1]) == ["omega_rad_s", "yc_m"]
     assert infinite(n_pulse=3) == NAMES[:3], (
-        "one curve over the pulses tells what goes with x, with y and with neither: yc alone is the last"
+        "three pulses leave one curve after a constant and a line; it determines yc only"
     )
     assert infinite(n_pulse=1) == NAMES[:3] + ["yc_m"]
     assert infinite(noise_std=0.0) == []
 
 
 def test_a_line_through_the_centre_leaves_the_rate_almost_unknown() -> None:
-    """Condition 2e9 by the brief: finite, but forty times that of points off the line."""
+    """The bound is finite (condition number 2e9), but forty times that of points off the line."""
     x, y, amplitude = points(20)
     kind = {"wavelength_m": WAVELENGTH, "prf_hz": 4e3, "n_pulse": 80, "free_centre": False}
     line = rotation_bounds(y / 2, y, amplitude, 0.1, 0.02, K[:2], **kind)
@@ -203,10 +203,10 @@ def test_gradients() -> None:
     )
 
 
-def test_refusals() -> None:
+def test_invalid_arguments_raise() -> None:
     x, y, amplitude = points()
     kind = {"wavelength_m": WAVELENGTH, "prf_hz": 4e3, "n_pulse": 40}
-    with pytest.raises(ValueError, match=r"as many targets, got the shapes \(5,\), \(4,\), \(5,\)"):
+    with pytest.raises(ValueError, match=r"equally many targets, got the shapes \(5,\), \(4,\), \(5,\)"):
         rotation_bounds(x, y[:4], amplitude, 0.1, 0.02, K[:2], **kind)
     with pytest.raises(ValueError, match=r"warp_k is \(\.\.\., order - 1\)"):
         rotation_bounds(x, y, amplitude, 0.1, 0.02, K[0], **kind)

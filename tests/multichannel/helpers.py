@@ -1,5 +1,6 @@
-"""Echoes of moving points before a bistatic receiver, by direct sums: nothing that the package
-computes them with.
+"""Echoes of moving points in front of a bistatic receiver, by direct sums.
+
+They share no code with the simulation of the package.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from torchsar.radar import BistaticRadar, LinearFM
 
 
 def published_radar(**changes) -> BistaticRadar:
-    """The instrument of brief 001, c = 3e8 m/s as the printed figures use."""
+    """Return the instrument of Remote Sens. 2020, 12, 1703, Table 1, with c = 3e8 m/s."""
     values: dict = {
         "carrier_hz": 1.25e9,
         "pulse": LinearFM(50e6, 10e-6),
@@ -31,7 +32,7 @@ def time_of(radar, n_pulse):
 
 
 def range_of(radar, time_s, u_r=0.0, u_a=0.0, y0=0.0, r0=None):
-    """R_m(t), (channel, pulse), printed formula."""
+    """Return R_m(t) by the printed formula, (channel, pulse)."""
     r0 = radar.reference_range_m if r0 is None else r0
     dx = torch.tensor(radar.channel_m, dtype=torch.float64)[:, None]
     return torch.sqrt((r0 - u_r * time_s) ** 2 + ((radar.speed_m_s - u_a) * time_s - y0 - dx) ** 2)
@@ -46,15 +47,17 @@ def transmit_of(radar, time_s):
 
 
 def azimuth_echo(radar, n_pulse, u_r=0.0, u_a=0.0, y0=0.0, r0=None, gate_s=4.5):
-    """(channel, pulse) of one point, with the transmit range of the radar."""
+    """Return the echo (channel, pulse) of one point, with the transmit range of the radar."""
     t = time_of(radar, n_pulse)
     path = range_of(radar, t, u_r, u_a, y0, r0) - radar.reference_range_m + transmit_of(radar, t)
     return torch.exp(-2j * math.pi * torch.remainder(path / radar.wavelength_m, 1)) * lit(radar, t, u_a, y0, gate_s)
 
 
 def compressed_echo(radar, n_pulse, n_range, points, gate_s=4.5):
-    """Signal (channel, pulse, range) of points (dicts of u_r, u_a, y0, r0, amplitude): a
-    rectangular band of unit peak at R_m(t), the transmit range in the carrier only.
+    """Return the signal (channel, pulse, range) of points (dicts of u_r, u_a, y0, r0, amplitude).
+
+    Each point has a rectangular band of unit peak at R_m(t); the transmit range is in the carrier
+    only.
     """
     t = time_of(radar, n_pulse)
     fr = torch.fft.fftfreq(n_range, 1 / radar.sampling_hz, dtype=torch.float64)

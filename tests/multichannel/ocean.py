@@ -1,4 +1,4 @@
-"""Small frames of ships on a sea, and the settings of the flow that fit them."""
+"""Small frames of ships on a sea, and settings of the imaging that suit them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def ship(u_r=8.0, u_a=0.0, **values) -> Ship:
 
 
 def frame_of(ships: Mapping[str, Ship], seed=1, pulses=540, lines=120, sea=True, dtype=torch.complex64) -> Signal:
-    """Channels (channel, pulse, range) with noise of -30 dB, a sea of 0 dB."""
+    """Return channels (channel, pulse, range) with noise of -30 dB and a sea of 0 dB."""
     world = BistaticWorld(
         Fleet(ships) if ships else None, BandLimited(GATE_S), KSea(shape=1.5) if sea else None, snr_db=30.0
     )
@@ -32,7 +32,7 @@ def frame_of(ships: Mapping[str, Ship], seed=1, pulses=540, lines=120, sea=True,
 
 
 def flow(**values) -> ImageMovers:
-    """Looks at the conventional image only, which is enough for bright ships."""
+    """Return the imaging stage with the conventional image only, enough for bright ships."""
     return ImageMovers(
         RADAR, **{"extraction": EXTRACTION, "detector": Detector(suppressed_m_s=()), "u_a_half_m_s": 12.0, **values}
     )

@@ -1,6 +1,4 @@
-"""Images of single points along azimuth, rebuilt and focused with given velocities, and their
-figures.
-"""
+"""Azimuth images of single points, focused with given velocities, and their figures."""
 
 from __future__ import annotations
 
@@ -37,7 +35,7 @@ def focused(data, radar, motion, rebuild, band_hz: float | None = BAND_HZ, left_
 
 
 def figures_of(image, radar, bands, u_r=0.0, u_a=0.0, y0=0.0, gate_s: float | None = GATE_S, used=None):
-    """Along the track that the target sees, x = v t, as the printed figures have it."""
+    """Measure an image on x = v t, the track as seen by the target, as in the printed figures."""
     along = radar.speed_m_s - u_a
     step, n = along / (bands * radar.prf_hz), image.shape[-1]
     response = replicas.azimuth_response(image, step, -(n // 2) * step)
@@ -50,7 +48,7 @@ def figures_of(image, radar, bands, u_r=0.0, u_a=0.0, y0=0.0, gate_s: float | No
 
 
 def measured(radar, rebuild, u_r=0.0, u_a=0.0, y0=0.0, n_pulse=LONG, band_hz: float | None = BAND_HZ, used=None):
-    """Figures of a band-limited point, rebuilt with its own motion or the `used` one."""
+    """Return the figures of a band-limited point, focused with its own or the `used` motion."""
     assumed = (u_r, u_a, y0) if used is None else used
     image = focused(azimuth_echo(radar, n_pulse, u_r, u_a, y0), radar, motion_of(radar, *assumed), rebuild, band_hz)
     return figures_of(image, radar, rebuild.bands, u_r, u_a, y0, used=None if used is None else (used[0], used[1]))

@@ -1,6 +1,4 @@
-"""Whether velocities lie whole pulse rates off is told rightly, whatever an estimator was told of
-the along-track speed.
-"""
+"""Velocities off by whole PRFs are detected, whatever along-track speed an estimator assumed."""
 
 from __future__ import annotations
 
@@ -22,9 +20,7 @@ RADAR = BistaticRadar(1.25e9, LinearFM(50e6, 10e-6), 60e6, 180.0, 300.0, 5000.0,
     ("u_r", "u_a", "off"),
     [(10.0, 5.0, 0.0), (0.0, 10.0, 0.0), (10.0, 15.0, 0.0), (30.0, 0.0, 1.0), (30.0, 10.0, 1.0), (-30.0, 5.0, -1.0)],
 )
-def test_the_number_of_pulse_rates_is_right_though_the_speed_along_track_is_not(
-    u_r: float, u_a: float, off: float
-) -> None:
+def test_the_ambiguity_number_is_right_with_a_wrong_along_track_speed(u_r: float, u_a: float, off: float) -> None:
     world = BistaticWorld(MovingPoints([u_r], [u_a], [0.0], [0.0]), BandLimited(4.5), snr_db=20.0)
     signal = simulate_bistatic(RADAR, world, 900, None, Draws(3))[0].signal
     with warnings.catch_warnings(record=True) as said:
@@ -37,9 +33,9 @@ def test_the_number_of_pulse_rates_is_right_though_the_speed_along_track_is_not(
         assert float(Interferometry(RADAR, Dwell(4.5))(signal, u_a_m_s=u_a).info["pulse_rates"]) == off
 
 
-def test_targets_that_no_pulse_sees_are_named() -> None:
+def test_targets_outside_the_record_are_reported() -> None:
     far = MovingPoints([0.0, 0.0], [0.0, 0.0], [0.0, 9000.0], [0.0, 0.0])
-    with pytest.warns(UserWarning, match="1 of 2 targets shine at no pulse"):
+    with pytest.warns(UserWarning, match="1 of 2 targets are received in no pulse"):
         simulate_bistatic(RADAR, BistaticWorld(far, BandLimited(4.5)), 90, None, Draws(1))
     with pytest.raises(ValueError, match=r"target 1 \(counted from 0\) lies 9000 m"):
         simulate_bistatic(
@@ -49,11 +45,11 @@ def test_targets_that_no_pulse_sees_are_named() -> None:
             32,
             Draws(1),
         )
-    with pytest.raises(ValueError, match="one entry a target"):
+    with pytest.raises(ValueError, match="one entry per target"):
         MovingPoints(10.0, 0.0, 0.0, 0.0)  # type: ignore[arg-type]
 
 
-def test_silence_is_not_ambiguous() -> None:
+def test_zero_data_are_not_ambiguous() -> None:
     world = BistaticWorld(MovingPoints([5.0], [0.0], [0.0], [0.0]), BandLimited(4.5))
     signal = simulate_bistatic(RADAR, world, 120, None, Draws(1))[0].signal
     assert (

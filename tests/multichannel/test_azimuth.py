@@ -1,5 +1,7 @@
-"""Focused points against the theory of a rectangular band and the tables of brief 001, by echoes
-summed directly.
+"""Focused points against the theory of a rectangular band and the tables of the paper.
+
+Echoes are direct sums; the figures marked "prototype" are those of an independent float64
+prototype.
 """
 
 from __future__ import annotations
@@ -25,13 +27,13 @@ OTHERS = [(0.0, 0.0), (20.0, 0.0), (-20.0, 0.0), (0.0, 12.0), (20.0, 20.0), (-20
 
 
 def theory_m(u_a):
-    """0.886 lambda R0 / (v T), the band as wide as it is processed at most."""
+    """Return 0.886 lambda R0 / (v T), with the band limited to the processed one."""
     v = 300 - u_a
     return 0.886 * v / min(v**2 * GATE_S / (0.24 * 5000), BAND_HZ)
 
 
 @pytest.mark.parametrize(("u_r", "u_a"), TABLE_4 + OTHERS)
-def test_table_4_with_velocities_told(u_r, u_a):
+def test_table_4_with_known_velocities(u_r, u_a):
     found = measured(RADAR, LeastSquares(2), u_r, u_a)
     assert found.irw_m == pytest.approx(theory_m(u_a), rel=0.02)
     assert found.pslr_db == pytest.approx(-13.26, abs=0.15)
@@ -48,7 +50,7 @@ def test_inverse_of_three_bands(u_r, u_a, mfta_db):
 
 
 @pytest.mark.parametrize("y0", [150.0, -400.0])
-def test_a_point_beside_the_middle(y0):
+def test_a_point_off_the_middle(y0):
     found = measured(RADAR, LeastSquares(2), 10.0, 5.0, y0)
     assert (
         found.irw_m == pytest.approx(theory_m(5.0), rel=0.02)
@@ -60,8 +62,8 @@ def test_a_point_beside_the_middle(y0):
     assert float(motion.place_m(motion.image_s)) == pytest.approx(y0, abs=1e-9)
 
 
-def test_the_place_belongs_into_the_filter():
-    """Brief 001, Algorithm 7: at y0 = 150 m, u_r = 10 m/s the least range is 5 m smaller."""
+def test_the_filter_needs_the_along_track_position():
+    """At y0 = 150 m and u_r = 10 m/s the least range is 5 m smaller than at y0 = 0."""
     motion = motion_of(RADAR, 10.0, 0.0, 150.0)
     assert float(motion_of(RADAR, 10.0).closest_m - motion.closest_m) == pytest.approx(5.0, abs=0.02)
     assert measured(RADAR, LeastSquares(2), 10.0, 0.0, 150.0, used=(10.0, 0.0, 0.0)).pslr_db == pytest.approx(
@@ -70,7 +72,7 @@ def test_the_place_belongs_into_the_filter():
 
 
 def test_conventional_processing_makes_false_targets():
-    """Velocities of zero in response and filter (Table 4, trial column, two bands)."""
+    """Velocities of zero in response and filter (Table 4, two bands, prototype)."""
     for move, irw, mfta in (((10.0, 0.0), 0.96, -19.4), ((0.0, 10.0), 82.4, -45.6)):
         found = measured(RADAR, LeastSquares(2), *move, used=(0.0, 0.0, 0.0))
         assert found.mfta_db == pytest.approx(mfta, abs=3.0)
@@ -83,7 +85,7 @@ def test_conventional_processing_makes_false_targets():
     ids=["two", "three", "prior"],
 )
 def test_through_the_pattern_of_an_antenna(rebuild, mfta_db):
-    """Fig. 17 (trial) at u_r = 10 m/s: energy two pulse rates away aliases."""
+    """Fig. 17 at u_r = 10 m/s (prototype): energy two PRFs away aliases."""
     t = time_of(RADAR, LONG)
     path = range_of(RADAR, t, 10.0)
     along = 300 * t - torch.tensor(RADAR.channel_m, dtype=F64)[:, None]
@@ -93,14 +95,15 @@ def test_through_the_pattern_of_an_antenna(rebuild, mfta_db):
 
 
 def test_peak_and_phase():
-    """A unit point for T seconds: T V / sqrt(lambda R) at -45 degrees, against its phase at zero
-    Doppler offset and the reference range.
+    """A unit point for T seconds has the peak T V / sqrt(lambda R) at -45 degrees.
+
+    The phase is relative to that at zero Doppler offset and at the reference range.
     """
     for u_r, u_a, y0 in ((0.0, 0.0, 0.0), (10.0, 5.0, 30.0), (-10.0, 5.0, -60.0)):
         motion, v = motion_of(RADAR, u_r, u_a, y0), 300 - u_a
         peak = measured(RADAR, LeastSquares(2), u_r, u_a, y0, band_hz=None).peak
         assert abs(peak) == pytest.approx(GATE_S * math.sqrt((v**2 + u_r**2) / (0.24 * 5000)), rel=0.01)
-        turns = u_r / 0.24 * float(motion.image_s)  # the demodulation, which the image keeps
+        turns = u_r / 0.24 * float(motion.image_s)  # the demodulation, which remains in the image
         assert (
             abs(math.remainder(math.atan2(peak.imag, peak.real) + math.pi / 4 + 2 * math.pi * turns, 2 * math.pi))
             < 0.05
@@ -116,7 +119,7 @@ def test_filter_is_the_exact_phase_of_the_spectrum():
     torch.testing.assert_close(
         azimuth_filter(offset, RADAR, motion, torch.complex128), torch.exp(1j * phase), atol=1e-8, rtol=0
     )
-    slow = published_radar(speed_m_s=15.0)  # Doppler beyond 2 V / lambda belongs to no point
+    slow = published_radar(speed_m_s=15.0)  # no point has a Doppler beyond V / lambda
     gone = azimuth_filter(offset, slow, motion_of(slow), torch.complex128)
     assert torch.equal(gone == 0, 0.24 * offset.abs() >= 15.0)
 
@@ -139,7 +142,7 @@ def test_trials_equal_singles_and_keep_precision(dtype):
 
 
 def test_every_line_is_focused_for_the_range_of_one_target():
-    """That of the strongest line, or the one given."""
+    """The range is that of the strongest line, or the given one."""
     points = [{"u_r": 10.0, "r0": 4900.0}, {"u_r": 10.0, "r0": 5150.0, "amplitude": 0.5}]
     signal = compressed_echo(RADAR, 900, 96, points)
     still = CorrectMigration(RADAR, Keystone())(signal, u_r_m_s=10.0)
@@ -163,10 +166,8 @@ def test_gradients():
     )
 
 
-def test_records_that_do_not_hold_the_point():
-    """Nothing in, nothing out; a point whose image lies beyond the record wraps around and stays
-    finite.
-    """
+def test_points_outside_the_record():
+    """Zero data give a zero image; an image beyond the record wraps around, finite."""
     motion = motion_of(RADAR, 0.0, 0.0, 2000.0)
     assert float(focused(azimuth_echo(RADAR, 900, 0.0, 0.0, 2000.0), RADAR, motion, LeastSquares(2)).abs().max()) == 0
     far = focused(azimuth_echo(RADAR, 900, 40.0, 0.0, 0.0), RADAR, motion_of(RADAR, 40.0), LeastSquares(2))

@@ -1,4 +1,4 @@
-"""Differences between channels, found in clutter and taken out."""
+"""Differences between channels, estimated from clutter and removed."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ N, CELLS, LONG = 256, 160, 4096
 
 
 def clutter(radar, power_of_doppler, snr_db, trials=2, n_range=CELLS, seed=3):
-    """Gaussian clutter of a Doppler spectrum in pulses of channels that lie dx / V apart, cut from
-    a long periodic one, (trial, channel, pulse, range), in the pulse's band.
+    """Return Gaussian clutter (trial, channel, pulse, range) of a given Doppler spectrum.
+
+    Channels are dx / V apart in time; the pulses are cut from a long periodic record, and the range
+    band is that of the transmitted pulse.
     """
     generator = torch.Generator().manual_seed(seed)
     factor = 8
@@ -56,7 +58,7 @@ def pattern(f):
         (180.0, (ElementPattern(), 5), pattern, 2.5),
     ],
 )
-def test_found_as_well_as_foretold(prf, chosen, power, limit_deg):
+def test_errors_agree_with_the_predicted_std(prf, chosen, power, limit_deg):
     radar = published_radar(prf_hz=prf)
     found = estimate_balance(differed(clutter(radar, power, 40.0), radar), radar, *chosen)
     assert bool(found.ok.all())
@@ -72,7 +74,7 @@ def test_found_as_well_as_foretold(prf, chosen, power, limit_deg):
         assert bool((found.std[name][..., [0, 2]] > 0).all())
 
 
-def test_deviations_are_the_foretold_ones():
+def test_spread_equals_the_predicted_std():
     radar = published_radar()
     found = estimate_balance(
         clutter(radar, flat, 30.0, trials=24, n_range=48), radar, FlatBand(360.0), 2, delays=False, blocks=4
@@ -84,7 +86,7 @@ def test_deviations_are_the_foretold_ones():
     assert float(found.info["snr_db"].mean()) == pytest.approx(30 - 3, abs=3.5)
 
 
-def test_stages_undo_what_was_done():
+def test_stages_remove_the_differences():
     radar = published_radar()
     clean = clutter(radar, flat, 40.0, trials=1)
     signal = Signal(differed(clean, radar), radar.axes(N, CELLS))
@@ -97,7 +99,7 @@ def test_stages_undo_what_was_done():
     torch.testing.assert_close(flat_line, line * (10 ** (-GAIN / 20) * torch.exp(-1j * PHASE))[:, None])
 
 
-def test_trials_stand_alone_and_silence_is_told():
+def test_trials_are_independent_and_empty_ones_not_ok():
     radar = published_radar()
     data = differed(clutter(radar, flat, 30.0), radar)
     dead = data[:1] * torch.tensor([1.0, 0.0, 1.0])[:, None, None]

@@ -1,4 +1,4 @@
-"""Bodies: segments, echoes against direct sums, velocities and places."""
+"""Bodies: segments, echoes against direct sums, velocities and positions."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_the_echo_of_a_body_is_the_direct_sum() -> None:
     frame = Frame.of(RADAR, data)
     body = known_body(data.data, frame, motion_of(), WIDE)
     assert bool(body.ok) and float(body.motion.u_r_m_s) == 7
-    # side lobes in range beyond the lines have -23 dB
+    # range side lobes outside the lines have -23 dB
     assert left_db(clean.data, body_echo(body, frame)) < -20
     assert body_echo(body, frame).dtype == torch.complex128
 
@@ -79,12 +79,12 @@ def test_everything_is_the_data_of_its_lines_and_tones() -> None:
     assert left_db(clean.data, taken) < -20 and left_db(data.data, taken) < -20
 
 
-def test_the_place_and_amplitude_of_a_point() -> None:
+def test_position_and_amplitude_of_a_point() -> None:
     data, _ = noisy_point()
     frame = Frame.of(RADAR, data)
     body = known_body(
         data.data, frame, motion_of(y0=10.0, r0=5003.0), EXTRACTION
-    )  # the middle is put right, the velocity kept
+    )  # the middle is corrected, the velocity is kept
     assert float(body.motion.y0_m) == pytest.approx(20.0, abs=0.05) and float(body.motion.range_m) == pytest.approx(
         5010.0, abs=0.5
     )
@@ -105,7 +105,7 @@ def test_a_ship_on_a_sea_is_found_with_its_velocity() -> None:
     assert bool(body.ok) and abs(float(body.motion.u_r_m_s) - 8) < 0.5 and abs(float(body.motion.u_a_m_s) - 5) < 1.0
     assert abs(float(body.motion.u_r_m_s) - 8) < 6 * float(body.u_r_std_m_s) + 0.1
     own = centred_motion(chip_about(alone.data, frame, true, EXTRACTION))
-    # 16.7 m a metre per second of u_r
+    # y0 changes by 16.7 m per metre per second of u_r
     assert abs(float(body.motion.y0_m - own.y0_m) + 5000 / 295 * (float(body.motion.u_r_m_s) - 8)) < 3
 
 
@@ -119,10 +119,17 @@ def test_a_body_that_cannot_be_found_is_not_ok() -> None:
     assert not bool(silent.ok) and bool(torch.isfinite(silent.level)) and bool(torch.isfinite(silent.motion.u_r_m_s))
 
 
-def test_mistakes_are_named() -> None:
+def test_a_motion_that_leaves_the_record_ends_the_search() -> None:
+    """Seed 110 drives the search to a motion that no pulse illuminates; it used to go on forever."""
+    data = frame_of({}, seed=110)
+    body = find_body(data.data, Frame.of(RADAR, data), 0.0, 5000.0, EXTRACTION)
+    assert not bool(body.ok)
+
+
+def test_invalid_arguments_are_rejected() -> None:
     data, _ = noisy_point()
     frame = Frame.of(RADAR, data)
-    with pytest.raises(ValueError, match="12 beside it to learn the sea from, got 0 lines"):
+    with pytest.raises(ValueError, match="12 beside it for the covariance of the sea, got 0 lines"):
         chip_about(data.data, frame, motion_of(r0=9000.0), EXTRACTION)
     with pytest.raises(ValueError, match="segment_s of an extraction must be positive"):
         Extraction(segment_s=0.0)

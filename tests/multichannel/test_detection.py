@@ -1,4 +1,4 @@
-"""Places that stand out of an image."""
+"""Detection of bright positions in an image."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def patch(data, azimuth_m, range_m, level) -> None:
     data[row - 15 : row + 16, column - 1 : column + 2] *= level
 
 
-def test_bright_places_are_found_strongest_first() -> None:
+def test_bright_positions_are_detected_strongest_first() -> None:
     data = speckle()
     patch(data, -100.0, 5100.0, 8.0)
     patch(data, 150.0, 5200.0, 20.0)
@@ -30,7 +30,7 @@ def test_bright_places_are_found_strongest_first() -> None:
         assert abs(place.azimuth_m - azimuth) < 15 and abs(place.range_m - range_) < 5
 
 
-def test_neighbours_are_one_place_and_most_is_kept() -> None:
+def test_neighbours_are_one_detection_and_most_limits_the_number() -> None:
     data = speckle()
     patch(data, -30.0, 5100.0, 20.0)
     patch(data, 30.0, 5100.0, 18.0)
@@ -51,7 +51,7 @@ def test_contrast_is_the_mean_of_a_neighbourhood_over_the_median() -> None:
     )
 
 
-def test_nothing_is_found_in_speckle_or_silence_and_trials_are_refused() -> None:
+def test_nothing_is_detected_in_speckle_or_zeros_and_trials_are_rejected() -> None:
     assert detect(Signal(speckle(), AXES)) == [] == detect(Signal(torch.zeros(800, 64, dtype=torch.complex64), AXES))
     with pytest.raises(ValueError, match="one image at a time"):
         detect(Signal(torch.zeros(2, 800, 64, dtype=torch.complex64), AXES))

@@ -1,4 +1,4 @@
-"""Migration of aliased channels: figures of brief 001, against the envelopes of the true motion."""
+"""Migration correction of aliased channels, against correction with the true motion."""
 
 from __future__ import annotations
 
@@ -34,9 +34,7 @@ def motion(u_r=0.0, u_a=0.0, y0=0.0, r0=None, radar=RADAR):
 
 
 def figures(signal, of, range_m):
-    """Widths on x = v t and on c tau / 2, and the peak, of the image of a target with its true
-    motion.
-    """
+    """Return widths on x = v t and on c tau / 2, and the peak, for the true motion."""
     spectrum = reconstruct_lines(signal.data, RADAR, of, LeastSquares())
     doppler, lines = doppler_axis(RADAR, N, 2), signal.axis("range")
     image = Signal(
@@ -61,7 +59,7 @@ def corrected(signal, reference, migration, ambiguity=0.0):
         ({"u_r": -10.0, "r0": 4750.0}, 0.05),
     ],
 )
-def test_as_good_as_with_the_true_motion(move, loss_db):
+def test_keystone_equals_the_true_motion(move, loss_db):
     signal, of = compressed_echo(RADAR, N, 384, [move]), motion(**move)
     ambiguity = ambiguity_number(RADAR, of, motion())
     assert float(ambiguity) == {25.0: 1.0, -35.0: -1.0}.get(move["u_r"], 0.0)
@@ -74,13 +72,13 @@ def test_as_good_as_with_the_true_motion(move, loss_db):
     assert got["pslr_azimuth_db"] == pytest.approx(float(best["pslr_azimuth_db"]), abs=0.1)
     assert got["pslr_range_db"] == pytest.approx(-13.3, abs=0.2)
     assert 2 * got["position_range_m"] == pytest.approx(lies_at, abs=0.2)
-    if move == {"u_r": 10.0}:  # brief 001: 0.793 and 2.647 m
+    if move == {"u_r": 10.0}:  # figures of an independent float64 prototype
         assert got["irw_azimuth_m"] == pytest.approx(0.793, abs=0.004) and got["irw_range_m"] == pytest.approx(
             2.647, abs=0.02
         )
 
 
-def test_what_the_simpler_forms_lose():
+def test_loss_of_the_simpler_forms():
     move = {"u_r": 10.0, "r0": 5400.0}
     signal, of = compressed_echo(RADAR, N, 256, [move]), motion(**move)
     whole, bulk, fixed, none = (
@@ -91,10 +89,8 @@ def test_what_the_simpler_forms_lose():
     assert 0.2 < loss[0] < 0.6 and loss[1] > 10 and loss[2] > 8
 
 
-def test_moving_envelopes_are_foretold():
-    """Neglected migration against where the strongest cell of a pulse at the edge of the aperture
-    lies.
-    """
+def test_neglected_migration_is_predicted():
+    """The prediction is compared with the strongest cell of a pulse at the edge of the aperture."""
     move = {"u_r": 12.0, "r0": 5600.0}
     signal, of = compressed_echo(RADAR, N, 512, [move]), motion(**move)
     for migration in (NoMigration(), StaticBulk(False), Keystone(False)):
@@ -104,7 +100,7 @@ def test_moving_envelopes_are_foretold():
         assert moved == pytest.approx(float(migration.neglected_m(800 / 180, of, motion())), abs=RADAR.range_step_m)
 
 
-def test_phases_stay_those_of_the_carrier():
+def test_carrier_phases_are_unchanged():
     signal, of = compressed_echo(RADAR, 600, 128, [{"u_r": 5.0}], gate_s=3.0), motion(5.0)
     out = corrected(signal, motion(), Keystone()).data[:, 100:500, 64]
     t = Frame.of(RADAR, signal).time_s[100:500]
@@ -126,7 +122,7 @@ def test_a_reference_that_moves_needs_no_ambiguity_number():
     assert got["peak"].abs() == pytest.approx(float(best["peak"].abs()), rel=2e-3)
 
 
-def test_trials_have_references_and_ambiguities_of_their_own():
+def test_references_and_ambiguities_per_trial():
     signal = compressed_echo(RADAR, 60, 64, [{"u_r": 25.0}, {"r0": 5100.0}], gate_s=0.25)
     both = signal.with_data(torch.stack([signal.data, 2 * signal.data]))
     values = {"u_r_m_s": torch.tensor([0.0, 3.0]), "y0_m": torch.tensor([0.0, 10.0]), "ambiguity": torch.tensor([1, 0])}
@@ -157,7 +153,7 @@ def test_gradients(migration):
     )
 
 
-def test_refuses_data_of_other_axes():
+def test_data_of_other_axes_are_rejected():
     signal = compressed_echo(RADAR, 8, 16, [{}])
     with pytest.raises(ValueError, match=r"data \(\.\.\., 3, 8, 16\).*got shape \(2, 8, 16\)"):
         correct_migration(signal.data[:2], Frame.of(RADAR, signal), motion())

@@ -1,4 +1,4 @@
-"""One motion as a plan against the chain of two stages, and what it costs."""
+"""Plan for one motion against the chain of two stages, and its cost."""
 
 from __future__ import annotations
 
@@ -73,13 +73,14 @@ def test_gradients_and_refusals() -> None:
         plan.image(torch.zeros(3, 12, dtype=torch.complex64))
     with pytest.raises(ValueError, match="serves one motion"):
         AzimuthPlan(radar, PointMotion.of(radar, torch.zeros(()), torch.zeros(2, dtype=F64)), 12)
-    with pytest.raises(ValueError, match="cannot be told apart"):
+    with pytest.raises(ValueError, match="cannot be separated"):
         AzimuthPlan(radar, motion, 12, LeastSquares(4))
 
 
 def test_an_image_costs_little_more_than_its_transforms() -> None:
-    """At most three times (measured 2 to 2.5); the best of many turns on a machine that
-    others use.
+    """The image takes at most 3.5 times the time of its transforms (measured 1.3 to 2.6).
+
+    The best of many runs counts, since the machine may be shared.
     """
     radar = receiver()
     threads = torch.get_num_threads()

@@ -1,4 +1,4 @@
-"""Rebuilt spectra against those of one channel that samples fast enough, and what is refused."""
+"""Reconstructed spectra against those of one channel with a higher PRF, and rejected arguments."""
 
 from __future__ import annotations
 
@@ -128,18 +128,18 @@ def test_single_precision_agrees():
 
 
 @pytest.mark.parametrize(("prf", "u_a"), [(187.5, 0.0), (180.0, 12.0)])
-def test_channels_at_the_same_places_are_refused(prf, u_a):
+def test_channels_at_the_same_positions_are_rejected(prf, u_a):
     radar = published_radar(prf_hz=prf)
     signal = Signal(azimuth_echo(radar, 90), radar.axes(90))
     with pytest.raises(
         ValueError,
         match=(
-            f"pulse rate of {prf:g} Hz and a speed past the target of {300 - u_a:g} m/s .* 3 bands cannot be told apart"
+            f"pulse rate of {prf:g} Hz and a speed past the target of {300 - u_a:g} m/s .* 3 bands cannot be separated"
         ),
     ):
         Reconstruct(radar, LeastSquares(3))(signal, u_a_m_s=u_a)
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # two bands, or a prior, take it
+        warnings.simplefilter("error")  # two bands or a prior are well conditioned
         for rebuild in (LeastSquares(2), MinimumMeanSquare()):
             assert bool(torch.isfinite(Reconstruct(radar, rebuild)(signal, u_a_m_s=u_a).data.abs()).all())
 
@@ -154,17 +154,17 @@ def test_a_search_crosses_the_singular_speed():
     assert bool(torch.isfinite(data.abs()).all() and torch.isfinite(slope).all())
 
 
-def test_a_poor_inverse_is_refused_in_single_precision_first():
+def test_a_poor_inverse_is_rejected_in_single_precision_first():
     radar, data = published_radar(), torch.randn(3, 90, dtype=torch.complex128)
     with pytest.warns(UserWarning, match="condition number 1.1[78]e\\+05"):
         Reconstruct(radar, LeastSquares(3))(Signal(data, radar.axes(90)), u_a_m_s=11.999)
-    with pytest.raises(ValueError, match="cannot be told apart"):
+    with pytest.raises(ValueError, match="cannot be separated"):
         Reconstruct(radar, LeastSquares(3))(Signal(data.to(torch.complex64), radar.axes(90)), u_a_m_s=11.999)
 
 
 def test_refusals():
     radar = published_radar()
-    with pytest.raises(ValueError, match="4 Doppler bands cannot be told apart by 3 channels"):
+    with pytest.raises(ValueError, match="4 Doppler bands cannot be separated by 3 channels"):
         Reconstruct(radar, LeastSquares(4))
     with pytest.raises(ValueError, match="expects 3 channels .* got data with 2"):
         Reconstruct(radar)(

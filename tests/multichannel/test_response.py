@@ -1,6 +1,4 @@
-"""The channel response and the weights that tell Doppler bands apart, against the tables of brief
-001 and matrices written out.
-"""
+"""Channel response and reconstruction weights against the printed equations and tables."""
 
 from __future__ import annotations
 
@@ -67,7 +65,7 @@ def test_the_singular_pulse_rate_moves_with_the_target():
     assert float(
         condition_number(published_radar(prf_hz=187.5, channel_m=(-0.4, 0.4)), motion_of(radar), 2)
     ) == pytest.approx(1, abs=1e-6)
-    # five channels half as far apart are of no help, uneven places are
+    # five channels half as far apart do not help, unevenly spaced channels do
     five = published_radar(channel_m=(-1.6, -0.8, 0.0, 0.8, 1.6))
     assert float(condition_number(five, motion_of(five, u_a=12.0), 3)) == math.inf
     uneven = published_radar(channel_m=(-0.8, 0.0, 0.75))
@@ -80,7 +78,7 @@ def test_the_singular_pulse_rate_moves_with_the_target():
 @pytest.mark.parametrize("move", MOTIONS)
 @pytest.mark.parametrize("bands, n", [(2, 60), (3, 61)])
 def test_response_is_the_printed_formula(move, bands, n):
-    """Of all bands: what they share times what tells them apart."""
+    """The product of the shared and the separating part is Eq. (34) in all bands."""
     radar, motion = published_radar(), motion_of(published_radar(), *move)
     alike = shared_response(radar, motion, n, bands, C128)
     matrix = band_matrix(radar, motion, bands)
@@ -94,9 +92,7 @@ def test_response_is_the_printed_formula(move, bands, n):
     [((0.0, 0.0, 0.0), 1e-6), ((10.0, 0.0, 0.0), 0.012), ((20.0, 0.0, 0.0), 0.03), ((10.0, 5.0, 150.0), 0.015)],
 )
 def test_response_against_exact_ranges(move, worst_rad):
-    """R_m(t) = R(t - dx / v_e) + C / (2 R0): the phase that the formula leaves over an aperture
-    (brief 001, Signal model).
-    """
+    """R_m(t) = R(t - dx / v_e) + C / (2 R0): residual phase of Eqs. (6), (7)."""
     radar = published_radar()
     u_r, u_a, y0 = move
     t = torch.linspace(-2.25, 2.25, 201, dtype=F64) + y0 / (300 - u_a)
@@ -109,7 +105,7 @@ def test_response_against_exact_ranges(move, worst_rad):
 
 
 def test_34_against_27_with_k1_left_in_the_data():
-    """Brief 001, erratum 1."""
+    """Eq. (34) is right where k1 remains in the data, the printed Eq. (27) is not."""
     k1, u_r = -243.0, 10.0
     radar = published_radar(transmit_range=(k1,))
     data, motion = azimuth_echo(radar, LONG, u_r), motion_of(radar, u_r)
@@ -185,7 +181,7 @@ def test_least_mean_square_becomes_the_inverse_without_noise():
     motion = motion_of(radar, 10.0)
     weights = MinimumMeanSquare(3, 120.0, FlatBand(3 * 160.0 + 1)).weights(radar, motion, 8)
     torch.testing.assert_close(weights, LeastSquares(3).weights(radar, motion, 8).expand(8, 3, 3), atol=1e-6, rtol=0)
-    # bands without expected power come out empty
+    # bands without expected power are zero
     empty = MinimumMeanSquare(3, 40.0, FlatBand(100.0)).weights(radar, motion, 8)
     assert (
         float(empty[:, 0].abs().max()) == 0 == float(empty[:, 2].abs().max()) and float(empty[4, 1].abs().max()) > 0.3
@@ -242,6 +238,6 @@ def test_refusals():
         motion_of(published_radar(), math.nan)
     assert (
         LeastSquares(2).refusal(1)
-        == "2 Doppler bands cannot be told apart by 1 channel; rebuild at most 1, or give a prior (MinimumMeanSquare)"
+        == "2 Doppler bands cannot be separated by 1 channel; rebuild at most 1, or give a prior (MinimumMeanSquare)"
     )
     assert MinimumMeanSquare(5).refusal(1) is None

@@ -1,4 +1,4 @@
-"""The whole flow: movers found, taken out, and put in their places."""
+"""Imaging of a whole scene: moving targets are found, removed and relocated."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .ocean import EXTRACTION, RADAR, flow, frame_of, ship
 
 @cache
 def scenes() -> tuple[Signal, Signal]:
-    """A moving ship on a sea, and the sea alone."""
+    """Return a moving ship on a sea, and the sea alone."""
     return frame_of({"one": ship()}), frame_of({})
 
 
@@ -43,7 +43,7 @@ def ratio_db(a: torch.Tensor, b: torch.Tensor) -> float:
     return 10 * math.log10(float(a.abs().square().mean() / b.abs().square().mean()))
 
 
-def test_a_ship_is_found_removed_and_put_in_its_place() -> None:
+def test_a_ship_is_found_removed_and_relocated() -> None:
     scene, still = made(), StationaryImage(RADAR)(scenes()[1])
     (body,) = scene.bodies
     assert abs(float(body.motion.u_r_m_s) - 8) < 0.5 and abs(float(body.motion.y0_m)) < 20
@@ -72,11 +72,11 @@ def test_a_known_motion_is_kept() -> None:
     assert ratio_db(near(scene.rest, shown, 5000.0) - near(still, shown, 5000.0), near(still, shown, 5000.0)) < -5
     none = flow()(scenes()[0], known=[])
     assert none.bodies == [] and torch.equal(none.rest.data, none.conventional.data)
-    with pytest.raises(ValueError, match="9 motions are known, and the detector takes at most 8"):
+    with pytest.raises(ValueError, match="9 motions are known, but the detector allows at most 8"):
         flow()(scenes()[0], known=9 * [known()])
 
 
-def test_zeroing_takes_the_sea_along() -> None:
+def test_zeroing_removes_the_sea_as_well() -> None:
     still, zero = StationaryImage(RADAR)(scenes()[1]), flow(removal="zero")(scenes()[0], known=[known()])
     shown = 300 * float(known().image_s)
     left = [
@@ -96,7 +96,7 @@ def test_a_ship_at_rest_stays_in_the_image() -> None:
     )
 
 
-def test_a_placed_point_lies_as_high_as_one_at_rest() -> None:
+def test_a_relocated_point_has_the_amplitude_of_one_at_rest() -> None:
     point = ship(length_m=0.0, range_cells=1, count=1, level_db=40.0)
     scene = flow()(frame_of({"one": point}, sea=False), known=[known()])
     rest = StationaryImage(RADAR)(
@@ -122,9 +122,9 @@ def test_nothing_is_found_where_nothing_moves() -> None:
         )
 
 
-def test_side_lobes_of_a_ship_are_no_targets() -> None:
+def test_side_lobes_of_a_ship_are_not_targets() -> None:
     ship, movers = made().bodies[0], flow()
-    # a point's side lobes have (6 / 90 pi)^2 = 4.5e-4 of it 90 m away
+    # the side lobes of a point have (6 / 90 pi)^2 = 4.5e-4 of its peak 90 m away
     beside = replace(ship, motion=replace(ship.motion, range_m=ship.motion.range_m + 90.0), level=5e-3 * ship.level)
     assert movers._side_lobe(beside, ship)
     assert not movers._side_lobe(replace(beside, level=0.05 * ship.level), ship)
@@ -132,7 +132,7 @@ def test_side_lobes_of_a_ship_are_no_targets() -> None:
     assert not movers._side_lobe(replace(beside, motion=replace(beside.motion, y0_m=ship.motion.y0_m + 300.0)), ship)
 
 
-def test_any_rebuild_serves_what_is_at_rest() -> None:
+def test_any_reconstruction_images_the_stationary_scene() -> None:
     for rebuild in (LeastSquares(1), MinimumMeanSquare(3)):
         scene = flow(rebuild=rebuild)(scenes()[0], known=[known()])
         assert scene.rest.axes[0].n == rebuild.bands * 540 and bool(
@@ -140,7 +140,7 @@ def test_any_rebuild_serves_what_is_at_rest() -> None:
         )
 
 
-def test_mistakes_are_named() -> None:
+def test_invalid_arguments_are_rejected() -> None:
     data = scenes()[0]
     with pytest.raises(ValueError, match="one frame at a time"):
         flow()(data.with_data(data.data[None]))
@@ -150,5 +150,5 @@ def test_mistakes_are_named() -> None:
         flow()(data.with_data(broken))
     with pytest.raises(ValueError, match="removal must be"):
         flow(removal="paint")
-    with pytest.raises(ValueError, match="2 Doppler bands cannot be told apart by 1 channel"):
+    with pytest.raises(ValueError, match="2 Doppler bands cannot be separated by 1 channel"):
         ImageMovers(published_radar(channel_m=(0.0,)))

@@ -1,6 +1,4 @@
-"""The signal intensity ratio against its printed formulas, the figures of brief 001 and Monte Carlo
-of its Table 2.
-"""
+"""Signal intensity ratio against its printed formulas and by Monte Carlo trials of Table 2."""
 
 from __future__ import annotations
 
@@ -27,7 +25,7 @@ def decibel(x: torch.Tensor) -> torch.Tensor:
 
 
 def reference_spectrum(n_pulse: int, u_r: float, gate_s: float | None, bands: int = 3) -> torch.Tensor:
-    """Of the middle channel sampled `bands` times as fast, about its Doppler centre, rising."""
+    """Return the spectrum of the middle channel, sampled `bands` times as fast, rising."""
     single = published_radar(prf_hz=180.0 * bands, channel_m=(0.0,))
     time = time_of(single, bands * n_pulse)
     path = range_of(single, time, u_r)[0]
@@ -37,10 +35,7 @@ def reference_spectrum(n_pulse: int, u_r: float, gate_s: float | None, bands: in
 
 
 def three_bands_of(n_pulse: int, u_r: float, gate_s: float | None) -> torch.Tensor:
-    """(channel, pulse) as Eq. (35) has them: the three bands seen by Eq.
-
-    (34), and nothing beyond, aliased.
-    """
+    """Return (channel, pulse) by Eq. (35): three bands with the response of Eq. (34), aliased."""
     spectrum = reference_spectrum(n_pulse, u_r, gate_s)
     offset = (torch.arange(3 * n_pulse, dtype=F64) + first_bin(n_pulse, 3)) * 180 / n_pulse
     dx, square = torch.tensor(RADAR.channel_m, dtype=F64)[:, None], 300**2 + u_r**2
@@ -58,10 +53,9 @@ def ratios(data: torch.Tensor, u_r: list[float]) -> tuple[torch.Tensor, torch.Te
 
 
 def test_printed_formulas():
-    """Eqs.
+    """Eqs. (37), (38) over a spectrum that was not reconstructed.
 
-    (37), (38) over a spectrum that no reconstruction touches: what is rebuilt from three bands is
-    that spectrum.
+    The reconstruction of its three bands gives the same spectrum.
     """
     spectrum = reference_spectrum(900, 10.0, 4.5).abs()
     inside = ((torch.arange(2700) + first_bin(900, 3)) * 0.2).abs() <= BAND / 2
@@ -75,15 +69,13 @@ def test_printed_formulas():
 
 @pytest.mark.parametrize(("gate_s", "published"), [(4.5, (24.5, 14.8, 39.2)), (None, (7.3, 4.4, 11.6))])
 def test_peaks_over_the_value_at_rest(gate_s, published):
-    """The figures of the brief come out of three bands and nothing beyond."""
+    """Figures of an independent float64 prototype, with three bands and nothing outside them."""
     found = ratios(three_bands_of(3600, 10.0, gate_s), [0.0, 10.0])
     assert [float(decibel(x[1] / x[0])) for x in found] == pytest.approx(published, abs=0.3)
 
 
-def test_what_aliases_from_beyond_the_bands_lowers_the_peak():
-    """Direct echoes: what lies beyond three bands comes back through a matrix of condition 10 and
-    noise gain 12 dB.
-    """
+def test_aliasing_from_outside_the_bands_lowers_the_peak():
+    """Direct echoes: energy outside three bands aliases through a matrix of condition number 10."""
     direct = ratios(azimuth_echo(RADAR, 3600, 10.0), [0.0, 10.0])
     assert [float(decibel(x[1] / x[0])) for x in direct] == pytest.approx((17.9, 10.1, 28.1), abs=0.2)
 
@@ -120,15 +112,16 @@ def test_noise_free_velocity(u_r):
 
 
 def noisy(radar, trials: int, raw_db: float, seed: int = 1) -> Signal:
-    """Echoes at u_r 10 m/s in white noise, SNR as before range compression (27 dB below that of a
-    sample).
+    """Return echoes at u_r = 10 m/s in white noise.
+
+    The SNR is that before range compression, 27 dB below that of a sample.
     """
     n = round(5 * radar.prf_hz)
     noise = torch.randn(trials, 3, n, generator=torch.Generator().manual_seed(seed), dtype=torch.complex64)
     return Signal(azimuth_echo(radar, n, 10.0).to(torch.complex64) + 10 ** (-(raw_db + 27) / 20) * noise, radar.axes(n))
 
 
-# brief 001, Table 2, SIR trial
+# Table 2 of the paper: figures of an independent float64 prototype of the ratio
 TABLE = [
     (170.0, -20, 0.25),
     (170.0, -10, 0.08),
@@ -147,7 +140,7 @@ def test_mean_errors_of_the_second_table(prf_hz, raw_db, error):
     assert error / 1.8 < float((found["u_r_m_s"] - 10).abs().mean()) < error * 1.8
 
 
-def test_predicted_deviation_and_verdict():
+def test_predicted_std_and_ok():
     found = SignalIntensityRatio(RADAR, BAND, search_m_s=(-20.0, 20.0))(noisy(RADAR, 40, -15, seed=3))
     assert bool(found.ok.all())
     assert 0.5 < float(found.std["u_r_m_s"].median() / (found["u_r_m_s"] - 10).std()) < 2
@@ -155,8 +148,8 @@ def test_predicted_deviation_and_verdict():
     assert float(lost.ok.to(F64).mean()) < 0.2 and float(lost.quality.mean()) < 0.2
 
 
-def test_a_stationary_scene_says_that_nothing_moves():
-    """Brief 001: the error equals u_r."""
+def test_a_stationary_scene_biases_the_estimate_to_zero():
+    """The error then equals u_r."""
     still = sum(
         (10 * azimuth_echo(RADAR, 900, 0.0, y0=y0) for y0 in (-60.0, -10.0, 25.0, 70.0)),
         torch.zeros(3, 900, dtype=torch.complex128),
@@ -165,7 +158,7 @@ def test_a_stationary_scene_says_that_nothing_moves():
     assert abs(float(found["u_r_m_s"])) < 1
 
 
-def test_trials_and_lines_stand_for_themselves():
+def test_trials_and_lines_are_independent():
     data = torch.stack([azimuth_echo(RADAR, 900, u_r, u_a) for u_r, u_a in ((3.0, 0.0), (-7.0, 5.0))])
     stage, axes = SignalIntensityRatio(RADAR, BAND, step_m_s=1.0), RADAR.axes(900)
     together = stage(
@@ -180,7 +173,7 @@ def test_trials_and_lines_stand_for_themselves():
     )
 
 
-def test_no_data_and_the_end_of_the_search_are_marked():
+def test_zero_data_and_the_end_of_the_search_are_not_ok():
     nothing = SignalIntensityRatio(RADAR, BAND, search_m_s=(-5.0, 10.0))(
         Signal(torch.zeros(2, 3, 64, dtype=torch.complex64), RADAR.axes(64))
     )
@@ -198,7 +191,7 @@ def test_refusals_and_warnings():
         SignalIntensityRatio(RADAR, BAND, LeastSquares(4))
     with pytest.raises(ValueError, match="two steps of step_m_s"):
         SignalIntensityRatio(RADAR, BAND, search_m_s=(3.0, 3.5))
-    with pytest.raises(ValueError, match="nearly the same places"):
+    with pytest.raises(ValueError, match="nearly the same positions"):
         radar = published_radar(prf_hz=187.5)
         SignalIntensityRatio(radar, BAND, search_m_s=(-0.5, 0.5))(Signal(azimuth_echo(radar, 64), radar.axes(64)))
     with warnings.catch_warnings():

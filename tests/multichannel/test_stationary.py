@@ -1,6 +1,4 @@
-"""The conventional image of what is at rest: places, widths, phases over the whole swath, and what
-motion does to it.
-"""
+"""Conventional image: positions, widths and phases over the whole swath, and displaced targets."""
 
 from __future__ import annotations
 
@@ -87,5 +85,5 @@ def test_refusals():
     with pytest.raises(ValueError, match="rebuild at most 3"):
         StationaryImage(RADAR, LeastSquares(4))
     signal = compressed_echo(published_radar(prf_hz=187.5), 12, 16, [{}])
-    with pytest.raises(ValueError, match="sample nearly the same places"):
+    with pytest.raises(ValueError, match="sample nearly the same positions"):
         StationaryImage(published_radar(prf_hz=187.5), LeastSquares(3))(signal)

@@ -1,4 +1,4 @@
-"""Clock errors seen in the direct path, and compression of the full chirp."""
+"""Clock errors measured in the direct path, and compression of the full chirp."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RADAR = published_radar()
 
 
 def direct_path(phase, delay, n=64, noise=0.0, seed=0):
-    """Compressed direct signal (..., pulse, sample), summed frequency by frequency."""
+    """Return the compressed direct signal (..., pulse, sample), summed over frequencies."""
     f = torch.fft.fftfreq(n, 1 / RADAR.sampling_hz, dtype=torch.float64)
     f = f[f.abs() < RADAR.pulse.bandwidth_hz / 2]
     t = (torch.arange(n, dtype=torch.float64) - n // 2) / RADAR.sampling_hz
@@ -48,7 +48,7 @@ def test_exact_without_noise():
     assert bool(found.ok.all())
 
 
-def test_reaches_its_foretold_deviation():
+def test_error_equals_the_predicted_std():
     phase, delay = errors(4, 500)
     found = estimate_synchronisation(direct_path(phase, delay, noise=0.1), RADAR)
     for name, true in (("phase_rad", phase), ("delay_s", delay)):
@@ -59,7 +59,7 @@ def test_reaches_its_foretold_deviation():
     assert float(found.info["snr_db"].mean()) == pytest.approx(20 + 10 * math.log10(64 / 53), abs=0.3)
 
 
-def test_a_lost_direct_path_is_told_per_trial():
+def test_a_lost_direct_path_is_not_ok_per_trial():
     phase, delay = errors(2, 50)
     direct = direct_path(phase, delay, noise=0.01)
     direct[1, 20] = 0
@@ -75,7 +75,7 @@ def test_a_lost_direct_path_is_told_per_trial():
     torch.testing.assert_close(alone["phase_rad"], found["phase_rad"][0])
 
 
-def test_all_channels_are_freed_of_both():
+def test_phase_and_delay_are_removed_from_all_channels():
     signal = compressed_echo(RADAR, 40, 96, [{"r0": 5020.0}])
     phase, delay = (x[0] for x in errors(1, 40))
     f = torch.fft.fftfreq(96, 1 / RADAR.sampling_hz, dtype=torch.float64)

@@ -1,6 +1,4 @@
-"""The range of the transmitter taken out by the ephemeris, and by the paper's scaling phase with k1
-left to the reconstruction.
-"""
+"""Removal of the transmit range by the ephemeris, and by Eq. (31) with k1 in the response."""
 
 from __future__ import annotations
 
@@ -31,14 +29,14 @@ def echo(radar, **move):
 
 
 @pytest.mark.parametrize("with_range", [False, True])
-def test_leaves_the_echo_without_a_transmitter(with_range):
+def test_removal_leaves_the_receive_path(with_range):
     far, still = published_radar(transmit_range=K), published_radar()
     make = (lambda r: compressed_echo(r, 90, 64, [{"u_r": 10.0}])) if with_range else (lambda r: echo(r, u_r=10.0))
     out = RemoveTransmitRange(far)(make(far))
     torch.testing.assert_close(out.data, make(still).data, atol=1e-7, rtol=0)
 
 
-def test_orders_are_kept_out_one_by_one_and_counted():
+def test_orders_are_removed_one_by_one():
     radar = published_radar(transmit_range=K)
     data, time = echo(radar).data, time_of(radar, N)
     with pytest.warns(UserWarning, match="raise the order to 4"):
@@ -50,7 +48,7 @@ def test_orders_are_kept_out_one_by_one_and_counted():
     torch.testing.assert_close(
         torch.remainder(phase - expected + math.pi, 2 * math.pi), torch.full_like(phase, math.pi), atol=1e-6, rtol=0
     )
-    # brief 001: k2 matters, third order does not
+    # the second order matters in 4.5 s, higher orders do not
     assert neglected_transmit_phase_rad(radar, 1, 4.5) == pytest.approx(2 * math.pi / 0.24 * 0.0208 * 2.25**2, rel=1e-3)
     assert neglected_transmit_phase_rad(radar, 2, 4.5) < 1e-3
 
@@ -62,7 +60,7 @@ def test_coefficients_per_trial_with_gradients():
     together = remove_transmit_range(data, time, (1.0, k2), 0.24)
     torch.testing.assert_close(together[1], remove_transmit_range(data[1], time, (1.0, 0.02), 0.24))
     assert torch.autograd.gradcheck(lambda d, k: remove_transmit_range(d, time, (1.0, k), 0.24), (data, k2))
-    with pytest.raises(ValueError, match="one time a pulse \\(6\\)"):
+    with pytest.raises(ValueError, match="one time per pulse \\(6\\)"):
         remove_transmit_range(data, time[:5], K, 0.24)
 
 
@@ -82,13 +80,13 @@ def test_scaling_with_k1_in_the_response_rebuilds_the_same_image(u_r, u_a):
         for s in (removed, scaled)
     ]
     assert (filtered[0] - filtered[1]).norm() < 0.01 * filtered[0].norm()
-    assert filtered[0].max() > 25  # focused: the energy of 810 pulses in one place
-    # without k1 in the response the channels do not fit together
+    assert filtered[0].max() > 25  # focused: the energy of 810 pulses at one position
+    # without k1 in the response the reconstruction fails
     wrong = reconstruct(AzimuthScaling(radar)(signal, u_r_m_s=u_r, u_a_m_s=u_a).data, radar, motion, rebuild)
     assert (wrong.abs() - removed.abs()).norm() > 0.3 * removed.norm()
 
 
-def test_refuses_orders_it_has_not():
+def test_invalid_orders_are_rejected():
     with pytest.raises(ValueError, match="orders 2 to 4"):
         AzimuthScaling(published_radar(), order=5)
     with pytest.raises(ValueError, match="got -1"):

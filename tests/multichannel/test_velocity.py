@@ -1,6 +1,4 @@
-"""Estimators of a moving point's velocity against their bounds, each other, ambiguities and
-clutter.
-"""
+"""Velocity estimators of a moving point against bounds, each other, ambiguities and clutter."""
 
 from __future__ import annotations
 
@@ -86,7 +84,7 @@ def test_model_is_the_echo_and_its_slopes():
     [(0.0, 1.3, {"u_r": 10.0}), (7.0, 1.3, {"u_r": -7.0, "u_a": 3.0, "y0": 40.0}), (-10.0, 1.6, {"u_r": 4.0})],
 )
 def test_recommended_reaches_the_bound(snr_db, worst, move):
-    """And never beats it by more than chance: the edges of the gate must tell nothing."""
+    """The estimate is not better than the bound: the edges of the gate give no information."""
     estimate = moving_point_velocity(noisy(snr_db, 32, **move).data, RADAR, GATE, NEAR)
     least = bound(snr_db, **move)
     assert bool(estimate.ok.all())
@@ -95,7 +93,7 @@ def test_recommended_reaches_the_bound(snr_db, worst, move):
         assert float(estimate.std[name].median()) == pytest.approx(least[name], rel=0.3)
 
 
-def test_with_the_along_track_speed_told():
+def test_with_a_known_along_track_speed():
     estimate = MovingPointVelocity(RADAR, GATE, search=NEAR, u_a_m_s=5.0)(noisy(0.0, 32, u_r=10.0, u_a=5.0))
     assert set(estimate.std) == {"u_r_m_s", "y0_m"} and bool((estimate.value["u_a_m_s"] == 5).all())
     assert (
@@ -111,10 +109,10 @@ def test_interferometry_within_twice_the_bound(snr_db):
 
 
 @pytest.mark.parametrize("channels", [(-0.8, 0.0, 0.75), (-0.4, 0.4), (0.8, -0.8, 0.0)])
-def test_interferometry_with_channels_anywhere(channels):
+def test_interferometry_with_uneven_channels(channels):
     radar = published_radar(channel_m=channels)
     estimate = Interferometry(radar, GATE)(noisy(10.0, 20, radar=radar, u_r=10.0, u_a=5.0), u_a_m_s=5.0)
-    # what the direction between the channels tells, that is without the cubic phase
+    # bound by the look angle between the channels, without the cubic phase
     least = float(radial_velocity_bound_m_s(radar, 10.0, 810, 5.0))
     assert (
         0.6 < rms(estimate.value["u_r_m_s"] - 10) / least < 1.5
@@ -123,15 +121,11 @@ def test_interferometry_with_channels_anywhere(channels):
 
 
 def test_interferometry_and_the_ends_of_its_interval():
-    """u_r comes within half of lambda PRF, 43.2 m/s, about the start: 25 is seen as -18.2 (brief
-    001).
-    """
+    """u_r is returned within half of lambda PRF (43.2 m/s) about the start: 25 appears as -18.2."""
     for u_r in (21.0, -21.0):
         estimate = Interferometry(RADAR, GATE)(noisy(17.0, 4, u_r=u_r))
         assert rms(estimate.value["u_r_m_s"] - u_r) < 0.1 and bool(estimate.ok.all())
-    with pytest.warns(
-        UserWarning, match="in 4 of 4 trials the slant-range velocity is whole pulse rates, 43.2 m/s each, off"
-    ):
+    with pytest.warns(UserWarning, match="in 4 of 4 trials the slant-range velocity is off by whole pulse rates"):
         estimate = Interferometry(RADAR, GATE)(noisy(17.0, 4, u_r=25.0))
     assert (
         bool(((estimate.value["u_r_m_s"] - 25 + 43.2).abs() < 1.5).all())
@@ -143,7 +137,7 @@ def test_interferometry_and_the_ends_of_its_interval():
 
 
 def test_along_track_speed():
-    # three bands could not be told apart at 12 m/s
+    # three bands cannot be separated at 12 m/s
     signal = noisy(0.0, 24, u_r=10.0, u_a=12.0, y0=20.0)
     estimate = AlongTrackAutofocus(RADAR, GATE)(signal, u_r_m_s=10.0, y0_m=20.0)
     least = bound(0.0, ("u_a_m_s", "u_r_m_s"), u_r=10.0, u_a=12.0, y0=20.0)["u_a_m_s"]
@@ -164,7 +158,7 @@ def test_gauss_newton_and_gradients_agree(aperture):
         torch.testing.assert_close(
             newton.value[name], descent.value[name], atol=0.03 * float(newton.std[name].max()), rtol=0
         )
-    # both stand where the likelihood is flat
+    # both are at the maximum, where the gradient is zero
     motion = PointMotion.of(RADAR, signal.data, *(newton.value[name] for name in UNKNOWNS)).each(
         lambda x: x.requires_grad_()
     )
@@ -214,7 +208,7 @@ def test_range_walk_resolves_pulse_rates(u_r, number):
     assert estimate.value["ambiguity"].tolist() == [number, number] and bool(estimate.ok.all())
 
 
-def test_a_place_known_from_an_image():
+def test_a_position_known_from_an_image():
     """`bank_search` about the slow time at which the point appears in an image."""
     data = noisy(0.0, 3, u_r=10.0, u_a=5.0, y0=300.0).data
     appears = PointMotion.of(RADAR, data, 10.0, 5.0, 300.0).image_s
@@ -227,9 +221,7 @@ def test_a_place_known_from_an_image():
 
 
 class TestClutter:
-    """K-distributed sea at rest, 30 dB above noise of unit power, seen through the pattern of the
-    elements, a point at u_r = 10 m/s.
-    """
+    """A point at u_r = 10 m/s in a K-distributed sea 30 dB above unit noise."""
 
     RADAR = published_radar()
 
@@ -262,9 +254,7 @@ class TestClutter:
         assert rms(estimate.value["u_r_m_s"] - 10) < 0.3
 
     def test_covariance_from_neighbouring_lines(self):
-        """The place found decides where the aperture is expected, and clutter then drags the place:
-        the estimate must not be biased by that.
-        """
+        """Clutter biases the position and thereby the expected aperture, but not u_r."""
         data, around = self.data(10.0, trials=4, lines=5)
         estimate = moving_point_velocity(
             data, self.RADAR, ElementBeam(), NEAR, whitening=line_whitening(around, self.RADAR)
@@ -280,7 +270,7 @@ class TestClutter:
 
 
 def test_below_the_threshold_nothing_is_found():
-    """19 dB over all samples, -15 dB per sample (brief 001)."""
+    """The threshold is 19 dB over all samples, -15 dB per sample."""
     for snr_db, found in ((-300.0, False), (-20.0, False), (-8.0, True)):
         signal = noisy(snr_db, 6, u_r=5.0)
         assert bool(torch.equal(MovingPointVelocity(RADAR, GATE, search=NEAR)(signal).ok, torch.full((6,), found)))
@@ -289,7 +279,7 @@ def test_below_the_threshold_nothing_is_found():
 
 @pytest.mark.parametrize("aperture", [GATE, ElementBeam()], ids=["gate", "beam"])
 @pytest.mark.parametrize("name", ESTIMATORS)
-def test_silence_and_points_outside_the_record(name, aperture):
+def test_zeros_and_points_outside_the_record(name, aperture):
     stage = _small(name, RADAR, aperture)
     data = torch.stack([torch.zeros(3, 200, dtype=C128), azimuth_echo(RADAR, 200, y0=2500.0)])
     for values in ({},) if name == "recommended" else ({}, {"y0_m": 2500.0}):
@@ -309,8 +299,8 @@ def _small(name, radar=RADAR, aperture=GATE, **settings):
 
 @pytest.mark.parametrize("dtype", [torch.complex64, C128])
 @pytest.mark.parametrize("name", ESTIMATORS)
-def test_trials_do_not_know_of_each_other(name, dtype):
-    """Loud, quiet, silent and noisy trials, and one in clutter, together and alone."""
+def test_trials_are_independent(name, dtype):
+    """Strong, weak, zero and noisy trials and one in clutter give the same together and alone."""
     quiet = noisy(10.0, 2, u_r=3.0).data[..., N // 2 - 192 : N // 2 + 192]
     slow = torch.exp(2j * math.pi * 0.01 * torch.arange(384, dtype=F64))
     data = torch.stack(
@@ -328,8 +318,9 @@ def test_trials_do_not_know_of_each_other(name, dtype):
 
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_single_precision_and_range_lines(name):
-    """complex64 data give the velocities of complex128 data; on lines the strongest one is taken,
-    with its own closest range.
+    """complex64 data give the velocities of complex128 data.
+
+    With range lines the strongest one is used, with its own closest range.
     """
     signal, start = noisy(10.0, 2, u_r=3.0), {} if name == "recommended" else {"u_r_m_s": 3.01}
     double, single = (
@@ -347,12 +338,13 @@ def test_single_precision_and_range_lines(name):
 
 
 def test_one_channel():
-    """It cannot tell a velocity from a place: interferometry refuses, the others say that they do
-    not know.
+    """One channel cannot separate velocity and position.
+
+    Interferometry rejects it, the other estimates are not ok.
     """
     radar = published_radar(channel_m=(0.0,))
     signal = noisy(10.0, 2, radar=radar, u_r=3.0)
-    with pytest.raises(ValueError, match="one channel cannot tell a place from a velocity"):
+    with pytest.raises(ValueError, match="one channel cannot separate position and velocity"):
         Interferometry(radar, GATE)(signal)
     estimate = _small("recommended", radar)(signal)
     assert (
@@ -376,7 +368,7 @@ def test_refusals():
         with pytest.raises(ValueError, match="at least 4 pulses, got 3 and 2"):
             _small(name)(Signal(signal.data[..., :2], RADAR.axes(2)))
     for unknowns in (("u_r",), (), ("u_r_m_s", "u_r_m_s")):
-        with pytest.raises(ValueError, match="unknowns names some of"):
+        with pytest.raises(ValueError, match="unknowns must be names among"):
             LikelihoodVelocity(RADAR, GATE, unknowns=unknowns)
     with pytest.raises(ValueError, match="half_m_s of a search along track must be positive, got 0"):
         AlongTrackAutofocus(RADAR, GATE, half_m_s=0.0)(signal)

@@ -1,4 +1,4 @@
-"""Functions of known minimum for searches that need no gradient."""
+"""Functions with a known minimum for searches without gradients."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def rotated(x: Tensor) -> Tensor:
 
 
 def rastrigin(x: Tensor) -> Tensor:
-    """One deepest of a thousand minima, at 0, of cost 0."""
+    """A function with a thousand minima, of which the deepest is at 0 and has cost 0."""
     return (x.square() - 10 * torch.cos(2 * math.pi * x) + 10).sum(-1)
 
 

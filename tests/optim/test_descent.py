@@ -1,6 +1,4 @@
-"""Descents of many trials at once: they reach what single descents reach, and no trial feels
-another.
-"""
+"""Descents of many trials at once against single descents, scipy and known minima."""
 
 from __future__ import annotations
 
@@ -12,7 +10,7 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from torchsar.optim import Descent, adam, lbfgs
-from torchsar.optim.descent import _Pairs, _remember
+from torchsar.optim.descent import _append, _Pairs
 
 F64 = torch.float64
 
@@ -34,8 +32,8 @@ def rosenbrock_with_gradient(x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def periodic(x: Tensor) -> Tensor:
-    """A chain of phases: differences want to be 0.3 modulo 2 pi, each phase wants to be 0 modulo
-    pi; many minima.
+    """A chain of phases with many minima: differences of neighbours near 0.3 modulo 2 pi and phases
+    near 0 modulo pi lower the cost.
     """
     return (
         (1 - torch.cos(x[..., 1:] - x[..., :-1] - 0.3)).sum(-1)
@@ -131,7 +129,7 @@ def test_batch_equals_singles(descend: Callable, limits: dict, objective: Callab
 
 
 @pytest.mark.parametrize("descend", [lbfgs, adam])
-def test_wild_neighbours_change_nothing(descend: Callable) -> None:
+def test_trials_with_non_finite_or_large_costs_leave_others_unchanged(descend: Callable) -> None:
     start, level = normal(4, 5), torch.tensor([1.0, 1e6, 1.0, 1.0], dtype=F64)
     bad = torch.tensor([False, False, True, False])
 
@@ -145,7 +143,7 @@ def test_wild_neighbours_change_nothing(descend: Callable) -> None:
         equal(found, i, descend(rosenbrock, start[i], steps=60))
 
 
-def test_a_finished_trial_stays_as_it_is() -> None:
+def test_a_finished_trial_is_evaluated_at_its_result() -> None:
     start = torch.stack([normal(6, seed=1), torch.ones(6, dtype=F64) + 1e-3])
     seen: list[Tensor] = []
 
@@ -168,7 +166,7 @@ def test_steps_limit_each_trial() -> None:
 
 
 @pytest.mark.parametrize("descend", [lbfgs, adam])
-def test_a_start_without_slope_is_the_result(descend: Callable) -> None:
+def test_a_start_with_zero_gradient_is_the_result(descend: Callable) -> None:
     start = torch.stack([torch.ones(4, dtype=F64), normal(4)])
     found = descend(rosenbrock, start, steps=30)
     assert torch.equal(found.x[0], start[0]) and found.converged[0] and found.ok[0]
@@ -189,8 +187,8 @@ def test_a_value_tolerance_ends_earlier() -> None:
     )
 
 
-def test_a_rounded_cost_wastes_no_evaluations() -> None:
-    """Near the minimum the cost 1e6 + q cannot tell points apart, the slope can."""
+def test_rounding_of_the_cost_takes_no_further_evaluations() -> None:
+    """Near the minimum the cost 1e6 + q is constant to rounding, while its slope is not."""
     objective, centre = quadratic(10, 100.0)
     found = lbfgs(
         lambda x: 1e6 + objective(x),
@@ -207,7 +205,7 @@ def test_pairs_without_positive_curvature_are_dropped_per_trial() -> None:
     old = _Pairs(normal(2, 4, 3), normal(2, 4, 3, seed=1), torch.ones(2, 4, dtype=F64))
     move, moved = normal(4, 3, seed=2), torch.tensor([True, True, True, False])
     change = move * torch.tensor([2.0, -1.0, 0.0, 1.0], dtype=F64)[:, None]
-    new = _remember(old, move, change, moved)
+    new = _append(old, move, change, moved)
     for kept in (1, 2, 3):
         assert all(torch.equal(a[:, kept], b[:, kept]) for a, b in zip(new, old, strict=True))
     assert torch.equal(new.move[:, 0], torch.stack([old.move[1, 0], move[0]]))
@@ -249,7 +247,7 @@ def test_one_trial_of_float32(descend: Callable) -> None:
     assert found.cost.shape == () and found.cost < rosenbrock(normal(5))
 
 
-def test_a_minimum_at_the_start_ends_soon() -> None:
+def test_a_start_at_the_minimum_ends_after_few_evaluations() -> None:
     objective, centre = quadratic(8, 1e2)
     once = lbfgs(lambda x: 1 + objective(x), centre + normal(4, 8, seed=2), steps=200)
     again = lbfgs(lambda x: 1 + objective(x), once.x, steps=200)
@@ -257,7 +255,7 @@ def test_a_minimum_at_the_start_ends_soon() -> None:
     torch.testing.assert_close(again.x, once.x, atol=1e-3, rtol=0)
 
 
-def test_steps_over_a_wall_are_shortened() -> None:
+def test_steps_to_a_non_finite_cost_are_shortened() -> None:
     """-log x + x is not finite for x <= 0; its minimum is at 1."""
     found = lbfgs(
         lambda x: (x - torch.log(x)).sum(-1),
@@ -268,11 +266,11 @@ def test_steps_over_a_wall_are_shortened() -> None:
     torch.testing.assert_close(found.x, torch.ones(3, 2, dtype=F64), atol=1e-4, rtol=0)
 
 
-def test_a_descent_into_a_wall_keeps_its_best_finite_point() -> None:
+def test_a_descent_to_a_non_finite_cost_returns_its_best_finite_point() -> None:
     start = torch.tensor([[1.0], [1.0]], dtype=F64)
 
     def cliff(x: Tensor) -> Tensor:
-        """The second row falls towards a wall at 0.3."""
+        """The cost of the second row is not finite below 0.3."""
         return torch.where(torch.tensor([False, True]) & (x[..., 0] < 0.3), torch.nan, 1 + (x + 1).square().sum(-1))
 
     found = lbfgs(cliff, start)
@@ -282,7 +280,7 @@ def test_a_descent_into_a_wall_keeps_its_best_finite_point() -> None:
     assert stepped.ok.tolist() == [True, False] and 0.3 <= float(stepped.x[1, 0]) < 0.36
 
 
-def test_a_non_finite_gradient_is_a_wall_too() -> None:
+def test_a_non_finite_gradient_ends_the_trial() -> None:
     def corner(x: Tensor) -> tuple[Tensor, Tensor]:
         return x.square().sum(-1), torch.where(x.abs() < 0.1, torch.nan, 2 * x)
 
@@ -290,13 +288,13 @@ def test_a_non_finite_gradient_is_a_wall_too() -> None:
     assert not found.ok.any() and 0.1 <= float(found.x) <= 1 and float(found.cost) <= 1
 
 
-def test_a_cost_without_bottom_ends() -> None:
+def test_an_unbounded_cost_ends_after_the_given_steps() -> None:
     found = lbfgs(lambda x: x.sum(-1), normal(2, 3), steps=5)
     assert (found.steps <= 5).all() and torch.isfinite(found.x).all() and (found.cost < -1e3).all()
 
 
 @pytest.mark.parametrize("descend", [lbfgs, adam])
-def test_gradients_given_equal_gradients_derived(descend: Callable) -> None:
+def test_given_gradients_and_autograd_agree(descend: Callable) -> None:
     derived = descend(rosenbrock, normal(4, 6), steps=40)
     given = descend(rosenbrock_with_gradient, normal(4, 6), steps=40, with_gradient=True)
     torch.testing.assert_close(given.x, derived.x, atol=1e-7, rtol=0)
@@ -304,7 +302,7 @@ def test_gradients_given_equal_gradients_derived(descend: Callable) -> None:
 
 
 @pytest.mark.parametrize("descend", [lbfgs, adam])
-def test_callers_without_gradients_and_trials_of_any_shape(descend: Callable) -> None:
+def test_works_under_no_grad_and_for_trials_of_any_shape(descend: Callable) -> None:
     start = normal(2, 3, 4).requires_grad_()
     with torch.no_grad():
         found = descend(rosenbrock, start, steps=20)
@@ -334,7 +332,7 @@ def test_adam_reaches_the_minimum() -> None:
 
 
 def test_adam_returns_the_best_point_visited() -> None:
-    """A rate far too large jumps about the minimum."""
+    """With a rate that is far too large the points jump about the minimum."""
     costs: list[Tensor] = []
 
     def watched(x: Tensor) -> Tensor:
@@ -380,7 +378,7 @@ MISTAKES = [
 
 @pytest.mark.parametrize("descend", [lbfgs, adam])
 @pytest.mark.parametrize("start, objective, limits, error, words", MISTAKES)
-def test_mistakes_are_named(
+def test_invalid_arguments_raise(
     descend: Callable, start: Tensor, objective: Callable, limits: dict, error: type, words: str
 ) -> None:
     with pytest.raises(error, match=words):

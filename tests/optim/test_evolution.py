@@ -1,4 +1,4 @@
-"""Differential evolution: known minima, and the same numbers whatever the batch."""
+"""Differential evolution: known minima, and results that do not depend on the batch."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Strategy = Literal["rand1bin", "best1bin"]
 
 
 @pytest.mark.parametrize("strategy", ["rand1bin", "best1bin"])
-def test_finds_the_bottom_of_bowls(strategy: Strategy) -> None:
+def test_finds_the_minimum_of_quadratics(strategy: Strategy) -> None:
     draws = Draws(1, trials=range(6))
     assert ((differential_evolution(sphere, *box(6), draws=draws, strategy=strategy).x - CENTRE).abs() < 0.05).all()
     found = differential_evolution(rotated, *box(6), draws=draws, strategy=strategy, generations=120)
@@ -29,7 +29,7 @@ def test_leaves_local_minima() -> None:
     assert (found.cost < 1e-2).all()
 
 
-def test_counts_and_never_forgets_the_best() -> None:
+def test_counts_evaluations_and_keeps_the_best() -> None:
     found = differential_evolution(sphere, *box(2), draws=Draws(1))
     assert (found.evaluations == 888).all() and found.history.shape == (2, 37)
     assert (found.history.diff(dim=-1) <= 0).all()
@@ -50,7 +50,7 @@ def test_a_batch_equals_its_singles(strategy: Strategy) -> None:
         torch.testing.assert_close(alone.x[0], whole.x[i], atol=1e-12, rtol=0)
 
 
-def test_the_box_is_kept() -> None:
+def test_candidates_stay_in_the_box() -> None:
     low, high = torch.tensor([1.0, -2.0, -2.0], dtype=F64), torch.tensor([2.0, 3.0, 3.0], dtype=F64)
     found = differential_evolution(sphere, low, high, draws=Draws(1))
     assert found.x[0] == 1.0
@@ -65,10 +65,10 @@ def test_the_box_is_kept() -> None:
     [
         ({"population": 3}, "population is 3"),
         ({"strategy": "rand2"}, "'rand1bin' or 'best1bin'"),
-        ({"weight": 0.0}, "weight 0"),
-        ({"crossover": -0.1}, "a chance in 0..1"),
+        ({"weight": 0.0}, "weight is 0"),
+        ({"crossover": -0.1}, "a probability of crossover in 0..1"),
     ],
 )
-def test_refuses_settings_that_make_no_sense(options: dict, message: str) -> None:
+def test_invalid_settings_raise(options: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         differential_evolution(sphere, *box(2), draws=Draws(1), **options)

@@ -1,4 +1,4 @@
-"""The genetic algorithm: known minima, the box, counts, and the same numbers whatever the batch."""
+"""Genetic algorithm: known minima, the box, counts, and results that do not depend on the batch."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from torchsar.optim import genetic
 
 
 @pytest.mark.parametrize("selection", ["tournament", "roulette"])
-def test_finds_the_bottom_of_a_bowl(selection: Literal["tournament", "roulette"]) -> None:
+def test_finds_the_minimum_of_a_quadratic(selection: Literal["tournament", "roulette"]) -> None:
     found = genetic(sphere, *box(8), draws=Draws(1, trials=range(8)), selection=selection)
     assert found.ok.all()
     assert ((found.x - CENTRE).abs() < (0.02 if selection == "tournament" else 0.1)).all()
 
 
-def test_beats_chance_in_a_narrow_valley() -> None:
+def test_finds_lower_costs_than_random_points_in_a_narrow_valley() -> None:
     draws = Draws(1, trials=range(20))
     found = genetic(rotated, *box(20), draws=draws)
     chance = rotated(draws.uniform("points", (870, 3), -5.0, 5.0)).amin(-1)
@@ -36,7 +36,7 @@ def test_leaves_local_minima() -> None:
     assert (still.cost < 0.9).sum() < (found.cost < 0.9).sum()
 
 
-def test_counts_what_it_evaluates_and_never_forgets_the_best() -> None:
+def test_counts_evaluations_and_keeps_the_best() -> None:
     seen: list[int] = []
 
     def counted(x: Tensor) -> Tensor:
@@ -69,7 +69,7 @@ def test_draws_without_trials_are_the_same_in_every_trial() -> None:
     torch.testing.assert_close(shared.x, alone.x.expand(2, 3, 3), atol=1e-12, rtol=0)
 
 
-def test_the_box_is_kept_and_fixed_unknowns_stay() -> None:
+def test_candidates_stay_in_the_box_and_fixed_unknowns_stay_fixed() -> None:
     low, high = torch.tensor([1.0, -2.0, 0.5], dtype=F64), torch.tensor([2.0, 3.0, 0.5], dtype=F64)
 
     def watched(x: Tensor) -> Tensor:
@@ -81,7 +81,7 @@ def test_the_box_is_kept_and_fixed_unknowns_stay() -> None:
     assert found.x[0] == 1.0 and found.x[2] == 0.5
 
 
-def test_impossible_candidates_are_passed_over() -> None:
+def test_candidates_with_nan_costs_are_rejected() -> None:
     def half(x: Tensor) -> Tensor:
         return torch.where(x[..., 0] > 0, torch.nan, sphere(x))
 
@@ -104,16 +104,16 @@ def test_float32_is_kept() -> None:
         ({"elites": 30}, "leave no children"),
         ({"elites": 0}, "elites is 0"),
         ({"selection": "rank"}, "'tournament' or 'roulette'"),
-        ({"crossover": 1.5}, "chances in 0..1"),
+        ({"crossover": 1.5}, "choose probabilities in 0..1"),
         ({"draws": Draws(1, trials=range(5))}, "draws for 5 trials"),
     ],
 )
-def test_refuses_settings_that_make_no_sense(options: dict, message: str) -> None:
+def test_invalid_settings_raise(options: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         genetic(sphere, *box(2), **{"draws": Draws(1), **options})
 
 
-def test_refuses_boxes_and_objectives_that_do_not_fit() -> None:
+def test_invalid_boxes_and_objectives_raise() -> None:
     low, high = box(2)
     with pytest.raises(ValueError, match="low <= high"):
         genetic(sphere, high, low, draws=Draws(1))

@@ -1,4 +1,4 @@
-"""The full grid: every point once, the best per trial."""
+"""Full grid: every point once, the best per trial."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ def test_trials_without_axes_of_their_own() -> None:
     assert ((found.x - CENTRE).abs() <= torch.tensor([0.125, 0.5, 0.25], dtype=F64)).all()
 
 
-def test_what_is_not_finite_loses() -> None:
+def test_non_finite_costs_are_not_selected() -> None:
     found = grid_search(lambda x: torch.where(x[..., 0] > 0, torch.nan, sphere(x)), AXES)
     assert found.ok and found.x[0] == 0
     assert not grid_search(lambda x: torch.full_like(x[..., 0], torch.inf), AXES).ok
 
 
-def test_refusals() -> None:
+def test_invalid_arguments_raise() -> None:
     with pytest.raises(ValueError, match="9 x 4 x 5 values are 180 evaluations per trial, above the limit of 100"):
         grid_search(sphere, AXES, limit=100)
-    with pytest.raises(ValueError, match="one unknown at least"):
+    with pytest.raises(ValueError, match="at least one unknown"):
         grid_search(sphere, [])
     with pytest.raises(ValueError, match="axis 1 needs finite values"):
         grid_search(sphere, [AXES[0], AXES[1] * torch.inf, AXES[2]])

@@ -1,4 +1,4 @@
-"""Newton's method: one step on a quadratic, descent where damped, honest failure where not."""
+"""Newton's method: one step on a quadratic, descent where damped, and `ok` False where it fails."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_quadratic_convergence_near_the_minimum() -> None:
     assert errors[1] < 3 * errors[0] ** 2 and errors[2] < 1e-12
 
 
-def test_plain_steps_climb_and_damped_ones_descend() -> None:
+def test_plain_steps_reach_a_maximum_and_damped_ones_a_minimum() -> None:
     start = torch.tensor([[0.1, -0.2]], dtype=F64)
     plain, damped = newton(hill, start, damped=False), newton(hill, start)
     assert plain.converged.all() and not plain.ok.any(), "it has found the maximum"
@@ -63,7 +63,7 @@ def test_divergence_ends_at_a_finite_point() -> None:
     assert newton(lambda x: torch.log(torch.cosh(x)).sum(-1), start, steps=30).ok.all()
 
 
-def test_a_wall_is_stepped_back_from() -> None:
+def test_steps_to_an_infinite_cost_are_shortened() -> None:
     def walled(x: Tensor) -> Tensor:
         return torch.where(
             (x > 2).any(-1),
@@ -105,7 +105,7 @@ def test_evaluations_are_counted_per_trial() -> None:
     assert int(found.evaluations) == calls
 
 
-def test_refusals() -> None:
+def test_invalid_arguments_raise() -> None:
     with pytest.raises(ValueError, match="autograd cannot follow"):
         newton(lambda x: sphere(x.detach()), torch.zeros(3, dtype=F64))
     with pytest.raises(ValueError, match="one real cost per trial"):

@@ -1,4 +1,4 @@
-"""Imbalance of channels that record the lines in turn."""
+"""Gain and phase imbalance of channels that record the lines in turn."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ def scene(lines=256, n=512, seed=0, centre=0.3, trials=2):
 
 
 def unbalanced(x, gain, degrees):
+    """Lines times the gain and phase of their channel."""
     factor = torch.polar(torch.tensor(gain, dtype=torch.float64), torch.tensor(degrees, dtype=torch.float64) * DEGREE)
     return x * factor[torch.arange(x.shape[-2]) % len(gain), None].to(x.dtype)
 
@@ -47,14 +48,14 @@ def test_imbalance_within_its_predicted_error(gain, degrees, seed):
     assert float(estimate.std["phase_rad"].max()) < 0.5 * DEGREE and float(estimate.std["gain"].max()) < 0.01
 
 
-def test_the_doppler_settles_phases_beyond_ninety_degrees():
+def test_the_doppler_centroid_resolves_phases_beyond_ninety_degrees():
     y = unbalanced(scene(centre=0.3), (1, 1.0), (0, 130))
-    blind, told = estimate_imbalance(y), estimate_imbalance(y, doppler_cycles=torch.tensor([0.3, 0.33]))
+    blind, with_doppler = estimate_imbalance(y), estimate_imbalance(y, doppler_cycles=torch.tensor([0.3, 0.33]))
     assert bool(((blind["phase_rad"][:, 1] / DEGREE + 50).abs() < 1).all())
-    assert bool(((told["phase_rad"][:, 1] / DEGREE - 130).abs() < 1).all())
+    assert bool(((with_doppler["phase_rad"][:, 1] / DEGREE - 130).abs() < 1).all())
 
 
-def test_silent_trials_and_scale_do_not_matter():
+def test_empty_trials_are_not_ok_and_the_scale_does_not_matter():
     y = (
         unbalanced(scene(trials=3), (1, 1.2), (0, 60)).to(torch.complex64)
         * torch.tensor([1e-22, 1.0, 0.0])[:, None, None]
@@ -74,7 +75,7 @@ def test_correction_is_the_inverse_and_differentiable():
     )
 
 
-def test_too_few_lines_are_refused():
+def test_too_few_lines_raise():
     with pytest.raises(ValueError, match="at least 5 lines"):
         estimate_imbalance(torch.zeros(4, 8, dtype=torch.complex64))
 
@@ -91,5 +92,5 @@ def test_even_and_odd_lines_of_recorded_data(recorded, name, hz):
     assert abs(float(trace.values["imbalance.gain"][1]) - 1.2) < 0.0036
     assert abs(float(trace.values["imbalance.phase_rad"][1]) / DEGREE - 60) < 0.2
     assert float(correlation(trace.signal.data.to(torch.complex128), clean.signal.data.to(torch.complex128))) > 0.99999
-    told = EstimateImbalance()(impaired.signal, doppler_hz=torch.tensor(hz, dtype=torch.float64))
-    torch.testing.assert_close(told["phase_rad"], trace.values["imbalance.phase_rad"])
+    with_doppler = EstimateImbalance()(impaired.signal, doppler_hz=torch.tensor(hz, dtype=torch.float64))
+    torch.testing.assert_close(with_doppler["phase_rad"], trace.values["imbalance.phase_rad"])

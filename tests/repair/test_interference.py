@@ -1,4 +1,4 @@
-"""Brief 004, item 3: narrowband interference on simulated and on recorded data."""
+"""Narrowband interference on simulated and on recorded data."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def image_error_db(repaired: torch.Tensor, clean: Recording) -> float:
 
 @pytest.mark.parametrize("snr_db", [None, 20.0])
 @pytest.mark.parametrize("kind", ["one", "two", "comb5", "comb9", "comb25", "random", "speckle"])
-def test_clean_scene_passes_unchanged(kind: str, snr_db: float | None) -> None:
+def test_a_clean_scene_is_unchanged(kind: str, snr_db: float | None) -> None:
     clean = acquire(kind, snr_db, seed=3)
     result = subtract_interference(clean.signal.data)
     assert not bool(result.missing.any())
@@ -88,32 +88,34 @@ def mean_db(values: list[float]) -> float:
 
 
 @pytest.mark.parametrize("kind", ["random", "speckle"])
-def test_figures_of_the_brief(kind: str) -> None:
-    """300 of 8192 lines, 20 dB: uncorrected +5.7 dB, notch -17.9 dB, subtraction -44.8 dB; here 9
-    of 256 lines, mean of six cases.
+def test_errors_reach_the_reference_figures(kind: str) -> None:
+    """Errors against those of a reference implementation, mean of six cases.
+
+    Here 9 of 256 lines are contaminated. The reference with 300 of 8192 lines at 20 dB: uncorrected
+    +5.7 dB, notch -17.9 dB, subtraction -44.8 dB.
     """
     figures: dict[str, list[float]] = {"raw": [], "notch": [], "subtract": []}
     for seed, frequency_hz in enumerate((20e6, -47e6, 70e6, -80e6, 3e6, -15e6)):
         clean = acquire(kind, 20.0, seed, n_pulse=256)
-        impaired, told = Tone(20.0, frequency_hz, 1e6, share=SHARE)(clean, Draws(seed))
+        impaired, truth = Tone(20.0, frequency_hz, 1e6, share=SHARE)(clean, Draws(seed))
         subtracted, notched = subtract_interference(impaired.signal.data), notch_interference(impaired.signal.data)
         for name, data in (("raw", impaired.signal.data), ("notch", notched.data), ("subtract", subtracted.data)):
             figures[name].append(image_error_db(data, clean))
-        assert torch.equal(subtracted.touched, told["contaminated"]) and torch.equal(
-            notched.touched, told["contaminated"]
+        assert torch.equal(subtracted.touched, truth["contaminated"]) and torch.equal(
+            notched.touched, truth["contaminated"]
         )
-        untouched = ~told["contaminated"]
+        untouched = ~truth["contaminated"]
         assert torch.equal(subtracted.data[untouched], clean.signal.data[untouched])
     assert 5.0 < mean_db(figures["raw"]) < 6.4
     assert -25 < mean_db(figures["notch"]) < -12
     assert mean_db(figures["subtract"]) < -44.8
 
 
-def test_drop_gives_the_contaminated_lines_to_the_fill() -> None:
+def test_drop_marks_the_contaminated_lines_as_missing() -> None:
     clean = acquire("speckle", 20.0, 1)
-    impaired, told = Tone(20.0, 20e6, 1e6, share=SHARE)(clean, Draws(1))
+    impaired, truth = Tone(20.0, 20e6, 1e6, share=SHARE)(clean, Draws(1))
     dropped = drop_interference(impaired.signal.data)
-    assert torch.equal(dropped.missing, told["contaminated"])
+    assert torch.equal(dropped.missing, truth["contaminated"])
     assert float(dropped.data[dropped.missing].abs().max()) == 0
     assert not bool(subtract_interference(impaired.signal.data).missing.any())
 
@@ -131,10 +133,10 @@ def test_drop_gives_the_contaminated_lines_to_the_fill() -> None:
     ids=["sweeping", "band_edge", "coherent", "two", "wide", "wide_and_tone"],
 )
 def test_kinds_of_interferers_on_all_lines(impairments, loss_db: float) -> None:
-    """All lines contaminated.
+    """All lines are contaminated.
 
     A tone costs 1 to 2.5 of 2048 samples, at 1.25 of the mean density in the pulse band (-32 to -28
-    dB); a band its degrees of freedom (8 cells here) and as many again for each edge.
+    dB); a band costs its degrees of freedom (8 cells here) and as many again for each edge.
     """
     clean = acquire("speckle", 20.0, seed=5, n_pulse=160)
     impaired = clean
@@ -145,18 +147,18 @@ def test_kinds_of_interferers_on_all_lines(impairments, loss_db: float) -> None:
     assert image_error_db(result.data, clean) < loss_db
 
 
-def test_lines_beyond_repair_are_reported_missing() -> None:
-    """More bands on a line than can be modelled: the line is given up, no other is harmed."""
+def test_lines_that_cannot_be_corrected_are_missing() -> None:
+    """A line with more bands than can be modelled is missing; no other line changes."""
     clean = acquire("speckle", 20.0, seed=6, n_pulse=96)
-    impaired, told = clean, {}
+    impaired, truth = clean, {}
     for frequency in (-80e6, -50e6, -20e6, 20e6, 50e6, 75e6):
-        impaired, told = WideInterferer(10.0, frequency, 1e6, share=4 / 96)(impaired, Draws(3))
+        impaired, truth = WideInterferer(10.0, frequency, 1e6, share=4 / 96)(impaired, Draws(3))
     result = subtract_interference(impaired.signal.data)
-    assert torch.equal(result.missing, told["contaminated"])
+    assert torch.equal(result.missing, truth["contaminated"])
     assert torch.equal(result.data[~result.missing], clean.signal.data[~result.missing])
 
 
-def test_batch_equals_singles_and_quiet_trials_stay_quiet() -> None:
+def test_batch_equals_singles_and_clean_trials_are_unchanged() -> None:
     clean, _ = small_recording(96, 512, trials=3, dtype=torch.complex128)
     tone = Tone(torch.tensor([20.0, -400.0, 5.0]), torch.tensor([5e6, 0.0, -9e6]), share=0.3)
     impaired, _ = tone(clean, Draws(2, trials=range(3)))
@@ -191,23 +193,23 @@ def test_gradient_through_the_subtraction() -> None:
         weight = Draws(2).normal("w", (6, 128), torch.complex128)
         x = data.clone().requires_grad_()
         (subtract_interference(x).data * weight.conj()).sum().abs().square().backward()
-        # a unit tone at the found frequency is removed whatever its amplitude: the gradient has no
-        # part along it
+        # a tone at the estimated frequency is removed at any amplitude: the gradient has no part
+        # along it
         along = torch.exp(2j * torch.pi * 0.2137 * torch.arange(128)) / 128**0.5
         for i in (0, 2, 5):
             assert float((x.grad[i] * along.conj()).sum().abs()) < 0.05 * float(torch.linalg.vector_norm(x.grad[i]))
 
 
-def test_stages_in_a_chain_report_what_they_touched() -> None:
+def test_stages_in_a_chain_report_touched_lines_and_cells() -> None:
     clean = acquire("speckle", 20.0, seed=8, n_pulse=96)
-    impaired, told = Tone(20.0, 20e6, share=0.1)(clean, Draws(1))
+    impaired, truth = Tone(20.0, 20e6, share=0.1)(clean, Draws(1))
     for stage in (SubtractInterference(), NotchInterference(), DropInterference()):
         trace = Chain(interference=stage, focus=use(OmegaK(RADAR, doppler_hz=0.0))).trace(impaired)
         estimate = trace.estimates["interference"]
-        assert int(estimate.info["lines_touched"]) == int(told["contaminated"].sum()) == 10
+        assert int(estimate.info["lines_touched"]) == int(truth["contaminated"].sum()) == 10
         assert int(estimate.info["cells_touched"]) > 0 and bool(estimate.ok)
     assert trace.values["interference.missing"].shape == (96,)
-    found = SubtractInterference()(impaired.signal)[1].info["tone_cycles_per_sample"][told["contaminated"]]
+    found = SubtractInterference()(impaired.signal)[1].info["tone_cycles_per_sample"][truth["contaminated"]]
     assert float((found * RADAR.sampling_hz - 20e6).abs().max()) < 0.05 * RADAR.sampling_hz / 2048
 
 
@@ -221,15 +223,13 @@ def test_extremes_stay_finite(data: torch.Tensor) -> None:
         assert torch.isfinite(repair(data).data.abs()).all()
 
 
-def test_threshold_below_the_clutter_is_refused() -> None:
+def test_a_threshold_below_the_clutter_raises() -> None:
     with pytest.raises(ValueError, match="threshold 0.5 is not above"):
         SubtractInterference(0.5)
 
 
 class Bench:
-    """A recording with the AGC undone last, so that impairment is put into what the
-    converter saw.
-    """
+    """Recording whose receiver attenuation is compensated after the impairments."""
 
     def __init__(self, name: str, path) -> None:
         self.recording = read_stripmap(path)
@@ -274,13 +274,13 @@ class Bench:
     ],
     ids=["squamish", "squamish_clean", "english_bay"],
 )
-def test_recorded_data_reach_the_brief(name: str, cases: dict, recorded) -> None:
+def test_recorded_data_reach_the_reference_figures(name: str, cases: dict, recorded) -> None:
     bench = Bench(name, recorded(name))
     reached = {case: bench.repaired(impairments) for case, (impairments, _) in cases.items()}
     assert all(reached[case] >= least for case, (_, least) in cases.items()), reached
 
 
-def test_signal_axes_and_untouched_identity() -> None:
+def test_a_clean_signal_is_returned_unchanged() -> None:
     signal = Signal(Draws(1).normal("x", (16, 128), torch.complex64), RADAR.raw_axes(16, 128))
     out, estimate = SubtractInterference()(signal)
     assert torch.equal(out.data, signal.data) and out.axes == signal.axes and not bool(estimate["missing"].any())

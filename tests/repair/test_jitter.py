@@ -1,4 +1,4 @@
-"""Converter jitter: correction at each accuracy, offsets from a pilot and from clutter."""
+"""Converter jitter: correction at each accuracy, and offsets from a pilot tone and from clutter."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def offsets(period, rms=0.1, seed=0):
     return e * rms / e.square().mean().sqrt()
 
 
-def test_accuracies_of_the_brief():
+def test_errors_reach_the_reference_figures():
     x = clutter(8, 2048)
     y = sample_unevenly(x, OFFSETS)
     assert abs(float(error_db(y, x)) + 16) < 0.5
@@ -64,7 +64,7 @@ def test_batch_equals_singles_with_offsets_per_trial(method):
     torch.testing.assert_close(method(x, e), torch.stack([method(x[i], e[i]) for i in range(3)]))
 
 
-def test_periods_that_differ_between_trials_and_clean_ones_untouched():
+def test_periods_differ_between_trials_and_zero_offsets_change_nothing():
     x = clutter(6, 128).reshape(3, 2, 128)
     e = torch.zeros(3, 4, dtype=torch.float64)
     e[0], e[1, :2] = OFFSETS, torch.tensor([0.1, -0.1])
@@ -73,7 +73,7 @@ def test_periods_that_differ_between_trials_and_clean_ones_untouched():
     assert bool((error_db(out[:2], x[:2]) < -147).all()) and torch.equal(out[2], x[2])
 
 
-def test_zero_offsets_pass_through():
+def test_zero_offsets_change_nothing():
     x = clutter(2, 100)
     assert torch.equal(correct_jitter_lagrange(x, torch.zeros(4), 8), x)
     assert float(error_db(correct_jitter_exact(x, torch.zeros(4)), x)) < -250
@@ -86,7 +86,7 @@ def test_exact_correction_is_differentiable():
 
 @pytest.mark.parametrize("bad", [[0.0, -1.0], [0.6, -0.5], [0.0, math.nan]])
 @pytest.mark.parametrize("method", [Exact(), Lagrange(8), BandLimited(8)])
-def test_coinciding_instants_are_refused(bad, method):
+def test_coinciding_instants_raise(bad, method):
     with pytest.raises(ValueError, match="instants"):
         method(clutter(1, 64), torch.tensor(bad, dtype=torch.float64))
 
@@ -104,7 +104,7 @@ def test_pilot_reaches_the_predicted_error(snr_db, cycles, period):
         assert 0.85 < float(error / predicted) < 1.15
 
 
-def test_clean_pilot_changes_nothing():
+def test_a_pilot_without_jitter_gives_zero_offsets():
     pilot = PeriodicJitter((0.0,)).pilot(
         torch.zeros(1, dtype=torch.float64), Draws(0, trials=range(200)), torch.zeros(1, dtype=torch.complex64)
     )
@@ -114,7 +114,7 @@ def test_clean_pilot_changes_nothing():
     assert bool(estimate.ok.all()) and float(estimate["offset_samples"].abs().max()) == 0
 
 
-def test_bad_pilots():
+def test_invalid_pilots_raise_or_are_not_ok():
     good = PeriodicJitter(OFFSETS).pilot(OFFSETS, Draws(0, trials=range(5)), torch.zeros(1, dtype=torch.complex128))
     bad = good.clone()
     bad[1], bad[2, 7], bad[3] = (
@@ -168,7 +168,7 @@ def test_blind_offsets_of_simulated_clutter(period, seed):
     assert float(estimate["offset_samples"][1].abs().max()) == 0
 
 
-def test_blind_keeps_a_silent_trial_apart():
+def test_blind_estimate_of_an_empty_trial_is_not_ok():
     x = clutter(64, 512, seed=3)
     y = torch.stack([sample_unevenly(x, OFFSETS), torch.zeros_like(x)])
     estimate = estimate_jitter_blind(y)
@@ -178,9 +178,7 @@ def test_blind_keeps_a_silent_trial_apart():
 
 @pytest.mark.parametrize("name, seed", [("radarsat1_english_bay.npz", 0), ("radarsat1_squamish.npz", 1)])
 def test_blind_on_recorded_data(recorded, name, seed):
-    """The bar is 0.003 sample; the recordings hold a pattern of their own of about 0.0012 sample,
-    of period 8.
-    """
+    """The bound is 0.003 sample; the recordings themselves have about 0.0012 sample of jitter."""
     x = read_stripmap(recorded(name)).signal.data[:1024]
     true = offsets(8, 0.1, seed)
     y = sample_unevenly(x, true)

@@ -1,4 +1,4 @@
-"""Line integrity: verified numbers, a regular grid, and no line silently lost."""
+"""Line integrity: verified numbers, a regular grid, and complete counts."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def lines(trials: int | None = 2, n: int = N) -> Tensor:
 
 def impaired(seed: int, trials: int = 2, **impairments) -> tuple[Recording, Recording, dict]:
     clean = Recording(Signal(lines(trials), small_radar().raw_axes(N, 3)), small_radar())
-    out, told = apply_impairments(clean, impairments, Draws(seed, trials=range(trials)))
-    return clean, out, told
+    out, truth = apply_impairments(clean, impairments, Draws(seed, trials=range(trials)))
+    return clean, out, truth
 
 
 def check_counts(estimate: Estimate) -> None:
@@ -33,7 +33,7 @@ def check_counts(estimate: Estimate) -> None:
 
 @pytest.mark.parametrize("trials", [None, 2])
 @pytest.mark.parametrize("first", [0, 1, 71000])
-def test_regular_input_passes_bit_for_bit(trials: int | None, first: int) -> None:
+def test_regular_input_is_unchanged_bit_for_bit(trials: int | None, first: int) -> None:
     x = lines(trials)
     signal = Signal(x, small_radar().raw_axes(N, 3))
     out, estimate = LineIntegrity()(signal, torch.arange(first, first + N))
@@ -42,7 +42,7 @@ def test_regular_input_passes_bit_for_bit(trials: int | None, first: int) -> Non
     check_counts(estimate)
 
 
-def test_shorter_trials_stay_padded() -> None:
+def test_shorter_trials_keep_their_padding() -> None:
     x, number = lines(2), torch.arange(N).repeat(2, 1)
     number[1, 500:], x[1, 500:] = -1, 0
     out, estimate = LineIntegrity()(Signal(x, small_radar().raw_axes(N, 3)), number)
@@ -53,11 +53,11 @@ def test_shorter_trials_stay_padded() -> None:
 @pytest.mark.parametrize(
     "loss", [LostLines(count=6), LostLines(fraction=0.05), LostLines(fraction=0.2), LostGaps(5, 8), LostGaps(2, 60)]
 )
-def test_every_line_returns_to_its_place(seed: int, loss) -> None:
-    clean, out, told = impaired(seed, loss=loss)
+def test_every_line_returns_to_its_position(seed: int, loss) -> None:
+    clean, out, truth = impaired(seed, loss=loss)
     repaired, estimate = LineIntegrity()(out.signal, out.aux["line_number"])
-    lost = told["loss.lost"]
-    # lost behind the last received line: nothing tells of them
+    lost = truth["loss.lost"]
+    # losses after the last received line cannot be detected
     behind = (~lost).flip(-1).cumsum(-1).flip(-1) == 0
     assert torch.equal(estimate["missing"], lost & ~behind)
     assert torch.equal(repaired.data, torch.where(lost[..., None], 0, clean.signal.data))
@@ -67,10 +67,10 @@ def test_every_line_returns_to_its_place(seed: int, loss) -> None:
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.05])
 def test_corrupted_and_repeated_numbers(seed: int, share: float) -> None:
-    _, out, told = impaired(seed, loss=LostLines(fraction=share), again=RepeatedLines(5), wrong=CorruptedNumbers(12))
+    _, out, truth = impaired(seed, loss=LostLines(fraction=share), again=RepeatedLines(5), wrong=CorruptedNumbers(12))
     _, estimate = LineIntegrity()(out.signal, out.aux["line_number"])
     placed = estimate.info["number"] != -1
-    assert torch.equal(estimate.info["number"][placed], told["wrong.true_number"][placed])
+    assert torch.equal(estimate.info["number"][placed], truth["wrong.true_number"][placed])
     assert (estimate.info["repeated_count"] >= 4).all()  # one may have fallen off the end
     assert (
         estimate.info["corrected_count"] + estimate.info["unplaced_count"] + estimate.info["repeated_count"] >= 12
@@ -96,7 +96,7 @@ def test_a_stuck_counter_and_a_cluster_are_corrected() -> None:
     assert estimate.info["corrected_count"][0] == 5
 
 
-def test_a_line_with_two_possible_places_is_left_out_and_counted() -> None:
+def test_a_line_with_two_possible_positions_is_left_out_and_counted() -> None:
     number = torch.cat([torch.arange(300), torch.tensor([77]), torch.arange(303, 303 + N - 301)])
     x = lines(None)
     plan = line_integrity(x, number)
@@ -115,14 +115,14 @@ def test_grid_can_be_given() -> None:
     )
 
 
-def test_dead_lines_are_missing_and_silence_at_the_ends_is_not() -> None:
+def test_lines_of_zeros_are_missing_except_at_the_ends() -> None:
     x = lines(None)
     x[:5], x[100], x[-7:] = 0, 0, 0
     _, estimate = LineIntegrity()(Signal(x, small_radar().raw_axes(N, 3)), torch.arange(N))
     assert estimate["missing"].nonzero()[:, 0].tolist() == [100]
 
 
-def test_one_hopeless_trial_changes_no_other() -> None:
+def test_one_inconsistent_trial_does_not_change_others() -> None:
     x, number = lines(2), torch.arange(N).repeat(2, 1)
     number[1] = torch.randperm(N, generator=torch.Generator().manual_seed(1))
     out, estimate = LineIntegrity()(Signal(x, small_radar().raw_axes(N, 3)), number)
@@ -139,6 +139,6 @@ def test_one_hopeless_trial_changes_no_other() -> None:
         (torch.arange(N) + 0.5, "must be integers"),
     ],
 )
-def test_hopeless_input_is_named(number: Tensor, message: str) -> None:
+def test_inconsistent_or_invalid_numbers_raise(number: Tensor, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         LineIntegrity()(Signal(lines(None), small_radar().raw_axes(N, 3)), number)

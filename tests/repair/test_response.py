@@ -1,6 +1,4 @@
-"""Channel response: conventions, correction, and estimates from bright places of simulated and
-recorded images.
-"""
+"""Channel response: conventions, correction, and estimates from simulated and recorded images."""
 
 from __future__ import annotations
 
@@ -23,10 +21,8 @@ def rms(x: torch.Tensor) -> float:
     return float(x.square().mean().sqrt())
 
 
-def brief_phase(u: torch.Tensor) -> torch.Tensor:
-    """1.2 u^3 + 0.5 sin(6 pi u) less its straight line, which no processor can tell from a
-    shift.
-    """
+def reference_phase(u: torch.Tensor) -> torch.Tensor:
+    """1.2 u^3 + 0.5 sin(6 pi u) without its straight line, which is a displacement."""
     curve = 1.2 * u**3 + 0.5 * torch.sin(6 * math.pi * u)
     slope = 3 * (1.2 / 5 - 0.5 * 2 / (6 * math.pi) / 2)  # 3 times the mean of u * curve over -1..1
     return curve - slope * u
@@ -39,10 +35,10 @@ def test_legendre_is_orthonormal_over_the_band():
     )
 
 
-def test_constant_and_line_are_no_response():
+def test_constant_and_linear_phase_are_removed():
     u = band_grid()
     assert rms(without_line(0.7 + 2.3 * u)) < 1e-12
-    assert rms(without_line(brief_phase(u)) - brief_phase(u)) < 5e-3
+    assert rms(without_line(reference_phase(u)) - reference_phase(u)) < 5e-3
 
 
 @pytest.fixture(scope="module")
@@ -56,30 +52,30 @@ def scene():
 def test_known_response_is_removed_exactly(scene):
     radar, recording = scene
     impaired, truth = apply_impairments(
-        recording, {"r": ChannelResponse(brief_phase, lambda u: 10 ** (3 * u / 20))}, Draws(0)
+        recording, {"r": ChannelResponse(reference_phase, lambda u: 10 ** (3 * u / 20))}, Draws(0)
     )
     u = band_grid()
     back = correct_response(
-        impaired.signal.data, brief_phase(u), 10 ** (3 * u / 20), radar.pulse.bandwidth_hz / radar.sampling_hz
+        impaired.signal.data, reference_phase(u), 10 ** (3 * u / 20), radar.pulse.bandwidth_hz / radar.sampling_hz
     )
     assert error_db(back, recording.signal.data) < -60
     assert set(truth) == {"r.phase_rad", "r.amplitude"}
 
 
-def test_phase_of_the_brief_is_found_and_corrected(scene):
+def test_the_reference_phase_is_estimated_and_corrected(scene):
     radar, recording = scene
     focus = OmegaK(radar, "flat")
     clean = focus(recording.signal)
-    impaired, _ = apply_impairments(recording, {"r": ChannelResponse(brief_phase)}, Draws(0))
+    impaired, _ = apply_impairments(recording, {"r": ChannelResponse(reference_phase)}, Draws(0))
     image = focus(impaired.signal)
     found = EstimateResponse(radar)(image)
-    assert bool(found.ok) and rms(without_line(found["phase_rad"] - brief_phase(band_grid()))) < 0.06
+    assert bool(found.ok) and rms(without_line(found["phase_rad"] - reference_phase(band_grid()))) < 0.06
     repaired = CorrectResponse(radar)(image, found["phase_rad"])
     assert error_db(image, clean) > -10
     assert error_db(repaired, clean) < -22
 
 
-def test_clean_image_is_left_almost_alone(scene):
+def test_a_clean_image_is_almost_unchanged(scene):
     radar, recording = scene
     image = OmegaK(radar, "flat")(recording.signal)
     found = EstimateResponse(radar)(image)

@@ -1,4 +1,4 @@
-"""Separation of a triangular record against sweeps evaluated one by one."""
+"""Separation of a triangular record, against sweeps that are evaluated one by one."""
 
 from __future__ import annotations
 
@@ -22,14 +22,12 @@ from torchsar.scene import EverySample, LadarWorld, Points, Polynomial
 
 
 def rms(x, first=12, last=2):
-    """Over samples without the transient and the very end, and over periods without the outer ones,
-    where the record itself ends.
-    """
+    """Rms without the transient, the last samples and the outer periods."""
     return float(x[..., 2:-2, first : x.shape[-1] - last].abs().square().mean().sqrt())
 
 
 def signal_of(radar, x):
-    """A record whose first samples are at the starts of the blocks."""
+    """Record whose first samples are at the starts of the blocks."""
     pulse, time = radar.record_axes(*x.shape[-2:])
     return Signal(x, (pulse, Axis("time", time.n, 0.0, time.step, "s")))
 
@@ -40,7 +38,7 @@ SCENE = {1.5: {"scatterers": ((1.5, 1.0),)}, 10.5: {"scatterers": ((10.5, 1.0),)
 @pytest.mark.parametrize("sign", ["lo_conj_echo", "echo_conj_lo"])
 @pytest.mark.parametrize("trigger_s", [5.3e-6 + 0.3125 / 64e6, 5.3e-6, 0.0, 14.9e-6])
 def test_complex_record(trigger_s, sign):
-    """Samples of a symmetric grid pass as they are; between samples the delay costs 0.1 %."""
+    """Samples of a symmetric grid are unchanged; between samples the delay costs 0.1 %."""
     radar = table1(dechirp_sign=sign)
     split = split_record(record(radar, trigger_s, 10), radar, trigger_s)
     assert split.shape == (2, 10 if trigger_s == 0 else 9, 512)
@@ -51,15 +49,15 @@ def test_complex_record(trigger_s, sign):
 @pytest.mark.parametrize("radar, range_m, bound", [(ground(), 10.5, 0.015), (table1(detection="real"), 1.5, 0.025)])
 @pytest.mark.parametrize("sign", ["lo_conj_echo", "echo_conj_lo"])
 @pytest.mark.parametrize("side", [1, -1])
-def test_one_channel_gives_the_sweeps_of_two(radar, range_m, bound, sign, side):
-    """Canonical signs of both ramps, for scenes beyond the reference and nearer."""
+def test_a_real_detector_gives_the_sweeps_of_a_complex_one(radar, range_m, bound, sign, side):
+    """Signs of both ramps, for scenes beyond the reference and nearer."""
     radar = type(radar)(**{**radar.__dict__, "dechirp_sign": sign})
     scene = {"scatterers": ((side * range_m, 1.0),)}
     split = split_record(record(radar, 5.3e-6, 10, **scene), radar, 5.3e-6, nearer=side < 0)
     assert split.is_complex() and rms(split - sweeps(radar, 9, **scene), 12, 12) < bound
 
 
-def test_formed_before_the_cut_is_better_than_after():
+def test_the_analytic_signal_is_better_before_the_cut():
     radar = ground()
     half = 0.5 / radar.sample_rate_hz
     x = record(radar, -half, 8, **SCENE[10.5])
@@ -70,7 +68,7 @@ def test_formed_before_the_cut_is_better_than_after():
 
 
 @pytest.mark.parametrize("radar", [ground(keep_every=4), ground(keep_every=4, detection="complex")])
-def test_longer_blocks_are_cut_inside(radar):
+def test_longer_blocks_are_cut_individually(radar):
     split = split_record(record(radar, 10e-6, 4, 8000, **SCENE[10.5]), radar, 10e-6)
     assert split.shape == (2, 4, 2400)
     assert float((split - sweeps(radar, 4, **SCENE[10.5]))[..., 12:-12].abs().square().mean().sqrt()) < 0.025
@@ -91,7 +89,7 @@ def test_a_trigger_of_each_trial():
         torch.testing.assert_close(split[i], alone[:, :7], atol=1e-12, rtol=0)
 
 
-def test_slow_time_of_the_stage_and_its_drop_of_one_period():
+def test_slow_time_after_separation_and_the_dropped_period():
     radar = table1()
     x = record(radar, 5.3e-6, 6)
     out = SplitSweeps(radar, 5.3e-6)(signal_of(radar, x))
@@ -102,9 +100,7 @@ def test_slow_time_of_the_stage_and_its_drop_of_one_period():
 
 
 def test_records_of_the_radar_need_no_delay():
-    """The axis of a record starts half a sample after the block: sweeps of trigger zero are its
-    samples.
-    """
+    """The axis of a record begins half a sample after its block, where sweeps do."""
     radar = table1()
     axes = radar.record_axes(6, 1024)
     out = SplitSweeps(radar)(Signal(record(radar, 0.0, 6, first_s=axes[1].start), axes))
@@ -116,9 +112,7 @@ def test_records_of_the_radar_need_no_delay():
 
 @pytest.mark.parametrize("trigger_s", [0.0, 3.25e-6])
 def test_a_simulated_record_splits_into_simulated_sweeps(trigger_s):
-    """Away from the transient of 0.64 samples; a trigger of whole samples drops one period and
-    moves slow time.
-    """
+    """Away from the transient of 0.64 samples; a trigger of whole samples drops one period."""
     radar = table1()
     world = LadarWorld(Points([0.0], [1.5]), motion=[Polynomial([0.35, 10.0])], fidelity=EverySample())
     recorded, _ = simulate_ladar_record(radar, world, 8, Draws(1), trigger_s=trigger_s, dtype=torch.complex128)
@@ -146,7 +140,7 @@ def test_recorded_trigger_in_a_chain():
 
 
 def test_circular_shift_joins_samples_one_period_apart():
-    """The phase steps back by 2 pi fd period at the joint, inside a sweep. Erratum 16."""
+    """The phase steps back by 2 pi fd period at the joint, inside a sweep."""
     radar, trigger = table1(), 6e-6
     x = record(radar, trigger, 4, motion=lambda t: 0.3 * t)
     shifted = CircularShift(radar, trigger)(signal_of(radar, x)).data
@@ -171,7 +165,7 @@ def test_blanking():
         blank_turning_points(ones, radar, 0.0, -10.5).sum()
     ) == 6 * 2389
     assert float(blank_turning_points(ones, radar, 10.5, margin=3).sum()) == 6 * (2400 - 11 - 6)
-    with pytest.raises(ValueError, match="are the ranges relative"):
+    with pytest.raises(ValueError, match="the ranges are relative"):
         BlankTurningPoints(radar, 4339.5)
 
 
@@ -191,7 +185,7 @@ def test_gradients_and_vmap(real):
     )
 
 
-def test_dtype_is_kept_and_odd_input_refused():
+def test_dtype_is_kept_and_invalid_input_raises():
     radar = table1()
     for dtype, expected in (
         (torch.complex64, torch.complex64),
@@ -204,9 +198,9 @@ def test_dtype_is_kept_and_odd_input_refused():
     for trigger in ("late", float("nan")):
         with pytest.raises(ValueError, match="trigger must be"):
             SplitSweeps(radar, trigger)
-    with pytest.raises(ValueError, match="holds no whole one"):
+    with pytest.raises(ValueError, match="has no complete one"):
         split_record(record(radar, 0.0, 1), radar, 3e-6)
-    with pytest.raises(ValueError, match="the radar says"):
+    with pytest.raises(ValueError, match="sample_rate_hz of the radar is"):
         SplitSweeps(table1(sample_rate_hz=32e6))(signal_of(radar, record(radar, 0.0, 2)))
     with pytest.raises(TypeError, match="complex samples"):
         BlankTurningPoints(radar, 1.5)(Signal(torch.zeros(2, 3, 512), radar.sweep_axes(3)))

@@ -1,6 +1,4 @@
-"""Correction of non-linear sweeps by the calibration channel, against the sweeps of a linear
-transmitter.
-"""
+"""Correction of non-linear sweeps, against the sweeps of a linear transmitter."""
 
 from __future__ import annotations
 
@@ -16,13 +14,14 @@ from torchsar.repair.triangle_calibrate import sweep_error_s
 
 
 def error_turns(radar, u, ramp):
-    """Phase error of a sweep (turns): slow, fast and cubic, different in up and down."""
+    """Phase error of a sweep in turns, slow, fast and cubic, different in up and down sweeps."""
     x = u / radar.sweep_s
     slow = (3.0, 2.0)[ramp] * torch.sin(2 * math.pi * x * (1.3 + 0.4 * ramp) + 0.4)
     return slow + (0.7, -0.5)[ramp] * torch.cos(10 * math.pi * x) + (24, -24)[ramp] * x**3
 
 
 def echo(radar, range_m, velocity_m_s=0.0, linear=False, n_period=3):
+    """Sweeps of one scatterer, with the sweep error or linear."""
     u, rows = radar.fast_time_axis().values(), []
     for ramp, sign in ((0, 1), (1, -1)):
         t = torch.arange(n_period, dtype=torch.float64)[:, None] * radar.period_s + (0.5 + ramp) * radar.sweep_s + u
@@ -33,10 +32,12 @@ def echo(radar, range_m, velocity_m_s=0.0, linear=False, n_period=3):
 
 
 def signed(radar, turns):
+    """Beat in the sign convention of the radar."""
     return unit_phasor(turns if radar.dechirp_sign == "lo_conj_echo" else -turns, torch.complex128)
 
 
 def channel(radar, delay_s, n_period=1, noise=0.0):
+    """Beat of the calibration channel."""
     u = radar.fast_time_axis().values()
     rows = [
         s * radar.chirp_rate_hz_s * delay_s * u + error_turns(radar, u, r) - error_turns(radar, u - delay_s, r) + 0.3
@@ -48,7 +49,7 @@ def channel(radar, delay_s, n_period=1, noise=0.0):
 
 
 def residual_rad(x, reference, margin=10):
-    """Rms phase of x against the reference, its mean of each sweep left out."""
+    """Rms phase of x against the reference, without the mean of each sweep."""
     z = (x * reference.conj())[..., margin:-margin]
     return float(torch.angle(z * z.sum(-1, keepdim=True).conj()).square().mean().sqrt())
 
@@ -93,7 +94,7 @@ def test_resampling_is_right_for_all_ranges_and_phase_for_one(sign):
     )
 
 
-def test_range_of_the_gate_centre_helps_far_from_the_reference():
+def test_the_range_of_the_gate_lowers_the_error_far_from_the_reference():
     radar = ground()
     x, reference = echo(radar, 10.8), echo(radar, 10.8, linear=True)
     plain, centred = (
@@ -103,8 +104,8 @@ def test_range_of_the_gate_centre_helps_far_from_the_reference():
     assert plain < 0.04 and centred < 0.005
 
 
-def test_carrier_phase_is_left_alone():
-    """The mean phase of a sweep stays, and a Doppler keeps 2 pi fd (w - u) only."""
+def test_the_carrier_phase_is_kept():
+    """The mean phase of a sweep is kept; a Doppler shift keeps only 2 pi fd (w - u)."""
     radar = table1()
     x, reference = echo(radar, 1.5, 0.5), echo(radar, 1.5, 0.5, linear=True)
     out = calibrate_sweeps(x, channel(radar, 50e-9), radar, 50e-9)
@@ -121,8 +122,8 @@ def test_stage_batches_gradients_and_dtype():
     calibration = torch.stack([channel(radar, 50e-9), channel(radar, 50e-9, noise=0.01)])
     signal = Signal(x, radar.sweep_axes(3))
     out = CalibrateSweeps(radar, 50e-9)(signal, calibration)
-    told = CalibrateSweeps(radar)(signal, calibration, torch.tensor(50e-9, dtype=torch.float64))
-    assert torch.equal(out.data, told.data)
+    with_delay = CalibrateSweeps(radar)(signal, calibration, torch.tensor(50e-9, dtype=torch.float64))
+    assert torch.equal(out.data, with_delay.data)
     torch.testing.assert_close(out.data[1], calibrate_sweeps(x[1], calibration[1], radar, 50e-9), atol=1e-9, rtol=0)
     assert (
         CalibrateSweeps(radar, 50e-9)(signal.to(torch.complex64), calibration.to(torch.complex64)).data.dtype
@@ -134,12 +135,12 @@ def test_stage_batches_gradients_and_dtype():
     )
 
 
-def test_odd_input_is_refused():
+def test_invalid_input_raises():
     radar, x = table1(), echo(table1(), 1.5)
     for bad in ({"method": "phase"}, {"delay_s": -1.0}, {"method": "other"}):
         with pytest.raises(ValueError, match="method must be|must be positive"):
             CalibrateSweeps(radar, **{"delay_s": 50e-9, **bad})
     with pytest.raises(ValueError, match="complex \\(..., 2, K or 1, 512\\)"):
         calibrate_sweeps(x, channel(radar, 50e-9)[..., :100], radar, 50e-9)
-    with pytest.raises(ValueError, match="more than half must be left"):
+    with pytest.raises(ValueError, match="at least half must remain"):
         calibrate_sweeps(x, channel(radar, 50e-9), radar, 5e-6)

@@ -1,6 +1,4 @@
-"""Timing of a triangular record found from the record itself, against the timing it was
-made with.
-"""
+"""Timing of a triangular record estimated from the record, against the true timing."""
 
 from __future__ import annotations
 
@@ -15,7 +13,7 @@ SHARES = (0.0, 0.07, 0.3, 0.511, 0.97)
 
 
 def made(radar, n_period, block=None, snr_db=10.0, shares=SHARES, **scene):
-    """Records of several triggers, and the triggers."""
+    """Records of several triggers, and the triggers in seconds."""
     period = radar.period_s * (1 if block is None else 0.8)
     trigger = torch.tensor(shares, dtype=torch.float64) * period + 1e-9 * torch.rand(
         len(shares), dtype=torch.float64, generator=torch.Generator().manual_seed(1)
@@ -26,6 +24,7 @@ def made(radar, n_period, block=None, snr_db=10.0, shares=SHARES, **scene):
 
 
 def error(estimate, trigger, radar):
+    """Error of the estimated trigger in seconds, modulo the period."""
     return torch.remainder(estimate["trigger_s"] - trigger + radar.sweep_s, radar.period_s) - radar.sweep_s
 
 
@@ -63,9 +62,7 @@ def test_blocks_of_the_ground_ladar():
 
 
 def test_a_real_record_without_motion_has_no_order():
-    """A motion v in one order is -v in the other, sample by sample: where nothing moves nothing
-    tells, and nothing is claimed.
-    """
+    """A motion v in one order is -v in the other, so without motion the order is undetermined."""
     radar = table1(detection="real")
     x, trigger = made(radar, 32, motion=lambda t: 0 * t)
     found = find_trigger(x, radar)
@@ -75,8 +72,8 @@ def test_a_real_record_without_motion_has_no_order():
 
 
 @pytest.mark.parametrize("detection, n_period", [("complex", 24), ("real", 192)])
-def test_several_scatterers_do_not_cost_a_fringe(detection, n_period):
-    """Three points whose beats add up anew at every turning point: one fringe is 80 ns."""
+def test_several_scatterers_do_not_shift_the_trigger_by_a_fringe(detection, n_period):
+    """Three points whose beats add up differently at every turning point; one fringe is 80 ns."""
     radar = table1(detection=detection)
     x, trigger = made(radar, n_period, shares=(0.07, 0.3), scatterers=((1.0, 0.7), (1.5, 1.0), (2.0, 0.7)))
     found = find_trigger(x, radar)
@@ -91,7 +88,7 @@ def test_scene_nearer_than_the_reference():
     assert float((error(wrong, trigger, radar).abs() - radar.sweep_s).abs().max()) < 0.1e-6
 
 
-def test_hopeless_trials_are_not_ok_and_leave_their_neighbours_alone():
+def test_empty_and_noise_trials_are_not_ok_and_do_not_change_others():
     radar = table1()
     x, _ = made(radar, 24, shares=(0.3,))
     noise = torch.randn(x.shape, dtype=x.dtype, generator=torch.Generator().manual_seed(3))
@@ -100,13 +97,13 @@ def test_hopeless_trials_are_not_ok_and_leave_their_neighbours_alone():
     torch.testing.assert_close(together["trigger_s"][0], find_trigger(x[0], radar)["trigger_s"], atol=1e-15, rtol=0)
 
 
-def test_single_precision_finds_the_same():
+def test_single_precision_gives_the_same_trigger():
     radar = table1()
     x, trigger = made(radar, 24)
     assert float(error(find_trigger(x.to(torch.complex64), radar), trigger, radar).abs().max()) < 0.3e-9
 
 
-def test_searching_stage_splits_as_the_recorded_trigger_does():
+def test_the_stage_separates_with_the_estimated_trigger():
     radar = table1()
     x, _ = made(radar, 16, snr_db=None)
     signal = Signal(x, radar.record_axes(16, 1024))
@@ -117,7 +114,7 @@ def test_searching_stage_splits_as_the_recorded_trigger_does():
     assert torch.equal(trace.values["split.trigger_s"], found["trigger_s"])
 
 
-def test_short_records_are_refused():
+def test_short_records_raise():
     radar = ground(keep_every=4)
     with pytest.raises(ValueError, match="too short to find turning points"):
         find_trigger(record(radar, 0.0, 4, 4800), radar)

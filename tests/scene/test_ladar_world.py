@@ -29,12 +29,15 @@ from torchsar.scene import (
 
 
 def test_the_letter() -> None:
-    """Brief 000, section 8 B: 62 points, spine 5 cm, arms 1 cm, at spine points 0, 8, 16."""
+    """A spine of 17 points 5 cm apart; arms of 15 points 1 cm apart at its points 0, 8 and 16."""
     s = LetterE().scatterers(Draws(1, trials=range(3)))
     assert s.range_m.shape == s.azimuth_m.shape == (62,) and s.amplitude.shape == (3, 62)
-    places = {(round(float(x), 3), round(float(r), 3)) for x, r in zip(s.azimuth_m, s.range_m, strict=True)}
-    assert len(places) == 62 and {(-0.075, -0.4), (-0.075, 0.4), (0.075, 0.0), (-0.065, 0.4), (-0.075, 0.35)} <= places
-    assert (-0.065, -0.35) not in places
+    positions = {(round(float(x), 3), round(float(r), 3)) for x, r in zip(s.azimuth_m, s.range_m, strict=True)}
+    assert (
+        len(positions) == 62
+        and {(-0.075, -0.4), (-0.075, 0.4), (0.075, 0.0), (-0.065, 0.4), (-0.075, 0.35)} <= positions
+    )
+    assert (-0.065, -0.35) not in positions
     torch.testing.assert_close(s.amplitude.abs(), torch.ones(3, 62, dtype=torch.float64))
     assert not torch.equal(s.amplitude[0], s.amplitude[1])
     assert torch.equal(
@@ -43,7 +46,7 @@ def test_the_letter() -> None:
 
 
 def test_the_ground_target() -> None:
-    """Brief 000, section 8 C: retro 25 dB, nine points 18 dB below it, 0.25 to 0.55 m beyond."""
+    """A retro-reflector of 25 dB, and nine points 18 dB below it, 0.25 to 0.55 m behind it."""
     s = RetroAndBrokenLine().scatterers(Draws(1, trials=range(2)))
     level = 20 * torch.log10(s.amplitude.abs())
     assert s.range_m.shape == (10,) and float(s.range_m[0]) == 10.5
@@ -68,7 +71,7 @@ def test_spectra_follow_their_power_law(kind, slope: float) -> None:
     assert bool((tones.frequency_hz > edges[:-1]).all()) and bool((tones.frequency_hz < edges[1:]).all())
 
 
-def test_defaults_follow_the_recording_and_rms_the_trial() -> None:
+def test_the_default_band_follows_the_recording_and_rms_values_may_differ() -> None:
     tones = PathFluctuation(torch.tensor([1.0, 3.0], dtype=torch.float64)).drawn(Draws(0, trials=range(2)), 0.5)
     assert 2.0 < float(tones.frequency_hz[0]) < 2.3 and 1800 < float(tones.frequency_hz[-1]) < 2000
     power = (tones.cosine.square() + tones.sine.square()).sum(-1) / 2
@@ -91,7 +94,7 @@ def test_tones_are_sums_of_sinusoids_at_any_times() -> None:
     assert tones.value(torch.tensor(0.3, dtype=torch.float64)).shape == (2,)
 
 
-def test_random_motions_have_addresses() -> None:
+def test_random_motions_depend_on_their_address_only() -> None:
     motion = [PathFluctuation(1e-6), Polynomial([0.3]), PathFluctuation(1e-6)]
     time = torch.linspace(0, 0.01, 5, dtype=torch.float64)
     together = drawn_motion(motion, Draws(1, trials=[3, 5]), 0.01)
@@ -128,7 +131,7 @@ def test_measured_tracks_from_files(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_allclose(found.displacement_m(torch.tensor(at)).numpy(), CubicSpline(time, track)(at), atol=1e-17)
 
 
-def test_measured_tracks_refuse_what_they_cannot_be(tmp_path: Path) -> None:
+def test_unsuitable_measured_tracks_are_refused(tmp_path: Path) -> None:
     (tmp_path / "three.csv").write_text("1,2,3\n4,5,6\n")
     (tmp_path / "words.txt").write_text("no numbers\nat all\n")
     written(tmp_path, ".npy", np.array([0.0, 1.0, 3.0]), np.zeros(3))
@@ -161,11 +164,11 @@ def test_measured_tracks_refuse_what_they_cannot_be(tmp_path: Path) -> None:
         (lambda: RetroAndBrokenLine(range_m=math.inf), "range_m of a retro-reflector"),
     ],
 )
-def test_bad_worlds_are_refused(build, message: str) -> None:
+def test_invalid_worlds_are_refused(build, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         build()
 
 
-def test_a_fidelity_must_be_one() -> None:
+def test_another_fidelity_is_refused() -> None:
     with pytest.raises(TypeError, match="fidelity must be LinearInSweep"):
         LadarWorld(Points([0.0], [0.0]), fidelity=Sinusoid(1.0, 1.0))  # type: ignore[arg-type]

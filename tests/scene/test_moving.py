@@ -1,6 +1,4 @@
-"""Moving targets: ranges against three-dimensional geometry, series against the square root, and
-what ships and fleets draw.
-"""
+"""Moving targets: ranges against three-dimensional geometry, series, ships and fleets."""
 
 from __future__ import annotations
 
@@ -68,9 +66,7 @@ def test_ground_movers_follow_three_dimensions_exactly():
 
 
 def test_ground_motion_in_the_slant_plane_is_an_along_track_bias():
-    """Brief 001, Model only what a scene requires: 12.5 m/s on the ground at 3 km height bends the
-    phase like 0.094 m/s along track.
-    """
+    """12.5 m/s on the ground at a height of 3 km curves the phase like 0.094 m/s along track."""
     movers = movers_of(GroundMovers([-12.5], [0.0], [0.0], [4000.0]))
     assert float(movers.u_r_m_s) == pytest.approx(10.0) and float(movers.range_m) == pytest.approx(0.0)
     exact = ExactRange().range_m(movers, TIME, RADAR)[1, :, 0]
@@ -89,8 +85,8 @@ def test_motion_towards_the_transmitter_shortens_its_range():
 
 
 @pytest.mark.parametrize(("u_r", "wrong"), [(0.0, 5.4), (10.0, 12.1)])
-def test_the_papers_parabola_is_wrong_by_radians_and_higher_orders_are_not(u_r, wrong):
-    """Brief 001, erratum 5."""
+def test_the_parabola_errs_by_radians_and_higher_orders_do_not(u_r, wrong):
+    """Remote Sens. 2020, 12, 1703, Eqs. (3), (5): the parabola at the aperture edge."""
     movers = movers_of(MovingPoints([u_r], [0.0], [0.0], [0.0]))
     assert float(TaylorRange(2).neglected_phase_rad(movers, TIME, RADAR)) == pytest.approx(wrong, abs=0.15)
     assert float(TaylorRange(4).neglected_phase_rad(movers, TIME, RADAR)) < 0.2
@@ -120,7 +116,7 @@ def test_gates_by_time_and_by_direction():
     torch.testing.assert_close(pattern, torch.where(q == 0, 1.0, torch.sin(q) / q))
 
 
-def test_ships_have_the_level_and_the_lines_asked_for():
+def test_ships_have_the_given_level_and_range_cells():
     ship = movers_of(Ship(10.0, torch.tensor([0.0, 5.0, 10.0]), 40.0, -30.0, count=14, level_db=6.0), range(3))
     assert ship.amplitude.shape == (3, 14) and ship.u_a_m_s[2, 0] == 10
     lines = {r: ship.range_m[0] == r for r in (-39.0, -33.0, -27.0, -21.0)}
@@ -131,7 +127,7 @@ def test_ships_have_the_level_and_the_lines_asked_for():
     torch.testing.assert_close(movers_of(Ship(10.0, 0.0, 40.0, count=14), [2]).y0_m[0], ship.y0_m[2])
 
 
-def test_fleets_join_what_is_bent_with_what_is_not():
+def test_fleets_join_uniform_and_accelerated_targets():
     points, ground = MovingPoints([1.0], [2.0], [3.0], [4.0]), GroundMovers([6.0], [0.0], [0.0], [4000.0])
     ship = Ship(0.0, 0.0, count=5)
     fleet = movers_of(Fleet({"point": points, "ground": ground, "ship": ship, "again": ship}), range(2))
@@ -151,9 +147,9 @@ def test_points_may_differ_between_trials_and_be_complex():
 
 
 @pytest.mark.parametrize(
-    ("build", "says"),
+    ("build", "message"),
     [
-        (lambda: MovingPoints([1.0], [0.0, 1.0], [0.0], [0.0]), "one speed, place"),
+        (lambda: MovingPoints([1.0], [0.0, 1.0], [0.0], [0.0]), "one speed, position"),
         (lambda: MovingPoints([math.nan], [0.0], [0.0], [0.0]), "u_r_m_s of moving points must be a finite"),
         (lambda: Ship(0.0, 0.0, count=3, range_cells=4), "a scatterer for each"),
         (lambda: GroundMovers([1.0], [0.0], [0.0], [1.0], towards_transmitter=(1.0, 1.0)), "longer than 1"),
@@ -165,6 +161,6 @@ def test_points_may_differ_between_trials_and_be_complex():
         (lambda: movers_of(Fleet({})), "holds no scene"),
     ],
 )
-def test_impossible_scenes_are_refused(build, says):
-    with pytest.raises(ValueError, match=says):
+def test_impossible_scenes_are_refused(build, message):
+    with pytest.raises(ValueError, match=message):
         build()

@@ -1,6 +1,4 @@
-"""Orbits against the laws of motion, the series of the range against its closed forms and the
-errata of brief 001, and the timing diagram against counting.
-"""
+"""Orbits against the laws of motion, range series against closed forms, and the timing diagram."""
 
 from __future__ import annotations
 
@@ -41,7 +39,7 @@ def test_orbits_obey_gravity(orbit):
     torch.testing.assert_close(position[-1], position[0], rtol=1e-9, atol=1e-3)
 
 
-def test_elements_stand_for_what_they_say():
+def test_elements_have_their_usual_meaning():
     at_perigee = Orbit(1e7, 0.2, 90.0, 0.0, 90.0)
     position, velocity = (x[0] for x in at_perigee.state(torch.zeros(1, dtype=torch.float64)))
     torch.testing.assert_close(position, torch.tensor([0.0, 0.0, 8e6], dtype=torch.float64), rtol=0, atol=1e-6)
@@ -61,7 +59,7 @@ def test_elements_have_gradients_and_trials():
 
 @pytest.mark.parametrize("orbit", [PAPER, ECCENTRIC], ids=["paper", "eccentric"])
 def test_coefficients_are_the_corrected_equations_10_and_11(orbit):
-    """Brief 001, erratum 2."""
+    """Remote Sens. 2020, 12, 1703, Eqs. (10), (11), with signs and factors corrected."""
     time = over_a_turn(orbit, 13)
     position, velocity = orbit.state(time)
     point = seen_point(position, velocity, 5.0, 40.0)
@@ -91,8 +89,10 @@ def test_higher_coefficients_follow_the_exact_range():
 
 @pytest.mark.parametrize(("orbit", "greatest"), [(PAPER, 0.0208), (Orbit(42_164e3, **ELEMENTS), 0.0215)])
 def test_published_sizes_of_the_transmit_range(orbit, greatest):
-    """Brief 001, erratum 3: k2 in -0.0146..0.0208 (0.0215 at the geosynchronous radius), k1 up to
-    376 m/s off zero Doppler, the third power below 1e-4 pi.
+    """k2 lies in -0.0146..0.0208, or up to 0.0215 at the geosynchronous radius.
+
+    k1 reaches 376 m/s off zero Doppler. The phase of the third power is below 1e-4 pi, as Remote
+    Sens. 2020, 12, 1703 states.
     """
     time = over_a_turn(orbit)
     position, velocity = orbit.state(time)
@@ -139,7 +139,7 @@ def diagram(pulse_s=20e-6, guard_s=50e-6, nadir_s=30e-6):
     )
 
 
-def test_lost_places_are_those_where_echoes_meet_pulses():
+def test_lost_ranges_are_those_where_echoes_meet_pulses():
     d = diagram()
     delay = 2 / 299_792_458.0 * ground_slant_m(36_500e3, d.ground_m)
     for row in (0, 15, 30):
@@ -153,7 +153,7 @@ def test_lost_places_are_those_where_echoes_meet_pulses():
     assert bool(d.transmit.any()) and bool(d.nadir.any())
 
 
-def test_swaths_fit_where_every_place_is_clear():
+def test_swaths_fit_where_every_range_is_clear():
     d = diagram()
     fits = d.swath_fits(500e3)
     for row in range(0, 31, 7):
@@ -167,7 +167,7 @@ def test_swaths_fit_where_every_place_is_clear():
 
 
 @pytest.mark.parametrize(
-    ("build", "says"),
+    ("build", "message"),
     [
         (lambda: Orbit(6e6), "meets the ground"),
         (lambda: Orbit(1e7, 0.95), "eccentricity"),
@@ -178,6 +178,6 @@ def test_swaths_fit_where_every_place_is_clear():
         (lambda: timing_diagram(1e6, torch.tensor([100.0]), torch.tensor([0.0, 1e7]), 1e-5), "horizon"),
     ],
 )
-def test_impossible_orbits_are_refused(build, says):
-    with pytest.raises(ValueError, match=says):
+def test_impossible_orbits_are_refused(build, message):
+    with pytest.raises(ValueError, match=message):
         build()

@@ -1,4 +1,4 @@
-"""The procedural satellite: its extents, shares, corners and draws."""
+"""Satellite model: its extents, parts, corners and draws."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ SETS = {
 def test_extents_are_exact_in_every_trial(satellite: Satellite) -> None:
     s = satellite.scatterers(Draws(1, trials=range(4)))
     assert s.azimuth_m.shape == s.range_m.shape == s.amplitude.shape == (4, satellite.count)
-    for places, half in ((s.azimuth_m, satellite.half_width_m), (s.range_m, satellite.half_depth_m)):
-        torch.testing.assert_close(places.amax(-1), torch.full((4,), half, dtype=torch.float64), rtol=1e-14, atol=0)
-        torch.testing.assert_close(places.amin(-1), torch.full((4,), -half, dtype=torch.float64), rtol=1e-14, atol=0)
+    for positions, half in ((s.azimuth_m, satellite.half_width_m), (s.range_m, satellite.half_depth_m)):
+        torch.testing.assert_close(positions.amax(-1), torch.full((4,), half, dtype=torch.float64), rtol=1e-14, atol=0)
+        torch.testing.assert_close(positions.amin(-1), torch.full((4,), -half, dtype=torch.float64), rtol=1e-14, atol=0)
 
 
 def test_parts_hold_their_shares_and_lie_where_they_should() -> None:
@@ -46,7 +46,7 @@ def test_parts_hold_their_shares_and_lie_where_they_should() -> None:
 
 
 def test_panels_are_grids() -> None:
-    """Every point of a panel lies on one of its 5 ribs or 9 strings, and both hold many."""
+    """Every point of a panel lies on one of its 5 ribs or 9 strings, with many on both."""
     satellite = Satellite()
     s = satellite.scatterers(Draws(2))
     members = satellite.parts()["panel_right"]
@@ -70,7 +70,7 @@ def test_corners_are_strong_and_shared_and_tips_are_at_the_ends() -> None:
     assert float((s.azimuth_m[0, others] - s.azimuth_m[1, others]).abs().mean()) > 0.01
 
 
-def test_amplitudes_have_their_law() -> None:
+def test_amplitudes_follow_their_distribution() -> None:
     s, corners = Satellite().scatterers(Draws(4, trials=range(20))), Satellite().corners()
     level, phase = s.amplitude[:, ~corners].abs(), torch.angle(s.amplitude)
     assert float(level.min()) >= 0.4
@@ -79,7 +79,7 @@ def test_amplitudes_have_their_law() -> None:
     assert float(torch.polar(torch.ones_like(phase), phase).mean().abs()) < 0.03
 
 
-def test_draws_have_addresses() -> None:
+def test_draws_depend_on_their_address_only() -> None:
     satellite = Satellite(120, 1.6)
     whole, part, alone, other = (
         satellite.scatterers(d) for d in (Draws(5, trials=range(4)), Draws(5, trials=[3, 1]), Draws(5), Draws(6))

@@ -1,6 +1,4 @@
-"""Seas: moments of K clutter, where its texture lies, images as texture, draws by address, and what
-is refused.
-"""
+"""Seas: moments of K clutter, texture, images, draws, and errors."""
 
 from __future__ import annotations
 
@@ -50,8 +48,9 @@ def test_a_gamma_of_shape_one_is_exponential():
 
 
 def test_texture_is_shared_in_a_cell_and_only_there():
-    """Cells of 10 by 30 m under a grid of 5 m: averages of intensity over the trials of one texture
-    are equal in a cell, and neighbouring cells know nothing of each other.
+    """Cells of 10 by 30 m on a grid of 5 m have one texture each.
+
+    The mean intensity over trials is equal within a cell, and neighbouring cells are uncorrelated.
     """
     sea = KSea(0.5, cell_m=(10.0, 30.0))
     table, row, column = sea.texture(grid(40, 5.0), grid(60, 5.0), Draws(2, trials=range(300)))
@@ -64,14 +63,14 @@ def test_texture_is_shared_in_a_cell_and_only_there():
     assert float((torch.corrcoef(pair) - torch.eye(3)).abs().max()) < 0.2
 
 
-def test_an_unordered_grid_has_the_same_law():
+def test_an_unordered_grid_has_the_same_texture():
     order = torch.randperm(40, generator=torch.Generator().manual_seed(1))
     table, row, column = KSea(cell_m=(60.0, 60.0)).texture(grid()[order], grid(), Draws(3))
     straight, straight_row, _ = KSea(cell_m=(60.0, 60.0)).texture(grid(), grid(), Draws(3))
     assert torch.equal(table, straight) and torch.equal(row, straight_row[order]) and int(column.min()) == 0
 
 
-def test_draws_have_addresses():
+def test_draws_depend_on_their_address_only():
     whole, part, alone, other = (
         KSea().reflectivity(grid(), grid(10), d)
         for d in (Draws(5, trials=range(4)), Draws(5, trials=[3, 1]), Draws(5), Draws(6))
@@ -84,10 +83,8 @@ def test_draws_have_addresses():
     )
 
 
-def test_an_image_lies_in_place_and_is_mirrored_beyond():
-    """Two by four pixels of 100 by 50 m: which pixel a place falls on, also far outside, and the
-    mean of the image is one.
-    """
+def test_an_image_has_its_position_and_is_mirrored_beyond():
+    """Two by four pixels of 100 by 50 m: pixels of positions, also far outside; mean one."""
     image = torch.tensor([[1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0]])
     sea = ImageReflectivity(image, 200.0, 200.0)
     azimuth, distance = (
@@ -164,6 +161,6 @@ def test_impossible_images_are_refused(image, extent, sentence):
         ImageReflectivity(image, extent, 10.0)
 
 
-def test_gamma_numbers_of_no_shape_are_refused():
+def test_an_invalid_shape_of_gamma_numbers_is_refused():
     with pytest.raises(ValueError, match="gamma numbers are made for shapes of 0.1 to 1000, got 0"):
         gamma_from_normal(torch.zeros(1, dtype=torch.float64), 0.0)

@@ -339,10 +339,10 @@ def test_trade_sets_histories_dimensions_and_reconstructions_side_by_side(tmp_pa
         ({"world": world(targets={"p": {"range_m": 10.0}})}, "azimuth-only data (samples: null) know one range"),
         ({"world": world(targets={"p": {"u_a_m_s": 300.0}})}, "speed past the fastest target is 0 m/s"),
         ({"world": world(pulses=600)}, "record is 3.333 s, and must be at least 4.5 s"),
-        ({"processor": {"recommended": chain(TRUE, 4)}}, "4 Doppler bands cannot be told apart by 3 channels"),
+        ({"processor": {"recommended": chain(TRUE, 4)}}, "4 Doppler bands cannot be separated by 3 channels"),
         (
             {"radar": {**TINY["radar"], "prf_hz": 187.5}, "processor": {"recommended": chain(TRUE, 3)}},
-            "at a pulse rate of 187.5 Hz and 300 m/s channels sample the same places",
+            "at a pulse rate of 187.5 Hz and 300 m/s channels sample the same positions",
         ),
         (
             {

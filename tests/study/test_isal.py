@@ -439,7 +439,7 @@ def test_an_image_of_other_profiles_leaves_no_operator_behind(tmp_path: Path) ->
     stage = TargetImage(
         recording.radar, geometry_of(recording.aux["frequency_hz"], angle_rad=recording.aux["angle_rad"])
     )
-    with pytest.raises(ValueError, match="crop both alike"):
+    with pytest.raises(ValueError, match="crop both to the same samples"):
         stage(recording.signal.crop(range=(0, 20)))
     fresh = TargetImage(
         recording.radar, geometry_of(recording.aux["frequency_hz"], angle_rad=recording.aux["angle_rad"])

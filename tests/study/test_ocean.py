@@ -228,12 +228,12 @@ def test_trade_changes_one_setting_at_a_time(tmp_path: Path) -> None:
         ),
         (
             {"processor": {"recommended": chain({"stage": "stationary_image", "bands": 4})}},
-            "4 Doppler bands cannot be told apart by 3 channels",
+            "4 Doppler bands cannot be separated by 3 channels",
         ),
         ({"processor": {"recommended": chain({**FLOW, "removal": "paint"})}}, "removal"),
         (
             {"radar": {**TINY["radar"], "prf_hz": 187.5}, "processor": {"recommended": chain({**FLOW, "bands": 3})}},
-            "at a pulse rate of 187.5 Hz and 300 m/s channels sample the same places",
+            "at a pulse rate of 187.5 Hz and 300 m/s channels sample the same positions",
         ),
         ({"metrics": {"reference": "oracle"}}, "metrics.reference"),
     ],

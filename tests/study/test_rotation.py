@@ -364,5 +364,5 @@ def test_limits_follow_their_formulas() -> None:
     assert (
         limits([1.0, 2.0, 3.0], [3.0, -1.0, 3.0], rate_bound=math.inf)["Cramer-Rao bound of the rate"].verdict == "warn"
     )
-    with pytest.raises(ValueError, match="alike"):
+    with pytest.raises(ValueError, match="the same shape"):
         limits([1.0, 2.0], [1.0])

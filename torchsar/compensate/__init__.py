@@ -24,20 +24,26 @@ from torchsar.compensate.envelope import (
     shift_range,
 )
 from torchsar.compensate.point import PointDoppler, doppler_at, peak_time_s
-from torchsar.compensate.pulse_phase.descent import maximum_contrast, minimum_entropy, sharpest_phase
-from torchsar.compensate.pulse_phase.gradient import Listed, Measured, Shrinking, pga, pga_sca
-from torchsar.compensate.pulse_phase.pairs import sca
-from torchsar.compensate.pulse_phase.recommended import autofocus
-from torchsar.compensate.pulse_phase.sharpen import entropy_fixed_point
-from torchsar.compensate.pulse_phase.stages import (
+from torchsar.compensate.pulse_phase import (
     Autofocus,
     CorrectPulsePhase,
     EntropyFixedPoint,
+    Listed,
+    Measured,
     Pga,
     PgaSca,
     Sca,
     SharpestPhase,
+    Shrinking,
+    autofocus,
     correct_pulse_phase,
+    entropy_fixed_point,
+    maximum_contrast,
+    minimum_entropy,
+    pga,
+    pga_sca,
+    sca,
+    sharpest_phase,
 )
 from torchsar.compensate.radial import (
     CompensateMotion,
@@ -67,6 +73,7 @@ from torchsar.compensate.rotation import (
     ChirpletClean,
     Chirplets,
     CoarseRotation,
+    EntropyObjective,
     ImageEntropy,
     PhaseFitRotation,
     RotationAutofocus,
@@ -101,6 +108,7 @@ __all__ = [
     "EffectiveVelocity",
     "EnergyCentre",
     "EntropyFixedPoint",
+    "EntropyObjective",
     "EqualisePulses",
     "ImageEntropy",
     "Listed",

@@ -1,13 +1,17 @@
-"""The Doppler ambiguity from range migration, told nothing (brief 004, item 5).
+"""Absolute Doppler centroid: the PRF ambiguity is resolved from range migration.
 
-Three kinds of evidence, each a log-likelihood per candidate number of PRFs, from statistics over
-independent blocks of the data:
-    looks   range displacement between azimuth looks of the image: dr = lambda k prf df / (2 Ka);
-    strong wherever there is contrast; lines   range displacement between adjacent lines: the phase
-    increment grows with range frequency as f_dc (f0 + f) / f0; works on
-            featureless speckle, and is all there is to go by on it;
-    entropy a small group of range lines focused with every candidate.
-They are added. Doppler is positive when closing; walk per second is -lambda f_dc / 2.
+The multiple of the PRF is found without prior knowledge. Three kinds of evidence give a
+log-likelihood for each candidate number of PRFs, from statistics over independent blocks of data:
+
+- looks: the range displacement between azimuth looks of the image, dr = lambda k PRF df / (2 Ka).
+- lines: the range displacement between adjacent lines; the phase increment grows with range
+frequency as f_dc (f0 + f) / f0.
+- entropy: the entropy of a small group of range cells that is focused with every candidate.
+
+The looks are the strongest evidence wherever there is contrast. The lines are the only evidence on
+featureless speckle. The log-likelihoods are added.
+
+Doppler is positive when closing. Range changes by -lambda f_dc / 2 metres per second.
 """
 
 from __future__ import annotations
@@ -35,23 +39,34 @@ from torchsar.core import Estimate, Signal, Stage, fft_lines, settle, take
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
 
-_BLOCKS = 8
+_BLOCKS = 8  # independent parts of the data; more give more degrees of freedom, each of less contrast
 
 
 def candidate_turns(reach: int, device: torch.device | None = None) -> Tensor:
-    """-reach..reach, float64; 0 alone where no other squint is possible."""
+    """List the candidate numbers of PRFs, -reach..reach.
+
+    Args:
+        reach: Largest number of PRFs; 0 where no other squint is possible.
+        device: Device of the result.
+
+    Returns:
+        The candidates, shape (2 reach + 1,), float64.
+
+    Raises:
+        ValueError: If `reach` is negative.
+    """
     if reach < 0:
         raise ValueError(f"the ambiguity search needs a reach of 0 or more PRFs, got {reach}")
     return torch.arange(-reach, reach + 1, dtype=torch.float64, device=device)
 
 
 def _evidence(scores: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Log-likelihood of each candidate (..., candidate): how surely it is worse than the best one,
-    from scores of blocks (..., block, candidate).
+    """Log-likelihood of each candidate (..., candidate) from the scores of blocks.
 
-    weight: (..., block) with sum 1, equal by default. Student's t of the mean deficit; its degrees
-    of freedom follow from how many blocks carry weight, and a tenth of the deficit itself counts as
-    uncertainty, so that no single kind of evidence becomes certainty.
+    It says how certainly a candidate is worse than the best one. scores: (..., block, candidate).
+    weight: (..., block) with sum 1, equal by default. The value is Student's t of the mean deficit;
+    its degrees of freedom follow from the number of blocks that carry weight. A tenth of the
+    deficit is added to its uncertainty, so that no single kind of evidence becomes a certainty.
     """
     if weight is None:
         weight = torch.full(scores.shape[:-1], 1 / scores.shape[-2], dtype=scores.dtype, device=scores.device)
@@ -66,12 +81,22 @@ def _evidence(scores: Tensor, weight: Tensor | None = None) -> Tensor:
 
 
 def look_scores(group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turns: Tensor, looks: int = 16) -> Tensor:
-    """Correlation of neighbouring azimuth looks at the range displacement of every candidate, (...,
-    block, candidate).
+    """Correlate neighbouring azimuth looks at the range displacement of every candidate ambiguity.
 
-    The group is focused with the baseband Doppler (...,) as if it were absolute; a true centroid k
-    PRFs away displaces look l + 1 against look l by dr. Blocks are ranges of image lines.
-    Intensities are limited to 20 times the mean, so that one ship cannot rule.
+    The group is focused with the baseband Doppler as if it were absolute. If the true centroid lies
+    k PRFs away, look l + 1 is displaced against look l by dr of the module's docstring. Blocks are
+    ranges of image lines. Intensities are limited to 20 times their mean, so that one ship cannot
+    dominate.
+
+    Args:
+        group: Group of range cells.
+        doppler_hz: Baseband centroid in Hz, shape (...,), positive when closing.
+        velocity_m_s: Velocity of the platform in m/s.
+        turns: Candidate numbers of PRFs, shape (candidate,).
+        looks: Number of azimuth looks.
+
+    Returns:
+        The correlations, shape (..., block, candidate), float64; larger is better.
     """
     rows = beam_spectrum(group, doppler_hz).rows(doppler_hz, velocity_m_s)
     height = rows.shape[-2] // looks
@@ -87,21 +112,27 @@ def look_scores(group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turn
     cells = group.radar.wavelength_m * group.radar.prf_hz * step_hz / (2 * rate * group.radar.range_step_m)
     frequency = torch.arange(spectra.shape[-1], dtype=torch.float64, device=rows.device) / n
     score = torch.zeros((), dtype=torch.float64, device=rows.device)
-    for apart in (1, 2, 3):
-        cross = (spectra[..., :-apart, :, :].conj() * spectra[..., apart:, :, :]).sum(-3)
+    for distance in (1, 2, 3):
+        cross = (spectra[..., :-distance, :, :].conj() * spectra[..., distance:, :, :]).sum(-3)
         blocks = torch.stack([part.sum(-2) for part in cross.tensor_split(_BLOCKS, -2)], -2).to(torch.complex128)
-        phase = 2 * math.pi * apart * (cells[..., None, None] * turns[:, None] * frequency)
+        phase = 2 * math.pi * distance * (cells[..., None, None] * turns[:, None] * frequency)
         score = score + (blocks @ torch.polar(torch.ones_like(phase), phase).mT).real
     return score / n
 
 
 def line_doppler(lines: Tensor, radar: StripmapRadar) -> tuple[Tensor, Tensor]:
-    """Absolute Doppler from the growth of the phase increment over range frequency, with its
-    predicted deviation; (...,) each, Hz.
+    """Estimate the absolute Doppler from the growth of the phase increment with range frequency.
 
-    lines: range-compressed (..., pulse, range). Amplitudes are limited to three times their mean.
-    Unambiguous, but coarse: its deviation is about f0 / bandwidth * sqrt(12) times that of the
-    baseband centroid.
+    The estimate is unambiguous but coarse: its standard deviation is about f0 / bandwidth *
+    sqrt(12) times that of the baseband centroid. Amplitudes are limited to three times their mean.
+
+    Args:
+        lines: Range-compressed lines, shape (..., pulse, range), complex.
+        radar: Radar parameters.
+
+    Returns:
+        The Doppler, positive when closing, and its predicted standard deviation (jackknife over
+        blocks of lines), both in Hz, shape (...,).
     """
     modulus = lines.abs()
     level = 3 * modulus.mean((-2, -1), keepdim=True)
@@ -119,9 +150,7 @@ def line_doppler(lines: Tensor, radar: StripmapRadar) -> tuple[Tensor, Tensor]:
 
 
 def _phase_slope(products: Tensor, frequency_hz: Tensor) -> Tensor:
-    """Least-squares slope (rad/Hz) of the small phase of products (..., f) about their common
-    phase.
-    """
+    """Least-squares slope (rad/Hz) of the phase of products (..., f) about their common phase."""
     mean = torch.angle(products.sum(-1, keepdim=True))
     turned = products * torch.polar(torch.ones_like(mean), -mean)
     weight = turned.real
@@ -133,8 +162,18 @@ def _phase_slope(products: Tensor, frequency_hz: Tensor) -> Tensor:
 def entropy_scores(
     group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turns: Tensor, dwell_s: float
 ) -> tuple[Tensor, Tensor]:
-    """Negative entropies of the range blocks of a group focused with every candidate, (..., block,
-    candidate), and the blocks' weights.
+    """Compute the negative entropies of a group focused with every candidate ambiguity.
+
+    Args:
+        group: Group of range cells.
+        doppler_hz: Baseband centroid in Hz, shape (...,), positive when closing.
+        velocity_m_s: Velocity of the platform in m/s.
+        turns: Candidate numbers of PRFs, shape (candidate,).
+        dwell_s: Time that a target stays in the beam, in seconds.
+
+    Returns:
+        The negative entropies in nats, shape (..., block, candidate), and the weights of the
+        blocks, shape (..., block), with sum 1.
     """
     spectrum, weight = beam_spectrum(group, doppler_hz), block_weights(group.data, group.radar, doppler_hz, dwell_s)
     scores = []
@@ -147,11 +186,24 @@ def entropy_scores(
 def ambiguity_evidence(
     raw: Tensor, radar: StripmapRadar, doppler_baseband_hz: Tensor, reference: Tensor | None, reach: int = 12
 ) -> dict[str, Tensor]:
-    """Log-likelihoods of the candidates -reach..reach, each (..., candidate): "looks", "lines",
-    "entropy"; and "line_doppler_hz" with its deviation.
+    """Compute the log-likelihood of every candidate ambiguity from each kind of evidence.
 
-    raw: (..., pulse, range); reference: range reference spectrum, None for compressed data. Uses at
-    most four apertures of lines and 4096 columns about mid-swath.
+    At most four apertures of lines and 4096 range cells about the middle of the swath are used.
+
+    Args:
+        raw: Lines, shape (..., pulse, range), complex.
+        radar: Radar parameters.
+        doppler_baseband_hz: Baseband centroid in Hz, shape (...,), positive when closing.
+        reference: Range reference spectrum, shape (range,); None if `raw` is already
+            range-compressed.
+        reach: The candidates are -reach..reach PRFs.
+
+    Returns:
+        "looks", "lines" and "entropy", shape (..., candidate) each, and "line_doppler_hz" with
+        "line_doppler_std_hz", shape (...,), see `line_doppler`.
+
+    Raises:
+        ValueError: If `reach` is negative.
     """
     turns = candidate_turns(reach, raw.device)
     dwell = aperture_s(radar, raw.shape[-1])
@@ -171,24 +223,42 @@ def ambiguity_evidence(
 
 
 def possible_reach(radar: StripmapRadar, reach: int) -> int:
-    """At most `reach` PRFs, and no further than squints of about 70 degrees: 0.94 * 2 v /
-    lambda.
+    """Limit the search for the ambiguity to squints of about 70 degrees, 0.94 * 2 v / lambda.
+
+    Args:
+        radar: Radar parameters.
+        reach: Largest number of PRFs that is wanted.
+
+    Returns:
+        The largest number of PRFs to search, at most `reach`.
     """
     return max(0, min(reach, math.floor(1.88 * radar.velocity_m_s / (radar.wavelength_m * radar.prf_hz) - 0.5)))
 
 
 class DopplerCentroid(Stage):
-    """The recommended estimator: absolute Doppler centroid, its ambiguity and the squint angle;
-    leaves the signal alone.
+    """Absolute Doppler centroid with its ambiguity and the squint angle; the recommended estimator.
 
-    Baseband from the phase increment; the ambiguity from range migration, told nothing; then, where
-    the beam's dwell is known (`radar.integration_s`) and shorter than the record, the baseband
-    again from targets that the record holds for their whole dwell: one that the record's ends cut
-    would pull the centroid. Values: doppler_hz (absolute), doppler_baseband_hz, ambiguity (PRFs,
-    whole numbers as float64), squint_deg (positive ahead, at the nominal velocity). quality is the
-    probability of the ambiguity, ok where it exceeds 0.9. info: block_hz, block_power,
-    log-likelihoods `looks`, `lines`, `entropy`, `candidates`, margin (log-likelihood over the
-    runner-up).
+    The baseband centroid comes from the phase increment, and the ambiguity from range migration,
+    without prior knowledge. If the dwell of the beam is known (`radar.integration_s`) and shorter
+    than the record, the centroid is refined with targets whose whole dwell lies in the record (see
+    `complete_aperture_centroid`), because targets cut by the ends of the record would pull it. The
+    signal is left unchanged.
+
+    Provides `doppler_hz` (absolute, positive when closing), `doppler_baseband_hz`, `ambiguity`
+    (whole number of PRFs, as float64) and `squint_deg` (positive ahead, for the nominal velocity).
+
+    Args:
+        radar: Radar parameters.
+        reference: Name of the range reference in `torchsar.focus.reference`; None for
+            range-compressed data.
+        reach: Largest ambiguity that is searched, in PRFs.
+        blocks: Number of blocks along pulses and along range for the baseband centroid.
+
+    Raises:
+        ValueError: If the range reference is unknown or `reach` is below one.
+
+    Reference:
+        Tsvetkov 2017, text after Fig. 5.
     """
 
     provides = ("doppler_hz", "doppler_baseband_hz", "ambiguity", "squint_deg")
@@ -200,14 +270,22 @@ class DopplerCentroid(Stage):
         if reference is not None and reference not in REFERENCES:
             raise ValueError(
                 f"range reference {reference!r} is unknown; choose one of {sorted(REFERENCES)}, or "
-                "None for compressed data"
+                "None for range-compressed data"
             )
         if reach < 1:
             raise ValueError(f"the ambiguity search needs a reach of at least one PRF, got {reach}")
         self.radar, self.reference, self.reach, self.blocks = radar, reference, possible_reach(radar, reach), blocks
 
     def spectrum(self, n: int, device: torch.device | str | None = None) -> Tensor | None:
-        """Range reference for lines of n samples, None for compressed data."""
+        """Compute the range reference spectrum for lines of n samples.
+
+        Args:
+            n: Number of range samples.
+            device: Device of the result.
+
+        Returns:
+            The spectrum, shape (n,), complex; None for range-compressed data.
+        """
         return (
             None
             if self.reference is None
@@ -216,6 +294,16 @@ class DopplerCentroid(Stage):
 
     @torch.no_grad()
     def forward(self, signal: Signal) -> Estimate:
+        """Estimate the centroid of a signal of axes (pulse, range).
+
+        Returns:
+            The four values, shape (...,) each, with the standard deviations of both frequencies in
+            Hz. quality is the probability of the ambiguity. `ok` is False where that probability is
+            0.9 or less, or where the baseband centroid is unreliable. info: block_hz, block_power,
+            the log-likelihoods looks, lines and entropy, line_doppler_hz and line_doppler_std_hz,
+            candidates, margin (log-likelihood over that of the second-best candidate) and
+            coherence.
+        """
         raw, radar = signal.data, self.radar
         first = phase_increment(raw, radar.prf_hz, self.blocks)
         base = first["doppler_baseband_hz"]

@@ -1,9 +1,9 @@
-"""Doppler centroid from targets that the record holds for their whole dwell.
+"""Doppler centroid from targets that are illuminated for their whole dwell within the record.
 
-The ends of a record cut the apertures of targets near them; of a strip with a few bright points
-that pulls the centroid by a good part of the beam's band. In an image each target sits at the time
-when the beam centre crosses it, so the lines of complete apertures can be told apart, and the
-azimuth spectrum of these lines alone is the beam's, whatever the scene. Brief 004, item 5.
+The ends of a record cut the apertures of the targets near them. In a strip with a few bright points
+this pulls the centroid by a considerable part of the beam's band. In an image each target lies at
+the time when the beam centre crosses it, so lines of complete apertures can be separated from the
+others. The azimuth spectrum of these lines alone is that of the beam, whatever the scene.
 """
 
 from __future__ import annotations
@@ -21,19 +21,33 @@ from torchsar.core import settle
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
 
-_TILE_LINES, _TILE_COLUMNS, _CHUNK_COLUMNS = 16, 32, 2048
-_GUARD = 0.02
+# size of a tile, found by trial: larger tiles measure their coherence better, smaller ones resolve
+# the end of the complete lines
+_TILE_LINES, _TILE_COLUMNS = 16, 32
+_CHUNK_COLUMNS = 2048  # bounds the memory of an image on wide swaths
+_GUARD = 0.02  # share of the dwell by which it is widened at each end, found by trial
 
 
 def complete_aperture_centroid(
     raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, std_hz: Tensor, reference: str | None, rounds: int = 2
 ) -> tuple[Tensor, Tensor]:
-    """Refine an absolute centroid (...,) with predicted deviation std_hz (...,) by complete
-    apertures; returns both anew.
+    """Refine an absolute Doppler centroid by using complete apertures only.
 
-    raw: (..., pulse, range). A trial keeps what it had where the new deviation is more than twice
-    the old one. Everything stays as it is where the beam's dwell is not known
-    (`radar.integration_s`) or the record is hardly longer.
+    The input is returned unchanged if the dwell of the beam is not known (`radar.integration_s` is
+    None), or if the record is shorter than 1.1 dwells.
+
+    Args:
+        raw: Lines, shape (..., pulse, range), complex.
+        radar: Radar parameters.
+        doppler_hz: Absolute centroid in Hz, shape (...,), positive when closing.
+        std_hz: Its predicted standard deviation in Hz, shape (...,).
+        reference: Name of the range reference in `torchsar.focus.reference`; None if `raw` is
+            already range-compressed.
+        rounds: Number of rounds, each of which forms the image anew with the current centroid.
+
+    Returns:
+        The refined centroid and its standard deviation in Hz, shape (...,) each. A trial keeps its
+        input where the new standard deviation exceeds twice the old one.
     """
     if radar.integration_s is None:
         return doppler_hz, std_hz
@@ -43,7 +57,7 @@ def complete_aperture_centroid(
     raw, value, std = unit_peak(raw), doppler_hz, std_hz
     for _ in range(rounds):
         found, found_std = _refined(raw, radar, value, dwell, reference)
-        # the deviation of the first estimate does not know of the cut apertures
+        # the standard deviation of the first estimate does not include the effect of cut apertures
         better = found_std < 2 * std_hz
         value, std = torch.where(better, found, doppler_hz), torch.where(better, found_std, std_hz)
     return value, std
@@ -52,9 +66,7 @@ def complete_aperture_centroid(
 def _refined(
     raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwell: int, reference: str | None
 ) -> tuple[Tensor, Tensor]:
-    """One round: image tiles' lag products in the frame doppler_hz, then the set of complete lines
-    and the centroid in turns.
-    """
+    """One round: form an image with centroid doppler_hz, then update lines and centroid in turn."""
     parts = [_tiles(block, radar_part, doppler_hz, reference) for block, radar_part in _chunks(raw, radar, reference)]
     products = torch.cat([p for p, _, _ in parts], -1)
     rate = torch.cat([r.expand(p.shape[-1]) for p, _, r in parts])
@@ -66,7 +78,7 @@ def _refined(
     total, scale = doppler_hz, radar.prf_hz / (2 * math.pi)
     std = torch.full_like(doppler_hz, math.inf)
     for _ in range(8):
-        # a frame off by d shows a target d / rate late
+        # in a frame with an error d, targets appear late by d / rate
         shift = (total - doppler_hz)[..., None, None] / rate * radar.prf_hz
         whole = _whole(line[:, None] - shift, raw.shape[-2], dwell)
         chosen = products * whole
@@ -79,18 +91,18 @@ def _refined(
 
 
 def _whole(crossing: Tensor, lines: int, dwell: int) -> Tensor:
-    """Weight of image lines by the line at which the beam crosses them: 1 where the dwell lies
-    inside the record, 0 where not.
+    """Weight of image lines by the line at which the beam centre crosses their targets.
 
-    It falls off over a tenth of a dwell: a sharp end would cut responses that a wrong nominal
-    velocity smears, and each part of such a response has another Doppler.
+    The weight is 1 where the whole dwell lies inside the record and 0 where it does not. It falls
+    off over a tenth of a dwell: a sharp end would cut responses that a wrong nominal velocity
+    smears, and the parts of such a response differ in Doppler.
     """
     margin = torch.minimum(crossing - dwell / 2, lines - dwell / 2 - crossing)
     return (margin / min(0.1 * dwell, (lines - dwell) / 4)).clamp(0, 1)
 
 
 def _chunks(raw: Tensor, radar: StripmapRadar, reference: str | None) -> list[tuple[Tensor, StripmapRadar]]:
-    """Range chunks that overlap by a pulse, so that memory stays bounded on wide swaths."""
+    """Range chunks that overlap by a pulse length, so that memory stays bounded on wide swaths."""
     extra = 0 if reference is None else raw.shape[-1] - full_columns(raw.shape[-1], radar.pulse_samples)
     columns = raw.shape[-1] - extra
     count = max(1, round(columns / _CHUNK_COLUMNS))
@@ -104,8 +116,9 @@ def _chunks(raw: Tensor, radar: StripmapRadar, reference: str | None) -> list[tu
 def _tiles(
     raw: Tensor, radar: StripmapRadar, doppler_hz: Tensor, reference: str | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Lag products and powers of image tiles (..., a, b), and the azimuth rate at the chunk's
-    middle, (1,) Hz/s.
+    """Lag products and powers of image tiles, and the azimuth rate in the middle of the chunk.
+
+    The products and powers have shape (..., a, b), the rate has shape (1,) and is in Hz/s.
     """
     spectrum = (
         None if reference is None else REFERENCES[reference](radar.pulse, raw.shape[-1], radar.sampling_hz, raw.device)
@@ -126,8 +139,10 @@ def _tiles(
 
 
 def _noise_variance(power: Tensor) -> Tensor:
-    """Variance of the imaginary part of a tile's product by noise, against noise and against
-    signal; the noise is the tile at the lowest tenth.
+    """Variance that noise adds to the imaginary part of the products of a tile.
+
+    It includes noise times noise and noise times signal. The noise power is that of the tile at the
+    lowest tenth.
     """
     flat = power.flatten(-2)
     floor = torch.where(flat > 0, flat, torch.inf).kthvalue(max(1, flat.shape[-1] // 10), dim=-1).values
@@ -136,11 +151,10 @@ def _noise_variance(power: Tensor) -> Tensor:
 
 
 def _std_rad(products: Tensor, noise: Tensor, phase_rad: Tensor) -> Tensor:
-    """Deviation of the common phase from the scatter over columns of tiles in four parts of the
-    strip, and from noise.
+    """Standard deviation of the common phase, from noise and the scatter over columns of tiles.
 
-    The parts are much longer than a point's response, whose tiles differ in Doppler when the
-    nominal velocity is off.
+    The scatter is taken in four parts of the strip. They are much longer than the response of a
+    point, whose tiles differ in Doppler when the nominal velocity is wrong.
     """
     parts = torch.stack([part.sum(-2) for part in products.tensor_split(4, -2)], -2).flatten(-2)
     turned = parts * torch.polar(torch.ones_like(phase_rad), -phase_rad)[..., None]
@@ -149,8 +163,6 @@ def _std_rad(products: Tensor, noise: Tensor, phase_rad: Tensor) -> Tensor:
 
 
 def _above_noise(products: Tensor, power: Tensor) -> Tensor:
-    """Weight 0..1 of a tile: how far its coherence exceeds that of white noise, 1 /
-    sqrt(samples).
-    """
+    """Weight 0..1 of a tile: how far its coherence exceeds that of white noise."""
     coherence = products.abs() / torch.where(power > 0, power, 1)
     return (1 - 6 / (_TILE_LINES * _TILE_COLUMNS * coherence.square()).clamp_min(1e-9)).clamp_min(0)

@@ -1,10 +1,11 @@
-"""Doppler centroid within one PRF: phase increment and energy centre, blind to velocity (brief 004,
-item 5; Tsvetkov 2017).
+"""Doppler centroid within one PRF: mean phase increment and energy centre of the azimuth spectrum.
 
-Both estimators are the first Fourier coefficient of the azimuth power spectrum, once taken in time
-(the products of adjacent lines) and once in frequency, so they agree to rounding and are not
-independent evidence. Doppler is positive when closing. Lines that are all zero (missing) take part
-in no product and bias neither.
+Neither estimator needs the velocity (Tsvetkov 2017, Doppler estimation). Both are the first Fourier
+coefficient of the azimuth power spectrum, taken once in time (the products of adjacent lines) and
+once in frequency. They agree to rounding and are therefore not independent evidence.
+
+Doppler is positive when closing. Lines that are all zero (missing) enter no product and bias
+neither estimator.
 """
 
 from __future__ import annotations
@@ -18,24 +19,39 @@ from torch import Tensor
 from torchsar.core import Estimate, Signal, Stage, fft_lines, legendre, settle
 from torchsar.radar import StripmapRadar
 
-OVER = ("mean", "median")
+OVER = ("mean", "median")  # how `combine_blocks` combines the blocks
 
 
 def wrap_hz(frequency_hz: Tensor, prf_hz: float) -> Tensor:
-    """Into -prf/2 .. prf/2."""
+    """Wrap frequencies into the interval -PRF/2 .. PRF/2.
+
+    Args:
+        frequency_hz: Frequencies in Hz, any shape.
+        prf_hz: Pulse repetition frequency in Hz.
+
+    Returns:
+        The wrapped frequencies in Hz, same shape.
+    """
     return frequency_hz - prf_hz * torch.round(frequency_hz / prf_hz)
 
 
 def unit_peak(x: Tensor) -> Tensor:
-    """x over its detached peak modulus per trial, so that squares neither under- nor overflow.
+    """Divide each trial by its peak modulus, so that squares neither underflow nor overflow.
 
-    (..., pulse, range).
+    The peak is detached: gradients do not pass through it.
+
+    Args:
+        x: Lines, shape (..., pulse, range), complex.
+
+    Returns:
+        The scaled lines, same shape; a trial of zeros is returned as it is.
     """
     peak = x.detach().abs().amax((-2, -1), keepdim=True)
     return x / torch.where(peak > 0, peak, 1)
 
 
 def _bounds(n: int, parts: int, what: str) -> list[tuple[int, int]]:
+    """First and last index of each of `parts` nearly equal parts of 0..n."""
     if not 1 <= parts <= n:
         raise ValueError(f"{parts} blocks do not fit {n} {what}; choose 1..{n}")
     edges = [round(i * n / parts) for i in range(parts + 1)]
@@ -43,12 +59,22 @@ def _bounds(n: int, parts: int, what: str) -> list[tuple[int, int]]:
 
 
 def lag_products(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> tuple[Tensor, Tensor]:
-    """Sums of conj(line n) * line n+1 over blocks of (pulse, range), and the mean power of the same
-    pairs.
+    """Sum the products of adjacent lines, and their mean powers, over blocks.
 
-    x: (..., pulse, range). Returns products (..., a, b) complex128 and power (..., a, b) float64
-    with |product| <= power; every pair of adjacent lines belongs to exactly one block. Scale free:
-    x is divided by its peak per trial. Differentiable.
+    The products are conj(line n) * line n+1. Every pair of adjacent lines belongs to exactly one
+    block. The lines are divided by their peak per trial, so the results do not depend on the scale
+    of the input. Differentiable.
+
+    Args:
+        x: Lines, shape (..., pulse, range), complex.
+        blocks: Number of blocks a along pulses and b along range.
+
+    Returns:
+        The products, shape (..., a, b), complex128, and the mean power of the same pairs, shape
+        (..., a, b), float64, with |product| <= power.
+
+    Raises:
+        ValueError: If there are fewer pairs of lines or range cells than blocks.
     """
     x = unit_peak(x)
     columns = [last - first for first, last in _bounds(x.shape[-1], blocks[1], "range samples")]
@@ -66,15 +92,25 @@ def lag_products(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> tuple[Tensor, T
 
 
 def _sums(x: Tensor, sizes: list[int]) -> Tensor:
+    """Sums over consecutive parts of the last dimension with the given sizes."""
     return torch.stack([part.sum(-1) for part in x.split(sizes, -1)], -1)
 
 
 def block_spectra(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> Tensor:
-    """Azimuth power spectra of blocks of lines, summed over the range blocks: (..., a, b, n)
-    float64 in FFT order.
+    """Compute azimuth power spectra of blocks of lines, summed over the range cells of each block.
 
-    Blocks share one line with the next one and are zero-padded, so that their first Fourier
-    coefficients are `lag_products`.
+    Each block shares one line with the next and is padded with zeros, so that the first Fourier
+    coefficient of its spectrum equals its `lag_products`.
+
+    Args:
+        x: Lines, shape (..., pulse, range), complex.
+        blocks: Number of blocks a along pulses and b along range.
+
+    Returns:
+        Power spectra in FFT order, shape (..., a, b, n), float64.
+
+    Raises:
+        ValueError: If there are fewer pairs of lines or range cells than blocks.
     """
     x = unit_peak(x)
     segments = _bounds(x.shape[-2] - 1, blocks[0], "pairs of lines")
@@ -89,8 +125,16 @@ def block_spectra(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> Tensor:
 
 
 def circular_centre(spectrum: Tensor) -> Tensor:
-    """First Fourier coefficient of a power spectrum (..., n) in FFT order; its argument over 2 pi
-    is the energy centre in sampling rates.
+    """Compute the first Fourier coefficient of a power spectrum.
+
+    Its argument divided by 2 pi is the energy centre of the spectrum, as a fraction of the sampling
+    rate.
+
+    Args:
+        spectrum: Power spectrum in FFT order, shape (..., n).
+
+    Returns:
+        The coefficient, shape (...,), complex128.
     """
     n = spectrum.shape[-1]
     turns = torch.arange(n, dtype=torch.float64, device=spectrum.device) / n
@@ -99,9 +143,16 @@ def circular_centre(spectrum: Tensor) -> Tensor:
 
 
 def plain_energy_centre(spectrum: Tensor, prf_hz: float) -> Tensor:
-    """Ordinary centre of mass of a spectrum (..., n) in FFT order, Hz.
+    """Compute the ordinary, non-circular centre of mass of a power spectrum.
 
-    The baseline that is wrong wherever the spectrum wraps.
+    A baseline for comparison: it is wrong wherever the spectrum wraps. Use `energy_centre` instead.
+
+    Args:
+        spectrum: Power spectrum in FFT order, shape (..., n).
+        prf_hz: Pulse repetition frequency in Hz.
+
+    Returns:
+        The centre of mass in Hz, shape (...,), float64; 0 for an empty spectrum.
     """
     spectrum = spectrum.to(torch.float64)
     frequency = torch.fft.fftfreq(spectrum.shape[-1], 1 / prf_hz, dtype=torch.float64, device=spectrum.device)
@@ -110,11 +161,19 @@ def plain_energy_centre(spectrum: Tensor, prf_hz: float) -> Tensor:
 
 
 def combine_blocks(products: Tensor, over: str = "mean") -> Tensor:
-    """One phase increment (rad) from the products of all blocks, (..., a, b) -> (...,).
+    """Combine the products of all blocks into one phase increment per trial.
 
-    "mean": argument of their sum, weighted by energy. "median": of the blocks' angles, measured
-    from that mean so that they do not wrap; each block with energy counts once, so that one bright
-    block cannot rule.
+    Args:
+        products: Block products, shape (..., a, b), complex.
+        over: "mean" takes the argument of their sum, which weights blocks by their energy. "median"
+            takes the median of their angles about that mean, so that the angles do not wrap; each
+            block with energy has equal weight, so that one bright block cannot dominate.
+
+    Returns:
+        The phase increment from line to line in rad, shape (...,).
+
+    Raises:
+        ValueError: If `over` is neither "mean" nor "median".
     """
     if over not in OVER:
         raise ValueError(f"blocks are combined by one of {OVER}, got {over!r}")
@@ -122,17 +181,22 @@ def combine_blocks(products: Tensor, over: str = "mean") -> Tensor:
     mean = torch.angle(flat.sum(-1))
     if over == "mean":
         return mean
-    deviation = torch.angle(flat * torch.polar(torch.ones_like(mean), -mean)[..., None])
-    deviation = torch.where(flat.abs() > 0, deviation, torch.nan)
-    return mean + settle(torch.nanquantile(deviation, 0.5, dim=-1), 0.0)[0]
+    offset = torch.angle(flat * torch.polar(torch.ones_like(mean), -mean)[..., None])
+    offset = torch.where(flat.abs() > 0, offset, torch.nan)
+    return mean + settle(torch.nanquantile(offset, 0.5, dim=-1), 0.0)[0]
 
 
 def increment_std_rad(products: Tensor, phase_rad: Tensor) -> Tensor:
-    """Predicted deviation of a combined increment from the scatter of the blocks about it, (..., a,
-    b), (...,) -> (...,).
+    """Predict the standard deviation of a combined phase increment from the scatter of the blocks.
 
-    Holds whatever makes blocks differ: noise, speckle and scene content. pi where there is no
-    energy.
+    It includes everything that makes blocks differ: noise, speckle and scene content.
+
+    Args:
+        products: Block products, shape (..., a, b), complex.
+        phase_rad: Combined increment in rad, shape (...,).
+
+    Returns:
+        The standard deviation in rad, shape (...,); pi where there is no energy.
     """
     flat = products.flatten(-2) * torch.polar(torch.ones_like(phase_rad), -phase_rad)[..., None]
     count = (flat.abs() > 0).sum(-1)
@@ -144,8 +208,20 @@ def increment_std_rad(products: Tensor, phase_rad: Tensor) -> Tensor:
 
 
 def baseband_estimate(products: Tensor, power: Tensor, phase_rad: Tensor, prf_hz: float, **info: Tensor) -> Estimate:
-    """Estimate of `doppler_baseband_hz` from block products: quality is the lag-1 coherence, ok
-    where the increment is known to a tenth of a turn.
+    """Make the estimate of the baseband Doppler centroid from block products.
+
+    Args:
+        products: Block products, shape (..., a, b), complex.
+        power: Mean power of the same pairs of lines, shape (..., a, b).
+        phase_rad: Combined phase increment in rad, shape (...,).
+        prf_hz: Pulse repetition frequency in Hz.
+        info: Further entries of the estimate's info.
+
+    Returns:
+        `doppler_baseband_hz` of shape (...,), positive when closing, with its standard deviation.
+        quality is the coherence of adjacent lines. `ok` is False where there is no energy, or where
+        the standard deviation of the increment exceeds a tenth of a turn. info: block_hz,
+        block_power, both of shape (..., a, b).
     """
     scale = prf_hz / (2 * math.pi)
     std = increment_std_rad(products, phase_rad)
@@ -161,21 +237,52 @@ def baseband_estimate(products: Tensor, power: Tensor, phase_rad: Tensor, prf_hz
 
 
 def phase_increment(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8), over: str = "mean") -> Estimate:
-    """Doppler centroid from the mean phase increment between adjacent lines, f = prf * dphi / (2
-    pi). x: (..., pulse, range).
+    """Estimate the baseband Doppler centroid from the mean phase increment between adjacent lines.
 
-    info: block_hz, block_power (..., a, b), the increments along the strip and over range.
+    The centroid is f = PRF * dphi / (2 pi). It is ambiguous by multiples of the PRF;
+    `DopplerCentroid` resolves the ambiguity.
+
+    Args:
+        x: Lines, shape (..., pulse, range), complex.
+        prf_hz: Pulse repetition frequency in Hz.
+        blocks: Number of blocks along pulses and along range.
+        over: "mean" or "median" over the blocks, see `combine_blocks`.
+
+    Returns:
+        An estimate as `baseband_estimate` describes it. info["block_hz"] shows how the centroid
+        varies along the strip and over range.
+
+    Raises:
+        ValueError: If there are fewer pairs of lines or range cells than blocks, or `over` is
+            unknown.
+
+    Reference:
+        Tsvetkov 2017, text before Fig. 5.
     """
     products, power = lag_products(x, blocks)
     return baseband_estimate(products, power, combine_blocks(products, over), prf_hz)
 
 
 def energy_centre(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8)) -> Estimate:
-    """Doppler centroid as the circular energy centre of the azimuth power spectrum averaged over
-    range. x: (..., pulse, range).
+    """Estimate the baseband Doppler centroid as the circular energy centre of the azimuth spectrum.
 
-    info: as phase_increment, and spectrum (..., n) in FFT order, plain_baseband_hz (the
-    non-circular centre, a baseline that is wrong).
+    The power spectrum is averaged over range. The result agrees with `phase_increment` to rounding.
+
+    Args:
+        x: Lines, shape (..., pulse, range), complex.
+        prf_hz: Pulse repetition frequency in Hz.
+        blocks: Number of blocks along pulses and along range.
+
+    Returns:
+        An estimate as `baseband_estimate` describes it. info also holds spectrum, shape (..., n) in
+        FFT order, and plain_baseband_hz, the non-circular centre, which is wrong where the spectrum
+        wraps.
+
+    Raises:
+        ValueError: If there are fewer pairs of lines or range cells than blocks.
+
+    Reference:
+        Tsvetkov 2017, energy centre of the azimuth spectrum.
     """
     spectra = block_spectra(x, blocks)
     products, power = circular_centre(spectra), spectra.mean(-1)
@@ -191,13 +298,24 @@ def energy_centre(x: Tensor, prf_hz: float, blocks: tuple[int, int] = (8, 8)) ->
 
 
 def fit_over_range(products: Tensor, power: Tensor, order: int, rounds: int = 12) -> tuple[Tensor, Tensor]:
-    """Robust polynomial of the phase increment over range blocks. products, power: (..., b).
+    """Fit a robust polynomial to the phase increment over range blocks.
 
-    Returns coefficients (..., order + 1), residuals (..., b), rad.
+    The polynomial is a sum of Legendre polynomials of the block centre u in -1..1. Blocks are
+    weighted with the square of their coherence. Blocks that lie off the curve by more than the
+    common scatter are weighted down (Cauchy weights), so that a few very bright targets do not bend
+    the curve.
 
-    Legendre polynomials of the block centre u in -1..1. Blocks weigh with their coherence; those
-    that lie off the curve by more than the common scatter lose weight (Cauchy), so a few very
-    bright targets cannot bend it.
+    Args:
+        products: Block products, shape (..., b), complex.
+        power: Mean power of the same pairs of lines, shape (..., b).
+        order: Order of the polynomial.
+        rounds: Number of reweighted least-squares rounds.
+
+    Returns:
+        The coefficients in rad, shape (..., order + 1), and the residuals in rad, shape (..., b).
+
+    Raises:
+        ValueError: If the order is negative or not below the number of range blocks.
     """
     count = products.shape[-1]
     if not 0 <= order < count:
@@ -217,6 +335,7 @@ def fit_over_range(products: Tensor, power: Tensor, order: int, rounds: int = 12
 
 
 def _weighted_fit(basis: Tensor, y: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Coefficients and residuals of a weighted least-squares fit of y (..., b) by basis (b, n)."""
     weighted = basis * weight[..., None]
     normal = weighted.mT @ basis
     ridge = 1e-12 * (normal.diagonal(dim1=-2, dim2=-1).amax(-1) + 1e-30)
@@ -226,13 +345,30 @@ def _weighted_fit(basis: Tensor, y: Tensor, weight: Tensor) -> tuple[Tensor, Ten
 
 
 def block_centres(count: int, device: torch.device | None = None) -> Tensor:
-    """Centres of `count` equal blocks of -1..1, float64."""
+    """Compute the centres of equal blocks of the interval -1..1.
+
+    Args:
+        count: Number of blocks.
+        device: Device of the result.
+
+    Returns:
+        The centres, shape (count,), float64.
+    """
     return (2 * torch.arange(count, dtype=torch.float64, device=device) + 1) / count - 1
 
 
 class PhaseIncrement(Stage):
-    """`doppler_baseband_hz` from the mean (or median over blocks) phase increment between lines;
-    leaves the signal alone.
+    """Baseband Doppler centroid from the phase increment between lines.
+
+    Provides `doppler_baseband_hz` and leaves the signal unchanged. See `phase_increment`.
+
+    Args:
+        radar: Radar parameters, of which the PRF is used.
+        blocks: Number of blocks along pulses and along range.
+        over: "mean" or "median" over the blocks.
+
+    Raises:
+        ValueError: If `over` is neither "mean" nor "median".
     """
 
     provides = ("doppler_baseband_hz",)
@@ -244,12 +380,18 @@ class PhaseIncrement(Stage):
         self.prf_hz, self.blocks, self.over = radar.prf_hz, blocks, over
 
     def forward(self, signal: Signal) -> Estimate:
+        """Estimate the baseband centroid of a signal of axes (pulse, range)."""
         return phase_increment(signal.data, self.prf_hz, self.blocks, self.over)
 
 
 class EnergyCentre(Stage):
-    """`doppler_baseband_hz` from the circular energy centre of the azimuth spectrum; leaves the
-    signal alone.
+    """Baseband Doppler centroid as the circular energy centre of the spectrum.
+
+    Provides `doppler_baseband_hz` and leaves the signal unchanged. See `energy_centre`.
+
+    Args:
+        radar: Radar parameters, of which the PRF is used.
+        blocks: Number of blocks along pulses and along range.
     """
 
     provides = ("doppler_baseband_hz",)
@@ -259,16 +401,22 @@ class EnergyCentre(Stage):
         self.prf_hz, self.blocks = radar.prf_hz, blocks
 
     def forward(self, signal: Signal) -> Estimate:
+        """Estimate the baseband centroid of a signal of axes (pulse, range)."""
         return energy_centre(signal.data, self.prf_hz, self.blocks)
 
 
 class RangeDependentCentroid(Stage):
-    """Doppler centroid of every range sample, a robust polynomial over range blocks.
+    """Doppler centroid of every range cell, by a robust polynomial over range.
 
-    Values: doppler_range_hz (..., range), and doppler_baseband_hz (...,) at the middle of the
-    swath. Connected to an absolute `doppler_hz`, the curve is absolute too (the multiple of the PRF
-    nearest to it at mid-swath); otherwise it is baseband. info: block_hz (..., b), coefficients_hz
-    (..., order + 1) of Legendre polynomials.
+    Provides `doppler_range_hz` of shape (..., range), and `doppler_baseband_hz` of shape (...,) in
+    the middle of the swath; leaves the signal unchanged. If an absolute `doppler_hz` is connected,
+    the curve is absolute too, by the multiple of the PRF that brings it nearest to that value in
+    the middle of the swath; otherwise it is baseband.
+
+    Args:
+        radar: Radar parameters, of which the PRF is used.
+        order: Order of the polynomial over range, see `fit_over_range`.
+        blocks: Number of blocks along pulses and along range.
     """
 
     provides = ("doppler_range_hz", "doppler_baseband_hz")
@@ -278,6 +426,22 @@ class RangeDependentCentroid(Stage):
         self.prf_hz, self.order, self.blocks = radar.prf_hz, order, blocks
 
     def forward(self, signal: Signal, doppler_hz: Tensor | None = None) -> Estimate:
+        """Estimate the centroid of every range cell of a signal of axes (pulse, range).
+
+        Args:
+            signal: Lines, shape (..., pulse, range), complex.
+            doppler_hz: Absolute centroid in Hz, shape (...,), positive when closing.
+
+        Returns:
+            `doppler_range_hz` and `doppler_baseband_hz` in Hz, the latter with its standard
+            deviation. `ok` is False where there is no energy, or where that standard deviation
+            exceeds a tenth of the PRF. info: block_hz, shape (..., b), and coefficients_hz, shape
+            (..., order + 1), of the Legendre polynomials.
+
+        Raises:
+            ValueError: If there are too few lines or range cells for the blocks, or too few blocks
+                for the order.
+        """
         products, power = (part.sum(-2) for part in lag_products(signal.data, self.blocks))
         coefficients, residual = fit_over_range(products, power, self.order)
         scale = self.prf_hz / (2 * math.pi)
@@ -306,13 +470,23 @@ class RangeDependentCentroid(Stage):
 def point_doppler(
     x: Tensor, prf_hz: float, rate_hz_s: Tensor | float = 0.0, centre_hz: Tensor | float = 0.0, rounds: int = 6
 ) -> Tensor:
-    """Doppler of one point at the middle line of its aperture, from its azimuth history x (...,
-    pulse): maximum likelihood.
+    """Estimate the Doppler of one point at the middle line of its aperture by maximum likelihood.
 
-    rate_hz_s: magnitude of its Doppler rate, (...,) or a number, taken out first (0 for a tone).
-    The peak of the zero-padded spectrum is refined by Newton steps; reaches the Cramer-Rao bound of
-    a tone, 0.39 / (T sqrt(q)), below the paper's curve 1 / (T sqrt(q)). The result lies within half
-    a PRF of centre_hz. It is the Doppler of that point at that time, not the centroid of the beam.
+    The known quadratic phase is removed first. The peak of the zero-padded spectrum is then refined
+    by Newton steps. The result reaches the Cramer-Rao bound of a tone, 0.39 / (T sqrt(q)), below
+    the reference curve 1 / (T sqrt(q)) of Tsvetkov (2017). It is the Doppler of that point at that
+    time, not the centroid of the beam.
+
+    Args:
+        x: Azimuth history of the point, shape (..., pulse), complex.
+        prf_hz: Pulse repetition frequency in Hz.
+        rate_hz_s: Magnitude of the Doppler rate in Hz/s, shape (...,) or a number; 0 for a tone.
+        centre_hz: Frequency in Hz, shape (...,) or a number, within half a PRF of which the result
+            lies.
+        rounds: Number of Newton steps.
+
+    Returns:
+        The Doppler in Hz, shape (...,), float64, positive when closing.
     """
     n = x.shape[-1]
     t = (torch.arange(n, dtype=torch.float64, device=x.device) - (n - 1) / 2) / prf_hz

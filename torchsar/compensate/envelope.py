@@ -1,15 +1,16 @@
-"""Alignment of the envelopes of pulses in range, ahead of any estimate of their phases (brief 002,
-section 9).
+"""Alignment of the envelopes of pulses in range, before their phases are estimated.
 
-A shift is the place of a pulse against what the pulses have in common, in cells, towards greater
-range and circular in the window. It is to be removed: `shift_range(data, -shift_cells)`. Envelopes
-are powers |s|^2 on a grid of half cells, where they are band-limited and shifts by any fraction
-exact, each over its own mean: neither the phase nor the gain of a pulse can change its shift.
+A shift is the position of a pulse relative to what all pulses have in common, in range cells,
+positive towards greater range and circular in the window. `shift_range(data, -shift_cells)` removes
+it. Envelopes are powers |s|^2 on a grid of half cells, on which they are band-limited, so that
+shifts by any fraction of a cell are exact. Each is divided by its own mean: neither the phase nor
+the gain of a pulse affects its shift.
 
-A range cell of many scatterers is speckle: its power in a pulse is exponential about the mean T of
-all pulses, noise included. The log-likelihood of a shift is then the correlation of |s|^2 with -1 /
-T, not with T or with |s|. On the aircraft of brief 002 this halves the jitter of single pulses and
-lets a polynomial be found at -10 dB.
+A range cell with many scatterers is speckle: its power in a pulse has an exponential distribution
+about the mean T of all pulses, noise included. The log-likelihood of a shift is then the
+correlation of |s|^2 with -1 / T, not with T nor of |s|. On a simulated aircraft (as in Ruan et al.
+2013, Fig. 2) this halves the jitter of single pulses and allows a polynomial to be fitted at -10
+dB.
 """
 
 from __future__ import annotations
@@ -32,42 +33,62 @@ from torchsar.compensate.envelope_fit import (
     unit_time,
     with_tones,
 )
+from torchsar.compensate.pulse_phase import autofocus, correct_pulse_phase
 from torchsar.compensate.pulse_phase.data import checked
-from torchsar.compensate.pulse_phase.recommended import autofocus
-from torchsar.compensate.pulse_phase.stages import correct_pulse_phase
 from torchsar.core import Estimate, Signal, Stage, block_bytes_of, fft_lines, legendre, linear_phasor, refuse_non_finite
 from torchsar.metrics.image import entropy
 from torchsar.optim.descent import lbfgs
 
-GOOD_CELLS = 0.5  # deviation of a shift beyond which an alignment is not ok
+# standard deviation of a shift in cells from which on an alignment is not ok: a convention
+GOOD_CELLS = 0.5
 
 
 def shift_range(data: Tensor, shift_cells: Tensor | float) -> Tensor:
-    """Every pulse moved by its shift towards greater range, circularly.
+    """Shift every pulse in range, circularly.
 
-    data: (..., pulse, range) complex; shift_cells: (..., pulse), (pulse,) or a number.
+    The shift is a linear phase about the centre of fast time, which is the middle of the band: the
+    phase of an echo does not change with its position. Unitary; shift_range(., -s) reverses
+    shift_range(., s). Differentiable in both arguments.
 
-    A linear phase about the centre of fast time, the middle of the band: the phase of an echo does
-    not turn with its place. Unitary, and shift_range(., -s) undoes shift_range(., s).
-    Differentiable in both. Raises ValueError for shifts of another shape or not finite.
+    Args:
+        data: Range-compressed pulses, shape (..., pulse, range), complex.
+        shift_cells: Shifts in range cells, positive towards greater range, shape (..., pulse),
+            (pulse,) or a number.
+
+    Returns:
+        The shifted pulses, shape (..., pulse, range), complex.
+
+    Raises:
+        ValueError: If the shifts have another shape or are not finite.
     """
     n = data.shape[-1]
     shift = torch.as_tensor(shift_cells, dtype=torch.float64, device=data.device)
     if shift.ndim and shift.shape[-1] != data.shape[-2]:
-        raise ValueError(f"one shift per pulse is needed, (..., {data.shape[-2]}), got {tuple(shift.shape)}")
+        raise ValueError(
+            f"shift_range: one shift per pulse is needed, (..., {data.shape[-2]}), got {tuple(shift.shape)}"
+        )
     refuse_non_finite(shift, "shift_range: shift_cells")
     phasor = torch.fft.ifftshift(linear_phasor(-shift / n, -(n // 2), n, data.dtype), dim=-1)
     return torch.fft.ifft(torch.fft.fft(data) * phasor)
 
 
 def align_running(data: Tensor, *, memory_pulses: float = 10.0) -> Estimate:
-    """Shift of each pulse against an exponentially running mean of the aligned ones before it, with
-    value["shift_cells"] (..., pulse).
+    """Estimate the shift of each pulse against a running mean of the aligned pulses before it.
 
-    data: (..., pulse, range) complex, range-compressed. Correlates |s|, peak by a parabola through
-    samples a quarter of a cell apart. memory_pulses: how far the mean reaches back. Follows any
-    motion of less than half a window from pulse to pulse, but the mean drifts: for a start. See
-    `align_envelopes`, also for std, ok and errors.
+    Correlates |s|; the peak is found by a parabola through samples a quarter of a cell apart.
+    Follows any motion of less than half a window from pulse to pulse, but the mean drifts: use it
+    as a start for other methods.
+
+    Args:
+        data: Range-compressed pulses, shape (..., pulse, range), complex.
+        memory_pulses: Length of the exponential memory of the mean, in pulses.
+
+    Returns:
+        `shift_cells` of shape (..., pulse); std, quality and `ok` as for `align_envelopes`.
+
+    Raises:
+        TypeError: If the data are not complex.
+        ValueError: If the data are empty or not finite, or `memory_pulses` is below 1.
     """
     if not memory_pulses >= 1:
         raise ValueError(f"align_running: memory_pulses is {memory_pulses}; choose 1 or more")
@@ -77,14 +98,24 @@ def align_running(data: Tensor, *, memory_pulses: float = 10.0) -> Estimate:
 def align_mean(
     data: Tensor, *, first: Literal["running", "none"] = "running", match: Match = "likelihood", iterations: int = 4
 ) -> Estimate:
-    """Shift of each pulse by itself against the mean envelope of all, iterated, with
-    value["shift_cells"] (..., pulse).
+    """Estimate the shift of each pulse separately against the mean envelope, iteratively.
 
-    data: (..., pulse, range) complex. first: where to begin, the running mean or the data as they
-    are. match: "likelihood" correlates |s|^2 with -1 / T, "amplitude" |s| with its mean. On a
-    perfect recording of the aircraft the shifts have 0.03 cell (likelihood) or 0.07 cell rms of
-    speckle jitter. For motion that has no smooth course; otherwise `align_envelopes`, also for std,
-    ok and errors.
+    For motion that is not a smooth function of slow time; otherwise use `align_envelopes`. On
+    noise-free data of a simulated aircraft the shifts have an rms speckle jitter of 0.03 cell
+    ("likelihood") or 0.07 cell ("amplitude").
+
+    Args:
+        data: Range-compressed pulses, shape (..., pulse, range), complex.
+        first: Where to begin: "running" with the running mean, "none" with the data as they are.
+        match: "likelihood" correlates |s|^2 with -1 / T, "amplitude" correlates |s| with its mean.
+        iterations: Number of times that the mean envelope is formed anew.
+
+    Returns:
+        `shift_cells` of shape (..., pulse); std, quality and `ok` as for `align_envelopes`.
+
+    Raises:
+        TypeError: If the data are not complex.
+        ValueError: If the data are empty or not finite, or an option is invalid.
     """
     if first not in ("running", "none") or match not in ("likelihood", "amplitude") or iterations < 1:
         raise ValueError(
@@ -104,25 +135,40 @@ def align_mean(
 def align_envelopes(
     data: Tensor, *, degree: int | None = 2, tones: int = 0, passes: int = 6, blocks: int = 16
 ) -> Estimate:
-    """The recommended alignment, with value["shift_cells"] (..., pulse) to be removed: a smooth
-    course of shifts of mean zero.
+    """Estimate a smooth history of range shifts; the recommended alignment.
 
-    data: (..., pulse, range) complex, range-compressed, of any phases. The line along which the
-    coarse envelopes add up best, then `passes` rounds: the mean envelope, the likelihood of the
-    shift of each of `blocks` runs of pulses against that of the others, and a polynomial of
-    `degree` through these, robust against runs that went wrong. tones: number of sinusoids
-    (vibration) that are then looked for in the shifts of single pulses, and kept where they stand
-    out; they need periods of two pulses or more, and shifts of single pulses, that is about -5 dB.
-    degree None: shifts of single pulses, not smoothed, begun at a parabola.
+    First the straight line is found along which the coarse envelopes add up best. In each of
+    `passes` rounds, the likelihood of the shift of each block of pulses is evaluated against the
+    mean envelope of the other blocks, and a polynomial is fitted to these shifts, robust against
+    blocks that failed. Shifts may cross the ends of the window any number of times, but must not
+    depart from a straight line by half a window. Not differentiable.
 
-    On the aircraft of brief 002 (400 pulses) the course is found to 0.02 cell down to -8 dB and to
-    0.05 cell at -12.5 dB, and costs perfect data less than 0.002 nats. Shifts may pass the ends of
-    the window any number of times, but not curve away from a line by half a window. A pulse of
-    zeros takes the place that the course gives it. std: half of the rms difference between what the
-    lower and the upper half of the band say, each found from nothing, or the deviation of the
-    course by the scatter of its runs where that is more; ok: it is below half a cell. quality: 1 /
-    (1 + (2 std)^2). Not differentiable. Raises TypeError or ValueError for samples that are not
-    finite and complex, or settings that make no sense.
+    On a simulated aircraft of 400 pulses the shift history is found to 0.02 cell down to -8 dB and
+    to 0.05 cell at -12.5 dB; on noise-free data the alignment costs less than 0.002 nats of
+    entropy.
+
+    Args:
+        data: Range-compressed pulses of any phase, shape (..., pulse, range), complex.
+        degree: Degree of the polynomial. None returns unsmoothed shifts of single pulses that start
+            from a parabola.
+        tones: Number of sinusoids (vibration) that are also estimated, from the shifts of single
+            pulses, and kept where they clearly exceed the jitter. Needs periods of two pulses or
+            more and about -5 dB.
+        passes: Number of rounds.
+        blocks: Number of blocks of pulses.
+
+    Returns:
+        `shift_cells` of shape (..., pulse), of mean zero; `shift_range(data, -shift_cells)` removes
+        it. A pulse of zeros has the shift of the fitted history. Its standard deviation is half of
+        the rms difference between independent estimates from the lower and the upper half of the
+        band, or the standard deviation of the history by the scatter of its blocks if that is
+        larger. quality is 1 / (1 + (2 std)^2). `ok` is False where the standard deviation reaches
+        half a cell, or fewer than two pulses hold samples. info["present"] marks the pulses that
+        hold samples.
+
+    Raises:
+        TypeError: If the data are not complex.
+        ValueError: If the data are empty or not finite, or an option is invalid.
     """
     whole = all(isinstance(value, int) for value in (degree or 0, tones, passes, blocks))
     if not (whole and (degree is None or degree >= 0) and tones >= 0 and passes >= 1 and blocks >= 1) or (
@@ -135,10 +181,10 @@ def align_envelopes(
         )
 
     def find(pulses: Envelopes) -> Course:
-        smooth, deviation = smooth_shifts(pulses, 2 if degree is None else degree, passes, blocks)
+        smooth, std = smooth_shifts(pulses, 2 if degree is None else degree, passes, blocks)
         if degree is None:
             return single_shifts(pulses, smooth, "likelihood", 3), None
-        return with_tones(pulses, smooth, tones, degree), deviation
+        return with_tones(pulses, smooth, tones, degree), std
 
     return _estimated(data, "align_envelopes", find)
 
@@ -146,15 +192,27 @@ def align_envelopes(
 def refine_alignment(
     data: Tensor, shift_cells: Tensor, *, degree: int = 2, rounds: int = 2, steps: int = 15
 ) -> Estimate:
-    """Image-based refinement: the polynomial that, added to shifts (..., pulse), gives the image of
-    least entropy, with value["shift_cells"].
+    """Refine an alignment by the polynomial of shifts that gives the image of least entropy.
 
-    data: (..., pulse, range) complex. In each round `autofocus` finds the phases at the present
-    shifts; then the coefficients of degrees 1..degree are varied with these phases held
-    (torchsar.optim.lbfgs, each trial by itself, at most `steps` steps). A round that does not lower
-    the entropy is not taken. Needs phases that can be found, that is shifts within about a cell. On
-    shifts of `align_envelopes` it changes the entropy by less than 0.005. ok and quality: those of
-    the last autofocus. Errors as `align_envelopes`.
+    In each round `autofocus` finds the phases for the present shifts; then the coefficients of
+    degrees 1 to `degree` are varied with these phases held. A round that does not lower the entropy
+    is discarded. Assumes shifts that are right within about a cell, so that the phases can be
+    found. After `align_envelopes` it changes the entropy by less than 0.005 nats.
+
+    Args:
+        data: Range-compressed pulses, shape (..., pulse, range), complex.
+        shift_cells: Shifts to refine, in cells, shape (..., pulse).
+        degree: Degree of the polynomial.
+        rounds: Number of rounds.
+        steps: Largest number of descent steps in a round; each trial descends separately.
+
+    Returns:
+        `shift_cells` of shape (..., pulse). quality and `ok` are those of the last `autofocus`.
+        info["entropy_nats"], shape (...,), is the entropy of the image.
+
+    Raises:
+        TypeError: If the data are not complex.
+        ValueError: If the data are empty or not finite, or degree or rounds are below 1.
     """
     flat, _ = checked(data, "refine_alignment")
     if degree < 1 or rounds < 1:
@@ -184,12 +242,18 @@ def refine_alignment(
 
 
 def _focused(data: Tensor, shift: Tensor, phase_rad: Tensor) -> Tensor:
+    """Image of the data with the given shifts and phases removed."""
     return fft_lines(correct_pulse_phase(shift_range(data, -shift), phase_rad))
 
 
 def drift_cells(shift_cells: Tensor) -> Tensor:
-    """Mean drift of shifts (..., pulse), cells a pulse (...,): the slope of the line through them
-    by least squares; 0 for a single pulse.
+    """Compute the mean drift of shifts: the slope of the straight line fitted by least squares.
+
+    Args:
+        shift_cells: Shifts in cells, shape (..., pulse).
+
+    Returns:
+        The drift in cells per pulse, shape (...,); 0 for a single pulse.
     """
     n = shift_cells.shape[-1]
     k = torch.arange(n, dtype=shift_cells.dtype, device=shift_cells.device) - (n - 1) / 2
@@ -197,21 +261,22 @@ def drift_cells(shift_cells: Tensor) -> Tensor:
 
 
 def _estimated(data: Tensor, name: str, find: Callable[[Envelopes], Course]) -> Estimate:
-    """Shifts of the whole band and, to judge them, of its lower and upper half, whose speckle and
-    noise are independent.
+    """Estimate of shifts by `find`, with a standard deviation from both halves of the band.
+
+    The speckle and the noise of the lower and the upper half of the band are independent.
     """
     flat, present = checked(data, name)
     height = (
         max(1, 8 * block_bytes_of(flat.device) // max(1, flat[0].numel() * flat.element_size())) if len(flat) else 1
     )
     with torch.no_grad():
-        parts = [_judged(flat[first : first + height].detach(), find) for first in range(0, len(flat), height)]
+        parts = [_shifts_and_std(flat[first : first + height].detach(), find) for first in range(0, len(flat), height)]
     parts = parts or [
         (torch.zeros_like(present, dtype=torch.float64), torch.zeros(0, dtype=torch.float64, device=flat.device))
     ]  # no trials
     shift, std = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
-    learnable = present.sum(-1) >= 2
-    shift, std = torch.where(learnable[:, None], shift, 0), torch.where(learnable, std, data.shape[-1] / math.sqrt(12))
+    enough = present.sum(-1) >= 2
+    shift, std = torch.where(enough[:, None], shift, 0), torch.where(enough, std, data.shape[-1] / math.sqrt(12))
     quality = 1 / (1 + (std / GOOD_CELLS).square())
     shape = data.shape[:-2]
     wide = std[:, None].expand_as(shift).reshape(data.shape[:-1])
@@ -219,28 +284,31 @@ def _estimated(data: Tensor, name: str, find: Callable[[Envelopes], Course]) -> 
         value={"shift_cells": shift.reshape(data.shape[:-1])},
         std={"shift_cells": wide},
         quality=quality.reshape(shape),
-        ok=(learnable & (std < GOOD_CELLS)).reshape(shape),
+        ok=(enough & (std < GOOD_CELLS)).reshape(shape),
         info={"present": present.reshape(data.shape[:-1])},
     )
 
 
-def _judged(lines: Tensor, find: Callable[[Envelopes], Course]) -> tuple[Tensor, Tensor]:
-    """Shifts (trial, pulse) and their deviation (trial,) in cells: what the halves disagree by, or
-    what the method says itself where that is more.
+def _shifts_and_std(lines: Tensor, find: Callable[[Envelopes], Course]) -> tuple[Tensor, Tensor]:
+    """Shifts (trial, pulse) and their standard deviation (trial,) in cells.
+
+    The standard deviation follows from the difference between the halves of the band, or is the one
+    that `find` returns where that is larger.
     """
     envelopes, n = Envelopes.of(lines), lines.shape[-1]
-    shift, deviation = find(envelopes)
+    shift, std = find(envelopes)
     if n < 4:
         return shift, shift.new_full(shift.shape[:1], n / math.sqrt(12))
     lower, upper = (find(Envelopes.of(half))[0] * (n / half.shape[-1]) for half in _band_halves(lines))
-    off = about_circular_mean(lower - upper, envelopes.present, n)
-    disagreement = (off.square().sum(-1) / envelopes.present.sum(-1).clamp_min(1)).sqrt() / 2
-    return shift, disagreement if deviation is None else torch.maximum(disagreement, deviation)
+    difference = about_circular_mean(lower - upper, envelopes.present, n)
+    band_std = (difference.square().sum(-1) / envelopes.present.sum(-1).clamp_min(1)).sqrt() / 2
+    return shift, band_std if std is None else torch.maximum(band_std, std)
 
 
 def _band_halves(lines: Tensor) -> list[Tensor]:
-    """Pulses compressed from the two halves of the band alone, each about its own middle, (trial,
-    pulse, n // 2), cells twice as wide.
+    """Pulses compressed from the two halves of the band, each shifted to baseband.
+
+    (trial, pulse, n // 2) each, with cells twice as wide.
     """
     half = lines.shape[-1] // 2
     spectrum = torch.fft.fftshift(torch.fft.fft(lines), dim=-1)
@@ -248,13 +316,19 @@ def _band_halves(lines: Tensor) -> list[Tensor]:
 
 
 class AlignEnvelopes(Stage):
-    """`align_envelopes`, with shift_m (..., pulse) towards greater range, to be removed by
-    `ShiftRange`, and the range rate velocity_m_s (...,).
+    """Range shift of every pulse and the residual range rate; a stage for `align_envelopes`.
 
-    velocity_m_s: that of the residual drift (receding positive), added to the one that the pulses
-    were compressed with where such a value is connected: what `focus.CompressDechirped` should be
-    given. Drift is known modulo a window per pulse, and an acceleration a adds a f0 / gamma to it
-    where dechirped pulses couple range to Doppler (0.13 s in brief 002).
+    Provides `shift_m` of shape (..., pulse), positive towards greater range, to be removed by
+    `ShiftRange`, and the range rate `velocity_m_s` of shape (...,), receding positive. The signal
+    is left unchanged. Drift is known modulo a window per pulse. Where dechirped pulses couple range
+    to Doppler, an acceleration a adds a f0 / gamma to the range rate (f0 / gamma is 0.13 s for the
+    parameters of Ruan et al. 2013).
+
+    Args:
+        degree: Degree of the polynomial, see `align_envelopes`.
+        tones: Number of sinusoids, see `align_envelopes`.
+        passes: Number of rounds.
+        blocks: Number of blocks of pulses.
     """
 
     provides = ("shift_m", "velocity_m_s")
@@ -264,6 +338,18 @@ class AlignEnvelopes(Stage):
         self.degree, self.tones, self.passes, self.blocks = degree, tones, passes, blocks
 
     def forward(self, signal: Signal, velocity_m_s: Tensor | None = None) -> Estimate:
+        """Estimate the shifts of a signal of axes (pulse, range).
+
+        Args:
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            velocity_m_s: Range rate in m/s for which the pulses were compressed, shape (...,).
+
+        Returns:
+            `shift_m` in metres with its standard deviation, and `velocity_m_s`, the range rate of
+            the residual drift plus that of the compression: the value to give to
+            `torchsar.focus.CompressDechirped`. quality, `ok` and info are those of
+            `align_envelopes`.
+        """
         found = align_envelopes(
             signal.data, degree=self.degree, tones=self.tones, passes=self.passes, blocks=self.blocks
         )
@@ -277,9 +363,20 @@ class AlignEnvelopes(Stage):
 
 
 class ShiftRange(Stage):
-    """Moves every pulse back by shift_m (..., pulse), a value of `AlignEnvelopes`: see
-    `shift_range`. Differentiable in both.
+    """Shift of every pulse back in range by a connected value `shift_m`; see `shift_range`.
+
+    Differentiable in the signal and the shifts.
     """
 
     def forward(self, signal: Signal, shift_m: Tensor) -> Signal:
+        """Shift the pulses of a signal of axes (pulse, range).
+
+        Args:
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            shift_m: Shifts to remove in metres, shape (..., pulse), positive towards greater range,
+                such as those of `AlignEnvelopes`.
+
+        Returns:
+            The signal with every pulse moved by -shift_m.
+        """
         return signal.with_data(shift_range(signal.data, -shift_m / signal.axis("range").step))

@@ -1,5 +1,6 @@
-"""The courses that shifts of envelopes take: shifts of single pulses, lines, robust polynomials and
-tones, found by the likelihood of speckle.
+"""Shift histories of envelopes, found by the likelihood of speckle.
+
+Shifts of single pulses, straight lines, robust polynomials of slow time, and sinusoids.
 """
 
 from __future__ import annotations
@@ -15,25 +16,31 @@ from torchsar.core import legendre, linear_phasor
 
 Match = Literal["likelihood", "amplitude"]
 
-_HALF = 2  # samples a cell: |s|^2 has twice the band of s
-_QUARTER = 4  # samples a cell in correlations, whose other factor has no band limit
-_FLOOR = 1e-2  # of the mean power: what the likelihood takes an empty cell to hold
-_COARSE = 16  # cycles in the window, the finest features that drift is looked for in
-_TUKEY = 4.685
-_LEAST_CELLS = 1e-3
-_LEAST_TONE_CELLS = 0.05  # smaller ones cost less than they would add
-_TUNINGS = 5
-_STANDS_OUT = (
-    # of the mean power of a periodogram, beyond the log of the number of its cells: one false tone
-    # in 400 trials
-    6.0
-)
+_HALF = 2  # samples per cell: |s|^2 has twice the band of s
+_QUARTER = 4  # samples per cell in correlations, whose other factor is not band-limited
+# least power of a cell in the likelihood, over the mean power: empty cells must not dominate
+_FLOOR = 1e-2
+# cycles in the window of the finest features used for the mean drift, found by trial: finer
+# features agree only close to the right drift, coarser ones measure it less well
+_COARSE = 16
+_TUKEY = 4.685  # the usual constant of the biweight: 95 % efficiency for normal errors
+_LEAST_CELLS = 1e-3  # keeps the scale of the biweight positive; far below any jitter
+_LEAST_TONE_CELLS = 0.05  # amplitude of a tone whose removal costs as much as it gains
+_TUNINGS = 5  # Gauss-Newton steps for a tone, found by trial: enough to converge
+# power of a tone in the mean powers of a periodogram, beyond the log of its number of cells: one
+# false tone in 400 trials (exp(-6) = 1 / 403)
+_STANDS_OUT = 6.0
 
 
 @dataclass(frozen=True)
 class Envelopes:
-    """Powers of pulses as half spectra (trial, pulse, frequency), frequency i being i / n cycles a
-    cell; zero where not present (trial, pulse). n: cells.
+    """Power envelopes of pulses, as half spectra over range.
+
+    Args:
+        spectra: Half spectra, shape (trial, pulse, frequency), complex; frequency i is i / n cycles
+            per cell. Zero for pulses that are not present.
+        present: False where a pulse holds only zeros, shape (trial, pulse), bool.
+        n: Number of range cells.
     """
 
     spectra: Tensor
@@ -42,13 +49,18 @@ class Envelopes:
 
     @property
     def count(self) -> Tensor:
-        """Pulses that are there, (trial, 1, 1), at least 1."""
+        """Number of pulses that are present, shape (trial, 1, 1), at least 1."""
         return self.present.sum(-1)[:, None, None].clamp_min(1)
 
     @staticmethod
     def of(lines: Tensor) -> Envelopes:
-        """Envelopes of pulses (trial, pulse, range): |s|^2 on half cells over its mean in each
-        pulse.
+        """Compute the envelopes of pulses: |s|^2 on half cells, over its mean in each pulse.
+
+        Args:
+            lines: Pulses, shape (trial, pulse, range), complex.
+
+        Returns:
+            The envelopes.
         """
         n = lines.shape[-1]
         present = (lines != 0).any(-1)
@@ -59,49 +71,74 @@ class Envelopes:
         return Envelopes(torch.fft.rfft(power / torch.where(mean > 0, mean, 1)), present, n)
 
     def moved(self, shift: Tensor) -> Tensor:
-        """Spectra with shifts (trial, pulse) in cells taken out."""
+        """Remove shifts from the envelopes.
+
+        Args:
+            shift: Shifts in cells, shape (trial, pulse), towards greater range.
+
+        Returns:
+            Spectra, shape (trial, pulse, frequency).
+        """
         return self.spectra * linear_phasor(shift / self.n, 0, self.spectra.shape[-1], self.spectra.dtype)
 
     def amplitudes(self) -> Envelopes:
-        """The same of |s|."""
+        """Compute the envelopes of |s| instead of |s|^2."""
         return Envelopes(torch.fft.rfft(self.on_grid(self.spectra).clamp_min(0).sqrt()), self.present, self.n)
 
     def on_grid(self, spectra: Tensor, per_cell: int = _HALF) -> Tensor:
-        """Samples of half spectra, per_cell of them a cell."""
+        """Compute samples of envelopes from their half spectra.
+
+        Args:
+            spectra: Half spectra, shape (..., frequency).
+            per_cell: Samples per range cell.
+
+        Returns:
+            The samples, shape (..., per_cell * n).
+        """
         return torch.fft.irfft(spectra, per_cell * self.n) * (per_cell / _HALF)
 
     def likelihood(self, mean: Tensor) -> Tensor:
-        """Spectrum of -1 / T, as far as envelopes reach, for that of the mean envelope T:
-        correlated with the power of a pulse, the log-likelihood of its shift.
+        """Compute the spectrum of -1 / T within the band of the envelopes, for a mean envelope T.
+
+        Its correlation with the power of a pulse is the log-likelihood of the shift of that pulse.
+
+        Args:
+            mean: Half spectrum of T, shape (..., frequency).
+
+        Returns:
+            The half spectrum, shape (..., frequency).
         """
         weight = -1 / self.on_grid(mean, _QUARTER).clamp_min(_FLOOR)
         return torch.fft.rfft(weight)[..., : self.spectra.shape[-1]] * (_HALF / _QUARTER)
 
     def peak(self, spectra: Tensor) -> Tensor:
-        """Place in cells, -n/2..n/2, of the maximum of a correlation given by its half spectrum
-        (..., frequency): a parabola through three samples a quarter of a cell apart.
+        """Find the position of the maximum of a correlation, by a parabola through three samples.
+
+        The samples are a quarter of a cell apart.
+
+        Args:
+            spectra: Half spectrum of the correlation, shape (..., frequency).
+
+        Returns:
+            The position in cells, -n/2..n/2, shape (...,), float64.
         """
-        samples = self.on_grid(
-            torch.cat([torch.zeros_like(spectra[..., :1]), spectra[..., 1:]], -1), _QUARTER
-        )  # its mean says nothing, and costs digits
+        # the mean does not affect the maximum; without it, rounding errors are smaller
+        samples = self.on_grid(torch.cat([torch.zeros_like(spectra[..., :1]), spectra[..., 1:]], -1), _QUARTER)
         length = samples.shape[-1]
         at = samples.argmax(-1, keepdim=True)
         left, top, right = (samples.gather(-1, (at + step) % length).to(torch.float64) for step in (-1, 0, 1))
         bend = left - 2 * top + right
         part = torch.where(bend < 0, 0.5 * (left - right) / torch.where(bend < 0, bend, -1), 0)
-        place = (at + torch.where(torch.isfinite(part), part, 0)).squeeze(-1)
-        return torch.where(place > length / 2, place - length, place) / _QUARTER
+        position = (at + torch.where(torch.isfinite(part), part, 0)).squeeze(-1)
+        return torch.where(position > length / 2, position - length, position) / _QUARTER
 
 
-Course = tuple[
-    Tensor, Tensor | None
-]  # shifts (trial, pulse), and their deviation (trial,) where the method has one of its own
+# shifts (trial, pulse), and their standard deviation (trial,) if the method predicts one
+Course = tuple[Tensor, Tensor | None]
 
 
 def _half_cells(lines: Tensor) -> Tensor:
-    """Band-limited interpolation to half cells; the whole spectrum of n samples stays, from -n // 2
-    on.
-    """
+    """Band-limited interpolation to half cells; all n frequencies are kept, from -(n // 2) on."""
     n = lines.shape[-1]
     spectrum = torch.fft.fftshift(torch.fft.fft(lines), dim=-1)
     before = n - n // 2
@@ -110,8 +147,16 @@ def _half_cells(lines: Tensor) -> Tensor:
 
 
 def running_shifts(pulses: Envelopes, gain: float) -> Tensor:
-    """Shifts against a mean that each pulse enters with `gain`, (trial, pulse) float64, continued
-    over the ends of the window from pulse to pulse.
+    """Find the shift of each pulse against an exponentially running mean of the pulses before it.
+
+    Shifts continue over the ends of the window from pulse to pulse.
+
+    Args:
+        pulses: Envelopes.
+        gain: Weight with which a pulse enters the mean.
+
+    Returns:
+        The shifts in cells, shape (trial, pulse), float64, of mean zero.
     """
     amplitude = pulses.amplitudes()
     mean, shift, shifts = (
@@ -131,8 +176,18 @@ def running_shifts(pulses: Envelopes, gain: float) -> Tensor:
 
 
 def single_shifts(pulses: Envelopes, start: Tensor, match: Match, iterations: int) -> Tensor:
-    """Shifts of pulses by themselves against the mean envelope, within half a window of the start,
-    (trial, pulse) float64.
+    """Find the shift of each pulse separately against the mean envelope.
+
+    The shifts lie within half a window of the start.
+
+    Args:
+        pulses: Envelopes.
+        start: Shifts to start from, in cells, shape (trial, pulse).
+        match: "likelihood" correlates |s|^2 with -1 / T, "amplitude" correlates |s| with its mean.
+        iterations: Number of times that the mean envelope is formed anew.
+
+    Returns:
+        The shifts in cells, shape (trial, pulse), float64, of mean zero.
     """
     used = pulses.amplitudes() if match == "amplitude" else pulses
     shift = start
@@ -145,8 +200,17 @@ def single_shifts(pulses: Envelopes, start: Tensor, match: Match, iterations: in
 
 
 def smooth_shifts(pulses: Envelopes, degree: int, passes: int, blocks: int) -> tuple[Tensor, Tensor]:
-    """Polynomial course of the shifts, (trial, pulse) float64 of mean zero, and its deviation by
-    the scatter of the runs about it, (trial,).
+    """Fit a polynomial of slow time to the shifts of blocks of pulses.
+
+    Args:
+        pulses: Envelopes.
+        degree: Degree of the polynomial.
+        passes: Number of rounds.
+        blocks: Number of blocks of pulses, at least `degree` + 1 of which are used.
+
+    Returns:
+        The shifts in cells, shape (trial, pulse), float64, of mean zero; and their standard
+        deviation in cells by the scatter of the blocks about the polynomial, shape (trial,).
     """
     k = pulses.present.shape[-1]
     basis = legendre(unit_time(k, pulses.present.device), degree)
@@ -156,22 +220,29 @@ def smooth_shifts(pulses: Envelopes, degree: int, passes: int, blocks: int) -> t
     middle = (runs @ basis) / count.clamp_min(1)[..., None]
     for _ in range(passes):
         sums = runs.to(pulses.spectra.dtype) @ pulses.moved(shift)
-        # a run is held against the others alone: its own noise would hold it where it is
+        # a block is compared with the others alone: its own noise would keep its present shift
         others = (sums.sum(-2, keepdim=True) - sums) / (count.sum(-1, keepdim=True) - count).clamp_min(1)[..., None]
         found = pulses.peak(sums * pulses.likelihood(others).conj())
         step = robust_fit(found, middle, count)
         shift = shift + (basis @ step[..., None]).squeeze(-1)
         shift = shift - shift.mean(-1, keepdim=True)
-    off = (found - (middle @ step[..., None]).squeeze(-1)).abs()
-    return shift, _middling(off, count > 0).squeeze(-1) * ((degree + 1) / (count > 0).sum(-1).clamp_min(1)).sqrt()
+    residual = (found - (middle @ step[..., None]).squeeze(-1)).abs()
+    return shift, _robust_std(residual, count > 0).squeeze(-1) * (
+        (degree + 1) / (count > 0).sum(-1).clamp_min(1)
+    ).sqrt()
 
 
 def mean_drift(pulses: Envelopes) -> Tensor:
-    """Cells a pulse, (trial,) float64, modulo the window: the line along which the coarse features
-    of all envelopes together add up best.
+    """Find the mean drift of the envelopes: the straight line along which they add up best.
 
-    sum_f |sum_k P_k(f) exp(2j pi f v k / n)|^2 over the lowest frequencies f and all v at once,
-    from one zero-padded transform along pulses.
+    Maximises sum_f |sum_k P_k(f) exp(2j pi f v k / n)|^2 over the drift v, with the lowest
+    frequencies f only, for all v at once from one zero-padded transform along pulses.
+
+    Args:
+        pulses: Envelopes.
+
+    Returns:
+        The drift in cells per pulse, modulo the window, shape (trial,), float64.
     """
     k, last = pulses.present.shape[-1], min(_COARSE, pulses.n - 1)
     if last < 1:
@@ -185,33 +256,47 @@ def mean_drift(pulses: Envelopes) -> Tensor:
 
 
 def robust_fit(values: Tensor, basis: Tensor, weight: Tensor, iterations: int = 12) -> Tensor:
-    """Coefficients (trial, term) of basis (trial, m, term) through values (trial, m), by reweighted
-    least squares: absolute deviations, then Tukey's biweight.
+    """Fit a linear model by reweighted least squares that withstands outliers.
 
-    weight: (trial, m), zero for values that do not count. The scale of the biweight is the median
-    deviation of each trial.
+    The first half of the iterations minimises absolute residuals, the second uses Tukey's biweight
+    with the median absolute residual of each trial as its scale.
+
+    Args:
+        values: Values, shape (trial, m).
+        basis: Basis, shape (trial, m, term).
+        weight: Weights, shape (trial, m); zero excludes a value.
+        iterations: Number of iterations.
+
+    Returns:
+        The coefficients, shape (trial, term).
     """
     now, coefficients = weight, torch.zeros_like(basis[:, 0])
-    for turn in range(iterations):
+    for iteration in range(iterations):
         coefficients = weighted_fit(values, basis, now)
-        off = (values - (basis @ coefficients[..., None]).squeeze(-1)).abs()
-        if turn < iterations // 2:
-            now = weight / off.clamp_min(0.1)
+        residual = (values - (basis @ coefficients[..., None]).squeeze(-1)).abs()
+        if iteration < iterations // 2:
+            now = weight / residual.clamp_min(0.1)
         else:
-            scale = _middling(off, weight > 0) + _LEAST_CELLS
-            now = weight * (1 - (off / (_TUKEY * scale)).square()).clamp_min(0).square()
+            scale = _robust_std(residual, weight > 0) + _LEAST_CELLS
+            now = weight * (1 - (residual / (_TUKEY * scale)).square()).clamp_min(0).square()
     return coefficients
 
 
-def _middling(off: Tensor, counts: Tensor) -> Tensor:
-    """Deviation of normal errors with the median of these sizes (trial, m), (trial, 1)."""
-    return 1.4826 * torch.where(counts, off, torch.nan).nanmedian(-1, keepdim=True).values.nan_to_num()
+def _robust_std(magnitude: Tensor, used: Tensor) -> Tensor:
+    """Standard deviation (trial, 1) of normal errors from the median of their magnitudes."""
+    return 1.4826 * torch.where(used, magnitude, torch.nan).nanmedian(-1, keepdim=True).values.nan_to_num()
 
 
 def weighted_fit(values: Tensor, basis: Tensor, weight: Tensor) -> Tensor:
-    """Least squares, (trial, term); directions that nothing determines get zero.
+    """Fit a linear model by weighted least squares.
 
-    Shapes as `robust_fit`.
+    Args:
+        values: Values, shape (trial, m).
+        basis: Basis, shape (trial, m, term).
+        weight: Weights, shape (trial, m).
+
+    Returns:
+        The coefficients, shape (trial, term); zero along directions that the data do not determine.
     """
     share = weight / weight.sum(-1, keepdim=True).clamp_min(torch.finfo(weight.dtype).tiny)
     normal = (basis.mT * share[:, None]) @ basis
@@ -221,8 +306,9 @@ def weighted_fit(values: Tensor, basis: Tensor, weight: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class _Tone:
-    """One sinusoid per trial: frequency (trial,) in cycles a pulse, cosine and sine parts (trial,
-    2) in cells.
+    """One sinusoid per trial.
+
+    frequency: (trial,) in cycles per pulse. parts: cosine and sine amplitudes (trial, 2) in cells.
     """
 
     frequency: Tensor
@@ -234,7 +320,7 @@ class _Tone:
         return torch.stack([torch.cos(angle), torch.sin(angle)], -1)
 
     def columns(self, time: Tensor) -> Tensor:
-        """Derivatives of the sinusoid after its two parts and its frequency, (trial, pulse, 3)."""
+        """Derivatives with respect to both parts and the frequency, (trial, pulse, 3)."""
         waves = self.waves(time)
         turned = (self.parts[:, None, 1] * waves[..., 0] - self.parts[:, None, 0] * waves[..., 1]) * (
             2 * math.pi * (time - time.mean())
@@ -243,8 +329,18 @@ class _Tone:
 
 
 def with_tones(pulses: Envelopes, smooth: Tensor, tones: int, degree: int) -> Tensor:
-    """The course with up to `tones` sinusoids added one by one, each only in trials where it stands
-    out of the jitter of single pulses, (trial, pulse).
+    """Add sinusoids to a shift history, one by one.
+
+    A sinusoid is added only in trials where it clearly exceeds the jitter of single pulses.
+
+    Args:
+        pulses: Envelopes.
+        smooth: Shift history in cells, shape (trial, pulse).
+        tones: Largest number of sinusoids.
+        degree: Degree of the polynomial that is fitted together with each sinusoid.
+
+    Returns:
+        The shift history in cells, shape (trial, pulse).
     """
     course = smooth
     for _ in range(tones):
@@ -253,16 +349,14 @@ def with_tones(pulses: Envelopes, smooth: Tensor, tones: int, degree: int) -> Te
 
 
 def _with_tone(pulses: Envelopes, course: Tensor, degree: int) -> Tensor:
-    """The course with one more sinusoid, tuned together with the polynomial by Gauss-Newton steps
-    through the shifts of single pulses.
-    """
+    """Shift history with one more sinusoid, fitted together with the polynomial."""
     k = course.shape[-1]
     time, weight = torch.arange(k, dtype=torch.float64, device=course.device), pulses.present.to(torch.float64)
     terms = legendre(unit_time(k, course.device), degree).expand(len(course), -1, -1)
-    frequency, stands_out = strongest_tone(_left(pulses, course), pulses.present)
+    frequency, stands_out = strongest_tone(_residual_shifts(pulses, course), pulses.present)
     tone, base, now = _Tone(frequency, torch.zeros_like(terms[:, 0, :1]).expand(-1, 2)), course, course
     for _ in range(_TUNINGS):
-        step = robust_fit(_left(pulses, now), torch.cat([terms, tone.columns(time)], -1), weight)
+        step = robust_fit(_residual_shifts(pulses, now), torch.cat([terms, tone.columns(time)], -1), weight)
         tone = _Tone(tone.frequency + step[:, -1].clamp(-0.5 / k, 0.5 / k), tone.parts + step[:, -3:-1])
         base = base + (terms @ step[:, :-3, None]).squeeze(-1)
         now = base + (tone.waves(time) @ tone.parts[..., None]).squeeze(-1)
@@ -271,57 +365,111 @@ def _with_tone(pulses: Envelopes, course: Tensor, degree: int) -> Tensor:
     return centred(torch.where(kept[:, None], now, course), torch.ones_like(pulses.present))
 
 
-def _left(pulses: Envelopes, course: Tensor) -> Tensor:
-    """What single pulses are off a course, (trial, pulse)."""
+def _residual_shifts(pulses: Envelopes, course: Tensor) -> Tensor:
+    """Shifts of single pulses relative to a shift history, (trial, pulse)."""
     return single_shifts(pulses, course, "likelihood", 1) - course
 
 
 def log_likelihood(pulses: Envelopes, course: Tensor) -> Tensor:
-    """Of a course, (trial,), with the mean envelope T that is best for it: - pulses * sum over
-    cells of ln T.
+    """Compute the log-likelihood of a shift history, with the mean envelope T that is best for it.
+
+    It is -(number of pulses) * sum over cells of ln T, up to a constant.
+
+    Args:
+        pulses: Envelopes.
+        course: Shift history in cells, shape (trial, pulse).
+
+    Returns:
+        The log-likelihood, shape (trial,), float64.
     """
     mean = pulses.on_grid(pulses.moved(course).sum(-2, keepdim=True) / pulses.count).clamp_min(_FLOOR)
     return -(torch.log(mean).sum(-1, keepdim=True) * pulses.count / _HALF)[:, 0, 0].to(torch.float64)
 
 
 def strongest_tone(rest: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
-    """Frequency (cycles a pulse) of the strongest sinusoid in residual shifts (trial, pulse), and
-    whether noise would hardly hold it; both (trial,).
+    """Find the frequency of the strongest sinusoid in residual shifts.
+
+    Args:
+        rest: Residual shifts in cells, shape (trial, pulse).
+        present: False for pulses without samples, shape (trial, pulse), bool.
+
+    Returns:
+        The frequency in cycles per pulse, shape (trial,), and whether noise would hardly contain a
+        sinusoid as strong, shape (trial,), bool.
     """
     k = rest.shape[-1]
     limit = 3 * rest.abs().median(-1, keepdim=True).values
     power = torch.fft.rfft(torch.where(present, rest.clamp(-limit, limit), 0), 8 * k).abs().square()
-    power[:, :8] = 0  # less than a period is the polynomial's
+    power[:, :8] = 0  # less than one period in the aperture is left to the polynomial
     top, at = power.max(-1)
     return at / (8 * k), top > (math.log(k) + _STANDS_OUT) * power.mean(-1)
 
 
 def about_circular_mean(shift: Tensor, present: Tensor, n: int) -> Tensor:
-    """Shifts (trial, pulse) less their mean on the circle of n cells, in -n/2..n/2; zero where not
-    present.
+    """Subtract from shifts their mean on the circle of n cells.
+
+    Args:
+        shift: Shifts in cells, shape (trial, pulse).
+        present: False for pulses without samples, shape (trial, pulse), bool.
+        n: Number of cells of the window.
+
+    Returns:
+        The shifts in cells, in -n/2..n/2, shape (trial, pulse); zero for pulses that are not
+        present.
     """
-    turn = torch.where(present, torch.polar(torch.ones_like(shift), 2 * math.pi / n * shift), 0)
-    return torch.where(present, wrapped(shift - torch.angle(turn.sum(-1, keepdim=True)) * (n / (2 * math.pi)), n), 0)
+    phasor = torch.where(present, torch.polar(torch.ones_like(shift), 2 * math.pi / n * shift), 0)
+    return torch.where(present, wrapped(shift - torch.angle(phasor.sum(-1, keepdim=True)) * (n / (2 * math.pi)), n), 0)
 
 
 def centred(shift: Tensor, present: Tensor) -> Tensor:
-    """Shifts (trial, pulse) less their mean over the pulses that are there."""
+    """Subtract from shifts their mean over the pulses that are present.
+
+    Args:
+        shift: Shifts in cells, shape (trial, pulse).
+        present: False for pulses without samples, shape (trial, pulse), bool.
+
+    Returns:
+        The shifts in cells, shape (trial, pulse).
+    """
     return shift - (shift * present).sum(-1, keepdim=True) / present.sum(-1, keepdim=True).clamp_min(1)
 
 
 def wrapped(cells: Tensor, n: int) -> Tensor:
-    """Modulo the window, in -n/2..n/2."""
+    """Wrap shifts into the window, to -n/2..n/2.
+
+    Args:
+        cells: Shifts in cells, any shape.
+        n: Number of cells of the window.
+
+    Returns:
+        The wrapped shifts, same shape.
+    """
     return cells - n * torch.round(cells / n)
 
 
 def unit_time(n: int, device: torch.device) -> Tensor:
-    """Pulses on -1..1."""
+    """Compute the times of n pulses on the interval -1..1.
+
+    Args:
+        n: Number of pulses.
+        device: Device of the result.
+
+    Returns:
+        The times, shape (n,), float64.
+    """
     return (2 * torch.arange(n, dtype=torch.float64, device=device) - (n - 1)) / max(1, n - 1)
 
 
 def runs_of(n: int, blocks: int, present: Tensor) -> Tensor:
-    """Which pulses that are there belong to which of at most `blocks` runs of equal length, (trial,
-    run, pulse) of 0 and 1, float64.
+    """Divide the pulses into blocks of equal length.
+
+    Args:
+        n: Number of pulses.
+        blocks: Largest number of blocks.
+        present: False for pulses without samples, shape (trial, pulse), bool.
+
+    Returns:
+        1 where a present pulse belongs to a block, else 0; shape (trial, block, pulse), float64.
     """
     length = -(-n // blocks)
     run = torch.arange(n, device=present.device) // length

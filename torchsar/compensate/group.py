@@ -1,9 +1,9 @@
-"""A small group of range lines cut out of a recording, focused by itself, quickly and as often as
-an estimator likes.
+"""A small group of range cells, cut out of a recording and focused alone.
 
-The group may lie elsewhere in every trial, so its reference range is a per-trial tensor. Focusing
-is the bulk + refocus omega-K of the chain (`torchsar.focus.omega_k`) referred to the middle of the
-group, in the frame of the Doppler centroid.
+Estimators focus such a group many times at low cost. The group may lie elsewhere in every trial, so
+its reference range is a tensor per trial. It is focused by the omega-K algorithm in its form of
+bulk compression and refocusing (`torchsar.focus.omega_k`), referred to the middle of the group, in
+the frame of the Doppler centroid.
 """
 
 from __future__ import annotations
@@ -19,34 +19,62 @@ from torchsar.focus.omega_k import FrameGeometry, FrequencyBasis, bulk_filter, r
 from torchsar.focus.reference import range_compress
 from torchsar.radar import StripmapRadar
 
+# range cells of a block: wide enough for the range walk that a wrong velocity leaves
 BLOCK_COLUMNS = 32
 
 
 def aperture_s(radar: StripmapRadar, n_range: int) -> float:
-    """Time a target stays in the recorded band: the nominal dwell, or the time to sweep one PRF
-    where none is known.
+    """Return the time that a target stays in the recorded band.
+
+    Args:
+        radar: Radar parameters.
+        n_range: Number of range samples.
+
+    Returns:
+        The nominal dwell in seconds, or the time to sweep one PRF if no dwell is known.
     """
     middle = radar.near_range_m + n_range / 2 * radar.range_step_m
     return radar.aperture_s(middle)
 
 
 def central_lines(raw: Tensor, most: int) -> Tensor:
-    """At most `most` lines about the middle of the record, (..., pulse, range)."""
+    """Cut out the lines about the middle of the record.
+
+    Args:
+        raw: Lines, shape (..., pulse, range).
+        most: Largest number of lines to keep.
+
+    Returns:
+        At most `most` lines, shape (..., pulse, range).
+    """
     first = max(0, (raw.shape[-2] - most) // 2)
     return raw[..., first : first + most, :]
 
 
 def full_columns(n_range: int, pulse_samples: int) -> int:
-    """Columns of a compressed line that hold the whole pulse; all of them where the line is hardly
-    longer than the pulse.
+    """Count the columns of a compressed line that hold the whole pulse.
+
+    Args:
+        n_range: Number of range samples of the line.
+        pulse_samples: Length of the pulse in samples.
+
+    Returns:
+        The number of columns; all of them if the line is hardly longer than the pulse.
     """
     return n_range - pulse_samples if n_range > pulse_samples + 64 else n_range
 
 
 def compress(raw: Tensor, radar: StripmapRadar, spectrum: Tensor | None) -> Tensor:
-    """Range-compressed lines, only the fully compressed columns.
+    """Compress lines in range and keep only the fully compressed columns.
 
-    spectrum: range reference, None for compressed data.
+    Args:
+        raw: Lines, shape (..., pulse, range), complex.
+        radar: Radar parameters.
+        spectrum: Range reference spectrum, shape (range,); None if `raw` is already
+            range-compressed.
+
+    Returns:
+        Range-compressed lines, shape (..., pulse, column), complex.
     """
     if spectrum is None:
         return raw
@@ -55,8 +83,12 @@ def compress(raw: Tensor, radar: StripmapRadar, spectrum: Tensor | None) -> Tens
 
 @dataclass(frozen=True)
 class RangeGroup:
-    """Compressed lines (..., pulse, width) whose column 0 is column `start` (...,) of the
-    recording.
+    """Range-compressed lines of neighbouring range cells.
+
+    Args:
+        data: Lines, shape (..., pulse, width), complex.
+        start: Range sample of the recording at which column 0 lies, shape (...,).
+        radar: Radar parameters.
     """
 
     data: Tensor
@@ -65,7 +97,7 @@ class RangeGroup:
 
     @property
     def middle_m(self) -> Tensor:
-        """Slant range of column width // 2, (...,) float64."""
+        """Slant range in metres of column width // 2, shape (...,), float64."""
         return (
             self.radar.near_range_m
             + (self.start + self.data.shape[-1] // 2).to(torch.float64) * self.radar.range_step_m
@@ -74,8 +106,12 @@ class RangeGroup:
 
 @dataclass(frozen=True)
 class BeamSpectrum:
-    """Two-dimensional spectrum of a group, or those of its rows that are wanted: data (..., d,
-    width), doppler_hz (..., d).
+    """Two-dimensional spectrum of a group, or a part of its Doppler rows.
+
+    Args:
+        group: The group.
+        data: Spectrum, shape (..., d, width), complex.
+        doppler_hz: Doppler of the rows in Hz, shape (..., d).
     """
 
     group: RangeGroup
@@ -83,11 +119,26 @@ class BeamSpectrum:
     doppler_hz: Tensor
 
     def moved(self, by_hz: Tensor | float) -> BeamSpectrum:
-        """The same samples read as lying by_hz higher in absolute Doppler."""
+        """Interpret the same samples as lying higher in absolute Doppler.
+
+        Args:
+            by_hz: Increase of the Doppler in Hz, shape (...,) or a number.
+
+        Returns:
+            The spectrum with the new Doppler of its rows.
+        """
         return replace(self, doppler_hz=self.doppler_hz + by_hz)
 
     def rows(self, frame_hz: Tensor, velocity_m_s: Tensor | float) -> Tensor:
-        """Range-Doppler rows of the focused group, (..., d, width)."""
+        """Focus the group in the range-Doppler domain.
+
+        Args:
+            frame_hz: Doppler of the frame of the image in Hz, shape (...,).
+            velocity_m_s: Effective velocity in m/s, shape (...,) or a number.
+
+        Returns:
+            Range-Doppler rows of the focused group, shape (..., d, width), complex.
+        """
         radar, n = self.group.radar, self.data.shape[-1]
         at = FrameGeometry(
             radar,
@@ -100,16 +151,31 @@ class BeamSpectrum:
         return refocus(torch.fft.ifft(rows), refocus_turns_per_sample(at), n // 2)
 
     def image(self, frame_hz: Tensor, velocity_m_s: Tensor | float) -> Tensor:
-        """Image of the group, (..., azimuth, width), sampled as coarsely as the band allows.
+        """Focus the group, sampled in azimuth as coarsely as the band of the rows allows.
 
         Differentiable in the velocity.
+
+        Args:
+            frame_hz: Doppler of the frame of the image in Hz, shape (...,).
+            velocity_m_s: Effective velocity in m/s, shape (...,) or a number.
+
+        Returns:
+            Image, shape (..., azimuth, width), complex.
         """
         return fft_lines(self.rows(frame_hz, velocity_m_s), inverse=True)
 
 
 def full_spectrum(group: RangeGroup, doppler_hz: Tensor) -> BeamSpectrum:
-    """All rows in FFT order, unwrapped about the centroid (...,): images of it keep the phase from
-    line to line.
+    """Compute the whole spectrum of a group, unwrapped about the Doppler centroid.
+
+    The rows are in FFT order; images of this spectrum keep the phase from line to line.
+
+    Args:
+        group: The group.
+        doppler_hz: Centroid in Hz, shape (...,).
+
+    Returns:
+        The spectrum with all its Doppler rows.
     """
     return BeamSpectrum(
         group, torch.fft.fft2(group.data), group.radar.doppler_hz(group.data.shape[-2], doppler_hz, group.data.device)
@@ -117,11 +183,18 @@ def full_spectrum(group: RangeGroup, doppler_hz: Tensor) -> BeamSpectrum:
 
 
 def beam_spectrum(group: RangeGroup, doppler_hz: Tensor, margin: float = 1.2) -> BeamSpectrum:
-    """Rows of a group about the centroid (...,) in rising Doppler: `margin` times the band of the
-    beam's dwell, all where no dwell is known.
+    """Compute the spectrum of a group within the Doppler band of the beam.
 
-    Outside that band there is only noise, whose phase under the azimuth filter changes fastest with
-    velocity: it would make objectives rough.
+    Outside that band there is only noise. Its phase under the azimuth filter changes fastest with
+    the velocity and would make objective functions rough.
+
+    Args:
+        group: The group.
+        doppler_hz: Centroid in Hz, shape (...,).
+        margin: Width of the band that is kept, as a multiple of the band of the beam's dwell.
+
+    Returns:
+        The spectrum with its rows in rising Doppler; all rows if no dwell is known.
     """
     radar, n, full = group.radar, group.data.shape[-2], full_spectrum(group, doppler_hz)
     order = full.doppler_hz.argsort(-1)
@@ -134,11 +207,17 @@ def beam_spectrum(group: RangeGroup, doppler_hz: Tensor, margin: float = 1.2) ->
 
 
 def column_signal(lines: Tensor) -> Tensor:
-    """Energy of each column above the background, in backgrounds, limited to 10: (..., pulse,
-    range) -> (..., range) float64, never quite 0.
+    """Measure the energy of each column above the background.
 
-    The background is the column at the lowest tenth; what four deviations of noise could be does
-    not count. The limit keeps one ship from outweighing a hundred good columns.
+    The background is the energy of the column at the lowest tenth. Four standard deviations of
+    noise are subtracted. The result is limited to 10, so that one ship does not outweigh a hundred
+    good columns, and is never quite 0.
+
+    Args:
+        lines: Lines or an image, shape (..., pulse, range), complex.
+
+    Returns:
+        The energy above the background, in units of the background, shape (..., range), float64.
     """
     energy = (lines.detach().real.square() + lines.detach().imag.square()).sum(-2).to(torch.float64)
     floor = energy.kthvalue(max(1, energy.shape[-1] // 10), dim=-1, keepdim=True).values
@@ -147,39 +226,64 @@ def column_signal(lines: Tensor) -> Tensor:
 
 
 def pick_group(lines: Tensor, radar: StripmapRadar, width: int) -> RangeGroup:
-    """The group of `width` columns with the most signal above the background, nearer to mid-swath
-    where several are alike.
+    """Choose the group of columns with the most signal above the background.
+
+    Among similar groups the one nearer to the middle of the swath is chosen.
+
+    Args:
+        lines: Range-compressed lines, shape (..., pulse, range), complex.
+        radar: Radar parameters.
+        width: Number of columns.
+
+    Returns:
+        The group, which may lie elsewhere in every trial.
     """
     count = lines.shape[-1]
     width = min(width, count)
     sums = torch.nn.functional.pad(column_signal(lines).cumsum(-1), (1, 0))
     signal = sums[..., width:] - sums[..., : count - width + 1]
-    place = torch.arange(count - width + 1, dtype=torch.float64, device=lines.device)
-    off = (2 * place / max(1, count - width) - 1).square()
+    first = torch.arange(count - width + 1, dtype=torch.float64, device=lines.device)
+    off = (2 * first / max(1, count - width) - 1).square()
     start = (signal * (1 - 0.3 * off)).argmax(-1)
     columns = start[..., None] + torch.arange(width, device=lines.device)
     return RangeGroup(lines.gather(-1, columns[..., None, :].expand(*lines.shape[:-1], width)), start, radar)
 
 
 def stays_inside(width: int, radar: StripmapRadar, doppler_hz: Tensor, dwell_s: float) -> Tensor:
-    """1 for the columns of a group of `width` whose targets stay in it while they migrate for
-    dwell_s, else 0, (..., width) float64.
+    """Mark the columns of a group whose targets stay in the group while they migrate.
 
-    doppler_hz: absolute centroid (...,). The middle half always counts.
+    The middle half is always marked.
+
+    Args:
+        width: Number of columns of the group.
+        radar: Radar parameters.
+        doppler_hz: Absolute centroid in Hz, shape (...,).
+        dwell_s: Time that a target stays in the beam, in seconds.
+
+    Returns:
+        1 where the targets stay in the group, else 0; shape (..., width), float64.
     """
     curvature_m = (radar.velocity_m_s * dwell_s / 2) ** 2 / (2 * radar.near_range_m)
     half_walk = (0.25 * radar.wavelength_m * doppler_hz.abs() * dwell_s + curvature_m) / radar.range_step_m
     reach = (width / 2 - half_walk - 2).clamp_min(width / 4)
-    place = torch.arange(width, dtype=torch.float64, device=doppler_hz.device) - (width - 1) / 2
-    return (place.abs() <= reach[..., None]).to(torch.float64)
+    column = torch.arange(width, dtype=torch.float64, device=doppler_hz.device) - (width - 1) / 2
+    return (column.abs() <= reach[..., None]).to(torch.float64)
 
 
 def block_weights(columns: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwell_s: float) -> Tensor:
-    """Weights of the range blocks of a group in an objective, (..., block) with sum 1: their signal
-    (`column_signal`).
+    """Compute the weights of the range blocks of a group in an objective function.
 
-    Columns whose targets would walk out of the group within the aperture do not count; those of the
-    middle half always do. columns: (..., n, width), lines or an image.
+    A block is weighted with its signal (`column_signal`). Columns whose targets migrate out of the
+    group within the aperture do not contribute; those of the middle half always do.
+
+    Args:
+        columns: Lines or an image of the group, shape (..., n, width), complex.
+        radar: Radar parameters.
+        doppler_hz: Absolute centroid in Hz, shape (...,).
+        dwell_s: Time that a target stays in the beam, in seconds.
+
+    Returns:
+        The weights, shape (..., block), with sum 1.
     """
     width = columns.shape[-1]
     weight = column_signal(columns) * stays_inside(width, radar, doppler_hz, dwell_s)
@@ -188,15 +292,21 @@ def block_weights(columns: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwe
 
 
 def _block_count(width: int) -> int:
+    """Number of blocks of about BLOCK_COLUMNS columns."""
     return max(1, width // BLOCK_COLUMNS)
 
 
 def block_entropy(image: Tensor) -> Tensor:
-    """Entropy of each block of about 32 range lines by itself, (..., azimuth, range) -> (...,
-    block), nats, float64.
+    """Compute the entropy of each block of about 32 range cells separately.
 
-    A bright block counts no more than any other, so that a few ships do not rule; a block is wide
-    enough for the range walk that a wrong velocity leaves. Differentiable; 0 for an empty block.
+    A bright block has no more influence than any other, so a few ships do not dominate. A block is
+    wide enough for the range walk that a wrong velocity leaves. Differentiable.
+
+    Args:
+        image: Image, shape (..., azimuth, range), complex.
+
+    Returns:
+        The entropies in nats, shape (..., block), float64; 0 for an empty block.
     """
     power = image.real.square() + image.imag.square()
     tiny = torch.finfo(power.dtype).tiny
@@ -208,13 +318,29 @@ def block_entropy(image: Tensor) -> Tensor:
 
 
 def student_log_likelihood(t: Tensor, degrees: Tensor | int) -> Tensor:
-    """Logarithm of Student's density at t without its constant: how well a deviation of t predicted
-    ones is explained, outliers included.
+    """Compute the logarithm of Student's density, without its constant.
+
+    It measures how well an error of t predicted standard deviations is explained, outliers
+    included.
+
+    Args:
+        t: Error divided by its predicted standard deviation.
+        degrees: Degrees of freedom.
+
+    Returns:
+        The log-likelihood, in the shape of the arguments broadcast together.
     """
     return -0.5 * (degrees + 1) * torch.log1p(t.square() / degrees)
 
 
 def jackknife_std(left_out: Tensor) -> Tensor:
-    """Standard deviation from leave-one-out values, (..., block) -> (...,)."""
+    """Compute the standard deviation of an estimate from its leave-one-out values.
+
+    Args:
+        left_out: Estimates without one block each, shape (..., block).
+
+    Returns:
+        The standard deviation, shape (...,).
+    """
     n = left_out.shape[-1]
     return math.sqrt((n - 1) / n) * torch.linalg.vector_norm(left_out - left_out.mean(-1, keepdim=True), dim=-1)

@@ -1,10 +1,12 @@
-"""Doppler of the beam from the place of one point in a focused image (Tsvetkov 2017, text after
-Fig. 5).
+"""Doppler centroid of the beam from the position of one point in a focused image.
 
-A point whose crossing of the beam centre is known, such as a corner reflector, tells the Doppler at
-that time by where it lies along azimuth: an image holds it at the time when its Doppler is that of
-the image's frame. The place of a peak is known to 0.39 / (T sqrt(q)) in Doppler, the Cramer-Rao
-bound of a tone, which no estimator of the beam's envelope can reach through one point.
+If the time is known at which the beam centre crosses a point, such as a corner reflector, the
+azimuth position of the point in the image gives the Doppler at that time: the image holds the point
+at the time when its Doppler equals that of the frame of the image. The position of the peak is
+known to 0.39 / (T sqrt(q)) in Doppler, the Cramer-Rao bound of a tone. No estimator that uses the
+envelope of the beam's spectrum reaches this accuracy from one point.
+
+Reference: Tsvetkov 2017, text after Fig. 5.
 """
 
 from __future__ import annotations
@@ -29,10 +31,21 @@ def doppler_at(
     velocity_m_s: Tensor | float,
     crossing_s: Tensor | float,
 ) -> Tensor:
-    """Doppler at the slow time crossing_s of a point that an image of frame frame_hz holds at
-    (azimuth_m, slant_m), Hz, positive when closing.
+    """Compute the Doppler of a point at a given time from its position in an image.
 
-    All arguments broadcast. Exact for a straight path; the inverse of StripmapRadar.image_position.
+    Exact for a straight path; the inverse of `StripmapRadar.image_position`. All arguments
+    broadcast.
+
+    Args:
+        radar: Radar parameters.
+        azimuth_m: Azimuth position in the image in metres.
+        slant_m: Slant range position in the image in metres.
+        frame_hz: Doppler of the frame of the image in Hz.
+        velocity_m_s: Effective velocity in m/s.
+        crossing_s: Slow time in seconds at which the Doppler is wanted.
+
+    Returns:
+        The Doppler in Hz, positive when closing.
     """
     sin = radar.sin_squint(frame_hz, velocity_m_s)
     closest = slant_m * torch.sqrt(1 - sin.square())
@@ -50,14 +63,24 @@ def peak_time_s(
     doppler_hz: Tensor,
     start_s: Tensor,
 ) -> Tensor:
-    """Refine the slow time start_s (...,), counted from the first line, of a peak at one range
-    position; maximum likelihood.
+    """Refine the slow time of a peak at one range position by maximum likelihood.
 
-    image: (..., azimuth, range); sample: range position (...,), fractional. The column is spread
-    out again to the azimuth history of the point about its Doppler doppler_hz (...,), of which only
-    seen_s is kept: an image passes the noise of all lines and of the whole PRF. rate_hz_s:
-    magnitude of the Doppler rate; seen_s: when the record saw the point, from and to, counted from
-    the beam's crossing.
+    The column of the image is defocused to the azimuth history of the point about its Doppler. Only
+    the part in which the point was observed is kept, because an image contains the noise of all
+    lines and of the whole PRF.
+
+    Args:
+        image: Image, shape (..., azimuth, range), complex.
+        prf_hz: Pulse repetition frequency in Hz.
+        sample: Range position of the peak in samples, fractional, shape (...,).
+        rate_hz_s: Magnitude of the Doppler rate in Hz/s, shape (...,) or a number.
+        seen_s: First and last time at which the record observed the point, in seconds from the
+            crossing of the beam centre.
+        doppler_hz: Doppler of the point in Hz, shape (...,).
+        start_s: Slow time of the peak in seconds from the first line, shape (...,).
+
+    Returns:
+        The refined slow time in seconds, shape (...,).
     """
     n = image.shape[-2]
     weights = torch.sinc(torch.arange(image.shape[-1], dtype=torch.float64, device=image.device) - sample[..., None])
@@ -69,7 +92,7 @@ def peak_time_s(
     history = torch.fft.ifft(spectrum * cis(math.pi * offset.square() / rate))
     lines = (
         torch.round(start_s[..., None] * prf_hz) - n // 2 + torch.arange(n, dtype=torch.float64, device=image.device)
-    )  # the peak in the middle
+    )  # the peak is in the middle
     since = lines / prf_hz - start_s[..., None]
     tone = (
         history.gather(-1, torch.remainder(lines, n).long())
@@ -81,18 +104,20 @@ def peak_time_s(
 
 
 class PointDoppler(Stage):
-    """`doppler_hz` (...,) of the beam from the brightest point of an image (..., azimuth, range),
-    which the beam centre crosses at crossing_s.
+    """Doppler centroid of the beam from the brightest point of an image.
 
-    Tsvetkov 2017, text after Fig. 5. crossing_s: slow time, the middle line by default.
+    Provides `doppler_hz` and `doppler_baseband_hz`. Assumes that the beam centre crosses the point
+    at `crossing_s`. The band of the beam must lie within half a PRF of the frame of the image,
+    because focusing folds what lies outside, and its Doppler within half the length of the image,
+    rate * n / (2 PRF).
 
-    frame_hz, velocity_m_s: those of the image; by default the radar's pointing and its nominal
-    velocity. The band of the beam must lie within half a PRF of the frame (focusing folds what does
-    not), and its Doppler within half the length of the image, rate * n / (2 PRF). std: the bound of
-    a tone at the measured q (info), for the part of the dwell that the record saw; it holds where
-    radar.integration_s is the true dwell. ok where the crossing lies within the record and the peak
-    is higher than noise alone would have it once in 10,000 images. Raises ValueError where neither
-    the radar nor a connected value says what the frame is.
+    Args:
+        radar: Radar parameters.
+        crossing_s: Slow time in seconds at which the beam centre crosses the point; by default that
+            of the middle line.
+
+    Reference:
+        Tsvetkov 2017, text after Fig. 5.
     """
 
     works_on = ("azimuth", "range")
@@ -104,6 +129,24 @@ class PointDoppler(Stage):
 
     @torch.no_grad()
     def forward(self, signal: Signal, frame_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Estimate:
+        """Estimate the centroid from an image of axes (azimuth, range).
+
+        Args:
+            signal: Focused image, shape (..., azimuth, range), complex.
+            frame_hz: Doppler of the frame of the image in Hz; by default the pointing of the radar.
+            velocity_m_s: Effective velocity of the image in m/s; by default the nominal one.
+
+        Returns:
+            `doppler_hz` and `doppler_baseband_hz` in Hz, shape (...,), positive when closing, with
+            the bound of a tone as their standard deviation. The bound is that for the measured q
+            (info["q"]) and the part of the dwell that the record observed; it holds if
+            radar.integration_s is the true dwell. quality is 1 - 1 / (1 + q). `ok` is False where
+            the crossing lies outside the record, or where noise alone would have as high a peak
+            more often than once in 10,000 images.
+
+        Raises:
+            ValueError: If neither the radar nor a connected value gives the frame of the image.
+        """
         radar, image, (azimuth, slant) = self.radar, signal.data, signal.axes
         frame = radar.pointing_doppler_hz if frame_hz is None else frame_hz
         if frame is None:
@@ -132,18 +175,18 @@ class PointDoppler(Stage):
         dwell = radar.aperture_s(slant.start)
         seen = max(-dwell / 2, -crossing), min(dwell / 2, record - crossing)
         at_s = (found["position_azimuth_m"] - azimuth.start) / radar.velocity_m_s
-        # an image is circular: the peak may lie beyond its end
+        # an image is circular in azimuth: the peak may lie beyond its end
         at_s = crossing + wrap_hz(at_s - crossing, record)
         value = doppler_at(radar, at_s * radar.velocity_m_s, position, frame, velocity, crossing)
         for _ in range(4):
             at_s = peak_time_s(image, radar.prf_hz, slant.index_of(position), rate, seen, value, at_s)
             value = doppler_at(radar, at_s * radar.velocity_m_s, position, frame, velocity, crossing)
         value, finite = settle(value, 0.0)
-        # the mean of an exponential law
+        # noise power has an exponential distribution, whose mean is the median / ln 2
         floor = power.flatten(-2).median(-1).values.double() / math.log(2)
         peak_to_noise = found["peak"].abs().square() / torch.where(floor > 0, floor, 1)
         visible = max(seen[1] - seen[0], 1 / radar.prf_hz)
-        # the image holds the noise of the whole PRF
+        # the image contains the noise of the whole PRF, not only that of the band of the point
         q = peak_to_noise * (radar.prf_hz / (rate * visible)).clamp_min(1)
         std = tone_frequency_bound_hz(q.clamp_min(1e-12), visible)
         return Estimate(

@@ -1,9 +1,8 @@
-"""Effective velocity by minimum entropy of a small group of range lines (brief 004, item 8;
-Tsvetkov 2017).
+"""Effective velocity by minimum entropy of a small group of range cells (Tsvetkov 2017).
 
-Always evaluated on the original data: the group's two-dimensional spectrum is formed once and
-focused anew with every velocity. The objective is the mean entropy of blocks of range lines, each
-taken by itself, so that a few very bright ships do not rule it.
+The group is always focused from the original data: its two-dimensional spectrum is formed once and
+focused anew for every velocity. The objective is the mean entropy of blocks of range cells, each
+block taken separately, so that a few very bright ships do not dominate.
 """
 
 from __future__ import annotations
@@ -34,22 +33,42 @@ Refine = Callable[..., tuple[Tensor, Tensor]]
 
 
 class Focuser(Protocol):
-    """What the estimator needs to know of the chain's focusing stage (`torchsar.focus.OmegaK` and
-    its relatives).
+    """What the estimator uses of a focusing stage, such as `torchsar.focus.OmegaK`.
+
+    Args:
+        radar: Radar parameters of the stage.
     """
 
     radar: StripmapRadar
 
-    def spectrum(self, n: int, device: torch.device | str | None = None) -> Tensor | None: ...
+    def spectrum(self, n: int, device: torch.device | str | None = None) -> Tensor | None:
+        """Compute the range reference spectrum for lines of n samples.
+
+        Args:
+            n: Number of range samples.
+            device: Device of the result.
+
+        Returns:
+            The spectrum, shape (n,), complex; None for range-compressed data.
+        """
+        ...
 
 
 def velocity_objective(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) -> Callable[[Tensor], Tensor]:
-    """Function velocity (...,) -> entropies of the range blocks (..., block) times their weights,
-    whose sum over the last dim is the objective.
+    """Make the function that maps a velocity to the weighted entropies of the range blocks.
 
-    Differentiable in the velocity. Columns whose targets walk out of the group do not count; the
-    others with their signal above the background in the image of the nominal velocity, where
-    migration is already undone.
+    The function is differentiable. Columns whose targets migrate out of the group do not
+    contribute. The others are weighted with their signal above the background in the image of the
+    nominal velocity, in which range migration is already corrected.
+
+    Args:
+        group: Group of range cells.
+        doppler_hz: Absolute Doppler centroid in Hz, shape (...,), positive when closing.
+        dwell_s: Time that a target stays in the beam, in seconds.
+
+    Returns:
+        A function of the velocity in m/s, shape (...,), that returns the entropies times their
+        weights in nats, shape (..., block). Their sum over the last dimension is the objective.
     """
     radar = group.radar
     spectrum = beam_spectrum(group, doppler_hz)
@@ -63,8 +82,18 @@ def velocity_objective(group: RangeGroup, doppler_hz: Tensor, dwell_s: float) ->
 
 
 def grid_step_m_s(radar: StripmapRadar, range_m: float, dwell_s: float) -> float:
-    """Velocity error that bends the phase by one turn between the middle and the end of the
-    aperture: 2 lambda R / (v T^2).
+    """Compute the step of the grid search for the velocity.
+
+    It is the velocity error that changes the phase by one cycle between the middle and the end of
+    the aperture, 2 lambda R / (v T^2).
+
+    Args:
+        radar: Radar parameters.
+        range_m: Slant range in metres.
+        dwell_s: Length of the aperture in seconds.
+
+    Returns:
+        The step in m/s.
     """
     return 2 * radar.wavelength_m * range_m / (radar.velocity_m_s * dwell_s**2)
 
@@ -72,12 +101,22 @@ def grid_step_m_s(radar: StripmapRadar, range_m: float, dwell_s: float) -> float
 def minimum_entropy_velocity(
     group: RangeGroup, doppler_hz: Tensor, dwell_s: float, reach_m_s: float, refine: Refine, tolerance_m_s: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Velocity (...,) of least entropy within the radar's nominal one +- reach, its predicted
-    deviation, and the costs of the grid (..., grid).
+    """Find the velocity of least entropy: a grid search, then a refinement.
 
-    refine: `parabola_minimum` or `gradient_minimum` of torchsar.optim. The deviation is how far the
-    minima of separate parts of the group scatter about the common one (eight parts, by their slopes
-    at the minimum and the common curvature).
+    The standard deviation follows from how far the minima of eight separate parts of the group
+    scatter about the common minimum (by their slopes there and the common curvature).
+
+    Args:
+        group: Group of range cells.
+        doppler_hz: Absolute Doppler centroid in Hz, shape (...,), positive when closing.
+        dwell_s: Time that a target stays in the beam, in seconds.
+        reach_m_s: Half width of the search about the nominal velocity of the radar, in m/s.
+        refine: `parabola_minimum` or `gradient_minimum` of `torchsar.optim.scalar`.
+        tolerance_m_s: Tolerance of the refinement in m/s.
+
+    Returns:
+        The velocity in m/s, shape (...,); its predicted standard deviation in m/s, shape (...,);
+        and the objective on the grid in nats, shape (..., grid).
     """
     blocks = velocity_objective(group, doppler_hz, dwell_s)
 
@@ -94,6 +133,7 @@ def minimum_entropy_velocity(
 
 
 def _scatter_std(blocks: Callable[[Tensor], Tensor], velocity: Tensor, curvature: Tensor, half: float) -> Tensor:
+    """Standard deviation (...,) in m/s from the slopes of eight parts at the minimum."""
     with torch.no_grad():
         slopes = (blocks(velocity + half) - blocks(velocity - half)) / (2 * half)
     parts = torch.stack([part.sum(-1) for part in slopes.tensor_split(8, -1)], -1)
@@ -102,15 +142,23 @@ def _scatter_std(blocks: Callable[[Tensor], Tensor], velocity: Tensor, curvature
 
 
 class EffectiveVelocity(Stage):
-    """`velocity_m_s` of least entropy; leaves the signal alone.
+    """Effective velocity of least image entropy.
 
-    The Doppler centroid (absolute) is a value to connect.
+    Provides `velocity_m_s` and leaves the signal unchanged. The absolute Doppler centroid is a
+    value to connect. At most four apertures of pulses about the middle of the record are used.
 
-    focuser: the chain's focusing stage, from which the radar and the range reference are taken.
-    reach_m_s: how far the nominal velocity may be off. lines: range lines in the group; at most
-    four apertures of pulses about the middle of the record are used. ok where the minimum lies
-    inside the grid and its predicted deviation is below 5 m/s. info: grid_velocity_m_s,
-    grid_entropy (..., grid), group_start (...,).
+    Args:
+        focuser: Focusing stage of the chain, of which the radar and the range reference are used.
+        reach_m_s: Largest error of the nominal velocity in m/s.
+        lines: Number of range cells in the group, at least 16.
+        refine: `parabola_minimum` or `gradient_minimum` of `torchsar.optim.scalar`.
+        tolerance_m_s: Tolerance of the refinement in m/s.
+
+    Raises:
+        ValueError: If the reach or the tolerance is not positive, or there are fewer than 16 lines.
+
+    Reference:
+        Tsvetkov 2017, focusing algorithm, remark on step 4.
     """
 
     provides = ("velocity_m_s",)
@@ -127,14 +175,21 @@ class EffectiveVelocity(Stage):
         if not (reach_m_s > 0 and tolerance_m_s > 0 and lines >= 16):
             raise ValueError(
                 "a velocity search needs a positive reach and tolerance and at least 16 lines, got "
-                f"{reach_m_s}, {tolerance_m_s}, {lines}"
+                f"reach_m_s {reach_m_s}, tolerance_m_s {tolerance_m_s} and lines {lines}"
             )
-        # in a list, so that the chain's focuser does not become a submodule twice
+        # in a list, so that torch does not register the focuser of the chain as a submodule twice
         self._focuser = [focuser]
         self.reach_m_s, self.lines, self.refine, self.tolerance_m_s = reach_m_s, lines, refine, tolerance_m_s
 
     def group(self, raw: Tensor) -> tuple[RangeGroup, float]:
-        """The group of range lines the estimate is made on, and the time a target stays in it."""
+        """Cut out the group of range cells that the estimate uses.
+
+        Args:
+            raw: Lines, shape (..., pulse, range), complex.
+
+        Returns:
+            The group, and the time that a target stays in the beam, in seconds.
+        """
         focuser = self._focuser[0]
         radar, n = focuser.radar, raw.shape[-1]
         dwell = aperture_s(radar, n)
@@ -146,6 +201,19 @@ class EffectiveVelocity(Stage):
         return pick_group(lines, radar, self.lines), dwell
 
     def forward(self, signal: Signal, doppler_hz: Tensor | None = None) -> Estimate:
+        """Estimate the effective velocity of a signal of axes (pulse, range).
+
+        Args:
+            signal: Lines, shape (..., pulse, range), complex.
+            doppler_hz: Absolute Doppler centroid in Hz, shape (...,), positive when closing; by
+                default the pointing of the radar, or 0.
+
+        Returns:
+            `velocity_m_s` of shape (...,) with its standard deviation. `ok` is False where the
+            minimum lies at the edge of the search or the standard deviation is 5 m/s or more. info:
+            grid_velocity_m_s, shape (grid,), grid_entropy, shape (..., grid), and group_start,
+            shape (...,).
+        """
         raw = signal.data.detach()
         radar = self._focuser[0].radar
         doppler = torch.as_tensor(

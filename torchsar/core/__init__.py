@@ -1,4 +1,4 @@
-"""Axes, signals, phase, chains, estimates and random draws: what every other part stands on."""
+"""Foundation of the package: axes, signals, chains, estimates, random draws and transforms."""
 
 from torchsar.core.alternate import Alternate, Turn
 from torchsar.core.axis import Axis

@@ -1,4 +1,4 @@
-"""Estimators in turn, each on the original data with what the others have found taken out."""
+"""Alternation between estimators, each on data corrected with the results of the others."""
 
 from __future__ import annotations
 
@@ -15,10 +15,12 @@ from torchsar.core.stage import Stage
 
 @dataclass(frozen=True)
 class Turn:
-    """One side of an alternation.
+    """One estimator of an alternation, with the stage that corrects the data with its values.
 
-    corrector: the stage that takes its values out of the data for the others, or None where these
-    use the values themselves.
+    Args:
+        estimator: Stage that returns an Estimate.
+        corrector: Stage that removes the estimated effect from the signal before the other
+            estimators run; None if the other estimators take the values as arguments instead.
     """
 
     estimator: nn.Module
@@ -26,15 +28,24 @@ class Turn:
 
 
 class Alternate(Stage):
-    """`Alternate(rounds=3, phase=Turn(autofocus, corrector), rotation=Turn(estimator))`: an
-    estimator of everything that its turns estimate.
+    """Joint estimate of several effects, by running one estimator for each of them in turn.
 
-    A round runs the turns in the order given. Each sees the ORIGINAL signal after the correctors of
-    all other turns, each with its own turn's latest values, and is handed those latest values, its
-    own among them, that its `forward` has parameters for; in the first round it does without what
-    is not there yet. Errors of a turn so never stay in the data. ok: all turns are; quality: the
-    least; a name that several turns offer is that of the last. Raises ValueError for fewer than two
-    turns, less than one round, or a parameter that no turn can offer before it is needed.
+    One round runs all estimators in the order given. Each receives the original signal after the
+    correctors of all other turns, every corrector with the latest values of its own estimator.
+    Correction always starts from the original signal, so that errors of an early round do not
+    remain in the data. An estimator also receives those of the latest values, its own among them,
+    that are parameters of its `forward`; a value that no turn has estimated yet is left out.
+
+        Alternate(rounds=3, phase=Turn(autofocus, corrector), rotation=Turn(estimator))
+
+    Args:
+        rounds: Number of rounds, at least one.
+        **turns: Two or more turns by name, in the order in which they run.
+
+    Raises:
+        ValueError: If there are fewer than two turns or less than one round, if an estimator needs
+            a value that no earlier turn provides in the first round, or if a corrector needs a
+            value that its own estimator does not provide.
     """
 
     def __init__(self, rounds: int = 3, **turns: Turn) -> None:
@@ -54,25 +65,36 @@ class Alternate(Stage):
         self._check()
 
     def _check(self) -> None:
-        offered: set[str] = set()
+        """Reject estimators and correctors whose required values are not available in time."""
+        available: set[str] = set()
         for name, estimator in self.estimators.items():
-            missing = [p.name for p in _parameters(estimator) if p.default is p.empty and p.name not in offered]
+            missing = [p.name for p in _parameters(estimator) if p.default is p.empty and p.name not in available]
             if missing:
                 raise ValueError(
-                    f"the turn {name!r} needs {missing} in the first round, but the turns before it offer "
-                    f"{sorted(offered) or 'nothing'}; change the order, or give it a default"
+                    f"the turn {name!r} needs {missing} in the first round, but the turns before it provide "
+                    f"{sorted(available) or 'nothing'}; change the order of the turns, or give the parameter a default"
                 )
-            offered |= set(getattr(estimator, "provides", ()))
+            available |= set(getattr(estimator, "provides", ()))
         for name, corrector in self.correctors.items():
             missing = {p.name for p in _parameters(corrector) if p.default is p.empty} - set(
                 getattr(self.estimators[name], "provides", ())
             )
             if missing:
                 raise ValueError(
-                    f"the corrector of the turn {name!r} needs {sorted(missing)}, which its estimator does not offer"
+                    f"the corrector of the turn {name!r} needs {sorted(missing)}, which its estimator does not provide"
                 )
 
     def forward(self, signal: Signal) -> Estimate:
+        """Estimate the values of all turns.
+
+        Args:
+            signal: Signal on the axes that the estimators and correctors work on.
+
+        Returns:
+            Values and standard deviations of all turns; of a name that several turns provide, those
+            of the last. `quality` is the lowest of the turns. `ok` is False where any of the turns
+            is unreliable. Keys of `info` begin with the name of the turn.
+        """
         found: dict[str, Estimate] = {}
         for _ in range(self.rounds):
             for name, estimator in self.estimators.items():
@@ -81,6 +103,7 @@ class Alternate(Stage):
         return _merged(found)
 
     def _without_others(self, signal: Signal, name: str, found: dict[str, Estimate]) -> Signal:
+        """Signal after the correctors of all turns but one."""
         for other, corrector in self.correctors.items():
             if other != name and other in found:
                 signal = corrector(signal, **_accepted(corrector, found[other].value))
@@ -88,16 +111,17 @@ class Alternate(Stage):
 
 
 def _parameters(stage: nn.Module) -> list[inspect.Parameter]:
-    """Parameters of forward but the signal."""
+    """Parameters of `forward` after the signal."""
     return list(inspect.signature(stage.forward).parameters.values())[1:]
 
 
 def _accepted(stage: nn.Module, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Those of the values that are parameters of the stage's `forward`."""
     return {p.name: values[p.name] for p in _parameters(stage) if p.name in values}
 
 
 def _merged(found: dict[str, Estimate]) -> Estimate:
-    """One estimate of all values, ok where all are."""
+    """Estimate of all values; `ok` is False where any part is unreliable."""
     parts = list(found.values())
     ok, quality = parts[0].ok, parts[0].quality.double()
     for part in parts[1:]:

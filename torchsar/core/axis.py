@@ -1,4 +1,4 @@
-"""Named physical axes of the trailing dims of a signal."""
+"""Named, uniformly sampled physical axes of the trailing dimensions of a signal."""
 
 from __future__ import annotations
 
@@ -7,16 +7,29 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+# names of frequency axes by convention; other names get the suffix "_frequency"
 _DUAL_NAME = {"pulse": "doppler", "range": "range_frequency"}
 
 
 @dataclass(frozen=True)
 class Axis:
-    """A uniform sampling grid: sample i lies at `start + i * step`, in `unit`.
+    """Uniform sampling grid of one dimension: sample i lies at `start + i * step`.
 
-    Names in use: `pulse` (slow time, s), `range` (slant range, m), and the axes of an image,
-    `azimuth` (m) and `range` (m). The Fourier partner of an axis remembers where it came from, so
-    that going back restores the origin.
+    Axes of raw data are `pulse` (slow time in s) and `range` (slant range in m), those of an image
+    `azimuth` and `range` (both in m). A frequency axis made by `dual` keeps the origin of the axis
+    that it came from, so that the inverse transform restores it.
+
+    Args:
+        name: Name of the axis.
+        n: Number of samples, at least one.
+        start: Coordinate of the first sample, in `unit`.
+        step: Distance between samples, in `unit`, positive.
+        unit: Unit of the coordinates, such as "s", "m" or "Hz".
+        dual_start: Of a frequency axis, the `start` of the axis that it came from; None for any
+            other.
+
+    Raises:
+        ValueError: If there is no sample, or the step is not positive.
     """
 
     name: str
@@ -34,34 +47,68 @@ class Axis:
 
     @property
     def stop(self) -> float:
-        """Coordinate of the last sample."""
+        """Coordinate of the last sample, in `unit`."""
         return self.start + (self.n - 1) * self.step
 
     def values(self, device: torch.device | str | None = None) -> Tensor:
-        """Coordinates of all samples, float64, shape (n,)."""
+        """Return the coordinates of all samples.
+
+        Args:
+            device: Device of the result.
+
+        Returns:
+            Coordinates in `unit`, shape (n,), float64.
+        """
         return self.start + self.step * torch.arange(self.n, dtype=torch.float64, device=device)
 
     def offsets(self, device: torch.device | str | None = None) -> Tensor:
-        """Coordinates relative to the first sample, float64, shape (n,): the form to build phases
-        from.
+        """Return the coordinates of all samples relative to the first one.
+
+        Form phases from these differences rather than from `values`: a large `start` costs
+        precision.
+
+        Args:
+            device: Device of the result.
+
+        Returns:
+            Coordinates minus `start`, in `unit`, shape (n,), float64.
         """
         return self.step * torch.arange(self.n, dtype=torch.float64, device=device)
 
     def index_of(self, value: Tensor | float) -> Tensor:
-        """Fractional sample index of a coordinate."""
+        """Return the fractional sample index of a coordinate.
+
+        Args:
+            value: Coordinates in `unit`, any shape.
+
+        Returns:
+            Indices of the same shape, float64; below 0 or above n - 1 outside the axis.
+        """
         return (torch.as_tensor(value, dtype=torch.float64) - self.start) / self.step
 
     def part(self, first: int, last: int) -> Axis:
-        """The axis of samples first..last-1; bounds outside the axis extend it."""
+        """Return the axis of the samples `first` to `last - 1`; indices outside 0..n extend it.
+
+        Args:
+            first: Index of the first sample that is kept.
+            last: Index after the last sample that is kept.
+        """
         return replace(self, n=last - first, start=self.start + first * self.step)
 
     def resampled(self, factor: int) -> Axis:
-        """The axis after band-limited interpolation by an integer factor."""
+        """Return the axis after band-limited interpolation.
+
+        Args:
+            factor: Number of new samples for each old one.
+        """
         return replace(self, n=self.n * factor, step=self.step / factor)
 
     def dual(self) -> Axis:
-        """The centred frequency axis of this axis (cycles per unit); of a frequency axis, the axis
-        it came from.
+        """Return the frequency axis of a centred transform, or the original of a frequency axis.
+
+        Returns:
+            Frequencies in cycles per unit (Hz for s, 1/m for m), rising, with zero at sample n //
+            2. The dual of `pulse` is `doppler`, that of `range` is `range_frequency`.
         """
         step = 1.0 / (self.n * self.step)
         if self.dual_start is not None:

@@ -1,4 +1,4 @@
-"""Stages in order, with named values between them, and re-runnable parts."""
+"""Chains of stages that run in order, exchange named values and can be rerun in part."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ from torchsar.core.signal import Recording, Signal
 
 
 class Use(nn.Module):
-    """A stage and where its values come from: {parameter of forward: "stage.value" or "aux.name"}.
+    """Stage together with the sources of the values that it takes; made by `use`.
 
-    Made by `use`.
+    Args:
+        stage: Stage whose `forward` takes the values.
+        names: Source of each parameter of `forward`: "STAGE.VALUE" or "aux.NAME".
     """
 
     def __init__(self, stage: nn.Module, names: Mapping[str, str]) -> None:
@@ -27,11 +29,23 @@ class Use(nn.Module):
 
 
 def use(stage: nn.Module, **names: str) -> Use:
-    """Connect values of earlier stages: `use(OmegaK(radar), doppler_hz="doppler",
-    velocity_m_s="velocity")`.
+    """Connect parameters of a stage to values of earlier stages or to recorded side data.
 
-    "doppler" alone is short for "doppler.doppler_hz", the value called like the parameter;
-    "aux.NAME" is recorded side data.
+    In the following example the values come from the stages named "doppler" and "velocity".
+
+        use(OmegaK(radar), doppler_hz="doppler", velocity_m_s="velocity")
+
+    Args:
+        stage: Stage whose `forward` takes the values.
+        **names: Source of each parameter: "STAGE.VALUE", or "STAGE" alone if the value has the name
+            of the parameter, or "aux.NAME" for side data of the recording, or "given.NAME" for a
+            value that the caller of the chain gives.
+
+    Returns:
+        The stage with its sources, to be given to a `Chain`.
+
+    Raises:
+        TypeError: If a source is not a name; a constant belongs in the constructor of the stage.
     """
     for parameter, source in names.items():
         if not isinstance(source, str):
@@ -46,8 +60,15 @@ def use(stage: nn.Module, **names: str) -> Use:
 
 @dataclass(frozen=True)
 class Trace:
-    """Every intermediate of one run: what went into each stage, what came out, the values, and what
-    it cost.
+    """All intermediate results of one run of a chain, by the names of the stages.
+
+    Args:
+        inputs: Signal before each stage.
+        outputs: Signal after each stage.
+        estimates: Estimate of each stage that returned one.
+        values: Estimated and given values under "STAGE.VALUE", side data under "aux.NAME".
+        seconds: Wall time of each stage, in seconds.
+        bytes: Size of the samples after each stage, in bytes.
     """
 
     inputs: Mapping[str, Signal]
@@ -59,12 +80,14 @@ class Trace:
 
     @property
     def signal(self) -> Signal:
-        """Output of the last stage."""
+        """Signal after the last stage."""
         return list(self.outputs.values())[-1]
 
 
 @dataclass
 class _Log:
+    """Record of a run that becomes its Trace."""
+
     inputs: dict[str, Signal] = field(default_factory=dict)
     outputs: dict[str, Signal] = field(default_factory=dict)
     estimates: dict[str, Estimate] = field(default_factory=dict)
@@ -73,14 +96,22 @@ class _Log:
 
 
 class Chain(nn.Module):
-    """`Chain(name=stage, ...)` runs stages in order; an estimator leaves the signal alone and
-    offers its values by name.
+    """Sequence of stages that run in order and pass estimates to later stages as named values.
 
-    chain(x): the signal after the last stage; x is a Recording or a Signal. chain.trace(x): every
-    intermediate. chain.rerun(trace, start, given={"velocity.velocity_m_s": v}): the part from
-    `start` on, from the signal that entered it, with values held fixed; this is the objective of
-    minimum-entropy searches, always on the original data, and differentiable. Connections are
-    checked at construction; a misuse names the stage, what it needs and what there is.
+    `chain(x)` returns the signal after the last stage, `chain.trace(x)` every intermediate result.
+    `chain.rerun(trace, start, given={"velocity.velocity_m_s": v})` repeats the stages from `start`
+    on with some values replaced. It is differentiable and always begins with the signal of the
+    trace, so it can serve as the objective of a minimum-entropy search. A stage that returns only
+    an Estimate leaves the signal unchanged. Connections made by `use` are checked at construction.
+
+    Args:
+        **stages: Stages by name, in the order in which they run; `use` connects their parameters.
+
+    Raises:
+        ValueError: If there is no stage, if torch.nn.ModuleDict reserves a name, if a connection
+            names an unknown parameter or a value that no earlier stage provides, or if a required
+            parameter is not connected.
+        TypeError: If a stage is not a torch.nn.Module.
     """
 
     def __init__(self, **stages: nn.Module) -> None:
@@ -91,13 +122,14 @@ class Chain(nn.Module):
             )
         members = {name: item.stage if isinstance(item, Use) else item for name, item in stages.items()}
         for name, stage in members.items():
-            _refuse_foreign(name, stage)
+            _check_member(name, stage)
         self.stages = nn.ModuleDict(members)
         self.uses = {name: item.names if isinstance(item, Use) else {} for name, item in stages.items()}
         self._check()
 
     def _check(self) -> None:
-        offered: set[str] = set()
+        """Reject connections that do not fit, and required values without a connection."""
+        available: set[str] = set()
         for name, stage in self.stages.items():
             parameters = list(inspect.signature(stage.forward).parameters.values())[1:]
             accepted = [p.name for p in parameters]
@@ -107,10 +139,11 @@ class Chain(nn.Module):
                         f"stage {name!r} ({type(stage).__name__}) has no value {parameter!r} to connect; it "
                         f"accepts {accepted or 'none'}"
                     )
-                if not source.startswith("aux.") and source not in offered:
+                if not source.startswith(("aux.", "given.")) and source not in available:
                     raise ValueError(
-                        f"stage {name!r} uses {source!r}, which no earlier stage provides; there is "
-                        f"{sorted(offered) or 'nothing yet'}, and 'aux.NAME' for recorded side data"
+                        f"stage {name!r} uses {source!r}, which no earlier stage provides; available are "
+                        f"{sorted(available) or 'nothing yet'}, 'aux.NAME' for recorded side data, and "
+                        "'given.NAME' for values given to the chain"
                     )
             for p in parameters:
                 if (
@@ -118,24 +151,44 @@ class Chain(nn.Module):
                     and p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)
                     and p.name not in self.uses[name]
                 ):
-                    there = f"one of {sorted(offered)}" if offered else "a value of an earlier stage"
+                    choices = f"one of {sorted(available)}" if available else "a value of an earlier stage"
                     raise ValueError(
                         f"stage {name!r} ({type(stage).__name__}) needs the value {p.name!r}; connect it "
-                        f"(`use`) with {there}, or with 'aux.NAME' for recorded side data"
+                        f"(`use`) with {choices}, or with 'aux.NAME' for recorded side data"
                     )
-            offered |= {f"{name}.{key}" for key in getattr(stage, "provides", ())}
+            available |= {f"{name}.{key}" for key in getattr(stage, "provides", ())}
 
     def forward(self, x: Recording | Signal, given: Mapping[str, Tensor] | None = None) -> Signal:
-        """The signal after the last stage. given: values that replace what an estimator
-        would find.
+        """Run all stages.
+
+        Args:
+            x: Recording, whose side data are available as "aux.NAME", or a Signal.
+            given: Values by name ("STAGE.VALUE" or "aux.NAME") that replace those estimated or
+                recorded. A stage does not run at all, even if it would change the signal, where
+                `given` holds every value that it provides.
+
+        Returns:
+            Signal after the last stage.
+
+        Raises:
+            KeyError: If a given value has an unknown name, or a connected value is missing.
+            TypeError: If x is neither a Recording nor a Signal, or a stage returns anything else
+                than a Signal, an Estimate or a pair of both.
         """
         signal, aux = _split(x)
         self._refuse_unknown(given, aux)
         return self._run(list(self.stages), signal, {**aux, **(given or {})}, set(given or {}), None)
 
     def trace(self, x: Recording | Signal, given: Mapping[str, Tensor] | None = None) -> Trace:
-        """Run and keep every intermediate by stage name, with wall seconds and bytes of each
-        output.
+        """Run all stages and return every intermediate result, with times and sizes.
+
+        Args:
+            x: As in `forward`.
+            given: As in `forward`.
+
+        Raises:
+            KeyError: As in `forward`.
+            TypeError: As in `forward`.
         """
         signal, aux = _split(x)
         self._refuse_unknown(given, aux)
@@ -146,8 +199,19 @@ class Chain(nn.Module):
     def rerun(
         self, trace: Trace, start: str, stop: str | None = None, given: Mapping[str, Tensor] | None = None
     ) -> Signal:
-        """Run again from stage `start` to `stop` (inclusive; the last by default) on what entered
-        `start` in the trace.
+        """Repeat some stages on the signal that entered the first of them in a trace.
+
+        Args:
+            trace: Result of `trace`.
+            start: Name of the first stage to repeat.
+            stop: Name of the last stage to repeat; by default the last one of the chain.
+            given: Values by name that replace those of the trace.
+
+        Returns:
+            Signal after the last repeated stage.
+
+        Raises:
+            KeyError: If a stage or a given value has an unknown name.
         """
         names = list(self.stages)
         for name in (start, stop or start):
@@ -160,14 +224,14 @@ class Chain(nn.Module):
         return self._run(part, trace.inputs[start], {**trace.values, **(given or {})}, set(given or {}), None)
 
     def _refuse_unknown(self, given: Mapping[str, Tensor] | None, aux: Mapping[str, Tensor]) -> None:
-        """A value that no stage offers or uses and nothing recorded would be held for nothing."""
-        offered = {
+        """Reject given values that no stage provides or uses and no recording holds."""
+        available = {
             f"{name}.{key}" for name, stage in self.stages.items() for key in getattr(stage, "provides", ())
         } | set(aux)
-        offered |= {source for names in self.uses.values() for source in names.values()}
-        unknown = set(given or {}) - offered
+        available |= {source for names in self.uses.values() for source in names.values()}
+        unknown = set(given or {}) - available
         if unknown:
-            raise KeyError(f"given {sorted(unknown)}, but the chain offers the values {sorted(offered)}")
+            raise KeyError(f"given {sorted(unknown)}, but the chain has the values {sorted(available)}")
 
     def _run(
         self, names: list[str], signal: Signal, values: dict[str, Tensor], held: set[str], log: _Log | None
@@ -191,7 +255,9 @@ class Chain(nn.Module):
         arguments = {}
         for parameter, source in self.uses[name].items():
             if source not in values:
-                raise KeyError(f"stage {name!r} needs {source!r} for {parameter!r}, but there is {sorted(values)}")
+                raise KeyError(
+                    f"stage {name!r} needs {source!r} for {parameter!r}, but the values are {sorted(values)}"
+                )
             arguments[parameter] = values[source]
         result = stage(signal, **arguments)
         out, estimate = result if isinstance(result, tuple) else (result, None)
@@ -211,15 +277,13 @@ class Chain(nn.Module):
         return out
 
 
-def _refuse_foreign(name: str, stage: object) -> None:
-    """A member of a chain is a module, under a name that nn.ModuleDict does not need for itself."""
+def _check_member(name: str, stage: object) -> None:
+    """Raise an error unless a member is a module whose name nn.ModuleDict does not reserve."""
     if not isinstance(stage, nn.Module):
         got = f"the class {stage.__name__}, not an instance of it" if isinstance(stage, type) else type(stage).__name__
         raise TypeError(f"stage {name!r} must be a torch.nn.Module, such as a Stage, got {got}")
     if hasattr(nn.ModuleDict(), name) or "." in name:
-        raise ValueError(
-            f"a stage cannot be called {name!r}, which torch.nn.ModuleDict has for itself; choose another name"
-        )
+        raise ValueError(f"a stage cannot be called {name!r}, which torch.nn.ModuleDict reserves; choose another name")
 
 
 def _split(x: Recording | Signal) -> tuple[Signal, dict[str, Tensor]]:

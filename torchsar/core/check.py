@@ -1,4 +1,4 @@
-"""Refusing samples that no stage can work on."""
+"""Check that samples are finite."""
 
 from __future__ import annotations
 
@@ -7,9 +7,17 @@ from torch import Tensor
 
 
 def refuse_non_finite(x: Tensor, what: str) -> None:
-    """Raise ValueError, with the count and the first place, where x holds NaN or Inf.
+    """Raise ValueError if samples are NaN or infinite.
 
-    Costs one sum over clean data.
+    Costs one sum over valid data. Has no effect inside torch.vmap, where values cannot be read.
+
+    Args:
+        x: Samples of any shape, real or complex.
+        what: Name of the samples for the message.
+
+    Raises:
+        ValueError: If a sample is NaN or infinite; the message has the number of such samples and
+            the index of the first.
     """
     try:
         total = torch.view_as_real(x.detach()).sum() if x.is_complex() else x.detach().sum()
@@ -17,11 +25,11 @@ def refuse_non_finite(x: Tensor, what: str) -> None:
             return
         bad = ~torch.isfinite(x.detach())
         count = int(bad.sum())
-    except RuntimeError:  # inside vmap a value cannot be looked at
+    except RuntimeError:  # inside vmap values cannot be read
         return
     if count:
         first = tuple(int(i) for i in bad.nonzero()[0])
         raise ValueError(
             f"{what}: {count} of {x.numel()} samples are NaN or Inf, the first at index {first}; "
-            "mark such lines as missing or repair the reader"
+            "mark such lines as missing or correct the reader"
         )

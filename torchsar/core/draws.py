@@ -1,4 +1,4 @@
-"""Random numbers with addresses: (seed, purpose, case, trial)."""
+"""Reproducible random numbers that depend only on seed, purpose, case and trial."""
 
 from __future__ import annotations
 
@@ -12,7 +12,17 @@ from torch import Tensor
 
 
 def generator_at(*address: str | int) -> np.random.Generator:
-    """The source of random numbers that lives at this address."""
+    """Return the random generator of an address.
+
+    The address is hashed (BLAKE2b) to the key of a counter-based generator (Philox), so that equal
+    addresses give equal numbers and different addresses independent ones.
+
+    Args:
+        *address: Text and whole numbers, such as seed, purpose, case and trial.
+
+    Returns:
+        A generator at the beginning of its sequence.
+    """
     return np.random.Generator(
         np.random.Philox(key=int.from_bytes(hashlib.blake2b(repr(address).encode(), digest_size=16).digest(), "big"))
     )
@@ -20,15 +30,23 @@ def generator_at(*address: str | int) -> np.random.Generator:
 
 @dataclass(frozen=True)
 class Draws:
-    """A source whose every draw depends on its address alone, never on what was drawn before, on
-    chunking or on the device.
+    """Source of random numbers, each of which depends only on its address.
 
-    seed: of the whole study. case: any text or number that names a parameter point (a hash of its
-    parameters, so that a growing grid moves no seed), or a tuple of them, one per trial, where a
-    batch holds several points. trials: indices of the trials of this chunk, which become the
-    leading dim; None draws one unbatched trial, equal to trial 0. Draws are made in float64 on the
-    host and then cast, so that complex64 and complex128, CPU and GPU see the same noise. Raises
-    ValueError where cases and trials disagree in number.
+    The address of a draw is (seed, purpose, case, trial). A draw therefore does not depend on draws
+    made before it, on the division of trials into chunks, or on the device; a repeated draw gives
+    the same numbers. Numbers are drawn in float64 on the CPU and then converted, so that all
+    precisions and devices see the same noise.
+
+    Args:
+        seed: Seed of the whole study.
+        case: Text or number of a point in parameter space, such as a hash of its parameters, so
+            that a point keeps its numbers when a grid grows. A tuple has one case per trial, for a
+            batch that holds several points.
+        trials: Indices of the trials of this chunk, which become the leading dimension. None draws
+            a single trial without that dimension, with the numbers of trial 0.
+
+    Raises:
+        ValueError: If a tuple of cases and the trials differ in number.
     """
 
     seed: int
@@ -44,12 +62,24 @@ class Draws:
             )
 
     def for_trials(self, trials: Sequence[int]) -> Draws:
-        """The same source for other trials."""
+        """Return the same source for other trials.
+
+        Args:
+            trials: Indices of the trials.
+
+        Raises:
+            ValueError: If there is a tuple of cases and it differs from the trials in number.
+        """
         return replace(self, trials=trials)
 
     def part(self, name: str) -> Draws:
-        """An independent source for a named part of the world, so that two patches of one kind
-        differ.
+        """Return an independent source for a named part of a scene.
+
+        Two parts of one kind, such as two areas of speckle, draw the same numbers unless their
+        sources have different names.
+
+        Args:
+            name: Name of the part, added to the case.
         """
         return replace(
             self,
@@ -59,11 +89,13 @@ class Draws:
         )
 
     def _generators(self, purpose: str) -> list[np.random.Generator]:
+        """Generators at the addresses of all trials."""
         trials = self.trials if self.trials is not None else [0]
         cases = self.case if isinstance(self.case, tuple) else [self.case] * len(trials)
         return [generator_at(self.seed, purpose, case, trial) for case, trial in zip(cases, trials, strict=True)]
 
     def _stack(self, arrays: list[np.ndarray], dtype: torch.dtype, device: torch.device | str | None) -> Tensor:
+        """Arrays of all trials as one tensor, without the leading dimension for a single trial."""
         x = torch.from_numpy(np.stack(arrays))
         return (x if self.trials is not None else x[0]).to(device=device, dtype=dtype)
 
@@ -74,8 +106,17 @@ class Draws:
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> Tensor:
-        """Standard normal numbers, (trials, *shape); for a complex dtype circular with unit mean
-        square.
+        """Draw standard normal numbers.
+
+        Args:
+            purpose: Name of the quantity, part of the address.
+            shape: Shape of one trial.
+            dtype: Real or complex dtype of the result.
+            device: Device of the result.
+
+        Returns:
+            Numbers of shape (trial, *shape) with mean zero and unit variance; for a complex dtype
+            circular, with unit mean square magnitude.
         """
         if dtype.is_complex:
             parts = self._stack(
@@ -95,11 +136,55 @@ class Draws:
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> Tensor:
-        """Uniform numbers in low..high, (trials, *shape)."""
+        """Draw numbers that are uniform between two limits.
+
+        Args:
+            purpose: Name of the quantity, part of the address.
+            shape: Shape of one trial.
+            low: Lower limit.
+            high: Upper limit.
+            dtype: Dtype of the result.
+            device: Device of the result.
+
+        Returns:
+            Numbers of shape (trial, *shape).
+        """
         return self._stack(
             [np.asarray(g.uniform(low, high, tuple(shape))) for g in self._generators(purpose)], dtype, device
         )
 
     def subset(self, purpose: str, n: int, k: int, device: torch.device | str | None = None) -> Tensor:
-        """k of the numbers 0..n-1 without repetition, rising, (trials, k) int64."""
+        """Draw k of the whole numbers 0 to n - 1 without repetition.
+
+        Args:
+            purpose: Name of the quantity, part of the address.
+            n: Number of whole numbers to choose from.
+            k: Number of whole numbers to choose.
+            device: Device of the result.
+
+        Returns:
+            Chosen numbers of shape (trial, k) in rising order, int64.
+        """
         return self._stack([np.sort(g.permutation(n)[:k]) for g in self._generators(purpose)], torch.int64, device)
+
+    def permutation(self, purpose: str, n: int | Sequence[int], device: torch.device | str | None = None) -> Tensor:
+        """Draw the whole numbers 0 to n - 1 in random order.
+
+        `subset` is the first k of them at the same address, sorted.
+
+        Args:
+            purpose: Name of the quantity, part of the address.
+            n: Number of whole numbers, one for all trials or one for each.
+            device: Device of the result.
+
+        Returns:
+            Numbers of shape (trial, largest n), int64; a shorter row ends in the numbers from its
+            own n on, in rising order.
+        """
+        generators = self._generators(purpose)
+        counts = [n] * len(generators) if isinstance(n, int) else list(n)
+        rows = [
+            np.concatenate([g.permutation(count), np.arange(count, max(counts))])
+            for g, count in zip(generators, counts, strict=True)
+        ]
+        return self._stack(rows, torch.int64, device)

@@ -1,4 +1,4 @@
-"""What an estimator returns: values, predicted deviations, quality and a verdict, per trial."""
+"""Result of an estimator: values, standard deviations, quality and reliability in each trial."""
 
 from __future__ import annotations
 
@@ -11,12 +11,22 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Estimate:
-    """Result of an estimator; every tensor leads with the trial dims.
+    """Estimated values with their predicted accuracy and their reliability in each trial.
 
-    value: unit-suffixed names to tensors, such as {"doppler_hz": (...,)} or {"phase_rad": (...,
-    pulse)}; finite even where not ok. std: predicted standard deviation under the same names, where
-    theory gives one. quality: (...,) in 0..1. ok: (...,) bool; False marks a trial whose value
-    should not be trusted. info: further tensors for reports.
+    All tensors begin with the trial dimensions (...). A trial in which the estimation fails raises
+    no error: `ok` is False there, and the values are finite.
+
+    Args:
+        value: Estimated values by name. Names end in the unit, such as `doppler_hz` of shape (...,)
+            or `phase_rad` of shape (..., pulse). Finite even where `ok` is False.
+        quality: Shape (...,), from 0 (unusable) to 1; each estimator defines its measure.
+        ok: Bool, shape (...,); False where the estimate is unreliable.
+        std: Predicted standard deviations, with the names, shapes and units of the values; present
+            only where theory gives one.
+        info: Further tensors for reports.
+
+    Raises:
+        ValueError: If `ok` is not a bool tensor with the shape of `quality`.
     """
 
     value: Mapping[str, Tensor]
@@ -33,15 +43,22 @@ class Estimate:
             )
 
     def __getitem__(self, name: str) -> Tensor:
-        """The value of that name; its error names those there are."""
+        """Return the value of a name; raise KeyError with the names that exist if there is none."""
         if name not in self.value:
             raise KeyError(f"estimate holds {tuple(self.value)}, not {name!r}")
         return self.value[name]
 
     @staticmethod
     def joined(parts: Sequence[Estimate], trials: torch.Size) -> Estimate:
-        """One estimate of all trials from those of blocks of them, whose one leading dim is the
-        block's.
+        """Join the estimates of consecutive blocks of trials.
+
+        Args:
+            parts: Estimates with equal names; each tensor has one leading dimension, the trials of
+                its block.
+            trials: Trial dimensions of the result; empty for a single trial without that dimension.
+
+        Returns:
+            One estimate of all trials, in the order of the blocks.
         """
 
         def whole(tensors: list[Tensor]) -> Tensor:
@@ -55,9 +72,15 @@ class Estimate:
 
 
 def settle(value: Tensor, fallback: Tensor | float) -> tuple[Tensor, Tensor]:
-    """Replace non-finite entries by a fallback; also says where it was finite.
+    """Replace values that are not finite.
 
-    Both shaped like value.
+    Args:
+        value: Values of any shape, float.
+        fallback: Replacement, a number or a tensor that broadcasts to the shape of `value`.
+
+    Returns:
+        The values with the replacements, and a bool mask that is True where the value was finite;
+        both have the shape of `value`.
     """
     finite = torch.isfinite(value)
     return torch.where(finite, value, torch.as_tensor(fallback, dtype=value.dtype, device=value.device)), finite

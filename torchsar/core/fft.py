@@ -1,4 +1,4 @@
-"""Centred Fourier transforms that move the samples and their axis together."""
+"""Centred Fourier transforms of signals, and transforms of large arrays in small blocks."""
 
 from __future__ import annotations
 
@@ -13,32 +13,53 @@ from torchsar.core.signal import Signal
 
 
 def centred_fft(x: Tensor, dim: int = -1) -> Tensor:
-    """X(f) = sum_i x[i] exp(-2j pi f (i - n//2)), frequencies -n//2 .. in rising order.
+    """Compute the Fourier transform whose phases refer to the middle sample.
 
-    Differentiable; inverse: centred_ifft.
+    X(f) = sum_i x[i] exp(-2j pi f (i - n // 2)), differentiable; the inverse is `centred_ifft`.
+
+    Args:
+        x: Samples, any shape, complex.
+        dim: Dimension to transform.
+
+    Returns:
+        Spectrum of the same shape, frequencies rising from -(n // 2) / n cycles per sample.
     """
     return torch.fft.fftshift(torch.fft.fft(torch.fft.ifftshift(x, dim=dim), dim=dim), dim=dim)
 
 
 def centred_ifft(x: Tensor, dim: int = -1) -> Tensor:
-    """Inverse of centred_fft."""
+    """Compute the inverse of `centred_fft`.
+
+    Args:
+        x: Spectrum, any shape, frequencies rising, complex.
+        dim: Dimension to transform.
+
+    Returns:
+        Samples of the same shape.
+    """
     return torch.fft.fftshift(torch.fft.ifft(torch.fft.ifftshift(x, dim=dim), dim=dim), dim=dim)
 
 
 def fft_lines(x: Tensor, inverse: bool = False, n: int | None = None) -> Tensor:
-    """FFT along -2 that rounds alike for any number of trials: left to itself, the library takes
-    another path for a single matrix.
+    """Compute the FFT along dim -2 with rounding that does not depend on the number of trials.
 
-    x: (..., line, range); n: length, by default that of x. Differentiable.
+    torch.fft.fft along dim -2 treats a single matrix and a batch differently, so that the last bits
+    of its results differ. Differentiable.
+
+    Args:
+        x: Samples, shape (..., line, range), complex.
+        inverse: Whether to compute the inverse transform.
+        n: Length of the transform; by default the number of lines.
+
+    Returns:
+        Spectrum in FFT order, shape (..., n, range).
     """
     transform = torch.fft.ifft if inverse else torch.fft.fft
     return _ContiguousGradient.apply(transform(_ContiguousGradient.apply(x).mT.contiguous(), n)).mT
 
 
 class _ContiguousGradient(torch.autograd.Function):
-    """Passes its input on; gradients come back contiguous, so that their transform rounds alike for
-    any number of trials too.
-    """
+    """Identity with a contiguous gradient, whose transform also rounds alike for any batch."""
 
     generate_vmap_rule = True
 
@@ -60,34 +81,61 @@ class _ContiguousGradient(torch.autograd.Function):
 
 
 def to_frequency(signal: Signal, name: str) -> Signal:
-    """The named axis and its samples in frequency (`pulse` -> `doppler` in Hz, `range` ->
-    `range_frequency` in 1/m).
+    """Transform one axis of a signal to frequency.
 
     Phases refer to the middle sample (n // 2) of the axis, not to its coordinate zero.
+
+    Args:
+        signal: Signal with the axis.
+        name: Name of the axis: `pulse` becomes `doppler` in Hz, `range` becomes `range_frequency`
+            in 1/m.
+
+    Returns:
+        Spectrum with the frequency axis in place of the named one.
+
+    Raises:
+        KeyError: If the signal has no axis of that name.
     """
     return signal.with_axis(centred_fft(signal.data, signal.dim(name)), **{name: signal.axis(name).dual()})
 
 
 def from_frequency(signal: Signal, name: str) -> Signal:
-    """Inverse of to_frequency; `name` is the frequency axis. Restores the original axis."""
+    """Compute the inverse of `to_frequency`, which restores the original axis.
+
+    Args:
+        signal: Signal with a frequency axis made by `to_frequency`.
+        name: Name of the frequency axis.
+
+    Raises:
+        KeyError: If the signal has no axis of that name.
+    """
     return signal.with_axis(centred_ifft(signal.data, signal.dim(name)), **{name: signal.axis(name).dual()})
 
 
 def block_bytes_of(device: torch.device) -> int:
-    """Size of the blocks that large arrays are worked on in: what stays in the cache of a CPU core,
-    much more on an accelerator.
+    """Return the size of the blocks in which large arrays are processed.
+
+    Args:
+        device: Device of the array.
+
+    Returns:
+        Bytes: 1 MiB on a CPU, which stays in the cache of a core, 256 MiB on an accelerator.
     """
     return 1 << 20 if device.type == "cpu" else 1 << 28
 
 
 def over_blocks(work: Callable[[Any], None], parts: Iterable[Any], like: Tensor) -> None:
-    """Call work on every part of an array, in as many threads as torch uses; not differentiable.
+    """Call a function for every part of an array, in as many threads as torch uses.
 
-    like: the array.
+    Each thread processes its own parts with single-threaded operations, so that none waits for the
+    slowest thread after every operation; on a busy machine that costs several times the work
+    itself. Parts are processed one after another if there are fewer than two for each thread, on an
+    accelerator, and inside torch.func transforms. Not differentiable.
 
-    Each thread works on blocks of its own with one-threaded operations: nothing waits for a slower
-    thread at every operation, which on a busy machine costs several times the work itself. Few
-    blocks, accelerators and torch.func transforms go one after another.
+    Args:
+        work: Function of one part, which writes its result into the array.
+        parts: Parts of the array, in any form that `work` accepts.
+        like: The array; decides whether threads can be used.
     """
     parts, threads = list(parts), torch.get_num_threads()
     if threads == 1 or len(parts) < 2 * threads or like.device.type != "cpu" or not _has_storage(like):
@@ -112,7 +160,7 @@ def over_blocks(work: Callable[[Any], None], parts: Iterable[Any], like: Tensor)
 
 
 def _has_storage(x: Tensor) -> bool:
-    """False inside torch.func transforms, whose state does not pass to other threads."""
+    """Whether x is a plain tensor; torch.func transforms do not reach other threads."""
     try:
         return x.data_ptr() != 0
     except RuntimeError:
@@ -122,12 +170,21 @@ def _has_storage(x: Tensor) -> bool:
 def transform_in_blocks(
     x: Tensor, dim: int, inverse: bool = False, out: Tensor | None = None, block_bytes: int | None = None
 ) -> Tensor:
-    """FFT of x along -1 or -2 into `out` (x itself by default), by blocks that stay in the cache;
-    not differentiable.
+    """Compute an FFT along dim -1 or -2 in blocks that stay in the cache.
 
-    A pass along -2 gathers a few columns into the cache, transforms them there and puts them back:
-    two to four times as fast as one call on the large array, and needs no second array (unless
-    `out` is not contiguous).
+    Along dim -2 a few columns at a time are gathered, transformed and written back: two to four
+    times as fast as one call for the large array, and without a second array if `out` is
+    contiguous. Not differentiable.
+
+    Args:
+        x: Samples, shape (..., line, range), complex.
+        dim: -1 or -2.
+        inverse: Whether to compute the inverse transform.
+        out: Array for the result, of the shape of x; by default x itself.
+        block_bytes: Size of a block; by default that of `block_bytes_of`.
+
+    Returns:
+        `out`, in FFT order.
     """
     out = x if out is None else out
     transform = torch.fft.ifft if inverse else torch.fft.fft
@@ -148,8 +205,16 @@ def transform_in_blocks(
 
 
 def spectrum_in_blocks(x: Tensor) -> Tensor:
-    """fft2 of x (..., pulse, range) into a new array, by whole trials where they fit the cache,
-    else pass by pass; not differentiable.
+    """Compute the two-dimensional FFT in blocks that stay in the cache.
+
+    Trials that fit the cache are transformed whole, larger ones along one dimension after the
+    other. Not differentiable.
+
+    Args:
+        x: Samples, shape (..., pulse, range), complex.
+
+    Returns:
+        Spectrum in FFT order, a new array of the same shape.
     """
     out = torch.empty_like(x, memory_format=torch.contiguous_format)
     if x.shape[-2] * x.shape[-1] * x.element_size() > 4 * block_bytes_of(x.device):
@@ -164,11 +229,10 @@ def spectrum_in_blocks(x: Tensor) -> Tensor:
 
 
 def _blocks(x: Tensor, dim: int, block_bytes: int) -> Iterator[tuple[slice, ...]]:
-    """Slices of (row, n) for a transform along -1, of (trial, n, column) for one along -2: trials
-    where they fit, else their columns.
+    """Slices of (row, n) for a transform along dim -1, of (trial, n, column) for one along dim -2.
 
-    Trials go one by one unless they are tiny: a strided transform of several makes torch copy them
-    first.
+    Small trials share a slice, each large one is divided by columns: torch first copies a strided
+    transform of several trials.
     """
     item = x[0].numel() * x.element_size()
     if dim == -1 or item <= block_bytes:

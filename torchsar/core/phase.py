@@ -1,4 +1,4 @@
-"""The only place where range becomes phase, and fast unit phasors."""
+"""Phases: reduction to one turn in float64, and fast unit phasors."""
 
 from __future__ import annotations
 
@@ -7,24 +7,40 @@ import math
 import torch
 from torch import Tensor
 
+# the distance of float64 numbers of this size is 6e-5 turn
 MAX_TURNS = 4e11
+# real dtype of each complex dtype
 _REAL = {torch.complex64: torch.float32, torch.complex128: torch.float64}
 
 
 def real_dtype(dtype: torch.dtype) -> torch.dtype:
-    """The real dtype of the parts of a complex one. Raises TypeError for any other dtype."""
+    """Return the real dtype that belongs to a complex one.
+
+    Args:
+        dtype: complex64 or complex128.
+
+    Returns:
+        float32 or float64.
+
+    Raises:
+        TypeError: For any other dtype.
+    """
     if dtype not in _REAL:
-        raise TypeError(
-            f"expected complex64 or complex128, got {dtype}; convert the samples first, nothing is cast silently"
-        )
+        raise TypeError(f"expected complex64 or complex128, got {dtype}; convert the samples first")
     return _REAL[dtype]
 
 
 def cis(angle_rad: Tensor) -> Tensor:
-    """exp(1j * angle), in the precision of the angle, which must already be small (a few turns).
+    """Compute exp(1j * angle) in the precision of the angle.
 
-    Writes cosine and sine straight into the real view of the result, a third of the time of
-    torch.polar; differentiable.
+    Takes a third of the time of torch.polar. Use `unit_phasor` for phases of more than a few turns.
+    Differentiable.
+
+    Args:
+        angle_rad: Angle in radians, any shape, float32 or float64.
+
+    Returns:
+        Unit phasors of the same shape, complex64 or complex128.
     """
     if angle_rad.requires_grad:
         return torch.complex(torch.cos(angle_rad), torch.sin(angle_rad))
@@ -38,39 +54,56 @@ def cis(angle_rad: Tensor) -> Tensor:
 
 
 def reduced_turns(turns: Tensor) -> Tensor:
-    """Turns with the whole ones dropped, in -0.5..0.5, float64.
+    """Remove whole turns from a phase.
 
-    Differentiable: the dropped part is a constant.
+    Differentiable: the removed part counts as a constant.
 
-    Raises TypeError unless float64, ValueError beyond 4e11 turns, where float64 itself holds only
-    1e-4 turn.
+    Args:
+        turns: Phase in turns, any shape, float64.
+
+    Returns:
+        Phase in -0.5..0.5 turns, same shape, float64.
+
+    Raises:
+        TypeError: If the phase is not float64.
+        ValueError: If the phase exceeds 4e11 turns, where float64 resolves only 1e-4 turn.
     """
     if turns.dtype != torch.float64:
         raise TypeError(
             f"phase needs float64 turns, got {turns.dtype}: a range of 700 km is 1e7 turns at S "
-            "band and 1e12 in the near infrared"
+            "band and 1e12 in the near infrared; form the phase in float64"
         )
-    _refuse_huge(turns)
+    _check_resolution(turns)
     return turns - torch.round(turns.detach())
 
 
 def unit_phasor(turns: Tensor, dtype: torch.dtype) -> Tensor:
-    """exp(2j*pi*turns) in `dtype`.
+    """Compute exp(2j * pi * turns); whole turns are removed while the phase is still float64.
 
-    turns: float64, any shape; whole turns are dropped before leaving float64.
+    The phase convention is exp(-2j pi f tau): the echo of delay tau at carrier frequency f is
+    `unit_phasor(-f * tau, dtype)`. Differentiable.
 
-    An echo of delay tau at carrier f is `unit_phasor(-f * tau, dtype)` (design: phase exp(-j 2 pi f
-    tau)).
+    Args:
+        turns: Phase in turns, any shape, float64.
+        dtype: complex64 or complex128.
+
+    Returns:
+        Unit phasors of the same shape.
+
+    Raises:
+        TypeError: If the phase is not float64 or `dtype` is not complex.
+        ValueError: If the phase exceeds 4e11 turns.
     """
     return cis((2 * math.pi * reduced_turns(turns)).to(real_dtype(dtype)))
 
 
-def _refuse_huge(turns: Tensor) -> None:
+def _check_resolution(turns: Tensor) -> None:
+    """Raise ValueError for phases beyond the precision of float64."""
     if turns.numel() == 0:
         return
     try:
         worst = float(turns.detach().abs().max())
-    except RuntimeError:  # inside vmap a value cannot be looked at
+    except RuntimeError:  # inside vmap values cannot be read
         return
     if not worst <= MAX_TURNS:
         raise ValueError(
@@ -80,24 +113,50 @@ def _refuse_huge(turns: Tensor) -> None:
 
 
 def linear_phasor(turns_per_step: Tensor, start: float, n: int, dtype: torch.dtype) -> Tensor:
-    """exp(2j pi s (start + i)) for i = 0..n-1, from two short float64 tables and one complex
-    product per element.
+    """Compute exp(2j pi s (start + i)) for i = 0..n - 1, with s in turns.
 
-    turns_per_step: float64 (...,). Returns (..., n). As exact as unit_phasor on every element, at a
-    tenth of its cost; differentiable.
+    Multiplies two short tables: as exact as `unit_phasor` of every element, at a tenth of its cost.
+    Differentiable.
+
+    Args:
+        turns_per_step: Phase step s in turns, shape (...,), float64.
+        start: Offset of the first element in steps.
+        n: Number of elements.
+        dtype: complex64 or complex128.
+
+    Returns:
+        Unit phasors, shape (..., n).
     """
     fine, coarse = phasor_tables(turns_per_step, start, n, dtype)
     return outer_phasor(fine, coarse, n)
 
 
 def outer_phasor(fine: Tensor, coarse: Tensor, n: int) -> Tensor:
-    """The first n products of phasor_tables' factors, (..., n)."""
+    """Multiply the tables of `phasor_tables`.
+
+    Args:
+        fine: Shape (..., m), complex.
+        coarse: Shape (..., ceil(n / m)), complex.
+        n: Number of elements.
+
+    Returns:
+        The first n products, shape (..., n); element i is fine[i % m] * coarse[i // m].
+    """
     return (coarse[..., :, None] * fine[..., None, :]).flatten(-2)[..., :n]
 
 
 def phasor_tables(turns_per_step: Tensor, start: float, n: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Factors of linear_phasor: fine (..., m) and coarse (..., ceil(n / m)), element i being fine[i
-    % m] * coarse[i // m].
+    """Return the two factors of `linear_phasor`, for use where the full product is not needed.
+
+    Args:
+        turns_per_step: As in `linear_phasor`.
+        start: As in `linear_phasor`.
+        n: As in `linear_phasor`.
+        dtype: As in `linear_phasor`.
+
+    Returns:
+        `fine` of shape (..., m) and `coarse` of shape (..., ceil(n / m)), complex; element i of the
+        phasor is fine[i % m] * coarse[i // m], with m a power of two near sqrt(n).
     """
     m = max(1, 2 ** round(math.log2(max(n, 1)) / 2))
     steps = torch.arange(m, dtype=torch.float64, device=turns_per_step.device)

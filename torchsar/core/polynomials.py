@@ -1,4 +1,4 @@
-"""Orthogonal polynomials that estimators describe smooth curves with."""
+"""Orthogonal polynomials, with which estimators describe smooth curves."""
 
 from __future__ import annotations
 
@@ -7,9 +7,16 @@ from torch import Tensor
 
 
 def legendre(u: Tensor, order: int) -> Tensor:
-    """Legendre polynomials of degree 0..order at u in -1..1, (*u.shape, order + 1).
+    """Evaluate the Legendre polynomials of degree 0 to `order`.
 
-    Their mean squares over -1..1 are 1 / (2 degree + 1).
+    Their mean squares over -1..1 are 1 / (2 degree + 1). Differentiable.
+
+    Args:
+        u: Positions in -1..1, any shape, float.
+        order: Highest degree.
+
+    Returns:
+        Values, shape (*u.shape, order + 1).
     """
     terms = [torch.ones_like(u), u]
     for k in range(1, order):

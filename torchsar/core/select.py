@@ -1,4 +1,4 @@
-"""Choices made per trial: broadcasting, gathering and picking without leaving the batch."""
+"""Selection by trial: broadcasting, gathering and the choice of the best candidate in a batch."""
 
 from __future__ import annotations
 
@@ -7,16 +7,30 @@ from torch import Tensor
 
 
 def per_trial(value: Tensor | float, trailing: int, like: Tensor) -> Tensor:
-    """A number or per-trial tensor (...,) as float64 with `trailing` unit dims behind, ready to
-    broadcast against (..., a, b).
+    """Return a number or one value per trial in a form that broadcasts against data.
+
+    Args:
+        value: Number, or one value per trial, shape (...,).
+        trailing: Number of trailing dimensions of the data.
+        like: Tensor that gives the device.
+
+    Returns:
+        Float64, shape (..., 1, ..., 1) with `trailing` dimensions of length one at the end.
     """
     value = torch.as_tensor(value, dtype=torch.float64, device=like.device)
     return value[(...,) + (None,) * trailing]
 
 
 def take(x: Tensor, index: Tensor, dim: int = -1) -> Tensor:
-    """x[..., index, ...] along `dim` with one index per leading trial; index: shape of x without
-    the dims from `dim` on.
+    """Take the element at one index per trial along a dimension.
+
+    Args:
+        x: Tensor with the dimension `dim`, any shape.
+        index: Indices, int64, with the shape of the dimensions of x before `dim`.
+        dim: Dimension to select from.
+
+    Returns:
+        Tensor with the shape of x without `dim`.
     """
     dim = dim % x.ndim
     shape = index.shape + (1,) * (x.ndim - index.ndim)
@@ -25,9 +39,15 @@ def take(x: Tensor, index: Tensor, dim: int = -1) -> Tensor:
 
 
 def best_of(costs: Tensor, candidates: Tensor) -> tuple[Tensor, Tensor]:
-    """Per trial the candidate of least cost. costs, candidates: (candidate, ...).
+    """Choose the candidate of lowest cost in each trial.
 
-    Returns (value, margin to the runner-up).
+    Args:
+        costs: Shape (candidate, ...).
+        candidates: Shape (candidate, ...).
+
+    Returns:
+        The best candidate, shape (...,), and the difference between the second-lowest and the
+        lowest cost, which is infinite if there is only one candidate.
     """
     order = costs.argsort(dim=0)
     value = take(candidates.movedim(0, -1), order[0])

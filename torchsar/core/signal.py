@@ -1,4 +1,4 @@
-"""What flows between stages: a tensor and the names of its trailing axes."""
+"""Signals with named axes, recordings of an instrument, and the truth of a simulation."""
 
 from __future__ import annotations
 
@@ -13,16 +13,24 @@ from torch import Tensor
 from torchsar.core.axis import Axis
 from torchsar.core.check import refuse_non_finite
 
+# Limit of plausibility, for errors in files: 200 dB is a factor of 1e10 in amplitude.
 AGC_LIMIT_DB = 200.0
 
 
 @dataclass(frozen=True)
 class Signal:
-    """Complex samples with named trailing axes; every dim before them is a Monte Carlo trial.
+    """Samples with named trailing axes; every dimension before them is a Monte Carlo trial.
 
-    data: (*trials, axes[0].n, axes[1].n, ...), slow time before fast time, range last and
-    contiguous. Raises ValueError where the trailing shape and the axes disagree, TypeError for data
-    that are no tensor.
+    Slow time comes before fast time, and range is last and contiguous. Samples are complex, except
+    those of a one-channel detector, which are real.
+
+    Args:
+        data: Samples, shape (*trials, axes[0].n, axes[1].n, ...).
+        axes: One axis for each trailing dimension.
+
+    Raises:
+        ValueError: If the trailing dimensions do not have the lengths of the axes.
+        TypeError: If `data` is not a tensor.
     """
 
     data: Tensor
@@ -45,58 +53,97 @@ class Signal:
 
     @property
     def trials(self) -> torch.Size:
-        """Shape of the leading trial dims."""
+        """Shape of the leading trial dimensions."""
         return self.data.shape[: self.data.ndim - len(self.axes)]
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of the axes, in order."""
         return tuple(axis.name for axis in self.axes)
 
     def axis(self, name: str) -> Axis:
-        """The axis of that name. Raises KeyError naming the axes there are."""
+        """Return the axis of a name.
+
+        Raises:
+            KeyError: If the signal has no axis of that name.
+        """
         return self.axes[self.dim(name)]
 
     def dim(self, name: str) -> int:
-        """Position of the named axis counted from the end (negative), so that it holds for any
-        number of trial dims.
+        """Return the dimension of a named axis, counted from the end.
+
+        Returns:
+            A negative number: -1 for the last axis.
+
+        Raises:
+            KeyError: If the signal has no axis of that name.
         """
         if name not in self.names:
             raise KeyError(f"signal has the axes {self.names}, not {name!r}")
         return self.names.index(name) - len(self.axes)
 
     def with_data(self, data: Tensor) -> Signal:
-        """Other samples on the same axes."""
+        """Return a signal with other samples on the same axes.
+
+        Args:
+            data: Samples whose trailing dimensions fit the axes.
+
+        Raises:
+            ValueError: If the trailing dimensions do not have the lengths of the axes.
+        """
         return replace(self, data=data)
 
     def with_axis(self, data: Tensor, **axes: Axis) -> Signal:
-        """Other samples with some axes replaced, each named by what it replaces."""
+        """Return a signal with other samples and with some axes replaced.
+
+        Args:
+            data: Samples whose trailing dimensions fit the new axes.
+            **axes: New axes, by the names of those that they replace.
+
+        Raises:
+            KeyError: If the signal has no axis of such a name.
+            ValueError: If the trailing dimensions do not have the lengths of the new axes.
+        """
         for name in axes:
             self.dim(name)
         return Signal(data, tuple(axes.get(axis.name, axis) for axis in self.axes))
 
     def crop(self, **bounds: tuple[int, int]) -> Signal:
-        """Samples first..last-1 of the named axes: `signal.crop(range=(0, 1480))`."""
+        """Return a part of the samples along some axes: `signal.crop(range=(0, 1480))`.
+
+        Args:
+            **bounds: Pairs (first, last) by the name of the axis; samples first to last - 1 are
+                kept.
+
+        Raises:
+            KeyError: If the signal has no axis of such a name.
+            ValueError: If a pair is empty or exceeds its axis.
+        """
         signal = self
         for name, (first, last) in bounds.items():
             axis = signal.axis(name)
             if not 0 <= first < last <= axis.n:
-                raise ValueError(f"crop of axis {name!r} to {first}:{last} does not fit its {axis.n} samples")
+                raise ValueError(
+                    f"crop of axis {name!r} to {first}:{last} does not fit its {axis.n} samples; "
+                    f"give 0 <= first < last <= {axis.n}"
+                )
             data = signal.data.narrow(signal.dim(name), first, last - first)
             signal = signal.with_axis(data, **{name: axis.part(first, last)})
         return signal
 
     def to(self, *args: Any, **kwargs: Any) -> Signal:
-        """As Tensor.to, for the samples."""
+        """Return the signal on another device or in another dtype; arguments as for Tensor.to."""
         return self.with_data(self.data.to(*args, **kwargs))
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What an instrument hands over: samples, what it knows about itself, and recorded side data.
+    """Samples of an instrument, with its description and the side data recorded beside them.
 
-    signal: raw samples with true axes. radar: a frozen description (carrier, waveform, nominal
-    path). aux: named tensors that were recorded beside the samples, such as `line_number` (...,
-    pulse) or `agc_db` (..., pulse).
+    Args:
+        signal: Raw samples on true axes.
+        radar: Frozen description of the instrument: carrier, waveform, nominal path.
+        aux: Side data by name, such as `line_number` or `agc_db`, both of shape (..., pulse).
     """
 
     signal: Signal
@@ -114,13 +161,24 @@ class Recording:
         what: str = "data",
         **aux: Any,
     ) -> Recording:
-        """A recording from a user's own complex raw matrix (..., line, sample), range last, and
-        side data by name.
+        """Make a recording from a user's own raw data matrix and side data.
 
-        radar: an instrument description with `raw_axes`, such as StripmapRadar. `agc_db` (...,
-        line), receiver attenuation, is undone here: each line is multiplied by 10**(agc_db/20).
-        `line_number` (..., line) has one number a line. Raises ValueError where shapes disagree or
-        samples are not complex and finite; warns of lines that hold only zeros.
+        Lines that hold only zeros raise a warning.
+
+        Args:
+            data: Complex samples (..., line, sample), range last, as an array or a tensor.
+            radar: Description of the instrument with a method `raw_axes`, such as StripmapRadar.
+            dtype: complex64 or complex128; the samples are converted to it.
+            start_s: Slow time of the first line, in seconds.
+            what: Name of the data for messages.
+            **aux: Side data by name. `agc_db` (..., line) is the attenuation of the receiver in dB:
+                each line is multiplied by 10**(agc_db / 20) here. `line_number` (..., line) has one
+                number per line.
+
+        Raises:
+            ValueError: If `dtype` or the samples are not complex, there are no samples, a sample is
+                not finite, side data are no numbers or do not fit the lines, or `agc_db` exceeds
+                200 dB.
         """
         if not dtype.is_complex:
             raise ValueError(f"{what}: dtype must be complex64 or complex128, got {dtype}")
@@ -131,11 +189,11 @@ class Recording:
                 f"of shape {tuple(x.shape)}"
             )
         refuse_non_finite(x, what)
-        _warn_of_silence(x, what)
+        _warn_of_empty_lines(x, what)
         side = {name: _as_tensor(value, f"{what}: {name}") for name, value in aux.items()}
         for name in ("agc_db", "line_number"):
             if name in side:
-                _refuse_other_lines(side[name], x, f"{what}: {name}")
+                _check_side_data(side[name], x, f"{what}: {name}")
         x = x.to(dtype)
         if "agc_db" in side:
             level = side["agc_db"].to(torch.float64)
@@ -148,7 +206,10 @@ class Recording:
         return cls(Signal(x, radar.raw_axes(x.shape[-2], x.shape[-1], start_s)), radar, side)
 
     def to(self, *args: Any, **kwargs: Any) -> Recording:
-        """Samples and side data moved; only the samples change dtype."""
+        """Return the recording with samples and side data moved; arguments as for Tensor.to.
+
+        Only the samples change their dtype.
+        """
         signal = self.signal.to(*args, **kwargs)
         return replace(
             self, signal=signal, aux={name: value.to(signal.data.device) for name, value in self.aux.items()}
@@ -156,7 +217,7 @@ class Recording:
 
 
 def _as_tensor(value: Any, what: str) -> Tensor:
-    """torch.as_tensor with the offender named."""
+    """torch.as_tensor with an error message that names the data."""
     try:
         return torch.as_tensor(value)
     except (TypeError, ValueError, RuntimeError):
@@ -164,20 +225,21 @@ def _as_tensor(value: Any, what: str) -> Tensor:
         raise ValueError(f"{what}: expected numbers in an array or a tensor, got {kind}") from None
 
 
-def _warn_of_silence(samples: Tensor, what: str) -> None:
-    silent = ~samples.detach().bool().any(-1)
-    count = int(silent.sum())
+def _warn_of_empty_lines(samples: Tensor, what: str) -> None:
+    """Warn of lines that hold only zeros."""
+    empty = ~samples.detach().bool().any(-1)
+    count = int(empty.sum())
     if count:
-        first = int(silent.nonzero()[0, -1])
+        first = int(empty.nonzero()[0, -1])
         warnings.warn(
-            f"{what}: {count} of {silent.numel()} lines hold only zeros, the first is line "
+            f"{what}: {count} of {empty.numel()} lines hold only zeros, the first is line "
             f"{first}; line integrity marks such lines as missing",
             stacklevel=3,
         )
 
 
-def _refuse_other_lines(side: Tensor, samples: Tensor, what: str) -> None:
-    """Side data have one real number per line, for all trials or per trial."""
+def _check_side_data(side: Tensor, samples: Tensor, what: str) -> None:
+    """Raise ValueError unless side data have one real number per line."""
     lines, trials = samples.shape[-2], samples.shape[:-2]
     if side.ndim == 0 or side.shape[-1] != lines:
         raise ValueError(
@@ -192,8 +254,11 @@ def _refuse_other_lines(side: Tensor, samples: Tensor, what: str) -> None:
 
 @dataclass(frozen=True)
 class Truth:
-    """What the world knows and no processor may see: named per-trial tensors, and the unimpaired
-    recording where there is one.
+    """True values of a simulation, for evaluation only; no processing stage may use them.
+
+    Args:
+        values: True values by name; tensors begin with the trial dimensions.
+        clean: Recording without the impairments, or None if there is none.
     """
 
     values: Mapping[str, Tensor]

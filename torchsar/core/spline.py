@@ -1,6 +1,4 @@
-"""Cubic splines through values on a uniform grid: smooth curves between pulses, with slope and
-integral.
-"""
+"""Cubic splines on a uniform grid, with their derivative and their integral."""
 
 from __future__ import annotations
 
@@ -12,20 +10,30 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv1d
 
-# the root of z^2 + 4 z + 1 inside the unit circle: what happens k knots away counts z^k
+# root of z^2 + 4 z + 1 inside the unit circle: the influence of a knot k steps away is z^k
 _DECAY = math.sqrt(3.0) - 2.0
+# half width of the truncated response in knots: |z|^32 = 5e-19 is below the precision of float64
 _REACH = 32
 
 
 @dataclass(frozen=True)
 class UniformSpline:
-    """The cubic spline through values at `start + i * step`, not-a-knot at both ends (as
-    scipy.interpolate.CubicSpline by default).
+    """Cubic spline through values at `start + i * step`, with not-a-knot conditions at both ends.
 
-    values: float64 (..., n), n >= 2; two make a line, three a parabola. Leading dims are trials,
-    the grid is one for all. Outside the grid the end pieces go on. Differentiable in the values and
-    in the times of evaluation. Raises TypeError for values that are not float64, ValueError for
-    fewer than two of them or a step that is not positive.
+    It equals scipy.interpolate.CubicSpline with default settings. Two values give a straight line,
+    three a parabola. Outside the grid the polynomials of the first and last interval continue.
+    Differentiable in the values and in the times of evaluation.
+
+    Args:
+        values: Values at the knots, shape (..., n) with n >= 2, float64; leading dimensions are
+            trials.
+        start: Time of the first knot.
+        step: Distance between knots, positive.
+
+    Raises:
+        TypeError: If the values are not float64.
+        ValueError: If there are fewer than two values, the step is not positive, or start or step
+            are not finite.
     """
 
     values: Tensor
@@ -47,36 +55,60 @@ class UniformSpline:
             )
 
     def at(self, t: Tensor) -> Tensor:
-        """Value at float64 times of any shape, which all trials share: (..., *t.shape)."""
+        """Evaluate the spline.
+
+        Args:
+            t: Times, any shape, float64, the same for all trials.
+
+        Returns:
+            Values, shape (..., *t.shape).
+        """
         return self._polynomial(self._unit, t)
 
     def slope(self, t: Tensor) -> Tensor:
-        """Derivative, in units of values per unit of time, (..., *t.shape)."""
+        """Evaluate the derivative of the spline.
+
+        Args:
+            t: Times, any shape, float64, the same for all trials.
+
+        Returns:
+            Derivative in units of the values per unit of time, shape (..., *t.shape).
+        """
         c0 = self._unit
         return self._polynomial([c0[1], 2 * c0[2], 3 * c0[3]], t) / self.step
 
     def integral(self, t: Tensor) -> Tensor:
-        """Antiderivative that is zero at `start`, (..., *t.shape)."""
+        """Evaluate the integral of the spline from `start` on.
+
+        Args:
+            t: Times, any shape, float64, the same for all trials.
+
+        Returns:
+            Integral in units of the values times the unit of time, shape (..., *t.shape).
+        """
         c = self._unit
         whole = c[0] + c[1] / 2 + c[2] / 3 + c[3] / 4
         before = torch.cat([torch.zeros_like(whole[..., :1]), whole.cumsum(-1)[..., :-1]], -1)
         return self._polynomial([before, c[0], c[1] / 2, c[2] / 3, c[3] / 4], t) * self.step
 
     def pieces(self) -> Tensor:
-        """Polynomial coefficients (..., n - 1, 4) of each interval, rising powers of the time since
-        its first knot.
+        """Return the polynomial coefficients of every interval.
+
+        Returns:
+            Coefficients of rising powers of the time since the first knot of the interval, shape
+            (..., n - 1, 4).
         """
         return torch.stack([c / self.step**power for power, c in enumerate(self._unit)], -1)
 
     @cached_property
     def _unit(self) -> list[Tensor]:
-        """Coefficients (..., n - 1) of powers 0..3 of the time in steps."""
+        """Coefficients (..., n - 1) of the powers 0..3 of the time in steps."""
         y, bend = self.values, second_differences(self.values)
         first, last = bend[..., :-1], bend[..., 1:]
         return [y[..., :-1], y[..., 1:] - y[..., :-1] - (2 * first + last) / 6, first / 2, (last - first) / 6]
 
     def _polynomial(self, powers: list[Tensor], t: Tensor) -> Tensor:
-        """Horner's rule on the interval of each time."""
+        """Evaluate polynomials by Horner's rule, each time in its interval."""
         position = (t.to(torch.float64) - self.start) / self.step
         piece = torch.floor(position.detach()).clamp(0, self.values.shape[-1] - 2)
         offset, index = position - piece, piece.to(torch.int64).flatten()
@@ -87,13 +119,19 @@ class UniformSpline:
 
 
 def second_differences(values: Tensor) -> Tensor:
-    """Second derivatives at the knots of the not-a-knot spline through values (..., n) one apart,
-    (..., n).
+    """Return the second derivatives at the knots of a not-a-knot spline with unit step.
 
-    M[i-1] + 4 M[i] + M[i+1] = 6 (y[i-1] - 2 y[i] + y[i+1]) inside. With M linear through the first
-    three knots, row 1 says M[1] = the second difference there, and so at the other end; between
-    them the rows are solved at once by the decaying response of the endless grid, z^|k| / (2 sqrt
-    3), and two decaying terms that meet the known ends.
+    The second derivatives M solve M[i-1] + 4 M[i] + M[i+1] = 6 (y[i-1] - 2 y[i] + y[i+1]) inside.
+    Not-a-knot makes M linear through the first three knots, so that M[1] is the second difference
+    of y there; likewise at the other end. Between them all equations are solved at once, by
+    convolution with the response of the infinite grid, z^|k| / (2 sqrt 3) with z = sqrt 3 - 2, and
+    two decaying terms that satisfy the conditions at the ends.
+
+    Args:
+        values: Values y at the knots, shape (..., n) with n >= 2, float64.
+
+    Returns:
+        Second derivatives, shape (..., n).
     """
     n = values.shape[-1]
     if n == 2:
@@ -106,9 +144,7 @@ def second_differences(values: Tensor) -> Tensor:
 
 
 def _dirichlet(known: Tensor) -> Tensor:
-    """x (..., m) with x[i-1] + 4 x[i] + x[i+1] = 6 known[i] between its ends, and equal to `known`
-    at them; m >= 2.
-    """
+    """Solve x[i-1] + 4 x[i] + x[i+1] = 6 known[i], with x equal to `known` at both ends."""
     m = known.shape[-1]
     away = torch.arange(-_REACH, _REACH + 1, dtype=torch.float64, device=known.device).abs()
     response = 6 * _power(away) / (2 * math.sqrt(3.0))
@@ -121,5 +157,5 @@ def _dirichlet(known: Tensor) -> Tensor:
 
 
 def _power(k: Tensor) -> Tensor:
-    """z^k of whole numbers k >= 0: z is negative."""
+    """Power z^k of whole numbers k >= 0; z is negative."""
     return torch.where(k.remainder(2) == 0, 1.0, -1.0).to(k) * abs(_DECAY) ** k

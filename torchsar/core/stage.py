@@ -1,6 +1,4 @@
-"""The base of every stage: a thin nn.Module that knows axis names and refuses what it cannot work
-on.
-"""
+"""Base class of all processing stages."""
 
 from __future__ import annotations
 
@@ -14,14 +12,21 @@ from torchsar.core.signal import Signal
 
 
 class Stage(nn.Module):
-    """`stage(signal, **values)` returns a Signal, an Estimate (the signal is left alone), or both
-    as a pair.
+    """Base class of a processing stage, which checks axes and samples before `forward` runs.
 
-    Subclasses say in `works_on` which trailing axes they need, in `also_on` what else they work on,
-    and in `provides` which values their Estimate carries; keyword parameters of `forward` that are
-    not the signal are values that a Chain can connect. Constants are buffers, tunables are
-    nn.Parameters. Samples that are not finite or not complex are refused here, once, for every
-    stage; one that separates the record of a one-channel detector says `takes_real`.
+    `stage(signal, **values)` returns a Signal, an Estimate (the signal is then unchanged), or a
+    pair of both. Keyword parameters of `forward` are values that a Chain can connect. Constants are
+    buffers, tunable values are nn.Parameters (see `hold`). A subclass sets the following class
+    attributes:
+
+    - `works_on`: names of the trailing axes that it needs.
+    - `also_on`: further tuples of axes that it accepts.
+    - `provides`: names of the values in its Estimate.
+    - `takes_real`: True if it accepts the real samples of a one-channel detector.
+
+    Raises:
+        TypeError: On a call, if the argument is not a Signal or the samples are not complex.
+        ValueError: On a call, if the axes do not fit or a sample is not finite.
     """
 
     works_on: tuple[str, ...] = ("pulse", "range")
@@ -34,7 +39,7 @@ class Stage(nn.Module):
         if not isinstance(signal, Signal):
             raise TypeError(
                 f"{name} works on a Signal with the axes {self.works_on}, got "
-                f"{type(signal).__name__}; wrap the tensor: Signal(data, radar.axes(lines, samples))"
+                f"{type(signal).__name__}; wrap the tensor: Signal(data, radar.raw_axes(lines, samples))"
             )
         if signal.names not in (self.works_on, *self.also_on):
             raise ValueError(
@@ -46,8 +51,12 @@ class Stage(nn.Module):
         return super().__call__(signal, *args, **values)
 
     def hold(self, name: str, value: Tensor | float) -> None:
-        """Register a value of this stage: an nn.Parameter stays one (tunable), anything else
-        becomes a float64 buffer (constant).
+        """Register a value of the stage: an nn.Parameter as tunable, anything else as a constant.
+
+        Args:
+            name: Name of the attribute.
+            value: nn.Parameter, which is kept as it is, or a number or tensor, which becomes a
+                float64 buffer.
         """
         if isinstance(value, nn.Parameter):
             self.register_parameter(name, value)

@@ -1,11 +1,14 @@
-"""The warp of slow time by which a target that turns unevenly turns: angle = rate at the first
-pulse * warp(time since the first pulse).
+"""Warped slow time of a target with non-uniform rotation.
 
-warp(t) = t + k1 t^2 / 2! + k2 t^3 / 3! + ..., so that k1 = acceleration / rate (1/s) and k2 = jerk
-/ rate (1/s^2) are TRUE derivatives of the rate at the first pulse over that rate, not coefficients
-of a polynomial: `coefficients_of` gives those (k1 / 2, k2 / 6; a factor of 2 or 6 is a silent
-error). `k` is a tensor (..., order - 1), its last dim (k1, k2, ...); an empty one is even rotation.
-Remote Sens. 2025, 17, 3447, Eqs. (1)-(3).
+The angle of the target is the rotation rate at the first pulse times warp(t), where t is the time
+since the first pulse and warp(t) = t + k1 t^2 / 2! + k2 t^3 / 3! + ... The relative derivatives k1
+= acceleration / rate (1/s), k2 = jerk / rate (1/s^2), ... are derivatives of the rate at the first
+pulse divided by that rate. They are not the coefficients of a polynomial, which are k1 / 2, k2 / 6,
+... (see `coefficients_of`). They stand in a tensor `k` of shape (..., order - 1); an empty tensor
+means uniform rotation.
+
+Reference:
+    Remote Sens. 2025, 17, 3447, Eqs. (1)-(3).
 """
 
 from __future__ import annotations
@@ -19,22 +22,37 @@ from torch import Tensor
 
 
 def warp(time_s: Tensor, k: Tensor) -> Tensor:
-    """Warped time (s) at time_s since the first pulse.
+    """Compute the warped time.
 
-    time_s: (m,) or (..., m); k: (..., order - 1). Returns (..., m). Differentiable.
+    Differentiable.
+
+    Args:
+        time_s: Time since the first pulse in seconds, shape (m,) or (..., m).
+        k: Relative derivatives of the rotation rate in 1/s, 1/s^2, ..., shape (..., order - 1).
+
+    Returns:
+        Warped time in seconds, shape (..., m).
     """
     return time_s * _horner(time_s, k, 2)
 
 
 def warp_rate(time_s: Tensor, k: Tensor) -> Tensor:
-    """Derivative of `warp`: rotation rate over the rate at the first pulse. Shapes as there."""
+    """Compute the derivative of the warp: the rotation rate relative to that at the first pulse.
+
+    Differentiable.
+
+    Args:
+        time_s: Time since the first pulse in seconds, shape (m,) or (..., m).
+        k: Relative derivatives of the rotation rate in 1/s, 1/s^2, ..., shape (..., order - 1).
+
+    Returns:
+        Relative rotation rate, shape (..., m).
+    """
     return _horner(time_s, k, 1)
 
 
 def _horner(time_s: Tensor, k: Tensor, first: int) -> Tensor:
-    """1 + k1 t / first (1 + k2 / k1 t / (first + 1) ...), without the division: sum of k_i t^i
-    (first - 1)! / (first - 1 + i)!.
-    """
+    """Sum over i of k_i t^i (first - 1)! / (first - 1 + i)!, with k_0 = 1."""
     trials = torch.broadcast_shapes(k.shape[:-1], time_s.shape[:-1])
     total, power = (
         torch.ones((*trials, time_s.shape[-1]), dtype=time_s.dtype, device=time_s.device),
@@ -47,32 +65,63 @@ def _horner(time_s: Tensor, k: Tensor, first: int) -> Tensor:
 
 
 def coefficients_of(k: Tensor) -> Tensor:
-    """Coefficients of t^2, t^3, ... of the warp, k_i / (i + 1)!. (..., order - 1)."""
+    """Convert relative derivatives to the polynomial coefficients of the warp.
+
+    Args:
+        k: Relative derivatives k_i, shape (..., order - 1).
+
+    Returns:
+        Coefficients k_i / (i + 1)! of t^2, t^3, ..., same shape.
+    """
     return k / _factorials(k)
 
 
 def k_of_coefficients(coefficients: Tensor) -> Tensor:
-    """Inverse of `coefficients_of`."""
+    """Compute the inverse of `coefficients_of`.
+
+    Args:
+        coefficients: Coefficients of t^2, t^3, ... of the warp, shape (..., order - 1).
+
+    Returns:
+        Relative derivatives k_i, same shape.
+    """
     return coefficients * _factorials(coefficients)
 
 
 def _factorials(k: Tensor) -> Tensor:
+    """Factorials 2!, 3!, ... that belong to k1, k2, ..."""
     return torch.tensor([math.factorial(i + 2) for i in range(k.shape[-1])], dtype=k.dtype, device=k.device)
 
 
 def least_rate(k: Tensor, duration_s: float, points: int = 513) -> Tensor:
-    """Least derivative of the warp over 0..duration_s, (...,): at or below zero two times share an
-    angle, and no image can be formed.
+    """Return the lowest relative rotation rate during the observation.
+
+    At zero or below, two times share one angle, and no image can be formed.
+
+    Args:
+        k: Relative derivatives of the rotation rate, shape (..., order - 1).
+        duration_s: Duration of the observation in seconds.
+        points: Number of times at which the rate is evaluated.
+
+    Returns:
+        Lowest rate relative to that at the first pulse, shape (...,).
     """
     return warp_rate(torch.linspace(0, duration_s, points, dtype=torch.float64, device=k.device), k).amin(-1)
 
 
 def shape_of(k: Tensor, duration_s: float) -> Tensor:
-    """Legendre shape (q2, q3, ...) of the warp over 0..duration_s: warp = c1 (s + q2 P2(s) + q3
-    P3(s) + ...) + const, s = 2 t / duration - 1.
+    """Convert relative derivatives to the Legendre coefficients of the warp.
 
-    (..., order - 1) for any order. The shape is far better conditioned than k, whose errors pull
-    against each other.
+    The warp is c1 (s + q2 P2(s) + q3 P3(s) + ...) + constant, with s = 2 t / duration - 1. The
+    coefficients q are much better conditioned than k, whose estimation errors are strongly
+    correlated.
+
+    Args:
+        k: Relative derivatives of the rotation rate, shape (..., order - 1).
+        duration_s: Duration of the observation in seconds.
+
+    Returns:
+        Legendre coefficients q2, q3, ... relative to c1, same shape.
     """
     base, slopes = _legendre_of(k, duration_s)
     c = base + (k[..., None] * slopes).sum(-2)
@@ -80,8 +129,16 @@ def shape_of(k: Tensor, duration_s: float) -> Tensor:
 
 
 def k_of_shape(shape: Tensor, duration_s: float) -> Tensor:
-    """Inverse of `shape_of`. Needs a warp that grows at the first pulse: 1 + sum q_j
-    P_j'(-1) > 0.
+    """Compute the inverse of `shape_of`.
+
+    The warp must rise at the first pulse: 1 + sum_j q_j P_j'(-1) > 0.
+
+    Args:
+        shape: Legendre coefficients q2, q3, ..., shape (..., order - 1).
+        duration_s: Duration of the observation in seconds.
+
+    Returns:
+        Relative derivatives k_i, same shape.
     """
     order = shape.shape[-1] + 1
     half = duration_s / 2
@@ -104,16 +161,13 @@ def k_of_shape(shape: Tensor, duration_s: float) -> Tensor:
 
 
 def _monomials(polynomial: np.polynomial.Polynomial, order: int) -> np.ndarray:
-    """Coefficients of (s + 1)^1..^order."""
+    """Coefficients of (s + 1)^1 to (s + 1)^order."""
     shifted = polynomial(np.polynomial.Polynomial([-1.0, 1.0])).coef
     return np.pad(shifted, (0, order + 1 - len(shifted)))[1:]
 
 
 def _legendre_of(k: Tensor, duration_s: float) -> tuple[Tensor, Tensor]:
-    """Legendre coefficients 0..order of t, and of t^(i+1) / (i+1)!
-
-    for each k_i (order - 1, order + 1).
-    """
+    """Legendre coefficients 0..order of t, and of t^(i + 1) / (i + 1)! for each k_i."""
     order, half = k.shape[-1] + 1, duration_s / 2
 
     def row(power: int) -> np.ndarray:
@@ -126,4 +180,5 @@ def _legendre_of(k: Tensor, duration_s: float) -> tuple[Tensor, Tensor]:
 
 
 def _on(like: Tensor, values: np.ndarray) -> Tensor:
+    """Values as a tensor with the dtype and device of another one."""
     return torch.as_tensor(values, dtype=like.dtype, device=like.device)

@@ -1,4 +1,9 @@
-"""Radar and scene to recordings: echoes, noise and receiver impairment."""
+"""Simulation: from radar and world to recording and truth, with noise and receiver impairments.
+
+An impairment is called with a recording and random draws; it returns the impaired recording and the
+true values of the impairment. It works on recorded data as well. Parameters may differ between
+trials as in `torchsar.scene`.
+"""
 
 from torchsar.echo.bistatic import bistatic_echo, simulate_bistatic
 from torchsar.echo.channel_errors import ChannelErrors, PolynomialDrift, SinusoidDrift, SynchronisationError, WalkDrift

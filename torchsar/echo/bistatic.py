@@ -1,6 +1,4 @@
-"""Simulated acquisitions of an airborne multichannel receiver under a far transmitter: world in,
-recording and truth out.
-"""
+"""Simulation of an airborne multichannel receiver with a distant transmitter."""
 
 from __future__ import annotations
 
@@ -13,14 +11,15 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Axis, Draws, Recording, Signal, Truth, per_trial, real_dtype, unit_phasor
-from torchsar.echo.ladar_course import refuse_trials
 from torchsar.echo.pulsed import echo_spectrum
 from torchsar.echo.sea import sea_echo
 from torchsar.echo.stripmap import Impairment
 from torchsar.radar import BistaticRadar
 from torchsar.scene import BandLimited, BistaticWorld, ExactRange, Gate, Movers, ReceiveRange, TransmitRange
+from torchsar.scene.trials import refuse_other_trials, with_dims
 
 Kind = Literal["compressed", "full"]
+# phase tables of a block of pulses, about the cache of a processor
 _TABLE_BYTES = 8 << 20
 _EXACT = ExactRange()
 
@@ -37,17 +36,32 @@ def bistatic_echo(
     kind: Kind = "compressed",
     dtype: torch.dtype = torch.complex64,
 ) -> Tensor:
-    """Echo of moving points without noise, (..., channel, pulse, range) of `dtype`; without n_range
-    the peak lines alone, (..., channel, pulse).
+    """Return the echo of moving points without noise.
 
-    Phase -2 pi / lambda (R_T(t) - R_T(0) + R_m(t) - reference_range_m), one way each. The receive
-    window follows the ephemeris: the envelope lies at R_m plus what the true range to the
-    transmitter has over radar.transmit_range. kind: "compressed" for a rectangular band of the
-    pulse's width, peak 1 for amplitude 1; "full" for the sampled pulse itself, whose leading edge
-    lies at R_m (`focus.RangeCompress` gives the compressed echo). Ranges are frozen during a pulse.
-    transmit: None for the ephemeris. An echo partly outside the range axis is cut, never wrapped
-    (compressed: below -35 dB). Differentiable in speeds, places and amplitudes. Sources: Remote
-    Sens. 2020, 12, 1703, Eqs. (1), (4), (15); brief 001, Signal model.
+    The phase is -2 pi / lambda (R_T(t) - R_T(0) + R_m(t) - reference_range_m), one way for each
+    range. The receive window follows the ephemeris: the envelope lies at R_m plus the difference of
+    the true range to the transmitter and radar.transmit_range. Ranges are constant during a pulse.
+    Echoes partly outside the range axis are cut and never wrap (compressed: below -35 dB).
+    Differentiable in speeds, positions and amplitudes.
+
+    Args:
+        movers: Targets, shape (..., target).
+        radar: Receiver.
+        n_pulse: Number of pulses.
+        n_range: Number of range samples, None for the peak lines alone.
+        gate: Receive gain.
+        receive: Model of the range to the receiver.
+        transmit: True range to the transmitter, None for that of the ephemeris.
+        kind: "compressed" for a rectangular band of the width of the pulse, with the peak 1 for
+            amplitude 1. "full" for the sampled pulse itself, whose leading edge lies at R_m;
+            `focus.RangeCompress` gives its compressed echo.
+        dtype: Complex dtype of the result.
+
+    Returns:
+        Echo, shape (..., channel, pulse, range), or (..., channel, pulse) without n_range.
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, Eqs. (1), (4), (15).
     """
     time_s = radar.pulse_axis(n_pulse).values(movers.u_r_m_s.device)
     if n_range is None:
@@ -59,7 +73,7 @@ def bistatic_echo(
     parts = []
     for pulses in _pulse_blocks(
         n_pulse, 16 * radar.channels * max(grid.n_fft, movers.amplitude.shape[-1])
-    ):  # whatever the number of trials: sums then round alike in any batch
+    ):  # independent of the number of trials, so that sums round equally in any batch
         block = _Lines.of(movers, radar, time_s[pulses], gate, receive, transmit).spectrum(grid, radar, dtype)
         parts.append(torch.fft.ifft(torch.fft.ifftshift(block * spectrum, dim=-1))[..., :n_range])
     return torch.cat(parts, -2)
@@ -67,9 +81,7 @@ def bistatic_echo(
 
 @dataclass(frozen=True)
 class _Lines:
-    """Echoes of targets in some pulses: where their envelopes lie, turns of their carriers, and
-    weights, (..., channel, pulse, target) each.
-    """
+    """Envelope range, carrier cycles and weight of targets, (..., channel, pulse, target)."""
 
     envelope_m: Tensor
     turns: Tensor
@@ -84,14 +96,15 @@ class _Lines:
         receive: ReceiveRange,
         transmit: TransmitRange | None,
     ) -> _Lines:
+        """Ranges and weights of targets at some pulses."""
         range_m = receive.range_m(movers, time_s, radar)
         if movers.bend is not None:
             range_m = range_m + movers.bend.transmit_m(time_s)
         known = radar.transmit_range_m(time_s)
         true = known if transmit is None else transmit.range_m(time_s)
         weight = gate.weight(movers, time_s, radar) * movers.amplitude[..., None, None, :]
-        late, true = (x[..., None, :, None] for x in (true - known, true))
-        return _Lines(range_m + late, (range_m + true) / radar.wavelength_m, weight)
+        late_m, true = (x[..., None, :, None] for x in (true - known, true))
+        return _Lines(range_m + late_m, (range_m + true) / radar.wavelength_m, weight)
 
     def peaks(self, dtype: torch.dtype) -> Tensor:
         """Sum over targets as if each lay on the one recorded line, (..., channel, pulse)."""
@@ -101,7 +114,7 @@ class _Lines:
         """Sum over targets in range frequency, rising order, (..., channel, pulse, n_fft)."""
         samples = self.envelope_m / radar.range_step_m + grid.n_range // 2
         inside = (samples > -grid.margin) & (samples < grid.n_range + grid.margin)
-        weight = self.weight.expand(samples.shape) * inside
+        weight = self.weight * inside
         return echo_spectrum(
             samples / radar.sampling_hz, self.turns, weight, grid.n_fft, radar.sampling_hz / grid.n_fft, dtype
         )
@@ -109,9 +122,7 @@ class _Lines:
 
 @dataclass(frozen=True)
 class _Grid:
-    """Line of n_fft samples in which echoes of n_range recorded ones do not wrap; margin: samples
-    beyond its ends from which echoes still reach in.
-    """
+    """FFT length for recorded lines; margin: samples beyond a line whose echoes reach into it."""
 
     n_range: int
     n_fft: int
@@ -120,20 +131,20 @@ class _Grid:
 
     @staticmethod
     def of(radar: BistaticRadar, n_range: int, kind: Kind) -> _Grid:
+        """The shortest fast FFT in which echoes do not wrap."""
         margin = max(32, n_range // 8) if kind == "compressed" else radar.pulse.n_samples(radar.sampling_hz)
         need = n_range + 2 * margin
         return _Grid(n_range, next(n for n in range(need, 2 * need) if _smooth(n)), margin, kind)
 
     def spectrum(self, radar: BistaticRadar, device: torch.device) -> Tensor:
-        """Of the transmitted pulse, or of its compressed response, complex128 (n_fft,) in FFT
-        order.
-        """
+        """Spectrum of the pulse, or of its compressed response, (n_fft,) in FFT order."""
         if self.kind == "full":
             return radar.pulse.spectrum(self.n_fft, radar.sampling_hz, device)
         return radar.band_weights(self.n_fft, device).to(torch.complex128)
 
 
 def _smooth(n: int) -> bool:
+    """Whether a number has no prime factor above 5."""
     for p in (2, 3, 5):
         while n % p == 0:
             n //= p
@@ -141,6 +152,7 @@ def _smooth(n: int) -> bool:
 
 
 def _pulse_blocks(n_pulse: int, bytes_per_pulse: int) -> Iterator[slice]:
+    """Blocks of pulses whose tables fit the cache."""
     height = max(1, min(n_pulse, _TABLE_BYTES // max(1, bytes_per_pulse)))
     for first in range(0, n_pulse, height):
         yield slice(first, min(first + height, n_pulse))
@@ -158,22 +170,40 @@ def simulate_bistatic(
     dtype: torch.dtype = torch.complex64,
     device: torch.device | str | None = None,
 ) -> tuple[Recording, Truth]:
-    """A recording (..., channel, pulse[, range]) of a world and the truth about it, batched over
-    the trials of `draws`.
+    """Simulate a recording of moving targets and a sea, batched over the trials of the draws.
 
-    n_range: None for azimuth-only data, on which every target lies on the one recorded line. kind:
-    see `bistatic_echo`; azimuth-only data are compressed. impairments: applied in order, by name.
-    The truth, float64 (..., target): `u_r_m_s`, `u_a_m_s`, `y0_m` (also as `azimuth_m`), `range_m`
-    (R0), `amplitude`, and `u_t_m_s`, the closing speed towards the transmitter, where there is one;
-    `transmit_range_m` (pulse,), the true R_T(t) - R_T(0); `noise_std` of a sample of this kind
-    (...,); what each impairment says under "<impairment>.<name>". `clean` is the recording without
-    noise and impairments. Warns of targets that shine at no pulse. Raises ValueError for targets as
-    fast as the receiver or far outside the range axis, no pulses, or lines that do not hold the
-    pulse.
+    Warns of targets that the gate passes at no pulse.
+
+    Args:
+        radar: Receiver.
+        world: World.
+        n_pulse: Number of pulses.
+        n_range: Number of range samples, None for azimuth-only data, in which every target lies on
+            the one recorded line.
+        draws: Random draws.
+        kind: See `bistatic_echo`; azimuth-only data are compressed.
+        impairments: Impairments by name, applied in order.
+        dtype: Complex dtype of the recording.
+        device: Device of the recording.
+
+    Returns:
+        The recording, shape (..., channel, pulse, range) or (..., channel, pulse), and the truth.
+        The truth holds, per target, shape (..., target): `u_r_m_s`, `u_a_m_s`, `y0_m` (also as
+        `azimuth_m`), the closest range `range_m`, `amplitude`, and the closing speed towards the
+        transmitter `u_t_m_s` where there is one. It further holds `transmit_range_m`, the true
+        R_T(t) - R_T(0), shape (..., pulse); `noise_std`, the standard deviation of the noise of a
+        sample of this kind, shape (...,); and the values of each impairment under
+        "<impairment>.<name>". `clean` is the recording without noise and impairments.
+
+    Raises:
+        TypeError: If an argument is of another kind.
+        ValueError: If a target is as fast as the receiver or far outside the range axis, there are
+            no pulses, lines do not hold the pulse, or a parameter per trial has another length than
+            the trials.
     """
     _refuse_impossible(radar, world, n_pulse, n_range, kind, draws)
     movers = _movers(radar, world, n_range, draws, device)
-    _warn_of_dark(movers, radar, world.gate, n_pulse)
+    _warn_of_unlit(movers, radar, world.gate, n_pulse)
     axes = radar.axes(n_pulse, n_range)
     time_s = axes[1].values(device)
     transmit_m = radar.transmit_range_m(time_s) if world.transmit is None else world.transmit.range_m(time_s)
@@ -189,7 +219,7 @@ def simulate_bistatic(
         dtype=dtype,
     )
     if world.sea is not None:
-        gate: Any = world.gate  # sea_echo refuses what it does not know
+        gate: Any = world.gate  # sea_echo rejects other gates
         sea = sea_echo(world.sea, radar, n_pulse, n_range, gate, draws.part("sea"), dtype, device)
         echo = echo + (
             _received(sea[..., None], transmit_m, radar, kind)[..., 0]
@@ -204,16 +234,17 @@ def simulate_bistatic(
     recording = (
         clean if world.snr_db is None else Recording(Signal(echo + _noise(std, axes, draws, dtype), axes), radar)
     )
-    told: dict[str, Tensor] = {}
+    impairment_truth: dict[str, Tensor] = {}
     for name, impairment in (impairments or {}).items():
-        recording, said = impairment(recording, draws.part(name))
-        told.update({f"{name}.{key}": value for key, value in said.items()})
-    return recording, Truth({**values, **told}, clean)
+        recording, added = impairment(recording, draws.part(name))
+        impairment_truth.update({f"{name}.{key}": value for key, value in added.items()})
+    return recording, Truth({**values, **impairment_truth}, clean)
 
 
 def _movers(
     radar: BistaticRadar, world: BistaticWorld, n_range: int | None, draws: Draws, device: torch.device | str | None
 ) -> Movers:
+    """Targets on the device, checked against receiver and range axis."""
     if world.scene is None:
         none = torch.zeros(0, dtype=torch.float64, device=device)
         return Movers(none, none, none, none, none.to(torch.complex128))
@@ -254,17 +285,18 @@ def _movers(
     return movers
 
 
-def _warn_of_dark(movers: Movers, radar: BistaticRadar, gate: Gate, n_pulse: int) -> None:
-    """Targets that the gate lights at no pulse of the record."""
+def _warn_of_unlit(movers: Movers, radar: BistaticRadar, gate: Gate, n_pulse: int) -> None:
+    """Warn of targets that a band-limited gate passes at no pulse of the record."""
     if not isinstance(gate, BandLimited):
         return
-    abeam_s = (movers.y0_m / (radar.speed_m_s - movers.u_a_m_s)).detach().abs()
-    dark = abeam_s > (n_pulse // 2) / radar.prf_hz + gate.duration_s / 2
-    if bool(dark.any()):
-        last = float(abeam_s.max())
-        when = f"one is abeam {last:.3g} s from the middle of a record of {n_pulse / radar.prf_hz:.3g} s"
+    closest_s = (movers.y0_m / (radar.speed_m_s - movers.u_a_m_s)).detach().abs()
+    unlit = closest_s > (n_pulse // 2) / radar.prf_hz + with_dims(gate.duration_s, 1, closest_s) / 2
+    if bool(unlit.any()):
+        last = float(closest_s.max())
+        when = f"one is closest {last:.3g} s from the middle of a record of {n_pulse / radar.prf_hz:.3g} s"
         warnings.warn(
-            f"{int(dark.sum())} of {dark.numel()} targets shine at no pulse: {when}; record longer, or move it",
+            f"{int(unlit.sum())} of {unlit.numel()} targets are received in no pulse: {when}; record longer, "
+            "or move them",
             stacklevel=3,
         )
 
@@ -272,6 +304,7 @@ def _warn_of_dark(movers: Movers, radar: BistaticRadar, gate: Gate, n_pulse: int
 def _refuse_impossible(
     radar: BistaticRadar, world: BistaticWorld, n_pulse: int, n_range: int | None, kind: str, draws: Draws
 ) -> None:
+    """Raise an error for arguments that allow no simulation."""
     if not isinstance(radar, BistaticRadar) or not isinstance(world, BistaticWorld) or not isinstance(draws, Draws):
         raise TypeError(
             "a bistatic recording is simulated from a BistaticRadar, a BistaticWorld and Draws, "
@@ -286,7 +319,7 @@ def _refuse_impossible(
         )
     if kind not in get_args(Kind):
         raise ValueError(f"kind must be one of {', '.join(get_args(Kind))}, got {kind!r}")
-    refuse_trials("snr_db", world.snr_db, draws)
+    refuse_other_trials(world, draws)
     samples = radar.pulse.n_samples(radar.sampling_hz)
     if kind == "full" and (n_range is None or n_range < samples):
         raise ValueError(
@@ -296,9 +329,7 @@ def _refuse_impossible(
 
 
 def _received(sea: Tensor, transmit_m: Tensor, radar: BistaticRadar, kind: Kind) -> Tensor:
-    """A sea with the range to the transmitter on its carrier, (..., channel, pulse, range); for
-    full echoes spread out by the pulse.
-    """
+    """Sea with the range to the transmitter on its carrier; full echoes are spread by the pulse."""
     if kind == "full":
         n_range = sea.shape[-1]
         n_fft = _Grid.of(radar, n_range, kind).n_fft
@@ -310,21 +341,22 @@ def _received(sea: Tensor, transmit_m: Tensor, radar: BistaticRadar, kind: Kind)
 
 
 def _noise_std(radar: BistaticRadar, world: BistaticWorld, kind: Kind, like: Tensor) -> Tensor:
-    """Deviation of the complex noise of a sample, (...,): a pulse of n samples gathers n times its
-    power.
-    """
+    """Standard deviation of the complex noise of a sample, (...,)."""
     if world.snr_db is None:
         return torch.zeros((), dtype=torch.float64, device=like.device)
+    # compression raises the signal-to-noise ratio by the number of samples of the pulse
     gain = radar.pulse.n_samples(radar.sampling_hz) if kind == "full" else 1
     return torch.sqrt(gain * 10 ** (-per_trial(world.snr_db, 0, like) / 10))
 
 
 def _noise(std: Tensor, axes: tuple[Axis, ...], draws: Draws, dtype: torch.dtype) -> Tensor:
+    """Circular Gaussian noise of a standard deviation (...,)."""
     unit = draws.normal("echo.bistatic.noise", [axis.n for axis in axes], dtype, std.device)
     return unit * std.to(real_dtype(dtype))[(...,) + (None,) * len(axes)]
 
 
 def _truths(movers: Movers, radar: BistaticRadar, transmit_m: Tensor, noise_std: Tensor) -> dict[str, Tensor]:
+    """True values by name."""
     values = {
         "u_r_m_s": movers.u_r_m_s,
         "u_a_m_s": movers.u_a_m_s,

@@ -1,6 +1,4 @@
-"""What receivers do to multichannel recordings: channels that differ, and clocks that drift against
-the transmitter's.
-"""
+"""Errors of multichannel recordings: unequal channels, and clocks that drift apart."""
 
 from __future__ import annotations
 
@@ -14,14 +12,23 @@ from torch import Tensor
 
 from torchsar.core import Draws, Recording, Signal, real_dtype, unit_phasor
 from torchsar.radar import BistaticRadar
-from torchsar.scene.vibration import refuse_unless_finite
+from torchsar.scene.trials import refuse_other_trials, refuse_unless_finite, stacked, with_dims
 
-PerChannel = Sequence[float] | Tensor
+PerChannel = Sequence[Tensor | float] | Tensor
 
 
 def delayed(signal: Signal, delay_s: Tensor, radar: BistaticRadar) -> Signal:
-    """Range lines later by delay_s, float64 (..., channel, pulse) or what broadcasts to it,
-    carriers unchanged. The ends of a line join: what leaves one enters the other.
+    """Delay range lines without a change of their carrier phases.
+
+    The lines are periodic: what leaves one end enters at the other.
+
+    Args:
+        signal: Data of shape (..., channel, pulse, range), complex.
+        delay_s: Delay in seconds, later positive, broadcastable to (..., channel, pulse), float64.
+        radar: Receiver.
+
+    Returns:
+        Delayed data.
     """
     frequency = radar.range_frequency_hz(signal.data.shape[-1], signal.data.device)
     shift = unit_phasor(-delay_s[..., None] * frequency, signal.data.dtype)
@@ -29,6 +36,7 @@ def delayed(signal: Signal, delay_s: Tensor, radar: BistaticRadar) -> Signal:
 
 
 def _refuse_delay(recording: Recording, what: str) -> None:
+    """Raise ValueError for data without a range axis."""
     if "range" not in recording.signal.names:
         raise ValueError(
             f"{what} has delays, but azimuth-only data have no range axis to shift along; "
@@ -38,12 +46,21 @@ def _refuse_delay(recording: Recording, what: str) -> None:
 
 @dataclass(frozen=True)
 class ChannelErrors:
-    """Phase (rad), gain (dB) and delay (s, later positive) of each channel, target and noise alike.
+    """Impairment: phase, gain and delay of each channel, for signal and noise.
 
-    One entry a channel, lists or tensors (..., channel) that may differ between trials; None for
-    none. Delays shift lines without turning carriers. Truth: `phase_rad`, `gain_db`, `delay_s`,
-    float64 (..., channel) each. Raises ValueError for numbers that do not fit the channels, or
-    delays on azimuth-only data.
+    Delays shift lines without a change of their carrier phases. Each parameter is a list with one
+    entry per channel (numbers, or one value per trial), a tensor of shape (..., channel), or None
+    for no error. The truth holds `phase_rad`, `gain_db` and `delay_s`, shape (..., channel) each,
+    float64.
+
+    Args:
+        phase_rad: Phases in radians.
+        gain_db: Gains in decibels.
+        delay_s: Delays in seconds, later positive.
+
+    Raises:
+        ValueError: If a number is not finite; when applied, if the numbers do not fit the channels,
+            or delays meet azimuth-only data.
     """
 
     phase_rad: PerChannel | None = None
@@ -52,14 +69,12 @@ class ChannelErrors:
 
     def __post_init__(self) -> None:
         for name in ("phase_rad", "gain_db", "delay_s"):
-            if getattr(self, name) is not None:
-                refuse_unless_finite(f"{name} of channels", torch.as_tensor(getattr(self, name)))
+            refuse_unless_finite(f"{name} of channels", getattr(self, name))
 
     def _values(self, name: str, channels: int, device: torch.device) -> Tensor:
+        """Values of a parameter for all channels, zero where it is not given, (..., channel)."""
         given = getattr(self, name)
-        value = (
-            torch.zeros(channels, dtype=torch.float64) if given is None else torch.as_tensor(given, dtype=torch.float64)
-        )
+        value = torch.zeros(channels, dtype=torch.float64) if given is None else stacked(given)
         if not value.ndim or value.shape[-1] != channels:
             raise ValueError(
                 f"{name} of channels needs one entry for each of the {channels} channels, got shape "
@@ -68,6 +83,7 @@ class ChannelErrors:
         return value.to(device)
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, Mapping[str, Tensor]]:
+        refuse_other_trials(self, draws, recording)
         signal = recording.signal
         tail = (None,) * (-signal.dim("channel") - 1)
         phase, gain, delay = (
@@ -85,103 +101,171 @@ class ChannelErrors:
 
 
 class Drift(Protocol):
-    """How an error of a clock goes with slow time: float64 (pulse,), zero at the middle pulse ->
-    (..., pulse).
-    """
+    """Error of a clock as a function of slow time."""
 
-    def values(self, time_s: Tensor, draws: Draws) -> Tensor: ...
+    def values(self, time_s: Tensor, draws: Draws) -> Tensor:
+        """Return the error.
+
+        Args:
+            time_s: Slow time in seconds, zero at the middle pulse, shape (pulse,), float64.
+            draws: Random draws.
+
+        Returns:
+            Error in radians or seconds, shape (..., pulse), float64.
+        """
+        ...
 
 
 @dataclass(frozen=True)
 class PolynomialDrift:
-    """coefficients[0] + coefficients[1] t + ..., the coefficients per power of a second."""
+    """Polynomial drift, c0 + c1 t + c2 t^2 + ...
 
-    coefficients: Sequence[float]
+    Args:
+        coefficients: c0, c1, ... per power of a second; each a number or one value per trial.
+
+    Raises:
+        ValueError: If a coefficient is not finite.
+    """
+
+    coefficients: Sequence[Tensor | float]
 
     def __post_init__(self) -> None:
-        refuse_unless_finite("coefficients of a drift", torch.tensor(list(self.coefficients), dtype=torch.float64))
+        refuse_unless_finite("coefficients of a drift", self.coefficients)
 
     def values(self, time_s: Tensor, draws: Draws) -> Tensor:
+        """Return the drift.
+
+        Args:
+            time_s: Slow time in seconds, shape (pulse,), float64.
+            draws: Random draws, which are not used.
+
+        Returns:
+            Drift, shape (..., pulse), float64.
+        """
         total = torch.zeros_like(time_s)
         for c in reversed(self.coefficients):
-            total = total * time_s + c
+            total = total * time_s + with_dims(c, time_s.ndim, time_s)
         return total
 
 
 @dataclass(frozen=True)
 class SinusoidDrift:
-    """amplitude sin(2 pi frequency_hz t + start_rad); start_rad: None for one at random in each
-    trial.
+    """Sinusoidal drift, amplitude sin(2 pi frequency t + start).
+
+    Args:
+        amplitude: Amplitude in radians or seconds.
+        frequency_hz: Frequency in hertz.
+        start_rad: Phase at slow time zero in radians, None for a random phase in each trial.
+
+    Raises:
+        ValueError: If a number is not finite.
     """
 
-    amplitude: float
-    frequency_hz: float
-    start_rad: float | None = None
+    amplitude: Tensor | float
+    frequency_hz: Tensor | float
+    start_rad: Tensor | float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("amplitude", "frequency_hz"):
+        for name in ("amplitude", "frequency_hz", "start_rad"):
             refuse_unless_finite(f"{name} of a drift", getattr(self, name))
 
     def values(self, time_s: Tensor, draws: Draws) -> Tensor:
+        """Return the drift.
+
+        Args:
+            time_s: Slow time in seconds, shape (pulse,), float64.
+            draws: Random draws of the start phase.
+
+        Returns:
+            Drift, shape (..., pulse), float64.
+        """
         start = (
             2 * math.pi * draws.uniform("echo.drift.sinusoid")
             if self.start_rad is None
-            else torch.tensor(self.start_rad, dtype=torch.float64)
-        )
-        return self.amplitude * torch.sin(2 * math.pi * self.frequency_hz * time_s + start.to(time_s.device)[..., None])
+            else torch.as_tensor(self.start_rad, dtype=torch.float64)
+        ).to(time_s.device)[..., None]
+        amplitude, frequency = (with_dims(v, 1, time_s) for v in (self.amplitude, self.frequency_hz))
+        return amplitude * torch.sin(2 * math.pi * frequency * time_s + start)
 
 
 @dataclass(frozen=True)
 class WalkDrift:
-    """A random walk with normal steps of deviation `step` from pulse to pulse, zero at the middle
-    one.
+    """Random walk with normal steps from pulse to pulse, zero at the middle pulse.
+
+    Args:
+        step: Standard deviation of a step in radians or seconds.
+
+    Raises:
+        ValueError: If the standard deviation is negative or not finite.
     """
 
-    step: float
+    step: Tensor | float
 
     def __post_init__(self) -> None:
         refuse_unless_finite("step of a drift", self.step, 0.0)
 
     def values(self, time_s: Tensor, draws: Draws) -> Tensor:
-        walk = (self.step * draws.normal("echo.drift.walk", (time_s.numel(),))).cumsum(-1)
+        """Draw the walk.
+
+        Args:
+            time_s: Slow time in seconds, shape (pulse,), float64.
+            draws: Random draws.
+
+        Returns:
+            Drift, shape (..., pulse), float64.
+        """
+        unit = draws.normal("echo.drift.walk", (time_s.numel(),))
+        walk = (with_dims(self.step, 1, unit) * unit).cumsum(-1)
         return (walk - walk[..., time_s.numel() // 2, None]).to(time_s.device)
 
 
 @dataclass(frozen=True)
 class SynchronisationError:
-    """Phase (rad) and delay (s, later positive) of every pulse, common to all channels, and a
-    direct path from the transmitter that shows both.
+    """Impairment: phase and delay of every pulse by clocks that drift apart, and a direct path.
 
-    phase_rad, delay_s: lists of drifts that are added up: `PolynomialDrift`, `SinusoidDrift`,
-    `WalkDrift`. Data become exp(j phase) times data delayed by delay, without turning carriers.
-    aux: `direct_path` (..., pulse, direct_samples), the direct signal of each pulse after range
-    compression at the sampling rate of the echoes, its known range taken out: a rectangular band,
-    peak exp(j phase) at sample direct_samples // 2 + delay_s sampling_hz. direct_snr_db: of its
-    peak over noise variance per sample, None for no noise. Truth: `phase_rad`, `delay_s`, float64
-    (..., pulse). Raises ValueError for delays on azimuth-only data, or beyond a quarter of the
-    direct path's samples.
+    Both errors are common to all channels: data become exp(j phase) times data that are delayed
+    without a change of their carrier phases. The recording gets aux `direct_path`, the direct
+    signal of the transmitter in each pulse after range compression, shape (..., pulse,
+    direct_samples). Its known range is removed; it has a rectangular band and the peak exp(j phase)
+    at sample direct_samples // 2 + delay_s sampling_hz. The truth holds `phase_rad` and `delay_s`,
+    shape (..., pulse) each, float64.
+
+    Args:
+        phase_rad: Drifts whose sum is the phase in radians.
+        delay_s: Drifts whose sum is the delay in seconds, later positive.
+        direct_snr_db: Peak power of the direct path over the noise variance per sample in decibels,
+            None for no noise.
+        direct_samples: Number of samples of the direct path, at least 8.
+
+    Raises:
+        TypeError: If a single drift is given instead of a list.
+        ValueError: If the ratio is not finite or the samples are too few; when applied, if delays
+            meet azimuth-only data or exceed a quarter of the direct path.
     """
 
     phase_rad: Sequence[Drift] = ()
     delay_s: Sequence[Drift] = ()
-    direct_snr_db: float | None = 40.0
+    direct_snr_db: Tensor | float | None = 40.0
     direct_samples: int = 64
 
     def __post_init__(self) -> None:
         if hasattr(self.phase_rad, "values") or hasattr(self.delay_s, "values"):
-            raise TypeError("phase_rad and delay_s must be lists of drifts; put a single one in brackets")
-        if self.direct_snr_db is not None:
-            refuse_unless_finite("direct_snr_db", self.direct_snr_db)
+            raise TypeError(
+                f"phase_rad and delay_s must be lists of drifts, got {self.phase_rad!r} and {self.delay_s!r}; "
+                "put a single one in brackets"
+            )
+        refuse_unless_finite("direct_snr_db", self.direct_snr_db)
         if not self.direct_samples >= 8:
             raise ValueError(
-                f"a direct path needs at least 8 samples a pulse, got direct_samples={self.direct_samples}"
+                f"a direct path needs at least 8 samples per pulse, got direct_samples={self.direct_samples}"
             )
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, Mapping[str, Tensor]]:
+        refuse_other_trials(self, draws, recording)
         signal, radar = recording.signal, recording.radar
-        trials, axis = signal.trials, signal.axis("pulse")
+        axis = signal.axis("pulse")
         phase, delay = (
-            _total(drifts, axis.values(signal.data.device), draws.part(name)).expand(*trials, axis.n)
+            _total(drifts, axis.values(signal.data.device), draws.part(name)).expand(*signal.trials, axis.n)
             for name, drifts in (("phase", self.phase_rad), ("delay", self.delay_s))
         )
         tail = (None,) * (-signal.dim("pulse") - 1)
@@ -194,12 +278,13 @@ class SynchronisationError:
         return replace(recording, signal=impaired, aux=aux), {"phase_rad": phase, "delay_s": delay}
 
     def _direct_path(self, turn: Tensor, delay_s: Tensor, radar: BistaticRadar, draws: Draws) -> Tensor:
+        """Direct signal of each pulse, (..., pulse, direct_samples)."""
         n = self.direct_samples
         worst = float(delay_s.abs().max()) * radar.sampling_hz
         if not worst <= n / 4:
             raise ValueError(
-                f"a delay of {worst:.4g} samples passes a quarter of the {n} samples of the direct "
-                "path; give it more (direct_samples) or smaller drifts"
+                f"a delay of {worst:.4g} samples exceeds a quarter of the {n} samples of the direct "
+                "path; give more samples (direct_samples) or smaller drifts"
             )
         frequency = radar.range_frequency_hz(n, delay_s.device)
         band = radar.band_weights(n, delay_s.device).to(turn.dtype)
@@ -210,9 +295,11 @@ class SynchronisationError:
         if self.direct_snr_db is None:
             return line
         noise = draws.normal("echo.direct_path.noise", line.shape[-2:], line.dtype, line.device)
-        return line + 10 ** (-self.direct_snr_db / 20) * noise
+        std = 10 ** (-with_dims(self.direct_snr_db, 2, line) / 20)
+        return line + (std.to(real_dtype(line.dtype)) if isinstance(std, Tensor) else std) * noise
 
 
 def _total(drifts: Sequence[Drift], time_s: Tensor, draws: Draws) -> Tensor:
+    """Sum of drifts, each of which draws from an address of its own, (..., pulse)."""
     values = [drift.values(time_s, draws.part(str(i))) for i, drift in enumerate(drifts)]
     return sum(values, torch.zeros_like(time_s))

@@ -1,4 +1,4 @@
-"""Receiver channels that record the lines in turn and are not alike."""
+"""Imbalance of receiver channels that record the lines in turn."""
 
 from __future__ import annotations
 
@@ -9,22 +9,38 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording
+from torchsar.scene.trials import refuse_other_trials, refuse_unless_finite, stacked
 
 
 @dataclass(frozen=True)
 class ChannelImbalance:
-    """Line i is multiplied by gain[c] exp(j phase_rad[c]), c = i mod the number of channels.
+    """Impairment: gain and phase of receiver channels that record the lines in turn.
 
-    gain, phase_rad: one number per channel, or tensors (..., C) with one row per trial. Even and
-    odd lines as two channels: `ChannelImbalance(gain=(1, 1.2), phase_rad=(0, math.pi / 3))`.
+    Line i is multiplied by gain[c] exp(j phase_rad[c]) with c = i modulo the number of channels.
+    Even and odd lines are two channels: `ChannelImbalance(gain=(1, 1.2), phase_rad=(0, math.pi /
+    3))`. The truth holds `gain` and `phase_rad`, shape (..., channel), float64.
+
+    Args:
+        gain: Gain of each channel: numbers or values per trial, or one tensor of shape (...,
+            channel).
+        phase_rad: Phase of each channel in radians, in the same form.
+
+    Raises:
+        ValueError: If a number is not finite; when applied, if the numbers of gains and phases
+            differ.
     """
 
-    gain: Sequence[float] | Tensor
-    phase_rad: Sequence[float] | Tensor
+    gain: Sequence[Tensor | float] | Tensor
+    phase_rad: Sequence[Tensor | float] | Tensor
+
+    def __post_init__(self) -> None:
+        refuse_unless_finite("gain of channels", self.gain)
+        refuse_unless_finite("phase_rad of channels", self.phase_rad)
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
+        refuse_other_trials(self, draws, recording)
         data = recording.signal.data
-        gain, phase = (torch.as_tensor(x, dtype=torch.float64, device=data.device) for x in (self.gain, self.phase_rad))
+        gain, phase = stacked(self.gain, data.device), stacked(self.phase_rad, data.device)
         if gain.shape[-1] != phase.shape[-1]:
             raise ValueError(
                 f"channel imbalance needs as many gains as phases, got {gain.shape[-1]} and {phase.shape[-1]}"

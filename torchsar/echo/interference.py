@@ -1,9 +1,8 @@
-"""Interference in the receiver: tones, wider emitters, and the converter that has to digitise them
-with the echo.
+"""Interference in the receiver: tones, wideband interferers, and the converter that digitises them.
 
-Levels are the interferer's power over the mean power per sample, averaged over the contaminated
-lines, of the recording as it comes: of the echo and its noise for the first interferer, of these
-and the earlier interferers for a second. The world side of brief 004, item 3.
+The level of an interferer is its power over the mean power per sample of the recording that it is
+added to, averaged over the contaminated lines: echo and noise for the first interferer, in addition
+the earlier interferers for a second one.
 """
 
 from __future__ import annotations
@@ -15,18 +14,30 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, cis, per_trial, real_dtype, reduced_turns
+from torchsar.scene.trials import positive, refuse_other_trials, refuse_unless, refuse_unless_finite, with_dims
 
 
 @dataclass(frozen=True)
 class Tone:
-    """A tone on a share of the lines.
+    """Impairment: a tone on a share of the lines.
 
-    over_signal_db: tone power over mean power per sample of the contaminated lines. frequency_hz:
-    baseband frequency at the first line; drift_hz: frequency change from the first line to the
-    last, linear; wander_hz: amplitude of one slow sine on top of it; rate_hz_s: drift inside a
-    line. share: of the lines, chosen at random. coherent: one oscillator through the whole
-    recording (the phase follows from slow and fast time); otherwise each line has its own random
-    phase. Numbers, or per-trial tensors (...,).
+    The truth holds `contaminated`, shape (..., pulse), bool, and `frequency_hz` at the middle of
+    each line, shape (..., pulse).
+
+    Args:
+        over_signal_db: Power of the tone over the mean power per sample of the contaminated lines
+            in decibels.
+        frequency_hz: Baseband frequency at the first line in hertz.
+        drift_hz: Linear change of the frequency from the first to the last line in hertz.
+        wander_hz: Amplitude of one slow sinusoidal period of the frequency over the record in
+            hertz.
+        rate_hz_s: Linear change of the frequency within a line in hertz per second.
+        share: Share of the lines, chosen at random, above 0 and at most 1.
+        coherent: Whether one oscillator runs through the whole recording, so that the phase follows
+            from slow and fast time; otherwise each line has a random phase.
+
+    Raises:
+        ValueError: If a number is not finite or the share is out of range.
     """
 
     over_signal_db: Tensor | float
@@ -34,13 +45,16 @@ class Tone:
     drift_hz: Tensor | float = 0.0
     wander_hz: Tensor | float = 0.0
     rate_hz_s: Tensor | float = 0.0
-    share: float = 1.0
+    share: Tensor | float = 1.0
     coherent: bool = False
 
     def __post_init__(self) -> None:
         _check_share(self.share)
+        for name in ("over_signal_db", "frequency_hz", "drift_hz", "wander_hz", "rate_hz_s"):
+            refuse_unless_finite(f"{name} of a tone", getattr(self, name))
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
+        refuse_other_trials(self, draws, recording)
         data, fs = recording.signal.data, recording.radar.sampling_hz
         lines = _chosen_lines(draws, self.share, data)
         frequency = self._frequency_hz(data.shape[-2], draws, data)
@@ -63,7 +77,7 @@ class Tone:
         return per_trial(self.frequency_hz, 1, like) + per_trial(self.drift_hz, 1, like) * along + wander
 
     def _phase_turns(self, frequency: Tensor, recording: Recording, draws: Draws) -> Tensor:
-        """Phase at the middle of each line, turns (..., pulse)."""
+        """Phase at the middle of each line in cycles, (..., pulse)."""
         n_pulse = frequency.shape[-1]
         if self.coherent:
             per_line = frequency / recording.radar.prf_hz
@@ -75,26 +89,40 @@ class Tone:
 
 @dataclass(frozen=True)
 class WideInterferer:
-    """Band-limited noise of bandwidth_hz about frequency_hz on a share of the lines, independent
-    from line to line.
+    """Impairment: band-limited noise on a share of the lines, independent from line to line.
 
-    over_signal_db: its power over mean power per sample of the contaminated lines. The noise is
-    stationary: a line is a cut from a longer process, not a period of a circular one.
+    The noise is stationary: a line is a section of a longer process, not a period of a circular
+    one. The truth holds `contaminated`, shape (..., pulse), bool, and `bandwidth_hz`, shape (...,).
+
+    Args:
+        over_signal_db: Power of the noise over the mean power per sample of the contaminated lines
+            in decibels.
+        frequency_hz: Centre frequency in hertz.
+        bandwidth_hz: Bandwidth in hertz, fixed for all trials, since it decides how many numbers
+            are drawn.
+        share: Share of the lines, chosen at random, above 0 and at most 1.
+
+    Raises:
+        ValueError: If a number is not finite, the bandwidth is not positive or the share is out of
+            range.
     """
 
     over_signal_db: Tensor | float
     frequency_hz: Tensor | float
     bandwidth_hz: float
-    share: float = 1.0
+    share: Tensor | float = 1.0
 
     def __post_init__(self) -> None:
         _check_share(self.share)
+        refuse_unless_finite("over_signal_db of an interferer", self.over_signal_db)
+        refuse_unless_finite("frequency_hz of an interferer", self.frequency_hz)
         if not self.bandwidth_hz > 0:
             raise ValueError(
                 f"an interferer's bandwidth_hz must be positive, got {self.bandwidth_hz}; for a single tone use Tone"
             )
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
+        refuse_other_trials(self, draws, recording)
         data, fs = recording.signal.data, recording.radar.sampling_hz
         lines = _chosen_lines(draws, self.share, data)
         n_pulse, n = data.shape[-2:]
@@ -117,28 +145,40 @@ class WideInterferer:
 
 @dataclass(frozen=True)
 class Quantiser:
-    """An I/Q converter of `bits` bits behind an automatic gain: odd levels -(2^bits - 1) ..
+    """Impairment: an I/Q converter behind an automatic gain control, without dither.
 
-    2^bits - 1, clipped.
+    The output levels are the odd numbers from -(2^bits - 1) to 2^bits - 1; larger samples are
+    clipped. The gain of a trial brings the rms value of one component to rms_levels and is undone
+    after the conversion. The truth holds `gain` and the share of samples at the outermost levels,
+    `extreme_share`, shape (...,) each.
 
-    The gain of a trial brings the rms of one component to rms_levels (RADARSAT-1 records 4 bits at
-    6.6 to 7.4) and is undone after the conversion. No dither.
+    Args:
+        bits: Number of bits, 1 to 16, fixed for all trials.
+        rms_levels: Rms value of one component in units of half a level step; RADARSAT-1 records 4
+            bits at 6.6 to 7.4.
+
+    Raises:
+        ValueError: If the number of bits or the rms value is out of range.
     """
 
     bits: int
-    rms_levels: float = 7.0
+    rms_levels: Tensor | float = 7.0
 
     def __post_init__(self) -> None:
-        if not (1 <= self.bits <= 16 and self.rms_levels > 0):
-            raise ValueError(
-                f"a converter needs 1 to 16 bits and rms_levels above 0, got bits={self.bits}, "
-                f"rms_levels={self.rms_levels}"
-            )
+        if not 1 <= self.bits <= 16:
+            raise ValueError(f"a converter needs 1 to 16 bits, got bits={self.bits}")
+        refuse_unless("rms_levels of a converter must be above 0", self.rms_levels, positive)
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
+        refuse_other_trials(self, draws, recording)
         parts = torch.view_as_real(recording.signal.data)
         rms = parts.square().mean((-3, -2, -1)).sqrt()
-        gain = self.rms_levels / torch.where(rms > 0, rms, 1)
+        levels = with_dims(self.rms_levels, 0, rms)
+        # torch divides a number by a tensor in this way; another rounding would move samples at the
+        # edge of a level
+        gain = (levels.to(rms.dtype) if isinstance(levels, Tensor) else levels) * torch.where(
+            rms > 0, rms, 1
+        ).reciprocal()
         top = 2**self.bits - 1
         levels = (2 * torch.floor(parts * gain[..., None, None, None] / 2) + 1).clamp(-top, top)
         clipped = (levels.abs() == top).to(torch.float64).mean((-3, -2, -1))
@@ -149,23 +189,22 @@ class Quantiser:
         }
 
 
-def _check_share(share: float) -> None:
-    if not 0 < share <= 1:
-        raise ValueError(f"share of contaminated lines must be in 0..1 and above 0, got {share}")
+def _check_share(share: Tensor | float) -> None:
+    """Raise ValueError for a share of lines that is out of range."""
+    refuse_unless("share of contaminated lines must be in 0..1 and above 0", share, lambda x: (x > 0) & (x <= 1))
 
 
-def _chosen_lines(draws: Draws, share: float, data: Tensor) -> Tensor:
-    """round(share * lines) lines at random, at least one, bool (..., pulse)."""
+def _chosen_lines(draws: Draws, share: Tensor | float, data: Tensor) -> Tensor:
+    """Mask of round(share * lines) lines chosen at random, at least one, bool (..., pulse)."""
     n_pulse = data.shape[-2]
-    index = draws.subset("interference.lines", n_pulse, max(1, round(share * n_pulse)), data.device)
-    lines = torch.zeros((*index.shape[:-1], n_pulse), dtype=torch.bool, device=data.device).scatter(-1, index, True)
-    return lines.expand(data.shape[:-1])
+    count = torch.round(per_trial(share, 1, data) * n_pulse).clamp_min(1)
+    order = draws.permutation("interference.lines", n_pulse, data.device)
+    chosen = (torch.arange(n_pulse, device=data.device) < count).expand(data.shape[:-1])
+    return torch.zeros_like(chosen).scatter(-1, order.expand(chosen.shape), chosen)
 
 
 def _add(recording: Recording, wave: Tensor, lines: Tensor, over_signal_db: Tensor | float) -> Recording:
-    """The recording with the wave (unit mean power) on some lines, at a level over the mean power
-    of those lines.
-    """
+    """The recording plus a wave of unit mean power, at a level over the mean power of its lines."""
     data = recording.signal.data
     power = (data.abs().square().mean(-1) * lines).sum(-1) / lines.sum(-1)
     ratio = 10 ** (per_trial(over_signal_db, 0, data) / 10)

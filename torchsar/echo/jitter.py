@@ -1,4 +1,4 @@
-"""A converter with periodic jitter, and its pilot record."""
+"""Periodic sampling jitter of a converter, and its pilot record."""
 
 from __future__ import annotations
 
@@ -8,13 +8,19 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Recording, linear_phasor, unit_phasor
+from torchsar.core import Draws, Recording, linear_phasor, real_dtype, unit_phasor
+from torchsar.scene.trials import refuse_other_trials, refuse_unless_finite, stacked, with_dims
 
 
 def sample_unevenly(x: Tensor, offset_samples: Tensor) -> Tensor:
-    """Samples of x at the instants n + e[n mod M].
+    """Sample periodic band-limited lines at the instants n + e[n mod M].
 
-    x: (..., pulse, range), taken as band-limited and periodic; offset_samples: (M,) or (..., M).
+    Args:
+        x: Lines, shape (..., pulse, range), complex, taken as band-limited and periodic.
+        offset_samples: Offsets e in samples, shape (M,) or (..., M).
+
+    Returns:
+        Samples of the shape of x.
     """
     n, m = x.shape[-1], offset_samples.shape[-1]
     spectrum = torch.fft.fft(x)
@@ -28,20 +34,30 @@ def sample_unevenly(x: Tensor, offset_samples: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class PeriodicJitter:
-    """Sample n of every line is taken at n + e[n mod M]; a pilot tone through the same converter is
-    recorded in aux["pilot"].
+    """Impairment: sample n of every line is taken at the instant n + e[n mod M].
 
-    offset_samples: e_0 .. e_{M-1}, numbers or a tensor (..., M) with one row per trial. Only
-    differences can be seen in a pilot: choose offsets of mean zero (or e_0 = 0, with an estimator
-    of that origin) where images are compared in position. pilot_cycles: frequency of the tone in
-    cycles per sample; pilot_snr_db: tone power over noise variance, None for no noise;
-    pilot_samples: length, 0 for no record.
+    A pilot tone through the same converter is recorded as aux `pilot`, shape (..., pilot_samples),
+    with a random phase. A pilot shows only differences of the offsets: choose offsets of mean zero
+    (or e_0 = 0, with an estimator of that origin) where positions in images are compared. The truth
+    holds `offset_samples`, shape (..., M), and `pilot_cycles`.
+
+    Args:
+        offset_samples: Offsets e_0 to e_{M-1} in samples: numbers or values per trial, or one
+            tensor of shape (..., M).
+        pilot_cycles: Frequency of the pilot tone in cycles per sample.
+        pilot_samples: Length of the pilot record, 0 for none, fixed for all trials.
+        pilot_snr_db: Power of the pilot tone over the noise variance in decibels, None for no
+            noise.
+
+    Raises:
+        ValueError: If there is no offset, the length is negative or a number is not finite; when
+            applied, if sample instants coincide or cross.
     """
 
-    offset_samples: Sequence[float] | Tensor
-    pilot_cycles: float = 0.2137
+    offset_samples: Sequence[Tensor | float] | Tensor
+    pilot_cycles: Tensor | float = 0.2137
     pilot_samples: int = 4096
-    pilot_snr_db: float | None = 60.0
+    pilot_snr_db: Tensor | float | None = 60.0
 
     def __post_init__(self) -> None:
         if not len(self.offset_samples) or self.pilot_samples < 0:
@@ -49,10 +65,14 @@ class PeriodicJitter:
                 "jitter needs at least one offset and pilot_samples of 0 or more, got offsets "
                 f"{self.offset_samples} and {self.pilot_samples} samples"
             )
+        refuse_unless_finite("pilot_cycles", self.pilot_cycles)
+        refuse_unless_finite("pilot_snr_db", self.pilot_snr_db)
+        refuse_unless_finite("offset_samples", self.offset_samples)
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
+        refuse_other_trials(self, draws, recording)
         data = recording.signal.data
-        offsets = torch.as_tensor(self.offset_samples, dtype=torch.float64, device=data.device)
+        offsets = stacked(self.offset_samples, data.device)
         instants = torch.arange(offsets.shape[-1], device=data.device) + offsets
         if not bool((torch.cat([instants, instants[..., :1] + offsets.shape[-1]], -1).diff(dim=-1) > 0).all()):
             raise ValueError(
@@ -64,16 +84,25 @@ class PeriodicJitter:
             impaired = replace(impaired, aux={**impaired.aux, "pilot": self.pilot(offsets, draws, data)})
         return impaired, {
             "offset_samples": offsets,
-            "pilot_cycles": torch.tensor(self.pilot_cycles, dtype=torch.float64),
+            "pilot_cycles": torch.as_tensor(self.pilot_cycles, dtype=torch.float64),
         }
 
     def pilot(self, offsets: Tensor, draws: Draws, like: Tensor) -> Tensor:
-        """The recorded tone, (..., pilot_samples), with a random phase at its start."""
+        """Return the recorded pilot tone.
+
+        Args:
+            offsets: Offsets in samples, shape (..., M), float64.
+            draws: Random draws.
+            like: Tensor that gives dtype and device.
+
+        Returns:
+            Tone, shape (..., pilot_samples), complex.
+        """
         index = torch.arange(self.pilot_samples, device=like.device)
-        turns = self.pilot_cycles * (index + offsets[..., index % offsets.shape[-1]])
+        turns = with_dims(self.pilot_cycles, 1, offsets) * (index + offsets[..., index % offsets.shape[-1]])
         tone = unit_phasor(turns + draws.uniform("pilot.phase", device=like.device)[..., None], like.dtype)
         if self.pilot_snr_db is None:
             return tone
-        return tone + 10 ** (-self.pilot_snr_db / 20) * draws.normal(
-            "pilot.noise", (self.pilot_samples,), like.dtype, like.device
-        )
+        noise = draws.normal("pilot.noise", (self.pilot_samples,), like.dtype, like.device)
+        std = 10 ** (-with_dims(self.pilot_snr_db, 1, offsets) / 20)
+        return tone + (std.to(real_dtype(like.dtype)) if isinstance(std, Tensor) else std) * noise

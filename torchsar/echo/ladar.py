@@ -1,6 +1,4 @@
-"""Simulated acquisitions of a triangular-sweep ladar, sweep by sweep: world in, recording and truth
-out.
-"""
+"""Simulation of a triangular-sweep ladar by separated sweeps."""
 
 from __future__ import annotations
 
@@ -26,9 +24,10 @@ from torchsar.scene import (
     SweepError,
 )
 
+# phase tables of a block of pulses, about the cache of a processor
 _TABLE_BYTES = 8 << 20
 _DEFAULT = LinearInSweep()
-# sign of the sweep rate in up and down sweeps
+# sign of the sweep rate in up-sweeps and down-sweeps
 _RATES = (1.0, -1.0)
 
 
@@ -41,16 +40,33 @@ def ladar_echo(
     sweep_error: SweepError | None = None,
     dtype: torch.dtype = torch.complex64,
 ) -> Tensor:
-    """Dechirped sweeps without noise, (*trials, 2, pulse, fast_time) of `dtype`: up sweeps, then
-    down sweeps, both in natural time order.
+    """Return dechirped sweeps without noise.
 
-    Turns of a scatterer at RD(t) beyond the reference, dtau = 2 RD / c, in the convention LO *
-    conj(echo): fc dtau +- (K u dtau - K dtau^2 / 2), + in the up sweep (brief 000, section 3); all
-    conjugated for "echo_conj_lo". Beside the beam (radar.beam_rad) a scatterer is dark: |V t - x|
-    beyond half the beam in the middle of the sweep. motion: without random ones. sweep_error: below
-    `EverySample` its change with the motion of a scatterer within the sweep and with that of the
-    whole is left out. Differentiable in positions, amplitudes and motions. Raises ValueError where
-    a beat does not fit the sampling rate.
+    The phase of a scatterer at the relative range RD(t) is fc dtau +- (K u dtau - K dtau^2 / 2) in
+    cycles, with dtau = 2 RD / c and the upper sign in the up-sweep, in the convention
+    LO * conj(echo); it is conjugated for "echo_conj_lo". A scatterer is illuminated while |V t - x|
+    at the middle of the sweep is at most half the width of the beam. Differentiable in positions,
+    amplitudes and motions.
+
+    Args:
+        scatterers: Scatterers, shape (..., target).
+        radar: Ladar.
+        n_period: Number of periods.
+        motion: Motions along the line of sight, random ones already drawn.
+        fidelity: Model of the range within a sweep.
+        sweep_error: Phase error of the laser. Models below `EverySample` neglect its change by the
+            motion.
+        dtype: Complex dtype of the result.
+
+    Returns:
+        Sweeps, shape (*trials, 2, pulse, fast_time), up-sweeps first, both in their natural order
+        of time.
+
+    Raises:
+        ValueError: If a beat frequency exceeds half the sampling rate.
+
+    Reference:
+        Remote Sens. 2024, 16, 793, section 2.2, with the signs of the down-sweep corrected.
     """
     s = Scatterers(shared(scatterers.azimuth_m), shared(scatterers.range_m), scatterers.amplitude)
     history = RangeHistory(s, radar, motion, radar.sweep_axes(n_period)[1].start, fidelity.without)
@@ -61,12 +77,21 @@ def ladar_echo(
     if isinstance(fidelity, EverySample):
         echo = _sampled(history, sweep_error, middle_s, lit, lines.start.shape[:-3].numel(), dtype)
     else:
-        echo = _lined(lines, s, sweep_error, lit, radar, dtype)
+        echo = _sum_of_lines(lines, s, sweep_error, lit, radar, dtype)
     return echo.conj().resolve_conj() if radar.dechirp_sign == "echo_conj_lo" else echo
 
 
 def lit_by(s: Scatterers, radar: TriangularLadar, time_s: Tensor) -> Tensor:
-    """Whether the beam lights each scatterer at times of any shape, bool (..., *times, target)."""
+    """Return whether the beam illuminates each scatterer.
+
+    Args:
+        s: Scatterers, shape (..., target).
+        radar: Ladar.
+        time_s: Slow time in seconds, any shape, float64.
+
+    Returns:
+        Shape (..., *times, target), bool.
+    """
     x, near = (
         v.detach()[(...,) + (None,) * time_s.ndim + (slice(None),)]
         for v in (s.azimuth_m, radar.reference_range_m + s.range_m)
@@ -76,17 +101,24 @@ def lit_by(s: Scatterers, radar: TriangularLadar, time_s: Tensor) -> Tensor:
 
 
 def refuse_beats(beat_hz: Tensor, shines: Tensor, radar: TriangularLadar) -> None:
-    """Raise ValueError where a beat of a scatterer that shines lies beyond half the
-    sampling rate.
+    """Raise ValueError if a beat frequency exceeds half the sampling rate.
+
+    Args:
+        beat_hz: Beat frequencies in hertz, shape (..., target).
+        shines: Scatterers that contribute, broadcastable, bool.
+        radar: Ladar.
+
+    Raises:
+        ValueError: If a contributing scatterer has too high a beat frequency.
     """
     try:
         worst = float(torch.where(shines, beat_hz.detach().abs(), 0.0).max())
-    except RuntimeError:  # inside vmap a value cannot be looked at
+    except RuntimeError:  # values cannot be read inside vmap
         return
     if not worst < radar.sample_rate_hz / 2:
         raise ValueError(
             f"a scatterer beats at {worst / 1e6:.6g} MHz, beyond half the sampling rate of "
-            f"{radar.sample_rate_hz / 1e6:g} MHz; bring it nearer to the reference range "
+            f"{radar.sample_rate_hz / 1e6:g} MHz; move it nearer to the reference range "
             f"(1 m is {radar.beat_hz(1.0) / 1e6:.3g} MHz), move it more slowly (1 m/s is "
             f"{radar.doppler_hz(1.0) / 1e6:.3g} MHz), sample faster, or gate it out (gate_m)"
         )
@@ -94,10 +126,14 @@ def refuse_beats(beat_hz: Tensor, shines: Tensor, radar: TriangularLadar) -> Non
 
 @dataclass(frozen=True)
 class SweepLines:
-    """Phase of each scatterer in each sweep: turns in its middle, slope (Hz), and bend of all
-    (turns / s^2), None for straight lines.
+    """Phase of each scatterer in each sweep as a polynomial of the fast time.
 
-    start, slope: (*trials, 2, pulse, target); curve: (*trials, 2, pulse). float64.
+    Args:
+        start: Phase at the middle of the sweep in cycles, shape (*trials, 2, pulse, target),
+            float64.
+        slope: Frequency in hertz, same shape.
+        curve: Quadratic coefficient of all scatterers together in cycles per square second, shape
+            (*trials, 2, pulse); None for straight lines.
     """
 
     start: Tensor
@@ -106,14 +142,22 @@ class SweepLines:
 
     @staticmethod
     def of(history: RangeHistory, fidelity: Fidelity, middle_s: Tensor) -> SweepLines:
-        """Lines at the level of `fidelity`; those of `EverySample` serve only to judge its
-        beats.
+        """Form the polynomials of a range history.
+
+        Args:
+            history: Range of the scatterers.
+            fidelity: Model of the range within a sweep; the lines of `EverySample` serve only to
+                check beat frequencies.
+            middle_s: Slow times of the sweep middles in seconds, shape (2, pulse).
+
+        Returns:
+            The polynomials.
         """
         radar, per_m = history.radar, 2 / history.radar.wave_speed_m_s
-        place, speed, bend = fidelity.sweep_range_m(history, middle_s)
+        range_m, speed, bend = fidelity.sweep_range_m(history, middle_s)
         rate = radar.chirp_rate_hz_s * torch.tensor(_RATES, dtype=torch.float64, device=middle_s.device)[:, None, None]
         video = 0.0 * rate if "residual_video" in history.without else rate
-        delay, drift = per_m * place, per_m * speed
+        delay, drift = per_m * range_m, per_m * speed
         start = radar.carrier_hz * delay - video * delay.square() / 2
         slope = radar.carrier_hz * drift + rate * delay - video * delay * drift
         if bend is None:
@@ -122,12 +166,10 @@ class SweepLines:
         return SweepLines(start, slope, curve.mean(-1))
 
 
-def _lined(
+def _sum_of_lines(
     lines: SweepLines, s: Scatterers, error: SweepError | None, lit: Tensor, radar: TriangularLadar, dtype: torch.dtype
 ) -> Tensor:
-    """Sum over scatterers of straight lines of phase, (*trials, 2, pulse, fast_time), bent
-    together.
-    """
+    """Sum over scatterers with polynomial phases, (*trials, 2, pulse, fast_time)."""
     u = radar.fast_time_axis().values(lines.start.device)
     amplitude = s.amplitude[..., None, None, :].to(dtype) * lit
     table = None if error is None else _error_table(error, s, u, radar, dtype)
@@ -135,7 +177,7 @@ def _lined(
     for pulses in _pulse_blocks(lines.start.shape[-2], 2 * s.range_m.shape[-1] * 16 * 64):
         weight = unit_phasor(lines.start[..., pulses, :], dtype) * amplitude[..., pulses, :]
         turns = lines.slope[..., pulses, :] / radar.sample_rate_hz
-        total = _line_sum(weight, turns, len(u), dtype) if table is None else _erring_sum(weight, turns, table)
+        total = _line_sum(weight, turns, len(u), dtype) if table is None else _sum_with_errors(weight, turns, table)
         parts.append(
             total if lines.curve is None else total * unit_phasor(lines.curve[..., pulses, None] * u.square(), dtype)
         )
@@ -143,18 +185,14 @@ def _lined(
 
 
 def _line_sum(weight: Tensor, turns: Tensor, n: int, dtype: torch.dtype) -> Tensor:
-    """sum_m weight_m exp(2j pi turns_m i), i counted from the middle of n samples: (..., target) ->
-    (..., n), as a product of two short tables.
-    """
+    """sum_m weight_m exp(2j pi turns_m i), i about the middle: (..., target) -> (..., n)."""
     m = 2 ** round(math.log2(n) / 2)
     fine, coarse = linear_phasor(turns, 0, m, dtype), linear_phasor(m * turns, -(n - 1) / (2 * m), -(-n // m), dtype)
     return ((coarse * weight[..., None]).mT @ fine).flatten(-2)[..., :n]
 
 
-def _erring_sum(weight: Tensor, turns: Tensor, table: Tensor) -> Tensor:
-    """The same with phases of their own for each scatterer, table (..., 2, 1, target, n): scatterer
-    by scatterer, as lines are no longer short tables.
-    """
+def _sum_with_errors(weight: Tensor, turns: Tensor, table: Tensor) -> Tensor:
+    """The same with a phase table (..., 2, 1, target, n), scatterer by scatterer."""
     n, total = table.shape[-1], torch.zeros((), dtype=table.dtype, device=table.device)
     for at in range(turns.shape[-1]):
         total = (
@@ -167,15 +205,14 @@ def _erring_sum(weight: Tensor, turns: Tensor, table: Tensor) -> Tensor:
 def _error_table(error: SweepError, s: Scatterers, u: Tensor, radar: TriangularLadar, dtype: torch.dtype) -> Tensor:
     """exp(2j pi (e(u) - e(u - dtau))) of scatterers at rest, (..., 2, 1, target, n)."""
     delay = (2 / radar.wave_speed_m_s * s.range_m)[..., None]
-    return torch.stack(
-        [unit_phasor(error.turns(u, ramp) - error.turns(u - delay, ramp), dtype) for ramp in (0, 1)], -3
-    )[..., None, :, :]
+    turns = [error.turns(u, ramp, 2) - error.turns(u - delay, ramp, 2) for ramp in (0, 1)]
+    return unit_phasor(torch.stack(torch.broadcast_tensors(*turns), -3), dtype)[..., None, :, :]
 
 
 def _sampled(
     history: RangeHistory, error: SweepError | None, middle_s: Tensor, lit: Tensor, trials: int, dtype: torch.dtype
 ) -> Tensor:
-    """Direct evaluation, the range at every sample; blocks hold the ranges of so many trials."""
+    """Sum over scatterers with the range at every sample, in blocks of pulses."""
     s, radar = history.scatterers, history.radar
     u = radar.fast_time_axis().values(middle_s.device)
     amplitude = s.amplitude[..., None, None, :].to(dtype) * lit
@@ -187,7 +224,7 @@ def _sampled(
 
 
 def _sample_turns(history: RangeHistory, error: SweepError | None, time_s: Tensor, u: Tensor) -> Tensor:
-    """Turns at times (2, pulse, fast_time), (*trials, 2, pulse, fast_time, target)."""
+    """Phases at times (2, pulse, fast_time) in cycles, (*trials, 2, pulse, fast_time, target)."""
     radar = history.radar
     delay = 2 / radar.wave_speed_m_s * history.at(time_s)
     half = 0.0 if "residual_video" in history.without else 0.5
@@ -195,20 +232,29 @@ def _sample_turns(history: RangeHistory, error: SweepError | None, time_s: Tenso
     turns = delay * (radar.carrier_hz + rate * (u[:, None] - half * delay))
     if error is None:
         return turns
-    return turns + torch.stack(
-        [error.turns(u[:, None], ramp) - error.turns(u[:, None] - delay[..., ramp, :, :, :], ramp) for ramp in (0, 1)],
-        -4,
-    )
+    added = [
+        error.turns(u[:, None], ramp, 3) - error.turns(u[:, None] - delay[..., ramp, :, :, :], ramp, 3)
+        for ramp in (0, 1)
+    ]
+    return turns + torch.stack(torch.broadcast_tensors(*added), -4)
 
 
 def shared(positions: Tensor) -> Tensor:
-    """Positions without trial dims that only repeat them."""
+    """Remove trial dimensions that only repeat the same positions.
+
+    Args:
+        positions: Positions, shape (..., target).
+
+    Returns:
+        The same positions without leading dimensions of length one or stride zero.
+    """
     while positions.ndim > 1 and (positions.shape[0] == 1 or positions.stride(0) == 0):
         positions = positions[0]
     return positions
 
 
 def _pulse_blocks(n_pulse: int, bytes_per_pulse: int) -> Iterator[slice]:
+    """Blocks of pulses whose tables fit the cache."""
     height = max(1, min(n_pulse, _TABLE_BYTES // bytes_per_pulse))
     for first in range(0, n_pulse, height):
         yield slice(first, min(first + height, n_pulse))
@@ -223,19 +269,36 @@ def simulate_ladar(
     dtype: torch.dtype = torch.complex64,
     device: torch.device | str | None = None,
 ) -> tuple[Recording, Truth]:
-    """Separated sweeps (ramp, pulse, fast_time) of a world and the truth about it, batched over the
-    trials of `draws`.
+    """Simulate separated sweeps of a ladar, batched over the trials of the draws.
 
-    The samples are complex whatever radar.detection is, as an ideal splitter would hand them over;
-    `simulate_ladar_record` gives what the receiver records. aux: `calibration` (..., 2, K or 1,
-    fast_time) and `calibration_delay_s` where the world has a fibre. The truth, float64 (...,
-    pulse) at the turning points t_k + period / 2 (with the flight time R / c earlier):
-    `velocity_m_s` of the motion alone, receding positive; `range_error_m`, and `range_error_up_m`,
-    `range_error_down_m` in the middles of sweeps; `log_amplitude` where modelled; `azimuth_m`,
-    `range_m`, `amplitude` of the scatterers; `noise_std` of a sample; what each impairment says
-    under "<impairment>.<name>". `clean` is the same world without motion and impairments, with the
-    same noise and scintillation. Raises ValueError for beats beyond the sampling rate, an empty
-    scene or gate.
+    Samples are complex whatever radar.detection is, as an ideal splitter would give them; use
+    `simulate_ladar_record` for what the receiver records.
+
+    Args:
+        radar: Ladar.
+        world: World.
+        n_period: Number of periods.
+        draws: Random draws.
+        impairments: Impairments by name, applied in order.
+        dtype: Complex dtype of the recording.
+        device: Device of the recording.
+
+    Returns:
+        The recording, shape (..., 2, pulse, fast_time), and the truth. With a calibration fibre the
+        recording has aux `calibration`, shape (..., 2, pulse or 1, fast_time), and
+        `calibration_delay_s`. The truth holds at the turning points t_k + period / 2, shape (...,
+        pulse): `velocity_m_s` of the motion alone in m/s, receding positive; `range_error_m`, the
+        displacement in metres, and `range_error_up_m`, `range_error_down_m` at the middles of the
+        sweeps; `log_amplitude` if it is modelled (with the flight time, all at the time of
+        reflection R / c earlier). It further holds `azimuth_m`, `range_m` and `amplitude` of the
+        scatterers, shape (..., target); `noise_std`, the standard deviation of the noise of a
+        sample, shape (...,); and the values of each impairment under "<impairment>.<name>". `clean`
+        is the recording without motion and impairments, with the same noise and scintillation.
+
+    Raises:
+        TypeError: If an argument is of another kind.
+        ValueError: If a beat frequency exceeds half the sampling rate, the scene or the gate is
+            empty, there is no period, or a parameter per trial has another length than the trials.
     """
     course = LadarCourse.of(radar, world, n_period, draws, device)
     axes = radar.sweep_axes(n_period)
@@ -269,9 +332,7 @@ def _noise(
     draws: Draws,
     dtype: torch.dtype,
 ) -> Tensor | float:
-    """Circular noise, conjugated with the dechirp sign, so that both conventions give conjugate
-    recordings.
-    """
+    """Circular noise, conjugated with the dechirp sign, so that both signs give conjugate data."""
     if snr_db is None:
         return 0.0
     unit = draws.normal("echo.ladar.noise", shape, dtype, std.device)

@@ -1,9 +1,8 @@
-"""What happens while a ladar records a world: everything that is drawn, the truth about it, and how
-recordings are handed over.
-"""
+"""Random quantities and truth of a ladar simulation, common to sweeps and continuous records."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,12 +15,22 @@ from torchsar.echo.stripmap import Impairment, apply_impairments
 from torchsar.echo.sweep_error import calibration_channel
 from torchsar.radar import TriangularLadar
 from torchsar.scene import LadarWorld, Motion, Scatterers, Tones, displacement_m, drawn_motion
+from torchsar.scene.trials import refuse_other_trials
+
+# nodes of the interpolation between trigger times: through 16 Chebyshev nodes a sinusoid with one
+# cycle over their span is exact to 1e-14 of its amplitude
+_NODES = 16
 
 
 @dataclass(frozen=True)
 class LadarCourse:
-    """What happens while a world is recorded: the scatterers within the gate, the motions, the
-    scintillation (None for none).
+    """What is drawn for a simulation: scatterers within the gate, motions and scintillation.
+
+    Args:
+        scatterers: Scatterers, zero outside the gate, shape (..., target).
+        motion: Motions, random ones drawn.
+        chi: Log-amplitude, None for none.
+        start_s: Start of the first recorded period in seconds.
     """
 
     scatterers: Scatterers
@@ -33,7 +42,23 @@ class LadarCourse:
     def of(
         radar: TriangularLadar, world: LadarWorld, n_period: int, draws: Draws, device: torch.device | str | None
     ) -> LadarCourse:
-        """Everything drawn. Raises ValueError for no period, or no scatterer within the gate."""
+        """Draw everything random of a simulation.
+
+        Args:
+            radar: Ladar.
+            world: World.
+            n_period: Number of periods.
+            draws: Random draws.
+            device: Device of the scatterers.
+
+        Returns:
+            Scatterers, motions and scintillation.
+
+        Raises:
+            TypeError: If an argument is of another kind.
+            ValueError: If there is no period, no scatterer within the gate, or a parameter per
+                trial has another length than the trials.
+        """
         if not isinstance(radar, TriangularLadar) or not isinstance(world, LadarWorld) or not isinstance(draws, Draws):
             raise TypeError(
                 "a ladar is simulated from a TriangularLadar, a LadarWorld and Draws, got "
@@ -41,7 +66,7 @@ class LadarCourse:
             )
         if not (isinstance(n_period, int) and n_period >= 1):
             raise ValueError(f"a recording needs at least one period, a whole number of them, got n_period={n_period}")
-        refuse_trials("snr_db", world.snr_db, draws)
+        refuse_other_trials(world, draws)
         drawn = world.scene.scatterers(draws)
         s = Scatterers(*(v.to(device) for v in (drawn.azimuth_m, drawn.range_m, drawn.amplitude)))
         axis = radar.sweep_axes(n_period)[1]
@@ -50,16 +75,38 @@ class LadarCourse:
         return LadarCourse(_gated(s, world.gate_m), drawn_motion(world.motion, draws, span_s), chi, axis.start)
 
     def moved_m(self, time_s: Tensor) -> Tensor:
-        """Displacement at slow times of any shape, (*trials, *times)."""
+        """Return the displacement.
+
+        Args:
+            time_s: Slow time in seconds, any shape, float64.
+
+        Returns:
+            Displacement in metres, receding positive, shape (*trials, *times).
+        """
         return displacement_m(self.motion, time_s - self.start_s)
 
     def log_amplitude(self, time_s: Tensor) -> Tensor:
-        """chi at slow times, (*trials, *times); zeros where it is not modelled."""
+        """Return the log-amplitude chi, zero if it is not modelled.
+
+        Args:
+            time_s: Slow time in seconds, any shape, float64.
+
+        Returns:
+            chi, shape (*trials, *times).
+        """
         return torch.zeros_like(time_s) if self.chi is None else self.chi.value(time_s - self.start_s)
 
     def velocity_m_s(self, time_s: Tensor, step_s: float) -> Tensor:
-        """Slope of the displacement at slow times, (*trials, *times), by central differences of
-        sixth order: 1e-10 where motions turn once in 300 steps.
+        """Return the radial velocity by central differences of sixth order.
+
+        The relative error is 1e-10 for motions with one cycle in 300 steps.
+
+        Args:
+            time_s: Slow time in seconds, any shape, float64.
+            step_s: Step of the differences in seconds.
+
+        Returns:
+            Velocity in m/s, receding positive, shape (*trials, *times).
         """
         if not self.motion:
             return torch.zeros_like(time_s)
@@ -69,8 +116,16 @@ class LadarCourse:
     def truths(
         self, radar: TriangularLadar, world: LadarWorld, middle_s: Tensor, later_s: Tensor | None = None
     ) -> dict[str, Tensor]:
-        """Named truths of a recording whose sweeps have their middles at middle_s (2, pulse) +
-        later_s (...,); with the flight time, at the reflection.
+        """Return the true values of a recording, with the flight time at the time of reflection.
+
+        Args:
+            radar: Ladar.
+            world: World.
+            middle_s: Slow times of the sweep middles in seconds, shape (2, pulse).
+            later_s: Delay of all sweeps in seconds, a number or shape (...,).
+
+        Returns:
+            Tensors by name; see `simulate_ladar`.
         """
         then = (
             middle_s
@@ -92,23 +147,40 @@ class LadarCourse:
 
 
 def _later(value: Callable[[Tensor], Tensor], time_s: Tensor, later_s: Tensor | None) -> Tensor:
-    """A function of slow time (n,) at times later by later_s (...,), (..., n): where trials differ,
-    by a polynomial through eight times that all share.
-    """
+    """A function of slow time (n,) at times later by later_s (...,), (..., n)."""
     if later_s is None or later_s.ndim == 0:
         return value(time_s if later_s is None else time_s + later_s)
-    first, last = float(later_s.min()), float(later_s.max())
-    nodes = torch.linspace(first, max(last, first + 1e-9), 8, dtype=torch.float64, device=time_s.device)
+    # where trials differ: a polynomial through nodes that they share
+    nodes = _nodes(later_s)
     known = value(time_s + nodes[:, None])
-    gaps = nodes[:, None] - nodes + torch.eye(8, dtype=torch.float64, device=time_s.device)
-    away = (later_s[..., None, None] - nodes).expand(*later_s.shape, 8, 8)
-    eye = torch.eye(8, dtype=torch.bool, device=time_s.device)
+    gaps = nodes[:, None] - nodes + torch.eye(len(nodes), dtype=torch.float64, device=time_s.device)
+    away = (later_s[..., None, None] - nodes).expand(*later_s.shape, len(nodes), len(nodes))
+    eye = torch.eye(len(nodes), dtype=torch.bool, device=time_s.device)
     weights = torch.where(eye, 1.0, away / gaps).prod(-1)
     return (known * weights[..., None]).sum(-2)
 
 
+def _nodes(values: Tensor) -> Tensor:
+    """The different values themselves, or Chebyshev nodes over their span where there are many."""
+    nodes = values.detach().unique()
+    if len(nodes) <= _NODES and not values.requires_grad:
+        return nodes
+    first, last = float(nodes[0]), float(nodes[-1])
+    angle = math.pi * (torch.arange(_NODES, dtype=torch.float64, device=values.device) + 0.5) / _NODES
+    return (first + last) / 2 + max(last - first, 1e-9) / 2 * torch.cos(angle)
+
+
 def noise_std(snr_db: Tensor | float | None, like: Tensor) -> Tensor:
-    """Deviation of the complex noise of a sample, (...,): 10^(-snr / 20)."""
+    """Return the standard deviation of the complex noise of a sample.
+
+    Args:
+        snr_db: Signal-to-noise ratio per sample in decibels, a number or one value per trial; None
+            for no noise.
+        like: Tensor that gives the device.
+
+    Returns:
+        10^(-snr / 20), shape (...,), float64.
+    """
     return (
         torch.zeros((), dtype=torch.float64, device=like.device)
         if snr_db is None
@@ -116,29 +188,19 @@ def noise_std(snr_db: Tensor | float | None, like: Tensor) -> Tensor:
     )
 
 
-def refuse_trials(name: str, value: Tensor | float | None, draws: Draws) -> None:
-    """Raise ValueError for a per-trial tensor of another number of trials than the draws have."""
-    if (
-        isinstance(value, Tensor)
-        and value.ndim
-        and draws.trials is not None
-        and value.shape[-1] not in (1, len(draws.trials))
-    ):
-        raise ValueError(
-            f"{name} must be a number or one for each of the {len(draws.trials)} trials of the "
-            f"draws, got shape {tuple(value.shape)}"
-        )
-
-
-def _gated(s: Scatterers, gate_m: tuple[float, float] | None) -> Scatterers:
+def _gated(s: Scatterers, gate_m: tuple[Tensor | float, Tensor | float] | None) -> Scatterers:
+    """Scatterers with zero amplitude outside the gate."""
     if not s.range_m.shape[-1]:
         raise ValueError("the scene holds no scatterer; give it at least one")
     if gate_m is None:
         return s
-    inside = (s.range_m >= gate_m[0]) & (s.range_m <= gate_m[1])
-    if not bool(inside.any(-1).all()):
+    low, high = (per_trial(bound, 1, s.range_m) for bound in gate_m)
+    inside = (s.range_m >= low) & (s.range_m <= high)
+    empty = ~inside.any(-1, keepdim=True)
+    if bool(empty.any()):
+        low, high = (float(bound.expand(empty.shape)[empty][0]) for bound in (low, high))
         raise ValueError(
-            f"no scatterer lies within the gate of {gate_m[0]:g} to {gate_m[1]:g} m; they lie "
+            f"no scatterer lies within the gate of {low:g} to {high:g} m; they lie "
             f"from {float(s.range_m.min()):g} to {float(s.range_m.max()):g} m: widen gate_m"
         )
     return replace(s, amplitude=s.amplitude * inside)
@@ -152,13 +214,25 @@ def calibration_aux(
     dtype: torch.dtype,
     device: torch.device | str | None,
 ) -> dict[str, Tensor]:
-    """Side data of the calibration fibre, nothing where there is none."""
+    """Return the side data of the calibration fibre.
+
+    Args:
+        radar: Ladar.
+        world: World.
+        n_period: Number of periods.
+        draws: Random draws.
+        dtype: Complex dtype of the channel.
+        device: Device of the channel.
+
+    Returns:
+        `calibration` and `calibration_delay_s`, or nothing without a fibre.
+    """
     if world.calibration is None:
         return {}
     channel = calibration_channel(radar, world.calibration, world.sweep_error, n_period, draws, dtype, device)
     return {
         "calibration": channel,
-        "calibration_delay_s": torch.tensor(world.calibration.delay_s, dtype=torch.float64, device=device),
+        "calibration_delay_s": torch.as_tensor(world.calibration.delay_s, dtype=torch.float64, device=device),
     }
 
 
@@ -172,7 +246,21 @@ def hand_over(
     impairments: Mapping[str, Impairment] | None,
     draws: Draws,
 ) -> tuple[Recording, Truth]:
-    """Recording and truth with the trial dims of `draws`, the recording impaired."""
+    """Form recording and truth with the trials of the draws, and apply impairments.
+
+    Args:
+        data: Samples, shape (..., *axes).
+        clean: Samples without motion, same shape.
+        axes: Axes of the samples.
+        radar: Ladar.
+        aux: Recorded side data.
+        values: True values by name.
+        impairments: Impairments by name, applied in order.
+        draws: Random draws.
+
+    Returns:
+        Recording and truth.
+    """
     tail = len(axes)
     trials = torch.broadcast_shapes(
         data.shape[:-tail], clean.shape[:-tail], () if draws.trials is None else (len(draws.trials),)
@@ -182,7 +270,7 @@ def hand_over(
         if name in values:
             values[name] = values[name].expand(*trials, -1)
     recording = Recording(Signal(data, axes), radar, aux)
-    told: dict[str, Tensor] = {}
+    impairment_truth: dict[str, Tensor] = {}
     if impairments:
-        recording, told = apply_impairments(recording, impairments, draws)
-    return recording, Truth({**values, **told}, Recording(Signal(clean, axes), radar, aux))
+        recording, impairment_truth = apply_impairments(recording, impairments, draws)
+    return recording, Truth({**values, **impairment_truth}, Recording(Signal(clean, axes), radar, aux))

@@ -1,6 +1,4 @@
-"""What the receiver of a triangular-sweep ladar records: a continuous beat with its transients at
-the turning points, real or complex.
-"""
+"""Simulation of the continuous record of a triangular-sweep ladar, transients included."""
 
 from __future__ import annotations
 
@@ -13,7 +11,7 @@ from torch import Tensor
 
 from torchsar.core import Draws, Recording, Truth, UniformSpline, cis, per_trial, real_dtype, reduced_turns
 from torchsar.echo.ladar import SweepLines, lit_by, refuse_beats, shared
-from torchsar.echo.ladar_course import LadarCourse, calibration_aux, hand_over, noise_std, refuse_trials
+from torchsar.echo.ladar_course import LadarCourse, calibration_aux, hand_over, noise_std
 from torchsar.echo.stripmap import Impairment
 from torchsar.echo.sweep_error import wound_turns
 from torchsar.radar import TriangularLadar, sweep_middles
@@ -30,9 +28,10 @@ from torchsar.scene import (
     displacement_m,
 )
 
+# size of a block of the record, so that its intermediates fit the cache of a processor
 _BLOCK_BYTES = 4 << 20
-# knots of the motion in a period, joined by a spline: 1e-7 of a vibration whose period is the
-# triangle's, 1e-4 of one six times as fast
+# knots of the spline of the motion in a period: the error is 1e-7 of a vibration with the period of
+# the triangle, 1e-4 of one six times as fast
 _KNOTS = 64
 
 
@@ -48,17 +47,36 @@ def ladar_record(
     log_amplitude: Callable[[Tensor], Tensor] | None = None,
     dtype: torch.dtype = torch.complex64,
 ) -> Tensor:
-    """Blocks of a continuous record without noise, (*trials, pulse, time): of `dtype`, or of its
-    real parts where radar.detection is "real".
+    """Return blocks of a continuous record without noise.
 
-    Turns of a scatterer: fc dtau + psi(t') - psi(t' - dtau), with psi the phase of the triangle and
-    t' the time since a reference of it arrived; in block k triangles start at t_k + trigger_s, and
-    one period before and after. Within a sweep that is +- (K u dtau - K dtau^2 / 2); an echo that
-    was sent before the last turning point, by a time o, differs by +- K o^2 more. The range goes
-    along parabolas within a block, the motion along splines with 64 knots a period, the
-    log-amplitude along lines. trigger_s, and what log_amplitude gives at slow times (*times) ->
-    (*trials, *times), may differ between trials. Differentiable. Raises ValueError where a beat
-    does not fit the sampling rate, or real samples would fold it.
+    The phase of a scatterer in cycles is fc dtau + psi(t') - psi(t' - dtau), where psi is the phase
+    of the triangle and t' the time since the arrival of a reference. In block k triangles start at
+    t_k + trigger_s, and one period before and after. Within a sweep this is
+    +-(K u dtau - K dtau^2 / 2); an echo that was sent before the last turning point, by a time o,
+    differs by +-K o^2. Within a block the range of each scatterer follows a parabola, the motion a
+    spline with 64 knots per period, and the log-amplitude a straight line. Differentiable.
+
+    Args:
+        scatterers: Scatterers, shape (..., target).
+        radar: Ladar.
+        n_period: Number of recorded periods, one block each.
+        n_sample: Number of samples of a block.
+        motion: Motions along the line of sight, random ones already drawn.
+        trigger_s: Time from the start of a block to the start of an up-sweep in seconds, a number
+            or one value per trial.
+        without: Omitted effects.
+        sweep_error: Phase error of the laser.
+        log_amplitude: Function of slow times (*times) that returns the log-amplitude, shape
+            (*trials, *times); None for none.
+        dtype: Complex dtype of the result, or of which it has the real dtype if radar.detection is
+            "real".
+
+    Returns:
+        Record, shape (*trials, pulse, time).
+
+    Raises:
+        ValueError: If a beat frequency exceeds half the sampling rate, or folds at zero in real
+            samples.
     """
     axis, time = radar.record_axes(n_period, n_sample)
     scatterers = Scatterers(shared(scatterers.azimuth_m), shared(scatterers.range_m), scatterers.amplitude)
@@ -87,21 +105,17 @@ def ladar_record(
 
 @dataclass(frozen=True)
 class _Ramps:
-    """What the triangle does at the samples of a block: time from its start, and from the middle of
-    the sweep (s), signed sweep rate (Hz/s).
-
-    (n,), or (*trials, 1, n) with a trigger of each trial. video: 0.5, or 0 without the residual
-    video phase.
-    """
+    """Times within triangle and sweep (s) and sweep rate (Hz/s) at the samples of a block."""
 
     radar: TriangularLadar
-    position_s: Tensor
-    middle_s: Tensor
-    rate: Tensor
-    video: float
+    position_s: Tensor  # since the start of the triangle
+    middle_s: Tensor  # since the middle of the sweep
+    rate: Tensor  # signed
+    video: float  # 0.5, or 0 without the residual video phase
 
     @staticmethod
     def of(radar: TriangularLadar, time_s: Tensor, trigger_s: Tensor | float, video: float) -> _Ramps:
+        """The triangle at the samples of a block, (n,), or (*trials, 1, n) by trigger times."""
         trigger = torch.as_tensor(trigger_s, dtype=torch.float64, device=time_s.device)
         position = time_s - (trigger if trigger.ndim == 0 else per_trial(trigger, 2, time_s))
         position = position - radar.period_s * torch.floor(position.detach() / radar.period_s + 1e-9)
@@ -110,7 +124,7 @@ class _Ramps:
         return _Ramps(radar, position, middle, radar.chirp_rate_hz_s * torch.where(down, -1.0, 1.0).to(time_s), video)
 
     def turns(self, delay: Tensor, error: SweepError | None) -> Tensor:
-        """Turns of a beat of delays against the reference, (..., pulse, n)."""
+        """Phase of a beat of given delays in cycles, (..., pulse, n)."""
         late = torch.relu((self.middle_s - delay).abs() - self.radar.sweep_s / 2)
         turns = (
             delay * (self.radar.carrier_hz + self.rate * (self.middle_s - self.video * delay))
@@ -127,12 +141,20 @@ class _Ramps:
 
 @dataclass(frozen=True)
 class BlockPaths:
-    """Ranges of scatterers in blocks of the record: parabolas of each, and the motion of all at
-    knots.
+    """Ranges of scatterers in blocks of a record.
 
-    place (m), speed (m/s), bend (m/s^2, half of it): (..., pulse, target) at the start of the
-    block; knots: (..., pulse, knot) in m, step_s apart; shrink: (..., pulse, target), 1 - v / c
-    where the flight time is modelled, else 1; lit: bool. offsets_s: (n,) of the samples.
+    Args:
+        place: Relative range at the start of the block in metres, shape (..., pulse, target),
+            float64.
+        speed: First derivative there in m/s, same shape.
+        bend: Half the second derivative in m/s^2, same shape.
+        knots: Displacement by the motion at knots in metres, shape (..., pulse, knot).
+        shrink: 1 - v / c where the flight time is modelled, otherwise 1, shape (..., pulse,
+            target).
+        lit: Whether the scatterer is illuminated, shape (..., pulse, target), bool.
+        step_s: Distance of the knots in seconds.
+        offsets_s: Times of the samples from the start of the block in seconds, shape (n,).
+        wave_speed_m_s: Speed of light in m/s.
     """
 
     place: Tensor
@@ -154,6 +176,19 @@ class BlockPaths:
         motion: Sequence[Motion],
         without: Sequence[Effect],
     ) -> BlockPaths:
+        """Form the ranges of all blocks.
+
+        Args:
+            scatterers: Scatterers, shape (..., target).
+            radar: Ladar.
+            start_s: Starts of the blocks in seconds, shape (pulse,), float64.
+            n_sample: Number of samples of a block.
+            motion: Motions along the line of sight.
+            without: Omitted effects.
+
+        Returns:
+            Ranges of all blocks.
+        """
         length = n_sample / radar.sample_rate_hz
         flight = "flight" not in without
         then = start_s - (radar.reference_range_m / radar.wave_speed_m_s if flight else 0.0)
@@ -181,7 +216,15 @@ class BlockPaths:
         )
 
     def part(self, first: int, last: int) -> BlockPaths:
-        """The blocks first..last-1."""
+        """Return some of the blocks.
+
+        Args:
+            first: First block.
+            last: Block after the last one.
+
+        Returns:
+            The blocks first to last - 1.
+        """
         return replace(
             self,
             **{
@@ -191,11 +234,23 @@ class BlockPaths:
         )
 
     def motion_m(self) -> Tensor:
-        """Displacement at the samples, (..., pulse, n)."""
+        """Return the displacement by the motion at the samples.
+
+        Returns:
+            Displacement in metres, shape (..., pulse, n).
+        """
         return UniformSpline(self.knots, 0.0, self.step_s).at(self.offsets_s)
 
     def delay_s(self, target: int, motion_m: Tensor) -> Tensor:
-        """2 RD / c of one scatterer at the samples, (..., pulse, n)."""
+        """Return the delay of one scatterer at the samples.
+
+        Args:
+            target: Index of the scatterer.
+            motion_m: Displacement at the samples in metres, shape (..., pulse, n).
+
+        Returns:
+            2 RD / c in seconds, shape (..., pulse, n).
+        """
         place, speed, bend, shrink = (v[..., target, None] for v in (self.place, self.speed, self.bend, self.shrink))
         range_m = place + self.offsets_s * (speed + bend * self.offsets_s) + motion_m
         return 2 / self.wave_speed_m_s * shrink * range_m
@@ -224,7 +279,7 @@ def _real_part(turns: Tensor, weight: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def _level(log_amplitude: Callable[[Tensor], Tensor], start_s: Tensor, length_s: float, n: int) -> Tensor:
-    """exp(chi), chi along a line in each block, (*trials, pulse, n)."""
+    """exp(chi) with chi along a straight line in each block, (*trials, pulse, n)."""
     first, last = log_amplitude(start_s), log_amplitude(start_s + length_s)
     share = torch.linspace(0, 1, n, dtype=torch.float64, device=start_s.device)
     return torch.exp(first[..., None] + (last - first)[..., None] * share)
@@ -233,28 +288,30 @@ def _level(log_amplitude: Callable[[Tensor], Tensor], start_s: Tensor, length_s:
 def _refuse_record(
     s: Scatterers, radar: TriangularLadar, n_period: int, motion: Sequence[Motion], without: Sequence[Effect]
 ) -> None:
+    """Raise ValueError for beat frequencies that a record cannot hold."""
     middle_s = sweep_middles(radar, radar.sweep_axes(n_period)[1], s.range_m.device)
     level = LinearInSweep(tuple(without))
     beat = SweepLines.of(
         RangeHistory(s, radar, motion, radar.sweep_axes(n_period)[1].start, without), level, middle_s
     ).slope
-    shines = lit_by(s, radar, middle_s) & (s.amplitude != 0)[..., None, None, :]
-    refuse_beats(beat, shines, radar)
+    contributing = lit_by(s, radar, middle_s) & (s.amplitude != 0)[..., None, None, :]
+    refuse_beats(beat, contributing, radar)
     if radar.detection == "real":
-        _refuse_folding(beat.detach(), shines)
+        _refuse_folding(beat.detach(), contributing)
 
 
-def _refuse_folding(beat_hz: Tensor, shines: Tensor) -> None:
-    """Real samples do not know the sign of a beat: all must be positive in up sweeps and negative
-    in down sweeps, or the reverse.
-    """
+def _refuse_folding(beat_hz: Tensor, contributing: Tensor) -> None:
+    """Raise ValueError where beats fold at zero, as real samples have no sign of frequency."""
     up = beat_hz * torch.tensor([1.0, -1.0], dtype=torch.float64, device=beat_hz.device)[:, None, None]
-    low, high = float(torch.where(shines, up, math.inf).min()), float(torch.where(shines, up, -math.inf).max())
+    low, high = (
+        float(torch.where(contributing, up, math.inf).min()),
+        float(torch.where(contributing, up, -math.inf).max()),
+    )
     if low <= 0 <= high:
         raise ValueError(
-            f"beats of {low / 1e6:.6g} to {high / 1e6:.6g} MHz fold at zero in real samples; move "
-            "the reference range off the scene until the beat of the "
-            'range is beyond that of the velocity, 2 v / lambda, or detect complex samples (detection "complex")'
+            f"beats of {low / 1e6:.6g} to {high / 1e6:.6g} MHz fold at zero in real samples; move the "
+            "reference range off the scene until the beat of the range exceeds that of the velocity, "
+            '2 v / lambda, or detect complex samples (detection "complex")'
         )
 
 
@@ -270,30 +327,60 @@ def simulate_ladar_record(
     dtype: torch.dtype = torch.complex64,
     device: torch.device | str | None = None,
 ) -> tuple[Recording, Truth]:
-    """A continuous record (pulse, time) of a world, one block a recorded period, and the truth
-    about it; batched over the trials of `draws`.
+    """Simulate a continuous record of a ladar, batched over the trials of the draws.
 
-    block_s: length of a block; by default one period where all are recorded, so that blocks join,
-    and two periods where only every keep_every-th is. trigger_s: where in the block an up sweep
-    starts, a number or per-trial tensor (whole samples, zero among them, put samples on the
-    symmetric grid of separated sweeps); the recording holds it as aux `trigger_s` only if
-    told_trigger. Samples are complex (`dtype`) or real (its real dtype) by radar.detection; real
-    noise has half the variance, so that the analytic signal has the SNR of complex samples. Truth
-    and aux are as of `simulate_ladar`, at the turning points t_k + trigger_s + period / 2, besides
-    `trigger_s`. Raises ValueError for beats beyond the sampling rate or that fold, blocks that
-    overlap or hold no sweep, a fidelity that is no record's.
+    The record has one block per recorded period. Samples are complex or real by radar.detection;
+    real noise has half the variance, so that the analytic signal has the signal-to-noise ratio of
+    complex samples.
+
+    Args:
+        radar: Ladar.
+        world: World.
+        n_period: Number of recorded periods.
+        draws: Random draws.
+        block_s: Length of a block in seconds. By default one period if all periods are recorded, so
+            that blocks adjoin, otherwise two periods.
+        trigger_s: Time from the start of a block to the start of an up-sweep in seconds, a number
+            or one value per trial. Whole samples, zero among them, put samples on the symmetric
+            grid of separated sweeps.
+        told_trigger: Whether the recording holds the trigger times, as aux `trigger_s`.
+        impairments: Impairments by name, applied in order.
+        dtype: Complex dtype of the recording, or of which it has the real dtype.
+        device: Device of the recording.
+
+    Returns:
+        The recording, shape (..., pulse, time), and the truth. With a calibration fibre the
+        recording has aux `calibration`, shape (..., 2, pulse or 1, fast_time), and
+        `calibration_delay_s`. The truth holds at the turning points t_k + trigger_s + period / 2,
+        shape (..., pulse): `velocity_m_s` of the motion alone in m/s, receding positive;
+        `range_error_m`, the displacement in metres, and `range_error_up_m`, `range_error_down_m` at
+        the middles of the sweeps; `log_amplitude` if it is modelled; all are exact for up to 16
+        different trigger times, and interpolated for more. It further holds `azimuth_m`, `range_m`
+        and `amplitude` of the scatterers, shape (..., target); `noise_std`, shape (...,);
+        `trigger_s`; and the values of each impairment under "<impairment>.<name>". `clean` is the
+        recording without motion and impairments, with the same noise and scintillation.
+
+    Raises:
+        TypeError: If an argument is of another kind.
+        ValueError: If a beat frequency exceeds half the sampling rate or folds at zero, blocks
+            overlap or hold no sweep, the fidelity does not apply to a record, the scene or the gate
+            is empty, or a parameter per trial has another length than the trials.
     """
     if not isinstance(world.fidelity, EverySample | LinearInSweep | QuadraticInSweep):
         raise ValueError(
-            "a continuous record follows the range at every sample, which "
-            f"{type(world.fidelity).__name__} does not; use simulate_ladar for such studies"
+            "a continuous record needs EverySample, LinearInSweep or QuadraticInSweep, got "
+            f"{type(world.fidelity).__name__}; use simulate_ladar for such studies"
         )
     course = LadarCourse.of(radar, world, n_period, draws, device)
     axes = radar.record_axes(n_period, _block_samples(radar, block_s))
     trigger = torch.as_tensor(trigger_s, dtype=torch.float64, device=device)
-    refuse_trials("trigger_s", trigger, draws)
+    if trigger.ndim and draws.trials is not None and trigger.shape[-1] not in (1, len(draws.trials)):
+        raise ValueError(
+            f"trigger_s must be a number or one for each of the {len(draws.trials)} trials of the draws, "
+            f"got shape {tuple(trigger.shape)}"
+        )
     if not bool(torch.isfinite(trigger).all()):
-        raise ValueError("trigger_s must be finite seconds, a number or one per trial, got NaN or Inf")
+        raise ValueError("trigger_s must be a finite number of seconds, or one per trial, got NaN or Inf")
 
     def echo_of(motion: Sequence[Motion]) -> Tensor:
         chi = None if course.chi is None else course.log_amplitude
@@ -331,6 +418,7 @@ def simulate_ladar_record(
 
 
 def _block_samples(radar: TriangularLadar, block_s: float | None) -> int:
+    """Number of samples of a block."""
     length = (radar.period_s if radar.keep_every == 1 else 2 * radar.period_s) if block_s is None else block_s
     if not radar.sweep_s <= length <= radar.pulse_step_s * (1 + 1e-9):
         raise ValueError(
@@ -348,6 +436,7 @@ def _record_noise(
     dtype: torch.dtype,
     device: torch.device,
 ) -> Tensor | float:
+    """Noise of the record, zero without a signal-to-noise ratio."""
     if snr_db is None:
         return 0.0
     real = radar.detection == "real"

@@ -1,9 +1,9 @@
-"""Impairment to the sequence of lines: lost, repeated and misnumbered ones (brief 004, item 1).
+"""Impairments of the sequence of lines: lost, repeated and misnumbered lines.
 
-A lost line is really gone: the later lines move up and the end of the matrix is filled with zero
-lines of number -1, as in recordings of different lengths. Recorded side data that has one entry a
-line moves with its line. Each object does one thing; combine them in the order lost, repeated,
-misnumbered. The first line is never lost: its number is where the processor's grid begins.
+A lost line leaves no gap: later lines move up, and the end of the matrix is filled with zero lines
+of number -1, as in recordings of different lengths. Recorded side data with one entry per line move
+with their lines. Combine impairments in the order lost, repeated, misnumbered. The first line is
+never lost, since its number is the origin of the processing grid.
 """
 
 from __future__ import annotations
@@ -14,34 +14,52 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording
+from torchsar.scene.trials import refuse_other_trials, refuse_unless
 
+# line number of padding at the end of a trial, by convention: no line has a negative number
 PADDING = -1
-# side data that is never one entry per line, whatever its length
+# side data that never have one entry per line, whatever their length
 _NOT_PER_LINE = ("pilot",)
 
 
 def _numbers(recording: Recording) -> Tensor:
-    """Line numbers (*trials, pulse), 0.. where the recording has none."""
+    """Line numbers (*trials, pulse), 0, 1, ... where the recording has none."""
     data = recording.signal.data
     number = recording.aux.get("line_number", torch.arange(data.shape[-2], device=data.device))
     return number.to(torch.int64).expand(data.shape[:-1])
 
 
-def _valid_count(number: Tensor) -> int:
-    """Lines that every trial has."""
-    return int((number != PADDING).sum(-1).min())
+def _valid_count(number: Tensor, draws: Draws) -> Tensor:
+    """Number of lines of each trial (trial,), or () of all where the draws have other trials."""
+    have = (number != PADDING).sum(-1)
+    return have if draws.trials is not None and have.shape == (len(draws.trials),) else have.min()
 
 
-def _of_draws(index: Tensor, number: Tensor) -> Tensor:
-    """Drawn row indices (trial, k), or (k,), as (*trials of the recording, k).
+def lost_count(count: int | None, fraction: Tensor | float | None, have: Tensor | int, like: Tensor) -> Tensor:
+    """Return how many lines are lost.
 
-    Raises ValueError where the trials do not agree.
+    Args:
+        count: Number of lines, or None.
+        fraction: Fraction of the lines if count is None, a number or one value per trial.
+        have: Number of lines that there are, a number or shape (...,).
+        like: Tensor that gives the device.
+
+    Returns:
+        Number of lines, shape (...,), float64.
     """
+    if count is not None:
+        return torch.as_tensor(count, dtype=torch.float64, device=like.device)
+    return torch.round(torch.as_tensor(fraction, dtype=torch.float64, device=like.device) * have)
+
+
+def _order(draws: Draws, purpose: str, n: Tensor, number: Tensor) -> Tensor:
+    """The numbers 0..n-1 in random order for each trial, (*trials, largest n)."""
+    order = draws.permutation(purpose, n.tolist(), number.device)
     try:
-        return index.to(number.device).expand(*number.shape[:-1], index.shape[-1])
+        return order.expand(*number.shape[:-1], -1)
     except RuntimeError:
         raise ValueError(
-            f"draws for {tuple(index.shape[:-1])} trials do not fit a recording of "
+            f"draws for {tuple(order.shape[:-1])} trials do not fit a recording of "
             f"{tuple(number.shape[:-1])} trials; draw one unbatched trial for a single recording"
         ) from None
 
@@ -52,8 +70,14 @@ def _at(index: Tensor, n: int) -> Tensor:
 
 
 def take_lines(recording: Recording, source: Tensor) -> Recording:
-    """The recording whose line i is line source[i] of the given one, a zero line of number -1 where
-    source is -1. source: (*trials, pulse).
+    """Return the recording whose line i is line source[i] of another one.
+
+    Args:
+        recording: Recording of lines, shape (*trials, pulse, range).
+        source: Index of each line, -1 for a zero line of number -1, shape (*trials, pulse), int64.
+
+    Returns:
+        Recording of the same shape; side data with one entry per line are rearranged as well.
     """
     data, n = recording.signal.data, recording.signal.data.shape[-2]
     present, index = source >= 0, source.clamp_min(0)
@@ -67,55 +91,76 @@ def take_lines(recording: Recording, source: Tensor) -> Recording:
 
 
 def _drop(recording: Recording, lost: Tensor) -> tuple[Recording, dict[str, Tensor]]:
-    """Remove the lines under the mask (*trials, pulse), which close up."""
+    """Remove the lines under a mask (*trials, pulse); the others close up."""
     n, number = lost.shape[-1], _numbers(recording)
     order = lost.to(torch.int8).argsort(dim=-1, stable=True)
     row = torch.arange(n, device=lost.device)
     kept = n - lost.sum(-1, keepdim=True)
-    # the grid of line numbers starts where the unimpaired numbers do
+    # the grid begins at the first line number
     slot = (number - number[..., :1]).clamp(0, n - 1)
+    first = (~lost).to(torch.int8).argsort(dim=-1, stable=True)[..., : int((n - kept).max())]
     return take_lines(recording, torch.where(row < kept, order, -1)), {
         "lost": torch.zeros_like(lost).scatter(-1, slot, lost),
-        "lost_number": number[lost].reshape(*number.shape[:-1], -1),
+        "lost_number": torch.where(lost.gather(-1, first), number.gather(-1, first), PADDING),
     }
 
 
 @dataclass(frozen=True)
 class LostLines:
-    """Single lines lost at random places: `count` of them, or a `fraction` of all lines.
+    """Impairment: single lines lost at random positions.
 
-    Give one of the two.
+    The truth holds `lost`, shape (..., pulse), bool, on the grid of line number minus first number,
+    and `lost_number`, shape (..., count), padded with -1 where trials lose fewer lines.
 
-    Truth: `lost` (..., pulse), the lost lines on the grid line number - first number; `lost_number`
-    (..., count).
+    Args:
+        count: Number of lost lines, fixed for all trials; None if a fraction is given.
+        fraction: Fraction of all lines, at least 0 and below 1; None if a count is given.
+
+    Raises:
+        ValueError: If both or none is given, or one is out of range; when applied, if no line would
+            be left or the trials of draws and recording differ.
     """
 
     count: int | None = None
-    fraction: float | None = None
+    fraction: Tensor | float | None = None
 
     def __post_init__(self) -> None:
         if (self.count is None) == (self.fraction is None):
             raise ValueError(f"lost lines need a count or a fraction, got count={self.count}, fraction={self.fraction}")
-        if (self.count is not None and self.count < 0) or (self.fraction is not None and not 0 <= self.fraction < 1):
-            raise ValueError(
-                f"lost lines need a count >= 0 or a fraction in 0..1, got count={self.count}, fraction={self.fraction}"
-            )
+        expected = "lost lines need a count >= 0 or a fraction in 0..1"
+        if self.count is not None and self.count < 0:
+            raise ValueError(f"{expected}, got count={self.count}")
+        if self.fraction is not None:
+            refuse_unless(expected, self.fraction, lambda x: (x >= 0) & (x < 1))
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
+        refuse_other_trials(self, draws, recording)
         number = _numbers(recording)
-        have = _valid_count(number)
-        count = self.count if self.count is not None else round((self.fraction or 0.0) * have)
-        if count >= have:
-            raise ValueError(f"{count} lost lines leave nothing of a recording of {have} lines; lose fewer")
-        index = _of_draws(1 + draws.subset("echo.lines.lost", have - 1, count), number)
-        return _drop(recording, _at(index, number.shape[-1]))
+        have = _valid_count(number, draws)
+        count = lost_count(self.count, self.fraction, have, number)
+        left = have - count
+        if bool((left <= 0).any()):
+            lost, lines = (int(v.expand(left.shape)[left <= 0][0]) for v in (count, have))
+            raise ValueError(f"{lost} lost lines leave nothing of a recording of {lines} lines; lose fewer")
+        order = _order(draws, "echo.lines.lost", have - 1, number)
+        chosen = torch.arange(order.shape[-1], device=number.device) < count[..., None]
+        lost = torch.zeros(number.shape, dtype=torch.bool, device=number.device)
+        return _drop(recording, lost.scatter(-1, 1 + order, chosen.expand(order.shape)))
 
 
 @dataclass(frozen=True)
 class LostGaps:
-    """`count` gaps of `length` consecutive lines each, apart from one another.
+    """Impairment: gaps of consecutive lost lines, apart from one another.
 
-    Truth as for LostLines.
+    The truth is that of `LostLines`.
+
+    Args:
+        count: Number of gaps, fixed for all trials.
+        length: Number of lines of each gap, fixed for all trials.
+
+    Raises:
+        ValueError: If a number is out of range; when applied, if the gaps do not fit or the trials
+            of draws and recording differ.
     """
 
     count: int
@@ -129,25 +174,33 @@ class LostGaps:
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         number = _numbers(recording)
-        have = _valid_count(number)
+        have = _valid_count(number, draws)
         free = have - self.count * self.length
-        if free <= self.count:
+        if bool((free <= self.count).any()):
             raise ValueError(
-                f"{self.count} gaps of {self.length} lines do not fit a recording of {have} lines; "
+                f"{self.count} gaps of {self.length} lines do not fit a recording of {int(have.min())} lines; "
                 "lose fewer or shorter ones"
             )
-        # a gap begins behind a kept line: choose kept lines, then open the gaps
-        begin = 1 + draws.subset("echo.lines.gaps", free - 1, self.count) + self.length * torch.arange(self.count)
-        index = (begin[..., None] + torch.arange(self.length)).flatten(-2)
-        return _drop(recording, _at(_of_draws(index, number), number.shape[-1]))
+        # a gap begins after a kept line: kept lines are chosen, then the gaps are opened
+        kept = _order(draws, "echo.lines.gaps", free - 1, number)[..., : self.count].sort(-1).values
+        begin = 1 + kept + self.length * torch.arange(self.count, device=number.device)
+        index = (begin[..., None] + torch.arange(self.length, device=number.device)).flatten(-2)
+        return _drop(recording, _at(index, number.shape[-1]))
 
 
 @dataclass(frozen=True)
 class RepeatedLines:
-    """`count` lines that a buffer hands over twice, number and samples alike; the last lines of a
-    full matrix fall off its end.
+    """Impairment: lines that appear twice in succession, with the same number and samples.
 
-    Truth: `repeated` (..., pulse), the second copies in the impaired matrix.
+    The last lines of a full matrix are dropped. The truth holds `repeated`, shape (..., pulse),
+    bool, the second copies in the impaired matrix.
+
+    Args:
+        count: Number of repeated lines, fixed for all trials.
+
+    Raises:
+        ValueError: If the count is negative; when applied, if it exceeds half of the lines or the
+            trials of draws and recording differ.
     """
 
     count: int
@@ -158,13 +211,14 @@ class RepeatedLines:
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         number = _numbers(recording)
-        n, have = number.shape[-1], _valid_count(number)
-        if self.count > have // 2:
+        n, have = number.shape[-1], _valid_count(number, draws)
+        if bool((self.count > have // 2).any()):
             raise ValueError(
-                f"{self.count} repeated lines are more than half of a recording of {have} lines; repeat fewer"
+                f"{self.count} repeated lines are more than half of a recording of {int(have.min())} lines; "
+                "repeat fewer"
             )
-        repeat = _at(_of_draws(draws.subset("echo.lines.repeated", have - self.count, self.count), number), n)
-        # line i lands behind all copies of the lines before it, and its own copy behind it
+        repeat = _at(_order(draws, "echo.lines.repeated", have - self.count, number)[..., : self.count], n)
+        # line i follows all copies of the lines before it; its own copy follows it
         landing = torch.arange(n, device=number.device) + repeat.cumsum(-1) - repeat.long()
         starts = torch.zeros((*number.shape[:-1], 2 * n), dtype=torch.int64, device=number.device).scatter(
             -1, landing, 1
@@ -175,11 +229,18 @@ class RepeatedLines:
 
 @dataclass(frozen=True)
 class CorruptedNumbers:
-    """`count` line numbers overwritten: by any number 0..65535, or by the true one with one of its
-    low `bits` bits flipped.
+    """Impairment: line numbers that are overwritten, while the samples are unchanged.
 
-    The samples are untouched. Truth: `corrupted` (..., pulse) and `true_number` (..., pulse), both
-    in the order of the matrix.
+    The truth holds `corrupted`, bool, and `true_number`, shape (..., pulse) each, in the order of
+    the matrix.
+
+    Args:
+        count: Number of corrupted line numbers, fixed for all trials.
+        bits: None for any number 0 to 65535; otherwise one of this many low bits is flipped.
+
+    Raises:
+        ValueError: If a number is out of range; when applied, if the count exceeds the lines or the
+            trials of draws and recording differ.
     """
 
     count: int
@@ -193,12 +254,13 @@ class CorruptedNumbers:
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         number = _numbers(recording)
-        have = _valid_count(number)
-        if self.count > have:
+        have = _valid_count(number, draws)
+        if bool((self.count > have).any()):
             raise ValueError(
-                f"{self.count} corrupted numbers are more than the {have} lines of the recording; corrupt fewer"
+                f"{self.count} corrupted numbers are more than the {int(have.min())} lines of the recording; "
+                "corrupt fewer"
             )
-        index = _of_draws(draws.subset("echo.lines.corrupted", have, self.count), number)
+        index = _order(draws, "echo.lines.corrupted", have, number)[..., : self.count].sort(-1).values
         drawn = draws.uniform("echo.lines.number", (self.count,), 0.0, 1.0).to(number.device).expand(index.shape)
         true = number.gather(-1, index)
         wrong = (65536 * drawn).long() if self.bits is None else true ^ (1 << (self.bits * drawn).long())

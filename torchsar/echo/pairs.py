@@ -1,6 +1,4 @@
-"""Simulated (Recording, Truth) pairs as an iterable, for training and for judging over many
-scenes.
-"""
+"""Simulated pairs of recording and truth as an iterable."""
 
 from __future__ import annotations
 
@@ -17,13 +15,24 @@ from torchsar.scene import StripmapWorld
 
 @dataclass(frozen=True)
 class SimulatedPairs:
-    """Iterates over batches of trials of one world; batch b holds the trials b * batch ..
+    """Iterable over batches of trials of one world, for training and for tests over many scenes.
 
-    (b + 1) * batch - 1 of `seed`.
+    Batch b holds the trials b * batch to (b + 1) * batch - 1 of the seed. Every trial draws its own
+    scene, phases, noise and impairments, and is the same in any batch size. World parameters must
+    be plain numbers, since a batch may hold any of the trials. Each item is a Recording and its
+    Truth.
 
-    Every trial draws its own scene, phases, noise and impairment, and is the same in any batch
-    size. count: trials in all; the last batch may be smaller. World values that are given per trial
-    must be numbers here, as a batch holds any of the trials.
+    Args:
+        radar: Radar.
+        world: World.
+        n_pulse: Number of pulses.
+        n_range: Number of range samples.
+        seed: Seed of the random draws.
+        count: Number of trials in all.
+        batch: Number of trials in a batch; the last batch may be smaller.
+        impairments: Impairments by name, applied in order.
+        dtype: Complex dtype of the recordings.
+        device: Device of the recordings.
     """
 
     radar: StripmapRadar

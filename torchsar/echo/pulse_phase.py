@@ -1,77 +1,110 @@
-"""Phase errors put into range-compressed pulses, simulated or recorded: impairments that an
-autofocus has to find again.
-"""
+"""Phase errors of range-compressed pulses, as impairments for studies of autofocus."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, unit_phasor
+from torchsar.scene.trials import finite, refuse_other_trials, refuse_unless, refuse_unless_finite, with_dims
 
 
 def _turned(recording: Recording, phase_rad: Tensor) -> tuple[Recording, Mapping[str, Tensor]]:
-    """The recording with every pulse turned by exp(j phase), and the truth `phase_rad` (..., pulse)
-    float64.
-    """
+    """The recording with every pulse multiplied by exp(j phase), and the truth `phase_rad`."""
     data = recording.signal.data
     phase = phase_rad.to(data.device).expand(data.shape[:-1])
     turned = data * unit_phasor(phase / (2 * math.pi), data.dtype)[..., None]
     return replace(recording, signal=recording.signal.with_data(turned)), {"phase_rad": phase}
 
 
+def _level(x: Any) -> Any:
+    """Whether a number, or each entry of a tensor, is finite and not negative."""
+    return finite(x) & (x >= 0)
+
+
 def _pulses(recording: Recording) -> int:
+    """Number of pulses."""
     return recording.signal.data.shape[-2]
 
 
 @dataclass(frozen=True)
 class WhitePhase:
-    """An independent phase of each pulse: uniform within +- limit_rad."""
+    """Impairment: an independent phase of each pulse, uniform within +-limit_rad.
 
-    limit_rad: float = math.pi
+    The truth holds `phase_rad`, shape (..., pulse), float64.
+
+    Args:
+        limit_rad: Largest phase in radians.
+
+    Raises:
+        ValueError: If the limit is negative or not finite.
+    """
+
+    limit_rad: Tensor | float = math.pi
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.limit_rad) and self.limit_rad >= 0):
-            raise ValueError(f"limit_rad must be 0 rad or more, got {self.limit_rad}")
+        refuse_unless("limit_rad must be 0 rad or more", self.limit_rad, _level)
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, Mapping[str, Tensor]]:
-        return _turned(
-            recording, draws.uniform("echo.phase.white", (_pulses(recording),), -self.limit_rad, self.limit_rad)
-        )
+        refuse_other_trials(self, draws, recording)
+        share = draws.uniform("echo.phase.white", (_pulses(recording),))
+        limit = with_dims(self.limit_rad, 1, share)
+        return _turned(recording, 2 * limit * share - limit)
 
 
 @dataclass(frozen=True)
 class PhaseWalk:
-    """A random walk from pulse to pulse with normal steps of deviation step_rad."""
+    """Impairment: a random walk of the phase with normal steps from pulse to pulse.
 
-    step_rad: float = 1.0
+    The truth holds `phase_rad`, shape (..., pulse), float64.
+
+    Args:
+        step_rad: Standard deviation of a step in radians.
+
+    Raises:
+        ValueError: If the standard deviation is negative or not finite.
+    """
+
+    step_rad: Tensor | float = 1.0
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.step_rad) and self.step_rad >= 0):
-            raise ValueError(f"step_rad must be 0 rad or more, got {self.step_rad}")
+        refuse_unless("step_rad must be 0 rad or more", self.step_rad, _level)
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, Mapping[str, Tensor]]:
-        return _turned(recording, (self.step_rad * draws.normal("echo.phase.walk", (_pulses(recording),))).cumsum(-1))
+        refuse_other_trials(self, draws, recording)
+        unit = draws.normal("echo.phase.walk", (_pulses(recording),))
+        return _turned(recording, (with_dims(self.step_rad, 1, unit) * unit).cumsum(-1))
 
 
 @dataclass(frozen=True)
 class PhaseSinusoid:
-    """A vibration of amplitude_rad and `cycles` periods over the recording, at a random start."""
+    """Impairment: a sinusoidal phase with a random start, as of a vibration.
 
-    amplitude_rad: float = 10.0
-    cycles: float = 5.0
+    The truth holds `phase_rad`, shape (..., pulse), float64.
+
+    Args:
+        amplitude_rad: Amplitude in radians.
+        cycles: Number of periods over the recording.
+
+    Raises:
+        ValueError: If a number is not finite.
+    """
+
+    amplitude_rad: Tensor | float = 10.0
+    cycles: Tensor | float = 5.0
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.amplitude_rad) and math.isfinite(self.cycles)):
-            raise ValueError(
-                f"amplitude_rad and cycles must be finite numbers, got {self.amplitude_rad} and {self.cycles}"
-            )
+        refuse_unless_finite("amplitude_rad of a phase sinusoid", self.amplitude_rad)
+        refuse_unless_finite("cycles of a phase sinusoid", self.cycles)
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, Mapping[str, Tensor]]:
-        n = _pulses(recording)
-        turns = self.cycles * torch.arange(n, dtype=torch.float64) / n + draws.uniform("echo.phase.sinusoid")[..., None]
-        return _turned(recording, self.amplitude_rad * torch.sin(2 * math.pi * turns))
+        refuse_other_trials(self, draws, recording)
+        pulse = torch.arange(_pulses(recording), dtype=torch.float64)
+        amplitude, cycles = (with_dims(v, 1, pulse) for v in (self.amplitude_rad, self.cycles))
+        turns = cycles * pulse / len(pulse) + draws.uniform("echo.phase.sinusoid")[..., None]
+        return _turned(recording, amplitude * torch.sin(2 * math.pi * turns))

@@ -1,4 +1,4 @@
-"""A channel whose phase and gain depend on range frequency."""
+"""Frequency response of a receiver channel."""
 
 from __future__ import annotations
 
@@ -15,13 +15,21 @@ Curve = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class ChannelResponse:
-    """Every range spectrum is multiplied by amplitude(u) exp(j phase(u)), u = f / (pulse bandwidth
-    / 2).
+    """Impairment: every range spectrum is multiplied by amplitude(u) exp(j phase(u)).
 
-    phase_rad, amplitude: functions of a float64 tensor u (n,), giving (n,) or one row per trial
-    (..., n); None leaves that part alone. They are asked for u within -1..1 only: outside the band
-    the edge values hold. A constant or linear part of the phase is applied as given, though no
-    processor can tell it from a phase and a shift of the scene.
+    u is the range frequency over half the pulse bandwidth. The functions are evaluated within -1..1
+    only; outside the band their values at its edges hold. Constant and linear parts of the phase
+    are applied as well, although no processor can distinguish them from a phase and a shift of the
+    scene. The truth holds `phase_rad` and `amplitude` at 1025 points of -1..1.
+
+    Args:
+        phase_rad: Function of u, shape (n,), float64, that returns the phase in radians, shape (n,)
+            or (..., n); None for zero.
+        amplitude: Function of u that returns the positive amplitude, in the same form; None for
+            one.
+
+    Raises:
+        ValueError: When applied, if the amplitude is not positive.
     """
 
     phase_rad: Curve | None = None
@@ -43,9 +51,16 @@ class ChannelResponse:
         }
 
     def curves(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Phase and amplitude at u, float64, of one shape.
+        """Return phase and amplitude.
 
-        The truth holds them on 1025 points of -1..1.
+        Args:
+            u: Normalised frequency within -1..1, shape (n,), float64.
+
+        Returns:
+            Phase in radians and amplitude, shape (n,) or (..., n) each.
+
+        Raises:
+            ValueError: If an amplitude is not positive.
         """
         phase = torch.zeros_like(u) if self.phase_rad is None else self.phase_rad(u)
         amplitude = torch.ones_like(u) if self.amplitude is None else self.amplitude(u)

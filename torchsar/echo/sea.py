@@ -1,14 +1,18 @@
-"""Echo of a stationary surface in all channels of a bistatic receiver, made from its
-two-dimensional spectrum.
+"""Echo of a stationary surface in all channels of a bistatic receiver.
 
-A scatterer at closest range R0 and along-track place y has the spectrum (stationary phase, one way;
-F = carrier + f_r, f Doppler, V the receiver's speed)
-    exp(-j 2 pi [ f y / V + sqrt(F^2 - (c f / V)^2) R0 / c ]),    seen under sin(look) = -c f / (F
-    V):
-the exponent from which omega-K focusing starts, read backwards. The channel at dx sees what the
-reference saw dx / V before, exactly: exp(-j 2 pi f dx / V). So one sum over range per bin of the
-full Doppler band serves every channel; only the folding to the pulse rate is a channel's own.
-Source: brief 001, signal model with u_r = u_a = 0. Own code.
+The echo is formed from its two-dimensional spectrum. A scatterer at the closest range R0 and the
+along-track position y has the spectrum (stationary phase, one way; F is the carrier plus the range
+frequency f_r, f the Doppler frequency, V the speed of the receiver)
+
+    exp(-j 2 pi [ f y / V + sqrt(F^2 - (c f / V)^2) R0 / c ]),    sin(look) = -c f / (F V).
+
+This is the phase from which omega-K focusing starts. The channel at dx receives what the reference
+channel received dx / V earlier, which is the exact factor exp(-j 2 pi f dx / V). One sum over range
+per bin of the full Doppler band therefore serves all channels; they differ only in their folding to
+the pulse rate.
+
+Reference:
+    Remote Sens. 2020, 12, 1703, Eqs. (1), (4), with zero target velocity.
 """
 
 from __future__ import annotations
@@ -25,11 +29,15 @@ from torchsar.core import Draws, fft_lines, linear_phasor, per_trial, real_dtype
 from torchsar.radar import BistaticRadar
 from torchsar.scene.bistatic import BandLimited, Pattern
 from torchsar.scene.sea import Sea
+from torchsar.scene.trials import refuse_other_trials
 
-# sine of the look angle beyond which no surface is lit: towards 1 its range grows without bounds
+# largest sine of the look angle that is illuminated, by choice: towards 1 the range grows without
+# bounds
 _STEEPEST = 0.8
-_HALF_POWER = 0.443  # of the first null, where a one-way sinc has half its power
-_SKIRT = 16  # cells by which range responses reach into a frame
+_HALF_POWER = 0.443  # sinc^2(0.443) = 1/2, in units of the first null
+# cells beyond a frame whose range responses are included, by choice: a sinc has fallen to -34 dB
+_SKIRT = 16
+# phasors of a block of Doppler rows, 16 MB in complex128
 _BLOCK_PHASORS = 1 << 20
 
 
@@ -43,77 +51,100 @@ def sea_echo(
     dtype: torch.dtype = torch.complex64,
     device: torch.device | str | None = None,
 ) -> Tensor:
-    """Range-compressed echo of a sea, (..., channel, pulse, range) on radar.axes(n_pulse, n_range);
-    without n_range one line at the reference range, (..., channel, pulse).
+    """Return the range-compressed echo of a sea without noise.
 
-    gate: `BandLimited(T)` lights the Doppler band |f| < V^2 T / (2 lambda R0) of the reference
-    range at every range, as a beam of fixed width does; `Pattern()` weights with sinc(element
-    sin(look) / lambda), up to `sea.lobes` nulls. The phase is -2 pi / lambda (R_m - reference
-    range), the response in range is that of the rectangular band of the pulse: the transmit range
-    and a pulse of other shape are the caller's to multiply with. A cell keeps its amplitude as long
-    as it is lit; over range amplitudes fall with 1 / sqrt(R0), as the cells in the beam grow in
-    number: mean power is 10^(sea.power_db / 10) in every sample, whatever the gate and the frame.
-    Exact but for stationary phase, which blurs the edges of a band-limited gate by their Fresnel
-    ripple. Differentiable in power_db and in images. Raises TypeError for another gate or dtype,
-    ValueError for frames that begin behind the receiver and for bands wider than a look of 53
-    degrees.
+    The phase is -2 pi / lambda (R_m - reference range), and the range response is that of the
+    rectangular band of the pulse; the transmit range and a pulse of another shape are applied by
+    the caller. A cell keeps its amplitude while it is illuminated. Amplitudes fall with
+    1 / sqrt(R0) over range, as the number of cells in the beam grows, so that the mean power is
+    10^(power_db / 10) in every sample, for every gate and frame. The stationary phase is the only
+    approximation; it blurs the edges of a band-limited gate by their Fresnel ripple. Differentiable
+    in power_db and in images.
+
+    Args:
+        sea: Surface.
+        radar: Receiver.
+        n_pulse: Number of pulses.
+        n_range: Number of range samples, None for one line at the reference range.
+        gate: `BandLimited` of duration T illuminates the Doppler band |f| < V^2 T / (2 lambda R0)
+            of the reference range at every range, as a beam of fixed width does. `Pattern` weights
+            with sinc(element sin(look) / lambda) up to sea.lobes nulls. Both need one value for all
+            trials.
+        draws: Random draws.
+        dtype: Complex dtype of the result.
+        device: Device of the result.
+
+    Returns:
+        Echo on radar.axes(n_pulse, n_range), shape (..., channel, pulse, range), or (..., channel,
+        pulse) without n_range.
+
+    Raises:
+        TypeError: If the gate or the dtype is of another kind.
+        ValueError: If the frame begins behind the receiver, the gate is wider than a look angle of
+            53 degrees or differs between trials, or power_db has another length than the trials.
     """
     real_dtype(dtype)
+    refuse_other_trials(sea, draws)
     light = _Light.of(gate, radar, sea.lobes)
     lines = _Lines.of(radar, n_range, light.last_sin)
     bins = _Bins.of(sea, radar, n_pulse, light, lines)
     cells = sea.reflectivity(bins.azimuth_m(device), lines.offset_m(device), draws, dtype)
     spectrum = fft_lines(cells).contiguous()
-    seen, power = [], torch.zeros((), dtype=torch.float64, device=device)
+    spectra, power = [], torch.zeros((), dtype=torch.float64, device=device)
     for rows in bins.blocks(lines, device):
         cell = _Transfer.of(bins.doppler_hz(rows)[:, None], *lines.band(device), radar, light)
         power = power + lines.sample_power(cell, bins.times(rows))
         response = unit_phasor(lines.centre_turns(cell, radar), dtype) * cell.gain.to(real_dtype(dtype))
         pair = spectrum.index_select(-2, torch.cat([rows, -rows % bins.n])).unflatten(-2, (2, -1))
-        seen.append(_sum_over_range(pair, -cell.wavenumber * lines.step_m, dtype) * response)
+        spectra.append(_sum_over_range(pair, -cell.wavenumber * lines.step_m, dtype) * response)
     scale = torch.sqrt(10 ** (per_trial(sea.power_db, 0, cells) / 10) / (power * bins.n))
-    data = _to_time(_fold(bins.in_order(torch.cat(seen, -2)), bins, radar), n_pulse, lines) * bins.pulses
+    data = _to_time(_fold(bins.in_order(torch.cat(spectra, -2)), bins, radar), n_pulse, lines) * bins.pulses
     data = data * scale.to(data.real.dtype)[..., None, None, None]
     return data[..., 0] if n_range is None else data
 
 
 @dataclass(frozen=True)
 class _Light:
-    """What a gate is to a surface that stands still: an even weight over the sine of the look
-    angle.
-
-    edge_sin: of a band-limited gate, or where a pattern has half its power; last_sin: where the
-    surface is cut off.
-    """
+    """Gain of a gate over the sine of the look angle, its edge (half power) and its end."""
 
     weight: Callable[[Tensor], Tensor]
-    edge_sin: float
-    last_sin: float
+    edge_sin: float  # end of a band-limited gate, or half power of a pattern
+    last_sin: float  # beyond it nothing is illuminated
 
     @staticmethod
     def of(gate: BandLimited | Pattern, radar: BistaticRadar, lobes: int) -> _Light:
-        """Raises TypeError for another gate, ValueError for one that no look angle has."""
+        """The gain of a gate; raises TypeError or ValueError for an unsuitable gate."""
         if isinstance(gate, BandLimited):
-            edge = radar.speed_m_s * gate.duration_s / (2 * radar.reference_range_m)
+            duration_s = _of_all_trials(gate.duration_s, "duration_s")
+            edge = radar.speed_m_s * duration_s / (2 * radar.reference_range_m)
             if edge > _STEEPEST:
                 raise ValueError(
-                    f"a gate of {gate.duration_s:g} s at {radar.reference_range_m:g} m ends at a look "
+                    f"a gate of {duration_s:g} s at {radar.reference_range_m:g} m ends at a look "
                     f"angle of sine {edge:.3g}, beyond {_STEEPEST}; shorten it, or use Pattern()"
                 )
             return _Light(torch.ones_like, edge, edge)
         if isinstance(gate, Pattern):
-            null = radar.wavelength_m / (gate.element_m or radar.element_m)
+            element = radar.element_m if gate.element_m is None else _of_all_trials(gate.element_m, "element_m")
+            null = radar.wavelength_m / element
             return _Light(
                 lambda sine: torch.sinc(sine / null), min(_HALF_POWER * null, _STEEPEST), min(lobes * null, _STEEPEST)
             )
-        raise TypeError(f"a sea is lit by BandLimited(duration_s) or Pattern(), got {gate!r}")
+        raise TypeError(f"gate of a sea must be BandLimited(duration_s) or Pattern(), got {gate!r}")
+
+
+def _of_all_trials(value: Tensor | float, name: str) -> float:
+    """The number of a gate; raises ValueError for a value per trial, as it decides the grid."""
+    if isinstance(value, Tensor) and value.numel() != 1:
+        raise ValueError(
+            f"{name} of the gate of a sea must be one number, since it decides how many cells there are, "
+            f"got shape {tuple(value.shape)}; simulate one value at a time"
+        )
+    return float(value)
 
 
 @dataclass(frozen=True)
 class _Lines:
-    """Cells in closest range and the range frequencies they are summed at: first cell, cells, FFT
-    length, samples (all relative to the middle of the frame), step (m).
-    """
+    """Range cells and range frequencies of a frame; samples count from its middle."""
 
     first: int
     cells: int
@@ -126,9 +157,7 @@ class _Lines:
 
     @staticmethod
     def of(radar: BistaticRadar, n_range: int | None, last_sin: float) -> _Lines:
-        """All cells that migrate through a frame, and an FFT in which nothing that leaves it comes
-        back.
-        """
+        """All cells that migrate through a frame, and an FFT in which they do not wrap into it."""
         step, middle = radar.range_step_m, radar.reference_range_m
         if n_range is None:
             return _Lines(0, 1, 1, 1, step, radar.sampling_hz, radar.pulse.bandwidth_hz, middle)
@@ -154,52 +183,42 @@ class _Lines:
         )
 
     def offset_m(self, device: torch.device | str | None) -> Tensor:
-        """Closest range of the cells less that of the middle of the scene, float64 (cell,)."""
+        """Closest range of the cells relative to the middle of the scene in metres, (cell,)."""
         return self.step_m * (self.first + torch.arange(self.cells, dtype=torch.float64, device=device))
 
     def band(self, device: torch.device | str | None) -> tuple[Tensor, Tensor]:
-        """Range frequencies in the band of the pulse and the share of each bin that lies inside,
-        float64 (frequency,), FFT order.
-        """
+        """Range frequencies within the band and the share of each bin inside, (frequency,) each."""
         f = torch.fft.fftfreq(self.length, 1 / self.sampling_hz, dtype=torch.float64, device=device)
         share = ((self.band_hz / 2 - f.abs()) * self.length / self.sampling_hz + 0.5).clamp(0, 1)
         return f[share > 0], share[share > 0]
 
     def centre_turns(self, cell: _Transfer, radar: BistaticRadar) -> Tensor:
-        """Turns of the middle cell less those of range at the reference range, formed without the
-        large difference.
-        """
+        """Cycles of the middle cell relative to the reference range, without large differences."""
         offset_m = (self.first + self.cells // 2) * self.step_m
         return -(cell.bend * radar.reference_range_m + cell.wavenumber * offset_m)
 
     def sample_power(self, cell: _Transfer, times: Tensor) -> Tensor:
-        """Share of some bins in the mean power of a sample, for cells of unit power.
-
-        times: how often each row counts.
-
-        At a look angle, a cell of closest range is 1 / cos(look) as long on the range axis: fewer
-        of them share a sample.
-        """
+        """Share of some bins in the mean power of a sample, for cells of unit power."""
+        # a cell of closest range is 1 / cos(look) as long on the range axis, so that fewer share a
+        # sample; `times` counts each row
         power = times @ cell.gain.square() if self.cells == 1 else times @ (cell.gain.square() * cell.cos)
         return power.sum() / self.length
 
 
 @dataclass(frozen=True)
 class _Transfer:
-    """A cell in the spectrum, float64 (row, frequency), alike at Doppler f and -f: gain, cosine of
-    the look angle, turns per metre of closest range, and that less F / c (`bend`).
-    """
+    """Spectrum of a cell, equal at Doppler f and -f, (row, frequency), float64."""
 
     gain: Tensor
-    cos: Tensor
-    wavenumber: Tensor
-    bend: Tensor
+    cos: Tensor  # of the look angle
+    wavenumber: Tensor  # cycles per metre of closest range
+    bend: Tensor  # wavenumber - F / c
 
     @staticmethod
     def of(doppler_hz: Tensor, frequency_hz: Tensor, share: Tensor, radar: BistaticRadar, light: _Light) -> _Transfer:
-        """A cell is lit for a time per Doppler of lambda R0 / (V^2 cos^3(look)): stationary phase
-        gives the square root of it as amplitude (without R0).
-        """
+        """The spectrum of a cell by stationary phase, without the factor of its range."""
+        # a cell is illuminated per Doppler for lambda R0 / (V^2 cos^3(look)), whose square root is
+        # its amplitude by stationary phase
         f = radar.carrier_hz + frequency_hz
         sine = -radar.wave_speed_m_s * doppler_hz / (f * radar.speed_m_s)
         lit = sine.abs() <= light.last_sin * (1 + 1e-12)
@@ -212,9 +231,7 @@ class _Transfer:
 
 @dataclass(frozen=True)
 class _Bins:
-    """Doppler bins of the full band: `bands` times the pulse rate wide, `pulses` bins in each, all
-    of a period that holds the record.
-    """
+    """Doppler bins: `bands` times the pulse rate, `pulses` bins in each, covering the record."""
 
     bands: int
     pulses: int
@@ -223,6 +240,7 @@ class _Bins:
 
     @staticmethod
     def of(sea: Sea, radar: BistaticRadar, n_pulse: int, light: _Light, lines: _Lines) -> _Bins:
+        """The Doppler bins of a record with its margins."""
         tangent = light.edge_sin / math.sqrt(1 - light.edge_sin**2)
         margin_s = lines.far_m * tangent / radar.speed_m_s if sea.margin_s is None else sea.margin_s
         highest_hz = (
@@ -233,38 +251,35 @@ class _Bins:
 
     @property
     def n(self) -> int:
+        """Number of bins."""
         return self.bands * self.pulses
 
     def azimuth_m(self, device: torch.device | str | None) -> Tensor:
-        """Along-track places of the cells in FFT order, float64 (n,)."""
+        """Along-track positions of the cells in FFT order in metres, (n,)."""
         return torch.fft.fftfreq(self.n, 1 / self.n, dtype=torch.float64, device=device) * (
             self.speed_m_s / (self.prf_hz * self.bands)
         )
 
     def doppler_hz(self, row: Tensor) -> Tensor:
-        """Doppler of rows counted from zero in either direction, float64."""
+        """Doppler frequency of rows, counted from zero in either direction."""
         return row.to(torch.float64) * (self.prf_hz / self.pulses)
 
     def times(self, row: Tensor) -> Tensor:
-        """2 for rows that exist at Doppler f and at -f, else 1, float64."""
+        """2 for rows that exist at Doppler f and at -f, otherwise 1."""
         return 2.0 - ((row == 0) | (2 * row == self.n)).to(torch.float64)
 
     def in_order(self, pairs: Tensor) -> Tensor:
-        """All bins in FFT order (..., n, frequency) from rows 0..n // 2 at f and at -f, (..., 2,
-        row, frequency).
-        """
+        """Bins in FFT order (..., n, frequency) from rows at f and -f, (..., 2, row, frequency)."""
         return torch.cat([pairs[..., 0, : (self.n + 1) // 2, :], pairs[..., 1, 1 : self.n // 2 + 1, :].flip(-2)], -2)
 
     def blocks(self, lines: _Lines, device: torch.device | str | None) -> Iterator[Tensor]:
-        """Rows 0..n // 2 worked on at once, whatever the number of trials: sums then round alike in
-        batches of any size.
-        """
+        """Blocks of rows, independent of the number of trials, so that sums round equally."""
         height = max(1, _BLOCK_PHASORS // (2 * lines.length * (1 + math.isqrt(lines.cells))))
         yield from torch.arange(self.n // 2 + 1, device=device).split(height)
 
 
 def _fast_length(n: int) -> int:
-    """The least FFT length >= n with no prime factor above 5."""
+    """The smallest FFT length >= n with no prime factor above 5."""
 
     def rest(k: int) -> int:
         for p in (2, 3, 5):
@@ -276,13 +291,7 @@ def _fast_length(n: int) -> int:
 
 
 def _sum_over_range(cells: Tensor, turns: Tensor, dtype: torch.dtype) -> Tensor:
-    """sum_j cells_j exp(2j pi turns (j - n // 2)).
-
-    cells: (..., row, n); turns: float64 (row, frequency). Returns (..., row, frequency).
-
-    Exact: the exponential separates into a coarse and a fine factor, which makes one small matrix
-    product per row of the sum; all other dims are its columns.
-    """
+    """sum_j cells_j exp(2j pi turns (j - n // 2)): (..., row, n) -> (..., row, frequency)."""
     n = cells.shape[-1]
     m = 2 ** round(math.log2(n) / 2)
     count = -(-n // m)
@@ -294,20 +303,16 @@ def _sum_over_range(cells: Tensor, turns: Tensor, dtype: torch.dtype) -> Tensor:
     )
 
 
-def _fold(seen: Tensor, bins: _Bins, radar: BistaticRadar) -> Tensor:
-    """Spectra of the channels at the pulse rate, (..., channel, pulse, frequency), from the full
-    band in FFT order (..., n, frequency).
-    """
-    order = torch.fft.fftfreq(bins.n, 1 / bins.n, dtype=torch.float64, device=seen.device)
-    delay_s = radar.channels_at(seen.device) / radar.speed_m_s
-    steering = unit_phasor(-bins.doppler_hz(order) * delay_s[:, None], seen.dtype)[..., None]
-    return torch.stack([(phasor * seen).unflatten(-2, (bins.bands, bins.pulses)).sum(-3) for phasor in steering], -3)
+def _fold(spectra: Tensor, bins: _Bins, radar: BistaticRadar) -> Tensor:
+    """Spectra of the channels at the pulse rate, (..., channel, pulse, frequency)."""
+    order = torch.fft.fftfreq(bins.n, 1 / bins.n, dtype=torch.float64, device=spectra.device)
+    delay_s = radar.channels_at(spectra.device) / radar.speed_m_s
+    steering = unit_phasor(-bins.doppler_hz(order) * delay_s[:, None], spectra.dtype)[..., None]
+    return torch.stack([(phasor * spectra).unflatten(-2, (bins.bands, bins.pulses)).sum(-3) for phasor in steering], -3)
 
 
 def _to_time(spectrum: Tensor, n_pulse: int, lines: _Lines) -> Tensor:
-    """Samples (..., channel, pulse, range) of a frame about slow time zero and the reference range,
-    from in-band spectra in FFT order.
-    """
+    """Samples of a frame about slow time zero and the reference range, from in-band spectra."""
     positive = (spectrum.shape[-1] + 1) // 2
     gap = spectrum.new_zeros((*spectrum.shape[:-1], lines.length - spectrum.shape[-1]))
     data = torch.fft.ifft(torch.cat([spectrum[..., :positive], gap, spectrum[..., positive:]], -1))

@@ -1,4 +1,4 @@
-"""Simulated stripmap acquisitions: world in, recording and truth out."""
+"""Simulation of stripmap acquisitions, and the application of impairments."""
 
 from __future__ import annotations
 
@@ -14,13 +14,17 @@ from torchsar.core import Draws, Recording, Signal, Truth, per_trial
 from torchsar.echo.pulsed import echo_spectrum
 from torchsar.radar import StripmapRadar
 from torchsar.scene import Scatterers, StripmapWorld
+from torchsar.scene.trials import refuse_other_trials
 
+# phase tables of a block of pulses and targets, about the cache of a processor
 _TABLE_BYTES = 8 << 20
 
 
 class Impairment(Protocol):
-    """Something that happens to a recording on its way: returns the impaired recording and what is
-    true about the impairment.
+    """Impairment of a recording by the receiver or the environment.
+
+    It is called with a recording and random draws, and returns the impaired recording and the true
+    values of the impairment by name.
     """
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, Mapping[str, Tensor]]: ...
@@ -28,8 +32,14 @@ class Impairment(Protocol):
 
 @dataclass(frozen=True)
 class Placed:
-    """Scatterers on a straight path: when the beam centre crosses them, when they are closest, how
-    far. float64, (..., target).
+    """Scatterers in the geometry of a straight path.
+
+    Args:
+        crossing_s: Slow time at which the beam centre crosses the scatterer in seconds, shape (...,
+            target), float64.
+        zero_doppler_s: Slow time of closest approach in seconds, same shape.
+        closest_m: Closest range in metres, same shape.
+        amplitude: Amplitude, same shape, complex.
     """
 
     crossing_s: Tensor
@@ -46,9 +56,21 @@ def place(
     doppler_hz: Tensor | float,
     velocity_m_s: Tensor | float,
 ) -> Placed:
-    """From positions in the recorded frame to the geometry of the path.
+    """Convert positions in the recorded frame to the geometry of the path.
 
-    The frame's middle is the middle pulse and the middle of the fully compressed part of a line.
+    The middle of the frame is the middle pulse and the middle of the fully compressed part of a
+    line.
+
+    Args:
+        scatterers: Scatterers, shape (..., target).
+        radar: Radar.
+        n_pulse: Number of pulses.
+        n_range: Number of range samples.
+        doppler_hz: Doppler frequency of the beam centre in hertz, a number or one value per trial.
+        velocity_m_s: Effective velocity in m/s, a number or one value per trial.
+
+    Returns:
+        The scatterers, shape (..., target).
     """
     doppler, velocity = (per_trial(v, 1, scatterers.azimuth_m) for v in (doppler_hz, velocity_m_s))
     middle_m = radar.near_range_m + max(0, n_range - radar.pulse_samples) / 2 * radar.range_step_m
@@ -69,13 +91,45 @@ def stripmap_echo(
     n_range: int,
     dtype: torch.dtype = torch.complex64,
 ) -> Tensor:
-    """Raw echo without noise, (..., pulse, range) of `dtype`. Slow time starts at 0.
+    """Return the raw echo without noise.
 
-    Built in range frequency from the spectrum of the sampled pulse, by blocks of pulses and of the
-    targets lit in them. Differentiable in positions, amplitudes, velocity and Doppler. The echo of
-    a target partly outside the record is cut, never wrapped.
+    The echo is formed in range frequency from the spectrum of the sampled pulse, by blocks of
+    pulses and of the targets that they illuminate. Slow time starts at zero. Echoes partly outside
+    the record are cut and never wrap. Differentiable in positions, amplitudes, velocity and Doppler
+    frequency.
+
+    Args:
+        placed: Scatterers, shape (..., target).
+        world: World.
+        radar: Radar.
+        n_pulse: Number of pulses.
+        n_range: Number of range samples.
+        dtype: Complex dtype of the result.
+
+    Returns:
+        Echo, shape (..., pulse, range).
     """
     n_fft = _line_length(placed, radar, n_range)
+    echo = _lines(placed, world, radar, n_pulse, n_range, n_fft, dtype)
+    if n_fft == n_range or placed.closest_m.ndim == 1:
+        return echo
+    fits = _fits(placed, radar, n_range)
+    if not bool(fits.any()):
+        return echo
+    # where only some trials need a longer FFT, each has the one that it would have alone
+    return torch.where(fits[..., None, None], _lines(placed, world, radar, n_pulse, n_range, n_range, dtype), echo)
+
+
+def _lines(
+    placed: Placed,
+    world: StripmapWorld,
+    radar: StripmapRadar,
+    n_pulse: int,
+    n_range: int,
+    n_fft: int,
+    dtype: torch.dtype,
+) -> Tensor:
+    """Raw lines (..., pulse, range) by FFTs of n_fft samples."""
     spectrum = torch.fft.fftshift(radar.pulse.spectrum(n_fft, radar.sampling_hz, placed.closest_m.device)).to(dtype)
     lines = []
     for pulses in _pulse_blocks(placed, n_pulse, n_fft):
@@ -90,18 +144,16 @@ def stripmap_echo(
 def _block_spectrum(
     placed: Placed, world: StripmapWorld, radar: StripmapRadar, pulse_s: Tensor, n_fft: int, dtype: torch.dtype
 ) -> Tensor:
-    """Range spectrum (..., pulse, n_fft) of one block of pulses, summed over blocks of the targets
-    that are lit in it.
-    """
+    """Range spectrum (..., pulse, n_fft) of a block of pulses, summed over blocks of targets."""
     velocity = per_trial(radar.velocity_m_s if world.velocity_m_s is None else world.velocity_m_s, 2, pulse_s)
     doppler = per_trial(_true_doppler(world, radar), 2, pulse_s)
     total = torch.zeros((*placed.closest_m.shape[:-1], pulse_s.numel(), n_fft), dtype=dtype, device=pulse_s.device)
     blocks = list(_target_blocks(placed, pulse_s.numel(), n_fft))
     for targets in blocks:
-        since, closest, weight = _seen(placed, targets, world, radar, pulse_s, doppler, velocity)
+        since, closest, weight = _times_and_gain(placed, targets, world, radar, pulse_s, doppler, velocity)
         lit = (
             slice(None) if len(blocks) == 1 else _lit(weight)
-        )  # few targets all count, so that a trial's sum does not depend on its neighbours
+        )  # all of few targets, so that the sum of a trial does not depend on other trials
         since, closest, weight = (x[..., lit] for x in (since, closest, weight))
         if not since.shape[-1]:
             continue
@@ -120,7 +172,7 @@ def _block_spectrum(
     return total
 
 
-def _seen(
+def _times_and_gain(
     placed: Placed,
     targets: slice,
     world: StripmapWorld,
@@ -129,9 +181,7 @@ def _seen(
     doppler_hz: Tensor,
     velocity_m_s: Tensor,
 ) -> list[Tensor]:
-    """Time since closest approach, closest range and gain of the beam for targets at pulses, (...,
-    pulse, target) each.
-    """
+    """Time since closest approach, closest range and gain, (..., pulse, target) each."""
     crossing, zero, closest = (
         x[..., None, targets] for x in (placed.crossing_s, placed.zero_doppler_s, placed.closest_m)
     )
@@ -147,27 +197,41 @@ def _seen(
 
 
 def _true_doppler(world: StripmapWorld, radar: StripmapRadar) -> Tensor | float:
+    """Doppler frequency of the beam centre of the world, by default that of the radar."""
     return (radar.pointing_doppler_hz or 0.0) if world.doppler_hz is None else world.doppler_hz
 
 
 def _lit(weight: Tensor) -> Tensor:
-    """Indices of the targets that any pulse of any trial sees. weight: (..., pulse, target)."""
+    """Indices of the targets that any pulse of any trial illuminates."""
     return (weight.detach() != 0).flatten(0, -2).any(0).nonzero()[:, 0]
 
 
 def _line_length(placed: Placed, radar: StripmapRadar, n_range: int) -> int:
-    """FFT length that keeps every echo from wrapping: the line itself where all echoes lie inside
-    it, else one pulse longer.
-    """
-    delay = 2 * (placed.closest_m.detach() - radar.near_range_m) / radar.wave_speed_m_s * radar.sampling_hz
-    margin = 256 + radar.pulse_samples
-    if float(delay.min()) >= 0 and float(delay.max()) + margin <= n_range:
+    """FFT length in which no echo wraps: the line itself if all fit, else one pulse longer."""
+    first, last = (
+        2 * (float(closest) - radar.near_range_m) / radar.wave_speed_m_s * radar.sampling_hz
+        for closest in placed.closest_m.detach().aminmax()
+    )
+    if first >= 0 and last + _margin(radar) <= n_range:
         return n_range
     need = n_range + radar.pulse_samples
     return next(n for n in range(need, 2 * need) if _smooth(n))
 
 
+def _fits(placed: Placed, radar: StripmapRadar, n_range: int) -> Tensor:
+    """Whether all echoes of a trial lie inside the line, (...,) bool."""
+    nearest, farthest = placed.closest_m.detach().aminmax(dim=-1)
+    last_m = radar.near_range_m + (n_range - _margin(radar)) * radar.range_step_m
+    return (nearest >= radar.near_range_m) & (farthest <= last_m)
+
+
+def _margin(radar: StripmapRadar) -> int:
+    """Samples of a pulse and, by choice, 256 samples of range migration."""
+    return 256 + radar.pulse_samples
+
+
 def _smooth(n: int) -> bool:
+    """Whether a number has no prime factor above 5."""
     for p in (2, 3, 5):
         while n % p == 0:
             n //= p
@@ -175,39 +239,51 @@ def _smooth(n: int) -> bool:
 
 
 def _pulse_blocks(placed: Placed, n_pulse: int, n_fft: int) -> Iterator[slice]:
-    """Blocks of pulses, whatever the number of trials: sums then round alike in batches of any
-    size.
-    """
+    """Blocks of pulses, independent of the number of trials, so that sums round equally."""
     height = max(1, min(64, _TABLE_BYTES // (8 * n_fft)))
     for first in range(0, n_pulse, height):
         yield slice(first, min(first + height, n_pulse))
 
 
 def _target_blocks(placed: Placed, height: int, n_fft: int) -> Iterator[slice]:
+    """Blocks of targets whose tables fit the cache."""
     width = max(16, _TABLE_BYTES // (8 * height * 3 * math.isqrt(n_fft)))
     for first in range(0, placed.closest_m.shape[-1], width):
         yield slice(first, min(first + width, placed.closest_m.shape[-1]))
 
 
 def target_energy(truth: Truth, world: StripmapWorld, radar: StripmapRadar, n_pulse: int) -> Tensor:
-    """Energy of each target's raw echo in squared sample amplitudes, (..., target), over the lines
-    of the record that see it.
+    """Return the energy of the raw echo of each target over all lines of the record.
 
-    Over the noise variance (`noise_std` squared) it is q, the peak signal-to-noise ratio after
+    Over the noise variance (`noise_std` squared) it is the peak signal-to-noise ratio after
     two-dimensional compression.
+
+    Args:
+        truth: Truth of `simulate`.
+        world: World.
+        radar: Radar.
+        n_pulse: Number of pulses.
+
+    Returns:
+        Energy in squared sample amplitudes, shape (..., target).
     """
     values = truth.values
     crossing = values["crossing_s"]
     placed = Placed(crossing, values["zero_doppler_s"], values["closest_range_m"], values["amplitude"])
     pulse_s = torch.arange(n_pulse, dtype=torch.float64, device=crossing.device) / radar.prf_hz
     velocity, doppler = (per_trial(values[name], 2, pulse_s) for name in ("velocity_m_s", "doppler_hz"))
-    weight = _seen(placed, slice(None), world, radar, pulse_s, doppler, velocity)[2]
+    weight = _times_and_gain(placed, slice(None), world, radar, pulse_s, doppler, velocity)[2]
     return radar.pulse.duration_s * radar.sampling_hz * values["amplitude"].abs().square() * weight.square().sum(-2)
 
 
 def lit_power(echo: Tensor) -> Tensor:
-    """Mean power of the lit raw samples, (...,): those above 1e-4 of the strongest sample's power
-    in their trial.
+    """Return the mean power of the illuminated raw samples.
+
+    Args:
+        echo: Raw echo, shape (..., pulse, range), complex.
+
+    Returns:
+        Mean power of the samples above 1e-4 of the largest power of their trial, shape (...,).
     """
     power = echo.real.square() + echo.imag.square()
     lit = power > 1e-4 * power.amax((-2, -1), keepdim=True)
@@ -224,15 +300,32 @@ def simulate(
     dtype: torch.dtype = torch.complex64,
     device: torch.device | str | None = None,
 ) -> tuple[Recording, Truth]:
-    """A recording of the world and the truth about it, batched over the trials of `draws`.
+    """Simulate a raw stripmap recording, batched over the trials of the draws.
 
-    Noise follows `world.snr_db`: mean signal power per lit raw sample over noise variance.
-    impairments: applied in order, by name. The truth holds target positions (zero-Doppler time,
-    closest range), velocity, beam Doppler, noise deviation, what each impairment says under
-    "<impairment>.<name>", and the unimpaired recording with the same noise as `clean`. Raises
-    ValueError for what no radar can record: a squint beyond 90 degrees, targets behind it, a pulse
-    longer than a line.
+    Args:
+        radar: Radar.
+        world: World.
+        n_pulse: Number of pulses.
+        n_range: Number of range samples.
+        draws: Random draws.
+        impairments: Impairments by name, applied in order.
+        dtype: Complex dtype of the recording.
+        device: Device of the recording.
+
+    Returns:
+        The recording, shape (..., pulse, range), and the truth. The truth holds the targets, shape
+        (..., target): `crossing_s` (beam centre) and `zero_doppler_s` in seconds, `closest_range_m`
+        and `amplitude`; `velocity_m_s` and `doppler_hz`, shape (...,) or (); `noise_std`, the
+        standard deviation of the noise of a sample, shape (...,); and the values of each impairment
+        under "<impairment>.<name>". `clean` is the recording without impairments, with the same
+        noise.
+
+    Raises:
+        ValueError: If there is no scatterer, the squint exceeds 90 degrees, a target lies behind
+            the radar, a line does not hold the pulse, or a parameter per trial has another length
+            than the trials.
     """
+    refuse_other_trials(world, draws)
     velocity = radar.velocity_m_s if world.velocity_m_s is None else world.velocity_m_s
     doppler = _true_doppler(world, radar)
     scatterers = world.scene.scatterers(draws)
@@ -251,7 +344,7 @@ def simulate(
         noise = draws.normal("noise", (n_pulse, n_range), dtype, device)
         echo = echo + noise * std.to(echo.real.dtype)[..., None, None]
     trials = () if draws.trials is None else (len(draws.trials),)
-    # nothing may differ between trials
+    # without random numbers the echo has no trials yet
     echo = echo.expand(*torch.broadcast_shapes(echo.shape[:-2], trials), -1, -1)
     clean = Recording(Signal(echo, radar.raw_axes(n_pulse, n_range)), radar)
     values = {
@@ -263,18 +356,19 @@ def simulate(
         "doppler_hz": torch.as_tensor(doppler, dtype=torch.float64),
         "noise_std": std,
     }
-    recording, told = apply_impairments(clean, impairments or {}, draws)
-    return recording, Truth({**values, **told}, clean)
+    recording, true_values = apply_impairments(clean, impairments or {}, draws)
+    return recording, Truth({**values, **true_values}, clean)
 
 
 def _refuse_impossible(scatterers: Scatterers, radar: StripmapRadar, n_range: int, sin_squint: Tensor) -> None:
+    """Raise ValueError for a world that the radar cannot record."""
     if not scatterers.azimuth_m.shape[-1]:
         raise ValueError("the scene holds no scatterer; give it at least one")
     if not bool((sin_squint.abs() < 1).all()):
         worst = float(sin_squint.abs().max())
         raise ValueError(
-            f"the Doppler of the beam asks for a squint beyond 90 degrees (sine {worst:.4g}); it "
-            "must stay below 2 * velocity / wavelength in magnitude"
+            f"the Doppler frequency of the beam requires a squint beyond 90 degrees (sine {worst:.4g}); its "
+            "magnitude must be below 2 * velocity / wavelength"
         )
     if radar.pulse_samples > n_range:
         raise ValueError(
@@ -286,17 +380,25 @@ def _refuse_impossible(scatterers: Scatterers, radar: StripmapRadar, n_range: in
 def apply_impairments(
     recording: Recording, impairments: Mapping[str, Impairment], draws: Draws
 ) -> tuple[Recording, dict[str, Tensor]]:
-    """Impairment a recording, simulated or real, in the order of the mapping.
+    """Apply impairments to a recording, simulated or recorded.
 
-    Returns it with the truth under "<impairment>.<name>".
+    The recording gets aux `line_number` if it has none.
+
+    Args:
+        recording: Recording.
+        impairments: Impairments by name, applied in order.
+        draws: Random draws; each impairment draws from an address of its own, its name.
+
+    Returns:
+        The impaired recording, and the true values under "<impairment>.<name>".
     """
     if "line_number" not in recording.aux:
         lines = torch.arange(recording.signal.data.shape[-2], device=recording.signal.data.device)
         recording = replace(
             recording, aux={**recording.aux, "line_number": lines.expand(recording.signal.data.shape[:-1])}
         )
-    told: dict[str, Tensor] = {}
+    true_values: dict[str, Tensor] = {}
     for name, impairment in impairments.items():
         recording, values = impairment(recording, draws.part(name))
-        told.update({f"{name}.{key}": value for key, value in values.items()})
-    return recording, told
+        true_values.update({f"{name}.{key}": value for key, value in values.items()})
+    return recording, true_values

@@ -1,6 +1,4 @@
-"""Sweeps that are not straight: phase errors of the laser, and the internal channel that records
-them.
-"""
+"""Non-linear sweeps of a ladar: phase errors of the laser, and the channel that records them."""
 
 from __future__ import annotations
 
@@ -14,78 +12,120 @@ from torch import Tensor
 from torchsar.core import Draws, per_trial, unit_phasor
 from torchsar.radar import TriangularLadar
 from torchsar.scene import CalibrationFibre, SweepError
+from torchsar.scene.trials import either, finite, positive, refuse_unless, refuse_unless_finite, with_dims
 
 
 @dataclass(frozen=True)
 class PolynomialSweepError:
-    """Frequency error sum_i c_i (u / s)^i of the sweep, u from its middle: coefficients (Hz, Hz/s,
-    Hz/s^2, ...) of up and down sweeps.
+    """Frequency error of the sweep as a polynomial, sum_i c_i u^i.
 
-    The phase error e(u) is its antiderivative, zero in the middle of each sweep.
+    u is the time from the middle of the sweep in seconds. The phase error is the antiderivative of
+    the frequency error, zero at the middle of each sweep.
+
+    Args:
+        up_hz: c_0, c_1, ... of the up-sweep in Hz, Hz/s, ...; each a number or one value per trial.
+        down_hz: c_0, c_1, ... of the down-sweep.
+
+    Raises:
+        ValueError: If a list is empty or a coefficient is not finite.
     """
 
-    up_hz: Sequence[float]
-    down_hz: Sequence[float]
+    up_hz: Sequence[Tensor | float]
+    down_hz: Sequence[Tensor | float]
 
     def __post_init__(self) -> None:
-        if (
-            not len(self.up_hz)
-            or not len(self.down_hz)
-            or not all(math.isfinite(c) for c in (*self.up_hz, *self.down_hz))
-        ):
+        sentence = "a polynomial sweep error needs finite coefficients for up and down"
+        if not len(self.up_hz) or not len(self.down_hz):
             raise ValueError(
-                "a polynomial sweep error needs finite coefficients for up and down, got "
-                f"{self.up_hz} and {self.down_hz}; leave the effect out where there is none"
+                f"{sentence}, got {self.up_hz} and {self.down_hz}; leave the effect out where there is none"
             )
+        for c in (*self.up_hz, *self.down_hz):
+            refuse_unless(sentence, c, finite)
 
-    def turns(self, time_s: Tensor, ramp: int) -> Tensor:
+    def turns(self, time_s: Tensor, ramp: int, dims: int | None = None) -> Tensor:
+        """Return the phase error.
+
+        Args:
+            time_s: Time u from the middle of the sweep in seconds, float64.
+            ramp: 0 for the up-sweep, 1 for the down-sweep.
+            dims: Number of last dimensions of time_s that are no trials, all by default.
+
+        Returns:
+            Phase error in cycles; the trials of the parameters lead.
+        """
+        behind = time_s.ndim if dims is None else dims
         total = torch.zeros_like(time_s)
         for degree, c in reversed(list(enumerate(self.down_hz if ramp else self.up_hz))):
-            total = (total + c / (degree + 1)) * time_s
+            total = (total + with_dims(c, behind, time_s) / (degree + 1)) * time_s
         return total
 
 
 @dataclass(frozen=True)
 class SinusoidSweepError:
-    """Frequency error A sin(2 pi F u + phase) of the sweep, u from its middle, with a phase of its
-    own in up and down sweeps.
+    """Frequency error of the sweep as a sinusoid, A sin(2 pi F u + phase).
+
+    u is the time from the middle of the sweep. The phase error is the antiderivative of the
+    frequency error, zero at the middle of each sweep.
+
+    Args:
+        amplitude_hz: Amplitude A in hertz.
+        frequency_hz: Frequency F in hertz.
+        phase_up_deg: Phase of the up-sweep in degrees.
+        phase_down_deg: Phase of the down-sweep in degrees.
+
+    Raises:
+        ValueError: If a number is not finite or the frequency is not positive.
     """
 
-    amplitude_hz: float
-    frequency_hz: float
-    phase_up_deg: float = 0.0
-    phase_down_deg: float = 0.0
+    amplitude_hz: Tensor | float
+    frequency_hz: Tensor | float
+    phase_up_deg: Tensor | float = 0.0
+    phase_down_deg: Tensor | float = 0.0
 
     def __post_init__(self) -> None:
-        if (
-            not all(
-                math.isfinite(v) for v in (self.amplitude_hz, self.frequency_hz, self.phase_up_deg, self.phase_down_deg)
-            )
-            or not self.frequency_hz > 0
-        ):
-            raise ValueError(f"a sinusoidal sweep error needs finite numbers and a frequency above 0 Hz, got {self}")
+        for name in ("amplitude_hz", "phase_up_deg", "phase_down_deg"):
+            refuse_unless_finite(f"{name} of a sinusoidal sweep error", getattr(self, name))
+        refuse_unless("frequency_hz of a sinusoidal sweep error must be above 0 Hz", self.frequency_hz, positive)
 
-    def turns(self, time_s: Tensor, ramp: int) -> Tensor:
-        phase = math.radians(self.phase_down_deg if ramp else self.phase_up_deg)
-        middle = math.cos(phase)
-        return (
-            self.amplitude_hz
-            / (2 * math.pi * self.frequency_hz)
-            * (middle - torch.cos(2 * math.pi * self.frequency_hz * time_s + phase))
+    def turns(self, time_s: Tensor, ramp: int, dims: int | None = None) -> Tensor:
+        """Return the phase error.
+
+        Args:
+            time_s: Time u from the middle of the sweep in seconds, float64.
+            ramp: 0 for the up-sweep, 1 for the down-sweep.
+            dims: Number of last dimensions of time_s that are no trials, all by default.
+
+        Returns:
+            Phase error in cycles; the trials of the parameters lead.
+        """
+        behind = time_s.ndim if dims is None else dims
+        phase = either(self.phase_down_deg if ramp else self.phase_up_deg, math.radians, torch.deg2rad)
+        amplitude, frequency, middle, phase = (
+            with_dims(v, behind, time_s)
+            for v in (self.amplitude_hz, self.frequency_hz, either(phase, math.cos, torch.cos), phase)
         )
+        return amplitude / (2 * math.pi * frequency) * (middle - torch.cos(2 * math.pi * frequency * time_s + phase))
 
 
 def wound_turns(error: SweepError, radar: TriangularLadar, position_s: Tensor) -> Tensor:
-    """Phase error as a continuous function of the time since the start of a triangle (turns): sweep
-    joined to sweep, period to period.
+    """Return the phase error as a continuous function over sweeps and periods.
+
+    Args:
+        error: Phase error of the sweeps.
+        radar: Ladar.
+        position_s: Time since the start of a triangle in seconds, shape (n,) or (..., pulse, n),
+            float64.
+
+    Returns:
+        Phase error in cycles, of the shape of position_s behind the trials of the parameters.
     """
     half = torch.as_tensor(radar.sweep_s / 2, dtype=torch.float64, device=position_s.device)
-    ends = [(error.turns(-half, ramp), error.turns(half, ramp)) for ramp in (0, 1)]
+    ends = [(error.turns(-half, ramp, 2), error.turns(half, ramp, 2)) for ramp in (0, 1)]
     gain_up, gain_down = (last - first for first, last in ends)
     period = torch.floor(position_s.detach() / radar.period_s)
     within = position_s - period * radar.period_s
-    up = error.turns(within - half, 0) - ends[0][0]
-    down = gain_up + error.turns(within - 3 * half, 1) - ends[1][0]
+    up = error.turns(within - half, 0, 2) - ends[0][0]
+    down = gain_up + error.turns(within - 3 * half, 1, 2) - ends[1][0]
     return period * (gain_up + gain_down) + torch.where(within.detach() < radar.sweep_s, up, down)
 
 
@@ -98,22 +138,38 @@ def calibration_channel(
     dtype: torch.dtype,
     device: torch.device | str | None = None,
 ) -> Tensor:
-    """What the internal fibre records in the sweeps, (*trials, 2, K or 1, fast_time) of `dtype`,
-    amplitude 1.
+    """Return the recording of the internal fibre in the sweeps, of amplitude 1.
 
-    Turns in the up sweep: fc tc + K u tc - K tc^2 / 2 + e(u) - e(u - tc), in the down sweep with -K
-    and its own e; conjugated where the radar's dechirp sign is "echo_conj_lo". Noise by
-    fibre.snr_db per sample.
+    The phase in the up-sweep is fc tc + K u tc - K tc^2 / 2 + e(u) - e(u - tc) in cycles; the
+    down-sweep has -K and its own error e. It is conjugated if the dechirp sign of the radar is
+    "echo_conj_lo".
+
+    Args:
+        radar: Ladar.
+        fibre: Calibration fibre with the delay tc.
+        error: Phase error of the laser, None for none.
+        n_period: Number of periods.
+        draws: Random draws of the noise.
+        dtype: Complex dtype of the result.
+        device: Device of the result.
+
+    Returns:
+        Beat, shape (*trials, 2, n_period or 1, fast_time).
+
+    Reference:
+        Remote Sens. 2024, 16, 793, section 2.1 (internal calibration module).
     """
-    u, delay, rate = radar.fast_time_axis().values(device), fibre.delay_s, radar.chirp_rate_hz_s
+    u, rate = radar.fast_time_axis().values(device), radar.chirp_rate_hz_s
+    delay = with_dims(fibre.delay_s, 1, u)
     rows = []
     for ramp, sign in ((0, 1.0), (1, -1.0)):
         turns = radar.carrier_hz * delay + sign * rate * delay * (u - delay / 2)
-        rows.append(turns if error is None else turns + error.turns(u, ramp) - error.turns(u - delay, ramp))
-    clean = unit_phasor(torch.stack(rows), dtype)[:, None]
+        rows.append(turns if error is None else turns + error.turns(u, ramp, 1) - error.turns(u - delay, ramp, 1))
+    clean = unit_phasor(torch.stack(torch.broadcast_tensors(*rows), -2), dtype)[..., None, :]
     shape = (2, n_period if fibre.every_period else 1, len(u))
     if fibre.snr_db is None:
-        found = clean.expand(*shape) if draws.trials is None else clean.expand(len(draws.trials), *shape)
+        trials = torch.broadcast_shapes(clean.shape[:-3], () if draws.trials is None else (len(draws.trials),))
+        found = clean.expand(*trials, *shape)
     else:
         std = 10 ** (-per_trial(fibre.snr_db, 3, u) / 20)
         found = clean + draws.normal("echo.calibration.noise", shape, dtype, device) * std.to(clean.real.dtype)

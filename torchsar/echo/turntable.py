@@ -1,4 +1,4 @@
-"""Simulated acquisitions of turning targets: world in, recording and truth out."""
+"""Simulation of inverse synthetic aperture recordings of a rotating target."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Axis, Draws, Recording, Signal, Truth, linear_phasor, per_trial, unit_phasor
+from torchsar.echo.lines import lost_count
 from torchsar.echo.stripmap import Impairment, apply_impairments
 from torchsar.radar import InverseRadar
 from torchsar.scene import (
@@ -22,28 +23,48 @@ from torchsar.scene import (
     displacement_m,
     start_phase_rad,
 )
+from torchsar.scene.trials import refuse_other_trials, refuse_unless
 
 Rotation = Tensor | float | PolynomialRotation
 
+# phase tables of a block of pulses, about the cache of a processor
 _TABLE_BYTES = 8 << 20
+# largest error of the power series of phases within a pulse, by choice, and its longest length: the
+# series then holds to 0.6 rad
 _SERIES_ERROR = 1e-12
 _SERIES_TERMS = 12
-# what the model of a dechirped pulse may leave out, rad
+# phase in radians that the model of a dechirped pulse may neglect, by choice
 _DROPPED_RAD = 1e-6
 
 
 def rotation_angle(radar: InverseRadar, n_pulse: int, rotation: Rotation, like: Tensor) -> Tensor:
-    """theta at the middle of each pulse, (*trials, pulse) float64; zero at pulse n_pulse // 2 of an
-    even rotation, given as its rate in rad/s, and at the first pulse of a PolynomialRotation.
-    Raises ValueError for one that turns back within the record.
+    """Return the rotation angle at the middle of each pulse.
+
+    Args:
+        radar: Radar.
+        n_pulse: Number of pulses.
+        rotation: Rate in rad/s of a uniform rotation, a number or one value per trial, with the
+            angle zero at pulse n_pulse // 2; or a PolynomialRotation, with the angle zero at the
+            first pulse.
+        like: Tensor that gives the device.
+
+    Returns:
+        Angle in radians, shape (*trials, pulse), float64.
+
+    Raises:
+        ValueError: If the rate of a PolynomialRotation falls to zero within the record.
     """
     return PulseTurn.of(rotation, radar, n_pulse, like).angle_rad
 
 
 @dataclass(frozen=True)
 class PulseTurn:
-    """How the target stands and turns at the middle of each pulse: angle (rad), rate (rad/s),
-    acceleration (rad/s^2), (*trials, pulse) float64.
+    """Angle and rotation rate of the target at the middle of each pulse.
+
+    Args:
+        angle_rad: Angle in radians, shape (*trials, pulse), float64.
+        rate_rad_s: Rotation rate in rad/s, same shape.
+        acceleration_rad_s2: Angular acceleration in rad/s^2, same shape.
     """
 
     angle_rad: Tensor
@@ -52,6 +73,20 @@ class PulseTurn:
 
     @staticmethod
     def of(rotation: Rotation, radar: InverseRadar, n_pulse: int, like: Tensor) -> PulseTurn:
+        """Evaluate a rotation.
+
+        Args:
+            rotation: See `rotation_angle`.
+            radar: Radar.
+            n_pulse: Number of pulses.
+            like: Tensor that gives the device.
+
+        Returns:
+            Angle, rate and acceleration of each pulse.
+
+        Raises:
+            ValueError: If the rate of a PolynomialRotation falls to zero within the record.
+        """
         pulse = torch.arange(n_pulse, dtype=torch.float64, device=like.device)
         if isinstance(rotation, PolynomialRotation):
             rotation.refuse_turning_back(n_pulse / radar.prf_hz)
@@ -76,17 +111,36 @@ def turntable_echo(
     dtype: torch.dtype = torch.complex64,
     centre_deviation_m: Tensor | float = 0.0,
 ) -> Tensor:
-    """Range-compressed pulses without errors or noise, (*trials, pulse, range) of `dtype` (Ruan et
-    al. 2013, Eqs. 1 and 9).
+    """Return range-compressed pulses with fixed envelopes, without noise.
 
-    s[k, n] = sum_m a_m h(n - y_m / dr) exp(-4j pi / lambda (x_m sin theta_k + (y_m + yc) (cos
-    theta_k - 1))), x cross range, y range. h is the response of a rectangular band of n_range
-    frequencies, unit peak, periodic in the window. The phase of a_m is that of the echo at theta =
-    0. rotation_rad_s: a number or per-trial tensor for an even rotation, theta = 0 at pulse n_pulse
-    // 2, or a PolynomialRotation, theta = 0 at the first pulse (Remote Sens. 2025, 17, 3447, Eq. 3,
-    with sine and cosine unabridged). centre_deviation_m: yc, a number or per-trial tensor. Range
-    frequency by range frequency the sum over scatterers is a matrix product of phasors.
-    Differentiable in positions, amplitudes, rate, k and yc.
+    s[k, n] = sum_m a_m h(n - y_m / dr)
+    exp(-4j pi / lambda (x_m sin theta_k + (y_m + yc) (cos theta_k - 1))), with cross range x and
+    range y. h is the response of a rectangular band of n_range frequencies, with unit peak and
+    periodic in the window. The phase of a_m is that of the echo at theta = 0. For each range
+    frequency the sum over scatterers is a matrix product of phasors. Differentiable in positions,
+    amplitudes, rate, k and yc.
+
+    Args:
+        scatterers: Scatterers, shape (..., target).
+        radar: Radar.
+        n_pulse: Number of pulses.
+        n_range: Number of range samples.
+        rotation_rad_s: Rotation rate in rad/s of a uniform rotation, a number or one value per
+            trial, with the angle zero at pulse n_pulse // 2; or a PolynomialRotation, with the
+            angle zero at the first pulse.
+        dtype: Complex dtype of the result.
+        centre_deviation_m: Distance yc of the centre of rotation in metres, a number or one value
+            per trial.
+
+    Returns:
+        Pulses, shape (*trials, pulse, range).
+
+    Raises:
+        ValueError: If the rate of a PolynomialRotation falls to zero within the record.
+
+    Reference:
+        Ruan et al. 2013, Eqs. (1), (9); Remote Sens. 2025, 17, 3447, Eq. (3), with exact sine and
+        cosine.
     """
     x, y, amplitude = _rows_of(scatterers)
     lever = y + per_trial(centre_deviation_m, 1, y)
@@ -98,20 +152,22 @@ def turntable_echo(
     parts = []
     for pulses in _pulse_blocks(n_pulse, x.shape[-1]):
         angle = theta[..., pulses, None]
-        way = x[..., None, :] * torch.sin(angle) - lever[..., None, :] * (2 * torch.sin(angle / 2).square())
-        lines = unit_phasor(-2 / radar.wavelength_m * way, dtype) @ spectra
-        # centred in both domains: sample n_range // 2 is range zero; block by block, while the
-        # lines are in the cache
+        path = x[..., None, :] * torch.sin(angle) - lever[..., None, :] * (2 * torch.sin(angle / 2).square())
+        lines = unit_phasor(-2 / radar.wavelength_m * path, dtype) @ spectra
+        # centred in both domains: sample n_range // 2 is range zero; in blocks, while the lines are
+        # in the cache
         parts.append(torch.fft.fftshift(torch.fft.ifft(torch.fft.ifftshift(lines, dim=-1)), dim=-1))
     return torch.cat(parts, -2)
 
 
 @dataclass(frozen=True)
 class PulseWay:
-    """Range of the whole target against the reference during pulses: at their middles, its slope,
-    and what is left of straight lines.
+    """Range of the whole target relative to the reference during pulses.
 
-    middle_m, speed_m_s: (*trials, pulse); bend_m: (*trials, pulse, fast_time). float64.
+    Args:
+        middle_m: Range at the middle of each pulse in metres, shape (*trials, pulse), float64.
+        speed_m_s: Slope of the range in m/s, same shape.
+        bend_m: Residual of the straight line in metres, shape (*trials, pulse, fast_time).
     """
 
     middle_m: Tensor
@@ -122,8 +178,17 @@ class PulseWay:
     def of(
         motion: Sequence[Motion], track: Sequence[Motion], pulse_s: Tensor, fast_s: Tensor, half_s: float
     ) -> PulseWay:
-        """The motion during pulses with middles at pulse_s (pulse,), half_s to either side, less
-        the place of the track at the middles.
+        """Evaluate the motion during pulses.
+
+        Args:
+            motion: Motions along the line of sight.
+            track: Motions that the reference follows from pulse to pulse.
+            pulse_s: Times of the pulse middles in seconds, shape (pulse,), float64.
+            fast_s: Fast time from the middle of a pulse in seconds, shape (fast_time,), float64.
+            half_s: Half the pulse length in seconds.
+
+        Returns:
+            Motion relative to the track at the pulse middles.
         """
         start, middle, end = (displacement_m(motion, pulse_s + shift) for shift in (-half_s, 0.0, half_s))
         speed = (end - start) / (2 * half_s)
@@ -142,21 +207,42 @@ def dechirped_echo(
     dtype: torch.dtype = torch.complex64,
     centre_deviation_m: Tensor | float = 0.0,
 ) -> Tensor:
-    """Dechirped pulses without noise, (*trials, pulse, fast_time) of `dtype`, the range evaluated
-    at every sample.
+    """Return dechirped pulses with the range evaluated at every sample, without noise.
 
-    Phase of a scatterer: -2 pi (f0 dtau + gamma t' dtau - gamma dtau^2 / 2), dtau = 2 (x sin theta
-    + y cos theta + d) / c at the time t' from the middle of the pulse, less the constant f0 2 y /
-    c, so that amplitudes mean the same as in `turntable_echo`; d is the motion less the track's
-    place at the middle. rotation_rad_s and centre_deviation_m as in `turntable_echo`; a centre at
-    -yc gives x sin theta + (y + yc) cos theta - yc in place of the first two terms of dtau, and a
-    rate that changes is followed inside the pulse by its value and slope at the middle. Within a
-    pulse the phases of scatterers differ by lines in t' and by 1e-4 rad beyond them: lines are a
-    matrix product of short tables, the rest a power series; together they are exact to 1e-6 rad, to
-    1e-10 for the ladar of the paper. The receiver is ideal: a beat frequency beyond the window's,
-    such as the coupling v f0 / gamma, wraps round, and `focus.compress_dechirped` takes it back.
-    Differentiable, in omega, k and yc as well. Raises ValueError where target or motion turn so far
-    within a pulse that more than 1e-6 rad would be missed.
+    The phase of a scatterer is -2 pi (f0 dtau + gamma t' dtau - gamma dtau^2 / 2) at the time t'
+    from the middle of the pulse, with dtau = 2 (x sin theta + y cos theta + d) / c, where d is the
+    motion minus the track at the middle of the pulse. The constant f0 2 y / c is omitted, so that
+    amplitudes have the same meaning as in `turntable_echo`. With a centre of rotation at -yc the
+    first two terms of dtau become x sin theta + (y + yc) cos theta - yc. A changing rotation rate
+    is followed within a pulse by its value and slope at the middle.
+
+    Within a pulse the phases of scatterers are linear in t' except for about 1e-4 rad. The linear
+    parts are a matrix product of short tables, the rest a power series. The result is exact to
+    1e-6 rad, and to 1e-10 rad for the ladar of Ruan et al. 2013. The receiver is ideal: a beat
+    frequency outside the window, such as that of the coupling v f0 / gamma, wraps, and
+    `focus.compress_dechirped` unwraps it. Differentiable in positions, amplitudes, omega, k and yc.
+
+    Args:
+        scatterers: Scatterers, shape (..., target).
+        radar: Radar, with a pulse length.
+        n_pulse: Number of pulses.
+        n_fast: Number of samples of a pulse.
+        rotation_rad_s: Rotation rate in rad/s of a uniform rotation, a number or one value per
+            trial, with the angle zero at pulse n_pulse // 2; or a PolynomialRotation, with the
+            angle zero at the first pulse.
+        motion: Motions along the line of sight.
+        track: Motions that the reference follows from pulse to pulse.
+        dtype: Complex dtype of the result.
+        centre_deviation_m: Distance yc of the centre of rotation in metres, a number or one value
+            per trial.
+
+    Returns:
+        Pulses, shape (*trials, pulse, fast_time).
+
+    Raises:
+        ValueError: If rotation or motion within a pulse would cost more than 1e-6 rad, the pulse
+            length is not known, or the rate of a PolynomialRotation falls to zero within the
+            record.
     """
     x, y, amplitude = _rows_of(scatterers)
     lever = y + per_trial(centre_deviation_m, 1, y)
@@ -172,19 +258,24 @@ def dechirped_echo(
     pulse_s = torch.arange(n_pulse, dtype=torch.float64, device=x.device) / radar.prf_hz
     parts = []
     for pulses in _pulse_blocks(n_pulse, x.shape[-1] * 2 * math.isqrt(n_fast)):
-        way = PulseWay.of(motion, track, pulse_s[pulses], fast_s, half_s)
-        lines = ScattererLines.of(radar, x, y, lever, turn[pulses], way)
-        total = _sum_of_lines(lines, amplitude, way.bend_m, fast_s, dtype)
-        parts.append(total * unit_phasor(_common_turns(radar, way, fast_s), dtype))
+        path = PulseWay.of(motion, track, pulse_s[pulses], fast_s, half_s)
+        lines = ScattererLines.of(radar, x, y, lever, turn[pulses], path)
+        total = _sum_of_lines(lines, amplitude, path.bend_m, fast_s, dtype)
+        parts.append(total * unit_phasor(_common_turns(radar, path, fast_s), dtype))
     return torch.cat(parts, -2)
 
 
 @dataclass(frozen=True)
 class ScattererLines:
-    """Turns of every scatterer in every pulse beyond what all of them share: start + slope t' +
-    curve t'^2 + bend * (bend of the way).
+    """Phase of every scatterer in every pulse beyond the phase that all share.
 
-    float64 (*trials, pulse, target), in turns, turns/s, turns/s^2, turns/m.
+    The phase is start + slope t' + curve t'^2 + bend * (residual range of the motion).
+
+    Args:
+        start: Phase at the middle of the pulse in cycles, shape (*trials, pulse, target), float64.
+        slope: Frequency in hertz, same shape.
+        curve: Quadratic coefficient in cycles per square second, same shape.
+        bend: Cycles per metre of the residual range, same shape.
     """
 
     start: Tensor
@@ -194,10 +285,20 @@ class ScattererLines:
 
     @staticmethod
     def of(radar: InverseRadar, x: Tensor, y: Tensor, lever: Tensor, turn: PulseTurn, way: PulseWay) -> ScattererLines:
-        """Rotation inside the pulse to the second order of t': range along + across (rate t' +
-        acceleration t'^2 / 2) - towards (rate t')^2 / 2.
+        """Form the phases for a rotation of second order within the pulse.
 
-        y, lever: ranges from the middle of the window and from the centre of rotation.
+        The range is along + across (rate t' + acceleration t'^2 / 2) - towards (rate t')^2 / 2.
+
+        Args:
+            radar: Radar.
+            x: Cross ranges in metres, shape (..., target), float64.
+            y: Ranges from the middle of the window in metres, same shape.
+            lever: Ranges from the centre of rotation in metres, same shape.
+            turn: Rotation of each pulse.
+            way: Motion during each pulse.
+
+        Returns:
+            Phases of all scatterers.
         """
         x, y, lever = x[..., None, :], y[..., None, :], lever[..., None, :]
         theta, rate, acceleration = (
@@ -224,9 +325,9 @@ class ScattererLines:
         return ScattererLines(start, slope, curve, 2 * video * along)
 
 
-def _common_turns(radar: InverseRadar, way: PulseWay, fast_s: Tensor) -> Tensor:
-    """Turns that the way of the whole target gives every scatterer, (*trials, pulse, fast_time)."""
-    delay = 2 / radar.wave_speed_m_s * (way.middle_m[..., None] + way.speed_m_s[..., None] * fast_s + way.bend_m)
+def _common_turns(radar: InverseRadar, path: PulseWay, fast_s: Tensor) -> Tensor:
+    """Cycles by the motion of the whole target, (*trials, pulse, fast_time)."""
+    delay = 2 / radar.wave_speed_m_s * (path.middle_m[..., None] + path.speed_m_s[..., None] * fast_s + path.bend_m)
     return -delay * (radar.carrier_hz + radar.chirp_rate_hz_s * (fast_s - delay / 2))
 
 
@@ -247,21 +348,18 @@ def _sum_of_lines(
     for order in range(1, _series_terms(curve) + 1):
         term = curve.pow(order) / math.factorial(order)
         total = total + line_sum(weight * (term * 1j**order).to(dtype)) * u2.pow(order).to(dtype)
-    if _bends(lines.bend, bend_m):
+    if _needs_bend(lines.bend, bend_m):
         total = total + line_sum(weight * (2j * math.pi * lines.bend).to(dtype)) * bend_m.to(dtype)
     return total
 
 
-def _bends(turns_per_m: Tensor, bend_m: Tensor) -> bool:
-    """Whether the bend of the way within pulses moves scatterers apart at all.
-
-    Raises ValueError where it does so beyond first order.
-    """
+def _needs_bend(turns_per_m: Tensor, bend_m: Tensor) -> bool:
+    """Whether the residual range of the motion changes phases between scatterers."""
     worst = 2 * math.pi * float(turns_per_m.detach().abs().max()) * float(bend_m.detach().abs().max())
     if not worst**2 / 2 <= _DROPPED_RAD:
         raise ValueError(
-            f"the motion bends by {float(bend_m.detach().abs().max()):.3g} m within a pulse, "
-            "which the dechirped model does not follow; shorten the pulse or slow the motion"
+            f"the motion departs by {float(bend_m.detach().abs().max()):.3g} m from a straight line within a "
+            "pulse, which exceeds the dechirped model; shorten the pulse or slow the motion"
         )
     return worst > _SERIES_ERROR
 
@@ -275,25 +373,26 @@ def _line_tables(slope: Tensor, fast_s: Tensor, dtype: torch.dtype) -> tuple[Ten
 
 
 def _series_terms(phase_rad: Tensor) -> int:
-    """Terms of the power series of exp(j phase) beyond the first that leave less than 1e-12.
-
-    Raises ValueError where that would be many.
-    """
+    """Number of terms beyond the first of the power series of exp(j phase)."""
     worst = float(phase_rad.detach().abs().max())
-    # at least one: a target at rest has the gradient of one that turns
+    # at least one term, so that gradients are right for a target at rest, too
     for order in range(1, _SERIES_TERMS + 1):
         if worst ** (order + 1) / math.factorial(order + 1) < _SERIES_ERROR:
             return order
     raise ValueError(
-        f"the target turns so fast that phases bend by {worst:.3g} rad within a pulse; the "
-        "dechirped model holds to 0.6 rad: shorten the pulse"
+        f"the rotation curves phases by {worst:.3g} rad within a pulse, and the dechirped model holds to "
+        "0.6 rad; shorten the pulse"
     )
 
 
 @dataclass(frozen=True)
 class TurnInPulse:
-    """Largest angles (rad) that the target turns through in half a pulse: by its rate, by its
-    acceleration, and by what comes after.
+    """Largest rotation of the target in half a pulse, by order.
+
+    Args:
+        by_rate: Angle by the rate in radians.
+        by_acceleration: Angle by the acceleration in radians.
+        beyond: Angle by all higher orders in radians.
     """
 
     by_rate: float
@@ -302,7 +401,17 @@ class TurnInPulse:
 
     @staticmethod
     def worst(turn: PulseTurn, rotation: Rotation, radar: InverseRadar, half_s: float) -> TurnInPulse:
-        """Over all pulses and trials."""
+        """Return the largest angles of all pulses and trials.
+
+        Args:
+            turn: Rotation of each pulse.
+            rotation: See `rotation_angle`.
+            radar: Radar.
+            half_s: Half the pulse length in seconds.
+
+        Returns:
+            The largest angles.
+        """
         by_rate, by_acceleration = (
             float(turn.rate_rad_s.detach().abs().max()) * half_s,
             float(turn.acceleration_rad_s2.detach().abs().max()) * half_s**2 / 2,
@@ -320,9 +429,7 @@ class TurnInPulse:
 
 
 def _refuse_fast_turns(radar: InverseRadar, radius_m: float, turn: TurnInPulse, half_s: float) -> None:
-    """The rotation inside a pulse is followed to the second order of time on the carrier and to the
-    first on the chirp: what comes after must be nothing.
-    """
+    """Raise ValueError if the orders of rotation that are dropped matter."""
     whole = turn.by_rate + turn.by_acceleration + turn.beyond
     squares = (whole**2 - turn.by_rate**2) / 2
     on_carrier = whole**3 / 6 + squares + turn.beyond
@@ -342,25 +449,36 @@ def _refuse_fast_turns(radar: InverseRadar, radius_m: float, turn: TurnInPulse, 
 
 
 def fast_time_axis(radar: InverseRadar, n_fast: int) -> Axis:
-    """Fast time of a dechirped pulse (s), zero at sample n_fast // 2, the middle of the pulse."""
+    """Return the fast-time axis of a dechirped pulse.
+
+    Args:
+        radar: Radar, with a pulse length.
+        n_fast: Number of samples of a pulse.
+
+    Returns:
+        Axis in seconds, zero at sample n_fast // 2, the middle of the pulse.
+
+    Raises:
+        ValueError: If the pulse length is not known.
+    """
     step = _pulse_s(radar) / n_fast
     return Axis("fast_time", n_fast, -(n_fast // 2) * step, step, "s")
 
 
 def _pulse_s(radar: InverseRadar) -> float:
+    """Pulse length in seconds."""
     if radar.pulse_s is None:
         raise ValueError("radar.pulse_s is not set; a dechirped pulse needs its length")
     return radar.pulse_s
 
 
 def _rows_of(scatterers: Scatterers) -> tuple[Tensor, ...]:
+    """Cross range, range and amplitude of one shape."""
     return torch.broadcast_tensors(scatterers.azimuth_m, scatterers.range_m, scatterers.amplitude)
 
 
 def _pulse_blocks(n_pulse: int, per_pulse: int) -> Iterator[slice]:
-    """Blocks of pulses, whatever the number of trials: sums then round alike in batches of any
-    size.
-    """
+    """Blocks of pulses, independent of the number of trials, so that sums round equally."""
     height = max(1, min(64, _TABLE_BYTES // (16 * per_pulse)))
     for first in range(0, n_pulse, height):
         yield slice(first, min(first + height, n_pulse))
@@ -368,40 +486,49 @@ def _pulse_blocks(n_pulse: int, per_pulse: int) -> Iterator[slice]:
 
 @dataclass(frozen=True)
 class LostPulses:
-    """Whole pulses that were not received, at random places: `count` of them, or a `fraction` of
-    all. Their samples are zero.
+    """Impairment: whole pulses at random positions that were not received; their samples are zero.
 
-    Unlike `LostLines` they keep their place: pulses are counted by the trigger. Truth: `present`
-    (..., pulse) bool.
+    Unlike with `LostLines` other pulses keep their positions, since pulses are counted by the
+    trigger. The truth holds `present`, shape (..., pulse), bool.
+
+    Args:
+        count: Number of lost pulses, fixed for all trials; None if a fraction is given.
+        fraction: Fraction of all pulses, at least 0 and below 1; None if a count is given.
+
+    Raises:
+        ValueError: If both or none is given, or one is out of range; when applied, if no pulse
+            would be left or the trials of draws and recording differ.
     """
 
     count: int | None = None
-    fraction: float | None = None
+    fraction: Tensor | float | None = None
 
     def __post_init__(self) -> None:
         if (self.count is None) == (self.fraction is None):
             raise ValueError(
                 f"lost pulses need a count or a fraction, got count={self.count}, fraction={self.fraction}"
             )
-        if (self.count is not None and self.count < 0) or (self.fraction is not None and not 0 <= self.fraction < 1):
-            raise ValueError(
-                f"lost pulses need a count >= 0 or a fraction in 0..1, got count={self.count}, fraction={self.fraction}"
-            )
+        expected = "lost pulses need a count >= 0 or a fraction in 0..1"
+        if self.count is not None and self.count < 0:
+            raise ValueError(f"{expected}, got count={self.count}")
+        if self.fraction is not None:
+            refuse_unless(expected, self.fraction, lambda x: (x >= 0) & (x < 1))
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
+        refuse_other_trials(self, draws, recording)
         data = recording.signal.data
         n = data.shape[-2]
-        count = self.count if self.count is not None else round((self.fraction or 0.0) * n)
-        if count >= n:
-            raise ValueError(f"{count} lost pulses leave nothing of a recording of {n} pulses; lose fewer")
-        index = draws.subset("echo.pulses.lost", n, count, data.device)
-        if index.shape[:-1] not in ((), data.shape[:-2]):
+        count = lost_count(self.count, self.fraction, n, data)
+        if bool((count >= n).any()):
+            raise ValueError(f"{int(count.max())} lost pulses leave nothing of a recording of {n} pulses; lose fewer")
+        order = draws.permutation("echo.pulses.lost", n, data.device)
+        if order.shape[:-1] not in ((), data.shape[:-2]):
             raise ValueError(
-                f"draws for {tuple(index.shape[:-1])} trials do not fit a recording of "
+                f"draws for {tuple(order.shape[:-1])} trials do not fit a recording of "
                 f"{tuple(data.shape[:-2])} trials; draw one unbatched trial for a single recording"
             )
-        index = index.expand(*data.shape[:-2], -1)
-        present = torch.ones(data.shape[:-1], dtype=torch.bool, device=data.device).scatter(-1, index, False)
+        kept = (torch.arange(n, device=data.device) >= count[..., None]).expand(data.shape[:-1])
+        present = torch.zeros_like(kept).scatter(-1, order.expand(kept.shape), kept)
         return replace(recording, signal=recording.signal.with_data(data * present[..., None])), {"present": present}
 
 
@@ -415,29 +542,49 @@ def simulate_turntable(
     dtype: torch.dtype = torch.complex64,
     device: torch.device | str | None = None,
 ) -> tuple[Recording, Truth]:
-    """A recording of a turning target and the truth about it, batched over the trials of `draws`.
+    """Simulate a recording of a rotating target, batched over the trials of the draws.
 
-    At fidelity PhaseOnly the recording has the axes (pulse, range), range-compressed, at Dechirped
-    (pulse, fast_time), raw, and aux `reference_m` (..., pulse), how far the receiver's reference
-    went. The truth holds `phase_rad` (..., pulse), psi = delta - 4 pi d / lambda with start phase
-    delta and displacement d at the middle of the pulse, less the reference's; `displacement_m`
-    (..., pulse), the whole of it; `noise_std` of the samples; `cross_range_m`, `range_m`,
-    `amplitude` of the scatterers; `rotation_rad_s`; what each impairment says under
-    "<impairment>.<name>". Where the world has a polynomial rotation: `omega_rad_s` (...,), `warp_k`
-    (..., order - 1), `yc_m` (...,), and `rotation_rad_s` is its mean rate over the record. `clean`
-    is the recording without motion, start phases and impairments, with the same noise. At PhaseOnly
-    the unimpaired recording is clean * exp(j psi) EXACTLY, noise included: circular Gaussian noise
-    is as good after a turn, and tests of equivariance are exact. Noise follows `world.snr_db`, the
-    same before and after range compression. Raises ValueError for a target outside the range
-    window, an empty scene, no rotation rate, one that turns back, or a dechirped pulse of unknown
-    length.
+    With `PhaseOnly` the unimpaired recording is clean * exp(j psi) EXACTLY, noise included:
+    circular Gaussian noise keeps its distribution under a phase, and tests of equivariance are
+    exact. With `Dechirped` the noise does not take part in the phases. Noise follows world.snr_db,
+    which is the same before and after range compression.
+
+    Args:
+        radar: Radar.
+        world: World.
+        n_pulse: Number of pulses.
+        n_range: Number of range samples, or of samples of a dechirped pulse.
+        draws: Random draws.
+        impairments: Impairments by name, applied in order.
+        dtype: Complex dtype of the recording.
+        device: Device of the recording.
+
+    Returns:
+        The recording and the truth. With `PhaseOnly` the recording is range-compressed, shape (...,
+        pulse, range); with `Dechirped` it is raw, shape (..., pulse, fast_time), and has aux
+        `reference_m`, the displacement of the reference, shape (..., pulse). The truth holds
+        `phase_rad`, shape (..., pulse), psi = delta - 4 pi d / lambda with the start phase delta
+        and the displacement d relative to the reference at the middle of the pulse;
+        `displacement_m`, the whole displacement, shape (..., pulse); `noise_std`, the standard
+        deviation of the noise of a sample, shape (...,); `cross_range_m`, `range_m` and `amplitude`
+        of the scatterers, shape (..., target); `rotation_rad_s`, shape (...,) or (); and the values
+        of each impairment under "<impairment>.<name>". With a polynomial rotation it also holds
+        `omega_rad_s` and `yc_m`, shape (...,), and `warp_k`, shape (..., order - 1), and
+        `rotation_rad_s` is the mean rate over the record. `clean` is the recording without motion,
+        start phases and impairments, with the same noise.
+
+    Raises:
+        ValueError: If the target leaves the range window, the scene is empty, there is no rotation
+            rate, the rate falls to zero, the pulse length of a dechirped pulse is not known, or a
+            parameter per trial has another length than the trials.
     """
+    refuse_other_trials(world, draws)
     course = _Course.of(radar, world, n_pulse, n_range, draws, device)
     record = _dechirped if isinstance(world.fidelity, Dechirped) else _phase_only
     clean, data, std, axes, aux = record(radar, world, course, n_range, draws, dtype)
     trials = torch.broadcast_shapes(
         data.shape[:-2], () if draws.trials is None else (len(draws.trials),)
-    )  # nothing may differ between trials
+    )  # without random numbers the data have no trials yet
     clean, data, psi, moved = (
         v.expand(*trials, *v.shape[v.ndim - tail :])
         for v, tail in ((clean, 2), (data, 2), (course.psi_rad(radar), 1), (course.moved_m, 1))
@@ -451,17 +598,18 @@ def simulate_turntable(
         "amplitude": course.scatterers.amplitude,
         **_rotation_truth(course.rotation, world.centre_deviation_m, n_pulse / radar.prf_hz, data.device, trials),
     }
-    recording, told = apply_impairments(
+    recording, impairment_truth = apply_impairments(
         Recording(Signal(data, axes), radar, {name: v.expand(*trials, -1) for name, v in aux.items()}),
         impairments or {},
         draws,
     )
-    return recording, Truth({**values, **told}, Recording(Signal(clean, axes), radar))
+    return recording, Truth({**values, **impairment_truth}, Recording(Signal(clean, axes), radar))
 
 
 def _rotation_truth(
     rotation: Rotation, yc_m: Tensor | float, duration_s: float, device: torch.device, trials: torch.Size
 ) -> dict[str, Tensor]:
+    """True values of the rotation by name."""
     if not isinstance(rotation, PolynomialRotation):
         return {"rotation_rad_s": torch.as_tensor(rotation, dtype=torch.float64)}
     like = torch.zeros((), dtype=torch.float64, device=device)
@@ -476,9 +624,7 @@ def _rotation_truth(
 
 @dataclass(frozen=True)
 class _Course:
-    """What happens to a target from pulse to pulse: (*trials, pulse) each but the scatterers and
-    the rotation.
-    """
+    """Scatterers, rotation, displacements and start phases of a simulation."""
 
     scatterers: Scatterers
     rotation: Rotation
@@ -495,6 +641,7 @@ class _Course:
         draws: Draws,
         device: torch.device | str | None,
     ) -> _Course:
+        """Draw the target and its motion; raises ValueError for impossible ones."""
         rotation = _first_given(world.rotation, world.rotation_rad_s, radar.rotation_rad_s)
         if rotation is None:
             raise ValueError(
@@ -522,23 +669,22 @@ class _Course:
         )
 
     def psi_rad(self, radar: InverseRadar) -> Tensor:
-        """Total phase error of each pulse."""
+        """Total phase error of each pulse, (*trials, pulse)."""
         return self.start_rad - 4 * math.pi / radar.wavelength_m * (self.moved_m - self.reference_m)
 
 
 def _first_given(*choices: Rotation | None) -> Rotation | None:
+    """The first choice that is not None."""
     return next((choice for choice in choices if choice is not None), None)
 
 
-_Made = tuple[Tensor, Tensor, Tensor, tuple[Axis, ...], dict[str, Tensor]]
+_Simulated = tuple[Tensor, Tensor, Tensor, tuple[Axis, ...], dict[str, Tensor]]
 
 
 def _phase_only(
     radar: InverseRadar, world: TurntableWorld, course: _Course, n_range: int, draws: Draws, dtype: torch.dtype
-) -> _Made:
-    """Clean and recorded samples, deviation of the noise, axes and side data at the level of
-    phases.
-    """
+) -> _Simulated:
+    """Clean and recorded samples, noise standard deviation, axes and side data with `PhaseOnly`."""
     n_pulse = course.moved_m.shape[-1]
     still = turntable_echo(course.scatterers, radar, n_pulse, n_range, course.rotation, dtype, world.centre_deviation_m)
     noise, std = _noise(still, world.snr_db, draws)
@@ -548,11 +694,8 @@ def _phase_only(
 
 def _dechirped(
     radar: InverseRadar, world: TurntableWorld, course: _Course, n_fast: int, draws: Draws, dtype: torch.dtype
-) -> _Made:
-    """The same for dechirped pulses.
-
-    The noise is the receiver's and does not turn with the phases of the echo.
-    """
+) -> _Simulated:
+    """The same with `Dechirped`, where the noise of the receiver has no phase error."""
     n_pulse, track = course.moved_m.shape[-1], world.fidelity.track if isinstance(world.fidelity, Dechirped) else ()
     turned = partial(
         dechirped_echo,
@@ -572,13 +715,12 @@ def _dechirped(
 
 
 def _turned(pulses: Tensor, phase_rad: Tensor) -> Tensor:
+    """Pulses multiplied by exp(j phase)."""
     return pulses * unit_phasor(phase_rad / (2 * math.pi), pulses.dtype)[..., None]
 
 
 def _noise(echo: Tensor, snr_db: Tensor | float | None, draws: Draws) -> tuple[Tensor | float, Tensor]:
-    """Circular Gaussian noise for an echo, and its deviation (...,): mean power of all samples over
-    snr_db.
-    """
+    """Circular Gaussian noise of an echo, and its standard deviation (...,)."""
     if snr_db is None:
         return 0.0, torch.zeros((), dtype=torch.float64, device=echo.device)
     power = torch.view_as_real(echo.detach()).double().square().sum(-1).mean((-2, -1))
@@ -589,7 +731,7 @@ def _noise(echo: Tensor, snr_db: Tensor | float | None, draws: Draws) -> tuple[T
 
 
 def _refuse_outside(scatterers: Scatterers, off_m: Tensor, radar: InverseRadar, n_range: int) -> None:
-    """off_m: (*trials, pulse), how far the target is from where the window takes it to be."""
+    """Raise ValueError if the target leaves the range window; off_m: (*trials, pulse)."""
     if not scatterers.range_m.shape[-1]:
         raise ValueError("the scene holds no scatterer; give it at least one")
     y, off = scatterers.range_m.detach(), off_m.detach()
@@ -598,6 +740,6 @@ def _refuse_outside(scatterers: Scatterers, off_m: Tensor, radar: InverseRadar, 
     if not (low <= nearest and farthest <= high):
         raise ValueError(
             f"the target reaches from {nearest:.6g} to {farthest:.6g} m of a range window of "
-            f"{low:.6g} to {high:.6g} m; "
-            "choose a smaller target, more range samples, or let the reference follow it: Dechirped(track=...)"
+            f"{low:.6g} to {high:.6g} m; choose a smaller target or more range samples, or let the reference "
+            "follow it: Dechirped(track=...)"
         )

@@ -1,4 +1,4 @@
-"""Range compression and image formation."""
+"""Range compression, image formation, and the requirements of each scene on its processor."""
 
 from torchsar.focus.backprojection import Backproject, DopplerBand, EveryPulse, Integration, backproject
 from torchsar.focus.chirp_z import chirp_z, keystone
@@ -6,16 +6,14 @@ from torchsar.focus.coordinates import ClosestRange, PaddedLines, closest_range
 from torchsar.focus.dechirped import AzimuthTransform, CompressDechirped, azimuth_transform, compress_dechirped
 from torchsar.focus.defocus import InvertibleOmegaK, defocus_omega_k
 from torchsar.focus.detection import Detect, QuickLook, amplitude, multilook, quicklook_looks, to_db
+from torchsar.focus.image_lines import CrossRangeLines, DopplerLines, cross_range_of, lines_for, mean_rate
 from torchsar.focus.inverse_requirements import inverse_requirements
 from torchsar.focus.ladar_requirements import Limit, ladar_limits, ladar_requirements
 from torchsar.focus.matched_fourier import (
     MatchedFourier,
     MatchedFourierOperator,
     RangePhase,
-    cross_range_of,
-    lines_for,
     matched_fourier,
-    mean_rate,
     range_phase,
 )
 from torchsar.focus.nufft import Nufft, nufft_type1, nufft_type2
@@ -28,6 +26,7 @@ from torchsar.focus.spotlight import GroundGrid, SpotlightBackprojection, backpr
 from torchsar.focus.stolt import OmegaKStolt, omega_k_stolt
 from torchsar.focus.strip import StripPlan, focus_strip, plan_strip, reach_lines, write_strip
 from torchsar.focus.target import TargetImage
+from torchsar.focus.transforms import CompiledNufft, ExplicitSum, Gridding, Resampling
 from torchsar.focus.triangular import (
     AzimuthMatchedFilter,
     CompressSweeps,
@@ -43,12 +42,17 @@ __all__ = [
     "AzimuthTransform",
     "Backproject",
     "ClosestRange",
+    "CompiledNufft",
     "CompressDechirped",
     "CompressSweeps",
+    "CrossRangeLines",
     "DerampAzimuth",
     "Detect",
     "DopplerBand",
+    "DopplerLines",
     "EveryPulse",
+    "ExplicitSum",
+    "Gridding",
     "GroundGrid",
     "Integration",
     "InvertibleOmegaK",
@@ -66,6 +70,7 @@ __all__ = [
     "RangeDoppler",
     "RangePhase",
     "Requirement",
+    "Resampling",
     "SpotlightBackprojection",
     "StoredOmegaK",
     "StripPlan",

@@ -1,4 +1,4 @@
-"""Backprojection of stripmap data: slow, exact, the yardstick of every faster focuser."""
+"""Backprojection of stripmap data: slow and exact, the reference for every faster focuser."""
 
 from __future__ import annotations
 
@@ -16,11 +16,16 @@ from torchsar.radar import StripmapRadar
 
 
 class Aperture(Protocol):
-    """Which pulses form a pixel: (slow time since the beam centre crossed it, its Doppler relative
-    to the centroid) -> weight.
-    """
+    """Weights of the pulses that form a pixel."""
 
-    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor: ...
+    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
+        """Return the weight of each pulse, in the shape of the arguments.
+
+        Args:
+            since_s: Slow time since the beam centre crossed the pixel, in seconds.
+            doppler_offset_hz: Doppler of the pixel relative to the centroid, in Hz.
+        """
+        ...
 
 
 @dataclass(frozen=True)
@@ -28,28 +33,54 @@ class EveryPulse:
     """All recorded pulses."""
 
     def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
+        """Return weights of 1, in the shape of `since_s`.
+
+        Args:
+            since_s: Slow time since the beam centre crossed the pixel, in seconds.
+            doppler_offset_hz: Doppler of the pixel relative to the centroid, in Hz.
+        """
         return torch.ones_like(since_s)
 
 
 @dataclass(frozen=True)
 class Integration:
-    """The pulses within integration_s about the crossing of the beam centre."""
+    """The pulses within an integration time about the crossing of the beam centre.
+
+    Args:
+        integration_s: Integration time in seconds.
+    """
 
     integration_s: float
 
     def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
+        """Return 1 within the integration time and 0 elsewhere.
+
+        Args:
+            since_s: Slow time since the beam centre crossed the pixel, in seconds.
+            doppler_offset_hz: Doppler of the pixel relative to the centroid, in Hz.
+        """
         return (since_s.abs() <= self.integration_s / 2).to(since_s.dtype)
 
 
 @dataclass(frozen=True)
 class DopplerBand:
-    """The pulses in which the pixel's Doppler is within width_hz about the centroid; with the PRF,
-    what a Doppler processor uses.
+    """The pulses in which the Doppler of the pixel lies in a band about the centroid.
+
+    With the PRF as width these are the pulses that a Doppler processor uses.
+
+    Args:
+        width_hz: Width of the band in Hz.
     """
 
     width_hz: float
 
     def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
+        """Return 1 within the band and 0 elsewhere.
+
+        Args:
+            since_s: Slow time since the beam centre crossed the pixel, in seconds.
+            doppler_offset_hz: Doppler of the pixel relative to the centroid, in Hz.
+        """
         return (doppler_offset_hz.abs() <= self.width_hz / 2).to(since_s.dtype)
 
 
@@ -68,29 +99,51 @@ def backproject(
     eps: float = 1e-10,
     block_bytes: int = 1 << 23,
 ) -> Tensor:
-    """Coherent sum over pulses of the compressed echo at each pixel's own range.
+    """Sum the compressed echo coherently over the pulses at the range of each pixel.
 
-    raw: (..., pulse, range) -> (..., *pixels), complex.
+    The range history is the exact hyperbola, formed as a difference to the range of the pixel at
+    crossing. The echo between samples comes from its range spectrum by a non-uniform FFT. A target
+    has the phase -4 pi R / lambda and the sum of its pulses as amplitude. Echoes outside the record
+    count as zero. Takes pulses x pixels x 50 operations: use it for patches. Differentiable in the
+    raw data, the velocity, the frame and the pixel positions.
 
-    azimuth_m, range_m: float64 pixel coordinates that broadcast to `pixels`, in the image
-    coordinates of `omega_k`: x = nominal velocity * slow time of crossing, and the slant range at
-    crossing, in the frame Doppler. start_s: slow time of the first pulse. The range history is the
-    exact hyperbola, formed as a difference to the pixel's range at crossing; the echo between
-    samples comes from its range spectrum by a non-uniform FFT of relative error eps. A target has
-    the phase -4 pi R / lambda and the sum of its pulses as amplitude. Echoes outside the record
-    count as zero. Costs pulses x pixels x 50 operations: for patches. Differentiable in raw,
-    velocity, frame and pixel positions.
+    Args:
+        raw: Raw or range-compressed data, shape (..., pulse, range), complex.
+        radar: Radar of the recording.
+        azimuth_m: Azimuth of the pixels in metres, nominal velocity x slow time of crossing;
+            float64, broadcasts against `range_m`.
+        range_m: Slant range of the pixels at crossing in metres, in the frame Doppler; float64.
+        doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,).
+        velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
+            radar.
+        frame_hz: Frame Doppler of the image coordinates in Hz; None for the nominal pointing of the
+            radar, or the centroid where there is none.
+        reference: Range reference spectrum, shape (range,); None for range-compressed data.
+        aperture: Pulses that form a pixel; None for all.
+        start_s: Slow time of the first pulse in seconds.
+        eps: Relative error of the interpolation in range.
+        block_bytes: Size of a working array in bytes.
+
+    Returns:
+        Image, shape (..., *pixels), complex, where `pixels` is the broadcast shape of the
+        coordinates.
+
+    Raises:
+        ValueError: If a value per trial has another shape than the trials, the velocity is not
+            positive, or a Doppler exceeds 2 velocity / wavelength.
     """
     at = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz)
     x, r = torch.broadcast_tensors(
         *(torch.as_tensor(v, dtype=torch.float64, device=raw.device) for v in (azimuth_m, range_m))
     )
     shape, x, r = x.shape, x.reshape(-1), r.reshape(-1)
-    sight = _Sight(radar, at.velocity_m_s, at.frame_hz, per_trial(doppler_hz, 2, x), aperture or EveryPulse())
+    geometry = _PixelGeometry(
+        radar, at.velocity_m_s, at.frame_hz, per_trial(doppler_hz, 2, x), aperture or EveryPulse()
+    )
     echo = _EchoBetweenSamples(raw, reference, radar, eps)
     pulse_s = start_s + torch.arange(raw.shape[-2], dtype=torch.float64, device=raw.device) / radar.prf_hz
     trials = max(1, raw[..., 0, 0].numel())
-    # each of the about 20 working arrays of a block takes 16 bytes a pulse and pixel
+    # each of the about 20 working arrays of a block takes 16 bytes per pulse and pixel
     pixels_at_once = min(max(1, x.numel()), 4096)
     height = max(1, min(raw.shape[-2], block_bytes // (16 * trials * max(pixels_at_once, 2 * raw.shape[-1]))))
     sums = [
@@ -100,19 +153,20 @@ def backproject(
     for pulses in _slices(raw.shape[-2], height):
         grid = echo.grid(pulses)
         for i, pixels in enumerate(_slices(x.numel(), pixels_at_once)):
-            difference, weight = sight(pulse_s[pulses, None], x[pixels], r[pixels])
+            difference, weight = geometry(pulse_s[pulses, None], x[pixels], r[pixels])
             sums[i] = sums[i] + echo.at(grid, r[pixels], difference, weight).sum(-2)
     return torch.cat(sums, -1).reshape((*raw.shape[:-2], *shape))
 
 
 def _slices(n: int, step: int) -> Iterator[slice]:
+    """Slices of at most `step` that cover 0..n."""
     yield from (slice(first, min(first + step, n)) for first in range(0, n, step))
 
 
 @dataclass(frozen=True)
-class _Sight:
-    """The way a pixel is seen from the path: range relative to the crossing, and the weight of the
-    aperture.
+class _PixelGeometry:
+    """Range of pixels relative to the crossing of the beam centre, and the weights of the
+    pulses.
     """
 
     radar: StripmapRadar
@@ -122,17 +176,16 @@ class _Sight:
     aperture: Aperture
 
     def __call__(self, pulse_s: Tensor, azimuth_m: Tensor, range_m: Tensor) -> tuple[Tensor, Tensor]:
-        """pulse_s: (pulse, 1); pixels (pixel,).
-
-        Returns r(t) - R in metres and the weight, float64 (..., pulse, pixel).
+        """Return r(t) - R in metres and the weight, float64 (..., pulse, pixel), for pulses (pulse,
+        1) and pixels (pixel,).
         """
         velocity, frame = (per_trial(v, 2, pulse_s) for v in (self.velocity_m_s, self.frame_hz))
         sin = self.radar.wavelength_m * frame / (2 * velocity)
         since = pulse_s - azimuth_m / self.radar.velocity_m_s
-        way = velocity * since
-        excess = way * (way - 2 * range_m * sin)
+        along = velocity * since
+        excess = along * (along - 2 * range_m * sin)
         slant = torch.sqrt(range_m.square() + excess)
-        doppler = 2 * velocity * (range_m * sin - way) / (slant * self.radar.wavelength_m)
+        doppler = 2 * velocity * (range_m * sin - along) / (slant * self.radar.wavelength_m)
         return excess / (slant + range_m), self.aperture.weight(
             *torch.broadcast_tensors(since, doppler - self.centroid_hz)
         )
@@ -149,6 +202,7 @@ class _EchoBetweenSamples:
         self.plan = Nufft(self.n, eps, raw.dtype, raw.device)
 
     def grid(self, pulses: slice) -> Tensor:
+        """Oversampled range spectra of some pulses."""
         spectrum = torch.fft.fft(self.raw[..., pulses, :])
         if self.reference is not None:
             spectrum = spectrum * self.reference.to(spectrum.dtype)
@@ -158,7 +212,7 @@ class _EchoBetweenSamples:
         """Weighted echo of each pulse and pixel, (..., pulse, pixel)."""
         cell = ((range_m - self.radar.near_range_m) + difference_m) / self.radar.range_step_m
         weight = weight * ((cell >= 0) & (cell <= self.n - 1))
-        # exp(+2j pi k q / n) asks for points of the other sign
+        # the exponent is +2j pi k q / n, so that points have the opposite sign
         points = Points.of(
             self.plan.kernel, -cell * (self.plan.length / self.n), self.plan.length, real_dtype(grid.dtype)
         )
@@ -167,11 +221,23 @@ class _EchoBetweenSamples:
 
 
 class Backproject(Focuser):
-    """Focus a patch by backprojection: lines and cells (first, last) of the raw matrix, all by
-    default, sampled `oversampling` times finer.
+    """Stage that focuses a patch by backprojection, on the image axes of the faster focusers.
 
-    Other arguments as `Focuser`. The exact reference for the faster focusers, on the same image
-    axes.
+    Args:
+        radar: Radar of the recording.
+        reference: Name of the range reference; None for range-compressed data.
+        velocity_m_s: Effective velocity in m/s; None for that of the radar.
+        doppler_hz: Absolute Doppler centroid in Hz; None for the nominal pointing of the radar.
+        frame_hz: Frame Doppler of the image in Hz; None for the nominal pointing, else the
+            centroid.
+        lines: First and last raw line of the patch; None for all.
+        cells: First and last range cell of the patch; None for all.
+        oversampling: Pixels per raw sample along either axis.
+        aperture: Pulses that form a pixel; None for all.
+        eps: Relative error of the interpolation in range.
+
+    Raises:
+        ValueError: If `reference` is not known.
     """
 
     form = staticmethod(backproject)
@@ -193,6 +259,13 @@ class Backproject(Focuser):
         self.lines, self.cells, self.oversampling, self.aperture, self.eps = lines, cells, oversampling, aperture, eps
 
     def forward(self, signal: Signal, doppler_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Signal:
+        """Focus a signal with axes (pulse, range).
+
+        Args:
+            signal: Recording.
+            doppler_hz: Doppler centroid in Hz; None for that of the stage.
+            velocity_m_s: Effective velocity in m/s; None for that of the stage.
+        """
         azimuth, range_ = self.radar.image_axes(signal.axes)
         azimuth, range_ = (
             axis.part(*(bounds or (0, axis.n))).resampled(self.oversampling)

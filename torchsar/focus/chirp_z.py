@@ -1,9 +1,10 @@
-"""Spectra on any uniform grid of frequencies by the chirp-z transform, and the keystone transform
-that stands on it.
+"""Chirp-z transform onto any uniform grid of frequencies, and the keystone transform.
 
-Both are exact sums, not interpolations: X_i = sum_j x_j exp(-2j pi (start + i step) (j - j0)), as
-one convolution with a chirp. Source: Bluestein 1970 (chirp-z); Perry, DiPietro and Fante 1999, IEEE
-Trans. AES 35(1) (keystone). Own code.
+Both evaluate exact sums, X_i = sum_j x_j exp(-2j pi (start + i step) (j - j0)), as one convolution
+with a chirp, not interpolations.
+
+Reference:
+    Bluestein 1970 (chirp-z); Perry, DiPietro and Fante 1999, IEEE Trans. AES 35(1) (keystone).
 """
 
 from __future__ import annotations
@@ -18,16 +19,29 @@ from torchsar.focus.nufft import smooth_length
 def chirp_z(
     x: Tensor, start: Tensor | float, step: Tensor | float, n: int, dim: int = -1, centre: int | None = None
 ) -> Tensor:
-    """X_i = sum_j x_j exp(-2j pi (start + i step) (j - centre)), i = 0..n-1, by Bluestein's
-    convolution.
+    """Evaluate the spectrum of samples on a uniform grid of frequencies by Bluestein's convolution.
 
-    x: complex (..., m) along dim; start, step: cycles per sample, any real numbers, float64 (...,)
-    to broadcast against the dims of x but `dim`. centre: sample that phases refer to, m // 2 by
-    default. Exact to the precision of the data: chirps are float64 phases. Differentiable in all
-    three. Raises ValueError for n < 1.
+    X_i = sum_j x_j exp(-2j pi (start + i step) (j - centre)), i = 0..n-1, exact to the precision of
+    the data, since the chirps are formed from float64 phases. Differentiable in `x`, `start` and
+    `step`.
+
+    Args:
+        x: Samples, shape (..., m) along `dim`, complex.
+        start: First frequency in cycles per sample, a number or float64 (...,) that broadcasts
+            against the dims of `x` except `dim`.
+        step: Step of frequency in cycles per sample, any real number, shape as `start`.
+        n: Number of frequencies.
+        dim: Dimension of the samples.
+        centre: Sample that the phases refer to; None for m // 2.
+
+    Returns:
+        Spectrum, shape (..., n) along `dim`, complex.
+
+    Raises:
+        ValueError: If `n` is below 1.
     """
     if n < 1:
-        raise ValueError(f"a chirp-z transform gives at least one frequency, got n={n}")
+        raise ValueError(f"a chirp-z transform needs at least one frequency, got n={n}")
     if dim % x.ndim != x.ndim - 1:
         return chirp_z(x.movedim(dim, -1), start, step, n, -1, centre).movedim(-1, dim)
     m = x.shape[-1]
@@ -45,18 +59,31 @@ def chirp_z(
 
 
 def keystone(data: Tensor, frequency_hz: Tensor, carrier_hz: float, ambiguity: Tensor | int = 0) -> Tensor:
-    """Slow time rescaled per range frequency, s(t carrier / (carrier + f), f), which takes out the
-    range walk of every target at once.
+    """Rescale slow time per range frequency, which removes the range walk of all targets at once.
 
-    data: complex (..., pulse, range frequency); frequency_hz: f, float64 (range frequency,),
-    relative to the carrier. A target that moves by v has the phase (carrier + f) v t: afterwards
-    carrier * v * t, and its range stands still. Slow time is zero at pulse `n // 2`, where nothing
-    moves. ambiguity: whole pulse rates (...,) by which the true Doppler exceeds the sampled one;
-    with a wrong number the walk of that many pulse rates stays. The Doppler of the whole band must
-    lie within half a pulse rate of that: it grows with carrier + f. Evaluated exactly as the
-    periodic band-limited signal through the pulses: where the scale exceeds one (f < 0), the
-    outermost pulses are read from beyond the aperture and wrap around. Differentiable in the data.
-    Raises ValueError where frequencies do not fit the data or reach minus the carrier.
+    The result is s(t carrier / (carrier + f), f). A target that moves with v has the phase (carrier
+    + f) v t; afterwards carrier v t, and its range is constant. Slow time is zero at pulse `n //
+    2`, where the data do not change. The Doppler of the whole band, which grows with carrier + f,
+    must lie within half a pulse rate of `ambiguity` pulse rates. The signal is evaluated exactly as
+    periodic and band-limited through the pulses: where the scale exceeds one (f < 0), the outermost
+    pulses are taken from beyond the aperture and wrap around. Differentiable in the data.
+
+    Args:
+        data: Pulses, shape (..., pulse, range frequency), complex.
+        frequency_hz: Range frequencies f relative to the carrier in Hz, shape (range frequency,).
+        carrier_hz: Carrier frequency in Hz.
+        ambiguity: Number of pulse rates by which the true Doppler exceeds the sampled one, a number
+            or shape (...,). A wrong number leaves the walk of the missing pulse rates.
+
+    Returns:
+        Pulses of the same shape.
+
+    Raises:
+        ValueError: If the number of frequencies does not fit the data, or a frequency reaches minus
+            the carrier.
+
+    Reference:
+        Perry, DiPietro and Fante 1999, IEEE Trans. AES 35(1).
     """
     n, frequency_hz = data.shape[-2], frequency_hz.to(device=data.device, dtype=torch.float64)
     if frequency_hz.shape != data.shape[-1:]:

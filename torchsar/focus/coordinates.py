@@ -1,6 +1,4 @@
-"""From beam coordinates to the range of closest approach, and room for apertures that begin or end
-outside of the record.
-"""
+"""Range of closest approach as image coordinate, and zero padding of the record."""
 
 from __future__ import annotations
 
@@ -22,20 +20,29 @@ def closest_range(
     velocity_m_s: Tensor | float | None = None,
     eps: float = 1e-5,
 ) -> Tensor:
-    """Resample an image so that its range axis holds the range of closest approach r = R
-    cos(squint) instead of the slant range R.
+    """Resample an image from slant range R to the range of closest approach, r = R cos(squint).
 
-    image: (..., azimuth, range) in the frame Doppler frame_hz (...,). Band-limited interpolation
-    with one set of points per trial, of relative error eps; samples from beyond the record wrap. A
-    squint of 1.6 degrees moves a target at 1000 km by 400 m. Differentiable.
+    Band-limited interpolation; samples from beyond the record wrap around. A squint of 1.6 degrees
+    moves a target at 1000 km by 400 m. Differentiable.
+
+    Args:
+        image: Focused image in the frame Doppler, shape (..., azimuth, range), complex.
+        radar: Radar of the recording.
+        frame_hz: Frame Doppler of the image in Hz, a number or shape (...,).
+        velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
+            radar.
+        eps: Relative error of the interpolation.
+
+    Returns:
+        Image of the same shape on the same range axis, which now is the range of closest approach.
     """
     n = image.shape[-1]
     sin = radar.sin_squint(
         per_trial(frame_hz, 2, image), per_trial(radar.velocity_m_s if velocity_m_s is None else velocity_m_s, 2, image)
     )
     cosine = torch.sqrt(1 - sin.square())
-    # column k shows r = near + k dr, which lies at the slant range r / cos; 1 / cos - 1 is formed
-    # without a difference of near ones
+    # column k is r = near + k dr, at the slant range r / cos; 1 / cos - 1 is formed without a
+    # difference of nearly equal numbers
     excess = sin.square() / (cosine * (1 + cosine))
     column = torch.arange(n, dtype=torch.float64, device=image.device)
     source = column + (radar.near_range_m / radar.range_step_m + column) * excess
@@ -45,11 +52,14 @@ def closest_range(
 
 
 class ClosestRange(Stage):
-    """Turn the range axis of a focused image into the range of closest approach (zero-Doppler
-    range); azimuth stays the beam crossing.
+    """Stage that converts the range axis of a focused image to the range of closest approach.
 
-    frame: the radar's nominal pointing where it is known, else the centroid `doppler_hz` that the
-    image was focused with.
+    This is the zero-Doppler range; azimuth remains the crossing of the beam centre. The frame is
+    the nominal pointing of the radar, or the centroid `doppler_hz` where the radar has none.
+
+    Args:
+        radar: Radar of the recording.
+        eps: Relative error of the interpolation.
     """
 
     works_on = ("azimuth", "range")
@@ -59,6 +69,16 @@ class ClosestRange(Stage):
         self.radar, self.eps = radar, eps
 
     def forward(self, signal: Signal, doppler_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Signal:
+        """Convert an image with axes (azimuth, range).
+
+        Args:
+            signal: Focused image.
+            doppler_hz: Doppler centroid in Hz with which it was focused.
+            velocity_m_s: Effective velocity in m/s; None for that of the radar.
+
+        Raises:
+            ValueError: If the radar has no nominal pointing and `doppler_hz` is absent.
+        """
         real_dtype(signal.data.dtype)
         pointing = self.radar.pointing_doppler_hz
         frame = pointing if pointing is not None else doppler_hz
@@ -71,21 +91,34 @@ class ClosestRange(Stage):
 
 
 class PaddedLines(Stage):
-    """Focus with empty lines behind the record, so that apertures cut by its ends do not wrap round
-    into the other end.
+    """Stage that focuses with zero lines after the record.
 
-    lines: how many; None adds one aperture, the time in which a target sweeps one PRF (or the
-    nominal dwell). The image keeps the record's lines. Costs the share of added lines in time and
-    memory.
+    Apertures that the end of the record cuts off then do not wrap around. The image has the lines
+    of the record. Time and memory grow with the share of added lines.
+
+    Args:
+        focuser: Focusing stage.
+        lines: Number of added lines; None for one aperture, the time in which a target sweeps one
+            PRF, or the nominal dwell of the radar.
+
+    Raises:
+        ValueError: If `lines` is negative.
     """
 
     def __init__(self, focuser: Focuser, lines: int | None = None) -> None:
         super().__init__()
         if lines is not None and lines < 0:
-            raise ValueError(f"a record is padded by 0 or more lines, got {lines}")
+            raise ValueError(f"PaddedLines needs 0 or more lines, got {lines}")
         self.focuser, self.lines = focuser, lines
 
     def forward(self, signal: Signal, doppler_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Signal:
+        """Focus a signal with axes (pulse, range).
+
+        Args:
+            signal: Recording.
+            doppler_hz: Doppler centroid in Hz; None for that of the focuser.
+            velocity_m_s: Effective velocity in m/s; None for that of the focuser.
+        """
         n, radar = signal.axis("pulse").n, self.focuser.radar
         more = radar.aperture_lines(signal.axis("range").stop) if self.lines is None else self.lines
         padded = signal.with_axis(pad(signal.data, (0, 0, 0, more)), pulse=signal.axis("pulse").part(0, n + more))

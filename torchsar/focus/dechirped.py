@@ -1,9 +1,8 @@
-"""From the dechirped pulses of a turning target to range-compressed ones, and from these to an
-image.
+"""Range compression of dechirped pulses and azimuth transform of a rotating target.
 
-What a pulse of an echo holds after dechirping, with the delay dtau against the reference and t'
-from the middle of the pulse, is exp(-2j pi (f0 dtau + gamma t' dtau - gamma dtau^2 / 2)). Turntable
-transforms over pulses use exp(+j): +x lies at + on the axis.
+With the delay dtau relative to the reference and t' from the middle of the pulse, a dechirped pulse
+has the phase exp(-2j pi (f0 dtau + gamma t' dtau - gamma dtau^2 / 2)). Transforms over the pulses
+of a turntable use exp(+j), so that +x lies at positive coordinates of the image axis.
 """
 
 from __future__ import annotations
@@ -16,20 +15,34 @@ from torch import Tensor
 from torchsar.core import Axis, Signal, Stage, centred_ifft, fft_lines, real_dtype, unit_phasor
 from torchsar.radar import InverseRadar
 
+# windows over the pulses that `AzimuthTransform` accepts
 WINDOWS = ("none", "hann")
 
 
 def compress_dechirped(
     raw: Tensor, radar: InverseRadar, velocity_m_s: Tensor | float | None = None, residual_video: bool = True
 ) -> Tensor:
-    """Range compression of dechirped pulses: (..., pulse, fast_time) -> (..., pulse, range), a unit
-    echo to a unit peak.
+    """Compress dechirped pulses in range.
 
-    Fast time i lies at (i - n // 2) * pulse_s / n from the middle of the pulse; range i at (i - n
-    // 2) * range_step_m from the reference. velocity_m_s (...,): range rate dR/dt within pulses,
-    receding positive. Its phase 2 pi (2 v / c) (f0 t' + gamma t'^2) is taken out first: the shift v
-    f0 / gamma, also where it wrapped round, and the blur of the walk. residual_video: whether pi
-    gamma (2 r / c)^2 is taken out at each range r. Differentiable in samples and velocity.
+    Fast time i lies at (i - n // 2) pulse_s / n from the middle of the pulse, range i at (i - n //
+    2) range_step_m from the reference. With a velocity the phase
+    2 pi (2 v / c) (f0 t' + gamma t'^2) is removed first: the shift v f0 / gamma, also where it
+    wraps around, and the blur by range walk within the pulse. Differentiable in samples and
+    velocity.
+
+    Args:
+        raw: Dechirped pulses, shape (..., pulse, fast_time), complex.
+        radar: Radar of the recording, with its pulse length.
+        velocity_m_s: Range rate dR/dt within pulses in m/s, receding positive, a number or shape
+            (...,); None for no correction.
+        residual_video: Remove the residual video phase pi gamma (2 r / c)^2 at each range r.
+
+    Returns:
+        Range-compressed pulses, shape (..., pulse, range); an echo of unit amplitude has a unit
+        peak.
+
+    Raises:
+        ValueError: If a velocity is given and the radar has no pulse length.
     """
     n = raw.shape[-1]
     cell = torch.arange(n, dtype=torch.float64, device=raw.device) - n // 2
@@ -46,12 +59,19 @@ def compress_dechirped(
 
 
 def azimuth_transform(pulses: Tensor, window: str = "none", oversampling: int = 1) -> Tensor:
-    """Image from phase-corrected pulses, (..., pulse, range) -> (..., oversampling * pulse, range):
-    centred transform with exp(+j) over pulses.
+    """Form the image of phase-corrected pulses by a centred transform with exp(+j) over the pulses.
 
-    Line q holds sum_k w_k s[k] exp(2j pi (q - n // 2) (k - pulse // 2) / n) / sqrt(n), n =
-    oversampling * pulse: the energy of the pulses is kept. window: "none" or "hann", of unit mean
-    square, so that noise keeps its level. Rounds alike for any number of trials; differentiable.
+    Line q is sum_k w_k s[k] exp(2j pi (q - n // 2) (k - pulse // 2) / n) / sqrt(n) with n =
+    oversampling * pulse, so that the energy of the pulses is preserved. Rounding does not depend on
+    the number of trials. Differentiable.
+
+    Args:
+        pulses: Range-compressed pulses, shape (..., pulse, range), complex.
+        window: "none" or "hann", of unit mean square, so that noise keeps its level.
+        oversampling: Image lines per pulse, by zero padding.
+
+    Returns:
+        Image, shape (..., oversampling * pulse, range).
     """
     k = pulses.shape[-2]
     n = oversampling * k
@@ -63,22 +83,32 @@ def azimuth_transform(pulses: Tensor, window: str = "none", oversampling: int = 
 
 
 def _hann(n: int, like: Tensor) -> Tensor:
+    """Hann window of unit mean square, (n,)."""
     w = torch.sin(math.pi * (torch.arange(n, dtype=torch.float64, device=like.device) + 0.5) / n).square()
     return (w / w.square().mean().sqrt()).to(real_dtype(like.dtype))
 
 
 def _pulse_s(radar: InverseRadar) -> float:
+    """Pulse length of the radar; raises ValueError where it is not set."""
     if radar.pulse_s is None:
         raise ValueError("radar.pulse_s is not set; a dechirped pulse needs its length")
     return radar.pulse_s
 
 
 class CompressDechirped(Stage):
-    """Dechirped pulses (pulse, fast_time) to range-compressed ones (pulse, range).
+    """Stage that compresses dechirped pulses (pulse, fast_time) in range, see `compress_dechirped`.
 
-    velocity_m_s (...,): range rate within pulses, see `compress_dechirped`; a connected value goes
-    before that of the constructor. At pulses of 100 us and 150 GHz the velocity must be known to 5
-    m/s (quadratic phase of pi / 4): `focus.inverse_requirements`.
+    For pulses of 100 us and 150 GHz the velocity must be known to 5 m/s (quadratic phase of pi /
+    4), see `inverse_requirements`.
+
+    Args:
+        radar: Radar of the recording, with its pulse length.
+        residual_video: Remove the residual video phase.
+        velocity_m_s: Range rate within pulses in m/s, receding positive; a connected value takes
+            precedence.
+
+    Raises:
+        ValueError: If the radar has no pulse length.
     """
 
     works_on = ("pulse", "fast_time")
@@ -97,14 +127,24 @@ class CompressDechirped(Stage):
             self.hold("velocity_m_s", velocity_m_s)
 
     def forward(self, signal: Signal, velocity_m_s: Tensor | None = None) -> Signal:
+        """Compress a signal with axes (pulse, fast_time).
+
+        Args:
+            signal: Dechirped recording.
+            velocity_m_s: Range rate within pulses in m/s; None for that of the stage.
+
+        Raises:
+            ValueError: If the fast-time samples do not span the pulse about its middle.
+        """
         pulse, fast = signal.axes
-        self._refuse_other_sampling(fast)
+        self._check_sampling(fast)
         lines = compress_dechirped(
             signal.data, self.radar, self.velocity_m_s if velocity_m_s is None else velocity_m_s, self.residual_video
         )
         return Signal(lines, (pulse, self.radar.raw_axes(pulse.n, fast.n)[1]))
 
-    def _refuse_other_sampling(self, fast: Axis) -> None:
+    def _check_sampling(self, fast: Axis) -> None:
+        """Raise ValueError where the fast-time samples do not span the pulse about its middle."""
         step = _pulse_s(self.radar) / fast.n
         if abs(fast.step - step) > 1e-9 * step or abs(fast.start + (fast.n // 2) * step) > 1e-6 * step:
             raise ValueError(
@@ -114,11 +154,17 @@ class CompressDechirped(Stage):
 
 
 class AzimuthTransform(Stage):
-    """Range-compressed pulses of a turning target to an image in cross range, or in Doppler where
-    the radar's rotation rate is not known.
+    """Stage that transforms range-compressed pulses of a rotating target into an image.
 
-    window: "none" or "hann"; oversampling: lines per cross-range cell, by zero padding. See
-    `azimuth_transform`.
+    The azimuth axis is cross range, or Doppler where the radar has no rotation rate.
+
+    Args:
+        radar: Radar of the recording.
+        window: "none" or "hann" over the pulses.
+        oversampling: Lines per cross-range cell, by zero padding.
+
+    Raises:
+        ValueError: If `window` is not known or `oversampling` is not a whole number of 1 or more.
     """
 
     def __init__(self, radar: InverseRadar, window: str = "none", oversampling: int = 1) -> None:
@@ -130,6 +176,11 @@ class AzimuthTransform(Stage):
         self.radar, self.window, self.oversampling = radar, window, int(oversampling)
 
     def forward(self, signal: Signal) -> Signal:
+        """Transform a signal with axes (pulse, range).
+
+        Args:
+            signal: Range-compressed pulses.
+        """
         pulse, range_ = signal.axes
         image = azimuth_transform(signal.data, self.window, self.oversampling)
         padded = Axis(pulse.name, image.shape[-2], pulse.start, pulse.step, pulse.unit)

@@ -1,8 +1,8 @@
-"""The way back from an image to lines: bulk + refocus omega-K as an invertible operator.
+"""Bulk + refocus omega-K as an invertible operator between raw lines and image.
 
-Every filter of `omega_k` but the range reference has unit modulus, so that with an all-pass
-reference the operator is unitary: its inverse is its adjoint, the conjugate filters in reverse
-order. Repairs that model the scene stand on this.
+Every filter of `omega_k` except the range reference has unit modulus. With an all-pass reference
+the operator is unitary: its inverse is its adjoint, the conjugate filters in reverse order.
+Corrections that model the scene use this.
 """
 
 from __future__ import annotations
@@ -16,21 +16,38 @@ from torchsar.radar import StripmapRadar
 
 
 def all_pass(reference: Tensor) -> Tensor:
-    """The phase of a range reference spectrum, unit modulus, (range,); 1 where the reference is
-    zero.
+    """Return the phase of a range reference spectrum with unit modulus.
+
+    Args:
+        reference: Range reference spectrum, shape (range,), complex.
+
+    Returns:
+        Spectrum of unit modulus, same shape; 1 where the reference is zero.
     """
     size = reference.abs()
     return torch.where(size > 0, reference / torch.where(size > 0, size, 1), 1)
 
 
 class InvertibleOmegaK:
-    """Bulk + refocus omega-K with stored filters, forwards and backwards, for one geometry (one per
-    trial). (..., pulse, range).
+    """Bulk + refocus omega-K with stored filters and its adjoint, for one geometry per trial.
 
-    Exact inverse where |reference| = 1 or reference is None (range-compressed data); otherwise
-    `defocus` is the adjoint of `focus`. The Doppler-range domain between the two halves is public,
-    for models of the azimuth spectrum: focus = from_doppler(to_doppler). Holds one complex number
-    per sample of the lines. Geometry arguments as in `omega_k`; neglects what it neglects.
+    The adjoint is the exact inverse where |reference| = 1 or `reference` is None. The Doppler-range
+    domain between the two halves is accessible, for models of the azimuth spectrum. Stores one
+    complex number per sample. Makes the approximation of `omega_k`.
+
+    Args:
+        radar: Radar of the recording.
+        like: Data that give shape, dtype and device, shape (..., pulse, range).
+        doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,).
+        velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
+            radar.
+        frame_hz: Frame Doppler of the image in Hz; None for the nominal pointing, else the
+            centroid.
+        reference: Range reference spectrum, shape (range,); None for range-compressed data.
+
+    Raises:
+        ValueError: If a value per trial has another shape than the trials, the velocity is not
+            positive, or a Doppler exceeds 2 velocity / wavelength.
     """
 
     def __init__(
@@ -51,22 +68,51 @@ class InvertibleOmegaK:
         self.fine, self.coarse = phasor_tables(refocus_turns_per_sample(at), -centre, n, like.dtype)
 
     def _residual(self) -> Tensor:
+        """Phase of the refocusing step."""
         return outer_phasor(self.fine, self.coarse, self.n)
 
     def to_doppler(self, lines: Tensor) -> Tensor:
-        """Lines to focused azimuth spectra, (..., doppler, range)."""
+        """Transform raw lines into focused azimuth spectra.
+
+        Args:
+            lines: Raw lines, shape (..., pulse, range), complex.
+
+        Returns:
+            Azimuth spectra, shape (..., doppler, range).
+        """
         return torch.fft.ifft(torch.fft.fft2(lines) * self.bulk) * self._residual()
 
     def from_doppler(self, spectra: Tensor) -> Tensor:
-        """Adjoint and, with an all-pass reference, inverse of to_doppler."""
+        """Apply the adjoint of `to_doppler`, with an all-pass reference its inverse.
+
+        Args:
+            spectra: Azimuth spectra, shape (..., doppler, range), complex.
+
+        Returns:
+            Raw lines, shape (..., pulse, range).
+        """
         return torch.fft.ifft2(torch.fft.fft(spectra * self._residual().conj()) * self.bulk.conj())
 
     def focus(self, lines: Tensor) -> Tensor:
-        """The image; `omega_k` of the same arguments."""
+        """Form the image that `omega_k` forms with the same arguments.
+
+        Args:
+            lines: Raw lines, shape (..., pulse, range), complex.
+
+        Returns:
+            Image, same shape.
+        """
         return torch.fft.ifft(self.to_doppler(lines), dim=-2)
 
     def defocus(self, image: Tensor) -> Tensor:
-        """The lines of an image."""
+        """Apply the adjoint of `focus`, with an all-pass reference its inverse.
+
+        Args:
+            image: Image, shape (..., azimuth, range), complex.
+
+        Returns:
+            Raw lines, same shape.
+        """
         return self.from_doppler(torch.fft.fft(image, dim=-2))
 
 
@@ -79,8 +125,25 @@ def defocus_omega_k(
     frame_hz: Tensor | float | None = None,
     reference: Tensor | None = None,
 ) -> Tensor:
-    """Lines whose bulk + refocus image is `image` (adjoint of `omega_k`; exact inverse for an
-    all-pass reference or None).
+    """Compute the raw lines of an image: the adjoint of `omega_k`.
+
+    Exact inverse for an all-pass reference or None.
+
+    Args:
+        image: Image, shape (..., azimuth, range), complex.
+        radar: Radar of the recording.
+        doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,).
+        velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
+            radar.
+        frame_hz: Frame Doppler of the image in Hz; None for the nominal pointing, else the
+            centroid.
+        reference: Range reference spectrum, shape (range,); None for range-compressed data.
+
+    Returns:
+        Raw lines, same shape.
+
+    Raises:
+        ValueError: As in `InvertibleOmegaK`.
     """
     operator = InvertibleOmegaK(
         radar, image, doppler_hz=doppler_hz, velocity_m_s=velocity_m_s, frame_hz=frame_hz, reference=reference

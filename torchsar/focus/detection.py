@@ -1,4 +1,4 @@
-"""From complex images to pictures: detection, looks, decibels, quick-looks."""
+"""Detection of complex images: amplitude, multilooking, decibels and quick-look pictures."""
 
 from __future__ import annotations
 
@@ -10,17 +10,31 @@ from torchsar.core import Axis, Signal, Stage
 
 
 def power(image: Tensor) -> Tensor:
-    """|I|^2 of a complex image, or the image itself where it is real (detected) already."""
+    """Compute |I|^2 of a complex image; a real image is returned as it is (already detected).
+
+    Args:
+        image: Image, shape (..., azimuth, range).
+
+    Returns:
+        Power, same shape, real.
+    """
     return image.real.square() + image.imag.square() if image.is_complex() else image
 
 
 def multilook(image: Tensor, looks: tuple[int, int]) -> Tensor:
-    """Mean power over blocks of (azimuth, range) samples.
+    """Average the power over blocks of (azimuth, range) samples.
 
-    (..., azimuth, range) -> real (..., azimuth // a, range // r).
+    Rows and columns that fill no whole block are dropped. Differentiable.
 
-    Rows and columns that fill no whole block are dropped. Differentiable. Raises ValueError where a
-    block exceeds the image.
+    Args:
+        image: Image, shape (..., azimuth, range), complex, or real power.
+        looks: Samples (a, r) of a block in azimuth and range.
+
+    Returns:
+        Mean power, shape (..., azimuth // a, range // r), real.
+
+    Raises:
+        ValueError: If a block exceeds the image.
     """
     azimuth, range_ = looks
     if not (1 <= azimuth <= image.shape[-2] and 1 <= range_ <= image.shape[-1]):
@@ -35,9 +49,20 @@ def multilook(image: Tensor, looks: tuple[int, int]) -> Tensor:
 
 
 def amplitude(image: Tensor, looks: tuple[int, int] = (1, 1)) -> Tensor:
-    """Square root of the mean power over looks, real.
+    """Compute the square root of the mean power over looks.
 
-    Scaled by each trial's peak on the way, so that no level over- or underflows.
+    Scaled by the peak of each trial during the computation, so that no level overflows or
+    underflows.
+
+    Args:
+        image: Image, shape (..., azimuth, range), complex, or real power.
+        looks: Samples (a, r) of a block in azimuth and range.
+
+    Returns:
+        Amplitude, shape (..., azimuth // a, range // r), real.
+
+    Raises:
+        ValueError: If a block exceeds the image.
     """
     peak = image.detach().abs().amax((-2, -1), keepdim=True)
     mean = multilook(image / torch.where(peak > 0, peak, 1), looks) if image.is_complex() else multilook(image, looks)
@@ -46,9 +71,15 @@ def amplitude(image: Tensor, looks: tuple[int, int] = (1, 1)) -> Tensor:
 
 
 def to_db(power_: Tensor, floor_db: float = -120.0, reference: Tensor | None = None) -> Tensor:
-    """10 lg of power over a reference, (..., azimuth, range): by default each trial's own maximum.
+    """Convert power to decibels relative to a reference, 10 log10(power / reference).
 
-    Clamped at floor_db; an all-zero image is the floor.
+    Args:
+        power_: Power, shape (..., azimuth, range).
+        floor_db: Least value in dB; an all-zero image has this value.
+        reference: Reference power, shape (...,); None for the maximum of each trial.
+
+    Returns:
+        Power in dB, same shape.
     """
     top = power_.detach().amax((-2, -1)) if reference is None else reference
     top = top[..., None, None]
@@ -57,8 +88,15 @@ def to_db(power_: Tensor, floor_db: float = -120.0, reference: Tensor | None = N
 
 
 def quicklook_looks(shape: tuple[int, ...], step_m: tuple[float, float], size: int) -> tuple[int, int]:
-    """Looks that bring an image of (azimuth, range) shape to at most `size` samples a side with
-    cells as square as whole numbers allow.
+    """Choose looks for a picture of limited size with cells as square as whole numbers allow.
+
+    Args:
+        shape: Shape of the image, ending in (azimuth, range).
+        step_m: Sample spacing in azimuth and range in metres.
+        size: Largest number of samples per side.
+
+    Returns:
+        Looks in azimuth and range.
     """
     azimuth, range_ = shape[-2:]
     side = max(azimuth * step_m[0], range_ * step_m[1]) / size
@@ -67,13 +105,15 @@ def quicklook_looks(shape: tuple[int, ...], step_m: tuple[float, float], size: i
 
 
 def _looked(axis: Axis, looks: int) -> Axis:
-    """The axis of block means: samples at the middles of the blocks."""
+    """Axis of block means, with samples at the middles of the blocks."""
     return Axis(axis.name, axis.n // looks, axis.start + (looks - 1) / 2 * axis.step, axis.step * looks, axis.unit)
 
 
 class Detect(Stage):
-    """Amplitude of a focused image, sqrt of the mean power over `looks` (azimuth, range); the axes
-    follow.
+    """Stage that computes the amplitude of a focused image, see `amplitude`.
+
+    Args:
+        looks: Samples of a block in azimuth and range.
     """
 
     works_on = ("azimuth", "range")
@@ -83,14 +123,27 @@ class Detect(Stage):
         self.looks = looks
 
     def forward(self, signal: Signal) -> Signal:
+        """Detect an image with axes (azimuth, range); the axes are those of the blocks.
+
+        Args:
+            signal: Focused image.
+
+        Raises:
+            ValueError: If a block exceeds the image.
+        """
         data = amplitude(signal.data, self.looks)
         azimuth, range_ = signal.axes
         return Signal(data, (_looked(azimuth, self.looks[0]), _looked(range_, self.looks[1])))
 
 
 class QuickLook(Stage):
-    """Amplitude picture of at most `size` samples a side, cells as square in metres as whole looks
-    allow.
+    """Stage that makes an amplitude picture of limited size with cells nearly square in metres.
+
+    Args:
+        size: Largest number of samples per side.
+
+    Raises:
+        ValueError: If `size` is below 1.
     """
 
     works_on = ("azimuth", "range")
@@ -102,5 +155,10 @@ class QuickLook(Stage):
         self.size = size
 
     def forward(self, signal: Signal) -> Signal:
+        """Make the picture of an image with axes (azimuth, range).
+
+        Args:
+            signal: Focused image.
+        """
         azimuth, range_ = signal.axes
         return Detect(quicklook_looks(signal.data.shape, (azimuth.step, range_.step), self.size))(signal)

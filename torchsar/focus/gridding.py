@@ -1,12 +1,15 @@
-"""A non-uniform FFT along pulses whose points are shared by all range cells: range stays
-contiguous, and only short tables depend on the points.
+"""Non-uniform FFT along pulses with points that all range cells share.
 
-Spreading, interpolating and the derivative of either in the tap weights are the three partial
-derivatives of one trilinear form, so that they are each other's gradients to any order: sum over m,
-tap and column of weights[m, tap] * values[m, column] * grid[first[m] + tap, column]. Each is one
-bag of weighted rows (`embedding_bag`), which on a CPU core takes a tenth of the time of adding
-complex rows by index. Source: Fessler and Sutton 2003 (gridding), Barnett et al. 2019 (kernel,
-error against width and oversampling); own code.
+Range remains contiguous in memory, and only short tables depend on the points. Spreading,
+interpolation and the derivative of either in the tap weights are the three partial derivatives of
+one trilinear form, sum over m, tap and column of
+weights[m, tap] * values[m, column] * grid[first[m] + tap, column]. They are therefore each other's
+gradients to any order. Each is a bag of weighted rows (`embedding_bag`), which on a CPU core takes
+a tenth of the time of adding complex rows by index.
+
+Reference:
+    Fessler and Sutton 2003 (gridding); Barnett et al. 2019 (kernel, error against width and
+    oversampling).
 """
 
 from __future__ import annotations
@@ -22,37 +25,59 @@ from torch.nn.functional import embedding_bag
 from torchsar.core import block_bytes_of, over_blocks, real_dtype
 from torchsar.focus.nufft import Kernel, smooth_length
 
+# the three factors of the trilinear form, in the order of the arguments of `_Trilinear`
 _PARTS = ("weights", "values", "grid")
 
 
 def spread_rows(weights: Tensor, values: Tensor, first: Tensor, length: int) -> Tensor:
     """Add weights[m, tap] * values[m] onto row first[m] + tap of a grid.
 
-    Real (b, m, tap), (b, m, column), int64 (b, m) -> (b, length, column).
+    Fastest where `first` rises along m. Differentiable any number of times in weights and values.
 
-    Fastest where `first` rises along m. Differentiable any number of times in weights and values,
-    as the other two.
+    Args:
+        weights: Tap weights, shape (b, m, tap), real.
+        values: Rows of values, shape (b, m, column), real.
+        first: First grid row of each point, shape (b, m), int64.
+        length: Number of grid rows.
+
+    Returns:
+        Grid, shape (b, length, column).
     """
     return _Trilinear.apply("grid", length, first, weights, values)
 
 
 def interpolate_rows(weights: Tensor, grid: Tensor, first: Tensor) -> Tensor:
-    """Adjoint of spread_rows in the values: sum over taps of weights[m, tap] * grid[first[m] +
-    tap], (b, m, column).
+    """Apply the adjoint of `spread_rows` in the values: sum weights[m, tap] * grid[first[m] + tap].
+
+    Args:
+        weights: Tap weights, shape (b, m, tap), real.
+        grid: Grid, shape (b, row, column), real.
+        first: First grid row of each point, shape (b, m), int64.
+
+    Returns:
+        Values, shape (b, m, column).
     """
     return _Trilinear.apply("values", 0, first, weights, grid)
 
 
 def correlate_rows(values: Tensor, grid: Tensor, first: Tensor, taps: int) -> Tensor:
-    """Adjoint of spread_rows in the weights: sum over columns of values[m] * grid[first[m] + tap],
-    (b, m, tap).
+    """Apply the adjoint of `spread_rows` in the weights: sum values[m] * grid[first[m] + tap].
+
+    Args:
+        values: Rows of values, shape (b, m, column), real.
+        grid: Grid, shape (b, row, column), real.
+        first: First grid row of each point, shape (b, m), int64.
+        taps: Number of taps.
+
+    Returns:
+        Weights, shape (b, m, tap).
     """
     return _Trilinear.apply("weights", taps, first, values, grid)
 
 
 class _Trilinear(torch.autograd.Function):
-    """One partial derivative of the trilinear form; a and b are the other two parts, in the order
-    of _PARTS. size: taps or grid rows, where wanted.
+    """One partial derivative of the trilinear form; a and b are the other two factors in the order
+    of _PARTS, `size` is the number of taps or grid rows of the result.
     """
 
     @staticmethod
@@ -84,7 +109,7 @@ class _Trilinear(torch.autograd.Function):
 
 
 def _partial(name: str, parts: dict[str, Tensor], first: Tensor) -> Tensor:
-    """Derivative of the form in the named part, which lends its size."""
+    """Derivative of the form by the named factor, in the size of that factor."""
     others = [parts[part] for part in _PARTS if part != name]
     size = {"grid": parts["grid"].shape[-2], "weights": parts["weights"].shape[-1], "values": 0}[name]
     return _Trilinear.apply(name, size, first, *others)
@@ -103,6 +128,7 @@ def _rows(first: Tensor, taps: int, length: int) -> Tensor:
 
 
 def _interpolate(weights: Tensor, grid: Tensor, first: Tensor) -> Tensor:
+    """Weighted sum of grid rows per point."""
     rows = _rows(first, weights.shape[-1], grid.shape[-2])
     return embedding_bag(rows, grid.flatten(0, 1), mode="sum", per_sample_weights=weights.flatten(0, 1)).unflatten(
         0, first.shape
@@ -110,8 +136,8 @@ def _interpolate(weights: Tensor, grid: Tensor, first: Tensor) -> Tensor:
 
 
 def _correlate(values: Tensor, grid: Tensor, first: Tensor, taps: int) -> Tensor:
-    """The derivative of the bags in their weights: torch has it as one operation, gathering all
-    taps of all rows first takes four times as long.
+    """Derivative of the bags by their weights as one torch operation; gathering all taps of all
+    rows first takes four times as long.
     """
     count = first.numel()
     starts = torch.arange(0, count * taps, taps, device=first.device)
@@ -124,8 +150,8 @@ def _correlate(values: Tensor, grid: Tensor, first: Tensor, taps: int) -> Tensor
 
 
 def _spread(weights: Tensor, values: Tensor, first: Tensor, length: int) -> Tensor:
-    """Every grid row gathers the values that reach it: the entries of a row follow one another in
-    `source`, from `starts` on.
+    """Weighted sum of values per grid row; the entries of a row are contiguous in `source`, from
+    `starts` on.
     """
     b, m, taps = weights.shape
     rank, start = _ranks(first), _rows(first, 1, length).flatten()
@@ -135,17 +161,17 @@ def _spread(weights: Tensor, values: Tensor, first: Tensor, length: int) -> Tens
     entries = below - before
     starts = entries.cumsum(0) - entries
     rows = _rows(first, taps, length)
-    place = ((starts - before).index_select(0, rows.flatten()).view(-1, taps) + rank[:, None]).flatten()
+    slot = ((starts - before).index_select(0, rows.flatten()).view(-1, taps) + rank[:, None]).flatten()
     point = torch.arange(b * m, device=first.device).repeat_interleave(taps)
-    source = torch.empty_like(point).scatter_(0, place, point)
-    ordered = torch.empty_like(weights).flatten().scatter_(0, place, weights.flatten())
+    source = torch.empty_like(point).scatter_(0, slot, point)
+    ordered = torch.empty_like(weights).flatten().scatter_(0, slot, weights.flatten())
     return embedding_bag(source, values.flatten(0, 1), starts, mode="sum", per_sample_weights=ordered).unflatten(
         0, (b, length)
     )
 
 
 def _ranks(first: Tensor) -> Tensor:
-    """Place of each point in the order of its trial and grid row, (b * m,)."""
+    """Position of each point in the order of trial and grid row, (b * m,)."""
     every = torch.arange(first.numel(), device=first.device)
     if not bool((first.diff(dim=-1) < 0).any()):
         return every
@@ -156,8 +182,12 @@ def _ranks(first: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class PulsePoints:
-    """Where pulses lie on the grid: index of the first row, int64 (..., m), tap weights (..., m,
-    tap), and the number of rows that they reach.
+    """Positions of the pulses on the grid of a `PulseNufft`.
+
+    Args:
+        first: Index of the first grid row, shape (..., m), int64.
+        weights: Tap weights, shape (..., m, tap).
+        rows: Number of grid rows that the points reach.
     """
 
     first: Tensor
@@ -166,12 +196,16 @@ class PulsePoints:
 
 
 class PulseNufft:
-    """Sums of pulses at points of their own into uniform lines, and the adjoint: for data (...,
-    pulse, range) and points (..., pulse) in cycles a line.
+    """Sums of pulses at non-uniform points into uniform lines, and the adjoint.
 
-    lines: output lines, of which number `lines // 2` is frequency zero. kernel: width and
-    oversampling, `Kernel.of(eps)` or `Kernel(taps, oversampling)`. Built for one dtype and device;
-    no points are kept. scale: factor on all results of type1 and type2.
+    Built for one dtype and device; the points are arguments of each transform.
+
+    Args:
+        lines: Number of lines; line `lines // 2` is frequency zero.
+        kernel: Interpolation kernel, `Kernel.of(eps)` or `Kernel(taps, oversampling)`.
+        dtype: Complex type of the data.
+        device: Device of the data.
+        scale: Factor on the results of `type1` and `type2`.
     """
 
     def __init__(
@@ -185,21 +219,26 @@ class PulseNufft:
         self.lines, self.kernel, self.dtype = lines, kernel, dtype
         self.length = smooth_length(max(math.ceil(kernel.oversampling * lines), 2 * kernel.taps))
         line = torch.arange(lines, dtype=torch.float64, device=device) - lines // 2
-        # taps start at the row of their point, half a width late; so a point on a row has its taps
-        # about the middle of the kernel at any width
+        # the taps start at the row of their point instead of half a width before it, so that a
+        # point on a row has its taps about the middle of the kernel for any width; the factor
+        # corrects the shift
         late = (kernel.taps - 1) / 2 / self.length
         self._factor = torch.polar(scale / kernel.spectrum(line / self.length), -2 * math.pi * late * line).to(dtype)
 
     def points(self, cycles_per_line: Tensor) -> PulsePoints:
-        """Prepare points, float64 (..., m), any real numbers (periodic in 1). Differentiable.
+        """Prepare points; differentiable.
 
-        Raises TypeError unless float64.
+        A trial with points that are not finite gives NaN and leaves the other trials unchanged.
 
-        A trial with points that are not finite transforms into NaN, its neighbours do not: searches
-        try any warp.
+        Args:
+            cycles_per_line: Points in cycles per line, shape (..., m), float64, any real numbers
+                (periodic in 1).
+
+        Raises:
+            TypeError: If the points are not float64.
         """
         if cycles_per_line.dtype != torch.float64:
-            raise TypeError(f"points of a non-uniform FFT are float64 cycles, got {cycles_per_line.dtype}")
+            raise TypeError(f"points of a non-uniform FFT must be float64 cycles, got {cycles_per_line.dtype}")
         whole = torch.floor(cycles_per_line.detach())
         position = (cycles_per_line - whole) * self.length
         first = torch.nan_to_num(torch.round(position.detach()), 0.0, 0.0, 0.0)
@@ -207,8 +246,8 @@ class PulseNufft:
         return PulsePoints(first.to(torch.int64), weights.movedim(0, -1), self._reach(first))
 
     def _reach(self, first: Tensor) -> int:
-        """Rows that the taps reach, so that what lies behind is never handled; all of them inside
-        vmap, where a value cannot be looked at.
+        """Number of rows that the taps reach, so that rows beyond are not processed; all rows
+        inside vmap, where values cannot be read.
         """
         try:
             return int(first.max()) + self.kernel.taps
@@ -216,9 +255,16 @@ class PulseNufft:
             return self.length + self.kernel.taps + 1
 
     def type1(self, y: Tensor, points: PulsePoints) -> Tensor:
-        """sum_m y[m] exp(+2j pi p[m] (q - lines // 2)), q = 0..lines - 1.
+        """Compute sum_m y[m] exp(+2j pi p[m] (q - lines // 2)) for q = 0..lines - 1.
 
-        y: (..., m, range) -> (..., lines, range). Differentiable in y and points.
+        Differentiable in `y` and in the points.
+
+        Args:
+            y: Pulses, shape (..., m, range), complex.
+            points: Points p of the pulses.
+
+        Returns:
+            Lines, shape (..., lines, range).
         """
         trials = torch.broadcast_shapes(y.shape[:-2], points.first.shape[:-1])
         first, weights = _joined(points.first, trials, 1), _joined(points.weights, trials, 2)
@@ -229,9 +275,14 @@ class PulseNufft:
         return image.view(*trials, *image.shape[-2:])
 
     def type2(self, x: Tensor, points: PulsePoints) -> Tensor:
-        """Adjoint of type1: sum_q x[q] exp(-2j pi p[m] (q - lines // 2)).
+        """Compute sum_q x[q] exp(-2j pi p[m] (q - lines // 2)), the adjoint of `type1`.
 
-        x: (..., lines, range) -> (..., m, range).
+        Args:
+            x: Lines, shape (..., lines, range), complex.
+            points: Points p of the pulses.
+
+        Returns:
+            Pulses, shape (..., m, range).
         """
         trials = torch.broadcast_shapes(x.shape[:-2], points.first.shape[:-1])
         first, weights = _joined(points.first, trials, 1), _joined(points.weights, trials, 2)
@@ -241,16 +292,14 @@ class PulseNufft:
 
 
 def _joined(x: Tensor, trials: torch.Size, trailing: int) -> Tensor:
-    """x for all trials, as one leading dim."""
+    """x for all trials, with one leading dim."""
     return x.expand(*trials, *x.shape[x.ndim - trailing :]).reshape(-1, *x.shape[x.ndim - trailing :])
 
 
 class _Lines(torch.autograd.Function):
-    """Grid rows to lines, (b, row, range) -> (b, line, range): inverse FFT along rows, crop,
-    factor; with rows > 0 its adjoint, onto so many rows.
-
-    Works on blocks of columns that stay in the cache and lie along memory while they are
-    transformed. Lines come back with range strided.
+    """Grid rows to lines, (b, row, range) to (b, line, range): inverse FFT along rows, crop,
+    factor; with rows > 0 its adjoint onto that number of rows. Works on blocks of columns that
+    fit the cache and are contiguous while they are transformed; lines have a strided range dim.
     """
 
     @staticmethod
@@ -275,8 +324,8 @@ class _Lines(torch.autograd.Function):
 
 
 def _blocks(x: Tensor, length: int) -> list[tuple[slice, slice]]:
-    """Parts (trial, column) of x (b, n, column) whose transforms stay in the cache: trials where
-    several fit, else columns of one.
+    """Parts (trial, column) of x (b, n, column) whose transforms fit the cache: several trials, or
+    columns of one trial.
     """
     b, _, columns = x.shape
     room = max(8, 4 * block_bytes_of(x.device) // (length * x.element_size()))
@@ -287,6 +336,7 @@ def _blocks(x: Tensor, length: int) -> list[tuple[slice, slice]]:
 
 
 def _grid_to_lines(grid: Tensor, factor: Tensor, length: int) -> Tensor:
+    """Inverse FFT of grid rows, cropped to the lines and multiplied by the factor."""
     b, rows, columns = grid.shape
     lines, half, inside = factor.shape[0], factor.shape[0] // 2, min(rows, length)
     out = grid.new_empty(b, columns, lines)
@@ -306,6 +356,7 @@ def _grid_to_lines(grid: Tensor, factor: Tensor, length: int) -> Tensor:
 
 
 def _lines_to_grid(x: Tensor, factor: Tensor, length: int, rows: int) -> Tensor:
+    """Adjoint of `_grid_to_lines` onto `rows` grid rows."""
     b, lines, columns = x.shape
     half, inside, conj = lines // 2, min(rows, length), factor.conj().resolve_conj()
     out = x.new_empty(b, rows, columns)

@@ -1,12 +1,12 @@
-"""One-dimensional non-uniform Fourier transforms with points of their own in every row, and the
-interpolation kernel behind them.
+"""One-dimensional non-uniform FFT with separate points in every row, and its interpolation kernel.
 
-Type 2 evaluates the spectrum of uniform samples at arbitrary frequencies, type 1 is its adjoint: it
-sums samples taken at arbitrary points into uniform frequencies. Both go over a twice oversampled
-FFT grid with a Kaiser-Bessel kernel whose width follows from the wanted accuracy `eps`; the kernel
-is evaluated as one small matrix product of polynomials. Differentiable in samples and points.
-Source: Fessler and Sutton 2003 (gridding), Barnett et al. 2019 (kernel as piecewise polynomial);
-own code.
+Type 2 evaluates the spectrum of uniform samples at arbitrary frequencies; type 1, its adjoint, sums
+samples at arbitrary points into uniform frequencies. Both use a twice oversampled FFT grid and a
+Kaiser-Bessel kernel whose width follows from the accuracy `eps`; the kernel is evaluated as one
+small matrix product of polynomials. Differentiable in samples and points.
+
+Reference:
+    Fessler and Sutton 2003 (gridding); Barnett et al. 2019 (kernel as piecewise polynomial).
 """
 
 from __future__ import annotations
@@ -21,16 +21,23 @@ from torch.nn.functional import pad
 
 from torchsar.core import real_dtype
 
+# fineness of the FFT grid relative to the samples, the usual choice in gridding
 OVERSAMPLING = 2
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """Kaiser-Bessel interpolation kernel of `taps` grid points, 2..16, on a grid `oversampling`
-    times as fine as the samples, 1.25..2.
+    """Kaiser-Bessel interpolation kernel.
 
-    `Kernel.of(eps)` chooses the width. A grid of 1.25 needs about 1.6 times the taps of one of 2
-    and an FFT of 5/8 the length.
+    `Kernel.of(eps)` chooses the width. A grid of 1.25 needs about 1.6 times the taps of a grid of
+    2, and an FFT of 5/8 the length.
+
+    Args:
+        taps: Width in grid points, 2 to 16.
+        oversampling: Fineness of the grid relative to the samples, 1.25 to 2.
+
+    Raises:
+        ValueError: If a value lies outside its range.
     """
 
     taps: int
@@ -46,12 +53,16 @@ class Kernel:
 
     @staticmethod
     def of(eps: float, oversampling: float = OVERSAMPLING, even: bool = False) -> Kernel:
-        """The narrowest kernel whose relative error stays below eps.
+        """Choose the narrowest kernel whose relative error stays below eps.
 
-        Raises ValueError outside 1e-13..0.1, or where 16 taps are too few.
+        Args:
+            eps: Relative error, 1e-13 to 0.1.
+            oversampling: Fineness of the grid relative to the samples, 1.25 to 2.
+            even: Choose an even width. Odd widths are the default, because with an even one the set
+                of taps changes at points on the grid, and gradients there would be one-sided.
 
-        Odd widths unless `even`: with an even one, points on the grid lie where the set of taps
-        changes, and gradients there would be one-sided.
+        Raises:
+            ValueError: If `eps` lies outside its range, or 16 taps do not reach it.
         """
         if not 1e-13 <= eps <= 0.1:
             raise ValueError(f"a non-uniform FFT reaches relative errors of 1e-13 to 0.1, got eps={eps}")
@@ -66,20 +77,27 @@ class Kernel:
 
     @property
     def error(self) -> float:
-        """Relative error: the theoretical decay at a level that measurements against the direct sum
-        stay 1.2 to 5 times below.
+        """Relative error.
+
+        The theoretical decay, scaled so that errors measured against the direct sum are 1.2 to 5
+        times smaller.
         """
         free = 1 - 1 / self.oversampling
         return max(8 * free * math.sqrt(self.taps) * math.exp(-math.pi * self.taps * math.sqrt(free)), 3e-14)
 
     @property
     def shape(self) -> float:
+        """Shape parameter of the kernel, 0.98 pi taps (1 - 1 / (2 oversampling))."""
         return math.pi * self.taps * (1 - 0.5 / self.oversampling) * 0.98
 
     def weights(self, offset: Tensor) -> Tensor:
-        """Kernel values at the taps around a point.
+        """Evaluate the kernel at the taps around points.
 
-        offset: real (...,), point minus nearest centre tap, -0.5..0.5. Returns (taps, ...).
+        Args:
+            offset: Point minus nearest centre tap, -0.5..0.5, real (...,).
+
+        Returns:
+            Weights, shape (taps, ...).
         """
         coefficients = _polynomials(self).to(dtype=offset.dtype, device=offset.device)
         u = 2 * offset
@@ -90,8 +108,13 @@ class Kernel:
         return (coefficients @ stacked.flatten(1)).unflatten(-1, offset.shape)
 
     def spectrum(self, cycles: Tensor) -> Tensor:
-        """Fourier transform of the kernel at `cycles` per grid step, float64: what the
-        interpolation multiplies its input by.
+        """Evaluate the Fourier transform of the kernel, the factor that interpolation applies.
+
+        Args:
+            cycles: Frequencies in cycles per grid step, float64.
+
+        Returns:
+            Spectrum, same shape, float64.
         """
         # sinh(x) / x of a real or imaginary x, scaled as weights() are
         square = self.shape**2 - (math.pi * self.taps * cycles).square()
@@ -106,10 +129,10 @@ class Kernel:
 
 @functools.lru_cache
 def _polynomials(kernel: Kernel) -> Tensor:
-    """Coefficients of each tap's piece of the kernel in powers of twice the offset, float64 (taps,
-    degree + 1).
+    """Coefficients of the piece of the kernel at each tap in powers of twice the offset, float64
+    (taps, degree + 1).
     """
-    degree = kernel.taps  # one less still reaches the kernel's own error, two less does not
+    degree = kernel.taps  # found by trial: taps - 1 still reaches the kernel's error, taps - 2 does not
     u = torch.cos(math.pi * (torch.arange(3 * degree, dtype=torch.float64) + 0.5) / (3 * degree))
     tap = torch.arange(kernel.taps, dtype=torch.float64) - (kernel.taps - 1) / 2
     z = 2 * (tap[:, None] - u / 2) / kernel.taps
@@ -121,8 +144,11 @@ def _polynomials(kernel: Kernel) -> Tensor:
 
 @dataclass(frozen=True)
 class Points:
-    """Where rows are evaluated: index of the first tap, periodic, int64 (..., m), and the tap
-    weights (taps, ..., m).
+    """Positions of non-uniform points on the grid.
+
+    Args:
+        first: Index of the first tap, periodic, shape (..., m), int64.
+        weights: Tap weights, shape (taps, ..., m).
     """
 
     first: Tensor
@@ -130,10 +156,16 @@ class Points:
 
     @staticmethod
     def of(kernel: Kernel, start: Tensor, length: int, dtype: torch.dtype, shift: Tensor | None = None) -> Points:
-        """Positions start + shift in grid steps, any numbers, periodic in `length`.
+        """Prepare points at the positions start + shift.
 
-        start: float64, often one (m,) for all rows; shift: real (..., m), small enough for its own
-        precision. dtype: of the weights.
+        Args:
+            kernel: Interpolation kernel.
+            start: Positions in grid steps, any numbers, periodic in `length`; float64, often one
+                row (m,) for all.
+            length: Length of the grid.
+            dtype: Real type of the weights.
+            shift: Further positions in grid steps, shape (..., m), small enough for the precision
+                of its own dtype.
         """
         start = start - (kernel.taps - 1) / 2
         whole = torch.round(start.detach())
@@ -146,9 +178,14 @@ class Points:
 
 
 def interpolate(grid: Tensor, points: Points) -> Tensor:
-    """Sum over taps of weight * grid[first + tap], periodic.
+    """Sum weight * grid[first + tap] over the taps, periodic.
 
-    grid: complex (..., length); points (..., m). Returns (..., m).
+    Args:
+        grid: Grid, shape (..., length), complex.
+        points: Points, shape (..., m).
+
+    Returns:
+        Values at the points, shape (..., m).
     """
     taps, m = points.weights.shape[0], points.weights.shape[-1]
     rows = torch.broadcast_shapes(grid.shape[:-1], points.first.shape[:-1])
@@ -161,9 +198,15 @@ def interpolate(grid: Tensor, points: Points) -> Tensor:
 
 
 def spread(values: Tensor, points: Points, length: int) -> Tensor:
-    """Adjoint of interpolate: adds weight * value onto the grid. values: complex (..., m).
+    """Apply the adjoint of `interpolate`: add weight * value onto the grid.
 
-    Returns (..., length).
+    Args:
+        values: Values at the points, shape (..., m), complex.
+        points: Points, shape (..., m).
+        length: Length of the grid.
+
+    Returns:
+        Grid, shape (..., length).
     """
     taps, m = points.weights.shape[0], points.weights.shape[-1]
     rows = torch.broadcast_shapes(values.shape[:-1], points.first.shape[:-1])
@@ -177,16 +220,25 @@ def spread(values: Tensor, points: Points, length: int) -> Tensor:
 
 
 def _flat_index(first: Tensor, width: int) -> Tensor:
+    """Index of the first tap in the flattened grid of all rows."""
     row = torch.arange(math.prod(first.shape[:-1]), device=first.device) * width
     return (first + row.view(*first.shape[:-1], 1)).reshape(-1)
 
 
 class Nufft:
-    """Transforms between n uniform samples and points in cycles per sample, for one length and
-    accuracy; build once, use for many rows.
+    """Transforms between uniform samples and points in cycles per sample.
 
-    eps: relative error (root mean square over the points against the direct sum, for white
-    samples); complex64 data end at about 1e-6.
+    Built for one length and accuracy; use it for many rows.
+
+    Args:
+        n: Number of samples.
+        eps: Relative error, as the root mean square over the points against the direct sum, for
+            white samples; complex64 data reach about 1e-6.
+        dtype: Complex type of the data.
+        device: Device of the data.
+
+    Raises:
+        ValueError: If `eps` lies outside 1e-13..0.1.
     """
 
     def __init__(self, n: int, eps: float, dtype: torch.dtype, device: torch.device | str | None = None) -> None:
@@ -196,15 +248,21 @@ class Nufft:
         self.weight = (1 / self.kernel.spectrum(offset / self.length)).to(real_dtype(dtype))
 
     def points(self, cycles_per_sample: Tensor) -> Points:
-        """Prepare points, float64 (..., m), any real numbers (periodic in 1); they can be used for
-        several arrays.
+        """Prepare points, which can be used for several arrays.
+
+        Args:
+            cycles_per_sample: Points, shape (..., m), float64, any real numbers (periodic in 1).
         """
         return Points.of(self.kernel, cycles_per_sample * self.length, self.length, real_dtype(self.dtype))
 
     def grid(self, x: Tensor) -> Tensor:
-        """The oversampled spectrum that `interpolate` takes points from.
+        """Compute the oversampled spectrum that `interpolate` takes.
 
-        x: (..., n) -> (..., length).
+        Args:
+            x: Samples, shape (..., n), complex.
+
+        Returns:
+            Spectrum, shape (..., length).
         """
         x = x * self.weight
         half = self.n // 2
@@ -212,46 +270,97 @@ class Nufft:
         return torch.fft.fft(torch.cat([x[..., half:], gap, x[..., :half]], -1))
 
     def type2(self, x: Tensor, points: Points) -> Tensor:
-        """sum_j x_j exp(-2j pi p (j - n//2)). x: (..., n) -> (..., m)."""
+        """Compute sum_j x_j exp(-2j pi p (j - n//2)).
+
+        Args:
+            x: Samples, shape (..., n), complex.
+            points: Points p, shape (..., m).
+
+        Returns:
+            Spectrum at the points, shape (..., m).
+        """
         return interpolate(self.grid(x), points)
 
     def type1(self, y: Tensor, points: Points) -> Tensor:
-        """sum_k y_k exp(+2j pi p_k (j - n//2)), the adjoint of type2. y: (..., m) -> (..., n)."""
+        """Compute sum_k y_k exp(+2j pi p_k (j - n//2)), the adjoint of `type2`.
+
+        Args:
+            y: Values at the points, shape (..., m), complex.
+            points: Points p, shape (..., m).
+
+        Returns:
+            Samples, shape (..., n).
+        """
         x = torch.fft.ifft(spread(y, points, self.length), norm="forward")
         half = self.n // 2
         return torch.cat([x[..., self.length - half :], x[..., : self.n - half]], -1) * self.weight
 
 
 def nufft_type2(x: Tensor, points: Tensor, eps: float = 1e-6) -> Tensor:
-    """Spectrum of uniform samples at any frequencies, sum_j x_j exp(-2j pi p (j - n//2)).
+    """Evaluate the spectrum of uniform samples at any frequencies.
 
-    x: complex (..., n); points: float64 (..., m) in cycles per sample, rows of their own or shared;
-    leading dims broadcast. Returns (..., m). Differentiable in both. Raises TypeError where points
-    are not float64: float32 holds no fine place in a long row.
+    sum_j x_j exp(-2j pi p (j - n//2)). Differentiable in samples and points.
+
+    Args:
+        x: Samples, shape (..., n), complex.
+        points: Points p in cycles per sample, float64 (..., m); leading dims broadcast with those
+            of the samples.
+        eps: Relative error.
+
+    Returns:
+        Spectrum at the points, shape (..., m).
+
+    Raises:
+        TypeError: If the points are not float64; float32 does not resolve positions in a long row.
+        ValueError: If `eps` lies outside 1e-13..0.1.
     """
     plan = Nufft(x.shape[-1], eps, x.dtype, x.device)
     return plan.type2(x, plan.points(_as_points(points)))
 
 
 def nufft_type1(y: Tensor, points: Tensor, n: int, eps: float = 1e-6) -> Tensor:
-    """Adjoint of nufft_type2: x_j = sum_k y_k exp(+2j pi p_k (j - n//2)), j = 0..n-1.
+    """Sum samples at any points into uniform frequencies, the adjoint of `nufft_type2`.
 
-    y: (..., m), points: float64 (..., m) -> (..., n).
+    x_j = sum_k y_k exp(+2j pi p_k (j - n//2)), j = 0..n-1. Differentiable in samples and points.
+
+    Args:
+        y: Values at the points, shape (..., m), complex.
+        points: Points p in cycles per sample, float64 (..., m).
+        n: Number of uniform samples.
+        eps: Relative error.
+
+    Returns:
+        Uniform samples, shape (..., n).
+
+    Raises:
+        TypeError: If the points are not float64.
+        ValueError: If `eps` lies outside 1e-13..0.1.
     """
     plan = Nufft(n, eps, y.dtype, y.device)
     return plan.type1(y, plan.points(_as_points(points)))
 
 
 def _as_points(points: Tensor) -> Tensor:
+    """The points; raises TypeError unless float64."""
     if points.dtype != torch.float64:
-        raise TypeError(f"points of a non-uniform FFT are float64 cycles per sample, got {points.dtype}")
+        raise TypeError(f"points of a non-uniform FFT must be float64 cycles per sample, got {points.dtype}")
     return points
 
 
 def smooth_length(n: int) -> int:
-    """The least FFT length >= n with no prime factor above 5."""
+    """Return the least FFT length of at least n without prime factors above 5.
+
+    Args:
+        n: Least length.
+
+    Raises:
+        ValueError: If n is below 1.
+    """
+    if n < 1:
+        raise ValueError(f"an FFT has at least one sample, got the length {n}")
 
     def is_smooth(k: int) -> bool:
+        """Whether k has no prime factor above 5."""
         for p in (2, 3, 5):
             while k % p == 0:
                 k //= p

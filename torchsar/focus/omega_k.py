@@ -2,12 +2,17 @@
 
 A target at slant range R from the beam centre, crossed at slow time t, has the two-dimensional
 spectrum (stationary phase)
-    exp(-j 2 pi [2 R G(f, X) / c + f_a t]),   G = cos(s) sqrt((f0 + f)^2 - X^2) + sin(s) X,   X = c
-    f_a / (2 v),
-with s the squint of the frame Doppler: sin(s) = lambda f_frame / (2 v). In wavenumber space G is a
-rotation by s, so G = f0 + f with zero slope at the frame Doppler: images keep the range and azimuth
-axes of the raw matrix, and their spectra stay centred however large the squint. A frame of 0 Hz
-gives the classical zero-Doppler image. Source: brief 004, item 7; Tsvetkov 2017, steps 1 to 6.
+
+    exp(-j 2 pi [2 R G(f, X) / c + f_a t]),    X = c f_a / (2 v),
+    G = cos(s) sqrt((f0 + f)^2 - X^2) + sin(s) X,
+
+with s the squint of the frame Doppler, sin(s) = lambda f_frame / (2 v). In wavenumber space G is a
+rotation by s, so that G = f0 + f with zero slope at the frame Doppler: images keep the range and
+azimuth axes of the raw matrix, and their spectra stay centred at any squint. A frame of 0 Hz gives
+the classical zero-Doppler image.
+
+Reference:
+    Tsvetkov 2017, focusing steps 1 to 6 after Eq. (2).
 """
 
 from __future__ import annotations
@@ -39,8 +44,8 @@ from torchsar.core import (
 from torchsar.focus.reference import REFERENCES
 from torchsar.radar import StripmapRadar
 
-# phase that the stationary-phase spectrum of a receding-frequency azimuth signal carries beside its
-# exponent, taken back by the bulk filter
+# phase in turns (pi / 4) of the stationary-phase spectrum of an azimuth signal with falling
+# frequency, which the bulk filter removes
 STATIONARY_TURNS = 1 / 8
 
 
@@ -51,11 +56,20 @@ def wavenumber(
     velocity_m_s: Tensor | float,
     frame_hz: Tensor | float,
 ) -> Tensor:
-    """G(f, f_a) - f0, float64: range frequency after the wavenumber mapping.
+    """Map range frequencies to wavenumbers: G(f, f_a) - f0.
 
-    frequency_hz: (f,) baseband; doppler_hz: (..., d); velocity and frame: (...,). Returns (..., d,
-    f). Differences are formed before they can lose digits, and evanescent pairs (|X| > f0 + f) are
-    clamped to grazing.
+    Differences are formed before they can lose digits. Evanescent pairs (|X| > f0 + f) are clamped
+    to grazing incidence.
+
+    Args:
+        radar: Radar of the recording.
+        frequency_hz: Baseband range frequencies in Hz, shape (f,).
+        doppler_hz: Doppler frequencies in Hz, shape (..., d).
+        velocity_m_s: Effective velocity in m/s, a number or shape (...,).
+        frame_hz: Frame Doppler in Hz, a number or shape (...,).
+
+    Returns:
+        Mapped frequencies in Hz, shape (..., d, f), float64.
     """
     velocity, frame = (per_trial(value, 2, doppler_hz) for value in (velocity_m_s, frame_hz))
     f0, c = radar.carrier_hz, radar.wave_speed_m_s
@@ -64,19 +78,30 @@ def wavenumber(
     cos = torch.sqrt(1 - sin.square())
     root = torch.sqrt(((f0 + frequency_hz - x) * (f0 + frequency_hz + x)).clamp_min(0))
     at_frame = f0 * cos
-    # cos * root + sin * x - f0, with f0 = f0 (cos^2 + sin^2) taken apart
+    # cos * root + sin * x - f0, with f0 split into f0 (cos^2 + sin^2)
     return cos * (root - at_frame) + sin * (x - f0 * sin)
 
 
-BAND_EDGE = 0.1  # of the band, the width of its raised-cosine edges
+# chosen: width of the raised-cosine edges relative to the processed band
+BAND_EDGE = 0.1
 
 
 def band_weight(radar: StripmapRadar, offset_hz: Tensor, band_hz: float) -> Tensor:
-    """Weight of Doppler offsets from the centroid in a processed band: 1 inside, 1/2 at +-band_hz /
-    2, raised-cosine edges of a tenth of the band.
+    """Compute the weights of a processed Doppler band: 1 inside, 1/2 at +-band_hz / 2.
 
-    Raises ValueError where band_hz is no positive number; warns where band and edges do not fit the
-    PRF, which folds azimuth.
+    The edges are raised cosines of a tenth of the band. Warns where band and edges exceed the PRF,
+    so that azimuth spectra fold.
+
+    Args:
+        radar: Radar of the recording.
+        offset_hz: Doppler relative to the centroid in Hz, any shape.
+        band_hz: Processed bandwidth in Hz.
+
+    Returns:
+        Weights, same shape as `offset_hz`.
+
+    Raises:
+        ValueError: If `band_hz` is not a positive number.
     """
     if not (math.isfinite(band_hz) and band_hz > 0):
         raise ValueError(f"the processed Doppler band must be a positive number of Hz, got {band_hz}")
@@ -93,10 +118,14 @@ def band_weight(radar: StripmapRadar, offset_hz: Tensor, band_hz: float) -> Tens
 
 @dataclass(frozen=True)
 class FrameGeometry:
-    """The rows of an azimuth spectrum: radar, absolute Doppler (..., d), and velocity and frame
-    Doppler (...,), all float64.
+    """Geometry of the rows of an azimuth spectrum; all values are float64.
 
-    weight: (..., d) of a processed Doppler band, None for the whole PRF.
+    Args:
+        radar: Radar of the recording.
+        doppler_hz: Absolute Doppler of the rows in Hz, shape (..., d).
+        velocity_m_s: Effective velocity in m/s, shape (...,).
+        frame_hz: Frame Doppler in Hz, shape (...,).
+        weight: Weights of a processed Doppler band, shape (..., d); None for the whole PRF.
     """
 
     radar: StripmapRadar
@@ -115,9 +144,21 @@ class FrameGeometry:
         device: torch.device | None = None,
         band_hz: float | None = None,
     ) -> FrameGeometry:
-        """Geometry of all rows of raw (..., pulse, range).
+        """Build the geometry of all rows of raw data.
 
-        Raises ValueError where the Doppler asks for a squint beyond 90 degrees.
+        Args:
+            radar: Radar of the recording.
+            raw: Raw data, shape (..., pulse, range).
+            doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,).
+            velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
+                radar.
+            frame_hz: Frame Doppler in Hz; None for the nominal pointing, else the centroid.
+            device: Device of the result; None for that of the data.
+            band_hz: Processed Doppler bandwidth in Hz; None for the whole PRF.
+
+        Raises:
+            ValueError: If a value per trial has another shape than the trials, the velocity is not
+                positive, or a Doppler exceeds 2 velocity / wavelength.
         """
         device = raw.device if device is None else device
         centroid = torch.as_tensor(doppler_hz, dtype=torch.float64, device=device)
@@ -132,7 +173,7 @@ class FrameGeometry:
                     f"{name} of shape {tuple(value.shape)} does not match the trial dims "
                     f"{tuple(raw.shape[:-2])} of the data; give one number per trial"
                 )
-        _refuse_impossible(radar, velocity, centroid, frame)
+        _check_squint(radar, velocity, centroid, frame)
         doppler = radar.doppler_hz(raw.shape[-2], centroid, device)
         return FrameGeometry(
             radar,
@@ -143,49 +184,75 @@ class FrameGeometry:
         )
 
     def rows(self, part: slice) -> FrameGeometry:
-        """The same for some of the rows."""
+        """Select some of the rows.
+
+        Args:
+            part: Slice of the Doppler axis.
+        """
         return replace(
             self, doppler_hz=self.doppler_hz[..., part], weight=None if self.weight is None else self.weight[..., part]
         )
 
     def weighted(self, lines: Tensor) -> Tensor:
-        """lines (..., d, n) times the weight of their row, where there is one."""
+        """Multiply lines by the weight of their row, if there is one.
+
+        Args:
+            lines: Lines, shape (..., d, n), complex.
+
+        Returns:
+            Lines, same shape.
+        """
         return lines if self.weight is None else lines * self.weight.to(real_dtype(lines.dtype))[..., None]
 
     @property
     def requires_grad(self) -> bool:
+        """True where Doppler, velocity or frame require gradients."""
         return any(value.requires_grad for value in (self.doppler_hz, self.velocity_m_s, self.frame_hz))
 
     def mapped(self, frequency_hz: Tensor) -> Tensor:
-        """wavenumber() of these rows, (..., d, f)."""
+        """Apply `wavenumber` to these rows.
+
+        Args:
+            frequency_hz: Baseband range frequencies in Hz, shape (f,).
+
+        Returns:
+            Mapped frequencies in Hz, shape (..., d, f).
+        """
         return wavenumber(self.radar, frequency_hz, self.doppler_hz, self.velocity_m_s, self.frame_hz)
 
 
-def _refuse_impossible(radar: StripmapRadar, velocity_m_s: Tensor, *doppler_hz: Tensor) -> None:
-    """Raise ValueError for velocities that are not positive and for Dopplers that no squint
-    gives.
+def _check_squint(radar: StripmapRadar, velocity_m_s: Tensor, *doppler_hz: Tensor) -> None:
+    """Raise ValueError for velocities that are not positive and for Dopplers beyond 90 degrees of
+    squint.
     """
     try:
         slowest = float(velocity_m_s.detach().min())
         largest = max(
             float(radar.sin_squint(value.detach(), velocity_m_s.detach()).abs().max()) for value in doppler_hz
         )
-    except RuntimeError:  # inside vmap a value cannot be looked at
+    except RuntimeError:  # inside vmap a value cannot be read
         return
     if not 0 < slowest < math.inf:
         raise ValueError(f"velocity_m_s must be positive and finite in every trial, got {slowest:g}")
     if not largest < 1:
         raise ValueError(
-            f"a Doppler asks for a squint of sine {largest:.4g}; doppler_hz and frame_hz must "
+            f"a Doppler needs a squint of sine {largest:.4g}; doppler_hz and frame_hz must "
             "stay below 2 * velocity / wavelength in magnitude"
         )
 
 
 def residual_frequency(at: FrameGeometry, offset_hz: Tensor) -> Tensor:
-    """What bulk + refocus leave of the wavenumber mapping: f(G(0) + h) - h in Hz, float64 (..., d,
-    h), for image frequencies h about G(0).
+    """Compute the part of the wavenumber mapping that bulk filter and refocusing leave.
 
-    f(G) is the inverse of wavenumber(): the raw range frequency that an image frequency is made of.
+    f(G(0) + h) - h for image frequencies h about G(0), where f(G), the inverse of `wavenumber`, is
+    the raw range frequency of an image frequency.
+
+    Args:
+        at: Geometry of the rows.
+        offset_hz: Image frequencies h in Hz, shape (h,).
+
+    Returns:
+        Frequencies in Hz, shape (..., d, h), float64.
     """
     velocity, frame = (per_trial(value, 2, at.doppler_hz) for value in (at.velocity_m_s, at.frame_hz))
     f0, c = at.radar.carrier_hz, at.radar.wave_speed_m_s
@@ -197,11 +264,15 @@ def residual_frequency(at: FrameGeometry, offset_hz: Tensor) -> Tensor:
 
 
 class FrequencyBasis:
-    """Chebyshev polynomials over the range band: a smooth phase per Doppler row becomes a few
-    float64 numbers and one matrix product.
+    """Chebyshev polynomials over the range band, which evaluate smooth phases per Doppler row.
 
-    The number of nodes follows from the fractional bandwidth so that the polynomial errs below 1e-6
-    turn.
+    A phase then takes a few float64 numbers per row and one matrix product. The number of nodes
+    follows from the fractional bandwidth so that the polynomial errs below 1e-6 turn.
+
+    Args:
+        radar: Radar of the recording.
+        n: Number of range frequencies.
+        device: Device of the result.
     """
 
     def __init__(self, radar: StripmapRadar, n: int, device: torch.device | None = None) -> None:
@@ -216,14 +287,26 @@ class FrequencyBasis:
         self._polynomials = torch.cos(torch.acos(u) * order[:, None])
 
     def evaluate(self, values_at_nodes: Tensor, dtype: torch.dtype) -> Tensor:
-        """A smooth real function on the FFT grid in `dtype`, from its float64 values at the nodes,
-        (..., row, node) -> (..., row, n).
+        """Evaluate a smooth real function on the FFT grid from its values at the nodes.
+
+        Args:
+            values_at_nodes: Values, shape (..., row, node), float64.
+            dtype: Real type of the result.
+
+        Returns:
+            Values, shape (..., row, n).
         """
         return (values_at_nodes @ self._to_coefficients).to(dtype) @ self._polynomials.to(dtype)
 
     def phasor(self, turns_at_nodes: Tensor, dtype: torch.dtype) -> Tensor:
-        """exp(2j pi turns) on the FFT grid from float64 turns at the nodes, (..., row, node) ->
-        (..., row, n).
+        """Evaluate exp(2j pi turns) on the FFT grid from the turns at the nodes.
+
+        Args:
+            turns_at_nodes: Phase in turns, shape (..., row, node), float64.
+            dtype: Complex type of the result.
+
+        Returns:
+            Phasors, shape (..., row, n).
         """
         coefficients = turns_at_nodes @ self._to_coefficients
         constant = reduced_turns(coefficients[..., :1])
@@ -234,11 +317,21 @@ class FrequencyBasis:
 def bulk_filter(
     basis: FrequencyBasis, at: FrameGeometry, range_m: Tensor | float, reference: Tensor | None, dtype: torch.dtype
 ) -> Tensor:
-    """Conjugate two-dimensional spectrum of a target at range_m, (..., d, n): phase 2 pi [(2 R / c)
-    (G - f0 - f) + 1/8], 1/8 turn at the frame Doppler.
+    """Compute the conjugate two-dimensional spectrum of a target at one range.
 
-    A focused target then has the phase -4 pi R / lambda of its echo at the crossing of the beam
-    centre, as backprojection has. The range reference (n,) is multiplied in where there is one.
+    The phase is 2 pi [(2 R / c) (G - f0 - f) + 1/8], 1/8 turn at the frame Doppler. A focused
+    target then has the phase -4 pi R / lambda of its echo at the crossing of the beam centre, as in
+    backprojection.
+
+    Args:
+        basis: Basis over the range band.
+        at: Geometry of the rows.
+        range_m: Slant range R in metres.
+        reference: Range reference spectrum to include, shape (n,); None for none.
+        dtype: Complex type of the result.
+
+    Returns:
+        Filter, shape (..., d, n).
     """
     turns = (2 * range_m / at.radar.wave_speed_m_s) * (at.mapped(basis.nodes_hz) - basis.nodes_hz) + STATIONARY_TURNS
     h = basis.phasor(turns, dtype)
@@ -246,17 +339,30 @@ def bulk_filter(
 
 
 def refocus_turns_per_sample(at: FrameGeometry) -> Tensor:
-    """Turns per range sample of the azimuth phase left by the bulk filter, (2 dr / c) (G(0, X) -
-    f0), (..., d) float64.
+    """Compute the azimuth phase per range sample that the bulk filter leaves.
+
+    It is (2 dr / c) (G(0, X) - f0).
+
+    Args:
+        at: Geometry of the rows.
+
+    Returns:
+        Turns per range sample, shape (..., d), float64.
     """
     zero = torch.zeros(1, dtype=torch.float64, device=at.doppler_hz.device)
     return (2 * at.radar.range_step_m / at.radar.wave_speed_m_s) * at.mapped(zero)[..., 0]
 
 
 def refocus(rows: Tensor, turns_per_sample: Tensor, centre: int) -> Tensor:
-    """Azimuth phase of each range line relative to line `centre`.
+    """Apply the azimuth phase of each range line relative to line `centre`.
 
-    rows: (..., d, n) azimuth spectra; turns_per_sample: (..., d).
+    Args:
+        rows: Azimuth spectra, shape (..., d, n), complex.
+        turns_per_sample: Turns per range sample, shape (..., d).
+        centre: Range line of the bulk filter.
+
+    Returns:
+        Azimuth spectra, same shape.
     """
     return rows * linear_phasor(turns_per_sample, -centre, rows.shape[-1], rows.dtype)
 
@@ -271,18 +377,33 @@ def omega_k(
     reference: Tensor | None = None,
     band_hz: float | None = None,
 ) -> Tensor:
-    """Bulk + refocus omega-K (the form of Tsvetkov 2017, steps 1 to 5).
+    """Focus by bulk + refocus omega-K.
 
-    raw, result: (..., pulse, range) complex.
+    Neglects the change of migration over the swath, which `requirements` predicts; `omega_k_stolt`
+    does not. A focused target has the phase -4 pi R / lambda. Differentiable in the raw data, the
+    velocity and the frame; without gradients it works by blocks within one copy of the data.
 
-    doppler_hz: absolute Doppler centroid, about which the azimuth spectrum is unwrapped; frame_hz:
-    frame of the image coordinates, by default the radar's nominal pointing, else the centroid. Both
-    and velocity_m_s may differ per trial, (...,). reference: range reference spectrum (range,),
-    None for range-compressed data. band_hz: processed Doppler bandwidth about the centroid, None
-    for the whole PRF. Neglects the change of migration over the swath (`focus.requirements` says
-    how much that is); `omega_k_stolt` does not. A focused target has the phase -4 pi R / lambda.
-    Differentiable in raw, velocity and frame; without gradients it works by blocks in one copy of
-    the data.
+    Args:
+        raw: Raw or range-compressed data, shape (..., pulse, range), complex.
+        radar: Radar of the recording.
+        doppler_hz: Absolute Doppler centroid in Hz, about which the azimuth spectrum is unwrapped,
+            a number or shape (...,).
+        velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
+            radar.
+        frame_hz: Frame Doppler of the image coordinates in Hz; None for the nominal pointing, else
+            the centroid.
+        reference: Range reference spectrum, shape (range,); None for range-compressed data.
+        band_hz: Processed Doppler bandwidth about the centroid in Hz; None for the whole PRF.
+
+    Returns:
+        Image, shape (..., azimuth, range), complex.
+
+    Raises:
+        ValueError: If a value per trial has another shape than the trials, the velocity is not
+            positive, a Doppler exceeds 2 velocity / wavelength, or `band_hz` is not positive.
+
+    Reference:
+        Tsvetkov 2017, focusing steps 1 to 5 after Eq. (2).
     """
     geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz, band_hz=band_hz)
     n, centre = raw.shape[-1], raw.shape[-1] // 2
@@ -300,13 +421,20 @@ def omega_k(
 def through_doppler(
     raw: Tensor, focus_rows: Callable[[Tensor, slice], Tensor], differentiable: bool, block_bytes: int | None = None
 ) -> Tensor:
-    """Two-dimensional FFT, `focus_rows` on the rows of the spectrum, inverse azimuth FFT.
+    """Apply a function to the rows of the two-dimensional spectrum, then an inverse azimuth FFT.
 
-    raw, result: (..., pulse, range).
+    Where gradients are required all rows are processed at once; otherwise blocks of rows are
+    processed inside one copy of the data.
 
-    focus_rows takes rows (..., d, range frequency) and their slice of the Doppler axis, and returns
-    (..., d, range). Where gradients are wanted all rows go at once; otherwise blocks of rows are
-    worked on inside one copy of the data, which is all the memory it takes.
+    Args:
+        raw: Raw data, shape (..., pulse, range), complex.
+        focus_rows: Maps rows (..., d, range frequency) and their slice of the Doppler axis to (...,
+            d, range).
+        differentiable: Whether gradients are required.
+        block_bytes: Size of a block in bytes; None for the cache of the device.
+
+    Returns:
+        Image, same shape as the data.
     """
     if differentiable and torch.is_grad_enabled():
         return torch.fft.ifft(focus_rows(torch.fft.fft2(raw), slice(None)), dim=-2)
@@ -322,14 +450,25 @@ def through_doppler(
 
 
 class Focuser(Stage):
-    """Base of the focusing stages: a radar, a range reference, a velocity and a Doppler; `form` is
-    the function that does the work.
+    """Base of the focusing stages.
 
-    Image axes (azimuth, range) are in the coordinates of the frame Doppler. reference: a name of
-    REFERENCES to compress the pulse in the same pass, None for range-compressed data. velocity_m_s
-    and doppler_hz may be given here (a number, a per-trial tensor, or an nn.Parameter to optimise)
-    or by a chain at every call, which wins. band_hz: processed Doppler bandwidth, None for the
-    whole PRF.
+    The image axes (azimuth, range) are coordinates of the frame Doppler. Values of `velocity_m_s`
+    and `doppler_hz` that a chain connects take precedence over those given here. A subclass sets
+    `form`, the function that focuses.
+
+    Args:
+        radar: Radar of the recording.
+        reference: Name of the range reference in REFERENCES, compressed in the same pass; None for
+            range-compressed data.
+        velocity_m_s: Effective velocity in m/s: a number, a tensor per trial, or an nn.Parameter to
+            optimise; None for that of the radar.
+        doppler_hz: Absolute Doppler centroid in Hz, likewise; None for the nominal pointing or 0.
+        frame_hz: Frame Doppler of the image in Hz; None for the nominal pointing, else the
+            centroid.
+        band_hz: Processed Doppler bandwidth in Hz; None for the whole PRF.
+
+    Raises:
+        ValueError: If `reference` is not known.
     """
 
     form: Callable[..., Tensor]
@@ -356,7 +495,15 @@ class Focuser(Stage):
         self.hold("doppler_hz", (radar.pointing_doppler_hz or 0.0) if doppler_hz is None else doppler_hz)
 
     def spectrum(self, n: int, device: torch.device | str | None = None) -> Tensor | None:
-        """Range reference for lines of n samples, None for compressed data."""
+        """Return the range reference spectrum, or None for range-compressed data.
+
+        Args:
+            n: Number of samples of a line.
+            device: Device of the result.
+
+        Returns:
+            Spectrum, shape (n,), complex128.
+        """
         return (
             None
             if self.reference is None
@@ -364,6 +511,16 @@ class Focuser(Stage):
         )
 
     def forward(self, signal: Signal, doppler_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Signal:
+        """Focus a signal with axes (pulse, range).
+
+        Args:
+            signal: Recording.
+            doppler_hz: Doppler centroid in Hz; None for that of the stage.
+            velocity_m_s: Effective velocity in m/s; None for that of the stage.
+
+        Raises:
+            ValueError: As in the function that focuses.
+        """
         data = type(self).form(
             signal.data,
             replace(self.radar, near_range_m=signal.axes[-1].start),
@@ -377,17 +534,20 @@ class Focuser(Stage):
 
 
 class OmegaK(Focuser):
-    """Focus by bulk + refocus omega-K; arguments as `Focuser`."""
+    """Stage that focuses by bulk + refocus omega-K, see `omega_k`; arguments as in `Focuser`."""
 
     form = staticmethod(omega_k)
 
 
 class StoredOmegaK(Stage):
-    """OmegaK for fixed axes, velocity and Doppler, with its filters built once: for many recordings
-    of one geometry.
+    """Stage that focuses many recordings of one geometry with filters built once.
 
-    Holds one complex number per sample of the raw matrix. Built by `StoredOmegaK(stage, axes,
-    dtype)`.
+    Stores one complex number per sample of the raw matrix.
+
+    Args:
+        stage: Stage whose radar, reference, velocity and Doppler are used.
+        axes: Axes of the raw matrix, ending in (pulse, range).
+        dtype: Complex type of the data.
     """
 
     filter: Tensor
@@ -418,10 +578,18 @@ class StoredOmegaK(Stage):
             self.register_buffer("coarse", coarse)
 
     def forward(self, signal: Signal) -> Signal:
+        """Focus a signal on the axes of the stage.
+
+        Args:
+            signal: Recording.
+
+        Raises:
+            ValueError: If axes or dtype are not those that the filters were built for.
+        """
         if signal.axes != self.axes or signal.data.dtype != self.filter.dtype:
             raise ValueError(
                 f"stored filters are for the axes {self.axes} in {self.filter.dtype}, got "
-                f"{signal.axes} in {signal.data.dtype}; build them anew"
+                f"{signal.axes} in {signal.data.dtype}; build a new StoredOmegaK"
             )
 
         def focus_rows(rows: Tensor, part: slice) -> Tensor:

@@ -1,12 +1,14 @@
-"""Polar format by gridding: the image of plane waves as one two-dimensional non-uniform FFT, and
-its exact adjoint.
+"""Polar format by gridding: an image of plane waves as one two-dimensional non-uniform FFT.
 
-image(x, y) = sum_k sum_f s_k(f) exp(+4j pi f / c (u_k . (x, y) + offset_k)), which is
-backprojection with `FarField` ranges. The samples lie on a polar raster of wave vectors 2 f / c
-u_k; a Kaiser-Bessel kernel spreads them onto a twice oversampled rectangular grid, an FFT makes the
-image, a division removes the kernel. Where the spreading goes is worked out once, as a sparse
-matrix. Source: Fessler and Sutton 2003 (gridding); Carrara, Goodman and Majewski 1995, ch. 3 (polar
-format); own code.
+    image(x, y) = sum_k sum_f s_k(f) exp(+4j pi f / c (u_k . (x, y) + offset_k)),
+
+which is backprojection with `FarField` ranges. The samples lie on a polar raster of wave vectors 2
+f / c u_k. A Kaiser-Bessel kernel spreads them onto a twice oversampled rectangular grid, an FFT
+forms the image, and a division corrects the kernel. The positions on the grid are computed once, as
+a sparse matrix, which also gives the exact adjoint.
+
+Reference:
+    Fessler and Sutton 2003 (gridding); Carrara, Goodman and Majewski 1995, ch. 3 (polar format).
 """
 
 from __future__ import annotations
@@ -27,9 +29,13 @@ from torchsar.radar.spotlight import FarField, Spotlight, frequency_samples, ran
 
 @dataclass(frozen=True, eq=False)
 class SparseRows:
-    """A real sparse matrix of `size` by compressed rows.
+    """A real sparse matrix in compressed rows, as plain tensors that can be copied and pickled.
 
-    Plain tensors, so that it can be copied and pickled, which sparse ones cannot.
+    Args:
+        starts: First entry of each row, shape (rows + 1,).
+        columns: Column of each entry.
+        weights: Value of each entry, real.
+        size: Number of rows and columns.
     """
 
     starts: Tensor
@@ -46,14 +52,25 @@ class SparseRows:
 
 @dataclass(frozen=True, eq=False)
 class SparsePair:
-    """A real sparse matrix and its transpose. Applied to complex vectors along the last dim."""
+    """A real sparse matrix and its transpose.
+
+    Args:
+        matrix: The matrix.
+        transpose: Its transpose.
+    """
 
     matrix: SparseRows
     transpose: SparseRows
 
     @staticmethod
     def of_columns(row: Tensor, weight: Tensor, rows: int) -> SparsePair:
-        """From the entries of each column: row numbers and weights, (column, entry)."""
+        """Build the pair from the entries of each column.
+
+        Args:
+            row: Row of each entry, shape (column, entry), int64.
+            weight: Value of each entry, shape (column, entry), real.
+            rows: Number of rows.
+        """
         columns, entries = row.shape
         kind = torch.int32 if max(row.numel(), rows) < 2**31 else torch.int64
         order = torch.argsort(row.reshape(-1).to(kind), stable=True)
@@ -65,16 +82,19 @@ class SparsePair:
         )
 
     def flipped(self) -> SparsePair:
+        """Return the pair with matrix and transpose exchanged."""
         return SparsePair(self.transpose, self.matrix)
 
     def __call__(self, x: Tensor) -> Tensor:
-        """Matrix times vectors, complex (..., columns) -> (..., rows). Differentiable in x."""
+        """Multiply the matrix with complex vectors (..., columns), giving (..., rows);
+        differentiable in x.
+        """
         return _Apply.apply(x, self)
 
 
 class _Apply(torch.autograd.Function):
-    """A sparse matrix on complex vectors: real and imaginary parts of all trials are the columns of
-    one product.
+    """Product of a sparse matrix with complex vectors; real and imaginary parts of all trials are
+    the columns of one product.
     """
 
     @staticmethod
@@ -103,7 +123,7 @@ class _Apply(torch.autograd.Function):
 
 
 class _GridAxis:
-    """One image axis: where wave numbers lie on its oversampled grid, and the crop and division
+    """One image axis: positions of wave numbers on its oversampled grid, and the crop and division
     that undo the oversampling.
     """
 
@@ -121,6 +141,7 @@ class _GridAxis:
         return (points.first[:, None] + tap) % self.length, points.weights.T
 
     def crop(self, grid: Tensor, dim: int) -> Tensor:
+        """The image part of the grid along dim."""
         half = self.n // 2
         return torch.cat([grid.narrow(dim, self.length - half, half), grid.narrow(dim, 0, self.n - half)], dim)
 
@@ -134,16 +155,23 @@ class _GridAxis:
 
 
 class PolarOperator:
-    """The linear map from range profiles (..., pulse, range) to an image (..., azimuth, range), and
-    its exact adjoint.
+    """Linear map from range profiles to an image by polar format, with its exact adjoint.
 
-    geometry: plane waves; the image's range axis is the first ground direction (x), its azimuth
-    axis the second (y): turn the geometry (`FarField.turned`) for other directions. azimuth,
-    range_: axes in metres. window: "none" or "hann", over pulses and over frequencies. eps:
-    relative error against the direct sum. Built for one dtype and device (that of the geometry) and
-    one geometry, shared by all trials; building takes under a second and 20 bytes x kernel taps^2 a
-    sample (complex64). A unit point gives the sum of the window weights. Differentiable in its
-    argument.
+    Built for one dtype and device (that of the geometry) and one geometry, shared by all trials.
+    Building takes under a second and 20 bytes x kernel taps^2 per sample (complex64). A unit point
+    gives the sum of the window weights. Differentiable in the profiles.
+
+    Args:
+        geometry: Plane waves. The range axis of the image is the first ground direction (x), the
+            azimuth axis the second (y); use `FarField.turned` for other directions.
+        azimuth: Azimuth axis of the image in metres.
+        range_: Range axis of the image in metres.
+        window: "none" or "hann", over pulses and over frequencies.
+        eps: Relative error against the direct sum.
+        dtype: Complex type of the data.
+
+    Raises:
+        ValueError: If `window` is not known or `eps` lies outside 1e-13..0.1.
     """
 
     def __init__(
@@ -159,7 +187,7 @@ class PolarOperator:
         self.geometry, self.azimuth, self.range, self.dtype = geometry, azimuth, range_, dtype
         device, real = geometry.direction.device, real_dtype(dtype)
         self._y, self._x = (_GridAxis(axis, Kernel.of(eps), real, device) for axis in (azimuth, range_))
-        wave_number = 2 / geometry.wave_speed_m_s * geometry.frequency_hz  # cycles a metre
+        wave_number = 2 / geometry.wave_speed_m_s * geometry.frequency_hz  # cycles per metre
         self._spread = self._layout(geometry.direction[:, :, None] * wave_number)
         centre = (
             geometry.direction @ geometry.direction.new_tensor([self._x.centre_m, self._y.centre_m]) + geometry.offset_m
@@ -168,7 +196,7 @@ class PolarOperator:
         self._unkernel = self._y.weight[:, None] * self._x.weight
 
     def _layout(self, cycles_m: Tensor) -> SparsePair:
-        """Samples (pulse, 2, frequency) onto the flattened grid."""
+        """Sparse matrix from samples (pulse, 2, frequency) onto the flattened grid."""
         column, across = self._x.taps(cycles_m[:, 0].reshape(-1))
         row, down = self._y.taps(cycles_m[:, 1].reshape(-1))
         cell = row[:, :, None] * self._x.length + column[:, None, :]
@@ -177,22 +205,44 @@ class PolarOperator:
         )
 
     def image(self, profiles: Tensor) -> Tensor:
-        """Profiles (..., pulse, range) to the image (..., azimuth, range)."""
+        """Transform range profiles into the image.
+
+        Args:
+            profiles: Range profiles, shape (..., pulse, range), complex.
+
+        Returns:
+            Image, shape (..., azimuth, range).
+
+        Raises:
+            TypeError: If the dtype is not that of the operator.
+            ValueError: If the size is not that of the geometry.
+        """
         refuse_other_size(profiles, self.geometry)
-        self._refuse_other_dtype(profiles)
+        self._check_dtype(profiles)
         return self._by_trials(self._image, profiles)
 
     def _image(self, profiles: Tensor) -> Tensor:
+        """The image of one block of trials."""
         samples = frequency_samples(profiles) * self._factor
         grid = self._spread(samples.flatten(-2)).unflatten(-1, (self._y.length, self._x.length))
         columns = self._y.crop(torch.fft.ifft(grid, dim=-2, norm="forward"), -2)
         return self._x.crop(torch.fft.ifft(columns, norm="forward"), -1) * self._unkernel
 
     def adjoint(self, image: Tensor) -> Tensor:
-        """Image (..., azimuth, range) to profiles (..., pulse, range): <image(p), i> = <p,
-        adjoint(i)> with <a, b> = sum a conj(b).
+        """Apply the adjoint to an image.
+
+        Args:
+            image: Image, shape (..., azimuth, range), complex.
+
+        Returns:
+            Range profiles, shape (..., pulse, range), with <image(p), i> = <p, adjoint(i)> and
+            <a, b> = sum a conj(b).
+
+        Raises:
+            TypeError: If the dtype is not that of the operator.
+            ValueError: If the size is not that of the image.
         """
-        self._refuse_other_dtype(image)
+        self._check_dtype(image)
         if tuple(image.shape[-2:]) != (self.azimuth.n, self.range.n):
             raise ValueError(
                 f"image of shape {tuple(image.shape)} does not end in the (azimuth, range) = "
@@ -201,19 +251,21 @@ class PolarOperator:
         return self._by_trials(self._adjoint, image)
 
     def _adjoint(self, image: Tensor) -> Tensor:
+        """The adjoint of one block of trials."""
         columns = torch.fft.fft(self._x.embed(image * self._unkernel, -1))
         grid = torch.fft.fft(self._y.embed(columns, -2), dim=-2)
         samples = self._spread.flipped()(grid.flatten(-2)).unflatten(-1, self._factor.shape)
         return range_profiles(samples * self._factor.conj())
 
     def _by_trials(self, work: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-        """work on blocks of trials whose grids stay in the cache."""
+        """Apply `work` to blocks of trials whose grids fit the cache."""
         count = max(1, 8 * block_bytes_of(x.device) // (self._y.length * self._x.length * x.element_size()))
         flat = x.reshape(-1, *x.shape[-2:])
         out = work(flat) if flat.shape[0] <= count else torch.cat([work(part) for part in flat.split(count)])
         return out.view(*x.shape[:-2], *out.shape[-2:])
 
-    def _refuse_other_dtype(self, x: Tensor) -> None:
+    def _check_dtype(self, x: Tensor) -> None:
+        """Raise TypeError for data of another dtype."""
         if x.dtype != self.dtype:
             raise TypeError(
                 f"this polar operator was built for {self.dtype}, got {x.dtype}; build it with dtype={x.dtype}"
@@ -221,18 +273,21 @@ class PolarOperator:
 
 
 class PolarFormat(GroundImager):
-    """Image the ground plane by polar format.
+    """Stage that images the ground plane by polar format; arguments as in `GroundImager`.
 
-    Arguments as `GroundImager`; neglects the curvature of the wavefront (`plane_wave_loss`).
-
-    The operator of the last geometry is kept: `operator(profiles, geometry)` gives it to autofocus
-    loops.
+    Neglects the curvature of the wavefront, see `plane_wave_loss`. The operator of the last
+    geometry is stored; `operator` gives it to autofocus loops.
     """
 
     _kept: tuple[list[Tensor], PolarOperator] | None = None
 
     def operator(self, profiles: Tensor, geometry: FarField | Spotlight) -> PolarOperator:
-        """The operator for this geometry, in turned coordinates, and the dtype of the profiles."""
+        """Return the operator for a geometry in turned coordinates and the dtype of the profiles.
+
+        Args:
+            profiles: Range profiles, shape (..., pulse, range), complex.
+            geometry: Geometry of the recording.
+        """
         waves = geometry.far_field() if isinstance(geometry, Spotlight) else geometry
         key = [waves.frequency_hz, waves.direction, waves.offset_m]
         kept = self._kept
@@ -244,8 +299,20 @@ class PolarFormat(GroundImager):
         return kept[1]
 
     def form(self, profiles: Tensor, geometry: FarField | Spotlight, azimuth: Axis, range_: Axis) -> Tensor:
+        """Form the image by polar format.
+
+        Args:
+            profiles: Range profiles, shape (..., pulse, range), complex.
+            geometry: Geometry in the turned coordinates of the axes.
+            azimuth: Azimuth axis of the image.
+            range_: Range axis of the image.
+
+        Returns:
+            Image, shape (..., azimuth, range).
+        """
         return self.operator(profiles, geometry).image(profiles)
 
 
 def _same(kept: list[Tensor], now: list[Tensor]) -> bool:
+    """Whether two geometries are equal."""
     return all(a.device == b.device and torch.equal(a, b) for a, b in zip(kept, now))

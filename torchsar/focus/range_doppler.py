@@ -1,4 +1,4 @@
-"""Range-Doppler focusing: the textbook baseline that omega-K is measured against."""
+"""Range-Doppler focusing, the textbook baseline for omega-K."""
 
 from __future__ import annotations
 
@@ -12,11 +12,16 @@ from torchsar.radar import StripmapRadar
 
 
 def migration(at: FrameGeometry) -> Tensor:
-    """Relative range migration of each Doppler row, cos(squint of the frame) / cos(squint of the
-    row) - 1, float64 (..., d).
+    """Compute the relative range migration of each Doppler row.
 
-    A target at slant range R appears at R (1 + migration): the slope of the wavenumber mapping at
-    the carrier. Formed as a difference.
+    cos(squint of the frame) / cos(squint of the row) - 1, formed as a difference. A target at slant
+    range R appears at R (1 + migration), the slope of the wavenumber mapping at the carrier.
+
+    Args:
+        at: Geometry of the rows.
+
+    Returns:
+        Relative migration, shape (..., d), float64.
     """
     velocity, frame = at.velocity_m_s[..., None], at.frame_hz[..., None]
     sin, sin_frame = (at.radar.wavelength_m * f / (2 * velocity) for f in (at.doppler_hz, frame))
@@ -35,14 +40,30 @@ def range_doppler(
     band_hz: float | None = None,
     eps: float = 2e-4,
 ) -> Tensor:
-    """Range-Doppler algorithm: azimuth FFT, migration taken out by interpolation, hyperbolic
-    azimuth phase per range, inverse FFT.
+    """Focus by the range-Doppler algorithm.
 
-    raw, result: (..., pulse, range) complex; arguments, coordinates and phases as `omega_k`. Exact
-    for the whole swath in migration and azimuth phase; neglects the coupling of range and azimuth
-    beyond the carrier (no secondary range compression), which broadens wide bands, long apertures
-    and squinted beams: `focus.requirements` says by how much. eps: relative error of the
-    interpolation.
+    Azimuth FFT, correction of migration by interpolation, hyperbolic azimuth phase per range,
+    inverse FFT. Exact over the whole swath in migration and azimuth phase. Neglects the coupling of
+    range and azimuth beyond the carrier (no secondary range compression), which broadens responses
+    for wide bands, long apertures and squinted beams; `requirements` predicts by how much.
+
+    Args:
+        raw: Raw or range-compressed data, shape (..., pulse, range), complex.
+        radar: Radar of the recording.
+        doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,).
+        velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
+            radar.
+        frame_hz: Frame Doppler of the image coordinates in Hz; None for the nominal pointing, else
+            the centroid.
+        reference: Range reference spectrum, shape (range,); None for range-compressed data.
+        band_hz: Processed Doppler bandwidth about the centroid in Hz; None for the whole PRF.
+        eps: Relative error of the interpolation.
+
+    Returns:
+        Image, shape (..., azimuth, range), complex, with coordinates and phases as in `omega_k`.
+
+    Raises:
+        ValueError: As in `omega_k`.
     """
     geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz, band_hz=band_hz)
     n, centre, real = raw.shape[-1], raw.shape[-1] // 2, real_dtype(raw.dtype)
@@ -55,8 +76,8 @@ def range_doppler(
     def focus_rows(rows: Tensor, part: slice) -> Tensor:
         at = geometry.rows(part)
         spectrum = rows if reference is None else rows * reference.to(rows.dtype)
-        # cell i of the image lies at cell i + range_cells * migration of the row; exp(+2j pi k q /
-        # n) asks for points of the other sign
+        # cell i of the image lies at cell i + range_cells * migration of the row; the exponent is
+        # +2j pi k q / n, so that points have the opposite sign
         start = migration(at) * centre_cells
         shift = start[..., None] + migration(at)[..., None] * (range_cells - centre_cells)
         points = Points.of(plan.kernel, -per_sample * cell, plan.length, real, (-per_sample * shift).to(real))
@@ -69,6 +90,6 @@ def range_doppler(
 
 
 class RangeDoppler(Focuser):
-    """Focus by the range-Doppler algorithm, the baseline; arguments as `Focuser`."""
+    """Stage that focuses by the range-Doppler algorithm; arguments as in `Focuser`."""
 
     form = staticmethod(range_doppler)

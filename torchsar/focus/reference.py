@@ -1,4 +1,4 @@
-"""Range compression and the reference spectra that it uses."""
+"""Range compression and its reference spectra."""
 
 from __future__ import annotations
 
@@ -10,20 +10,36 @@ from torchsar.radar import LinearFM, StripmapRadar
 
 
 def matched_reference(pulse: LinearFM, n: int, sampling_hz: float, device: torch.device | str | None = None) -> Tensor:
-    """Conjugate pulse spectrum in FFT order, complex128 (n,), scaled so that a unit echo compresses
-    to a unit peak.
+    """Compute the conjugate pulse spectrum, the matched filter.
+
+    Args:
+        pulse: Transmitted pulse.
+        n: Number of samples of a line.
+        sampling_hz: Sampling rate in Hz.
+        device: Device of the result.
+
+    Returns:
+        Spectrum in FFT order, shape (n,), complex128; an echo of unit amplitude has a unit peak.
     """
     spectrum = pulse.spectrum(n, sampling_hz, device)
     return spectrum.conj() * (n / spectrum.abs().square().sum())
 
 
 def flat_reference(pulse: LinearFM, n: int, sampling_hz: float, device: torch.device | str | None = None) -> Tensor:
-    """Inverse pulse spectrum inside the pulse bandwidth and zero outside, complex128 (n,): an
-    exactly rectangular band.
+    """Compute the inverse pulse spectrum inside the pulse bandwidth, zero outside.
 
-    The response is a pure sinc (PSLR -13.26 dB) where the matched one carries the Fresnel ripple of
-    a short pulse; noise outside the band is removed. Costs 0.1 to 0.3 dB of signal-to-noise ratio
-    at usual time-bandwidth products.
+    The response is a pure sinc (PSLR -13.26 dB), while the matched one has the Fresnel ripple of a
+    short pulse; noise outside the band is removed. Costs 0.1 to 0.3 dB of signal-to-noise ratio at
+    usual time-bandwidth products.
+
+    Args:
+        pulse: Transmitted pulse.
+        n: Number of samples of a line.
+        sampling_hz: Sampling rate in Hz.
+        device: Device of the result.
+
+    Returns:
+        Spectrum in FFT order, shape (n,), complex128; an echo of unit amplitude has a unit peak.
     """
     spectrum = pulse.spectrum(n, sampling_hz, device)
     frequency = torch.fft.fftfreq(n, 1 / sampling_hz, dtype=torch.float64, device=device)
@@ -33,35 +49,54 @@ def flat_reference(pulse: LinearFM, n: int, sampling_hz: float, device: torch.de
 
 
 def phase_reference(pulse: LinearFM, n: int, sampling_hz: float, device: torch.device | str | None = None) -> Tensor:
-    """Conjugate phase of the pulse spectrum, modulus constant over the whole sampled band,
-    complex128 (n,), unit peak for a unit echo.
+    """Compute the conjugate phase of the pulse spectrum, of constant modulus in the sampled band.
 
-    Keeps what little signal there is beyond the nominal band edges: a few percent sharper than
-    matched where the noise allows it.
+    Uses the signal beyond the nominal band edges: a few percent sharper than the matched reference
+    where the noise allows it.
+
+    Args:
+        pulse: Transmitted pulse.
+        n: Number of samples of a line.
+        sampling_hz: Sampling rate in Hz.
+        device: Device of the result.
+
+    Returns:
+        Spectrum in FFT order, shape (n,), complex128; an echo of unit amplitude has a unit peak.
     """
     spectrum = pulse.spectrum(n, sampling_hz, device)
     size = spectrum.abs().clamp_min(torch.finfo(torch.float64).tiny)
     return spectrum.conj() / size * (n / size.sum())
 
 
+# range references by the names that stages accept
 REFERENCES = {"matched": matched_reference, "flat": flat_reference, "phase": phase_reference}
 
 
 def range_compress(raw: Tensor, reference: Tensor) -> Tensor:
-    """Circular convolution along the last dim.
+    """Convolve lines circularly with a range reference.
 
-    raw: (..., pulse, range); reference: spectrum in FFT order, (range,) or (..., 1, range).
+    Args:
+        raw: Raw data, shape (..., pulse, range), complex.
+        reference: Reference spectrum in FFT order, shape (range,) or (..., 1, range).
+
+    Returns:
+        Range-compressed data, same shape.
     """
     return torch.fft.ifft(torch.fft.fft(raw) * reference.to(raw.dtype))
 
 
 class RangeCompress(Stage):
-    """Range compression with the transmitted pulse (brief 004, item 6).
+    """Stage that compresses pulses in range with the transmitted pulse.
 
-    reference: "matched", "flat" or "phase".
+    Samples closer to the end of a line than one pulse length are compressed with the recorded part
+    of their echo.
 
-    Samples closer to the end of a line than one pulse length are compressed with the part of the
-    echo that was recorded.
+    Args:
+        radar: Radar of the recording.
+        reference: "matched", "flat" or "phase".
+
+    Raises:
+        ValueError: If `reference` is not known.
     """
 
     def __init__(self, radar: StripmapRadar, reference: str = "matched") -> None:
@@ -71,9 +106,22 @@ class RangeCompress(Stage):
         self.radar, self.reference = radar, reference
 
     def spectrum(self, n: int, device: torch.device | str | None = None) -> Tensor:
-        """The reference spectrum for lines of n samples, complex128 (n,)."""
+        """Return the reference spectrum.
+
+        Args:
+            n: Number of samples of a line.
+            device: Device of the result.
+
+        Returns:
+            Spectrum in FFT order, shape (n,), complex128.
+        """
         return REFERENCES[self.reference](self.radar.pulse, n, self.radar.sampling_hz, device)
 
     def forward(self, signal: Signal) -> Signal:
+        """Compress a signal with axes (pulse, range).
+
+        Args:
+            signal: Recording.
+        """
         real_dtype(signal.data.dtype)
         return signal.with_data(range_compress(signal.data, self.spectrum(signal.data.shape[-1], signal.data.device)))

@@ -1,5 +1,6 @@
-"""What a stripmap scene requires of its focuser: the phase that each simplification would neglect,
-predicted before anything runs.
+"""Requirements of a stripmap scene on its focuser: the phase that each simplification neglects.
+
+All values follow from the radar and the axes, before any simulation.
 """
 
 from __future__ import annotations
@@ -18,8 +19,18 @@ from torchsar.radar import StripmapRadar
 
 @dataclass(frozen=True)
 class Requirement:
-    """One simplification: the largest phase it neglects anywhere in the scene, the same as range
-    cells (nan where it is no shift), the verdict.
+    """One simplification and the largest phase that it neglects anywhere in the scene.
+
+    Args:
+        effect: Name of the simplification.
+        neglects: Description of the neglected term.
+        phase_rad: Neglected phase in rad.
+        range_cells: The same in range cells; nan where it is not a shift.
+        tolerance_rad: Tolerated phase in rad.
+        remedy: Remedy where the simplification is not permissible.
+        error_db: Relative error in dB that the phase makes in the response of a point where it is
+            largest, see `phase_error_db`; nan where it is not predicted.
+        tolerance_db: Tolerated error in dB.
     """
 
     effect: str
@@ -28,21 +39,46 @@ class Requirement:
     range_cells: float
     tolerance_rad: float
     remedy: str
+    error_db: float = math.nan
+    tolerance_db: float = -20.0
 
     @property
     def ok(self) -> bool:
-        """Whether the simplification may be made."""
-        return self.phase_rad <= self.tolerance_rad
+        """True where the simplification is permissible: by its error where that is predicted, else
+        by its phase.
+        """
+        if math.isnan(self.error_db):
+            return self.phase_rad <= self.tolerance_rad
+        return self.error_db <= self.tolerance_db
 
     @property
     def verdict(self) -> str:
+        """ "enough" where the simplification is permissible, otherwise the remedy."""
         return "enough" if self.ok else self.remedy
+
+
+def phase_error_db(phase_rad: Tensor) -> float:
+    """Relative error of a response with a neglected phase: mean |exp(j phi) - 1|^2 in dB.
+
+    A quadratic phase that reaches pi / 4 at the ends of an aperture gives -11 dB, or -12.6 dB if
+    its mean is removed.
+
+    Args:
+        phase_rad: Phase in rad over the support of the spectrum, any shape.
+    """
+    error = float((2 - 2 * torch.cos(phase_rad)).mean())
+    return 10 * math.log10(max(error, 1e-30))
 
 
 @dataclass(frozen=True)
 class Aperture:
-    """The part of the wavenumber plane that a scene fills, sampled: the radar at its Doppler rows,
-    and the range band.
+    """Samples of the part of the wavenumber plane that a target occupies.
+
+    Args:
+        at: Geometry at the sampled Doppler rows.
+        frequency_hz: Samples of the range band in Hz.
+        integration_s: Integration time in seconds.
+        doppler_band_hz: Doppler bandwidth in Hz.
     """
 
     at: FrameGeometry
@@ -60,8 +96,19 @@ class Aperture:
         integration_s: float | None,
         samples: int = 65,
     ) -> Aperture:
-        """Doppler rows of a target at slant range range_m seen for integration_s (None: as long as
-        it stays inside one PRF).
+        """Sample the Doppler rows and the range band of a target.
+
+        Warns where the PRF is below the Doppler band of the aperture.
+
+        Args:
+            radar: Radar of the recording.
+            range_m: Slant range of the target in metres.
+            doppler_hz: Absolute Doppler centroid in Hz.
+            velocity_m_s: Effective velocity in m/s.
+            frame_hz: Frame Doppler in Hz.
+            integration_s: Integration time in seconds; None for the time that the target stays
+                inside one PRF.
+            samples: Number of samples per axis.
         """
         cos2 = 1 - float(radar.sin_squint(doppler_hz, velocity_m_s)) ** 2
         rate = float(radar.azimuth_rate_hz_s(range_m, velocity_m_s)) * cos2
@@ -81,26 +128,38 @@ class Aperture:
 
     @property
     def carrier_row(self) -> Tensor:
-        """G(0, X) - f0, (d, 1)."""
+        """G(0, X) - f0 in Hz, shape (d, 1)."""
         return self.at.mapped(torch.zeros(1, dtype=torch.float64))
 
     @property
     def slope(self) -> Tensor:
-        """dG / df at the carrier, minus one, (d, 1): the relative migration of a row."""
+        """dG / df at the carrier minus one, the relative migration of a row, shape (d, 1)."""
         step = 1e-3 * self.at.radar.carrier_hz
         ends = self.at.mapped(torch.tensor([-step, step], dtype=torch.float64))
         return (ends[:, 1:] - ends[:, :1]) / (2 * step) - 1
 
     def bulk_residual_rad(self, offset_m: float) -> Tensor:
-        """Phase (d, f) that bulk + refocus leave on a target offset_m from the centre range: 2 pi
-        (2 dr / c) (G(f) - G(0) - f).
+        """Compute the phase that bulk + refocus omega-K leaves, 2 pi (2 dr / c) (G(f) - G(0) - f).
+
+        Args:
+            offset_m: Distance dr of the target from the centre range in metres.
+
+        Returns:
+            Phase in rad, shape (d, f).
         """
         left = self.at.mapped(self.frequency_hz) - self.carrier_row - self.frequency_hz
         return 4 * math.pi * offset_m / self.at.radar.wave_speed_m_s * left
 
     def coupling_rad(self, range_m: float) -> Tensor:
-        """Phase (d, f) that range-Doppler leaves at range_m: the curvature of G over the range
-        band, 2 pi (2 R / c) (G(f) - G(0) - G'(0) f).
+        """Compute the phase that the range-Doppler algorithm leaves.
+
+        It is the curvature of G over the range band, 2 pi (2 R / c) (G(f) - G(0) - G'(0) f).
+
+        Args:
+            range_m: Slant range R of the target in metres.
+
+        Returns:
+            Phase in rad, shape (d, f).
         """
         left = self.at.mapped(self.frequency_hz) - self.carrier_row - (1 + self.slope) * self.frequency_hz
         return 4 * math.pi * range_m / self.at.radar.wave_speed_m_s * left
@@ -115,19 +174,30 @@ def requirements(
     frame_hz: float | None = None,
     tolerance_rad: float = math.pi / 4,
     velocity_error_m_s: float = 1.0,
+    tolerance_db: float = -20.0,
 ) -> tuple[Requirement, ...]:
-    """Table of simplifications with the phase [rad] that each neglects at worst in this scene,
-    against tolerance_rad.
+    """List the phase that each simplification neglects at worst in a stripmap scene.
 
-    axes: of the raw matrix, (pulse, range). doppler_hz: absolute centroid, by default the nominal
-    pointing or 0; frame_hz: by default the nominal pointing, else the centroid (as the focusers
-    choose it); integration_s: time that a target is seen, by default the radar's own, else one PRF
-    of Doppler. A quarter of a range resolution cell of migration is pi/4 at the ends of the band:
-    the two ways of counting agree. Warns where the PRF is below the Doppler band. Source: brief
-    004, "Model only what a scene requires".
+    A quarter of a range resolution cell of migration is pi/4 at the ends of the band, so that
+    counting in cells and in phase agrees. Warns where the PRF is below the Doppler band.
+
+    Args:
+        radar: Radar of the recording.
+        axes: Axes of the raw matrix, (pulse, range).
+        doppler_hz: Absolute Doppler centroid in Hz; None for the nominal pointing or 0.
+        velocity_m_s: Effective velocity in m/s; None for that of the radar.
+        integration_s: Integration time of a target in seconds; None for that of the radar, else one
+            PRF of Doppler.
+        frame_hz: Frame Doppler in Hz; None for the nominal pointing, else the centroid, as in the
+            focusers.
+        tolerance_rad: Tolerated phase in rad.
+        velocity_error_m_s: Error of the effective velocity of one of the rows, in m/s.
+        tolerance_db: Tolerated relative error of a response, for rows that predict one.
+
+    Returns:
+        One row per simplification.
     """
-    near, far = axes[-1].start, axes[-1].stop
-    middle, half = (near + far) / 2, (far - near) / 2
+    middle = axes[-1].start + axes[-1].n // 2 * axes[-1].step  # where bulk processing is exact
     velocity = radar.velocity_m_s if velocity_m_s is None else float(velocity_m_s)
     doppler = (radar.pointing_doppler_hz or 0.0) if doppler_hz is None else float(doppler_hz)
     frame = (
@@ -137,29 +207,36 @@ def requirements(
         if radar.pointing_doppler_hz is not None
         else doppler
     )
-    seen = Aperture.of(
+    aperture = Aperture.of(
         radar, middle, doppler, velocity, frame, radar.integration_s if integration_s is None else integration_s
     )
-    bulk, rda = (float(x.abs().max()) for x in (seen.bulk_residual_rad(half), seen.coupling_rad(far)))
-    path, cells = _parabola_rad(seen, near), radar.range_step_m
+    near, far = full_swath_m(radar, axes, doppler, velocity, aperture.integration_s)
+    half = max(abs(near - middle), abs(far - middle))
+    bulk_rad, coupling_rad = aperture.bulk_residual_rad(half), aperture.coupling_rad(far)
+    bulk, rda = (float(x.abs().max()) for x in (bulk_rad, coupling_rad))
+    path, cells = _parabola_rad(aperture, near), radar.range_step_m
     band_turns = radar.pulse.bandwidth_hz / radar.wave_speed_m_s
-    walk = abs(float(radar.sin_squint(doppler, velocity))) * velocity * seen.integration_s
+    walk = abs(float(radar.sin_squint(doppler, velocity))) * velocity * aperture.integration_s
     back_turns = 2 * radar.carrier_hz / radar.wave_speed_m_s
-    defocus = 2 * math.pi * back_turns * velocity * velocity_error_m_s * (seen.integration_s / 2) ** 2 / near
-    inside = math.pi * seen.doppler_band_hz * radar.pulse.duration_s
+    defocus = 2 * math.pi * back_turns * velocity * velocity_error_m_s * (aperture.integration_s / 2) ** 2 / near
+    inside = math.pi * aperture.doppler_band_hz * radar.pulse.duration_s
     displaced = abs(doppler) / abs(radar.pulse.rate_hz_s) * radar.sampling_hz
     single = 2 * math.pi * back_turns * far * 2.0**-24
 
-    def row(effect: str, neglects: str, phase_rad: float, range_cells: float, remedy: str) -> Requirement:
-        return Requirement(effect, neglects, phase_rad, range_cells, tolerance_rad, remedy)
+    def row(
+        effect: str, neglects: str, phase_rad: float, range_cells: float, remedy: str, over: Tensor | None = None
+    ) -> Requirement:
+        error_db = math.nan if over is None else phase_error_db(over)
+        return Requirement(effect, neglects, phase_rad, range_cells, tolerance_rad, remedy, error_db, tolerance_db)
 
     return (
         row(
             "bulk + refocus (omega_k)",
             "change of migration over the swath",
             bulk,
-            float(seen.slope.abs().max()) * half / cells,
+            float(aperture.slope.abs().max()) * half / cells,
             "use omega_k_stolt",
+            bulk_rad,
         ),
         row(
             "range-Doppler",
@@ -167,6 +244,7 @@ def requirements(
             rda,
             math.nan,
             "use omega_k",
+            coupling_rad,
         ),
         row(
             "parabolic range history", "third and higher orders of the hyperbola", path, math.nan, "keep the hyperbola"
@@ -202,21 +280,48 @@ def requirements(
     )
 
 
+def full_swath_m(
+    radar: StripmapRadar, axes: tuple[Axis, ...], doppler_hz: float, velocity_m_s: float, integration_s: float
+) -> tuple[float, float]:
+    """Slant ranges at the beam centre whose echoes are recorded over the whole aperture.
+
+    Args:
+        radar: Radar of the recording.
+        axes: Axes of the raw matrix, (pulse, range).
+        doppler_hz: Absolute Doppler centroid in Hz.
+        velocity_m_s: Effective velocity in m/s.
+        integration_s: Integration time of a target in seconds.
+
+    Returns:
+        Least and largest range in metres; the middle of the record twice where no range is.
+    """
+    start, stop = axes[-1].start, axes[-1].stop - radar.pulse_samples * axes[-1].step
+    along = velocity_m_s * integration_s / 2
+    walk = along * abs(float(radar.sin_squint(doppler_hz, velocity_m_s))) + along**2 / (2 * start)
+    middle = (axes[-1].start + axes[-1].stop) / 2
+    return (start + walk, stop - walk) if start + walk <= stop - walk else (middle, middle)
+
+
 def recommended_form(rows: tuple[Requirement, ...]) -> str:
-    """Name of the cheapest focuser of this package that the table of `requirements` allows: omega_k
-    or omega_k_stolt.
+    """Name the cheapest focuser that the table of `requirements` permits.
+
+    Args:
+        rows: Table of `requirements`.
+
+    Returns:
+        "omega_k" or "omega_k_stolt".
     """
     return "omega_k" if rows[0].ok else "omega_k_stolt"
 
 
-def _parabola_rad(seen: Aperture, range_m: float) -> float:
-    """Largest 4 pi / lambda |r - parabola| over the aperture of a target at slant range range_m;
-    the parabola touches at the beam centre.
+def _parabola_rad(aperture: Aperture, range_m: float) -> float:
+    """Largest 4 pi / lambda |r - parabola| over the aperture of a target at slant range range_m,
+    with a parabola that touches the range history at the beam centre.
     """
-    radar, velocity = seen.at.radar, float(seen.at.velocity_m_s)
-    sin = float(radar.sin_squint(seen.at.doppler_hz.mean(), velocity))
-    way = velocity * seen.integration_s * torch.linspace(-0.5, 0.5, 65, dtype=torch.float64)
-    excess = way * (way - 2 * range_m * sin)
+    radar, velocity = aperture.at.radar, float(aperture.at.velocity_m_s)
+    sin = float(radar.sin_squint(aperture.at.doppler_hz.mean(), velocity))
+    along = velocity * aperture.integration_s * torch.linspace(-0.5, 0.5, 65, dtype=torch.float64)
+    excess = along * (along - 2 * range_m * sin)
     exact = excess / (torch.sqrt(range_m**2 + excess) + range_m)
-    parabola = -way * sin + way.square() * (1 - sin**2) / (2 * range_m)
+    parabola = -along * sin + along.square() * (1 - sin**2) / (2 * range_m)
     return float((exact - parabola).abs().max()) * 4 * math.pi / radar.wavelength_m

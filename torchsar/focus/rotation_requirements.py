@@ -1,8 +1,6 @@
-"""What an unevenly turning target allows and requires: limits of estimating its rotation, and the
-phase that each simplification neglects.
+"""Limits of estimating a non-uniform rotation, and requirements of the target on its processor.
 
-Both are predicted from radar, rotation and scatterers before anything runs. Brief 003, sections
-"Limits" and "What a scene needs".
+Both follow from radar, rotation and scatterers, before any simulation.
 """
 
 from __future__ import annotations
@@ -17,13 +15,24 @@ from torch import Tensor
 from torchsar.core.warp import least_rate, warp, warp_rate
 from torchsar.focus.ladar_requirements import Limit, Verdict
 from torchsar.focus.matched_fourier import MIN_PULSES
-from torchsar.focus.requirements import Requirement
+from torchsar.focus.requirements import Requirement, phase_error_db
 from torchsar.radar import InverseRadar
 
-VISIBLE, RATE_BOUND_PERCENT, OFF_LINE, WALK_CELLS, DOPPLER = 1.0, 5.0, 0.05, 0.2, 0.95
-# power of a focused scatterer over the noise of a line, of which the noise alone passes one in 5e8
+# chosen limits of estimating the rotation rate: phase of the range term (rad), Cramer-Rao bound
+# (%), and rms share of the ranges that no line through the centre explains
+VISIBLE, RATE_BOUND_PERCENT, OFF_LINE = 1.0, 5.0, 0.05
+# migration in range cells at which a peak loses 0.2 dB
+WALK_CELLS = 0.2
+# chosen: Doppler over half the pulse rate from which on a warning is given
+DOPPLER = 0.95
+# power of a focused scatterer over the noise of a line; noise alone exceeds it with the probability
+# exp(-20), one in 5e8
 _PEAK_SNR = 20.0
+# chosen: samples over the aperture at which the warp is evaluated
 _POINTS = 513
+# chosen: frequencies over the band at which migration is evaluated
+_BAND = 17
+# orders of the warp that `rotation_requirements` lists
 _ORDERS = 4
 
 
@@ -38,21 +47,43 @@ def rotation_limits(
     noise_std: float = 0.0,
     rate_bound: float | None = None,
 ) -> tuple[Limit, ...]:
-    """Limits of estimating and imaging a target that turns by omega_rad_s (t + k1 t^2 / 2! + ...).
+    """List the limits of estimating and imaging a target with non-uniform rotation.
 
-    cross_range_m, lever_m, amplitude: (target,), places of the scatterers, lever_m from the
-    rotation centre (y + yc), and amplitudes of range-compressed samples; noise_std: of the complex
-    noise of a sample. rate_bound: Cramer-Rao bound of omega_rad_s (rad/s), see
-    `metrics.rotation_bounds`; its row is absent where it is None. Raises ValueError for places that
-    do not fit together, or numbers that are not finite and positive where they must be.
+    The angle is omega_rad_s (t + k1 t^2 / 2! + ...).
+
+    Args:
+        radar: Radar of the recording.
+        n_pulse: Number of pulses.
+        omega_rad_s: Rotation rate at the first pulse in rad/s.
+        k: Coefficients k1, k2, ... of the warp.
+        cross_range_m: Cross range of the scatterers in metres, shape (target,).
+        lever_m: Range of the scatterers from the rotation centre (y + yc) in metres, shape
+            (target,).
+        amplitude: Amplitudes of range-compressed samples, shape (target,).
+        noise_std: Square root of the variance of the complex noise per sample.
+        rate_bound: Cramer-Rao bound of omega_rad_s in rad/s, see `metrics.rotation_bounds`; its row
+            is absent where this is None.
+
+    Returns:
+        One row per limit.
+
+    Raises:
+        ValueError: If the shapes differ, the rate is not positive, or a number is not finite.
     """
-    _refuse(omega_rad_s, k, cross_range_m, lever_m, amplitude)
+    _check(omega_rad_s, k, cross_range_m, lever_m, amplitude)
     warp_k, duration = torch.tensor(list(k), dtype=torch.float64), n_pulse / radar.prf_hz
     fastest = float(_rates(warp_k, duration).max())
     doppler = 4 * omega_rad_s * fastest * float(cross_range_m.abs().max()) / (radar.wavelength_m * radar.prf_hz)
     rows = (
         Limit(
-            "pulses", n_pulse, MIN_PULSES, "", "refuse", "nothing can be told from fewer", "record more", at_least=True
+            "pulses",
+            n_pulse,
+            MIN_PULSES,
+            "",
+            "refuse",
+            "fewer do not determine a rotation",
+            "record more",
+            at_least=True,
         ),
         Limit(
             "least rotation rate over the first",
@@ -60,7 +91,7 @@ def rotation_limits(
             1e-6,
             "",
             "refuse",
-            "two times share an angle, and no image forms",
+            "two times share an angle, and no image can be formed",
             "record fewer pulses",
             at_least=True,
         ),
@@ -84,20 +115,21 @@ def rotation_limits(
 
 
 def _beyond(doppler: float) -> Verdict:
+    """Verdict for a Doppler above its limit."""
     return "refuse" if doppler > 1 else "warn"
 
 
 def _scene_limits(
     radar: InverseRadar, angle: float, x: Tensor, lever: Tensor, amplitude: Tensor, noise_std: float, n_pulse: int
 ) -> tuple[Limit, ...]:
-    """What the scatterers themselves allow."""
+    """Limits that the scatterers set."""
     power = amplitude.abs().square()
     cell = radar.wavelength_m / (2 * angle)
     visible = math.pi * radar.wavelength_m * float(_weighted_rms(lever, power)) / cell**2
     above = int((power * n_pulse > _PEAK_SNR * noise_std**2).sum()) if noise_std > 0 else int((power > 0).sum())
     no_rate = "the rate, and with it the scale in metres, cannot be estimated, while k1 and k2 can"
-    alike = "range term and k1 look alike: the rate cannot be estimated"
-    nothing: Verdict = "refuse" if not bool((lever.abs() > 0).any()) else "warn"
+    coupled = "the phases of range term and k1 are nearly equal: the rate cannot be estimated"
+    no_lever: Verdict = "refuse" if not bool((lever.abs() > 0).any()) else "warn"
     return (
         Limit(
             "scatterers above the noise",
@@ -105,7 +137,7 @@ def _scene_limits(
             3,
             "",
             "refuse",
-            "a rotation cannot be told from fewer",
+            "fewer do not determine a rotation",
             "raise the SNR or the number of pulses",
             at_least=True,
         ),
@@ -114,7 +146,7 @@ def _scene_limits(
             visible,
             VISIBLE,
             "rad",
-            nothing,
+            no_lever,
             no_rate,
             "lengthen the aperture",
             at_least=True,
@@ -125,17 +157,18 @@ def _scene_limits(
             OFF_LINE,
             "",
             "warn",
-            alike,
-            "scale by a rate from elsewhere",
+            coupled,
+            "scale the image by a rate from another source",
             at_least=True,
         ),
     )
 
 
 def _bound_limit(omega: float, bound: float | None) -> tuple[Limit, ...]:
+    """Limit of the Cramer-Rao bound of the rate, none where the bound is not given."""
     if bound is None:
         return ()
-    consequence = "no estimator can scale the image well, while k1 and k2 still focus it"
+    consequence = "no estimator determines the scale of the image well, while k1 and k2 focus it"
     return (
         Limit(
             "Cramer-Rao bound of the rate",
@@ -150,11 +183,12 @@ def _bound_limit(omega: float, bound: float | None) -> tuple[Limit, ...]:
 
 
 def _weighted_rms(x: Tensor, weight: Tensor) -> Tensor:
+    """Weighted root mean square."""
     return ((x.square() * weight).sum() / weight.sum().clamp_min(torch.finfo(torch.float64).tiny)).sqrt()
 
 
 def _off_line(x: Tensor, y: Tensor, weight: Tensor) -> float:
-    """Share (0..1) of the ranges that no line y = s x through the centre explains, rms; 0 for a
+    """Rms share (0..1) of the ranges that no line y = s x through the centre explains; 0 for a
     single scatterer.
     """
     if int((weight > 0).sum()) < 2:
@@ -174,13 +208,24 @@ def rotation_requirements(
     lever_m: float,
     tolerance_rad: float = math.pi / 4,
 ) -> tuple[Requirement, ...]:
-    """Phase (rad) that each simplification neglects at worst, for scatterers out to cross_range_m
-    and lever_m (m, from the rotation centre), against tolerance_rad.
+    """List the phase that each simplification neglects at worst for a rotating target.
 
-    Orders of the warp: the Legendre terms left out, which no lower order takes up. Azimuth only:
-    the range term beyond a line in the warp, pi/4 at the depth of focus 2 ra^2 / lambda. Fixed
-    envelopes: migration at the ends of the band, allowed to 0.2 range cells, where a peak loses 0.2
-    dB.
+    Orders of the warp neglect the Legendre terms that no lower order represents. Azimuth only
+    neglects the range term beyond a line in the warp, pi/4 at the depth of focus 2 ra^2 / lambda.
+    Fixed envelopes neglect migration, a phase at the ends of the band. Both are judged by the
+    relative error of the response, the range term by its phase.
+
+    Args:
+        radar: Radar of the recording.
+        n_pulse: Number of pulses.
+        omega_rad_s: Rotation rate at the first pulse in rad/s.
+        k: Coefficients k1, k2, ... of the warp.
+        cross_range_m: Largest cross range of the scatterers in metres.
+        lever_m: Largest range of the scatterers from the rotation centre in metres.
+        tolerance_rad: Tolerated phase in rad.
+
+    Returns:
+        One row per simplification.
     """
     warp_k, duration = torch.tensor(list(k), dtype=torch.float64), n_pulse / radar.prf_hz
     c4 = 4 * math.pi / radar.wavelength_m
@@ -188,17 +233,22 @@ def rotation_requirements(
     walk = cross_range_m * angle / radar.range_step_m
     small = c4 * (cross_range_m * angle**3 / 6 + lever_m * angle**4 / 24)
     single = c4 * (radar.reference_range_m + lever_m) * 2.0**-24
+    across = c4 * cross_range_m * omega_rad_s
     orders = [
         Requirement(
             f"warp of order {order}",
             _ORDER_NEGLECTS[order],
-            c4 * cross_range_m * omega_rad_s * left,
+            across * float(left.abs().max()),
             math.nan,
             tolerance_rad,
             f"use order {order + 1} or more",
+            phase_error_db(across * left),
         )
         for order, left in enumerate(_legendre_left(warp_k, duration), start=1)
     ]
+    turned = warp(torch.linspace(0, duration, _POINTS, dtype=torch.float64), warp_k) * omega_rad_s
+    band = torch.linspace(-0.5, 0.5, _BAND, dtype=torch.float64)
+    migration = 2 * math.pi * band * cross_range_m / radar.range_step_m * turned[:, None]
     return (
         *orders,
         Requirement(
@@ -207,7 +257,7 @@ def rotation_requirements(
             c4 / 8 * lever_m * angle**2,
             math.nan,
             tolerance_rad,
-            "take the range term out (range_phase)",
+            "remove the range term (range_phase)",
         ),
         Requirement(
             "fixed envelopes (phase_only)",
@@ -216,6 +266,7 @@ def rotation_requirements(
             walk,
             math.pi * WALK_CELLS,
             "use the fidelity dechirped",
+            phase_error_db(migration),
         ),
         Requirement(
             "small angles",
@@ -236,26 +287,30 @@ def rotation_requirements(
     )
 
 
+# terms of the angle that a warp of each order neglects
 _ORDER_NEGLECTS = {
     1: "acceleration (range-Doppler)",
-    2: "jerk and all beyond",
-    3: "the fourth power of time and all beyond",
-    4: "the fifth power of time and all beyond",
+    2: "jerk and higher terms",
+    3: "the fourth power of time and higher terms",
+    4: "the fifth power of time and higher terms",
 }
 
 
 def least_order(rows: Sequence[Requirement]) -> int:
-    """The least order of the warp that a table of `rotation_requirements` allows, one more than its
-    last where none does.
+    """Return the least order of the warp that a table of `rotation_requirements` permits.
+
+    Args:
+        rows: Table of `rotation_requirements`.
+
+    Returns:
+        The order; one more than the last of the table where none is permitted.
     """
     orders = [row for row in rows if row.effect.startswith("warp of order")]
     return next((i for i, row in enumerate(orders, start=1) if row.ok), len(orders) + 1)
 
 
-def _legendre_left(k: Tensor, duration_s: float) -> list[float]:
-    """Largest size (s) over the aperture of the Legendre terms of the warp beyond order 1,
-    2, 3, 4.
-    """
+def _legendre_left(k: Tensor, duration_s: float) -> list[Tensor]:
+    """Sum (s) over the aperture of the Legendre terms of the warp beyond orders 1, 2, 3 and 4."""
     s = np.linspace(-1, 1, _POINTS)
     values = warp(torch.from_numpy((s + 1) * duration_s / 2), k).numpy()
     degree = max(_ORDERS + 1, k.shape[-1] + 1)
@@ -263,25 +318,27 @@ def _legendre_left(k: Tensor, duration_s: float) -> list[float]:
     left = []
     for order in range(1, _ORDERS + 1):
         beyond = np.where(np.arange(degree + 1) > max(order, 1), terms, 0)
-        size = float(np.abs(np.polynomial.legendre.legval(s, beyond)).max())
-        left.append(0.0 if size < 1e-12 * duration_s else size)
+        term = torch.from_numpy(np.polynomial.legendre.legval(s, beyond))
+        left.append(torch.zeros_like(term) if float(term.abs().max()) < 1e-12 * duration_s else term)
     return left
 
 
 def _rates(k: Tensor, duration_s: float) -> Tensor:
+    """Rate of the warp over the aperture."""
     return warp_rate(torch.linspace(0, duration_s, _POINTS, dtype=torch.float64), k)
 
 
 def _whole(k: Tensor, duration_s: float) -> Tensor:
-    """phi(T), s."""
+    """phi(T) in seconds."""
     return warp(torch.tensor([duration_s], dtype=torch.float64), k)[0]
 
 
-def _refuse(omega: float, k: Sequence[float], x: Tensor, lever: Tensor, amplitude: Tensor) -> None:
+def _check(omega: float, k: Sequence[float], x: Tensor, lever: Tensor, amplitude: Tensor) -> None:
+    """Raise ValueError for an invalid rotation or shapes that differ."""
     if not (math.isfinite(omega) and omega > 0) or not all(math.isfinite(one) for one in k):
         raise ValueError(f"a rotation needs a positive rate and finite k, got omega_rad_s={omega} and k={list(k)}")
     if not x.shape == lever.shape == amplitude.shape or x.ndim != 1 or not len(x):
         raise ValueError(
-            "cross_range_m, lever_m and amplitude are (target,) alike, got the shapes "
+            "cross_range_m, lever_m and amplitude must have the same shape (target,), got the shapes "
             f"{tuple(x.shape)}, {tuple(lever.shape)} and {tuple(amplitude.shape)}"
         )

@@ -1,6 +1,4 @@
-"""Backprojection of spotlight and turntable recordings: exact at every point, the yardstick of
-polar format.
-"""
+"""Backprojection of spotlight and turntable recordings, the exact reference for polar format."""
 
 from __future__ import annotations
 
@@ -17,8 +15,18 @@ from torchsar.radar.spotlight import FarField, Spotlight, frequency_samples, fre
 
 
 def window_weights(name: str, n: int, device: torch.device | str | None = None) -> Tensor:
-    """Weights over an aperture or a band, float64 (n,): "none" is all ones, "hann" a raised cosine
-    whose zeros lie just outside, so that all count.
+    """Compute weights over an aperture or a band.
+
+    Args:
+        name: "none" for ones, "hann" for a raised cosine whose zeros lie just outside.
+        n: Number of samples.
+        device: Device of the result.
+
+    Returns:
+        Weights, shape (n,), float64.
+
+    Raises:
+        ValueError: If the window is not known.
     """
     if name not in ("none", "hann"):
         raise ValueError(f"window {name!r} is not known; choose 'none' or 'hann'")
@@ -28,21 +36,39 @@ def window_weights(name: str, n: int, device: torch.device | str | None = None) 
 
 
 def aperture_weights(window: str, geometry: FarField | Spotlight) -> Tensor:
-    """The window over pulses times the window over frequencies, float64 (pulse, range)."""
+    """Compute the product of the windows over pulses and over frequencies.
+
+    Args:
+        window: "none" or "hann".
+        geometry: Geometry of the recording.
+
+    Returns:
+        Weights, shape (pulse, range), float64.
+
+    Raises:
+        ValueError: If the window is not known.
+    """
     f = geometry.frequency_hz
     return window_weights(window, geometry.pulses, f.device)[:, None] * window_weights(window, f.shape[0], f.device)
 
 
 def refuse_other_size(profiles: Tensor, geometry: FarField | Spotlight) -> None:
-    """Raise where profiles (..., pulse, range) are not complex or of another size than the geometry
-    describes.
+    """Check that profiles are complex and of the size of the geometry.
+
+    Args:
+        profiles: Range profiles, shape (..., pulse, range).
+        geometry: Geometry of the recording.
+
+    Raises:
+        TypeError: If the profiles are not complex.
+        ValueError: If their size is not that of the geometry.
     """
     real_dtype(profiles.dtype)
     expected = (geometry.pulses, geometry.frequency_hz.shape[0])
     if tuple(profiles.shape[-2:]) != expected:
         raise ValueError(
             f"profiles of shape {tuple(profiles.shape)} do not end in the (pulse, frequency) = "
-            f"{expected} of the geometry; crop both alike"
+            f"{expected} of the geometry; crop both to the same samples"
         )
 
 
@@ -56,17 +82,33 @@ def backproject_spotlight(
     eps: float = 1e-10,
     block_bytes: int = 1 << 23,
 ) -> Tensor:
-    """Sum over pulses and frequencies of s_k(f) exp(+4j pi f r_k / c), r_k the range of the pixel
-    in pulse k. Complex (..., *pixels).
+    """Sum the samples over pulses and frequencies at the range of each pixel.
 
-    profiles: (..., pulse, range) as `read_inverse` gives them, whose frequency samples are s.
-    geometry: `Spotlight` for exact ranges, `FarField` for plane waves. x_m, y_m: float64 ground
-    coordinates that broadcast to `pixels`. A point of unit amplitude gives the sum of the window
-    weights (their number without a window) with its own phase. Between range samples the profile
-    comes from a non-uniform FFT of relative error eps. Profiles are periodic in range: what lies c
-    / (2 frequency step) farther appears in the same place. Costs pulses x pixels x 40 operations.
-    Differentiable in profiles, pixel and antenna positions; blocks of pulses take about block_bytes
-    an array.
+        image = sum_k sum_f s_k(f) exp(+4j pi f r_k / c),    r_k the range of the pixel in pulse k.
+
+    A point of unit amplitude gives the sum of the window weights (their number without a window)
+    with its own phase. Between range samples the profile comes from a non-uniform FFT. Profiles are
+    periodic in range: a scatterer c / (2 frequency step) farther appears at the same position.
+    Takes pulses x pixels x 40 operations. Differentiable in profiles, pixel and antenna positions.
+
+    Args:
+        profiles: Range profiles, shape (..., pulse, range), complex, as from `read_inverse`; s are
+            their frequency samples.
+        geometry: `Spotlight` for exact ranges, `FarField` for plane waves.
+        x_m: Ground coordinate of the pixels in metres, float64.
+        y_m: Ground coordinate of the pixels in metres, float64; broadcasts against `x_m`.
+        window: "none" or "hann", over pulses and over frequencies.
+        eps: Relative error of the interpolation in range.
+        block_bytes: Size of a working array in bytes.
+
+    Returns:
+        Image, shape (..., *pixels), complex, where `pixels` is the broadcast shape of the
+        coordinates.
+
+    Raises:
+        TypeError: If the profiles are not complex.
+        ValueError: If their size is not that of the geometry, there is no pixel, or the window is
+            not known.
     """
     refuse_other_size(profiles, geometry)
     x, y = torch.broadcast_tensors(
@@ -78,7 +120,7 @@ def backproject_spotlight(
     samples = frequency_samples(profiles) * aperture_weights(window, geometry).to(real_dtype(profiles.dtype))
     between = _BetweenSamples(geometry, eps, samples)
     trials = max(1, math.prod(samples.shape[:-2]))
-    # each of the about 20 working arrays of a block takes up to 16 bytes a pulse and pixel
+    # each of the about 20 working arrays of a block takes up to 16 bytes per pulse and pixel
     pixels_at_once = min(x.numel(), 4096)
     height = max(1, min(samples.shape[-2], block_bytes // (16 * trials * max(pixels_at_once, 2 * samples.shape[-1]))))
     sums = [
@@ -93,11 +135,12 @@ def backproject_spotlight(
 
 
 def _slices(n: int, step: int) -> Iterator[slice]:
+    """Slices of at most `step` that cover 0..n."""
     yield from (slice(first, min(first + step, n)) for first in range(0, n, step))
 
 
 class _BetweenSamples:
-    """Profiles at any range, carrier restored, from their frequency samples."""
+    """Profiles at any range with restored carrier, from their frequency samples."""
 
     def __init__(self, geometry: FarField | Spotlight, eps: float, like: Tensor) -> None:
         f, per_metre = geometry.frequency_hz, 2 / geometry.wave_speed_m_s
@@ -106,14 +149,14 @@ class _BetweenSamples:
         self.carrier_cycles_m = per_metre * float(f[f.shape[0] // 2])
 
     def grid(self, samples: Tensor) -> Tensor:
+        """Oversampled profiles of some pulses."""
         return self.plan.grid(samples)
 
     def at(self, grid: Tensor, range_m: Tensor) -> Tensor:
-        """sum_f s(f) exp(+4j pi f r / c).
-
-        grid: (..., pulse, length), range_m: float64 (pulse, pixel). Returns (..., pulse, pixel).
+        """sum_f s(f) exp(+4j pi f r / c), (..., pulse, pixel), for a grid (..., pulse, length) and
+        ranges (pulse, pixel).
         """
-        # exp(+2j pi k q) asks for points of the other sign
+        # the exponent is +2j pi k q, so that points have the opposite sign
         points = Points.of(
             self.plan.kernel,
             -range_m * (self.step_cycles_m * self.plan.length),
@@ -125,11 +168,17 @@ class _BetweenSamples:
 
 @dataclass(frozen=True)
 class GroundGrid:
-    """A square of the ground plane: extent_m wide, sampled every step_m, about centre_m = (x, y).
+    """A square grid on the ground plane.
 
-    range_axis_rad: direction of the image's range axis, from x towards y; the azimuth axis lies a
-    quarter turn further. At 0 the range axis is x and the azimuth axis y. Centre and axes are in
-    the turned coordinates.
+    Args:
+        extent_m: Side of the square in metres.
+        step_m: Sample spacing in metres.
+        centre_m: Centre (x, y) in metres, in the turned coordinates.
+        range_axis_rad: Direction of the range axis of the image, from x towards y; the azimuth axis
+            is a quarter turn further. At 0 the range axis is x and the azimuth axis y.
+
+    Raises:
+        ValueError: If a number is not finite, or 0 < step_m <= extent_m does not hold.
     """
 
     extent_m: float
@@ -145,22 +194,35 @@ class GroundGrid:
             )
 
     def axes(self) -> tuple[Axis, Axis]:
-        """("azimuth", "range") axes in metres; the centre is sample n // 2."""
+        """Return the axes ("azimuth", "range") in metres; the centre is sample n // 2."""
         n = round(self.extent_m / self.step_m) + 1
         start_range, start_azimuth = (c - (n // 2) * self.step_m for c in self.centre_m)
         return Axis("azimuth", n, start_azimuth, self.step_m, "m"), Axis("range", n, start_range, self.step_m, "m")
 
 
 class GroundImager(Stage):
-    """Base of the stages that turn range profiles into an image of the ground plane, with the axes
-    ("azimuth", "range").
+    """Base of the stages that form an image of the ground plane from range profiles.
 
-    extent_m, step_m, centre_m, range_axis_rad: see `GroundGrid`. height_m: z of the imaged plane.
-    window: "none" or "hann", over pulses and over frequencies. eps: relative error of the
-    interpolation. geometry: where it is known beforehand; otherwise connect recorded side data:
-    `use(PolarFormat(100.0, 0.25), frequency_hz="aux.frequency_hz", position_m="aux.position_m",
-    reference_m="aux.reference_m")`, or frequency_hz and angle_rad for a turntable. One geometry
-    serves all trials.
+    The image has the axes ("azimuth", "range"). One geometry is used for all trials. Where the
+    geometry is not known in advance, connect recorded side data:
+
+        use(PolarFormat(100.0, 0.25), frequency_hz="aux.frequency_hz",
+            position_m="aux.position_m", reference_m="aux.reference_m")
+
+    or `frequency_hz` and `angle_rad` for a turntable.
+
+    Args:
+        extent_m: Side of the image in metres, see `GroundGrid`.
+        step_m: Sample spacing in metres.
+        centre_m: Centre (x, y) in metres.
+        range_axis_rad: Direction of the range axis in rad.
+        height_m: Height z of the imaged plane in metres.
+        window: "none" or "hann", over pulses and over frequencies.
+        eps: Relative error of the interpolation.
+        geometry: Geometry of the recording, if known in advance.
+
+    Raises:
+        ValueError: If the window is not known or the grid is not valid.
     """
 
     def __init__(
@@ -182,7 +244,17 @@ class GroundImager(Stage):
         self.height_m, self.window, self.eps, self.geometry = height_m, window, eps, geometry
 
     def form(self, profiles: Tensor, geometry: FarField | Spotlight, azimuth: Axis, range_: Axis) -> Tensor:
-        """The image (..., azimuth, range); geometry is in the turned coordinates of the axes."""
+        """Form the image; subclasses implement it.
+
+        Args:
+            profiles: Range profiles, shape (..., pulse, range), complex.
+            geometry: Geometry in the turned coordinates of the axes.
+            azimuth: Azimuth axis of the image.
+            range_: Range axis of the image.
+
+        Returns:
+            Image, shape (..., azimuth, range).
+        """
         raise NotImplementedError
 
     def forward(
@@ -193,6 +265,15 @@ class GroundImager(Stage):
         position_m: Tensor | None = None,
         reference_m: Tensor | None = None,
     ) -> Signal:
+        """Form the image of a signal with axes (pulse, range).
+
+        Args:
+            signal: Range profiles.
+            frequency_hz: Frequencies in Hz, shape (range,); None for the geometry of the stage.
+            angle_rad: Angle of each pulse of a turntable in rad, shape (pulse,).
+            position_m: Antenna position of each pulse in metres, shape (pulse, 3).
+            reference_m: Reference range of each pulse in metres, shape (pulse,).
+        """
         geometry = self.geometry
         if geometry is None or frequency_hz is not None:
             geometry = geometry_of(frequency_hz, angle_rad, position_m, reference_m, self.height_m)
@@ -202,11 +283,22 @@ class GroundImager(Stage):
 
 
 class SpotlightBackprojection(GroundImager):
-    """Image the ground plane by backprojection with exact ranges.
+    """Stage that images the ground plane by backprojection with exact ranges.
 
-    Arguments as `GroundImager`; the exact reference for `PolarFormat`.
+    The exact reference for `PolarFormat`; arguments as in `GroundImager`.
     """
 
     def form(self, profiles: Tensor, geometry: FarField | Spotlight, azimuth: Axis, range_: Axis) -> Tensor:
+        """Form the image by backprojection.
+
+        Args:
+            profiles: Range profiles, shape (..., pulse, range), complex.
+            geometry: Geometry in the turned coordinates of the axes.
+            azimuth: Azimuth axis of the image.
+            range_: Range axis of the image.
+
+        Returns:
+            Image, shape (..., azimuth, range).
+        """
         y, x = azimuth.values(profiles.device), range_.values(profiles.device)
         return backproject_spotlight(profiles, geometry, x, y[:, None], window=self.window, eps=self.eps)

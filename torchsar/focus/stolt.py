@@ -1,4 +1,4 @@
-"""Omega-K focusing with the Stolt mapping: exact over the whole swath."""
+"""Omega-K focusing with the Stolt mapping, exact over the whole swath."""
 
 from __future__ import annotations
 
@@ -21,12 +21,20 @@ from torchsar.radar import StripmapRadar
 
 
 class StoltMap:
-    """Residual Stolt mapping of rows that the bulk filter has passed: the change of migration and
-    of range focus over the swath.
+    """Residual Stolt mapping after the bulk filter.
 
-    After bulk filter and refocus only f(G(0) + h) - h is left of the mapping, a fraction of a
-    frequency bin in most scenes; the spectrum is evaluated there by a non-uniform FFT with points
-    of its own in every Doppler row, so that it holds for large ones as well.
+    It corrects the change of migration and of range focus over the swath. After bulk filter and
+    refocusing only f(G(0) + h) - h of the mapping remains, a fraction of a frequency bin in most
+    scenes. The spectrum is evaluated there by a non-uniform FFT with separate points in every
+    Doppler row, so that large residuals are handled as well.
+
+    Args:
+        basis: Basis over the range band.
+        radar: Radar of the recording.
+        n: Number of range samples.
+        eps: Relative error of the interpolation.
+        dtype: Complex type of the data.
+        device: Device of the data.
     """
 
     def __init__(
@@ -43,8 +51,8 @@ class StoltMap:
         self.start = radar.range_frequency_hz(n, device) / self.step_hz
 
     def __call__(self, lines: Tensor, at: FrameGeometry) -> Tensor:
-        """lines: (..., d, range) azimuth spectra after the bulk filter; returns the same with the
-        mapping applied, refocus still to come.
+        """Apply the mapping to azimuth spectra (..., d, range) after the bulk filter and before
+        refocusing.
         """
         residual = residual_frequency(at, self.basis.nodes_hz) / self.step_hz
         real = real_dtype(lines.dtype)
@@ -63,14 +71,30 @@ def omega_k_stolt(
     band_hz: float | None = None,
     eps: float = 2e-4,
 ) -> Tensor:
-    """Omega-K with Stolt interpolation (brief 004, item 7 ii).
+    """Focus by omega-K with Stolt interpolation.
 
-    raw, result: (..., pulse, range) complex.
+    The image of a target is exact at every range; coordinates and phases are those of `omega_k`, to
+    which it tends for narrow swaths. Takes two to three times the time of `omega_k`. Differentiable
+    in the raw data, the velocity and the frame.
 
-    Arguments, coordinates and phases are those of `omega_k`, to which it tends where the swath is
-    narrow; the image of a target is exact at every range. eps: relative error of the interpolation;
-    the default keeps the image within -80 dB, 1e-12 suits complex128 references. Two to three times
-    the time of `omega_k`. Differentiable in raw, velocity and frame.
+    Args:
+        raw: Raw or range-compressed data, shape (..., pulse, range), complex.
+        radar: Radar of the recording.
+        doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,).
+        velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
+            radar.
+        frame_hz: Frame Doppler of the image coordinates in Hz; None for the nominal pointing, else
+            the centroid.
+        reference: Range reference spectrum, shape (range,); None for range-compressed data.
+        band_hz: Processed Doppler bandwidth about the centroid in Hz; None for the whole PRF.
+        eps: Relative error of the interpolation. The default keeps the image error below -80 dB;
+            1e-12 suits complex128 references.
+
+    Returns:
+        Image, shape (..., azimuth, range), complex.
+
+    Raises:
+        ValueError: As in `omega_k`.
     """
     geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz, band_hz=band_hz)
     n, centre = raw.shape[-1], raw.shape[-1] // 2
@@ -87,8 +111,6 @@ def omega_k_stolt(
 
 
 class OmegaKStolt(Focuser):
-    """Focus by omega-K with Stolt interpolation, exact over the whole swath; arguments as
-    `Focuser`.
-    """
+    """Stage that focuses by omega-K with Stolt interpolation; arguments as in `Focuser`."""
 
     form = staticmethod(omega_k_stolt)

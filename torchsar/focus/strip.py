@@ -1,10 +1,10 @@
-"""Focusing of strips longer than memory, by overlapping azimuth blocks of known size.
+"""Focusing of strips longer than memory, by overlapping azimuth blocks.
 
 A focused line is a convolution of raw lines with the azimuth filter, which occupies (processed
 band) / (Doppler rate) seconds and has tails beyond. Blocks overlap by that length and by a guard
-that holds the energy of the cut tails below a tolerance; apart from those tails the blocks give
-what one transform of the whole strip gives. Focusers with a processed band (`band_hz`) have short
-tails; those that use the whole PRF have long ones, because their filter jumps where the band wraps.
+that keeps the energy of the cut tails below a tolerance; except for those tails the blocks equal
+one transform of the whole strip. Focusers with a processed band (`band_hz`) have short tails. Those
+that use the whole PRF have long ones, because their filter is discontinuous where the band wraps.
 """
 
 from __future__ import annotations
@@ -22,13 +22,14 @@ from torchsar.focus.nufft import smooth_length
 from torchsar.focus.omega_k import BAND_EDGE
 from torchsar.radar import StripmapRadar
 
-# of block size at once: raw block, its image, and the previous image in the hands of the caller
+# arrays of block size in memory: raw block, its image, and the previous image held by the caller
 ARRAYS = 3
 
 
 class Lines(Protocol):
-    """Anything sliceable as source[..., first:last, :] into complex samples: a tensor, a numpy
-    array or memmap, a zarr array.
+    """Any source of complex lines that is sliced as source[..., first:last, :].
+
+    Examples are a tensor, a numpy array or memmap, and a zarr array.
     """
 
     shape: Any
@@ -38,9 +39,15 @@ class Lines(Protocol):
 
 @dataclass(frozen=True)
 class StripPlan:
-    """How a strip is cut. Image line k needs the raw lines k + reach[0] ..
+    """Division of a strip into blocks.
 
-    k + reach[1]; blocks read `height` lines each.
+    Image line k needs the raw lines k + reach[0] to k + reach[1].
+
+    Args:
+        n_lines: Number of lines of the strip.
+        height: Raw lines read per block.
+        reach: First and last raw line relative to an image line.
+        bytes: Memory of the samples in bytes.
     """
 
     n_lines: int
@@ -50,7 +57,7 @@ class StripPlan:
 
     @property
     def blocks(self) -> list[tuple[slice, slice]]:
-        """(raw lines to read, image lines to keep) of every block; the kept ones tile the strip."""
+        """Raw lines to read and image lines to keep of every block; the latter tile the strip."""
         if self.height >= self.n_lines:
             return [(slice(0, self.n_lines), slice(0, self.n_lines))]
         step = self.height - (self.reach[1] - self.reach[0])
@@ -63,11 +70,16 @@ class StripPlan:
 
 
 def filter_tail(guard_lines: float) -> float:
-    """Energy of a whole-PRF azimuth filter beyond guard_lines from the ends of its aperture,
-    relative to all of it.
+    """Compute the energy of a whole-PRF azimuth filter beyond a guard, relative to all of it.
 
-    The filter's phase jumps by any amount where the PRF band wraps; a jump of two gives |h| = 1 /
-    (pi g), half of it on average.
+    The phase of the filter jumps by any amount where the PRF band wraps; a jump that changes the
+    filter by 2 gives |h| = 1 / (pi g), and half of that energy is the average.
+
+    Args:
+        guard_lines: Distance g from the ends of the aperture in lines.
+
+    Returns:
+        Relative energy.
     """
     return 1 / (math.pi**2 * guard_lines)
 
@@ -81,14 +93,23 @@ def reach_lines(
     band_hz: float | None = None,
     tolerance_db: float = -60.0,
 ) -> tuple[int, int]:
-    """First and last raw line, relative to an image line, that the image line is made of.
+    """Compute the first and last raw line, relative to an image line, that contribute to it.
 
-    doppler_hz: lowest and highest absolute centroid of the strip; frame_hz: frame of the image
-    coordinates, the centroid itself where None. band_hz: the processed Doppler band of the focuser;
-    its soft edges make the filter compact, the overlap shortest and the tolerance sure. Without one
-    the aperture is that of the whole PRF, and the guard keeps tails below the tolerance for data
-    whose ends of the PRF band are 30 dB down (a beam narrower than the PRF, little noise): data
-    that fill the band agree to about -45 dB.
+    With a processed band the soft edges make the filter compact: the overlap is shortest, and the
+    tolerance holds for any data. Without one the aperture is that of the whole PRF, and the
+    tolerance holds for data that are 30 dB down at the ends of the PRF band (a beam narrower than
+    the PRF, little noise); data that fill the band agree to about -45 dB.
+
+    Args:
+        radar: Radar of the recording.
+        axes: Axes of the raw matrix, (pulse, range).
+        doppler_hz: Lowest and highest absolute centroid of the strip in Hz.
+        frame_hz: Frame Doppler of the image coordinates in Hz; None for the centroid itself.
+        band_hz: Processed Doppler bandwidth of the focuser in Hz; None for the whole PRF.
+        tolerance_db: Energy of the cut tails in dB.
+
+    Returns:
+        First and last raw line relative to the image line.
     """
     far, near = axes[-1].stop, axes[-1].start
     cos2 = 1 - max(float(radar.sin_squint(f)) ** 2 for f in doppler_hz)
@@ -112,8 +133,8 @@ def reach_lines(
 
 
 def _frame_shift_s(radar: StripmapRadar, doppler_hz: float, frame_hz: float, range_m: float) -> float:
-    """Time from the crossing of the frame's direction to the crossing of the beam centre, for a
-    target at slant range range_m of the frame.
+    """Time from the crossing of the frame direction to the crossing of the beam centre, for a
+    target at slant range range_m in the frame.
     """
     sin, sin_frame = (float(radar.sin_squint(f)) for f in (doppler_hz, frame_hz))
     closest = range_m * math.sqrt(1 - sin_frame**2)
@@ -121,11 +142,22 @@ def _frame_shift_s(radar: StripmapRadar, doppler_hz: float, frame_hz: float, ran
 
 
 def plan_strip(shape: tuple[int, ...], reach: tuple[int, int], memory_bytes: int, itemsize: int = 8) -> StripPlan:
-    """Blocks for a strip of shape (..., line, sample) that never hold more than memory_bytes of
-    samples, three arrays of a block at once.
+    """Divide a strip into blocks that fit a memory limit.
 
-    Raises ValueError, naming the least memory that would do, where the overlap leaves no room for
-    new lines.
+    Three arrays of a block are in memory at once.
+
+    Args:
+        shape: Shape of the strip, (..., line, sample).
+        reach: First and last raw line relative to an image line, see `reach_lines`.
+        memory_bytes: Memory for samples in bytes.
+        itemsize: Bytes per sample.
+
+    Returns:
+        Plan of the blocks.
+
+    Raises:
+        ValueError: If the overlap leaves no space for new lines; the message names the least
+            memory.
     """
     n_lines = shape[-2]
     line_bytes = ARRAYS * itemsize * math.prod(shape[:-2]) * shape[-1]
@@ -154,18 +186,32 @@ def focus_strip(
     values: Callable[[slice], Mapping[str, Tensor | float]] | None = None,
     device: torch.device | str | None = None,
 ) -> Iterator[tuple[slice, Signal]]:
-    """Focus block after block; yields (image lines, their image), which tile the strip.
+    """Focus a strip block by block.
 
-    source: (..., line, sample), read by blocks. focus: any focusing stage or chain that keeps the
-    matrix size, called as focus(signal, **values(lines)). values: what differs along the strip,
-    such as {"doppler_hz": ..., "velocity_m_s": ...} for the raw lines of a block; then the radar
-    should have a nominal pointing, which keeps all blocks in one frame. Holds at most `plan.bytes`
-    of samples if the caller keeps one block; the stage's own blocks come on top (tens of
-    megabytes). Raises ValueError where source and plan disagree.
+    Holds at most `plan.bytes` of samples if the caller keeps one block; the working memory of the
+    stage is additional (tens of megabytes).
+
+    Args:
+        source: Raw lines, shape (..., line, sample), read by blocks.
+        focus: Focusing stage or chain that keeps the size of the matrix, called as focus(signal,
+            **values(lines)).
+        radar: Radar of the recording.
+        plan: Plan of the blocks.
+        axes: Axes of the raw matrix; None for those of the radar.
+        values: Values that change along the strip, such as {"doppler_hz": ..., "velocity_m_s":
+            ...}, for the raw lines of a block. The radar should then have a nominal pointing, which
+            gives all blocks the same frame.
+        device: Device for the computation.
+
+    Yields:
+        Image lines and their image; the images tile the strip.
+
+    Raises:
+        ValueError: If the source has another number of lines than the plan.
     """
     if source.shape[-2] != plan.n_lines:
         raise ValueError(
-            f"the plan is for {plan.n_lines} lines, the source has {source.shape[-2]}; plan anew "
+            f"the plan is for {plan.n_lines} lines, the source has {source.shape[-2]}; make a plan "
             "with plan_strip(source.shape, ...)"
         )
     axes = radar.raw_axes(plan.n_lines, source.shape[-1]) if axes is None else axes
@@ -183,11 +229,12 @@ def _focus_block(
     values: Mapping[str, Tensor | float],
     device: torch.device | str | None,
 ) -> Signal:
+    """Focus one block and select the image lines to keep."""
     pulse, range_ = axes
     raw = Signal(torch.as_tensor(source[..., read, :], device=device), (pulse.part(read.start, read.stop), range_))
     image = focus(raw, **values).data
     del raw
-    # the azimuth transform is circular: an image line outside the block read appears at its place
+    # the azimuth transform is circular: an image line outside the block appears at its position
     # modulo the block
     first, count = (keep.start - read.start) % image.shape[-2], keep.stop - keep.start
     if first + count > image.shape[-2]:
@@ -197,8 +244,11 @@ def _focus_block(
 
 
 def write_strip(blocks: Iterator[tuple[slice, Signal]], target: Any) -> None:
-    """Write every block into target[..., lines, :] (a tensor, numpy array or memmap, zarr array) as
-    it is made.
+    """Write the blocks of `focus_strip` into an array as they are produced.
+
+    Args:
+        blocks: Image lines and their image.
+        target: Tensor, numpy array or memmap, or zarr array, written as target[..., lines, :].
     """
     for lines, image in blocks:
         samples: Any = image.data if isinstance(target, Tensor) else image.data.cpu().numpy()

@@ -1,4 +1,4 @@
-"""The image of a target from its range profiles, by what the recording tells about the geometry."""
+"""Image of a target from its range profiles, by polar format or by a transform along pulses."""
 
 from __future__ import annotations
 
@@ -13,14 +13,21 @@ from torchsar.radar import FarField, InverseRadar, Spotlight
 
 
 class TargetImage(Stage):
-    """Range profiles ("pulse", "range") to an image ("azimuth", "range"): polar format where the
-    geometry is known, else a transform along pulses.
+    """Stage that forms an image ("azimuth", "range") from range profiles ("pulse", "range").
 
-    window: "none" or "hann" over pulses (and frequencies, in polar format). oversampling: of the
-    transform. step_cells: sample spacing of the polar image in resolution cells. Its range axis
-    lies along the mean line of sight, range growing away from the radar, and it covers the whole
-    unambiguous extent of cross range and all range cells: what `autofocus` asks of an image
-    formation.
+    Polar format where the geometry is known, otherwise a transform along pulses. The polar image
+    has its range axis along the mean line of sight, range increasing away from the radar; it covers
+    the whole unambiguous extent of cross range and all range cells, as `autofocus` requires.
+
+    Args:
+        radar: Radar of the recording.
+        geometry: Geometry of the recording; None where it is not known.
+        window: "none" or "hann" over pulses, in polar format also over frequencies.
+        oversampling: Lines per cross-range cell of the transform along pulses.
+        step_cells: Sample spacing of the polar image in resolution cells, above 0 and at most 1.
+
+    Raises:
+        ValueError: If `step_cells`, `window` or `oversampling` is not valid.
     """
 
     def __init__(
@@ -44,12 +51,20 @@ class TargetImage(Stage):
         self._operator: PolarOperator | None = None
 
     def operator(self, profiles: Tensor) -> PolarOperator | None:
-        """The polar operator for profiles (..., pulse, range), kept for the next of the same kind;
-        None where images are transforms along pulses.
+        """Return the polar operator for profiles, or None where images are transforms along pulses.
+
+        The operator is stored for further profiles of the same dtype and device.
+
+        Args:
+            profiles: Range profiles, shape (..., pulse, range), complex.
+
+        Raises:
+            ValueError: If the size is not that of the geometry, or the line of sight does not
+                rotate.
         """
         if self.waves is None:
             return None
-        self._refuse_other_pulses(profiles)
+        self._check_size(profiles)
         kept = self._operator
         if kept is None or kept.dtype != profiles.dtype or kept.geometry.direction.device != profiles.device:
             waves = self.waves.to(profiles.device)
@@ -58,23 +73,26 @@ class TargetImage(Stage):
             )
         return kept
 
-    def _refuse_other_pulses(self, profiles: Tensor) -> None:
-        """Before an operator is kept for them."""
+    def _check_size(self, profiles: Tensor) -> None:
+        """Raise ValueError for profiles of another size than the geometry."""
         assert self.waves is not None
         want = self.waves.direction.shape[0], self.waves.frequency_hz.shape[0]
         if profiles.shape[-2:] != want:
             raise ValueError(
                 f"profiles of shape {tuple(profiles.shape)} do not end in the (pulse, frequency) = "
-                f"{want} of the geometry; crop both alike"
+                f"{want} of the geometry; crop both to the same samples"
             )
 
     def _axes(self, waves: FarField, profiles: Tensor) -> tuple[Axis, Axis]:
+        """Axes of the polar image."""
         n_pulse, n_range = profiles.shape[-2:]
         turn = abs(float(waves.direction[-1, 1] - waves.direction[0, 1])) / max(
             n_pulse - 1, 1
-        )  # cross range enters the range by so much more a pulse
+        )  # change of range per pulse and metre of cross range
         if not turn:
-            raise ValueError("the line of sight does not turn; without a turn there is no cross range to image")
+            raise ValueError(
+                "the line of sight does not rotate, so that there is no cross range to image; record over an angle"
+            )
         across = self.radar.wavelength_m / (2 * turn)
         along = self.radar.range_step_m * n_range / float(waves.direction.norm(dim=-1).mean())
         return _axis("azimuth", across, self.step_cells * across / n_pulse), _axis(
@@ -82,6 +100,15 @@ class TargetImage(Stage):
         )
 
     def forward(self, signal: Signal) -> Signal:
+        """Form the image of a signal with axes (pulse, range).
+
+        Args:
+            signal: Range profiles.
+
+        Raises:
+            ValueError: If the size is not that of the geometry, or the line of sight does not
+                rotate.
+        """
         operator = self.operator(signal.data)
         return (
             self.along(signal)
@@ -91,13 +118,12 @@ class TargetImage(Stage):
 
 
 def _along_sight(waves: FarField) -> FarField:
-    """The geometry in coordinates whose first axis is the mean ground direction away from the
-    radar.
-    """
+    """Geometry in coordinates whose first axis is the mean ground direction away from the radar."""
     mean = waves.direction.mean(0)
     return waves.turned(math.atan2(float(mean[1]), float(mean[0])))
 
 
 def _axis(name: str, extent_m: float, step_m: float) -> Axis:
+    """Axis of an extent and a sample spacing, centred on zero."""
     n = max(1, round(extent_m / step_m))
     return Axis(name, n, -(n // 2) * step_m, step_m, "m")

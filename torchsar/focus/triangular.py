@@ -1,5 +1,9 @@
-"""From dechirped triangular sweeps to a focused image: range compression, azimuth deramp, azimuth
-matched filter.
+"""From dechirped triangular sweeps to a focused image.
+
+Range compression, azimuth deramp, azimuth matched filter.
+
+Reference:
+    Remote Sens. 2024, 16, 793.
 """
 
 from __future__ import annotations
@@ -14,36 +18,63 @@ from torchsar.core import Axis, Signal, Stage, refuse_non_finite, unit_phasor
 from torchsar.radar import TriangularLadar
 
 Ramp = Literal["up", "down"]
+# middle of each sweep as a share of the period
 _EPOCH = {"up": 0.25, "down": 0.75}
 
 
 def video_filter(frequency_hz: Tensor, radar: TriangularLadar, ramp: Ramp = "up") -> Tensor:
-    """exp(+j pi f^2 / K) for beats of the up sweep, its conjugate for the down sweep, complex128:
-    takes out the residual video phase (paper, Eq. 5, erratum 2).
+    """Compute the filter that removes the residual video phase.
+
+    exp(+j pi f^2 / K) for the up-sweep, its conjugate for the down-sweep.
+
+    Args:
+        frequency_hz: Beat frequencies f in Hz.
+        radar: Radar with the chirp rate K.
+        ramp: "up" or "down".
+
+    Returns:
+        Filter, same shape, complex128.
+
+    Reference:
+        Remote Sens. 2024, 16, 793, Eq. (5), whose printed sign belongs to the conjugate convention.
     """
     turns = frequency_hz.square() / (2 * radar.chirp_rate_hz_s)
     return unit_phasor(turns if ramp == "up" else -turns, torch.complex128)
 
 
 def compress_sweeps(sweeps: Tensor, radar: TriangularLadar, ramp: Ramp = "up", video: bool = True) -> Tensor:
-    """Range profiles (..., pulse, N) of the up or the down sweeps, relative range rising from -(N
-    // 2) cells.
+    """Compress the up-sweeps or the down-sweeps into range profiles.
 
-    sweeps: (..., 2, pulse, N) in the radar's dechirp sign; the result is in the sign of the paper,
-    phase +4 pi RD / lambda. A scatterer of amplitude a has a peak a. video: take out the residual
-    video phase, -pi K dtau^2 of the up sweep; after motion compensation, not before (brief 000,
-    section 3). Spectra refer to the middle of the sweep. Differentiable. Raises TypeError or
-    ValueError for other sweeps.
+    The sweeps are in the dechirp sign of the radar. The profiles are in the sign of the Reference,
+    with the phase +4 pi RD / lambda for the relative range RD, and refer to the middle of the
+    sweep. A scatterer of amplitude a has the peak a. Remove the residual video phase after motion
+    compensation, not before. Differentiable.
+
+    Args:
+        sweeps: Dechirped sweeps, shape (..., 2, pulse, N), up before down, complex.
+        radar: Radar of the recording.
+        ramp: "up" or "down".
+        video: Remove the residual video phase, -pi K dtau^2 of the up-sweep.
+
+    Returns:
+        Range profiles, shape (..., pulse, N), relative range rising from -(N // 2) cells.
+
+    Raises:
+        TypeError: If the sweeps are not complex.
+        ValueError: If the sweeps have another shape or are not finite, or `ramp` is not known.
+
+    Reference:
+        Remote Sens. 2024, 16, 793, Eq. (5), for the residual video phase.
     """
     n = radar.sweep_samples
     if not (isinstance(sweeps, Tensor) and sweeps.is_complex()):
         raise TypeError(
-            f"compress_sweeps works on complex sweeps (..., 2, pulse, {n}), got "
+            f"compress_sweeps needs complex sweeps (..., 2, pulse, {n}), got "
             f"{getattr(sweeps, 'dtype', type(sweeps).__name__)}"
         )
     if sweeps.ndim < 3 or sweeps.shape[-3] != 2 or sweeps.shape[-2] < 1 or sweeps.shape[-1] != n:
         raise ValueError(
-            f"compress_sweeps works on sweeps (..., 2, pulse, {n}), up before down, got shape {tuple(sweeps.shape)}"
+            f"compress_sweeps needs sweeps (..., 2, pulse, {n}), up before down, got shape {tuple(sweeps.shape)}"
         )
     refuse_non_finite(sweeps, "compress_sweeps")
     if ramp not in _EPOCH:
@@ -59,7 +90,15 @@ def compress_sweeps(sweeps: Tensor, radar: TriangularLadar, ramp: Ramp = "up", v
 
 
 def profile_axes(pulse: Axis, radar: TriangularLadar, ramp: Ramp = "up") -> tuple[Axis, Axis]:
-    """Axes of range profiles: slow time of the middles of the sweeps (s), relative range (m)."""
+    """Return the axes of range profiles: slow time in seconds, relative range in metres.
+
+    Slow time refers to the middle of the sweeps.
+
+    Args:
+        pulse: Pulse axis of the sweeps.
+        radar: Radar of the recording.
+        ramp: "up" or "down".
+    """
     n = radar.sweep_samples
     middle = Axis("pulse", pulse.n, pulse.start + _EPOCH[ramp] * radar.period_s, pulse.step, "s")
     return middle, Axis("range", n, -(n // 2) * radar.range_step_m, radar.range_step_m, "m")
@@ -68,8 +107,21 @@ def profile_axes(pulse: Axis, radar: TriangularLadar, ramp: Ramp = "up") -> tupl
 def azimuth_turns(
     pulse: Axis, range_: Axis, radar: TriangularLadar, device: torch.device | str | None = None
 ) -> Tensor:
-    """Turns 2 (sqrt(R^2 + (V t)^2) - R) / lambda of a scatterer at azimuth zero, (pulse, range)
-    float64, R = reference + relative range.
+    """Compute the azimuth phase in turns of a scatterer at azimuth zero.
+
+    It is 2 (sqrt(R^2 + (V t)^2) - R) / lambda with R = reference + relative range.
+
+    Args:
+        pulse: Slow time of the samples, zero abeam.
+        range_: Relative range.
+        radar: Radar of the recording.
+        device: Device of the result.
+
+    Returns:
+        Phase in turns, shape (pulse, range), float64.
+
+    Raises:
+        ValueError: If the range axis reaches the radar.
     """
     across = (radar.speed_m_s * pulse.values(device))[:, None].square()
     r = radar.reference_range_m + range_.values(device)
@@ -80,28 +132,40 @@ def azimuth_turns(
     return 2 / radar.wavelength_m * across / (torch.sqrt(r.square() + across) + r)
 
 
-def _refuse_other_profiles(data: Tensor, pulse: Axis, range_: Axis, what: str) -> None:
+def _check_profiles(data: Tensor, pulse: Axis, range_: Axis, what: str) -> None:
     """Raise TypeError or ValueError unless data are finite, complex and shaped as their axes."""
     if not (isinstance(data, Tensor) and data.is_complex()):
         raise TypeError(
-            f"{what} works on complex profiles (..., pulse, range), got {getattr(data, 'dtype', type(data).__name__)}"
+            f"{what} needs complex profiles (..., pulse, range), got {getattr(data, 'dtype', type(data).__name__)}"
         )
     if data.ndim < 2 or tuple(data.shape[-2:]) != (pulse.n, range_.n):
         raise ValueError(
-            f"{what} works on profiles (..., {pulse.n}, {range_.n}) as their axes say, got shape {tuple(data.shape)}"
+            f"{what} needs profiles (..., {pulse.n}, {range_.n}) that match their axes, got shape {tuple(data.shape)}"
         )
     refuse_non_finite(data, what)
 
 
 def deramp_azimuth(data: Tensor, radar: TriangularLadar, pulse: Axis, range_: Axis) -> Tensor:
-    """Profiles (..., pulse, range) without the azimuth phase of a scatterer at azimuth zero; one at
-    x keeps a tone of -2 V x / (lambda R) Hz.
+    """Remove the azimuth phase of a scatterer at azimuth zero.
 
-    pulse: slow time of the samples (middles of the sweeps), zero abeam. What estimators of a phase
-    per pulse need. Differentiable. Raises TypeError or ValueError for data that are not complex,
-    not finite, or do not fit their axes.
+    A scatterer at azimuth x keeps a tone of -2 V x / (lambda R) Hz. Estimators of a phase per pulse
+    need deramped profiles. Differentiable.
+
+    Args:
+        data: Range profiles, shape (..., pulse, range), complex.
+        radar: Radar of the recording.
+        pulse: Slow time of the samples (middles of the sweeps), zero abeam.
+        range_: Relative range.
+
+    Returns:
+        Deramped profiles, same shape.
+
+    Raises:
+        TypeError: If the data are not complex.
+        ValueError: If the data are not finite or do not fit their axes, or the range axis reaches
+            the radar.
     """
-    _refuse_other_profiles(data, pulse, range_, "deramp_azimuth")
+    _check_profiles(data, pulse, range_, "deramp_azimuth")
     return data * unit_phasor(-azimuth_turns(pulse, range_, radar, data.device), data.dtype)
 
 
@@ -113,17 +177,31 @@ def azimuth_matched_filter(
     beam_rad: float | None = None,
     weighting: float = 0.0,
 ) -> Tensor:
-    """Image (..., azimuth, range) of deramped profiles (..., pulse, range): sum over the aperture
-    of s(t) exp(-j 2 pi (V t - x)^2 / (lambda R)) at x = V t.
+    """Form the image of deramped profiles by the azimuth matched filter.
 
-    beam_rad: azimuth angle of the aperture, beam_rad * R long about every x, by default the
-    radar's, and the whole record where that is None. A scatterer that is lit all over its aperture
-    keeps its amplitude. weighting: a of the weights 1 - a + a cos(2 pi y / L) over the aperture L,
-    which lower the first side lobes (0: -13.27 dB; 0.03: -13.9 dB and 1 % wider; 0.46: Hamming).
-    Exact phases of every range cell; no wrap-around. Differentiable. Raises ValueError for a target
-    that stands still, or a weighting outside 0..0.5.
+    The image is the sum over the aperture of s(t) exp(-j 2 pi (V t - x)^2 / (lambda R)) at x = V t,
+    with the exact phases of every range cell and without wrap-around. A scatterer that is
+    illuminated over its whole aperture keeps its amplitude. Differentiable.
+
+    Args:
+        data: Deramped profiles, shape (..., pulse, range), complex.
+        radar: Radar of the recording.
+        pulse: Slow time of the samples.
+        range_: Relative range.
+        beam_rad: Azimuth angle of the aperture, which is beam_rad * R long about every x; None for
+            that of the radar, or the whole record where the radar has none.
+        weighting: Coefficient a of the weights 1 - a + a cos(2 pi y / L) over the aperture L, which
+            lower the first side lobes (0: -13.27 dB; 0.03: -13.9 dB and 1 % wider; 0.46: Hamming).
+
+    Returns:
+        Image, shape (..., azimuth, range).
+
+    Raises:
+        TypeError: If the data are not complex.
+        ValueError: If the data are not finite or do not fit their axes, the speed of the radar is
+            0, `beam_rad` is not positive, or `weighting` lies outside 0..0.5.
     """
-    _refuse_other_profiles(data, pulse, range_, "azimuth_matched_filter")
+    _check_profiles(data, pulse, range_, "azimuth_matched_filter")
     if not 0 <= weighting <= 0.5:
         raise ValueError(f"weighting must lie in 0..0.5, got {weighting}")
     if not radar.speed_m_s > 0:
@@ -141,14 +219,14 @@ def azimuth_matched_filter(
     )
     length = 2 ** math.ceil(math.log2(2 * n - 1 + n - 1))
     lit = torch.minimum(2 * half + 1, torch.full_like(half, n))
-    # the aperture goes with the pixel, but for that of the whole record, which stays where it is
-    weights, still = (
+    # the aperture is centred on the pixel, except that of the whole record, which is fixed
+    weights, fixed = (
         (_cosine(lag[:, None] / lit, weighting), 1.0)
         if int(half.max()) < n
         else (1.0, _cosine((lag[n - 1 :, None] - (n - 1) / 2) / n, weighting))
     )
     data, filter_ = (
-        x * w.to(x.real.dtype) if isinstance(w, Tensor) else x for x, w in ((data, still), (filter_, weights))
+        x * w.to(x.real.dtype) if isinstance(w, Tensor) else x for x, w in ((data, fixed), (filter_, weights))
     )
     spectrum = torch.fft.fft(data * unit_phasor(turns, data.dtype), length, dim=-2) * torch.fft.fft(
         filter_, length, dim=-2
@@ -174,7 +252,17 @@ def _half_aperture(radar: TriangularLadar, pulse: Axis, range_: Axis, beam_rad: 
 
 
 class CompressSweeps(Stage):
-    """`compress_sweeps` of one ramp; window_m: keep only these relative ranges (low, high)."""
+    """Stage that compresses the sweeps of one ramp into range profiles, see `compress_sweeps`.
+
+    Args:
+        radar: Radar of the recording.
+        ramp: "up" or "down".
+        video: Remove the residual video phase.
+        window_m: Least and greatest relative range to keep in metres; None for all.
+
+    Raises:
+        ValueError: If `ramp` is not known.
+    """
 
     works_on = ("ramp", "pulse", "fast_time")
 
@@ -192,6 +280,14 @@ class CompressSweeps(Stage):
         self.ramp: Ramp = ramp
 
     def forward(self, signal: Signal) -> Signal:
+        """Compress a signal with axes (ramp, pulse, fast_time).
+
+        Args:
+            signal: Dechirped sweeps.
+
+        Raises:
+            ValueError: If `window_m` does not lie in the relative ranges of the profiles.
+        """
         axes = profile_axes(signal.axis("pulse"), self.radar, self.ramp)
         out = Signal(compress_sweeps(signal.data, self.radar, self.ramp, self.video), axes)
         if self.window_m is None:
@@ -210,24 +306,44 @@ class CompressSweeps(Stage):
 
 
 class DerampAzimuth(Stage):
-    """`deramp_azimuth`."""
+    """Stage that removes the azimuth phase of a scatterer at azimuth zero, see `deramp_azimuth`.
+
+    Args:
+        radar: Radar of the recording.
+    """
 
     def __init__(self, radar: TriangularLadar) -> None:
         super().__init__()
         self.radar = radar
 
     def forward(self, signal: Signal) -> Signal:
+        """Deramp a signal with axes (pulse, range).
+
+        Args:
+            signal: Range profiles.
+        """
         return signal.with_data(deramp_azimuth(signal.data, self.radar, *signal.axes))
 
 
 class AzimuthMatchedFilter(Stage):
-    """`azimuth_matched_filter`: deramped profiles in, an image (azimuth, range) in metres out."""
+    """Stage that forms an image (azimuth, range) in metres from deramped profiles.
+
+    Args:
+        radar: Radar of the recording.
+        beam_rad: Azimuth angle of the aperture, see `azimuth_matched_filter`.
+        weighting: Coefficient of the aperture weights, see `azimuth_matched_filter`.
+    """
 
     def __init__(self, radar: TriangularLadar, beam_rad: float | None = None, weighting: float = 0.0) -> None:
         super().__init__()
         self.radar, self.beam_rad, self.weighting = radar, beam_rad, weighting
 
     def forward(self, signal: Signal) -> Signal:
+        """Filter a signal with axes (pulse, range).
+
+        Args:
+            signal: Deramped profiles.
+        """
         pulse, range_ = signal.axes
         image = azimuth_matched_filter(signal.data, self.radar, pulse, range_, self.beam_rad, self.weighting)
         v = self.radar.speed_m_s

@@ -1,8 +1,11 @@
-"""Ways to form the sum of a matched Fourier transform over pulses, each with its exact adjoint:
-gridding, the sum itself, resampling, a compiled library.
+"""Sums of a matched Fourier transform over pulses, each with its exact adjoint.
 
-Source: Greengard and Lee 2004 (non-uniform FFT), see `focus.gridding`; Remote Sens. 2025, 17, 3447,
-Eq. (9).
+The sums are formed by gridding, directly, by resampling, or by a compiled library; the choices are
+in `focus.transforms`.
+
+Reference:
+    Remote Sens. 2025, 17, 3447, Eq. (9); Greengard and Lee 2004 (non-uniform FFT), see
+    `focus.gridding`.
 """
 
 from __future__ import annotations
@@ -23,14 +26,31 @@ from torchsar.focus.nufft import Kernel
 
 
 def slow_times(n_pulse: int, prf_hz: float, device: torch.device | str | None = None) -> Tensor:
-    """Time since the first pulse (s), float64 (n_pulse,)."""
+    """Return the time since the first pulse.
+
+    Args:
+        n_pulse: Number of pulses.
+        prf_hz: Pulse rate in Hz.
+        device: Device of the result.
+
+    Returns:
+        Times in seconds, shape (n_pulse,), float64.
+    """
     return torch.arange(n_pulse, dtype=torch.float64, device=device) / prf_hz
 
 
 def normalised_warp(k: Tensor, n_pulse: int, prf_hz: float) -> tuple[Tensor, Tensor]:
-    """u = phi(t) / phi(T) and its rate du/d(t/T), 1 for even rotation. k: (..., order - 1).
+    """Compute the normalised warp u = phi(t) / phi(T) and its rate du/d(t/T) at the pulses.
 
-    Returns two float64 (..., pulse). Differentiable.
+    The rate is 1 for uniform rotation. Differentiable.
+
+    Args:
+        k: Coefficients of the warp, shape (..., order - 1).
+        n_pulse: Number of pulses.
+        prf_hz: Pulse rate in Hz.
+
+    Returns:
+        u and its rate, shape (..., pulse) each, float64.
     """
     k = k.to(torch.float64)
     total = whole_warp(k, n_pulse / prf_hz)
@@ -39,70 +59,141 @@ def normalised_warp(k: Tensor, n_pulse: int, prf_hz: float) -> tuple[Tensor, Ten
 
 
 def whole_warp(k: Tensor, duration_s: float) -> Tensor:
-    """phi(T), (..., 1)."""
+    """Compute the warp of the whole aperture, phi(T).
+
+    Args:
+        k: Coefficients of the warp, shape (..., order - 1).
+        duration_s: Aperture time T in seconds.
+
+    Returns:
+        phi(T) in seconds, shape (..., 1), float64.
+    """
     return warp(torch.tensor([duration_s], dtype=torch.float64, device=k.device), k)
 
 
 class Sum(Protocol):
-    """Pulses (..., pulse, range) into lines (..., line, range), and the adjoint."""
+    """A linear map from pulses to image lines with its adjoint."""
 
-    def forward(self, pulses: Tensor) -> Tensor: ...
+    def forward(self, pulses: Tensor) -> Tensor:
+        """Transform pulses (..., pulse, range) into lines (..., line, range).
 
-    def adjoint(self, image: Tensor) -> Tensor: ...
+        Args:
+            pulses: Pulses, complex.
+        """
+        ...
+
+    def adjoint(self, image: Tensor) -> Tensor:
+        """Transform lines (..., line, range) into pulses (..., pulse, range).
+
+        Args:
+            image: Image lines, complex.
+        """
+        ...
 
 
 class Gridded:
-    """By gridding, see `focus.gridding`."""
+    """The sum by gridding, see `focus.gridding`.
+
+    Args:
+        points: Cycles per line of each pulse, shape (..., pulse), float64.
+        lines: Number of image lines.
+        kernel: Interpolation kernel.
+        dtype: Complex type of the data.
+        scale: Factor on the sum.
+    """
 
     def __init__(self, points: Tensor, lines: int, kernel: Kernel, dtype: torch.dtype, scale: float) -> None:
         self.plan = PulseNufft(lines, kernel, dtype, points.device, scale)
         self.points = self.plan.points(points)
 
     def forward(self, pulses: Tensor) -> Tensor:
+        """Transform pulses (..., pulse, range) into lines (..., line, range).
+
+        Args:
+            pulses: Pulses, complex.
+        """
         return self.plan.type1(pulses, self.points)
 
     def adjoint(self, image: Tensor) -> Tensor:
+        """Transform lines (..., line, range) into pulses (..., pulse, range).
+
+        Args:
+            image: Image lines, complex.
+        """
         return self.plan.type2(image, self.points)
 
 
 class Explicit:
-    """The sum itself, by blocks of lines."""
+    """The direct sum, by blocks of lines.
+
+    Args:
+        points: Cycles per line of each pulse, shape (..., pulse), float64.
+        lines: Number of image lines.
+        dtype: Complex type of the data.
+        scale: Factor on the sum.
+    """
 
     def __init__(self, points: Tensor, lines: int, dtype: torch.dtype, scale: float) -> None:
         self.points, self.lines, self.dtype, self.scale = points, lines, dtype, scale
 
     def _blocks(self) -> list[tuple[int, int]]:
+        """First line and number of lines of each block."""
         size = max(16, 32 * block_bytes_of(self.points.device) // (self.points.numel() * self.dtype.itemsize))
         return [(at, min(size, self.lines - at)) for at in range(0, self.lines, size)]
 
     def _matrix(self, at: int, count: int) -> Tensor:
-        """(..., pulse, line)."""
+        """Matrix (..., pulse, line) of a block of lines."""
         return self.scale * linear_phasor(self.points, at - self.lines // 2, count, self.dtype)
 
     def forward(self, pulses: Tensor) -> Tensor:
+        """Transform pulses (..., pulse, range) into lines (..., line, range).
+
+        Args:
+            pulses: Pulses, complex.
+        """
         return torch.cat([self._matrix(*block).mT @ pulses for block in self._blocks()], -2)
 
     def adjoint(self, image: Tensor) -> Tensor:
+        """Transform lines (..., line, range) into pulses (..., pulse, range).
+
+        Args:
+            image: Image lines, complex.
+        """
         parts = [self._matrix(at, count).conj() @ image[..., at : at + count, :] for at, count in self._blocks()]
         return torch.stack(parts).sum(0)
 
 
 class Resampled:
-    """Pulses interpolated to times of even angle, then a transform over those: the classical way.
+    """The sum by interpolation of the pulses to equal steps of angle, followed by an FFT.
 
-    Over du, so that a sum over pulses takes 1 / rate.
+    The transform over equal steps is an integral over du, so that pulses are divided by the rate of
+    the warp.
+
+    Args:
+        k: Coefficients of the warp, shape (..., order - 1), float64.
+        n_pulse: Number of pulses.
+        prf_hz: Pulse rate in Hz.
+        step: Step between image lines in Doppler cells, shape (...,), float64.
+        lines: Number of image lines.
+        interpolation: "linear" or "spline".
+        scale: Factor on the sum.
     """
 
     def __init__(
-        self, k: Tensor, n_pulse: int, prf_hz: float, step: Tensor, lines: int, method: str, scale: float
+        self, k: Tensor, n_pulse: int, prf_hz: float, step: Tensor, lines: int, interpolation: str, scale: float
     ) -> None:
         self.step, self.lines, self.n_pulse = step, lines, n_pulse
-        self.interpolate = {"linear": _linear, "spline": _spline}[method]
+        self.interpolate = {"linear": _linear, "spline": _spline}[interpolation]
         time = times_of_even_angle(k, n_pulse, prf_hz)
         rate = warp_rate(time, k) * (n_pulse / prf_hz) / whole_warp(k, n_pulse / prf_hz)
         self.position, self.factor = time * prf_hz, scale / rate
 
     def forward(self, pulses: Tensor) -> Tensor:
+        """Transform pulses (..., pulse, range) into lines (..., line, range).
+
+        Args:
+            pulses: Pulses, complex.
+        """
         even = self.interpolate(pulses, self.position) * self.factor.to(pulses.real.dtype)[..., None]
         length = round(self.n_pulse / float(self.step)) if self.step.ndim == 0 and not self.step.requires_grad else 0
         if length < self.lines or abs(length * float(self.step) - self.n_pulse) > 1e-9 * self.n_pulse:
@@ -112,7 +203,11 @@ class Resampled:
         return torch.cat([whole[..., length - half :], whole[..., : self.lines - half]], -1).mT
 
     def adjoint(self, image: Tensor) -> Tensor:
-        """By automatic differentiation of the linear map."""
+        """Transform lines into pulses, by automatic differentiation of the linear map.
+
+        Args:
+            image: Image lines, shape (..., line, range), complex.
+        """
         trials = torch.broadcast_shapes(image.shape[:-2], self.position.shape[:-1])
         with torch.enable_grad():
             pulses = image.new_zeros(*trials, self.n_pulse, image.shape[-1]).requires_grad_()
@@ -122,9 +217,17 @@ class Resampled:
 
 
 def times_of_even_angle(k: Tensor, n_pulse: int, prf_hz: float) -> Tensor:
-    """Times (s) at which the warp reaches j phi(T) / n_pulse, float64 (..., n_pulse).
+    """Compute the times at which the warp reaches equal steps of angle, j phi(T) / n_pulse.
 
     Differentiable twice: the last two Newton steps carry gradients.
+
+    Args:
+        k: Coefficients of the warp, shape (..., order - 1), float64.
+        n_pulse: Number of pulses.
+        prf_hz: Pulse rate in Hz.
+
+    Returns:
+        Times in seconds, shape (..., n_pulse), float64.
     """
     duration = n_pulse / prf_hz
     angle = torch.arange(n_pulse, dtype=torch.float64, device=k.device) / n_pulse * whole_warp(k, duration)
@@ -136,7 +239,7 @@ def times_of_even_angle(k: Tensor, n_pulse: int, prf_hz: float) -> Tensor:
 
 
 def _table_times(angle: Tensor, k: Tensor, n_pulse: int, prf_hz: float) -> Tensor:
-    """The same to within a pulse's bend, from a table of the warp at the pulses."""
+    """First approximation of these times, linear between the values of the warp at the pulses."""
     table = warp(slow_times(n_pulse + 1, prf_hz, k.device), k)
     piece = (torch.searchsorted(table.contiguous(), angle.contiguous(), right=True) - 1).clamp(0, n_pulse - 1)
     low, high = table.gather(-1, piece), table.gather(-1, piece + 1)
@@ -144,16 +247,15 @@ def _table_times(angle: Tensor, k: Tensor, n_pulse: int, prf_hz: float) -> Tenso
 
 
 def _linear(pulses: Tensor, position: Tensor) -> Tensor:
-    """Straight lines between pulses. pulses: (..., pulse, range), position in pulses (..., m).
-
-    Returns (..., m, range); the end pieces go on.
+    """Linear interpolation of pulses (..., pulse, range) at positions (..., m) in pulses, (..., m,
+    range); extrapolated at the ends.
     """
     piece, right = _piece(position, pulses)
     return (1 - right) * _pulses_at(pulses, piece) + right * _pulses_at(pulses, piece + 1)
 
 
 def _spline(pulses: Tensor, position: Tensor) -> Tensor:
-    """The not-a-knot cubic spline through the pulses; shapes as _linear."""
+    """Not-a-knot cubic spline through the pulses, with the shapes of `_linear`."""
     piece, right = _piece(position, pulses)
     parts = torch.view_as_real(pulses.resolve_conj()).movedim(-3, -1).to(torch.float64)
     bend = torch.view_as_complex(second_differences(parts).movedim(-1, -3).contiguous()).to(pulses.dtype)
@@ -164,7 +266,7 @@ def _spline(pulses: Tensor, position: Tensor) -> Tensor:
 
 
 def _piece(position: Tensor, pulses: Tensor) -> tuple[Tensor, Tensor]:
-    """Index of the pulse before each position, and how far it is behind, (..., m, 1) in the
+    """Index of the pulse before each position, and the distance from it, (..., m, 1), in the
     precision of the pulses.
     """
     piece = torch.floor(position.detach()).clamp(0, pulses.shape[-2] - 2)
@@ -179,8 +281,18 @@ def _pulses_at(pulses: Tensor, index: Tensor) -> Tensor:
 
 
 class Compiled:
-    """The compiled library, in float64 whatever the data: its single-precision points lose a
-    thousandth of a cell far from zero.
+    """The sum by the compiled library finufft, in float64 for all data.
+
+    In single precision its points lose a thousandth of a cell far from zero.
+
+    Args:
+        points: Cycles per line of each pulse, shape (..., pulse), float64.
+        lines: Number of image lines.
+        eps: Relative error.
+        scale: Factor on the sum.
+
+    Raises:
+        ModuleNotFoundError: If finufft is not installed.
     """
 
     def __init__(self, points: Tensor, lines: int, eps: float, scale: float) -> None:
@@ -188,9 +300,19 @@ class Compiled:
         self.points, self.lines, self.eps, self.scale = points, lines, eps, scale
 
     def forward(self, pulses: Tensor) -> Tensor:
+        """Transform pulses (..., pulse, range) into lines (..., line, range).
+
+        Args:
+            pulses: Pulses, complex.
+        """
         return _CompiledSum.apply(*self._together(pulses), self.lines, self.eps).to(pulses.dtype) * self.scale
 
     def adjoint(self, image: Tensor) -> Tensor:
+        """Transform lines (..., line, range) into pulses (..., pulse, range).
+
+        Args:
+            image: Image lines, complex.
+        """
         return _CompiledSum.apply(*self._together(image), 0, self.eps).to(image.dtype) * self.scale
 
     def _together(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -200,7 +322,7 @@ class Compiled:
 
 
 class _CompiledSum(torch.autograd.Function):
-    """Type 1 into `lines` for lines > 0, else its adjoint. First derivatives, in data and
+    """Type 1 into `lines` for lines > 0, otherwise its adjoint; first derivatives in data and
     points.
     """
 
@@ -222,7 +344,7 @@ class _CompiledSum(torch.autograd.Function):
 
 
 def _compiled(x: Tensor, points: Tensor, lines: int, eps: float) -> Tensor:
-    """One plan a trial: the library takes one set of points at a time."""
+    """One transform of the library per trial, since it takes one set of points at a time."""
     library, n, columns = _library(), lines or points.shape[-1], x.shape[-1]
     rows = x.detach().mT.reshape(-1, columns, x.shape[-2]).contiguous().cpu().numpy()
     angles = (
@@ -237,9 +359,12 @@ def _compiled(x: Tensor, points: Tensor, lines: int, eps: float) -> Tensor:
 
 
 def _library() -> Any:
+    """The module finufft; raises ModuleNotFoundError with the name of the extra where it is
+    missing.
+    """
     try:
         return importlib.import_module("finufft")
     except ModuleNotFoundError:
         raise ModuleNotFoundError(
-            "method 'finufft' needs the package finufft: pip install 'torchsar-lab[nufft]', or choose method 'nufft'"
+            "CompiledNufft needs the package finufft: pip install 'torchsar-lab[nufft]', or choose Gridding()"
         ) from None

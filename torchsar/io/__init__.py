@@ -1,4 +1,4 @@
-"""Recorded data in, images out."""
+"""Readers of recorded data."""
 
 from torchsar.io.inverse import read_inverse
 from torchsar.io.recorded import read_stripmap

@@ -1,6 +1,4 @@
-"""Recorded inverse and spotlight data from `.npz` files: range profiles of a target in flight,
-turntable sweeps, phase histories.
-"""
+"""Reader of recorded inverse synthetic aperture and spotlight data in `.npz` files."""
 
 from __future__ import annotations
 
@@ -16,34 +14,46 @@ from torchsar.core import Recording
 from torchsar.radar import LIGHT_M_S, InverseRadar, range_profiles
 from torchsar.radar.spotlight import frequency_step_hz
 
+# sample array of each kind of data, and the keys that it requires
 _SCHEMAS = {
     "profiles": ("range_step_m", "bandwidth_hz", "prf_hz"),
     "sig": ("freq_hz", "angle_deg"),
     "fp": ("freq_hz", "x_m", "y_m", "z_m", "r0_m"),
 }
+# C band, commonly given in the literature for the Yak-42 recording, not verified; `profiles`
+# without `f0_hz` are taken for data of this kind
 UNSTATED_CARRIER_HZ = 5.52e9
 
 
 def read_inverse(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording:
-    """Read range profiles, a turntable sweep or a spotlight phase history from a numpy archive
-    without pickles.
+    """Read range profiles, a turntable sweep or a spotlight phase history from a numpy archive.
 
-    Schema, known by its keys: (a) target in flight: `profiles` complex (range, pulse), range
-    growing away from the radar, with the numbers `range_step_m`, `bandwidth_hz`, `prf_hz`, and
-    optionally `f0_hz` (5.52e9 where it is not stated; it only scales cross range); (b) turntable:
-    `sig` complex (frequency, pulse), `freq_hz` (frequency,) rising in equal steps, `angle_deg`
-    (pulse,), phase -4 pi f (x cos a + y sin a) / c; (c) spotlight: `fp` complex (frequency, pulse),
-    `freq_hz`, antenna position `x_m`, `y_m`, `z_m` (pulse,) about the scene centre, and reference
-    range `r0_m` (pulse,), phase -4 pi f (|antenna - p| - r0) / c. (b) and (c) may state `prf_hz`, 1
-    by default, so that slow time counts pulses. Other keys are ignored.
+    The archive has no pickles and holds one of three sample arrays. Target in flight: `profiles`,
+    complex (range, pulse), range increasing away from the radar, with the numbers `range_step_m`,
+    `bandwidth_hz`, `prf_hz` and optionally `f0_hz` (by default 5.52e9; it only scales cross range).
+    Turntable: `sig`, complex (frequency, pulse), of phase -4 pi f (x cos a + y sin a) / c, with
+    `freq_hz` (frequency,) rising in equal steps and `angle_deg` (pulse,). Spotlight: `fp`, complex
+    (frequency, pulse), of phase -4 pi f (|antenna - p| - r0) / c, with `freq_hz`, the antenna
+    position `x_m`, `y_m`, `z_m` (pulse,) relative to the scene centre, and the reference range
+    `r0_m` (pulse,). Turntable and spotlight data may have `prf_hz`, by default 1, so that slow time
+    counts pulses. Other keys are ignored.
 
-    Returns a Recording of range profiles with the axes (pulse, range) and an InverseRadar; range is
-    zero at cell n // 2, the scene centre. For (b) and (c) profiles are the centred unitary
-    transform of the frequency samples (`radar.frequency_samples` takes it back), and aux holds, in
-    float64, `frequency_hz` (range,) and `angle_rad` (pulse,), or `position_m` (pulse, 3) and
-    `reference_m` (pulse,): what `PolarFormat` and `SpotlightBackprojection` connect to.
-    radar.rotation_rad_s is the mean turn of the line of sight, unknown for (a). Raises
-    FileNotFoundError, or ValueError naming the file and the key.
+    Args:
+        path: Path of the archive.
+        dtype: complex64 or complex128, dtype of the profiles.
+
+    Returns:
+        Recording of range profiles with the axes (pulse, range) and an InverseRadar. Range is zero
+        at cell n // 2, the scene centre. For turntable and spotlight data the profiles are the
+        centred unitary transform of the frequency samples, which `radar.frequency_samples` inverts,
+        and `aux` holds, in float64, `frequency_hz` (range,) in Hz with `angle_rad` (pulse,), or
+        with `position_m` (pulse, 3) and `reference_m` (pulse,): the inputs of `PolarFormat` and
+        `SpotlightBackprojection`. `radar.rotation_rad_s` is the mean rotation rate of the line of
+        sight, None for a target in flight.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file is not such an archive, or a key is missing or invalid.
     """
     path = Path(path)
     arrays = _load(path)
@@ -55,6 +65,7 @@ def read_inverse(path: str | Path, dtype: torch.dtype = torch.complex64) -> Reco
 
 
 def _load(path: Path) -> dict[str, np.ndarray]:
+    """Arrays of the archive by name."""
     if not path.is_file():
         raise FileNotFoundError(
             f"data.file: {path} does not exist; give the path of an .npz file with range profiles or phase history"
@@ -67,10 +78,7 @@ def _load(path: Path) -> dict[str, np.ndarray]:
 
 
 def _kind(arrays: dict[str, np.ndarray], path: Path) -> str:
-    """Which schema: the one whose sample array is there.
-
-    Raises where none or several are, or where keys of it lack.
-    """
+    """Key of the only sample array in the archive; raise ValueError if keys are missing."""
     found = [kind for kind in _SCHEMAS if kind in arrays]
     if len(found) != 1:
         choices = "; ".join(f"{kind} with {', '.join(keys)}" for kind, keys in _SCHEMAS.items())
@@ -88,6 +96,7 @@ def _kind(arrays: dict[str, np.ndarray], path: Path) -> str:
 
 
 def _samples(value: np.ndarray, key: str, path: Path) -> Tensor:
+    """Sample array as a complex tensor."""
     if not np.iscomplexobj(value) or value.ndim != 2 or min(value.shape) < 2:
         rows = "range" if key == "profiles" else "frequency"
         raise ValueError(f"{path}: {key} must be complex ({rows}, pulse) with two or more of each, got {_shown(value)}")
@@ -97,9 +106,7 @@ def _samples(value: np.ndarray, key: str, path: Path) -> Tensor:
 def _profiles_radar(
     arrays: dict[str, np.ndarray], shape: torch.Size, path: Path
 ) -> tuple[InverseRadar, dict[str, Any]]:
-    """The radar's bandwidth is the sampled one, c / (2 step), so that its range cell is the step of
-    the file.
-    """
+    """Radar of range profiles; its bandwidth is c / (2 step), so that a range cell is the step."""
     step, bandwidth = _number(arrays, "range_step_m", path), _number(arrays, "bandwidth_hz", path)
     sampled = LIGHT_M_S / (2 * step)
     if bandwidth > 1.01 * sampled:
@@ -114,6 +121,7 @@ def _profiles_radar(
 def _turntable_radar(
     arrays: dict[str, np.ndarray], shape: torch.Size, path: Path
 ) -> tuple[InverseRadar, dict[str, Any]]:
+    """Radar and side data of a turntable sweep."""
     frequency = _frequency(arrays, shape[0], path)
     angle = torch.deg2rad(_vector(arrays, "angle_deg", shape[1], path))
     turn = float((angle[-1] - angle[0]).abs())
@@ -123,12 +131,13 @@ def _turntable_radar(
 def _spotlight_radar(
     arrays: dict[str, np.ndarray], shape: torch.Size, path: Path
 ) -> tuple[InverseRadar, dict[str, Any]]:
+    """Radar and side data of a spotlight phase history."""
     frequency = _frequency(arrays, shape[0], path)
     position = torch.stack([_vector(arrays, key, shape[1], path) for key in ("x_m", "y_m", "z_m")], -1)
     reference = _vector(arrays, "r0_m", shape[1], path)
     if not bool((reference > 0).all() and (torch.linalg.vector_norm(position, dim=-1) > 0).all()):
         raise ValueError(
-            f"{path}: r0_m must be positive and the antenna must not stand at the scene centre, "
+            f"{path}: r0_m must be positive and the antenna must not be at the scene centre, "
             f"got r0_m down to {float(reference.min()):g}"
         )
     aux = {"frequency_hz": frequency, "position_m": position, "reference_m": reference}
@@ -141,7 +150,7 @@ _READERS = {"profiles": _profiles_radar, "sig": _turntable_radar, "fp": _spotlig
 def _radar(
     arrays: dict[str, np.ndarray], frequency: Tensor, shape: torch.Size, turn_rad: float, reference_m: float, path: Path
 ) -> InverseRadar:
-    """turn_rad: of the line of sight between the first and the last pulse."""
+    """Radar of frequency samples whose line of sight turns by turn_rad from first to last pulse."""
     prf = _number(arrays, "prf_hz", path) if "prf_hz" in arrays else 1.0
     n = shape[0]
     rotation = turn_rad * prf / (shape[1] - 1)
@@ -155,11 +164,13 @@ def _radar(
 
 
 def _turn_rad(position: Tensor) -> float:
+    """Angle between the first and the last line of sight, radians."""
     first, last = (position[i] / torch.linalg.vector_norm(position[i]) for i in (0, -1))
     return 2 * math.asin(min(1.0, float(torch.linalg.vector_norm(last - first)) / 2))
 
 
 def _frequency(arrays: dict[str, np.ndarray], n: int, path: Path) -> Tensor:
+    """Frequencies in Hz, rising in equal steps."""
     frequency = _vector(arrays, "freq_hz", n, path)
     try:
         frequency_step_hz(frequency)
@@ -169,6 +180,7 @@ def _frequency(arrays: dict[str, np.ndarray], n: int, path: Path) -> Tensor:
 
 
 def _vector(arrays: dict[str, np.ndarray], key: str, n: int, path: Path) -> Tensor:
+    """Side data of n finite real numbers."""
     value = np.asarray(arrays[key])
     if value.shape != (n,) or value.dtype.kind not in "iuf" or not np.isfinite(value).all():
         raise ValueError(f"{path}: {key} must be {n} finite real numbers, got {_shown(value)}")
@@ -176,6 +188,7 @@ def _vector(arrays: dict[str, np.ndarray], key: str, n: int, path: Path) -> Tens
 
 
 def _number(arrays: dict[str, np.ndarray], key: str, path: Path) -> float:
+    """One positive number."""
     value = np.asarray(arrays[key])
     if not (value.ndim == 0 and value.dtype.kind in "iuf" and np.isfinite(value) and value > 0):
         raise ValueError(f"{path}: {key} must be one positive number, got {_shown(value)}")
@@ -183,4 +196,5 @@ def _number(arrays: dict[str, np.ndarray], key: str, path: Path) -> float:
 
 
 def _shown(value: np.ndarray) -> str:
+    """Value or shape of an array for messages."""
     return repr(value.item()) if value.ndim == 0 else f"{value.dtype} of shape {value.shape}"

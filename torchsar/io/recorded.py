@@ -1,5 +1,6 @@
-"""Recorded stripmap data from `.npz` files; a user's own arrays become a Recording by
-`Recording.from_arrays`.
+"""Reader of recorded raw stripmap data in `.npz` files.
+
+`Recording.from_arrays` makes a recording from arrays in any other form.
 """
 
 from __future__ import annotations
@@ -13,22 +14,35 @@ import torch
 from torchsar.core import Recording
 from torchsar.radar import LIGHT_M_S, LinearFM, StripmapRadar
 
+# keys of the archive: samples, then numbers
 _REQUIRED = ("iq", "fs_hz", "prf_hz", "f0_hz", "chirp_rate_hz_s", "pulse_s", "slant_range_cell1_m", "v_eff_m_s")
+# optional keys that become side data of the recording
 _AUX = ("agc_db", "line_number", "pilot")
 
 
 def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording:
-    """Read a raw stripmap recording from a numpy archive without pickles.
+    """Read a raw stripmap recording from a numpy archive.
 
-    Schema: `iq` integer or float (line, sample, 2) or complex (line, sample); numbers `fs_hz`,
-    `prf_hz`, `f0_hz`, `chirp_rate_hz_s` (negative: down-chirp), `pulse_s`, `slant_range_cell1_m`
-    (slant range of cell 1, leading edge of the echo), `v_eff_m_s` (nominal effective velocity);
-    optional `first_line`, `first_cell` (1-based position of the block, default 1), `c_m_s`,
-    `agc_db` (line,) receiver attenuation, undone here, `line_number` (line,), and `pilot` (sample,)
-    a recorded pilot tone. A Doppler ambiguity in the file is ignored: the processor finds it.
+    The archive has no pickles and holds the samples `iq`, integer or float (line, sample, 2) or
+    complex (line, sample), and the numbers `fs_hz`, `prf_hz`, `f0_hz`, `chirp_rate_hz_s` (negative
+    for a down-chirp), `pulse_s`, `slant_range_cell1_m` (slant range of cell 1, at the leading edge
+    of the echo) and `v_eff_m_s` (nominal effective velocity). Optional are `first_cell` (index of
+    the first sample, counted from 1, by default 1), `c_m_s` (speed of light), `agc_db` (line,)
+    (attenuation of the receiver in dB, compensated here), `line_number` (line,) and `pilot`
+    (sample,), a recorded pilot tone. Other keys are ignored, a Doppler ambiguity among them, which
+    the processor estimates.
 
-    Returns a Recording with the axes (pulse, range). Raises FileNotFoundError, or ValueError naming
-    the file and the key.
+    Args:
+        path: Path of the archive.
+        dtype: complex64 or complex128, dtype of the samples.
+
+    Returns:
+        Recording with the axes (pulse, range), a StripmapRadar, and the optional side data in
+        `aux`.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file is not such an archive, or a key is missing or invalid.
     """
     path = Path(path)
     if not path.is_file():
@@ -55,6 +69,7 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Rec
 
 
 def _radar(number: dict[str, float], c: float, first_cell: int) -> StripmapRadar:
+    """Radar with these numbers, c in m/s."""
     rate, duration, fs = number["chirp_rate_hz_s"], number["pulse_s"], number["fs_hz"]
     return StripmapRadar(
         carrier_hz=number["f0_hz"],
@@ -68,7 +83,7 @@ def _radar(number: dict[str, float], c: float, first_cell: int) -> StripmapRadar
 
 
 def _number(arrays: dict[str, np.ndarray], key: str, path: Path) -> float:
-    """A finite number; positive too, but for the chirp rate, whose sign is the direction."""
+    """One finite number, positive except for the chirp rate, whose sign is the direction."""
     value = np.asarray(arrays[key])
     signed = key == "chirp_rate_hz_s"
     plain = value.ndim == 0 and value.dtype.kind in "iuf"
@@ -81,6 +96,7 @@ def _number(arrays: dict[str, np.ndarray], key: str, path: Path) -> float:
 
 
 def _first_cell(arrays: dict[str, np.ndarray], path: Path) -> int:
+    """Index of the first sample, counted from 1."""
     value = np.asarray(arrays.get("first_cell", 1))
     if value.ndim or value.dtype.kind not in "iuf" or value != np.round(value):
         raise ValueError(f"{path}: first_cell must be one whole number, got {_shown(value)}")
@@ -88,10 +104,12 @@ def _first_cell(arrays: dict[str, np.ndarray], path: Path) -> int:
 
 
 def _shown(value: np.ndarray) -> str:
+    """Value or shape of an array for messages."""
     return repr(value.item()) if value.ndim == 0 else f"{value.dtype} of shape {value.shape}"
 
 
 def _complex(iq: np.ndarray, path: Path) -> np.ndarray:
+    """Samples as complex numbers."""
     if np.iscomplexobj(iq) and iq.ndim == 2:
         return iq
     if iq.ndim == 3 and iq.shape[-1] == 2 and iq.dtype.kind in "iuf":

@@ -1,4 +1,4 @@
-"""Figures of merit, and the bounds that estimators are judged by."""
+"""Image quality, errors of estimates, and Cramer-Rao bounds."""
 
 from torchsar.metrics.bistatic_bounds import bistatic_bounds, radial_velocity_bound_m_s
 from torchsar.metrics.bounds import (

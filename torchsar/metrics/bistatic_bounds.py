@@ -1,8 +1,7 @@
-"""What no estimator of a moving point can beat: bounds of its velocities and place in the data of a
-receiver with channels along track (brief 001, Velocity).
+"""Cramer-Rao bounds of a moving point seen by a receiver with several channels along track.
 
-snr is everywhere the power of the point over the noise variance, of one range-compressed sample of
-one channel where the gate is one.
+`snr` is the power of the point over the noise variance, of one range-compressed sample of one
+channel where the weight of the antenna pattern is one.
 """
 
 from __future__ import annotations
@@ -17,24 +16,37 @@ from torch import Tensor
 from torchsar.core import per_trial, unit_phasor
 from torchsar.radar import BistaticRadar, receive_range
 
+# slant-range speed (closing positive), along-track speed, along-track position at t = 0
 UNKNOWNS = ("u_r_m_s", "u_a_m_s", "y0_m")
-_SINGULAR = 1e-13  # eigenvalues of a correlation matrix below it are rounding
-_TOUCHED = 1e-12  # squared share of an unknown in a direction that nothing is known about
+# float64 rounding: eigenvalues of a correlation matrix below this count as zero
+_SINGULAR = 1e-13
+# float64 rounding: an unknown whose squared share in an unobservable direction exceeds this has an
+# infinite bound
+_INVOLVED = 1e-12
 
 Value = Tensor | float
 
 
 def radial_velocity_bound_m_s(radar: BistaticRadar, snr: Value, n_seen: Value, u_a_m_s: Value = 0.0) -> Tensor:
-    """Bound of u_r (m/s) with u_a, y0 and amplitude unknown, in closed form: v lambda / (2 pi
-    sqrt(2 Ns snr sum (dx_m - mean dx)^2)), float64.
+    """Compute the bound of u_r with u_a, y0 and the amplitude unknown, in closed form.
 
-    n_seen: pulses Ns with the point in the gate. Three channels d apart give v lambda / (4 pi d
-    sqrt(Ns snr)). It is what the look angle between the channels tells; the curvature of the
-    Doppler history, which `bistatic_bounds` includes, adds almost nothing. Infinite for a single
-    channel.
+        v lambda / (2 pi sqrt(2 Ns snr sum (dx_m - mean dx)^2))
+
+    Three channels d apart give v lambda / (4 pi d sqrt(Ns snr)). The formula describes the look
+    angle between the channels. The curvature of the Doppler history, which `bistatic_bounds`
+    includes, adds almost nothing.
+
+    Args:
+        radar: Radar with the positions of the channels along track.
+        snr: Power of the point over the noise variance per sample.
+        n_seen: Number of pulses Ns in which the point is illuminated.
+        u_a_m_s: Along-track speed of the point in m/s.
+
+    Returns:
+        Standard deviation of u_r in m/s, float64; infinite for a single channel.
     """
-    places = radar.channels_at()
-    spread = (places - places.mean()).square().sum()
+    along_m = radar.channels_at()
+    spread = (along_m - along_m.mean()).square().sum()
     speed = radar.speed_m_s - torch.as_tensor(u_a_m_s, dtype=torch.float64)
     energy = torch.as_tensor(n_seen, dtype=torch.float64) * torch.as_tensor(snr, dtype=torch.float64)
     return speed * radar.wavelength_m / (2 * math.pi * torch.sqrt(2 * energy * spread))
@@ -49,52 +61,72 @@ def bistatic_bounds(
     y0_m: Value = 0.0,
     range_m: Value | None = None,
     *,
-    integration_s: float | None = None,
+    integration_s: Value | None = None,
     unknown: Sequence[str] = UNKNOWNS,
     gate_tells: bool = False,
     covariance: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """Least standard deviations of the unknowns among u_r_m_s, u_a_m_s and y0_m (m/s, m), float64
-    (...,) each, infinite where the data tell nothing.
+    """Compute the least standard deviations of the velocities and the position of a moving point.
 
-    Samples are a w exp(-j 2 pi / lambda R_m(t)) of n_pulse pulses and all channels, transmit range
-    removed, complex amplitude a unknown, R0 and the noise known. Values broadcast over trials.
-    integration_s: length of a rectangular gate |t - y0/v| < T/2; None for the one-way pattern of
-    the radar's elements. unknown: the others are known. With u_a and y0 known, u_r is a mere
-    frequency and its bound means little for an estimator that must find them. gate_tells: count
-    what the slopes of the pattern tell about where the point is; by default only phases count.
-    covariance: of noise and clutter across channels in each bin, FFT order, of the unitary FFT over
-    the pulses, (..., n_pulse, channel, channel), where white noise of unit variance is the
-    identity. Information 2 snr Re(D^H C^-1 D) with the amplitude projected out; at 0 dB, PRF 180
-    Hz, T 4.5 s and three channels 0.8 m apart 0.251 m/s, with u_a known 0.148, with y0 known too
-    0.00042. Raises ValueError for names that are no unknowns, a rectangular gate that is to tell,
-    and shapes that do not fit.
+    The samples are a w exp(-j 2 pi / lambda R_m(t)) over `n_pulse` pulses and all channels, with
+    the transmit range removed; the complex amplitude a is unknown, R0 and the noise are known. The
+    Fisher information is 2 snr Re(D^H C^-1 D) after projection onto the complement of the
+    amplitude. At 0 dB, PRF 180 Hz, 4.5 s and three channels 0.8 m apart the bound of u_r is 0.251
+    m/s; with u_a known 0.148 m/s; with y0 known too 0.00042 m/s. In the last case u_r is a mere
+    frequency, and its bound means little for an estimator that must find the others as well.
+
+    Args:
+        radar: Radar with the positions of the channels along track.
+        n_pulse: Number of pulses.
+        snr: Power of the point over the noise variance per sample.
+        u_r_m_s: Slant-range speed in m/s, closing positive.
+        u_a_m_s: Along-track speed in m/s.
+        y0_m: Along-track position at t = 0 in metres.
+        range_m: Slant range at t = 0 in metres; None for the reference range of the radar.
+        integration_s: Length T of a rectangular gate |t - y0/v| < T/2 in seconds, a number or shape
+            (...,); None for the one-way pattern of the radar's elements.
+        unknown: Names of the unknowns; the others are known.
+        gate_tells: Include the information in the slopes of the antenna pattern about the position.
+            By default only phases count.
+        covariance: Covariance of noise and clutter across the channels, shape (..., n_pulse,
+            channel, channel), per bin of the unitary FFT over the pulses in FFT order. White noise
+            of unit variance is the identity.
+
+    Returns:
+        Bounds of the unknowns by name in m/s and m, shape (...,) each, float64; infinite for
+        unknowns that the data do not determine.
+
+    Raises:
+        ValueError: If `unknown` has other names, `gate_tells` is set with a rectangular gate, or
+            `covariance` has another shape.
     """
-    _refuse(radar, n_pulse, unknown, integration_s, gate_tells, covariance)
+    _check(radar, n_pulse, unknown, integration_s, gate_tells, covariance)
     like = next((x for x in (u_r_m_s, u_a_m_s, y0_m, snr, covariance) if isinstance(x, Tensor)), torch.zeros(()))
     values = [
         per_trial(x, 2, like) for x in (u_r_m_s, u_a_m_s, y0_m, radar.reference_range_m if range_m is None else range_m)
     ]
-    seen = _Seen.of(radar, radar.pulse_axis(n_pulse).values(like.device), *values)
+    point = _MovingPoint.of(radar, radar.pulse_axis(n_pulse).values(like.device), *values)
     weight, slopes = (
-        (seen.pattern(), seen.pattern_slopes()) if integration_s is None else (seen.rectangle(integration_s), None)
+        (point.pattern(), point.pattern_slopes())
+        if integration_s is None
+        else (point.rectangle(per_trial(integration_s, 2, like)), None)
     )
-    turned = -2 * math.pi / radar.wavelength_m * weight[..., None] * seen.range_slopes()
+    turned = -2 * math.pi / radar.wavelength_m * weight[..., None] * point.range_slopes()
     columns = torch.complex(
         slopes.expand_as(turned) if gate_tells and slopes is not None else torch.zeros_like(turned), turned
     )
     columns = columns[..., [UNKNOWNS.index(name) for name in unknown]]
     samples = torch.cat([weight[..., None].to(columns.dtype).expand(*columns.shape[:-1], 1), columns], -1)
     if covariance is not None:
-        samples = _whitened(samples * seen.phasor()[..., None], covariance)
-    bounds = _deviations(_information(samples.flatten(-3, -2))) / per_trial(snr, 1, like).sqrt()
+        samples = _whitened(samples * point.phasor()[..., None], covariance)
+    bounds = _standard_deviations(_information(samples.flatten(-3, -2))) / per_trial(snr, 1, like).sqrt()
     return dict(zip(unknown, bounds.unbind(-1), strict=True))
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """A point over channels and pulses: (..., channel, pulse), values with two unit dims behind the
-    trials.
+class _MovingPoint:
+    """Geometry of a point over channels and pulses, (..., channel, pulse); the values have two unit
+    dims behind the trials.
     """
 
     radar: BistaticRadar
@@ -107,10 +139,11 @@ class _Seen:
     path_m: Tensor
 
     @staticmethod
-    def of(radar: BistaticRadar, time_s: Tensor, u_r: Tensor, u_a: Tensor, y0: Tensor, range_m: Tensor) -> _Seen:
+    def of(radar: BistaticRadar, time_s: Tensor, u_r: Tensor, u_a: Tensor, y0: Tensor, range_m: Tensor) -> _MovingPoint:
+        """Geometry of the point with these velocities, position and range."""
         dx, speed = radar.channels_at(time_s.device)[:, None], radar.speed_m_s - u_a
         excess = receive_range(time_s, u_r, u_a, y0, range_m, radar.speed_m_s, dx)
-        return _Seen(
+        return _MovingPoint(
             radar, time_s, speed, y0, range_m - u_r * time_s, speed * time_s - y0 - dx, excess, excess + range_m
         )
 
@@ -120,17 +153,20 @@ class _Seen:
         return torch.stack([-self.closing_m * self.time_s / self.path_m, -sine * self.time_s, -sine], -1)
 
     def phasor(self) -> Tensor:
+        """exp(-j 2 pi (R_m - R0) / lambda), complex128."""
         return unit_phasor(-self.excess_m / self.radar.wavelength_m, torch.complex128)
 
-    def rectangle(self, integration_s: float) -> Tensor:
+    def rectangle(self, integration_s: Tensor) -> Tensor:
+        """Rectangular gate: 1 within the integration time, else 0."""
         inside = (self.time_s - self.y0_m / self.speed_m_s).abs() < integration_s / 2
         return inside.to(torch.float64).expand(self.along_m.shape)
 
     def pattern(self) -> Tensor:
+        """One-way amplitude pattern of the elements."""
         return torch.sinc(self._offset())
 
     def pattern_slopes(self) -> Tensor:
-        """dw / d(u_r, u_a, y0), (..., channel, pulse, 3)."""
+        """Derivative of the pattern by (u_r, u_a, y0), (..., channel, pulse, 3)."""
         x = self._offset()[..., None]
         near = x.abs() < 1e-4
         safe = torch.where(near, 1.0, x)
@@ -148,12 +184,13 @@ class _Seen:
         )
 
     def _offset(self) -> Tensor:
+        """Argument of the sinc of the pattern."""
         return self.radar.element_m / self.radar.wavelength_m * self.along_m / self.path_m
 
 
 def _whitened(samples: Tensor, covariance: Tensor) -> Tensor:
-    """C^-1/2 over the channels of each Doppler bin of (..., channel, pulse, column); bins take the
-    place of pulses.
+    """C^-1/2 applied over the channels of each Doppler bin of (..., channel, pulse, column); bins
+    replace pulses.
     """
     spectra = torch.fft.fft(samples, dim=-2, norm="ortho").movedim(-3, -2)
     root = torch.linalg.cholesky(covariance.to(spectra.dtype))
@@ -162,51 +199,52 @@ def _whitened(samples: Tensor, covariance: Tensor) -> Tensor:
 
 def _information(samples: Tensor) -> Tensor:
     """2 Re(D^H D) (..., unknown, unknown) of the columns (..., sample, 1 + unknown) after the
-    first, their part along the first taken out.
+    first, made orthogonal to the first.
     """
     point, columns = samples[..., :1], samples[..., 1:]
     energy = point.abs().square().sum(-2, keepdim=True)
     unit = point * torch.where(energy > 0, energy, 1).rsqrt()
-    for _ in range(2):  # a second pass takes out what rounding leaves
+    for _ in range(2):  # the second pass removes rounding errors of the first
         columns = columns - unit * (unit.conj() * columns).sum(-2, keepdim=True)
     return 2 * (columns.mH @ columns).real
 
 
-def _deviations(information: Tensor) -> Tensor:
-    """Square roots of the diagonal of the inverse (..., n, n) -> (..., n), infinite for unknowns
-    that a direction without information takes part in.
+def _standard_deviations(information: Tensor) -> Tensor:
+    """Square roots of the diagonal of the inverse, (..., n, n) to (..., n); infinite for unknowns
+    with a share in an unobservable direction.
     """
     size = information.diagonal(dim1=-2, dim2=-1)
     root = torch.where(size > 0, size, 1).rsqrt()
     value, vector = torch.linalg.eigh(information * root[..., :, None] * root[..., None, :])
-    blind, share = (value < _SINGULAR)[..., None, :], vector.square()
-    variance = torch.where(blind, 0.0, share / torch.where(blind, 1.0, value[..., None, :])).sum(-1)
-    return torch.where((share * blind).sum(-1) > _TOUCHED, torch.inf, variance.sqrt() * root)
+    unobservable, share = (value < _SINGULAR)[..., None, :], vector.square()
+    variance = torch.where(unobservable, 0.0, share / torch.where(unobservable, 1.0, value[..., None, :])).sum(-1)
+    return torch.where((share * unobservable).sum(-1) > _INVOLVED, torch.inf, variance.sqrt() * root)
 
 
-def _refuse(
+def _check(
     radar: BistaticRadar,
     n_pulse: int,
     unknown: Sequence[str],
-    integration_s: float | None,
+    integration_s: Value | None,
     gate_tells: bool,
     covariance: Tensor | None,
 ) -> None:
+    """Raise ValueError for arguments that do not fit."""
     if not unknown or len(set(unknown)) != len(unknown) or not set(unknown) <= set(UNKNOWNS):
-        raise ValueError(f"bistatic_bounds: unknown names some of {UNKNOWNS}, each once, got {tuple(unknown)}")
-    if integration_s is not None and not integration_s > 0:
+        raise ValueError(f"bistatic_bounds: unknown must name some of {UNKNOWNS}, each once, got {tuple(unknown)}")
+    if integration_s is not None and not bool((torch.as_tensor(integration_s) > 0).all()):
         raise ValueError(
             "bistatic_bounds: integration_s must be positive, or None for the pattern of the "
             f"elements, got {integration_s}"
         )
     if integration_s is not None and gate_tells:
         raise ValueError(
-            "bistatic_bounds: the edges of a rectangular gate have no Cramer-Rao bound; leave "
-            "gate_tells out, or use the pattern (integration_s=None)"
+            "bistatic_bounds: the edges of a rectangular gate have no Cramer-Rao bound; leave out "
+            "gate_tells, or use the pattern (integration_s=None)"
         )
     expected = (n_pulse, radar.channels, radar.channels)
     if covariance is not None and tuple(covariance.shape[-3:]) != expected:
         raise ValueError(
-            f"bistatic_bounds: covariance is (..., n_pulse, channel, channel), here {expected}, "
+            f"bistatic_bounds: covariance must have the shape (..., n_pulse, channel, channel), here {expected}, "
             f"got the shape {tuple(covariance.shape)}"
         )

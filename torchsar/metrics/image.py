@@ -1,4 +1,4 @@
-"""Sharpness and similarity of whole images."""
+"""Sharpness and similarity of images."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ from torch import Tensor
 
 from torchsar.core import Signal
 
+# quantities that sharpness is defined for, with their power of the modulus |I|
 _OF = {"intensity": 2, "amplitude": 1}
 
 
 def _tensor(image: Tensor | Signal) -> Tensor:
-    """The samples (..., azimuth, range). Raises TypeError or ValueError for what is no image."""
+    """Samples (..., azimuth, range) of an image; raises TypeError or ValueError for anything
+    else.
+    """
     x = image.data if isinstance(image, Signal) else image
     if not isinstance(x, Tensor) or x.dtype == torch.bool:
         raise TypeError(
@@ -25,6 +28,7 @@ def _tensor(image: Tensor | Signal) -> Tensor:
 
 
 def _pair(image: Tensor | Signal, reference: Tensor | Signal) -> tuple[Tensor, Tensor]:
+    """Samples of two complex images of equal size; raises ValueError for others."""
     a, b = _tensor(image), _tensor(reference)
     if not (a.is_complex() and b.is_complex()) or a.shape[-2:] != b.shape[-2:]:
         raise ValueError(
@@ -35,14 +39,14 @@ def _pair(image: Tensor | Signal, reference: Tensor | Signal) -> tuple[Tensor, T
 
 
 def _power(image: Tensor) -> Tensor:
-    """|image|^2 over its peak."""
+    """Intensity |image|^2 relative to its peak."""
     unit = _over_peak(image)
     return unit.real.square() + unit.imag.square() if unit.is_complex() else unit.square()
 
 
 def _levels(image: Tensor | Signal, of: str, mask: Tensor | None, what: str) -> tuple[Tensor, Tensor | None]:
-    """Intensities or amplitudes relative to the peak of the pixels that count, and the weights of
-    the pixels in the same precision.
+    """Intensities or amplitudes relative to the peak of the selected pixels, and the weights of the
+    pixels in the same precision.
     """
     if of not in _OF:
         raise ValueError(f"{what} of {of!r} is not defined; choose 'intensity' or 'amplitude'")
@@ -52,14 +56,13 @@ def _levels(image: Tensor | Signal, of: str, mask: Tensor | None, what: str) -> 
         x = torch.where(weight > 0, x, 0)
     level = (
         _power(x) if of == "intensity" else _over_peak(x).abs()
-    )  # abs has the gradient 0 at 0, where a root of the power has none
+    )  # abs has the gradient 0 at zero, where the square root of the power has none
     return level, None if weight is None else weight.to(level.dtype)
 
 
 def _weights(mask: Tensor, image: Tensor, what: str) -> Tensor:
-    """The mask at the shape of the image.
-
-    Raises TypeError or ValueError unless it broadcasts and holds finite weights of 0 or more.
+    """The mask expanded to the shape of the image; raises TypeError or ValueError for an invalid
+    mask.
     """
     if not isinstance(mask, Tensor) or mask.is_complex():
         raise TypeError(
@@ -76,27 +79,43 @@ def _weights(mask: Tensor, image: Tensor, what: str) -> Tensor:
     if not _holds_weights(mask):
         raise ValueError(
             f"{what}: a mask needs finite weights of 0 or more, got {float(mask.min()):g} to "
-            f"{float(mask.max()):g}; a bool mask marks the pixels that count"
+            f"{float(mask.max()):g}; a bool mask selects pixels"
         )
     return weight
 
 
 def _holds_weights(mask: Tensor) -> bool:
+    """Whether all values are finite and 0 or more; True inside vmap, where values cannot be
+    read.
+    """
     try:
         return mask.dtype == torch.bool or not mask.numel() or bool(((mask >= 0) & torch.isfinite(mask)).all())
-    except RuntimeError:  # inside vmap a value cannot be looked at
+    except RuntimeError:  # inside vmap a value cannot be read
         return True
 
 
 def entropy(image: Tensor | Signal, of: str = "intensity", mask: Tensor | None = None) -> Tensor:
-    """Image entropy in nats, -sum p ln p with p = |I|^2 / sum |I|^2, or of the amplitude p = |I| /
-    sum |I|. (..., azimuth, range) -> (...,).
+    """Compute the image entropy -sum p ln p in nats.
 
-    Invariant to scale; 0 for an all-zero image; ln(number of pixels) for a flat one. mask: bool or
-    real weights >= 0 that broadcast to the image: a pixel of weight w counts as w pixels, one of
-    weight 0 not at all, whatever it holds; 0 where nothing counts. Differentiable, also where
-    pixels are zero: there the amplitude has an infinite slope, of which the gradient is 0. Raises
-    ValueError for an `of` or a mask that does not fit.
+    p = |I|^2 / sum |I|^2 for the intensity and |I| / sum |I| for the amplitude. The entropy is
+    invariant to scale, 0 for an all-zero image, and ln(number of pixels) for a flat one.
+    Differentiable, also where pixels are zero; there the slope of the amplitude is infinite and its
+    gradient is set to 0.
+
+    Args:
+        image: Image, shape (..., azimuth, range), real or complex, or a Signal.
+        of: "intensity" or "amplitude".
+        mask: Bool or real weights >= 0 that broadcast to the image. A pixel of weight w counts as w
+            pixels; one of weight 0 has no influence, whatever its value. The entropy is 0 where all
+            weights are 0.
+
+    Returns:
+        Entropy, shape (...,).
+
+    Raises:
+        TypeError: If the image or the mask is not a tensor of numbers.
+        ValueError: If `of` is not known, the image has no pixels, or the mask does not broadcast or
+            has negative or non-finite weights.
     """
     level, weight = _levels(image, of, mask, "entropy")
     total = _sum(level, weight)[..., None, None]
@@ -105,11 +124,21 @@ def entropy(image: Tensor | Signal, of: str = "intensity", mask: Tensor | None =
 
 
 def contrast(image: Tensor | Signal, of: str = "intensity", mask: Tensor | None = None) -> Tensor:
-    """Standard deviation over mean of the intensity |I|^2 (or the amplitude |I|).
+    """Compute the standard deviation over the mean of the intensity |I|^2, or of the amplitude |I|.
 
-    (..., azimuth, range) -> (...,).
+    0 for an all-zero image; 1 for the intensity of fully developed speckle. Differentiable.
 
-    0 for an all-zero image. mask, gradients and errors as in `entropy`.
+    Args:
+        image: Image, shape (..., azimuth, range), real or complex, or a Signal.
+        of: "intensity" or "amplitude".
+        mask: Weights of the pixels as in `entropy`.
+
+    Returns:
+        Contrast, shape (...,).
+
+    Raises:
+        TypeError: If the image or the mask is not a tensor of numbers.
+        ValueError: As in `entropy`.
     """
     level, weight = _levels(image, of, mask, "contrast")
     count = level.shape[-2] * level.shape[-1] if weight is None else torch.where(_sum(weight) > 0, _sum(weight), 1)
@@ -120,29 +149,40 @@ def contrast(image: Tensor | Signal, of: str = "intensity", mask: Tensor | None 
 
 
 def _sum(x: Tensor, weight: Tensor | None = None) -> Tensor:
+    """Weighted sum over the pixels."""
     return (x if weight is None else x * weight).sum((-2, -1))
 
 
 def _norm(x: Tensor) -> Tensor:
-    """Root of the energy of each image, summed in float64: a million float32 terms would lose the
-    fourth digit.
+    """Square root of the energy of each image, summed in float64; in float32 the sum of a million
+    terms would lose the fourth digit.
     """
     return (x.real.square() + x.imag.square()).sum((-2, -1), dtype=torch.float64).sqrt()
 
 
 def _over_peak(x: Tensor) -> Tensor:
-    """An image over its detached peak, per trial, so that its squares neither under- nor overflow.
-
-    All-zero stays zero.
+    """Image divided by its detached peak per trial, so that squares neither underflow nor overflow;
+    zero images stay zero.
     """
     peak = x.detach().abs().amax((-2, -1), keepdim=True)
     return x / torch.where(peak > 0, peak, 1)
 
 
 def correlation(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
-    """rho = |<I, I0>| / (|I| |I0|) of two complex images, (...,) float64 in 0..1.
+    """Compute the correlation rho = |<I, I0>| / (|I| |I0|) of two complex images.
 
-    Blind to a common gain and phase; 0 where one is all zero.
+    Invariant to a common gain and phase. 0 where one image is all zero.
+
+    Args:
+        image: Image I, shape (..., azimuth, range), complex, or a Signal.
+        reference: Image I0, same size.
+
+    Returns:
+        Correlation in 0..1, shape (...,), float64.
+
+    Raises:
+        TypeError: If one of them is not a tensor of numbers.
+        ValueError: If they are not complex images of equal size.
     """
     a, b = (_over_peak(x) for x in _pair(image, reference))
     product = (a * b.conj()).sum((-2, -1), dtype=torch.complex128).abs()
@@ -151,9 +191,20 @@ def correlation(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
 
 
 def error_db(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
-    """10 lg of |I - I0|^2 / |I0|^2 in dB, (...,) float64.
+    """Compute the relative error |I - I0|^2 / |I0|^2 of an image in dB.
 
-    Sees gain and phase; use `correlation` where those are free.
+    A difference in gain or phase counts as error; use `correlation` where those are arbitrary.
+
+    Args:
+        image: Image I, shape (..., azimuth, range), complex, or a Signal.
+        reference: Image I0, same size.
+
+    Returns:
+        Error in dB, shape (...,), float64.
+
+    Raises:
+        TypeError: If one of them is not a tensor of numbers.
+        ValueError: If they are not complex images of equal size.
     """
     a, b = _pair(image, reference)
     peak = b.detach().abs().amax((-2, -1), keepdim=True)

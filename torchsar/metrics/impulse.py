@@ -9,8 +9,11 @@ from torch import Tensor
 
 from torchsar.core import Signal, cis, refuse_non_finite
 
+# chosen: samples per axis of the neighbourhood in which the maximum is interpolated
 _PATCH = 64
+# chosen: samples of a slice; 10 null spacings of up to 25 samples fit on either side
 _SLICE = 512
+# chosen: grid points per sample of the search for the maximum, before a parabola refines it
 _FINE = 32
 
 
@@ -21,30 +24,39 @@ def impulse_response(
     search_m: float | None = None,
     centre_turns: tuple[float | None, float | None] = (None, None),
 ) -> dict[str, Tensor]:
-    """Measure the responses nearest to the given places of an image with two axes, the first before
-    the second.
+    """Measure the responses nearest to given positions of an image.
 
-    at_m: coordinates on the two axes, each (...,) one target per trial or (..., target). The
-    strongest sample within search_m (default 8 samples) is taken. centre_turns: centre of the
-    spectrum along each axis in turns per sample, None to estimate it from the neighbourhood, where
-    other scatterers may mislead it; a full band, which leaves no gap, should be told.
-    sidelobe_nulls: extent of the side lobes in null spacings of a rectangular band; 10 give ISLR
-    -10.17 dB for a sinc.
+    Slices are band-limited about their own spectral centre and zero-padded by two before
+    interpolation, so that full-band images and squinted spectra are measured correctly.
 
-    Returns for each axis A of the image: irw_A_m (-3 dB width), pslr_A_db (strongest side lobe in
-    the extent), islr_A_db (side-lobe over main-lobe energy, null to null), position_A_m; and peak,
-    the complex interpolated peak. Shapes as at_m broadcast with the trials. Slices are band-limited
-    about their own spectral centre and zero-padded by two before interpolation, so that full-band
-    images and squinted spectra are read correctly. Raises ValueError for an image without two axes
-    or a place outside of it.
+    Args:
+        signal: Image with two axes, (..., first, second).
+        at_m: Coordinates on the two axes in metres, each of shape (...,) for one target per trial,
+            or (..., target). The strongest sample within `search_m` is taken.
+        sidelobe_nulls: Extent of the side lobes in null spacings of a rectangular band; 10 give an
+            ISLR of -10.17 dB for a sinc.
+        search_m: Half width of the search in metres; None for 8 samples.
+        centre_turns: Centre of the spectrum along each axis in turns per sample. None estimates it
+            from the neighbourhood, where other scatterers may bias it; a full band has no gap in
+            its spectrum and needs the value.
+
+    Returns:
+        For each axis A of the image `irw_A_m` (-3 dB width), `pslr_A_db` (strongest side lobe
+        within the extent), `islr_A_db` (side-lobe over main-lobe energy, null to null) and
+        `position_A_m`; and `peak`, the complex interpolated peak. The shapes are those of `at_m`
+        broadcast with the trials.
+
+    Raises:
+        ValueError: If the signal does not have two axes, is not finite, or a position lies outside
+            it, or if `sidelobe_nulls` is below 1 or `search_m` not positive.
     """
     if not isinstance(signal, Signal) or len(signal.axes) != 2:
         raise ValueError(
-            "impulse_response works on a Signal with two axes, got "
+            "impulse_response needs a Signal with two axes, got "
             f"{signal.names if isinstance(signal, Signal) else type(signal).__name__}"
         )
     if len(at_m) != 2:
-        raise ValueError(f"at_m holds one coordinate for each of the axes {signal.names}, got {len(at_m)}")
+        raise ValueError(f"at_m needs one coordinate for each of the axes {signal.names}, got {len(at_m)}")
     if sidelobe_nulls < 1 or (search_m is not None and not search_m > 0):
         raise ValueError(
             "impulse_response needs sidelobe_nulls of 1 or more and search_m above 0, got "
@@ -52,14 +64,14 @@ def impulse_response(
         )
     refuse_non_finite(signal.data, "impulse_response")
     per_target = any(torch.as_tensor(a).ndim > len(signal.trials) for a in at_m)
-    places = torch.broadcast_tensors(
+    positions = torch.broadcast_tensors(
         *(torch.as_tensor(a, dtype=torch.float64, device=signal.data.device) for a in at_m)
     )
-    places = [p if per_target else p[..., None] for p in places]
-    shape = torch.broadcast_shapes(places[0].shape, (*signal.trials, 1))
+    positions = [p if per_target else p[..., None] for p in positions]
+    shape = torch.broadcast_shapes(positions[0].shape, (*signal.trials, 1))
     centre = [
         _nearest(axis.index_of(p.cpu()).to(p.device), axis.n, axis.name).expand(shape)
-        for axis, p in zip(signal.axes, places, strict=True)
+        for axis, p in zip(signal.axes, positions, strict=True)
     ]
     reach = [_reach(search_m, axis.step) for axis in signal.axes]
     data = signal.data.to(torch.complex128)
@@ -81,21 +93,23 @@ def impulse_response(
 
 
 def _nearest(index: Tensor, n: int, name: str) -> Tensor:
+    """Nearest sample of each position; raises ValueError outside the axis."""
     if not bool(((index >= -0.5) & (index <= n - 0.5)).all()):
         raise ValueError(
-            f"a place given to impulse_response lies outside the {name} axis (sample "
-            f"{float(index.min()):.1f} to {float(index.max()):.1f} of {n})"
+            f"a position given to impulse_response lies outside the {name} axis: samples "
+            f"{float(index.min()):.1f} to {float(index.max()):.1f} of {n}"
         )
     return index.round().long().clamp(0, n - 1)
 
 
 def _reach(search_m: float | None, step: float) -> int:
+    """Half width of the search in samples."""
     return 8 if search_m is None else max(1, math.ceil(search_m / step))
 
 
 def _patch(data: Tensor, rows: Tensor, cols: Tensor, height: int, width: int) -> Tensor:
-    """Neighbourhoods (..., target, height, width) about (rows, cols), sample height//2, width//2
-    being the centre; zero outside the image.
+    """Neighbourhoods (..., target, height, width) with (rows, cols) at sample (height//2,
+    width//2); zero outside the image.
     """
     n_a, n_r = data.shape[-2:]
     i = rows[..., None, None] + torch.arange(height, device=data.device)[:, None] - height // 2
@@ -108,6 +122,7 @@ def _patch(data: Tensor, rows: Tensor, cols: Tensor, height: int, width: int) ->
 
 
 def _brightest(data: Tensor, centre: list[Tensor], reach: list[int]) -> tuple[Tensor, Tensor]:
+    """Row and column of the strongest sample within reach of each position."""
     height, width = 2 * reach[0] + 1, 2 * reach[1] + 1
     best = _patch(data, centre[0], centre[1], height, width).abs().flatten(-2).argmax(-1)
     return centre[0] + best // width - reach[0], centre[1] + best % width - reach[1]
@@ -116,11 +131,9 @@ def _brightest(data: Tensor, centre: list[Tensor], reach: list[int]) -> tuple[Te
 def _climb(
     data: Tensor, rows: Tensor, cols: Tensor, centre_turns: tuple[float | None, float | None], rounds: int = 3
 ) -> tuple[Tensor, ...]:
-    """From the strongest sample to the interpolated maximum: (row, column, spectral centres in
-    turns per sample, offsets in samples).
-
-    A skewed response that is sampled finely in one axis and coarsely in the other has its maximum
-    more than a sample away from its strongest sample.
+    """From the strongest sample to the interpolated maximum: row, column, spectral centres in turns
+    per sample, offsets in samples. A skewed response that is sampled finely in one axis and
+    coarsely in the other has its maximum more than a sample away from its strongest sample.
     """
     for _ in range(rounds):
         _, _, da, dr = _refined(data, rows, cols, centre_turns)
@@ -137,16 +150,22 @@ def _refined(
     patch = _patch(data, rows, cols, _PATCH, _PATCH)
     tone_a, tone_r = (
         _centre_turns(patch, dim)
-        if told is None
-        else torch.full(patch.shape[:-2], told, dtype=torch.float64, device=patch.device)
-        for dim, told in zip((-2, -1), centre_turns, strict=True)
+        if centre is None
+        else torch.full(patch.shape[:-2], centre, dtype=torch.float64, device=patch.device)
+        for dim, centre in zip((-2, -1), centre_turns, strict=True)
     )
     return tone_a, tone_r, *_fine_peak(patch, tone_a, tone_r)
 
 
 def cut_offset(cut: Tensor, tone: Tensor) -> Tensor:
-    """Offset (...,) in samples of the interpolated maximum of cuts (..., n) from their strongest
-    sample n//2. tone: as for `cut_figures`.
+    """Find the interpolated maximum of cuts near their middle sample.
+
+    Args:
+        cut: Cuts whose strongest sample is n // 2, shape (..., n), complex.
+        tone: Centre of the spectrum in turns per sample, shape (...,).
+
+    Returns:
+        Offset of the maximum from sample n // 2 in samples, shape (...,).
     """
     grid = torch.linspace(-1, 1, 2 * _FINE + 1, dtype=torch.float64, device=cut.device).expand(*tone.shape, -1)
     fine = (_kernel(grid, cut.shape[-1], tone) @ cut[..., None])[..., 0].abs().square()
@@ -164,15 +183,15 @@ def _centre_turns(patch: Tensor, dim: int) -> Tensor:
 
 
 def _kernel(offsets: Tensor, n: int, tone: Tensor) -> Tensor:
-    """Weights (..., offset, n) that read a band about `tone` at fractional offsets from sample
-    n//2. offsets: (..., offset).
+    """Weights (..., offset, n) that interpolate a band about `tone` at fractional offsets (...,
+    offset) from sample n//2.
     """
     distance = offsets[..., None] - (torch.arange(n, dtype=torch.float64, device=offsets.device) - n // 2)
     return torch.sinc(distance) * cis(2 * math.pi * tone[..., None, None] * distance)
 
 
 def _fine_peak(patch: Tensor, tone_a: Tensor, tone_r: Tensor) -> tuple[Tensor, Tensor]:
-    """Offset of the interpolated maximum from the central sample, along each dim, in samples, (...,
+    """Offset of the interpolated maximum from the central sample along each dim in samples, (...,
     target).
     """
     grid = torch.linspace(-1, 1, 2 * _FINE + 1, dtype=torch.float64, device=patch.device)
@@ -194,17 +213,23 @@ def _parabola(curve: Tensor, index: Tensor) -> Tensor:
 
 
 def _slice_through(patch: Tensor, tone: Tensor, offset: Tensor, dim: int) -> Tensor:
-    """The cut (..., target, n) along the other dim, at a fractional offset along `dim`."""
+    """Cut (..., target, n) along the other dim, at a fractional offset along `dim`."""
     weights = _kernel(offset[..., None], patch.shape[dim], tone)[..., 0, :]
     return (patch * (weights[..., None, :] if dim == -1 else weights[..., :, None])).sum(dim)
 
 
 def cut_figures(cut: Tensor, tone: Tensor, offset: Tensor, nulls: int) -> tuple[dict[str, Tensor], Tensor]:
-    """irw (samples), pslr and islr (dB), and the complex peak, (...,) each, of cuts (..., n) whose
-    maxima lie `offset` (...,) samples from sample n//2.
+    """Measure width and side lobes of cuts through responses.
 
-    tone: centre of the spectrum in turns per sample, (...,). nulls: extent of the side lobes in
-    null spacings of a rectangular band.
+    Args:
+        cut: Cuts, shape (..., n), complex.
+        tone: Centre of the spectrum in turns per sample, shape (...,).
+        offset: Position of the maximum relative to sample n // 2 in samples, shape (...,).
+        nulls: Extent of the side lobes in null spacings of a rectangular band.
+
+    Returns:
+        A dict with `irw` (-3 dB width in samples), `pslr` and `islr` in dB, and the complex peak,
+        each of shape (...,).
     """
     n, factor = cut.shape[-1], 16
     base = torch.arange(n, dtype=torch.float64, device=cut.device) - n // 2
@@ -243,8 +268,8 @@ def cut_figures(cut: Tensor, tone: Tensor, offset: Tensor, nulls: int) -> tuple[
 
 
 def _crossing(side: Tensor) -> Tensor:
-    """Distance from the peak (index 0) to half its power, by linear interpolation, in fine
-    samples.
+    """Distance from the peak (index 0) to half its power in fine samples, by linear
+    interpolation.
     """
     below = side < side[..., :1] / 2
     i = torch.where(below.any(-1), below.to(torch.int8).argmax(-1), side.shape[-1] - 1).clamp_min(1)

@@ -1,6 +1,4 @@
-"""Errors of a phase per pulse, compared as phases must be: on the circle, without what an image
-cannot tell.
-"""
+"""Errors of a phase per pulse, without its constant and linear terms."""
 
 from __future__ import annotations
 
@@ -11,18 +9,30 @@ from torch import Tensor
 
 from torchsar.core import unit_phasor
 
+# chosen: zero padding of the spectrum in which the linear term is searched; a Newton step is at
+# most one of its bins
 _OVERSAMPLING = 8
+# chosen: Newton steps that refine the peak of that spectrum
 _NEWTON = 4
 
 
 def residual_phase(estimate_rad: Tensor, reference_rad: Tensor, present: Tensor | None = None) -> Tensor:
-    """estimate - reference per pulse, in -pi..pi, without the constant and the linear term, (...,
-    pulse) float64.
+    """Compute the phase error per pulse after removal of its constant and linear terms.
 
-    Both terms only turn and shift an image. They are removed on the circle: the peak of the
-    zero-padded spectrum of exp(j difference), then Newton steps; never by unwrapping and fitting a
-    line. estimate_rad, reference_rad: (..., pulse), any number of turns, broadcast. present: (...,
-    pulse) bool, pulses that count; the residual of the others is zero.
+    Both terms only add a phase to the image and shift it. They are estimated modulo 2 pi, from the
+    peak of the zero-padded spectrum of exp(j difference) with Newton steps, not by unwrapping and
+    fitting a line.
+
+    Args:
+        estimate_rad: Estimated phases, shape (..., pulse), with any number of whole turns.
+        reference_rad: True phases, shape (..., pulse), broadcast against the estimate.
+        present: Pulses that count, shape (..., pulse), bool; the residual of the others is zero.
+
+    Returns:
+        Estimate minus reference in -pi..pi, shape (..., pulse), float64.
+
+    Raises:
+        ValueError: If a phase is not finite.
     """
     difference = estimate_rad.to(torch.float64) - reference_rad.to(torch.float64)
     z = unit_phasor(difference / (2 * math.pi), torch.complex128)
@@ -40,7 +50,7 @@ def residual_phase(estimate_rad: Tensor, reference_rad: Tensor, present: Tensor 
 
 
 def _peak(z: Tensor) -> Tensor:
-    """Strongest frequency of exp(j difference), in cycles per record, to a fraction of 1 / 8."""
+    """Strongest frequency of exp(j difference), in cycles per record, on a grid of 1/8 cycle."""
     n = _OVERSAMPLING * z.shape[-1]
     at = torch.fft.fft(z.detach(), n).abs().argmax(-1).to(torch.float64)
     return torch.where(at > n / 2, at - n, at) / _OVERSAMPLING
@@ -61,9 +71,20 @@ def _newton_step(z: Tensor, cycles: Tensor, k: Tensor) -> Tensor:
 
 
 def phase_rmse(estimate_rad: Tensor, reference_rad: Tensor, present: Tensor | None = None) -> Tensor:
-    """Root mean square of `residual_phase` over the pulses that count, rad, (...,) float64.
+    """Compute the root mean square of `residual_phase` over the pulses.
 
-    White phases have 1.6 to 1.7 rad.
+    Independent uniform phases give 1.6 to 1.7 rad.
+
+    Args:
+        estimate_rad: Estimated phases, shape (..., pulse).
+        reference_rad: True phases, shape (..., pulse).
+        present: Pulses that count, shape (..., pulse), bool.
+
+    Returns:
+        Rms error in rad, shape (...,), float64.
+
+    Raises:
+        ValueError: If a phase is not finite.
     """
     residual = residual_phase(estimate_rad, reference_rad, present)
     count = residual.shape[-1] if present is None else present.expand(residual.shape).sum(-1).clamp_min(1)
@@ -71,7 +92,12 @@ def phase_rmse(estimate_rad: Tensor, reference_rad: Tensor, present: Tensor | No
 
 
 def strehl(residual_rad: Tensor) -> Tensor:
-    """Strehl ratio |mean exp(j residual)|^2 over pulses, (...,): 1 for none, 0.8 for about 0.47 rad
-    rms.
+    """Compute the Strehl ratio |mean exp(j residual)|^2 over pulses.
+
+    Args:
+        residual_rad: Residual phases, shape (..., pulse).
+
+    Returns:
+        Strehl ratio, shape (...,), float64: 1 without error, 0.8 for about 0.47 rad rms.
     """
     return unit_phasor(residual_rad.to(torch.float64) / (2 * math.pi), torch.complex128).mean(-1).abs().square()

@@ -1,9 +1,11 @@
-"""Azimuth profiles of moving points rebuilt from several channels: their response, and the false
-targets beside it.
+"""Azimuth response of moving points rebuilt from several channels, and their false targets.
 
-Doppler bands that are told apart badly leave a point's spectrum k pulse rates from its place, where
-it focuses as a replica k PRF lambda R0 v / V^2 away, a little further by the hyperbola. Source:
-Remote Sens. 2020, 12, 1703, Table 4 and Figure 17 (MFTA); brief 001, Experiments.
+Where the reconstruction does not separate the Doppler bands, part of the spectrum of a point
+appears k pulse rates from its true Doppler and focuses as a replica about k PRF lambda R0 v / V^2
+away.
+
+Reference:
+    Remote Sens. 2020, 12, 1703, Table 4 and Figure 17 (maximum false target amplitude, MFTA).
 """
 
 from __future__ import annotations
@@ -19,9 +21,14 @@ from torchsar.core import linear_phasor, per_trial, refuse_non_finite
 from torchsar.metrics.impulse import cut_figures, cut_offset
 from torchsar.radar import BistaticRadar
 
+# chosen: samples of the cut about the peak that `azimuth_response` analyses
 _WINDOW = 512
+# points per sample at which profiles are searched, which misses at most 0.06 dB of a peak
 _OVERSAMPLED = 8
+# resolution cells added on either side of a zone: beyond them the side lobes of a replica are below
+# -30 dB of it
 _MARGIN_CELLS = 10
+# chosen: Doppler samples over a band at which the positions in a zone are evaluated
 _ROWS = 33
 
 Value = Tensor | float
@@ -30,19 +37,30 @@ Value = Tensor | float
 def azimuth_response(
     profile: Tensor, step_m: float, start_m: float = 0.0, *, centre_turns: float | None = 0.0, sidelobe_nulls: int = 20
 ) -> dict[str, Tensor]:
-    """Response of the strongest point of each complex profile (..., azimuth): irw_m, pslr_db,
-    islr_db, position_m and the complex peak, (...,) each.
+    """Measure the response of the strongest point of each azimuth profile.
 
-    step_m, start_m: of the axis, sample 0 at start_m. centre_turns: centre of the spectrum in turns
-    per sample; 0 for images made from spectra about their Doppler centre, as this package makes
-    them; None to estimate it, which a full band does not allow. sidelobe_nulls: extent of the side
-    lobes to either side in null spacings of a rectangular band: a sinc has ISLR -10.17 dB with 10,
-    -9.92 with 20 and -9.68 with all of them; the PSLR is -13.26 dB for any. A cut of 512 samples
-    about the peak is analysed: widths beyond a quarter of it, and side lobes outside, are not seen.
-    Profiles of zeros have the width of the cut and side lobes of -300 dB. Raises ValueError for
-    real, empty or non-finite profiles.
+    A cut of 512 samples about the peak is analysed: widths beyond a quarter of it, and side lobes
+    outside it, are not measured. All-zero profiles have the width of the cut and side lobes of -300
+    dB.
+
+    Args:
+        profile: Azimuth profiles, shape (..., azimuth), complex.
+        step_m: Step of the axis in metres.
+        start_m: Coordinate of sample 0 in metres.
+        centre_turns: Centre of the spectrum in turns per sample; 0 for images formed about their
+            Doppler centre, as in this package. None estimates it, which a full band does not allow.
+        sidelobe_nulls: Extent of the side lobes to either side in null spacings of a rectangular
+            band. A sinc has an ISLR of -10.17 dB with 10, -9.92 dB with 20 and -9.68 dB with all of
+            them; its PSLR is -13.26 dB for any.
+
+    Returns:
+        `irw_m`, `pslr_db`, `islr_db`, `position_m` and the complex `peak`, shape (...,) each.
+
+    Raises:
+        ValueError: If profiles are real, empty or not finite, `sidelobe_nulls` is below 1, or
+            `step_m` is not positive.
     """
-    _refuse_profile(profile, "azimuth_response")
+    _check_profile(profile, "azimuth_response")
     if sidelobe_nulls < 1 or not step_m > 0:
         raise ValueError(
             "azimuth_response needs sidelobe_nulls of 1 or more and a positive step_m, got "
@@ -64,28 +82,41 @@ def azimuth_response(
 
 
 def _cut(data: Tensor, centre: Tensor, width: int) -> Tensor:
-    """Samples (..., width) with `centre` at width // 2, zero outside of the profile."""
+    """Samples (..., width) with `centre` at width // 2, zero outside the profile."""
     n = data.shape[-1]
     index = centre[..., None] + torch.arange(width, device=data.device) - width // 2
     return data.gather(-1, index.clamp(0, n - 1)) * ((index >= 0) & (index < n))
 
 
 def _tone(cut: Tensor) -> Tensor:
+    """Centre of the spectrum in turns per sample, from the phase of the lag-one product."""
     return torch.angle((cut[..., 1:] * cut[..., :-1].conj()).sum(-1)) / (2 * math.pi)
 
 
 def replica_level(profile: Tensor, step_m: float, zones_m: Tensor, *, centre_turns: float = 0.0) -> dict[str, Tensor]:
-    """Largest false target of each complex profile (..., azimuth) against its peak: mfta_db,
-    offset_m from the peak, and covered, the share of zones on the axis, (...,) each.
+    """Measure the largest false target of each azimuth profile relative to its peak.
 
-    zones_m: (..., zone, 2), first and last offset from the peak, see `replica_zones`. centre_turns:
-    as for `azimuth_response`. Profiles are read eight times as finely as they are sampled, which
-    misses 0.06 dB at most. The point's own side lobes count where they are higher: a sinc's fall to
-    -68 dB at 800 cells. Zones off the axis do not count: record 4 PRF lambda R0 / v^2 or more to
-    see two replicas on either side. Profiles of zeros have -300 dB. Raises ValueError for real or
-    non-finite profiles, and where no zone of any trial lies on the axis.
+    Profiles are interpolated by eight, which misses at most 0.06 dB. The side lobes of the point
+    count where they are higher than a replica; those of a sinc fall to -68 dB at 800 cells. Zones
+    outside the axis do not count: a record of 4 PRF lambda R0 / v^2 or more contains two replicas
+    on either side.
+
+    Args:
+        profile: Azimuth profiles, shape (..., azimuth), complex.
+        step_m: Step of the axis in metres.
+        zones_m: First and last offset from the peak in metres of each zone, shape (..., zone, 2),
+            see `replica_zones`.
+        centre_turns: Centre of the spectrum in turns per sample.
+
+    Returns:
+        `mfta_db` (maximum false target amplitude, -300 for all-zero profiles), `offset_m` from the
+        peak and `covered`, the share of zones on the axis, shape (...,) each.
+
+    Raises:
+        ValueError: If profiles are real, empty or not finite, or if no zone of any trial lies on
+            the axis.
     """
-    _refuse_profile(profile, "replica_level")
+    _check_profile(profile, "replica_level")
     fine, step = _oversampled(profile.to(torch.complex128), centre_turns), step_m / _OVERSAMPLED
     power = fine.abs().square()
     peak, at = power.max(-1)
@@ -98,13 +129,13 @@ def replica_level(profile: Tensor, step_m: float, zones_m: Tensor, *, centre_tur
             f"replica_level: the nearest replica lies {reach:.4g} m from the peak, off a profile "
             f"of {profile.shape[-1] * step_m:.4g} m; record longer"
         )
-    level, place = torch.where(torch.stack(inside).any(0), power, 0).max(-1)
+    level, index = torch.where(torch.stack(inside).any(0), power, 0).max(-1)
     ratio = level / peak.clamp_min(torch.finfo(torch.float64).tiny)
-    return {"mfta_db": 10 * torch.log10(ratio.clamp_min(1e-30)), "offset_m": (place - at) * step, "covered": covered}
+    return {"mfta_db": 10 * torch.log10(ratio.clamp_min(1e-30)), "offset_m": (index - at) * step, "covered": covered}
 
 
 def _oversampled(data: Tensor, centre_turns: float) -> Tensor:
-    """The profile at _OVERSAMPLED points a sample, by zeros beyond its band, (..., n *
+    """The profile at _OVERSAMPLED points per sample by zero padding of its spectrum, (..., n *
     _OVERSAMPLED).
     """
     n = data.shape[-1]
@@ -121,18 +152,19 @@ def _oversampled(data: Tensor, centre_turns: float) -> Tensor:
     )
 
 
-def _refuse_profile(profile: Tensor, what: str) -> None:
+def _check_profile(profile: Tensor, what: str) -> None:
+    """Raise ValueError for real, empty or non-finite profiles."""
     if not profile.is_complex() or not profile.ndim or not profile.shape[-1]:
         raise ValueError(
-            f"{what} reads complex profiles (..., azimuth), got {profile.dtype} of shape {tuple(profile.shape)}"
+            f"{what} needs complex profiles (..., azimuth), got {profile.dtype} of shape {tuple(profile.shape)}"
         )
     refuse_non_finite(profile, what)
 
 
 @dataclass(frozen=True)
 class _Hyperbola:
-    """Spectrum of a point along a straight path: centre (Hz), image time t0 (s), and delay of each
-    Doppler, values (..., 1).
+    """Spectrum of a point on a straight path: centre (Hz), image time (s), and the delay of each
+    Doppler; values have the shape (..., 1).
     """
 
     wavelength_m: float
@@ -144,6 +176,7 @@ class _Hyperbola:
 
     @staticmethod
     def of(radar: BistaticRadar, u_r: Tensor, u_a: Tensor, y0: Tensor, range_m: Tensor) -> _Hyperbola:
+        """Spectrum of the point with these velocities, position and range."""
         along = radar.speed_m_s - u_a
         speed = torch.hypot(along, u_r)
         image = (u_r * range_m + along * y0) / speed.square()
@@ -152,8 +185,8 @@ class _Hyperbola:
         )
 
     def curvature_s(self, doppler_hz: Tensor) -> Tensor:
-        """Delay against the image time that the curvature of the path makes, and its filter takes
-        out (s).
+        """Delay (s) relative to the image time due to the curvature of the path, which its filter
+        removes.
         """
         sine = (self.wavelength_m * doppler_hz / self.speed_m_s).clamp(-0.99, 0.99)
         return -self.closest_m * sine / (self.speed_m_s * torch.sqrt(1 - sine.square()))
@@ -167,22 +200,43 @@ def replica_zones(
     y0_m: Value = 0.0,
     range_m: Value | None = None,
     *,
-    integration_s: float | None = None,
+    integration_s: Value | None = None,
     focused_at: tuple[Value, Value] | None = None,
     orders: Sequence[int] = (1, 2),
     axis_speed_m_s: Value | None = None,
 ) -> Tensor:
-    """Where replicas of a point can lie, first and last offset (m) from its peak, float64 (..., 2 *
-    orders, 2), rising k from -max to max.
+    """Compute the offsets at which replicas of a point can appear.
 
-    The exact hyperbola gives the place of each Doppler of the point that lies k pulse rates off in
-    the rebuilt band, N PRF about the centre; a zone spans those places (a few metres at the
-    parameters of the paper) and ten resolution cells to either side, the reach of side lobes of a
-    replica above -30 dB of it. integration_s: of a rectangular gate, None for the main lobe of the
-    elements' pattern. focused_at: (u_r, u_a) that the image was rebuilt and focused with, by
-    default the point's: where they differ, peak and replicas blur, and zones widen by as much.
-    axis_speed_m_s: x of the image over slow time, by default the receiver's speed. Raises
-    ValueError for orders below 1 or no bands.
+    The exact hyperbola gives the position of each Doppler of the point that appears k pulse rates
+    off within the reconstructed band of `bands` PRF about the centre. A zone covers those
+    positions, a few metres for the parameters of the Reference, and ten resolution cells to either
+    side, beyond which the side lobes of a replica lie below -30 dB of it.
+
+    Args:
+        radar: Radar with pulse rate, wavelength and speed.
+        bands: Number of Doppler bands of one PRF that are reconstructed.
+        u_r_m_s: Slant-range speed in m/s, closing positive.
+        u_a_m_s: Along-track speed in m/s.
+        y0_m: Along-track position at t = 0 in metres.
+        range_m: Slant range at t = 0 in metres; None for the reference range of the radar.
+        integration_s: Length of a rectangular gate in seconds, a number or shape (...,); None for
+            the main lobe of the pattern of the elements.
+        focused_at: (u_r, u_a) in m/s with which the image was reconstructed and focused; None for
+            those of the point. Where they differ, peak and replicas blur and zones widen
+            accordingly.
+        orders: Orders k of the replicas, from 1 on.
+        axis_speed_m_s: Position on the image axis over slow time in m/s; None for the speed of the
+            receiver.
+
+    Returns:
+        First and last offset from the peak in metres, shape (..., 2 * orders, 2), float64, with k
+        rising from the negative orders to the positive ones.
+
+    Raises:
+        ValueError: If `bands` or an order is below 1.
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, Figure 17.
     """
     if bands < 1 or not orders or min(orders) < 1:
         raise ValueError(
@@ -202,9 +256,9 @@ def replica_zones(
         else _Hyperbola.of(radar, per_trial(focused_at[0], 1, like), per_trial(focused_at[1], 1, like), y0, r0)
     )
     half = _half_band_hz(radar, point, r0, integration_s)
-    peak = _places_s(point, assumed, half, bands, radar.prf_hz, 0)
+    peak = _positions_s(point, assumed, half, bands, radar.prf_hz, 0)
     zones = [
-        _places_s(point, assumed, half, bands, radar.prf_hz, k) - peak.flip(-1)
+        _positions_s(point, assumed, half, bands, radar.prf_hz, k) - peak.flip(-1)
         for k in sorted({sign * k for k in orders for sign in (-1, 1)})
     ]
     margin = (_MARGIN_CELLS / (2 * half)) * torch.tensor([-1.0, 1.0], dtype=torch.float64, device=half.device)
@@ -212,20 +266,23 @@ def replica_zones(
     return torch.stack(torch.broadcast_tensors(*((zone + margin) * scale for zone in zones)), -2)
 
 
-def _half_band_hz(radar: BistaticRadar, point: _Hyperbola, range_m: Tensor, integration_s: float | None) -> Tensor:
+def _half_band_hz(radar: BistaticRadar, point: _Hyperbola, range_m: Tensor, integration_s: Value | None) -> Tensor:
+    """Half width of the Doppler band of the point."""
     if integration_s is None:
         return point.along_m_s / radar.element_m
-    return point.speed_m_s.square() * integration_s / (2 * radar.wavelength_m * range_m)
+    return point.speed_m_s.square() * per_trial(integration_s, 1, range_m) / (2 * radar.wavelength_m * range_m)
 
 
-def _places_s(point: _Hyperbola, assumed: _Hyperbola, half_hz: Tensor, bands: int, prf_hz: float, order: int) -> Tensor:
+def _positions_s(
+    point: _Hyperbola, assumed: _Hyperbola, half_hz: Tensor, bands: int, prf_hz: float, order: int
+) -> Tensor:
     """First and last image time (..., 2) of the part of the point's band that lies `order` pulse
-    rates off, within the rebuilt band; its nearest edge where none does.
+    rates off within the reconstructed band; its nearest edge where there is no such part.
     """
     edge = bands * prf_hz / 2
     ends = [point.centre_hz + sign * half_hz for sign in (-1, 1)]
     window = [assumed.centre_hz + sign * edge - order * prf_hz for sign in (-1, 1)]
     first, last = (torch.minimum(torch.maximum(w, ends[0]), ends[1]) for w in window)
     doppler = first + (last - first) * torch.linspace(0, 1, _ROWS, dtype=torch.float64, device=half_hz.device)
-    place = point.image_s + point.curvature_s(doppler) - assumed.curvature_s(doppler + order * prf_hz)
-    return torch.stack([place.amin(-1), place.amax(-1)], -1)
+    position = point.image_s + point.curvature_s(doppler) - assumed.curvature_s(doppler + order * prf_hz)
+    return torch.stack([position.amin(-1), position.amax(-1)], -1)

@@ -1,6 +1,4 @@
-"""What no estimator of uneven rotation can beat: the Cramer-Rao bound of the motion that all
-scatterers of a turning target share (brief 003).
-"""
+"""Cramer-Rao bounds of the non-uniform rotation that all scatterers of a target share."""
 
 from __future__ import annotations
 
@@ -12,8 +10,11 @@ from torch import Tensor
 from torchsar.core import per_trial
 from torchsar.core.warp import warp
 
-_SINGULAR = 1e-13  # eigenvalues of a correlation matrix below it are rounding
-_TOUCHED = 1e-12  # squared share of an unknown in a direction that nothing is known about
+# float64 rounding: eigenvalues of a correlation matrix below this count as zero
+_SINGULAR = 1e-13
+# float64 rounding: an unknown whose squared share in an unobservable direction exceeds this has an
+# infinite bound
+_INVOLVED = 1e-12
 
 
 def rotation_bounds(
@@ -30,33 +31,50 @@ def rotation_bounds(
     n_pulse: int,
     free_centre: bool = True,
 ) -> dict[str, Tensor]:
-    """Least standard deviations of omega_rad_s, k1_per_s, k2_per_s2, ...
+    """Compute the least standard deviations of the rotation parameters of a target.
 
-    and, with free_centre, yc_m: float64 (...,) each, infinite where the data tell nothing.
+    The noise is known; the complex amplitude and the cross range of every scatterer are unknown and
+    its range is known. The phase derivatives, after removal of a constant and a line in the warp
+    phi, determine the motion:
 
-    cross_range_m, range_m, amplitude: (..., target), places (m) and amplitudes of resolved
-    scatterers in range-compressed data, an amplitude being that of a sample at the peak of the
-    range response; range_m counts from where the processor takes the centre to be, so that range_m
-    + yc_m is the distance from the rotation centre (the `lever` of `echo.turntable_echo`).
-    noise_std: of the complex noise, noise power = noise_std^2 a sample. warp_k: (..., order - 1) of
-    any order, see `core.warp`. Trials broadcast.
+        J_ij = (2 / noise_std^2) sum_p |s_p|^2 <P d_i, P d_j>,    c4 = 4 pi / wavelength,
+        d_Om = c4 y Om phi^2,    d_yc = (c4 / 2) Om^2 phi^2,
+        d_ki = c4 (-x Om + y Om^2 phi) t^(i+1) / (i+1)!
 
-    Noise known; complex amplitude and cross range of every scatterer unknown and its range known:
-    what is left of phase derivatives once a constant and a line in the warp phi are taken out tells
-    about the motion, J_ij = (2 / noise_std^2) sum_p |s_p|^2 <P d_i, P d_j>, c4 = 4 pi / wavelength,
-    d_Om = c4 y Om phi^2, d_ki = c4 (-x Om + y Om^2 phi) t^(i+1) / (i+1)!, d_yc = (c4 / 2) Om^2
-    phi^2. Neighbours that overlap only raise it. All scatterers at one range leave Om (and a free
-    yc) infinite, k finite. Falls as 10^(-SNR / 20). Differentiable. Raises ValueError for shapes
-    that do not fit.
+    Overlapping scatterers raise the true bound above this one. If all scatterers have one range, Om
+    (and a free yc) is infinite and k is finite. The bounds fall as 10^(-SNR / 20). Differentiable.
+
+    Args:
+        cross_range_m: Cross range of the resolved scatterers in metres, shape (..., target).
+        range_m: Range of the scatterers in metres from the centre that the processor assumes, shape
+            (..., target); range_m + yc_m is the distance from the rotation centre (`lever` of
+            `echo.turntable_echo`).
+        amplitude: Amplitude of a range-compressed sample at the peak of the range response, shape
+            (..., target).
+        noise_std: Square root of the variance of the complex noise per sample, shape (...,).
+        omega_rad_s: Rotation rate at the first pulse in rad/s, shape (...,).
+        warp_k: Coefficients of the warp, shape (..., order - 1), of any order, see `core.warp`.
+        yc_m: Range centre deviation in metres, shape (...,).
+        wavelength_m: Carrier wavelength in metres.
+        prf_hz: Pulse rate in Hz.
+        n_pulse: Number of pulses.
+        free_centre: Treat yc_m as an unknown.
+
+    Returns:
+        Bounds of `omega_rad_s`, `k1_per_s`, `k2_per_s2`, ... and, with `free_centre`, `yc_m`, shape
+        (...,) each, float64; infinite where the data do not determine the unknown.
+
+    Raises:
+        ValueError: If shapes do not fit.
     """
-    _refuse(cross_range_m, range_m, amplitude, warp_k)
+    _check(cross_range_m, range_m, amplitude, warp_k)
     x, k = cross_range_m.to(torch.float64), warp_k.to(torch.float64)
     lever = range_m.to(torch.float64) + per_trial(yc_m, 1, x)
     slopes = _slopes(x, lever, per_trial(omega_rad_s, 1, x), k.shape[-1], free_centre) * (4 * math.pi / wavelength_m)
     weighted = slopes * amplitude.abs().to(torch.float64)[..., None, None, :]
-    told = _products(k, n_pulse, prf_hz)[..., None, :, :] @ weighted
-    information = weighted.flatten(-2) @ told.flatten(-2).mT
-    unit = _deviations(information)
+    products = _products(k, n_pulse, prf_hz)[..., None, :, :] @ weighted
+    information = weighted.flatten(-2) @ products.flatten(-2).mT
+    unit = _standard_deviations(information)
     noise = per_trial(noise_std, 1, x) / math.sqrt(2)
     bounds = torch.where(torch.isinf(unit), unit, unit * noise)
     names = [
@@ -67,24 +85,25 @@ def rotation_bounds(
     return dict(zip(names, bounds.unbind(-1), strict=True))
 
 
-def _refuse(cross_range_m: Tensor, range_m: Tensor, amplitude: Tensor, warp_k: Tensor) -> None:
+def _check(cross_range_m: Tensor, range_m: Tensor, amplitude: Tensor, warp_k: Tensor) -> None:
+    """Raise ValueError for shapes that do not fit."""
     counts = [x.shape[-1] if x.ndim else None for x in (cross_range_m, range_m, amplitude)]
     if None in counts or len(set(counts)) > 1:
         shapes = ", ".join(str(tuple(x.shape)) for x in (cross_range_m, range_m, amplitude))
         raise ValueError(
-            "rotation_bounds: cross_range_m, range_m and amplitude are (..., target) of as many "
-            f"targets, got the shapes {shapes}"
+            "rotation_bounds: cross_range_m, range_m and amplitude must have the shape (..., target) with "
+            f"equally many targets, got the shapes {shapes}"
         )
     if not warp_k.ndim:
         raise ValueError(
             "rotation_bounds: warp_k is (..., order - 1), got a tensor without dims; write "
-            "torch.zeros(0) for an even rotation"
+            "torch.zeros(0) for uniform rotation"
         )
 
 
 def _slopes(x: Tensor, lever: Tensor, omega: Tensor, terms: int, free_centre: bool) -> Tensor:
     """Coefficients of the curves of `_products` in the phase of each scatterer per unit of each
-    unknown, less the factor c4: (..., unknown, curve, target).
+    unknown, without the factor c4: (..., unknown, curve, target).
     """
     zero = torch.zeros_like(x * lever * omega)
     turned, bent, square = zero - x * omega, lever * omega.square() + zero, 2 * terms
@@ -95,8 +114,8 @@ def _slopes(x: Tensor, lever: Tensor, omega: Tensor, terms: int, free_centre: bo
 
 
 def _products(k: Tensor, n_pulse: int, prf_hz: float) -> Tensor:
-    """Inner products over the pulses of t^(i+1) / (i+1)!, of phi times each, and of phi^2, without
-    their parts along 1 and phi. (..., curve, curve).
+    """Inner products over the pulses of t^(i+1) / (i+1)!, of phi times each, and of phi^2, after
+    removal of their parts along 1 and phi, (..., curve, curve).
     """
     time = torch.arange(n_pulse, dtype=torch.float64, device=k.device) / prf_hz
     phi = warp(time, k)
@@ -104,22 +123,22 @@ def _products(k: Tensor, n_pulse: int, prf_hz: float) -> Tensor:
     curves = torch.stack([*powers, *(phi * power for power in powers), phi.square()], -2)
     line = phi - phi.mean(-1, keepdim=True)
     line = (line / line.square().sum(-1, keepdim=True).sqrt().clamp_min(torch.finfo(torch.float64).tiny))[..., None, :]
-    for _ in range(2):  # a second pass takes out what rounding leaves
+    for _ in range(2):  # the second pass removes rounding errors of the first
         curves = curves - curves.mean(-1, keepdim=True)
         curves = curves - (curves * line).sum(-1, keepdim=True) * line
     return curves @ curves.mT
 
 
-def _deviations(information: Tensor) -> Tensor:
-    """Square roots of the diagonal of the inverse (..., n, n) -> (..., n), infinite for unknowns
-    that a direction without information takes part in.
+def _standard_deviations(information: Tensor) -> Tensor:
+    """Square roots of the diagonal of the inverse, (..., n, n) to (..., n); infinite for unknowns
+    with a share in an unobservable direction.
     """
     size = information.diagonal(dim1=-2, dim2=-1)
     root = torch.where(size > 0, size, 1).rsqrt()
     unit = information * root[..., :, None] * root[..., None, :]
     value, vector = torch.linalg.eigh(unit.detach())
-    blind = vector * (value < _SINGULAR)[..., None, :]
-    blind = blind @ blind.mT
-    share = blind.diagonal(dim1=-2, dim2=-1)
-    variance = torch.linalg.inv(unit + blind).diagonal(dim1=-2, dim2=-1) - share
-    return torch.where(share > _TOUCHED, torch.inf, variance.clamp_min(0).sqrt() * root)
+    unobservable = vector * (value < _SINGULAR)[..., None, :]
+    unobservable = unobservable @ unobservable.mT
+    share = unobservable.diagonal(dim1=-2, dim2=-1)
+    variance = torch.linalg.inv(unit + unobservable).diagonal(dim1=-2, dim2=-1) - share
+    return torch.where(share > _INVOLVED, torch.inf, variance.clamp_min(0).sqrt() * root)

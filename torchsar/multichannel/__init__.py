@@ -1,5 +1,8 @@
-"""Azimuth-multichannel data: reconstruction and focusing with the velocity of a target, velocities,
-movers in a scene, calibration of channels and clocks.
+"""Azimuth-multichannel SAR: reconstruction and focusing, velocity estimation, and calibration.
+
+The receiver has several channels along track and a low pulse rate. Doppler spectra of stationary
+scenes and of moving targets are reconstructed from the channels, with the velocity of the target
+where it moves.
 """
 
 from torchsar.multichannel.azimuth import FocusAzimuth, azimuth_filter, focus_azimuth

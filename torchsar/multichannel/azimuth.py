@@ -1,8 +1,8 @@
-"""Azimuth focusing of a moving point by the exact range history of an airborne receiver, and the
-correction of its place.
+"""Azimuth focusing of a moving point with the exact range history of an airborne receiver.
 
-Source: brief 001, Algorithm 7 (the exact spectrum of a hyperbola with y0); Remote Sens. 2020, 12,
-1703, Eq. (30) with the sign corrected.
+Reference:
+    Remote Sens. 2020, 12, 1703, sections 4.1 and 4.3. The filter is the exact spectrum of the
+    hyperbolic range history, including an along-track offset y0.
 """
 
 from __future__ import annotations
@@ -19,19 +19,29 @@ from torchsar.radar import BistaticRadar
 def azimuth_filter(
     offset_hz: Tensor, radar: BistaticRadar, motion: PointMotion, dtype: torch.dtype, centre_hz: Tensor | None = None
 ) -> Tensor:
-    """exp(+j 2 pi / lambda (Rmin sqrt(1 - (lambda f / V)^2) - R_ref)), (..., bin) of `dtype`: takes
-    the curvature out of the spectrum of a point with this motion.
+    """Return the matched filter of a point with a given motion over Doppler.
 
-    offset_hz: float64 (bin,), Doppler against the centre; R_ref: the radar's reference range,
-    against which phases of echoes are counted. centre_hz: (...,), by default that of the motion.
-    Zero at Doppler that no point of this speed has. Differentiable in the motion.
+    The filter exp(+j 2 pi / lambda (Rmin sqrt(1 - (lambda f / V)^2) - R_ref)) removes the curvature
+    of the phase of the spectrum. R_ref is the reference range of the radar, to which echo phases
+    refer. Differentiable in the motion.
+
+    Args:
+        offset_hz: Doppler relative to the centre in Hz, float64 (bin,).
+        radar: Instrument.
+        motion: Motion of the point, shape (...,).
+        dtype: Complex dtype of the result.
+        centre_hz: Doppler centre in Hz, shape (...,), by default that of the motion.
+
+    Returns:
+        The filter, shape (..., bin), complex, zero at |f| >= V / lambda, where no point of this
+        speed has a spectrum.
     """
     centre_hz = doppler_centre_hz(radar, motion) if centre_hz is None else centre_hz
     sine = radar.wavelength_m * (centre_hz[..., None] + offset_hz) / motion.square_m2_s2.sqrt()[..., None]
     real = sine.detach().abs() < 1
     square = torch.where(real, sine, 0.0).square()
     closest = motion.closest_m[..., None]
-    # Rmin sqrt(1 - s^2) - R_ref as a sum of differences
+    # Rmin sqrt(1 - s^2) - R_ref as a sum of differences, which keeps precision
     path = (closest - radar.reference_range_m) - closest * square / (1 + torch.sqrt(1 - square))
     return unit_phasor(path / radar.wavelength_m, dtype) * real.to(real_dtype(dtype))
 
@@ -39,11 +49,22 @@ def azimuth_filter(
 def focus_azimuth(
     spectrum: Tensor, offset_hz: Tensor, radar: BistaticRadar, motion: PointMotion, bandwidth_hz: float | None = None
 ) -> Tensor:
-    """Rebuilt spectra (..., bin) about the Doppler centre of the motion to images over slow time
-    (..., bin), zero at bin n // 2, a point at `motion.image_s`.
+    """Focus reconstructed spectra to azimuth images over slow time.
 
-    bandwidth_hz: processed Doppler bandwidth about the centre, None for all. Differentiable in
-    spectrum and motion.
+    Differentiable in spectrum and motion.
+
+    Args:
+        spectrum: Reconstructed spectra about the Doppler centre of the motion, shape (..., bin),
+            complex.
+        offset_hz: Doppler relative to the centre in Hz, float64 (bin,).
+        radar: Instrument.
+        motion: Motion of the point, shape (...,).
+        bandwidth_hz: Processed Doppler bandwidth about the centre in Hz, None for the whole
+            spectrum.
+
+    Returns:
+        Images over slow time, shape (..., bin), complex, with time zero at bin n // 2. A point
+        appears at `motion.image_s`.
     """
     matched = azimuth_filter(offset_hz, radar, motion, spectrum.dtype)
     if bandwidth_hz is not None:
@@ -52,14 +73,21 @@ def focus_azimuth(
 
 
 class FocusAzimuth(Stage):
-    """Spectra (doppler[, range]) of `Reconstruct` to the image (azimuth[, range]) of one target per
-    trial with the velocities given, x = V_R t (m) in the frame of the scene.
+    """Azimuth focusing of one target per trial with its velocities.
 
-    Along the track that the target itself sees, x = (speed - u_a) t, everything is (speed - u_a) /
-    speed as wide. All lines are focused for one range, that of forward (...,), else that of the
-    strongest line, or the radar's reference range where there is no range axis: to focus each for
-    its own would bend the range side lobes of the target. (A whole scene at rest:
-    `StationaryImage`.) bandwidth_hz: processed Doppler bandwidth about the centre, None for all.
+    The input is a spectrum (doppler[, range]) of `Reconstruct`, the output an image (azimuth[,
+    range]) with azimuth x = V_R t in metres. On the axis x = (V_R - u_a) t, which refers to the
+    track as seen by the target, all widths are scaled by (V_R - u_a) / V_R. All range lines are
+    focused for a single range, since a separate range for each line would curve the range side
+    lobes of the target. Use `StationaryImage` for a whole stationary scene.
+
+    Args:
+        radar: Instrument.
+        bandwidth_hz: Processed Doppler bandwidth about the centre in Hz, None for the whole
+            spectrum.
+
+    Raises:
+        ValueError: If `bandwidth_hz` is not positive and finite.
     """
 
     works_on = ("doppler",)
@@ -69,7 +97,7 @@ class FocusAzimuth(Stage):
         super().__init__()
         self.radar, self.bandwidth_hz = radar, bandwidth_hz
         if bandwidth_hz is not None and not 0 < bandwidth_hz < float("inf"):
-            raise ValueError(f"bandwidth_hz must be positive, or None for all that is rebuilt, got {bandwidth_hz}")
+            raise ValueError(f"bandwidth_hz must be positive, or None for the whole spectrum, got {bandwidth_hz}")
 
     def forward(
         self,
@@ -79,6 +107,20 @@ class FocusAzimuth(Stage):
         y0_m: Number = 0.0,
         range_m: Number | None = None,
     ) -> Signal:
+        """Focus one target per trial.
+
+        Args:
+            signal: Spectrum with the axes (doppler[, range]).
+            u_r_m_s: Slant-range speed in m/s, closing positive, shape (...,) or a number.
+            u_a_m_s: Along-track speed in m/s, positive in the direction of the receiver, same
+                shape.
+            y0_m: Along-track position at t = 0 in metres, same shape.
+            range_m: Closest range R0 in metres, same shape. By default that of the strongest range
+                line, or the reference range of the radar where there is no range axis.
+
+        Returns:
+            Image with the axes (azimuth[, range]) in metres.
+        """
         lines, doppler = "range" in signal.names, signal.axis("doppler")
         near = self._range(signal) if range_m is None else range_m
         u_r, u_a, y0, near = (per_trial(value, int(lines), signal.data) for value in (u_r_m_s, u_a_m_s, y0_m, near))
@@ -88,7 +130,7 @@ class FocusAzimuth(Stage):
         return Signal(image.mT if lines else image, (image_axis(self.radar, doppler), *signal.axes[1:]))
 
     def _range(self, signal: Signal) -> Number:
-        """Of the strongest line, or of the scene."""
+        """Return the range of the strongest line, or the reference range without a range axis."""
         if "range" not in signal.names:
             return self.radar.reference_range_m
         across = signal.axis("range")
@@ -96,6 +138,11 @@ class FocusAzimuth(Stage):
 
 
 def image_axis(radar: BistaticRadar, doppler: Axis) -> Axis:
-    """x = V_R t (m) of the image of a spectrum."""
+    """Return the azimuth axis x = V_R t in metres of the image of a spectrum.
+
+    Args:
+        radar: Instrument.
+        doppler: Doppler axis of the spectrum.
+    """
     time = doppler.dual()
     return Axis("azimuth", time.n, time.start * radar.speed_m_s, time.step * radar.speed_m_s, "m")

@@ -1,15 +1,16 @@
-"""A moving body of any extent: one velocity for all of it, its picture, and its echo to be taken
-out of the data.
+"""Extended moving targets ("bodies"): one velocity for all scatterers, image, and echo to subtract.
 
-Range lines about the body are shifted by its range history and deramped channel by channel. Each
-part of the body then is one tone in all channels, whatever the aliasing: the frequency F gives its
-place along track, y = y0 + F lambda R0 / v, and that place and the velocity give its phases across
-the channels. In short segments of slow time the sea behind a tone comes from as few directions as
-there are Doppler bands; lines beside the body show its covariance. All parts and segments together
-tell the slant-range velocity, by likelihood with a free amplitude for each; the sharpness of the
-picture tells the along-track velocity; what fits both is its echo. Source: brief 001, Velocity
-(stationary clutter, whitening) and Algorithm 8 (subtraction); Remote Sens. 2020, 12, 1703, section
-4.3 (one speed for targets close together).
+Range lines around the body are shifted by its range history and deramped channel by channel. Each
+scatterer then is one tone in all channels, whatever the aliasing: the frequency F gives its
+along-track position y = y0 + F lambda R0 / v, and position and velocity give its phases across the
+channels. In short segments of slow time the sea at the frequency of a tone comes from as few look
+angles as there are Doppler bands; range lines beside the body give its covariance. The slant-range
+velocity is the most likely one for all tones and segments with free amplitudes, the along-track
+velocity is the one of the sharpest image, and the echo is the fit with both.
+
+Reference:
+    Remote Sens. 2020, 12, 1703, section 4.3 (extraction of moving targets, one velocity for
+    scatterers close together).
 """
 
 from __future__ import annotations
@@ -27,20 +28,49 @@ from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.velocity.model import point_phasor
 from torchsar.radar import BistaticRadar
 
-_TINY = 1e-100  # far from where reciprocals overflow
+_TINY = 1e-100  # floor of divisors, far from the overflow of reciprocals
+# Range cells left out beside a body, whose side lobes reach there. Found by trial: 2 to 12 cells
+# give the same velocities.
 _GUARD_CELLS = 6
-_LINES_USED = 8  # for the sharpness of a picture
-_LEAST_LINES = 12
-_LOADING = 1e-5
-_BRIGHT = 12.0  # times what sea and noise leave in a pixel
+# Brightest lines used for the sharpness of an image, found by trial: 4 to 16 lines give the same
+# velocities, 16 take a quarter more time.
+_LINES_USED = 8
+_LEAST_LINES = 12  # convention: fewest lines beside a body for the covariance of the sea
+_LOADING = 1e-5  # relative to the mean power: keeps the covariance of noise-free data invertible
+# Intensities in units of the residual sea and noise of a pixel, all found by trial. Pixels of a
+# body exceed _BRIGHT (4 to 30 give the same velocities) and this share of the brightest pixel.
+_BRIGHT, _BRIGHT_SHARE = 12.0, 0.01
+# Pixels above this are subtracted with a body: less removes sea as well, more leaves some body.
 _CLEAR = 2.0
-_CREDIBLE = 40.0  # times what sea and noise leave, the mean of the bright pixels
+# Least mean of the bright pixels of a reliable body: sea alone stays below 18 in 15 trials, a ship
+# that is weak but visible (4 dB in the frames of the tests) reaches 7000.
+_CREDIBLE = 40.0
+# A grid search takes 40 steps to either side of its middle (0.5 m/s in a search of +-20 m/s, as in
+# `Search`) and is repeated _GRIDS times, each time with a tenth of the step about the best point.
+_GRID_HALF, _GRID_REFINEMENT, _GRIDS = 40, 10, 3
+# Candidate motions evaluated together: 81 at once take two thirds of the time and nine times the
+# memory.
+_MOTIONS_AT_ONCE = 9
+# Fraction of the half width of the search: a velocity beyond it counts as at the end of the search.
+_INSIDE = 0.98
+# Rounds over the whole search; later rounds search near the velocities found, since the motion then
+# changes by little. Trades time against the number of rounds.
+_WIDE_ROUNDS = 2
+_NEAR_U_R_M_S, _NEAR_U_A_M_S, _LAST_U_R_M_S = 2.0, 1.0, 1.0
 
 
 @dataclass(frozen=True)
 class Extraction:
-    """What belongs to a body: half widths (m) along track and in range about its middle, the time
-    (s) for which a point shines, and the length (s) of segments.
+    """Extent of a body in the data.
+
+    Args:
+        along_m: Half width along track about the middle in metres.
+        range_m: Half width in range about the middle in metres.
+        integration_s: Time for which a scatterer is illuminated in seconds.
+        segment_s: Length of the segments of slow time in seconds.
+
+    Raises:
+        ValueError: If a value is not positive and finite.
     """
 
     along_m: float = 120.0
@@ -56,9 +86,13 @@ class Extraction:
 
 @dataclass(frozen=True)
 class Segments:
-    """Short Fourier transforms of slow time: half-overlapping segments and the bins kept of each.
+    """Short-time Fourier transform of slow time with half-overlapping Hann windows.
 
-    bins: (tone,) FFT indices; rows: (segment,) of those in which a body shines.
+    Args:
+        n: Number of pulses.
+        length: Number of pulses of a segment.
+        bins: FFT indices kept of each segment, shape (tone,).
+        rows: Indices of the segments in which a body is illuminated, shape (segment,).
     """
 
     n: int
@@ -68,13 +102,15 @@ class Segments:
 
     @property
     def hop(self) -> int:
+        """Number of pulses between segments."""
         return self.length // 2
 
     def window(self) -> Tensor:
+        """Return the Hann window, float64 (length,)."""
         return torch.hann_window(self.length, dtype=torch.float64, device=self.bins.device)
 
     def of(self, x: Tensor) -> Tensor:
-        """(..., pulse) complex128 to (..., segment, tone)."""
+        """Transform data (..., pulse), complex128, to segments (..., segment, tone)."""
         made = torch.stft(
             x.flatten(0, -2),
             self.length,
@@ -88,7 +124,7 @@ class Segments:
         return made[:, self.bins][..., self.rows].mT.unflatten(0, x.shape[:-1])
 
     def back(self, cells: Tensor) -> Tensor:
-        """Inverse of `of`, zero where segments or bins were left out."""
+        """Invert `of`; segments and bins that were left out are zero."""
         full = torch.zeros(
             cells.shape[:-2].numel(), self.length, self.n // self.hop + 1, dtype=cells.dtype, device=cells.device
         )
@@ -108,13 +144,19 @@ class Segments:
 
 @dataclass(frozen=True)
 class Chip:
-    """Lines about a body, deramped by the motion of its middle, in segments.
+    """Range lines around a body in segments, deramped by the motion of its middle.
 
-    cells: complex128 (line, channel, segment, tone); beside: the same of lines beside it; tone_hz:
-    (tone,).
-
-    range_m: (line,) closest ranges; inverse: (segment, tone, channel, channel) inverse covariance
-    of the sea and noise; lit: (pulse,) bool, some part of the body shines.
+    Args:
+        radar: Instrument.
+        motion: Motion of the middle of the body.
+        segments: Transform of slow time.
+        cells: Lines of the body, complex128 (line, channel, segment, tone).
+        beside: Lines beside the body, complex128 (line, channel, segment, tone).
+        tone_hz: Frequencies of the tones in Hz, shape (tone,).
+        range_m: Closest ranges of the lines of the body in metres, shape (line,).
+        inverse: Inverse covariance of sea and noise, complex128 (segment, tone, channel, channel).
+        lit: True for pulses at which some part of the body is illuminated, bool (pulse,).
+        time_s: Slow time in seconds, float64 (pulse,).
     """
 
     radar: BistaticRadar
@@ -129,33 +171,52 @@ class Chip:
     time_s: Tensor
 
     def steering(self, motion: PointMotion, tone_hz: Tensor) -> Tensor:
-        """Phases over channels of what has this motion and lies at tones, against what was
-        deramped, complex128 (..., tone, channel).
+        """Return the phases across the channels of scatterers at given tones.
+
+        Args:
+            motion: Motion of the scatterers, shape (...,).
+            tone_hz: Frequencies of the tones in Hz, shape (tone,).
+
+        Returns:
+            Phasors relative to the deramp, complex128 (..., tone, channel).
         """
-        place = self.place_m(motion, tone_hz) - self.motion.y0_m
+        position = self.place_m(motion, tone_hz) - self.motion.y0_m
         return unit_phasor(
-            -place[..., None]
-            * self.radar.channels_at(place.device)
+            -position[..., None]
+            * self.radar.channels_at(position.device)
             / (self.radar.wavelength_m * motion.range_m[..., None, None]),
             torch.complex128,
         )
 
     def place_m(self, motion: PointMotion, tone_hz: Tensor) -> Tensor:
-        """Along-track place at t = 0 of tones for a motion whose y0 is that of tone zero, (...,
-        tone).
+        """Return the along-track positions at t = 0 of tones.
+
+        Args:
+            motion: Motion whose y0 is the position of tone zero, shape (...,).
+            tone_hz: Frequencies of the tones in Hz, shape (tone,).
+
+        Returns:
+            Positions in metres, shape (..., tone).
         """
         per_hz = self.radar.wavelength_m * motion.range_m / motion.along_m_s
         return motion.y0_m[..., None] + per_hz[..., None] * tone_hz
 
     def _weights(self, motion: PointMotion) -> tuple[Tensor, Tensor]:
-        """R^-1 a (..., segment, tone, channel) and a^H R^-1 a (..., segment, tone)."""
+        """Return R^-1 a (..., segment, tone, channel) and a^H R^-1 a (..., segment, tone)."""
         steering = self.steering(motion, self.tone_hz)
         weight = torch.einsum("sfmn,...fn->...sfm", self.inverse, steering)
         return weight, (steering[..., None, :, :].conj() * weight).sum(-1).real.clamp_min(_TINY)
 
     def energy(self, motions: PointMotion) -> Tensor:
-        """What cells of free amplitude explain of the data for each motion (candidate,): the
-        log-likelihood but for constants.
+        """Return the energy of the data that cells of free amplitude explain.
+
+        Up to constants this is the log-likelihood.
+
+        Args:
+            motions: Candidate motions, shape (candidate,).
+
+        Returns:
+            Energy, shape (candidate,).
         """
         weight, gain = self._weights(motions)
         return (torch.einsum("lmsf,csfm->clsf", self.cells, weight.conj()).abs().square() / gain[:, None]).sum(
@@ -163,15 +224,22 @@ class Chip:
         )
 
     def echo(self, cells: Tensor) -> Tensor:
-        """Most likely deramped echo, seen from the reference of the track, of what has the chip's
-        motion: (line, channel, segment, tone) to (line, pulse), zero where nothing shines.
+        """Return the most likely deramped echo of scatterers with the motion of the chip.
+
+        Args:
+            cells: Segments, complex128 (line, channel, segment, tone).
+
+        Returns:
+            Echo at the reference point of the track, complex128 (line, pulse), zero in pulses at
+            which nothing is illuminated.
         """
         weight, gain = self._weights(self.motion)
         return self.segments.back(torch.einsum("lmsf,sfm->lsf", cells, weight.conj()) / gain) * self.lit
 
     def picture(self) -> Picture:
-        """Of the body: spectra of its echo, and the mean intensity that sea and noise leave in
-        them, by the lines beside it.
+        """Image the body: spectra of its echo, and the mean intensity of residual sea and noise.
+
+        The residual intensity is measured in the lines beside the body.
         """
         n = self.segments.n
         hz = torch.fft.fftfreq(n, 1 / self.radar.prf_hz, dtype=torch.float64, device=self.lit.device)
@@ -182,8 +250,13 @@ class Chip:
 
 @dataclass(frozen=True)
 class Picture:
-    """Complex amplitudes (line, tone) of a body, sum over lit pulses of its echo at each tone;
-    left: mean intensity of sea and noise in them (); index: of the tones in an FFT of all pulses.
+    """Image of a body over range lines and tones.
+
+    Args:
+        amplitude: Sum of the echo over illuminated pulses at each tone, complex128 (line, tone).
+        left: Mean intensity of the residual sea and noise, shape ().
+        tone_hz: Frequencies of the tones in Hz, shape (tone,).
+        index: Index of each tone in an FFT over all pulses, shape (tone,).
     """
 
     amplitude: Tensor
@@ -193,25 +266,29 @@ class Picture:
 
     @property
     def level(self) -> Tensor:
-        """Intensity over what sea and noise leave."""
+        """Intensity relative to the residual sea and noise, shape (line, tone)."""
         return self.amplitude.abs().square() / self.left
 
     @property
     def bright(self) -> Tensor:
+        """True for pixels of the body, above 12 times the residual and 1 % of the maximum."""
         level = self.level
-        return level > torch.maximum(level.new_tensor(_BRIGHT), 0.01 * level.max())
+        return level > torch.maximum(level.new_tensor(_BRIGHT), _BRIGHT_SHARE * level.max())
 
 
 @dataclass(frozen=True)
 class Body:
-    """A body that was found.
+    """Moving body that was found.
 
-    motion: velocity, and along-track place and closest range of its middle, by intensity;
-    u_r_std_m_s: predicted deviation of u_r.
-
-    chip, picture: its data, deramped by that motion, and what they show; level: mean of the bright
-    pixels over what sea and noise leave. ok: it stands out by 16 dB, and u_r does not end its
-    search.
+    Args:
+        motion: Velocity of the body, and along-track position and closest range of its middle by
+            intensity.
+        u_r_std_m_s: Predicted standard deviation of u_r in m/s.
+        chip: Data of the body, deramped by its motion.
+        picture: Image of the body.
+        level: Mean of the bright pixels relative to the residual sea and noise.
+        ok: False if `level` is below 40 (16 dB), u_r lies at the end of its search, or the body
+            left the frame during the search.
     """
 
     motion: PointMotion
@@ -223,12 +300,20 @@ class Body:
 
 
 def chip_about(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extraction) -> Chip:
-    """Lines about a body of this motion.
+    """Extract the range lines around a body of a given motion.
 
-    data: complex (channel, pulse, range), range compressed, transmit range removed, with lines
-    beside the body to learn the sea from.
+    Args:
+        data: Range-compressed channels without the transmit range, shape (channel, pulse, range),
+            complex, including lines beside the body.
+        frame: Geometry of the data.
+        motion: Motion of the body.
+        extraction: Extent of the body.
 
-    Raises ValueError where the body lies outside the lines, or too few lie beside it.
+    Returns:
+        The lines in segments, with the covariance of the sea.
+
+    Raises:
+        ValueError: If the body lies outside the range lines, or fewer than 12 lines lie beside it.
     """
     off = (frame.range_m - motion.range_m).abs()
     body, beside = off <= extraction.range_m, off > extraction.range_m + _GUARD_CELLS * frame.radar.range_step_m
@@ -238,7 +323,8 @@ def chip_about(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extr
             f"{float(motion.range_m):.0f} m and {int(beside.sum())} beside them"
         )
         raise ValueError(
-            f"a body needs range lines about it and {_LEAST_LINES} beside it to learn the sea from, got {counts}"
+            f"a body needs range lines about it and {_LEAST_LINES} beside it for the covariance of the sea, "
+            f"got {counts}; give more range lines or a smaller extraction"
         )
     lit = (
         frame.time_s - motion.y0_m / motion.along_m_s
@@ -263,7 +349,7 @@ def chip_about(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extr
 
 
 def _segments(frame: Frame, motion: PointMotion, extraction: Extraction, lit: Tensor) -> tuple[Segments, Tensor]:
-    """Segments in which the body shines, and the tones at which it may lie."""
+    """Return the segments in which the body is illuminated, and the frequencies of its tones."""
     n, prf = len(frame.time_s), frame.radar.prf_hz
     length = min(2 * max(4, round(extraction.segment_s * prf / 2)), n // 2 * 2)
     tone_hz = torch.fft.fftfreq(length, 1 / prf, dtype=torch.float64, device=lit.device)
@@ -278,8 +364,10 @@ def _segments(frame: Frame, motion: PointMotion, extraction: Extraction, lit: Te
 
 
 def _inverse_covariance(chip: Chip) -> Tensor:
-    """Of the lines beside the body: from tone to tone it turns as phases of places do, and else is
-    the same for all tones of a segment.
+    """Return the inverse covariance of the lines beside the body.
+
+    Its phases depend on the tone as those of positions do; otherwise it is the same for all tones
+    of a segment.
     """
     turn = chip.steering(chip.motion, chip.tone_hz)
     aligned = chip.beside.movedim(1, -1) * turn.conj()
@@ -301,44 +389,66 @@ def find_body(
     u_a_half_m_s: float = 20.0,
     rounds: int = 4,
 ) -> Body:
-    """Velocity and place of the body that appears at slow time image_s and range image_m (m) of an
-    image of everything at rest.
+    """Find velocity and position of a body that appears in an image of the stationary scene.
 
-    data: complex (channel, pulse, range) about the body (see `chip_about`). u_r_half_m_s: of the
-    search, by default half of lambda PRF. Every round shifts and deramps by the motion found so
-    far.
+    Each round shifts and deramps the data by the motion found so far.
+
+    Args:
+        data: Range-compressed channels without the transmit range, shape (channel, pulse, range),
+            complex, around the body as in `chip_about`.
+        frame: Geometry of the data.
+        image_s: Slow time in seconds at which the image shows the body.
+        image_m: Range in metres at which the image shows the body.
+        extraction: Extent of the body.
+        u_r_half_m_s: Half width of the search in u_r in m/s, by default half of lambda PRF.
+        u_a_half_m_s: Half width of the search in u_a in m/s.
+        rounds: Number of rounds.
+
+    Returns:
+        The body; see `Body` for `ok`.
+
+    Raises:
+        ValueError: As in `chip_about`.
     """
     half = frame.radar.ambiguous_velocity_m_s / 2 if u_r_half_m_s is None else u_r_half_m_s
-    chip = chip_about(data, frame, _appearing(frame.radar, data, 0.0, 0.0, image_s, image_m), extraction)
+    chip = chip_about(data, frame, _motion_imaged_at(frame.radar, data, 0.0, 0.0, image_s, image_m), extraction)
     for number in range(rounds):
-        u_r, std = _closing_speed(chip, image_s, image_m, half if number < 2 else 2.0)
-        motion = _appearing(frame.radar, data, u_r, chip.motion.u_a_m_s, image_s, image_m)
-        if not _covered(frame, motion, extraction):
-            return _judged(chip, std, half, lost=True)
-        u_a = _along_speed(chip_about(data, frame, motion, extraction), extraction, u_a_half_m_s if number < 2 else 1.0)
-        chip = chip_about(data, frame, _appearing(frame.radar, data, u_r, u_a, image_s, image_m), extraction)
+        u_r, std = _closing_speed(chip, image_s, image_m, half if number < _WIDE_ROUNDS else _NEAR_U_R_M_S)
+        motion = _motion_imaged_at(frame.radar, data, u_r, chip.motion.u_a_m_s, image_s, image_m)
+        if not _inside_frame(frame, motion, extraction):
+            return _body_of(chip, std, half, lost=True)
+        moved = chip_about(data, frame, motion, extraction)
+        if not len(moved.time_s[moved.lit]):  # the motion has left every pulse of the record
+            return _body_of(chip, std, half, lost=True)
+        u_a = _along_speed(
+            moved,
+            extraction,
+            u_a_half_m_s if number < _WIDE_ROUNDS else _NEAR_U_A_M_S,
+        )
+        chip = chip_about(data, frame, _motion_imaged_at(frame.radar, data, u_r, u_a, image_s, image_m), extraction)
         image_s, image_m, motion = _centred(chip, image_s, image_m)
         chip = chip_about(data, frame, motion, extraction)
-    u_r, std = _closing_speed(chip, image_s, image_m, 1.0)
-    motion = _appearing(frame.radar, data, u_r, chip.motion.u_a_m_s, image_s, image_m)
-    return _judged(chip_about(data, frame, motion, extraction), std, half)
+    u_r, std = _closing_speed(chip, image_s, image_m, _LAST_U_R_M_S)
+    motion = _motion_imaged_at(frame.radar, data, u_r, chip.motion.u_a_m_s, image_s, image_m)
+    return _body_of(chip_about(data, frame, motion, extraction), std, half)
 
 
-def _covered(frame: Frame, motion: PointMotion, extraction: Extraction) -> bool:
-    """The lines of the frame hold a body of this motion, and some more."""
+def _inside_frame(frame: Frame, motion: PointMotion, extraction: Extraction) -> bool:
+    """Test whether the lines of the frame contain a body of this motion with a margin."""
     reach = extraction.range_m / 2
     return bool((frame.range_m[0] + reach <= motion.range_m) & (motion.range_m <= frame.range_m[-1] - reach))
 
 
-def _judged(chip: Chip, std: Tensor, half_m_s: float, lost: bool = False) -> Body:
+def _body_of(chip: Chip, std: Tensor, half_m_s: float, lost: bool = False) -> Body:
+    """Form the body of a chip and judge it."""
     picture = chip.picture()
     bright = picture.bright
     level = (picture.level * bright).sum() / bright.sum().clamp_min(1)
-    ok = (level > _CREDIBLE) & (chip.motion.u_r_m_s.abs() < 0.98 * half_m_s)
+    ok = (level > _CREDIBLE) & (chip.motion.u_r_m_s.abs() < _INSIDE * half_m_s)
     return Body(chip.motion, std, chip, picture, level, ok & (not lost))
 
 
-def _appearing(
+def _motion_imaged_at(
     radar: BistaticRadar,
     like: Tensor,
     u_r: Tensor | float,
@@ -346,8 +456,9 @@ def _appearing(
     image_s: Tensor | float,
     image_m: Tensor | float,
 ) -> PointMotion:
-    """The motion of these velocities that an image of everything at rest shows at this slow time
-    and range: Rmin V = v R0 - u_r y0, V^2 t = u_r R0 + v y0.
+    """Return the motion of given velocities that is imaged at a slow time and range.
+
+    Rmin V = v R0 - u_r y0 and V^2 t = u_r R0 + v y0.
     """
     m = PointMotion.of(radar, like.real, u_r, u_a)
     speed = m.square_m2_s2.sqrt()
@@ -360,52 +471,51 @@ def _appearing(
 
 
 def _closing_speed(chip: Chip, image_s: float, image_m: float, half_m_s: float) -> tuple[Tensor, Tensor]:
-    """The most likely u_r within half_m_s of that of the chip, by grids and a parabola, and its
-    predicted deviation.
-    """
-    middle, step = chip.motion.u_r_m_s, torch.as_tensor(half_m_s / 40, dtype=torch.float64)
+    """Return the most likely u_r near that of the chip, and its standard deviation."""
+    middle, step = chip.motion.u_r_m_s, torch.as_tensor(half_m_s / _GRID_HALF, dtype=torch.float64)
     std = step
-    for _ in range(3):
-        u_r = middle + step * torch.arange(-40, 41, dtype=torch.float64, device=middle.device)
+    for _ in range(_GRIDS):
+        u_r = middle + step * torch.arange(-_GRID_HALF, _GRID_HALF + 1, dtype=torch.float64, device=middle.device)
         energy = torch.cat(
             [
                 chip.energy(
-                    _appearing(chip.radar, chip.cells, part, chip.motion.u_a_m_s.expand(part.shape), image_s, image_m)
+                    _motion_imaged_at(
+                        chip.radar, chip.cells, part, chip.motion.u_a_m_s.expand(part.shape), image_s, image_m
+                    )
                 )
-                for part in u_r.split(9)
+                for part in u_r.split(_MOTIONS_AT_ONCE)
             ]
         )
-        shift, bend = _peak(energy)
-        middle, std, step = middle + step * shift, step / torch.sqrt(bend), step / 10
+        shift, curvature = _peak(energy)
+        middle, std, step = middle + step * shift, step / torch.sqrt(curvature), step / _GRID_REFINEMENT
     return middle, std
 
 
 def _peak(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Place of the greatest value against the middle, in steps, by a parabola through its
-    neighbours, and minus the second difference there.
-    """
+    """Return the position of the maximum from the middle, in steps, and its curvature."""
     inner = min(max(int(values.argmax()), 1), len(values) - 2)
     low, top, high = values[inner - 1 : inner + 2]
-    bend = (2 * top - low - high).clamp_min(_TINY)
-    return inner - len(values) // 2 + (0.5 * (high - low) / bend).clamp(-1, 1), bend
+    curvature = (2 * top - low - high).clamp_min(_TINY)
+    return inner - len(values) // 2 + (0.5 * (high - low) / curvature).clamp(-1, 1), curvature
 
 
 def _along_speed(chip: Chip, extraction: Extraction, half_m_s: float) -> Tensor:
-    """The u_a within half_m_s of that of the chip whose picture is sharpest (mean square over
-    squared mean of intensities), by grids and a parabola.
+    """Return the u_a within half_m_s of that of the chip with the sharpest image.
+
+    Sharpness is the mean square of the intensities over their squared mean.
     """
     radar, motion = replace(chip.radar, channel_m=(0.0,)), chip.motion
     time_s = chip.time_s[chip.lit]
-    # a taper, since side lobes of neighbours would interfere
+    # Hann weighted, since side lobes of neighbouring scatterers would interfere
     echo = chip.echo(chip.cells)[:, chip.lit] * torch.hann_window(
         len(time_s), dtype=torch.float64, device=time_s.device
     )
     echo = echo[echo.abs().square().sum(-1).topk(min(_LINES_USED, len(echo))).indices]
     back = point_phasor(radar, motion, time_s, torch.complex128)[0]
-    middle, step = motion.u_a_m_s, half_m_s / 40
-    for _ in range(3):
-        u_a = middle + step * torch.arange(-40, 41, dtype=torch.float64, device=middle.device)
-        there = replace(motion.each(lambda value: value.expand(81)), u_a_m_s=u_a)
+    middle, step = motion.u_a_m_s, half_m_s / _GRID_HALF
+    for _ in range(_GRIDS):
+        u_a = middle + step * torch.arange(-_GRID_HALF, _GRID_HALF + 1, dtype=torch.float64, device=middle.device)
+        there = replace(motion.each(lambda value: value.expand(2 * _GRID_HALF + 1)), u_a_m_s=u_a)
         turn = point_phasor(radar, there, time_s, torch.complex128)[:, 0].conj() * back
         picture = (
             torch.fft.fft((echo * turn[:, None]).to(torch.complex64), smooth_length(2 * echo.shape[-1]))
@@ -414,12 +524,12 @@ def _along_speed(chip: Chip, extraction: Extraction, half_m_s: float) -> Tensor:
             .to(torch.float64)
         )
         shift, _ = _peak(picture.square().sum((-2, -1)) / picture.sum((-2, -1)).square().clamp_min(_TINY))
-        middle, step = middle + step * shift, step / 10
+        middle, step = middle + step * shift, step / _GRID_REFINEMENT
     return middle
 
 
 def _centred(chip: Chip, image_s: float, image_m: float) -> tuple[float, float, PointMotion]:
-    """Where the middle of the bright pixels appears, and its motion."""
+    """Return the imaged slow time and range of the middle of the bright pixels, and its motion."""
     motion = centred_motion(chip)
     return (
         (image_s, image_m, chip.motion)
@@ -429,35 +539,49 @@ def _centred(chip: Chip, image_s: float, image_m: float) -> tuple[float, float, 
 
 
 def centred_motion(chip: Chip) -> PointMotion:
-    """The motion of a chip with the place and range of the middle, by intensity, of the bright
-    pixels of its picture; the very motion where nothing is bright.
+    """Return the motion of a chip with the position and range of the middle of its bright pixels.
+
+    The middle is weighted by intensity. Without bright pixels the motion is unchanged.
     """
     picture = chip.picture()
     weight = picture.level * picture.bright
     total = weight.sum()
     if not float(total) > 0:
         return chip.motion
-    place = (weight.sum(0) * chip.place_m(chip.motion, picture.tone_hz)).sum() / total
+    position = (weight.sum(0) * chip.place_m(chip.motion, picture.tone_hz)).sum() / total
     near = (weight.sum(1) * chip.range_m).sum() / total
-    return replace(chip.motion, y0_m=place, range_m=near)
+    return replace(chip.motion, y0_m=position, range_m=near)
 
 
 def known_body(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extraction) -> Body:
-    """The body of a known motion: its velocity is kept, its middle is put where its picture has it.
+    """Form the body of a known motion: its velocity is kept, its middle is measured.
 
-    Data and errors as in `chip_about`.
+    Args:
+        data: Channels as in `chip_about`.
+        frame: Geometry of the data.
+        motion: Known motion of the body.
+        extraction: Extent of the body.
+
+    Raises:
+        ValueError: As in `chip_about`.
     """
     chip = chip_about(data, frame, motion, extraction)
     chip = chip_about(data, frame, centred_motion(chip), extraction)
-    return _judged(chip, torch.zeros_like(motion.u_r_m_s), math.inf)
+    return _body_of(chip, torch.zeros_like(motion.u_r_m_s), math.inf)
 
 
 def body_echo(body: Body, frame: Frame, everything: bool = False) -> Tensor:
-    """The echo of a body, complex128 (channel, pulse, range): what to subtract from the data of the
-    frame in which it was found.
+    """Return the echo of a body, to subtract from the data of the frame in which it was found.
 
-    It is what pixels hold that stand above sea and noise. everything: all that lies in its lines
-    and tones instead, sea included.
+    The echo consists of the pixels above the residual sea and noise.
+
+    Args:
+        body: Body.
+        frame: Geometry of the data.
+        everything: True for all data in its lines and tones, including the sea.
+
+    Returns:
+        Echo, complex128 (channel, pulse, range).
     """
     chip, picture = body.chip, body.picture
     if everything:
@@ -478,7 +602,7 @@ def body_echo(body: Body, frame: Frame, everything: bool = False) -> Tensor:
 
 
 def _shifted_back(data: Tensor, frame: Frame, motion: PointMotion) -> Tensor:
-    """Inverse of `StaticBulk`: lines moved along range by the history of the motion."""
+    """Undo `StaticBulk`: shift lines along range by the history of the motion."""
     n = data.shape[-1]
     turns = -frame.path_m(motion) / (frame.radar.range_step_m * n)
     phasor = torch.fft.ifftshift(linear_phasor(turns, -(n // 2), n, data.dtype), dim=-1)
@@ -486,8 +610,15 @@ def _shifted_back(data: Tensor, frame: Frame, motion: PointMotion) -> Tensor:
 
 
 def body_image(body: Body, place_m: Tensor, extraction: Extraction) -> Tensor:
-    """Complex amplitudes of the points of a body at along-track places (place,) at t = 0, (place,
-    line), the sea suppressed: that of a point of amplitude 1 is 1.
+    """Return the complex image of a body at given along-track positions, with the sea suppressed.
+
+    Args:
+        body: Body.
+        place_m: Along-track positions at t = 0 in metres, float64 (position,).
+        extraction: Extent of the body.
+
+    Returns:
+        Amplitudes, complex128 (position, line); a scatterer of amplitude 1 has the value 1.
     """
     chip, motion = body.chip, body.chip.motion
     echo, time_s = chip.echo(chip.cells)[:, chip.lit], chip.time_s[chip.lit]

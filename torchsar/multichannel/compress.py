@@ -12,12 +12,19 @@ from torchsar.radar import BistaticRadar
 
 
 class CompressChannels(Stage):
-    """Range compression with the transmitted pulse, a unit echo to a unit peak at its range.
+    """Range compression with the transmitted pulse; a unit echo has a unit peak at its range.
 
-    reference: "matched", "flat" or "phase" (`focus.RangeCompress`).
+    An echo whose pulse is cut by an end of the range line is compressed with the samples that
+    remain.
 
-    "flat" makes an exactly rectangular band, the response of simulated compressed data. Echoes
-    whose pulse is cut by an end of the line are compressed with what there is.
+    Args:
+        radar: Instrument.
+        reference: Reference spectrum "matched", "flat" or "phase", see `focus.RangeCompress`.
+            "flat" gives an exactly rectangular band, the response of data simulated as range
+            compressed.
+
+    Raises:
+        ValueError: If `reference` is unknown.
     """
 
     works_on = ("channel", "pulse", "range")
@@ -29,8 +36,9 @@ class CompressChannels(Stage):
         self.radar, self.reference = radar, reference
 
     def spectrum(self, n: int, device: torch.device | str | None = None) -> Tensor:
-        """The reference spectrum for lines of n samples, complex128 (n,)."""
+        """Return the reference spectrum for range lines of n samples, complex128 (n,)."""
         return REFERENCES[self.reference](self.radar.pulse, n, self.radar.sampling_hz, device)
 
     def forward(self, signal: Signal) -> Signal:
+        """Compress data with the axes (channel, pulse, range) in range."""
         return signal.with_data(range_compress(signal.data, self.spectrum(signal.data.shape[-1], signal.data.device)))

@@ -1,6 +1,4 @@
-"""Targets that stand out of the sea: places in an image at which the mean intensity of a
-neighbourhood exceeds what is usual.
-"""
+"""Detection of targets in sea clutter by the mean intensity of image neighbourhoods."""
 
 from __future__ import annotations
 
@@ -15,8 +13,13 @@ from torchsar.core import Signal
 
 @dataclass(frozen=True)
 class Detection:
-    """One place: azimuth x = V_R t and range (m) of the middle of the neighbourhood, and how far it
-    stands above the median of the image.
+    """Position of one detection in an image.
+
+    Args:
+        azimuth_m: Azimuth x = V_R t of the intensity centre in metres.
+        range_m: Range of the intensity centre in metres.
+        contrast_db: Mean intensity of the strongest neighbourhood over the median of the image in
+            dB.
     """
 
     azimuth_m: float
@@ -25,8 +28,15 @@ class Detection:
 
 
 def contrast(image: Signal, extent_m: tuple[float, float] = (60.0, 10.0)) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-    """Mean intensity over neighbourhoods of extent_m, half overlapping, over the median of all:
-    (..., row, column), and the azimuths (row,) and ranges (column,) of their middles (m).
+    """Compute the mean intensity of half-overlapping neighbourhoods over the median of them all.
+
+    Args:
+        image: Image (azimuth, range), complex.
+        extent_m: Extent of a neighbourhood in azimuth and range in metres.
+
+    Returns:
+        The contrast (intensity ratio), float64 (..., row, column), and the azimuths (row,) and
+        ranges (column,) of the middles of the neighbourhoods in metres.
     """
     azimuth, range_ = image.axes
     size = tuple(
@@ -40,12 +50,12 @@ def contrast(image: Signal, extent_m: tuple[float, float] = (60.0, 10.0)) -> tup
         stride=(size[0] // 2, size[1] // 2),
     )
     mean = mean[:, 0].unflatten(0, image.trials) if image.trials else mean[0, 0]
-    usual = mean.flatten(-2).median(-1).values.clamp_min(torch.finfo(torch.float64).tiny)
-    places = [
+    typical = mean.flatten(-2).median(-1).values.clamp_min(torch.finfo(torch.float64).tiny)
+    middles = [
         axis.start + axis.step * ((n - 1) / 2 + n // 2 * torch.arange(count, dtype=torch.float64))
         for axis, n, count in zip((azimuth, range_), size, mean.shape[-2:], strict=True)
     ]
-    return mean / usual[..., None, None], (places[0], places[1])
+    return mean / typical[..., None, None], (middles[0], middles[1])
 
 
 def detect(
@@ -55,11 +65,26 @@ def detect(
     apart_m: tuple[float, float] = (200.0, 40.0),
     most: int = 16,
 ) -> list[Detection]:
-    """Places of one image (azimuth, range), strongest first, at least apart_m from each other along
-    one axis. The place is the centre of intensity of all that is bright there.
+    """Detect bright targets in one image, strongest first.
+
+    Targets are separated by at least `apart_m` along one axis. The position is the intensity centre
+    of the neighbourhoods above a quarter of the peak within that distance.
+
+    Args:
+        image: Image (azimuth, range) without trials, complex.
+        threshold_db: Least contrast of a detection in dB.
+        extent_m: Extent of a neighbourhood in azimuth and range in metres.
+        apart_m: Least separation in azimuth and range in metres.
+        most: Largest number of detections.
+
+    Returns:
+        The detections, strongest first.
+
+    Raises:
+        ValueError: If the image has trials.
     """
     if image.trials:
-        raise ValueError(f"detect works on one image at a time, got trials {tuple(image.trials)}")
+        raise ValueError(f"detect works on one image at a time, got trials {tuple(image.trials)}; call it for each")
     level, (rows, columns) = contrast(image, extent_m)
     left, found = level.clone(), []
     while len(found) < most and float(left.max()) >= 10 ** (threshold_db / 10):
@@ -67,7 +92,7 @@ def detect(
         row, column = divmod(int(left.argmax()), left.shape[1])
         near = ((rows - rows[row]).abs() < apart_m[0])[:, None] & ((columns - columns[column]).abs() < apart_m[1])
         bright = torch.where(near & (level > peak / 4), level, 0.0)
-        azimuth, range_ = ((bright.sum(dim) * place).sum() / bright.sum() for dim, place in ((1, rows), (0, columns)))
+        azimuth, range_ = ((bright.sum(dim) * middle).sum() / bright.sum() for dim, middle in ((1, rows), (0, columns)))
         found.append(Detection(float(azimuth), float(range_), 10 * float(torch.log10(torch.tensor(peak)))))
         left = torch.where(near, 0.0, left)
     return found

@@ -1,13 +1,15 @@
-"""Range migration of moving points in channels that are aliased in azimuth: deramp, keystone,
-reramp.
+"""Range migration correction of moving points in channels that are aliased in azimuth.
 
-A keystone transform takes out the range walk of all targets at once, but it needs unaliased slow
-time, and the channels are aliased. So the range history of a reference is first taken out of
-carrier and envelope alike, times exp(+j 2 pi (fc + fr) / c (R_ref,m(t) - R_ref)), which leaves a
-tone of every target; then slow time is rescaled, t -> t fc / (fc + fr); then the history goes back
-into the carrier alone. Azimuth phases are what they were, and envelopes stand still. Source: brief
-001, RCMC order; Remote Sens. 2020, 12, 1703, section 4.1 names the keystone transform without its
-order.
+A keystone transform removes the range walk of all targets at once, but it needs unaliased slow
+time, and each channel is aliased. The range history of a reference is therefore removed first from
+carrier and envelope, by the factor exp(+j 2 pi (fc + fr) / c (R_ref,m(t) - R_ref)), which reduces
+each target to a tone. Slow time is then rescaled, t -> t fc / (fc + fr), and the history is
+restored in the carrier alone. Azimuth phases are unchanged, and the envelope of each target stays
+at one range.
+
+Reference:
+    Remote Sens. 2020, 12, 1703, section 4.1, which names the keystone transform without the deramp
+    that aliased data require.
 """
 
 from __future__ import annotations
@@ -27,13 +29,19 @@ from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.multichannel.reconstruct import refuse_shifted
 from torchsar.radar import BistaticRadar, receive_range
 
+# Relative error of the non-uniform FFT: -100 dB, well below the -60 dB asked of complex64 images;
+# in complex128 a smaller error would widen the kernel and cost time.
 _EPS = {torch.complex64: 1e-5, torch.complex128: 1e-10}
 
 
 @dataclass(frozen=True)
 class Frame:
-    """Where data (..., channel, pulse, range) were taken: radar, slow time (pulse,) in s, and
-    closest ranges of the axis (range,) in m, both float64.
+    """Geometry of data (..., channel, pulse, range).
+
+    Args:
+        radar: Instrument.
+        time_s: Slow time in seconds, float64 (pulse,).
+        range_m: Closest ranges of the range axis in metres, float64 (range,).
     """
 
     radar: BistaticRadar
@@ -42,19 +50,34 @@ class Frame:
 
     @staticmethod
     def of(radar: BistaticRadar, signal: Signal) -> Frame:
+        """Return the frame of a signal with the axes (channel, pulse, range)."""
         device = signal.data.device
         return Frame(radar, signal.axis("pulse").values(device), signal.axis("range").values(device))
 
     def path_m(self, reference: PointMotion) -> Tensor:
-        """R_ref,m(t) - R_ref of the reference, (..., channel, pulse)."""
+        """Return the range history R_ref,m(t) - R_ref of a reference.
+
+        Args:
+            reference: Motion of the reference, shape (...,).
+
+        Returns:
+            Change of range in metres, float64 (..., channel, pulse).
+        """
         return self._history(reference, reference.range_m[..., None, None, None]).path_m[..., 0]
 
     def residual_m(self, reference: PointMotion, walks: float) -> Tensor:
-        """How far envelopes at the closest ranges of the axis lie off when the history of the
-        reference is taken out, (..., channel, pulse, range).
+        """Return the displacement of envelopes after the history of the reference is removed.
 
-        e(t), the change of the history with range, less walks * t de/dt: a keystone (walks = 1)
-        takes out what is linear in t and moves the rest by -t de/dt.
+        With e(t) the history at the range of the cell minus that of the reference, the displacement
+        is e(t) - walks * t de/dt: a keystone transform (walks = 1) removes what is linear in t and
+        displaces the rest by -t de/dt.
+
+        Args:
+            reference: Motion of the reference, shape (...,).
+            walks: 1 after a keystone transform, 0 without.
+
+        Returns:
+            Displacement in metres, float64 (..., channel, pulse, range).
         """
         own, of_reference = (
             self._history(reference, self.range_m),
@@ -64,6 +87,7 @@ class Frame:
         return e if not walks else e - walks * self.time_s[:, None] * (own.rate_m_s - of_reference.rate_m_s)
 
     def _history(self, reference: PointMotion, range_m: Tensor) -> _History:
+        """Return the range history of the reference motion at given closest ranges."""
         u_r, u_a, y0 = (
             value[..., None, None, None] for value in (reference.u_r_m_s, reference.u_a_m_s, reference.y0_m)
         )
@@ -80,7 +104,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class _History:
-    """Range of a point over time, all fields broadcast to (..., channel, pulse, range)."""
+    """Range of a point over time; all fields broadcast to (..., channel, pulse, range)."""
 
     time_s: Tensor
     u_r_m_s: Tensor
@@ -92,61 +116,84 @@ class _History:
 
     @property
     def path_m(self) -> Tensor:
+        """Change of range R_m(t) - R0 in metres."""
         return receive_range(
             self.time_s, self.u_r_m_s, self.u_a_m_s, self.y0_m, self.range_m, self.speed_m_s, self.channel_m
         )
 
     @property
     def rate_m_s(self) -> Tensor:
-        """Derivative of the range over time."""
+        """Derivative of the range with respect to time in m/s."""
         v = self.speed_m_s - self.u_a_m_s
         across, along = self.range_m - self.u_r_m_s * self.time_s, v * self.time_s - self.y0_m - self.channel_m
         return (v * along - self.u_r_m_s * across) / torch.sqrt(across.square() + along.square())
 
 
 class Migration(Protocol):
-    """A way to make envelopes stand still.
+    """Method of range migration correction."""
 
-    `apply` takes data (..., channel, pulse, range), their frame, the motion of the reference
-    (...,), and the ambiguity number (...,). `neglected_m` says how far (m) it lets the envelope of
-    a point with another motion move over an integration time about t = 0: below a quarter of a
-    range cell, c / (4 B), nothing is lost.
-    """
+    def apply(self, data: Tensor, frame: Frame, reference: PointMotion, ambiguity: Tensor) -> Tensor:
+        """Correct the migration.
 
-    def apply(self, data: Tensor, frame: Frame, reference: PointMotion, ambiguity: Tensor) -> Tensor: ...
+        Args:
+            data: Range-compressed channels, shape (..., channel, pulse, range), complex.
+            frame: Geometry of the data.
+            reference: Motion of the reference, shape (...,).
+            ambiguity: PRF ambiguity number, shape (...,).
 
-    def neglected_m(self, integration_s: float, motion: PointMotion, reference: PointMotion) -> Tensor: ...
+        Returns:
+            Corrected data, same shape.
+        """
+        ...
+
+    def neglected_m(self, integration_s: float, motion: PointMotion, reference: PointMotion) -> Tensor:
+        """Return the envelope motion in metres that remains for a point with another motion.
+
+        The motion is the largest over an integration time about t = 0. Below a quarter of a range
+        cell, c / (4 B), the loss is negligible.
+
+        Args:
+            integration_s: Integration time in seconds.
+            motion: Motion of the point, shape (...,).
+            reference: Motion of the reference, shape (...,).
+        """
+        ...
 
 
 @dataclass(frozen=True)
 class NoMigration:
-    """Envelopes stay where they are."""
+    """No range migration correction."""
 
     def apply(self, data: Tensor, frame: Frame, reference: PointMotion, ambiguity: Tensor) -> Tensor:
+        """Return the data unchanged."""
         return data
 
     def neglected_m(self, integration_s: float, motion: PointMotion, reference: PointMotion) -> Tensor:
-        """All migration against t = 0, (...,)."""
+        """Return the whole migration relative to t = 0 in metres, (...,)."""
         return _moved_m(integration_s, motion).abs().amax(0)
 
 
 @dataclass(frozen=True)
 class StaticBulk:
-    """Every pulse shifted along range by the history of the reference: exact for a point that moves
-    as the reference does, whatever its Doppler ambiguity.
+    """Shift of every pulse along range by the history of the reference.
 
-    What others walk against it stays. whole_swath: shifts follow the closest range along the axis,
-    else they are those of the reference.
+    Exact for a point that moves as the reference does, whatever its Doppler ambiguity. The range
+    walk of other points relative to the reference remains.
+
+    Args:
+        whole_swath: True to follow the closest range along the range axis, False to use the shifts
+            of the reference for all ranges.
     """
 
     whole_swath: bool = False
 
     def apply(self, data: Tensor, frame: Frame, reference: PointMotion, ambiguity: Tensor) -> Tensor:
+        """Shift the pulses by the history of the reference; arguments as in `Migration.apply`."""
         spectrum = torch.fft.fft(data) * _envelope_phasor(frame.path_m(reference), frame.radar, data)
         return _profiles(spectrum, frame, reference, 0.0) if self.whole_swath else torch.fft.ifft(spectrum)
 
     def neglected_m(self, integration_s: float, motion: PointMotion, reference: PointMotion) -> Tensor:
-        """Walk and curvature that differ from those of the reference, (...,)."""
+        """Return the walk and curvature in metres that differ from the reference, (...,)."""
         return (
             (_moved_m(integration_s, motion) - _moved_m(integration_s, _followed(motion, reference, self.whole_swath)))
             .abs()
@@ -156,18 +203,21 @@ class StaticBulk:
 
 @dataclass(frozen=True)
 class Keystone:
-    """Deramp, keystone, reramp: walks of all targets are taken out, whatever their velocities and
-    places, if the ambiguity number is theirs.
+    """Deramp, keystone transform and reramp, which remove the range walk of all targets.
 
-    The tone of a target, (u_r + v y0 / R0) / lambda against the reference, must lie within half a
-    pulse rate of the ambiguity number times the pulse rate. whole_swath: the curvature follows the
-    closest range along the axis; else it is that of the reference, which serves 165 m to either
-    side in the geometry of the paper, in a third of the time.
+    The ambiguity number must be that of the target: its tone (u_r + v y0 / R0) / lambda relative to
+    the reference must lie within half a PRF of the ambiguity number times the PRF.
+
+    Args:
+        whole_swath: True if the curvature follows the closest range along the range axis. False
+            uses the curvature of the reference, which suffices within 165 m of the reference range
+            in the geometry of the paper and takes a third of the time.
     """
 
     whole_swath: bool = True
 
     def apply(self, data: Tensor, frame: Frame, reference: PointMotion, ambiguity: Tensor) -> Tensor:
+        """Apply deramp, keystone transform and reramp; arguments as in `Migration.apply`."""
         path = frame.path_m(reference)
         deramp = unit_phasor(path / frame.radar.wavelength_m, data.dtype)[..., None]
         spectrum = torch.fft.fft(data * deramp) * _envelope_phasor(path, frame.radar, data)
@@ -175,15 +225,13 @@ class Keystone:
         return _profiles(spectrum, frame, reference, 1.0) if self.whole_swath else torch.fft.ifft(spectrum)
 
     def neglected_m(self, integration_s: float, motion: PointMotion, reference: PointMotion) -> Tensor:
-        """Curvature that differs from that of the reference, (...,): a keystone takes out what is
-        linear.
-        """
+        """Return the curvature in metres that differs from that of the reference, (...,)."""
         e = _moved_m(integration_s, motion) - _moved_m(integration_s, _followed(motion, reference, self.whole_swath))
         return e.mean(0).abs()
 
 
 def _moved_m(integration_s: float, motion: PointMotion) -> Tensor:
-    """R(+-T/2) - R(0), (2, ...)."""
+    """Return the range changes R(+-T/2) - R(0) in metres, (2, ...)."""
 
     def at(time_s: float) -> Tensor:
         time = torch.tensor(time_s, dtype=torch.float64, device=motion.range_m.device)
@@ -193,33 +241,44 @@ def _moved_m(integration_s: float, motion: PointMotion) -> Tensor:
 
 
 def _followed(motion: PointMotion, reference: PointMotion, whole_swath: bool) -> PointMotion:
-    """The motion whose history is taken out at the range of a point."""
+    """Return the motion whose history is removed at the range of a point."""
     return replace(reference, range_m=motion.range_m) if whole_swath else reference
 
 
 def ambiguity_number(radar: BistaticRadar, motion: PointMotion, reference: PointMotion) -> Tensor:
-    """Whole pulse rates in the tone of a point after the deramp, round((du_r + v y0 / R0) / (lambda
-    PRF)) against the reference, float64 (...,).
+    """Return the PRF ambiguity number of the tone of a point after the deramp.
+
+    The number is round((du_r + v y0 / R0) / (lambda PRF)), relative to the reference.
+
+    Args:
+        radar: Instrument.
+        motion: Motion of the point, shape (...,).
+        reference: Motion of the reference, shape (...,).
+
+    Returns:
+        Whole numbers, float64 (...,).
     """
     tone = [m.u_r_m_s + m.along_m_s * m.y0_m / m.range_m for m in (motion, reference)]
     return torch.round((tone[0] - tone[1]) / radar.ambiguous_velocity_m_s)
 
 
 def _envelope_phasor(path_m: Tensor, radar: BistaticRadar, data: Tensor) -> Tensor:
-    """exp(+j 2 pi fr / c path) over the range frequencies of an FFT, (..., range frequency)."""
+    """Return exp(+j 2 pi fr / c path) over range frequency in FFT order, (..., range frequency)."""
     n = data.shape[-1]
     turns = path_m / (radar.range_step_m * n)
     return torch.fft.ifftshift(linear_phasor(turns, -(n // 2), n, data.dtype), dim=-1)
 
 
 def _rescaled(spectrum: Tensor, radar: BistaticRadar, ambiguity: Tensor) -> Tensor:
-    """Keystone of (..., channel, pulse, range frequency), with pulses of zeros around it: what is
-    read from beyond the aperture is not its other end.
+    """Apply the keystone transform to (..., channel, pulse, range frequency).
+
+    The pulses are zero-padded, so that reads beyond one end of the aperture do not wrap to the
+    other.
     """
     n, frequency = spectrum.shape[-2], radar.range_frequency_hz(spectrum.shape[-1], spectrum.device)
     margin = math.ceil(n * radar.sampling_hz / (4 * radar.carrier_hz - 2 * radar.sampling_hz)) + 1
     padded, ambiguity = pad(spectrum, (0, 0, margin, margin)), ambiguity[..., None]
-    # a few columns at a time stay in the cache: four times as fast as all at once
+    # blocks of a few columns stay in the cache: four times as fast as all columns at once
     width = max(16, block_bytes_of(spectrum.device) // (n * spectrum.element_size()))
     parts = [
         keystone(x, f, radar.carrier_hz, ambiguity) for x, f in zip(padded.split(width, -1), frequency.split(width))
@@ -228,9 +287,7 @@ def _rescaled(spectrum: Tensor, radar: BistaticRadar, ambiguity: Tensor) -> Tens
 
 
 def _profiles(spectrum: Tensor, frame: Frame, reference: PointMotion, walks: float) -> Tensor:
-    """Range profiles of spectra (..., channel, pulse, range frequency), each cell read where
-    `Frame.residual_m` says that its envelope went.
-    """
+    """Return range profiles, each cell read where `Frame.residual_m` predicts its envelope."""
     n = spectrum.shape[-1]
     cells = (
         torch.arange(n, dtype=torch.float64, device=spectrum.device)
@@ -246,35 +303,51 @@ def correct_migration(
     migration: Migration | None = None,
     ambiguity: Tensor | float = 0,
 ) -> Tensor:
-    """Data in which envelopes stand still, at their range at t = 0 less that of the reference plus
-    R_ref; carrier phases are left as they are.
+    """Correct the range migration so that each envelope stays at one range.
 
-    data: (..., channel, pulse, range), range compressed, transmit range removed; reference: the
-    motion (...,) whose history is taken out; migration: `Keystone()` by default. ambiguity: whole
-    pulse rates (...,) in the tones left by the reference, see `ambiguity_number`. A point at y0
-    comes to lie at sqrt(R0^2 + y0^2) with a reference at y0 = 0. Lines wrap around: leave as many
-    cells free at both ends as envelopes move. Differentiable in the data and, without whole_swath
-    also, in the reference.
+    An envelope stays at its range at t = 0, minus that of the reference, plus the closest range of
+    the reference; a point at y0 thus lies at sqrt(R0^2 + y0^2) with a reference at y0 = 0. Carrier
+    phases are unchanged. Range lines wrap around: leave as many free cells at both ends as the
+    envelopes move. Differentiable in the data and, with `whole_swath` False, in the reference.
+
+    Args:
+        data: Range-compressed channels without the transmit range, shape (..., channel, pulse,
+            range), complex.
+        frame: Geometry of the data.
+        reference: Motion whose history is removed, shape (...,).
+        migration: Method, `Keystone()` by default.
+        ambiguity: PRF ambiguity number of the tones relative to the reference, shape (...,) or a
+            number, see `ambiguity_number`.
+
+    Returns:
+        Corrected data, same shape.
+
+    Raises:
+        ValueError: If the shape of the data does not match the frame.
     """
     if data.ndim < 3 or data.shape[-3:] != (frame.radar.channels, frame.time_s.shape[0], frame.range_m.shape[0]):
         expected = (frame.radar.channels, frame.time_s.shape[0], frame.range_m.shape[0])
         raise ValueError(
-            f"correct_migration works on data (..., {', '.join(map(str, expected))}) as radar and "
-            f"axes say, got shape {tuple(data.shape)}"
+            f"correct_migration works on data (..., {', '.join(map(str, expected))}), the shape of radar "
+            f"and axes, got shape {tuple(data.shape)}; give the frame of the data"
         )
     return (Keystone() if migration is None else migration).apply(data, frame, reference, per_trial(ambiguity, 0, data))
 
 
 class CorrectMigration(Stage):
-    """`correct_migration` of range-compressed channels.
+    """Range migration correction of range-compressed channels (channel, pulse, range).
 
-    range_m: closest range of the reference, None for the radar's reference range.
+    Azimuth-only data (channel, pulse), which do not migrate, pass unchanged.
 
-    Velocities and place of the reference, and the ambiguity number, are values, per trial: all zero
-    for a reference at rest that is abeam at t = 0.
+    Args:
+        radar: Instrument.
+        migration: Method, `Keystone()` by default.
+        range_m: Closest range of the reference in metres, None for the reference range of the
+            radar.
     """
 
     works_on = ("channel", "pulse", "range")
+    also_on = (("channel", "pulse"),)
     range_m: Tensor
 
     def __init__(self, radar: BistaticRadar, migration: Migration | None = None, range_m: Number | None = None) -> None:
@@ -285,6 +358,21 @@ class CorrectMigration(Stage):
     def forward(
         self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0, ambiguity: Number = 0
     ) -> Signal:
+        """Correct the migration with a reference per trial, by default at rest and abeam at t = 0.
+
+        Args:
+            signal: Channels with the axes (channel, pulse, range) or (channel, pulse).
+            u_r_m_s: Slant-range speed of the reference in m/s, closing positive, shape (...,) or a
+                number.
+            u_a_m_s: Along-track speed of the reference in m/s, same shape.
+            y0_m: Along-track position of the reference at t = 0 in metres, same shape.
+            ambiguity: PRF ambiguity number, same shape.
+
+        Raises:
+            ValueError: If slow time is not zero at pulse n // 2.
+        """
+        if "range" not in signal.names:
+            return signal
         refuse_shifted(self.radar, signal.axis("pulse"))
         reference = PointMotion.of(self.radar, signal.data, u_r_m_s, u_a_m_s, y0_m, self.range_m)
         return signal.with_data(

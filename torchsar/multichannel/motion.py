@@ -1,6 +1,4 @@
-"""Uniform motion of a point before a receiver that flies past: what its range history comes to, per
-trial.
-"""
+"""Uniform motion of a point in front of an airborne receiver, and the quantities that follow."""
 
 from __future__ import annotations
 
@@ -18,12 +16,20 @@ Number = Tensor | float
 
 @dataclass(frozen=True)
 class PointMotion:
-    """Velocity and place of one point per trial, float64 tensors that broadcast to (...,), against
-    the receiver's speed.
+    """Velocity and position of one point per trial, and the speed of the receiver.
 
-    u_r_m_s: slant-range speed, closing positive; u_a_m_s: along track, positive with the receiver;
-    y0_m: along-track place at t = 0; range_m: closest range R0 of the track at rest. With v = speed
-    - u_a and V^2 = v^2 + u_r^2 (brief 001, Symbols).
+    The tensors are float64 and broadcast to (...,). The derived quantities use v = V_R - u_a and
+    V^2 = v^2 + u_r^2.
+
+    Args:
+        u_r_m_s: Slant-range speed u_r in m/s, closing positive.
+        u_a_m_s: Along-track speed u_a in m/s, positive in the direction of the receiver.
+        y0_m: Along-track position y0 at t = 0 in metres.
+        range_m: Closest range R0 between the track and the point at rest in metres.
+        speed_m_s: Speed V_R of the receiver in m/s.
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, Eqs. (1), (2), (25), with y0 added.
     """
 
     u_r_m_s: Tensor
@@ -41,8 +47,19 @@ class PointMotion:
         y0_m: Number = 0.0,
         range_m: Number | None = None,
     ) -> PointMotion:
-        """From numbers or tensors (...,), on the device of `like`; range_m: None for the radar's
-        reference range. Raises ValueError for a point as fast as the receiver.
+        """Build a motion from numbers or tensors (...,) on the device of `like`.
+
+        Args:
+            radar: Instrument.
+            like: Tensor whose device is used.
+            u_r_m_s: Slant-range speed in m/s, closing positive.
+            u_a_m_s: Along-track speed in m/s, positive in the direction of the receiver.
+            y0_m: Along-track position at t = 0 in metres.
+            range_m: Closest range in metres, None for the reference range of the radar.
+
+        Raises:
+            ValueError: If a value is not finite, the point is as fast along track as the receiver,
+                or the range is not positive.
         """
         near = radar.reference_range_m if range_m is None else range_m
         motion = PointMotion(
@@ -52,74 +69,82 @@ class PointMotion:
             per_trial(near, 0, like),
             radar.speed_m_s,
         )
-        _refuse_overtaking(motion)
+        _check_motion(motion)
         return motion
 
     def each(self, change: Callable[[Tensor], Tensor]) -> PointMotion:
-        """All four tensors changed alike, such as `lambda value: value[..., None]`."""
+        """Return the motion with a function applied to all four tensors."""
         return PointMotion(
             change(self.u_r_m_s), change(self.u_a_m_s), change(self.y0_m), change(self.range_m), self.speed_m_s
         )
 
     @property
     def along_m_s(self) -> Tensor:
-        """v, along-track speed of the receiver past the point."""
+        """Along-track speed v = V_R - u_a of the receiver relative to the point in m/s."""
         return self.speed_m_s - self.u_a_m_s
 
     @property
     def square_m2_s2(self) -> Tensor:
-        """V^2."""
+        """Squared relative speed V^2 = v^2 + u_r^2 in m^2/s^2."""
         return self.along_m_s.square() + self.u_r_m_s.square()
 
     @property
     def effective_m_s(self) -> Tensor:
-        """v_e = V^2 / v, Eq. (25)."""
+        """Relative sensor velocity v_e = V^2 / v in m/s, Eq. (25)."""
         return self.square_m2_s2 / self.along_m_s
 
     @property
     def trial_dims(self) -> int:
-        """Number of trial dims of what depends on the velocities."""
+        """Number of trial dimensions of quantities that depend on the velocities."""
         return max(self.u_r_m_s.ndim, self.u_a_m_s.ndim)
 
     @property
     def image_s(self) -> Tensor:
-        """Slow time t0 of zero Doppler, where the focused point appears: (u_r R0 + v y0) / V^2."""
+        """Slow time t0 = (u_r R0 + v y0) / V^2 of zero Doppler in s, where the point is imaged."""
         return (self.u_r_m_s * self.range_m + self.along_m_s * self.y0_m) / self.square_m2_s2
 
     @property
     def closest_m(self) -> Tensor:
-        """Least range of the whole straight path, sqrt(R0^2 + y0^2 - (u_r R0 + v y0)^2 / V^2)."""
+        """Least range of the path, sqrt(R0^2 + y0^2 - (u_r R0 + v y0)^2 / V^2), in metres."""
         cross = self.along_m_s * self.range_m - self.u_r_m_s * self.y0_m
         return cross / self.square_m2_s2.sqrt()
 
     def place_m(self, image_s: Tensor) -> Tensor:
-        """Along-track place y0 at t = 0 of a point that appears at this slow time: the location
-        correction, Eq. (30) with its sign put right (brief 001, erratum 7).
+        """Return the along-track position y0 at t = 0 of a point that appears at a given slow time.
+
+        This is the location correction. Eq. (30) is printed with the opposite sign: on x = V_R t a
+        closing target (u_r > 0) appears displaced by +V_R u_r R0 / V^2.
+
+        Args:
+            image_s: Slow time in seconds at which the image shows the point, shape (...,).
+
+        Returns:
+            Along-track position in metres, shape (...,).
         """
         return (self.square_m2_s2 * image_s - self.u_r_m_s * self.range_m) / self.along_m_s
 
 
-def _refuse_overtaking(motion: PointMotion) -> None:
+def _check_motion(motion: PointMotion) -> None:
+    """Raise ValueError for motions that are not finite, overtake the receiver or have no range."""
     try:
         slowest, nearest = float(motion.along_m_s.detach().min()), float(motion.range_m.detach().min())
-        wild = [
+        not_finite = [
             name
             for name in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
             if not bool(torch.isfinite(getattr(motion, name)).all())
         ]
-    except RuntimeError:  # inside vmap a value cannot be looked at
+    except RuntimeError:  # values cannot be read inside vmap
         return
-    if wild:
+    if not_finite:
         raise ValueError(
-            f"velocity and place of a point must be finite, got NaN or Inf in {', '.join(wild)}; "
-            "replace estimates that failed before they are used"
+            f"velocity and position of a point must be finite, got NaN or Inf in {', '.join(not_finite)}; "
+            "replace failed estimates before using them"
         )
     if not slowest > 0:
         fastest = motion.speed_m_s - slowest
         raise ValueError(
             f"a point moves along track at {fastest:g} m/s, as fast as the receiver "
-            f"({motion.speed_m_s:g} m/s) or faster, so that no aperture forms; give u_a_m_s below "
-            "that"
+            f"({motion.speed_m_s:g} m/s) or faster, so that no aperture forms; give a smaller u_a_m_s"
         )
     if not nearest > 0:
         raise ValueError(f"the closest range of a point must be positive, got range_m={nearest:g}")

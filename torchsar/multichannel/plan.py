@@ -1,10 +1,10 @@
-"""Reconstruction and focusing for one motion as a plan: everything that does not depend on the data
-is formed once, and an image costs little more than its transforms.
+"""Reconstruction and focusing for one motion as a precomputed plan.
 
-Per alias frequency the chain of `reconstruct` and `focus_azimuth` is one small matrix from channels
-to Doppler bands, the exact filter and the places of time zero included. For Monte Carlo trials, for
-many range lines, and for whatever else shares its motion; where each trial has its own velocities
-the chain of two stages serves.
+All that does not depend on the data is computed once, so that an image costs little more than its
+transforms. At each alias frequency the chain of `reconstruct` and `focus_azimuth` is one small
+matrix from channels to Doppler bands, with the exact filter included. Use a plan for Monte Carlo
+trials or range lines that share one motion; use the two stages where each trial has its own
+velocities.
 """
 
 from __future__ import annotations
@@ -21,12 +21,22 @@ from torchsar.radar import BistaticRadar
 
 
 class AzimuthPlan:
-    """`image(data)`: channels (..., channel, pulse) to the focused image (..., bands * pulse) of
-    points with one motion, slow time zero at sample bands * pulse // 2.
+    """Plan that turns channels into focused images of points with one motion.
 
-    The image is that of `focus_azimuth(reconstruct(data))` times the carrier of its Doppler centre,
-    exp(+j 2 pi f t), the centre taken to the nearest bin. motion: without trials. Raises ValueError
-    for a motion with trials, and where the bands cannot be told apart by so many channels.
+    The image equals that of `focus_azimuth(reconstruct(data))` times the carrier exp(+j 2 pi f t)
+    of the Doppler centre, which is rounded to the nearest bin.
+
+    Args:
+        radar: Instrument.
+        motion: Motion of the points, without trials.
+        n_pulse: Number of pulses.
+        rebuild: Reconstruction method, `LeastSquares()` by default.
+        bandwidth_hz: Processed Doppler bandwidth about the centre in Hz, None for the whole
+            spectrum.
+        dtype: Complex dtype of the data.
+
+    Raises:
+        ValueError: If the motion has trials, or there are too few channels for the bands.
     """
 
     def __init__(
@@ -44,34 +54,44 @@ class AzimuthPlan:
             raise ValueError(why)
         if motion.u_r_m_s.ndim or motion.u_a_m_s.ndim or motion.y0_m.ndim or motion.range_m.ndim:
             raise ValueError(
-                "a plan serves one motion, got one with trials; use Reconstruct and FocusAzimuth "
+                "a plan serves one motion, got a motion with trials; use Reconstruct and FocusAzimuth "
                 "where each trial has its own velocities"
             )
         self.bands, self.n_pulse = rebuild.bands, n_pulse
         self.matrix = _matrix(radar, motion, n_pulse, rebuild, bandwidth_hz).to(dtype)
 
     def image(self, data: Tensor) -> Tensor:
-        """data: complex (..., channel, pulse) of the plan's dtype. Differentiable in the data."""
+        """Focus channels; differentiable in the data.
+
+        Args:
+            data: Channels, shape (..., channel, pulse), complex, of the dtype of the plan.
+
+        Returns:
+            Images over slow time, shape (..., bands * pulse), complex, with time zero at sample
+            bands * pulse // 2.
+
+        Raises:
+            ValueError: If shape or dtype differ from those of the plan.
+        """
         if data.dtype != self.matrix.dtype or data.shape[-2:] != self.matrix.shape[-2:]:
             expected = f"(..., {self.matrix.shape[-2]}, {self.matrix.shape[-1]}) of {self.matrix.dtype}"
             raise ValueError(
-                f"this plan works on channels and pulses {expected}, got {tuple(data.shape)} of {data.dtype}"
+                f"this plan works on channels and pulses {expected}, got {tuple(data.shape)} of {data.dtype}; "
+                "form a plan for these data"
             )
         if torch.is_grad_enabled() and data.requires_grad:
             spectrum = torch.fft.fft(data)
             return torch.fft.ifft(torch.einsum("bmp,...mp->...bp", self.matrix, spectrum).flatten(-2))
         rows = data.reshape(-1, *data.shape[-2:])
         image = rows.new_empty(len(rows), self.bands * self.n_pulse)
-        # a few trials at a time stay in the cache
+        # blocks of a few trials stay in the cache
         height = max(1, block_bytes_of(data.device) // (self.matrix[0].numel() * data.element_size()))
         for part, out in zip(rows.split(height), image.split(height)):
             torch.fft.ifft(self._bands(torch.fft.fft(part)).flatten(-2), out=out)
         return image.view(*data.shape[:-2], -1)
 
     def _bands(self, spectrum: Tensor) -> Tensor:
-        """Spectra (trial, channel, pulse) to bands (trial, band, pulse), in place as far as it
-        goes.
-        """
+        """Combine spectra (trial, channel, pulse) to bands (trial, band, pulse) in place."""
         bands = spectrum.new_empty(len(spectrum), self.bands, self.n_pulse)
         for weights, band in zip(self.matrix, bands.unbind(1)):
             torch.mul(spectrum[:, 0], weights[0], out=band)
@@ -81,9 +101,7 @@ class AzimuthPlan:
 
 
 def _matrix(radar: BistaticRadar, motion: PointMotion, n: int, rebuild: Rebuild, bandwidth_hz: float | None) -> Tensor:
-    """Weights (band, channel, pulse), complex128, from the FFT of channels to that of the image,
-    all bins in FFT order.
-    """
+    """Return weights (band, channel, pulse), complex128, between FFTs of channels and image."""
     bands, total, step = rebuild.bands, rebuild.bands * n, radar.prf_hz / n
     centre_hz = doppler_centre_hz(radar, motion)
     middle_hz = torch.round(centre_hz / step) * step
@@ -106,7 +124,7 @@ def _matrix(radar: BistaticRadar, motion: PointMotion, n: int, rebuild: Rebuild,
     if bandwidth_hz is not None:
         found = found * ((middle_hz + offset - centre_hz).abs() <= bandwidth_hz / 2)[:, None]
     bins = torch.remainder(torch.round((middle_hz + offset) / step), total)
-    # slow time is zero in the middle of the data and of the image
+    # slow time zero is the middle of the data and of the image
     turns = torch.remainder(bins, n) * (n // 2) / n - bins * (total // 2) / total
     natural = torch.zeros_like(found)
     natural[bins.long()] = found * unit_phasor(turns, torch.complex128)[:, None]
@@ -114,12 +132,24 @@ def _matrix(radar: BistaticRadar, motion: PointMotion, n: int, rebuild: Rebuild,
 
 
 class FocusPlan(Stage):
-    """Channels (channel, pulse) to the image (azimuth,) of points with one motion told beforehand,
-    x = V_R t (m): `AzimuthPlan` as a stage.
+    """`AzimuthPlan` as a stage: channels (channel, pulse) to the image (azimuth,) of one motion.
 
-    Its plan is kept as long as pulses, dtype and device of the data stay. Arguments as Reconstruct
-    and FocusAzimuth have them, velocities as numbers. Refuses motions at which channels sample the
-    same places, and warns of poor ones.
+    The motion is known a priori. Azimuth is x = V_R t in metres. The plan is kept until the number
+    of pulses, the dtype or the device of the data changes. A warning is given where the
+    reconstruction is ill-conditioned.
+
+    Args:
+        radar: Instrument.
+        rebuild: Reconstruction method, `LeastSquares()` by default.
+        bandwidth_hz: Processed Doppler bandwidth about the centre in Hz, None for the whole
+            spectrum.
+        u_r_m_s: Slant-range speed in m/s, closing positive.
+        u_a_m_s: Along-track speed in m/s, positive in the direction of the receiver.
+        y0_m: Along-track position at t = 0 in metres.
+        range_m: Closest range in metres, None for the reference range of the radar.
+
+    Raises:
+        ValueError: If the motion is impossible, see `PointMotion.of`.
     """
 
     works_on = ("channel", "pulse")
@@ -140,7 +170,12 @@ class FocusPlan(Stage):
         self._plan: AzimuthPlan | None = None
 
     def plan(self, data: Tensor) -> AzimuthPlan:
-        """For data like these, formed at the first call."""
+        """Return the plan for data of this shape, dtype and device.
+
+        Raises:
+            ValueError: If the reconstruction is singular, or there are too few channels for the
+                bands.
+        """
         kept = None if self._plan is None else (self._plan.n_pulse, self._plan.matrix.dtype, self._plan.matrix.device)
         if self._plan is None or kept != (data.shape[-1], data.dtype, data.device):
             mind_condition(self.radar, self.motion, self.rebuild, data.dtype)
@@ -149,6 +184,11 @@ class FocusPlan(Stage):
         return self._plan
 
     def forward(self, signal: Signal) -> Signal:
+        """Focus channels (channel, pulse).
+
+        Raises:
+            ValueError: If slow time is not zero at pulse n // 2, or as in `plan`.
+        """
         pulse = signal.axis("pulse")
         refuse_shifted(self.radar, pulse)
         return Signal(

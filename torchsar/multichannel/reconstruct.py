@@ -1,9 +1,10 @@
-"""Azimuth reconstruction: from the aliased spectra of several channels to the full Doppler band of
-a moving point.
+"""Azimuth reconstruction: from the aliased spectra of several channels to the full Doppler band.
 
-Source: Remote Sens. 2020, 12, 1703, Eqs. (34)-(36). Data are demodulated by the Doppler centre of
-the assumed motion, so that the rebuilt bands lie evenly about it to a fraction of a bin, and the
-result is smooth in the velocities.
+Data are demodulated by the Doppler centre of the assumed motion. The reconstructed bands are then
+centred on it to a fraction of a bin, and the result is smooth in the velocities.
+
+Reference:
+    Remote Sens. 2020, 12, 1703, Eqs. (34)-(36).
 """
 
 from __future__ import annotations
@@ -32,13 +33,26 @@ from torchsar.radar import BistaticRadar
 def reconstruct(
     data: Tensor, radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, left_k1_m_s: float = 0.0
 ) -> Tensor:
-    """The full-band Doppler spectrum of points with this motion, about their Doppler centre.
+    """Reconstruct the full-band Doppler spectrum of points with a given motion.
 
-    data: complex (..., channel, pulse), slow time zero at pulse n // 2, transmit range removed
-    (else left_k1_m_s is its rate). Returns (..., bands * pulse), bins rising from `first_bin`,
-    phases against slow time zero, scaled as the FFT of bands * pulse samples of the point seen by
-    one channel. Differentiable in data and motion. Raises ValueError where the bands cannot be told
-    apart by so many channels.
+    Differentiable in data and motion.
+
+    Args:
+        data: Channels with slow time zero at pulse n // 2, shape (..., channel, pulse), complex.
+            The transmit range is removed, or `left_k1_m_s` is its rate.
+        radar: Instrument.
+        motion: Motion of the points, shape (...,).
+        rebuild: Reconstruction method.
+        left_k1_m_s: Rate k1 of the transmit range that remains in the data in m/s.
+
+    Returns:
+        Spectrum about the Doppler centre of the motion, shape (..., bands * pulse), complex. Bins
+        rise from `first_bin`, phases refer to slow time zero, and the scale is that of the FFT of
+        bands * pulse samples of a single channel.
+
+    Raises:
+        ValueError: If the data do not have the channels of the radar, or there are too few channels
+            for the bands.
     """
     return reconstruct_lines(data[..., None], radar, motion, rebuild, left_k1_m_s)[..., 0]
 
@@ -46,10 +60,24 @@ def reconstruct(
 def reconstruct_lines(
     data: Tensor, radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, left_k1_m_s: float = 0.0
 ) -> Tensor:
-    """As `reconstruct` for data (..., channel, pulse, range) with one motion for all range lines;
-    returns (..., bands * pulse, range).
+    """Reconstruct the spectra of range lines that share one motion.
+
+    Arguments are as in `reconstruct`, except for the range axis.
+
+    Args:
+        data: Channels, shape (..., channel, pulse, range), complex.
+        radar: Instrument.
+        motion: Motion of the points, shape (...,).
+        rebuild: Reconstruction method.
+        left_k1_m_s: Rate k1 of the transmit range that remains in the data in m/s.
+
+    Returns:
+        Spectra, shape (..., bands * pulse, range), complex.
+
+    Raises:
+        ValueError: As in `reconstruct`.
     """
-    _refuse_bands(data, radar, rebuild)
+    _check_channels(data, radar, rebuild)
     n, dtype = data.shape[-2], data.dtype
     spectrum = fft_lines(_demodulated(data, radar, motion, rebuild.bands, left_k1_m_s))
     # pulse 0 was sampled n // 2 pulses before slow time zero
@@ -61,28 +89,25 @@ def reconstruct_lines(
 
 
 def _demodulated(data: Tensor, radar: BistaticRadar, motion: PointMotion, bands: int, left_k1_m_s: float) -> Tensor:
-    """Data whose FFT begins with the lowest bin of the lowest band about the Doppler centre: no
-    spectrum need be rolled.
-    """
+    """Demodulate data so that their FFT begins with the lowest bin of the lowest band."""
     n = data.shape[-2]
     turns = -doppler_centre_hz(radar, motion, left_k1_m_s) / radar.prf_hz - first_bin(n, bands) % n / n
     return data * linear_phasor(turns, -(n // 2), n, data.dtype)[..., None, :, None]
 
 
 def _combined(spectrum: Tensor, weights: Tensor, trial_dims: int) -> Tensor:
-    """Weights (..., band, channel), or per bin (..., pulse, band, channel), over spectra (...,
-    channel, pulse, range): (..., band * pulse, range).
-    """
+    """Combine spectra (..., channel, pulse, range) by weights to (..., band * pulse, range)."""
     if weights.ndim == trial_dims + 2:
         return (weights @ spectrum.flatten(-2)).unflatten(-1, spectrum.shape[-2:]).flatten(-3, -2)
     return (weights @ spectrum.transpose(-3, -2)).transpose(-3, -2).flatten(-3, -2)
 
 
-def _refuse_bands(data: Tensor, radar: BistaticRadar, rebuild: Rebuild) -> None:
+def _check_channels(data: Tensor, radar: BistaticRadar, rebuild: Rebuild) -> None:
+    """Raise ValueError unless the data have the channels of the radar and enough for the bands."""
     if data.shape[-3] != radar.channels:
         raise ValueError(
-            f"reconstruction expects {radar.channels} channels by the radar's channel_m, got data "
-            f"with {data.shape[-3]}; select the channels of both"
+            f"reconstruction expects {radar.channels} channels as in the radar's channel_m, got data "
+            f"with {data.shape[-3]}; select the same channels in radar and data"
         )
     why = rebuild.refusal(radar.channels)
     if why is not None:
@@ -90,13 +115,19 @@ def _refuse_bands(data: Tensor, radar: BistaticRadar, rebuild: Rebuild) -> None:
 
 
 class Reconstruct(Stage):
-    """Channels (channel, pulse[, range]) to the full Doppler band of points with the velocities
-    given: axes (doppler[, range]), Doppler (Hz) against the centre.
+    """Reconstruction of the full Doppler band of points with given velocities.
 
-    rebuild: LeastSquares(bands) or MinimumMeanSquare(...). range_m: closest range of the points,
-    None for the radar's reference range. Values of forward (u_r_m_s, u_a_m_s, y0_m) are per trial,
-    zero for a stationary scene. Refuses motions that make the channels of ALL trials sample the
-    same places, and warns of poor ones.
+    The input has the axes (channel, pulse[, range]), the output the axes (doppler[, range]) with
+    Doppler in Hz relative to the Doppler centre.
+
+    Args:
+        radar: Instrument.
+        rebuild: `LeastSquares(bands)` (default) or `MinimumMeanSquare(...)`.
+        range_m: Closest range of the points in metres, None for the reference range of the radar.
+
+    Raises:
+        TypeError: If `rebuild` is no reconstruction method.
+        ValueError: If there are too few channels for the bands.
     """
 
     works_on = ("channel", "pulse")
@@ -112,6 +143,24 @@ class Reconstruct(Stage):
             raise ValueError(why)
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Signal:
+        """Reconstruct with velocities per trial, zero for a stationary scene.
+
+        A warning is given where the reconstruction is ill-conditioned.
+
+        Args:
+            signal: Channels with the axes (channel, pulse[, range]), transmit range removed.
+            u_r_m_s: Slant-range speed in m/s, closing positive, shape (...,) or a number.
+            u_a_m_s: Along-track speed in m/s, positive in the direction of the receiver, same
+                shape.
+            y0_m: Along-track position at t = 0 in metres, same shape.
+
+        Returns:
+            Spectrum with the axes (doppler[, range]).
+
+        Raises:
+            ValueError: If the least-squares matrix is singular in all trials, or slow time is not
+                zero at pulse n // 2.
+        """
         motion = PointMotion.of(self.radar, signal.data, u_r_m_s, u_a_m_s, y0_m, self.range_m)
         mind_condition(self.radar, motion, self.rebuild, signal.data.dtype)
         refuse_shifted(self.radar, signal.axis("pulse"))
@@ -125,8 +174,9 @@ class Reconstruct(Stage):
 
 
 def refuse_shifted(radar: BistaticRadar, pulse: Axis) -> None:
-    """Raise ValueError unless slow time is zero at pulse n // 2 and pulses come at the radar's
-    rate: phases are counted from there.
+    """Raise ValueError unless slow time is zero at pulse n // 2 and pulses come at the radar's PRF.
+
+    Phases are counted from slow time zero.
     """
     expected = radar.pulse_axis(pulse.n)
     if (
@@ -142,8 +192,15 @@ def refuse_shifted(radar: BistaticRadar, pulse: Axis) -> None:
 
 
 def doppler_axis(radar: BistaticRadar, n_pulse: int, bands: int) -> Axis:
-    """Of a rebuilt spectrum: Doppler (Hz) against the centre; remembers the slow time that it came
-    from.
+    """Return the Doppler axis of a reconstructed spectrum in Hz relative to the Doppler centre.
+
+    Args:
+        radar: Instrument.
+        n_pulse: Number of pulses.
+        bands: Number of reconstructed bands.
+
+    Returns:
+        The axis, which also stores the slow time of the data.
     """
     step = radar.prf_hz / n_pulse
     return Axis(
@@ -157,8 +214,19 @@ def doppler_axis(radar: BistaticRadar, n_pulse: int, bands: int) -> Axis:
 
 
 def mind_condition(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, dtype: torch.dtype) -> None:
-    """Refuse, naming what causes it, where an inverse is singular in all trials; warn where it is
-    poor in some. A prior has no such limit.
+    """Check the condition number of a least-squares reconstruction.
+
+    A warning is given where it exceeds 5 in some trials. `MinimumMeanSquare` has no such limit.
+
+    Args:
+        radar: Instrument.
+        motion: Motion of the points, shape (...,).
+        rebuild: Reconstruction method.
+        dtype: Dtype of the data.
+
+    Raises:
+        ValueError: If the condition number exceeds 1e6 (1e4 in complex64) in all trials. The
+            message names the pulse rate and the speed.
     """
     if not isinstance(rebuild, LeastSquares):
         return
@@ -166,14 +234,14 @@ def mind_condition(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, 
     limit = SINGULAR if dtype == torch.complex128 else SINGULAR_SINGLE
     if bool((found > limit).all()):
         then = (
-            f"so that {rebuild.bands} bands cannot be told apart; rebuild fewer bands, use "
+            f"so that {rebuild.bands} bands cannot be separated; rebuild fewer bands, use "
             "MinimumMeanSquare, or change the pulse rate"
         )
-        raise ValueError(_sentence(radar, motion, rebuild.bands, float(found.min()), then))
+        raise ValueError(_condition_message(radar, motion, rebuild.bands, float(found.min()), then))
     if bool((found > POOR).any()):
         worst = float(found.max())
         warnings.warn(
-            _sentence(
+            _condition_message(
                 radar,
                 motion,
                 rebuild.bands,
@@ -184,8 +252,9 @@ def mind_condition(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, 
         )
 
 
-def _sentence(radar: BistaticRadar, motion: PointMotion, bands: int, worst: float, then: str) -> str:
+def _condition_message(radar: BistaticRadar, motion: PointMotion, bands: int, worst: float, then: str) -> str:
+    """Return the message about an ill-conditioned reconstruction."""
     found = condition_number(radar, motion, bands)
     speed = motion.effective_m_s.detach().expand(found.shape).flatten()[int(found.flatten().argmax())]
     where = f"at a pulse rate of {radar.prf_hz:g} Hz and a speed past the target of {float(speed):.4g} m/s"
-    return f"{where} the channels sample nearly the same places (condition number {worst:.3g}), {then}"
+    return f"{where} the channels sample nearly the same positions (condition number {worst:.3g}), {then}"

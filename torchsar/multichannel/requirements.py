@@ -1,11 +1,12 @@
-"""What a receiver with channels along track allows and what its scene requires: limits, and the
-phase that each simplification neglects.
+"""Limits of a multichannel receiver, and the phase that each model simplification neglects.
 
-Both are predicted from radar, reconstruction and bounds of the motion before anything runs. Brief
-001, "Refuse or warn" and "Model only what a scene requires". Empty lists of channels, and rates,
-ranges and speeds that are not positive, are refused by `BistaticRadar`; samples that are not finite
-by every stage; estimates at the end of their search interval are marked by the estimators
-themselves.
+Both are predicted from the radar, the reconstruction and bounds of the motion before anything is
+computed. Other checks are made elsewhere: `BistaticRadar` rejects empty lists of channels and
+values that are not positive, every stage rejects samples that are not finite, and estimators mark
+an estimate at the end of its search interval.
+
+Reference:
+    Remote Sens. 2020, 12, 1703, sections 2 to 4.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from torch import Tensor
 
 from torchsar.core import cis
 from torchsar.focus.ladar_requirements import Limit
-from torchsar.focus.requirements import Requirement
+from torchsar.focus.requirements import Requirement, phase_error_db
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.response import (
     POOR,
@@ -34,26 +35,51 @@ from torchsar.multichannel.response import (
 )
 from torchsar.radar import BistaticRadar, receive_range
 
+# Convention: fraction of the largest unambiguous speed beyond which a warning is given.
 NEAR_AMBIGUOUS = 0.95
-GATHERED_SNR_DB, SIR_SNR_DB, FAINT_RAD = 19.0, 7.0, 0.3
+# Threshold of interferometry and maximum likelihood over all channels and pulses: -15 dB per sample
+# with three channels and 810 pulses. Below it the strongest tone is often one of noise.
+GATHERED_SNR_DB = 19.0
+# Upper end of the threshold of the intensity ratio, which lies at 0 to +7 dB per sample.
+SIR_SNR_DB = 7.0
+# Convention: well below the pi / 4 at which a quadratic phase broadens the impulse response.
+FAINT_RAD = 0.3
+# Samples over the aperture, the Doppler band and half the search interval: maxima of smooth curves
+# are found closely enough for a limit.
 _POINTS = 65
-_GEO_RANGE_M = 3.9e7
-_ALIKE = 1e-6  # turns between channels that sample the same places
+_GEO_RANGE_M = 3.9e7  # slant range of a geosynchronous transmitter
+_SAME_TURNS = 1e-6  # cycles between phases that are taken as equal: rounding only
 
 Estimator = Literal["sir", "ati", "ml", "whitened"]
 
 
 @dataclass(frozen=True)
 class MultichannelUse:
-    """How a radar is used: record, reconstruction, and bounds of what moves.
+    """Use of a radar: record, reconstruction, and bounds of the motion in the scene.
 
-    n_pulse: of the record; integration_s: time T that is focused; pattern: targets fade by the
-    pattern of the elements, instead of at the ends of T. u_r_m_s, u_a_m_s: least and largest
-    velocity searched; y0_m: largest |y0|; acceleration_m_s2: largest radial one; swath_m: range
-    swath, to either side. snr_db: of a range-compressed sample of one channel, None where unknown.
-    clutter: whether a stationary scene lies beside the targets. deramped: whether the keystone
-    transform works on deramped data. u_r_error_m_s, u_a_error_m_s, channel_error_rad: errors
-    expected in the reconstruction; replica_db: highest replica allowed.
+    Args:
+        n_pulse: Number of pulses of the record.
+        integration_s: Integration time T of an image in seconds.
+        rebuild: Reconstruction method.
+        pattern: True if targets fade by the element pattern, False if their echoes end at +-T / 2.
+        u_r_m_s: Least and largest slant-range speed searched in m/s, closing positive.
+        u_a_m_s: Least and largest along-track speed searched in m/s.
+        y0_m: Largest |y0| in metres.
+        acceleration_m_s2: Largest radial acceleration in m/s^2.
+        swath_m: Range swath to either side of the reference range in metres.
+        snr_db: SNR of a range-compressed sample of one channel in dB, None where unknown.
+        clutter: Whether stationary clutter is present beside the targets.
+        estimators: Velocity estimators in use.
+        deramped: Whether the keystone transform works on deramped data.
+        dtype: Dtype of the data.
+        u_r_error_m_s: Expected error of the slant-range speed in the reconstruction in m/s.
+        u_a_error_m_s: Expected error of the along-track speed in the reconstruction in m/s.
+        channel_error_rad: Expected phase error of a channel in radians.
+        replica_db: Highest accepted false target relative to the peak in dB.
+
+    Raises:
+        ValueError: If bounds are out of order or not finite, the record is empty, or a magnitude is
+            negative.
     """
 
     n_pulse: int
@@ -92,24 +118,31 @@ class MultichannelUse:
         wrong = {name: value for name, value in least.items() if not (math.isfinite(value) and value >= 0)}
         if wrong:
             raise ValueError(
-                "these must be finite and not negative: "
+                "these values must be finite and not negative, got "
                 f"{', '.join(f'{name}={value}' for name, value in wrong.items())}"
             )
 
     @property
     def fastest_m_s(self) -> float:
-        """Largest |u_r|."""
+        """Largest |u_r| in m/s."""
         return max(abs(u) for u in self.u_r_m_s)
 
 
 def _bandwidth_hz(radar: BistaticRadar, use: MultichannelUse, u_r: float = 0.0, u_a: float = 0.0) -> float:
-    """B_a = V^2 T / (lambda R0)."""
+    """Return the processed Doppler bandwidth B_a = V^2 T / (lambda R0) in Hz."""
     return ((radar.speed_m_s - u_a) ** 2 + u_r**2) * use.integration_s / (radar.wavelength_m * radar.reference_range_m)
 
 
 def multichannel_limits(radar: BistaticRadar, use: MultichannelUse) -> tuple[Limit, ...]:
-    """Limits of reconstructing, estimating and imaging as `use` says; rows that need what is not
-    there (snr_db, a pattern, an estimator) are absent.
+    """Return the limits of reconstruction, estimation and imaging for a use of the radar.
+
+    Args:
+        radar: Instrument.
+        use: Record, reconstruction and bounds of the motion.
+
+    Returns:
+        One row per limit. Rows that need an SNR, a pattern or an estimator that `use` does not have
+        are absent. If the fastest target is as fast as the receiver, that row alone is returned.
     """
     slowest = radar.speed_m_s - use.u_a_m_s[1]
     moves = Limit(
@@ -135,6 +168,7 @@ def multichannel_limits(radar: BistaticRadar, use: MultichannelUse) -> tuple[Lim
 
 
 def _record_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Limit]:
+    """Yield the limits of the length of the record."""
     record, slowest = use.n_pulse / radar.prf_hz, radar.speed_m_s - use.u_a_m_s[1]
     yield Limit(
         "record",
@@ -142,7 +176,7 @@ def _record_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Limit
         use.integration_s,
         "s",
         "refuse",
-        "it is shorter than the time to be integrated",
+        "it is shorter than the integration time",
         "record longer, or integrate less",
         at_least=True,
     )
@@ -153,7 +187,7 @@ def _record_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Limit
         record / 2,
         "s",
         "warn",
-        "targets are displaced beyond the record and wrap in azimuth",
+        "targets are displaced beyond the record and wrap around in azimuth",
         "record longer",
     )
     if use.pattern:
@@ -164,13 +198,14 @@ def _record_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Limit
             wrap,
             "s",
             "warn",
-            "replicas two pulse rates off wrap onto other places",
+            "false targets two PRFs away wrap around onto other positions",
             "record longer",
             at_least=True,
         )
 
 
 def _band_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Limit]:
+    """Yield the limits of the Doppler bandwidth."""
     bands, rebuilt = use.rebuild.bands, use.rebuild.bands * radar.prf_hz
     needed = _bandwidth_hz(radar, use, use.fastest_m_s, use.u_a_m_s[0])
     if use.rebuild.refusal(radar.channels) is not None or isinstance(use.rebuild, LeastSquares):
@@ -180,7 +215,7 @@ def _band_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Limit]:
             bands,
             "",
             "refuse",
-            "more bands cannot be told apart without a prior",
+            "more bands than channels cannot be separated without a prior",
             "rebuild fewer bands, or use MinimumMeanSquare",
             at_least=True,
         )
@@ -194,7 +229,7 @@ def _band_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Limit]:
         "rebuild more bands, or integrate less",
     )
     if "sir" in use.estimators:
-        nothing = "the intensity ratio has no band left outside the signal"
+        nothing = "the intensity ratio has no band outside the signal"
         yield Limit(
             "Doppler band inside the intensity ratio",
             _bandwidth_hz(radar, use),
@@ -207,7 +242,7 @@ def _band_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Limit]:
 
 
 def _channel_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Limit]:
-    """Where channels sample the same places: only an inverse minds."""
+    """Yield the limits of the condition number; only a least-squares inverse has them."""
     bands = use.rebuild.bands
     if isinstance(use.rebuild, MinimumMeanSquare) or bands > radar.channels or bands == 1:
         return
@@ -215,7 +250,7 @@ def _channel_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Limi
     least = SINGULAR if use.dtype == torch.complex128 else SINGULAR_SINGLE
     same = (
         f"at a pulse rate of {radar.prf_hz:g} Hz and {radar.speed_m_s:g} m/s channels sample "
-        f"the same places, and {bands} bands cannot be told apart"
+        f"the same positions, and {bands} bands cannot be separated"
     )
     other = "rebuild fewer bands, use MinimumMeanSquare, or change the pulse rate"
     yield Limit("condition number at rest", rest, least, "", "refuse", same, other)
@@ -243,7 +278,7 @@ def _channel_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Limi
 
 
 def _worst_condition(radar: BistaticRadar, use: MultichannelUse) -> tuple[float, float]:
-    """Largest condition number within the velocities, and the u_a where it is."""
+    """Return the largest condition number within the velocities, and the u_a at which it occurs."""
     u_a = torch.linspace(*use.u_a_m_s, 2 * _POINTS - 1, dtype=torch.float64)
     u_r = torch.tensor([*use.u_r_m_s], dtype=torch.float64)[:, None]
     found = condition_number(radar, PointMotion.of(radar, u_a, u_r, u_a), use.rebuild.bands)
@@ -251,37 +286,49 @@ def _worst_condition(radar: BistaticRadar, use: MultichannelUse) -> tuple[float,
 
 
 def singular_speeds_m_s(radar: BistaticRadar, bands: int, u_a_m_s: tuple[float, float]) -> list[float]:
-    """Speeds u_a within the bounds at which fewer than `bands` channels sample different places: v
-    = (m - m') d PRF / q for a pair of them, q a whole number (u_r = 0).
+    """Return along-track speeds at which the reconstruction is singular.
+
+    At these speeds fewer than `bands` channels sample different positions: v = (m - m') d PRF / q
+    for a pair of channels and a whole number q, at u_r = 0.
+
+    Args:
+        radar: Instrument.
+        bands: Number of Doppler bands.
+        u_a_m_s: Bounds of the along-track speed in m/s.
+
+    Returns:
+        Speeds u_a within the bounds in m/s, rising.
     """
-    places = radar.channel_m
-    pairs = {round(abs(a - b), 9) for i, a in enumerate(places) for b in places[:i]}
+    positions = radar.channel_m
+    pairs = {round(abs(a - b), 9) for i, a in enumerate(positions) for b in positions[:i]}
     fastest, slowest = radar.speed_m_s - u_a_m_s[0], radar.speed_m_s - u_a_m_s[1]
     speeds = {
         spacing * radar.prf_hz / q
         for spacing in pairs
         for q in _whole_between(spacing * radar.prf_hz / fastest, spacing * radar.prf_hz / slowest)
     }
-    return sorted(radar.speed_m_s - v for v in speeds if _different(places, radar.prf_hz / v) < bands)
+    return sorted(radar.speed_m_s - v for v in speeds if _count_different(positions, radar.prf_hz / v) < bands)
 
 
 def _whole_between(low: float, high: float) -> range:
+    """Return the positive whole numbers between two bounds, including them."""
     return range(max(1, math.ceil(low - 1e-9)), math.floor(high + 1e-9) + 1)
 
 
-def _different(places: tuple[float, ...], turns_per_m: float) -> int:
-    """Number of different phases, whole turns dropped."""
+def _count_different(positions: tuple[float, ...], turns_per_m: float) -> int:
+    """Return the number of channel positions whose phases differ by other than whole cycles."""
     seen: list[float] = []
-    for place in places:
-        turns = place * turns_per_m
-        if all(abs((turns - other + 0.5) % 1 - 0.5) > _ALIKE for other in seen):
+    for position in positions:
+        turns = position * turns_per_m
+        if all(abs((turns - other + 0.5) % 1 - 0.5) > _SAME_TURNS for other in seen):
             seen.append(turns)
     return len(seen)
 
 
 def _tone_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Limit]:
+    """Yield the limits of the Doppler ambiguity."""
     half, centre = radar.ambiguous_velocity_m_s / 2, use.fastest_m_s
-    unknown = "velocities are known modulo lambda PRF, and come out on the other side"
+    unknown = "velocities are measured modulo lambda PRF, and appear at the other end of the interval"
     yield Limit(
         "slant-range speed",
         centre,
@@ -298,11 +345,11 @@ def _tone_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Limit]:
         half,
         "m/s",
         "warn",
-        "the keystone transform shifts by a wrong multiple of the pulse rate",
-        "give it the ambiguity number",
+        "the keystone transform assumes a wrong multiple of the pulse rate",
+        "give the ambiguity number",
     )
     if not use.deramped:
-        smeared = "the keystone transform smears slow time that is aliased"
+        smeared = "the keystone transform defocuses data that are aliased in slow time"
         yield Limit(
             "Doppler band for the keystone transform",
             _bandwidth_hz(radar, use),
@@ -315,6 +362,7 @@ def _tone_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Limit]:
 
 
 def _estimator_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Limit]:
+    """Yield the limits of the velocity estimators."""
     if use.clutter and "sir" in use.estimators:
         yield Limit(
             "stationary clutter beside the intensity ratio",
@@ -322,8 +370,8 @@ def _estimator_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Li
             1,
             "",
             "warn",
-            "the ratio locks on u_r = 0 and reports that nothing moves",
-            "whiten, or take the clutter out first",
+            "the ratio has its maximum at u_r = 0, whatever the motion of the target",
+            "whiten, or suppress the clutter first",
         )
     if use.snr_db is None:
         return
@@ -335,7 +383,7 @@ def _estimator_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Li
             GATHERED_SNR_DB,
             "dB",
             "warn",
-            "estimates are wild below their threshold",
+            "estimates below the threshold have gross errors",
             "integrate longer",
             at_least=True,
         )
@@ -355,13 +403,22 @@ def _estimator_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Li
 def multichannel_requirements(
     radar: BistaticRadar, use: MultichannelUse, tolerance_rad: float = math.pi / 4
 ) -> tuple[Requirement, ...]:
-    """Phase (rad) that each simplification neglects at worst within `use`, against what may be
-    neglected.
+    """Return the phase that each simplification neglects at worst, against its tolerance.
 
-    Transmit range and y0 against 0.3 rad; range migration at the ends of the band, where a quarter
-    of a resolution cell c / B is pi/4; errors of the reconstruction against the phase that makes a
-    replica of use.replica_db. Quadratic phases count at the ends of the aperture. "Absorbed" terms
-    focus with another u_a.
+    Transmit and receive range and migration are judged by the relative error of the response; range
+    migration is expressed as the phase at the ends of the band, where a quarter of a resolution
+    cell c / B is pi / 4. y0 is compared with 0.3 rad. Errors of the
+    reconstruction are compared with the phase that makes a false target of `use.replica_db`.
+    Quadratic phases count at the ends of the aperture. Terms "absorbed by u_a" are focused by
+    another value of u_a.
+
+    Args:
+        radar: Instrument.
+        use: Record, reconstruction and bounds of the motion.
+        tolerance_rad: Tolerance of the other rows in radians.
+
+    Returns:
+        One row per simplification.
     """
     return (
         *_transmit_rows(radar, use),
@@ -373,16 +430,28 @@ def multichannel_requirements(
 
 
 def _transmit_rows(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Requirement]:
+    """Yield the rows of the transmit range."""
     k, half, wave = [*radar.transmit_range, 0.0, 0.0, 0.0, 0.0], use.integration_s / 2, 2 * math.pi / radar.wavelength_m
     second, beyond = wave * abs(k[1]) * half**2, wave * sum(abs(x) * half**i for i, x in enumerate(k[2:], start=3))
-    yield Requirement("transmit range of order 1", "its acceleration", second, math.nan, FAINT_RAD, "keep k2")
+    time = _aperture_times(use)
+    terms = [wave * x * time**i for i, x in enumerate(k, start=1)]
+    error_db = [phase_error_db(sum(terms[order:], torch.zeros_like(time))) for order in (1, 2)]
     yield Requirement(
-        "transmit range of order 2", "third and higher orders", beyond, math.nan, FAINT_RAD, "keep more orders"
+        "transmit range of order 1", "its acceleration", second, math.nan, FAINT_RAD, "keep k2", error_db[0]
+    )
+    yield Requirement(
+        "transmit range of order 2",
+        "third and higher orders",
+        beyond,
+        math.nan,
+        FAINT_RAD,
+        "keep more orders",
+        error_db[1],
     )
     spread = max(abs(x) for x in radar.channel_m) / (radar.speed_m_s - use.u_a_m_s[1])
     yield Requirement(
         "transmit range alike in all channels",
-        "2 k2 dt_m t, where k1 stays in the channel response",
+        "2 k2 dt_m t, where k1 remains in the channel response",
         wave * 2 * abs(k[1]) * spread * half,
         math.nan,
         FAINT_RAD,
@@ -391,20 +460,22 @@ def _transmit_rows(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Requi
 
 
 def _path_rows(radar: BistaticRadar, use: MultichannelUse, tolerance_rad: float) -> Iterable[Requirement]:
+    """Yield the rows of the receive range."""
     wave, half, r0, u_r = (
         2 * math.pi / radar.wavelength_m,
         use.integration_s / 2,
         radar.reference_range_m,
         use.fastest_m_s,
     )
-    v = radar.speed_m_s - use.u_a_m_s[0]
+    v, parabola = radar.speed_m_s - use.u_a_m_s[0], _parabola_left_m(radar, use)
     yield Requirement(
         "parabolic receive range",
         "third and higher orders of the hyperbola",
-        wave * _parabola_left_m(radar, use),
+        wave * float(parabola.abs().max()),
         math.nan,
         tolerance_rad,
         "focus with the hyperbola",
+        max(phase_error_db(wave * left) for left in parabola),
     )
     yield Requirement(
         "channels as delays of one another",
@@ -431,25 +502,26 @@ def _path_rows(radar: BistaticRadar, use: MultichannelUse, tolerance_rad: float)
         rise,
         math.nan,
         tolerance_rad,
-        "refit u_a per target, and do not call it speed",
+        "refit u_a per target, and do not interpret it as a speed",
     )
-    bent = wave * use.acceleration_m_s2 * half**2 / 2
+    acceleration_rad = wave * use.acceleration_m_s2 * half**2 / 2
     yield Requirement(
         "no radial acceleration",
         "its quadratic phase, absorbed by u_a",
-        bent,
+        acceleration_rad,
         math.nan,
         tolerance_rad,
-        "refit u_a per target, and do not call it speed",
+        "refit u_a per target, and do not interpret it as a speed",
     )
 
 
-def _seen_times(use: MultichannelUse) -> Tensor:
+def _aperture_times(use: MultichannelUse) -> Tensor:
+    """Return slow times over the integration time in seconds."""
     return use.integration_s * torch.linspace(-0.5, 0.5, _POINTS, dtype=torch.float64)
 
 
 def _corner_speeds(use: MultichannelUse) -> tuple[Tensor, Tensor]:
-    """(corner, 1) of the velocities searched, u_r = 0 with them."""
+    """Return the corners (corner, 1) of the velocities searched, including u_r = 0."""
     u_r, u_a = torch.meshgrid(
         torch.tensor([*use.u_r_m_s, 0.0], dtype=torch.float64),
         torch.tensor([*use.u_a_m_s], dtype=torch.float64),
@@ -458,19 +530,17 @@ def _corner_speeds(use: MultichannelUse) -> tuple[Tensor, Tensor]:
     return u_r.reshape(-1, 1), u_a.reshape(-1, 1)
 
 
-def _parabola_left_m(radar: BistaticRadar, use: MultichannelUse) -> float:
-    """Largest third and higher orders in time of the receive range of a point abeam."""
-    time, (u_r, u_a) = _seen_times(use), _corner_speeds(use)
+def _parabola_left_m(radar: BistaticRadar, use: MultichannelUse) -> Tensor:
+    """Return the error (corner, time) in metres of a parabolic receive range, for a point abeam."""
+    time, (u_r, u_a) = _aperture_times(use), _corner_speeds(use)
     exact = receive_range(time, u_r, u_a, 0.0, radar.reference_range_m, radar.speed_m_s, 0.0)
     parabola = -u_r * time + (radar.speed_m_s - u_a).square() * time.square() / (2 * radar.reference_range_m)
-    return float((exact - parabola).abs().max())
+    return exact - parabola
 
 
 def _delay_left_m(radar: BistaticRadar, use: MultichannelUse) -> float:
-    """Largest part, varying over time, of the path of a channel against the delayed path of the
-    reference, Eqs. (6), (7).
-    """
-    time, r0 = _seen_times(use), radar.reference_range_m
+    """Return the largest time-varying error in metres of the delay model, Eqs. (6), (7)."""
+    time, r0 = _aperture_times(use), radar.reference_range_m
     u_r, u_a = (u[:, None] for u in _corner_speeds(use))
     dx, v = radar.channels_at()[:, None], radar.speed_m_s - u_a
     delayed = receive_range(time - dx * v / (v.square() + u_r.square()), u_r, u_a, 0.0, r0, radar.speed_m_s, 0.0)
@@ -479,36 +549,46 @@ def _delay_left_m(radar: BistaticRadar, use: MultichannelUse) -> float:
 
 
 def _migration_rows(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Requirement]:
+    """Yield the rows of the range migration."""
     cell, u_r = radar.wave_speed_m_s / radar.pulse.bandwidth_hz, use.fastest_m_s
     v, r0 = radar.speed_m_s - use.u_a_m_s[0], radar.reference_range_m
     curve = (v * use.integration_s) ** 2 / (8 * r0)
     walk = (u_r + v * use.y0_m / r0) * use.integration_s
+    part = torch.linspace(-1, 1, _POINTS, dtype=torch.float64)[:, None]
 
-    def row(effect: str, neglects: str, path_m: float, remedy: str) -> Requirement:
-        return Requirement(effect, neglects, math.pi * path_m / cell, path_m / cell, math.pi / 4, remedy)
+    def row(effect: str, neglects: str, curve_m: float, walk_m: float, remedy: str) -> Requirement:
+        cells = (curve_m + walk_m) / cell
+        path = curve_m * part.square() + walk_m / 2 * part
+        error_db = phase_error_db(math.pi * path / cell * part.mT)
+        return Requirement(effect, neglects, math.pi * cells, cells, math.pi / 4, remedy, error_db)
 
     yield row(
         "no range migration correction",
         "curvature and walk",
-        curve + walk,
+        curve,
+        walk,
         "correct migration (static bulk, or deramp and keystone)",
     )
-    yield row("static bulk correction", "walk of what moves or lies off y0 = 0", walk, "use deramp and keystone")
     yield row(
-        "one reference range", "change of curvature over the swath", curve * use.swath_m / r0, "work in range blocks"
+        "static bulk correction, velocity unknown",
+        "walk of targets that move or lie off y0 = 0",
+        0.0,
+        walk,
+        "use deramp and keystone",
     )
     yield row(
-        "azimuth only",
-        "migration left by deramp and keystone",
-        0.0 if use.deramped else walk + curve,
-        "work in two dimensions",
+        "one reference range",
+        "change of curvature over the swath",
+        curve * use.swath_m / r0,
+        0.0,
+        "work in range blocks",
     )
+    left = (0.0, 0.0) if use.deramped else (curve, walk)
+    yield row("azimuth only", "migration that remains after deramp and keystone", *left, "work in two dimensions")
 
 
 def _rebuild_rows(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Requirement]:
-    """Errors of what the reconstruction assumes, as phase between the outermost channels' reference
-    and each channel.
-    """
+    """Yield the rows of errors in the reconstruction, as phases between channels."""
     if use.rebuild.refusal(radar.channels) is not None or use.rebuild.bands == 1:
         return
     v, reach = radar.speed_m_s, max(abs(x) for x in radar.channel_m)
@@ -517,14 +597,14 @@ def _rebuild_rows(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Requir
     flat = torch.ones(_POINTS, 1, dtype=torch.float64)
     linear = flat * radar.channels_at() / max(reach, 1e-12)
     sweep = torch.linspace(-1, 1, _POINTS, dtype=torch.float64)[:, None]
-    remedy = f"bring it down for replicas below {use.replica_db:g} dB"
+    remedy = f"reduce it for false targets below {use.replica_db:g} dB"
 
     def row(effect: str, phase: float, shapes: list[Tensor]) -> Requirement:
         level = max((_replica_share(radar, use, phase * shape) for shape in shapes), default=0.0)
         tolerance = phase * 10 ** (use.replica_db / 20) / level if level > 0 else math.inf
         return Requirement(
             effect,
-            f"phase between channels, replica at {20 * math.log10(max(level, 1e-15)):.1f} dB",
+            f"phase between channels, false target at {20 * math.log10(max(level, 1e-15)):.1f} dB",
             phase,
             math.nan,
             tolerance,
@@ -540,8 +620,9 @@ def _rebuild_rows(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Requir
 
 
 def _replica_share(radar: BistaticRadar, use: MultichannelUse, phase_rad: Tensor) -> float:
-    """Amplitude of the largest replica against the peak that phases (Doppler, channel) over the
-    processed band make; the largest u_a searched, where it is worse.
+    """Return the amplitude of the largest false target for phase errors (Doppler, channel).
+
+    The largest and least u_a searched and u_a = 0 are considered.
     """
     shares = []
     for u_a in (0.0, *use.u_a_m_s):
@@ -552,12 +633,15 @@ def _replica_share(radar: BistaticRadar, use: MultichannelUse, phase_rad: Tensor
 
 
 def _leak(radar: BistaticRadar, rebuild: Rebuild, motion: PointMotion, half_hz: float, phase_rad: Tensor) -> float:
+    """Return the largest mean leakage between bands for phase errors (Doppler, channel)."""
     bands, prf = rebuild.bands, radar.prf_hz
     doppler = half_hz * torch.linspace(-1, 1, phase_rad.shape[0], dtype=torch.float64) * (1 - 1e-9)
-    place = (doppler + bands * prf / 2) / prf
-    band = place.floor().long()
+    band_position = (doppler + bands * prf / 2) / prf
+    band = band_position.floor().long()
     weights = rebuild.weights(radar, motion, _POINTS)
-    weights = weights[((place - band) * _POINTS).long().clamp_max(_POINTS - 1)] if weights.ndim == 3 else weights
+    weights = (
+        weights[((band_position - band) * _POINTS).long().clamp_max(_POINTS - 1)] if weights.ndim == 3 else weights
+    )
     seen = band_matrix(radar, motion, bands).mT[band]
     leaked = (weights @ ((cis(phase_rad) - 1) * seen)[..., None])[..., 0]
     shares = [0.0]
@@ -571,6 +655,7 @@ def _leak(radar: BistaticRadar, rebuild: Rebuild, motion: PointMotion, half_hz: 
 
 
 def _precision_rows(radar: BistaticRadar, tolerance_rad: float) -> Iterable[Requirement]:
+    """Yield the rows of ranges in single precision."""
     wave = 2 * math.pi / radar.wavelength_m
     for name, range_m in (("transmit", _GEO_RANGE_M), ("receive", radar.reference_range_m)):
         single = wave * range_m * 2.0**-24
@@ -580,5 +665,5 @@ def _precision_rows(radar: BistaticRadar, tolerance_rad: float) -> Iterable[Requ
             single,
             math.nan,
             tolerance_rad,
-            "form phases in float64 from differences (always done here)",
+            "form phases in float64 from range differences (always done here)",
         )

@@ -1,11 +1,13 @@
-"""How channels along track see the Doppler bands of a moving point, and the weights that tell the
-bands apart.
+"""Response of channels along track to the Doppler bands of a point, and separating weights.
 
-One channel samples at the pulse rate, so that at each alias frequency its spectrum is a sum over
-Doppler bands that lie one pulse rate apart. Channel m is, but for a constant phase, the reference
-delayed by dx_m / v_e: its share of band b differs by exp(-j 2 pi b PRF dx_m / v_e) from channel to
-channel, which is what weights undo. Source: Remote Sens. 2020, 12, 1703, Eqs. (25)-(26), (34)-(36),
-with the corrections of brief 001.
+One channel samples at the pulse rate, so that its spectrum at each alias frequency is a sum over
+Doppler bands one PRF apart. Up to a constant phase, channel m is the reference channel delayed by
+dx_m / v_e: its response to band b has the factor exp(-j 2 pi b PRF dx_m / v_e), which differs
+between channels and allows the bands to be separated.
+
+Reference:
+    Remote Sens. 2020, 12, 1703, Eqs. (25), (26), (34)-(36). The constant phase is that of Eq. (34);
+    the printed Eq. (27) has wrong signs.
 """
 
 from __future__ import annotations
@@ -21,21 +23,35 @@ from torchsar.core import linear_phasor, unit_phasor
 from torchsar.multichannel.motion import PointMotion
 from torchsar.radar import BistaticRadar
 
-# condition numbers: refused in float64, in single precision, warned of
-SINGULAR, SINGULAR_SINGLE, POOR = 1e6, 1e4, 5.0
-_TINY = SINGULAR**-2  # of the largest eigenvalue of the normal matrix
+# Largest condition numbers of an inverse. Convention: an inverse in float64 may lose six of its
+# sixteen digits, one in complex64 four of its seven.
+SINGULAR, SINGULAR_SINGLE = 1e6, 1e4
+# Above this a warning is given: the noise gain of three bands of three channels is then 6.5 dB.
+POOR = 5.0
+# Damping relative to the largest eigenvalue of the normal matrix: it acts on singular values below
+# 1 / SINGULAR of the largest.
+_TINY = SINGULAR**-2
 
 
 def first_bin(n_pulse: int, bands: int) -> int:
-    """Index of the lowest Doppler bin against the centre: bins run over bands * n_pulse from here,
-    PRF / n_pulse apart.
+    """Return the index of the lowest Doppler bin relative to the centre.
+
+    The bands * n_pulse bins rise from this index, PRF / n_pulse apart.
     """
     return -(bands * n_pulse // 2)
 
 
 def doppler_offsets(n_pulse: int, bands: int, prf_hz: float, device: torch.device | str | None = None) -> Tensor:
-    """Doppler of all bins of a rebuilt spectrum against its centre (Hz), rising, float64 (bands *
-    n_pulse,).
+    """Return the Doppler of all bins of a reconstructed spectrum relative to its centre.
+
+    Args:
+        n_pulse: Number of pulses.
+        bands: Number of bands.
+        prf_hz: Pulse repetition frequency in Hz.
+        device: Device of the result.
+
+    Returns:
+        Doppler offsets in Hz, rising, float64 (bands * n_pulse,).
     """
     return (torch.arange(bands * n_pulse, dtype=torch.float64, device=device) + first_bin(n_pulse, bands)) * (
         prf_hz / n_pulse
@@ -43,8 +59,15 @@ def doppler_offsets(n_pulse: int, bands: int, prf_hz: float, device: torch.devic
 
 
 def band_matrix(radar: BistaticRadar, motion: PointMotion, bands: int) -> Tensor:
-    """exp(-j 2 pi b PRF dx_m / v_e), b counted from the lowest band, complex128 (..., channel,
-    band): H of Eq. (34) without what all bands share.
+    """Return the part of Eq. (34) that differs between bands, exp(-j 2 pi b PRF dx_m / v_e).
+
+    Args:
+        radar: Instrument.
+        motion: Motion of the point, shape (...,).
+        bands: Number of bands; b is counted from the lowest one.
+
+    Returns:
+        The matrix, complex128 (..., channel, band).
     """
     band = torch.arange(bands, dtype=torch.float64, device=motion.u_r_m_s.device)
     delay = radar.channels_at(band.device)[:, None] / motion.effective_m_s[..., None, None]
@@ -54,12 +77,23 @@ def band_matrix(radar: BistaticRadar, motion: PointMotion, bands: int) -> Tensor
 def shared_response(
     radar: BistaticRadar, motion: PointMotion, n_pulse: int, bands: int, dtype: torch.dtype, left_k1_m_s: float = 0.0
 ) -> Tensor:
-    """What the bands share of H (34) in the lowest of them: exp(-j 2 pi (f dx_m / v_e + C_m / (2 R0
-    lambda))), (..., channel, n_pulse) of `dtype`.
+    """Return the part of the channel response of Eq. (34) that all bands share.
 
-    Data are demodulated by the Doppler centre first, f counts from there. C_m = dx^2 - (v dx^2 + 2
-    R0 u_r dx) / v_e + 2 y0 dx u_r^2 / V^2, Eq. (7) with y0. left_k1_m_s: transmit range rate that
-    stays in the data, Eq. (34); zero once the transmit range is removed.
+    It is exp(-j 2 pi (f dx_m / v_e + C_m / (2 R0 lambda))) in the lowest band, with f counted from
+    the Doppler centre, by which the data are demodulated first, and C_m = dx^2 - (v dx^2 + 2 R0 u_r
+    dx) / v_e + 2 y0 dx u_r^2 / V^2, Eq. (7) extended by y0.
+
+    Args:
+        radar: Instrument.
+        motion: Motion of the point, shape (...,).
+        n_pulse: Number of pulses.
+        bands: Number of bands.
+        dtype: Complex dtype of the result.
+        left_k1_m_s: Rate k1 of the transmit range that remains in the data in m/s, zero once the
+            transmit range is removed.
+
+    Returns:
+        The response, shape (..., channel, n_pulse), complex.
     """
     dx = radar.channels_at(motion.u_r_m_s.device)
     m = motion.each(lambda value: value[..., None])
@@ -77,31 +111,59 @@ def shared_response(
 
 
 def doppler_centre_hz(radar: BistaticRadar, motion: PointMotion, left_k1_m_s: float = 0.0) -> Tensor:
-    """Doppler of a point as the beam meets it abeam, (u_r - k1) / lambda, with k1 only where the
-    transmit range stays in the data (brief 001, erratum 9).
+    """Return the Doppler centre (u_r - k1) / lambda of a point abeam.
+
+    Args:
+        radar: Instrument.
+        motion: Motion of the point, shape (...,).
+        left_k1_m_s: Rate k1 of the transmit range that remains in the data in m/s. It is zero once
+            the transmit range is removed, the case of Eq. (39).
+
+    Returns:
+        Doppler in Hz, shape (...,).
     """
     return (motion.u_r_m_s - left_k1_m_s) / radar.wavelength_m
 
 
 class Prior(Protocol):
-    """Expected power over Doppler offsets from the centre, relative to its peak."""
+    """Expected power over Doppler."""
 
-    def power(self, offset_hz: Tensor, radar: BistaticRadar, motion: PointMotion) -> Tensor: ...
+    def power(self, offset_hz: Tensor, radar: BistaticRadar, motion: PointMotion) -> Tensor:
+        """Return the expected power relative to its peak.
+
+        Args:
+            offset_hz: Doppler relative to the centre in Hz, any shape (bins).
+            radar: Instrument.
+            motion: Motion of the point, shape (...,).
+
+        Returns:
+            Power ratio, shape (..., bins) or (bins).
+        """
+        ...
 
 
 @dataclass(frozen=True)
 class ElementPattern:
-    """One-way power pattern of a channel's aperture, sinc^2(element sin(look) / lambda), over
-    Doppler: sin(look) = -lambda offset / v.
+    """One-way power pattern of the aperture of a channel, sinc^2(element sin(look) / lambda).
+
+    Over Doppler sin(look) = -lambda offset / v.
     """
 
     def power(self, offset_hz: Tensor, radar: BistaticRadar, motion: PointMotion) -> Tensor:
+        """Return the power pattern over Doppler offsets in Hz, see `Prior.power`."""
         return torch.sinc(radar.element_m * offset_hz / motion.along_m_s[(...,) + (None,) * offset_hz.ndim]).square()
 
 
 @dataclass(frozen=True)
 class FlatBand:
-    """Equal power within a band of bandwidth_hz about the centre, none beyond."""
+    """Equal power within a band about the Doppler centre, none outside.
+
+    Args:
+        bandwidth_hz: Width of the band in Hz.
+
+    Raises:
+        ValueError: If the bandwidth is not positive.
+    """
 
     bandwidth_hz: float
 
@@ -110,44 +172,69 @@ class FlatBand:
             raise ValueError(f"bandwidth_hz of a flat band must be positive, got {self.bandwidth_hz}")
 
     def power(self, offset_hz: Tensor, radar: BistaticRadar, motion: PointMotion) -> Tensor:
+        """Return 1 inside the band and 0 outside, see `Prior.power`."""
         return (offset_hz.abs() <= self.bandwidth_hz / 2).to(torch.float64)
 
 
 class Rebuild(Protocol):
-    """A way to tell bands apart: how many there are, and weights (..., band, channel), or (...,
-    n_pulse, band, channel) where they differ from bin to bin.
-    """
+    """Reconstruction method: the number of Doppler bands and the weights that separate them."""
 
     @property
-    def bands(self) -> int: ...
+    def bands(self) -> int:
+        """Number of reconstructed Doppler bands."""
+        ...
 
-    def weights(self, radar: BistaticRadar, motion: PointMotion, n_pulse: int) -> Tensor: ...
+    def weights(self, radar: BistaticRadar, motion: PointMotion, n_pulse: int) -> Tensor:
+        """Return the weights from channels to bands.
 
-    def refusal(self, channels: int) -> str | None: ...
+        Args:
+            radar: Instrument.
+            motion: Motion of the points, shape (...,).
+            n_pulse: Number of pulses.
+
+        Returns:
+            Weights, complex128 (..., band, channel), or (..., n_pulse, band, channel) where they
+            differ between bins.
+        """
+        ...
+
+    def refusal(self, channels: int) -> str | None:
+        """Return why the method cannot work with so many channels, or None if it can."""
+        ...
 
 
-def _refuse_no_bands(bands: int) -> None:
+def _check_bands(bands: int) -> None:
+    """Raise ValueError unless the number of bands is a whole number of at least one."""
     if not (isinstance(bands, int) and bands >= 1):
         raise ValueError(f"a reconstruction needs a whole number of Doppler bands, at least one, got bands={bands}")
 
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """Pseudo-inverse of the band matrix, Eq.
+    """Pseudo-inverse of the band matrix, Eq. (36) for any number of channels.
 
-    (36) for any number of channels (brief 001, erratum 8): the inverse where there are as many
-    bands as channels.
+    It is the inverse where there are as many bands as channels. Singular values below 1e-6 of the
+    largest are damped, so that the weights stay finite where two channels sample the same
+    positions. Prefer two bands for three channels: three bands amplify noise strongly near PRFs at
+    which channels sample the same positions.
 
-    Singular values below 1e-6 of the largest are damped, so that weights stay finite where two
-    channels sample the same places.
+    Args:
+        bands: Number of Doppler bands, at most the number of channels.
+
+    Raises:
+        ValueError: If `bands` is not a whole number of at least one.
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, Eqs. (35), (36).
     """
 
     bands: int = 2
 
     def __post_init__(self) -> None:
-        _refuse_no_bands(self.bands)
+        _check_bands(self.bands)
 
     def weights(self, radar: BistaticRadar, motion: PointMotion, n_pulse: int) -> Tensor:
+        """Return the pseudo-inverse, complex128 (..., band, channel); see `Rebuild`."""
         matrix = band_matrix(radar, motion, self.bands)
         normal = matrix.mH @ matrix
         floor = _TINY * self.bands * radar.channels
@@ -156,9 +243,9 @@ class LeastSquares:
         )
 
     def refusal(self, channels: int) -> str | None:
-        """Why it cannot work with so many channels, or None."""
+        """Return why the method cannot work with so many channels, or None if it can."""
         few = (
-            f"{self.bands} Doppler bands cannot be told apart by {channels} "
+            f"{self.bands} Doppler bands cannot be separated by {channels} "
             f"channel{'s' if channels > 1 else ''}; rebuild at most {channels}, or give a prior "
             "(MinimumMeanSquare)"
         )
@@ -167,10 +254,19 @@ class LeastSquares:
 
 @dataclass(frozen=True)
 class MinimumMeanSquare:
-    """The linear estimate of least mean square error, A G^H (G A G^H + I / snr)^-1, for bands of
-    the expected power A: works for more bands than channels.
+    """Linear estimate of least mean square error for bands of a given expected power.
 
-    snr_db: of the strongest expected power over the noise of a sample.
+    With the response G and the expected power A the weights are A G^H (G A G^H + I / snr)^-1. There
+    may be more bands than channels.
+
+    Args:
+        bands: Number of Doppler bands.
+        snr_db: Strongest expected power over the noise of a sample in dB.
+        prior: Expected power over Doppler.
+
+    Raises:
+        ValueError: If `bands` is not a whole number of at least one, or `snr_db` lies outside +-120
+            dB.
     """
 
     bands: int = 5
@@ -178,13 +274,14 @@ class MinimumMeanSquare:
     prior: Prior = ElementPattern()
 
     def __post_init__(self) -> None:
-        _refuse_no_bands(self.bands)
+        _check_bands(self.bands)
         if not abs(self.snr_db) <= 120:
             raise ValueError(
                 f"snr_db of a least-mean-square reconstruction must lie within +-120 dB, got {self.snr_db}"
             )
 
     def weights(self, radar: BistaticRadar, motion: PointMotion, n_pulse: int) -> Tensor:
+        """Return weights per bin, complex128 (..., n_pulse, band, channel); see `Rebuild`."""
         offset = doppler_offsets(n_pulse, self.bands, radar.prf_hz, motion.u_r_m_s.device).view(self.bands, n_pulse).T
         matrix = band_matrix(radar, motion, self.bands)[..., None, :, :]
         weighted = matrix * self.prior.power(offset, radar, motion)[..., None, :].to(matrix.dtype)
@@ -192,13 +289,47 @@ class MinimumMeanSquare:
         return torch.linalg.solve(weighted @ matrix.mH + noise, weighted).mH
 
     def refusal(self, channels: int) -> str | None:
-        """None: a prior tells any number of bands apart."""
+        """Return None: with a prior any number of bands can be separated."""
         return None
 
 
+def clutter_covariance(
+    radar: BistaticRadar, prior: Prior, n_pulse: int, bands: int, device: torch.device | str | None = None
+) -> Tensor:
+    """Return the covariance across channels of stationary clutter, per Doppler bin.
+
+    Args:
+        radar: Instrument.
+        prior: Expected power over Doppler, such as `ElementPattern()`.
+        n_pulse: Number of pulses.
+        bands: Number of Doppler bands that hold the clutter.
+        device: Device of the result.
+
+    Returns:
+        Covariance per bin of the unitary FFT over the pulses, FFT order, complex128 (n_pulse,
+        channel, channel), on the scale of the expected power.
+    """
+    motion = PointMotion.of(radar, torch.zeros((), dtype=torch.float64, device=device))
+    offset = doppler_offsets(n_pulse, bands, radar.prf_hz, device).view(bands, n_pulse).T
+    power = prior.power(offset, radar, motion)[:, None, :].to(torch.complex128)
+    shared = shared_response(radar, motion, n_pulse, bands, torch.complex128).T[..., None]
+    response = shared * band_matrix(radar, motion, bands)
+    return torch.roll((response * power) @ response.mH, first_bin(n_pulse, bands), 0)
+
+
 def condition_number(radar: BistaticRadar, motion: PointMotion, bands: int) -> Tensor:
-    """Ratio of the largest to the least singular value of the band matrix, (...,), infinite where
-    it is singular. Not differentiable where two are equal.
+    """Return the condition number of the band matrix.
+
+    It is the ratio of the largest to the least singular value, infinite where the matrix is
+    singular. Not differentiable.
+
+    Args:
+        radar: Instrument.
+        motion: Motion of the point, shape (...,).
+        bands: Number of bands.
+
+    Returns:
+        Condition number, float64 (...,).
     """
     values = torch.linalg.svdvals(band_matrix(radar, motion, bands).detach())
     if bands > radar.channels:
@@ -210,11 +341,20 @@ def condition_number(radar: BistaticRadar, motion: PointMotion, bands: int) -> T
 
 
 def noise_gain_db(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, n_pulse: int = 64) -> Tensor:
-    """Noise power of a rebuilt bin against that of ideal uniform sampling by as many channels, M /
-    N trace(W W^H), in dB, mean over bins, (...,).
+    """Return the noise gain of a reconstruction relative to ideal uniform sampling.
 
-    Infinite where an inverse is singular, although its damped weights are finite: they lose bands
-    instead.
+    The gain M / N trace(W W^H) is the noise power of a reconstructed bin over that of uniform
+    sampling with as many channels, as a mean over bins. It is infinite where a least-squares matrix
+    is singular: the damped weights are finite there, but they lose bands.
+
+    Args:
+        radar: Instrument.
+        motion: Motion of the point, shape (...,).
+        rebuild: Reconstruction method.
+        n_pulse: Number of pulses, for weights that differ between bins.
+
+    Returns:
+        Noise gain in dB, shape (...,).
     """
     weights = rebuild.weights(radar, motion, n_pulse)
     power = weights.abs().square().sum((-2, -1)) * (radar.channels / rebuild.bands)

@@ -1,10 +1,13 @@
-"""One picture of a scene at rest and of what moves in it, every target in its place: the whole flow
-of Remote Sens. 2020, 12, 1703, Fig. 13.
+"""Image of a stationary scene and of its moving targets at their true positions.
 
-Conventional image, detection, then for each target, strongest first: extraction of its lines,
-velocity, removal from the data, picture by its own velocity, and relocation. Replicas of a target
-go with it, so that they are not taken for targets. Weaker targets are looked for in images with the
-sea suppressed.
+The conventional image is formed and targets are detected in it. Then for each target, strongest
+first, its range lines are extracted, its velocity is estimated, its echo is removed from the data,
+it is imaged with its own velocity, and it is relocated. The false targets of a target are removed
+with its echo, so that they are not detected as targets. Weaker targets are detected in images with
+suppressed sea.
+
+Reference:
+    Remote Sens. 2020, 12, 1703, Fig. 13 and section 4.3.
 """
 
 from __future__ import annotations
@@ -29,20 +32,35 @@ from torchsar.multichannel.velocity.whitening import line_whitening
 from torchsar.radar import BistaticRadar
 
 Removal = Literal["subtract", "zero"]
-_ALIKE_M_S = 5.0
-# times those of one point: a body has many, and its brightest pixels stand above the mean
+# Found by trial: velocities within this difference count as equal. A larger value rejects targets
+# beside a ship, a smaller one accepts side lobes of the ship as targets.
+_SAME_VELOCITY_M_S = 5.0
+# Level of range side lobes relative to those of one point of the mean level, found by trial: a body
+# has many points, and its brightest ones exceed the mean.
 _SIDE_LOBES = 20.0
+# Range lines to either side of a body that are processed with it: 6 guard cells, and 28 lines for
+# the covariance of the sea. Found by trial: 20 to 80 give the same velocities, 80 take 1.4 times
+# the time; the lines must also hold the range migration of the body.
+_LINES_BESIDE = 34
+_BINS_AVERAGED = 4  # neighbouring Doppler bins over which the covariance of all lines is averaged
+_HALF_QUALITY_LEVEL = 100.0  # level (20 dB) at which the quality of a target is one half: convention
 
 
 @dataclass(frozen=True)
 class Detector:
-    """When something is a target.
+    """Settings of the detection of targets.
 
-    threshold_db: of the mean intensity of extent_m (along track, range) over the median of the
-    image; most: targets at most.
+    Args:
+        threshold_db: Least mean intensity of a neighbourhood over the median of the image in dB.
+        extent_m: Extent of a neighbourhood in azimuth and range in metres.
+        apart_m: Least separation of detections in azimuth and range in metres.
+        most: Largest number of targets.
+        suppressed_m_s: Slant-range speeds in m/s of the images with suppressed sea, in which weaker
+            targets are detected; empty to omit these.
 
-    suppressed_m_s: slant-range speeds at which the sea is suppressed to look for more, none to
-    leave that out.
+    Raises:
+        ValueError: If the threshold, an extent or a separation is not positive, or `most` is below
+            1.
     """
 
     threshold_db: float = 10.0
@@ -59,18 +77,22 @@ class Detector:
             )
 
     def found(self, image: Signal) -> list[Detection]:
+        """Return the detections in an image (azimuth, range), strongest first."""
         return detect(image, self.threshold_db, self.extent_m, self.apart_m, self.most)
 
 
 @dataclass(frozen=True)
 class SceneImage:
-    """conventional: the image of everything as if it were at rest.
+    """Images of a scene with moving targets.
 
-    rest: of what is left without the movers. fused: rest with every mover in its place. bodies: all
-    targets, strongest first.
-
-    estimate: u_r_m_s, u_a_m_s, y0_m, range_m (target,), those of the detector's `most` that do not
-    exist being zero and not ok. data: channels without the movers.
+    Args:
+        conventional: Image (azimuth, range) of all data as if the whole scene were stationary.
+        rest: Image of the data without the moving targets.
+        fused: Image `rest` with every moving target at its position.
+        bodies: All targets, strongest first.
+        estimate: `u_r_m_s`, `u_a_m_s`, `y0_m`, `range_m` of shape (target,), with the `most`
+            entries of the detector; entries without a target are zero and not `ok`.
+        data: Channels without the moving targets.
     """
 
     conventional: Signal
@@ -82,13 +104,24 @@ class SceneImage:
 
 
 class ImageMovers(Stage):
-    """Channels (channel, pulse, range) of one frame, range compressed and without the transmit
-    range, to a `SceneImage`.
+    """Imaging of a scene and its moving targets, from channels to a `SceneImage`.
 
-    rebuild: for what is at rest. removal: "subtract" the echo that fits a mover, or "zero" all that
-    lies in its lines and its extent, sea included (kept for comparison). slowest_m_s: what a target
-    must exceed in u_r, u_a to count as a mover; one at rest stays in the image. It takes one frame
-    at a time, since the number of targets differs.
+    The channels (channel, pulse, range) are range compressed and without the transmit range. One
+    frame is processed at a time, since the number of targets differs between frames.
+
+    Args:
+        radar: Instrument.
+        extraction: Extent of a target in the data.
+        detector: Settings of the detection.
+        rebuild: Reconstruction method for the stationary scene, `LeastSquares()` by default.
+        removal: "subtract" removes the echo fitted to a moving target. "zero" removes all data in
+            its lines and extent, including the sea, as in the paper.
+        slowest_m_s: Least |u_r| and |u_a| in m/s of a moving target; other targets remain in the
+            image.
+        u_a_half_m_s: Half width of the search in u_a in m/s.
+
+    Raises:
+        ValueError: If `removal` is unknown, or there are too few channels for the bands.
     """
 
     works_on = ("channel", "pulse", "range")
@@ -111,8 +144,21 @@ class ImageMovers(Stage):
         self.slowest_m_s, self.u_a_half_m_s = slowest_m_s, u_a_half_m_s
 
     def forward(self, signal: Signal, known: Sequence[PointMotion] | None = None) -> SceneImage:
-        """known: motions of all targets, strongest first, by their middles; nothing is looked for
-        then. None to find targets.
+        """Image one frame.
+
+        A warning is given if the swath is too narrow for any target to be detected.
+
+        Args:
+            signal: Channels with the axes (channel, pulse, range), without trials.
+            known: Motions of all targets by their middles, strongest first, if known a priori; no
+                targets are then detected. None to detect targets.
+
+        Returns:
+            The images and the targets.
+
+        Raises:
+            ValueError: If the signal has trials, more motions are known than the detector allows,
+                or as in `StationaryImage.forward` and `chip_about`.
         """
         if signal.trials:
             raise ValueError(
@@ -120,72 +166,72 @@ class ImageMovers(Stage):
             )
         conventional = self.image(signal)
         axis = signal.axis("range")
-        if known is None and not self._whole(Detection(0.0, axis.start + axis.step * (axis.n // 2), 0.0), signal):
+        if known is None and not self._inside_frame(
+            Detection(0.0, axis.start + axis.step * (axis.n // 2), 0.0), signal
+        ):
             warnings.warn(
-                f"no target can be looked for in a swath of {axis.n} range lines: what it walks "
-                "through leaves it; give more lines, or a smaller extraction",
+                f"no target can be detected in a swath of {axis.n} range lines, since its range walk "
+                "exceeds the swath; give more lines, or a smaller extraction",
                 stacklevel=3,
             )
-        left, bodies = signal, []
+        remaining, bodies = signal, []
         if known is not None:
-            left, bodies = self._told(left, known)
+            remaining, bodies = self._extract_known(remaining, known)
         else:
-            for image in self._looks(signal):
-                left, bodies = self._taken_out(left, image, bodies)
-        rest = self.image(left)
+            for image in self._detection_images(signal):
+                remaining, bodies = self._extract_detected(remaining, image, bodies)
+        rest = self.image(remaining)
         fused = rest
         for body in bodies:
             if self._moves(body):
                 fused = placed(fused, body, self.extraction)
-        return SceneImage(conventional, rest, fused, bodies, self._estimate(bodies, signal.data), left)
+        return SceneImage(conventional, rest, fused, bodies, self._estimate(bodies, signal.data), remaining)
 
-    def _looks(self, signal: Signal):
-        """Ways to look at data, each until it finds nothing new: the conventional image, then
-        images with the sea suppressed.
-        """
+    def _detection_images(self, signal: Signal):
+        """Yield imaging functions: the conventional image, then images with suppressed sea."""
         yield self.image
         if self.detector.suppressed_m_s:
             yield lambda data: suppressed_image(data, self.radar, self.image, self.detector.suppressed_m_s)
 
-    def _taken_out(self, left: Signal, look, bodies: list[Body]) -> tuple[Signal, list[Body]]:
-        """Targets found and movers removed, strongest first, until a look shows nothing new."""
-        bodies, seen = list(bodies), [self._shown(body) for body in bodies]
-        waiting = self.detector.found(look(left))
-        while waiting and len(bodies) < self.detector.most:
-            place = waiting.pop(0)
-            if not self._whole(place, left) or any(self._same(place, other) for other in seen):
+    def _extract_detected(self, remaining: Signal, image_of, bodies: list[Body]) -> tuple[Signal, list[Body]]:
+        """Detect targets and remove those that move, strongest first, until none is new."""
+        bodies, visited = list(bodies), [self._apparent_position(body) for body in bodies]
+        candidates = self.detector.found(image_of(remaining))
+        while candidates and len(bodies) < self.detector.most:
+            candidate = candidates.pop(0)
+            if not self._inside_frame(candidate, remaining) or any(
+                self._same_target(candidate, other) for other in visited
+            ):
                 continue
-            seen.append(place)
-            body = self._body(left, place)
+            visited.append(candidate)
+            body = self._body(remaining, candidate)
             if not bool(body.ok) or any(self._side_lobe(body, other) for other in bodies):
                 continue
             bodies.append(body)
-            seen.append(self._shown(body))
+            visited.append(self._apparent_position(body))
             if self._moves(body):
-                left = self._without(left, body)
-                waiting = self.detector.found(look(left))
-        return left, bodies
+                remaining = self._removed(remaining, body)
+                candidates = self.detector.found(image_of(remaining))
+        return remaining, bodies
 
-    def _told(self, left: Signal, known: Sequence[PointMotion]) -> tuple[Signal, list[Body]]:
-        """Bodies of known motions, and the data without those that move."""
+    def _extract_known(self, remaining: Signal, known: Sequence[PointMotion]) -> tuple[Signal, list[Body]]:
+        """Form the bodies of known motions and remove those that move."""
         if len(known) > self.detector.most:
             raise ValueError(
-                f"{len(known)} motions are known, and the detector takes at most {self.detector.most} "
+                f"{len(known)} motions are known, but the detector allows at most {self.detector.most} "
                 "targets; raise its `most`"
             )
         bodies = []
         for motion in known:
-            lines, frame = self._lines(left, float(motion.range_m))
-            body = known_body(left.data[..., lines], frame, motion, self.extraction)
+            lines, frame = self._lines(remaining, float(motion.range_m))
+            body = known_body(remaining.data[..., lines], frame, motion, self.extraction)
             bodies.append(body)
             if self._moves(body):
-                left = self._without(left, body)
-        return left, bodies
+                remaining = self._removed(remaining, body)
+        return remaining, bodies
 
-    def _whole(self, detection: Detection, signal: Signal) -> bool:
-        """A target here would lie in the swath whatever its velocity, and be abeam during the
-        record.
-        """
+    def _inside_frame(self, detection: Detection, signal: Signal) -> bool:
+        """Test whether a target stays in the swath at any velocity and is abeam in the record."""
         axis, pulse = signal.axis("range"), signal.axis("pulse")
         abeam_s = detection.azimuth_m / self.radar.speed_m_s
         walk = self.extraction.range_m + self.radar.ambiguous_velocity_m_s / 2 * (
@@ -197,31 +243,36 @@ class ImageMovers(Stage):
             and pulse.start < abeam_s < pulse.stop
         )
 
-    def _same(self, a: Detection, b: Detection) -> bool:
+    def _same_target(self, a: Detection, b: Detection) -> bool:
+        """Test whether two detections belong to the same target."""
         return (
             abs(a.azimuth_m - b.azimuth_m) < self.detector.apart_m[0] / 2
             and abs(a.range_m - b.range_m) < self.detector.apart_m[1]
         )
 
     def _side_lobe(self, body: Body, other: Body) -> bool:
-        """What a body shows may be side lobes in range, beyond the lines that were removed, of
-        another at the same place along track and of nearly the same velocity.
+        """Test whether a body may be range side lobes of another one, outside the removed lines.
+
+        It then has the same azimuth and nearly the same velocity as the other one.
         """
         away_m = float((body.motion.range_m - other.motion.range_m).abs())
-        moves_alike = (
-            abs(float(body.motion.u_r_m_s - other.motion.u_r_m_s)) < _ALIKE_M_S
-            and abs(float(body.motion.u_a_m_s - other.motion.u_a_m_s)) < _ALIKE_M_S
+        same_velocity = (
+            abs(float(body.motion.u_r_m_s - other.motion.u_r_m_s)) < _SAME_VELOCITY_M_S
+            and abs(float(body.motion.u_a_m_s - other.motion.u_a_m_s)) < _SAME_VELOCITY_M_S
         )
-        beside = abs(self._shown(body).azimuth_m - self._shown(other).azimuth_m) < self.detector.apart_m[0] / 2
+        same_azimuth = (
+            abs(self._apparent_position(body).azimuth_m - self._apparent_position(other).azimuth_m)
+            < self.detector.apart_m[0] / 2
+        )
         cell_m = self.radar.wave_speed_m_s / self.radar.pulse.bandwidth_hz
         return (
-            moves_alike
-            and beside
+            same_velocity
+            and same_azimuth
             and float(body.level) < _SIDE_LOBES * float(other.level) * (cell_m / (math.pi * max(away_m, cell_m))) ** 2
         )
 
-    def _shown(self, body: Body) -> Detection:
-        """Where an image of everything at rest shows a body."""
+    def _apparent_position(self, body: Body) -> Detection:
+        """Return where an image of the stationary scene shows a body."""
         return Detection(
             self.radar.speed_m_s * float(body.motion.image_s),
             float(body.motion.closest_m),
@@ -229,20 +280,22 @@ class ImageMovers(Stage):
         )
 
     def _moves(self, body: Body) -> bool:
+        """Test whether a body exceeds the least speed of a moving target."""
         return bool(body.motion.u_r_m_s.abs() > self.slowest_m_s[0]) or bool(
             body.motion.u_a_m_s.abs() > self.slowest_m_s[1]
         )
 
     def _lines(self, signal: Signal, near_m: float) -> tuple[slice, Frame]:
-        """Lines about a range, enough of them to learn the sea from."""
+        """Return the lines around a range, with lines beside it for the covariance of the sea."""
         axis = signal.axis("range")
-        half = math.ceil(self.extraction.range_m / axis.step) + 34
+        half = math.ceil(self.extraction.range_m / axis.step) + _LINES_BESIDE
         at = round((near_m - axis.start) / axis.step)
         lines = slice(max(0, at - half), min(axis.n, at + half))
         frame = Frame.of(self.radar, signal)
         return lines, replace(frame, range_m=frame.range_m[lines])
 
     def _body(self, signal: Signal, detection: Detection) -> Body:
+        """Find the body of a detection."""
         lines, frame = self._lines(signal, detection.range_m)
         return find_body(
             signal.data[..., lines],
@@ -253,14 +306,15 @@ class ImageMovers(Stage):
             u_a_half_m_s=self.u_a_half_m_s,
         )
 
-    def _without(self, signal: Signal, body: Body) -> Signal:
+    def _removed(self, signal: Signal, body: Body) -> Signal:
+        """Return the data without the echo of a body."""
         lines, frame = self._lines(signal, float(body.motion.range_m))
         data = signal.data.clone()
         data[..., lines] -= body_echo(body, frame, everything=self.removal == "zero").to(data.dtype)
         return signal.with_data(data)
 
     def _estimate(self, bodies: list[Body], like: Tensor) -> Estimate:
-        """Padded to the detector's `most`."""
+        """Form the estimate of all targets, padded to the `most` of the detector."""
         most = self.detector.most
 
         def row(values: list[Tensor]) -> Tensor:
@@ -276,22 +330,122 @@ class ImageMovers(Stage):
         ok = row([body.ok.to(torch.float64) for body in bodies]) > 0
         level = row([body.level for body in bodies])
         return Estimate(
-            value, level / (100 + level), ok, {"u_r_m_s": row([body.u_r_std_m_s for body in bodies])}, {"level": level}
+            value,
+            level / (_HALF_QUALITY_LEVEL + level),
+            ok,
+            {"u_r_m_s": row([body.u_r_std_m_s for body in bodies])},
+            {"level": level},
         )
+
+
+class MoversImage(Stage):
+    """`ImageMovers` as a stage of a chain: the fused image and the targets of every trial.
+
+    Args:
+        radar: Instrument.
+        rebuild: Reconstruction method for the stationary scene.
+        removal: "subtract" or "zero", see `ImageMovers`.
+        extraction: Extent of a target in the data.
+        detector: Settings of the detection.
+        u_a_half_m_s: Half width of the search in u_a in m/s.
+    """
+
+    works_on = ("channel", "pulse", "range")
+    provides = ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
+
+    def __init__(
+        self,
+        radar: BistaticRadar,
+        rebuild: Rebuild,
+        removal: Removal,
+        extraction: Extraction,
+        detector: Detector,
+        u_a_half_m_s: float = 20.0,
+    ) -> None:
+        super().__init__()
+        self.flow = ImageMovers(radar, extraction, detector, rebuild, removal, u_a_half_m_s=u_a_half_m_s)
+
+    def forward(
+        self,
+        signal: Signal,
+        u_r_m_s: Tensor | None = None,
+        u_a_m_s: Tensor | None = None,
+        y0_m: Tensor | None = None,
+        range_m: Tensor | None = None,
+    ) -> tuple[Signal, Estimate]:
+        """Image every trial.
+
+        Args:
+            signal: Channels (..., channel, pulse, range), without the transmit range.
+            u_r_m_s, u_a_m_s, y0_m, range_m: Motions of all targets, (..., target) each, strongest
+                first, if known a priori: all four, or none.
+
+        Returns:
+            The fused images (..., azimuth, range), and the estimate with values of shape (...,
+            target), padded to the `most` of the detector. Its info holds `level`, 0 where there is
+            no target, and the images `rest` and `conventional`, see `SceneImage`.
+
+        Raises:
+            ValueError: If some of the four values are missing, or as in `ImageMovers`.
+        """
+        values = [u_r_m_s, u_a_m_s, y0_m, range_m]
+        known = [None if x is None else x.to(torch.float64).expand(*signal.trials, x.shape[-1]) for x in values]
+        if any(x is None for x in known) != all(x is None for x in known):
+            raise ValueError(
+                "targets are known by u_r_m_s, u_a_m_s, y0_m and range_m together; connect all four, or none"
+            )
+        frames = signal.data.reshape(-1, *signal.data.shape[-3:])
+        rows = [None if x is None else x.reshape(len(frames), -1) for x in known]
+        made = [
+            self.flow(Signal(frame, signal.axes), self._motions(frame, [None if x is None else x[i] for x in rows]))
+            for i, frame in enumerate(frames)
+        ]
+
+        def stacked(images: list[Signal]) -> Tensor:
+            return torch.stack([image.data for image in images]).unflatten(0, signal.trials or (1,))
+
+        parts = []
+        for one in made:
+            assert one.estimate is not None
+            info = {**one.estimate.info, "rest": one.rest.data, "conventional": one.conventional.data}
+            tables = (one.estimate.value, one.estimate.std, info)
+            value, std, info = ({name: x[None] for name, x in table.items()} for table in tables)
+            parts.append(Estimate(value, one.estimate.quality[None], one.estimate.ok[None], std, info))
+        fused = stacked([one.fused for one in made])
+        image = Signal(fused if signal.trials else fused[0], made[0].fused.axes)
+        return image, Estimate.joined(parts, signal.trials)
+
+    def _motions(self, frame: Tensor, values: list[Tensor | None]) -> list[PointMotion] | None:
+        """Motions of all targets of one frame, None where they are not known."""
+        numbers = [x for x in values if x is not None]
+        pairs = zip(*numbers, strict=True)
+        return [PointMotion.of(self.flow.radar, frame.real, *of_one) for of_one in pairs] if numbers else None
 
 
 def suppressed_image(
     signal: Signal, radar: BistaticRadar, image: StationaryImage, speeds_m_s: Sequence[float]
 ) -> Signal:
-    """Intensity root of images in which the sea is suppressed, the greatest over slant-range
-    speeds, each over its own median: what moves stands out.
+    """Image moving targets with suppressed sea, over several slant-range speeds.
 
-    The channels of every Doppler bin are weighted by the inverse covariance of all range lines,
-    then by the response of a point of that speed: the Doppler filter of the paper with the channels
-    taken along. Real amplitudes on the axes of `image`.
+    In every Doppler bin the channels are weighted by the inverse covariance of all range lines,
+    then by the response of a point of each speed: the Doppler filter of the paper extended to the
+    channels. Each intensity image is divided by its median, and the maximum over the speeds is
+    taken.
+
+    Args:
+        signal: Channels with the axes (channel, pulse, range), without trials.
+        radar: Instrument.
+        image: Stage of the conventional image.
+        speeds_m_s: Slant-range speeds in m/s, closing positive.
+
+    Returns:
+        Real amplitudes with the dtype of the signal on the axes of `image`.
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, section 4.3 (clutter suppression via Doppler filtering).
     """
     data = signal.data.movedim(-1, -3)
-    whitening = line_whitening(data, radar, samples=4 * data.shape[-3])
+    whitening = line_whitening(data, radar, samples=_BINS_AVERAGED * data.shape[-3])
     backed = whitening.expanded(data.shape[-3]).backed(data.to(torch.complex128)).movedim(-3, -1).to(signal.data.dtype)
     best, shown = None, None
     for speed in speeds_m_s:
@@ -306,13 +460,14 @@ def suppressed_image(
 
 
 def _matched(data: Tensor, radar: BistaticRadar, motion: PointMotion, bands: int) -> Tensor:
-    """Doppler spectrum of what channels (channel, pulse, range) hold of points of this speed, bins
-    about zero Doppler, (bands * pulse, range).
+    """Return the Doppler spectrum of points of one speed in channels (channel, pulse, range).
+
+    Bins lie about zero Doppler, shape (bands * pulse, range).
     """
     n = data.shape[-2]
     spectrum = torch.roll(fft_lines(torch.fft.ifftshift(data, dim=-2)), -first_bin(n, bands), -2)
-    # bins lie about zero, not about the point's Doppler: its response at Doppler f is that at
-    # offset f - f_dc
+    # bins lie about zero, not about the Doppler centre of the point: its response at Doppler f is
+    # that at offset f - f_dc
     turns = motion.u_r_m_s / radar.wavelength_m * radar.channels_at(data.device) / motion.effective_m_s
     shift = linear_phasor(-turns, 1, 1, data.dtype)
     response = (
@@ -326,15 +481,24 @@ def _matched(data: Tensor, radar: BistaticRadar, motion: PointMotion, bands: int
 
 
 def placed(image: Signal, body: Body, extraction: Extraction) -> Signal:
-    """The image (azimuth, range) with the picture of a body added in its place: along track at t =
-    0, at its closest ranges, scaled as points at rest are.
+    """Add the image of a body to an image (azimuth, range) at its position at t = 0.
+
+    The body is placed at its closest ranges and scaled as stationary points are.
+
+    Args:
+        image: Image (azimuth, range).
+        body: Body.
+        extraction: Extent of the body.
+
+    Returns:
+        The image with the body.
     """
     azimuth, range_ = image.axes
     chip, motion = body.chip, body.chip.motion
-    place = azimuth.values(image.data.device)
-    rows = ((place - motion.y0_m).abs() <= extraction.along_m).nonzero()[:, 0]
+    position = azimuth.values(image.data.device)
+    rows = ((position - motion.y0_m).abs() <= extraction.along_m).nonzero()[:, 0]
     columns = torch.round((chip.range_m - range_.start) / range_.step).long()
     scale = extraction.integration_s * motion.along_m_s / torch.sqrt(chip.radar.wavelength_m * motion.range_m)
     data = image.data.clone()
-    data[rows[:, None], columns] += (scale * body_image(body, place[rows], extraction)).to(data.dtype)
+    data[rows[:, None], columns] += (scale * body_image(body, position[rows], extraction)).to(data.dtype)
     return image.with_data(data)

@@ -1,10 +1,13 @@
-"""The conventional chain: one image of everything at rest, from all channels over the whole swath.
+"""Conventional imaging of the stationary scene from all channels over the whole swath.
 
-For a point at rest channel m is the reference channel delayed by dx_m / V_R, exactly and at every
-range frequency, so that the bands are rebuilt with u = 0 before any migration is corrected. What
-follows is ordinary focusing of an unaliased stripmap: a path that is travelled once is one that is
-travelled both ways where waves are twice as fast, so that omega-K serves as it is. Source: Remote
-Sens. 2020, 12, 1703, Figs. 6 and 7 (conventional method); brief 001, Algorithm 4.
+For a stationary point, channel m is the reference channel delayed by dx_m / V_R, exactly and at
+every range frequency. The bands can therefore be reconstructed with u = 0 before any migration is
+corrected. The rest is ordinary focusing of an unaliased stripmap: a path that is travelled once
+equals one that is travelled both ways by waves of twice the speed, so that the monostatic omega-K
+algorithm applies unchanged.
+
+Reference:
+    Remote Sens. 2020, 12, 1703, Figs. 6 and 7 (conventional processing) and section 4.3.
 """
 
 from __future__ import annotations
@@ -24,8 +27,15 @@ FORMS: dict[str, Callable[..., Tensor]] = {"bulk": omega_k, "stolt": omega_k_sto
 
 
 def two_way_radar(radar: BistaticRadar, bands: int, near_range_m: float) -> StripmapRadar:
-    """The stripmap radar with the phases of the receive path: waves twice as fast, pulse rate bands
-    * PRF, looking abeam.
+    """Return the monostatic stripmap radar whose phases equal those of the receive path.
+
+    Args:
+        radar: Instrument.
+        bands: Number of reconstructed bands; the PRF of the result is bands * PRF.
+        near_range_m: Range of the first sample in metres.
+
+    Returns:
+        A radar that looks abeam with waves of twice the speed.
     """
     return StripmapRadar(
         carrier_hz=radar.carrier_hz,
@@ -47,15 +57,29 @@ def stationary_image(
     form: str = "stolt",
     band_hz: float | None = None,
 ) -> Tensor:
-    """Image (..., azimuth, range) of what is at rest, azimuth x = V_R t and range the closest range
-    R0. data: (..., channel, pulse, range), transmit range removed.
+    """Image the stationary scene.
 
-    rebuild: `LeastSquares(2)` by default. form: "stolt", exact at every range, or "bulk", migration
-    of the middle of the swath for all (omega-K, brief 004). band_hz: processed Doppler band about
-    zero, None for all bands * PRF. A unit point that is lit for T seconds has a peak of T
-    sqrt(V_R^2 / (lambda R0)) and the phase -2 pi (R0 - R_ref) / lambda. The image is as long as the
-    record and wraps around along azimuth. Moving points appear displaced by V_R u_r R0 / V^2,
-    blurred, and repeated. Differentiable in the data.
+    The image is as long as the record and wraps around in azimuth. A unit point illuminated for T
+    seconds has a peak of T sqrt(V_R^2 / (lambda R0)) and the phase -2 pi (R0 - R_ref) / lambda.
+    Moving points appear displaced by V_R u_r R0 / V^2, defocused and with false targets.
+    Differentiable in the data.
+
+    Args:
+        data: Range-compressed channels without the transmit range, shape (..., channel, pulse,
+            range), complex.
+        radar: Instrument.
+        near_range_m: Range of the first sample in metres.
+        rebuild: Reconstruction method, `LeastSquares(2)` by default.
+        form: "stolt", exact at every range, or "bulk", with the migration of mid-swath for all
+            ranges.
+        band_hz: Processed Doppler bandwidth about zero in Hz, None for all bands * PRF.
+
+    Returns:
+        Image (..., azimuth, range), complex, with azimuth x = V_R t and range the closest range R0.
+
+    Raises:
+        ValueError: If `form` is unknown, the data do not have the channels of the radar, or there
+            are too few channels for the bands.
     """
     rebuild = LeastSquares() if rebuild is None else rebuild
     spectrum = reconstruct_lines(data, radar, PointMotion.of(radar, data.real), rebuild)
@@ -70,8 +94,21 @@ def focus_stationary(
     form: str = "stolt",
     band_hz: float | None = None,
 ) -> Tensor:
-    """The second half of `stationary_image`: Doppler spectra (..., bands * pulse, range), bins
-    about zero, to an image.
+    """Focus reconstructed Doppler spectra to an image, the second half of `stationary_image`.
+
+    Args:
+        spectrum: Spectra about zero Doppler, shape (..., bands * pulse, range), complex.
+        radar: Instrument.
+        near_range_m: Range of the first sample in metres.
+        bands: Number of bands.
+        form: "stolt" or "bulk", see `stationary_image`.
+        band_hz: Processed Doppler bandwidth about zero in Hz, None for all.
+
+    Returns:
+        Image (..., azimuth, range), complex.
+
+    Raises:
+        ValueError: If `form` is unknown.
     """
     if form not in FORMS:
         raise ValueError(f"form of a stationary image must be one of {sorted(FORMS)}, got {form!r}")
@@ -81,9 +118,19 @@ def focus_stationary(
 
 
 class StationaryImage(Stage):
-    """`stationary_image`: range-compressed channels in, an image (azimuth, range) in metres out.
+    """Conventional image of range-compressed channels, see `stationary_image`.
 
-    Refuses pulse rates at which the channels cannot tell bands apart.
+    The input has the axes (channel, pulse, range), the output the axes (azimuth, range) in metres.
+
+    Args:
+        radar: Instrument.
+        rebuild: Reconstruction method, `LeastSquares()` by default.
+        form: "stolt", exact at every range, or "bulk", with the migration of mid-swath for all
+            ranges.
+        band_hz: Processed Doppler bandwidth about zero in Hz, None for all bands * PRF.
+
+    Raises:
+        ValueError: If there are too few channels for the bands.
     """
 
     works_on = ("channel", "pulse", "range")
@@ -98,6 +145,12 @@ class StationaryImage(Stage):
             raise ValueError(why)
 
     def forward(self, signal: Signal) -> Signal:
+        """Image the stationary scene.
+
+        Raises:
+            ValueError: If slow time is not zero at pulse n // 2, the pulse rate makes the
+                reconstruction singular, or `form` is unknown.
+        """
         refuse_shifted(self.radar, signal.axis("pulse"))
         mind_condition(self.radar, PointMotion.of(self.radar, signal.data.real), self.rebuild, signal.data.dtype)
         return self.focused(
@@ -106,8 +159,11 @@ class StationaryImage(Stage):
         )
 
     def focused(self, spectrum: Tensor, signal: Signal) -> Signal:
-        """The image of a spectrum (..., doppler, range) that was rebuilt of `signal` in some way,
-        bins about zero Doppler.
+        """Focus a spectrum that was reconstructed from `signal` by any method.
+
+        Args:
+            spectrum: Spectrum about zero Doppler, shape (..., doppler, range), complex.
+            signal: Channels from which it was reconstructed, for the axes.
         """
         _, pulse, range_ = signal.axes
         image = focus_stationary(spectrum, self.radar, range_.start, self.rebuild.bands, self.form, self.band_hz)
@@ -115,8 +171,12 @@ class StationaryImage(Stage):
 
 
 def stationary_axis(radar: BistaticRadar, pulse: Axis, bands: int) -> Axis:
-    """x = V_R t (m) of the image, as many samples as pulses at bands * PRF, zero at sample
-    n // 2.
+    """Return the azimuth axis x = V_R t in metres of the image, zero at sample n // 2.
+
+    Args:
+        radar: Instrument.
+        pulse: Slow-time axis of the data.
+        bands: Number of bands; the image has bands * pulse samples.
     """
     n = bands * pulse.n
     step = radar.speed_m_s / (bands * radar.prf_hz)

@@ -1,7 +1,9 @@
-"""Taking the range of a far transmitter out of the phase of every pulse: by the ephemeris, exactly,
-or by the scaling phase of the paper.
+"""Removal of the transmit range from the phase of every pulse.
 
-Source: brief 001, Signal model; Remote Sens. 2020, 12, 1703, Eq. (31).
+Reference:
+    Remote Sens. 2020, 12, 1703, Eqs. (8)-(14), (31). The transmit range does not depend on the
+    channel, so that its removal by the ephemeris is exact; Eq. (31) leaves the linear term in the
+    channel response.
 """
 
 from __future__ import annotations
@@ -21,8 +23,16 @@ from torchsar.radar import BistaticRadar, polynomial_range
 def transmit_phasor(
     coefficients: Sequence[float | Tensor], time_s: Tensor, wavelength_m: float, dtype: torch.dtype
 ) -> Tensor:
-    """exp(+j 2 pi / lambda (k1 t + k2 t^2 + ...)) of `dtype`, shape of time_s (float64, s): what
-    the transmit range took from the phase.
+    """Return exp(+j 2 pi / lambda (k1 t + k2 t^2 + ...)), which removes the transmit range.
+
+    Args:
+        coefficients: k1, k2, ... in m/s, m/s^2, ...
+        time_s: Slow time in seconds, float64.
+        wavelength_m: Carrier wavelength in metres.
+        dtype: Complex dtype of the result.
+
+    Returns:
+        The phasor, complex, shape of `time_s`.
     """
     return unit_phasor(polynomial_range(coefficients, time_s) / wavelength_m, dtype)
 
@@ -30,19 +40,31 @@ def transmit_phasor(
 def remove_transmit_range(
     data: Tensor, time_s: Tensor, coefficients: Sequence[float | Tensor], wavelength_m: float, with_range: bool = True
 ) -> Tensor:
-    """Data times exp(+j 2 pi / lambda (R_T(t) - R_T(0))), R_T(t) - R_T(0) = k1 t + k2 t^2 + ...:
-    afterwards the receive path alone is in the phase.
+    """Remove the transmit range from the phase, so that the phase of the receive path remains.
 
-    data: (..., channel, pulse, range), or (..., channel, pulse) where not with_range; time_s:
-    (pulse,) float64; coefficients: numbers or (...,). The transmit range is common to all channels,
-    so that this is exact; the receive window follows it, so that envelopes stay. Differentiable in
-    data and coefficients. Raises ValueError for times of other pulses.
+    Data are multiplied by exp(+j 2 pi / lambda (R_T(t) - R_T(0))) with R_T(t) - R_T(0) = k1 t + k2
+    t^2 + .... This is exact, since the transmit range is common to all channels. Envelopes stay,
+    since the receive window follows the transmit range. Differentiable in data and coefficients.
+
+    Args:
+        data: Channels, shape (..., channel, pulse, range), or (..., channel, pulse) if `with_range`
+            is False, complex.
+        time_s: Slow time in seconds, float64 (pulse,).
+        coefficients: k1, k2, ... in m/s, m/s^2, ...: numbers or tensors (...,).
+        wavelength_m: Carrier wavelength in metres.
+        with_range: Whether the data have a range axis.
+
+    Returns:
+        Data of the same shape.
+
+    Raises:
+        ValueError: If there is not one time per pulse.
     """
     pulses = data.shape[-2] if with_range else data.shape[-1]
     if time_s.shape[-1:] != (pulses,):
         raise ValueError(
-            f"remove_transmit_range needs one time a pulse ({pulses}), got shape "
-            f"{tuple(time_s.shape)}; with_range={with_range} says which axis holds the pulses"
+            f"remove_transmit_range needs one time per pulse ({pulses}), got shape "
+            f"{tuple(time_s.shape)}; check with_range={with_range}, which chooses the pulse axis"
         )
     phasor = transmit_phasor([per_trial(k, 1, data) for k in coefficients], time_s, wavelength_m, data.dtype)
     return data * _over_range(phasor[..., None, :], with_range)
@@ -51,26 +73,42 @@ def remove_transmit_range(
 def scale_azimuth(
     data: Tensor, radar: BistaticRadar, time_s: Tensor, motion: PointMotion, order: int = 4, with_range: bool = True
 ) -> Tensor:
-    """Azimuth nonlinear chirp scaling, Eq.
+    """Apply azimuth nonlinear chirp scaling (ANLCS), Eq. (31).
 
-    (31): data of channel m times exp(j pi (q2 t'^2 + q3 t'^3 + q4 t'^4)), t' = t - dx_m / v_e, q_i
-    = 2 k_i / lambda.
+    Data of channel m are multiplied by exp(j pi (q2 t'^2 + q3 t'^3 + q4 t'^4)) with t' = t - dx_m /
+    v_e and q_i = 2 k_i / lambda. The term k1 t remains; it centres the Doppler at (u_r - k1) /
+    lambda and belongs to the channel response, Eq. (34): use `reconstruct(..., left_k1_m_s=k1)`.
+    The phase 2 k2 t dx_m / v_e is neglected, 0.006 rad at the ends of 4.5 s. Differentiable. Prefer
+    `remove_transmit_range`, which is exact.
 
-    data: as in `remove_transmit_range`; motion: of the points, (...,). order: highest coefficient
-    taken out. k1 t stays, centres the Doppler at (u_r - k1) / lambda, and belongs into the channel
-    response (34): `reconstruct(..., left_k1_m_s=k1)`. Neglects 2 k2 t dx_m / v_e, 0.006 rad at the
-    ends of 4.5 s. Differentiable.
+    Args:
+        data: Channels as in `remove_transmit_range`.
+        radar: Instrument.
+        time_s: Slow time in seconds, float64 (pulse,).
+        motion: Motion of the points, shape (...,).
+        order: Highest order of the transmit range that is removed.
+        with_range: Whether the data have a range axis.
+
+    Returns:
+        Data of the same shape.
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, Eq. (31).
     """
     delay = radar.channels_at(data.device) / motion.effective_m_s[..., None]
-    bends = (0.0, *radar.transmit_range[1:order])
+    higher_orders = (0.0, *radar.transmit_range[1:order])
     return data * _over_range(
-        transmit_phasor(bends, time_s - delay[..., None], radar.wavelength_m, data.dtype), with_range
+        transmit_phasor(higher_orders, time_s - delay[..., None], radar.wavelength_m, data.dtype), with_range
     )
 
 
 def neglected_transmit_phase_rad(radar: BistaticRadar, order: int, integration_s: float) -> float:
-    """Largest phase of the transmit range beyond this order over an integration time centred on t =
-    0 (rad).
+    """Bound the phase of the transmit range beyond a given order, in radians.
+
+    Args:
+        radar: Instrument.
+        order: Highest order that is removed.
+        integration_s: Integration time centred on t = 0 in seconds.
     """
     half = integration_s / 2
     return (
@@ -82,16 +120,23 @@ def neglected_transmit_phase_rad(radar: BistaticRadar, order: int, integration_s
 
 
 def _over_range(phasor: Tensor, with_range: bool) -> Tensor:
+    """Add a range dimension to a phasor where the data have one."""
     return phasor[..., None] if with_range else phasor
 
 
 class RemoveTransmitRange(Stage):
-    """`remove_transmit_range` by the radar's ephemeris coefficients.
+    """`remove_transmit_range` with the ephemeris coefficients of the radar.
 
-    order: how many of them, None for all.
+    A warning is given where the remaining orders exceed 0.3 rad at the ends of the data. Two orders
+    are enough for apertures below 20 s: in the geometry of the paper the third and higher orders
+    reach 2.7e-4 rad in 4.5 s.
 
-    Two are enough for apertures below 20 s (brief 001); warns where the rest exceeds 0.3 rad at the
-    ends of the data.
+    Args:
+        radar: Instrument.
+        order: Number of coefficients to use, None for all.
+
+    Raises:
+        ValueError: If `order` is negative.
     """
 
     works_on = ("channel", "pulse")
@@ -100,15 +145,16 @@ class RemoveTransmitRange(Stage):
     def __init__(self, radar: BistaticRadar, order: int | None = None) -> None:
         super().__init__()
         if order is not None and order < 0:
-            raise ValueError(f"order counts coefficients of the transmit range, 0 for none, got {order}")
+            raise ValueError(f"order must be a number of transmit-range coefficients, 0 for none, got {order}")
         self.radar, self.order = radar, len(radar.transmit_range) if order is None else order
 
     def forward(self, signal: Signal) -> Signal:
+        """Remove the transmit range from channels (channel, pulse[, range])."""
         pulse = signal.axis("pulse")
         left = neglected_transmit_phase_rad(self.radar, max(self.order, 1), pulse.n * pulse.step)
-        if left > 0.3:
+        if left > 0.3:  # rad, well below the pi / 4 at which a quadratic phase broadens the response
             warnings.warn(
-                f"the transmit range beyond order {self.order} turns the phase by {left:.2g} rad at "
+                f"the transmit range beyond order {self.order} contributes a phase of {left:.2g} rad at "
                 f"the ends of the data; raise the order to {len(self.radar.transmit_range)}",
                 stacklevel=3,
             )
@@ -125,9 +171,14 @@ class RemoveTransmitRange(Stage):
 
 
 class AzimuthScaling(Stage):
-    """`scale_azimuth`, the paper's own form, which leaves k1 to the reconstruction.
+    """`scale_azimuth` as a stage, the form of the paper; k1 is left to the reconstruction.
 
-    order: highest coefficient taken out, 2..4; velocities per trial.
+    Args:
+        radar: Instrument.
+        order: Highest order of the transmit range that is removed, 2 to 4.
+
+    Raises:
+        ValueError: If `order` lies outside 2 to 4.
     """
 
     works_on = ("channel", "pulse")
@@ -136,10 +187,18 @@ class AzimuthScaling(Stage):
     def __init__(self, radar: BistaticRadar, order: int = 4) -> None:
         super().__init__()
         if not 2 <= order <= 4:
-            raise ValueError(f"azimuth scaling takes out orders 2 to 4 of the transmit range (Eq. 31), got {order}")
+            raise ValueError(f"azimuth scaling removes orders 2 to 4 of the transmit range (Eq. 31), got order={order}")
         self.radar, self.order = radar, order
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0) -> Signal:
+        """Scale channels (channel, pulse[, range]) for a motion per trial.
+
+        Args:
+            signal: Channels.
+            u_r_m_s: Slant-range speed in m/s, closing positive, shape (...,) or a number.
+            u_a_m_s: Along-track speed in m/s, positive in the direction of the receiver, same
+                shape.
+        """
         motion = PointMotion.of(self.radar, signal.data, u_r_m_s, u_a_m_s)
         time = signal.axis("pulse").values(signal.data.device)
         return signal.with_data(

@@ -1,4 +1,4 @@
-"""Batched optimisers that the estimators share."""
+"""Optimisers that minimise one cost function per trial, for all trials at once."""
 
 from torchsar.optim.descent import Descent, adam, lbfgs
 from torchsar.optim.evolution import differential_evolution

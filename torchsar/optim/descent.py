@@ -1,5 +1,6 @@
-"""Minimising a smooth function of a vector per trial, all trials at once: each trial has its own
-search, its own history and its own end.
+"""Gradient descent of a smooth cost per trial: L-BFGS and Adam.
+
+All trials are evaluated together; each has its own line search, its own history and its own end.
 """
 
 from __future__ import annotations
@@ -11,23 +12,33 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-# (..., n) -> (...,), or with_gradient=True: -> ((...,), (..., n))
+from torchsar.optim.checks import check_cost, check_limits, check_start, check_tolerances, described, norm
+
+# maps points (..., n) to costs (...,), with with_gradient=True also to gradients (..., n)
 Objective = Callable[[Tensor], Any]
 
-_SUFFICIENT = 1e-4  # of the decrease that the slope promises (Armijo)
-_CURVATURE = 0.9  # of the slope at the start of the search (strong Wolfe)
-_EDGE = 0.1  # of a bracket: no trial point closer to its ends
+# sufficient decrease (Armijo) and curvature (strong Wolfe) constants of the line search, the values
+# that Nocedal and Wright 2006, section 3.1, give for quasi-Newton methods
+_SUFFICIENT, _CURVATURE = 1e-4, 0.9
+# chosen safeguard: a new point of the line search keeps this share of the bracket from its ends
+_EDGE = 0.1
 
 
 @dataclass(frozen=True)
 class Descent:
-    """What a descent found, per trial (...,).
+    """Result of a descent, per trial.
 
-    x: (..., n) best point. cost: (...,) there, in the dtype of the objective. gradient_norm: (...,)
-    Euclidean, there. steps: (...,) int64 steps taken. evaluations: (...,) int64 calls of the
-    objective in which the trial took part. converged: (...,) bool, a tolerance was met. ok: (...,)
-    bool, False where the start or the way was not finite: x is then the best finite point, or the
-    start; a start that was not finite keeps its cost and gradient as they came.
+    Args:
+        x: Best point, shape (..., n). Where `ok` is False it is the best finite point, or the
+            start.
+        cost: Cost at `x`, shape (...,), in the dtype of the objective. A start whose cost or
+            gradient is not finite keeps them as they were returned.
+        gradient_norm: Euclidean norm of the gradient at `x`, shape (...,).
+        steps: Steps taken, shape (...,), int64.
+        evaluations: Calls of the objective in which the trial took part, shape (...,), int64.
+        converged: True where a tolerance was met, shape (...,), bool.
+        ok: False where the start, or a point at which the search ended, had a cost or gradient that
+            was not finite, shape (...,), bool. `newton` adds conditions of its own.
     """
 
     x: Tensor
@@ -51,41 +62,55 @@ def lbfgs(
     search: int = 20,
     with_gradient: bool = False,
 ) -> Descent:
-    """Limited-memory BFGS with a strong Wolfe line search.
+    """Minimise a smooth cost per trial by limited-memory BFGS with a strong Wolfe line search.
 
-    start: (..., n) float32 or float64; objective: (..., n) -> (...,) costs, each of its own row
-    alone.
+    Every call of the objective evaluates all trials, each at the current point of its own search,
+    so that no result depends on the other trials. A finished trial is evaluated at its result, but
+    neither changes nor counts. Apart from `value_tolerance` the search is invariant to the scale
+    and the offset of the cost. The result is detached. Trials are leading dims; do not use inside
+    vmap.
 
-    Every call of the objective serves all trials, each at its own place of its own search: none
-    waits for another, and no result depends on the others. A finished trial is still evaluated (at
-    its result), but neither changes nor counts. Gradients come from autograd, also under no_grad,
-    or from the objective itself (with_gradient=True: it returns costs (...,) and gradients (...,
-    n)). Invariant to the scale and the offset of the cost, but for value_tolerance. The result is
-    detached. Trials are leading dims; it cannot be put inside vmap.
+    Args:
+        objective: Maps points (..., n) to real costs (...,), each cost from its own row alone.
+            Gradients come from autograd, also under no_grad.
+        start: First point, shape (..., n), float32 or float64.
+        steps: Largest number of steps of a trial.
+        history: Number of stored pairs of moves and gradient changes. Pairs without positive
+            curvature are dropped.
+        gradient_tolerance: A trial has converged when its gradient norm is at most this fraction of
+            that at the start.
+        value_tolerance: A trial has converged when a step lowers the cost by at most this fraction
+            of the cost. Values below four units of rounding are raised to them, except 0.
+        first_step: Length of the first trial step, in the units of x.
+        search: Largest number of evaluations of one line search. A search that finds no lower point
+            drops the history once and then ends the trial. A step to a cost or gradient that is not
+            finite counts as too long; `ok` is False for a trial whose search ends there.
+        with_gradient: The objective returns costs (...,) and gradients (..., n) itself.
 
-    steps: at most, per trial. history: pairs kept, those without positive curvature are dropped.
-    gradient_tolerance: a trial has converged when its gradient norm is at most this fraction of
-    that at the start. value_tolerance: or when a step lowers the cost by at most this fraction of
-    it (at least four units of rounding). first_step: length of the first trial step in the units of
-    x. search: evaluations of one line search at most; a search that finds nothing drops the history
-    once, then ends the trial. A step into non-finite cost or gradient counts as too long; a trial
-    whose search ends at such a wall is not ok.
+    Returns:
+        Best point per trial, with cost, counts, `converged` and `ok`.
 
-    Raises TypeError or ValueError for a start that is not real floating, an answer of the wrong
-    shape, or limits that make no sense. Nocedal and Wright 2006, Numerical Optimization, algorithms
-    7.4 (two loops), 3.5 and 3.6 (search), Eq. (3.59) (cubic).
+    Raises:
+        TypeError: If the start is not float32 or float64, or `with_gradient` is set and the
+            objective does not return a pair.
+        ValueError: If the objective returns another shape or costs without a gradient, or if a
+            limit is not positive or a tolerance negative.
+
+    Reference:
+        Nocedal and Wright 2006, Numerical Optimization, algorithms 7.4 (two-loop recursion), 3.5
+        and 3.6 (line search), Eq. (3.59) (cubic interpolation).
     """
-    _check_start(start)
-    _check_limits("lbfgs", steps=steps, history=history, search=search, first_step=first_step)
-    _check_tolerances("lbfgs", gradient_tolerance, value_tolerance)
+    check_start(start)
+    check_limits("lbfgs", steps=steps, history=history, search=search, first_step=first_step)
+    check_tolerances("lbfgs", gradient_tolerance, value_tolerance)
     rules = _Rules(steps, gradient_tolerance, value_tolerance, first_step, search)
     with torch.no_grad():
         scaled = _Scaled(objective, start, with_gradient)
         state = _opening(scaled, history, rules)
         while bool(state.active.any()):
             state = _advance(state, scaled, rules)
-    norm = _norm(state.gradient) * scaled.scale
-    return Descent(state.x, state.cost, norm, state.steps, state.evaluations, state.converged, state.ok)
+    gradient_norm = norm(state.gradient) * scaled.scale
+    return Descent(state.x, state.cost, gradient_norm, state.steps, state.evaluations, state.converged, state.ok)
 
 
 def adam(
@@ -100,21 +125,39 @@ def adam(
     patience: int = 50,
     with_gradient: bool = False,
 ) -> Descent:
-    """Adam at a constant rate, returning the best point visited.
+    """Minimise a cost per trial by Adam at a constant rate and return the best point visited.
 
-    start, objective, gradients, result and errors as in `lbfgs`; one evaluation a step.
+    Suits costs that are rough on the scale of a step, or noisy; on a smooth cost `lbfgs` reaches a
+    lower cost in fewer evaluations. One evaluation per step.
 
-    rate: length of the first step in each coordinate, in the units of x. betas: memory of the
-    gradient and of its square, per step. A trial has converged when its gradient norm is at most
-    gradient_tolerance of that at the start, or when its best cost fell by at most value_tolerance
-    of itself during `patience` steps, which must outlast an overshoot. A trial that steps onto a
-    non-finite cost or gradient ends there, not ok. For costs that are rough on the scale of a step,
-    or noisy; `lbfgs` goes further in fewer evaluations on a smooth one. Kingma and Ba 2015,
-    algorithm 1, with epsilon relative to the first gradient.
+    Args:
+        objective: As in `lbfgs`.
+        start: First point, shape (..., n), float32 or float64.
+        steps: Largest number of steps of a trial.
+        rate: Length of the first step in each coordinate, in the units of x.
+        betas: Decay per step of the averages of the gradient and of its square.
+        gradient_tolerance: A trial has converged when its gradient norm is at most this fraction of
+            that at the start.
+        value_tolerance: A trial has converged when its best cost fell by at most this fraction of
+            itself during `patience` steps.
+        patience: Number of steps without gain after which a trial has converged; longer than an
+            overshoot.
+        with_gradient: As in `lbfgs`.
+
+    Returns:
+        Best point per trial, with cost, counts, `converged` and `ok`. `ok` is False where the start
+        or a later point had a cost or gradient that was not finite; the trial ends there.
+
+    Raises:
+        TypeError: As in `lbfgs`.
+        ValueError: As in `lbfgs`, or if `betas` do not lie in 0 <= beta < 1.
+
+    Reference:
+        Kingma and Ba 2015, algorithm 1, with epsilon relative to the first gradient.
     """
-    _check_start(start)
-    _check_limits("adam", steps=steps, patience=patience, rate=rate)
-    _check_tolerances("adam", gradient_tolerance, value_tolerance)
+    check_start(start)
+    check_limits("adam", steps=steps, patience=patience, rate=rate)
+    check_tolerances("adam", gradient_tolerance, value_tolerance)
     if not all(0 <= beta < 1 for beta in betas):
         raise ValueError(f"adam: betas are {betas}; choose both in 0 <= beta < 1, for instance (0.9, 0.999)")
     with torch.no_grad():
@@ -131,6 +174,8 @@ def adam(
 
 
 class _Rules(NamedTuple):
+    """Limits and tolerances of `lbfgs`."""
+
     steps: int
     gradient_tolerance: float
     value_tolerance: float
@@ -139,8 +184,8 @@ class _Rules(NamedTuple):
 
 
 class _Scaled:
-    """The objective with gradients divided by the largest element of the first one, per trial: no
-    square of them leaves the range of the dtype.
+    """The objective with gradients scaled per trial by the largest element of the first gradient,
+    so that no square leaves the range of the dtype.
     """
 
     def __init__(self, objective: Objective, start: Tensor, with_gradient: bool) -> None:
@@ -151,18 +196,18 @@ class _Scaled:
         peak = gradient.abs().amax(-1)
         self.scale = torch.where(peak > 0, peak, self.scale)
         self.gradient = gradient / self.scale[..., None]
-        self.norm = _norm(self.gradient)
+        self.norm = norm(self.gradient)
 
     def __call__(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Cost (...,) as it came, scaled gradient (..., n), and whether both are finite (...,)."""
+        """The cost (...,), the scaled gradient (..., n) and whether both are finite (...,)."""
         cost, gradient = (_given if self._with_gradient else _derived)(self._objective, x)
         finite = torch.isfinite(cost) & torch.isfinite(gradient).all(-1)
         return cost, gradient / self.scale[..., None], finite
 
 
 class _Point(NamedTuple):
-    """A point of the search: step along the direction, rise of the cost since the search began and
-    slope, both over the descent there (slope -1 at step 0).
+    """A point of the line search: step along the direction, and rise of the cost and slope relative
+    to the slope at step 0, where the slope is -1.
     """
 
     step: Tensor
@@ -171,9 +216,8 @@ class _Point(NamedTuple):
 
 
 class _Search(NamedTuple):
-    """low: the lowest point with sufficient decrease, with its cost and gradient.
-
-    high: the other end of the bracket, at step inf until there is one.
+    """A line search: `low` is the lowest point with sufficient decrease, with its cost and
+    gradient; `high` is the other end of the bracket, at step inf until there is one.
     """
 
     low: _Point
@@ -185,9 +229,8 @@ class _Search(NamedTuple):
 
 
 class _Pairs(NamedTuple):
-    """The last moves and gradient changes (history, ..., n), newest last, and 1 / (move .
-
-    change), (history, ...), 0 where there is none.
+    """The last moves and gradient changes, (history, ..., n), newest last, and 1 / (move . change),
+    (history, ...), 0 where a slot is empty.
     """
 
     move: Tensor
@@ -196,6 +239,8 @@ class _Pairs(NamedTuple):
 
 
 class _State(NamedTuple):
+    """State of `lbfgs` between two evaluations, per trial."""
+
     x: Tensor
     cost: Tensor
     gradient: Tensor
@@ -211,10 +256,11 @@ class _State(NamedTuple):
 
 
 def _opening(scaled: _Scaled, history: int, rules: _Rules) -> _State:
+    """State at the start, with a line search per trial that has not been evaluated."""
     none = scaled.start.new_zeros(history, *scaled.start.shape)
     pairs = _Pairs(none, none, none[..., 0])
     converged = scaled.finite & (scaled.norm == 0)
-    direction, descent, search = _aim(scaled.cost, scaled.gradient, pairs, rules)
+    direction, descent, search = _new_search(scaled.cost, scaled.gradient, pairs, rules)
     steps = torch.zeros_like(converged, dtype=torch.int64)
     active = scaled.finite & ~converged
     return _State(
@@ -234,27 +280,27 @@ def _opening(scaled: _Scaled, history: int, rules: _Rules) -> _State:
 
 
 def _advance(state: _State, scaled: _Scaled, rules: _Rules) -> _State:
-    """One evaluation of every active trial; those whose search has ended move and aim anew."""
+    """Evaluate every active trial once; where a line search has ended, move and start a new one."""
     search, accepted = _probe(state, scaled)
     state = state._replace(search=search, evaluations=state.evaluations + state.active)
     ended = state.active & (accepted | (search.tries >= rules.search))
     if not bool(ended.any()):
         return state
-    wall = ended & ~accepted & torch.isinf(search.high.rise)
-    return _turn(_move(state, ended, wall, scaled, rules), ended, rules)
+    not_finite = ended & ~accepted & torch.isinf(search.high.rise)
+    return _restart(_move(state, ended, not_finite, scaled, rules), ended, rules)
 
 
 def _probe(state: _State, scaled: _Scaled) -> tuple[_Search, Tensor]:
-    """Evaluate the next point of each search; the search that knows it, and whether the point is
-    good enough.
+    """Evaluate the next point of each line search; return the searches and whether the point is
+    accepted.
     """
     search = state.search
     cost, gradient, finite = scaled(_where(state.active, _along(state, search.step), state.x))
     rise = _relative(cost - state.cost, state, scaled)
     slope = _dot(gradient, state.direction) / state.descent
     point = _Point(search.step, torch.where(finite, rise, torch.inf), slope)
-    # near the minimum the cost is rounded: a rise of some units in its last place is none, and the
-    # slope decides
+    # near the minimum a rise of the cost by a few units of rounding is ignored, and the slope
+    # decides
     rounding = _relative(4 * torch.finfo(cost.dtype).eps * state.cost.abs(), state, scaled)
     low, high, step, higher, accepted = _narrow(search.low, search.high, point, rounding)
     return _Search(
@@ -266,7 +312,7 @@ def _narrow(
     low: _Point, high: _Point, point: _Point, rounding: Tensor
 ) -> tuple[_Point, _Point, Tensor, Tensor, Tensor]:
     """One round of the strong Wolfe search: new ends, next step, whether the point is too high, and
-    whether it is good enough.
+    whether it is accepted.
     """
     higher = ~(point.rise <= torch.minimum(-_SUFFICIENT * point.step, low.rise) + rounding)
     accepted = ~higher & (point.slope.abs() <= _CURVATURE)
@@ -278,28 +324,32 @@ def _narrow(
 
 
 def _between(low: _Point, high: _Point) -> Tensor:
+    """Next step inside a bracket: the minimum of the cubic, kept away from the ends."""
     width = high.step - low.step
     part = (_cubic(low, high) - low.step) / width
     return low.step + width * torch.where(torch.isfinite(part), part, 0.5).clamp(_EDGE, 1 - _EDGE)
 
 
 def _beyond(low: _Point, point: _Point) -> Tensor:
+    """Next step where there is no bracket yet: 1.1 to 4 times farther, by the cubic where it has a
+    minimum.
+    """
     width = point.step - low.step
     part = (_cubic(low, point) - point.step) / width
     return point.step + width * torch.where(torch.isfinite(part) & (part > 0), part, 4.0).clamp(1.1, 4.0)
 
 
 def _cubic(a: _Point, b: _Point) -> Tensor:
-    """Minimiser of the cubic through two points and their slopes; NaN where it has none."""
+    """Minimum of the cubic through two points and their slopes; NaN where it has none."""
     width = b.step - a.step
     bend = a.slope + b.slope - 3 * (b.rise - a.rise) / width
     root = torch.sign(width) * torch.sqrt(bend.square() - a.slope * b.slope)
     return b.step - width * (b.slope + root - bend) / (b.slope - a.slope + 2 * root)
 
 
-def _move(state: _State, ended: Tensor, wall: Tensor, scaled: _Scaled, rules: _Rules) -> _State:
-    """Take the lowest point of each search that has ended, remember the pair, and see who has
-    finished.
+def _move(state: _State, ended: Tensor, not_finite: Tensor, scaled: _Scaled, rules: _Rules) -> _State:
+    """Move to the lowest point of each search that has ended, store the pair, and mark finished
+    trials.
     """
     search = state.search
     moved = ended & (search.low.step > 0)
@@ -308,15 +358,15 @@ def _move(state: _State, ended: Tensor, wall: Tensor, scaled: _Scaled, rules: _R
         _where(moved, search.cost, state.cost),
         _where(moved, search.gradient, state.gradient),
     )
-    # below a few units of rounding a search only chases noise
+    # a gain of a few units of rounding is noise
     tolerance = max(rules.value_tolerance, 4 * torch.finfo(cost.dtype).eps) if rules.value_tolerance else 0.0
     lowered = state.cost - cost <= tolerance * torch.maximum(cost.abs(), state.cost.abs())
-    converged = moved & ((lowered & ~wall) | (_norm(gradient) <= rules.gradient_tolerance * scaled.norm))
+    converged = moved & ((lowered & ~not_finite) | (norm(gradient) <= rules.gradient_tolerance * scaled.norm))
     steps = state.steps + moved
     stuck = ended & ~moved & (state.pairs.inverse == 0).all(0)
-    pairs = _remember(state.pairs, x - state.x, gradient - state.gradient, moved)
+    pairs = _append(state.pairs, x - state.x, gradient - state.gradient, moved)
     pairs = pairs._replace(inverse=torch.where(ended & ~moved, 0, pairs.inverse))
-    active = state.active & ~(converged | stuck | wall | (steps >= rules.steps))
+    active = state.active & ~(converged | stuck | not_finite | (steps >= rules.steps))
     return state._replace(
         x=x,
         cost=cost,
@@ -325,13 +375,13 @@ def _move(state: _State, ended: Tensor, wall: Tensor, scaled: _Scaled, rules: _R
         steps=steps,
         active=active,
         converged=state.converged | converged,
-        ok=state.ok & (~wall | converged),
+        ok=state.ok & (~not_finite | converged),
     )
 
 
-def _turn(state: _State, ended: Tensor, rules: _Rules) -> _State:
-    """Begin a new search where one has ended."""
-    direction, descent, search = _aim(state.cost, state.gradient, state.pairs, rules)
+def _restart(state: _State, ended: Tensor, rules: _Rules) -> _State:
+    """Start a new line search where one has ended."""
+    direction, descent, search = _new_search(state.cost, state.gradient, state.pairs, rules)
     return state._replace(
         direction=_where(ended, direction, state.direction),
         descent=_where(ended, descent, state.descent),
@@ -339,17 +389,17 @@ def _turn(state: _State, ended: Tensor, rules: _Rules) -> _State:
     )
 
 
-def _aim(cost: Tensor, gradient: Tensor, pairs: _Pairs, rules: _Rules) -> tuple[Tensor, Tensor, _Search]:
-    """The quasi-Newton direction (steepest descent without pairs), the descent along it per unit
-    step, and a search that has not begun.
+def _new_search(cost: Tensor, gradient: Tensor, pairs: _Pairs, rules: _Rules) -> tuple[Tensor, Tensor, _Search]:
+    """The quasi-Newton direction (steepest descent without pairs), the decrease along it per unit
+    step, and a line search at step 0.
     """
     newton = _two_loops(gradient, pairs)
-    promised = -_dot(gradient, newton)
-    usable = (pairs.inverse[-1] > 0) & torch.isfinite(promised) & (promised > 0)
+    decrease = -_dot(gradient, newton)
+    usable = (pairs.inverse[-1] > 0) & torch.isfinite(decrease) & (decrease > 0)
     direction = _where(usable, newton, -gradient)
-    norm = _norm(gradient)
-    step = torch.where(usable, 1.0, rules.first_step / torch.where(norm > 0, norm, 1))
-    descent = torch.where(usable, promised, norm.square())
+    size = norm(gradient)
+    step = torch.where(usable, 1.0, rules.first_step / torch.where(size > 0, size, 1))
+    descent = torch.where(usable, decrease, size.square())
     zero = torch.zeros_like(step)
     low = _Point(zero, zero, zero - 1)
     return (
@@ -362,7 +412,7 @@ def _aim(cost: Tensor, gradient: Tensor, pairs: _Pairs, rules: _Rules) -> tuple[
 
 
 def _two_loops(gradient: Tensor, pairs: _Pairs) -> Tensor:
-    """-H gradient; a slot whose inverse is 0 changes nothing."""
+    """-H gradient by the two-loop recursion; a slot whose inverse is 0 changes nothing."""
     q, weights = -gradient, []
     for move, change, inverse in reversed(list(zip(*pairs, strict=True))):
         weights.append((inverse * _dot(move, q))[..., None])
@@ -374,10 +424,10 @@ def _two_loops(gradient: Tensor, pairs: _Pairs) -> Tensor:
     return q
 
 
-def _remember(pairs: _Pairs, move: Tensor, change: Tensor, moved: Tensor) -> _Pairs:
-    """Pairs with the newest one, where it has positive curvature beyond rounding."""
+def _append(pairs: _Pairs, move: Tensor, change: Tensor, moved: Tensor) -> _Pairs:
+    """Pairs with the newest one appended where its curvature is positive beyond rounding."""
     curvature = _dot(move, change)
-    keep = moved & (curvature > torch.finfo(move.dtype).eps * _norm(move) * _norm(change))
+    keep = moved & (curvature > torch.finfo(move.dtype).eps * norm(move) * norm(change))
     newest = _Pairs(move, change, 1 / torch.where(keep, curvature, 1))
     move, change, inverse = (torch.cat((old[1:], new[None])) for old, new in zip(pairs, newest, strict=True))
     return _Pairs(
@@ -388,14 +438,18 @@ def _remember(pairs: _Pairs, move: Tensor, change: Tensor, moved: Tensor) -> _Pa
 
 
 def _along(state: _State, step: Tensor) -> Tensor:
+    """Point at a step along the direction of the search."""
     return state.x + step[..., None] * state.direction
 
 
 def _relative(difference: Tensor, state: _State, scaled: _Scaled) -> Tensor:
+    """A difference of costs relative to the slope at the start of the search."""
     return (difference / scaled.scale).to(state.x.dtype) / state.descent
 
 
 class _Walk(NamedTuple):
+    """State of `adam` between two steps, per trial."""
+
     x: Tensor
     gradient: Tensor
     mean: Tensor
@@ -412,6 +466,7 @@ class _Walk(NamedTuple):
 
 
 def _first_walk(scaled: _Scaled, gradient_tolerance: float) -> _Walk:
+    """State of `adam` at the start."""
     none, count = torch.zeros_like(scaled.start), torch.zeros_like(scaled.finite, dtype=torch.int64)
     converged = scaled.finite & (scaled.norm == 0)
     active = scaled.finite & ~converged
@@ -448,7 +503,7 @@ def _walk(walk: _Walk, scaled: _Scaled, count: int, rate: float, betas: tuple[fl
         square=square,
         best=_where(better, x, walk.best),
         best_cost=_where(better, cost, walk.best_cost),
-        best_norm=_where(better, _norm(gradient), walk.best_norm),
+        best_norm=_where(better, norm(gradient), walk.best_norm),
         steps=walk.steps + active,
         active=active & finite,
         ok=walk.ok & (finite | ~active),
@@ -456,8 +511,8 @@ def _walk(walk: _Walk, scaled: _Scaled, count: int, rate: float, betas: tuple[fl
 
 
 def _ended(walk: _Walk, scaled: _Scaled, gradient_tolerance: float, value_tolerance: float, patience: int) -> _Walk:
-    """Who has converged: a small gradient at the best point, or no gain worth the name for
-    `patience` steps.
+    """Mark trials as converged: small gradient at the best point, or no gain during `patience`
+    steps.
     """
     gain = walk.mark - walk.best_cost > value_tolerance * torch.maximum(walk.mark.abs(), walk.best_cost.abs())
     waited = torch.where(gain, 0, walk.waited + 1)
@@ -471,10 +526,11 @@ def _ended(walk: _Walk, scaled: _Scaled, gradient_tolerance: float, value_tolera
 
 
 def _derived(objective: Objective, x: Tensor) -> tuple[Tensor, Tensor]:
+    """Cost and gradient by automatic differentiation."""
     with torch.enable_grad():
         x = x.detach().requires_grad_()
         cost = objective(x)
-        _check_cost(cost, x)
+        check_cost(cost, x)
         (gradient,) = torch.autograd.grad(cost.sum(), x, allow_unused=True) if cost.requires_grad else (None,)
         if gradient is None:
             raise ValueError(
@@ -485,6 +541,7 @@ def _derived(objective: Objective, x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _given(objective: Objective, x: Tensor) -> tuple[Tensor, Tensor]:
+    """Cost and gradient that the objective returns itself."""
     answer = objective(x)
     if not (isinstance(answer, tuple) and len(answer) == 2):
         raise TypeError(
@@ -492,65 +549,22 @@ def _given(objective: Objective, x: Tensor) -> tuple[Tensor, Tensor]:
             f"returned {type(answer).__name__}; return the pair or leave with_gradient out"
         )
     cost, gradient = answer
-    _check_cost(cost, x)
+    check_cost(cost, x)
     if not isinstance(gradient, Tensor) or gradient.shape != x.shape:
         raise ValueError(
-            f"the objective returned {_what(gradient)} as gradient at x of shape "
+            f"the objective returned {described(gradient)} as gradient at x of shape "
             f"{tuple(x.shape)}; return the same shape as x"
         )
     return cost.detach(), gradient.detach().to(x.dtype)
 
 
-def _check_start(start: Tensor) -> None:
-    if start.dtype not in (torch.float32, torch.float64):
-        raise TypeError(
-            f"start is {start.dtype}; a descent needs float32 or float64, give complex unknowns "
-            "as their real and imaginary parts"
-        )
-    if start.ndim == 0 or start.shape[-1] == 0:
-        raise ValueError(
-            f"start has shape {tuple(start.shape)}; give the unknowns in its last dim, (..., n) with n of at least 1"
-        )
-
-
-def _check_limits(method: str, **limits: float) -> None:
-    for name, value in limits.items():
-        if not value > 0:
-            raise ValueError(f"{method}: {name} is {value}; choose a positive number")
-
-
-def _check_tolerances(method: str, gradient_tolerance: float, value_tolerance: float) -> None:
-    if not (gradient_tolerance >= 0 and value_tolerance >= 0):
-        raise ValueError(
-            f"{method}: gradient_tolerance is {gradient_tolerance} and value_tolerance "
-            f"{value_tolerance}; choose relative tolerances of at least 0, such as 1e-6"
-        )
-
-
-def _check_cost(cost: Any, x: Tensor) -> None:
-    if not isinstance(cost, Tensor) or cost.shape != x.shape[:-1] or not cost.is_floating_point():
-        raise ValueError(
-            f"the objective returned {_what(cost)} for x of shape {tuple(x.shape)}; return one "
-            f"real cost per trial, shape {tuple(x.shape[:-1])}"
-        )
-
-
-def _what(value: Any) -> str:
-    return f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
-
-
 def _where(mask: Tensor, yes: Any, no: Any) -> Any:
-    """torch.where, in every tensor of named tuples; mask: (...,), also over tensors with a dim of
-    unknowns (..., n).
-    """
+    """torch.where in every tensor of named tuples; mask (...,) also applies to tensors (..., n)."""
     if isinstance(yes, Tensor):
         return torch.where(mask[..., None] if yes.ndim > mask.ndim else mask, yes, no)
     return type(yes)(*(_where(mask, a, b) for a, b in zip(yes, no, strict=True)))
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """Inner product over the unknowns."""
     return (a * b).sum(-1)
-
-
-def _norm(x: Tensor) -> Tensor:
-    return torch.linalg.vector_norm(x, dim=-1)

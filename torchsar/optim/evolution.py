@@ -1,4 +1,4 @@
-"""Differential evolution, many trials at once."""
+"""Differential evolution for many trials at once."""
 
 from __future__ import annotations
 
@@ -26,16 +26,37 @@ def differential_evolution(
     weight: float = 0.7,
     crossover: float = 0.9,
 ) -> Searched:
-    """Least cost inside a box by differences of candidates.
+    """Search a box for the least cost by differential evolution.
 
-    objective, low, high, draws, history and errors as in `genetic`.
+    In each generation every candidate competes with base + weight * (one - other), where base, one
+    and other are three further candidates; each unknown is taken from this challenger with the
+    probability `crossover`, and at least one is. The better of the two is kept. Challengers outside
+    the box are moved onto its edge. A trial takes population * (generations + 1) evaluations, 888
+    by default.
 
-    Every candidate is challenged, generation by generation, by base + weight * (one - other), where
-    base, one and other are three further candidates ("rand1bin"; for "best1bin" the base is the
-    best), of which each unknown is taken with the chance `crossover` and one at least; the better
-    of the two stays. Challengers outside the box are moved onto its edge. A trial costs population
-    * (generations + 1) evaluations (888 by default). population: 4 at least. Storn and Price 1997,
-    DE/rand/1/bin and DE/best/1/bin.
+    Args:
+        objective: Maps candidates (..., population, n) to costs (..., population) for all trials;
+            NaN counts as +inf.
+        low: Least values of the unknowns, shape (..., n).
+        high: Greatest values of the unknowns, shape (..., n).
+        population: Number of candidates, at least 4.
+        generations: Number of generations.
+        draws: Random numbers; with as many trials as the box, or without trials for the same
+            numbers in every trial. Results do not depend on how trials are batched.
+        strategy: "rand1bin" draws the base at random, "best1bin" takes the best candidate.
+        weight: Factor on the difference, above 0 and at most 2.
+        crossover: Probability that an unknown comes from the challenger.
+
+    Returns:
+        Best point per trial. `history` is the least cost of each generation, shape (...,
+        generations + 1).
+
+    Raises:
+        TypeError: If a bound is not a real floating tensor.
+        ValueError: If the box, a setting or the shape of the costs is not valid.
+
+    Reference:
+        Storn and Price 1997, DE/rand/1/bin and DE/best/1/bin.
     """
     box = Box.of(low, high, "differential_evolution")
     _check(population, generations, strategy, weight, crossover)
@@ -56,6 +77,8 @@ def differential_evolution(
 
 @dataclass(frozen=True)
 class _Rule:
+    """Settings and random numbers of differential evolution."""
+
     dice: Dice
     population: int
     strategy: Strategy
@@ -63,10 +86,12 @@ class _Rule:
     crossover: float
 
     def first(self) -> Tensor:
+        """First population, uniform in the box."""
         box = self.dice.box
         return box.at(self.dice.uniform("evolution first", (self.population, box.low.shape[-1])))
 
     def challengers(self, generation: int, x: Tensor, cost: Tensor) -> Tensor:
+        """Challengers of all candidates in one generation."""
         at, n = f"evolution {generation}", x.shape[-1]
         base, one, other = (pick(x, index) for index in self._partners(f"{at} partners"))
         if self.strategy == "best1bin":
@@ -77,9 +102,7 @@ class _Rule:
         return torch.where((chance[..., :n] < self.crossover) | forced, mutant, x)
 
     def _partners(self, purpose: str) -> tuple[Tensor, Tensor, Tensor]:
-        """Three candidates (..., population) for each, all different from it and from each
-        other.
-        """
+        """Three candidates (..., population) for each, different from it and from each other."""
         order = self.dice.uniform(purpose, (self.population, self.population)).clone()
         order.diagonal(dim1=-2, dim2=-1).fill_(torch.inf)
         first = order.argsort(-1)[..., :3]
@@ -87,11 +110,12 @@ class _Rule:
 
 
 def _check(population: int, generations: int, strategy: str, weight: float, crossover: float) -> None:
+    """Raise ValueError for invalid settings."""
     check_counts("differential_evolution", {"population": (population, 4), "generations": (generations, 0)})
     if strategy not in ("rand1bin", "best1bin"):
         raise ValueError(f"differential_evolution: strategy {strategy!r} is not known; choose 'rand1bin' or 'best1bin'")
     if not (0 < weight <= 2 and 0 <= crossover <= 1):
         raise ValueError(
-            f"differential_evolution: weight {weight} must be above 0 and at most 2, crossover "
-            f"{crossover} a chance in 0..1"
+            f"differential_evolution: weight is {weight} and crossover {crossover}; choose a weight above 0 and at "
+            "most 2, and a probability of crossover in 0..1"
         )

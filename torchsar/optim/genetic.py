@@ -1,5 +1,7 @@
-"""A genetic algorithm on real numbers, many trials at once: the published search of brief 003
-(Remote Sens. 2025, 17, 3447, section 3.3).
+"""Genetic algorithm on real numbers for many trials at once.
+
+Reference:
+    Remote Sens. 2025, 17, 3447, section 3.3.
 """
 
 from __future__ import annotations
@@ -33,25 +35,45 @@ def genetic(
     spread: float = 0.1,
     cooling: float = 0.9,
 ) -> Searched:
-    """Least cost inside a box by selection, blend crossover, Gaussian mutation and elitism.
+    """Search a box for the least cost by selection, blend crossover, Gaussian mutation and elitism.
 
-    objective: (..., population, n) candidates -> (..., population) costs, of all trials at once;
-    NaN counts as +inf. low, high: (..., n) per trial. The first population is uniform in the box;
-    then `generations` times the `elites` best live on and population - elites children are made and
-    evaluated, so a trial costs population + generations * (population - elites) evaluations (870 by
-    default). history: (..., generations + 1) least cost so far.
+    The first population is uniform in the box. In each generation the `elites` best candidates
+    survive and population - elites children are made and evaluated; children outside the box are
+    moved onto its edge. A trial takes population + generations * (population - elites) evaluations,
+    870 by default.
 
-    selection: "tournament" takes the best of `entrants` candidates drawn with replacement;
-    "roulette" draws with a chance proportional to how far a candidate is below the worst finite
-    cost. crossover: chance that a child is a blend, each unknown at a uniform place of the line
-    through both parents, `blend` of their distance beyond either; otherwise it copies the first
-    parent. mutation: chance per unknown of a Gaussian step of `spread` times the side of the box,
-    which shrinks by `cooling` every generation. Children outside the box are moved onto its edge.
+    Args:
+        objective: Maps candidates (..., population, n) to costs (..., population) for all trials;
+            NaN counts as +inf.
+        low: Least values of the unknowns, shape (..., n).
+        high: Greatest values of the unknowns, shape (..., n).
+        population: Number of candidates.
+        generations: Number of generations.
+        draws: Random numbers; with as many trials as the box, or without trials for the same
+            numbers in every trial. Results do not depend on how trials are batched.
+        elites: Number of best candidates that survive a generation.
+        selection: "tournament" takes the best of `entrants` candidates drawn with replacement;
+            "roulette" draws with a probability proportional to how far the cost of a candidate lies
+            below the worst finite cost.
+        entrants: Number of candidates of a tournament.
+        crossover: Probability that a child is a blend of both parents; otherwise it copies the
+            first.
+        blend: A blend is uniform on the line through both parents, extended by this fraction of
+            their distance beyond either.
+        mutation: Probability per unknown of a Gaussian step.
+        spread: Standard deviation of that step, relative to the side of the box.
+        cooling: Factor on `spread` per generation.
 
-    draws: with trials, as many as the box has, or without: then all trials see the same numbers.
-    Results depend on them alone, not on how trials are batched. The paper gives neither rates nor
-    operators; these are ours (Goldberg 1989; Eshelman and Schaffer 1993, BLX-alpha). Raises
-    TypeError or ValueError for a box, an answer of the objective or settings that make no sense.
+    Returns:
+        Best point per trial. `history` is the least cost so far, shape (..., generations + 1).
+
+    Raises:
+        TypeError: If a bound is not a real floating tensor.
+        ValueError: If the box, a setting or the shape of the costs is not valid.
+
+    Reference:
+        Remote Sens. 2025, 17, 3447, section 3.3, which gives neither rates nor operators; those
+        here follow Goldberg 1989, and Eshelman and Schaffer 1993 (BLX-alpha).
     """
     box = Box.of(low, high, "genetic")
     _check(population, generations, elites, selection, entrants, crossover, blend, mutation, spread, cooling)
@@ -83,6 +105,8 @@ def genetic(
 
 @dataclass(frozen=True)
 class _Breed:
+    """Settings and random numbers of the genetic algorithm."""
+
     dice: Dice
     population: int
     brood: int
@@ -95,23 +119,24 @@ class _Breed:
     cooling: float
 
     def first(self) -> Tensor:
+        """First population, uniform in the box."""
         box = self.dice.box
         return box.at(self.dice.uniform("genetic first", (self.population, box.low.shape[-1])))
 
     def children(self, generation: int, x: Tensor, cost: Tensor) -> Tensor:
-        """The next brood (..., brood, n) of ranked candidates x (..., population, n)."""
+        """Children (..., brood, n) of the ranked candidates x (..., population, n)."""
         at = f"genetic {generation}"
         box, n = self.dice.box, x.shape[-1]
         one, other = (pick(x, self._parents(f"{at} parent {i}", cost)) for i in range(2))
-        place = self.dice.uniform(f"{at} blend", (self.brood, n)) * (1 + 2 * self.blend) - self.blend
+        share = self.dice.uniform(f"{at} blend", (self.brood, n)) * (1 + 2 * self.blend) - self.blend
         chance = self.dice.uniform(f"{at} chance", (self.brood, n + 1))
-        child = torch.where(chance[..., :1] < self.crossover, one + place * (other - one), one)
+        child = torch.where(chance[..., :1] < self.crossover, one + share * (other - one), one)
         step = self.dice.normal(f"{at} mutation", (self.brood, n)) * (box.high - box.low)[..., None, :]
         child = child + torch.where(chance[..., 1:] < self.mutation, step * (self.spread * self.cooling**generation), 0)
         return box.kept(child)
 
     def _parents(self, purpose: str, cost: Tensor) -> Tensor:
-        """Numbers (..., brood) of the parents chosen among candidates ranked by cost."""
+        """Indices (..., brood) of the parents among candidates ranked by cost."""
         if self.selection == "tournament":
             drawn = self.dice.uniform(purpose, (self.brood, self.entrants))
             return (drawn.amin(-1) * self.population).to(torch.int64).clamp_max(self.population - 1)
@@ -119,8 +144,8 @@ class _Breed:
 
 
 def _spun(cost: Tensor, drawn: Tensor) -> Tensor:
-    """Roulette: numbers of candidates with chances proportional to the worst finite cost less their
-    own; all alike where none differ.
+    """Roulette: indices with probabilities proportional to the worst finite cost minus the own
+    cost; equal probabilities where no costs differ.
     """
     worst = torch.where(torch.isfinite(cost), cost, -torch.inf).amax(-1, keepdim=True)
     share = torch.where(torch.isfinite(cost), worst - cost, 0)
@@ -143,6 +168,7 @@ def _check(
     spread: float,
     cooling: float,
 ) -> None:
+    """Raise ValueError for invalid settings."""
     check_counts(
         "genetic",
         {
@@ -160,6 +186,6 @@ def _check(
         raise ValueError(f"genetic: selection {selection!r} is not known; choose 'tournament' or 'roulette'")
     if not (0 <= crossover <= 1 and 0 <= mutation <= 1 and 0 < cooling <= 1):
         raise ValueError(
-            f"genetic: crossover {crossover} and mutation {mutation} are chances in 0..1, cooling "
-            f"{cooling} a factor above 0 and at most 1"
+            f"genetic: crossover is {crossover}, mutation {mutation} and cooling {cooling}; choose probabilities "
+            "in 0..1 for the first two and a factor above 0 and at most 1 for cooling"
         )

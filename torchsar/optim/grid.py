@@ -1,4 +1,4 @@
-"""The full grid: every combination of given values, in blocks, the best per trial."""
+"""Search over the full grid: every combination of given values, the best per trial."""
 
 from __future__ import annotations
 
@@ -19,15 +19,23 @@ def grid_search(
     limit: int = 100_000,
     block: int = 1024,
 ) -> Searched:
-    """Least cost over all combinations of values.
+    """Evaluate the cost at all combinations of given values and return the best per trial.
 
-    objective as in `genetic`: (*trials, candidate, n) -> (*trials, candidate).
+    Args:
+        objective: Maps candidates (*trials, candidate, n) to costs (*trials, candidate); NaN counts
+            as +inf.
+        axes: Values of each unknown, real floating, shape (m_i,) for all trials or (*trials, m_i).
+        trials: Shape of the trials, needed where no axis has it.
+        limit: Largest number of grid points accepted.
+        block: Candidates per call of the objective.
 
-    axes: one tensor per unknown, real floating, (m_i,) for all trials or (*trials, m_i). trials:
-    shape of the trials where no axis has it. The last unknown runs fastest; of equal costs the
-    first counts. history: (*trials, m_1, m_2, ...) all costs. block: candidates per call. Raises
-    ValueError for a grid of more than `limit` points, TypeError or ValueError for axes that are no
-    finite real vectors.
+    Returns:
+        Best point per trial; of equal costs the first counts, with the last unknown varying
+        fastest. `history` holds all costs, shape (*trials, m_1, m_2, ...).
+
+    Raises:
+        TypeError: If an axis is not a real floating tensor.
+        ValueError: If the grid has more than `limit` points, or an axis is empty or not finite.
     """
     axes = _checked(axes)
     shape = torch.broadcast_shapes(tuple(trials), *(axis.shape[:-1] for axis in axes))
@@ -36,8 +44,7 @@ def grid_search(
     if total > limit:
         raise ValueError(
             f"grid_search: {' x '.join(map(str, sizes))} values are {total} evaluations per "
-            f"trial, above the limit of {limit}; use fewer values, or raise the limit if the time "
-            "is there"
+            f"trial, above the limit of {limit}; use fewer values, or raise the limit"
         )
     check_counts("grid_search", {"block": (block, 1)})
     axes = [axis.expand(*shape, axis.shape[-1]) for axis in axes]
@@ -52,7 +59,9 @@ def grid_search(
 
 
 def _points(axes: list[Tensor], sizes: list[int], number: Tensor) -> Tensor:
-    """Grid points (*trials, candidate, n) of the numbers (*trials, candidate), or (candidate,)."""
+    """Grid points (*trials, candidate, n) by their numbers, (*trials, candidate) or
+    (candidate,).
+    """
     columns = []
     for axis, size in zip(reversed(axes), reversed(sizes), strict=True):
         columns.append(axis.gather(-1, torch.remainder(number, size).expand(*axis.shape[:-1], number.shape[-1])))
@@ -61,13 +70,15 @@ def _points(axes: list[Tensor], sizes: list[int], number: Tensor) -> Tensor:
 
 
 def _parts(total: int, block: int, like: Tensor) -> Iterator[Tensor]:
+    """Numbers of the grid points in blocks."""
     for first in range(0, total, block):
         yield torch.arange(first, min(first + block, total), device=like.device)
 
 
 def _checked(axes: Sequence[Tensor]) -> list[Tensor]:
+    """Detached axes; raises where one is not a finite real vector."""
     if not len(axes):
-        raise ValueError("grid_search: give the values of one unknown at least")
+        raise ValueError("grid_search: got no axes; give the values of at least one unknown")
     for i, axis in enumerate(axes):
         if not isinstance(axis, Tensor) or not axis.is_floating_point():
             raise TypeError(

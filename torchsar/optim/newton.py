@@ -1,6 +1,4 @@
-"""Newton's method with exact second derivatives, per trial: damped, which descends, and plain,
-which does not have to.
-"""
+"""Newton's method with exact second derivatives per trial, damped or plain."""
 
 from __future__ import annotations
 
@@ -9,18 +7,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchsar.optim.descent import (
-    Descent,
-    Objective,
-    _check_cost,
-    _check_limits,
-    _check_start,
-    _check_tolerances,
-    _norm,
-)
+from torchsar.optim.checks import check_cost, check_limits, check_start, check_tolerances, norm
+from torchsar.optim.descent import Descent, Objective
 
-_SUFFICIENT = 1e-4  # of the decrease that the slope promises (Armijo)
-_LEAST = 1e-6  # of the largest curvature: what damping lifts the least one to, where it is positive
+# sufficient decrease (Armijo) of the line search, the value of Nocedal and Wright 2006, section 3.1
+_SUFFICIENT = 1e-4
+# chosen: damping raises the least eigenvalue of the Hessian to this share of the largest
+_LEAST = 1e-6
 
 
 def newton(
@@ -33,36 +26,51 @@ def newton(
     gradient_tolerance: float = 1e-6,
     value_tolerance: float = 1e-9,
 ) -> Descent:
-    """Newton's method.
+    """Minimise a smooth cost of few unknowns per trial by Newton's method.
 
-    start: (..., n) float32 or float64, n small; objective: (..., n) -> (...,) costs, each of its
-    own row alone, twice differentiable by autograd.
+    With `damped` the Hessian is shifted (Levenberg) until its least eigenvalue, if negative, has
+    changed sign, and is at least 1e-6 of the largest. The step is halved until the cost falls
+    (Armijo). Without `damped` the step is x - H^-1 gradient, which also climbs to maxima and
+    saddles and diverges where H is near singular: the behaviour that Remote Sens. 2025, 17, 3447
+    reports for its "Gauss-Newton". (An entropy is not a sum of squares, so a Gauss-Newton method in
+    the strict sense does not exist for it.) The result is detached; do not use inside vmap.
 
-    damped=True: the Hessian is shifted (Levenberg) until its least eigenvalue, if negative, has
-    changed sign, and is 1e-6 of the largest one at least; the step is halved, at most `search`
-    times, until the cost falls (Armijo), and a trial whose search finds nothing ends there.
-    damped=False: x - H^-1 gradient as it is, which climbs to maxima and saddles as readily as it
-    descends, and diverges where H is near singular: the published behaviour of what Remote Sens.
-    2025, 17, 3447 calls Gauss-Newton. (An entropy is no sum of squares; with its true Hessian this
-    is the Newton-type method that the name must stand for. The quasi-Newton one is `lbfgs`.)
+    Args:
+        objective: Maps points (..., n) to real costs (...,), each cost from its own row alone,
+            twice differentiable by autograd.
+        start: First point, shape (..., n), float32 or float64.
+        damped: Shift the Hessian and search along the step.
+        steps: Largest number of steps of a trial.
+        search: Largest number of halvings of a step. A trial whose search finds no lower cost ends.
+        gradient_tolerance: A trial has converged when its gradient norm is at most this fraction of
+            that at the start.
+        value_tolerance: A trial has converged when a step changed the cost by at most this fraction
+            of the cost, or by four units of rounding.
 
-    Result: x is the last point, finite wherever the start is: a trial that steps into a cost or
-    derivative that is not finite stays before it, not ok. converged: the gradient norm is at most
-    gradient_tolerance of that at the start, or a step changed the cost by at most value_tolerance
-    of it. ok: nothing was lost on the way, the end is not above the start and its Hessian positive
-    definite, and, undamped, the trial has converged. evaluations: calls of the objective in which
-    the trial took part; one that also gives the Hessian counts once but costs n + 1 backward passes
-    on top. Detached; it cannot be put inside vmap. Errors as in `lbfgs`. Nocedal and Wright 2006,
-    Numerical Optimization, section 3.4 (modification of the Hessian), algorithm 3.1.
+    Returns:
+        Last point per trial, finite where the start is: a trial that would step to a cost or
+        derivative that is not finite stops before it. `evaluations` counts calls of the objective;
+        one that also gives the Hessian counts once and takes n + 1 backward passes. `ok` is False
+        where the trial met values that were not finite, ended above its start or where the Hessian
+        is not positive definite, or, without `damped`, has not converged.
+
+    Raises:
+        TypeError: If the start is not float32 or float64.
+        ValueError: If the objective returns another shape or costs without a gradient, or if a
+            limit is not positive or a tolerance negative.
+
+    Reference:
+        Nocedal and Wright 2006, Numerical Optimization, section 3.4 (modification of the Hessian),
+        algorithm 3.1 (backtracking).
     """
-    _check_start(start)
-    _check_limits("newton", steps=steps, search=search)
-    _check_tolerances("newton", gradient_tolerance, value_tolerance)
-    begin = _place(objective, start.detach().clone())
+    check_start(start)
+    check_limits("newton", steps=steps, search=search)
+    check_tolerances("newton", gradient_tolerance, value_tolerance)
+    begin = _evaluated(objective, start.detach().clone())
     rules = _Rules(
         damped,
         search,
-        gradient_tolerance * _norm(begin.gradient),
+        gradient_tolerance * norm(begin.gradient),
         max(value_tolerance, 4 * torch.finfo(start.dtype).eps),
     )
     state = _opening(begin)
@@ -70,20 +78,24 @@ def newton(
         if not bool(state.active.any()):
             break
         state = _advance(objective, state, rules)
-    here = state.place
-    bowl = _curvatures(here)[0][..., 0] > 0
-    ok = begin.finite & ~state.lost & bowl & (here.cost <= begin.cost) & (state.converged | damped)
-    return Descent(here.x, here.cost, _norm(here.gradient), state.steps, state.evaluations, state.converged, ok)
+    here = state.point
+    convex = _curvatures(here)[0][..., 0] > 0
+    ok = begin.finite & ~state.lost & convex & (here.cost <= begin.cost) & (state.converged | damped)
+    return Descent(here.x, here.cost, norm(here.gradient), state.steps, state.evaluations, state.converged, ok)
 
 
 class _Rules(NamedTuple):
+    """Limits and tolerances of `newton`."""
+
     damped: bool
     search: int
-    small: Tensor
-    still: float
+    gradient_norm: Tensor
+    value_tolerance: float
 
 
-class _Place(NamedTuple):
+class _Point(NamedTuple):
+    """A point with its cost, gradient and Hessian, and whether all are finite."""
+
     x: Tensor
     cost: Tensor
     gradient: Tensor
@@ -92,9 +104,9 @@ class _Place(NamedTuple):
 
 
 class _State(NamedTuple):
-    """lost: stepped into a cost or derivative that is not finite, or had no finite step."""
+    """State between two steps; `lost` marks trials that met values that are not finite."""
 
-    place: _Place
+    point: _Point
     steps: Tensor
     evaluations: Tensor
     active: Tensor
@@ -102,26 +114,27 @@ class _State(NamedTuple):
     lost: Tensor
 
 
-def _opening(begin: _Place) -> _State:
+def _opening(begin: _Point) -> _State:
+    """State at the start."""
     none = torch.zeros_like(begin.finite, dtype=torch.int64)
-    level = begin.finite & (_norm(begin.gradient) == 0)
+    level = begin.finite & (norm(begin.gradient) == 0)
     return _State(begin, none, none + 1, begin.finite & ~level, level, torch.zeros_like(level))
 
 
 def _advance(objective: Objective, state: _State, rules: _Rules) -> _State:
     """One step of every active trial."""
-    here = state.place
+    here = state.point
     step = _step(here, rules.damped)
-    sound, tried = torch.isfinite(step).all(-1), torch.zeros_like(state.steps)
+    usable, tried = torch.isfinite(step).all(-1), torch.zeros_like(state.steps)
     if rules.damped:
-        step, tried = _shortened(objective, here, step, state.active & sound, rules.search)
-    moved = state.active & sound & (step != 0).any(-1)
-    there = _place(objective, torch.where(moved[..., None], here.x + step, here.x))
+        step, tried = _shortened(objective, here, step, state.active & usable, rules.search)
+    moved = state.active & usable & (step != 0).any(-1)
+    there = _evaluated(objective, torch.where(moved[..., None], here.x + step, here.x))
     arrived = moved & there.finite
-    still = (there.cost - here.cost).abs() <= rules.still * torch.maximum(there.cost.abs(), here.cost.abs())
-    ended = arrived & ((_norm(there.gradient) <= rules.small) | still)
+    level = (there.cost - here.cost).abs() <= rules.value_tolerance * torch.maximum(there.cost.abs(), here.cost.abs())
+    ended = arrived & ((norm(there.gradient) <= rules.gradient_norm) | level)
     return _State(
-        place=_Place(
+        point=_Point(
             *(
                 torch.where(arrived[(...,) + (None,) * (new.ndim - arrived.ndim)], new, old)
                 for new, old in zip(there, here, strict=True)
@@ -131,18 +144,18 @@ def _advance(objective: Objective, state: _State, rules: _Rules) -> _State:
         evaluations=state.evaluations + tried + moved,
         active=arrived & ~ended,
         converged=state.converged | ended,
-        lost=state.lost | (state.active & ~(sound & (arrived | ~moved))),
+        lost=state.lost | (state.active & ~(usable & (arrived | ~moved))),
     )
 
 
-def _place(objective: Objective, x: Tensor) -> _Place:
-    """Cost, gradient and Hessian at x (..., n): rows do not mix, so the Hessians of all trials come
-    from n backward passes.
+def _evaluated(objective: Objective, x: Tensor) -> _Point:
+    """Cost, gradient and Hessian at x (..., n); since rows do not mix, the Hessians of all trials
+    take n backward passes.
     """
     with torch.enable_grad():
         x = x.detach().requires_grad_()
         cost = objective(x)
-        _check_cost(cost, x)
+        check_cost(cost, x)
         if not cost.requires_grad:
             raise ValueError(
                 "the objective returned costs that autograd cannot follow back to x; leave out detach and no_grad"
@@ -151,45 +164,46 @@ def _place(objective: Objective, x: Tensor) -> _Place:
         hessian = torch.stack([_row(part, x) for part in gradient.unbind(-1)], -2)
     cost, gradient = cost.detach(), gradient.detach()
     finite = torch.isfinite(cost) & torch.isfinite(gradient).all(-1) & torch.isfinite(hessian).all(-1).all(-1)
-    return _Place(x.detach(), cost, gradient, 0.5 * (hessian + hessian.mT), finite)
+    return _Point(x.detach(), cost, gradient, 0.5 * (hessian + hessian.mT), finite)
 
 
 def _row(part: Tensor, x: Tensor) -> Tensor:
+    """One row of the Hessians; zeros where the gradient does not depend on x."""
     row = torch.autograd.grad(part.sum(), x, retain_graph=True, allow_unused=True)[0] if part.requires_grad else None
     return torch.zeros_like(x) if row is None else row.detach()
 
 
-def _curvatures(place: _Place) -> tuple[Tensor, Tensor]:
-    """Eigenvalues, rising, and eigenvectors of the Hessian; of a diagonal of zeros where it is not
+def _curvatures(point: _Point) -> tuple[Tensor, Tensor]:
+    """Eigenvalues (rising) and eigenvectors of the Hessian; those of zeros where it is not
     finite.
     """
-    return torch.linalg.eigh(torch.where(place.finite[..., None, None], place.hessian, 0))
+    return torch.linalg.eigh(torch.where(point.finite[..., None, None], point.hessian, 0))
 
 
-def _step(place: _Place, damped: bool) -> Tensor:
+def _step(point: _Point, damped: bool) -> Tensor:
     """-(H + shift)^-1 gradient; not finite where the Hessian is singular to the last digit."""
-    values, vectors = _curvatures(place)
+    values, vectors = _curvatures(point)
     if damped:
         least = values[..., 0]
         values = values + torch.maximum(-2 * least, _LEAST * values.abs().amax(-1) - least).clamp_min(0)[..., None]
-    along = (vectors.mT @ place.gradient[..., None])[..., 0]
+    along = (vectors.mT @ point.gradient[..., None])[..., 0]
     return -(vectors @ (along / values)[..., None])[..., 0]
 
 
-def _shortened(objective: Objective, place: _Place, step: Tensor, active: Tensor, search: int) -> tuple[Tensor, Tensor]:
-    """Steps halved until the cost falls enough, zero where it never does; and the evaluations this
-    took each trial.
+def _shortened(objective: Objective, point: _Point, step: Tensor, active: Tensor, search: int) -> tuple[Tensor, Tensor]:
+    """Steps halved until the cost falls sufficiently, 0 where it never does, and the evaluations
+    taken.
     """
-    promised = (place.gradient * step).sum(-1)
-    rounding = 4 * torch.finfo(place.cost.dtype).eps * place.cost.abs()
-    searching, scale = active & (promised < 0), torch.ones_like(promised)
+    slope = (point.gradient * step).sum(-1)
+    rounding = 4 * torch.finfo(point.cost.dtype).eps * point.cost.abs()
+    searching, scale = active & (slope < 0), torch.ones_like(slope)
     found, tries = torch.zeros_like(active), torch.zeros_like(active, dtype=torch.int64)
     with torch.no_grad():
         for _ in range(search):
             if not bool(searching.any()):
                 break
-            cost = objective(torch.where(searching[..., None], place.x + scale[..., None] * step, place.x))
-            low = searching & (cost - place.cost <= _SUFFICIENT * scale * promised + rounding)
+            cost = objective(torch.where(searching[..., None], point.x + scale[..., None] * step, point.x))
+            low = searching & (cost - point.cost <= _SUFFICIENT * scale * slope + rounding)
             tries, found, searching = tries + searching, found | low, searching & ~low
             scale = torch.where(searching, scale / 2, scale)
     return torch.where(found[..., None], scale[..., None] * step, 0), tries

@@ -1,6 +1,4 @@
-"""What searches by a population share: their result, the box they keep to, and random numbers at
-addresses.
-"""
+"""Parts shared by the searches without gradients: result, box, random numbers and costs."""
 
 from __future__ import annotations
 
@@ -13,16 +11,20 @@ from torch import Tensor
 
 from torchsar.core import Draws, take
 
-Population = Callable[[Tensor], Tensor]  # (..., candidate, n) -> (..., candidate)
+# objective of a population: maps candidates (..., candidate, n) to costs (..., candidate)
+Population = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True)
 class Searched:
-    """What a search without gradients found, per trial (...,).
+    """Result of a search without gradients, per trial.
 
-    x: (..., n) best point. cost: (...,) there. evaluations: (...,) int64 candidates whose cost was
-    computed. history: costs on the way; each search says which. ok: (...,) bool, False where no
-    candidate had a finite cost: x is then the first one and cost +inf.
+    Args:
+        x: Best point, shape (..., n). Where `ok` is False it is the first candidate.
+        cost: Cost at `x`, shape (...,); +inf where `ok` is False.
+        evaluations: Candidates whose cost was computed, shape (...,), int64.
+        history: Costs during the search; each search documents its shape.
+        ok: False where no candidate had a finite cost, shape (...,), bool.
     """
 
     x: Tensor
@@ -34,8 +36,11 @@ class Searched:
 
 @dataclass(frozen=True)
 class Box:
-    """Least and greatest values (*trials, n) of the unknowns, float64 or float32; equal ones hold
-    an unknown fixed.
+    """Least and greatest values of the unknowns per trial; equal values fix an unknown.
+
+    Args:
+        low: Least values, shape (*trials, n), float32 or float64.
+        high: Greatest values, same shape.
     """
 
     low: Tensor
@@ -43,8 +48,16 @@ class Box:
 
     @staticmethod
     def of(low: Tensor, high: Tensor, who: str) -> Box:
-        """Raises TypeError for what is no real floating tensor, ValueError for shapes that do not
-        fit, bounds that are not finite, or low > high.
+        """Build a box from bounds that broadcast against each other.
+
+        Args:
+            low: Least values, shape (..., n).
+            high: Greatest values, shape (..., n).
+            who: Name of the search, for messages.
+
+        Raises:
+            TypeError: If a bound is not a real floating tensor.
+            ValueError: If shapes do not fit, a bound is not finite, or low > high.
         """
         for name, bound in (("low", low), ("high", high)):
             if not isinstance(bound, Tensor) or not bound.is_floating_point():
@@ -67,21 +80,44 @@ class Box:
 
     @property
     def trials(self) -> torch.Size:
+        """Shape of the trials."""
         return self.low.shape[:-1]
 
     def at(self, part: Tensor) -> Tensor:
-        """Points at 0..1 of the box. part: (*trials, candidate, n)."""
+        """Map coordinates in 0..1 of the box to points.
+
+        Args:
+            part: Coordinates, shape (*trials, candidate, n).
+
+        Returns:
+            Points, same shape.
+        """
         return self.low[..., None, :] + part * (self.high - self.low)[..., None, :]
 
     def kept(self, x: Tensor) -> Tensor:
-        """Candidates (*trials, candidate, n) with what lies outside moved onto the edge."""
+        """Move candidates that lie outside the box onto its edge.
+
+        Args:
+            x: Candidates, shape (*trials, candidate, n).
+
+        Returns:
+            Candidates, same shape.
+        """
         return torch.minimum(torch.maximum(x, self.low[..., None, :]), self.high[..., None, :])
 
 
 @dataclass(frozen=True)
 class Dice:
-    """Random numbers for all trials of a box: of each trial's own address, or, where the draws know
-    no trials, the same ones in every trial.
+    """Random numbers for all trials of a box.
+
+    Each trial has its own numbers where the draws have trials; otherwise all trials share the same.
+
+    Args:
+        draws: Source of the random numbers.
+        box: Box whose trials the numbers are for.
+
+    Raises:
+        ValueError: If the draws have another number of trials than the box.
     """
 
     draws: Draws
@@ -96,21 +132,42 @@ class Dice:
             )
 
     def uniform(self, purpose: str, shape: Sequence[int]) -> Tensor:
-        """0..1, (*trials, *shape)."""
+        """Draw uniform numbers in 0..1, shape (*trials, *shape).
+
+        Args:
+            purpose: Address of the numbers within a trial.
+            shape: Shape for one trial.
+        """
         return self._of_trials(self.draws.uniform(purpose, shape), shape)
 
     def normal(self, purpose: str, shape: Sequence[int]) -> Tensor:
-        """Standard normal, (*trials, *shape)."""
+        """Draw standard normal numbers, shape (*trials, *shape).
+
+        Args:
+            purpose: Address of the numbers within a trial.
+            shape: Shape for one trial.
+        """
         return self._of_trials(self.draws.normal(purpose, shape), shape)
 
     def _of_trials(self, x: Tensor, shape: Sequence[int]) -> Tensor:
+        """Numbers in the dtype and shape of the box."""
         x = x.to(dtype=self.box.low.dtype, device=self.box.low.device)
         return x.expand(*self.box.trials, *shape) if self.draws.trials is None else x.reshape(*self.box.trials, *shape)
 
 
 def costs_of(objective: Population, x: Tensor, who: str) -> Tensor:
-    """Costs (*trials, candidate) of candidates (*trials, candidate, n), +inf where one is not a
-    number. Raises ValueError for an answer of another shape.
+    """Evaluate the objective without gradients; NaN counts as +inf.
+
+    Args:
+        objective: Maps candidates (*trials, candidate, n) to costs (*trials, candidate).
+        x: Candidates, shape (*trials, candidate, n).
+        who: Name of the search, for messages.
+
+    Returns:
+        Costs, shape (*trials, candidate).
+
+    Raises:
+        ValueError: If the objective does not return one real cost per candidate.
     """
     with torch.no_grad():
         cost = objective(x)
@@ -124,27 +181,56 @@ def costs_of(objective: Population, x: Tensor, who: str) -> Tensor:
 
 
 def ranked(x: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:
-    """Candidates and costs with the best first."""
+    """Sort candidates by cost, the best first.
+
+    Args:
+        x: Candidates, shape (*trials, candidate, n).
+        cost: Their costs, shape (*trials, candidate).
+
+    Returns:
+        Candidates and costs in that order.
+    """
     order = torch.argsort(cost, dim=-1, stable=True)
     return pick(x, order), cost.gather(-1, order)
 
 
 def pick(x: Tensor, index: Tensor) -> Tensor:
-    """Candidates of those numbers. x: (*trials, candidate, n); index: (*trials, m).
+    """Select candidates by index.
 
-    Returns (*trials, m, n).
+    Args:
+        x: Candidates, shape (*trials, candidate, n).
+        index: Indices, shape (*trials, m), int64.
+
+    Returns:
+        Candidates, shape (*trials, m, n).
     """
     return x.gather(-2, index[..., None].expand(*index.shape, x.shape[-1]))
 
 
 def best(x: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:
-    """The best candidate (*trials, n) and its cost."""
+    """Return the best candidate and its cost.
+
+    Args:
+        x: Candidates, shape (*trials, candidate, n).
+        cost: Their costs, shape (*trials, candidate).
+
+    Returns:
+        The candidate, shape (*trials, n), and its cost, shape (*trials,).
+    """
     index = cost.argmin(-1)
     return take(x, index, -2), take(cost, index)
 
 
 def check_counts(who: str, least: dict[str, tuple[float, float]]) -> None:
-    """{name: (value, least)}: ValueError where a value is below its least."""
+    """Check that settings are not below their least values.
+
+    Args:
+        who: Name of the search, for messages.
+        least: (value, least value) by parameter name.
+
+    Raises:
+        ValueError: If a value is below its least value.
+    """
     for name, (value, bound) in least.items():
         if not value >= bound:
             raise ValueError(f"{who}: {name} is {value}; choose at least {bound:g}")

@@ -1,4 +1,4 @@
-"""Minimising a function of one number per trial, all trials at once, each with its own end."""
+"""Minimisation of a function of one number per trial, for all trials at once."""
 
 from __future__ import annotations
 
@@ -9,13 +9,24 @@ from torch import Tensor
 
 from torchsar.core import take
 
+# maps one number per trial (...,) to one cost per trial (...,)
 Cost = Callable[[Tensor], Tensor]
 
 
 def grid_minimum(cost: Cost, centre: Tensor, reach: float, count: int) -> tuple[Tensor, Tensor]:
-    """The best of `count` equally spaced points of centre +- reach, per trial.
+    """Return the best of equally spaced points of centre +- reach per trial.
 
-    cost: (...,) -> (...,). Returns it and all costs (..., count).
+    Args:
+        cost: Maps points (...,) to costs (...,).
+        centre: Middle of the interval, shape (...,).
+        reach: Half width of the interval.
+        count: Number of points, at least 3.
+
+    Returns:
+        The best point, shape (...,), and all costs, shape (..., count).
+
+    Raises:
+        ValueError: If `count` is below 3.
     """
     if count < 3:
         raise ValueError(f"a grid search needs at least 3 points, got {count}")
@@ -28,12 +39,20 @@ def grid_minimum(cost: Cost, centre: Tensor, reach: float, count: int) -> tuple[
 def parabola_minimum(
     cost: Cost, start: Tensor, step: float, tolerance: float, rounds: int = 12
 ) -> tuple[Tensor, Tensor]:
-    """Successive parabolas about the best point so far; the step shrinks to a quarter when the
-    vertex lies inside it.
+    """Minimise a cost by successive parabolas about the best point so far.
 
-    start, result: (...,). step: first half-width, tolerance: a trial stops when its step is below
-    it. Stays within start +- 2 steps. Returns the minimiser and the second derivative there. Needs
-    no gradient, two evaluations a round.
+    The step shrinks to a quarter when the vertex lies inside it. The result stays within start +- 2
+    steps. Needs no gradient and takes two to three evaluations per round.
+
+    Args:
+        cost: Maps points (...,) to costs (...,).
+        start: First point, shape (...,).
+        step: First half width of the parabola.
+        tolerance: A trial stops when its half width is below it.
+        rounds: Largest number of rounds.
+
+    Returns:
+        The minimum and the second derivative there, each of shape (...,).
     """
     with torch.no_grad():
         x, half, best = start, torch.full_like(start, step), cost(start)
@@ -60,12 +79,20 @@ def parabola_minimum(
 def gradient_minimum(
     cost: Cost, start: Tensor, step: float, tolerance: float, rounds: int = 12
 ) -> tuple[Tensor, Tensor]:
-    """Root of the derivative by secants kept inside a bracket start +- step, with autograd; a trial
-    stops when its bracket or move is below tolerance.
+    """Minimise a differentiable cost by secants on its derivative inside a bracket.
 
-    start, result: (...,). Returns the minimiser and the second derivative from the last two slopes.
-    cost must be differentiable. Where the slopes at the ends do not bracket a minimum the trial
-    walks downhill, at most one more step.
+    The first bracket is start +- step. Where the slopes at its ends do not bracket a minimum, the
+    trial moves downhill by at most one more step.
+
+    Args:
+        cost: Maps points (...,) to costs (...,), differentiable by autograd.
+        start: First point, shape (...,).
+        step: Half width of the first bracket.
+        tolerance: A trial stops when its bracket or move is below it.
+        rounds: Largest number of rounds.
+
+    Returns:
+        The minimum and the second derivative from the last two slopes, each of shape (...,).
     """
     left, right = start - step, start + step
     slope_left, slope_right = _slope(cost, left), _slope(cost, right)
@@ -95,12 +122,16 @@ def gradient_minimum(
 
 
 def _finished(active: Tensor) -> bool:
+    """Whether no trial is active; False inside vmap, where values cannot be read and all rounds are
+    made.
+    """
     try:
         return not bool(active.any())
-    except RuntimeError:  # inside vmap a value cannot be looked at: all rounds are made
+    except RuntimeError:  # inside vmap a value cannot be read
         return False
 
 
 def _slope(cost: Cost, x: Tensor) -> Tensor:
+    """Derivative of the cost per trial."""
     with torch.enable_grad():
         return torch.func.grad(lambda value: cost(value).sum())(x.detach())

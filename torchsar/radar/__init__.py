@@ -1,4 +1,4 @@
-"""What an instrument knows about itself."""
+"""Descriptions of instruments: radars and ladars, their geometry, timing, orbits and waveforms."""
 
 from torchsar.radar.bistatic import BistaticRadar, polynomial_range, receive_range
 from torchsar.radar.inverse import InverseRadar

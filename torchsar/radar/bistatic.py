@@ -1,6 +1,4 @@
-"""What an airborne receiver with several channels along track knows about itself and about the
-satellite that lights its scene, and ranges of moving points.
-"""
+"""Bistatic radar with a multichannel airborne receiver and a far transmitter, and its ranges."""
 
 from __future__ import annotations
 
@@ -18,18 +16,30 @@ from torchsar.radar.waveform import LinearFM
 
 @dataclass(frozen=True)
 class BistaticRadar:
-    """A far transmitter with a low pulse rate and an airborne receiver with channels in a row along
-    track.
+    """Far transmitter with a low pulse rate and airborne receiver with channels along track.
 
-    speed_m_s: of the receiver, along its straight level track; reference_range_m: closest slant
-    range R0 of the middle of the scene; height_m: of the receiver. channel_m: along-track places
-    dx_m of the channels against the reference of the track, in any order and spacing; element_m:
-    along-track length of each. transmit_range: coefficients k1, k2, ... (m/s, m/s^2, ...) of R_T(t)
-    - R_T(0) = k1 t + k2 t^2 + ..., from the ephemeris (`radar.orbit.range_coefficients`). The phase
-    of an echo is -2 pi / lambda (R_T + R_m), once each way. A range axis holds the RECEIVE path R_m
-    = c tau - R_T (m), step c / sampling_hz; on the axis c tau / 2, on which resolutions are quoted,
-    everything is half as long. Slow time zero is pulse n // 2. Raises ValueError for parameters
-    that make no instrument.
+    The phase of an echo is -2 pi / lambda (R_T + R_m), one way each. A range axis holds the receive
+    path R_m = c tau - R_T in steps of c / sampling_hz; on the axis c tau / 2, on which resolutions
+    are quoted, all lengths are half of these. Slow time is zero at pulse n // 2.
+
+    Args:
+        carrier_hz: Carrier frequency in Hz.
+        pulse: Transmitted pulse.
+        sampling_hz: Complex sampling rate in Hz, at least the bandwidth of the pulse.
+        prf_hz: Pulse repetition frequency of the transmitter in Hz.
+        speed_m_s: Speed of the receiver along its straight, level track in m/s.
+        reference_range_m: Closest slant range R0 of the scene centre in metres.
+        channel_m: Along-track positions dx_m of the channels relative to the reference point of the
+            track in metres, in any order and spacing.
+        element_m: Along-track length of each channel's aperture in metres.
+        height_m: Height of the receiver in metres.
+        transmit_range: Coefficients k1, k2, ... (m/s, m/s^2, ...) of R_T(t) - R_T(0) = k1 t + k2
+            t^2 + ... from the ephemeris, see `range_coefficients`.
+        wave_speed_m_s: Propagation speed in m/s.
+
+    Raises:
+        ValueError: If a parameter is not finite or out of range, two channels share a position, or
+            the bandwidth of the pulse exceeds the sampling rate.
     """
 
     carrier_hz: float
@@ -69,44 +79,55 @@ class BistaticRadar:
         object.__setattr__(self, "transmit_range", tuple(self.transmit_range))
         if not self.channel_m or not all(math.isfinite(x) for x in self.channel_m):
             raise ValueError(
-                f"radar.channel_m needs the along-track place of at least one channel (m), got {self.channel_m}"
+                f"radar.channel_m needs the along-track position of at least one channel (m), got {self.channel_m}"
             )
         if len(set(self.channel_m)) != len(self.channel_m):
-            raise ValueError(f"radar.channel_m names a place twice, which gives no new samples: {self.channel_m}")
+            raise ValueError(
+                f"radar.channel_m must be distinct, since a repeated position adds no samples, got {self.channel_m}"
+            )
         if not all(math.isfinite(k) for k in self.transmit_range):
             raise ValueError(f"radar.transmit_range must be finite coefficients k1, k2, ..., got {self.transmit_range}")
 
     @property
     def wavelength_m(self) -> float:
+        """Carrier wavelength in metres."""
         return self.wave_speed_m_s / self.carrier_hz
 
     @property
     def channels(self) -> int:
+        """Number of channels."""
         return len(self.channel_m)
 
     @property
     def range_step_m(self) -> float:
-        """Of the receive path, c / sampling_hz."""
+        """Sample spacing of the receive path, c / sampling_hz, in metres."""
         return self.wave_speed_m_s / self.sampling_hz
 
     @property
     def ambiguous_velocity_m_s(self) -> float:
-        """Slant-range velocity that turns Doppler by one pulse rate, lambda PRF: what the channels
-        cannot tell apart (brief 001, Velocity).
+        """Slant-range velocity lambda PRF in m/s that shifts the Doppler frequency by one PRF.
+
+        The channels measure the slant-range velocity modulo this interval, however many they are.
         """
         return self.wavelength_m * self.prf_hz
 
     def channels_at(self, device: torch.device | str | None = None) -> Tensor:
-        """channel_m as float64 (channel,)."""
+        """Return `channel_m` as a float64 tensor (channel,) on a device."""
         return torch.tensor(self.channel_m, dtype=torch.float64, device=device)
 
     def pulse_axis(self, n_pulse: int) -> Axis:
-        """Slow time (s), zero at pulse n_pulse // 2."""
+        """Return the slow-time axis in seconds, zero at pulse n_pulse // 2."""
         return Axis("pulse", n_pulse, -(n_pulse // 2) / self.prf_hz, 1 / self.prf_hz, "s")
 
     def axes(self, n_pulse: int, n_range: int | None = None) -> tuple[Axis, ...]:
-        """Axes (channel, pulse, range) of range-compressed data, the middle of the range axis,
-        sample n_range // 2, at reference_range_m; (channel, pulse) without n_range.
+        """Return the axes (channel, pulse, range) of range-compressed data.
+
+        Args:
+            n_pulse: Number of pulses.
+            n_range: Number of range samples; None for data (channel, pulse) without a range axis.
+
+        Returns:
+            The axes. Sample n_range // 2 of the range axis lies at `reference_range_m`.
         """
         channel = Axis("channel", self.channels, 0.0, 1.0, "")
         if n_range is None:
@@ -119,24 +140,40 @@ class BistaticRadar:
         )
 
     def range_frequency_hz(self, n: int, device: torch.device | str | None = None) -> Tensor:
-        """Baseband range frequencies of an n-point FFT, FFT order, float64 (n,)."""
+        """Return the baseband range frequencies (Hz) of an n-point FFT, FFT order, float64 (n,)."""
         return torch.fft.fftfreq(n, 1 / self.sampling_hz, dtype=torch.float64, device=device)
 
     def band_weights(self, n: int, device: torch.device | str | None = None) -> Tensor:
-        """Spectrum of the range response, a rectangular band of the pulse's width with a peak of 1,
-        float64 (n,) in FFT order; the bins at its edges have the share that lies inside.
+        """Return the spectrum of a range response with a rectangular band and a peak of 1.
+
+        Args:
+            n: Number of range samples.
+            device: Device of the result.
+
+        Returns:
+            Weights in FFT order, float64 (n,). A bin at the edge of the band has the fraction that
+            lies inside.
         """
         bins = self.range_frequency_hz(n, device).abs() * n / self.sampling_hz
         inside = (self.pulse.bandwidth_hz * n / self.sampling_hz / 2 - bins + 0.5).clamp(0, 1)
         return inside * (n / inside.sum())
 
     def transmit_range_m(self, time_s: Tensor) -> Tensor:
-        """R_T(t) - R_T(0) (m) by the ephemeris, float64, shape of time_s."""
+        """Return R_T(t) - R_T(0) in metres by the ephemeris, float64, shape of time_s."""
         return polynomial_range(self.transmit_range, time_s)
 
 
 def polynomial_range(coefficients: Sequence[float | Tensor], time_s: Tensor) -> Tensor:
-    """k1 t + k2 t^2 + ..., float64; coefficients: numbers or tensors that broadcast with time_s."""
+    """Evaluate the range polynomial k1 t + k2 t^2 + ...
+
+    Args:
+        coefficients: k1, k2, ... in m/s, m/s^2, ...: numbers, or tensors that broadcast with
+            `time_s`.
+        time_s: Times in seconds.
+
+    Returns:
+        Range in metres, float64.
+    """
     total = torch.zeros_like(time_s, dtype=torch.float64)
     for k in reversed(coefficients):
         total = (total + k) * time_s
@@ -152,12 +189,25 @@ def receive_range(
     speed_m_s: float,
     channel_m: Tensor | float,
 ) -> Tensor:
-    """R_m(t) - R0 of a uniformly moving point, exact, float64 (m): sqrt((R0 - u_r t)^2 + (v t - y0
-    - dx_m)^2) - R0 with v = V_R - u_a, formed as a difference.
+    """Return the range history R_m(t) - R0 of a point in uniform motion, exact.
 
-    u_r_m_s: slant-range speed, closing positive; u_a_m_s: along-track speed, positive with the
-    receiver; y0_m: along-track place at t = 0; range_m: R0. All arguments broadcast. Remote Sens.
-    2020, 12, 1703, Eqs. (1), (4) (brief 001, with y0).
+    R_m(t) = sqrt((R0 - u_r t)^2 + (v t - y0 - dx_m)^2) with v = V_R - u_a. The result is formed as
+    a difference, so that it keeps its precision. All arguments broadcast.
+
+    Args:
+        time_s: Slow time t in seconds.
+        u_r_m_s: Slant-range speed u_r in m/s, closing positive.
+        u_a_m_s: Along-track speed u_a in m/s, positive in the direction of the receiver.
+        y0_m: Along-track position y0 at t = 0 in metres.
+        range_m: Closest range R0 of the track to the point at rest in metres.
+        speed_m_s: Speed V_R of the receiver in m/s.
+        channel_m: Along-track position dx_m of the channel in metres.
+
+    Returns:
+        R_m(t) - R0 in metres.
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, Eqs. (1), (4), extended by y0.
     """
     along = (speed_m_s - u_a_m_s) * time_s - y0_m - channel_m
     closing = u_r_m_s * time_s

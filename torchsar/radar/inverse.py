@@ -1,4 +1,4 @@
-"""What a radar or ladar that images turning targets knows about itself."""
+"""Instrument description of a radar or ladar that images rotating targets (ISAR, ISAL)."""
 
 from __future__ import annotations
 
@@ -11,14 +11,23 @@ from torchsar.radar.stripmap import LIGHT_M_S
 
 @dataclass(frozen=True)
 class InverseRadar:
-    """Instrument description of an inverse synthetic aperture radar or ladar, whose range window
-    follows the target.
+    """Inverse synthetic aperture radar or ladar whose range window follows the target.
 
-    carrier_hz: middle of the band; bandwidth_hz: of the range-compressed samples, whose cell is c /
-    (2 B); prf_hz: pulse rate. rotation_rad_s: rate at which the target is taken to turn, which
-    scales cross range; None where it is not known, and images then keep a Doppler axis in Hz.
-    pulse_s: length of a pulse that is dechirped on receive, None for range-compressed data.
-    reference_range_m: middle of the range window, where range coordinates are zero.
+    Args:
+        carrier_hz: Middle of the band in Hz.
+        bandwidth_hz: Bandwidth B of the range-compressed samples in Hz; a range cell is c / (2 B).
+        prf_hz: Pulse repetition frequency in Hz.
+        rotation_rad_s: Assumed rotation rate of the target in rad/s, which scales cross range. None
+            where it is unknown; images then have a Doppler axis in Hz.
+        pulse_s: Length in seconds of a pulse that is dechirped on receive, None for
+            range-compressed data.
+        reference_range_m: Range of the middle of the window in metres, where range coordinates are
+            zero.
+        wave_speed_m_s: Propagation speed in m/s.
+
+    Raises:
+        ValueError: If a parameter is not finite, a frequency, rate or length is not positive, or
+            the reference range is negative.
     """
 
     carrier_hz: float
@@ -42,42 +51,62 @@ class InverseRadar:
 
     @property
     def wavelength_m(self) -> float:
+        """Carrier wavelength in metres."""
         return self.wave_speed_m_s / self.carrier_hz
 
     @property
     def range_step_m(self) -> float:
-        """One range cell, c / (2 B)."""
+        """Range cell c / (2 B) in metres."""
         return self.wave_speed_m_s / (2 * self.bandwidth_hz)
 
     @property
     def chirp_rate_hz_s(self) -> float:
-        """Bandwidth over pulse length. Raises ValueError where the pulse is not known."""
+        """Chirp rate in Hz/s, the bandwidth over the pulse length.
+
+        Raises:
+            ValueError: If `pulse_s` is None.
+        """
         if self.pulse_s is None:
-            raise ValueError("radar.pulse_s is not set; a dechirped pulse needs its length")
+            raise ValueError("radar.pulse_s is not set; give the length of the dechirped pulse")
         return self.bandwidth_hz / self.pulse_s
 
     def cross_range_step_m(self, n_pulse: int) -> float:
-        """One cross-range cell, lambda / (2 omega T) with T = n_pulse / prf.
+        """Return the cross-range cell lambda / (2 omega T) in metres, with T = n_pulse / prf.
 
-        Raises ValueError where the rotation is not known.
+        Raises:
+            ValueError: If `rotation_rad_s` is None.
         """
         if self.rotation_rad_s is None:
             raise ValueError(
-                "radar.rotation_rad_s is not set; without it images have a Doppler axis, not one in metres"
+                "radar.rotation_rad_s is not set; give it for an axis in metres, else images have a Doppler axis"
             )
         return self.wavelength_m * self.prf_hz / (2 * self.rotation_rad_s * n_pulse)
 
     def raw_axes(self, n_pulse: int, n_range: int, start_s: float = 0.0) -> tuple[Axis, Axis]:
-        """Slow time (s) and range relative to the middle of the window (m) of range-compressed
-        pulses; the middle is sample n_range // 2.
+        """Return the axes (pulse, range) of range-compressed pulses.
+
+        Args:
+            n_pulse: Number of pulses.
+            n_range: Number of range cells.
+            start_s: Slow time of the first pulse in seconds.
+
+        Returns:
+            Slow time in seconds, and range in metres relative to the middle of the window, which is
+            sample n_range // 2.
         """
         return Axis("pulse", n_pulse, start_s, 1 / self.prf_hz, "s"), Axis(
             "range", n_range, -(n_range // 2) * self.range_step_m, self.range_step_m, "m"
         )
 
     def image_axes(self, raw: tuple[Axis, ...]) -> tuple[Axis, Axis]:
-        """Cross range (m), or Doppler (Hz) where the rotation is not known, with zero at line n //
-        2; and range (m).
+        """Return the axes (azimuth, range) of the image of range-compressed pulses.
+
+        Args:
+            raw: Axes of the data, the last two being (pulse, range).
+
+        Returns:
+            Cross range in metres (Doppler in Hz where the rotation is unknown) with zero at line n
+            // 2, and the range axis.
         """
         pulse, range_ = raw[-2:]
         if self.rotation_rad_s is None:

@@ -1,4 +1,4 @@
-"""What a synthetic aperture ladar with a triangular sweep knows about itself."""
+"""Instrument description of a synthetic aperture ladar with a triangular sweep."""
 
 from __future__ import annotations
 
@@ -18,23 +18,34 @@ Detection = Literal["complex", "real"]
 
 @dataclass(frozen=True)
 class TriangularLadar:
-    """Instrument description of a symmetric triangular FMCW ladar that is dechirped on receive
-    (STLFMCW).
+    """Symmetric triangular FMCW ladar that is dechirped on receive (STLFMCW).
 
-    carrier_hz: middle of the band; bandwidth_hz: swept by each half; period_s: the full triangle,
-    up and down (the paper's PRT); sample_rate_hz: of the beat signal, which must make a whole
-    number of samples of a sweep. speed_m_s: along track, or of the target across the line of sight.
-    reference_range_m: delay of the local oscillator as a range; ranges of scatterers are relative
-    to it. beam_rad: azimuth angle that the beam lights, None where it lights the whole scene.
-    keep_every: of so many periods one is recorded.
+    In a period that starts at t the middle of the up sweep is at t + period / 4, the turning point
+    at t + period / 2, and the middle of the down sweep at t + 3 period / 4.
 
-    detection: complex samples, or one real channel. dechirp_sign: "lo_conj_echo" (as the paper
-    prints it: phase +2 pi fc dtau, a scatterer beyond the reference has a positive beat in the up
-    sweep) or its conjugate "echo_conj_lo".
+    Args:
+        carrier_hz: Middle of the band in Hz.
+        bandwidth_hz: Bandwidth swept by each half of the triangle in Hz.
+        period_s: Length of the full triangle, up and down, in seconds (the PRT of the paper).
+        sample_rate_hz: Sampling rate of the beat signal in Hz; a sweep must hold a whole number of
+            samples, at least 16.
+        speed_m_s: Speed in m/s along track, or of the target across the line of sight.
+        reference_range_m: Delay of the local oscillator as a range in metres; ranges of scatterers
+            are relative to it.
+        beam_rad: Illuminated azimuth angle in radians, None where the beam covers the whole scene.
+        keep_every: One period is recorded of every `keep_every` periods.
+        detection: "complex" samples, or one "real" channel.
+        dechirp_sign: "lo_conj_echo" as printed in the paper: the phase is +2 pi fc dtau, and a
+            scatterer beyond the reference range has a positive beat frequency in the up sweep.
+            "echo_conj_lo" is its conjugate.
+        wave_speed_m_s: Propagation speed in m/s.
 
-    Of a period that starts at t: the up sweep has its middle at t + period/4, the TURNING POINT is
-    at t + period/2, the middle of the down sweep at t + 3 period/4. Raises ValueError for
-    parameters that make no instrument.
+    Raises:
+        ValueError: If a parameter lies outside its range, or a sweep does not hold a whole number
+            of 16 samples or more.
+
+    Reference:
+        Remote Sens. 2024, 16, 793.
     """
 
     carrier_hz: float
@@ -57,7 +68,7 @@ class TriangularLadar:
             raise ValueError(f"radar.speed_m_s must be a number of 0 or more, got {self.speed_m_s}")
         if self.beam_rad is not None and not 0 < self.beam_rad < math.pi:
             raise ValueError(
-                "radar.beam_rad must lie in 0..pi, or be None where the beam lights the whole scene, "
+                "radar.beam_rad must lie in 0..pi, or be None where the beam covers the whole scene, "
                 f"got {self.beam_rad}"
             )
         if not (isinstance(self.keep_every, int) and self.keep_every >= 1):
@@ -78,61 +89,79 @@ class TriangularLadar:
 
     @property
     def wavelength_m(self) -> float:
+        """Carrier wavelength in metres."""
         return self.wave_speed_m_s / self.carrier_hz
 
     @property
     def sweep_s(self) -> float:
-        """Length of ONE sweep, half of the period."""
+        """Length of one sweep in seconds, half of the period."""
         return self.period_s / 2
 
     @property
     def chirp_rate_hz_s(self) -> float:
-        """K = 2 B / period."""
+        """Chirp rate K = 2 B / period in Hz/s."""
         return self.bandwidth_hz / self.sweep_s
 
     @property
     def sweep_samples(self) -> int:
-        """Samples of one sweep."""
+        """Number of samples of one sweep."""
         return round(self.sweep_s * self.sample_rate_hz)
 
     @property
     def range_step_m(self) -> float:
-        """One range cell, c / (2 B), which is one bin 1 / sweep_s of the beat frequency."""
+        """Range cell c / (2 B) in metres, which is one bin 1 / sweep_s of the beat frequency."""
         return self.wave_speed_m_s / (2 * self.bandwidth_hz)
 
     @property
     def pulse_step_s(self) -> float:
-        """Time from one recorded period to the next."""
+        """Time in seconds from one recorded period to the next."""
         return self.keep_every * self.period_s
 
     @property
     def ambiguous_velocity_m_s(self) -> float:
-        """Change of velocity that turns the phase between half sweeps once, lambda / (2 sweep_s):
-        what integers count (brief 000, erratum 8).
+        """Velocity interval lambda / (2 sweep_s) in m/s of one cycle of the interference phase.
+
+        The segmented interference measures the radial velocity modulo this interval.
+
+        Reference:
+            Remote Sens. 2024, 16, 793, Eq. (17).
         """
         return self.wavelength_m / (2 * self.sweep_s)
 
     def beat_hz(self, relative_range_m: float) -> float:
-        """Beat frequency in the up sweep of a scatterer at rest, K 2 RD / c."""
+        """Return the beat frequency of a scatterer at rest in the up sweep, K 2 RD / c, in Hz.
+
+        Args:
+            relative_range_m: Range RD of the scatterer relative to the reference range in metres.
+        """
         return self.chirp_rate_hz_s * 2 * relative_range_m / self.wave_speed_m_s
 
     def doppler_hz(self, velocity_m_s: float) -> float:
-        """Shift of the beat by a radial velocity, 2 v / lambda, receding positive."""
+        """Return the shift of the beat frequency by a radial velocity, 2 v / lambda, in Hz.
+
+        Args:
+            velocity_m_s: Radial velocity v in m/s, receding positive.
+        """
         return 2 * velocity_m_s / self.wavelength_m
 
     def fast_time_axis(self) -> Axis:
-        """Time u from the middle of a sweep, u_n = (n - (N - 1) / 2) / fs: symmetric, so that a
-        sweep can be mirrored.
+        """Return the time from the middle of a sweep, u_n = (n - (N - 1) / 2) / fs, in seconds.
+
+        The samples are symmetric about zero, so that a sweep can be reversed in time.
         """
         n, step = self.sweep_samples, 1 / self.sample_rate_hz
         return Axis("fast_time", n, -(n - 1) / 2 * step, step, "s")
 
     def sweep_axes(self, n_period: int, start_s: float | None = None) -> tuple[Axis, Axis, Axis]:
-        """Axes of separated sweeps: ramp (0 up, 1 down), pulse (start of each period, s), fast time
-        (s).
+        """Return the axes (ramp, pulse, fast time) of separated sweeps.
 
-        start_s: start of the first period; by default the TURNING POINT of period n_period // 2
-        lies at slow time zero, where a scatterer at azimuth zero is abeam.
+        Args:
+            n_period: Number of recorded periods.
+            start_s: Start of the first period in seconds. By default the turning point of period
+                n_period // 2 lies at slow time zero, where a scatterer at azimuth zero is abeam.
+
+        Returns:
+            Ramp (0 up, 1 down), start of each period in seconds, and fast time in seconds.
         """
         start = -(n_period // 2) * self.pulse_step_s - self.period_s / 2 if start_s is None else start_s
         return (
@@ -142,11 +171,18 @@ class TriangularLadar:
         )
 
     def record_axes(self, n_period: int, n_sample: int, start_s: float | None = None) -> tuple[Axis, Axis]:
-        """Axes of blocks of a continuous record, one block a recorded period: pulse (start of each
-        block, s) and time within the block (s).
+        """Return the axes (pulse, time) of a continuous record in blocks, one per recorded period.
 
-        The first sample lies half a step after the start, so that samples of separated sweeps are
-        samples of the record where the triangle starts with the block.
+        The first sample lies half a sampling interval after the start of its block. Samples of
+        separated sweeps are then samples of the record where the triangle starts with the block.
+
+        Args:
+            n_period: Number of recorded periods.
+            n_sample: Number of samples of a block.
+            start_s: Start of the first block in seconds, by default as in `sweep_axes`.
+
+        Returns:
+            Start of each block in seconds, and time within the block in seconds.
         """
         return self.sweep_axes(n_period, start_s)[1], Axis(
             "time", n_sample, 0.5 / self.sample_rate_hz, 1 / self.sample_rate_hz, "s"
@@ -154,9 +190,15 @@ class TriangularLadar:
 
 
 def sweep_middles(radar: TriangularLadar, pulse: Axis, device: torch.device | str | None = None) -> Tensor:
-    """Slow times (s) of the middles of the up and the down sweeps, float64 (2, pulse).
+    """Return the slow times of the middles of the up and down sweeps.
 
-    pulse: starts of the periods.
+    Args:
+        radar: Instrument.
+        pulse: Axis of the starts of the periods in seconds.
+        device: Device of the result.
+
+    Returns:
+        Slow times in seconds, float64 (2, pulse), up sweeps first.
     """
     start = pulse.values(device)
     return torch.stack([start + 0.25 * radar.period_s, start + 0.75 * radar.period_s])

@@ -1,9 +1,8 @@
-"""From where the pulses of a spotlight or turntable recording saw the scene, and what plane waves
-neglect.
+"""Geometry of spotlight and turntable recordings, and the error of the plane-wave approximation.
 
-Ground points are x, y, z in metres about the scene centre. A scatterer at range r behind that
-centre (r grows away from the radar) has the phase -4 pi f r / c at the frequency f; range profiles
-are the centred unitary transform of such samples.
+Ground points have coordinates x, y, z in metres about the scene centre. A scatterer at range r
+behind that centre (r grows away from the radar) has the phase -4 pi f r / c at the frequency f.
+Range profiles are the centred unitary transform of such samples.
 """
 
 from __future__ import annotations
@@ -17,26 +16,40 @@ from torch import Tensor
 from torchsar.core import centred_fft, centred_ifft
 from torchsar.radar.stripmap import LIGHT_M_S
 
+# Largest relative error of a frequency step: stored frequencies are rounded, by 6e-4 of a step in
+# the GOTCHA recording; 1 % of a step still rejects a missing or repeated frequency.
 _STEP_TOLERANCE = 0.01
 
 
 def range_profiles(samples: Tensor) -> Tensor:
-    """Range profiles of frequency samples, both (..., n).
+    """Transform frequency samples to range profiles (unitary).
 
-    Cell n // 2 lies at range zero, range grows away from the radar. Unitary.
+    Args:
+        samples: Frequency samples, shape (..., n), complex.
+
+    Returns:
+        Range profiles, same shape. Cell n // 2 lies at range zero; range grows away from the radar.
     """
     return centred_ifft(samples) * math.sqrt(samples.shape[-1])
 
 
 def frequency_samples(profiles: Tensor) -> Tensor:
-    """Inverse and adjoint of range_profiles, (..., n) -> (..., n)."""
+    """Transform range profiles (..., n) to frequency samples, the inverse of `range_profiles`.
+
+    The transform is unitary, so that it is also the adjoint.
+    """
     return centred_fft(profiles) / math.sqrt(profiles.shape[-1])
 
 
 def frequency_step_hz(frequency_hz: Tensor) -> float:
-    """Step of a rising, uniform frequency axis (n,).
+    """Return the step of a rising, uniform frequency axis in Hz.
 
-    Raises ValueError where it is neither, or has fewer than two entries.
+    Args:
+        frequency_hz: Frequencies in Hz, shape (n,).
+
+    Raises:
+        ValueError: If there are fewer than two frequencies, one of them is not positive, or the
+            steps are not positive and equal within 1 %.
     """
     f = frequency_hz
     if f.ndim != 1 or f.shape[0] < 2 or not bool((torch.isfinite(f) & (f > 0)).all()):
@@ -55,12 +68,20 @@ def frequency_step_hz(frequency_hz: Tensor) -> float:
 
 @dataclass(frozen=True, eq=False)
 class FarField:
-    """Plane waves: the range of a ground point is direction . (x, y) + offset.
+    """Plane-wave geometry: the range of a ground point is direction . (x, y) + offset.
 
-    frequency_hz: (n,), rising in equal steps. direction: (pulse, 2), what a step along x and along
-    y adds to the range (the ground part of the unit vector away from the radar). offset_m:
-    (pulse,), range of the scene centre. All float64. Neglects the curvature of the wavefront:
-    `plane_wave_loss`, and exactly `Spotlight.neglected_range_m`.
+    The curvature of the wavefront is neglected; `plane_wave_loss` bounds the error and
+    `Spotlight.neglected_range_m` gives it exactly.
+
+    Args:
+        frequency_hz: Frequencies in Hz, float64 (n,), rising in equal steps.
+        direction: Change of range per metre along x and y, float64 (pulse, 2): the ground part of
+            the unit vector that points away from the radar.
+        offset_m: Range of the scene centre in metres, float64 (pulse,).
+        wave_speed_m_s: Propagation speed in m/s.
+
+    Raises:
+        ValueError: If the frequencies are not rising in equal steps, or the shapes do not match.
     """
 
     frequency_hz: Tensor
@@ -78,7 +99,16 @@ class FarField:
 
     @classmethod
     def turntable(cls, frequency_hz: Tensor, angle_rad: Tensor, wave_speed_m_s: float = LIGHT_M_S) -> FarField:
-        """Range x cos a + y sin a for a target turned by a = angle_rad (pulse,)."""
+        """Return the geometry of a rotating target, range x cos a + y sin a.
+
+        Args:
+            frequency_hz: Frequencies in Hz, float64 (n,).
+            angle_rad: Rotation angles a in radians, float64 (pulse,).
+            wave_speed_m_s: Propagation speed in m/s.
+
+        Raises:
+            TypeError: If a tensor is not float64 with one dimension.
+        """
         angle = _float64(angle_rad, "angle_rad", 1)
         return cls(
             _float64(frequency_hz, "frequency_hz", 1),
@@ -88,13 +118,13 @@ class FarField:
         )
 
     def turned(self, angle_rad: float) -> FarField:
-        """The same waves in coordinates whose first axis points angle_rad from x towards y."""
+        """Return the same waves in coordinates with the x axis turned by angle_rad towards y."""
         cos, sin = math.cos(angle_rad), math.sin(angle_rad)
         turn = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64, device=self.direction.device)
         return replace(self, direction=self.direction @ turn)
 
     def to(self, device: torch.device | str) -> FarField:
-        """The same waves on another device."""
+        """Return the same waves on another device."""
         return replace(
             self,
             frequency_hz=self.frequency_hz.to(device),
@@ -104,21 +134,39 @@ class FarField:
 
     @property
     def pulses(self) -> int:
+        """Number of pulses."""
         return self.direction.shape[0]
 
     def range_m(self, pulses: slice, x: Tensor, y: Tensor) -> Tensor:
-        """Range of the ground points x, y (point,) in the given pulses, float64 (pulse, point)."""
+        """Return the range of ground points in given pulses.
+
+        Args:
+            pulses: Pulses.
+            x: First coordinate in metres, shape (point,).
+            y: Second coordinate in metres, shape (point,).
+
+        Returns:
+            Range in metres, float64 (pulse, point).
+        """
         u = self.direction[pulses]
         return u[:, :1] * x + u[:, 1:] * y + self.offset_m[pulses, None]
 
 
 @dataclass(frozen=True, eq=False)
 class Spotlight:
-    """Antenna positions (pulse, 3) about the scene centre and the ranges (pulse,) to which the
-    profiles refer, in metres, float64.
+    """Antenna positions about the scene centre and the reference ranges of the profiles.
 
-    frequency_hz: (n,), rising in equal steps. The range of a point p is |position - p| - reference.
-    height_m: ground points lie at this z.
+    The range of a point p is |position - p| - reference.
+
+    Args:
+        frequency_hz: Frequencies in Hz, float64 (n,), rising in equal steps.
+        position_m: Antenna positions in metres, float64 (pulse, 3).
+        reference_m: Ranges in metres to which the profiles refer, float64 (pulse,).
+        height_m: Coordinate z of the ground points in metres.
+        wave_speed_m_s: Propagation speed in m/s.
+
+    Raises:
+        ValueError: If the frequencies are not rising in equal steps, or the shapes do not match.
     """
 
     frequency_hz: Tensor
@@ -140,7 +188,7 @@ class Spotlight:
             )
 
     def turned(self, angle_rad: float) -> Spotlight:
-        """The same antennas in coordinates whose first axis points angle_rad from x towards y."""
+        """Return the same antennas in coordinates with the x axis turned by angle_rad towards y."""
         cos, sin = math.cos(angle_rad), math.sin(angle_rad)
         turn = torch.tensor(
             [[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]], dtype=torch.float64, device=self.position_m.device
@@ -148,7 +196,7 @@ class Spotlight:
         return replace(self, position_m=self.position_m @ turn)
 
     def to(self, device: torch.device | str) -> Spotlight:
-        """The same antennas on another device."""
+        """Return the same antennas on another device."""
         return replace(
             self,
             frequency_hz=self.frequency_hz.to(device),
@@ -158,10 +206,20 @@ class Spotlight:
 
     @property
     def pulses(self) -> int:
+        """Number of pulses."""
         return self.position_m.shape[0]
 
     def range_m(self, pulses: slice, x: Tensor, y: Tensor) -> Tensor:
-        """Range of the ground points x, y (point,) in the given pulses, float64 (pulse, point)."""
+        """Return the range of ground points in given pulses.
+
+        Args:
+            pulses: Pulses.
+            x: First coordinate in metres, shape (point,).
+            y: Second coordinate in metres, shape (point,).
+
+        Returns:
+            Range in metres, float64 (pulse, point).
+        """
         antenna = self.position_m[pulses, None, :]
         square = (
             (antenna[..., 0] - x).square() + (antenna[..., 1] - y).square() + (antenna[..., 2] - self.height_m).square()
@@ -169,8 +227,9 @@ class Spotlight:
         return torch.sqrt(square) - self.reference_m[pulses, None]
 
     def far_field(self) -> FarField:
-        """Plane waves that agree with this geometry, in range and in its first derivatives, at the
-        centre of the ground plane.
+        """Return the plane waves that match this geometry at the scene centre.
+
+        Range and its first derivatives agree at the centre of the ground plane.
         """
         down = self.position_m.new_tensor([0.0, 0.0, self.height_m]) - self.position_m
         distance = torch.linalg.vector_norm(down, dim=-1)
@@ -179,18 +238,31 @@ class Spotlight:
         )
 
     def neglected_range_m(self, x: Tensor, y: Tensor) -> Tensor:
-        """Exact range minus that of plane waves, (pulse, point): rho^2 / (2 range) and smaller
-        terms.
+        """Return the exact range minus that of plane waves: rho^2 / (2 range) and smaller terms.
+
+        Args:
+            x: First coordinate of ground points in metres, shape (point,).
+            y: Second coordinate in metres, shape (point,).
+
+        Returns:
+            Neglected range in metres, shape (pulse, point).
         """
         every = slice(None)
         return self.range_m(every, x, y) - self.far_field().range_m(every, x, y)
 
     def apparent(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Where plane waves show the ground points x, y (point,): the least-squares fit of their
-        exact ranges over all pulses.
+        """Return the positions at which the plane-wave approximation shows ground points.
 
-        Sampling a polar-format image there puts it on the true ground; what the fit leaves is its
-        defocus. Needs an aperture that turns.
+        They are the least-squares fit of the exact ranges over all pulses. Sampling a polar-format
+        image at these positions puts it on the true ground; the residual of the fit is the
+        remaining defocus. The azimuth angle must change over the aperture.
+
+        Args:
+            x: First coordinate of ground points in metres, shape (point,).
+            y: Second coordinate in metres, shape (point,).
+
+        Returns:
+            Apparent coordinates x and y in metres, shape (point,) each.
         """
         waves = self.far_field()
         fit = torch.linalg.lstsq(waves.direction, self.neglected_range_m(x, y)).solution
@@ -199,11 +271,13 @@ class Spotlight:
 
 @dataclass(frozen=True)
 class PlaneWaveLoss:
-    """What plane waves neglect at the edge of an image: where a point appears wrongly, and how far
-    it is out of focus.
+    """Displacement and defocus that plane waves cause at the edge of an image.
 
-    total_rad: phase of the neglected range; all but defocus_rad of it only moves the point, by up
-    to displacement_m on the ground, either way.
+    Args:
+        total_rad: Phase of the neglected range in radians; all of it but `defocus_rad` only
+            displaces the point.
+        displacement_m: Largest displacement on the ground in metres, in either direction.
+        defocus_rad: Phase at the ends of the aperture that no displacement explains, in radians.
     """
 
     total_rad: float
@@ -214,14 +288,26 @@ class PlaneWaveLoss:
 def plane_wave_loss(
     radius_m: float, range_m: float, aperture_rad: float, wavelength_m: float, elevation_rad: float = 0.0
 ) -> PlaneWaveLoss:
-    """Upper bounds for a ground point radius_m from the scene centre, range_m from the radar, over
-    an azimuth aperture of aperture_rad.
+    """Bound the displacement and the defocus that plane waves cause at a ground point.
 
     The neglected range is d = (rho^2 - (u . p)^2) / (2 R) with u . p = rho cos(el) cos(azimuth from
-    the line of sight). Its mean shifts range and its slope over the aperture shifts cross range;
-    what a shifted point does not explain is d'' + d, at most rho^2 (1 + cos(el)^2) / (2 R), whose
-    phase at the ends of the aperture is defocus_rad. For apertures below about 1 rad; terms of
-    rho^3 / R^2 are left out.
+    the line of sight). Its mean shifts range and its slope over the aperture shifts cross range. A
+    shifted point does not explain d'' + d, which is at most rho^2 (1 + cos(el)^2) / (2 R); its
+    phase at the ends of the aperture is `defocus_rad`. Use it for apertures below about 1 rad;
+    terms of order rho^3 / R^2 are left out.
+
+    Args:
+        radius_m: Distance rho of the point from the scene centre in metres.
+        range_m: Range R of the scene centre in metres.
+        aperture_rad: Azimuth aperture in radians.
+        wavelength_m: Wavelength in metres.
+        elevation_rad: Elevation of the line of sight in radians.
+
+    Returns:
+        Upper bounds.
+
+    Raises:
+        ValueError: If an argument is out of range.
     """
     if not (
         0 <= radius_m < range_m
@@ -248,11 +334,22 @@ def geometry_of(
     reference_m: Tensor | None = None,
     height_m: float = 0.0,
 ) -> FarField | Spotlight:
-    """The geometry in the recorded side data: a turntable where there are angles, a spotlight where
-    there are antenna positions.
+    """Build the geometry from recorded side data.
 
-    reference_m: by default the distance of the antenna from the scene centre. Raises ValueError
-    where neither or both are given.
+    Angles give a turntable, antenna positions give a spotlight geometry.
+
+    Args:
+        frequency_hz: Frequencies in Hz, float64 (n,).
+        angle_rad: Rotation angles in radians, float64 (pulse,), or None.
+        position_m: Antenna positions in metres, float64 (pulse, 3), or None.
+        reference_m: Ranges of the profiles in metres, float64 (pulse,), by default the distance of
+            the antenna from the scene centre.
+        height_m: Coordinate z of the ground points in metres.
+
+    Raises:
+        ValueError: If the frequencies are missing, or not exactly one of angles and positions is
+            given.
+        TypeError: If a tensor is not float64 or has the wrong number of dimensions.
     """
     if frequency_hz is None or (angle_rad is None) == (position_m is None):
         given = [
@@ -274,6 +371,7 @@ def geometry_of(
 
 
 def _float64(value: Tensor | None, name: str, ndim: int) -> Tensor:
+    """Return the value if it is a float64 tensor with ndim dimensions, else raise TypeError."""
     if not isinstance(value, Tensor) or value.dtype != torch.float64 or value.ndim != ndim:
         got = f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
         raise TypeError(f"{name} must be a float64 tensor with {ndim} dims, shared by all trials, got {got}")

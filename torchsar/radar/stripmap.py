@@ -1,4 +1,4 @@
-"""What a side-looking stripmap radar knows about itself."""
+"""Instrument description of a side-looking stripmap radar."""
 
 from __future__ import annotations
 
@@ -11,19 +11,31 @@ from torch import Tensor
 from torchsar.core import Axis, per_trial
 from torchsar.radar.waveform import LinearFM
 
-LIGHT_M_S = 299_792_458.0
+LIGHT_M_S = 299_792_458.0  # speed of light in vacuum, by definition of the metre
 
 
 @dataclass(frozen=True)
 class StripmapRadar:
-    """Instrument description of a stripmap radar on a straight path (slant plane).
+    """Stripmap radar on a straight path, described in the slant plane.
 
-    carrier_hz, sampling_hz (complex), prf_hz; near_range_m: slant range of sample 0, counted from
-    the leading edge of the echo; velocity_m_s: nominal effective velocity, which also fixes the
-    azimuth scale of images (x = velocity * slow time); pointing_doppler_hz: nominal Doppler of the
-    beam centre, the frame of image coordinates; None where it is not known before it is estimated;
-    integration_s: nominal coherent integration (beam dwell), None where the beam fills the PRF
-    band.
+    The effective velocity also fixes the azimuth scale of images, x = velocity * slow time.
+
+    Args:
+        carrier_hz: Carrier frequency in Hz.
+        pulse: Transmitted pulse.
+        sampling_hz: Complex sampling rate in Hz, at least the bandwidth of the pulse.
+        prf_hz: Pulse repetition frequency in Hz.
+        velocity_m_s: Nominal effective velocity in m/s.
+        near_range_m: Slant range of sample 0 in metres, counted from the leading edge of the echo.
+        pointing_doppler_hz: Nominal Doppler of the beam centre in Hz, to which image coordinates
+            refer. None where it has yet to be estimated.
+        integration_s: Nominal coherent integration time (beam dwell) in seconds. None where the
+            beam fills the PRF band.
+        wave_speed_m_s: Propagation speed in m/s.
+
+    Raises:
+        ValueError: If a parameter is not positive or not finite, or the bandwidth of the pulse
+            exceeds the sampling rate.
     """
 
     carrier_hz: float
@@ -54,69 +66,111 @@ class StripmapRadar:
 
     @property
     def wavelength_m(self) -> float:
+        """Carrier wavelength in metres."""
         return self.wave_speed_m_s / self.carrier_hz
 
     @property
     def range_step_m(self) -> float:
+        """Slant-range spacing of the samples, c / (2 sampling rate), in metres."""
         return self.wave_speed_m_s / (2 * self.sampling_hz)
 
     @property
     def range_resolution_m(self) -> float:
-        """-3 dB width of a rectangular band, 0.886 c / (2 B)."""
+        """-3 dB width of the response of a rectangular band, 0.886 c / (2 B), in metres."""
         return 0.886 * self.wave_speed_m_s / (2 * self.pulse.bandwidth_hz)
 
     @property
     def pulse_samples(self) -> int:
+        """Number of samples of the transmitted pulse."""
         return self.pulse.n_samples(self.sampling_hz)
 
     def raw_axes(self, n_pulse: int, n_range: int, start_s: float = 0.0) -> tuple[Axis, Axis]:
-        """Slow time (s) and slant range (m) of a raw matrix."""
+        """Return the axes (pulse, range) of a raw data matrix.
+
+        Args:
+            n_pulse: Number of pulses.
+            n_range: Number of range samples.
+            start_s: Slow time of the first pulse in seconds.
+
+        Returns:
+            Slow time in seconds and slant range in metres.
+        """
         return Axis("pulse", n_pulse, start_s, 1 / self.prf_hz, "s"), Axis(
             "range", n_range, self.near_range_m, self.range_step_m, "m"
         )
 
     def image_axes(self, raw: tuple[Axis, ...]) -> tuple[Axis, Axis]:
-        """Azimuth x = nominal velocity * slow time of beam-centre crossing (m), and slant range at
-        that crossing (m).
+        """Return the axes (azimuth, range) of the image of raw data.
+
+        Args:
+            raw: Axes of the raw data, the last two being (pulse, range).
+
+        Returns:
+            Azimuth x = nominal velocity * slow time of beam-centre crossing, and slant range at
+            that crossing, both in metres.
         """
         pulse, range_ = raw[-2:]
         return Axis("azimuth", pulse.n, pulse.start * self.velocity_m_s, pulse.step * self.velocity_m_s, "m"), range_
 
     def range_frequency_hz(self, n: int, device: torch.device | str | None = None) -> Tensor:
-        """Baseband range frequencies of an n-point FFT, FFT order, float64 (n,)."""
+        """Return the baseband range frequencies (Hz) of an n-point FFT, FFT order, float64 (n,)."""
         return torch.fft.fftfreq(n, 1 / self.sampling_hz, dtype=torch.float64, device=device)
 
     def doppler_hz(self, n: int, centre_hz: Tensor | float, device: torch.device | str | None = None) -> Tensor:
-        """Absolute Doppler of an n-point FFT over pulses, unwrapped into one PRF about the centre.
+        """Return the Doppler frequencies of an n-point FFT over pulses, unwrapped about a centre.
 
-        (...,) -> (..., n), FFT order.
+        Args:
+            n: Number of pulses.
+            centre_hz: Centre of the PRF interval in Hz, shape (...,) or a number.
+            device: Device of the result.
+
+        Returns:
+            Absolute Doppler in Hz within half a PRF of the centre, FFT order, float64 (..., n).
         """
         base = torch.fft.fftfreq(n, 1 / self.prf_hz, dtype=torch.float64, device=device)
         centre = per_trial(centre_hz, 1, base)
         return base + self.prf_hz * torch.round((centre.detach() - base) / self.prf_hz)
 
     def sin_squint(self, doppler_hz: Tensor | float, velocity_m_s: Tensor | float | None = None) -> Tensor:
-        """Sine of the squint angle of a Doppler frequency: lambda f / (2 v), positive when the beam
-        looks ahead (closing).
+        """Return the sine of the squint angle of a Doppler frequency, lambda f / (2 v).
+
+        Args:
+            doppler_hz: Doppler frequency in Hz.
+            velocity_m_s: Effective velocity in m/s, by default the nominal one. Broadcasts with
+                `doppler_hz`.
+
+        Returns:
+            Sine of the squint angle, float64, positive when the beam looks ahead (closing range).
         """
         velocity = self.velocity_m_s if velocity_m_s is None else velocity_m_s
         return self.wavelength_m * torch.as_tensor(doppler_hz, dtype=torch.float64) / (2 * velocity)
 
     def azimuth_rate_hz_s(self, range_m: Tensor | float, velocity_m_s: Tensor | float | None = None) -> Tensor:
-        """Magnitude of the Doppler rate at closest approach, 2 v^2 / (lambda r)."""
+        """Return the magnitude of the Doppler rate at closest approach, 2 v^2 / (lambda r).
+
+        Args:
+            range_m: Closest range r in metres.
+            velocity_m_s: Effective velocity v in m/s, by default the nominal one. Broadcasts with
+                `range_m`.
+
+        Returns:
+            Doppler rate in Hz/s, float64.
+        """
         velocity = torch.as_tensor(self.velocity_m_s if velocity_m_s is None else velocity_m_s, dtype=torch.float64)
         return 2 * velocity.square() / (self.wavelength_m * torch.as_tensor(range_m, dtype=torch.float64))
 
     def aperture_s(self, range_m: float) -> float:
-        """Time of one synthetic aperture at this range: the nominal dwell, or the time to sweep one
-        PRF where none is known.
+        """Return the duration of one synthetic aperture at a range, in seconds.
+
+        This is the nominal integration time or, where that is None, the time in which the Doppler
+        of a point sweeps one PRF.
         """
         return (
             self.prf_hz / float(self.azimuth_rate_hz_s(range_m)) if self.integration_s is None else self.integration_s
         )
 
     def aperture_lines(self, range_m: float) -> int:
-        """Lines of one synthetic aperture at this range."""
+        """Return the number of pulses of one synthetic aperture at a range, rounded up."""
         return math.ceil(self.aperture_s(range_m) * self.prf_hz)
 
     def image_position(
@@ -126,11 +180,20 @@ class StripmapRadar:
         frame_doppler_hz: Tensor | float,
         velocity_m_s: Tensor | float,
     ) -> tuple[Tensor, Tensor]:
-        """Where a target appears in an image of frame Doppler f: (azimuth_m, range_m).
+        """Return the position of a target in an image that refers to a given Doppler frequency.
 
-        The target is met at the slant range R = r / cos(squint) and at the slow time t = t0 -
-        lambda f R / (2 v^2); an image holds it at (nominal velocity * t, R). With f = 0 these are
-        the zero-Doppler coordinates. All arguments broadcast.
+        The line of sight of frame Doppler f crosses the target at slant range R = r / cos(squint)
+        and slow time t = t0 - lambda f R / (2 v^2). The image shows the target at (nominal velocity
+        * t, R). With f = 0 these are the zero-Doppler coordinates. All arguments broadcast.
+
+        Args:
+            zero_doppler_s: Slow time t0 of closest approach in seconds.
+            closest_range_m: Closest range r in metres.
+            frame_doppler_hz: Doppler f to which the image coordinates refer, in Hz.
+            velocity_m_s: Effective velocity v of the target in m/s.
+
+        Returns:
+            Azimuth and slant range in metres.
         """
         sin = self.sin_squint(frame_doppler_hz, velocity_m_s)
         slant = closest_range_m / torch.sqrt(1 - sin.square())

@@ -12,11 +12,19 @@ from torchsar.core import unit_phasor
 
 @dataclass(frozen=True)
 class LinearFM:
-    """Linear frequency-modulated pulse exp(j pi k t^2), |t| < duration/2, with chirp rate k =
-    direction * bandwidth / duration.
+    """Linear frequency-modulated pulse exp(j pi k t^2) for |t| < duration / 2.
 
-    direction: +1 up-chirp, -1 down-chirp. The echo of a target at range R starts at fast time 2 R /
-    c.
+    The chirp rate is k = direction * bandwidth / duration. The echo of a target at range R starts
+    at the fast time 2 R / c.
+
+    Args:
+        bandwidth_hz: Swept bandwidth in Hz.
+        duration_s: Length of the pulse in seconds.
+        direction: +1 for an up-chirp, -1 for a down-chirp.
+
+    Raises:
+        ValueError: If the bandwidth or the duration is not positive, or `direction` is neither +1
+            nor -1.
     """
 
     bandwidth_hz: float
@@ -29,23 +37,43 @@ class LinearFM:
 
     @property
     def rate_hz_s(self) -> float:
+        """Chirp rate k in Hz/s, negative for a down-chirp."""
         return self.direction * self.bandwidth_hz / self.duration_s
 
     def n_samples(self, sampling_hz: float) -> int:
-        """Samples of the pulse at this sampling rate."""
+        """Return the number of samples of the pulse at a sampling rate, at least 1."""
         return max(1, round(self.duration_s * sampling_hz))
 
     def samples(
         self, sampling_hz: float, dtype: torch.dtype = torch.complex128, device: torch.device | str | None = None
     ) -> Tensor:
-        """The sampled pulse from its leading edge on, (n_samples,)."""
+        """Sample the pulse from its leading edge.
+
+        Args:
+            sampling_hz: Complex sampling rate in Hz.
+            dtype: Complex dtype of the result; the phase is formed in float64.
+            device: Device of the result.
+
+        Returns:
+            The sampled pulse, shape (n_samples,), complex, of amplitude 1.
+        """
         n = self.n_samples(sampling_hz)
         t = (torch.arange(n, dtype=torch.float64, device=device) - (n - 1) / 2) / sampling_hz
         return unit_phasor(0.5 * self.rate_hz_s * t.square(), dtype)
 
     def spectrum(self, n: int, sampling_hz: float, device: torch.device | str | None = None) -> Tensor:
-        """FFT of the zero-padded sampled pulse, complex128 (n,), in FFT order, leading edge at
-        sample 0.
+        """Return the FFT of the zero-padded pulse, whose leading edge is at sample 0.
+
+        Args:
+            n: Number of samples of a range line.
+            sampling_hz: Complex sampling rate in Hz.
+            device: Device of the result.
+
+        Returns:
+            The spectrum in FFT order, shape (n,), complex128.
+
+        Raises:
+            ValueError: If a line of n samples is shorter than the pulse.
         """
         if n < self.n_samples(sampling_hz):
             raise ValueError(

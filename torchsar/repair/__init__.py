@@ -1,5 +1,6 @@
-"""Repairs of raw data: lost lines, interference, converter jitter, channel imbalance, channel
-response, triangular sweeps.
+"""Correction of impaired raw data: lost lines, interference, converters, channels and sweeps.
+
+A line is the record of one pulse along range.
 """
 
 from torchsar.repair.channels import CorrectImbalance, EstimateImbalance, correct_imbalance, estimate_imbalance

@@ -1,4 +1,4 @@
-"""The analytic signal of one-channel samples, and delays of lines by parts of a sample."""
+"""Analytic signal of real samples, and delays of lines by a fraction of a sample."""
 
 from __future__ import annotations
 
@@ -9,11 +9,20 @@ from torchsar.core import linear_phasor
 
 
 def delayed(lines: Tensor, fraction: Tensor, analytic: bool = False) -> Tensor:
-    """Lines at the instants n + fraction, taken as periodic: (..., line, n), fraction (...,) or a
-    number, -0.5..0.5 samples.
+    """Evaluate lines at the instants n + fraction, with lines taken as periodic.
 
-    analytic: keep positive frequencies only, doubled: of real lines the complex signal whose real
-    part they are. Differentiable.
+    Differentiable.
+
+    Args:
+        lines: Lines, shape (..., line, n), real or complex.
+        fraction: Shift of the instants in samples, -0.5..0.5, positive for later instants; a number
+            or shape (...,), float64.
+        analytic: Whether to return the analytic signal: positive frequencies only, doubled, so that
+            its real part is the real line.
+
+    Returns:
+        Complex lines of the same shape; the lines themselves if all shifts are zero and `analytic`
+        is False.
     """
     n = lines.shape[-1]
     if not analytic and _all_zero(fraction):
@@ -26,15 +35,14 @@ def delayed(lines: Tensor, fraction: Tensor, analytic: bool = False) -> Tensor:
 
 
 def _positive(n: int, device: torch.device) -> Tensor:
-    """2 at positive frequencies, 1 at zero and at half the sampling rate, 0 at negative ones, (n,)
-    in FFT order.
-    """
+    """Factors of the analytic signal in FFT order, (n,): 2, 1 at zero and half the rate, 0."""
     order = torch.arange(n, device=device)
     return (2 * order < n).int() + ((2 * order <= n) & (order > 0)).int()
 
 
 def _all_zero(x: Tensor) -> bool:
+    """Whether x is zero and constant; False inside vmap, where values cannot be read."""
     try:
         return not x.requires_grad and not bool(x.any())
-    except RuntimeError:  # inside vmap a value cannot be looked at
+    except RuntimeError:  # inside vmap values cannot be read
         return False

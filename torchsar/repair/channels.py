@@ -1,10 +1,10 @@
-"""Gain and phase imbalance of channels that record the lines in turn (line i by channel i mod C).
+"""Gain and phase imbalance of channels that record the lines in turn.
 
-Channel c multiplies its lines by g_c exp(j phi_c). The product of a line with the one before it,
-averaged over a recording, has the phase phi_c - phi_(c-1) + rho, where rho is the phase increment
-that the Doppler centroid puts on every line; over all channels the phi cancel, so the C products
-give rho and all phi_c - phi_0. Gains follow from line powers. Source: data README (even and odd
-lines as two channels), brief 004, table of recorded data.
+Channel c records the lines i with i mod C = c and multiplies them by g_c exp(j phi_c). The product
+of a line with the conjugate of the one before, averaged over a recording, has the phase phi_c -
+phi_(c-1) + rho, where rho is the phase increment from line to line that belongs to the Doppler
+centroid. In the sum over all channels the phi cancel, so that the C products give rho and every
+phi_c - phi_0. Gains follow from the powers of the lines.
 """
 
 from __future__ import annotations
@@ -18,13 +18,19 @@ from torchsar.core import Estimate, Signal, Stage, cis, real_dtype
 
 
 def lag_products(x: Tensor, channels: int) -> tuple[Tensor, Tensor]:
-    """Mean over range and over the lines of each channel of s[i] conj(s[i - 1]), and of |s[i]|^2.
+    """Compute lag-one products and powers of the channels.
 
-    (..., pulse, range) -> (..., C) each.
+    Powers are compared with those of channel 0 interpolated to the same lines, so that a slow
+    change of the scene is not taken for a gain.
 
-    The power of a channel is a geometric mean over its lines relative to their neighbours, so that
-    neither a slow change of the scene nor a few very bright lines passes for a gain: the value
-    returned is 0 for channel 0 and ln(power / power of channel 0) for others.
+    Args:
+        x: Raw lines, shape (..., pulse, range), complex.
+        channels: Number of channels C.
+
+    Returns:
+        The product s[i] conj(s[i - 1]) averaged over range and over the lines i of each channel,
+        relative to the highest power of a line, shape (..., C), complex128; and ln(power / power of
+        channel 0), shape (..., C), float64.
     """
     lines = x.shape[-2]
     product = (x[..., 1:, :] * x[..., :-1, :].conj()).mean(-1).to(torch.complex128)
@@ -36,10 +42,7 @@ def lag_products(x: Tensor, channels: int) -> tuple[Tensor, Tensor]:
 
 
 def _relative_log_power(power: Tensor, channels: int) -> Tensor:
-    """ln of each channel's power over that of channel 0 interpolated to the same lines.
-
-    (..., pulse) -> (..., C).
-    """
+    """Logarithm of each channel's power over that of channel 0 at the same lines, (..., C)."""
     last = (power.shape[-1] - 1) // channels
     reference, after = power[..., : last * channels : channels], power[..., channels : last * channels + 1 : channels]
     ratios = [torch.zeros_like(power[..., 0])]
@@ -51,17 +54,29 @@ def _relative_log_power(power: Tensor, channels: int) -> Tensor:
 
 
 def estimate_imbalance(x: Tensor, channels: int = 2, doppler_cycles: Tensor | float | None = None) -> Estimate:
-    """Gain and phase of every channel relative to channel 0, which has the lines 0, C, 2C, ...
+    """Estimate gain and phase of every channel relative to channel 0, which records the first line.
 
-    x: raw (..., pulse, range).
+    The products of neighbouring lines leave the phase increment rho, and with it the phases,
+    ambiguous by 2 pi / C. For two channels, phi and phi + pi cannot be distinguished; they
+    correspond to Doppler spectra that are displaced by PRF / 2.
 
-    Gives `gain` (..., C), 1 for channel 0, and `phase_rad` (..., C), 0 for channel 0; to be divided
-    out. The lag products leave rho, and with it the phases, ambiguous by 2 pi / C (for two
-    channels: phi against phi + pi, which is a spectrum displaced by PRF / 2). doppler_cycles
-    (...,): baseband Doppler centroid over PRF, good to 1 / (2 C), settles that; without it the
-    phases of least mean square are taken (for two channels |phi| <= 90 degrees). std assumes a
-    Gaussian scene and independent lines. quality is the coherence of neighbouring lines. Not ok,
-    with gains 1 and phases 0: a channel without power, or a coherence within its chance.
+    Args:
+        x: Raw lines, shape (..., pulse, range), complex.
+        channels: Number of channels C.
+        doppler_cycles: Baseband Doppler centroid over PRF, shape (...,), accurate to 1 / (2 C);
+            resolves the ambiguity. Without it the phases of least mean square are taken, for two
+            channels those within 90 degrees.
+
+    Returns:
+        `gain` of shape (..., C), 1 for channel 0, and `phase_rad` of shape (..., C) in radians, 0
+        for channel 0, by which `correct_imbalance` divides. Standard deviations assume a Gaussian
+        scene and independent lines. `quality` is the coherence of neighbouring lines. `ok` is False
+        where a channel has no power (gain outside 1e-3..1e3), or the coherence is below 5 /
+        sqrt(range samples x lines per channel) and may be due to chance; gains are then 1 and
+        phases 0.
+
+    Raises:
+        ValueError: If there are fewer than two channels or fewer than 2 C + 1 lines.
     """
     if channels < 2 or x.shape[-2] < 2 * channels + 1:
         raise ValueError(
@@ -84,20 +99,21 @@ def estimate_imbalance(x: Tensor, channels: int = 2, doppler_cycles: Tensor | fl
     branch = cost.argmin(-1)[..., None, None].expand(*cost.shape[:-1], 1, channels)
     phase = torch.gather(phases, -2, branch)[..., 0, :]
     gain = torch.exp(log_power / 2)
-    return _judge(x, lag, phase, gain)
+    return _assess(x, lag, phase, gain)
 
 
-def _judge(x: Tensor, lag: Tensor, phase: Tensor, gain: Tensor) -> Estimate:
+def _assess(x: Tensor, lag: Tensor, phase: Tensor, gain: Tensor) -> Estimate:
+    """Estimate with standard deviations, coherence and reliability."""
     channels, lines = gain.shape[-1], x.shape[-2]
     power = x.abs().square().mean((-2, -1)).to(torch.float64)
     mean_gain = gain.square().mean(-1)
     level = power / x.abs().square().mean(-1).amax(-1).to(torch.float64).clamp_min(1e-300)
-    around = gain * torch.roll(gain, 1, -1) / mean_gain[..., None]
-    coherence = (lag.abs() / (level[..., None] * around).clamp_min(1e-300)).mean(-1).clamp(0, 1)
+    product = gain * torch.roll(gain, 1, -1) / mean_gain[..., None]
+    coherence = (lag.abs() / (level[..., None] * product).clamp_min(1e-300)).mean(-1).clamp(0, 1)
     looks = x.shape[-1] * lines / channels
-    one = torch.sqrt((1 - coherence.square()).clamp_min(0) / (2 * looks * coherence.square().clamp_min(1e-12)))
+    single_std = torch.sqrt((1 - coherence.square()).clamp_min(0) / (2 * looks * coherence.square().clamp_min(1e-12)))
     order = torch.arange(channels, dtype=torch.float64, device=x.device)
-    phase_std = one[..., None] * torch.sqrt(order * (channels - order) / channels)
+    phase_std = single_std[..., None] * torch.sqrt(order * (channels - order) / channels)
     gain_std = (gain * math.sqrt(0.5 / looks)) * (order > 0)
     ok = (
         torch.isfinite(gain).all(-1)
@@ -113,7 +129,18 @@ def _judge(x: Tensor, lag: Tensor, phase: Tensor, gain: Tensor) -> Estimate:
 def correct_imbalance(x: Tensor, gain: Tensor, phase_rad: Tensor) -> Tensor:
     """Divide the lines of channel c by gain[c] exp(j phase[c]).
 
-    x: (..., pulse, range); gain, phase_rad: (..., C) float64. Differentiable.
+    Differentiable.
+
+    Args:
+        x: Raw lines, shape (..., pulse, range), complex.
+        gain: Gains, shape (..., C), float64.
+        phase_rad: Phases in radians, shape (..., C), float64.
+
+    Returns:
+        Lines of the same shape.
+
+    Raises:
+        ValueError: If gains and phases differ in shape.
     """
     if gain.shape != phase_rad.shape:
         raise ValueError(
@@ -127,8 +154,12 @@ def correct_imbalance(x: Tensor, gain: Tensor, phase_rad: Tensor) -> Tensor:
 
 
 class EstimateImbalance(Stage):
-    """Imbalance of channels that record the lines in turn; run it after the lines are on a regular
-    grid. doppler_hz settles the branch.
+    """Estimator of the imbalance of channels that record the lines in turn.
+
+    The lines must be on a regular grid (see `LineIntegrity`).
+
+    Args:
+        channels: Number of channels.
     """
 
     provides = ("gain", "phase_rad")
@@ -138,12 +169,29 @@ class EstimateImbalance(Stage):
         self.channels = channels
 
     def forward(self, signal: Signal, doppler_hz: Tensor | None = None) -> Estimate:
+        """Estimate gains and phases; see `estimate_imbalance`.
+
+        Args:
+            signal: Raw lines, shape (..., pulse, range).
+            doppler_hz: Baseband Doppler centroid in Hz, shape (...,); resolves the ambiguity of the
+                phases.
+        """
         cycles = None if doppler_hz is None else doppler_hz * signal.axis("pulse").step
         return estimate_imbalance(signal.data, self.channels, cycles)
 
 
 class CorrectImbalance(Stage):
-    """Equalise the channels: `use(CorrectImbalance(), gain="imbalance", phase_rad="imbalance")`."""
+    """Correction of the imbalance of channels that record the lines in turn.
+
+    In a chain: `use(CorrectImbalance(), gain="imbalance", phase_rad="imbalance")`.
+    """
 
     def forward(self, signal: Signal, gain: Tensor, phase_rad: Tensor) -> Signal:
+        """Divide lines by the gain and phase of their channel; see `correct_imbalance`.
+
+        Args:
+            signal: Raw lines, shape (..., pulse, range).
+            gain: Gains, shape (..., C).
+            phase_rad: Phases in radians, shape (..., C).
+        """
         return signal.with_data(correct_imbalance(signal.data, gain, phase_rad))

@@ -1,10 +1,12 @@
-"""Lines that are missing: zeros, linear interpolation, the azimuth spectrum, or a model of the
-scene (brief 004, item 2).
+"""Reconstruction of missing lines by zeros, linear interpolation, azimuth spectrum or scene model.
 
-All four keep the received lines bit for bit and replace only the missing ones, whatever those hold.
-Errors of the image: zero fill errs by the share of missing lines; the azimuth spectrum (a
-stationary model) gains little where azimuth oversampling is low; only a model of the scene, which
-knows where the image is dark, gains much. Source: brief 004, item 2; Tsvetkov 2017.
+All four methods keep the received lines bit for bit and replace only the missing ones, whatever
+those hold. The image error of zero fill equals the share of missing lines. The azimuth spectrum, a
+stationary model, gains little if azimuth oversampling is low. Only a model of the scene, which uses
+where the image is dark, gains much.
+
+Reference:
+    Tsvetkov 2017 (zeros or interpolation).
 """
 
 from __future__ import annotations
@@ -19,10 +21,7 @@ from torchsar.repair.sparse import conjugate_fill, sparse_fill, unit_level
 
 
 def _mask(lines: Tensor, missing: Tensor) -> Tensor:
-    """missing as a bool mask that broadcasts against the lines, (..., pulse, 1).
-
-    Raises ValueError where it does not fit.
-    """
+    """Mask (..., pulse, 1) of missing lines; raise ValueError if it does not fit the lines."""
     if missing.shape[-1:] != lines.shape[-2:-1]:
         raise ValueError(
             f"mask of missing lines of shape {tuple(missing.shape)} does not fit "
@@ -32,9 +31,7 @@ def _mask(lines: Tensor, missing: Tensor) -> Tensor:
 
 
 def _nothing_missing(missing: Tensor) -> bool:
-    """Whether all the work can be saved; inside vmap a value cannot be looked at, and the work
-    leaves the lines alone anyway.
-    """
+    """Whether no line is missing; False inside vmap, where values cannot be read."""
     try:
         return not bool(missing.any())
     except RuntimeError:
@@ -42,20 +39,39 @@ def _nothing_missing(missing: Tensor) -> bool:
 
 
 def zero_fill(lines: Tensor, missing: Tensor) -> Tensor:
-    """Missing lines set to zero: the baseline.
+    """Set missing lines to zero: the baseline.
 
-    lines: (..., pulse, range); missing: bool (..., pulse).
+    Args:
+        lines: Lines, shape (..., pulse, range), complex.
+        missing: Missing lines, shape (..., pulse), bool.
+
+    Returns:
+        Lines of the same shape.
+
+    Raises:
+        ValueError: If the mask does not have one entry per line.
     """
     return torch.where(_mask(lines, missing), 0, lines)
 
 
 def linear_fill(lines: Tensor, missing: Tensor, doppler_turns: Tensor | float = 0.0) -> Tensor:
-    """Straight line between the nearest received lines, about a Doppler centroid of doppler_turns
-    cycles per line, (...,).
+    """Interpolate missing lines linearly between the nearest received ones.
 
-    Before the first and behind the last received line that line is held. Worse than zeros where
-    adjacent lines correlate less than 0.25 about the centroid, and inside gaps of several lines of
-    data with low azimuth oversampling.
+    The interpolation is made about the Doppler centroid. Before the first and behind the last
+    received line, that line is continued. Worse than zeros if adjacent lines correlate by less than
+    0.25 about the centroid, and inside gaps of several lines if azimuth oversampling is low.
+    Differentiable.
+
+    Args:
+        lines: Lines, shape (..., pulse, range), complex.
+        missing: Missing lines, shape (..., pulse), bool.
+        doppler_turns: Doppler centroid in cycles per line, a number or shape (...,).
+
+    Returns:
+        Lines of the same shape.
+
+    Raises:
+        ValueError: If the mask does not have one entry per line.
     """
     mask, n = _mask(lines, missing), lines.shape[-2]
     row = torch.arange(n, device=lines.device)
@@ -74,11 +90,17 @@ def linear_fill(lines: Tensor, missing: Tensor, doppler_turns: Tensor | float = 
 
 
 def azimuth_spectrum(lines: Tensor, received: Tensor, lags: int = 24) -> Tensor:
-    """Azimuth power spectrum from lag products of the received lines, averaged over range, unit
-    mean, (..., pulse) in FFT order.
+    """Estimate the azimuth power spectrum from lag products of the received lines.
 
-    lines: (..., range, pulse), azimuth last, zero where not received; received: bool (..., pulse).
     Smoothed over about 2 / lags of the PRF; may be slightly negative.
+
+    Args:
+        lines: Lines with azimuth last, shape (..., range, pulse), complex, zero where not received.
+        received: Received lines, shape (..., pulse), bool.
+        lags: Highest lag in lines.
+
+    Returns:
+        Spectrum averaged over range, of unit mean, in FFT order, shape (..., pulse).
     """
     n = lines.shape[-1]
     lags = min(lags, max(1, n // 4))
@@ -92,12 +114,23 @@ def azimuth_spectrum(lines: Tensor, received: Tensor, lags: int = 24) -> Tensor:
 
 
 def band_limited_fill(lines: Tensor, missing: Tensor, rounds: int = 2, steps: int = 8) -> Tensor:
-    """Least squares over the azimuth band: the missing lines that fit the azimuth spectrum of the
-    received ones best (Wiener).
+    """Fill missing lines by least squares, with the azimuth spectrum of the received ones (Wiener).
 
-    The spectrum, with the Doppler centroid in it, is estimated here from the received lines, then
-    once more from the filled ones. Minimises sum |D(f)|^2 / S(f) over the missing lines by
-    conjugate gradients. lines: (..., pulse, range); missing: bool (..., pulse).
+    Minimises sum |D(f)|^2 / S(f) over the missing lines by conjugate gradients. The spectrum S,
+    which includes the Doppler centroid, is estimated from the received lines, then again from the
+    filled ones. Differentiable in the received lines, with the spectrum held fixed.
+
+    Args:
+        lines: Lines, shape (..., pulse, range), complex.
+        missing: Missing lines, shape (..., pulse), bool.
+        rounds: Number of estimates of the spectrum.
+        steps: Steps of conjugate gradients in each round.
+
+    Returns:
+        Lines of the same shape.
+
+    Raises:
+        ValueError: If the mask does not have one entry per line.
     """
     # azimuth last: its FFTs then run along contiguous samples
     mask = _mask(lines, missing).mT
@@ -113,17 +146,24 @@ def band_limited_fill(lines: Tensor, missing: Tensor, rounds: int = 2, steps: in
 
 
 class ZeroFill(Stage):
-    """Missing lines set to zero. forward(signal, missing): missing is a bool mask (..., pulse)."""
+    """Missing lines set to zero: the baseline."""
 
     def forward(self, signal: Signal, missing: Tensor) -> Signal:
+        """Set missing lines to zero; see `zero_fill`.
+
+        Args:
+            signal: Lines, shape (..., pulse, range).
+            missing: Missing lines, shape (..., pulse), bool.
+        """
         return signal.with_data(zero_fill(signal.data, missing))
 
 
 class LinearFill(Stage):
-    """Linear interpolation over missing lines about the Doppler centroid; see linear_fill.
+    """Linear interpolation over missing lines about the Doppler centroid.
 
-    doppler_hz: by default the radar's nominal pointing, else 0; a chain may connect an estimate,
-    which wins. Only its fraction of the PRF matters.
+    Args:
+        radar: Radar, whose nominal pointing gives the Doppler centroid by default.
+        doppler_hz: Doppler centroid in Hz; only its fraction of the PRF matters.
     """
 
     doppler_hz: Tensor
@@ -133,14 +173,28 @@ class LinearFill(Stage):
         self.hold("doppler_hz", (radar.pointing_doppler_hz or 0.0) if doppler_hz is None else doppler_hz)
 
     def forward(self, signal: Signal, missing: Tensor, doppler_hz: Tensor | None = None) -> Signal:
+        """Interpolate missing lines; see `linear_fill`.
+
+        Args:
+            signal: Lines, shape (..., pulse, range).
+            missing: Missing lines, shape (..., pulse), bool.
+            doppler_hz: Doppler centroid in Hz, shape (...,); replaces that of the constructor.
+        """
         doppler = self.doppler_hz if doppler_hz is None else doppler_hz
         return signal.with_data(linear_fill(signal.data, missing, doppler * signal.axis("pulse").step))
 
 
 class BandLimitedFill(Stage):
-    """Least squares over the azimuth band; see band_limited_fill.
+    """Least-squares fill of missing lines with the azimuth spectrum of the received ones.
 
-    Needs no Doppler: the spectrum that it estimates holds the centroid.
+    No Doppler centroid is required: the estimated spectrum includes it.
+
+    Args:
+        rounds: Number of estimates of the spectrum.
+        steps: Steps of conjugate gradients in each round.
+
+    Raises:
+        ValueError: If `rounds` or `steps` is less than one.
     """
 
     def __init__(self, rounds: int = 2, steps: int = 8) -> None:
@@ -152,17 +206,34 @@ class BandLimitedFill(Stage):
         self.rounds, self.steps = rounds, steps
 
     def forward(self, signal: Signal, missing: Tensor) -> Signal:
+        """Fill missing lines; see `band_limited_fill`.
+
+        Args:
+            signal: Lines, shape (..., pulse, range).
+            missing: Missing lines, shape (..., pulse), bool.
+        """
         if _nothing_missing(missing):
             return signal
         return signal.with_data(band_limited_fill(signal.data, missing, self.rounds, self.steps))
 
 
 class SparseFill(Stage):
-    """Missing lines from a model of the focused scene; see sparse_fill.
+    """Reconstruction of missing lines by a model of the focused scene.
 
-    reference: "matched" for raw lines, None for range-compressed ones. doppler_hz and velocity_m_s
-    as in OmegaK: given here, or by a chain at every call, which wins. The Doppler must be absolute
-    (ambiguity resolved) where range migration exceeds a cell.
+    The Doppler centroid must be absolute (ambiguity resolved) if range migration exceeds a cell.
+
+    Args:
+        radar: Radar.
+        reference: "matched" for raw lines, None for range-compressed ones.
+        velocity_m_s: Effective velocity in m/s; by default that of the radar.
+        doppler_hz: Absolute Doppler centroid in Hz; by default the nominal pointing of the radar,
+            or 0.
+        looks: Number of sub-looks in Doppler.
+        rounds: Number of estimates of the local powers.
+        steps: Steps of conjugate gradients in each round.
+
+    Raises:
+        ValueError: If the reference is unknown, or `looks`, `rounds` or `steps` is less than one.
     """
 
     doppler_hz: Tensor
@@ -197,6 +268,15 @@ class SparseFill(Stage):
     def forward(
         self, signal: Signal, missing: Tensor, doppler_hz: Tensor | None = None, velocity_m_s: Tensor | None = None
     ) -> Signal:
+        """Reconstruct missing lines; see `sparse_fill`.
+
+        Args:
+            signal: Lines, shape (..., pulse, range).
+            missing: Missing lines, shape (..., pulse), bool.
+            doppler_hz: Absolute Doppler centroid in Hz, shape (...,); replaces that of the
+                constructor.
+            velocity_m_s: Effective velocity in m/s, shape (...,); replaces that of the constructor.
+        """
         lines, radar = signal.data, self.radar
         if _nothing_missing(missing):
             return signal

@@ -1,9 +1,11 @@
-"""External narrowband interference: three repairs with one interface.
+"""Correction of narrowband interference from external sources, by three methods of one interface.
 
-Each function takes raw lines (..., pulse, range) and returns a Repaired; each stage returns the
-signal and an Estimate that says how many lines and cells were touched and which lines are missing
-now (for the stage that fills lines). Lines without interference pass bit by bit. Recommended:
-`subtract_interference`. Source: brief 004, item 3; Tsvetkov 2017.
+Each function takes raw lines (..., pulse, range) and returns a `Repaired`. Each stage returns the
+signal and an Estimate with the missing lines, for the stage that fills lines. Lines without
+interference are unchanged bit for bit. `subtract_interference` is recommended.
+
+Reference:
+    Tsvetkov 2017, Figs. 2 and 3.
 """
 
 from __future__ import annotations
@@ -19,17 +21,22 @@ from torchsar.repair.interference_band import find_band, subtract_band
 from torchsar.repair.interference_detect import THRESHOLD, Level, clean_level, line_spectra, stands_out
 from torchsar.repair.interference_tone import Tone, anything, find_tones, subtract_tones
 
+# Largest number of bands that are subtracted, by choice: every round costs a search of all lines.
 _BAND_ROUNDS = 3
 
 
 @dataclass(frozen=True)
 class Repaired:
-    """data (..., pulse, range); touched, missing: lines that were changed and lines given up, bool
-    (..., pulse).
+    """Lines after the correction of interference.
 
-    cells: number of range-frequency cells of each line that stood above the threshold, int64 (...,
-    pulse). tone_cycles: frequency of the strongest tone of each line in cycles per sample, 0 where
-    there is none, float64 (..., pulse).
+    Args:
+        data: Lines, shape (..., pulse, range), complex.
+        touched: Lines that were changed, shape (..., pulse), bool.
+        missing: Lines that could not be corrected and are zero, shape (..., pulse), bool.
+        cells: Number of range-frequency cells of each line above the threshold, shape (..., pulse),
+            int64.
+        tone_cycles: Frequency of the strongest tone of each line in cycles per sample, 0 where
+            there is none, shape (..., pulse), float64.
     """
 
     data: Tensor
@@ -41,8 +48,13 @@ class Repaired:
 
 @dataclass(frozen=True)
 class Contamination:
-    """Suspected lines and cells: excess (..., pulse, range) of the range spectra over the robust
-    level, FFT order, and what exceeds.
+    """Lines and range-frequency cells that may hold interference.
+
+    Args:
+        level: Robust level of the clean spectra.
+        excess: Power spectra over the level, FFT order, shape (..., pulse, range).
+        cells: Cells above the threshold, shape (..., pulse, range), bool.
+        lines: Lines that exceed the threshold in few parts of the band, shape (..., pulse), bool.
     """
 
     level: Level
@@ -52,11 +64,14 @@ class Contamination:
 
 
 def find_contamination(raw: Tensor, threshold: float = THRESHOLD) -> Contamination:
-    """Cells whose tapered range spectrum exceeds `threshold` times the robust level, and lines
-    where that is in few places. raw: (..., pulse, range).
+    """Find cells whose tapered range spectrum exceeds the robust level, and their lines.
 
-    A first look: the repairs also test that what they see lasts the whole line, since regularly
-    spaced targets make spectral lines too.
+    The lines are candidates. Regularly spaced targets also make spectral lines, so the corrections
+    test in addition that the energy lasts the whole line.
+
+    Args:
+        raw: Raw lines, shape (..., pulse, range), complex.
+        threshold: Power over the mean level of clutter.
     """
     with torch.no_grad():
         power = line_spectra(raw)
@@ -67,14 +82,17 @@ def find_contamination(raw: Tensor, threshold: float = THRESHOLD) -> Contaminati
 
 
 def notch_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
-    """The baseline: in contaminated lines, zero every cell of the range spectrum above the
-    threshold. Differentiable in raw.
+    """Set contaminated cells of the range spectrum to zero: the baseline.
 
-    Takes the clutter of those cells with it and leaves the skirts of the tone that lie below the
-    threshold.
+    Removes the clutter of those cells as well, and leaves the side lobes of a tone that are below
+    the threshold. Differentiable in the lines.
+
+    Args:
+        raw: Raw lines, shape (..., pulse, range), complex.
+        threshold: Power over the mean level of clutter.
     """
     found = find_contamination(raw, threshold)
-    touched = _interfered(raw.detach(), found, threshold)
+    touched = _contaminated(raw.detach(), found, threshold)
     spectrum = torch.fft.fft(raw)
     with torch.no_grad():
         hit = (
@@ -85,25 +103,34 @@ def notch_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
 
 
 def drop_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
-    """Give contaminated lines up: they are set to zero and marked missing, for the stage that fills
-    lines. Differentiable in raw.
+    """Set contaminated lines to zero and mark them as missing, for the stage that fills lines.
+
+    Differentiable in the lines.
+
+    Args:
+        raw: Raw lines, shape (..., pulse, range), complex.
+        threshold: Power over the mean level of clutter.
     """
     found = find_contamination(raw, threshold)
-    touched = _interfered(raw.detach(), found, threshold)
+    touched = _contaminated(raw.detach(), found, threshold)
     data = raw.masked_fill(touched[..., None], 0)
     return Repaired(data, touched, touched, torch.where(touched, raw.shape[-1], 0), _no_tone(touched))
 
 
 def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones: int = 4) -> Repaired:
-    """Subtract tones by maximum likelihood and what is wider as a narrowband process; give up lines
-    that neither can save.
+    """Subtract tones by maximum likelihood, and wider interference as a narrowband random process.
 
-    raw: (..., pulse, range) complex. Up to `most_tones` tones a line, each with its own frequency
-    and drift, amplitude and phase; up to three bands, each narrower than about 1/40 of the sampling
-    rate. A tone costs a line of n samples 1 / n to 2 / n of the clutter's power at that frequency;
-    a band of width B about B n / fs cells. A line is missing where interference stronger than its
-    clutter is left. Differentiable in raw, with frequencies and spectra of the interferers held.
-    Works on the contaminated lines only; the others pass bit by bit.
+    Tones have their own frequency, linear drift, amplitude and phase in each line. Up to three
+    bands are subtracted, each narrower than about 1/40 of the sampling rate. Of a line of n samples
+    a tone costs 1 / n to 2 / n of the clutter's power at its frequency, and a band of width B about
+    B n / fs cells. A line is missing if the interference that remains is stronger than its clutter.
+    Lines without interference are unchanged. Differentiable in the lines, with the frequencies and
+    spectra of the interference held fixed.
+
+    Args:
+        raw: Raw lines, shape (..., pulse, range), complex.
+        threshold: Power over the mean level of clutter.
+        most_tones: Largest number of tones in a line.
     """
     found = find_contamination(raw, threshold)
     if not anything(found.lines):
@@ -120,7 +147,7 @@ def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones:
         if not anything(banded):
             break
         cleaned, touched = subtract_band(cleaned, banded, level), touched | banded
-    lost = touched & _ruined(cleaned.detach(), level, threshold)
+    lost = touched & _uncorrected(cleaned.detach(), level, threshold)
     cleaned = torch.where(touched[..., None], cleaned, lines).masked_fill(lost[..., None], 0)
     everywhere = torch.zeros_like(found.lines)
     touched_all = everywhere.scatter(-1, index, touched)
@@ -129,8 +156,8 @@ def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones:
     return Repaired(data, touched_all, everywhere.scatter(-1, index, lost), found.cells.sum(-1) * touched_all, cycles)
 
 
-def _interfered(raw: Tensor, found: Contamination, threshold: float) -> Tensor:
-    """Lines with a tone or with something wider that lasts the whole line, (..., pulse) bool."""
+def _contaminated(raw: Tensor, found: Contamination, threshold: float) -> Tensor:
+    """Lines with a tone or wider interference that lasts the whole line, (..., pulse) bool."""
     touched = find_band(raw, found.level, threshold)[0] if anything(found.lines) else found.lines
     for tone in find_tones(raw, found.level, most=1, threshold=threshold) if anything(found.lines & ~touched) else []:
         touched = touched | tone.present
@@ -138,48 +165,47 @@ def _interfered(raw: Tensor, found: Contamination, threshold: float) -> Tensor:
 
 
 def _selection(lines: Tensor) -> Tensor:
-    """Indices of marked lines in rising order, (..., count) int64, count the largest of any trial;
-    unmarked lines fill up behind.
-    """
+    """Indices of the marked lines of each trial, rising; unmarked ones follow."""
     try:
         count = int(lines.sum(-1).max())
-    except RuntimeError:  # inside vmap a value cannot be looked at
+    except RuntimeError:  # inside vmap values cannot be read
         count = lines.shape[-1]
     return torch.argsort((~lines).to(torch.int8), dim=-1, stable=True)[..., :count]
 
 
 def _take_lines(raw: Tensor, index: Tensor) -> Tensor:
+    """Lines of these indices."""
     return raw.gather(-2, index[..., None].expand(*index.shape, raw.shape[-1]))
 
 
-def _ruined(lines: Tensor, level: Level, threshold: float) -> Tensor:
-    """Lines where the cells still above the threshold hold more power than the clutter of the whole
-    line, (..., pulse) bool.
-    """
+def _uncorrected(lines: Tensor, level: Level, threshold: float) -> Tensor:
+    """Lines whose cells above the threshold hold more power than the clutter of the whole line."""
     power = line_spectra(lines)
     left = (power * (level.excess(power) > threshold)).sum(-1)
     return left > level.density.sum(-1)
 
 
 def _no_tone(touched: Tensor) -> Tensor:
+    """Zero frequency of every line."""
     return torch.zeros(touched.shape, dtype=torch.float64, device=touched.device)
 
 
 def _strongest(tones: list[Tone], index: Tensor) -> Tensor:
-    """Frequency of the first tone present in each line, else 0."""
+    """Frequency of the strongest tone in each line, 0 where there is none."""
     cycles = _no_tone(index)
     for tone in reversed(tones):
         cycles = torch.where(tone.present, tone.frequency, cycles)
     return cycles
 
 
-class _InterferenceRepair(Stage):
-    """Common part of the three stages: a repaired signal, and how much of it was touched.
+class _InterferenceCorrection(Stage):
+    """Common part of the three stages.
 
-    Estimate: value `missing` (..., pulse) bool, lines given up, joined with those that were missing
-    before where a chain connects them (`missing`), so that one fill serves both; info
-    `lines_touched`, `cells_touched` (...,) counts, `touched` (..., pulse), `tone_cycles_per_sample`
-    (..., pulse); quality is the share of lines kept, ok False where fewer than half are.
+    Args:
+        threshold: Power over the mean level of clutter; 20 to 50 is useful.
+
+    Raises:
+        ValueError: If the threshold is not above 1.
     """
 
     provides = ("missing",)
@@ -195,6 +221,18 @@ class _InterferenceRepair(Stage):
         self.threshold = float(threshold)
 
     def forward(self, signal: Signal, missing: Tensor | None = None) -> tuple[Signal, Estimate]:
+        """Correct the lines.
+
+        Args:
+            signal: Raw lines, shape (..., pulse, range).
+            missing: Lines that were missing before, shape (..., pulse), bool.
+
+        Returns:
+            The corrected signal, and an Estimate: `missing` of shape (..., pulse), bool, the lines
+            missing before or now. `quality` is the share of lines that are not missing now, `ok` is
+            False where it is below one half. `info` holds the counts `lines_touched` and
+            `cells_touched` (...,), and `touched` and `tone_cycles_per_sample` (..., pulse).
+        """
         result = type(self).repair(signal.data, self.threshold)
         quality = 1 - result.missing.to(torch.float64).mean(-1)
         given_up = result.missing if missing is None else result.missing | missing.bool()
@@ -207,19 +245,40 @@ class _InterferenceRepair(Stage):
         return signal.with_data(result.data), Estimate({"missing": given_up}, quality, quality >= 0.5, info=info)
 
 
-class SubtractInterference(_InterferenceRepair):
-    """Recommended: see subtract_interference."""
+class SubtractInterference(_InterferenceCorrection):
+    """Subtraction of interference (recommended); see `subtract_interference`.
+
+    Args:
+        threshold: Power over the mean level of clutter; 20 to 50 is useful.
+
+    Raises:
+        ValueError: If the threshold is not above 1.
+    """
 
     repair = staticmethod(subtract_interference)
 
 
-class NotchInterference(_InterferenceRepair):
-    """Baseline: see notch_interference."""
+class NotchInterference(_InterferenceCorrection):
+    """Notch filter for interference (baseline); see `notch_interference`.
+
+    Args:
+        threshold: Power over the mean level of clutter; 20 to 50 is useful.
+
+    Raises:
+        ValueError: If the threshold is not above 1.
+    """
 
     repair = staticmethod(notch_interference)
 
 
-class DropInterference(_InterferenceRepair):
-    """See drop_interference; connect its `missing` to the stage that fills lines."""
+class DropInterference(_InterferenceCorrection):
+    """Lines with interference set to zero; connect `missing` to the stage that fills lines.
+
+    Args:
+        threshold: Power over the mean level of clutter; 20 to 50 is useful.
+
+    Raises:
+        ValueError: If the threshold is not above 1.
+    """
 
     repair = staticmethod(drop_interference)

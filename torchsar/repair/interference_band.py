@@ -1,13 +1,12 @@
-"""Interferers with a bandwidth of their own: a Wiener estimate of a narrowband random process,
-subtracted.
+"""Interference with a bandwidth: Wiener estimate of a narrowband random process, subtracted.
 
-A stretch of lines shares one spectrum of the interferer, estimated as the excess of their averaged
-range spectra. The line is then the sum of a stationary process with that spectrum and of white
-clutter, and the conditional mean of the process is subtracted. The finite length of a line is part
-of the model (a process on 2 n periodic samples seen through n of them), so the skirts that a strong
-interferer throws over the whole spectrum, which no notch removes, go with it. Cost: the degrees of
-freedom of the band, about one for each 1 / line duration of bandwidth and a few for the edges.
-Source: brief 004, item 3.
+A group of successive lines shares one spectrum of the interferer, estimated as the excess of their
+averaged range spectra. Each line is modelled as the sum of a stationary process with that spectrum
+and of white clutter, and the conditional mean of the process is subtracted. The model includes the
+finite length of a line (n samples of a process that is periodic with 2 n), so that the spectral
+leakage of a strong interferer, which no notch removes, is subtracted as well. This costs the
+degrees of freedom of the band: about one for each 1 / (duration of a line) of bandwidth, and a few
+for its edges.
 """
 
 from __future__ import annotations
@@ -19,15 +18,23 @@ from torch.nn.functional import pad
 from torchsar.repair.interference_detect import LEVEL_SHARE, THRESHOLD, Level, line_spectra, stands_out
 from torchsar.repair.interference_tone import anything, block_sums, window_sums
 
+# Lines that share one spectrum, by choice: more lines estimate it better, fewer follow a changing
+# interferer.
 STRETCH_LINES = 32
 
 
 def lasts_the_line(lines: Tensor, cell: Tensor) -> Tensor:
-    """Whether the energy near one cell a line is there most of the time, (..., pulse, range), (...,
-    pulse) -> (..., pulse) bool.
+    """Return whether the energy near one frequency cell is present during most of the line.
 
-    Noise-like interference has a median of 0.7 of its mean power, a tone of 1; a few passing chirps
-    one near 0.
+    The median power of noise-like interference is 0.7 of its mean, that of a tone 1; that of a few
+    passing chirps is near 0.
+
+    Args:
+        lines: Raw lines, shape (..., pulse, range), complex.
+        cell: Cell of an n-point FFT for each line, shape (..., pulse), int64.
+
+    Returns:
+        Shape (..., pulse), bool.
     """
     n = lines.shape[-1]
     turns = (cell.to(torch.float64) / n)[..., None] * torch.arange(n, dtype=torch.float64, device=lines.device)
@@ -37,12 +44,19 @@ def lasts_the_line(lines: Tensor, cell: Tensor) -> Tensor:
 
 
 def find_band(lines: Tensor, level: Level, threshold: float = THRESHOLD) -> tuple[Tensor, Tensor]:
-    """Lines with an interferer that lasts, and its strongest cell (n-point FFT).
+    """Find lines with interference that lasts the whole line.
 
-    lines: (..., pulse, range); both (..., pulse).
+    A single line of noise-like interference may look intermittent, so the majority of the strong
+    lines nearby decides.
 
-    The verdict that it lasts is the majority's among the strong lines nearby: of a noise-like
-    interferer one line may look intermittent.
+    Args:
+        lines: Raw lines, shape (..., pulse, range), complex.
+        level: Robust level of the clean spectra.
+        threshold: Power over the mean level of clutter.
+
+    Returns:
+        Lines with interference, shape (..., pulse), bool, and their strongest cell of an n-point
+        FFT, shape (..., pulse), int64.
     """
     excess = level.excess(line_spectra(lines.detach()))
     strong, cell = stands_out(excess, threshold), excess.argmax(-1)
@@ -54,11 +68,18 @@ def find_band(lines: Tensor, level: Level, threshold: float = THRESHOLD) -> tupl
 
 
 def subtract_band(lines: Tensor, touched: Tensor, level: Level) -> Tensor:
-    """Lines (..., pulse, range) without the interferer near the strongest cell of each stretch of
-    lines.
+    """Subtract the interference near the strongest cell of each group of lines.
 
-    touched: (..., pulse), from find_band. Untouched lines pass unchanged. Differentiable in lines
-    (the spectrum of the interferer is held).
+    Differentiable in the lines, with the spectrum of the interference held fixed.
+
+    Args:
+        lines: Raw lines, shape (..., pulse, range), complex.
+        touched: Lines with interference from `find_band`, shape (..., pulse), bool; others are
+            unchanged.
+        level: Robust level of the clean spectra.
+
+    Returns:
+        Lines of the same shape.
     """
     n_pulse = lines.shape[-2]
     fill = -n_pulse % STRETCH_LINES
@@ -71,13 +92,10 @@ def subtract_band(lines: Tensor, touched: Tensor, level: Level) -> Tensor:
 
 
 def _mean_excess(x: Tensor, on: Tensor, level: Level) -> Tensor:
-    """Spectrum over the level at half cells, mean over the touched lines of a stretch.
-
-    (..., stretch, line, n) -> (..., stretch, 2 n).
-    """
+    """Spectrum over the level at half cells, mean of the marked lines of a group, (..., 2 n)."""
     density = pad(level.density, (0, 0, 0, -level.density.shape[-2] % STRETCH_LINES)).unflatten(-2, (-1, STRETCH_LINES))
     total = torch.zeros(*x.shape[:-2], 2 * x.shape[-1], dtype=x.real.dtype, device=x.device)
-    # one line of every stretch at a time: a fraction of the memory of all at once
+    # one line of every group at a time: a fraction of the memory of all at once
     for k in range(STRETCH_LINES):
         fine = density[..., k, :].repeat_interleave(2, -1)
         usable = on[..., k, None] & (fine > 0)
@@ -86,11 +104,7 @@ def _mean_excess(x: Tensor, on: Tensor, level: Level) -> Tensor:
 
 
 def _window(excess: Tensor, n: int) -> tuple[Tensor, Tensor]:
-    """First half cell of the band about the strongest one, and interferer over clutter in it:
-    (...,) and (..., m).
-
-    Half cells below the level (ratio below 1 after a short average) are no part of the interferer.
-    """
+    """First half cell of the band around the strongest one, and interferer over clutter."""
     m = 2 * max(8, round(n * LEVEL_SHARE / 2))
     smooth = torch.nn.functional.avg_pool1d(pad(excess.flatten(0, -2)[:, None], (2, 2), mode="circular"), 5, 1)[
         :, 0
@@ -102,25 +116,25 @@ def _window(excess: Tensor, n: int) -> tuple[Tensor, Tensor]:
 
 
 def _process(x: Tensor, first: Tensor, ratio: Tensor) -> Tensor:
-    """Conditional mean of a process with spectrum `ratio` (over white clutter) on m half cells from
-    `first`, given lines x.
+    """Conditional mean of a process on m half cells from `first`, given lines x.
 
-    x: (..., stretch, line, n); first: (..., stretch); ratio: (..., stretch, m). The prior is C = F
-    diag(ratio) F^H with F of the 2 n-point inverse DFT, and C (C + 1)^-1 x = F q (1 + q F^H F q)^-1
-    q F^H x with q^2 = ratio: an m x m solve per stretch.
+    x: (..., group, line, n); first: (..., group); ratio: (..., group, m), spectrum over white
+    clutter. The prior covariance is C = F diag(ratio) F^H with F from the inverse DFT of 2 n
+    points, and C (C + 1)^-1 x = F q (1 + q F^H F q)^-1 q F^H x with q^2 = ratio: an m x m solve per
+    group.
     """
     n, m = x.shape[-1], ratio.shape[-1]
     index = (first[..., None] + torch.arange(m, device=x.device)) % (2 * n)
     index = index[..., None, :].expand(*x.shape[:-1], m)
-    # the solve is small and its condition is the interferer's power over the clutter's: always in
-    # double precision
+    # in double precision: the condition of the small system is the power of the interferer over
+    # that of the clutter
     root, wide = torch.sqrt(ratio.to(torch.float64)), torch.complex128
-    seen = torch.fft.fft(x, 2 * n, norm="ortho").gather(-1, index).to(wide) * root[..., None, :]
+    projected = torch.fft.fft(x, 2 * n, norm="ortho").gather(-1, index).to(wide) * root[..., None, :]
     lag = torch.arange(m, device=x.device)
     overlap = torch.fft.ifft(pad(torch.ones(n, dtype=wide, device=x.device), (0, n)))[
         (lag[None, :] - lag[:, None]) % (2 * n)
     ]
     system = root[..., :, None] * overlap * root[..., None, :] + torch.eye(m, dtype=wide, device=x.device)
-    solved = torch.cholesky_solve(seen.mT, torch.linalg.cholesky(system)).mT * root[..., None, :]
+    solved = torch.cholesky_solve(projected.mT, torch.linalg.cholesky(system)).mT * root[..., None, :]
     spectrum = torch.zeros(*x.shape[:-1], 2 * n, dtype=x.dtype, device=x.device).scatter(-1, index, solved.to(x.dtype))
     return torch.fft.ifft(spectrum, norm="ortho")[..., :n]

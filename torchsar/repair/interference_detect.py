@@ -1,11 +1,13 @@
-"""Where a raw matrix holds narrowband interference: range spectra against a robust level.
+"""Detection of narrowband interference: range spectra of raw lines against a robust level.
 
-The level of a cell is the larger of two. One is the gain of its line times the shape of the clean
-spectrum, a median over lines followed by a running median over frequency, so that neither an
-interferer on all lines nor one that stays at its frequency lifts it; a running median leaves the
-steep edges of the pulse band where they are. The other is the median over the neighbourhood in the
-line's own spectrum: lines without echo have another shape than lines with. Source: brief 004, item
-3; Tsvetkov 2017.
+The level of a cell is the larger of two. The first is the gain of the line times the shape of the
+clean spectrum, a median over lines followed by a running median over frequency. Neither an
+interferer on all lines nor one of constant frequency raises it, and the running median preserves
+the steep edges of the pulse band. The second is the median over neighbouring cells of the line's
+own spectrum, since lines without echo have another shape than lines with echo.
+
+Reference:
+    Tsvetkov 2017, Fig. 3.
 """
 
 from __future__ import annotations
@@ -19,35 +21,63 @@ from torch import Tensor
 # In units of the mean level. Speckle is exponential: exp(-30) leaves one false cell in 1e13. The
 # clean RADARSAT-1 blocks stay below 24.
 THRESHOLD = 30.0
-# An interferer wider than this share of the band is not narrowband; half of it is what a running
-# median can still look past.
+# Width of the running median over the band, by choice: an interferer of half of it does not raise
+# the median; one that is wider than this is not narrowband.
 LEVEL_SHARE = 1 / 16
 
 
 @dataclass(frozen=True)
 class Level:
-    """Robust mean power spectral density of the clean part of each line, (..., pulse, range) in FFT
-    order.
+    """Robust mean power spectral density of the clean part of each line.
+
+    Args:
+        density: Density in FFT order, shape (..., pulse, range).
     """
 
     density: Tensor
 
     def at(self, cell: Tensor) -> Tensor:
-        """Density at one frequency cell a line. cell: int64 (..., pulse) -> (..., pulse)."""
+        """Return the density at one frequency cell of each line.
+
+        Args:
+            cell: Cell of an n-point FFT, shape (..., pulse), int64.
+
+        Returns:
+            Shape (..., pulse).
+        """
         return self.density.gather(-1, (cell % self.density.shape[-1])[..., None])[..., 0]
 
     def excess(self, power: Tensor) -> Tensor:
-        """Power spectra (..., pulse, range) over the level; 0 where a line is empty."""
+        """Return power spectra relative to the level.
+
+        Args:
+            power: Power spectra in FFT order, shape (..., pulse, range).
+
+        Returns:
+            Same shape; 0 where a line is empty.
+        """
         return torch.where(self.density > 0, power / torch.where(self.density > 0, self.density, 1), 0)
 
     def lines(self, index: Tensor) -> Level:
-        """The level of some lines. index: int64 (..., count)."""
+        """Return the level of some lines.
+
+        Args:
+            index: Indices of the lines, shape (..., count), int64.
+        """
         return Level(self.density.gather(-2, index[..., None].expand(*index.shape, self.density.shape[-1])))
 
 
 def blackman_harris(n: int, like: Tensor) -> Tensor:
-    """Four-term Blackman-Harris taper of unit mean square, (n,): side lobes at -92 dB keep a strong
-    tone within +-4 cells.
+    """Return the four-term Blackman-Harris taper with unit mean square.
+
+    Its side lobes of -92 dB confine a strong tone to +-4 cells.
+
+    Args:
+        n: Number of samples.
+        like: Tensor that gives device and precision.
+
+    Returns:
+        Shape (n,), real.
     """
     turn = 2 * math.pi * torch.arange(n, dtype=torch.float64, device=like.device) / n
     w = 0.35875 - 0.48829 * torch.cos(turn) + 0.14128 * torch.cos(2 * turn) - 0.01168 * torch.cos(3 * turn)
@@ -55,8 +85,14 @@ def blackman_harris(n: int, like: Tensor) -> Tensor:
 
 
 def line_spectra(raw: Tensor, oversampling: int = 1) -> Tensor:
-    """Tapered power spectral density of each line, FFT order, (..., pulse, range) -> (..., pulse,
-    oversampling * range).
+    """Compute the tapered power spectral density of each line.
+
+    Args:
+        raw: Raw lines, shape (..., pulse, range), complex.
+        oversampling: Number of cells for each sample.
+
+    Returns:
+        Density in FFT order, shape (..., pulse, oversampling * range).
     """
     n = raw.shape[-1]
     spectrum = torch.fft.fft(raw * blackman_harris(n, raw), oversampling * n)
@@ -64,8 +100,14 @@ def line_spectra(raw: Tensor, oversampling: int = 1) -> Tensor:
 
 
 def running_median(x: Tensor, width: int) -> Tensor:
-    """Circular running median along the last dim over about `width` samples, of which at most 33
-    are looked at.
+    """Compute a circular running median along the last dimension from at most 33 samples.
+
+    Args:
+        x: Shape (..., n), real.
+        width: Approximate width of the window in samples.
+
+    Returns:
+        Same shape.
     """
     stride = max(1, round(width / 32))
     half = min(16, max(1, (x.shape[-1] - 1) // (2 * stride)))
@@ -75,8 +117,14 @@ def running_median(x: Tensor, width: int) -> Tensor:
 
 
 def local_median(power: Tensor, width: int) -> Tensor:
-    """The larger median of the two half-overlapping windows that hold each cell of a circular
-    spectrum. Same shape as power.
+    """Return the larger median of the two half-overlapping windows that hold each cell.
+
+    Args:
+        power: Circular spectrum, shape (..., n).
+        width: Width of the windows in cells.
+
+    Returns:
+        Same shape.
     """
     n = power.shape[-1]
     width = min(width, n)
@@ -89,8 +137,13 @@ def local_median(power: Tensor, width: int) -> Tensor:
 
 
 def clean_level(power: Tensor) -> Level:
-    """The level of the clean part of power spectra (..., pulse, range), so that the excess of
-    speckle has unit mean.
+    """Estimate the level of the clean part of power spectra.
+
+    Args:
+        power: Power spectra in FFT order, shape (..., pulse, range).
+
+    Returns:
+        Level over which the power of speckle has unit mean.
     """
     width = max(32, round(LEVEL_SHARE * power.shape[-1]))
 
@@ -98,8 +151,7 @@ def clean_level(power: Tensor) -> Level:
         relative = torch.where(gain[..., None] > 0, power / torch.where(gain > 0, gain, 1)[..., None], torch.nan)
         return running_median(relative.nanmedian(-2).values.nan_to_num(0.0), width)
 
-    # first lines against their mean, then against the median over the part of the band that holds
-    # signal
+    # lines relative to their median over the whole band, then over the part that holds signal
     shape = shape_for(power.median(-1).values)
     lit = shape > 0.1 * shape.amax(-1, keepdim=True)
     inside = torch.where(lit[..., None, :], power / torch.where(lit, shape, 1)[..., None, :], torch.nan)
@@ -109,11 +161,18 @@ def clean_level(power: Tensor) -> Level:
 
 
 def stands_out(excess: Tensor, threshold: float = THRESHOLD) -> Tensor:
-    """Lines with cells above the threshold in few places, (..., pulse, range) -> (..., pulse) bool.
+    """Find lines that exceed the threshold in few parts of the band.
 
-    Echoes of regularly spaced targets make combs of spectral lines, all about as strong, over the
-    whole pulse band. Interferers are few: a line qualifies where at most a quarter of 32 parts of
+    Echoes of regularly spaced targets make combs of spectral lines of similar strength over the
+    whole pulse band, interferers only a few. A line qualifies if at most a quarter of 32 parts of
     the band come within 10 dB of its strongest cell.
+
+    Args:
+        excess: Power spectra over the level, shape (..., pulse, range).
+        threshold: Power over the mean level of clutter.
+
+    Returns:
+        Shape (..., pulse), bool.
     """
     n = excess.shape[-1]
     part = -(-n // 32)

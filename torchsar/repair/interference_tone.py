@@ -1,11 +1,11 @@
 """Tones in raw lines: estimated by maximum likelihood and subtracted.
 
-A tone is A exp(2j pi (f t + r t^2 / 2)) over the whole line, t in samples from the middle of the
-line: amplitude, frequency and a linear drift, each line with its own. Demodulated at (f, r), a line
-is expanded in Legendre polynomials; the tone is right when the first and second coefficients have
-no part in quadrature to the zeroth, and their quadrature parts are the Gauss-Newton steps. Every
+A tone is A exp(2j pi (f t + r t^2 / 2)) over the whole line, with t in samples from the middle of
+the line. Each line has its own amplitude, frequency and linear drift. A line demodulated with (f,
+r) is expanded in Legendre polynomials. At the maximum of the likelihood the first and second
+coefficients have no part in quadrature to the zeroth; these parts are the Gauss-Newton steps. Every
 real parameter costs a line of n samples 1 / (2 n) of the signal's power at that frequency, so f and
-r are pooled over lines wherever the tone drifts smoothly. Source: brief 004, item 3.
+r are averaged over lines wherever the tone drifts smoothly.
 """
 
 from __future__ import annotations
@@ -20,17 +20,25 @@ from torch import Tensor
 from torchsar.core import unit_phasor
 from torchsar.repair.interference_detect import THRESHOLD, Level, line_spectra, stands_out
 
-_SWEEP_CELLS = 48  # drift within a line that is searched, +- frequency cells
+# Largest drift within a line and largest error of the initial frequency that are searched, in
+# frequency cells either way, by choice: the cost of the search grows with the drift.
+_SWEEP_CELLS = 48
 _OFFSET_CELLS = 12
+# Gauss-Newton steps after the coarse search, by choice.
 _STEPS = 6
 
 
 @dataclass(frozen=True)
 class Tone:
-    """One tone a line: frequency (cycles per sample, at the middle), rate (cycles per sample^2),
-    all (..., pulse) float64; where it is present.
+    """One tone per line.
 
-    noise_rad: predicted standard deviation of each Legendre coefficient of the phase.
+    Args:
+        frequency: Frequency at the middle of the line in cycles per sample, shape (..., pulse),
+            float64.
+        rate: Drift of the frequency in cycles per sample^2, shape (..., pulse), float64.
+        present: Lines that hold the tone, shape (..., pulse), bool.
+        noise_rad: Predicted standard deviation of each Legendre coefficient of the phase in
+            radians, shape (..., pulse), float64.
     """
 
     frequency: Tensor
@@ -39,26 +47,48 @@ class Tone:
     noise_rad: Tensor
 
     def phasor(self, n: int, dtype: torch.dtype) -> Tensor:
-        """The tone with unit amplitude, (..., pulse, n)."""
+        """Return the tone with unit amplitude.
+
+        Args:
+            n: Number of samples of a line.
+            dtype: complex64 or complex128.
+
+        Returns:
+            Shape (..., pulse, n).
+        """
         t = torch.arange(n, dtype=torch.float64, device=self.frequency.device) - (n - 1) / 2
         return unit_phasor((self.frequency[..., None] + self.rate[..., None] * (t / 2)) * t, dtype)
 
     def cell(self, n: int) -> Tensor:
-        """Nearest cell of an n-point FFT, int64 (..., pulse)."""
+        """Return the nearest cell of an n-point FFT, shape (..., pulse), int64."""
         return torch.round(self.frequency * n).to(torch.int64) % n
 
     def waveform(self, lines: Tensor) -> Tensor:
-        """The tone as it is in these lines (least squares amplitude), zero where it is not present.
+        """Return the tone with its least-squares amplitude, zero where it is not present.
 
-        Differentiable in lines.
+        Differentiable in the lines.
+
+        Args:
+            lines: Raw lines, shape (..., pulse, n), complex.
+
+        Returns:
+            Same shape.
         """
         unit = self.phasor(lines.shape[-1], lines.dtype)
         amplitude = (lines * unit.conj()).mean(-1, keepdim=True)
         return amplitude * unit * self.present[..., None]
 
 
-def legendre(n: int, like: Tensor) -> Tensor:
-    """Orthonormal polynomials 1, u, u^2 over n samples (mean square 1), (n, 3) real."""
+def orthonormal_quadratics(n: int, like: Tensor) -> Tensor:
+    """Return the orthonormal polynomials of degree 0 to 2 over the samples of a line.
+
+    Args:
+        n: Number of samples.
+        like: Tensor that gives device and precision.
+
+    Returns:
+        Polynomials of unit mean square over the samples, shape (n, 3), real.
+    """
     u = torch.linspace(-1, 1, n, dtype=torch.float64, device=like.device)
     basis = [torch.ones_like(u)]
     for power in (1, 2):
@@ -69,8 +99,13 @@ def legendre(n: int, like: Tensor) -> Tensor:
 
 
 def block_sums(x: Tensor) -> Tensor:
-    """Sums over short blocks of a line, (..., n) -> (..., block): a narrow band about zero
-    frequency, n / 16 cells wide or less.
+    """Sum the samples of short blocks: a band of n / 16 cells or less about zero frequency.
+
+    Args:
+        x: Demodulated lines, shape (..., n), complex.
+
+    Returns:
+        Shape (..., block).
     """
     n = x.shape[-1]
     length = 2 ** math.ceil(math.log2(max(1, n / 128))) if n >= 1024 else max(1, n // 64)
@@ -78,8 +113,15 @@ def block_sums(x: Tensor) -> Tensor:
 
 
 def coarse_offset(blocks: Tensor, n: int) -> tuple[Tensor, Tensor]:
-    """Frequency offset and rate that collect most energy of demodulated block sums, in cells (1 /
-    n) and cells per line, (...,).
+    """Search the frequency offset and the drift that collect most energy of a demodulated tone.
+
+    Args:
+        blocks: Sums of `block_sums`, shape (..., block), complex.
+        n: Number of samples of a line.
+
+    Returns:
+        Offset in cells of 1 / n cycles per sample and drift in cells per line, shape (...,) each,
+        float64.
     """
     count = blocks.shape[-1]
     u = torch.linspace(-0.5, 0.5, count, dtype=torch.float64, device=blocks.device)
@@ -88,10 +130,10 @@ def coarse_offset(blocks: Tensor, n: int) -> tuple[Tensor, Tensor]:
     cells, sweep = torch.zeros_like(best, dtype=torch.float64), torch.zeros_like(best, dtype=torch.float64)
     for cells_per_line in sorted(range(-_SWEEP_CELLS, _SWEEP_CELLS + 1, 2), key=abs):
         chirp = unit_phasor(-0.5 * cells_per_line * u.square(), blocks.dtype)
-        # the strongest cell of a drifting tone may be any that it passes
+        # the strongest cell of a drifting tone may be any cell that it passes
         near = offset.abs() <= _OFFSET_CELLS + abs(cells_per_line) / 2
         value, index = (torch.fft.fft(blocks * chirp, 2 * count).abs() * near).max(-1)
-        # a drift must earn its parameter
+        # a drift counts only if it collects clearly more energy: it costs a parameter
         better = value > best * (1.0 if cells_per_line == 0 else 1.02)
         best, cells = torch.where(better, value, best), torch.where(better, offset[index], cells)
         sweep = torch.where(better, float(cells_per_line), sweep)
@@ -99,8 +141,15 @@ def coarse_offset(blocks: Tensor, n: int) -> tuple[Tensor, Tensor]:
 
 
 def phase_step(blocks: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
-    """Gauss-Newton steps of the first and second Legendre coefficient of the phase, rad, from
-    demodulated blocks. (..., block) -> (...,) each.
+    """Compute one Gauss-Newton step of the phase of a demodulated tone.
+
+    Args:
+        blocks: Sums of `block_sums`, shape (..., block), complex.
+        basis: Polynomials of `orthonormal_quadratics`, shape (block, 3).
+
+    Returns:
+        Steps of the first and second coefficient in radians, limited to +-0.7, shape (...,) each,
+        float64.
     """
     a = blocks @ basis.to(blocks.dtype)
     carrier = a[..., 0]
@@ -111,17 +160,23 @@ def phase_step(blocks: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _to_frequency(first_rad: Tensor, n: int) -> Tensor:
+    """First coefficient of the phase as a frequency in cycles per sample."""
     return math.sqrt(3) * first_rad / (math.pi * n)
 
 
 def _to_rate(second_rad: Tensor, n: int) -> Tensor:
+    """Second coefficient of the phase as a drift in cycles per sample^2."""
     return 6 * math.sqrt(5) * second_rad / (math.pi * n * n)
 
 
 def fit_tone(lines: Tensor, cell: Tensor, present: Tensor, level: Level) -> Tone:
-    """Maximum likelihood tone near a frequency cell of each line.
+    """Fit the tone of maximum likelihood near a frequency cell of each line.
 
-    lines: (..., pulse, range); cell, present: (..., pulse).
+    Args:
+        lines: Raw lines, shape (..., pulse, range), complex.
+        cell: Cell of an n-point FFT, shape (..., pulse), int64.
+        present: Lines that may hold a tone, shape (..., pulse), bool.
+        level: Robust level of the clean spectra.
     """
     n = lines.shape[-1]
     signed = torch.where(cell > n // 2, cell - n, cell).to(torch.float64)
@@ -141,7 +196,7 @@ def _refine(lines: Tensor, tone: Tone, steps: int) -> tuple[Tone, Tensor]:
     """Gauss-Newton steps on the block sums of one demodulation; also returns those sums."""
     n = lines.shape[-1]
     blocks = block_sums(lines * tone.phasor(n, lines.dtype).conj())
-    basis = legendre(blocks.shape[-1], lines)
+    basis = orthonormal_quadratics(blocks.shape[-1], lines)
     first = second = torch.zeros_like(tone.frequency)
     for _ in range(steps):
         turns = (first[..., None] * basis[:, 1] + second[..., None] * basis[:, 2]) / (2 * math.pi)
@@ -153,12 +208,19 @@ def _refine(lines: Tensor, tone: Tone, steps: int) -> tuple[Tone, Tensor]:
 
 
 def is_steady(blocks: Tensor, energy: Tensor, density: Tensor) -> Tensor:
-    """Whether the spectral line comes from a tone that lasts the whole line, (..., block) -> (...,)
-    bool.
+    """Return whether a spectral line comes from a tone that lasts the whole line.
 
-    Echoes of regularly spaced targets make spectral lines too, but a chirp passes a frequency in a
-    moment: their energy sits in few blocks. A tone fills all of them, so its coherent sum holds the
-    share z / (z + blocks) of the energy, z its excess.
+    Echoes of regularly spaced targets make spectral lines too, but a chirp passes a frequency in
+    few blocks. A tone fills all blocks: its coherent sum holds the share z / (z + blocks) of the
+    energy, where z is its excess.
+
+    Args:
+        blocks: Sums of `block_sums`, shape (..., block), complex.
+        energy: Energy of the tone over n, shape (...,).
+        density: Power spectral density of clutter at the tone, shape (...,).
+
+    Returns:
+        Shape (...,), bool.
     """
     n_blocks = blocks.shape[-1]
     coherent = blocks.sum(-1).abs().square() / (
@@ -169,12 +231,14 @@ def is_steady(blocks: Tensor, energy: Tensor, density: Tensor) -> Tensor:
 
 
 def pooled(tone: Tone, n: int, position: Tensor) -> Tone:
-    """Frequency and rate smoothed over neighbouring lines as far as the data agree with a smooth
-    drift.
+    """Average frequency and drift over neighbouring lines where the tone drifts smoothly.
 
-    Local straight lines over windows that grow threefold; a line keeps the widest window whose
-    residuals are no larger than the predicted noise. A tone that jumps from line to line keeps its
-    own values. position: line numbers, float64 (..., pulse).
+    A tone that jumps from line to line keeps the values of each line; see `smooth_track`.
+
+    Args:
+        tone: Tone with values of single lines.
+        n: Number of samples of a line.
+        position: Line numbers, shape (..., pulse), float64.
     """
     frequency = smooth_track(tone.frequency, _to_frequency(tone.noise_rad, n), tone.present, position)
     return replace(
@@ -183,8 +247,19 @@ def pooled(tone: Tone, n: int, position: Tensor) -> Tone:
 
 
 def smooth_track(value: Tensor, std: Tensor, present: Tensor, position: Tensor) -> Tensor:
-    """Local straight-line fits wherever they agree with the predicted std, the values themselves
-    elsewhere. All (..., pulse) float64.
+    """Replace values by local straight-line fits where these agree with the predicted scatter.
+
+    The width of the fits grows threefold in each step. A line keeps the widest window whose
+    residuals are no larger than predicted.
+
+    Args:
+        value: Values, shape (..., pulse), float64.
+        std: Predicted standard deviation of the values, shape (..., pulse), float64.
+        present: Lines that count, shape (..., pulse), bool.
+        position: Line numbers, shape (..., pulse), float64.
+
+    Returns:
+        Values of the same shape.
     """
     weight = torch.where(present, 1 / std.square().clamp_min(1e-60), 0.0)
     weight = weight / weight.amax(-1, keepdim=True).clamp_min(1e-300)
@@ -211,7 +286,11 @@ def smooth_track(value: Tensor, std: Tensor, present: Tensor, position: Tensor) 
 
 
 def window_sums(half: int) -> Callable[[Tensor], Tensor]:
-    """Sums over lines i - half .. i + half, cut at the ends."""
+    """Return a function that sums over the lines i - half to i + half, cut at the ends.
+
+    Args:
+        half: Half width of the window in lines.
+    """
 
     def sums(x: Tensor) -> Tensor:
         total = torch.nn.functional.pad(x, (half + 1, half)).cumsum(-1)
@@ -221,9 +300,7 @@ def window_sums(half: int) -> Callable[[Tensor], Tensor]:
 
 
 def _local_line(value: Tensor, weight: Tensor, i: Tensor, box: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
-    """Weighted straight-line fit over position i in a sliding window, at each position; also where
-    it is determined.
-    """
+    """Weighted straight-line fit in a sliding window, and where it is determined."""
     anchor = (weight * value).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp_min(1e-300)
     y = torch.where(weight > 0, value - anchor, 0.0)
     s0, s1, s2, sy, s1y = (box(part) for part in (weight, weight * i, weight * i * i, weight * y, weight * i * y))
@@ -237,12 +314,16 @@ def _local_line(value: Tensor, weight: Tensor, i: Tensor, box: Callable[[Tensor]
 def find_tones(
     lines: Tensor, level: Level, position: Tensor | None = None, most: int = 4, threshold: float = THRESHOLD
 ) -> list[Tone]:
-    """Up to `most` tones a line, strongest first, each found on what the earlier ones leave.
+    """Find tones in lines, the strongest first, each in what remains after the earlier ones.
 
-    lines: (..., pulse, range).
+    A line keeps no tones if they do not account for the energy around them.
 
-    position: line numbers (..., pulse) where the lines are a selection. Lines where the tones do
-    not account for the energy about them keep none: what is there is not a tone.
+    Args:
+        lines: Raw lines, shape (..., pulse, range), complex.
+        level: Robust level of the clean spectra.
+        position: Line numbers, shape (..., pulse), if the lines are a selection.
+        most: Largest number of tones in a line.
+        threshold: Power over the mean level of clutter.
     """
     rest, tones, n = lines.detach(), [], lines.shape[-1]
     blocked = torch.zeros(lines.shape, dtype=torch.bool, device=lines.device)
@@ -255,7 +336,7 @@ def find_tones(
         tone = fit_tone(rest, open_.argmax(-1), strong, level)
         without = rest - tone.waveform(rest)
         after, near = level.excess(line_spectra(without)), around(tone.cell(n), n)
-        # a tone that leaves most of the energy about it is part of something wider
+        # a tone that leaves most of the energy around it is part of wider interference
         useful = tone.present & accounts_for(excess, after, near, 0.7)
         rest, excess = torch.where(useful[..., None], without, rest), torch.where(useful[..., None], after, excess)
         blocked = blocked | near & (strong & ~useful)[..., None]
@@ -265,16 +346,31 @@ def find_tones(
 
 
 def accounts_for(before: Tensor, after: Tensor, near: Tensor, share: float) -> Tensor:
-    """Whether at most a share of the energy in the cells `near` is left, clutter (1 a cell) apart.
+    """Return whether at most a share of the energy in some cells remains, apart from clutter.
 
-    (..., pulse, range) -> (..., pulse) bool.
+    Args:
+        before: Power spectra over the level before subtraction, shape (..., pulse, range).
+        after: Power spectra over the level after subtraction, shape (..., pulse, range).
+        near: Cells that count, shape (..., pulse, range), bool.
+        share: Largest share that may remain.
+
+    Returns:
+        Shape (..., pulse), bool.
     """
     return (after * near).sum(-1) < share * (before * near).sum(-1) + 2 * near.sum(-1)
 
 
 def explaining(lines: Tensor, rest: Tensor, tones: list[Tone], level: Level) -> list[Tone]:
-    """The tones that together account for nearly all energy about them; the others are marked
-    absent.
+    """Mark tones as absent in lines where all tones together leave more than a tenth of the energy.
+
+    Args:
+        lines: Raw lines, shape (..., pulse, range), complex.
+        rest: Lines after the subtraction of the tones, same shape.
+        tones: Tones of the lines.
+        level: Robust level of the clean spectra.
+
+    Returns:
+        The tones that are present in any line.
     """
     if not tones:
         return tones
@@ -288,7 +384,14 @@ def explaining(lines: Tensor, rest: Tensor, tones: list[Tone], level: Level) -> 
 
 
 def refit(lines: Tensor, tones: list[Tone], position: Tensor, rounds: int = 2) -> list[Tone]:
-    """Each tone fitted again with the others taken out, then pooled over lines."""
+    """Fit each tone again without the others, then average over lines.
+
+    Args:
+        lines: Raw lines, shape (..., pulse, range), complex.
+        tones: Tones of the lines.
+        position: Line numbers, shape (..., pulse), float64.
+        rounds: Number of passes over all tones, if a line holds more than one.
+    """
     n, tones = lines.shape[-1], list(tones)
     if not tones:
         return tones
@@ -308,9 +411,17 @@ def refit(lines: Tensor, tones: list[Tone], position: Tensor, rounds: int = 2) -
 
 
 def subtract_each(lines: Tensor, tones: list[Tone], rounds: int = 3) -> list[Tensor]:
-    """Waveform of every tone in the lines, amplitudes fitted jointly by turns.
+    """Return the waveform of each tone, with amplitudes fitted jointly by alternation.
 
-    Differentiable in lines.
+    Differentiable in the lines.
+
+    Args:
+        lines: Raw lines, shape (..., pulse, range), complex.
+        tones: Tones of the lines.
+        rounds: Number of passes over all tones.
+
+    Returns:
+        One tensor of shape (..., pulse, range) for each tone.
     """
     waves = [torch.zeros_like(lines) for _ in tones]
     for _ in range(rounds if len(tones) > 1 else 1):
@@ -320,20 +431,42 @@ def subtract_each(lines: Tensor, tones: list[Tone], rounds: int = 3) -> list[Ten
 
 
 def subtract_tones(lines: Tensor, tones: list[Tone]) -> Tensor:
-    """Lines (..., pulse, range) without the tones."""
+    """Subtract tones from lines.
+
+    Differentiable in the lines.
+
+    Args:
+        lines: Raw lines, shape (..., pulse, range), complex.
+        tones: Tones of the lines.
+
+    Returns:
+        Lines of the same shape.
+    """
     for wave in subtract_each(lines, tones):
         lines = lines - wave
     return lines
 
 
 def around(cell: Tensor, n: int) -> Tensor:
-    """Cells within n / 32 of one cell a line, circular, (..., pulse) -> (..., pulse, n) bool."""
+    """Return the cells within n / 32 of one cell of each line, in circular order.
+
+    Args:
+        cell: Cell of an n-point FFT, shape (..., pulse), int64.
+        n: Number of cells.
+
+    Returns:
+        Shape (..., pulse, n), bool.
+    """
     distance = (torch.arange(n, device=cell.device) - cell[..., None]) % n
     return (distance <= n // 32) | (distance >= n - n // 32)
 
 
 def anything(mask: Tensor) -> bool:
-    """Whether any entry is true; True inside vmap, where a value cannot be looked at."""
+    """Return whether any entry is True; inside torch.vmap, where values cannot be read, True.
+
+    Args:
+        mask: Any shape, bool.
+    """
     try:
         return bool(mask.any())
     except RuntimeError:

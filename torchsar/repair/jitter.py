@@ -1,10 +1,13 @@
-"""Periodic jitter of the range converter: correction by interpolation, and exactly.
+"""Correction of periodic jitter of the range converter, by interpolation or exactly.
 
-A converter made of M interleaved ones takes sample n at the instant n + e[n mod M] (in samples).
-The phase of the pattern is that of the first sample of every line. A common offset of all instants
-is a delay, which no record can tell from range: the estimators put the mean offset to zero (origin
-"mean"), or the first one (origin "first"). Lines are taken as periodic, as every FFT does, so that
-their two ends meet. Source: brief 004, item 4.
+A converter made of M interleaved ones takes sample n at the instant n + e[n mod M], in samples; the
+pattern begins with the first sample of every line. A common offset of all instants is a delay,
+which no record can distinguish from range: the estimators set the mean offset to zero (origin
+"mean"), or the first one (origin "first"). Lines are taken as periodic, as in every FFT, so that
+their ends join.
+
+Reference:
+    Tsvetkov 2017, Fig. 4.
 """
 
 from __future__ import annotations
@@ -18,25 +21,38 @@ from torch import Tensor
 
 from torchsar.core import Signal, Stage, cis, linear_phasor, real_dtype
 
+# Smallest distance of sample instants, in samples. Limit of conditioning, by choice: noise grows
+# about as 1 / gap.
 MIN_GAP = 0.01
 
 
 def smallest_gap(offset_samples: Tensor) -> Tensor:
-    """Least distance of neighbouring sample instants, in samples. (..., M) -> (...,).
+    """Return the smallest distance between neighbouring sample instants.
 
-    Zero or less: they coincide or cross.
+    Args:
+        offset_samples: Offsets in samples, shape (..., M).
+
+    Returns:
+        Distance in samples, shape (...,); zero or less if instants coincide or cross.
     """
     return 1 + (torch.roll(offset_samples, -1, -1) - offset_samples).amin(-1)
 
 
 def refuse_crossing(offset_samples: Tensor) -> None:
-    """Raise ValueError where offsets (..., M) are not finite or bring sample instants together,
-    which no interpolation can undo.
+    """Raise ValueError if sample instants are too close for any interpolation (0.01 sample).
+
+    Has no effect inside torch.vmap, where values cannot be read.
+
+    Args:
+        offset_samples: Offsets in samples, shape (..., M).
+
+    Raises:
+        ValueError: If an offset is not finite, or instants are too close, coincide or cross.
     """
     offsets = offset_samples.detach()
     try:
         worst = float(torch.nan_to_num(smallest_gap(offsets), nan=-math.inf).min())
-    except RuntimeError:  # inside vmap a value cannot be looked at
+    except RuntimeError:  # inside vmap values cannot be read
         return
     if not worst >= MIN_GAP:
         shown = [round(x, 3) for x in offsets.reshape(-1, offsets.shape[-1])[0].tolist()]
@@ -48,16 +64,30 @@ def refuse_crossing(offset_samples: Tensor) -> None:
 
 
 def sample_offsets(offset_samples: Tensor, n: int) -> Tensor:
-    """The offset of every sample of a line, (..., M) -> (..., n)."""
+    """Return the offset of every sample of a line.
+
+    Args:
+        offset_samples: Offsets in samples, shape (..., M).
+        n: Number of samples of the line.
+
+    Returns:
+        Offsets in samples, shape (..., n).
+    """
     m = offset_samples.shape[-1]
     return offset_samples[..., torch.arange(n, device=offset_samples.device) % m]
 
 
 def neighbours(offset_samples: Tensor, points: int) -> tuple[Tensor, Tensor]:
-    """True instants (..., M, points) of the nearest samples relative to the wanted uniform one, and
-    the lag (..., M) of the first.
+    """Find the samples nearest to each uniform instant.
 
-    An even number of nodes is centred on the interval that holds the wanted instant.
+    Args:
+        offset_samples: Offsets in samples, shape (..., M).
+        points: Number of samples for each instant; an even number is centred on the interval that
+            holds the instant.
+
+    Returns:
+        True instants relative to the uniform one in samples, shape (..., M, points), and the index
+        of the first sample relative to that of the uniform instant, shape (..., M), int64.
     """
     m, device = offset_samples.shape[-1], offset_samples.device
     first = torch.where(offset_samples.detach() > 0, -(points // 2), -((points - 1) // 2))
@@ -67,9 +97,13 @@ def neighbours(offset_samples: Tensor, points: int) -> tuple[Tensor, Tensor]:
 
 
 def lagrange_weights(instants: Tensor) -> Tensor:
-    """Weights of samples at uneven instants for the polynomial through them at instant 0.
+    """Compute weights of the polynomial through samples at uneven instants, at instant 0.
 
-    (..., points) -> (..., points).
+    Args:
+        instants: Instants in samples, shape (..., points).
+
+    Returns:
+        Weights, shape (..., points).
     """
     own = torch.eye(instants.shape[-1], dtype=torch.bool, device=instants.device)
     apart = torch.where(own, 1, instants[..., :, None] - instants[..., None, :])
@@ -77,11 +111,17 @@ def lagrange_weights(instants: Tensor) -> Tensor:
 
 
 def band_limited_weights(instants: Tensor, band: float, floor: float = 1e-9) -> Tensor:
-    """Weights of least mean square error for a flat spectrum over the fraction `band` of the
-    sampling rate, at instant 0.
+    """Compute the weights of least mean square error for a flat spectrum, at instant 0.
 
-    Solves sinc(band (t_i - t_j)) w = sinc(band t_i); `floor` (relative power of white noise) keeps
-    the solve well posed.
+    Solves sinc(band (t_i - t_j)) w = sinc(band t_i).
+
+    Args:
+        instants: Instants t in samples, shape (..., points), float64.
+        band: Bandwidth of the signal over the sampling rate.
+        floor: Relative power of white noise that keeps the system well conditioned.
+
+    Returns:
+        Weights w, shape (..., points).
     """
     eye = torch.eye(instants.shape[-1], dtype=instants.dtype, device=instants.device)
     gram = torch.sinc(band * (instants[..., :, None] - instants[..., None, :])) + floor * eye
@@ -89,10 +129,7 @@ def band_limited_weights(instants: Tensor, band: float, floor: float = 1e-9) -> 
 
 
 def _combine(y: Tensor, weights: Tensor, first: Tensor) -> Tensor:
-    """x[n] = sum_k weights[n mod M, k] y[n + first[n mod M] + k], lines taken as periodic.
-
-    weights: (..., M, points); first: (..., M).
-    """
+    """Sum over k of weights[n mod M, k] y[n + first[n mod M] + k], with lines taken as periodic."""
     points = weights.shape[-1]
     lowest = -(points // 2)
     # 0 or 1: both placements share the lags lowest .. lowest + points
@@ -108,13 +145,21 @@ def _combine(y: Tensor, weights: Tensor, first: Tensor) -> Tensor:
 
 
 def correct_jitter_lagrange(y: Tensor, offset_samples: Tensor, points: int = 8) -> Tensor:
-    """Samples at uniform instants by Lagrange interpolation through `points` neighbours.
+    """Interpolate samples at uniform instants with Lagrange polynomials.
 
-    y: (..., pulse, range); offsets: (..., M) or (M,).
+    Fast, but limited by the oversampling: near the edge of the band a polynomial does not follow
+    the signal. Zero offsets leave the samples unchanged. Differentiable.
 
-    Cheap, and limited by the oversampling: near the edge of the band a polynomial does not follow
-    the signal. Any line length. Offsets of zero pass through untouched. Differentiable. Raises
-    ValueError for offsets that coincide or cross.
+    Args:
+        y: Lines of any length, shape (..., pulse, range), complex.
+        offset_samples: Offsets in samples, shape (..., M) or (M,).
+        points: Number of neighbours.
+
+    Returns:
+        Lines of the same shape.
+
+    Raises:
+        ValueError: If sample instants coincide or cross.
     """
     refuse_crossing(offset_samples)
     instants, first = neighbours(offset_samples.to(torch.float64), points)
@@ -122,11 +167,23 @@ def correct_jitter_lagrange(y: Tensor, offset_samples: Tensor, points: int = 8) 
 
 
 def correct_jitter_band_limited(y: Tensor, offset_samples: Tensor, points: int = 8, band: float = 0.95) -> Tensor:
-    """As correct_jitter_lagrange at the same cost, with the weights that are best for a signal that
-    fills `band` of the sampling rate.
+    """Interpolate samples at uniform instants with weights for a band-limited signal.
 
-    At a band of 0.8 and offsets up to 0.18 sample: -29, -43, -55 dB for 4, 8, 12 points, where
-    Lagrange reaches -23, -28, -32 dB.
+    Costs as much as `correct_jitter_lagrange`. For a band of 0.8 and offsets of up to 0.18 sample
+    the error is -29, -43 and -55 dB with 4, 8 and 12 points; that of Lagrange interpolation is -23,
+    -28 and -32 dB. Differentiable.
+
+    Args:
+        y: Lines of any length, shape (..., pulse, range), complex.
+        offset_samples: Offsets in samples, shape (..., M) or (M,).
+        points: Number of neighbours.
+        band: Bandwidth of the signal over the sampling rate.
+
+    Returns:
+        Lines of the same shape.
+
+    Raises:
+        ValueError: If sample instants coincide or cross.
     """
     refuse_crossing(offset_samples)
     instants, first = neighbours(offset_samples.to(torch.float64), points)
@@ -134,21 +191,29 @@ def correct_jitter_band_limited(y: Tensor, offset_samples: Tensor, points: int =
 
 
 def correct_jitter_exact(y: Tensor, offset_samples: Tensor, refinements: int | None = None) -> Tensor:
-    """Exact periodic non-uniform reconstruction.
+    """Reconstruct uniform samples exactly from periodic non-uniform ones.
 
-    y: (..., pulse, range) complex; offset_samples: (..., M) or (M,). Same shape.
+    The M frequencies that alias together in the M decimated lines are separated by the inverse of
+    one M x M matrix, the same for every group except for a diagonal factor. A line whose length is
+    not a multiple of M is extended to the next multiple, and the error that this leaves at its ends
+    is removed by residual correction. Differentiable.
 
-    The M frequencies that the M decimated lines alias together are separated by one M x M inverse,
-    the same for every group but for a diagonal. A line whose length is no multiple of M has a seam:
-    it is solved as if extended to the next multiple, and what that leaves at its ends is removed by
-    `refinements` steps of residual correction (default 6 in complex64, 12 in complex128).
-    Differentiable. Raises ValueError for offsets that coincide or cross.
+    Args:
+        y: Lines, shape (..., pulse, range), complex.
+        offset_samples: Offsets in samples, shape (..., M) or (M,).
+        refinements: Number of residual corrections; by default 6 in complex64, 12 in complex128.
+
+    Returns:
+        Lines of the same shape.
+
+    Raises:
+        ValueError: If sample instants coincide or cross, or a line is shorter than 2 M samples.
     """
     refuse_crossing(offset_samples)
     offsets, n, m = offset_samples.to(torch.float64), y.shape[-1], offset_samples.shape[-1]
     if n < 2 * m:
         raise ValueError(
-            f"lines of {n} samples hold less than two periods of {m}; give longer lines or a shorter period"
+            f"lines of {n} samples hold less than two periods of {m} samples; give longer lines or fewer offsets"
         )
     if n % m == 0:
         return _separate(y, offsets)
@@ -159,15 +224,15 @@ def correct_jitter_exact(y: Tensor, offset_samples: Tensor, refinements: int | N
 
 
 def _solve_extended(y: Tensor, offsets: Tensor) -> Tensor:
-    """_separate on lines continued round their seam to a multiple of M samples."""
+    """Separation of lines that are continued periodically to a multiple of M samples."""
     missing = -y.shape[-1] % offsets.shape[-1]
     return _separate(torch.cat([y, y[..., :missing]], -1), offsets)[..., : y.shape[-1]]
 
 
 def _separate(y: Tensor, offsets: Tensor) -> Tensor:
-    """correct_jitter_exact for lengths n = M q.
+    """Exact reconstruction of lines of n = M q samples.
 
-    With k = s + j + i q, s = -(n//2): Y_m[j] = e(s + j) sum_i V[m, i] X[k].
+    With k = s + j + i q and s = -(n // 2): Y_m[j] = e(s + j) sum_i V[m, i] X[k].
     """
     n, m = y.shape[-1], offsets.shape[-1]
     q, start = n // m, -(n // 2)
@@ -182,8 +247,14 @@ def _separate(y: Tensor, offsets: Tensor) -> Tensor:
 
 
 def jittered(x: Tensor, offset_samples: Tensor) -> Tensor:
-    """What a converter with these offsets makes of uniform samples x (..., pulse, range),
-    band-limited and periodic; any length.
+    """Return the samples that a converter with these offsets takes of band-limited, periodic lines.
+
+    Args:
+        x: Uniform samples, lines of any length, shape (..., pulse, range), complex.
+        offset_samples: Offsets in samples, shape (..., M) or (M,).
+
+    Returns:
+        Samples of the same shape.
     """
     n, m = x.shape[-1], offset_samples.shape[-1]
     spectrum = torch.fft.fftshift(torch.fft.fft(x), dim=-1)
@@ -198,8 +269,13 @@ def jittered(x: Tensor, offset_samples: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Lagrange:
-    """Correction by Lagrange interpolation through this many neighbours: fast, limited near the
-    band edges.
+    """Correction of jitter by Lagrange interpolation: fast, but inaccurate near the band edges.
+
+    Args:
+        points: Number of neighbours, 2 to 64; 4, 8 and 12 are usual.
+
+    Raises:
+        ValueError: If the number of neighbours is outside 2..64.
     """
 
     points: int = 8
@@ -214,8 +290,16 @@ class Lagrange:
 
 @dataclass(frozen=True)
 class BandLimited:
-    """Correction by the best local weights for a signal of this bandwidth over sampling rate: the
-    cost of Lagrange, far more exact.
+    """Correction of jitter by the best local weights for a band-limited signal.
+
+    As fast as `Lagrange` and much more accurate.
+
+    Args:
+        points: Number of neighbours, 2 to 64.
+        band: Bandwidth of the signal over the sampling rate, above 0 and up to 1.
+
+    Raises:
+        ValueError: If the number of neighbours or the band is outside its limits.
     """
 
     points: int = 8
@@ -234,7 +318,7 @@ class BandLimited:
 
 @dataclass(frozen=True)
 class Exact:
-    """Correction by exact periodic non-uniform reconstruction."""
+    """Correction of jitter by exact periodic non-uniform reconstruction."""
 
     def __call__(self, y: Tensor, offset_samples: Tensor) -> Tensor:
         return correct_jitter_exact(y, offset_samples)
@@ -246,11 +330,23 @@ def correct_jitter(
     period: Tensor | None = None,
     method: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> Tensor:
-    """Correct trials whose periods may differ.
+    """Correct jitter in trials whose periods may differ.
 
-    offset_samples: (..., P), of which the first `period` (...,) count; None: all P.
+    Trials of one period are processed together. Trials whose offsets are all zero are unchanged if
+    `period` is given.
 
-    Trials of one period go together; those whose offsets are all zero pass through bitwise.
+    Args:
+        y: Lines, shape (..., pulse, range), complex.
+        offset_samples: Offsets in samples, shape (..., P) or (P,).
+        period: Number of offsets that count in each trial, shape (...,), int64; None: all P.
+        method: Function of lines and offsets (..., M); by default `Exact()`.
+
+    Returns:
+        Lines of the same shape.
+
+    Raises:
+        ValueError: If the offsets do not fit the trials of the data, or sample instants coincide or
+            cross.
     """
     method = Exact() if method is None else method
     if offset_samples.ndim > 1 and offset_samples.shape[:-1] != y.shape[:-2]:
@@ -273,10 +369,18 @@ def correct_jitter(
 
 
 class CorrectJitter(Stage):
-    """Undo periodic jitter with offsets given here or, in a chain, by PilotJitter or BlindJitter.
+    """Correction of periodic jitter with known or estimated offsets.
 
-    Connect both values: `use(CorrectJitter(), offset_samples="pilot", period="pilot")`. method:
-    `Exact()`, `BandLimited(8, 0.8)`, `Lagrange(8)`, or any function of (samples, offsets (..., M)).
+    In a chain: `use(CorrectJitter(), offset_samples="pilot", period="pilot")`, with the estimates
+    of `PilotJitter` or `BlindJitter`.
+
+    Args:
+        offset_samples: Offsets in samples, shape (M,); by default zero.
+        method: `Exact()` (default), `BandLimited(8, 0.8)`, `Lagrange(8)`, or any function of lines
+            and offsets (..., M).
+
+    Raises:
+        ValueError: If sample instants coincide or cross.
     """
 
     offset_samples: Tensor
@@ -290,5 +394,12 @@ class CorrectJitter(Stage):
         refuse_crossing(self.offset_samples)
 
     def forward(self, signal: Signal, offset_samples: Tensor | None = None, period: Tensor | None = None) -> Signal:
+        """Correct the jitter; see `correct_jitter`.
+
+        Args:
+            signal: Lines, shape (..., pulse, range).
+            offset_samples: Offsets in samples, shape (..., P); replace those of the constructor.
+            period: Number of offsets that count in each trial, shape (...,), int64; None: all P.
+        """
         offsets = self.offset_samples if offset_samples is None else offset_samples
         return signal.with_data(correct_jitter(signal.data, offsets, period, self.method))

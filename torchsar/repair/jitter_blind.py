@@ -1,14 +1,15 @@
-"""Periodic jitter from the recorded clutter itself, without a pilot.
+"""Estimation of periodic jitter from the recorded clutter, without a pilot tone.
 
 Clutter is stationary along range: its spectrum has no correlation between different frequencies.
-Jitter e[n mod M] with the Fourier coefficients E_k = (1/M) sum_m e[m] exp(-2j pi k m / M) makes it
-cyclostationary; to first order, with the power spectrum S,
-    <Y(f) Y*(f - k/M)> = 2j pi E_k [(f - k/M) S(f - k/M) - f S(f)],  frequencies wrapped to +-1/2
-    cycle per sample.
-Each E_k is a least-squares fit of that over the band; exact correction and a new fit remove the
-higher orders. The unequal slopes of the pattern at the wrap tell jitter from a ripple of power; the
-mean offset (k = 0) cannot be seen. Source: brief 004, item 4 and its table of recorded data
-(offsets from clutter).
+Jitter e[n mod M] with the Fourier coefficients E_k = (1 / M) sum_m e[m] exp(-2j pi k m / M) makes
+it cyclostationary. To first order, with the power spectrum S and frequencies wrapped to +-1/2 cycle
+per sample,
+
+    <Y(f) Y*(f - k/M)> = 2j pi E_k [(f - k/M) S(f - k/M) - f S(f)].
+
+Each E_k is a least-squares fit of this over the band; exact correction and a new fit remove the
+higher orders. The unequal slopes on both sides of the wrap distinguish jitter from a periodic gain.
+The mean offset (k = 0) cannot be observed.
 """
 
 from __future__ import annotations
@@ -25,17 +26,26 @@ from torchsar.repair.jitter import MIN_GAP, correct_jitter_exact, smallest_gap
 
 @dataclass(frozen=True)
 class CyclicFit:
-    """First-order jitter of one period: coefficients E_1 ..
+    """First-order jitter of one period.
 
-    E_{M-1} and the variance of each, (..., M - 1).
+    Args:
+        coefficient: Fourier coefficients E_1 to E_(M-1) in samples, shape (..., M - 1), complex.
+        variance: Variance of each coefficient, shape (..., M - 1).
     """
 
     coefficient: Tensor
     variance: Tensor
 
     def significance(self, primitive: bool = False) -> Tensor:
-        """Chi-squared of the coefficients where there is no jitter, (...,): M - 1 degrees of
-        freedom, or those of no shorter period only.
+        """Return the chi-squared statistic of the coefficients.
+
+        Without jitter it has as many degrees of freedom as there are coefficients.
+
+        Args:
+            primitive: Whether to count only the coefficients that no shorter period has.
+
+        Returns:
+            Shape (...,).
         """
         m = self.coefficient.shape[-1] + 1
         used = [k - 1 for k in range(1, m) if not primitive or math.gcd(k, m) == 1]
@@ -43,21 +53,25 @@ class CyclicFit:
 
     @property
     def offset_samples(self) -> Tensor:
-        """Offsets of mean zero, (..., M)."""
+        """Offsets of mean zero in samples, shape (..., M)."""
         m = self.coefficient.shape[-1] + 1
         return torch.fft.ifft(torch.nn.functional.pad(self.coefficient, (1, 0)) * m).real
 
     @property
     def std_samples(self) -> Tensor:
-        """Deviation common to all offsets, (...,)."""
+        """Standard deviation of every offset in samples, shape (...,)."""
         return torch.sqrt(self.variance.sum(-1))
 
 
 def cyclic_fit(y: Tensor, period: int) -> CyclicFit:
-    """Fit E_k to the correlations between frequencies k/M apart. y: (..., pulse, range) complex.
+    """Fit the coefficients of jitter to the correlations between frequencies k / M apart.
 
-    The variance carries the scatter of the correlations about the fit, so that lines that resemble
-    one another are not counted twice.
+    The variance includes the scatter of the correlations about the fit, so that lines that resemble
+    each other do not count as independent.
+
+    Args:
+        y: Lines, shape (..., pulse, range), complex.
+        period: Period M in samples.
     """
     n = y.shape[-1] - y.shape[-1] % period
     spectrum = torch.fft.fft(y[..., :n]).to(torch.complex128)
@@ -92,12 +106,18 @@ def _smooth(power: Tensor, width: int) -> Tensor:
 
 
 def detect_jitter_period(y: Tensor, max_period: int = 16, lines: int = 256) -> Tensor:
-    """The shortest period that holds all significant repetitions, 1 where there is none; (...,
-    pulse, range) -> (...,) int64.
+    """Find the shortest period that contains all significant repetitions.
 
-    Looks at up to `lines` lines spread over the recording. For each M the coefficients that no
-    shorter period has are tested; false alarms stay below 1e-5 a trial. A repetition weaker by 27
-    dB than the strongest one is taken for its leakage.
+    For each M the coefficients that no shorter period has are tested; false alarms are below 1e-5
+    per trial. A repetition that is weaker than the strongest one by 27 dB is taken for its leakage.
+
+    Args:
+        y: Lines, shape (..., pulse, range), complex.
+        max_period: Longest period that is tested.
+        lines: Approximate number of lines that are used, spread over the recording.
+
+    Returns:
+        Period in samples, 1 where there is no jitter, shape (...,), int64.
     """
     stride = max(1, y.shape[-2] // lines)
     found = {m: cyclic_fit(y[..., ::stride, :], m).significance(primitive=True) for m in range(2, max_period + 1)}
@@ -112,21 +132,32 @@ def detect_jitter_period(y: Tensor, max_period: int = 16, lines: int = 256) -> T
 
 
 def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = None, passes: int = 3) -> Estimate:
-    """Period and offsets from clutter.
+    """Estimate period and offsets of periodic jitter from clutter.
 
-    y: (..., pulse, range) raw or range-compressed, no line number matters.
+    Needs a signal that is not much oversampled. A periodic gain that accompanies the jitter is not
+    modelled. Not differentiable.
 
-    Gives `offset_samples` (..., P) of mean zero and `period` (...,) as estimate_jitter_pilot does;
-    with a known `period` nothing is tested and P = period. quality: 1 - chance-sized share of the
-    offsets. Not ok, with zero offsets: an all-zero trial, or offsets that bring instants together.
-    Needs a signal that is not much oversampled and a range line of at least 8 periods; a periodic
-    change of gain that goes with the jitter is not modelled.
+    Args:
+        y: Raw or range-compressed lines, shape (..., pulse, range), complex, in any order.
+        max_period: Longest period that is tested.
+        period: Known period, which is then not tested.
+        passes: Number of fits, each after correction with the one before.
+
+    Returns:
+        `offset_samples` of shape (..., P), of mean zero, with standard deviations, and `period` of
+        shape (...,), int64; offsets repeat beyond the period. P is the known period or
+        `max_period`. `quality` is the mean square of the offsets over itself plus their variance,
+        or 1 where there is no jitter. `ok` is False, and the offsets are zero, where a trial is all
+        zero or sample instants would coincide or cross.
+
+    Raises:
+        ValueError: If the period is less than 2, or lines are shorter than 8 periods.
     """
     longest = max_period if period is None else period
     if longest < 2 or y.shape[-1] < 8 * longest:
         raise ValueError(
             "blind jitter estimation needs a period of 2 or more and lines of at least "
-            f"{8 * longest} samples, got period {longest} and lines of {y.shape[-1]}"
+            f"{8 * longest} samples, got period {longest} and lines of {y.shape[-1]}; give longer lines"
         )
     rows = y.detach().reshape(-1, *y.shape[-2:])
     periods = (
@@ -155,9 +186,15 @@ def estimate_jitter_blind(y: Tensor, max_period: int = 16, period: int | None = 
 
 
 def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[CyclicFit, Tensor]:
-    """Fit, correct the recording exactly, and fit what is left. y: (trial, pulse, range).
+    """Fit offsets, correct the recording exactly, and fit what remains.
 
-    Returns the last fit and the offsets (trial, M).
+    Args:
+        y: Lines, shape (trial, pulse, range), complex.
+        period: Period M in samples.
+        passes: Number of fits.
+
+    Returns:
+        The last fit, and the offsets in samples, shape (trial, M).
     """
     y = y[..., : y.shape[-1] - y.shape[-1] % period]
     total = torch.zeros((y.shape[0], period), dtype=torch.float64, device=y.device)
@@ -169,8 +206,13 @@ def refine_offsets(y: Tensor, period: int, passes: int) -> tuple[CyclicFit, Tens
 
 
 class BlindJitter(Stage):
-    """Jitter offsets from the clutter of the recording: `use(CorrectJitter(),
-    offset_samples="blind", period="blind")`.
+    """Estimator of periodic jitter from the clutter of the recording.
+
+    In a chain: `use(CorrectJitter(), offset_samples="blind", period="blind")`.
+
+    Args:
+        max_period: Longest period that is tested, in samples.
+        period: Known period in samples, which is then not tested.
     """
 
     provides = ("offset_samples", "period")
@@ -180,4 +222,9 @@ class BlindJitter(Stage):
         self.max_period, self.period = max_period, period
 
     def forward(self, signal: Signal) -> Estimate:
+        """Estimate period and offsets; see `estimate_jitter_blind`.
+
+        Args:
+            signal: Raw or range-compressed lines, shape (..., pulse, range).
+        """
         return estimate_jitter_blind(signal.data, self.max_period, self.period)

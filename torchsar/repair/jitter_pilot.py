@@ -1,9 +1,12 @@
-"""Periodic jitter from the record of a pilot tone through the same converter (brief 004, item 4).
+"""Estimation of periodic jitter from a pilot tone recorded by the same converter.
 
-A tone f (cycles per sample) sampled at n + e[n mod M] has the phase 2 pi f (n + e[n mod M]) +
-constant: the mean phase of every M-th sample, after the tone itself is taken out, is 2 pi f e[m].
-The frequency is found from the record, the period by a test of significance, so that a clean
-converter gives offsets of exactly zero.
+A tone of f cycles per sample, taken at n + e[n mod M], has the phase 2 pi f (n + e[n mod M]) +
+constant. After removal of the tone, the mean phase of every M-th sample is 2 pi f e[m]. The
+frequency is estimated from the record and the period by a test of significance, so that a converter
+without jitter gives offsets of exactly zero.
+
+Reference:
+    Tsvetkov 2017, Fig. 4 (estimation from pilot signals).
 """
 
 from __future__ import annotations
@@ -17,23 +20,36 @@ from torch import Tensor
 from torchsar.core import Estimate, Signal, Stage, linear_phasor
 from torchsar.repair.jitter import MIN_GAP, smallest_gap
 
+# conventions for the offset that no pilot can determine
 ORIGINS = ("mean", "first")
 
 
 def estimate_jitter_pilot(
     pilot: Tensor, max_period: int = 16, period: int | None = None, origin: str = "mean"
 ) -> Estimate:
-    """Period and offsets of a converter from a tone.
+    """Estimate period and offsets of periodic jitter from a pilot tone.
 
-    pilot: (..., n) complex, one tone of any frequency but zero, n >= 4 periods.
+    The pilot cannot determine the mean offset, which is a delay; `origin` sets it by convention.
 
-    Gives `offset_samples` (..., P) and `period` (...,) int64, where P = max_period and offsets
-    repeat beyond the period; with a known `period` P = period. origin: "mean" puts the mean offset
-    to zero, "first" the first one; the pilot cannot tell (the mean is a delay). std of the offsets
-    is the Cramer-Rao bound at the measured noise. quality is the share of the power that the tone
-    explains. Not ok, with zero offsets: a record that is not finite, all zero, without a tone above
-    the noise, a tone too close to zero frequency, or offsets that bring instants together. Raises
-    ValueError for an empty or short record, TypeError for a real one.
+    Args:
+        pilot: Record of one tone of any frequency other than zero, shape (..., n), complex.
+        max_period: Longest period that is tested.
+        period: Known period, which is then not tested.
+        origin: "mean" sets the mean offset to zero, "first" the first one.
+
+    Returns:
+        `offset_samples` of shape (..., P), and `period` of shape (...,), int64; offsets repeat
+        beyond the period. P is the known period or `max_period`. The standard deviation is the
+        Cramer-Rao bound at the measured noise. `quality` is the share of the power that the tone
+        explains. `ok` is False, and the offsets are zero, where the record is not finite, all zero,
+        without a tone above the noise or with a tone too close to zero frequency, or where sample
+        instants would coincide or cross. `info` has the frequency of the tone, `frequency_cycles`,
+        in cycles per sample.
+
+    Raises:
+        ValueError: If the record is shorter than 4 periods, the period is less than one, or the
+            origin is unknown.
+        TypeError: If the record is real.
     """
     _check(pilot, max_period, period, origin)
     finite = torch.isfinite(torch.view_as_real(pilot)).flatten(-2).all(-1)
@@ -46,6 +62,7 @@ def estimate_jitter_pilot(
 
 
 def _check(pilot: Tensor, max_period: int, period: int | None, origin: str) -> None:
+    """Raise an error for invalid arguments."""
     longest = max_period if period is None else period
     if longest < 1:
         raise ValueError(f"a jitter period must be at least one sample, got {longest}")
@@ -56,15 +73,15 @@ def _check(pilot: Tensor, max_period: int, period: int | None, origin: str) -> N
             f"a pilot record is complex samples (..., n), got {pilot.dtype}; form the analytic signal first"
         )
     if pilot.ndim < 1 or pilot.shape[-1] < 4 * longest:
-        held = pilot.shape[-1] if pilot.ndim else 0
+        length = pilot.shape[-1] if pilot.ndim else 0
         raise ValueError(
             f"a pilot record needs at least {4 * longest} samples for periods up to {longest}, "
-            f"got {held}; record longer or lower max_period"
+            f"got {length}; record a longer tone or lower max_period"
         )
 
 
 def _peak_frequency(x: Tensor, oversampling: int = 4) -> Tensor:
-    """Frequency of the strongest line in cycles per sample, within 1/(8 n). (..., n) -> (...,)."""
+    """Frequency of the strongest spectral line in cycles per sample, within 1 / (8 n), (...,)."""
     n = oversampling * x.shape[-1]
     index = torch.fft.fft(x, n).abs().argmax(-1)
     return (index - n * (2 * index >= n)).to(torch.float64) / n
@@ -72,7 +89,7 @@ def _peak_frequency(x: Tensor, oversampling: int = 4) -> Tensor:
 
 @dataclass(frozen=True)
 class _Fit:
-    """A tone with one free phasor for each of M interleaved converters, per trial."""
+    """Tone with one free phasor for each of M interleaved converters, per trial."""
 
     frequency: Tensor  # cycles per sample, (...,)
     phasor: Tensor  # (..., M)
@@ -82,12 +99,11 @@ class _Fit:
 
     @property
     def power(self) -> Tensor:
+        """Mean power of the phasors."""
         return self.phasor.abs().square().mean(-1)
 
     def significance(self, noise: Tensor) -> Tensor:
-        """Sum over converters of (phase / its deviation)^2: chi-squared with M - 1 degrees of
-        freedom where there is no jitter.
-        """
+        """Chi-squared statistic of the phases: M - 1 degrees of freedom without jitter."""
         information = (
             2 * self.count * self.phasor.abs().square() / noise.clamp_min(1e-30 * self.power + 1e-300)[..., None]
         )
@@ -95,20 +111,18 @@ class _Fit:
 
 
 def _fit(x: Tensor, frequency: Tensor, m: int, steps: int = 5) -> _Fit:
-    """Refine the frequency jointly with M class phasors: each step demodulates, then fits the
-    common phase slope that is left.
-    """
+    """Refine the frequency jointly with the M phasors by the phase slope that remains."""
     n = x.shape[-1]
     index = torch.arange(n, device=x.device) % m
     count = torch.bincount(index, minlength=m).to(torch.float64)
-    place = torch.arange(n, dtype=torch.float64, device=x.device) - (n - 1) / 2
+    position = torch.arange(n, dtype=torch.float64, device=x.device) - (n - 1) / 2
     for step in range(steps):
         z = x * linear_phasor(-frequency, 0, n, x.dtype)
         phasor = torch.zeros((*x.shape[:-1], m), dtype=x.dtype, device=x.device).index_add(-1, index, z) / count
         aligned = z * phasor[..., index].conj()
         if step < steps - 1:
             scale = phasor.abs().square().sum(-1).clamp_min(1e-300) / m
-            frequency = frequency + (place * aligned.imag).sum(-1) / scale / (2 * math.pi * place.square().sum())
+            frequency = frequency + (position * aligned.imag).sum(-1) / scale / (2 * math.pi * position.square().sum())
     noise = (z - phasor[..., index]).abs().square().sum(-1) / max(1, n - m - 1)
     mean = phasor.sum(-1, keepdim=True)
     phase = torch.angle(phasor * mean.conj())
@@ -118,7 +132,7 @@ def _fit(x: Tensor, frequency: Tensor, m: int, steps: int = 5) -> _Fit:
 def _choose(fits: list[_Fit]) -> Tensor:
     """Index of the shortest period that explains the record, (...,).
 
-    20 + 8 (M - 1) over chi-squared: false alarms below 1e-6 a trial.
+    The threshold of 20 + 8 (M - 1) keeps false alarms below 1e-6 per trial.
     """
     noise = torch.stack([fit.noise for fit in fits]).amin(0)
     gain = [fit.significance(noise) - (20 + 8 * i if i else 0) for i, fit in enumerate(fits)]
@@ -126,6 +140,7 @@ def _choose(fits: list[_Fit]) -> Tensor:
 
 
 def _estimate(fits: list[_Fit], best: Tensor, finite: Tensor, n: int, origin: str) -> Estimate:
+    """Estimate from the fit of the chosen period in each trial."""
     longest = fits[-1].phasor.shape[-1]
     tiled = torch.arange(longest, device=best.device)
 
@@ -142,13 +157,11 @@ def _estimate(fits: list[_Fit], best: Tensor, finite: Tensor, n: int, origin: st
     phase = pick([f.phase_rad[..., tiled % f.phasor.shape[-1]] for f in fits])
     radians = 2 * math.pi * torch.where(frequency.abs() > 1 / n, frequency, torch.inf)
     offsets = phase / radians[..., None]
-    deviation = torch.sqrt(noise * m / (2 * n * power.clamp_min(1e-300))) / radians.abs()
-    deviation = (deviation * torch.sqrt((m - 1) / m))[..., None].expand(offsets.shape)
+    std = torch.sqrt(noise * m / (2 * n * power.clamp_min(1e-300))) / radians.abs()
+    std = (std * torch.sqrt((m - 1) / m))[..., None].expand(offsets.shape)
     if origin == "first":
         offsets = offsets - offsets[..., :1]
-        deviation = (
-            deviation * math.sqrt(2) * torch.sqrt(m / (m - 1).clamp_min(1))[..., None] * (tiled % m[..., None] != 0)
-        )
+        std = std * math.sqrt(2) * torch.sqrt(m / (m - 1).clamp_min(1))[..., None] * (tiled % m[..., None] != 0)
     ok = finite & (power * n > 50 * noise) & (power > 0) & torch.isfinite(radians) & (smallest_gap(offsets) >= MIN_GAP)
     offsets, m = torch.where(ok[..., None], offsets, 0), torch.where(ok, m, 1 if len(fits) > 1 else longest)
     quality = torch.where(ok, power / (power + noise).clamp_min(1e-300), 0)
@@ -156,17 +169,20 @@ def _estimate(fits: list[_Fit], best: Tensor, finite: Tensor, n: int, origin: st
         {"offset_samples": offsets, "period": m},
         quality,
         ok,
-        {"offset_samples": torch.where(ok[..., None], deviation, 0)},
+        {"offset_samples": torch.where(ok[..., None], std, 0)},
         {"frequency_cycles": frequency},
     )
 
 
 class PilotJitter(Stage):
-    """Jitter offsets from recorded side data: `use(PilotJitter(), pilot="aux.pilot")`.
+    """Estimator of periodic jitter from a recorded pilot tone.
 
-    The signal is left alone.
+    In a chain: `use(PilotJitter(), pilot="aux.pilot")`. The signal is unchanged.
 
-    One pilot (n,) may serve all trials. See estimate_jitter_pilot for the origin of the offsets.
+    Args:
+        max_period: Longest period that is tested, in samples.
+        period: Known period in samples, which is then not tested.
+        origin: "mean" sets the mean offset to zero, "first" the first one.
     """
 
     provides = ("offset_samples", "period")
@@ -176,6 +192,15 @@ class PilotJitter(Stage):
         self.max_period, self.period, self.origin = max_period, period, origin
 
     def forward(self, signal: Signal, pilot: Tensor) -> Estimate:
+        """Estimate period and offsets; see `estimate_jitter_pilot`.
+
+        Args:
+            signal: Lines, shape (..., pulse, range); gives only the trials.
+            pilot: Record of the tone, shape (..., n), or (n,) for all trials.
+
+        Raises:
+            ValueError: If the record does not fit the trials of the signal.
+        """
         if not pilot.ndim or (pilot.ndim > 1 and pilot.shape[:-1] != signal.trials):
             raise ValueError(
                 f"pilot record of shape {tuple(pilot.shape)} does not match the trial dims "

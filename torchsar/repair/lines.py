@@ -1,10 +1,12 @@
-"""Line integrity: every line on its place of a regular azimuth grid, by numbers that are verified
-before they are trusted.
+"""Line integrity: verification of line numbers, and a regular azimuth grid from them.
 
-A number is judged against its neighbours: of two lines in order the later has the larger number, by
-at least their distance (lines are lost, never invented). In terms of offset = number - row this
-says: offsets never fall. A number that contradicts most of its neighbours on either side is
-corrupted. Source: brief 004, item 1; Tsvetkov 2017.
+Every line number is compared with its neighbours. Of two lines in order the later one has the
+larger number, by at least their distance, since lines are lost but never added. The offset, number
+minus row, therefore never falls. A number that contradicts most of its neighbours on either side is
+taken for corrupted.
+
+Reference:
+    Tsvetkov 2017 (verification of line numbers).
 """
 
 from __future__ import annotations
@@ -16,21 +18,29 @@ from torch import Tensor
 
 from torchsar.core import Estimate, Signal, Stage
 
+# line number of padding at the end of a trial, by convention: no line has a negative number
 PADDING = -1
-# neighbours on each side that vote on a number: wide first, against clusters of corrupted numbers,
-# then close ones, against small errors
+# numbers of neighbours on each side that are compared with a line, by choice: many at first,
+# against clusters of corrupted numbers, then few, against small errors
 _REACHES = (16, 4, 2)
 
 
 @dataclass(frozen=True)
 class LinePlan:
-    """Where the received lines belong. n: rows of the regular grid; all per trial.
+    """Positions of the received lines on a regular azimuth grid.
 
-    source (..., n): received row for each row of the grid, -1 where there is none. number (...,
-    received): verified number of each received row, -1 for padding, repeats and lines that could
-    not be placed. missing: bool (..., n). corrected, repeated, unplaced: bool (..., received).
-    first_number (...,): number of row 0 of the grid. trusted (...,): share of numbers that stood.
-    ok: bool (...,).
+    Args:
+        source: Received row for each of the n rows of the grid, -1 where there is none, shape (...,
+            n).
+        number: Verified number of each received row, shape (..., received); -1 for padding,
+            repeated lines and lines without a unique position.
+        missing: Rows of the grid without a line, shape (..., n), bool.
+        corrected: Lines with a corrected number, shape (..., received), bool.
+        repeated: Lines that repeat the line before, shape (..., received), bool.
+        unplaced: Lines without a unique position, shape (..., received), bool.
+        first_number: Number of row 0 of the grid, shape (...,).
+        trusted: Share of numbers that were accepted as received, shape (...,).
+        ok: False where fewer than half of the numbers were accepted, shape (...,), bool.
     """
 
     source: Tensor
@@ -45,27 +55,26 @@ class LinePlan:
 
 
 def _shifted(x: Tensor, by: int, fill: int | bool) -> Tensor:
-    """x[..., i + by], `fill` outside. |by| <= n."""
+    """Elements x[..., i + by], and `fill` outside; |by| <= n."""
     edge = torch.full_like(x[..., : abs(by)], fill)
     return torch.cat([x[..., by:], edge], -1) if by > 0 else torch.cat([edge, x[..., :by]], -1)
 
 
-def _votes(offset: Tensor, trusted: Tensor, reach: int, longest_gap: int, sign: int) -> tuple[Tensor, Tensor]:
-    """How many trusted neighbours on one side (sign +1: later) contradict each line, and how many
-    there are.
-    """
-    against, asked = torch.zeros_like(offset), torch.zeros_like(offset)
+def _contradictions(offset: Tensor, trusted: Tensor, reach: int, longest_gap: int, sign: int) -> tuple[Tensor, Tensor]:
+    """Number of accepted neighbours on one side that contradict each line, and of all of them."""
+    contradicting, count = torch.zeros_like(offset), torch.zeros_like(offset)
     for distance in range(1, min(reach, offset.shape[-1] - 1) + 1):
-        there = _shifted(trusted, sign * distance, False)
+        accepted = _shifted(trusted, sign * distance, False)
         rise = sign * (_shifted(offset, sign * distance, 0) - offset)
-        against = against + (there & ((rise < 0) | (rise > longest_gap)))
-        asked = asked + there
-    return against, asked
+        contradicting = contradicting + (accepted & ((rise < 0) | (rise > longest_gap)))
+        count = count + accepted
+    return contradicting, count
 
 
-def _lonely_ends(offset: Tensor, trusted: Tensor) -> Tensor:
-    """The first and the last trusted line where a jump parts them from the rest that is larger than
-    any inside: nothing on their far side speaks for them.
+def _unconfirmed_ends(offset: Tensor, trusted: Tensor) -> Tensor:
+    """First and last accepted line, if the jump to the next one exceeds all jumps inside.
+
+    They have no neighbour on the outer side to confirm them.
     """
     before, after = _nearest(offset, trusted)
     first = trusted & (trusted.cumsum(-1) == 1)
@@ -81,9 +90,7 @@ def _inner_before(inner: Tensor) -> Tensor:
 
 
 def _nearest(offset: Tensor, trusted: Tensor) -> tuple[Tensor, Tensor]:
-    """Offset of the nearest trusted line before and behind each row; where there is none on one
-    side, that of the other side.
-    """
+    """Offsets of the nearest accepted lines before and after; at the ends both of one line."""
     n = offset.shape[-1]
     row = torch.arange(n, device=offset.device).expand(offset.shape)
     before = _shifted(torch.where(trusted, row, -1).cummax(-1).values, -1, -1)
@@ -92,8 +99,8 @@ def _nearest(offset: Tensor, trusted: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(before < 0, right, left), torch.where(after >= n, left, right)
 
 
-def _disputed(offset: Tensor, trusted: Tensor) -> Tensor:
-    """Trusted lines that lie above a later or below an earlier one."""
+def _inconsistent(offset: Tensor, trusted: Tensor) -> Tensor:
+    """Accepted lines whose offset exceeds that of a later or is below that of an earlier one."""
     limit = torch.iinfo(offset.dtype)
     highest = torch.where(trusted, offset, limit.min).cummax(-1).values
     lowest = torch.where(trusted, offset, limit.max).flip(-1).cummin(-1).values.flip(-1)
@@ -101,34 +108,34 @@ def _disputed(offset: Tensor, trusted: Tensor) -> Tensor:
 
 
 def trusted_numbers(offset: Tensor, candidate: Tensor, longest_gap: int) -> Tensor:
-    """Lines whose number stands.
+    """Return the lines whose number is accepted.
 
-    offset: number - row, int64 (..., line); candidate: lines that take part, bool (..., line).
+    Args:
+        offset: Number minus row, shape (..., line), int64.
+        candidate: Lines that take part, shape (..., line), bool.
+        longest_gap: Largest step between neighbours that is not taken for an error.
+
+    Returns:
+        Shape (..., line), bool.
     """
     trusted = candidate
     for reach in _REACHES:
-        against = [_votes(offset, trusted, reach, longest_gap, sign) for sign in (-1, 1)]
-        trusted = trusted & ~torch.stack([2 * no > asked for no, asked in against]).any(0)
-    # what is left must not fall anywhere: numbers still in dispute are dropped, all of them
-    trusted = trusted & ~_disputed(offset, trusted)
-    return trusted & ~_lonely_ends(offset, trusted)
+        contradicting = [_contradictions(offset, trusted, reach, longest_gap, sign) for sign in (-1, 1)]
+        trusted = trusted & ~torch.stack([2 * no > count for no, count in contradicting]).any(0)
+    # the offsets that remain must not fall anywhere: all inconsistent numbers are dropped
+    trusted = trusted & ~_inconsistent(offset, trusted)
+    return trusted & ~_unconfirmed_ends(offset, trusted)
 
 
 def _repeats(lines: Tensor, number: Tensor, present: Tensor) -> Tensor:
-    """Lines that are the line before them once more, sample by sample, bool (..., line).
-
-    Lines of zeros are none.
-    """
+    """Lines with the samples of the line before, (..., line) bool; lines of zeros do not count."""
     same = (lines[..., 1:, :] == lines[..., :-1, :]).all(-1) & (lines[..., 1:, :] != 0).any(-1)
     first = torch.zeros_like(same[..., :1])
     return torch.cat([first, same], -1) & present
 
 
-def _dead(lines: Tensor, present: Tensor) -> Tensor:
-    """Lines of zeros between lines that are none: a dead receiver.
-
-    Silence before the first and behind the last echo is left alone.
-    """
+def _empty_lines(lines: Tensor, present: Tensor) -> Tensor:
+    """Lines of zeros between other lines, but not before the first or after the last echo."""
     lit = (lines != 0).any(-1)
     return present & ~lit & (lit.cumsum(-1) > 0) & (lit.flip(-1).cumsum(-1).flip(-1) > 0)
 
@@ -141,20 +148,26 @@ def line_integrity(
     n_lines: int | None = None,
     longest_gap: int = 1000,
 ) -> LinePlan:
-    """Verify line numbers and plan the regular grid.
+    """Verify line numbers and plan the regular azimuth grid.
 
-    lines: (..., line, range); line_number: integer (..., line), -1 for padding at the end.
+    Repeated lines (equal samples) are dropped. A number that contradicts its neighbours is
+    corrected if the lines beside it leave one position only; a line that fits several positions of
+    a gap is left out and counted. Lines of zeros between others count as missing. Rows after the
+    last received line do not, since trials of different lengths are padded there. A trial with
+    fewer than half of its numbers accepted has `ok` False and keeps its rows.
 
-    Repeated lines (equal samples) are dropped, numbers that contradict their neighbours are
-    corrected where the lines beside them leave one place only, and a line that could stand in
-    several places of a gap is left out and counted, rather than put where it may do harm. Lines of
-    zeros amid others hold nothing and count as missing; rows behind the last received line do not
-    (trials of different lengths are padded there). first_number: number of row 0 of the grid; None:
-    that of the first received line, per trial. n_lines: rows of the grid; None: as many as there
-    are lines, more where the numbers need more. longest_gap: a larger step between neighbours is
-    taken for a corrupted number. A trial with fewer than half of its numbers standing has ok =
-    False and stays as it came. Raises ValueError where shapes disagree, a number is no integer, or
-    no trial at all can be reconciled.
+    Args:
+        lines: Received lines, shape (..., line, range), complex.
+        line_number: Line numbers, shape (..., line), integer, -1 for padding at the end.
+        first_number: Number of row 0 of the grid; None: that of the first received line of each
+            trial.
+        n_lines: Number of rows of the grid; None: as many as there are lines, or more if the
+            numbers need more.
+        longest_gap: Largest step between neighbours that is not taken for an error.
+
+    Raises:
+        ValueError: If the numbers do not fit the lines or are not integers, the longest gap is less
+            than one, or fewer than half of the numbers are accepted in every trial.
     """
     _check(lines, line_number, longest_gap)
     n = lines.shape[-2]
@@ -170,20 +183,20 @@ def line_integrity(
     verified = torch.where(placeable, number - offset + torch.where(trusted, offset, before), PADDING)
     share = trusted.sum(-1) / single.sum(-1).clamp_min(1)
     ok = share >= 0.5
-    _refuse_hopeless(ok, trusted, single)
+    _check_consistency(ok, trusted, single)
     verified = torch.where(ok[..., None], verified, torch.where(present, row, PADDING))
-    # only the first received line can be row 0, be its own number right or wrong
+    # row 0 is the first received line, whether its own number is right or wrong
     origin = _first(verified) if first_number is None else torch.full_like(verified[..., 0], first_number)
     slot = verified - origin[..., None]
     rows = n_lines if n_lines is not None else _rows(slot, verified, n)
     inside = (verified != PADDING) & (slot >= 0) & (slot < rows)
     source = _sources(slot, inside, rows)
-    dead = _dead(lines, present).gather(-1, source.clamp_min(0)) & (source >= 0)
+    empty = _empty_lines(lines, present).gather(-1, source.clamp_min(0)) & (source >= 0)
     before_last = (source >= 0).flip(-1).cumsum(-1).flip(-1) > 0
     return LinePlan(
         source=source,
         number=torch.where(inside, verified, PADDING),
-        missing=ok[..., None] & (((source < 0) & before_last) | dead),
+        missing=ok[..., None] & (((source < 0) & before_last) | empty),
         corrected=ok[..., None] & inside & ~trusted,
         repeated=ok[..., None] & repeated,
         unplaced=(single | (present & ~ok[..., None])) & ~inside,
@@ -194,6 +207,7 @@ def line_integrity(
 
 
 def _check(lines: Tensor, line_number: Tensor, longest_gap: int) -> None:
+    """Raise ValueError for invalid line numbers or gaps."""
     if line_number.shape[-1:] != lines.shape[-2:-1]:
         raise ValueError(
             f"line numbers of shape {tuple(line_number.shape)} do not fit {lines.shape[-2]} "
@@ -205,67 +219,81 @@ def _check(lines: Tensor, line_number: Tensor, longest_gap: int) -> None:
         raise ValueError(f"the longest gap must be at least one line, got {longest_gap}")
 
 
-def _refuse_hopeless(ok: Tensor, trusted: Tensor, single: Tensor) -> None:
-    """Raise where not one trial can be reconciled; inside vmap a value cannot be looked at."""
+def _check_consistency(ok: Tensor, trusted: Tensor, single: Tensor) -> None:
+    """Raise ValueError if no trial has a consistent set of numbers."""
     try:
         if bool(ok.any()) or ok.numel() == 0:
             return
-        stand, of = int(trusted.sum()), int(single.sum())
+        accepted, total = int(trusted.sum()), int(single.sum())
     except RuntimeError:
         return
     raise ValueError(
-        f"the line numbers cannot be reconciled: only {stand} of {of} agree with their "
-        "neighbours; check that they rise with the lines, and longest_gap"
+        f"the line numbers cannot be reconciled: only {accepted} of {total} agree with their "
+        "neighbours; check that they rise with the lines, or raise longest_gap"
     )
 
 
 def _first(verified: Tensor) -> Tensor:
-    """Smallest number that is none of padding, (...,); 0 where there is none."""
+    """Smallest verified number, (...,); 0 where there is none."""
     least = torch.where(verified != PADDING, verified, torch.iinfo(verified.dtype).max).amin(-1)
     return torch.where(least == torch.iinfo(verified.dtype).max, 0, least)
 
 
 def _rows(slot: Tensor, verified: Tensor, n: int) -> int:
-    """Rows that hold every placed line of every trial, at least n."""
+    """Number of rows that holds every line of every trial, at least n."""
     try:
         return max(n, 1 + int(torch.where(verified != PADDING, slot, 0).max()))
-    except RuntimeError:  # inside vmap a value cannot be looked at
+    except RuntimeError:  # inside vmap values cannot be read
         return n
 
 
 def _sources(slot: Tensor, inside: Tensor, rows: int) -> Tensor:
-    """Received row for each row of the grid, -1 where none.
-
-    Lines outside go into a row that is cut off again.
-    """
+    """Received row for each row of the grid, -1 where there is none."""
     row = torch.arange(slot.shape[-1], device=slot.device).expand(slot.shape)
     plan = slot.new_full((*slot.shape[:-1], rows + 1), -1)
     return plan.scatter(-1, torch.where(inside, slot, rows), row)[..., :rows]
 
 
 def place_lines(x: Tensor, source: Tensor, fill: float = 0.0) -> Tensor:
-    """Received lines (..., received, range) on the grid of LinePlan.source (..., n); `fill` where
-    there is none. Differentiable.
+    """Put received lines on a regular grid.
+
+    Differentiable.
+
+    Args:
+        x: Received lines, shape (..., received, range).
+        source: Received row for each row of the grid, -1 where there is none, shape (..., n).
+        fill: Value of the rows without a line.
+
+    Returns:
+        Lines on the grid, shape (..., n, range).
     """
     index = source.clamp_min(0)[..., None].expand(*source.shape, x.shape[-1])
     return torch.where(source[..., None] >= 0, x.expand(*source.shape[:-1], *x.shape[-2:]).gather(-2, index), fill)
 
 
 def place_per_line(x: Tensor, source: Tensor, fill: float = 0.0) -> Tensor:
-    """Side data with one entry a received line, (..., received), on the same grid."""
+    """Put side data with one entry per received line on the same grid.
+
+    Args:
+        x: Side data, shape (..., received).
+        source: Received row for each row of the grid, -1 where there is none, shape (..., n).
+        fill: Value of the rows without a line.
+
+    Returns:
+        Shape (..., n).
+    """
     return place_lines(x[..., None], source, fill)[..., 0]
 
 
 class LineIntegrity(Stage):
-    """Put every line on its place of a regular azimuth grid; see line_integrity.
+    """Regular azimuth grid from verified line numbers; see `line_integrity`.
 
-    forward(signal, line_number).
-
-    Returns the signal on the grid, missing lines zero, and an Estimate: `missing` (..., pulse)
-    bool; quality: share of numbers that stood; info: `source`, `number`, masks `corrected`,
-    `repeated`, `unplaced` of the received lines, and per-trial counts `received`, `placed`,
-    `repeated_count`, `corrected_count`, `unplaced_count`, `missing_count`: received = placed +
-    repeated + unplaced, always. Regular input passes bit for bit.
+    Args:
+        first_number: Number of row 0 of the grid; None: that of the first received line of each
+            trial.
+        n_lines: Number of rows of the grid; None: as many as there are lines, or more if the
+            numbers need more.
+        longest_gap: Largest step between neighbours that is not taken for an error.
     """
 
     provides = ("missing",)
@@ -275,6 +303,24 @@ class LineIntegrity(Stage):
         self.first_number, self.n_lines, self.longest_gap = first_number, n_lines, longest_gap
 
     def forward(self, signal: Signal, line_number: Tensor) -> tuple[Signal, Estimate]:
+        """Put every line on its position of the grid.
+
+        Args:
+            signal: Received lines, shape (..., pulse, range).
+            line_number: Line numbers, shape (..., pulse), integer, -1 for padding at the end.
+
+        Returns:
+            The signal on the grid, with missing lines zero (regular input is unchanged bit for
+            bit), and an Estimate: `missing` of shape (..., pulse), bool. `quality` is the share of
+            numbers that were accepted; `ok` is False where it is below one half. `info` has
+            `source`, `number`, `corrected`, `repeated`, `unplaced` and `first_number` (see
+            `LinePlan`), and the counts `received`, `placed`, `repeated_count`, `corrected_count`,
+            `unplaced_count` and `missing_count` per trial, with received = placed + repeated +
+            unplaced.
+
+        Raises:
+            ValueError: As in `line_integrity`.
+        """
         plan = line_integrity(
             signal.data, line_number, first_number=self.first_number, n_lines=self.n_lines, longest_gap=self.longest_gap
         )

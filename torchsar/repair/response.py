@@ -1,11 +1,13 @@
-"""Phase- and amplitude-frequency response of the whole channel: its form, its correction, and the
-amplitude.
+"""Phase and amplitude response of the channel along range: its correction, and its amplitude.
 
-A response exp(j psi(u)) A(u) lies over the normalised range frequency u = f / (bandwidth / 2),
--1..1 over the band of the pulse, and is held at its edge values outside. By convention psi has no
-constant and no linear part over the band (they are a phase and a shift) and ln A has no mean (a
-gain). Responses travel as samples on GRID equally spaced u from -1 to 1. The phase is estimated in
-`response_phase`. Source: brief 004, items 6 and 9.
+The response is A(u) exp(j psi(u)), where u = f / (bandwidth / 2) is the normalised range frequency,
+-1..1 over the band of the pulse. Outside the band it keeps its values at the edges. By convention
+psi has no constant and no linear part over the band, which are a phase and a shift, and ln A has
+mean zero, which is a gain. Responses are sampled at GRID equally spaced u from -1 to 1.
+`response_phase` estimates the phase.
+
+Reference:
+    Tsvetkov 2017, Figs. 8 and 9.
 """
 
 from __future__ import annotations
@@ -16,18 +18,36 @@ from torch import Tensor
 from torchsar.core import Signal, Stage, cis, legendre, real_dtype
 from torchsar.radar import StripmapRadar
 
+# Samples of a response, by choice: odd, so that u = 0 is one of them, and about 80 for each period
+# of the highest Legendre degree (40) at the middle of the band.
 GRID = 1025
 
 
 def band_grid(device: torch.device | str | None = None) -> Tensor:
-    """The normalised frequencies at which responses are given, float64 (GRID,)."""
+    """Return the normalised frequencies at which responses are sampled.
+
+    Args:
+        device: Device of the result.
+
+    Returns:
+        Shape (GRID,), float64.
+    """
     return torch.linspace(-1, 1, GRID, dtype=torch.float64, device=device)
 
 
 def band_axis(n: int, band: float, device: torch.device | str | None = None) -> Tensor:
-    """Normalised frequency u of an n-point FFT, FFT order, float64 (n,).
+    """Return the normalised frequencies of an FFT.
 
-    band: pulse bandwidth over sampling rate.
+    Args:
+        n: Length of the FFT.
+        band: Bandwidth of the pulse over the sampling rate, above 0 and up to 1.
+        device: Device of the result.
+
+    Returns:
+        Normalised frequency u in FFT order, shape (n,), float64.
+
+    Raises:
+        ValueError: If `band` is outside its limits.
     """
     if not 0 < band <= 1:
         raise ValueError(f"band is the pulse bandwidth over the sampling rate and lies in 0..1, got {band}")
@@ -35,17 +55,27 @@ def band_axis(n: int, band: float, device: torch.device | str | None = None) -> 
 
 
 def unit_legendre(u: Tensor, order: int) -> Tensor:
-    """Legendre polynomials of degree 0..order, scaled to unit mean square over -1..1, (order + 1,
-    *u.shape) float64.
+    """Return Legendre polynomials with unit mean square over -1..1.
+
+    Args:
+        u: Normalised frequencies, any shape, float64.
+        order: Highest degree.
+
+    Returns:
+        Shape (order + 1, *u.shape), float64.
     """
     degree = torch.arange(order + 1, dtype=torch.float64, device=u.device)
     return (legendre(u, order) * torch.sqrt(2 * degree + 1)).movedim(-1, 0)
 
 
 def without_line(phase_rad: Tensor) -> Tensor:
-    """A phase on the grid less its constant and linear parts of least squares over the band.
+    """Remove the constant and linear parts of a phase over the band, by least squares.
 
-    (..., GRID) -> (..., GRID).
+    Args:
+        phase_rad: Phase in radians, shape (..., GRID), float64.
+
+    Returns:
+        Same shape.
     """
     line = unit_legendre(band_grid(phase_rad.device), 1)
     line = line / torch.linalg.vector_norm(line, dim=-1, keepdim=True)
@@ -53,21 +83,37 @@ def without_line(phase_rad: Tensor) -> Tensor:
 
 
 def on_axis(values: Tensor, u: Tensor) -> Tensor:
-    """Values given on the grid, interpolated at u and held outside the band.
+    """Interpolate values on the grid linearly; outside the band the values at the edges are kept.
 
-    (..., GRID), (n,) -> (..., n). Differentiable in values.
+    Differentiable in the values.
+
+    Args:
+        values: Values on the grid, shape (..., GRID).
+        u: Normalised frequencies, shape (n,).
+
+    Returns:
+        Shape (..., n).
     """
-    place = (u.clamp(-1, 1) + 1) / 2 * (values.shape[-1] - 1)
-    low = place.floor().to(torch.int64).clamp(0, values.shape[-1] - 2)
-    part = place - low
+    position = (u.clamp(-1, 1) + 1) / 2 * (values.shape[-1] - 1)
+    low = position.floor().to(torch.int64).clamp(0, values.shape[-1] - 2)
+    part = position - low
     return values[..., low] * (1 - part) + values[..., low + 1] * part
 
 
 def response_filter(
     phase_rad: Tensor, amplitude: Tensor | None, n: int, band: float, dtype: torch.dtype = torch.complex128
 ) -> Tensor:
-    """Inverse response exp(-j psi) / A in FFT order, (..., n): multiply it into a range reference
-    spectrum, or into range spectra.
+    """Return the inverse response exp(-j psi) / A, a factor of range spectra or reference spectra.
+
+    Args:
+        phase_rad: Phase psi in radians, shape (..., GRID), float64.
+        amplitude: Amplitude A, shape (..., GRID), or None for one.
+        n: Length of the spectra.
+        band: Bandwidth of the pulse over the sampling rate.
+        dtype: complex64 or complex128.
+
+    Returns:
+        FFT order, shape (..., n).
     """
     u = band_axis(n, band, phase_rad.device)
     inverse = cis(-on_axis(phase_rad, u).to(real_dtype(dtype)))
@@ -75,33 +121,54 @@ def response_filter(
 
 
 def correct_response(x: Tensor, phase_rad: Tensor, amplitude: Tensor | None, band: float) -> Tensor:
-    """Remove a response along the last dim.
+    """Remove a response along range.
 
-    x: (..., pulse, range) raw, range-compressed or image; phase_rad, amplitude: (..., GRID).
+    The range spectrum must be centred, as that of images in beam coordinates is. Differentiable.
 
-    The range spectrum of x must be centred, as that of images in beam coordinates is.
-    Differentiable.
+    Args:
+        x: Raw or range-compressed lines or image, shape (..., pulse, range), complex.
+        phase_rad: Phase in radians, shape (..., GRID), float64.
+        amplitude: Amplitude, shape (..., GRID), or None for one.
+        band: Bandwidth of the pulse over the sampling rate.
+
+    Returns:
+        Same shape.
     """
     inverse = response_filter(phase_rad, amplitude, x.shape[-1], band, x.dtype)
     return torch.fft.ifft(torch.fft.fft(x) * inverse[..., None, :])
 
 
 def band_power(x: Tensor) -> Tensor:
-    """Mean power spectrum along range, FFT order. (..., pulse, range) -> (..., range) float64.
+    """Return the mean power spectrum along range, for use as an expected spectrum.
 
-    What `expected` is made of.
+    Args:
+        x: Lines or image, shape (..., pulse, range), complex.
+
+    Returns:
+        FFT order, shape (..., range), float64.
     """
     return torch.fft.fft(x).abs().square().to(torch.float64).mean(-2)
 
 
 def estimate_amplitude_response(power: Tensor, expected: Tensor, band: float, order: int = 32) -> Tensor:
-    """Amplitude on the grid that turns `expected` into `power` spectra, both FFT order, (..., n)
-    and (..., n') of any lengths.
+    """Estimate the amplitude response that converts an expected power spectrum into a measured one.
 
-    Both are averaged over bins of the band; half the log of their ratio is fitted with Legendre
-    polynomials up to `order`, whose mean is dropped. expected: of clean data of the same kind, or
-    |pulse spectrum|^2 where noise and scene are white. Raises ValueError for an expected spectrum
-    that has no power in the band.
+    Both spectra are averaged over bins of the band, and half the logarithm of their ratio is fitted
+    with Legendre polynomials, without its mean.
+
+    Args:
+        power: Measured power spectrum, FFT order, shape (..., n).
+        expected: Power spectrum of clean data of the same kind, FFT order, shape (..., n') of any
+            length; |pulse spectrum|^2 if noise and scene are white.
+        band: Bandwidth of the pulse over the sampling rate.
+        order: Highest degree of the polynomials.
+
+    Returns:
+        Amplitude on the grid, shape (..., GRID); one where a trial has no power.
+
+    Raises:
+        ValueError: If the expected spectrum has a bin without power, or a spectrum has too few
+            samples in the band for the order.
     """
     bins = 4 * order
     u = (torch.arange(bins, dtype=torch.float64, device=power.device) + 0.5) * 2 / bins - 1
@@ -109,20 +176,20 @@ def estimate_amplitude_response(power: Tensor, expected: Tensor, band: float, or
     if not bool((wanted > 0).all()):
         raise ValueError(
             "the expected spectrum has bins without power inside the band; give a spectrum of "
-            "the same band and at least four bins an order"
+            "the same band and at least four bins per order"
         )
     ratio = _binned(power.to(torch.float64), band, bins) / wanted
     level = ratio.mean(-1, keepdim=True)
     half_log = 0.5 * torch.log((ratio / level.clamp_min(1e-300)).clamp_min(1e-6))
-    coefficients = torch.linalg.lstsq(unit_legendre(u, order).mT, half_log[..., None]).solution[..., 1:, 0]
+    terms = unit_legendre(u, order).mT
+    terms = terms.expand(*half_log.shape[:-1], *terms.shape)
+    coefficients = torch.linalg.lstsq(terms, half_log[..., None]).solution[..., 1:, 0]
     fitted = torch.exp(coefficients @ unit_legendre(band_grid(power.device), order)[1:])
     return torch.where(level > 0, fitted, 1)
 
 
 def _binned(power: Tensor, band: float, bins: int) -> Tensor:
-    """Mean over equal bins of u, (..., n) -> (..., bins); a bin without a sample takes the value
-    between its neighbours.
-    """
+    """Mean over equal bins of u in the band, (..., bins)."""
     u = band_axis(power.shape[-1], band, power.device)
     inside = u.abs() < 1
     if int(inside.sum()) < bins:
@@ -138,10 +205,17 @@ def _binned(power: Tensor, band: float, bins: int) -> Tensor:
 
 
 class CorrectResponse(Stage):
-    """Remove a response: `use(CorrectResponse(radar), phase_rad="response", amplitude="response")`.
+    """Correction of the phase and amplitude response of the channel along range.
 
-    on: "image", or "raw" for raw and range-compressed data, where it is the same as folding it into
-    the reference spectrum.
+    In a chain: `use(CorrectResponse(radar), phase_rad="response", amplitude="response")`.
+
+    Args:
+        radar: Radar; gives bandwidth and sampling rate.
+        on: "image", or "raw" for raw and range-compressed data, where the correction equals one of
+            the reference spectrum.
+
+    Raises:
+        ValueError: If `on` is neither of them.
     """
 
     def __init__(self, radar: StripmapRadar, on: str = "image") -> None:
@@ -152,4 +226,11 @@ class CorrectResponse(Stage):
         self.band = radar.pulse.bandwidth_hz / radar.sampling_hz
 
     def forward(self, signal: Signal, phase_rad: Tensor, amplitude: Tensor | None = None) -> Signal:
+        """Remove the response; see `correct_response`.
+
+        Args:
+            signal: Image, shape (..., azimuth, range), or lines, shape (..., pulse, range).
+            phase_rad: Phase in radians, shape (..., GRID).
+            amplitude: Amplitude, shape (..., GRID), or None for one.
+        """
         return signal.with_data(correct_response(signal.data, phase_rad, amplitude, self.band))

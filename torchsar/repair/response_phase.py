@@ -1,11 +1,13 @@
-"""Phase-frequency response from bright places of the focused image: the sharpest fit (recommended)
-and the point average (baseline).
+"""Phase response of the channel from bright points of the focused image.
 
-Both look at short range windows about the brightest points. The point average takes each for one
-point: its spectrum, less its own constant and linear phase, is averaged coherently. The sharpest
-fit asks for no single points: it finds the phase, as a sum of Legendre polynomials, whose removal
-gives the range responses of least entropy, so that ships, houses and doubles count as well. Source:
-brief 004, item 9 and its table of recorded data.
+Two methods use short range windows about the brightest points. The point average (baseline) takes
+each for a single point: spectra, each without its own constant and linear phase, are averaged
+coherently. The sharpest fit (recommended) does not need single points: it determines the phase, as
+a sum of Legendre polynomials, whose removal gives range responses of least entropy. Ships, houses
+and close pairs of points are therefore useful as well.
+
+Reference:
+    Tsvetkov 2017, Figs. 8 and 9 (point average).
 """
 
 from __future__ import annotations
@@ -28,16 +30,29 @@ from torchsar.repair.response import (
     unit_legendre,
 )
 
+# Highest Legendre degrees of the stages of a fit, by choice: a large smooth phase first, then
+# ripple of up to about 20 periods over the band.
 ORDERS = (2, 4, 8, 16, 40)
 
 
 def brightest_windows(image: Tensor, points: int, width: int, apart: int = 8) -> Tensor:
-    """Range windows about the brightest local maxima of each trial, (trial, azimuth, range) ->
-    (trial, points, width).
+    """Cut range windows about the brightest local maxima of each trial.
 
-    Maxima are at least `apart` samples from any brighter one in their own and the next lines; those
-    closer than half a window to the ends of a line are not taken. Where there are fewer maxima than
-    points, the other windows are zero.
+    Maxima closer than half a window to the ends of a line are not used. If there are fewer maxima
+    than points, the remaining windows are zero.
+
+    Args:
+        image: Image, shape (trial, azimuth, range), complex.
+        points: Number of windows.
+        width: Length of the windows in samples.
+        apart: Least distance of a maximum from any brighter one in its own and the next lines, in
+            samples.
+
+    Returns:
+        Windows, shape (trial, points, width).
+
+    Raises:
+        ValueError: If the width is below 16 samples or above half a line.
     """
     n, half = image.shape[-1], width // 2
     if width < 16 or n < 2 * width:
@@ -49,20 +64,29 @@ def brightest_windows(image: Tensor, points: int, width: int, apart: int = 8) ->
     highest = torch.nn.functional.max_pool2d(size[:, None], (3, 2 * apart + 1), 1, (1, apart))[:, 0]
     peaks = torch.where((size == highest) & (size > 0), size, 0).flatten(-2)
     level, index = peaks.topk(min(points, peaks.shape[-1]), -1)
-    place = index[..., None] + torch.arange(-half, width - half, device=image.device)
-    windows = torch.gather(image.flatten(-2), -1, place.clamp(0, peaks.shape[-1] - 1).flatten(-2)).unflatten(
-        -1, place.shape[-2:]
+    index_in_line = index[..., None] + torch.arange(-half, width - half, device=image.device)
+    windows = torch.gather(image.flatten(-2), -1, index_in_line.clamp(0, peaks.shape[-1] - 1).flatten(-2)).unflatten(
+        -1, index_in_line.shape[-2:]
     )
     return windows * (level > 0)[..., None]
 
 
 def window_weights(windows: Tensor, image: Tensor, floor: float = 20.0, full: float = 100.0) -> Tensor:
-    """Trust in each window by its peak power s over the background of the image, s / (s + full),
-    and 0 below floor. (..., point).
+    """Weight each window by its peak power s over the background of the image.
 
-    The background is the mean power that Gaussian speckle of the image's median power would have;
-    of a million of its pixels none exceeds the floor by chance. It is taken at least 50 dB below
-    the brightest peak: weaker maxima are its side lobes.
+    The weight is s / (s + full), and 0 below `floor`. The background is the mean power of Gaussian
+    speckle with the median power of the image; of a million of its pixels none exceeds the floor by
+    chance. It is never below 1e-5 (-50 dB) of the brightest peak, since weaker maxima are its side
+    lobes.
+
+    Args:
+        windows: Windows, shape (..., point, width), complex.
+        image: Image, shape (..., azimuth, range), complex.
+        floor: Lowest ratio s that counts.
+        full: Ratio s at which the weight is one half.
+
+    Returns:
+        Weights 0..1, shape (..., point), float64.
     """
     background = image.abs().flatten(-2).median(-1).values.square().to(torch.float64) / math.log(2)
     peak = windows.abs().amax(-1).square().to(torch.float64)
@@ -71,13 +95,20 @@ def window_weights(windows: Tensor, image: Tensor, floor: float = 20.0, full: fl
 
 
 def window_entropy(spectra: Tensor, phase_rad: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Weighted mean entropy of the windows after removing a phase, and its gradient to the phase of
-    each frequency.
+    """Compute the mean entropy of windows after removal of a phase, and its gradient.
 
-    spectra: (trial, point, n) complex128, unit energy each (or zero); phase_rad: (trial, n);
-    weight: (trial, point). Returns (trial,), (trial, n). Responses are sampled twice as finely as
-    the image, so that it matters less where a point lies between samples. The removal is unitary,
-    so p = |y|^2 sums to one and dH/dy* = -(ln p + 1) y.
+    Responses are sampled twice as finely as the image, so that the position of a point between
+    samples has less influence. The removal is unitary, so p = |y|^2 sums to one and dH/dy* = -(ln p
+    + 1) y.
+
+    Args:
+        spectra: Spectra of unit energy, or zero, shape (trial, point, n), complex128.
+        phase_rad: Phase in radians, FFT order, shape (trial, n), float64.
+        weight: Weights of the windows, shape (trial, point), float64.
+
+    Returns:
+        Weighted mean entropy in nats, shape (trial,), and its derivative with respect to the phase
+        of each frequency, shape (trial, n).
     """
     n = spectra.shape[-1]
     turned = spectra * cis(-phase_rad)[:, None]
@@ -98,12 +129,21 @@ def minimise(
     first_step: float = 0.3,
     rtol: float = 1e-7,
 ) -> Tensor:
-    """Quasi-Newton (BFGS) descent of every trial on its own.
+    """Minimise a cost by quasi-Newton (BFGS) descent, each trial by itself.
 
-    start: (trial, p); cost gives (trial,) and the gradient (trial, p).
+    A step is halved until the cost falls enough (Armijo rule). A trial that cannot improve, or
+    improves by less than rtol, keeps its parameters.
 
-    A step is halved until the cost falls enough (Armijo); a trial that cannot improve, or improves
-    by less than rtol, stays.
+    Args:
+        cost: Function of parameters (trial, p) that returns costs (trial,) and gradients (trial,
+            p).
+        start: First parameters, shape (trial, p), float64.
+        steps: Largest number of steps.
+        first_step: Length of the first step.
+        rtol: Relative improvement below which a trial stops.
+
+    Returns:
+        Parameters, shape (trial, p).
     """
     x, (value, slope) = start, cost(start)
     eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
@@ -147,12 +187,20 @@ def _bfgs(inverse: Tensor, moved: Tensor, turned: Tensor, eye: Tensor) -> Tensor
 def sharpest_coefficients(
     windows: Tensor, weight: Tensor, band: float, orders: tuple[int, ...] = ORDERS, steps: int = 40
 ) -> Tensor:
-    """Legendre coefficients (degrees 2..orders[-1]) of the phase that leaves the sharpest windows.
+    """Find the Legendre coefficients of the phase whose removal leaves the sharpest windows.
 
-    (trial, point, n) -> (trial, p).
+    The degrees are admitted in stages, each starting from the result of the one before, so that a
+    large smooth phase is found before fine ripple.
 
-    The orders are admitted in stages, each starting from the last, so that a large smooth phase is
-    found before fine ripple.
+    Args:
+        windows: Range windows, shape (trial, point, n), complex.
+        weight: Weights of the windows, shape (trial, point), float64.
+        band: Bandwidth of the pulse over the sampling rate.
+        orders: Highest degree of each stage, rising.
+        steps: Largest number of steps of a stage.
+
+    Returns:
+        Coefficients in radians of the degrees 2 to orders[-1], shape (trial, p).
     """
     n = windows.shape[-1]
     spectra = torch.fft.fft(windows.to(torch.complex128), norm="ortho")
@@ -180,18 +228,30 @@ def estimate_response_sharpest(
     passes: int = 3,
     valid: int | None = None,
 ) -> Estimate:
-    """Phase response by least entropy of the range windows about bright points.
+    """Estimate the phase response by least entropy of range windows about bright points.
 
-    image: (..., azimuth, range), range spectrum centred.
+    After each pass the image is corrected and the points are chosen again. The last pass fits two
+    halves of the points separately: the estimate is their mean, shrunk by what chance may
+    contribute, and its standard deviation follows from their difference. Not differentiable.
 
-    band: pulse bandwidth over sampling rate; width: window in samples, many times the spread of the
-    response (shortened to half the valid columns where these are few); valid: number of fully
-    compressed columns. After each pass the image is corrected and the points are chosen anew. The
-    last pass fits two halves of the points apart: their mean is the estimate, less what chance
-    makes of it, their difference its std. Gives `phase_rad` (..., GRID), see `repair.response` for
-    the conventions, `amplitude` ones. quality falls with the difference of the halves, 1 / (1 +
-    std^2). Not ok, with zero phase: no bright places (halves that differ by more than 0.25 rad
-    rms).
+    Args:
+        image: Image with centred range spectrum, shape (..., azimuth, range), complex.
+        band: Bandwidth of the pulse over the sampling rate.
+        points: Number of windows.
+        width: Length of the windows in samples, many times the width of the distorted impulse
+            response; at most half the valid columns are used.
+        orders: Highest Legendre degree of each stage.
+        passes: Number of passes.
+        valid: Number of fully compressed columns; by default all.
+
+    Returns:
+        `phase_rad` of shape (..., GRID) in radians, with standard deviation, and `amplitude`, all
+        ones; see `torchsar.repair.response` for the conventions. `quality` is 1 / (1 + variance).
+        `ok` is False, and the phase is zero, where the halves differ by more than 0.25 rad rms: the
+        image has too few bright points.
+
+    Raises:
+        ValueError: If there are fewer than 32 valid columns, or the width is below 16 samples.
     """
     used = image.detach()[..., :valid] if valid else image.detach()
     rows = used.reshape(-1, *used.shape[-2:])
@@ -213,14 +273,13 @@ def estimate_response_sharpest(
 
 
 def _significant(c: Tensor, std: Tensor, times: float = 4.0) -> Tensor:
-    """Coefficients (trial, p) less what chance makes of them: c max(0, 1 - (times * deviation /
-    c)^2), deviation = std / sqrt(p).
-    """
+    """Coefficients shrunk by c max(0, 1 - (times * std / (sqrt(p) c))^2)."""
     limit = times * std[:, None] / math.sqrt(c.shape[-1])
     return c * (1 - (limit / c.abs().clamp_min(1e-300)).square()).clamp_min(0)
 
 
 def _phase_estimate(phase_rad: Tensor, std: Tensor, trials: torch.Size) -> Estimate:
+    """Estimate of a phase response with its reliability."""
     ok = torch.isfinite(std) & (std < 0.125) & torch.isfinite(phase_rad).all(-1)
     phase_rad = torch.where(ok[:, None], phase_rad, 0).reshape(*trials, GRID)
     std = torch.where(torch.isfinite(std), std, math.pi)[:, None].expand(-1, GRID).reshape(*trials, GRID)
@@ -236,12 +295,21 @@ def _phase_estimate(phase_rad: Tensor, std: Tensor, trials: torch.Size) -> Estim
 def point_average_coefficients(
     windows: Tensor, weight: Tensor, band: float, order: int = 24, rounds: int = 6
 ) -> Tensor:
-    """Coherent average of the spectra of single points, each less its own constant and linear
-    phase. (trial, point, n) -> (trial, p).
+    """Average the spectra of single points coherently, and fit the phase of the average.
 
-    Starts from the spectrum of the brightest point, aligns every other one to it in slope (the peak
-    of their correlation) and constant, and repeats with the average. The phase of the average is
-    the running sum of its increments, fitted with Legendre polynomials.
+    Begins with the spectrum of the first point, aligns all others with it in slope (at the peak of
+    their correlation) and constant, and repeats with the average. The phase of the average is the
+    running sum of its increments.
+
+    Args:
+        windows: Range windows, the brightest first, shape (trial, point, n), complex.
+        weight: Weights of the windows, shape (trial, point), float64.
+        band: Bandwidth of the pulse over the sampling rate.
+        order: Highest Legendre degree.
+        rounds: Number of averages.
+
+    Returns:
+        Legendre coefficients in radians of the degrees 2 to `order`, shape (trial, p).
     """
     n = windows.shape[-1]
     u = torch.fft.fftshift(band_axis(n, band, windows.device))
@@ -260,14 +328,14 @@ def point_average_coefficients(
     average = average[..., 0, :]
     steps = torch.angle(average[..., 1:] * average[..., :-1].conj())
     phase = torch.nn.functional.pad(torch.cumsum(steps, -1), (1, 0))
-    sure = (average.abs() + 1e-12)[..., None]
-    return torch.linalg.lstsq(sure * unit_legendre(u[inside], order).mT, sure * phase[..., None]).solution[..., 2:, 0]
+    magnitude = (average.abs() + 1e-12)[..., None]
+    return torch.linalg.lstsq(magnitude * unit_legendre(u[inside], order).mT, magnitude * phase[..., None]).solution[
+        ..., 2:, 0
+    ]
 
 
 def _align(spectra: Tensor, reference: Tensor) -> Tensor:
-    """Spectra (..., point, n) turned by the linear and constant phase that bring them closest to
-    reference (..., 1, n).
-    """
+    """Spectra (..., point, n), with linear and constant phase aligned with the reference."""
     n = 8 * spectra.shape[-1]
     correlation = torch.fft.fft(spectra * reference.conj(), n)
     index = correlation.abs().argmax(-1, keepdim=True)
@@ -285,12 +353,26 @@ def estimate_response_points(
     passes: int = 3,
     valid: int | None = None,
 ) -> Estimate:
-    """Phase response by the average of isolated bright points: the baseline.
+    """Estimate the phase response by the coherent average of isolated bright points: the baseline.
 
-    Arguments and result as estimate_response_sharpest.
+    Uses one line for each point and is therefore more sensitive to noise than
+    `estimate_response_sharpest`. Fails if the brightest maxima are not single points, or if the
+    response spreads them over much of the window. Not differentiable.
 
-    Takes one line for each point, so that noise tells more than there. Fails where the brightest
-    places are not single points and where the response spreads them over much of the window.
+    Args:
+        image: Image with centred range spectrum, shape (..., azimuth, range), complex.
+        band: Bandwidth of the pulse over the sampling rate.
+        points: Number of windows.
+        width: Length of the windows in samples; at most half the valid columns are used.
+        order: Highest Legendre degree.
+        passes: Number of passes.
+        valid: Number of fully compressed columns; by default all.
+
+    Returns:
+        As `estimate_response_sharpest`.
+
+    Raises:
+        ValueError: If there are fewer than 32 valid columns, or the width is below 16 samples.
     """
     used = image.detach()[..., :valid] if valid else image.detach()
     rows = used.reshape(-1, *used.shape[-2:])
@@ -311,13 +393,17 @@ def estimate_response_points(
 
 
 class EstimateResponse(Stage):
-    """Phase response of the channel from its focused image; amplitude too where an expected
-    spectrum is given.
+    """Estimator of the channel's phase and amplitude response from a focused image.
 
-    method: `estimate_response_sharpest` (default) or `estimate_response_points`, or any function of
-    (image, band, valid=columns). expected_power (n,): range power spectrum, FFT order, that a clean
-    image of this kind has (`band_power(clean)`); without it the amplitude is one, because the
-    spectrum of scene and noise is not known.
+    The amplitude is estimated only if an expected spectrum is given, since the spectrum of scene
+    and noise is not known.
+
+    Args:
+        radar: Radar; gives bandwidth, sampling rate and length of the pulse.
+        method: `estimate_response_sharpest` (default), `estimate_response_points`, or any function
+            of (image, band, valid=columns) that returns such an Estimate.
+        expected_power: Range power spectrum of a clean image of this kind (`band_power(clean)`),
+            FFT order, shape (n,); None: the amplitude is one.
     """
 
     works_on = ("azimuth", "range")
@@ -336,6 +422,15 @@ class EstimateResponse(Stage):
         self.register_buffer("expected_power", expected_power)
 
     def forward(self, signal: Signal) -> Estimate:
+        """Estimate the response.
+
+        Args:
+            signal: Image, shape (..., azimuth, range).
+
+        Returns:
+            As `estimate_response_sharpest`, with the amplitude of `estimate_amplitude_response` if
+            a power spectrum is expected.
+        """
         band = self.radar.pulse.bandwidth_hz / self.radar.sampling_hz
         estimate = self.method(signal.data, band, valid=max(1, signal.data.shape[-1] - self.radar.pulse_samples))
         if self.expected_power is None:

@@ -1,14 +1,15 @@
-"""Missing lines from a model of the scene: where the focused image is dark, and when.
+"""Reconstruction of missing lines by a model of the power of the focused image.
 
-Model: the image, split by Doppler into a few sub-looks, is independent zero-mean noise of slowly
-varying power v(look, pixel). The most probable missing lines minimise sum |image|^2 / v, a linear
-system in the missing lines alone, solved by conjugate gradients; v is then estimated from the
-repaired image, and again. It begins from "focus, keep the bright part, defocus, take the missing
-lines" (brief 004, item 2), which alone finds points but no texture, and goes on with three changes
-that each lower the error on recorded data: the threshold becomes a local power estimate (a soft
-decision that follows texture), plain iteration becomes conjugate gradients, and sub-looks add what
-the azimuth spectrum knows: band edges, noise floor, drift of the Doppler centroid over the scene,
-apertures cut by the ends of the recording.
+The image is split by Doppler into a few sub-looks and modelled as independent zero-mean noise of
+slowly varying power v(look, pixel). The most probable missing lines minimise sum |image|^2 / v.
+This is a linear system in the missing lines alone, solved by conjugate gradients; v is then
+estimated from the reconstructed image, and the solution repeated.
+
+The first estimate keeps the bright part of the image (`bright_fill`), which finds points but no
+texture. Three properties of the model lower the error on recorded data further: a local power
+estimate instead of a threshold follows texture; conjugate gradients converge faster than plain
+iteration; and sub-looks include properties of the azimuth spectrum, such as band edges, noise
+floor, drift of the Doppler centroid over the scene and apertures cut by the ends of the recording.
 """
 
 from __future__ import annotations
@@ -25,8 +26,13 @@ from torchsar.radar import StripmapRadar
 
 
 def unit_level(lines: Tensor) -> tuple[Tensor, Tensor]:
-    """Lines over their largest sample, per trial, and that level (..., 1, 1): neither 1e-25 nor
-    1e19 may under- or overflow when squared.
+    """Scale lines to a peak of one in each trial, against under- and overflow of squares.
+
+    Args:
+        lines: Lines, shape (..., pulse, range), complex.
+
+    Returns:
+        Scaled lines of the same shape, and the peak, shape (..., 1, 1).
     """
     level = lines.detach().abs().amax((-2, -1), keepdim=True)
     level = torch.where(level > 0, level, 1)
@@ -34,15 +40,21 @@ def unit_level(lines: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def power_of(x: Tensor) -> Tensor:
+    """Return |x|^2 of complex samples of any shape."""
     return x.real.square() + x.imag.square()
 
 
 def conjugate_fill(quadratic: Callable[[Tensor], Tensor], lines: Tensor, mask: Tensor, steps: int) -> Tensor:
-    """Change lines under the mask so that <lines, quadratic(lines)> becomes least, by conjugate
-    gradients from where they are.
+    """Change lines under a mask so that <lines, quadratic(lines)> is least, by conjugate gradients.
 
-    quadratic: Hermitian, positive, (..., pulse, range) -> same. mask: bool (..., pulse, 1). Step
-    lengths are per trial.
+    Args:
+        quadratic: Hermitian positive operator on lines (..., pulse, range).
+        lines: Lines to begin with, shape (..., pulse, range), complex.
+        mask: Lines that may change, broadcasts against the lines, bool.
+        steps: Number of steps; their lengths are chosen per trial.
+
+    Returns:
+        Lines of the same shape.
     """
 
     def dot(a: Tensor, b: Tensor) -> Tensor:
@@ -63,13 +75,22 @@ def conjugate_fill(quadratic: Callable[[Tensor], Tensor], lines: Tensor, mask: T
 
 
 def smooth(power: Tensor, azimuth: float, range_: float) -> Tensor:
-    """Local mean of (..., range, azimuth) with Gaussian weights of these standard deviations;
-    circular in azimuth, edges held in range.
+    """Average power locally with Gaussian weights.
+
+    Args:
+        power: Power, shape (..., range, azimuth); circular in azimuth, continued by its edges in
+            range.
+        azimuth: Standard deviation of the weights in azimuth, in pixels.
+        range_: Standard deviation of the weights in range, in pixels.
+
+    Returns:
+        Same shape.
     """
     return _smooth_last(_smooth_last(power, azimuth, "circular").mT, range_, "replicate").mT
 
 
 def _smooth_last(x: Tensor, sigma: float, edges: str) -> Tensor:
+    """Gaussian average along the last dimension."""
     half = min(math.ceil(2.5 * sigma), x.shape[-1] - 1)
     offset = torch.arange(-half, half + 1, dtype=x.dtype, device=x.device)
     kernel = torch.exp(-0.5 * (offset / sigma).square())
@@ -78,10 +99,15 @@ def _smooth_last(x: Tensor, sigma: float, edges: str) -> Tensor:
 
 
 def look_windows(n: int, looks: int, doppler_turns: Tensor) -> Tensor:
-    """Overlapping cosine windows over the Doppler axis, squares summing to 1, centred evenly about
-    the centroid. (look, ..., n), float64.
+    """Return overlapping cosine windows over Doppler, whose squares sum to one.
 
-    doppler_turns: centroid in cycles per line, (...,).
+    Args:
+        n: Number of Doppler cells.
+        looks: Number of windows, centred evenly about the centroid.
+        doppler_turns: Doppler centroid in cycles per line, shape (...,), float64.
+
+    Returns:
+        Shape (look, ..., n), float64.
     """
     axis = torch.arange(n, dtype=torch.float64, device=doppler_turns.device) / n - doppler_turns[..., None]
     centre = ((torch.arange(looks, dtype=torch.float64, device=axis.device) + 0.5) / looks - 0.5).reshape(
@@ -93,12 +119,14 @@ def look_windows(n: int, looks: int, doppler_turns: Tensor) -> Tensor:
 
 
 class SubLooks:
-    """The precision (inverse covariance) of lines under the scene model.
+    """Precision (inverse covariance) of lines under the scene model.
 
-    windows: (look, ..., n) amplitude weights over Doppler.
+    Powers and weights of the sub-looks have azimuth last, (look, ..., range, pulse), where azimuth
+    FFTs take half the time.
 
-    Powers and weights of sub-looks are held with azimuth last, (look, ..., range, pulse), where
-    azimuth FFTs take half the time.
+    Args:
+        operator: Invertible focusing of the lines.
+        windows: Amplitude weights over Doppler, shape (look, ..., n).
     """
 
     def __init__(self, operator: InvertibleOmegaK, windows: Tensor) -> None:
@@ -107,11 +135,18 @@ class SubLooks:
         self.share = windows.square().mean(-1)[..., None, None]
 
     def power(self, lines: Tensor, unexplained: Tensor) -> Tensor:
-        """v: local power of each sub-look, the geometric mean of its own and of what the whole
-        image says of it.
+        """Estimate the local power v of each sub-look.
 
-        unexplained: power that errors of the filled lines may have in every pixel, broadcast
-        against (..., range, pulse).
+        It is the geometric mean of the sub-look's own local power and of that expected from the
+        whole image.
+
+        Args:
+            lines: Lines, shape (..., pulse, range), complex.
+            unexplained: Power that errors of the reconstructed lines may have in every pixel;
+                broadcasts against (..., range, pulse).
+
+        Returns:
+            Shape (look, ..., range, pulse).
         """
         spectra = self.operator.to_doppler(lines).mT.contiguous()
         whole = power_of(torch.fft.ifft(spectra))
@@ -126,7 +161,15 @@ class SubLooks:
         return torch.stack(result)
 
     def precision(self, lines: Tensor, weight: Tensor) -> Tensor:
-        """Lines -> gradient of sum weight |sub-look|^2."""
+        """Apply the precision to lines: the gradient of sum weight |sub-look|^2.
+
+        Args:
+            lines: Lines, shape (..., pulse, range), complex.
+            weight: Inverse powers, shape (look, ..., range, pulse).
+
+        Returns:
+            Same shape as the lines.
+        """
         spectra = self.operator.to_doppler(lines).mT.contiguous()
         total = torch.zeros_like(spectra)
         for window, w in zip(self.windows.to(weight.dtype), weight, strict=True):
@@ -143,12 +186,23 @@ def bright_fill(
     fall: float = 0.75,
     last: float = 2.0,
 ) -> Tensor:
-    """Focus, keep the bright part, defocus, take the missing lines from it, again and again: the
-    iteration of brief 004 as it stands.
+    """Reconstruct missing lines from the bright part of the image, by iteration.
 
-    The threshold falls from `first` of the strongest pixel by the factor `fall` a step, down to
-    `last` times the rms of the image, per trial. Finds isolated bright points however long the gap;
-    leaves texture to the model of powers. lines: zero under the mask (..., pulse, 1).
+    Each step focuses the lines, sets pixels below a threshold to zero, defocuses the rest, and
+    takes the missing lines from the result. Finds isolated bright points across gaps of any length,
+    but no texture.
+
+    Args:
+        lines: Lines, zero under the mask, shape (..., pulse, range), complex.
+        mask: Missing lines, shape (..., pulse, 1), bool.
+        operator: Invertible focusing of the lines.
+        steps: Number of steps.
+        first: First threshold over the strongest pixel of each trial.
+        fall: Factor by which the threshold falls in each step.
+        last: Lowest threshold over the rms amplitude of the image.
+
+    Returns:
+        Lines of the same shape.
     """
     filled, threshold = lines, None
     for _ in range(steps):
@@ -176,17 +230,29 @@ def sparse_fill(
     rounds: int = 2,
     steps: int = 4,
 ) -> Tensor:
-    """Missing lines that make the focused image most probable under a model of locally varying
-    power. lines: (..., pulse, range).
+    """Reconstruct the missing lines that are most probable under a model of locally varying power.
 
-    missing: bool (..., pulse). doppler_hz, velocity_m_s: absolute centroid and effective velocity,
-    (...,); errors of a few Hz and a small fraction of the velocity cost little, since the model
-    only asks where the image is dark. reference: range reference spectrum (range,) of raw lines, of
-    which the phase is used; None for range-compressed lines. Begins from bright_fill. Two looks are
-    enough for point-like scenes; more (4) pay for speckle that fills the PRF band; rounds beyond 2
-    and steps beyond 4 pay only in long gaps. Costs about 110 two-dimensional FFTs by default.
-    Received lines are kept bit for bit. Differentiable in lines, with thresholds and local powers
-    held fixed.
+    Begins with `bright_fill`. Two looks are enough for scenes of points; four or more are useful
+    for speckle that fills the PRF band. More than two rounds or four steps are useful only in long
+    gaps. By default the cost is that of about 110 two-dimensional FFTs. Received lines are kept bit
+    for bit. Differentiable in the lines, with thresholds and local powers held fixed.
+
+    Args:
+        lines: Lines, shape (..., pulse, range), complex.
+        missing: Missing lines, shape (..., pulse), bool.
+        radar: Radar.
+        doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,); errors of a few Hz
+            cost little.
+        velocity_m_s: Effective velocity in m/s, a number or shape (...,), by default that of the
+            radar; small relative errors cost little.
+        reference: Range reference spectrum of raw lines, shape (range,), of which only the phase is
+            used; None for range-compressed lines.
+        looks: Number of sub-looks in Doppler.
+        rounds: Number of estimates of the local powers.
+        steps: Steps of conjugate gradients in each round.
+
+    Returns:
+        Lines of the same shape.
     """
     mask = missing.bool().expand(lines.shape[:-1])[..., None]
     x, level = unit_level(torch.where(mask, 0, lines))
@@ -194,13 +260,13 @@ def sparse_fill(
     operator = InvertibleOmegaK(radar, x, doppler_hz=doppler_hz, velocity_m_s=velocity_m_s, reference=flat)
     turns = torch.as_tensor(doppler_hz, dtype=torch.float64, device=x.device) / radar.prf_hz
     model = SubLooks(operator, look_windows(x.shape[-2], looks, turns))
-    lost = mask.to(x.real.dtype).mean((-2, -1), keepdim=True)
-    unexplained = 0.5 * lost * power_of(x.detach()).mean((-2, -1), keepdim=True)
+    missing_share = mask.to(x.real.dtype).mean((-2, -1), keepdim=True)
+    unexplained = 0.5 * missing_share * power_of(x.detach()).mean((-2, -1), keepdim=True)
     x = bright_fill(x, mask, operator)
     for _ in range(rounds):
         power = model.power(x.detach(), unexplained)
         weight = power.mean((0, -2, -1), keepdim=True) / power
         x = conjugate_fill(lambda y, w=weight: model.precision(y, w), x, mask, steps)
-        # what a missing line keeps of its variance once the rest is known, spread over the image
-        unexplained = lost * (1 / (1 / power).mean((0, -1), keepdim=True))[0]
+        # variance of a missing line given all others, spread over the image
+        unexplained = missing_share * (1 / (1 / power).mean((0, -1), keepdim=True))[0]
     return torch.where(mask, x * level, lines)

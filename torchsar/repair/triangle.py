@@ -1,22 +1,25 @@
-"""Separation of a continuous triangular beat record into up and down sweeps, and blanking of its
-turning points.
+"""Separation of a continuous triangular beat record into sweeps, and blanking of turning points.
 
-A record (..., pulse, time) holds one block a recorded period; the triangle starts `trigger_s` after
-the start of each block. Sweeps are (..., ramp, pulse, fast_time), ramp 0 up and 1 down, both in
-natural time order, on the grid of TriangularLadar.fast_time_axis that is symmetric about the middle
-of the sweep. A trigger between two samples is met by a delay of the whole record (linear phase in
-its spectrum), never by a shifted grid: with a grid that is off by dt the velocity from the
-intercept of the mirror product is biased by 0.76 f+ dt lambda / T. So is a record whose first
-sample lies AT the trigger: the first sample of a symmetric grid lies half a sample later.
+A record (..., pulse, time) holds one block for each recorded period; the triangle starts
+`trigger_s` after the start of its block. Sweeps are (..., ramp, pulse, fast_time), ramp 0 up and 1
+down, both in natural time order, on the grid of `TriangularLadar.fast_time_axis`, which is
+symmetric about the middle of the sweep. A trigger between two samples is matched by a delay of the
+whole record (linear phase of its spectrum), never by a shifted grid: if the grid is off by dt, the
+velocity from the intercept of the mirror product is biased by 0.76 f+ dt lambda / T. A record whose
+first sample is AT the trigger has this error too, since the first sample of a symmetric grid is
+half a sample later.
 
-One real channel keeps |f| only. Its analytic signal has the beat f+ + fd in the up and f+ - fd in
-the down sweep, the latter mirrored; its conjugate is the sweep that a complex detector sees. The
-analytic signal is formed of the record BEFORE it is cut: the record runs on through turning points,
-where a cut sweep ends in a jump. Rms error with the transient and 2 samples of the end left out,
-one scatterer: 1.3 % at 350 cycles a sweep, 2.1 % at 50 (cutting first: 1.6 and 2.3 %), most of it
-at the ends: without 40 samples there 0.6 and 0.8 % (cutting first 0.65 %). A delay by half a sample
-costs 0.1 % of a complex record there, 0.04 % without 40 samples. Brief 000, sections 3 and 5,
-erratum 16.
+A detector with one real channel gives |f| only. Its analytic signal has the beat f+ + fd in the up
+sweep and f+ - fd in the down sweep, the latter mirrored; the conjugate of the latter is the sweep
+of a complex detector. The analytic signal is formed from the record BEFORE it is cut, since the
+record continues through turning points, where a cut sweep ends with a jump. Its rms error without
+the transient and 2 samples at the ends, for one scatterer, is 1.3 % at 350 cycles per sweep and 2.1
+% at 50 (1.6 and 2.3 % if cut first), most of it near the ends: without 40 samples at the ends 0.6
+and 0.8 % (0.65 % if cut first). A delay of half a sample costs 0.1 % in a complex record, and 0.04
+% without 40 samples at the ends.
+
+Reference:
+    Remote Sens. 2024, 16, 793, Fig. 15.
 """
 
 from __future__ import annotations
@@ -43,21 +46,32 @@ def split_record(
     nearer: bool = False,
     first_s: float = 0.0,
 ) -> Tensor:
-    """Up and down sweeps of a record.
+    """Separate a record into up and down sweeps.
 
-    record: (..., pulse, time) complex or real; trigger_s: number or (...,). Returns (..., 2, K', N)
-    complex.
+    A contiguous record, whose blocks follow each other without a gap, is cut again from the trigger
+    on, modulo the period. The period that its end leaves incomplete is dropped: K' = K - 1, or K if
+    a trigger common to all trials is less than half a sample. Other blocks are cut individually, K'
+    = K. The first sample of a sweep is half a sample after its start. Real detection requires |fd|
+    < f+. Differentiable in record and trigger.
 
-    contiguous: whether blocks follow each other without a gap; None: where they are one period long
-    and every period is kept. Such a record is cut anew from the trigger on (modulo the period), and
-    the period that its end leaves incomplete is dropped: K' = K - 1, or K where a trigger common to
-    all trials is less than half a sample. Other blocks are cut inside, K' = K, and need trigger +
-    period to fit. first_s: time of the first sample of a block, as trigger_s counts it. The first
-    sample of a sweep lies half a sample after its start. nearer: with real detection, whether the
-    scene lies nearer than the reference (RD < 0) and has negative beats in up sweeps. With real
-    detection |fd| < f+ is required. Differentiable in record and trigger_s. Raises ValueError where
-    a period does not fit, and for a trigger that is not finite or not one per trial; TypeError for
-    what is no record.
+    Args:
+        record: Record, shape (..., pulse, time), real or complex.
+        radar: Ladar.
+        trigger_s: Start of the triangle after the start of a block in seconds, a number or shape
+            (...,).
+        contiguous: Whether the record is contiguous; None: it is if blocks are one period long and
+            every period is recorded.
+        nearer: With real detection, whether the scene is nearer than the reference (RD < 0), so
+            that beats in up sweeps are negative.
+        first_s: Time of the first sample of a block in seconds, on the time axis of `trigger_s`.
+
+    Returns:
+        Sweeps of N samples, shape (..., 2, K', N), complex.
+
+    Raises:
+        ValueError: If a period does not fit its block, the record has no samples, or a trigger is
+            not finite or not one per trial.
+        TypeError: If the record is not a tensor of samples, or the trigger not a number.
     """
     refuse_no_record(record, "split_record")
     trigger = _trigger_of(trigger_s, record)
@@ -71,7 +85,16 @@ def split_record(
 
 
 def refuse_no_record(record: Tensor, what: str) -> None:
-    """Raise TypeError or ValueError unless record is floating or complex (..., pulse, time)."""
+    """Raise an error unless a record is real or complex (..., pulse, time).
+
+    Args:
+        record: Object to test.
+        what: Name of the function for messages.
+
+    Raises:
+        TypeError: If it is not a tensor of real or complex samples.
+        ValueError: If it has no samples or fewer than two dimensions.
+    """
     if not (isinstance(record, Tensor) and (record.is_complex() or record.is_floating_point())):
         raise TypeError(
             f"{what} works on a real or complex record (..., pulse, time), got "
@@ -90,8 +113,8 @@ def _trigger_of(trigger_s: Trigger, record: Tensor) -> Tensor:
     trigger, trials = torch.as_tensor(trigger_s, dtype=torch.float64, device=record.device), record.shape[:-2]
     if _any(~torch.isfinite(trigger)):
         raise ValueError(
-            "trigger_s must be finite, got NaN or Inf; take one that find_trigger is sure of "
-            "(ok), or leave that trial out"
+            "trigger_s must be finite, got NaN or Inf; use an estimate of find_trigger "
+            "with ok True, or leave that trial out"
         )
     if (
         trials
@@ -105,13 +128,26 @@ def _trigger_of(trigger_s: Trigger, record: Tensor) -> Tensor:
 
 
 def is_contiguous(block_samples: int, radar: TriangularLadar) -> bool:
-    """Whether blocks of so many samples follow each other without a gap."""
+    """Return whether blocks follow each other without a gap.
+
+    Args:
+        block_samples: Number of samples of a block.
+        radar: Ladar.
+    """
     return radar.keep_every == 1 and block_samples == 2 * radar.sweep_samples
 
 
 def start_sample(trigger_s: Tensor, radar: TriangularLadar, joined: bool) -> tuple[Tensor, Tensor]:
-    """First sample of the up sweep, half a sample after the trigger (...,): whole, modulo the
-    period in a joined record, and the fraction left.
+    """Return the first sample of the up sweep, which is half a sample after the trigger.
+
+    Args:
+        trigger_s: Trigger after the first sample of a block in seconds, shape (...,), float64.
+        radar: Ladar.
+        joined: Whether the record is contiguous; the sample is then taken modulo the period.
+
+    Returns:
+        Index of the nearest sample, shape (...,), int64, and the remaining fraction of a sample,
+        -0.5..0.5, shape (...,).
     """
     samples = trigger_s * radar.sample_rate_hz + 0.5
     start = torch.round(samples.detach())
@@ -121,8 +157,17 @@ def start_sample(trigger_s: Tensor, radar: TriangularLadar, joined: bool) -> tup
 
 
 def canonical_ramps(sweeps: Tensor, radar: TriangularLadar, nearer: bool) -> Tensor:
-    """Sweeps (..., 2, K, N) of an analytic signal as a complex detector gives them: the ramp whose
-    beat is negative is conjugated.
+    """Convert sweeps of an analytic signal to those of a complex detector.
+
+    The ramp with negative beat is conjugated.
+
+    Args:
+        sweeps: Sweeps of a real detector's analytic signal, shape (..., 2, K, N), complex.
+        radar: Ladar.
+        nearer: Whether the scene is nearer than the reference.
+
+    Returns:
+        Sweeps of the same shape.
     """
     up_positive = (radar.dechirp_sign == "lo_conj_echo") != nearer
     up, down = sweeps.unbind(-3)
@@ -130,26 +175,26 @@ def canonical_ramps(sweeps: Tensor, radar: TriangularLadar, nearer: bool) -> Ten
 
 
 def _cut_joined(line: Tensor, start: Tensor, n_period: int, radar: TriangularLadar) -> Tensor:
-    """(..., 1, n) -> (..., K', period) from sample `start` on."""
+    """Periods (..., K', period) of a contiguous record (..., 1, n) from sample `start` on."""
     period = 2 * radar.sweep_samples
     if line.shape[-1] != n_period * period:
         raise ValueError(
             f"a contiguous record of {n_period} periods of {period} samples has "
-            f"{n_period * period}, got {line.shape[-1]}; blocks of another length are no "
-            "contiguous record"
+            f"{n_period * period}, got {line.shape[-1]}; give contiguous=False for "
+            "blocks of another length"
         )
     if start.ndim == 0 and not _any(start != 0):
         return line.squeeze(-2).unflatten(-1, (n_period, period))
     if n_period < 2:
         raise ValueError(
-            f"a contiguous record of {n_period} period that starts inside a triangle holds no "
-            "whole one; record 2 periods or more"
+            f"a contiguous record of {n_period} period that starts inside a triangle has no "
+            "complete one; record 2 periods or more"
         )
     return _taken(line, start, (n_period - 1) * period).squeeze(-2).unflatten(-1, (n_period - 1, period))
 
 
 def _cut_inside(blocks: Tensor, start: Tensor, radar: TriangularLadar) -> Tensor:
-    """(..., K, n) -> (..., K, period)."""
+    """Periods (..., K, period) of blocks (..., K, n) from sample `start` on."""
     period, n = 2 * radar.sweep_samples, blocks.shape[-1]
     if period > n or _any((start < 0) | (start + period > n)):
         fits = (
@@ -165,7 +210,7 @@ def _cut_inside(blocks: Tensor, start: Tensor, radar: TriangularLadar) -> Tensor
 
 
 def _taken(lines: Tensor, start: Tensor, n: int) -> Tensor:
-    """n samples of every line (..., line, samples) from index `start` (...,) on."""
+    """Samples of every line (..., line, samples) from index `start` (...,) on, n of them."""
     if start.ndim == 0:
         return lines[..., start + torch.arange(n, device=lines.device)]
     index = start[..., None, None] + torch.arange(n, device=lines.device)
@@ -174,7 +219,7 @@ def _taken(lines: Tensor, start: Tensor, n: int) -> Tensor:
 
 
 def _any(condition: Tensor) -> bool:
-    """Whether it holds for a trial; False inside vmap, where a value cannot be looked at."""
+    """Whether a condition holds for any trial; False inside vmap, where values cannot be read."""
     try:
         return bool(condition.detach().any())
     except RuntimeError:
@@ -182,12 +227,22 @@ def _any(condition: Tensor) -> bool:
 
 
 def circular_shift(record: Tensor, shift_s: float, radar: TriangularLadar) -> Tensor:
-    """Each period moved to the left by whole samples and closed to a ring, (..., pulse, time): what
-    the paper does (its Fig. 15b). Not for use.
+    """Shift each period circularly by whole samples, as in the paper. Not for use.
 
-    Samples one period apart become neighbours: a phase step of 2 pi fd period inside one sweep,
-    which no method survives unless the shift falls into the last samples of a sweep. split_record
-    cuts the continuous record anew instead. Brief 000, erratum 16.
+    Samples that are one period apart become neighbours: a phase step of 2 pi fd period inside a
+    sweep. No method tolerates it unless the shift is a few samples at the end of a sweep.
+    `split_record` cuts the continuous record instead.
+
+    Args:
+        record: Record, shape (..., pulse, time), real or complex.
+        shift_s: Shift to earlier times in seconds, rounded to whole samples.
+        radar: Ladar.
+
+    Returns:
+        Record of the same shape.
+
+    Reference:
+        Remote Sens. 2024, 16, 793, Fig. 15b.
     """
     return torch.roll(record, -round(shift_s * radar.sample_rate_hz), -1)
 
@@ -195,13 +250,26 @@ def circular_shift(record: Tensor, shift_s: float, radar: TriangularLadar) -> Te
 def blank_turning_points(
     sweeps: Tensor, radar: TriangularLadar, farthest_m: float, nearest_m: float = 0.0, margin: int = 0
 ) -> Tensor:
-    """Zero the samples of sweeps (..., 2, K, N) where reference and echo sweep in opposite
-    directions. Differentiable.
+    """Set the samples to zero in which reference and echo sweep in opposite directions.
 
-    farthest_m: largest relative range; its echo turns 2 RD / c after the reference: the first
-    ceil(2 RD fs / c) samples of each sweep. nearest_m: least relative range; where negative its
-    echo turns earlier: the last samples. margin: further samples at either end. Raises ValueError
-    where this leaves less than half a sweep, for ranges out of order and a negative margin.
+    The echo of relative range RD turns 2 RD / c after the reference: the first ceil(2 RD fs / c)
+    samples of each sweep. The echo of a negative relative range turns before it, in the last
+    samples. Differentiable.
+
+    Args:
+        sweeps: Sweeps, shape (..., 2, K, N), complex.
+        radar: Ladar.
+        farthest_m: Largest relative range in metres.
+        nearest_m: Smallest relative range in metres.
+        margin: Number of further samples at either end.
+
+    Returns:
+        Sweeps of the same shape.
+
+    Raises:
+        ValueError: If less than half a sweep remains, the ranges are not in order, or the margin is
+            negative.
+        TypeError: If the sweeps are not a tensor.
     """
     if not isinstance(sweeps, Tensor):
         raise TypeError(f"blank_turning_points works on a tensor of sweeps (..., 2, K, N), got {type(sweeps).__name__}")
@@ -220,21 +288,30 @@ def blank_turning_points(
             f"ranges {nearest_m:g}..{farthest_m:g} m and a margin of {margin} blank "
             f"{first + last} of {n} samples of a sweep"
         )
-        raise ValueError(f"{blanked}; half must stay: are the ranges relative to the reference?")
-    place = torch.arange(n, device=sweeps.device)
-    return sweeps * ((place >= first) & (place < n - last))
+        raise ValueError(
+            f"{blanked}; at least half must remain, so check that the ranges are relative to the reference"
+        )
+    index = torch.arange(n, device=sweeps.device)
+    return sweeps * ((index >= first) & (index < n - last))
 
 
 class SplitSweeps(Stage):
-    """(pulse, time) -> (ramp, pulse, fast_time): `SplitSweeps(radar, trigger)`; trigger: seconds,
-    "recorded" or "search".
+    """Separation of a record with the axes (pulse, time) into sweeps (ramp, pulse, fast_time).
 
-    "recorded": `use(SplitSweeps(radar, "recorded"), trigger_s="aux.trigger_s")`, a number or one
-    per trial. "search": by find_trigger, whose Estimate (`trigger_s`) comes along; a trial that it
-    is not sure of is cut all the same. A trigger common to all trials moves the pulse axis; one per
-    trial cannot (an axis is shared): slow time is then early by the trigger, less than one period.
-    Real samples of one channel are taken and leave as complex ones. See split_record for `nearer`
-    and for periods dropped.
+    A trigger common to all trials moves the pulse axis. One per trial cannot, since all trials
+    share the axis: slow time is then early by the trigger, which is less than one period. The real
+    samples of a one-channel detector become complex ones.
+
+    In a chain: `use(SplitSweeps(radar, "recorded"), trigger_s="aux.trigger_s")`.
+
+    Args:
+        radar: Ladar.
+        trigger: Start of the triangle in seconds on the time axis of the record; "recorded" if
+            `forward` receives it; or "search" to estimate it by `find_trigger`.
+        nearer: Whether the scene is nearer than the reference.
+
+    Raises:
+        ValueError: If the trigger is neither a finite number nor one of these words.
     """
 
     works_on = ("pulse", "time")
@@ -250,6 +327,22 @@ class SplitSweeps(Stage):
         self.provides = ("trigger_s",) if trigger == "search" else ()
 
     def forward(self, signal: Signal, trigger_s: Tensor | None = None) -> Signal | tuple[Signal, Estimate]:
+        """Separate the record; see `split_record`.
+
+        Args:
+            signal: Record, shape (..., pulse, time), real or complex.
+            trigger_s: Recorded trigger in seconds on the time axis of the record, a number or shape
+                (...,).
+
+        Returns:
+            Sweeps, shape (..., ramp, pulse, fast_time), complex. With a search also the Estimate of
+            `find_trigger`, whose `trigger_s` is then on the time axis of the record; unreliable
+            trials (`ok` False) are separated all the same.
+
+        Raises:
+            ValueError: If a recorded trigger is missing, the sampling rate is not that of the
+                radar, or as in `split_record`.
+        """
         if self.trigger == "search":
             contiguous = self._contiguous(signal)
             found = find_trigger(signal.data, self.radar, contiguous, self.nearer)
@@ -268,7 +361,8 @@ class SplitSweeps(Stage):
         pulse, time = signal.axes
         if abs(time.step * self.radar.sample_rate_hz - 1) > 1e-9:
             raise ValueError(
-                f"the record is sampled at {1 / time.step:.6g} Hz, the radar says {self.radar.sample_rate_hz:.6g} Hz"
+                f"the record is sampled at {1 / time.step:.6g} Hz, but sample_rate_hz of the radar is "
+                f"{self.radar.sample_rate_hz:.6g} Hz; give the radar of the record"
             )
         return is_contiguous(time.n, self.radar) and abs(pulse.step / (time.n * time.step) - 1) < 1e-9
 
@@ -285,9 +379,7 @@ class SplitSweeps(Stage):
 
 
 def _fitting(trigger_s: Tensor, signal: Signal, radar: TriangularLadar, contiguous: bool) -> Tensor:
-    """A trigger that the data gave, held inside blocks that a period from it on would overrun
-    (find_trigger calls it not ok).
-    """
+    """Estimated trigger, limited so that a period fits its block."""
     if contiguous:
         return trigger_s
     first, room = signal.axes[1].start, signal.axes[1].n - 2 * radar.sweep_samples
@@ -295,7 +387,18 @@ def _fitting(trigger_s: Tensor, signal: Signal, radar: TriangularLadar, contiguo
 
 
 class BlankTurningPoints(Stage):
-    """Zero the transients after turning points: see blank_turning_points."""
+    """Transients after turning points set to zero; see `blank_turning_points`.
+
+    Args:
+        radar: Ladar.
+        farthest_m: Largest relative range in metres.
+        nearest_m: Smallest relative range in metres.
+        margin: Number of further samples at either end.
+
+    Raises:
+        ValueError: If less than half a sweep remains, the ranges are not in order, or the margin is
+            negative.
+    """
 
     works_on = ("ramp", "pulse", "fast_time")
 
@@ -305,14 +408,24 @@ class BlankTurningPoints(Stage):
         blank_turning_points(torch.zeros(radar.sweep_samples), radar, farthest_m, nearest_m, margin)
 
     def forward(self, signal: Signal) -> Signal:
+        """Set the transients to zero.
+
+        Args:
+            signal: Sweeps, shape (..., ramp, pulse, fast_time).
+        """
         return signal.with_data(
             blank_turning_points(signal.data, self.radar, self.farthest_m, self.nearest_m, self.margin)
         )
 
 
 class CircularShift(Stage):
-    """The paper's shift inside each period, for the experiment that shows why it fails: see
-    circular_shift. Followed by SplitSweeps(radar, 0.0).
+    """Circular shift inside each period, as in the paper, to show its errors; see `circular_shift`.
+
+    To be followed by `SplitSweeps(radar, 0.0)`.
+
+    Args:
+        radar: Ladar.
+        shift_s: Shift to earlier times in seconds, rounded to whole samples.
     """
 
     works_on = ("pulse", "time")
@@ -323,4 +436,9 @@ class CircularShift(Stage):
         self.radar, self.shift_s = radar, shift_s
 
     def forward(self, signal: Signal) -> Signal:
+        """Shift the samples of each period.
+
+        Args:
+            signal: Record, shape (..., pulse, time), real or complex.
+        """
         return signal.with_data(circular_shift(signal.data, self.shift_s, self.radar))

@@ -1,23 +1,25 @@
-"""Where a triangular sweep starts in a record whose timing is unknown, from the record itself.
+"""Start of the triangular sweeps in a record of unknown timing, estimated from the record itself.
 
-1. Turning points: a short-time transform is least concentrated in frequency where its window
-straddles one; folded over half a period and
-   averaged. 2. They are refined by cutting whole sweeps: their spectra are sharpest, on either side
-   falling alike, at the middle of the transient, 2 RD / c long, that begins at the turning point.
-   3. Finer than a sample: the tones of the strongest scatterer in up and down sweep have one phase
-   at that middle; of the fringes 1 / (2 f+) near the result of step 2 the one counts where samples
-   go over from the strongest tones of one sweep to those of the next. 4. Order: which half is the
-   up sweep.
+1. Turning points: a short-time spectrum is least concentrated where its window contains a turning
+   point. Concentration is folded over half a period and averaged.
+2. Refinement by cutting whole sweeps: their spectra are sharpest at the middle of the transient,
+   which is 2 RD / c long and begins at the turning point; sharpness falls alike on both sides.
+3. Fraction of a sample: the tones of the strongest scatterer in up and down sweep have equal phase
+   at that middle. Of the fringes, 1 / (2 f+) apart near the result of step 2, the one is chosen at
+   which the samples change from the strongest tones of one sweep to those of the next.
+4. Order: which half is the up sweep.
 
-Errors measured: complex record, RD 1.5 m, 24 periods: 0.02, 0.2, 0.6 ns without noise, at 10, at 0
-dB (a sample is 16 ns); real records of the ground ladar 0.01 to 0.04 ns at 10 dB, 64 periods. Cost
-of 960 blocks of 9600 real samples: 6 s and 1.2 GB on one core.
+Measured errors: complex record, RD 1.5 m, 24 periods: 0.02 ns without noise, 0.2 ns at 10 dB, 0.6
+ns at 0 dB (a sample is 16 ns); real records of the ground ladar 0.01 to 0.04 ns at 10 dB, 64
+periods. A record of 960 blocks of 9600 real samples takes 6 s and 1.2 GB on one core.
 
-Complex detection tells the order by the beat, which is higher in the up sweep where RD > 0. A real
-record is the same, sample by sample, for a motion v in one order and -v in the other, but for the
-envelope: the range read from the beats must follow the integrated velocity and not its mirror
-image. That is what focusing verifies, done here on range profiles alone. Brief 000, sections 4 (16)
-and 5; paper 000, Fig. 15.
+With complex detection the order follows from the beat, which is higher in the up sweep if RD > 0. A
+real record is the same, sample by sample, for a motion v in one order and -v in the other, except
+for the envelope: the range from the beats must follow the integrated velocity and not its mirror
+image. Focusing verifies the same; here range profiles suffice.
+
+Reference:
+    Remote Sens. 2024, 16, 793, Fig. 15 (separation by short-time Fourier transform).
 """
 
 from __future__ import annotations
@@ -32,16 +34,19 @@ from torchsar.core import Estimate, real_dtype, refuse_non_finite, take, unit_ph
 from torchsar.radar import TriangularLadar
 from torchsar.repair.analytic import delayed
 
+# Sweeps that are used in the search for turning points, by choice: more are more accurate but take
+# more time.
 MAX_WINDOWS = 192
+# Strongest scatterers whose tones are continued across a turning point, by choice.
 TONES = 4
+# Certainty below which a result is unreliable, in standard deviations, by choice: in a normal
+# distribution the chance is 3e-7 above 5 and 1e-3 above 3.
 ORDER_SIGMAS, FRINGE_SIGMAS = 5.0, 3.0
 
 
 @dataclass(frozen=True)
 class _Windows:
-    """Lines (..., line, n) of complex samples, and the sweeps that can be cut out of them: starts o
-    + j N for o in 0..N + 2 margin.
-    """
+    """Complex lines (..., line, n) and their sweeps from o + j N on, o in 0..N + 2 margin."""
 
     lines: Tensor
     radar: TriangularLadar
@@ -49,14 +54,12 @@ class _Windows:
 
     @property
     def count(self) -> int:
-        """Sweeps of one line, an even number."""
+        """Number of sweeps of one line, even."""
         n = self.radar.sweep_samples
         return ((self.lines.shape[-1] - 2 * self.margin) // n - 1) // 2 * 2
 
     def chosen(self, every: bool) -> tuple[Tensor, Tensor]:
-        """Lines, and of them numbers j of sweeps in pairs (even, odd): all, or about MAX_WINDOWS
-        sweeps spread over the record.
-        """
+        """Lines and numbers j of their sweeps, in pairs: all, or about MAX_WINDOWS."""
         pairs, n_line = self.count // 2, self.lines.shape[-2]
         step = 1 if every else max(1, pairs * n_line * 2 // MAX_WINDOWS)
         line_step = min(step, n_line)
@@ -64,21 +67,25 @@ class _Windows:
         return self.lines[..., ::line_step, :], torch.stack([j, j + 1], -1).flatten()
 
     def cut(self, start: Tensor, every: bool = False) -> Tensor:
-        """Sweeps from integer starts (..., o) on: (..., o, line, sweep, N); beyond the end of a
-        line its last sample.
-        """
+        """Sweeps from starts (..., o) on, (..., o, line, sweep, N); lines end in a constant."""
         n, (lines, j) = self.radar.sweep_samples, self.chosen(every)
-        place = (start[..., None, None] + (j[:, None] * n + torch.arange(n, device=lines.device))).clamp_max(
+        position = (start[..., None, None] + (j[:, None] * n + torch.arange(n, device=lines.device))).clamp_max(
             lines.shape[-1] - 1
         )
         source = lines[..., None, :, :].expand(*start.shape, *lines.shape[-2:])
-        index = place.flatten(-2)[..., None, :].expand(*start.shape, lines.shape[-2], j.numel() * n)
+        index = position.flatten(-2)[..., None, :].expand(*start.shape, lines.shape[-2], j.numel() * n)
         return source.gather(-1, index).unflatten(-1, (j.numel(), n))
 
 
 def refuse_no_samples(record: Tensor) -> None:
-    """Raise TypeError or ValueError unless record is a finite record (..., pulse, time), real or
-    complex.
+    """Raise an error unless a record is finite, real or complex (..., pulse, time).
+
+    Args:
+        record: Object to test.
+
+    Raises:
+        TypeError: If it is not a tensor of real or complex samples.
+        ValueError: If it has no samples, fewer than two dimensions, or a sample is not finite.
     """
     if not (isinstance(record, Tensor) and (record.is_complex() or record.is_floating_point())):
         raise TypeError(
@@ -95,16 +102,28 @@ def refuse_no_samples(record: Tensor) -> None:
 def find_trigger(
     record: Tensor, radar: TriangularLadar, contiguous: bool | None = None, nearer: bool = False
 ) -> Estimate:
-    """Start of the up sweep in the blocks of a record. record: (..., pulse, time) complex or real.
+    """Estimate the start of the up sweep in the blocks of a record.
 
-    Gives `trigger_s` (...,) after the first sample of a block, -1 sample..period - 1 sample.
+    A scene on both sides of the reference has no definite sign of the beat and is unreliable.
 
-    contiguous: as in split_record; other blocks need 1.7 periods of samples or more. nearer:
-    whether the scene lies nearer than the reference. info: `order_sigmas` (...,), by how many
-    deviations the order is certain (below 5: not ok), `fringe_sigmas`, the same of the fringe
-    (below 3: not ok), and `coarse_s`, modulo half a period. quality is the drop of concentration at
-    turning points, 0..1. A scene on both sides of the reference has no sign of beat: not ok. Raises
-    ValueError for short records.
+    Args:
+        record: Record, shape (..., pulse, time), real or complex.
+        radar: Ladar.
+        contiguous: As in `split_record`; blocks with gaps need at least 1.7 periods of samples.
+        nearer: Whether the scene is nearer than the reference.
+
+    Returns:
+        `trigger_s` of shape (...,), in seconds after the first sample of a block, from -1 sample to
+        one period - 1 sample. `quality` is the relative drop of concentration at turning points,
+        0..1. `ok` is False where the order of the sweeps is certain by less than 5 standard
+        deviations, the fringe by less than 3, there are no turning points (a drop below 0.05), or
+        no whole period fits its block. `info` has these certainties, `order_sigmas` and
+        `fringe_sigmas` (...,), and `coarse_s`, the result of step 2 in seconds, modulo half a
+        period.
+
+    Raises:
+        TypeError: If the record is not a tensor of real or complex samples.
+        ValueError: If the record is not finite or too short.
     """
     refuse_no_samples(record)
     n = radar.sweep_samples
@@ -120,11 +139,11 @@ def find_trigger(
     middle = _apex(windows, coarse, windows.margin)
     middle = _apex(windows, torch.round(middle).long(), max(n // 32, 6))
     middle = windows.margin + torch.remainder(middle - windows.margin, n)
-    return _judge(windows, middle, depth, nearer, record.is_complex(), joined, record.shape[-1])
+    return _assess(windows, middle, depth, nearer, record.is_complex(), joined, record.shape[-1])
 
 
 def _scaled(lines: Tensor) -> Tensor:
-    """Complex lines, analytic where real, with a peak of one."""
+    """Complex lines with a peak of one; the analytic signal of real ones."""
     peak = lines.abs().amax((-2, -1), keepdim=True)
     lines = lines / torch.where(peak > 0, peak, 1)
     return (
@@ -135,9 +154,7 @@ def _scaled(lines: Tensor) -> Tensor:
 
 
 def _turning_by_stft(windows: _Windows) -> tuple[Tensor, Tensor]:
-    """Sample of the turning points modulo N, in margin..margin + N, (...,) int64, and the relative
-    drop of concentration there.
-    """
+    """Sample of the turning points, margin..margin + N, and the drop of concentration."""
     n = windows.radar.sweep_samples
     hop, width = max(1, n // 32), max(8, n // 8)
     lines, _ = windows.chosen(False)
@@ -156,21 +173,19 @@ def _turning_by_stft(windows: _Windows) -> tuple[Tensor, Tensor]:
     total = torch.zeros((*sharp.shape[:-1], bins), dtype=sharp.dtype, device=sharp.device).index_add(-1, frame, sharp)
     mean = total / torch.bincount(frame, minlength=bins).clamp_min(1)
     smooth = (torch.roll(mean, 1, -1) + 2 * mean + torch.roll(mean, -1, -1)) / 4
-    place = smooth.argmin(-1) * hop
+    position = smooth.argmin(-1) * hop
     drop = 1 - smooth.amin(-1) / smooth.amax(-1).clamp_min(1e-30)
-    return torch.where(place < windows.margin, place + n, place), drop.to(torch.float64)
+    return torch.where(position < windows.margin, position + n, position), drop.to(torch.float64)
 
 
 def _sharpness(sweeps: Tensor) -> Tensor:
-    """Sum of squared over square of summed power of spectra along the last dim."""
+    """Sum of the squared power of spectra over the square of its sum."""
     power = torch.fft.fft(sweeps).abs().square().to(torch.float64)
     return power.square().sum(-1) / power.sum(-1).square().clamp_min(1e-300)
 
 
 def _apex(windows: _Windows, near: Tensor, reach: int) -> Tensor:
-    """First sample (...,) of the sweeps that are sharpest: sharpness is a tent over it, and the
-    lines through its slopes meet at the top.
-    """
+    """First sample (...,) of the sharpest sweeps: lines through both slopes meet there."""
     step = max(1, reach // 8)
     offset = torch.arange(-8, 9, device=near.device) * step
     start = (near[..., None] + offset).clamp(0, windows.radar.sweep_samples + 2 * windows.margin)
@@ -183,7 +198,7 @@ def _apex(windows: _Windows, near: Tensor, reach: int) -> Tensor:
 
 
 def _line_through(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Least squares y = a + b x along the last dim: (a, b)."""
+    """Least-squares line y = a + b x along the last dimension: (a, b)."""
     centred = x - x.mean()
     slope = (y * centred).sum(-1) / centred.square().sum()
     return y.mean(-1) - slope * x.mean(), slope
@@ -191,8 +206,9 @@ def _line_through(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class _Tones:
-    """Strongest tones of sweeps (..., pair), even and odd: frequency (cycles per sample) and phase
-    (turns) at the middle of the sweep.
+    """Strongest tones of the even and the odd sweeps (..., pair).
+
+    Frequency in cycles per sample, and phase in turns at the middle of the sweep.
     """
 
     even_cycles: Tensor
@@ -202,34 +218,32 @@ class _Tones:
 
 
 def _tones(cycles: Tensor, value: Tensor) -> _Tones:
-    """The strongest tones of sweeps (..., line, sweep, tone), even and odd in turn."""
+    """Strongest tones of sweeps (..., line, sweep, tone), even and odd."""
     turns = torch.angle(value[..., 0]) / (2 * math.pi)
     return _Tones(cycles[..., 0::2, 0], cycles[..., 1::2, 0], turns[..., 0::2], turns[..., 1::2])
 
 
-def _found_tones(sweeps: Tensor, skip: int, count: int = TONES) -> tuple[Tensor, Tensor]:
-    """Frequencies (cycles per sample) and complex amplitudes at the middle of the `count` strongest
-    tones, (..., count), one taken out after the other.
+def _find_tones(sweeps: Tensor, skip: int, count: int = TONES) -> tuple[Tensor, Tensor]:
+    """Frequencies and complex amplitudes of the strongest tones, (..., count), found in succession.
 
-    sweeps: (..., N), of which `skip` samples at each end are left out.
+    sweeps: (..., N), without `skip` samples at each end; frequencies in cycles per sample,
+    amplitudes at the middle of the sweep.
     """
     left = sweeps[..., skip : sweeps.shape[-1] - skip].to(torch.complex128)
-    m, found = left.shape[-1], []
+    m, tones = left.shape[-1], []
     window = torch.hann_window(m, periodic=False, dtype=torch.float64, device=sweeps.device)
-    place = torch.arange(m, dtype=torch.float64, device=sweeps.device) - (m - 1) / 2
+    position = torch.arange(m, dtype=torch.float64, device=sweeps.device) - (m - 1) / 2
     for _ in range(count):
         cycles = _peak_cycles(left * window)
-        tone = unit_phasor(cycles[..., None] * place, torch.complex128)
+        tone = unit_phasor(cycles[..., None] * position, torch.complex128)
         value = (left * window * tone.conj()).sum(-1) / window.sum()
         left = left - value[..., None] * tone
-        found.append((cycles, value))
-    return torch.stack([c for c, _ in found], -1), torch.stack([v for _, v in found], -1)
+        tones.append((cycles, value))
+    return torch.stack([c for c, _ in tones], -1), torch.stack([v for _, v in tones], -1)
 
 
 def _peak_cycles(x: Tensor) -> Tensor:
-    """Frequency of the strongest tone of windowed samples (..., m), by a parabola through the
-    logarithms of three bins of a fourfold spectrum.
-    """
+    """Frequency of the strongest tone of windowed samples, by a parabola through log power."""
     n = 4 * x.shape[-1]
     power = torch.fft.fft(x, n).abs().square()
     peak = power.argmax(-1)
@@ -240,27 +254,27 @@ def _peak_cycles(x: Tensor) -> Tensor:
     return cycles - torch.round(cycles)
 
 
-def _judge(
+def _assess(
     windows: _Windows, middle: Tensor, depth: Tensor, nearer: bool, is_complex: bool, joined: bool, block: int
 ) -> Estimate:
-    """Fringe, order and verdict from the middle of the transients."""
+    """Estimate from the middle of the transients: fringe, order and reliability."""
     radar, n = windows.radar, windows.radar.sweep_samples
     base = torch.round(middle).long().clamp(0, n + 2 * windows.margin)
-    cycles, value = _found_tones(windows.cut(base[..., None], every=True).squeeze(-4), max(2, n // 32))
+    cycles, value = _find_tones(windows.cut(base[..., None], every=True).squeeze(-4), max(2, n // 32))
     tones = _tones(cycles, value)
     if is_complex:
         even_is_up, order = _order_by_beat(tones, nearer, radar)
         plus = (tones.even_cycles - tones.odd_cycles).flatten(-2).median(-1).values.abs() / 2
-        apart = (tones.even_turns - tones.odd_turns) + n / 2 * (tones.even_cycles + tones.odd_cycles)
-        lean = torch.sign((tones.even_cycles - tones.odd_cycles).flatten(-2).median(-1).values)
+        phase_difference = (tones.even_turns - tones.odd_turns) + n / 2 * (tones.even_cycles + tones.odd_cycles)
+        sign = torch.sign((tones.even_cycles - tones.odd_cycles).flatten(-2).median(-1).values)
     else:
         even_is_up, order = _order_by_envelope(tones, radar)
         plus = (tones.even_cycles + tones.odd_cycles).flatten(-2).median(-1).values.abs() / 2
-        apart = (tones.even_turns + tones.odd_turns) + n / 2 * (tones.even_cycles - tones.odd_cycles)
-        lean = torch.ones_like(plus)
-    fine, fringe = _fringe(windows, base, (cycles, value), _meeting(apart, plus * lean, middle - base), plus)
-    # the tones meet half a transient, f+ / (2 K), after the turning point of the reference; before
-    # it where the scene is nearer
+        phase_difference = (tones.even_turns + tones.odd_turns) + n / 2 * (tones.even_cycles - tones.odd_cycles)
+        sign = torch.ones_like(plus)
+    fine, fringe = _fringe(windows, base, (cycles, value), _meeting(phase_difference, plus * sign, middle - base), plus)
+    # the tones have equal phase half a transient, f+ / (2 K), after the turning point of the
+    # reference; before it if the scene is nearer
     half_transient = (
         plus * radar.sample_rate_hz / radar.chirp_rate_hz_s / 2 * radar.sample_rate_hz * (-1 if nearer else 1)
     )
@@ -278,12 +292,10 @@ def _judge(
     return Estimate({"trigger_s": start / radar.sample_rate_hz}, torch.where(ok, depth.clamp(0, 1), 0), ok, info=info)
 
 
-def _meeting(apart: Tensor, plus_cycles: Tensor, expected: Tensor) -> Tensor:
-    """Sample offset (...,) at which even and odd tones have one phase, the fringe nearest to the
-    expected offset. apart: turns (..., line, pair).
-    """
-    ring = torch.polar(torch.ones_like(apart), 2 * math.pi * apart).mean((-2, -1))
-    turns, twice = torch.angle(ring) / (2 * math.pi), 2 * plus_cycles
+def _meeting(phase_difference: Tensor, plus_cycles: Tensor, expected: Tensor) -> Tensor:
+    """Sample offset nearest to the expected one at which even and odd tones have one phase."""
+    phasor = torch.polar(torch.ones_like(phase_difference), 2 * math.pi * phase_difference).mean((-2, -1))
+    turns, twice = torch.angle(phasor) / (2 * math.pi), 2 * plus_cycles
     known = twice.abs() > 1e-6
     return torch.where(
         known, -(turns + torch.round(-turns - expected * twice)) / torch.where(known, twice, 1), expected
@@ -291,98 +303,93 @@ def _meeting(apart: Tensor, plus_cycles: Tensor, expected: Tensor) -> Tensor:
 
 
 def _fringe(
-    windows: _Windows, base: Tensor, tones: tuple[Tensor, Tensor], found: Tensor, plus_cycles: Tensor
+    windows: _Windows, base: Tensor, tones: tuple[Tensor, Tensor], expected: Tensor, plus_cycles: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Of the fringes around `found` (sample offset from base) the one at which samples change from
-    the even tones to the odd ones; and by how many deviations (...,).
+    """Fringe around `expected` at which samples change from even to odd tones, and its certainty.
 
-    The sum of |x - odd|^2 - |x - even|^2 up to a boundary is largest at the true one; scatter
-    between pairs of sweeps tells its deviation.
+    The sum of |x - odd|^2 - |x - even|^2 up to a boundary is largest at the true one; its standard
+    deviation follows from the scatter between pairs of sweeps. Offsets are in samples from base,
+    the certainty in standard deviations.
     """
     n, reach = windows.radar.sweep_samples, windows.margin
     around = windows.cut((base - reach)[..., None], every=True).squeeze(-4)[..., 1::2, : 2 * reach]
-    place = torch.arange(-reach, reach, dtype=torch.float64, device=base.device)
+    position = torch.arange(-reach, reach, dtype=torch.float64, device=base.device)
     cycles, value = tones
-    even = _extrapolated(cycles[..., 0::2, :], value[..., 0::2, :], place + (n + 1) / 2)
-    odd = _extrapolated(cycles[..., 1::2, :], value[..., 1::2, :], place - (n - 1) / 2)
-    lean = (around - odd).abs().square() - (around - even).abs().square()
-    total = torch.nn.functional.pad(torch.cumsum(lean, -1), (1, 0)).flatten(-3, -2)
+    even = _extrapolated(cycles[..., 0::2, :], value[..., 0::2, :], position + (n + 1) / 2)
+    odd = _extrapolated(cycles[..., 1::2, :], value[..., 1::2, :], position - (n - 1) / 2)
+    difference = (around - odd).abs().square() - (around - even).abs().square()
+    total = torch.nn.functional.pad(torch.cumsum(difference, -1), (1, 0)).flatten(-3, -2)
     order = torch.arange(-3, 4, dtype=torch.float64, device=base.device)
-    offsets = found[..., None] + order / (2 * plus_cycles.clamp_min(1e-6))[..., None]
+    offsets = expected[..., None] + order / (2 * plus_cycles.clamp_min(1e-6))[..., None]
     gain = _interpolated(total, (offsets + reach).clamp(0, 2 * reach))
     best = gain.mean(-2).argmax(-1)
-    lead = take(gain.movedim(-1, -2), best, -2)[..., None] - gain
-    sigmas = lead.mean(-2) / (lead.std(-2) / math.sqrt(lead.shape[-2])).clamp_min(1e-9)
+    advantage = take(gain.movedim(-1, -2), best, -2)[..., None] - gain
+    sigmas = advantage.mean(-2) / (advantage.std(-2) / math.sqrt(advantage.shape[-2])).clamp_min(1e-9)
     others = torch.arange(7, device=base.device) != best[..., None]
-    certain = torch.where(others, sigmas, torch.inf).amin(-1)
-    return torch.where(certain > FRINGE_SIGMAS, take(offsets, best), found), certain
+    certainty = torch.where(others, sigmas, torch.inf).amin(-1)
+    return torch.where(certainty > FRINGE_SIGMAS, take(offsets, best), expected), certainty
 
 
-def _extrapolated(cycles: Tensor, value: Tensor, place: Tensor) -> Tensor:
-    """Sum of tones (..., tone) at samples `place` (m,) from the middle of their sweep: (..., m)."""
+def _extrapolated(cycles: Tensor, value: Tensor, position: Tensor) -> Tensor:
+    """Sum of tones (..., tone) at samples (m,) from the middle of their sweep, (..., m)."""
     return sum(
         (
-            value[..., i, None] * unit_phasor(cycles[..., i, None] * place, torch.complex128)
+            value[..., i, None] * unit_phasor(cycles[..., i, None] * position, torch.complex128)
             for i in range(cycles.shape[-1])
         ),
         start=torch.zeros_like(value[..., :1]),
     )
 
 
-def _interpolated(x: Tensor, place: Tensor) -> Tensor:
-    """x (..., k, n) at fractional indices (..., m), linearly: (..., k, m)."""
-    first = place.long().clamp(0, x.shape[-1] - 2)
-    shape = (*x.shape[:-1], place.shape[-1])
+def _interpolated(x: Tensor, position: Tensor) -> Tensor:
+    """Linear interpolation of x (..., k, n) at fractional indices (..., m), (..., k, m)."""
+    first = position.long().clamp(0, x.shape[-1] - 2)
+    shape = (*x.shape[:-1], position.shape[-1])
     low, high = (x.gather(-1, (first + i)[..., None, :].expand(shape)) for i in (0, 1))
-    return low + (place - first)[..., None, :] * (high - low)
+    return low + (position - first)[..., None, :] * (high - low)
 
 
 def _order_by_beat(tones: _Tones, nearer: bool, radar: TriangularLadar) -> tuple[Tensor, Tensor]:
-    """Whether even sweeps are up, and how many deviations that is certain by: the beat of the up
-    sweep is the higher one.
-    """
+    """Whether even sweeps are up, from the higher beat of up sweeps, and how certain."""
     gap = (tones.even_cycles - tones.odd_cycles).flatten(-2)
     up_higher = (radar.dechirp_sign == "lo_conj_echo") != nearer
     middle = gap.median(-1).values
-    deviation = (gap - middle[..., None]).abs().median(-1).values * 1.5 + 1e-3 / radar.sweep_samples
-    return (middle > 0) == up_higher, middle.abs() / deviation * math.sqrt(gap.shape[-1] / 2)
+    std = (gap - middle[..., None]).abs().median(-1).values * 1.5 + 1e-3 / radar.sweep_samples
+    return (middle > 0) == up_higher, middle.abs() / std * math.sqrt(gap.shape[-1] / 2)
 
 
 def _order_by_envelope(tones: _Tones, radar: TriangularLadar) -> tuple[Tensor, Tensor]:
-    """The same for a real record: does the range of the beats rise with the velocity that taking
-    even sweeps for up gives?
+    """Whether even sweeps of a real record are up, and how certain.
 
-    Range changes by plus or minus the integrated velocity; single wrong peaks are replaced by
-    medians. The certainty is the correlation of the two over what the scatter of the range from
-    period to period makes of it.
+    Even sweeps are up if the range of the beats rises with the velocity that this assumption gives.
+    Range changes by plus or minus the integrated velocity. The certainty is the correlation of both
+    relative to that due to the scatter of the range from period to period.
     """
     plus, shift = (tones.even_cycles + tones.odd_cycles) / 2, (tones.even_cycles - tones.odd_cycles) / 2
     per_cycle = radar.sample_rate_hz * radar.wave_speed_m_s / (2 * radar.chirp_rate_hz_s)
-    range_m = _settled(plus.flatten(-2) if plus.shape[-2] == 1 else plus[..., 0]) * per_cycle
+    range_m = _without_outliers(plus.flatten(-2) if plus.shape[-2] == 1 else plus[..., 0]) * per_cycle
     velocity = (
-        _settled(shift.flatten(-2) if shift.shape[-2] == 1 else shift[..., 0])
+        _without_outliers(shift.flatten(-2) if shift.shape[-2] == 1 else shift[..., 0])
         * radar.sample_rate_hz
         * radar.wavelength_m
         / 2
     )
     if range_m.shape[-1] < 4:
         return torch.ones_like(range_m[..., 0], dtype=torch.bool), torch.zeros_like(range_m[..., 0])
-    moved = torch.cumulative_trapezoid(velocity, dx=radar.pulse_step_s)
-    moved = torch.nn.functional.pad(moved, (1, 0))
-    moved, range_m = (x - x.mean(-1, keepdim=True) for x in (moved, range_m))
+    displacement = torch.cumulative_trapezoid(velocity, dx=radar.pulse_step_s)
+    displacement = torch.nn.functional.pad(displacement, (1, 0))
+    displacement, range_m = (x - x.mean(-1, keepdim=True) for x in (displacement, range_m))
     noise = torch.diff(range_m).square().mean(-1).clamp_min(1e-30).sqrt() / math.sqrt(2)
-    certain = (range_m * moved).sum(-1) / (noise * moved.square().sum(-1).clamp_min(1e-30).sqrt())
-    return certain > 0, certain.abs()
+    certainty = (range_m * displacement).sum(-1) / (noise * displacement.square().sum(-1).clamp_min(1e-30).sqrt())
+    return certainty > 0, certainty.abs()
 
 
-def _settled(x: Tensor, sigmas: float = 6.0) -> Tensor:
-    """Values (..., k) more than so many deviations from a running median replaced by it: wrong
-    peaks.
-    """
+def _without_outliers(x: Tensor, sigmas: float = 6.0) -> Tensor:
+    """Values (..., k) with outliers replaced by a running median."""
     width = min(9, x.shape[-1] // 2 * 2 - 1)
     padded = torch.cat(
         [x[..., :1].expand(*x.shape[:-1], width // 2), x, x[..., -1:].expand(*x.shape[:-1], width // 2)], -1
     )
     middle = padded.unfold(-1, width, 1).median(-1).values
-    apart = (x - middle).abs()
-    return torch.where(apart > sigmas * 1.5 * apart.median(-1, keepdim=True).values, middle, x)
+    distance = (x - middle).abs()
+    return torch.where(distance > sigmas * 1.5 * distance.median(-1, keepdim=True).values, middle, x)

@@ -1,4 +1,12 @@
-"""The truth: targets, path, beam."""
+"""Scenes, motions and worlds: the true state that a simulation starts from.
+
+A world collects everything that is true about an acquisition; `torchsar.echo` turns it into a
+recording and a truth. All objects are frozen.
+
+A parameter annotated `Tensor | float` is a number, equal in all trials, or a tensor of shape
+(trials,) with one value per trial. Parameters annotated with a plain type are fixed for all trials,
+because they decide shapes or choose a model.
+"""
 
 from torchsar.scene.aircraft import Aircraft, SpreadRows
 from torchsar.scene.bistatic import (

@@ -1,8 +1,7 @@
-"""Targets of inverse synthetic aperture ladar: a model aircraft, and rows of scatterers that
-estimators can be taken apart with.
+"""Targets of inverse synthetic aperture ladar: an aircraft model, and rows of scatterers.
 
-Cross range is azimuth_m of the scatterers, positive on the side that turns away from the radar
-first (echo phase exp(-4j pi x sin(theta) / lambda)).
+Cross range is `azimuth_m` of the scatterers. It is positive on the side that recedes from the radar
+first: the echo phase is exp(-4j pi x sin(theta) / lambda).
 """
 
 from __future__ import annotations
@@ -15,9 +14,10 @@ from torch import Tensor
 
 from torchsar.core import Draws
 from torchsar.scene.targets import Scatterers
+from torchsar.scene.trials import either, positive, refuse_unless, refuse_unless_finite, stacked, with_dims
 
-# one half of the silhouette from nose to tail: along the fuselage in lengths, across it in half
-# spans
+# one half of the outline from nose to tail, along the fuselage in lengths and across it in half
+# spans; chosen here, as the publication gives no coordinates
 _SIDE = (
     (0.50, 0.000),
     (0.47, 0.060),
@@ -32,16 +32,24 @@ _SIDE = (
     (-0.46, 0.060),
     (-0.49, 0.000),
 )
+# fin from above, in the same units; chosen here
 _FIN = ((-0.36, 0.0), (-0.48, 0.0))
 
 
 def _mirrored(line: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    """The line on the other side of the fuselage."""
     return tuple((x, -y) for x, y in line)
 
 
 def along_line(corners: Tensor, spacing_m: float) -> Tensor:
-    """Points spacing_m apart along a line of corners (corner, 2), from its first corner on, (point,
-    2) float64.
+    """Return points at equal distances along a line with corners.
+
+    Args:
+        corners: Corners of the line in metres, shape (corner, 2), float64.
+        spacing_m: Distance between neighbouring points in metres.
+
+    Returns:
+        Points from the first corner on in metres, shape (point, 2), float64.
     """
     ends = torch.linalg.vector_norm(corners.diff(dim=0), dim=-1).cumsum(0)
     reach = torch.arange(0.0, float(ends[-1]), spacing_m, dtype=torch.float64)
@@ -53,21 +61,33 @@ def along_line(corners: Tensor, spacing_m: float) -> Tensor:
 
 @dataclass(frozen=True)
 class Aircraft:
-    """Outline of an aircraft with swept wings, tail plane and fin, fuselage along cross range,
-    about 600 scatterers.
+    """Outline of an aircraft with swept wings, tail plane and fin, about 600 scatterers.
 
-    The published target has no coordinates; this one reproduces its pattern of entropies. length_m:
-    along the fuselage; width_m: span; spacing_m: of scatterers along the outline; heading_deg turns
-    the nose from +cross range towards +range. Each trial draws its own circular Gaussian amplitudes
-    (Rayleigh modulus, uniform phase, unit mean power) and moves every scatterer by up to half a
-    spacing in both directions, so that none sits on a grid. azimuth_m is cross range, range_m
-    counts from the middle of the window.
+    The fuselage lies along cross range; ranges count from the middle of the window. The publication
+    gives no coordinates of its target; this one reproduces the pattern of its entropies. Each trial
+    draws circular Gaussian amplitudes (Rayleigh magnitude, uniform phase, unit mean power) and
+    displaces every scatterer by up to half a spacing in both directions, so that no scatterer lies
+    on a grid.
+
+    Args:
+        spacing_m: Distance of scatterers along the outline in metres, fixed for all trials, since
+            it decides their number.
+        length_m: Length of the fuselage in metres, fixed for all trials.
+        width_m: Wing span in metres, fixed for all trials.
+        heading_deg: Rotation of the nose from positive cross range towards positive range in
+            degrees.
+
+    Raises:
+        ValueError: If a length is not positive or the heading is not finite.
+
+    Reference:
+        Ruan et al. 2013, Table 1 (entropies).
     """
 
     spacing_m: float = 1.2e-3
     length_m: float = 0.19
     width_m: float = 0.15
-    heading_deg: float = 0.0
+    heading_deg: Tensor | float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("spacing_m", "length_m", "width_m"):
@@ -75,44 +95,64 @@ class Aircraft:
                 raise ValueError(
                     f"{name} of an aircraft must be a positive number of metres, got {getattr(self, name)}"
                 )
-        if not math.isfinite(self.heading_deg):
-            raise ValueError(f"heading_deg of an aircraft must be a finite number, got {self.heading_deg}")
+        refuse_unless_finite("heading_deg of an aircraft", self.heading_deg)
 
     def outline(self) -> Tensor:
-        """Scatterers before they are moved, (target, 2) float64: cross range and range."""
+        """Return the scatterers before their random displacement.
+
+        Returns:
+            Cross range and range in metres, shape (..., target, 2), float64.
+        """
         scale = torch.tensor([self.length_m, self.width_m / 2], dtype=torch.float64)
         lines = (_SIDE, _mirrored(_SIDE), _FIN)
         points = torch.cat(
             [along_line(scale * torch.tensor(line, dtype=torch.float64), self.spacing_m) for line in lines]
         )
-        turn = math.radians(self.heading_deg)
-        return points @ torch.tensor(
-            [[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]], dtype=torch.float64
-        )
+        turn = either(self.heading_deg, math.radians, torch.deg2rad)
+        cos, sin = either(turn, math.cos, torch.cos), either(turn, math.sin, torch.sin)
+        return points @ stacked([cos, sin, -sin, cos]).unflatten(-1, (2, 2))
 
     def scatterers(self, draws: Draws) -> Scatterers:
+        """Draw displaced scatterers with circular Gaussian amplitudes.
+
+        Args:
+            draws: Random draws.
+
+        Returns:
+            Scatterers of shape (..., target).
+        """
         points = self.outline()
-        moved = points + self.spacing_m * (draws.uniform("scene.aircraft.place", tuple(points.shape)) - 0.5)
+        shape = tuple(points.shape[-2:])
+        moved = points + self.spacing_m * (draws.uniform("scene.aircraft.place", shape) - 0.5)
         return Scatterers(
-            moved[..., 0], moved[..., 1], draws.normal("scene.aircraft.amplitude", (len(points),), torch.complex128)
+            moved[..., 0], moved[..., 1], draws.normal("scene.aircraft.amplitude", shape[:1], torch.complex128)
         )
 
 
 @dataclass(frozen=True)
 class SpreadRows:
-    """`rows` occupied range cells, each with `per_row` scatterers of unit amplitude, random phase
-    and random cross range.
+    """Occupied range cells with several scatterers of unit amplitude in each.
 
-    The cells are spread evenly over the range_cells of the window and lie on its grid (sample
-    range_cells // 2 is range 0), so that no other row holds anything. width: share of the
-    unambiguous cross-range extent extent_m, lambda PRF / (2 omega), that the places fill.
+    The occupied cells are spread evenly over the window and lie on its grid, where sample
+    range_cells // 2 is range zero; all other cells are empty. Phases and cross ranges are random.
+
+    Args:
+        rows: Number of occupied range cells.
+        per_row: Number of scatterers in each of them.
+        width: Share of the unambiguous cross-range extent that the positions fill, 0 to 1.
+        extent_m: Unambiguous cross-range extent in metres, lambda PRF / (2 omega).
+        range_step_m: Length of a range cell in metres.
+        range_cells: Number of range cells of the window.
+
+    Raises:
+        ValueError: If a count, the width or a length is out of range.
     """
 
     rows: int
     per_row: int
-    width: float
-    extent_m: float
-    range_step_m: float
+    width: Tensor | float
+    extent_m: Tensor | float
+    range_step_m: Tensor | float
     range_cells: int = 256
 
     def __post_init__(self) -> None:
@@ -121,18 +161,25 @@ class SpreadRows:
                 f"spread rows need 1 to range_cells={self.range_cells} rows with at least one "
                 f"scatterer each, got rows={self.rows}, per_row={self.per_row}"
             )
-        if not (0 <= self.width <= 1 and all(math.isfinite(v) and v > 0 for v in (self.extent_m, self.range_step_m))):
-            raise ValueError(
-                "spread rows need a width in 0..1 and a positive extent_m and range_step_m, got "
-                f"{self.width}, {self.extent_m}, {self.range_step_m}"
-            )
+        refuse_unless("spread rows need a width in 0..1", self.width, lambda x: (x >= 0) & (x <= 1))
+        for name in ("extent_m", "range_step_m"):
+            refuse_unless(f"{name} of spread rows must be a positive number of metres", getattr(self, name), positive)
 
     def scatterers(self, draws: Draws) -> Scatterers:
+        """Draw phases and cross ranges.
+
+        Args:
+            draws: Random draws.
+
+        Returns:
+            Scatterers of shape (..., rows * per_row).
+        """
         cell = (
             (torch.arange(self.rows, dtype=torch.float64) + 0.5) * self.range_cells / self.rows
         ).floor() - self.range_cells // 2
         shape = (self.rows, self.per_row)
-        x = self.width * self.extent_m * (draws.uniform("scene.rows.azimuth", shape) - 0.5)
+        width, extent, step = (with_dims(v, 2, cell) for v in (self.width, self.extent_m, self.range_step_m))
+        x = width * extent * (draws.uniform("scene.rows.azimuth", shape) - 0.5)
         turns = draws.uniform("scene.rows.phase", shape)
-        y = (cell[:, None] * self.range_step_m).expand(x.shape)
-        return Scatterers(*(v.flatten(-2) for v in (x, y, torch.polar(torch.ones_like(turns), 2 * math.pi * turns))))
+        amplitude = torch.polar(torch.ones_like(turns), 2 * math.pi * turns)
+        return Scatterers(*(v.flatten(-2) for v in torch.broadcast_tensors(x, cell[:, None] * step, amplitude)))

@@ -1,4 +1,4 @@
-"""Everything that is true about a scene lit by a far satellite and seen by an airborne receiver."""
+"""World of a scene illuminated by a distant satellite and recorded by an airborne receiver."""
 
 from __future__ import annotations
 
@@ -13,73 +13,133 @@ from torch import Tensor
 from torchsar.radar import BistaticRadar, Orbit, orbit_range, polynomial_range
 from torchsar.scene.moving import ExactRange, Movers, MovingScene, ReceiveRange
 from torchsar.scene.sea import Sea
-from torchsar.scene.vibration import refuse_unless_finite
+from torchsar.scene.trials import positive, refuse_unless, refuse_unless_finite, stacked, with_dims
 
 
 class Gate(Protocol):
-    """What the receiver sees of a target, by time or by direction."""
+    """Receive gain of targets as a function of time or direction."""
 
-    def weight(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor: ...
+    def weight(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
+        """Return the amplitude gain.
+
+        Args:
+            movers: Targets.
+            time_s: Slow time in seconds, shape (pulse,), float64.
+            radar: Receiver.
+
+        Returns:
+            Gain of shape (..., 1 or channel, pulse, target), float64.
+        """
+        ...
 
 
 @dataclass(frozen=True)
 class BandLimited:
-    """Each target is seen for duration_s about the time y0 / v at which it is abreast, alike in all
-    channels: its band is limited.
+    """Gate that passes each target for a limited time, equal in all channels.
+
+    The interval is centred on the time y0 / v of the closest along-track position, so that the
+    Doppler band of the target is limited.
+
+    Args:
+        duration_s: Length of the interval in seconds. A sea needs one value for all trials.
+
+    Raises:
+        ValueError: If the duration is not positive.
     """
 
-    duration_s: float
+    duration_s: Tensor | float
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.duration_s) and self.duration_s > 0):
-            raise ValueError(f"duration_s of a band-limited gate must be a positive number, got {self.duration_s}")
+        refuse_unless("duration_s of a band-limited gate must be a positive number", self.duration_s, positive)
 
     def weight(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
-        """1 where |t - y0 / v| < duration_s / 2, else 0: float64 (..., 1, pulse, target)."""
+        """Return one where |t - y0 / v| < duration_s / 2, and zero elsewhere.
+
+        Args:
+            movers: Targets.
+            time_s: Slow time in seconds, shape (pulse,), float64.
+            radar: Receiver.
+
+        Returns:
+            Shape (..., 1, pulse, target), float64.
+        """
         abreast = movers.y0_m.detach() / (radar.speed_m_s - movers.u_a_m_s.detach())
-        return ((time_s[:, None] - abreast[..., None, None, :]).abs() < self.duration_s / 2).to(torch.float64)
+        duration = with_dims(self.duration_s, 3, time_s)
+        return ((time_s[:, None] - abreast[..., None, None, :]).abs() < duration / 2).to(torch.float64)
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """One-way pattern of a uniformly lit element, sin(pi q) / (pi q) with q = element_m sin(look) /
-    wavelength, seen over the whole record.
+    """One-way pattern of a uniformly illuminated antenna element over the whole record.
 
-    sin(look) = (v t - y0 - dx_m) / R_m. element_m: None for that of the radar.
+    The gain is sin(pi q) / (pi q) with q = element_m sin(look) / wavelength and
+    sin(look) = (v t - y0 - dx_m) / R_m, where dx_m is the position of channel m.
+
+    Args:
+        element_m: Length of the element in metres, None for that of the radar. A sea needs one
+            value for all trials.
+
+    Raises:
+        ValueError: If the length is not positive.
     """
 
-    element_m: float | None = None
+    element_m: Tensor | float | None = None
 
     def __post_init__(self) -> None:
-        if self.element_m is not None and not 0 < self.element_m < math.inf:
-            raise ValueError(
-                f"element_m of a pattern must be a positive length, or None for that of the radar, got {self.element_m}"
-            )
+        if self.element_m is not None:
+            sentence = "element_m of a pattern must be a positive length, or None for that of the radar"
+            refuse_unless(sentence, self.element_m, positive)
 
     def weight(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
-        """Amplitude gain of the receive pattern, float64 (..., channel, pulse, target)."""
+        """Return the amplitude gain of the receive pattern.
+
+        Args:
+            movers: Targets.
+            time_s: Slow time in seconds, shape (pulse,), float64.
+            radar: Receiver.
+
+        Returns:
+            Shape (..., channel, pulse, target), float64.
+        """
         closest = movers.closest_m(radar)[..., None, None, :]
         sine = movers.along_m(time_s, radar) / (closest + movers.excess_m(time_s, radar))
-        return torch.sinc((self.element_m or radar.element_m) / radar.wavelength_m * sine)
+        element = radar.element_m if self.element_m is None else with_dims(self.element_m, 3, time_s)
+        return torch.sinc(element / radar.wavelength_m * sine)
 
 
 class TransmitRange(Protocol):
-    """How the range from the transmitter to the scene changes."""
+    """True range from the transmitter to the scene as a function of time."""
 
-    def range_m(self, time_s: Tensor) -> Tensor: ...
+    def range_m(self, time_s: Tensor) -> Tensor:
+        """Return the change of the range since slow time zero.
+
+        Args:
+            time_s: Slow time in seconds, any shape, float64.
+
+        Returns:
+            R_T(t) - R_T(0) in metres, shape (*trials, *times), float64.
+        """
+        ...
 
 
 @dataclass(frozen=True)
 class PolynomialTransmit:
-    """R_T(t) - R_T(0) = k1 t + k2 t^2 + ..., of which `order` terms are kept, all by default."""
+    """Polynomial range from the transmitter, R_T(t) - R_T(0) = k1 t + k2 t^2 + ...
 
-    coefficients: Sequence[float]
+    Args:
+        coefficients: k1, k2, ... in m/s, m/s^2, ...; each a number or one value per trial.
+        order: Number of terms that are used, all by default.
+
+    Raises:
+        ValueError: If a coefficient is not finite or the order exceeds their number.
+    """
+
+    coefficients: Sequence[Tensor | float]
     order: int | None = None
 
     def __post_init__(self) -> None:
-        refuse_unless_finite(
-            "coefficients of a transmit range", torch.tensor(list(self.coefficients), dtype=torch.float64)
-        )
+        for degree, value in enumerate(self.coefficients, start=1):
+            refuse_unless_finite(f"coefficient {degree} of a transmit range", value)
         if self.order is not None and not 0 <= self.order <= len(self.coefficients):
             raise ValueError(
                 f"order of a transmit range must lie in 0..{len(self.coefficients)}, the number of "
@@ -87,54 +147,86 @@ class PolynomialTransmit:
             )
 
     def range_m(self, time_s: Tensor) -> Tensor:
-        """R_T(t) - R_T(0) (m), float64, shape of time_s."""
-        return polynomial_range(self.coefficients[: self.order], time_s)
+        """Return the change of the range since slow time zero.
+
+        Args:
+            time_s: Slow time in seconds, any shape, float64.
+
+        Returns:
+            R_T(t) - R_T(0) in metres, shape (*trials, *times), float64.
+        """
+        kept = [with_dims(k, time_s.ndim, time_s) for k in self.coefficients[: self.order]]
+        return polynomial_range(kept, time_s)
 
     def neglected_phase_rad(self, radar: BistaticRadar, duration_s: float) -> float:
-        """Largest phase (rad) of the dropped terms within duration_s about t = 0."""
+        """Return the largest phase of the terms beyond the order.
+
+        Args:
+            radar: Receiver.
+            duration_s: Length in seconds of the interval about slow time zero.
+
+        Returns:
+            Phase in radians, the largest of all trials.
+        """
         kept = len(self.coefficients) if self.order is None else self.order
         half = duration_s / 2
-        return (
-            2
-            * math.pi
-            / radar.wavelength_m
-            * sum(abs(k) * half ** (kept + 1 + i) for i, k in enumerate(self.coefficients[kept:]))
-        )
+        dropped = sum(abs(k) * half ** (kept + 1 + i) for i, k in enumerate(self.coefficients[kept:]))
+        return 2 * math.pi / radar.wavelength_m * float(torch.as_tensor(dropped, dtype=torch.float64).max())
 
 
 @dataclass(frozen=True)
 class OrbitTransmit:
-    """The exact range from a satellite to a point of the scene, which turns with the Earth.
+    """Exact range from a satellite to a point of the scene that rotates with the Earth.
 
-    point_m: the point at the epoch in the inertial frame (m), as of `radar.seen_point`; epoch_s:
-    time of the orbit at slow time zero.
+    Args:
+        orbit: Orbit of the satellite.
+        point_m: Point at the epoch in the inertial frame in metres, three coordinates, as from
+            `radar.seen_point`.
+        epoch_s: Time of the orbit at slow time zero in seconds.
+
+    Raises:
+        ValueError: If there are not three finite coordinates, or the epoch is not finite.
     """
 
     orbit: Orbit
-    point_m: Sequence[float]
-    epoch_s: float = 0.0
+    point_m: Sequence[Tensor | float]
+    epoch_s: Tensor | float = 0.0
 
     def __post_init__(self) -> None:
         if len(self.point_m) != 3:
             raise ValueError(f"point_m needs three coordinates in the inertial frame (m), got {len(self.point_m)}")
+        refuse_unless_finite("point_m of a transmit range", self.point_m)
+        refuse_unless_finite("epoch_s of a transmit range", self.epoch_s)
 
     def range_m(self, time_s: Tensor) -> Tensor:
-        """R_T(t) - R_T(0) (m), float64, shape of time_s, behind the trial dims of the orbit."""
-        return orbit_range(
-            self.orbit, torch.as_tensor(self.point_m, dtype=torch.float64, device=time_s.device), self.epoch_s, time_s
-        )
+        """Return the change of the range since slow time zero.
+
+        Args:
+            time_s: Slow time in seconds, shape (pulse,), float64.
+
+        Returns:
+            R_T(t) - R_T(0) in metres, shape (..., pulse), float64.
+        """
+        return orbit_range(self.orbit, stacked(self.point_m, time_s.device), self.epoch_s, time_s)
 
 
 @dataclass(frozen=True)
 class BistaticWorld:
-    """Moving targets, what the receiver sees of them, the sea under them, and the noise.
+    """Moving targets, their receive gain, the sea beneath them and the noise.
 
-    scene: None for no moving target. gate: `BandLimited` or `Pattern`. sea: such as `KSea`, None
-    for none. snr_db: power of a target of amplitude 1 over noise variance in a sample of one
-    channel after range compression, at the peak line of the target (in one pulse of raw echoes it
-    is B tau_p less), a number or per-trial tensor (...,); None for no noise. receive: how finely
-    ranges are followed. transmit: the true range to the transmitter; None for that of the
-    ephemeris.
+    Args:
+        scene: Moving targets, None for none.
+        gate: Receive gain, `BandLimited` or `Pattern`.
+        sea: Stationary surface such as `KSea`, None for none.
+        snr_db: Power of a target of amplitude 1 over the noise variance in decibels, in one sample
+            of one channel after range compression at the peak line of the target (before
+            compression it is lower by 10 log10(B tau_p)); None for no noise.
+        receive: Model of the range to the receiver, `ExactRange` or `TaylorRange`.
+        transmit: True range to the transmitter, None for that of the ephemeris.
+
+    Raises:
+        TypeError: If the scene, the gate or the range model is of another kind.
+        ValueError: If there is neither a scene nor a sea, or snr_db is not finite.
     """
 
     scene: MovingScene | None
@@ -155,5 +247,4 @@ class BistaticWorld:
             raise TypeError(f"receive must be ExactRange() or TaylorRange(order), got {self.receive!r}")
         if self.scene is None and self.sea is None:
             raise ValueError("a world without moving targets and without a sea is empty; give it a scene or a sea")
-        if self.snr_db is not None:
-            refuse_unless_finite("snr_db", self.snr_db)
+        refuse_unless_finite("snr_db", self.snr_db)

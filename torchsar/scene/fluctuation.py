@@ -1,6 +1,4 @@
-"""Random motions of the line of sight: turbulence, vibration spectra, scintillation, and motions
-that were measured.
-"""
+"""Random motions along the line of sight, scintillation, and measured motions."""
 
 from __future__ import annotations
 
@@ -15,39 +13,60 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, UniformSpline
-from torchsar.scene.vibration import Motion, refuse_unless_finite
+from torchsar.scene.trials import finite, positive, refuse_unless, refuse_unless_finite, with_dims
+from torchsar.scene.vibration import Motion
 
+# times in a block: the phases of 64 tones then take 8 MB, about the cache of a processor
 _TIMES_AT_ONCE = 1 << 14
+# default upper end of a band, by choice
 _HIGHEST_HZ = 2000.0
-# departures from an even step that a measured track may show, in steps
+# largest departure from equal spacing of a measured track, in steps, by choice
 _UNEVEN = 1e-3
 
 
 @runtime_checkable
 class RandomMotion(Protocol):
-    """A motion that differs from trial to trial: draws, and the length of the recording (s), give
-    the motion itself.
-    """
+    """Motion that is drawn in each trial."""
 
-    def drawn(self, draws: Draws, span_s: float) -> Motion: ...
+    def drawn(self, draws: Draws, span_s: float) -> Motion:
+        """Draw the motion of each trial.
+
+        Args:
+            draws: Random draws.
+            span_s: Length of the recording in seconds.
+
+        Returns:
+            A motion with the trials of the draws.
+        """
+        ...
 
 
 def drawn_motion(motion: Sequence[Motion | RandomMotion], draws: Draws, span_s: float) -> list[Motion]:
-    """A list of motions with the random ones drawn, each from an address of its own, its place in
-    the list.
+    """Draw the random motions of a list.
+
+    Args:
+        motion: Fixed and random motions.
+        draws: Random draws; each motion uses an address of its own, its position in the list.
+        span_s: Length of the recording in seconds.
+
+    Returns:
+        Motions in the same order.
     """
     return [
-        part.drawn(draws.part(f"motion.{place}"), span_s) if isinstance(part, RandomMotion) else part
-        for place, part in enumerate(motion)
+        part.drawn(draws.part(f"motion.{position}"), span_s) if isinstance(part, RandomMotion) else part
+        for position, part in enumerate(motion)
     ]
 
 
 @dataclass(frozen=True)
 class Tones:
-    """Sum of sinusoids at frequencies that all trials share: sum_i cosine_i cos(2 pi f_i t) +
-    sine_i sin(2 pi f_i t).
+    """Sum of sinusoids, sum_i cosine_i cos(2 pi f_i t) + sine_i sin(2 pi f_i t).
 
-    frequency_hz: (tone,); cosine, sine: (..., tone), in m for a motion. float64.
+    Args:
+        frequency_hz: Frequencies in hertz, shape (tone,) or (..., tone), float64. Frequencies
+            shared by all trials need one table of phases only.
+        cosine: Cosine amplitudes, shape (..., tone), float64; in metres for a motion.
+        sine: Sine amplitudes, shape (..., tone), float64.
     """
 
     frequency_hz: Tensor
@@ -55,37 +74,63 @@ class Tones:
     sine: Tensor
 
     def value(self, time_s: Tensor) -> Tensor:
-        """The sum at float64 times of any shape, (*trials, *times): one table of the tones for all
-        trials, in bounded memory.
+        """Evaluate the sum in blocks of times, so that memory stays bounded.
+
+        Args:
+            time_s: Times in seconds, any shape, shared by all trials, float64.
+
+        Returns:
+            Shape (*trials, *times), float64.
         """
-        parts = [self._block(block) for block in time_s.flatten().split(_TIMES_AT_ONCE)]
-        return torch.cat(parts, -1).reshape((*self.cosine.shape[:-1], *time_s.shape))
+        times = max(1, _TIMES_AT_ONCE // self.frequency_hz.shape[:-1].numel())
+        parts = [self._block(block) for block in time_s.flatten().split(times)]
+        values = torch.cat(parts, -1)
+        return values.reshape((*values.shape[:-1], *time_s.shape))
 
     def displacement_m(self, time_s: Tensor) -> Tensor:
-        """The same, under the name that motions go by."""
+        """Return the sum as a displacement; see `Motion`.
+
+        Args:
+            time_s: Times in seconds, any shape, float64.
+
+        Returns:
+            Displacement in metres, shape (*trials, *times).
+        """
         return self.value(time_s)
 
     def _block(self, time_s: Tensor) -> Tensor:
-        turns = self.frequency_hz.to(time_s.device)[:, None] * time_s
+        """The sum at times (time,), (*trials, time)."""
+        turns = self.frequency_hz.to(time_s.device)[..., None] * time_s
         angle = 2 * math.pi * (turns - torch.round(turns.detach()))
-        return self.cosine.to(time_s.device) @ torch.cos(angle) + self.sine.to(time_s.device) @ torch.sin(angle)
+        cosine, sine = self.cosine.to(time_s.device), self.sine.to(time_s.device)
+        if angle.ndim == 2:
+            return cosine @ torch.cos(angle) + sine @ torch.sin(angle)
+        return (cosine[..., None, :] @ torch.cos(angle) + sine[..., None, :] @ torch.sin(angle))[..., 0, :]
 
 
 @dataclass(frozen=True)
 class VibrationSpectrum:
-    """Random vibration of power spectral density f^slope between two frequencies, as `count`
-    sinusoids of random phases.
+    """Random vibration whose power spectral density follows a power of the frequency.
 
-    rms_m: over a long time, a number or per-trial tensor (...,). lowest_hz: None for one turn in
-    the recording. The sinusoids lie evenly in the logarithm of the frequency, each with the power
-    of its share of the band, so that every trial has the same rms. A band of one frequency has
-    lowest_hz = highest_hz. Raises ValueError for a band or count that is none.
+    The motion is a sum of sinusoids with random phases. Their frequencies are spaced evenly in the
+    logarithm, and each has the power of its part of the band, so that every trial has the same rms
+    value over a long time. Equal limits give a single frequency.
+
+    Args:
+        rms_m: Root mean square of the displacement within the band in metres.
+        lowest_hz: Lower end of the band in hertz, None for one cycle in the recording.
+        highest_hz: Upper end of the band in hertz.
+        slope: Exponent of the frequency in the power spectral density.
+        count: Number of sinusoids, fixed for all trials.
+
+    Raises:
+        ValueError: If the rms value is negative, the band is empty or the count is not positive.
     """
 
     rms_m: Tensor | float
-    lowest_hz: float | None
-    highest_hz: float
-    slope: float = 0.0
+    lowest_hz: Tensor | float | None
+    highest_hz: Tensor | float
+    slope: Tensor | float = 0.0
     count: int = 64
 
     def __post_init__(self) -> None:
@@ -93,38 +138,70 @@ class VibrationSpectrum:
         _refuse_band(self.lowest_hz, self.highest_hz, self.slope, self.count)
 
     def drawn(self, draws: Draws, span_s: float) -> Tones:
+        """Draw the phases of the sinusoids.
+
+        Args:
+            draws: Random draws.
+            span_s: Length of the recording in seconds.
+
+        Returns:
+            The sinusoids, amplitudes in metres.
+
+        Raises:
+            ValueError: If the band lies below one cycle in the recording.
+        """
         return random_tones(draws, self.rms_m, *_band(self.lowest_hz, self.highest_hz, span_s), self.slope, self.count)
 
 
 @dataclass(frozen=True)
 class PathFluctuation(VibrationSpectrum):
-    """Fluctuation of the optical path by turbulent air: coloured, f^(-8/3) as of a point receiver
-    in Kolmogorov turbulence (one way or two is the caller's).
+    """Fluctuation of the optical path by turbulent air.
 
-    rms_m: within the band, a number or per-trial tensor (...,). highest_hz: None for 2 kHz, or ten
-    turns in a recording so short. The rest as for `VibrationSpectrum`.
+    By default the power spectral density follows f^(-8/3), as for a point receiver in Kolmogorov
+    turbulence. The displacement is added to the range; the caller decides how the paths to and from
+    the target contribute to it. The sinusoids are those of `VibrationSpectrum`.
+
+    Args:
+        rms_m: Root mean square of the displacement within the band in metres.
+        lowest_hz: Lower end of the band in hertz, None for one cycle in the recording.
+        highest_hz: Upper end of the band in hertz; None for 2 kHz, or ten cycles in a short
+            recording.
+        slope: Exponent of the frequency in the power spectral density.
+        count: Number of sinusoids, fixed for all trials.
+
+    Raises:
+        ValueError: If the rms value is negative, the band is empty or the count is not positive.
     """
 
     rms_m: Tensor | float
-    lowest_hz: float | None = None
-    highest_hz: float | None = None
-    slope: float = -8 / 3
+    lowest_hz: Tensor | float | None = None
+    highest_hz: Tensor | float | None = None
+    slope: Tensor | float = -8 / 3
     count: int = 64
 
 
 @dataclass(frozen=True)
 class LogAmplitude:
-    """Scintillation: the echo's amplitude times exp(chi(t)), chi of power spectral density
-    f^(-5/3), all scatterers alike.
+    """Scintillation: the echo amplitude is multiplied by exp(chi(t)), equally for all scatterers.
 
-    rms: of chi, a number or per-trial tensor (...,); the rest as for `PathFluctuation`. `drawn`
-    gives chi as `Tones`.
+    By default the power spectral density of the log-amplitude chi follows f^(-5/3).
+
+    Args:
+        rms: Root mean square of chi within the band.
+        lowest_hz: Lower end of the band in hertz, None for one cycle in the recording.
+        highest_hz: Upper end of the band in hertz; None for 2 kHz, or ten cycles in a short
+            recording.
+        slope: Exponent of the frequency in the power spectral density.
+        count: Number of sinusoids, fixed for all trials.
+
+    Raises:
+        ValueError: If the rms value is negative, the band is empty or the count is not positive.
     """
 
     rms: Tensor | float
-    lowest_hz: float | None = None
-    highest_hz: float | None = None
-    slope: float = -5 / 3
+    lowest_hz: Tensor | float | None = None
+    highest_hz: Tensor | float | None = None
+    slope: Tensor | float = -5 / 3
     count: int = 64
 
     def __post_init__(self) -> None:
@@ -132,46 +209,81 @@ class LogAmplitude:
         _refuse_band(self.lowest_hz, self.highest_hz, self.slope, self.count)
 
     def drawn(self, draws: Draws, span_s: float) -> Tones:
+        """Draw the phases of the sinusoids.
+
+        Args:
+            draws: Random draws.
+            span_s: Length of the recording in seconds.
+
+        Returns:
+            chi as a sum of sinusoids.
+
+        Raises:
+            ValueError: If the band lies below one cycle in the recording.
+        """
         return random_tones(draws, self.rms, *_band(self.lowest_hz, self.highest_hz, span_s), self.slope, self.count)
 
 
-def _band(lowest_hz: float | None, highest_hz: float | None, span_s: float) -> tuple[float, float]:
-    """The band with its defaults: from one turn in the recording to 2 kHz, or ten turns in it where
-    it is short.
-    """
+def _band(
+    lowest_hz: Tensor | float | None, highest_hz: Tensor | float | None, span_s: float
+) -> tuple[Tensor | float, Tensor | float]:
+    """Limits of the band with their defaults."""
     lowest = 1 / span_s if lowest_hz is None else lowest_hz
-    return lowest, max(_HIGHEST_HZ, 10 * lowest) if highest_hz is None else highest_hz
+    if highest_hz is not None:
+        return lowest, highest_hz
+    if isinstance(lowest, Tensor):
+        return lowest, (10 * lowest.to(torch.float64)).clamp_min(_HIGHEST_HZ)
+    return lowest, max(_HIGHEST_HZ, 10 * lowest)
 
 
 def random_tones(
-    draws: Draws, rms: Tensor | float, lowest_hz: float, highest_hz: float, slope: float, count: int
+    draws: Draws,
+    rms: Tensor | float,
+    lowest_hz: Tensor | float,
+    highest_hz: Tensor | float,
+    slope: Tensor | float,
+    count: int,
 ) -> Tones:
-    """Sinusoids of random phases whose powers follow f^slope from lowest_hz to highest_hz; the mean
-    square of their sum is rms^2.
+    """Draw sinusoids whose powers follow a power law.
+
+    Args:
+        draws: Random draws of the phases.
+        rms: Root of the mean square of the sum.
+        lowest_hz: Lower end of the band in hertz.
+        highest_hz: Upper end of the band in hertz.
+        slope: Exponent of the frequency in the power spectral density.
+        count: Number of sinusoids.
+
+    Returns:
+        The sinusoids, shape (..., count).
+
+    Raises:
+        ValueError: If the band is empty.
     """
-    if not lowest_hz <= highest_hz:
-        raise ValueError(
-            f"a random motion from {lowest_hz:g} Hz, one turn in the recording, to {highest_hz:g} "
-            "Hz has no band; give lowest_hz or a larger highest_hz"
-        )
-    edges = lowest_hz * (highest_hz / lowest_hz) ** (torch.arange(count + 1, dtype=torch.float64) / count)
-    middle = torch.sqrt(edges[:-1] * edges[1:])
-    # power of a share of the band: density times width, the width being proportional to the
-    # frequency
-    power = (middle / lowest_hz) ** (slope + 1)
-    amplitude = torch.sqrt(2 * power / power.sum())
+    _refuse_empty_band(lowest_hz, highest_hz)
     angle = 2 * math.pi * draws.uniform("scene.tones.phase", (count,))
+    lowest_hz, highest_hz, slope = (with_dims(v, 1, angle) for v in (lowest_hz, highest_hz, slope))
+    edges = lowest_hz * (highest_hz / lowest_hz) ** (torch.arange(count + 1, dtype=torch.float64) / count)
+    middle = torch.sqrt(edges[..., :-1] * edges[..., 1:])
+    # power of a part of the band: density times width, which is proportional to the frequency
+    power = (middle / lowest_hz) ** (slope + 1)
+    amplitude = torch.sqrt(2 * power / power.sum(-1, keepdim=True))
     level = torch.as_tensor(rms, dtype=torch.float64)[..., None] * amplitude
     return Tones(middle, level * torch.cos(angle), level * torch.sin(angle))
 
 
 @dataclass(frozen=True)
 class MeasuredTrack:
-    """A displacement that was measured at even times, joined by a cubic spline.
+    """Measured displacement at equally spaced times, interpolated by a cubic spline.
 
-    time_s: (n,) from the start of the recording, even to a thousandth of a step; displacement_m:
-    (..., n). float64. Raises ValueError for uneven times, and when asked for times beyond the track
-    by more than one step.
+    Args:
+        time_s: Times from the start of the recording in seconds, shape (n,), shared by all trials;
+            equally spaced within a thousandth of a step.
+        displacement: Displacement in metres, shape (..., n).
+
+    Raises:
+        ValueError: If the numbers of times and displacements differ, one is not finite, or the
+            times are not equally spaced.
     """
 
     time_s: Tensor
@@ -192,19 +304,30 @@ class MeasuredTrack:
         off = float((time - time[0] - step * torch.arange(len(time), dtype=torch.float64)).abs().max())
         if not (step > 0 and off <= _UNEVEN * step):
             raise ValueError(
-                f"times of a measured track must rise evenly, got steps of {step:g} s on the mean and "
-                f"a time off by {off:.3g} s; resample the track first"
+                f"times of a measured track must rise evenly, got a mean step of {step:g} s and "
+                f"a departure of {off:.3g} s; resample the track first"
             )
 
     @property
     def step_s(self) -> float:
+        """Return the time step in seconds."""
         return float(self.time_s[-1] - self.time_s[0]) / (len(self.time_s) - 1)
 
     @classmethod
     def from_file(cls, path: str | Path) -> MeasuredTrack:
-        """A track from two columns, time in s and displacement in m: text or .csv (commas or
-        blanks, one line of names allowed), .npy (n, 2), or .npz with `time_s` (n,) and
-        `displacement_m` (..., n). Raises ValueError, with the name of the file, for anything else.
+        """Read a track of times in seconds and displacements in metres.
+
+        Args:
+            path: Text or .csv file of two columns (separated by commas or blanks, a line of names
+                is allowed), .npy file of shape (n, 2), or .npz file with `time_s` (n,) and
+                `displacement_m` (..., n).
+
+        Returns:
+            The track.
+
+        Raises:
+            ValueError: If the file does not exist or holds anything else; the message names the
+                file.
         """
         path = Path(path)
         if not path.is_file():
@@ -219,19 +342,30 @@ class MeasuredTrack:
             raise ValueError(f"{path}: {problem}") from None
 
     def displacement_m(self, time_s: Tensor) -> Tensor:
-        """d at float64 times of any shape, (*trials, *times)."""
+        """Interpolate the displacement.
+
+        Args:
+            time_s: Times in seconds, any shape, shared by all trials, float64.
+
+        Returns:
+            Displacement in metres, shape (*trials, *times).
+
+        Raises:
+            ValueError: If a time lies more than one step beyond the track.
+        """
         first, last = float(self.time_s[0]) - self.step_s, float(self.time_s[-1]) + self.step_s
         asked = time_s.detach()
         if asked.numel() and not (float(asked.min()) >= first and float(asked.max()) <= last):
             raise ValueError(
                 f"the measured track reaches from {first:g} to {last:g} s, asked for "
-                f"{float(asked.min()):g} to {float(asked.max()):g} s; record fewer periods or a "
-                "longer track"
+                f"{float(asked.min()):g} to {float(asked.max()):g} s; record fewer periods or "
+                "measure a longer track"
             )
         return UniformSpline(self.displacement.to(time_s.device), float(self.time_s[0]), self.step_s).at(time_s)
 
 
 def _columns_of(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Times and displacements of a file."""
     try:
         if path.suffix == ".npz":
             with np.load(path) as held:
@@ -250,6 +384,7 @@ def _columns_of(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read_text(path: Path) -> np.ndarray:
+    """Numbers of a text file without its comments and its line of names."""
     lines = [
         line.replace(",", " ").replace(";", " ")
         for line in path.read_text().splitlines()
@@ -261,12 +396,30 @@ def _read_text(path: Path) -> np.ndarray:
         return np.loadtxt(lines[1:], ndmin=2)
 
 
-def _refuse_band(lowest_hz: float | None, highest_hz: float | None, slope: float, count: int) -> None:
-    given = [f for f in (lowest_hz, highest_hz) if f is not None]
-    if not (all(0 < f < math.inf for f in given) and given == sorted(given) and math.isfinite(slope)):
+def _refuse_empty_band(lowest_hz: Tensor | float, highest_hz: Tensor | float) -> None:
+    """Raise ValueError if the lower end of the band exceeds the upper one in any trial."""
+    if (lowest_hz <= highest_hz) is True:
+        return
+    lowest, highest = (torch.as_tensor(v, dtype=torch.float64).detach() for v in (lowest_hz, highest_hz))
+    lowest, highest = torch.broadcast_tensors(lowest, highest)
+    empty = ~(lowest <= highest)
+    if bool(empty.any()):
         raise ValueError(
-            "a random motion needs 0 < lowest_hz <= highest_hz and a finite slope, got "
-            f"{lowest_hz}, {highest_hz} and {slope}"
+            f"a random motion from {float(lowest[empty][0]):g} Hz (by default one cycle in the recording) to "
+            f"{float(highest[empty][0]):g} Hz has no band; give lowest_hz or a larger highest_hz"
         )
+
+
+def _refuse_band(
+    lowest_hz: Tensor | float | None, highest_hz: Tensor | float | None, slope: Tensor | float, count: int
+) -> None:
+    """Raise ValueError for an empty band, a slope that is not finite or a bad count."""
+    expected = "a random motion needs 0 < lowest_hz <= highest_hz and a finite slope"
+    refuse_unless(expected, slope, finite)
+    for bound in (lowest_hz, highest_hz):
+        if bound is not None:
+            refuse_unless(expected, bound, positive)
+    if lowest_hz is not None and highest_hz is not None:
+        refuse_unless(expected, lowest_hz, lambda x: x <= highest_hz, f"highest_hz is {highest_hz}")
     if not (isinstance(count, int) and count >= 1):
         raise ValueError(f"a random motion needs a count of sinusoids of 1 or more, got {count}")

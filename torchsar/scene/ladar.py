@@ -1,6 +1,4 @@
-"""Everything that is true about a scene seen by a triangular-sweep ladar, and how finely its range
-is followed.
-"""
+"""World of a scene seen by a triangular-sweep ladar, and models of its range history."""
 
 from __future__ import annotations
 
@@ -15,20 +13,29 @@ from torch import Tensor
 from torchsar.radar import TriangularLadar
 from torchsar.scene.fluctuation import LogAmplitude, RandomMotion
 from torchsar.scene.targets import Scatterers, Scene
-from torchsar.scene.vibration import Motion, displacement_m, refuse_unless_finite
+from torchsar.scene.trials import refuse_unless, refuse_unless_finite
+from torchsar.scene.vibration import Motion, displacement_m
 
 Effect = Literal["residual_video", "hyperbola", "flight"]
-# over so long a time the speed is taken that moves a target on during the last metres of the flight
+# time step of the difference that gives the range rate, by choice: short against any motion, while
+# rounding of a range of 1 m costs 2e-10 m/s
 _SHORT_S = 1e-6
 
 
 @dataclass(frozen=True)
 class Extremes:
-    """What a scene and its motion reach, for predictions of neglected phases.
+    """Largest ranges and motions of a scene, from which neglected phases are predicted.
 
-    range_m: nearest and farthest relative range; across_m: largest |V t - x|; velocity_m_s,
-    acceleration_m_s2, jerk_m_s3: largest magnitudes of the whole range, velocity_change_m_s: over
-    the recording.
+    They describe a whole batch and are therefore plain numbers.
+
+    Args:
+        range_m: Smallest and largest relative range in metres.
+        across_m: Largest magnitude of the along-track offset V t - x in metres.
+        velocity_m_s: Largest magnitude of the radial velocity in metres per second.
+        velocity_change_m_s: Largest change of the radial velocity over the recording in metres per
+            second.
+        acceleration_m_s2: Largest magnitude of the radial acceleration.
+        jerk_m_s3: Largest magnitude of its derivative.
     """
 
     range_m: tuple[float, float] = (0.0, 0.0)
@@ -40,12 +47,21 @@ class Extremes:
 
 
 def omitted_phase_rad(without: Sequence[Effect], radar: TriangularLadar, extremes: Extremes) -> dict[str, float]:
-    """Phase (rad) that each omitted effect would have made, brief 000, section 10.
+    """Predict the phase of each omitted effect.
 
-    residual_video: pi K (dtau1^2 - dtau2^2) between the nearest and farthest scatterer, opposite in
-    up and down sweeps. hyperbola: pi X^4 / (2 lambda R^3). flight: 4 pi / lambda times the change
-    of the velocity times R / c, the shift of the epoch by a constant velocity being a constant
-    phase.
+    The residual video phase is pi K (dtau1^2 - dtau2^2) between the nearest and the farthest
+    scatterer, with opposite signs in up-sweeps and down-sweeps. A parabola instead of the hyperbola
+    costs pi X^4 / (2 lambda R^3). The flight time shifts the epoch by R / c, which matters by
+    4 pi / lambda times the change of the velocity times R / c; a constant velocity gives a constant
+    phase only.
+
+    Args:
+        without: Omitted effects.
+        radar: Ladar.
+        extremes: Largest ranges and motions of the scene.
+
+    Returns:
+        Phase in radians by effect.
     """
     near, far = sorted(abs(r) for r in extremes.range_m)
     least = 0.0 if extremes.range_m[0] * extremes.range_m[1] < 0 else near
@@ -62,12 +78,19 @@ def omitted_phase_rad(without: Sequence[Effect], radar: TriangularLadar, extreme
 
 @dataclass(frozen=True)
 class RangeHistory:
-    """Range of scatterers against the reference range as a function of slow time: sqrt((Rref +
-    RD)^2 + (V t - x)^2) - Rref + d(t - start_s).
+    """Range of scatterers relative to the reference range as a function of slow time.
 
-    Formed as a difference. motion counts time from start_s. Without "flight" the range at the time
-    of reception is taken, with it that at the reflection: R(t - R / c), where R / c is Rref / c and
-    a first-order step for the rest. Without "hyperbola" the square root is a parabola.
+    The range is sqrt((Rref + RD)^2 + (V t - x)^2) - Rref + d(t - start_s), formed as a difference.
+    With "flight" omitted it is the range at the time of reception, otherwise that at the time of
+    reflection, R(t - R / c): the delay Rref / c is exact, and a step of first order accounts for
+    the rest. With "hyperbola" omitted the square root is a parabola.
+
+    Args:
+        scatterers: Scatterers, shape (..., target).
+        radar: Ladar.
+        motion: Motions along the line of sight.
+        start_s: Slow time at which the time of the motions starts in seconds, fixed for all trials.
+        without: Omitted effects.
     """
 
     scatterers: Scatterers
@@ -77,7 +100,14 @@ class RangeHistory:
     without: Sequence[Effect] = ()
 
     def at(self, time_s: Tensor) -> Tensor:
-        """Relative range (m) at float64 times of any shape, (*trials, *times, target)."""
+        """Evaluate the relative range.
+
+        Args:
+            time_s: Slow time in seconds, any shape, float64.
+
+        Returns:
+            Relative range in metres, shape (*trials, *times, target).
+        """
         if "flight" in self.without:
             return self._reflected(time_s)
         c = self.radar.wave_speed_m_s
@@ -86,6 +116,7 @@ class RangeHistory:
         return there - (there - self._reflected(then - _SHORT_S)) / _SHORT_S * there / c
 
     def _reflected(self, time_s: Tensor) -> Tensor:
+        """Relative range at the times of reflection, (*trials, *times, target)."""
         x, near = self.scatterers.azimuth_m, self.radar.reference_range_m + self.scatterers.range_m
         x, near, relative = (
             v[(...,) + (None,) * time_s.ndim + (slice(None),)] for v in (x, near, self.scatterers.range_m)
@@ -95,8 +126,15 @@ class RangeHistory:
         return relative + across.square() / twice + displacement_m(self.motion, time_s - self.start_s)[..., None]
 
     def chords(self, middle_s: Tensor, half_s: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Range at middle_s, slope (m/s) of the chord from half_s before to half_s after, and bend
-        (m/s^2), (*trials, *middles, target) each.
+        """Approximate the range about given times by value, slope and curvature.
+
+        Args:
+            middle_s: Slow times in seconds, any shape, float64.
+            half_s: Half the length of the chord in seconds.
+
+        Returns:
+            Range in metres, slope of the chord in m/s and second derivative in m/s^2, shape
+            (*trials, *times, target) each.
         """
         first, middle, last = (self.at(middle_s + shift) for shift in (-half_s, 0.0, half_s))
         return middle, (last - first) / (2 * half_s), ((last - middle) - (middle - first)) / half_s**2
@@ -106,24 +144,42 @@ Lines = tuple[Tensor, Tensor, Tensor | None]
 
 
 class Fidelity(Protocol):
-    """How finely the range is followed: what sweeps are made of, what is left out, and the phase
-    that this costs.
-    """
+    """Model of the range within a sweep."""
 
     @property
-    def without(self) -> tuple[Effect, ...]: ...
+    def without(self) -> tuple[Effect, ...]:
+        """Return the omitted effects."""
+        ...
 
-    def sweep_range_m(self, history: RangeHistory, middle_s: Tensor) -> Lines: ...
+    def sweep_range_m(self, history: RangeHistory, middle_s: Tensor) -> Lines:
+        """Return range, slope and curvature of each scatterer in each sweep.
 
-    def neglected_phase_rad(self, radar: TriangularLadar, extremes: Extremes) -> dict[str, float]: ...
+        Args:
+            history: Range of the scatterers.
+            middle_s: Slow times of the sweep middles in seconds, shape (2, pulse), up-sweeps first.
+
+        Returns:
+            Range in metres, slope in m/s, shape (*trials, 2, pulse, target), and the second
+            derivative in m/s^2 or None.
+        """
+        ...
+
+    def neglected_phase_rad(self, radar: TriangularLadar, extremes: Extremes) -> dict[str, float]:
+        """Predict the largest neglected phases.
+
+        Args:
+            radar: Ladar.
+            extremes: Largest ranges and motions of the scene.
+
+        Returns:
+            Phase in radians by name.
+        """
+        ...
 
 
 @dataclass(frozen=True)
 class _Level:
-    """What every level has.
-
-    without: effects that are left out, of "residual_video", "hyperbola", "flight".
-    """
+    """Base of all range models, with the effects that they omit."""
 
     without: tuple[Effect, ...] = ("flight",)
 
@@ -133,40 +189,78 @@ class _Level:
 
 @dataclass(frozen=True)
 class EverySample(_Level):
-    """The range at each sample: the yardstick.
+    """Range evaluated at every sample: the exact model, and the slowest.
 
-    without: effects that are left out, of "residual_video", "hyperbola", "flight".
+    Args:
+        without: Effects that are omitted, a tuple of "residual_video", "hyperbola" and "flight".
+
+    Raises:
+        ValueError: If an effect is unknown.
     """
 
     def sweep_range_m(self, history: RangeHistory, middle_s: Tensor) -> Lines:
-        """Range at the middles of sweeps and slope (m/s) of its chord, by which beats are judged:
-        the echo itself asks for every sample.
+        """Return range and slope at the middle of each sweep, for the check of beat frequencies.
+
+        Args:
+            history: Range of the scatterers.
+            middle_s: Slow times of the sweep middles in seconds, shape (2, pulse), up-sweeps first.
+
+        Returns:
+            Range in metres and slope in m/s, shape (*trials, 2, pulse, target), and None.
         """
         return (*history.chords(middle_s, history.radar.sweep_s / 2)[:2], None)
 
     def neglected_phase_rad(self, radar: TriangularLadar, extremes: Extremes) -> dict[str, float]:
-        """Largest phase (rad) of each thing left out, by name."""
+        """Predict the phases of the omitted effects.
+
+        Args:
+            radar: Ladar.
+            extremes: Largest ranges and motions of the scene.
+
+        Returns:
+            Phase in radians by effect.
+        """
         return omitted_phase_rad(self.without, radar, extremes)
 
 
 @dataclass(frozen=True)
 class QuadraticInSweep(_Level):
-    """Line of the phase of each scatterer in each sweep, and one bend of it for all scatterers:
-    acceleration, and the band that velocity takes along.
+    """Linear phase of each scatterer in each sweep, with one curvature for all scatterers.
 
-    Between `LinearInSweep` and `EverySample`, at little more than the cost of lines where
-    scatterers are many. Neglects the jerk and what bends differ.
+    The curvature accounts for the acceleration and for the change of the Doppler shift across the
+    band. For many scatterers the model costs little more than `LinearInSweep`. It neglects the jerk
+    and differences of the curvature between scatterers.
+
+    Args:
+        without: Effects that are omitted, a tuple of "residual_video", "hyperbola" and "flight".
+
+    Raises:
+        ValueError: If an effect is unknown.
     """
 
     def sweep_range_m(self, history: RangeHistory, middle_s: Tensor) -> Lines:
-        """Range at the middles of sweeps, slope (m/s) of its chord, and bend (m/s^2), (*trials,
-        *middles, target) each.
+        """Return range, slope and curvature of each scatterer in each sweep.
+
+        Args:
+            history: Range of the scatterers.
+            middle_s: Slow times of the sweep middles in seconds, shape (2, pulse), up-sweeps first.
+
+        Returns:
+            Range in metres, slope of its chord in m/s and second derivative in m/s^2, shape
+            (*trials, 2, pulse, target) each.
         """
         return history.chords(middle_s, history.radar.sweep_s / 2)
 
     def neglected_phase_rad(self, radar: TriangularLadar, extremes: Extremes) -> dict[str, float]:
-        """Largest phase (rad) of each thing left out, by name: `level` is that of the jerk, j u
-        (u^2 - (T/2)^2) / 6, and of the band times the acceleration.
+        """Predict the largest neglected phases.
+
+        Args:
+            radar: Ladar.
+            extremes: Largest ranges and motions of the scene.
+
+        Returns:
+            Phase in radians by name. `level` is that of the jerk j, j u (u^2 - (T/2)^2) / 6 in
+            range, and of the acceleration across the band.
         """
         t = radar.sweep_s
         jerk = 4 * math.pi / radar.wavelength_m * extremes.jerk_m_s3 * (t / 2) ** 3 / 6 * 2 / math.sqrt(27)
@@ -176,22 +270,41 @@ class QuadraticInSweep(_Level):
 
 @dataclass(frozen=True)
 class LinearInSweep(_Level):
-    """Phase and frequency of each scatterer in each sweep: the range goes along a straight line in
-    it. The default (brief 000, section 10).
+    """Linear phase of each scatterer in each sweep: the range follows a straight line. The default.
 
-    Neglects acceleration and the band that velocity takes along, see neglected_phase_rad; the next
-    levels are `QuadraticInSweep` and `EverySample`.
+    The model neglects the acceleration and the change of the Doppler shift across the band; see
+    `neglected_phase_rad`. `QuadraticInSweep` and `EverySample` are more exact.
+
+    Args:
+        without: Effects that are omitted, a tuple of "residual_video", "hyperbola" and "flight".
+
+    Raises:
+        ValueError: If an effect is unknown.
     """
 
     def sweep_range_m(self, history: RangeHistory, middle_s: Tensor) -> Lines:
-        """Range at the middles of sweeps and slope (m/s) of its chord, (*trials, *middles, target)
-        each.
+        """Return range and slope of each scatterer in each sweep.
+
+        Args:
+            history: Range of the scatterers.
+            middle_s: Slow times of the sweep middles in seconds, shape (2, pulse), up-sweeps first.
+
+        Returns:
+            Range in metres and slope of its chord in m/s, shape (*trials, 2, pulse, target), and
+            None.
         """
         return (*history.chords(middle_s, history.radar.sweep_s / 2)[:2], None)
 
     def neglected_phase_rad(self, radar: TriangularLadar, extremes: Extremes) -> dict[str, float]:
-        """Largest phase (rad) of each thing left out, by name: `level` is that at the ends of a
-        sweep, 4 pi / lambda a T^2 / 8 + pi K v T^2 / c.
+        """Predict the largest neglected phases.
+
+        Args:
+            radar: Ladar.
+            extremes: Largest ranges and motions of the scene.
+
+        Returns:
+            Phase in radians by name. `level` is that at the ends of a sweep,
+            4 pi / lambda a T^2 / 8 + pi K v T^2 / c.
         """
         t = radar.sweep_s
         bend = 4 * math.pi / radar.wavelength_m * extremes.acceleration_m_s2 * t**2 / 8
@@ -201,19 +314,41 @@ class LinearInSweep(_Level):
 
 @dataclass(frozen=True)
 class OnePerSweep(_Level):
-    """Stop and go: the range stands still during each sweep.
+    """Stop-and-go approximation: the range is constant during each sweep.
 
-    Velocity then does not exist for methods that look into sweeps; for comparisons only.
+    There is no Doppler shift within a sweep, so that methods that measure the velocity within
+    sweeps find none. For comparisons only.
+
+    Args:
+        without: Effects that are omitted, a tuple of "residual_video", "hyperbola" and "flight".
+
+    Raises:
+        ValueError: If an effect is unknown.
     """
 
     def sweep_range_m(self, history: RangeHistory, middle_s: Tensor) -> Lines:
-        """Range at the middles of sweeps, slope zero."""
+        """Return the range at the middle of each sweep, with zero slope.
+
+        Args:
+            history: Range of the scatterers.
+            middle_s: Slow times of the sweep middles in seconds, shape (2, pulse), up-sweeps first.
+
+        Returns:
+            Range in metres and zero slope, shape (*trials, 2, pulse, target), and None.
+        """
         middle = history.at(middle_s)
         return middle, torch.zeros_like(middle), None
 
     def neglected_phase_rad(self, radar: TriangularLadar, extremes: Extremes) -> dict[str, float]:
-        """Largest phase (rad) of each thing left out, by name: `level` is that of the velocity at
-        the ends of a sweep, there at the upper end of the band.
+        """Predict the largest neglected phases.
+
+        Args:
+            radar: Ladar.
+            extremes: Largest ranges and motions of the scene.
+
+        Returns:
+            Phase in radians by name. `level` is that of the velocity at the ends of a sweep, at the
+            upper end of the band.
         """
         upper = radar.carrier_hz + radar.bandwidth_hz / 2
         return {
@@ -224,18 +359,39 @@ class OnePerSweep(_Level):
 
 @dataclass(frozen=True)
 class OnePerPeriod(_Level):
-    """Stop and go from period to period: both sweeps see the range of the turning point between
-    them. For comparisons only.
+    """Stop-and-go approximation by period, with the range at the turning point for both sweeps.
+
+    For comparisons only.
+
+    Args:
+        without: Effects that are omitted, a tuple of "residual_video", "hyperbola" and "flight".
+
+    Raises:
+        ValueError: If an effect is unknown.
     """
 
     def sweep_range_m(self, history: RangeHistory, middle_s: Tensor) -> Lines:
-        """Range at the turning points, slope zero. middle_s: (2, pulse), up sweeps first."""
+        """Return the range at the turning point of each period, with zero slope.
+
+        Args:
+            history: Range of the scatterers.
+            middle_s: Slow times of the sweep middles in seconds, shape (2, pulse), up-sweeps first.
+
+        Returns:
+            Range in metres and zero slope, shape (*trials, 2, pulse, target), and None.
+        """
         middle = history.at(middle_s.mean(0, keepdim=True).expand_as(middle_s))
         return middle, torch.zeros_like(middle), None
 
     def neglected_phase_rad(self, radar: TriangularLadar, extremes: Extremes) -> dict[str, float]:
-        """Largest phase (rad) of each thing left out, by name: `level` is that of the velocity at
-        the ends of the period.
+        """Predict the largest neglected phases.
+
+        Args:
+            radar: Ladar.
+            extremes: Largest ranges and motions of the scene.
+
+        Returns:
+            Phase in radians by name. `level` is that of the velocity at the ends of the period.
         """
         upper = radar.carrier_hz + radar.bandwidth_hz / 2
         return {
@@ -245,45 +401,73 @@ class OnePerPeriod(_Level):
 
 
 class SweepError(Protocol):
-    """Phase error of the laser in its sweeps: float64 times u (s) from the middle of a sweep, ramp
-    0 (up) or 1 (down) -> turns of u's shape.
-    """
+    """Phase error of the laser within its sweeps."""
 
-    def turns(self, time_s: Tensor, ramp: int) -> Tensor: ...
+    def turns(self, time_s: Tensor, ramp: int, dims: int | None = None) -> Tensor:
+        """Evaluate the phase error.
+
+        Args:
+            time_s: Time u from the middle of a sweep in seconds, float64.
+            ramp: 0 for the up-sweep, 1 for the down-sweep.
+            dims: Number of last dimensions of time_s that are no trials, all by default.
+
+        Returns:
+            Phase error in cycles, float64; the trials of the parameters lead.
+        """
+        ...
 
 
 @dataclass(frozen=True)
 class CalibrationFibre:
-    """An internal channel that beats the sweep against itself through a fibre of known delay (s),
-    with its own SNR per sample.
+    """Internal channel that mixes the sweep with a copy of itself from a fibre of known delay.
 
-    every_period: recorded in every period, or once for the whole recording.
+    Args:
+        delay_s: Delay of the fibre in seconds.
+        snr_db: Signal-to-noise ratio per sample in decibels, None for no noise.
+        every_period: Whether the channel is recorded in every period, or once for the whole
+            recording.
+
+    Raises:
+        ValueError: If the delay is not positive or the ratio is not finite.
     """
 
-    delay_s: float
+    delay_s: Tensor | float
     snr_db: Tensor | float | None = None
     every_period: bool = False
 
     def __post_init__(self) -> None:
         refuse_unless_finite("delay_s of a calibration fibre", self.delay_s, 0.0)
-        if not self.delay_s > 0:
-            raise ValueError(
-                "delay_s of a calibration fibre must be longer than 0 s; leave the fibre out where there is none"
-            )
-        if self.snr_db is not None:
-            refuse_unless_finite("snr_db of a calibration fibre", self.snr_db)
+        refuse_unless(
+            "delay_s of a calibration fibre must be longer than 0 s",
+            self.delay_s,
+            lambda x: x > 0,
+            "leave the fibre out where there is none",
+        )
+        refuse_unless_finite("snr_db of a calibration fibre", self.snr_db)
 
 
 @dataclass(frozen=True)
 class LadarWorld:
-    """A scene, what moves its line of sight, what the air and the laser do, and the noise.
+    """Scene, motion, propagation, laser errors and noise of a ladar acquisition.
 
-    motion: list of motions, fixed or random (`drawn`), time from the start of the first recorded
-    period. log_amplitude: scintillation. snr_db: PER SAMPLE of a scatterer of amplitude 1, before
-    any compression, a number or per-trial tensor (...,); None for no noise. fidelity: how finely
-    the range is followed. gate_m: (low, high) relative range; scatterers outside it are not
-    recorded. sweep_error: phase error of the laser's sweeps; calibration: an internal fibre that
-    shows it to the processor. What is None is absent.
+    Effects that are None or absent from a list do not exist.
+
+    Args:
+        scene: Scatterers.
+        motion: Motions along the line of sight, fixed or random; time counts from the start of the
+            first recorded period.
+        log_amplitude: Scintillation.
+        snr_db: Power of a scatterer of amplitude 1 over the noise variance in decibels, PER SAMPLE
+            before any compression; None for no noise.
+        fidelity: Model of the range within a sweep.
+        gate_m: Lower and upper limit of the relative range in metres; scatterers outside are not
+            recorded.
+        sweep_error: Phase error of the sweeps of the laser.
+        calibration: Internal fibre, which records the sweep error.
+
+    Raises:
+        TypeError: If the scene, the motion or the fidelity is of another kind.
+        ValueError: If snr_db is not finite or the gate is empty.
     """
 
     scene: Scene
@@ -291,21 +475,18 @@ class LadarWorld:
     log_amplitude: LogAmplitude | None = None
     snr_db: Tensor | float | None = None
     fidelity: Fidelity = field(default_factory=LinearInSweep)
-    gate_m: tuple[float, float] | None = None
+    gate_m: tuple[Tensor | float, Tensor | float] | None = None
     sweep_error: SweepError | None = None
     calibration: CalibrationFibre | None = None
 
     def __post_init__(self) -> None:
-        if self.snr_db is not None:
-            refuse_unless_finite("snr_db", self.snr_db)
+        refuse_unless_finite("snr_db", self.snr_db)
         if not hasattr(self.scene, "scatterers"):
             raise TypeError(f"scene must be an object with scatterers, such as Points or LetterE, got {self.scene!r}")
         if hasattr(self.motion, "displacement_m") or hasattr(self.motion, "drawn"):
-            raise TypeError("motion must be a list of motions; put a single one in brackets")
-        if self.gate_m is not None and not (
-            isinstance(self.gate_m, tuple | list) and len(self.gate_m) == 2 and self.gate_m[0] < self.gate_m[1]
-        ):
-            raise ValueError(f"gate_m must be (low, high) relative range in m with low < high, got {self.gate_m}")
+            raise TypeError(f"motion must be a list of motions, got {self.motion!r}; put it in brackets")
+        if self.gate_m is not None:
+            _refuse_gate(self.gate_m)
         if isinstance(self.fidelity, type) or not hasattr(self.fidelity, "sweep_range_m"):
             raise TypeError(
                 "fidelity must be LinearInSweep(), QuadraticInSweep(), EverySample(), OnePerSweep() "
@@ -313,7 +494,19 @@ class LadarWorld:
             )
 
 
+def _refuse_gate(gate_m: tuple[Tensor | float, Tensor | float]) -> None:
+    """Raise ValueError for a range gate that is empty in any trial."""
+    sentence = "gate_m must be (low, high) relative range in m with low < high"
+    if not (isinstance(gate_m, tuple | list) and len(gate_m) == 2):
+        raise ValueError(f"{sentence}, got {gate_m}")
+    low, high = torch.broadcast_tensors(*(torch.as_tensor(v, dtype=torch.float64).detach() for v in gate_m))
+    empty = ~(low < high)
+    if bool(empty.any()):
+        raise ValueError(f"{sentence}, got ({float(low[empty][0]):g}, {float(high[empty][0]):g})")
+
+
 def _refuse_effects(without: Sequence[str]) -> None:
+    """Raise ValueError for an unknown effect."""
     if isinstance(without, str) or not set(without) <= set(get_args(Effect)):
         raise ValueError(
             f"effects that may be left out are {', '.join(get_args(Effect))}, got {without!r}; give a tuple of them"

@@ -1,4 +1,4 @@
-"""Moving targets of a receiver on a straight track, and how finely their ranges are followed."""
+"""Moving targets of a receiver on a straight track, and models of their ranges."""
 
 from __future__ import annotations
 
@@ -12,18 +12,26 @@ from torch import Tensor
 
 from torchsar.core import Draws, per_trial
 from torchsar.radar import BistaticRadar, receive_range
-from torchsar.scene.vibration import refuse_unless_finite
+from torchsar.scene.trials import refuse_unless, refuse_unless_finite, with_dims
 
-Numbers = Sequence[float] | Tensor
+Numbers = Sequence[Tensor | float] | Tensor
 
 
 @dataclass(frozen=True)
 class Bend:
-    """What real motion adds to uniform motion in the slant plane. float64 (..., target) each.
+    """Deviation of a real motion from uniform motion in the slant plane.
 
-    transmit_m_s, transmit_m_s2: closing speed towards the transmitter and its growth; the range to
-    it shrinks by s t + a t^2 / 2. along_m_s2: acceleration along track. second, third, fourth: b2
-    t^2 + b3 t^3 + b4 t^4 (m^2) is added to (R0 - u_r t)^2 within the square of the range.
+    The range to the transmitter shrinks by s t + a t^2 / 2, and b2 t^2 + b3 t^3 + b4 t^4 is added
+    to (R0 - u_r t)^2 within the square of the range to the receiver.
+
+    Args:
+        transmit_m_s: Closing speed s towards the transmitter in m/s, shape (..., target), float64
+            as all others.
+        transmit_m_s2: Its derivative a in m/s^2.
+        along_m_s2: Along-track acceleration in m/s^2.
+        second: b2 in m^2/s^2.
+        third: b3 in m^2/s^3.
+        fourth: b4 in m^2/s^4.
     """
 
     transmit_m_s: Tensor
@@ -35,22 +43,48 @@ class Bend:
 
     @staticmethod
     def none(like: Tensor) -> Bend:
-        """Uniform motion in the slant plane, for joining with movers that have more."""
+        """Return zero deviation, for targets that are joined with others.
+
+        Args:
+            like: Tensor of shape (..., target).
+
+        Returns:
+            Deviation of zero for each target.
+        """
         return Bend(**{f.name: torch.zeros_like(like) for f in fields(Bend)})
 
     def each(self, change: Callable[[Tensor], Tensor]) -> Bend:
-        """With every entry changed alike."""
+        """Apply a function to every entry.
+
+        Args:
+            change: Function of a tensor of shape (..., target).
+
+        Returns:
+            Changed deviation.
+        """
         return Bend(**{f.name: change(getattr(self, f.name)) for f in fields(Bend)})
 
     def square_m2(self, time_s: Tensor) -> Tensor:
-        """b2 t^2 + b3 t^3 + b4 t^4, (..., 1, pulse, target)."""
+        """Return the term that is added to the squared range.
+
+        Args:
+            time_s: Slow time in seconds, shape (pulse,), float64.
+
+        Returns:
+            b2 t^2 + b3 t^3 + b4 t^4 in square metres, shape (..., 1, pulse, target).
+        """
         t = time_s[:, None]
         second, third, fourth = (b[..., None, None, :] for b in (self.second, self.third, self.fourth))
         return t.square() * (second + t * (third + t * fourth))
 
     def transmit_m(self, time_s: Tensor) -> Tensor:
-        """What the range to the transmitter grows by, (..., 1, pulse, target): negative for a
-        closing target.
+        """Return the change of the range to the transmitter by the motion.
+
+        Args:
+            time_s: Slow time in seconds, shape (pulse,), float64.
+
+        Returns:
+            Change in metres, negative for a closing target, shape (..., 1, pulse, target).
         """
         t = time_s[:, None]
         return -t * (self.transmit_m_s[..., None, None, :] + t / 2 * self.transmit_m_s2[..., None, None, :])
@@ -58,14 +92,22 @@ class Bend:
 
 @dataclass(frozen=True)
 class Movers:
-    """Point targets and their motion at t = 0, the middle pulse.
+    """Point targets and their motion at slow time zero, the middle pulse.
 
-    float64 (..., target), amplitude complex128; leading dims are trials. May require gradients.
+    All tensors have the shape (..., target), the leading dimensions being trials, and may require
+    gradients.
 
-    u_r_m_s: slant-range speed, closing positive; u_a_m_s: along track, positive with the receiver;
-    y0_m: along-track place; range_m: of R0 beyond radar.reference_range_m. bend: None for uniform
-    motion in the slant plane. Raises TypeError for other dtypes, ValueError for numbers of targets
-    that disagree.
+    Args:
+        u_r_m_s: Slant-range speed in m/s, closing positive, float64.
+        u_a_m_s: Along-track speed in m/s, positive in the direction of the receiver, float64.
+        y0_m: Along-track position in metres, float64.
+        range_m: Closest range R0 beyond the reference range of the radar in metres, float64.
+        amplitude: Amplitude, complex128.
+        bend: Deviation from uniform motion in the slant plane, None for none.
+
+    Raises:
+        TypeError: If a dtype is another one.
+        ValueError: If the tensors differ in the number of targets.
     """
 
     u_r_m_s: Tensor
@@ -79,42 +121,75 @@ class Movers:
         real = (self.u_r_m_s, self.u_a_m_s, self.y0_m, self.range_m)
         if any(x.dtype != torch.float64 for x in real) or not self.amplitude.is_complex():
             raise TypeError(
-                "movers need float64 speeds and places and complex amplitudes, got "
+                "movers need float64 speeds and positions and complex amplitudes, got "
                 f"{[x.dtype for x in (*real, self.amplitude)]}"
             )
         counts = [x.shape[-1] if x.ndim else 0 for x in (*real, self.amplitude)]
         if len(set(counts)) != 1:
             raise ValueError(
-                f"movers need as many speeds, places and amplitudes as targets in the last dim, got {counts}"
+                f"movers need as many speeds, positions and amplitudes as targets in the last dim, got {counts}"
             )
 
     def each(self, change: Callable[[Tensor], Tensor]) -> Movers:
-        """With every entry changed alike: `movers.each(lambda x: x.to(device))`."""
+        """Apply a function to every entry, such as a change of the device.
+
+        Args:
+            change: Function of a tensor of shape (..., target).
+
+        Returns:
+            Changed targets.
+        """
         bend = None if self.bend is None else self.bend.each(change)
         return Movers(
             *(change(x) for x in (self.u_r_m_s, self.u_a_m_s, self.y0_m, self.range_m, self.amplitude)), bend=bend
         )
 
     def closest_m(self, radar: BistaticRadar) -> Tensor:
-        """R0, (..., target)."""
+        """Return the closest range R0.
+
+        Args:
+            radar: Receiver.
+
+        Returns:
+            Range in metres, shape (..., target).
+        """
         return radar.reference_range_m + self.range_m
 
     def place_m(self, time_s: Tensor) -> Tensor:
-        """What the place along track has of the receiver's zero, without the part u_a t: y0 and
-        what an acceleration adds, (..., 1, pulse, target).
+        """Return the along-track position without the part u_a t.
+
+        Args:
+            time_s: Slow time in seconds, shape (pulse,), float64.
+
+        Returns:
+            y0 and the displacement by an acceleration in metres, shape (..., 1, pulse, target).
         """
         y0 = self.y0_m[..., None, None, :]
         return y0 if self.bend is None else y0 + self.bend.along_m_s2[..., None, None, :] * time_s[:, None].square() / 2
 
     def along_m(self, time_s: Tensor, radar: BistaticRadar) -> Tensor:
-        """Way v t - y0 - dx_m of each channel past each target along track, (..., channel, pulse,
-        target).
+        """Return the along-track distance of each channel from each target.
+
+        Args:
+            time_s: Slow time in seconds, shape (pulse,), float64.
+            radar: Receiver.
+
+        Returns:
+            v t - y0 - dx_m in metres, shape (..., channel, pulse, target).
         """
-        way = (radar.speed_m_s - self.u_a_m_s[..., None, None, :]) * time_s[:, None]
-        return way - self.place_m(time_s) - radar.channels_at(time_s.device)[:, None, None]
+        travelled = (radar.speed_m_s - self.u_a_m_s[..., None, None, :]) * time_s[:, None]
+        return travelled - self.place_m(time_s) - radar.channels_at(time_s.device)[:, None, None]
 
     def excess_m(self, time_s: Tensor, radar: BistaticRadar) -> Tensor:
-        """R_m(t) - R0, exact, (..., channel, pulse, target)."""
+        """Return the exact range to the receiver beyond the closest range.
+
+        Args:
+            time_s: Slow time in seconds, shape (pulse,), float64.
+            radar: Receiver.
+
+        Returns:
+            R_m(t) - R0 in metres, shape (..., channel, pulse, target).
+        """
         u_r, u_a, closest = (x[..., None, None, :] for x in (self.u_r_m_s, self.u_a_m_s, self.closest_m(radar)))
         channel = radar.channels_at(time_s.device)[:, None, None]
         excess = receive_range(time_s[:, None], u_r, u_a, self.place_m(time_s), closest, radar.speed_m_s, channel)
@@ -125,39 +200,59 @@ class Movers:
 
 
 class MovingScene(Protocol):
-    """Anything that turns random draws into moving targets before a radar."""
+    """Scene that gives moving targets."""
 
-    def movers(self, radar: BistaticRadar, draws: Draws) -> Movers: ...
+    def movers(self, radar: BistaticRadar, draws: Draws) -> Movers:
+        """Draw the targets.
+
+        Args:
+            radar: Receiver.
+            draws: Random draws.
+
+        Returns:
+            Targets, shape (..., target).
+        """
+        ...
 
 
 def _numbers(values: Numbers) -> Tensor:
-    """float64 of real numbers, complex128 of complex ones."""
+    """float64 tensor of real numbers, complex128 of complex ones, (..., target)."""
     if isinstance(values, (int, float, complex)) or (isinstance(values, Tensor) and not values.ndim):
         raise ValueError(
-            f"moving points take lists or tensors with one entry a target, got the number {values}; write [{values}]"
+            f"moving points take lists or tensors with one entry per target, got the number {values}; write [{values}]"
         )
-    x = (
-        values
-        if isinstance(values, Tensor)
-        else torch.tensor(
-            list(values), dtype=torch.complex128 if any(isinstance(v, complex) for v in values) else torch.float64
-        )
-    )
-    return x.to(torch.complex128 if x.is_complex() else torch.float64)
+    if isinstance(values, Tensor):
+        return values.to(torch.complex128 if values.is_complex() else torch.float64)
+    dtype = torch.complex128 if any(isinstance(v, complex) for v in values) else torch.float64
+    if not any(isinstance(v, Tensor) for v in values):
+        return torch.tensor(list(values), dtype=dtype)
+    entries = [torch.as_tensor(v) for v in values]
+    dtype = torch.complex128 if any(v.is_complex() for v in entries) else torch.float64
+    return torch.stack(torch.broadcast_tensors(*(v.to(dtype) for v in entries)), -1)
 
 
 def _phases(turns: Tensor) -> Tensor:
+    """Unit phasors of phases in cycles."""
     return torch.polar(torch.ones_like(turns), 2 * math.pi * turns)
 
 
 @dataclass(frozen=True)
 class MovingPoints:
-    """Explicit points in uniform motion: one entry a target, lists of numbers or tensors (...,
-    target), which may differ between trials and require gradients.
+    """Given points in uniform motion.
 
-    azimuth_m: place y0 along track at t = 0; range_m: of R0 beyond the reference range; amplitude:
-    1 by default, complex where a complex tensor is given; random_phase gives each trial its own
-    phases.
+    Each parameter is a list with one entry per target (numbers, or one value per trial) or a tensor
+    of shape (..., target), which may require gradients.
+
+    Args:
+        u_r_m_s: Slant-range speeds in m/s, closing positive.
+        u_a_m_s: Along-track speeds in m/s, positive in the direction of the receiver.
+        azimuth_m: Along-track positions at slow time zero in metres.
+        range_m: Closest ranges beyond the reference range in metres.
+        amplitude: Amplitudes, one by default; they may be complex.
+        random_phase: Whether each trial draws phases.
+
+    Raises:
+        ValueError: If a number is not finite, or the lists differ in length.
     """
 
     u_r_m_s: Numbers
@@ -175,10 +270,19 @@ class MovingPoints:
         counts = {name: value.shape[-1] if value.ndim else 0 for name, value in named.items()}
         if len(set(counts.values())) != 1:
             raise ValueError(
-                f"moving points need one speed, place (and amplitude, where given) for each target, got {counts}"
+                f"moving points need one speed, position (and amplitude, where given) for each target, got {counts}"
             )
 
     def movers(self, radar: BistaticRadar, draws: Draws) -> Movers:
+        """Draw the phases of the points.
+
+        Args:
+            radar: Receiver.
+            draws: Random draws.
+
+        Returns:
+            Targets, shape (..., target).
+        """
         real = [_numbers(v) for v in (self.u_r_m_s, self.u_a_m_s, self.azimuth_m, self.range_m)]
         level = torch.ones_like(real[0]) if self.amplitude is None else _numbers(self.amplitude)
         if self.random_phase:
@@ -188,22 +292,36 @@ class MovingPoints:
 
 @dataclass(frozen=True)
 class Ship:
-    """A body of `count` scatterers in common motion, spread at random over its length along track
-    and dealt in turn to range_cells lines of range.
+    """Extended target: scatterers of common motion at random positions along track.
 
-    Levels are equal and phases random, anew in each trial. level_db: mean power of a sample of one
-    of its lines, over that of a point of amplitude 1. azimuth_m, range_m: its middle; cell_m:
-    distance of the lines. Speeds and level may be tensors (...,), one number a trial.
+    The scatterers are distributed in turn to several range cells. Their levels are equal; each
+    trial draws positions and phases.
+
+    Args:
+        u_r_m_s: Slant-range speed in m/s, closing positive.
+        u_a_m_s: Along-track speed in m/s, positive in the direction of the receiver.
+        azimuth_m: Along-track position of the middle in metres.
+        range_m: Closest range of the middle beyond the reference range in metres.
+        length_m: Length along track in metres.
+        range_cells: Number of range cells, fixed for all trials.
+        count: Number of scatterers, fixed for all trials.
+        cell_m: Distance of the range cells in metres.
+        level_db: Mean power of a sample of one of its range cells over that of a point of amplitude
+            1 in decibels.
+
+    Raises:
+        ValueError: If a number is not finite, a length is negative, or there are fewer scatterers
+            than range cells.
     """
 
     u_r_m_s: Tensor | float
     u_a_m_s: Tensor | float
-    azimuth_m: float = 0.0
-    range_m: float = 0.0
-    length_m: float = 100.0
+    azimuth_m: Tensor | float = 0.0
+    range_m: Tensor | float = 0.0
+    length_m: Tensor | float = 100.0
     range_cells: int = 4
     count: int = 15
-    cell_m: float = 6.0
+    cell_m: Tensor | float = 6.0
     level_db: Tensor | float = 0.0
 
     def __post_init__(self) -> None:
@@ -218,26 +336,51 @@ class Ship:
             )
 
     def movers(self, radar: BistaticRadar, draws: Draws) -> Movers:
-        y0 = self.azimuth_m + self.length_m * (draws.uniform("scene.ship.azimuth", (self.count,)) - 0.5)
+        """Draw positions and phases of the scatterers.
+
+        Args:
+            radar: Receiver.
+            draws: Random draws.
+
+        Returns:
+            Targets, shape (..., count).
+        """
+        share = draws.uniform("scene.ship.azimuth", (self.count,))
+        middle, length, range_m, cell = (
+            with_dims(v, 1, share) for v in (self.azimuth_m, self.length_m, self.range_m, self.cell_m)
+        )
+        y0 = middle + length * (share - 0.5)
         line = torch.arange(self.count, dtype=torch.float64) % self.range_cells - (self.range_cells - 1) / 2
         level = torch.sqrt(10 ** (per_trial(self.level_db, 1, y0) / 10) * self.range_cells / self.count)
         amplitude = level * _phases(draws.uniform("scene.ship.phase", (self.count,)))
         u_r, u_a = (per_trial(u, 1, y0) for u in (self.u_r_m_s, self.u_a_m_s))
-        return Movers(*torch.broadcast_tensors(u_r, u_a, y0, self.range_m + line * self.cell_m, amplitude))
+        return Movers(*torch.broadcast_tensors(u_r, u_a, y0, range_m + line * cell, amplitude))
 
 
 @dataclass(frozen=True)
 class GroundMovers:
-    """Points that move on the flat ground radar.height_m below the track, followed in three
-    dimensions. One entry a target, lists or tensors (..., target).
+    """Points that move on flat ground, followed exactly in three dimensions.
 
-    outward_m_s: speed across the track, positive away from it; along_m_s: along track, positive
-    with the receiver; azimuth_m: place along track; ground_range_m: distance from the ground track;
-    outward_m_s2, along_m_s2: constant accelerations. All at t = 0. towards_transmitter: (outward,
-    along) parts of the unit vector from the scene to the transmitter; with it, motion changes the
-    range to the transmitter too. The square of the range, (g + w t + a t^2 / 2)^2 + h^2 + along^2,
-    is that of uniform motion in the slant plane with R0^2 = g^2 + h^2 and u_r = -g w / R0, and a
-    `Bend` with b2 = w^2 + g a - u_r^2, b3 = w a, b4 = a^2 / 4: nothing is neglected.
+    The ground lies radar.height_m below the track. The squared range
+    (g + w t + a t^2 / 2)^2 + h^2 + along^2 is that of uniform motion in the slant plane with
+    R0^2 = g^2 + h^2 and u_r = -g w / R0, plus a `Bend` with b2 = w^2 + g a - u_r^2, b3 = w a and
+    b4 = a^2 / 4. Each parameter is a list with one entry per target (numbers, or one value per
+    trial) or a tensor of shape (..., target). All values are those at slow time zero.
+
+    Args:
+        outward_m_s: Speeds across the track in m/s, positive away from it.
+        along_m_s: Speeds along track in m/s, positive in the direction of the receiver.
+        azimuth_m: Along-track positions in metres.
+        ground_range_m: Distances from the ground track in metres.
+        amplitude: Amplitudes, one by default; they may be complex.
+        outward_m_s2: Constant accelerations across the track in m/s^2, zero by default.
+        along_m_s2: Constant accelerations along track in m/s^2, zero by default.
+        towards_transmitter: Outward and along-track component of the unit vector from the scene to
+            the transmitter; by default the motion does not change the range to the transmitter.
+
+    Raises:
+        ValueError: If a number is not finite, the lists differ in length, or the vector is longer
+            than one.
     """
 
     outward_m_s: Numbers
@@ -247,19 +390,30 @@ class GroundMovers:
     amplitude: Numbers | None = None
     outward_m_s2: Numbers | None = None
     along_m_s2: Numbers | None = None
-    towards_transmitter: tuple[float, float] = (0.0, 0.0)
+    towards_transmitter: tuple[Tensor | float, Tensor | float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         for name in ("outward_m_s", "along_m_s", "azimuth_m", "ground_range_m", "outward_m_s2", "along_m_s2"):
             if getattr(self, name) is not None:
                 refuse_unless_finite(f"{name} of ground movers", _numbers(getattr(self, name)))
-        if not math.hypot(*self.towards_transmitter) <= 1:
-            raise ValueError(
-                "towards_transmitter holds two parts of a unit vector, got "
-                f"{self.towards_transmitter}, which is longer than 1"
-            )
+        out, along = (torch.as_tensor(v, dtype=torch.float64) for v in self.towards_transmitter)
+        refuse_unless(
+            "towards_transmitter holds two parts of a unit vector",
+            torch.hypot(*torch.broadcast_tensors(out, along)),
+            lambda length: length <= 1,
+            "it must not be longer than 1",
+        )
 
     def movers(self, radar: BistaticRadar, draws: Draws) -> Movers:
+        """Return the targets with their deviation from motion in the slant plane.
+
+        Args:
+            radar: Receiver.
+            draws: Random draws.
+
+        Returns:
+            Targets, shape (..., target).
+        """
         w, along, ground = (_numbers(v) for v in (self.outward_m_s, self.along_m_s, self.ground_range_m))
         a, along_a = (torch.zeros_like(w) if v is None else _numbers(v) for v in (self.outward_m_s2, self.along_m_s2))
         closest = torch.sqrt(ground.square() + radar.height_m**2)
@@ -267,7 +421,7 @@ class GroundMovers:
         points = MovingPoints(u_r, along, self.azimuth_m, closest - radar.reference_range_m, self.amplitude).movers(
             radar, draws
         )
-        out, on = self.towards_transmitter
+        out, on = (with_dims(v, 1, w) for v in self.towards_transmitter)
         bend = Bend(
             out * w + on * along,
             out * a + on * along_a,
@@ -281,11 +435,27 @@ class GroundMovers:
 
 @dataclass(frozen=True)
 class Fleet:
-    """Several moving scenes at once; each draws its own random numbers, addressed by its name."""
+    """Several moving scenes in one.
+
+    Args:
+        parts: Scenes by name; each draws its own random numbers, addressed by its name.
+    """
 
     parts: Mapping[str, MovingScene]
 
     def movers(self, radar: BistaticRadar, draws: Draws) -> Movers:
+        """Draw the targets of all parts.
+
+        Args:
+            radar: Receiver.
+            draws: Random draws.
+
+        Returns:
+            Targets of all parts in order, shape (..., target).
+
+        Raises:
+            ValueError: If there is no part.
+        """
         parts = [scene.movers(radar, draws.part(name)) for name, scene in self.parts.items()]
         if not parts:
             raise ValueError("a fleet holds no scene; give it at least one, or no scene at all")
@@ -300,40 +470,88 @@ class Fleet:
 
 
 def _joined(parts: list[Tensor]) -> Tensor:
-    """Targets of all parts in one dim; what is not random is the same in all trials."""
+    """Targets of all parts in one dimension, equal in all trials unless they are random."""
     trials = torch.broadcast_shapes(*(p.shape[:-1] for p in parts))
     return torch.cat([p.expand(*trials, -1) for p in parts], -1)
 
 
 class ReceiveRange(Protocol):
-    """How finely the range from targets to the receiver is followed."""
+    """Model of the range from targets to the receiver."""
 
-    def range_m(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor: ...
+    def range_m(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
+        """Return the range relative to the reference range.
 
-    def neglected_phase_rad(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor: ...
+        Args:
+            movers: Targets.
+            time_s: Slow time in seconds, shape (pulse,), float64.
+            radar: Receiver.
+
+        Returns:
+            Range in metres, shape (..., channel, pulse, target), float64.
+        """
+        ...
+
+    def neglected_phase_rad(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
+        """Return the largest phase that the model neglects.
+
+        Args:
+            movers: Targets.
+            time_s: Slow time in seconds, shape (pulse,), float64.
+            radar: Receiver.
+
+        Returns:
+            Phase in radians, shape (...,).
+        """
+        ...
 
 
 @dataclass(frozen=True)
 class ExactRange:
-    """The square root itself: the default and the yardstick, at the cost of any series."""
+    """Exact range by the square root: the default, as fast as any series."""
 
     def range_m(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
-        """R_m(t) - radar.reference_range_m, float64 (..., channel, pulse, target)."""
+        """Return R_m(t) relative to the reference range.
+
+        Args:
+            movers: Targets.
+            time_s: Slow time in seconds, shape (pulse,), float64.
+            radar: Receiver.
+
+        Returns:
+            Range in metres, shape (..., channel, pulse, target), float64.
+        """
         return movers.range_m[..., None, None, :] + movers.excess_m(time_s, radar)
 
     def neglected_phase_rad(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
-        """Nothing: zeros (...,)."""
+        """Return zero, as nothing is neglected.
+
+        Args:
+            movers: Targets.
+            time_s: Slow time in seconds, shape (pulse,), float64.
+            radar: Receiver.
+
+        Returns:
+            Zeros, shape (...,).
+        """
         return torch.zeros(movers.range_m.shape[:-1], dtype=torch.float64, device=time_s.device)
 
 
 @dataclass(frozen=True)
 class TaylorRange:
-    """The square root in powers of its excess, R0 (x / 2 - x^2 / 8 + ...) with x = R_m^2 / R0^2 -
-    1, up to x^(order / 2).
+    """Series of the range, R0 (x / 2 - x^2 / 8 + ...) with x = R_m^2 / R0^2 - 1.
 
-    order 2 is the paper's parabola, Eqs. (3) and (5) with u_r^2 in the last numerator of (3) (brief
-    001, erratum 5); order 4 adds x^2, and so on. Of the whole path and not only of the middle of an
-    aperture; converges for R_m < 1.4 R0. Raises ValueError for odd orders.
+    The series is that of the whole range history and not of one about the middle of an aperture; it
+    converges for R_m < 1.4 R0. Order 2 is the parabola of the publication, with u_r^2 instead of
+    the misprinted u_a^2 in the last numerator of Eq. (3).
+
+    Args:
+        order: Twice the highest power of x: 2, 4, 6, ...
+
+    Raises:
+        ValueError: If the order is odd or below 2.
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, Eqs. (3), (5).
     """
 
     order: int = 2
@@ -341,11 +559,20 @@ class TaylorRange:
     def __post_init__(self) -> None:
         if self.order < 2 or self.order % 2:
             raise ValueError(
-                f"order of a range series must be 2, 4, 6, ..., got {self.order}; each power of the excess is worth two"
+                f"order of a range series must be 2, 4, 6, ..., got {self.order}; each power of x counts as two"
             )
 
     def range_m(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
-        """R_m(t) - radar.reference_range_m by the series, float64 (..., channel, pulse, target)."""
+        """Return R_m(t) relative to the reference range by the series.
+
+        Args:
+            movers: Targets.
+            time_s: Slow time in seconds, shape (pulse,), float64.
+            radar: Receiver.
+
+        Returns:
+            Range in metres, shape (..., channel, pulse, target), float64.
+        """
         closest = movers.closest_m(radar)[..., None, None, :]
         excess = movers.excess_m(time_s, radar) / closest
         x = excess * (excess + 2)
@@ -355,8 +582,15 @@ class TaylorRange:
         return movers.range_m[..., None, None, :] + closest * total
 
     def neglected_phase_rad(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
-        """Largest phase (rad) that the series is wrong by at these times, over channels and
-        targets, (...,).
+        """Return the largest phase error of the series over channels, pulses and targets.
+
+        Args:
+            movers: Targets.
+            time_s: Slow time in seconds, shape (pulse,), float64.
+            radar: Receiver.
+
+        Returns:
+            Phase in radians, shape (...,).
         """
         missed = ExactRange().range_m(movers, time_s, radar) - self.range_m(movers, time_s, radar)
         return 2 * math.pi / radar.wavelength_m * missed.abs().amax((-3, -2, -1))

@@ -1,4 +1,4 @@
-"""Range histories and beams of a straight path, as interchangeable fidelity objects."""
+"""Range histories and beams of a straight path."""
 
 from __future__ import annotations
 
@@ -10,33 +10,74 @@ import torch
 from torch import Tensor
 
 from torchsar.radar import StripmapRadar
+from torchsar.scene.trials import refuse_unless, with_dims
 
 
 class Path(Protocol):
-    """Range from closest approach: (slow time since closest approach, closest range, velocity) ->
-    slant range, all float64.
-    """
+    """Range history of a target on a straight path."""
 
-    def range_m(self, since_s: Tensor, closest_m: Tensor, velocity_m_s: Tensor) -> Tensor: ...
+    def range_m(self, since_s: Tensor, closest_m: Tensor, velocity_m_s: Tensor) -> Tensor:
+        """Return the slant range.
 
-    def neglected_phase_rad(self, radar: StripmapRadar, range_m: float, since_s: float) -> float: ...
+        Args:
+            since_s: Slow time since closest approach in seconds, float64.
+            closest_m: Closest range in metres, float64.
+            velocity_m_s: Effective velocity in m/s, float64.
+
+        Returns:
+            Slant range in metres; all arguments broadcast.
+        """
+        ...
+
+    def neglected_phase_rad(self, radar: StripmapRadar, range_m: float, since_s: float) -> float:
+        """Return the largest phase that the history neglects within an aperture.
+
+        Args:
+            radar: Radar.
+            range_m: Closest range in metres.
+            since_s: Slow time of the aperture end since closest approach in seconds.
+
+        Returns:
+            Phase in radians.
+        """
+        ...
 
 
 @dataclass(frozen=True)
 class Hyperbola:
-    """Exact straight path, r(t) = sqrt(r0^2 + v^2 t^2); the range is frozen during a pulse.
+    """Exact range history of a straight path, r(t) = sqrt(r0^2 + v^2 t^2), constant during a pulse.
 
-    Neglects the motion inside the pulse: the Doppler 2 v_r / lambda displaces an up-chirp by a
-    constant delay and turns its phase.
+    The history neglects the motion within the pulse: the Doppler shift 2 v_r / lambda displaces an
+    up-chirp by a constant delay and adds a phase.
     """
 
     def range_m(self, since_s: Tensor, closest_m: Tensor, velocity_m_s: Tensor) -> Tensor:
+        """Return the slant range.
+
+        Args:
+            since_s: Slow time since closest approach in seconds, float64.
+            closest_m: Closest range in metres, float64.
+            velocity_m_s: Effective velocity in m/s, float64.
+
+        Returns:
+            Slant range in metres; all arguments broadcast.
+        """
         x2 = (velocity_m_s * since_s).square()
         return closest_m + x2 / (torch.sqrt(closest_m.square() + x2) + closest_m)
 
     def neglected_phase_rad(self, radar: StripmapRadar, range_m: float, since_s: float) -> float:
-        """Largest phase, at the ends of the pulse, of the Doppler that is not constant over the
-        aperture: pi f_d T with f_d at since_s.
+        """Return the phase at the ends of the pulse by the part of the Doppler shift that varies.
+
+        The phase is pi f_d T, with the Doppler shift f_d at the end of the aperture and the length
+        T of the pulse.
+
+        Args:
+            radar: Radar.
+            range_m: Closest range in metres.
+            since_s: Slow time of the aperture end since closest approach in seconds.
+
+        Returns:
+            Phase in radians.
         """
         closing = radar.velocity_m_s**2 * since_s / math.hypot(range_m, radar.velocity_m_s * since_s)
         return 2 * math.pi * closing / radar.wavelength_m * radar.pulse.duration_s
@@ -44,17 +85,40 @@ class Hyperbola:
 
 @dataclass(frozen=True)
 class Parabola:
-    """Second-order range history r0 + v^2 t^2 / (2 r0) (Tsvetkov 2017, Eq. 2).
+    """Second-order range history, r(t) = r0 + v^2 t^2 / (2 r0).
 
-    Neglects the fourth order, see neglected_phase_rad.
+    The history neglects the fourth order; see `neglected_phase_rad`.
+
+    Reference:
+        Tsvetkov 2017, Eq. (2).
     """
 
     def range_m(self, since_s: Tensor, closest_m: Tensor, velocity_m_s: Tensor) -> Tensor:
+        """Return the slant range.
+
+        Args:
+            since_s: Slow time since closest approach in seconds, float64.
+            closest_m: Closest range in metres, float64.
+            velocity_m_s: Effective velocity in m/s, float64.
+
+        Returns:
+            Slant range in metres; all arguments broadcast.
+        """
         return closest_m + (velocity_m_s * since_s).square() / (2 * closest_m)
 
     def neglected_phase_rad(self, radar: StripmapRadar, range_m: float, since_s: float) -> float:
-        """4 pi / lambda times the difference to the hyperbola at since_s from closest approach,
-        about pi x^4 / (2 lambda r^3).
+        """Return the phase of the difference to the hyperbola at the end of the aperture.
+
+        It is about pi x^4 / (2 lambda r^3), where x is the along-track distance from closest
+        approach.
+
+        Args:
+            radar: Radar.
+            range_m: Closest range in metres.
+            since_s: Slow time of the aperture end since closest approach in seconds.
+
+        Returns:
+            Phase in radians.
         """
         x2 = (radar.velocity_m_s * since_s) ** 2
         exact = x2 / (math.sqrt(range_m**2 + x2) + range_m)
@@ -62,48 +126,106 @@ class Parabola:
 
 
 class Beam(Protocol):
-    """Two-way illumination of a target: (slow time since the beam centre crossed it, its Doppler
-    relative to the centre) -> weight.
-    """
+    """Two-way illumination of a target."""
 
-    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor, velocity_m_s: Tensor) -> Tensor: ...
+    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor, velocity_m_s: Tensor) -> Tensor:
+        """Return the two-way gain.
+
+        Args:
+            since_s: Slow time since the beam centre crossed the target in seconds, shape (...,
+                pulse, target), float64.
+            doppler_offset_hz: Doppler frequency of the target relative to the beam centre in hertz,
+                same shape.
+            velocity_m_s: Effective velocity in m/s, broadcastable.
+
+        Returns:
+            Gain, shape (..., pulse, target), float64.
+        """
+        ...
 
 
 @dataclass(frozen=True)
 class AlwaysLit:
-    """Every target is seen by every pulse."""
+    """Beam that illuminates every target in every pulse."""
 
     def weight(self, since_s: Tensor, doppler_offset_hz: Tensor, velocity_m_s: Tensor) -> Tensor:
+        """Return one.
+
+        Args:
+            since_s: Slow time since the beam centre crossed the target in seconds, shape (...,
+                pulse, target), float64.
+            doppler_offset_hz: Doppler frequency of the target relative to the beam centre in hertz,
+                same shape.
+            velocity_m_s: Effective velocity in m/s, broadcastable.
+
+        Returns:
+            Gain, shape (..., pulse, target), float64.
+        """
         return torch.ones_like(since_s)
 
 
 @dataclass(frozen=True)
 class Dwell:
-    """A target is seen for dwell_s about the crossing of the beam centre, with constant gain: the
-    synthetic aperture of the paper.
+    """Beam of constant gain and limited dwell time.
+
+    Args:
+        dwell_s: Time for which a target is illuminated, centred on its crossing of the beam centre,
+            in seconds.
+
+    Raises:
+        ValueError: If the time is not positive.
     """
 
-    dwell_s: float
+    dwell_s: Tensor | float
 
     def __post_init__(self) -> None:
-        if not self.dwell_s > 0:
-            raise ValueError(f"dwell_s must be a positive number of seconds, got {self.dwell_s}")
+        refuse_unless("dwell_s must be a positive number of seconds", self.dwell_s, lambda x: x > 0)
 
     def weight(self, since_s: Tensor, doppler_offset_hz: Tensor, velocity_m_s: Tensor) -> Tensor:
-        return (since_s.abs() <= self.dwell_s / 2).to(since_s.dtype)
+        """Return one during the dwell time, and zero elsewhere.
+
+        Args:
+            since_s: Slow time since the beam centre crossed the target in seconds, shape (...,
+                pulse, target), float64.
+            doppler_offset_hz: Doppler frequency of the target relative to the beam centre in hertz,
+                same shape.
+            velocity_m_s: Effective velocity in m/s, broadcastable.
+
+        Returns:
+            Gain, shape (..., pulse, target), float64.
+        """
+        return (since_s.abs() <= with_dims(self.dwell_s, 2, since_s) / 2).to(since_s.dtype)
 
 
 @dataclass(frozen=True)
 class Antenna:
-    """Uniform aperture of length_m: two-way gain sinc^2(length * (Doppler offset) / (2 v)), side
-    lobes included.
+    """Beam of a uniform aperture, side lobes included.
+
+    The two-way gain is sinc^2(length f / (2 v)) at the Doppler offset f.
+
+    Args:
+        length_m: Length of the aperture in metres.
+
+    Raises:
+        ValueError: If the length is not positive.
     """
 
-    length_m: float
+    length_m: Tensor | float
 
     def __post_init__(self) -> None:
-        if not self.length_m > 0:
-            raise ValueError(f"length_m must be a positive number of metres, got {self.length_m}")
+        refuse_unless("length_m must be a positive number of metres", self.length_m, lambda x: x > 0)
 
     def weight(self, since_s: Tensor, doppler_offset_hz: Tensor, velocity_m_s: Tensor) -> Tensor:
-        return torch.sinc(self.length_m * doppler_offset_hz / (2 * velocity_m_s)).square()
+        """Return the two-way gain.
+
+        Args:
+            since_s: Slow time since the beam centre crossed the target in seconds, shape (...,
+                pulse, target), float64.
+            doppler_offset_hz: Doppler frequency of the target relative to the beam centre in hertz,
+                same shape.
+            velocity_m_s: Effective velocity in m/s, broadcastable.
+
+        Returns:
+            Gain, shape (..., pulse, target), float64.
+        """
+        return torch.sinc(with_dims(self.length_m, 2, since_s) * doppler_offset_hz / (2 * velocity_m_s)).square()

@@ -1,5 +1,7 @@
-"""A turntable that changes its rate: the angle is a polynomial of the time since the first pulse
-(Remote Sens. 2025, 17, 3447, Eqs. 1-3).
+"""Turntable with a rotation rate that changes.
+
+Reference:
+    Remote Sens. 2025, 17, 3447, Eqs. (1)-(3).
 """
 
 from __future__ import annotations
@@ -12,21 +14,29 @@ from torch import Tensor
 
 from torchsar.core import per_trial
 from torchsar.core.warp import least_rate, warp, warp_rate
-from torchsar.scene.vibration import refuse_unless_finite
+from torchsar.scene.trials import refuse_unless_finite
 
 
 @dataclass(frozen=True)
 class PolynomialRotation:
-    """theta(t) = omega_rad_s (t + k1 t^2 / 2! + k2 t^3 / 3!
+    """Rotation with a polynomial angle, theta(t) = omega (t + k1 t^2 / 2! + k2 t^3 / 3! + ...).
 
-    + ...), zero at the FIRST pulse, where t = 0; of any order.
+    Angle and time are zero at the FIRST pulse. A uniform rotation that is given as a number has its
+    zero at the middle pulse instead. A simulation rejects a rate that falls to zero; see
+    `refuse_turning_back`.
 
-    Not to be confused with an even rotation given as a number, which is zero at the middle pulse.
-    omega_rad_s: rate at the first pulse, a number or a per-trial tensor (...,). k: (k1, k2, ...) in
-    1/s, 1/s^2, ..., the TRUE derivatives of the rate at the first pulse over that rate (`core.warp`
-    converts to and from coefficients of a polynomial), each a number or a per-trial tensor (...,),
-    or all in one tensor (..., order - 1); empty for an even rotation. Raises ValueError for numbers
-    that are not finite; a simulation refuses rates that fall to zero, see `refuse_turning_back`.
+    Args:
+        omega_rad_s: Rotation rate at the first pulse in rad/s.
+        k: k1, k2, ... in 1/s, 1/s^2, ...: the derivatives of the rate at the first pulse, divided
+            by that rate (`core.warp` converts them to polynomial coefficients and back). A sequence
+            of numbers or values per trial, or one tensor of shape (..., order - 1); empty for a
+            uniform rotation.
+
+    Raises:
+        ValueError: If a number is not finite, or k is a tensor without dimensions.
+
+    Reference:
+        Remote Sens. 2025, 17, 3447, Eqs. (1)-(3).
     """
 
     omega_rad_s: Tensor | float
@@ -38,6 +48,7 @@ class PolynomialRotation:
             refuse_unless_finite(f"k{order} of a rotation", value)
 
     def _terms(self) -> Sequence[Tensor | float]:
+        """k1, k2, ... one by one."""
         if not isinstance(self.k, Tensor):
             return tuple(self.k)
         if not self.k.ndim:
@@ -48,11 +59,25 @@ class PolynomialRotation:
         return self.k.unbind(-1)
 
     def omega(self, like: Tensor) -> Tensor:
-        """Rate at the first pulse, (*trials,) float64 on the device of `like`."""
+        """Return the rate at the first pulse.
+
+        Args:
+            like: Tensor that gives the device.
+
+        Returns:
+            Rate in rad/s, shape (*trials,), float64.
+        """
         return per_trial(self.omega_rad_s, 0, like)
 
     def warp_k(self, like: Tensor) -> Tensor:
-        """(k1, k2, ...) as one tensor (*trials, order - 1), float64 on the device of `like`."""
+        """Return k1, k2, ... as one tensor.
+
+        Args:
+            like: Tensor that gives the device.
+
+        Returns:
+            Shape (*trials, order - 1), float64.
+        """
         terms = [per_trial(value, 0, like) for value in self._terms()]
         return (
             torch.stack(torch.broadcast_tensors(*terms), -1)
@@ -61,34 +86,65 @@ class PolynomialRotation:
         )
 
     def angle(self, time_s: Tensor) -> Tensor:
-        """theta at float64 times since the first pulse (pulse,), rad, (*trials, pulse).
+        """Return the rotation angle; differentiable in omega and k.
 
-        Differentiable in omega and k.
+        Args:
+            time_s: Time since the first pulse in seconds, shape (pulse,), float64.
+
+        Returns:
+            Angle in radians, shape (*trials, pulse).
         """
         return self.omega(time_s)[..., None] * warp(time_s, self.warp_k(time_s))
 
     def rate(self, time_s: Tensor) -> Tensor:
-        """d theta / dt, rad/s, (*trials, pulse)."""
+        """Return the rotation rate.
+
+        Args:
+            time_s: Time since the first pulse in seconds, shape (pulse,), float64.
+
+        Returns:
+            Rate in rad/s, shape (*trials, pulse).
+        """
         return self.omega(time_s)[..., None] * warp_rate(time_s, self.warp_k(time_s))
 
     def acceleration(self, time_s: Tensor) -> Tensor:
-        """d^2 theta / dt^2, rad/s^2, (*trials, pulse)."""
+        """Return the angular acceleration.
+
+        Args:
+            time_s: Time since the first pulse in seconds, shape (pulse,), float64.
+
+        Returns:
+            Acceleration in rad/s^2, shape (*trials, pulse).
+        """
         k = self.warp_k(time_s)
         if not k.shape[-1]:
             return torch.zeros_like(self.rate(time_s))
-        # the series of the rate one derivative on: k1 + k2 t + k3 t^2 / 2 ... begins with k1 where
-        # a warp's rate begins with 1
+        # k1 + k2 t + k3 t^2 / 2 + ... is the rate of a warp with the coefficients k2, k3, ..., with
+        # k1 as its first term instead of 1
         return self.omega(time_s)[..., None] * (k[..., :1] + warp_rate(time_s, k[..., 1:]) - 1)
 
     def mean_rate(self, duration_s: float, like: Tensor) -> Tensor:
-        """Angle over 0..duration_s by the duration, (*trials,): the rate that an image without
-        compensation is scaled by.
+        """Return the mean rate, which scales an image without compensation.
+
+        Args:
+            duration_s: Length of the record in seconds.
+            like: Tensor that gives the device.
+
+        Returns:
+            Total angle over the duration in rad/s, shape (*trials,).
         """
         return self.angle(torch.tensor([duration_s], dtype=torch.float64, device=like.device))[..., 0] / duration_s
 
     def refuse_turning_back(self, duration_s: float) -> None:
-        """Raise ValueError where, in any trial, the rate falls to zero or below within
-        0..duration_s: two times then share an angle.
+        """Raise ValueError if the rate falls to zero within the record in any trial.
+
+        Two times would then share an angle, and no image could be formed.
+
+        Args:
+            duration_s: Length of the record in seconds.
+
+        Raises:
+            ValueError: If the rate falls to zero.
         """
         least = float(least_rate(self.warp_k(torch.zeros(0, dtype=torch.float64)).detach(), duration_s).min())
         if not least > 0:

@@ -1,6 +1,4 @@
-"""A procedural satellite: box, two gridded panels, dish and boom, as scatterers that every trial
-draws anew.
-"""
+"""Satellite model of box, two gridded panels, dish and boom."""
 
 from __future__ import annotations
 
@@ -15,53 +13,49 @@ from torch import Tensor
 
 from torchsar.core import Draws
 from torchsar.scene.targets import Scatterers
-from torchsar.scene.vibration import refuse_unless_finite
+from torchsar.scene.trials import either, positive, refuse_unless, refuse_unless_finite, stacked, with_dims
 
-# body axes before the tilt: along the panels, along the line of sight (away from the radar), across
-# both. Only proportions count: the whole is
-# fitted to the extents asked for.
-_BUS = (0.7, 1.3, 1.2)
-_PANEL = (0.8, 6.43, 1.9)  # first and last place along the panels, half chord
-_BAYS, _STRINGS = 4, 8  # cells of a panel's grid along and across
-_DISH = (
-    0.2,
-    -1.5,
-    1.2,
-    0.8,
-)  # place along the panels, place of the vertex on the line of sight, radius of the rim, depth
-_FEED = -3.1
-_BOOM = ((-0.3, 1.3, 0.3), (-0.5, 3.5, 0.3))
-_CROSSBAR = 0.45
+# Proportions of the body, chosen here; only the panel tip at 6.43 m is published. The axes before
+# the tilt are: along the panels, along the line of sight away from the radar, and across both. The
+# whole is scaled to the given extents.
+_BUS = (0.7, 1.3, 1.2)  # half sides
+_PANEL = (0.8, 6.43, 1.9)  # first and last position along the panels, half chord
+_BAYS, _STRINGS = 4, 8  # cells of a panel grid along and across
+# position along the panels, position of the vertex on the line of sight, radius of the rim, depth
+_DISH = (0.2, -1.5, 1.2, 0.8)
+_FEED = -3.1  # position of the feed on the line of sight
+_BOOM = ((-0.3, 1.3, 0.3), (-0.5, 3.5, 0.3))  # root and tip
+_CROSSBAR = 0.45  # half length
+# fractions of the scatterers, by choice
 _SHARES = {"bus": 0.26, "panel_left": 0.29, "panel_right": 0.29, "dish": 0.08, "boom": 0.08}
-_LEAST = 60
+_LEAST = 60  # by choice: each part then has more points than corners
 
 
 class _Part(Protocol):
-    """A part of the body: corners, which all trials share, and the points that uniform numbers
-    (..., n, 3) become.
-    """
+    """Part of the satellite in body coordinates."""
 
-    def corners(self) -> Tensor: ...
+    def corners(self) -> Tensor:
+        """Corners, equal in all trials, (corner, 3)."""
+        ...
 
-    def points(self, u: Tensor) -> Tensor: ...
+    def points(self, u: Tensor) -> Tensor:
+        """Points of uniform random numbers u (..., n, 3), (..., n, 3)."""
+        ...
 
 
 def _table(rows: object) -> Tensor:
+    """float64 tensor of nested numbers."""
     return torch.tensor(rows, dtype=torch.float64)
 
 
 def _spread(u: Tensor) -> Tensor:
-    """One number in 0..1 for each of n points, (..., n): a random place in each of n equal cells,
-    so that nothing clumps.
-    """
+    """One random number in each of n equal cells of 0..1, (..., n): points do not cluster."""
     n = u.shape[-1]
     return (torch.arange(n, dtype=u.dtype, device=u.device) + u) / n
 
 
 def _on_lines(starts: Tensor, ends: Tensor, share: Tensor) -> Tensor:
-    """Points at shares (..., n) of the total length of lines from starts (line, 3) to ends (line,
-    3), (..., n, 3).
-    """
+    """Points at fractions (..., n) of the total length of lines (line, 3), (..., n, 3)."""
     length = torch.linalg.vector_norm(ends - starts, dim=-1)
     reach = share * length.sum()
     past = length.cumsum(0)
@@ -71,7 +65,7 @@ def _on_lines(starts: Tensor, ends: Tensor, share: Tensor) -> Tensor:
 
 
 class _Bus:
-    """The faces of a box, each with points by its area."""
+    """Faces of a box, with points in proportion to their areas."""
 
     def corners(self) -> Tensor:
         return _table(_BUS) * _table(list(itertools.product((-1.0, 1.0), repeat=3)))
@@ -88,13 +82,12 @@ class _Bus:
 
 @dataclass(frozen=True)
 class _Panel:
-    """The lines of a flat grid on one side (-1 or 1) of the bus; all of its outer edge is
-    the tip.
-    """
+    """Lines of a flat grid on one side (-1 or 1) of the bus; its outer edge is the tip."""
 
     side: float
 
     def _at(self, along: Tensor, chord: Tensor) -> Tensor:
+        """Points at fractions along the panel and of the chord."""
         first, last, half = _PANEL
         return torch.stack([self.side * (first + (last - first) * along), torch.zeros_like(along), half * chord], -1)
 
@@ -113,21 +106,21 @@ class _Panel:
 
 
 class _Dish:
-    """A paraboloid that opens towards the radar, the ends of its rim, and its feed."""
+    """Paraboloid that opens towards the radar, with the ends of its rim and its feed."""
 
     def corners(self) -> Tensor:
-        place, vertex, radius, depth = _DISH
-        return _table([(place, _FEED, 0), (place, vertex - depth, -radius), (place, vertex - depth, radius)])
+        along, vertex, radius, depth = _DISH
+        return _table([(along, _FEED, 0), (along, vertex - depth, -radius), (along, vertex - depth, radius)])
 
     def points(self, u: Tensor) -> Tensor:
-        place, vertex, radius, depth = _DISH
+        along, vertex, radius, depth = _DISH
         out, turn = _spread(u[..., 0]), 2 * math.pi * u[..., 1]
         reach = radius * torch.sqrt(out)
-        return torch.stack([place + reach * torch.cos(turn), vertex - depth * out, reach * torch.sin(turn)], -1)
+        return torch.stack([along + reach * torch.cos(turn), vertex - depth * out, reach * torch.sin(turn)], -1)
 
 
 class _Boom:
-    """A rod away from the radar with a crossbar at its end."""
+    """Rod away from the radar with a crossbar at its end."""
 
     def corners(self) -> Tensor:
         return _table([_BOOM[1]])
@@ -149,23 +142,36 @@ _PARTS: Mapping[str, _Part] = {
 
 @dataclass(frozen=True)
 class Satellite:
-    """A satellite of `count` scatterers: the faces of its box hold 26 %, two gridded panels 29 %
-    each, a dish and a boom 8 % each.
+    """Satellite of random scatterers: box, two gridded panels, dish and boom.
 
-    The stand-in for the model of Remote Sens. 2025, 17, 3447, whose points are not published.
-    Panels lie along cross range; the body is tilted by tilt_rad about them, projected to cross
-    range and range, and fitted to +-half_width_m and +-half_depth_m exactly. Tips, corners of box
-    and panels, rim and feed of the dish and the end of the boom are scatterers of amplitude
-    corner_level at places that all trials share; the tips lie exactly at +-half_width_m. All others
-    move from trial to trial and have amplitudes 0.4 + 0.6 r, r Rayleigh of unit scale. Phases are
-    uniform. azimuth_m is cross range.
+    The box has 26 % of the scatterers, each panel 29 %, dish and boom 8 % each. The panels lie
+    along cross range. The body is tilted about them, projected to cross range and range, and scaled
+    to the given extents exactly. Corners of box and panels, rim and feed of the dish and the end of
+    the boom are scatterers at fixed positions; the panel tips lie at +-half_width_m. All other
+    scatterers change from trial to trial and have the amplitude 0.4 + 0.6 r, with r Rayleigh
+    distributed of unit scale. Phases are uniform. The satellite of the publication has no
+    coordinates; this model stands in for it.
+
+    Args:
+        count: Number of scatterers, at least 60, fixed for all trials.
+        half_width_m: Half the extent in cross range in metres.
+        half_depth_m: Half the extent in range in metres.
+        tilt_rad: Tilt of the body about its panels in radians.
+        corner_level: Amplitude of the corners.
+
+    Raises:
+        ValueError: If there are too few scatterers, an extent or the amplitude is not positive, or
+            the tilt exceeds pi / 4.
+
+    Reference:
+        Remote Sens. 2025, 17, 3447 (satellite with a panel tip at 6.43 m).
     """
 
     count: int = 600
-    half_width_m: float = 6.43
-    half_depth_m: float = 3.4
-    tilt_rad: float = 0.42
-    corner_level: float = 1.5
+    half_width_m: Tensor | float = 6.43
+    half_depth_m: Tensor | float = 3.4
+    tilt_rad: Tensor | float = 0.42
+    corner_level: Tensor | float = 1.5
 
     def __post_init__(self) -> None:
         if self.count < _LEAST:
@@ -173,65 +179,75 @@ class Satellite:
                 f"a satellite needs at least {_LEAST} scatterers to have all of its parts, got count={self.count}"
             )
         for name in ("half_width_m", "half_depth_m", "corner_level"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ValueError(f"{name} of a satellite must be a positive number, got {getattr(self, name)}")
+            refuse_unless(f"{name} of a satellite must be a positive number", getattr(self, name), positive)
         refuse_unless_finite("tilt_rad of a satellite", self.tilt_rad)
-        if abs(self.tilt_rad) > math.pi / 4:
-            raise ValueError(
-                f"tilt_rad of a satellite must lie within +-pi/4, got {self.tilt_rad}; beyond, its "
-                "panels would reach farther in range than dish and boom"
-            )
+        refuse_unless(
+            "tilt_rad of a satellite must lie within +-pi/4",
+            self.tilt_rad,
+            lambda x: abs(x) <= math.pi / 4,
+            "beyond, its panels would reach farther in range than dish and boom",
+        )
 
     def parts(self) -> dict[str, slice]:
-        """Which of the scatterers belong to each part; the corners of a part come first."""
+        """Return which scatterers belong to each part; the corners of a part come first.
+
+        Returns:
+            Slices of the scatterers by the name of the part.
+        """
         shares = itertools.accumulate(_SHARES.values())
         ends = [round(share * self.count) for share in shares]
         return {name: slice(first, last) for name, first, last in zip(_SHARES, [0, *ends], ends)}
 
     def corners(self) -> Tensor:
-        """Which of the scatterers are corners, (target,) bool."""
+        """Return which scatterers are corners.
+
+        Returns:
+            Shape (target,), bool.
+        """
         found = torch.zeros(self.count, dtype=torch.bool)
         for name, members in self.parts().items():
             found[members.start : members.start + len(_PARTS[name].corners())] = True
         return found
 
-    def _seen(self, body: Tensor) -> Tensor:
-        """Body points (..., 3) as cross range and range before they are fitted to the extents,
-        (..., 2).
-        """
-        return torch.stack(
-            [body[..., 0], math.cos(self.tilt_rad) * body[..., 1] - math.sin(self.tilt_rad) * body[..., 2]], -1
+    def _projected(self, body: Tensor) -> Tensor:
+        """Body points (..., 3) as cross range and range before they are scaled, (..., 2)."""
+        cos, sin = (
+            with_dims(either(self.tilt_rad, *functions), 1, body)
+            for functions in ((math.cos, torch.cos), (math.sin, torch.sin))
         )
+        return torch.stack(torch.broadcast_tensors(body[..., 0], cos * body[..., 1] - sin * body[..., 2]), -1)
 
-    def _fitted(self, seen: Tensor) -> Tensor:
-        """Places (..., 2) in m: what the corners reach becomes the extents, which no other point
-        passes.
-        """
-        corners = self._seen(torch.cat([part.corners() for part in _PARTS.values()]))
-        low, high = corners.amin(0), corners.amax(0)
-        return (((seen - low) - (high - seen)) / (high - low)).clamp(-1, 1) * _table(
-            [self.half_width_m, self.half_depth_m]
-        )
+    def _fitted(self, projected: Tensor) -> Tensor:
+        """Positions in metres (..., 2), scaled so that the corners reach the extents."""
+        corners = self._projected(torch.cat([part.corners() for part in _PARTS.values()]))
+        low, high = corners.amin(-2, keepdim=True), corners.amax(-2, keepdim=True)
+        half = stacked([self.half_width_m, self.half_depth_m])[..., None, :]
+        return (((projected - low) - (high - projected)) / (high - low)).clamp(-1, 1) * half
 
     def scatterers(self, draws: Draws) -> Scatterers:
+        """Draw positions, amplitudes and phases.
+
+        Args:
+            draws: Random draws.
+
+        Returns:
+            Scatterers of shape (..., count); `azimuth_m` is cross range.
+        """
         u = draws.uniform("scene.satellite.place", (self.count, 3))
-        places = self._fitted(
-            self._seen(
+        positions = self._fitted(
+            self._projected(
                 torch.cat(
                     [_part_points(_PARTS[name], u[..., members, :]) for name, members in self.parts().items()], -2
                 )
             )
         )
         rayleigh = torch.sqrt(-2 * torch.log1p(-draws.uniform("scene.satellite.level", (self.count,))))
-        level = torch.where(self.corners(), self.corner_level, 0.4 + 0.6 * rayleigh)
-        return Scatterers(
-            places[..., 0],
-            places[..., 1],
-            torch.polar(level, 2 * math.pi * draws.uniform("scene.satellite.phase", (self.count,))),
-        )
+        level = torch.where(self.corners(), with_dims(self.corner_level, 1, rayleigh), 0.4 + 0.6 * rayleigh)
+        phase = 2 * math.pi * draws.uniform("scene.satellite.phase", (self.count,))
+        return Scatterers(positions[..., 0], positions[..., 1], torch.polar(*torch.broadcast_tensors(level, phase)))
 
 
 def _part_points(part: _Part, u: Tensor) -> Tensor:
-    """Corners of a part, then as many of its points as numbers are left, (..., n, 3)."""
+    """Corners of a part, then points for the remaining random numbers, (..., n, 3)."""
     corners = part.corners()
     return torch.cat([corners.expand(*u.shape[:-2], -1, -1), part.points(u[..., len(corners) :, :])], -2)

@@ -1,4 +1,4 @@
-"""The surface a moving target lies on: stationary, rough, and the same for every channel."""
+"""Stationary rough surfaces beneath moving targets, equal for all channels."""
 
 from __future__ import annotations
 
@@ -14,29 +14,38 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, real_dtype
-from torchsar.scene.vibration import refuse_unless_finite
+from torchsar.scene.trials import positive, refuse_unless, refuse_unless_finite, with_dims
 
+# limits of the shape of a gamma distribution, between which the table is checked
 _SHAPES = (0.1, 1000.0)
-# deviations and entries of the table that turns normal into gamma numbers
+# range in standard deviations and number of entries of the table of gamma numbers: linear
+# interpolation between them errs by less than 1e-4
 _REACH, _NODES = 9.0, 4097
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sea(ABC):
-    """A surface of independent circular Gaussian scatterers (speckle), the local mean intensity of
-    which (texture) is what a kind of sea describes.
+    """Surface of independent circular Gaussian scatterers with a local mean intensity.
 
-    power_db: mean power of one sample of azimuth-only or range-compressed data, a number or one per
-    trial (...,): against noise of -20 dB per sample, 0 dB is a clutter-to-noise ratio of 20 dB, and
-    a target of amplitude 1 stands at -power_db above it. It is the mean over draws: a record that
-    covers few cells of texture may hold more or less. margin_s: how much further than the record
-    the surface reaches at both ends. None: as far as the gate sees, through an antenna pattern with
-    half the power. What is seen from further away stands in from the other end. With 0 the surface
-    closes to a ring as long as the record: two to three times cheaper, but its Doppler bins are
-    then free of leakage, as no record's are. lobes: nulls to either side up to which an antenna
-    pattern lights the surface. Beyond the first lie 10 % of the power of a sinc, beyond the second
-    5 %; the second one costs about twice the Doppler band, and longer lines. Raises ValueError for
-    a power, margin or number of lobes that is none.
+    The scatterers are speckle, their mean intensity is the texture, in which kinds of sea differ.
+
+    Args:
+        power_db: Mean power of one sample of azimuth-only or range-compressed data in decibels.
+            With a noise variance of -20 dB, 0 dB is a clutter-to-noise ratio of 20 dB. It is the
+            mean over draws: a record with few texture cells may have more or less.
+        margin_s: Time by which the surface extends beyond the record at both ends in seconds, fixed
+            for all trials. None extends it as far as the gate illuminates, for an antenna pattern
+            down to half power; what is illuminated from further away is replaced by the surface at
+            the other end. With 0 the surface is periodic with the record: two to three times
+            faster, but its Doppler spectrum has no leakage, unlike that of a real record.
+        lobes: Number of nulls to either side up to which an antenna pattern illuminates the
+            surface, fixed for all trials. Beyond the first null lies 10 % of the power of a sinc,
+            beyond the second 5 %; a second one needs about twice the Doppler band, and longer
+            lines.
+
+    Raises:
+        ValueError: If the power is not finite, the margin is negative or the number of lobes is not
+            positive.
     """
 
     power_db: Tensor | float = 0.0
@@ -46,89 +55,169 @@ class Sea(ABC):
     def __post_init__(self) -> None:
         refuse_unless_finite("power_db of a sea", self.power_db)
         if self.margin_s is not None and not (math.isfinite(self.margin_s) and self.margin_s >= 0):
-            raise ValueError(
-                f"margin_s of a sea must be 0 s or more, or None for as far as the gate sees, got {self.margin_s}"
-            )
+            raise ValueError(f"margin_s of a sea must be 0 s or more, or None to follow the gate, got {self.margin_s}")
         if not (isinstance(self.lobes, int) and self.lobes >= 1):
             raise ValueError(f"lobes of a sea must be a whole number of 1 or more, got {self.lobes}")
 
     @abstractmethod
     def texture(self, azimuth_m: Tensor, range_m: Tensor, draws: Draws) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean intensity, unity on average, as a table (..., row, column) of float64 with the row
-        of each azimuth (a,) and the column of each range (r,), int64.
+        """Return the local mean intensity of a grid.
+
+        Args:
+            azimuth_m: Along-track positions of a grid in metres, shape (a,), float64.
+            range_m: Range positions of the grid in metres, shape (r,), float64.
+            draws: Random draws.
+
+        Returns:
+            Mean intensity of shape (..., row, column), float64, unity on average; the row of each
+            azimuth, shape (a,) or (..., a), and the column of each range, shape (r,) or (..., r),
+            int64.
         """
 
     def reflectivity(
         self, azimuth_m: Tensor, range_m: Tensor, draws: Draws, dtype: torch.dtype = torch.complex64
     ) -> Tensor:
-        """Complex amplitudes of the cells of a grid, (..., a, r), of unit mean square and
-        independent but for their texture.
+        """Draw the complex amplitudes of the cells of a grid.
 
-        azimuth_m: place along track (a,), zero under the receiver at slow time zero; range_m:
-        closest slant range less that of the middle of the scene (r,); float64, in any order. The
-        numbers drawn belong to the grid: another grid has another surface.
+        Amplitudes have unit mean square and are independent except for their texture. Another grid
+        has another surface.
+
+        Args:
+            azimuth_m: Along-track positions in metres, zero below the receiver at slow time zero,
+                in any order, shape (a,), float64.
+            range_m: Closest ranges relative to the middle of the scene in metres, in any order,
+                shape (r,), float64.
+            draws: Random draws.
+            dtype: Complex dtype of the result.
+
+        Returns:
+            Amplitudes, shape (..., a, r).
         """
         table, row, column = self.texture(azimuth_m, range_m, draws)
         root = torch.sqrt(table).to(real_dtype(dtype))
         speckle = draws.normal("sea.speckle", (len(azimuth_m), len(range_m)), dtype, azimuth_m.device)
-        return speckle * root.index_select(-2, row).index_select(-1, column)
+        return speckle * _entries(_entries(root, row, -2), column, -1)
+
+
+def _entries(table: Tensor, index: Tensor, dim: int) -> Tensor:
+    """Entries of a table (..., row, column) along a dimension at indices (n,) or (..., n)."""
+    if index.ndim == 1:
+        return table.index_select(dim, index)
+    trials = torch.broadcast_shapes(table.shape[:-2], index.shape[:-1])
+    index = index[..., None] if dim == -2 else index[..., None, :]
+    shape = (index.shape[-2], table.shape[-1]) if dim == -2 else (table.shape[-2], index.shape[-1])
+    return table.expand(*trials, -1, -1).gather(dim, index.expand(*trials, *shape))
 
 
 @dataclass(frozen=True)
 class KSea(Sea):
-    """K-distributed clutter: gamma texture of the given shape times speckle, so that <I^2> / <I>^2
-    = 2 (1 + 1 / shape).
+    """K-distributed clutter: speckle with a gamma-distributed texture.
 
-    shape: 0.1..1000, small for spiky seas, or inf for a surface of pure speckle. cell_m: sides
-    along track and in closest range of the rectangles that share one texture, none smaller than a
-    cell of the grid; an image shows the K distribution where it resolves them. Source: Ward, Tough
-    and Watts, Sea Clutter, IET 2013, compound model; shape 1.5 is that of brief 001.
+    The intensity I satisfies <I^2> / <I>^2 = 2 (1 + 1 / shape). An image shows the K distribution
+    where it resolves the texture cells.
+
+    Args:
+        shape: Shape of the gamma distribution, 0.1 to 1000, small for spiky seas; inf for pure
+            speckle. A table is computed once for each different value.
+        cell_m: Along-track and range side of the rectangles that share one texture in metres, fixed
+            for all trials; neither may be smaller than a cell of the grid.
+        power_db: Mean power of one sample of azimuth-only or range-compressed data in decibels.
+            With a noise variance of -20 dB, 0 dB is a clutter-to-noise ratio of 20 dB. It is the
+            mean over draws: a record with few texture cells may have more or less.
+        margin_s: Time by which the surface extends beyond the record at both ends in seconds, fixed
+            for all trials. None extends it as far as the gate illuminates, for an antenna pattern
+            down to half power; what is illuminated from further away is replaced by the surface at
+            the other end. With 0 the surface is periodic with the record: two to three times
+            faster, but its Doppler spectrum has no leakage, unlike that of a real record.
+        lobes: Number of nulls to either side up to which an antenna pattern illuminates the
+            surface, fixed for all trials. Beyond the first null lies 10 % of the power of a sinc,
+            beyond the second 5 %; a second one needs about twice the Doppler band, and longer
+            lines.
+
+    Raises:
+        ValueError: If the shape or a side is out of range, or as for `Sea`.
+
+    Reference:
+        Ward, Tough and Watts, Sea Clutter, IET 2013 (compound model).
     """
 
-    shape: float = 1.5
+    shape: Tensor | float = 1.5
     cell_m: tuple[float, float] = (20.0, 20.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not (_SHAPES[0] <= self.shape <= _SHAPES[1] or self.shape == math.inf):
-            raise ValueError(
-                f"shape of a K sea must lie in {_SHAPES[0]:g}..{_SHAPES[1]:g}, or be inf for pure "
-                f"speckle, got {self.shape}"
-            )
+        refuse_unless(
+            f"shape of a K sea must lie in {_SHAPES[0]:g}..{_SHAPES[1]:g}, or be inf for pure speckle",
+            self.shape,
+            lambda x: ((x >= _SHAPES[0]) & (x <= _SHAPES[1])) | (x == math.inf),
+        )
         if len(self.cell_m) != 2 or not all(math.isfinite(side) and side > 0 for side in self.cell_m):
             raise ValueError(
                 f"cell_m of a K sea must be two positive sides (m), along track and in range, got {self.cell_m}"
             )
 
     def texture(self, azimuth_m: Tensor, range_m: Tensor, draws: Draws) -> tuple[Tensor, Tensor, Tensor]:
-        row, column = (_cells(places, side) for places, side in zip((azimuth_m, range_m), self.cell_m, strict=True))
+        """Draw the texture.
+
+        Args:
+            azimuth_m: Along-track positions of a grid in metres, shape (a,), float64.
+            range_m: Range positions of the grid in metres, shape (r,), float64.
+            draws: Random draws.
+
+        Returns:
+            Mean intensity of shape (..., row, column), float64, unity on average; the row of each
+            azimuth, shape (a,) or (..., a), and the column of each range, shape (r,) or (..., r),
+            int64.
+        """
+        row, column = (
+            _cells(positions, side) for positions, side in zip((azimuth_m, range_m), self.cell_m, strict=True)
+        )
         shape = (int(row.max()) + 1, int(column.max()) + 1)
-        if self.shape == math.inf:
+        if not isinstance(self.shape, Tensor) and self.shape == math.inf:
             return torch.ones(shape, dtype=torch.float64, device=row.device), row, column
-        return gamma_from_normal(draws.normal("sea.texture", shape, device=row.device), self.shape), row, column
+        normal = draws.normal("sea.texture", shape, device=row.device)
+        return gamma_from_normal(normal, with_dims(self.shape, 2, row)), row, column
 
 
 @dataclass(frozen=True, eq=False)
 class ImageReflectivity(Sea):
-    """A surface whose mean intensity is an image: a recorded scene of any origin under speckle of
-    its own.
+    """Surface whose mean intensity is an image, under speckle that each trial draws.
 
-    intensity: array or tensor (..., azimuth, range), real and not negative (complex images count by
-    their squared magnitude); its level is normalised away. azimuth_extent_m, range_extent_m: what
-    it covers, its middle at azimuth 0 and at the reference range; beyond its edges it is mirrored.
-    A cell takes the value of the pixel it lies in. Differentiable in the intensity. Raises
-    ValueError for an image with NaN or negative pixels or with nothing in it.
+    A cell takes the value of the pixel in which it lies; beyond its edges the image is mirrored.
+    Differentiable in the intensity.
+
+    Args:
+        intensity: Image of shape (..., azimuth, range), an array or a tensor, real and not negative
+            (a complex image counts by its squared magnitude). Its mean is normalised.
+        azimuth_extent_m: Along-track extent of the image in metres; its middle lies at azimuth
+            zero.
+        range_extent_m: Range extent of the image in metres; its middle lies at the reference range.
+        power_db: Mean power of one sample of azimuth-only or range-compressed data in decibels.
+            With a noise variance of -20 dB, 0 dB is a clutter-to-noise ratio of 20 dB. It is the
+            mean over draws: a record with few texture cells may have more or less.
+        margin_s: Time by which the surface extends beyond the record at both ends in seconds, fixed
+            for all trials. None extends it as far as the gate illuminates, for an antenna pattern
+            down to half power; what is illuminated from further away is replaced by the surface at
+            the other end. With 0 the surface is periodic with the record: two to three times
+            faster, but its Doppler spectrum has no leakage, unlike that of a real record.
+        lobes: Number of nulls to either side up to which an antenna pattern illuminates the
+            surface, fixed for all trials. Beyond the first null lies 10 % of the power of a sinc,
+            beyond the second 5 %; a second one needs about twice the Doppler band, and longer
+            lines.
+
+    Raises:
+        ValueError: If the image has fewer than two dimensions, NaN or negative pixels or a mean of
+            zero, an extent is not positive, or as for `Sea`.
     """
 
     intensity: Any
-    azimuth_extent_m: float
-    range_extent_m: float
+    azimuth_extent_m: Tensor | float
+    range_extent_m: Tensor | float
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("azimuth_extent_m", "range_extent_m"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ValueError(f"{name} of an image must be a positive number of metres, got {getattr(self, name)}")
+            refuse_unless(f"{name} of an image must be a positive number of metres", getattr(self, name), positive)
         image = torch.as_tensor(self.intensity)
         image = (image.abs().square() if image.is_complex() else image).to(torch.float64)
         if image.ndim < 2 or not image.numel():
@@ -144,43 +233,91 @@ class ImageReflectivity(Sea):
 
     @staticmethod
     def from_file(
-        path: str | Path, azimuth_extent_m: float, range_extent_m: float, key: str | None = None, **changes: Any
+        path: str | Path,
+        azimuth_extent_m: Tensor | float,
+        range_extent_m: Tensor | float,
+        key: str | None = None,
+        **changes: Any,
     ) -> ImageReflectivity:
-        """The image in a .npy file, or in the array `key` of an .npz file (not needed if it holds
-        just one). Raises FileNotFoundError, or ValueError naming the file.
+        """Read the image from a .npy or .npz file.
+
+        Args:
+            path: File.
+            azimuth_extent_m: Along-track extent of the image in metres.
+            range_extent_m: Range extent of the image in metres.
+            key: Name of the array in an .npz file, not needed if it holds only one.
+            **changes: Further parameters of the class.
+
+        Returns:
+            The surface.
+
+        Raises:
+            FileNotFoundError: If the file does not exist.
+            ValueError: If it holds no such array; the message names the file.
         """
         return ImageReflectivity(_image(Path(path), key), azimuth_extent_m, range_extent_m, **changes)
 
     def texture(self, azimuth_m: Tensor, range_m: Tensor, draws: Draws) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the image, normalised to a mean of one.
+
+        Args:
+            azimuth_m: Along-track positions of a grid in metres, shape (a,), float64.
+            range_m: Range positions of the grid in metres, shape (r,), float64.
+            draws: Random draws.
+
+        Returns:
+            Mean intensity of shape (..., row, column), float64, unity on average; the row of each
+            azimuth, shape (a,) or (..., a), and the column of each range, shape (r,) or (..., r),
+            int64.
+        """
         image = self.intensity.to(azimuth_m.device)
         row, column = (
-            _mirrored(azimuth_m / self.azimuth_extent_m, image.shape[-2]),
-            _mirrored(range_m / self.range_extent_m, image.shape[-1]),
+            _mirrored(azimuth_m / with_dims(self.azimuth_extent_m, 1, azimuth_m), image.shape[-2]),
+            _mirrored(range_m / with_dims(self.range_extent_m, 1, range_m), image.shape[-1]),
         )
         return image / image.mean((-2, -1), keepdim=True), row, column
 
 
-def gamma_from_normal(x: Tensor, shape: float) -> Tensor:
-    """Standard normal numbers turned into gamma numbers of unit mean and the given shape, rank for
-    rank; float64, any shape, relative error below 1e-4.
+def gamma_from_normal(x: Tensor, shape: Tensor | float) -> Tensor:
+    """Transform standard normal numbers into gamma numbers of unit mean, rank by rank.
 
-    Correlated normal fields become correlated gamma fields (the memoryless transform of Tough and
-    Ward 1999). Raises ValueError for a shape outside 0.1..1000.
+    Correlated normal fields become correlated gamma fields. The relative error is below 1e-4;
+    numbers beyond 9 standard deviations are clamped.
+
+    Args:
+        x: Normal numbers of any shape, float64.
+        shape: Shape of the gamma distribution, 0.1 to 1000: a number, or a tensor that broadcasts
+            with x, in which inf gives ones. Results are not differentiable in it.
+
+    Returns:
+        Gamma numbers of the shape of x, float64.
+
+    Raises:
+        ValueError: If a shape is out of range.
+
+    Reference:
+        Tough and Ward 1999 (memoryless non-linear transform).
     """
-    table = _gamma_table(shape).to(x.device)
-    place = (x.clamp(-_REACH, _REACH) + _REACH) * ((_NODES - 1) / (2 * _REACH))
-    node = place.detach().floor().clamp(0, _NODES - 2).to(torch.int64)
-    return torch.exp(torch.lerp(table[node], table[node + 1], place - node))
+    if isinstance(shape, Tensor):
+        known, which = shape.detach().to(x.device, torch.float64).unique(return_inverse=True)
+        table = torch.cat([_gamma_table(one) if one < math.inf else torch.zeros(_NODES) for one in known.tolist()])
+        first = which * _NODES
+    else:
+        table, first = _gamma_table(shape), 0
+    table = table.to(x.device, torch.float64)
+    position = (x.clamp(-_REACH, _REACH) + _REACH) * ((_NODES - 1) / (2 * _REACH))
+    below = position.detach().floor().clamp(0, _NODES - 2).to(torch.int64)
+    node = first + below
+    return torch.exp(torch.lerp(table[node], table[node + 1], position - below))
 
 
 @functools.lru_cache
 def _gamma_table(shape: float) -> Tensor:
-    """Logarithm of the unit-mean gamma number at as many normal deviations from -9 to 9, by
-    bisection of whichever tail is the smaller.
-    """
+    """Logarithm of the gamma number at equally spaced normal numbers, by bisection."""
     if not _SHAPES[0] <= shape <= _SHAPES[1]:
         raise ValueError(f"gamma numbers are made for shapes of {_SHAPES[0]:g} to {_SHAPES[1]:g}, got {shape}")
     x = torch.linspace(-_REACH, _REACH, _NODES, dtype=torch.float64)
+    # the smaller tail probability of each number is matched, which keeps its digits
     tail, order = torch.special.ndtr(-x.abs()), torch.full_like(x, shape)
     low, high = (
         torch.full_like(x, -60 / min(shape, 1.0)),
@@ -196,21 +333,20 @@ def _gamma_table(shape: float) -> Tensor:
     return low - math.log(shape)
 
 
-def _cells(places_m: Tensor, side_m: float) -> Tensor:
-    """Number of the cell each place lies in, from 0 on; the middle of a cell lies at zero."""
-    cell = torch.round(places_m / side_m).to(torch.int64)
+def _cells(position_m: Tensor, side_m: float) -> Tensor:
+    """Index of the texture cell of each position, from 0; a cell is centred on position zero."""
+    cell = torch.round(position_m / side_m).to(torch.int64)
     return cell - cell.min()
 
 
 def _mirrored(share: Tensor, n: int) -> Tensor:
-    """Pixel of n that a place falls on, in shares of the extent from its middle; the image and its
-    mirror image take turns.
-    """
+    """Pixel of n for positions in units of the extent; image and mirrored image alternate."""
     pixel = torch.remainder(torch.floor((share + 0.5) * n).to(torch.int64), 2 * n)
     return torch.minimum(pixel, 2 * n - 1 - pixel)
 
 
 def _image(path: Path, key: str | None) -> Tensor:
+    """The image in a file."""
     if not path.is_file():
         raise FileNotFoundError(
             f"{path} does not exist; give the path of a .npy or .npz file with the image of a surface"

@@ -1,4 +1,4 @@
-"""Everything that is true about a turning target, and how finely its echo is modelled."""
+"""World of a rotating target, and models of its echo."""
 
 from __future__ import annotations
 
@@ -12,17 +12,24 @@ from torch import Tensor
 from torchsar.radar import InverseRadar
 from torchsar.scene.rotation import PolynomialRotation
 from torchsar.scene.targets import Scene
-from torchsar.scene.vibration import Motion, PulsePhase, refuse_unless_finite
+from torchsar.scene.trials import refuse_unless_finite
+from torchsar.scene.vibration import Motion, PulsePhase, displacement_m
+
+# samples along pulses and inside them on which neglected phases are evaluated
+_GRID = 65
 
 
 @dataclass(frozen=True)
 class PhaseOnly:
-    """Range-compressed pulses whose envelopes stand still: rotation, motion and start phases turn
-    phases alone (Ruan et al. 2013, Eqs. 1, 9).
+    """Range-compressed pulses with fixed envelopes, in which only the phases change.
 
-    The level for studies of phase errors. Neglects migration of the envelopes, motion inside the
-    pulse, coupling of range and Doppler, and the residual video phase, see neglected_phase_rad;
-    `Dechirped` is the next level.
+    Rotation, motion and start phases act on the phases. The model is meant for studies of phase
+    errors. It neglects migration of the envelopes, motion within the pulse, coupling of range and
+    Doppler, and the residual video phase; see `neglected_phase_rad`. `Dechirped` is the more exact
+    model.
+
+    Reference:
+        Ruan et al. 2013, Eqs. (1), (9).
     """
 
     def neglected_phase_rad(
@@ -35,14 +42,28 @@ class PhaseOnly:
         rotation_rad_s: float | PolynomialRotation | None = None,
         centre_deviation_m: float = 0.0,
     ) -> float:
-        """Bound of the phase, over the samples of all pulses, by which the dechirped echo of a
-        scatterer at (cross_range_m, range_m) differs.
+        """Return a bound of the phase by which the dechirped echo of a scatterer differs.
 
-        Sum of migration at the ends of the band (pi x A / dr over the total angle A of a
-        PolynomialRotation, half that for an even rotation, which is zero at the middle), of the
-        carrier's phase that rotation and speed_m_s (left of the motion by the tracking) run through
-        in half a pulse, of the same at the ends of the band, and of the residual video phase. The
-        worst of all trials of a rotation.
+        The bound is the sum of the phases of four effects: migration at the ends of the band
+        (pi x A / dr over the total angle A of a PolynomialRotation, half of that for a uniform
+        rotation, whose angle is zero at the middle pulse); the phase of the carrier that rotation
+        and residual speed accumulate in half a pulse; the same at the ends of the band; and the
+        residual video phase.
+
+        Args:
+            radar: Radar, with a pulse length.
+            n_pulse: Number of pulses.
+            cross_range_m: Cross range of the scatterer in metres.
+            range_m: Range of the scatterer in metres.
+            speed_m_s: Speed along the line of sight that the tracking leaves in m/s.
+            rotation_rad_s: Rotation rate in rad/s or rotation, None for the rate of the radar.
+            centre_deviation_m: Distance yc of the centre of rotation in metres.
+
+        Returns:
+            Phase in radians, the largest of all pulses, samples and trials.
+
+        Raises:
+            ValueError: If the pulse length or the rotation rate is not known.
         """
         theta, omega = _swing(radar, n_pulse, rotation_rad_s)
         half_s, per_m = _pulse_s(radar) / 2, 4 * math.pi / radar.wave_speed_m_s
@@ -53,17 +74,54 @@ class PhaseOnly:
         video = math.pi * radar.chirp_rate_hz_s * (2 * reach / radar.wave_speed_m_s) ** 2
         return per_m * (radar.bandwidth_hz / 2 * (migration + inside) + radar.carrier_hz * inside) + video
 
+    def neglected_db(
+        self, radar: InverseRadar, world: TurntableWorld, n_pulse: int, cross_range_m: float, range_m: float
+    ) -> float:
+        """Relative error of the echo of one scatterer: mean |exp(j phi) - 1|^2 in dB, phi being the
+        phase by which its dechirped echo differs from this model.
+
+        Evaluated on a grid of pulses and of times inside them; a constant velocity that the
+        receiver's track follows is left out, see `Dechirped`.
+        """
+        pulse = torch.linspace(0, n_pulse - 1, min(n_pulse, _GRID), dtype=torch.float64)[:, None]
+        inside = torch.linspace(-0.5, 0.5, _GRID, dtype=torch.float64) * _pulse_s(radar)
+        track = world.fidelity.track if isinstance(world.fidelity, Dechirped) else ()
+
+        def range_at(time_s: Tensor) -> Tensor:
+            if world.rotation is None:
+                rate = radar.rotation_rad_s if world.rotation_rad_s is None else world.rotation_rad_s
+                theta = float(torch.as_tensor(rate or 0.0).reshape(-1)[0]) * (time_s - n_pulse // 2 / radar.prf_hz)
+            else:
+                theta = world.rotation.angle(time_s).reshape(-1, *time_s.shape)[0]
+            moved = displacement_m(world.motion, time_s).reshape(-1, *time_s.shape)[0]
+            return cross_range_m * torch.sin(theta) + range_m * torch.cos(theta) + moved
+
+        middle, reference = range_at(pulse / radar.prf_hz), displacement_m(track, pulse / radar.prf_hz)
+        delay = 2 * (range_at(pulse / radar.prf_hz + inside) - reference) / radar.wave_speed_m_s
+        exact = radar.carrier_hz * delay + radar.chirp_rate_hz_s * (inside * delay - delay.square() / 2)
+        rest = 2 * range_m / radar.wave_speed_m_s
+        model = radar.carrier_hz * 2 * (middle - reference) / radar.wave_speed_m_s
+        model = model + radar.chirp_rate_hz_s * inside * rest
+        phase = -2 * math.pi * (exact - model)
+        drift = -2 * math.pi * radar.carrier_hz * 2 * inside / radar.wave_speed_m_s
+        velocity = float((reference.flatten(-2)[..., -1] - reference.flatten(-2)[..., 0]).reshape(-1)[0])
+        velocity *= radar.prf_hz / max(1, n_pulse - 1)
+        error = (2 - 2 * torch.cos(phase - drift * velocity)).mean()
+        return 10 * math.log10(max(float(error), 1e-30))
+
 
 @dataclass(frozen=True)
 class Dechirped:
-    """Dechirped pulses, the range evaluated at every sample of the pulse: rotation, translation and
-    vibration go on inside it.
+    """Dechirped pulses with the range evaluated at every sample.
 
-    Phase -2 pi (f0 dtau + gamma t' dtau - gamma dtau^2 / 2) with the delay dtau against the
-    reference and the time t' from the middle of the pulse. track: motions that the receiver's
-    reference follows, from pulse to pulse; the echo is relative to it, and the recording holds it
-    as aux `reference_m`. Neglects the curvature of the wavefront, see neglected_phase_rad, and the
-    motion during the time of flight.
+    Rotation, translation and vibration continue during the pulse. The phase is
+    -2 pi (f0 dtau + gamma t' dtau - gamma dtau^2 / 2), with the delay dtau relative to the
+    reference and the time t' from the middle of the pulse. The model neglects the curvature of the
+    wavefront, see `neglected_phase_rad`, and the motion during the time of flight.
+
+    Args:
+        track: Motions that the reference of the receiver follows from pulse to pulse. The echo is
+            relative to the reference, which the recording holds as aux `reference_m`.
     """
 
     track: Sequence[Motion] = ()
@@ -77,15 +135,28 @@ class Dechirped:
         rotation_rad_s: float | PolynomialRotation | None = None,
         centre_deviation_m: float = 0.0,
     ) -> float:
-        """Largest change over the aperture of the carrier's phase by the curvature of the
-        wavefront, 4 pi / lambda w^2 / (2 R), w across the line of sight.
+        """Return the largest change of the carrier phase by the curvature of the wavefront.
 
-        The worst of all trials of a rotation, turning either way. Raises ValueError where
-        radar.reference_range_m is zero, that is not known.
+        The phase is 4 pi / lambda w^2 / (2 R) at the distance w across the line of sight. Both
+        senses of rotation are considered.
+
+        Args:
+            radar: Radar, with the range of the target.
+            n_pulse: Number of pulses.
+            cross_range_m: Cross range of the scatterer in metres.
+            range_m: Range of the scatterer in metres.
+            rotation_rad_s: Rotation rate in rad/s or rotation, None for the rate of the radar.
+            centre_deviation_m: Distance yc of the centre of rotation in metres.
+
+        Returns:
+            Phase in radians, the largest over the aperture and all trials.
+
+        Raises:
+            ValueError: If the range of the target or the rotation rate is not known.
         """
         if not radar.reference_range_m:
             raise ValueError(
-                "radar.reference_range_m is 0; the curvature of the wavefront needs the range of the target"
+                "radar.reference_range_m is 0; the curvature of the wavefront depends on the target's range; set it"
             )
         theta, _ = _swing(radar, n_pulse, rotation_rad_s)
         lever = abs(range_m + centre_deviation_m)
@@ -102,16 +173,27 @@ Fidelity = PhaseOnly | Dechirped
 
 @dataclass(frozen=True)
 class TurntableWorld:
-    """A scene that turns by theta = rotation_rad_s (t - t of the middle pulse, n_pulse // 2) while
-    it moves along the line of sight.
+    """Scene that rotates while it moves along the line of sight.
 
-    rotation_rad_s: true rate, None for what the radar takes it to be. motion, start_phase: lists of
-    effects. snr_db: mean power of ALL range-compressed samples over noise variance, None for no
-    noise. Rate and SNR are numbers or per-trial tensors (...,). fidelity: PhaseOnly() or
-    Dechirped(). rotation: a rotation of changing rate in place of rotation_rad_s; its angle is zero
-    at the FIRST pulse. centre_deviation_m: yc, a number or per-trial tensor (...,): a scatterer at
-    range_m y of the window turns at y + yc from the centre of rotation, so that phases follow y +
-    yc where envelopes stay at y.
+    A uniform rotation has the angle theta = rotation_rad_s (t - t_mid), with the time t_mid of
+    pulse n_pulse // 2.
+
+    Args:
+        scene: Scatterers; `azimuth_m` is cross range.
+        rotation_rad_s: True uniform rotation rate in rad/s, None for the nominal rate of the radar.
+        motion: Motions along the line of sight.
+        start_phase: Start phases of the pulses.
+        snr_db: Mean power of ALL range-compressed samples over the noise variance in decibels, None
+            for no noise.
+        fidelity: Model of the echo, `PhaseOnly` or `Dechirped`.
+        rotation: Rotation with a changing rate instead of rotation_rad_s; its angle is zero at the
+            FIRST pulse.
+        centre_deviation_m: Distance yc: a scatterer at the range y of the window rotates at y + yc
+            from the centre of rotation. Phases follow y + yc, while envelopes stay at y.
+
+    Raises:
+        TypeError: If the fidelity or the rotation is of another kind.
+        ValueError: If a number is not finite, or both kinds of rotation are given.
     """
 
     scene: Scene
@@ -125,14 +207,13 @@ class TurntableWorld:
 
     def __post_init__(self) -> None:
         for name in ("rotation_rad_s", "snr_db", "centre_deviation_m"):
-            if getattr(self, name) is not None:
-                refuse_unless_finite(name, getattr(self, name))
+            refuse_unless_finite(name, getattr(self, name))
         if not isinstance(self.fidelity, PhaseOnly | Dechirped):
             raise TypeError(f"fidelity must be PhaseOnly() or Dechirped(), got {self.fidelity!r}")
         if not isinstance(self.rotation, PolynomialRotation | None):
             raise TypeError(
-                f"rotation must be a PolynomialRotation or None, got {self.rotation!r}; an even rate "
-                "belongs into rotation_rad_s"
+                f"rotation must be a PolynomialRotation or None, got {self.rotation!r}; give a uniform rate "
+                "as rotation_rad_s"
             )
         if self.rotation is not None and self.rotation_rad_s is not None:
             raise ValueError(
@@ -142,17 +223,18 @@ class TurntableWorld:
 
 
 def _swing(radar: InverseRadar, n_pulse: int, rotation: float | PolynomialRotation | None) -> tuple[float, float]:
-    """Largest angle from where theta is zero (rad) and largest rate (rad/s), both without sign."""
+    """Largest angle from theta = 0 in rad and largest rate in rad/s, without signs."""
     if isinstance(rotation, PolynomialRotation):
         time_s = torch.arange(n_pulse + 1, dtype=torch.float64) / radar.prf_hz
         return float(rotation.angle(time_s).detach().abs().max()), float(rotation.rate(time_s).detach().abs().max())
     rate = radar.rotation_rad_s if rotation is None else rotation
     if rate is None:
-        raise ValueError("neither the radar nor the call names a rotation rate; give rotation_rad_s")
+        raise ValueError("neither the radar nor the call has a rotation rate; give rotation_rad_s")
     return abs(rate) * n_pulse / (2 * radar.prf_hz), abs(rate)
 
 
 def _pulse_s(radar: InverseRadar) -> float:
+    """Pulse length in seconds."""
     if radar.pulse_s is None:
-        raise ValueError("radar.pulse_s is not set; what happens inside a pulse needs its length")
+        raise ValueError("radar.pulse_s is not set; phases within a pulse depend on its length; set it")
     return radar.pulse_s

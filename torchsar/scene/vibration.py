@@ -1,8 +1,8 @@
-"""What moves a target along the line of sight, and what turns the phase of its pulses: lists of
-effects, where an absent effect is absent.
+"""Motions of a target along the line of sight, and start phases of pulses.
 
-Displacements count away from the radar (range grows), time from the first pulse. A displacement d
-turns the phase by -4 pi d / lambda.
+An effect that does not exist is absent from the list of effects. Displacements are positive away
+from the radar; a displacement d changes the phase by -4 pi d / lambda. Time counts from the first
+pulse.
 """
 
 from __future__ import annotations
@@ -17,37 +17,47 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Draws, per_trial
+from torchsar.scene.trials import refuse_unless_finite
 
+# metres of the units in which vibrations are published
 _UNIT_M = {"mm": 1e-3, "um": 1e-6}
+# amplitude_frequency_phase, such as 1_0.1_90
 _NUMBER = r"(\d+(?:\.\d+)?)"
 _NAME = re.compile(rf"{_NUMBER}_{_NUMBER}_(-?\d+(?:\.\d+)?)")
 
 
-def refuse_unless_finite(what: str, value: Tensor | float, least: float = -math.inf) -> None:
-    """Raise ValueError unless every entry of a number or per-trial tensor is finite and at least
-    `least`.
-    """
-    x = torch.as_tensor(value, dtype=torch.float64).detach()
-    if not bool((torch.isfinite(x) & (x >= least)).all()):
-        bound = "" if least == -math.inf else f" of {least:g} or more"
-        raise ValueError(f"{what} must be a finite number{bound}, or one per trial, got {value}")
-
-
 class Motion(Protocol):
-    """Displacement of the whole target along the line of sight: float64 times of any shape (s) ->
-    (*trials, *times) in m.
-    """
+    """Displacement of the whole target along the line of sight."""
 
-    def displacement_m(self, time_s: Tensor) -> Tensor: ...
+    def displacement_m(self, time_s: Tensor) -> Tensor:
+        """Return the displacement.
+
+        Args:
+            time_s: Time since the first pulse in seconds, any shape, float64.
+
+        Returns:
+            Displacement in metres, receding positive, shape (*trials, *times).
+        """
+        ...
 
 
 @dataclass(frozen=True)
 class Sinusoid:
-    """Vibration d(t) = A sin(2 pi f t + phase); each parameter a number or a per-trial tensor
-    (...,).
+    """Sinusoidal vibration, d(t) = A sin(2 pi f t + phase).
 
-    SINE, as the experiments of Ruan et al. 2013 need it: with a cosine 1_0.1_90 is nearly linear in
-    time and hardly defocuses.
+    The publication is reproduced by the SINE: with a cosine, its vibration 1_0.1_90 is nearly
+    linear in time and hardly defocuses.
+
+    Args:
+        amplitude_m: Amplitude A in metres.
+        frequency_hz: Frequency f in hertz.
+        phase_deg: Phase at the first pulse in degrees.
+
+    Raises:
+        ValueError: If a number is not finite or the frequency is negative.
+
+    Reference:
+        Ruan et al. 2013, Table 1.
     """
 
     amplitude_m: Tensor | float
@@ -61,11 +71,21 @@ class Sinusoid:
 
     @classmethod
     def named(cls, name: str, *, unit: str) -> Sinusoid:
-        """The vibration of a name amplitude_frequency_phase as the paper writes them, `1_0.1_90`:
-        amplitude in `unit`, Hz, degrees.
+        """Return the vibration of a published name amplitude_frequency_phase, such as `1_0.1_90`.
 
-        unit: "mm" or "um", never guessed: the published figures need mm, and mm contradicts the
-        paper's own assumptions about the pulse. Raises ValueError for any other name or unit.
+        Args:
+            name: Amplitude in `unit`, frequency in hertz and phase in degrees.
+            unit: "mm" or "um", without a default. The published figures correspond to mm, although
+                1 mm at 100 Hz adds 4 rad within a pulse, which the publication neglects.
+
+        Returns:
+            The vibration.
+
+        Raises:
+            ValueError: If the name or the unit has another form.
+
+        Reference:
+            Ruan et al. 2013, Table 1.
         """
         if unit not in _UNIT_M:
             raise ValueError(f"unit {unit!r} of a vibration's amplitude is unknown; choose 'mm' or 'um'")
@@ -78,9 +98,13 @@ class Sinusoid:
         return cls(amplitude * _UNIT_M[unit], frequency, phase)
 
     def displacement_m(self, time_s: Tensor) -> Tensor:
-        """d at the times, (*trials, *times).
+        """Return the displacement; the phase is formed in cycles, which stays exact over hours.
 
-        The angle is formed in turns, as times of hours would lose it in radians.
+        Args:
+            time_s: Time since the first pulse in seconds, any shape, float64.
+
+        Returns:
+            Displacement in metres, receding positive, shape (*trials, *times).
         """
         amplitude, frequency, phase = (
             per_trial(v, time_s.ndim, time_s) for v in (self.amplitude_m, self.frequency_hz, self.phase_deg)
@@ -93,10 +117,14 @@ class Sinusoid:
 class Polynomial:
     """Translation d(t) = c1 t + c2 t^2 + ...
 
-    from its coefficients (m/s, m/s^2, ...): velocity, half the acceleration, and so on.
+    There is no constant term: the range window is centred on the initial position.
 
-    coefficients_m: each a number or a per-trial tensor (...,). There is no constant: the window
-    stands where the target begins.
+    Args:
+        coefficients_m: c1, c2, ... in m/s, m/s^2, ...: velocity, half the acceleration, and so on;
+            each a number or one value per trial.
+
+    Raises:
+        ValueError: If there is no coefficient, or one is not finite.
     """
 
     coefficients_m: Sequence[Tensor | float]
@@ -111,7 +139,14 @@ class Polynomial:
             refuse_unless_finite(f"coefficient {degree} of a translation", value)
 
     def displacement_m(self, time_s: Tensor) -> Tensor:
-        """d at the times, (*trials, *times), by Horner's rule."""
+        """Return the displacement.
+
+        Args:
+            time_s: Time since the first pulse in seconds, any shape, float64.
+
+        Returns:
+            Displacement in metres, receding positive, shape (*trials, *times).
+        """
         total = torch.zeros_like(time_s)
         for value in reversed(self.coefficients_m):
             total = (total + per_trial(value, time_s.ndim, time_s)) * time_s
@@ -119,8 +154,14 @@ class Polynomial:
 
 
 def displacement_m(motion: Sequence[Motion], time_s: Tensor) -> Tensor:
-    """Sum of a list of motions at float64 times of any shape, (*trials, *times); zeros for an empty
-    list.
+    """Return the sum of motions.
+
+    Args:
+        motion: Motions, none for zero displacement.
+        time_s: Time since the first pulse in seconds, any shape, float64.
+
+    Returns:
+        Displacement in metres, receding positive, shape (*trials, *times).
     """
     total = torch.zeros_like(time_s)
     for part in motion:
@@ -129,14 +170,31 @@ def displacement_m(motion: Sequence[Motion], time_s: Tensor) -> Tensor:
 
 
 class PulsePhase(Protocol):
-    """A phase that each pulse starts with: float64 (*trials, pulse) in rad."""
+    """Start phase of the pulses."""
 
-    def phase_rad(self, draws: Draws, n_pulse: int) -> Tensor: ...
+    def phase_rad(self, draws: Draws, n_pulse: int) -> Tensor:
+        """Draw the phases.
+
+        Args:
+            draws: Random draws.
+            n_pulse: Number of pulses.
+
+        Returns:
+            Phase in radians, shape (*trials, pulse), float64.
+        """
+        ...
 
 
 @dataclass(frozen=True)
 class StartPhase:
-    """Independent normal phase of each pulse, deviation sigma_rad (a number or per trial)."""
+    """Independent normally distributed phase of each pulse.
+
+    Args:
+        sigma_rad: Standard deviation in radians.
+
+    Raises:
+        ValueError: If the standard deviation is negative or not finite.
+    """
 
     sigma_rad: Tensor | float
 
@@ -144,23 +202,48 @@ class StartPhase:
         refuse_unless_finite("sigma_rad of a start phase", self.sigma_rad, 0.0)
 
     def phase_rad(self, draws: Draws, n_pulse: int) -> Tensor:
+        """Draw the phases.
+
+        Args:
+            draws: Random draws.
+            n_pulse: Number of pulses.
+
+        Returns:
+            Phase in radians, shape (*trials, pulse), float64.
+        """
         unit = draws.normal("scene.start_phase.normal", (n_pulse,))
         return per_trial(self.sigma_rad, 1, unit) * unit
 
 
 @dataclass(frozen=True)
 class UniformStartPhase:
-    """Independent phase of each pulse, uniform in 0..2 pi: nothing is left between pulses."""
+    """Independent phase of each pulse, uniform in 0 to 2 pi: pulses are incoherent."""
 
     def phase_rad(self, draws: Draws, n_pulse: int) -> Tensor:
+        """Draw the phases.
+
+        Args:
+            draws: Random draws.
+            n_pulse: Number of pulses.
+
+        Returns:
+            Phase in radians, shape (*trials, pulse), float64.
+        """
         return draws.uniform("scene.start_phase.uniform", (n_pulse,), 0.0, 2 * math.pi)
 
 
 def start_phase_rad(effects: Sequence[PulsePhase], draws: Draws, n_pulse: int) -> Tensor:
-    """Sum of a list of start phases, (*trials, pulse); each draws from an address of its own, its
-    place in the list.
+    """Draw the sum of start phases.
+
+    Args:
+        effects: Start phases; each draws from an address of its own, its position in the list.
+        draws: Random draws.
+        n_pulse: Number of pulses.
+
+    Returns:
+        Phase in radians, shape (*trials, pulse), float64.
     """
     total = torch.zeros(n_pulse, dtype=torch.float64)
-    for place, effect in enumerate(effects):
-        total = total + effect.phase_rad(draws.part(f"start_phase.{place}"), n_pulse)
+    for position, effect in enumerate(effects):
+        total = total + effect.phase_rad(draws.part(f"start_phase.{position}"), n_pulse)
     return total

@@ -1,4 +1,4 @@
-"""Everything that is true about a stripmap acquisition."""
+"""World of a stripmap acquisition."""
 
 from __future__ import annotations
 
@@ -8,17 +8,25 @@ from torch import Tensor
 
 from torchsar.scene.path import AlwaysLit, Beam, Hyperbola, Path
 from torchsar.scene.targets import Scene
+from torchsar.scene.trials import refuse_unless_finite
 
 
 @dataclass(frozen=True)
 class StripmapWorld:
-    """A scene seen from a straight path.
+    """Scene seen from a straight path.
 
-    Numbers or per-trial tensors (...,) for velocity, Doppler and SNR.
+    Args:
+        scene: Scatterers.
+        beam: Illumination.
+        path: Range history.
+        velocity_m_s: True effective velocity in m/s, None for the nominal one of the radar.
+        doppler_hz: True Doppler frequency of the beam centre in hertz, None for the nominal
+            pointing of the radar.
+        snr_db: Mean signal power of the illuminated raw samples over the noise variance in
+            decibels, None for no noise.
 
-    velocity_m_s: true effective velocity, None for the radar's nominal one. doppler_hz: true
-    Doppler of the beam centre, None for the nominal pointing. snr_db: mean signal power per lit raw
-    sample over noise variance, None for no noise.
+    Raises:
+        ValueError: If a number is not finite.
     """
 
     scene: Scene
@@ -27,3 +35,7 @@ class StripmapWorld:
     velocity_m_s: Tensor | float | None = None
     doppler_hz: Tensor | float | None = None
     snr_db: Tensor | float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("velocity_m_s", "doppler_hz", "snr_db"):
+            refuse_unless_finite(name, getattr(self, name))

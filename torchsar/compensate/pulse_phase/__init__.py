@@ -1,1 +1,41 @@
-"""The phase of every pulse, found from the range-compressed data alone: the autofocus family."""
+"""Autofocus: the phase error of every pulse, estimated from the range-compressed data alone."""
+
+from torchsar.compensate.pulse_phase.descent import maximum_contrast, minimum_entropy, sharpest_phase
+from torchsar.compensate.pulse_phase.gradient import Listed, Measured, Shrinking, pga, pga_sca
+from torchsar.compensate.pulse_phase.imaging import Imaging
+from torchsar.compensate.pulse_phase.pairs import sca
+from torchsar.compensate.pulse_phase.recommended import autofocus
+from torchsar.compensate.pulse_phase.sharpen import entropy_fixed_point
+from torchsar.compensate.pulse_phase.stages import (
+    Autofocus,
+    CorrectPulsePhase,
+    EntropyFixedPoint,
+    Pga,
+    PgaSca,
+    Sca,
+    SharpestPhase,
+    correct_pulse_phase,
+)
+
+__all__ = [
+    "Autofocus",
+    "CorrectPulsePhase",
+    "EntropyFixedPoint",
+    "Imaging",
+    "Listed",
+    "Measured",
+    "Pga",
+    "PgaSca",
+    "Sca",
+    "SharpestPhase",
+    "Shrinking",
+    "autofocus",
+    "correct_pulse_phase",
+    "entropy_fixed_point",
+    "maximum_contrast",
+    "minimum_entropy",
+    "pga",
+    "pga_sca",
+    "sca",
+    "sharpest_phase",
+]

@@ -1,6 +1,4 @@
-"""What every estimator of a phase per pulse begins with: data that are checked, scaled, and laid
-out for transforms along pulses.
-"""
+"""Input of the autofocus functions: data are checked, scaled and laid out."""
 
 from __future__ import annotations
 
@@ -13,16 +11,19 @@ from torch import Tensor
 
 from torchsar.core import cis, real_dtype, refuse_non_finite
 
-_PHASE_ERROR_RAD = 1e-3  # a start may lose this much by rounding
+# largest rounding error of a start, far below the accuracy of any estimate
+_PHASE_ERROR_RAD = 1e-3
 
 
 @dataclass(frozen=True)
 class Pulses:
-    """Range-compressed pulses, ready to work on.
+    """Range-compressed pulses, laid out for the estimators.
 
-    rows: (trial, range, pulse) complex, each trial over its own peak, so that squares neither
-    under- nor overflow. present: (trial, pulse) bool, False where a pulse holds only zeros. trials:
-    the leading dims that were folded into one.
+    Args:
+        rows: Samples, shape (trial, range, pulse), complex. Each trial is divided by its own peak,
+            so that squares neither underflow nor overflow.
+        present: False where a pulse holds only zeros, shape (trial, pulse), bool.
+        trials: The leading dimensions that were folded into one.
     """
 
     rows: Tensor
@@ -31,14 +32,24 @@ class Pulses:
 
     @property
     def n(self) -> int:
+        """Number of pulses."""
         return self.rows.shape[-1]
 
 
 def checked(data: Tensor, name: str) -> tuple[Tensor, Tensor]:
-    """Range-compressed data (..., pulse, range) as (trial, pulse, range), and which pulses hold
-    samples, (trial, pulse).
+    """Check range-compressed data and fold their leading dimensions into one.
 
-    Raises TypeError or ValueError naming the function for what are no finite complex samples.
+    Args:
+        data: Range-compressed pulses, shape (..., pulse, range), complex.
+        name: Name of the calling function for the error message.
+
+    Returns:
+        The data, shape (trial, pulse, range), and whether a pulse holds samples, shape (trial,
+        pulse), bool.
+
+    Raises:
+        TypeError: If the data are not a tensor of complex64 or complex128.
+        ValueError: If the data are empty, have fewer than two dimensions, or are not finite.
     """
     if not isinstance(data, Tensor) or not data.is_complex():
         raise TypeError(
@@ -57,21 +68,34 @@ def checked(data: Tensor, name: str) -> tuple[Tensor, Tensor]:
 
 
 def prepare(data: Tensor, name: str) -> Pulses:
-    """Check and lay out data (..., pulse, range).
+    """Check range-compressed data and lay them out for the estimators.
 
-    Raises TypeError or ValueError naming the estimator; warns where nothing can be learnt.
+    Warns if the data hold fewer than three pulses or only one range cell, from which no phase error
+    can be estimated.
+
+    Args:
+        data: Range-compressed pulses, shape (..., pulse, range), complex.
+        name: Name of the calling function for error messages and warnings.
+
+    Returns:
+        The pulses.
+
+    Raises:
+        TypeError: If the data are not a tensor of complex64 or complex128.
+        ValueError: If the data are empty, have fewer than two dimensions, or are not finite.
     """
     flat, present = checked(data, name)
     n_pulse, n_range = data.shape[-2:]
     if n_pulse < 3:
         warnings.warn(
-            f"{name}: {n_pulse} pulse(s) carry no phase error that can be told from a shift; the "
-            "estimate is zero and not ok",
+            f"{name}: a phase error of {n_pulse} pulse(s) cannot be distinguished from a shift of the "
+            "image; the estimate is zero and not ok; use three pulses or more",
             stacklevel=3,
         )
     elif n_range == 1:
         warnings.warn(
-            f"{name}: one range cell cannot tell phase errors from the scene; the estimate flattens it and is not ok",
+            f"{name}: with one range cell, phase errors cannot be distinguished from the scene; the "
+            "estimate flattens the phase and is not ok; use several range cells",
             stacklevel=3,
         )
     largest = torch.maximum(flat.detach().real.abs(), flat.detach().imag.abs()).amax(
@@ -82,8 +106,21 @@ def prepare(data: Tensor, name: str) -> Pulses:
 
 
 def starting_phase(start: Tensor | None, pulses: Pulses, name: str) -> Tensor | None:
-    """A start of the caller, (..., pulse) or (pulse,), as (trial, pulse) in the working precision;
-    trials with phases too large for it lose their whole turns first.
+    """Convert a start given by the caller to the working precision.
+
+    If phases are too large for that precision, whole turns are removed first.
+
+    Args:
+        start: Phases in rad, shape (..., pulse) or (pulse,), or None.
+        pulses: The pulses that the start belongs to.
+        name: Name of the calling function for error messages.
+
+    Returns:
+        The phases in rad, shape (trial, pulse), or None.
+
+    Raises:
+        TypeError: If the start is not a tensor.
+        ValueError: If the start is not real and finite, or does not have one phase per pulse.
     """
     if start is None:
         return None
@@ -109,9 +146,15 @@ def starting_phase(start: Tensor | None, pulses: Pulses, name: str) -> Tensor | 
 
 
 def refuse_odd_counts(name: str, least: int, **counts: int) -> None:
-    """Numbers of iterations are whole and at least `least`.
+    """Check that numbers of iterations are integers of at least `least`.
 
-    Raises ValueError naming the one that is not.
+    Args:
+        name: Name of the calling function for the error message.
+        least: Smallest allowed number.
+        counts: The numbers, by the name of their parameter.
+
+    Raises:
+        ValueError: If a number is not an integer or is too small.
     """
     for what, count in counts.items():
         if isinstance(count, bool) or not isinstance(count, int) or count < least:
@@ -119,20 +162,42 @@ def refuse_odd_counts(name: str, least: int, **counts: int) -> None:
 
 
 def rotate(rows: Tensor, phase_rad: Tensor) -> Tensor:
-    """rows * exp(-j phase). rows: (trial, range, pulse); phase_rad: (trial, pulse)."""
+    """Multiply pulses by exp(-j phase).
+
+    Args:
+        rows: Samples, shape (trial, range, pulse), complex.
+        phase_rad: Phases in rad, shape (trial, pulse).
+
+    Returns:
+        The product, shape (trial, range, pulse), complex.
+    """
     return rows * cis(-phase_rad)[..., None, :]
 
 
 def safe_angle(z: Tensor) -> Tensor:
-    """arg z, zero (with zero gradient) where z is zero."""
+    """Compute arg z; it is zero, with zero gradient, where z is zero.
+
+    Args:
+        z: Complex values, any shape.
+
+    Returns:
+        The angle in rad, same shape.
+    """
     nothing = z == 0
     return torch.where(nothing, 0, torch.angle(torch.where(nothing, 1, z)))
 
 
 def without_line(phase_rad: Tensor, present: Tensor) -> Tensor:
-    """The phase without its constant and its slope over the pulses that are there (least squares).
+    """Subtract from phases their constant and their slope, by least squares.
 
-    (..., pulse).
+    Only pulses that are present enter the fit.
+
+    Args:
+        phase_rad: Phases in rad, shape (..., pulse).
+        present: False for pulses without samples, shape (..., pulse), bool.
+
+    Returns:
+        The phases in rad, shape (..., pulse).
     """
     weight = present.to(phase_rad.dtype)
     k = torch.arange(phase_rad.shape[-1], dtype=phase_rad.dtype, device=phase_rad.device)
@@ -145,5 +210,12 @@ def without_line(phase_rad: Tensor, present: Tensor) -> Tensor:
 
 
 def on_the_circle(phase_rad: Tensor) -> Tensor:
-    """Phases modulo a turn, in -pi..pi."""
+    """Reduce phases modulo 2 pi to -pi..pi.
+
+    Args:
+        phase_rad: Phases in rad, any shape.
+
+    Returns:
+        The phases in rad, same shape.
+    """
     return phase_rad - 2 * math.pi * torch.round(phase_rad.detach() / (2 * math.pi))

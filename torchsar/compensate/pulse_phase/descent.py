@@ -1,6 +1,4 @@
-"""The phase of every pulse as the minimum of a figure of the image: descent on entropy, contrast,
-or any differentiable cost.
-"""
+"""The phase of every pulse as the minimum of a cost of the image, such as its entropy."""
 
 from __future__ import annotations
 
@@ -26,12 +24,16 @@ Cost = Callable[[Tensor], Tensor]
 Objective = Literal["power_entropy", "amplitude_entropy", "contrast"] | Cost
 Method = Literal["lbfgs", "adam"]
 
-_STEP_RAD = 0.05  # rms length of the first step
+# rms length of the first step, found by trial: shorter steps cost iterations, longer ones leave the
+# minimum near the start
+_STEP_RAD = 0.05
+# objectives by name, to be minimised
 _COSTS: dict[str, Callable[..., Tensor]] = {
     "power_entropy": entropy,
     "amplitude_entropy": partial(entropy, of="amplitude"),
     "contrast": lambda image, mask: -contrast(image, mask=mask),
 }
+# descents by name, with their default options; value_tolerance is a relative change of the cost
 _METHODS: dict[str, tuple[Callable[..., Descent], dict[str, Any]]] = {
     "lbfgs": (lbfgs, {"steps": 100, "value_tolerance": 1e-7}),
     "adam": (adam, {"steps": 500, "rate": _STEP_RAD}),
@@ -50,33 +52,46 @@ def sharpest_phase(
     tolerance: float = 1e-3,
     imaging: Imaging | None = None,
 ) -> Estimate:
-    """The phase that minimises a figure of the image, with value["phase_rad"] (..., pulse) to be
-    removed. data: (..., pulse, range) complex, range-compressed and aligned.
+    """Find the phase of each pulse that minimises a cost of the image, by gradient descent.
 
-    Each trial descends by itself from `start` (..., pulse) rad, by default that of `sca`, into a
-    minimum near by.
+    Each trial descends separately into a minimum near its start.
 
-    objective: "power_entropy", "amplitude_entropy" or "contrast" (maximised) of `torchsar.metrics`,
-    or a function of images (trial, azimuth, range) -> (trial,) that autograd can follow; it is
-    called with some of the trials at a time. Prefer the power entropy, whose minimum on a target of
-    many scatterers is the same from any start at 0 dB and above (0.066 rad off the truth at 0 dB,
-    0.032 at 20 dB; `autofocus` has 0.053 and 0.018). Contrast follows a few bright cells away from
-    the truth, the amplitude entropy the many cells of noise unless a mask leaves them out. mask:
-    weights of the pixels that count, (azimuth, range) or with the trials in front. imaging: any
-    object with `image` of (..., pulse, range) profiles, as in `entropy_fixed_point`,
-    differentiable; by default the image is that of `torchsar.focus.azimuth_transform`. It may be
-    told the place of the image by its migration: start from the phase that `autofocus` finds with
-    it. basis: (coefficient, pulse) or (..., coefficient, pulse), real: the phase is then a sum of
-    these functions, such as `torchsar.core.legendre(u, 5).mT[2:]`, beginning with the least-squares
-    fit to the start. method: "lbfgs", or "adam" for rough costs. steps: at most, by default 100 and
-    500. tolerance: of the gradient against that at the start; a trial also ends when a step gains
-    1e-7 of the cost.
+    Prefer the power entropy. Its minimum on a target of many scatterers is the same from any start
+    at 0 dB and above, with an error of 0.066 rad at 0 dB and 0.032 rad at 20 dB (`autofocus`: 0.053
+    and 0.018). The contrast follows a few bright cells away from the true phase. The amplitude
+    entropy follows the many cells of noise unless a mask excludes them.
 
-    info["iterations"]: steps taken. std and ok as in `entropy_fixed_point`, that is by entropy,
-    whatever the objective. The result is detached; pulses without samples keep the phase of the
-    start, or have that of the basis. Raises TypeError or ValueError for samples that are not finite
-    and complex, a start, mask or basis of another shape, functions that depend on each other, an
-    unknown objective or method.
+    Args:
+        data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
+        objective: "power_entropy", "amplitude_entropy" or "contrast" (maximised), see
+            `torchsar.metrics`; or a differentiable function of images (trial, azimuth, range) that
+            returns costs (trial,). It is called with some of the trials at a time.
+        mask: Weights of the pixels, shape (azimuth, range) or with the trials in front.
+        start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
+        basis: Real functions, shape (coefficient, pulse) or (..., coefficient, pulse). The phase is
+            then a sum of these functions, such as `torchsar.core.legendre(u, 5).mT[2:]`, starting
+            from the least-squares fit to the start.
+        method: "lbfgs", or "adam" for rough costs.
+        steps: Largest number of steps, by default 100 for "lbfgs" and 500 for "adam".
+        tolerance: Norm of the gradient, relative to that at the start, at which a trial ends. With
+            "lbfgs" it also ends when a step lowers the cost by less than 1e-7 of its value.
+        imaging: Any object with a differentiable `image` of profiles of shape (..., pulse, range),
+            see `entropy_fixed_point`; by default `torchsar.focus.azimuth_transform`. Where
+            migration determines the position of the image, start from the phase that `autofocus`
+            finds with the same `imaging`.
+
+    Returns:
+        `phase_rad` of shape (..., pulse), to be removed, detached, with its standard deviation.
+        `ok` is False unless the image is 1.5 times sharper than noise can be made, more than one
+        range cell contributes to the sharpness, and the predicted Strehl ratio exceeds 0.8. The
+        sharpness is measured by entropy whatever the objective. Pulses without samples keep the
+        phase of the start, or that of the basis. info["iterations"] is the number of steps.
+
+    Raises:
+        TypeError: If the data are not complex, or the start, mask or basis is not a tensor.
+        ValueError: If the data are empty or not finite, the start, mask or basis has the wrong
+            shape, the functions of the basis depend on each other, or the objective or method is
+            unknown.
     """
     name = "sharpest_phase"
     pulses = prepare(data, name)
@@ -88,7 +103,7 @@ def sharpest_phase(
         assert which is not None
         rows, own = rows.detach(), space.of(which)
         first = pair_phase(rows, present) if begin is None else begin[which]
-        found = descend(_Steep(cost(rows, which), own), own.coordinates(first))
+        found = descend(_InCoordinates(cost(rows, which), own), own.coordinates(first))
         moved = own.phase(found.x) if basis is not None else torch.where(present, found.x, first)
         return (
             moved,
@@ -96,23 +111,42 @@ def sharpest_phase(
             lambda some, there, at: at + own.phase(own.coordinates(on_the_circle(settled(some, there, at) - at))),
         )
 
-    # what `find` begins with says which trials a block holds: masks, starts and functions may
-    # differ between trials
+    # the start passed to `find` is the indices of the trials of a block, because masks, starts and
+    # basis functions may differ between trials
     return estimated(pulses, torch.arange(len(pulses.rows), device=pulses.rows.device), find)
 
 
 def minimum_entropy(data: Tensor, **options: Any) -> Estimate:
-    """`sharpest_phase` of the power entropy; options as there."""
+    """Find the phase of each pulse of least power entropy, see `sharpest_phase`.
+
+    Args:
+        data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
+        options: Options of `sharpest_phase`.
+
+    Returns:
+        The estimate of `sharpest_phase`.
+    """
     return sharpest_phase(data, objective="power_entropy", **options)
 
 
 def maximum_contrast(data: Tensor, **options: Any) -> Estimate:
-    """`sharpest_phase` of the contrast of intensities; options as there."""
+    """Find the phase of each pulse of most contrast of intensities, see `sharpest_phase`.
+
+    Args:
+        data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
+        options: Options of `sharpest_phase`.
+
+    Returns:
+        The estimate of `sharpest_phase`.
+    """
     return sharpest_phase(data, objective="contrast", **options)
 
 
 class _Space(Protocol):
-    """Where a descent moves: coordinates (trial, n) of phases (trial, pulse). `of` picks trials."""
+    """Coordinates (trial, n) of phases (trial, pulse) in which a descent moves.
+
+    `of` selects trials; `projected` maps a gradient of phases to one of coordinates.
+    """
 
     def of(self, which: Tensor) -> _Space: ...
 
@@ -120,11 +154,11 @@ class _Space(Protocol):
 
     def coordinates(self, phase_rad: Tensor) -> Tensor: ...
 
-    def pulled(self, gradient: Tensor) -> Tensor: ...
+    def projected(self, gradient: Tensor) -> Tensor: ...
 
 
 class _Free:
-    """Every pulse for itself."""
+    """Every pulse has a coordinate of its own."""
 
     def of(self, which: Tensor) -> _Free:
         return self
@@ -135,14 +169,15 @@ class _Free:
     def coordinates(self, phase_rad: Tensor) -> Tensor:
         return phase_rad
 
-    def pulled(self, gradient: Tensor) -> Tensor:
+    def projected(self, gradient: Tensor) -> Tensor:
         return gradient
 
 
 @dataclass(frozen=True)
 class _Spanned:
-    """Sums of functions (coordinate, pulse) or (trial, coordinate, pulse), orthogonal over the
-    pulses and of unit mean square each.
+    """Sums of functions (coordinate, pulse) or (trial, coordinate, pulse).
+
+    The functions are orthogonal over the pulses and have unit mean square.
     """
 
     functions: Tensor
@@ -153,18 +188,19 @@ class _Spanned:
     def phase(self, x: Tensor) -> Tensor:
         return (x[..., None, :] @ self.functions)[..., 0, :]
 
-    def pulled(self, gradient: Tensor) -> Tensor:
+    def projected(self, gradient: Tensor) -> Tensor:
         return (self.functions @ gradient[..., None])[..., 0]
 
     def coordinates(self, phase_rad: Tensor) -> Tensor:
-        return self.pulled(phase_rad) / phase_rad.shape[-1]
+        return self.projected(phase_rad) / phase_rad.shape[-1]
 
 
 def _space_of(basis: Tensor | None, pulses: Pulses) -> _Space:
+    """Coordinates for a basis; raises ValueError if the basis is invalid."""
     if basis is None:
         return _Free()
     if (
-        _tensor(basis, "basis").is_complex()
+        _check_tensor(basis, "basis").is_complex()
         or basis.ndim < 2
         or basis.shape[-1] != pulses.n
         or not 1 <= basis.shape[-2] <= pulses.n
@@ -176,20 +212,21 @@ def _space_of(basis: Tensor | None, pulses: Pulses) -> _Space:
     wide = _by_trial(basis.to(device=pulses.rows.device, dtype=torch.float64), pulses, "basis")
     if not torch.isfinite(wide).all() or bool((torch.linalg.matrix_rank(wide) < wide.shape[-2]).any()):
         raise ValueError(
-            f"sharpest_phase: the {wide.shape[-2]} functions of the basis must be finite and none "
-            "a sum of the others; orthogonal ones such as torchsar.core.legendre are"
+            f"sharpest_phase: the {wide.shape[-2]} functions of the basis must be finite and linearly "
+            "independent; orthogonal functions such as torchsar.core.legendre are"
         )
     return _Spanned((torch.linalg.qr(wide.mT).Q.mT * math.sqrt(pulses.n)).to(pulses.rows.real.dtype).contiguous())
 
 
-def _tensor(x: Tensor, what: str) -> Tensor:
+def _check_tensor(x: Tensor, what: str) -> Tensor:
+    """x, or TypeError if it is not a tensor."""
     if not isinstance(x, Tensor):
         raise TypeError(f"sharpest_phase: {what} must be a tensor, got {type(x).__name__}; torch.as_tensor makes one")
     return x
 
 
 def _by_trial(x: Tensor, pulses: Pulses, what: str) -> Tensor:
-    """x (..., a, b) as (trial, a, b); with two dims or less as it is."""
+    """x (..., a, b) as (trial, a, b); unchanged if it has two dimensions or fewer."""
     if x.ndim < 3:
         return x
     try:
@@ -202,27 +239,27 @@ def _by_trial(x: Tensor, pulses: Pulses, what: str) -> Tensor:
 
 
 # phase (trial, pulse) -> cost (trial,), gradient (trial, pulse)
-_Figure = Callable[[Tensor], tuple[Tensor, Tensor]]
+_PhaseCost = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
-class _Steep:
-    """A figure of phases as one of coordinates, with its gradient."""
+class _InCoordinates:
+    """A cost of phases as a cost of coordinates, with its gradient."""
 
-    figure: _Figure
+    cost: _PhaseCost
     space: _Space
 
     def __call__(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        cost, gradient = self.figure(self.space.phase(x))
-        return cost, self.space.pulled(gradient)
+        cost, gradient = self.cost(self.space.phase(x))
+        return cost, self.space.projected(gradient)
 
 
 def _cost_of(
     objective: Objective, mask: Tensor | None, imaging: Imaging | None, pulses: Pulses
-) -> Callable[[Tensor, Tensor], _Figure]:
-    """(rows, which trials) -> the figure of their phases.
+) -> Callable[[Tensor, Tensor], _PhaseCost]:
+    """Function of (rows, which trials) that returns the cost of their phases.
 
-    Raises ValueError for an unknown objective, or a mask that none would use.
+    Raises ValueError if the objective is unknown or does not use the mask.
     """
     if isinstance(objective, str) and objective not in _COSTS:
         raise ValueError(
@@ -231,44 +268,44 @@ def _cost_of(
         )
     if mask is not None and not isinstance(objective, str):
         raise ValueError(
-            "sharpest_phase: a mask belongs to the objectives known by name; let your own "
-            "function of images use its mask itself"
+            "sharpest_phase: a mask applies only to objectives given by name; apply the mask inside "
+            "your own function of images"
         )
     if objective == "power_entropy" and mask is None and imaging is None:
         return lambda rows, _: _PowerEntropy(rows, rows.conj().resolve_conj())
     operator = _Centred() if imaging is None else Through(imaging)
     if not isinstance(objective, str):
         return lambda rows, _: _Derived(rows, operator, objective)
-    weights = None if mask is None else _by_trial(_tensor(mask, "mask").to(pulses.rows.device), pulses, "mask")
-    figure = _COSTS[objective]
+    weights = None if mask is None else _by_trial(_check_tensor(mask, "mask").to(pulses.rows.device), pulses, "mask")
+    cost = _COSTS[objective]
 
-    def of_trials(rows: Tensor, which: Tensor) -> _Figure:
+    def of_trials(rows: Tensor, which: Tensor) -> _PhaseCost:
         return _Derived(
-            rows, operator, partial(figure, mask=weights if weights is None or weights.ndim < 3 else weights[which])
+            rows, operator, partial(cost, mask=weights if weights is None or weights.ndim < 3 else weights[which])
         )
 
     return of_trials
 
 
-def _descent_of(method: Method, steps: int | None, tolerance: float) -> Callable[[_Steep, Tensor], Descent]:
+def _descent_of(method: Method, steps: int | None, tolerance: float) -> Callable[[_InCoordinates, Tensor], Descent]:
+    """Descent by name with its options; raises ValueError if the method is unknown."""
     if method not in _METHODS:
         raise ValueError(f"sharpest_phase: method {method!r} is not known; choose one of {', '.join(_METHODS)}")
     run, options = _METHODS[method]
     if steps is not None:
         options = {**options, "steps": steps}
-    return lambda steep, start: run(
-        steep, start, with_gradient=True, gradient_tolerance=tolerance, **options, **_first_step(method, start)
+    return lambda cost_of_x, start: run(
+        cost_of_x, start, with_gradient=True, gradient_tolerance=tolerance, **options, **_first_step(method, start)
     )
 
 
 def _first_step(method: Method, start: Tensor) -> dict[str, float]:
+    """Option for the length of the first step, where the method has one."""
     return {"first_step": _STEP_RAD * math.sqrt(start.shape[-1])} if method == "lbfgs" else {}
 
 
 class _Centred:
-    """Image (trial, azimuth, range) of rows (trial, range, pulse), as
-    `torchsar.focus.azimuth_transform` makes it.
-    """
+    """Image (trial, azimuth, range) of rows (trial, range, pulse) as by `azimuth_transform`."""
 
     def image(self, rows: Tensor) -> Tensor:
         return (centred_ifft(rows) * math.sqrt(rows.shape[-1])).mT
@@ -276,7 +313,7 @@ class _Centred:
 
 @dataclass(frozen=True)
 class _Derived:
-    """Any cost of the image, with its gradient by autograd."""
+    """Any cost of the image, with its gradient by automatic differentiation."""
 
     rows: Tensor
     operator: _Centred | Through
@@ -286,11 +323,12 @@ class _Derived:
         with torch.enable_grad():
             phase = phase_rad.detach().requires_grad_()
             cost = self.cost(self.operator.image(rotate(self.rows, phase)))
-            _refuse_other_answer(cost, phase)
+            _check_cost(cost, phase)
             return cost.detach(), torch.autograd.grad(cost.sum(), phase)[0]
 
 
-def _refuse_other_answer(cost: Any, phase: Tensor) -> None:
+def _check_cost(cost: Any, phase: Tensor) -> None:
+    """Raise ValueError unless an objective returned one differentiable real cost per image."""
     if not isinstance(cost, Tensor) or cost.shape != phase.shape[:-1] or not cost.requires_grad:
         got = (
             f"{'' if cost.requires_grad else 'detached '}{cost.dtype} of shape {tuple(cost.shape)}"
@@ -299,14 +337,16 @@ def _refuse_other_answer(cost: Any, phase: Tensor) -> None:
         )
         raise ValueError(
             f"sharpest_phase: the objective returned {got} for {len(phase)} images; return one "
-            "real cost an image, differentiable in its samples"
+            "real cost per image, differentiable in its samples"
         )
 
 
 @dataclass(frozen=True)
 class _PowerEntropy:
-    """Entropy of the image and dE/dpsi_k = -(2 / F) Im sum_n x conj(IFFT((1 + ln p) f)), F the
-    energy; (1 + ln p) may lack any constant. mirrored: the conjugate of rows.
+    """Entropy of the image and its gradient.
+
+    dE/dpsi_k = -(2 / F) Im sum_n x conj(IFFT((1 + ln p) f)), where F is the energy. Any constant
+    may be omitted from (1 + ln p). mirrored: the conjugate of rows.
     """
 
     rows: Tensor

@@ -1,10 +1,10 @@
-"""Phase gradient autofocus (PGA): the phase of the strongest scatterer of every row, isolated by a
-window that narrows.
+"""Phase gradient autofocus (PGA).
 
-The window acts on an image of twice as many cells, that is on pulses padded with as many zeros. On
-the plain image a narrow window joins the last pulses to the first, and iterations then drift away
-from their optimum without end: from 0.07 rad at the best iterate to 0.4 rad after 20 on images of
-1024 x 1024 cells, where padded pulses stay at 0.03 rad.
+The strongest scatterer of every range cell is isolated by a window that narrows from iteration to
+iteration. The window acts on an image of twice as many cells, that is on pulses padded with as many
+zeros. On the plain image a narrow window joins the last pulses to the first, and the iterations
+then drift away from their optimum: from 0.07 rad at the best iterate to 0.4 rad after 20 iterations
+on images of 1024 x 1024 cells, where padded pulses stay at 0.03 rad.
 """
 
 from __future__ import annotations
@@ -31,23 +31,40 @@ from torchsar.compensate.pulse_phase.verdict import Found, estimated
 from torchsar.core import Estimate, unit_phasor
 
 Kernel = Literal["lumv", "ml", "synchronised", "eigenvector"]
-_POWER_STEPS = 6
-_PADDING = 2
+_POWER_STEPS = 6  # steps of the power method, found by trial: accuracy against time
+_PADDING = 2  # zero-padding of the pulses; the docstring of this module gives the reason
 
 
 class Windows(Protocol):
-    """Width of the window at an iteration, (trial,) in cells of the image.
+    """A schedule of window widths."""
 
-    n: cells of the image. profile(): (trial, n) power of the rows about their peaks, peak first.
-    """
+    def width(self, iteration: int, n: int, profile: Callable[[], Tensor]) -> Tensor:
+        """Compute the width of the window at an iteration.
 
-    def width(self, iteration: int, n: int, profile: Callable[[], Tensor]) -> Tensor: ...
+        Args:
+            iteration: Number of the iteration, from 0.
+            n: Number of Doppler cells of the image.
+            profile: Function that returns the power of the rows about their peaks, shape (trial,
+                n), peak first.
+
+        Returns:
+            The width in Doppler cells, shape (trial,) or (1,).
+        """
+        ...
 
 
 @dataclass(frozen=True)
 class Shrinking:
-    """A window that starts with a share of the pulses and narrows by a factor an iteration, down to
-    a floor (brief 002: 1/2, 0.8, 5 cells).
+    """A window that starts at a share of the pulses and narrows by a factor per iteration.
+
+    Args:
+        first: First width as a share of the number of pulses (1/2 in Ruan et al. 2013, section
+            3.1).
+        factor: Factor per iteration (0.8 in Ruan et al. 2013, section 3.1).
+        floor: Smallest width in Doppler cells.
+
+    Raises:
+        ValueError: If `first` or `factor` is not in 0..1, or the floor is below 1 cell.
     """
 
     first: float = 0.5
@@ -61,15 +78,33 @@ class Shrinking:
             )
 
     def width(self, iteration: int, n: int, profile: Callable[[], Tensor]) -> Tensor:
+        """Compute the width of the window at an iteration, see `Windows.width`.
+
+        Args:
+            iteration: Number of the iteration, from 0.
+            n: Number of Doppler cells of the image.
+            profile: Not used.
+
+        Returns:
+            The width in Doppler cells, shape (1,).
+        """
         return torch.tensor([max(self.floor, self.first * n * self.factor**iteration)])
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A window as wide as the blur itself: `margin` times the width over which the mean centred
-    power stays within `level_db` of its peak.
+    """A window that follows the width of the blur.
 
-    The classical rule (Wahl et al. 1994: 10 dB and half as much again).
+    Its width is `margin` times the width over which the mean centred power stays within `level_db`
+    of its peak.
+
+    Args:
+        level_db: Level below the peak in dB.
+        margin: Factor applied to the measured width.
+        floor: Smallest width in Doppler cells.
+
+    Reference:
+        Wahl et al. 1994 (10 dB and a margin of 50 %).
     """
 
     level_db: float = 10.0
@@ -77,6 +112,17 @@ class Measured:
     floor: float = 5.0
 
     def width(self, iteration: int, n: int, profile: Callable[[], Tensor]) -> Tensor:
+        """Compute the width of the window at an iteration, see `Windows.width`.
+
+        Args:
+            iteration: Not used.
+            n: Number of Doppler cells of the image.
+            profile: Function that returns the power of the rows about their peaks, shape (trial,
+                n), peak first.
+
+        Returns:
+            The width in Doppler cells, shape (trial,).
+        """
         about = profile()
         folded = torch.maximum(about, about.flip(-1).roll(1, -1))[..., : n // 2 + 1]
         above = folded >= 10 ** (-self.level_db / 10) * folded[..., :1]
@@ -86,7 +132,14 @@ class Measured:
 
 @dataclass(frozen=True)
 class Listed:
-    """Widths in cells, one an iteration; the last one serves all further iterations."""
+    """A list of window widths, one per iteration; the last one serves all further iterations.
+
+    Args:
+        cells: Widths in Doppler cells.
+
+    Raises:
+        ValueError: If the list is empty or a width is below 1 cell.
+    """
 
     cells: tuple[float, ...]
 
@@ -95,6 +148,16 @@ class Listed:
             raise ValueError(f"a list of windows needs widths of 1 cell or more, got {self.cells}")
 
     def width(self, iteration: int, n: int, profile: Callable[[], Tensor]) -> Tensor:
+        """Compute the width of the window at an iteration, see `Windows.width`.
+
+        Args:
+            iteration: Number of the iteration, from 0.
+            n: Not used.
+            profile: Not used.
+
+        Returns:
+            The width in Doppler cells, shape (1,).
+        """
         return torch.tensor([self.cells[min(iteration, len(self.cells) - 1)]])
 
 
@@ -107,22 +170,43 @@ def pga(
     iterations: int = 20,
     patience: int = 6,
 ) -> Estimate:
-    """Phase gradient autofocus, with value["phase_rad"] (..., pulse) to be removed.
+    """Estimate the phase of each pulse by phase gradient autofocus.
 
-    data: (..., pulse, range) complex, range-compressed and aligned.
+    Every iteration works on the original data with the present phase removed. It shifts the
+    strongest cell of each row to zero Doppler, applies a window, transforms back to pulses, and
+    estimates the phase with the kernel, without its constant and linear part. A trial ends after
+    `patience` iterations without a lower image entropy under a window that no longer narrows, and
+    returns its sharpest iterate, because narrow windows drift away. Differentiable except for the
+    choice of peaks and iterates.
 
-    Every iteration works on the original data turned by the phase so far: the strongest cell of
-    each row to zero Doppler, a window about it, back to pulses, the phase by the kernel, without
-    its constant and linear part. kernel: "lumv" (linear unbiased minimum variance, Eichel and
-    Jakowatz 1989; understates steps beyond a radian), "ml" (maximum likelihood of pairs, Jakowatz
-    and Wahl 1993), or coherent over the aperture, with peaks found to a fraction of a cell:
-    "synchronised" (unit phasors) and "eigenvector" (of the windowed covariance, Jakowatz and Wahl
-    1993). start: (..., pulse) rad, by default zero, from which PGA is not equivariant and large or
-    white errors defeat it. windows: `Shrinking()` by default. A trial ends after `patience`
-    iterations without a lower image entropy under a window that narrows no more, and returns its
-    sharpest iterate: narrow windows drift away. Differentiable but for the choice of peaks and
-    iterates. Raises TypeError or ValueError for samples that are not finite and complex, a start of
-    another shape, an unknown kernel.
+    From a zero start PGA is not equivariant and fails on large or white phase errors; use `pga_sca`
+    or `autofocus` for these.
+
+    Args:
+        data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
+        kernel: "lumv" (linear unbiased minimum variance; underestimates steps above one radian),
+            "ml" (maximum likelihood of adjacent pulses), or a kernel that is coherent over the
+            aperture, with peaks found to a fraction of a cell: "synchronised" (unit phasors) or
+            "eigenvector" (of the windowed covariance).
+        start: Phase to start from in rad, shape (..., pulse); by default zero.
+        windows: Schedule of window widths, by default `Shrinking()`.
+        iterations: Largest number of iterations.
+        patience: Number of iterations without a lower entropy after which a trial ends.
+
+    Returns:
+        `phase_rad` of shape (..., pulse), to be removed, with its standard deviation. `ok` is False
+        unless the image is 1.5 times sharper than noise can be made, more than one range cell
+        contributes to the sharpness, and the predicted Strehl ratio exceeds 0.8.
+
+    Raises:
+        TypeError: If the data are not complex, the start is not a tensor, or `windows` is not a
+            schedule.
+        ValueError: If the data are empty or not finite, the start does not have one phase per
+            pulse, the kernel is unknown, or a number of iterations is not a whole number of 1 or
+            more.
+
+    Reference:
+        Kernels: Eichel and Jakowatz 1989 ("lumv"); Jakowatz and Wahl 1993 ("ml", "eigenvector").
     """
     pulses = prepare(data, "pga")
     search = _Search(_solver(kernel), windows or Shrinking(), iterations, patience)
@@ -136,9 +220,27 @@ def pga(
 def pga_sca(
     data: Tensor, *, kernel: Kernel = "ml", windows: Windows | None = None, iterations: int = 20, patience: int = 6
 ) -> Estimate:
-    """PGA with the kernel of SCA, started from SCA (Ruan et al. 2013, Eqs.
+    """Estimate the phase of each pulse by PGA with the kernel of SCA, started from SCA.
 
-    11-16); arguments and result as `pga`. Equivariant, as `sca` is.
+    Equivariant, as `sca` is.
+
+    Args:
+        data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
+        kernel: Kernel, see `pga`.
+        windows: Schedule of window widths, by default `Shrinking()`.
+        iterations: Largest number of iterations.
+        patience: Number of iterations without a lower entropy after which a trial ends.
+
+    Returns:
+        An estimate as that of `pga`.
+
+    Raises:
+        TypeError: If the data are not complex or `windows` is not a schedule.
+        ValueError: If the data are empty or not finite, the kernel is unknown, or a number of
+            iterations is not a whole number of 1 or more.
+
+    Reference:
+        Ruan et al. 2013, Eqs. (11)-(16).
     """
     search = _Search(_solver(kernel), windows or Shrinking(), iterations, patience)
 
@@ -153,11 +255,11 @@ Solver = Callable[[Tensor, "_View", Tensor], Tensor]
 
 @dataclass(frozen=True)
 class _Search:
-    """The iterations of PGA: (rows, present, start) -> the phase of the sharpest iterate (trial,
-    pulse), and how many were made (trial,).
+    """The iterations of PGA.
 
-    Patience is counted only while the window narrows no more: in clutter wide windows blur for many
-    iterations what narrow ones then sharpen.
+    Maps (rows, present, start) to the phase of the sharpest iterate (trial, pulse) and the number
+    of iterations (trial,). Patience is counted only once the window no longer narrows: in clutter,
+    wide windows blur for many iterations what narrow ones sharpen later.
     """
 
     solve: Solver
@@ -199,8 +301,9 @@ class _Search:
 
 @dataclass(frozen=True)
 class _View:
-    """A padded image (trial, range, 2 n), its detached power, and the strongest cell of
-    each row.
+    """A padded image (trial, range, 2 n), its detached power, and the strongest cell of each row.
+
+    The strongest cells have shape (trial, range).
     """
 
     image: Tensor
@@ -209,6 +312,7 @@ class _View:
 
 
 def _view(rows: Tensor, phase: Tensor) -> _View:
+    """Padded image of the pulses with a phase removed."""
     image = torch.fft.fft(rotate(rows, phase), _PADDING * rows.shape[-1], norm="ortho")
     real, imag = (part.contiguous() for part in (image.detach().real, image.detach().imag))
     power = torch.addcmul(real * real, imag, imag)
@@ -216,15 +320,16 @@ def _view(rows: Tensor, phase: Tensor) -> _View:
 
 
 def _step(view: _View, width: Tensor, present: Tensor, solve: Solver) -> Tensor:
-    """Phase step (trial, pulse) from the windowed rows, their peaks at zero Doppler; width:
-    (trial,) in cells of the plain image.
+    """Phase step (trial, pulse) from the windowed rows with their peaks at zero Doppler.
+
+    width: (trial,) in cells of the plain image.
     """
     g = torch.fft.ifft(_windowed(view, (_PADDING * width / 2).floor().long()), norm="ortho")[..., : present.shape[-1]]
     return without_line(solve(g, view, present), present)
 
 
 def _windowed(view: _View, half: Tensor) -> Tensor:
-    """The cells within `half` (trial,) of the peak of each row, the peak in front, zeros elsewhere.
+    """The cells within `half` (trial,) of the peak of each row, peak first; zero elsewhere.
 
     (trial, range, 2 n).
     """
@@ -242,7 +347,7 @@ def _windowed(view: _View, half: Tensor) -> Tensor:
 
 
 def _entropy(power: Tensor) -> Tensor:
-    """Entropy of images by their powers (trial, range, Doppler), (trial,)."""
+    """Entropy (trial,) of images in nats from their powers (trial, range, Doppler)."""
     total = power.sum((-2, -1))
     tiny = torch.finfo(power.dtype).tiny
     return torch.log(total.clamp_min(tiny)) - (power * torch.log(power.clamp_min(tiny))).sum((-2, -1)) / torch.where(
@@ -251,17 +356,16 @@ def _entropy(power: Tensor) -> Tensor:
 
 
 def _profile(view: _View) -> Tensor:
-    """Power about the peaks summed over rows and over the cells of the padding, peak first, (trial,
-    n).
-    """
+    """Power about the peaks, summed over rows, peak first, (trial, n); padded cells are skipped."""
     padded = view.power.shape[-1]
     index = torch.remainder(torch.arange(0, padded, _PADDING, device=view.peak.device) + view.peak[..., None], padded)
     return view.power.gather(-1, index).sum(-2)
 
 
 def _fraction(view: _View) -> Tensor:
-    """Offset of the interpolated peak from the strongest cell, in cells of the padded image,
-    (trial, range): a parabola through three amplitudes.
+    """Offset (trial, range) of the interpolated peak from the strongest cell, in padded cells.
+
+    A parabola through three amplitudes.
     """
     padded = view.power.shape[-1]
     low, top, high = (
@@ -272,6 +376,7 @@ def _fraction(view: _View) -> Tensor:
 
 
 def _solver(kernel: Kernel) -> Solver:
+    """The function of a kernel."""
     solvers: dict[str, Solver] = {"lumv": _lumv, "ml": _ml, "synchronised": _synchronised, "eigenvector": _eigenvector}
     if kernel not in solvers:
         raise ValueError(f"kernel {kernel!r} is not known; choose one of {', '.join(solvers)}")
@@ -279,20 +384,19 @@ def _solver(kernel: Kernel) -> Solver:
 
 
 def _ml(g: Tensor, view: _View, present: Tensor) -> Tensor:
+    """Maximum likelihood kernel: the phases between adjacent pulses."""
     return running_sum(pair_products(g, present))
 
 
 def _lumv(g: Tensor, view: _View, present: Tensor) -> Tensor:
-    """Sum of Im(conj(g) dg) / sum |g|^2 with dg = g[k] - g[k - 1] (brief 002, section 4)."""
+    """LUMV kernel: sum of Im(conj(g) dg) / sum |g|^2, with dg = g[k] - g[k - 1]."""
     before = (g.real.square() + g.imag.square()).sum(-2)[..., :-1]
     step = pair_products(g, present).imag / torch.where(before > 0, before, 1)
     return torch.cat([torch.zeros_like(step[..., :1]), step.cumsum(-1)], -1)
 
 
 def _eigenvector(g: Tensor, view: _View, present: Tensor) -> Tensor:
-    """Phase of the first eigenvector of the sum over rows of g g^H, by power steps from the flat
-    phase.
-    """
+    """Phase of the first eigenvector of the sum over rows of g g^H, by power steps."""
     g = _centred(g, view, present)
     v = torch.ones_like(g[:, 0])
     for _ in range(_POWER_STEPS):
@@ -301,9 +405,7 @@ def _eigenvector(g: Tensor, view: _View, present: Tensor) -> Tensor:
 
 
 def _synchronised(g: Tensor, view: _View, present: Tensor) -> Tensor:
-    """As the eigenvector, but of unit modulus in every step: the phases that make the rows most
-    coherent over the aperture.
-    """
+    """Phases that make the rows most coherent over the aperture: power steps of unit modulus."""
     g = _centred(g, view, present)
     v = torch.ones_like(g[:, 0])
     for _ in range(_POWER_STEPS):
@@ -313,8 +415,9 @@ def _synchronised(g: Tensor, view: _View, present: Tensor) -> Tensor:
 
 
 def _centred(g: Tensor, view: _View, present: Tensor) -> Tensor:
-    """The rows with their interpolated peaks at zero Doppler: kernels that are coherent over the
-    aperture need it. Lost pulses are left out.
+    """The rows with their interpolated peaks at zero Doppler, and zeros for missing pulses.
+
+    Kernels that are coherent over the aperture need the peaks to a fraction of a cell.
     """
     k = torch.arange(g.shape[-1], dtype=torch.float64, device=g.device)
     return (
@@ -325,6 +428,7 @@ def _centred(g: Tensor, view: _View, present: Tensor) -> Tensor:
 
 
 def _covariance_times(g: Tensor, v: Tensor) -> Tensor:
+    """Product of the covariance over rows and a vector, over its largest modulus."""
     product = (g * (g.conj() * v[:, None, :]).sum(-1, keepdim=True)).sum(-2)
     largest = product.detach().abs().amax(-1, keepdim=True)
     return product / torch.where(largest > 0, largest, 1)

@@ -1,4 +1,4 @@
-"""Shear-average (SCA) estimate: the phase between adjacent pulses, summed over range."""
+"""Spatial correlation algorithm (SCA): the phase between adjacent pulses, summed over range."""
 
 from __future__ import annotations
 
@@ -11,17 +11,29 @@ from torchsar.core import Estimate
 
 
 def sca(data: Tensor) -> Estimate:
-    """Phase of each pulse from products of adjacent pulses (Ruan et al. 2013, Eqs.
+    """Estimate the phase of each pulse from the products of adjacent pulses.
 
-    4-6), with value["phase_rad"] (..., pulse) to be removed.
+    The compensated data are data * exp(-j phase_rad)[..., None]. The estimate is exactly
+    equivariant: for data * exp(j a) it is larger by a, up to a constant, whatever a is. The size of
+    the phase error therefore has no effect. The scene (about 1.2 rad for a target of many
+    scatterers per range cell) and noise limit the accuracy. Differentiable.
 
-    data: (..., pulse, range) complex, range-compressed and aligned; the compensated data are data *
-    exp(-j phase_rad)[..., None]. Exactly equivariant: on data * exp(j a) the estimate is larger by
-    a, up to a constant, whatever a is, so that the severity of the error is of no account. Its own
-    error comes from the scene (about 1.2 rad for a target of many scatterers a row) and from noise.
-    A pulse of zeros is bridged by the product of its neighbours and keeps the phase of the one
-    before. Differentiable. ok is False for noise. std: from two halves of the rows. Raises
-    TypeError or ValueError for what are no finite complex samples.
+    Args:
+        data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
+
+    Returns:
+        `phase_rad` of shape (..., pulse), to be removed, with a standard deviation from two halves
+        of the range cells. A pulse of zeros is bridged by the product of its neighbours and has the
+        phase of the pulse before. `ok` is False unless the image is 1.5 times sharper than noise
+        can be made, more than one range cell contributes to the sharpness, and the predicted Strehl
+        ratio exceeds 0.8.
+
+    Raises:
+        TypeError: If the data are not complex.
+        ValueError: If the data are empty or not finite.
+
+    Reference:
+        Ruan et al. 2013, Eqs. (4)-(6).
     """
 
     def find(rows: Tensor, present: Tensor, _: Tensor | None) -> Found:
@@ -35,15 +47,29 @@ def sca(data: Tensor) -> Estimate:
 
 
 def pair_phase(rows: Tensor, present: Tensor) -> Tensor:
-    """Running sum of the phases between pulses that follow each other, (trial, pulse) from rows
-    (trial, range, pulse).
+    """Sum the phases between successive pulses.
+
+    Args:
+        rows: Pulses, shape (trial, range, pulse), complex.
+        present: False for pulses without samples, shape (trial, pulse), bool.
+
+    Returns:
+        The phases in rad, shape (trial, pulse); that of the first pulse is 0.
     """
     return running_sum(pair_products(rows, present))
 
 
 def pair_products(rows: Tensor, present: Tensor) -> Tensor:
-    """Sum over range of s[k] conj(s[the pulse before k that is there]), (trial, pulse - 1) complex;
-    zero for a pulse that is not.
+    """Sum over range the product of each pulse and the conjugate of the pulse before it.
+
+    Pulses that are not present are skipped.
+
+    Args:
+        rows: Pulses, shape (trial, range, pulse), complex.
+        present: False for pulses without samples, shape (trial, pulse), bool.
+
+    Returns:
+        The products, shape (trial, pulse - 1), complex; zero for a pulse that is not present.
     """
     if bool(present.all()):
         return (rows[..., 1:] * rows[..., :-1].conj()).sum(-2)
@@ -56,16 +82,26 @@ def pair_products(rows: Tensor, present: Tensor) -> Tensor:
 
 
 def previous_present(present: Tensor) -> Tensor:
-    """Index of the last pulse with samples before each pulse but the first (0 where there is none),
-    (trial, pulse - 1).
+    """Find the last pulse with samples before each pulse but the first.
+
+    Args:
+        present: False for pulses without samples, shape (trial, pulse), bool.
+
+    Returns:
+        Its index, shape (trial, pulse - 1); 0 where there is none.
     """
     index = torch.arange(present.shape[-1], device=present.device)
     return torch.where(present, index, 0).cummax(-1).values[:, :-1]
 
 
 def running_sum(products: Tensor) -> Tensor:
-    """Phase of every pulse from the products with the one before, summed in float64; the first has
-    0. (trial, pulse).
+    """Sum the phases of products of successive pulses in float64.
+
+    Args:
+        products: Products with the pulse before, shape (trial, pulse - 1), complex.
+
+    Returns:
+        The phase of every pulse in rad, shape (trial, pulse); that of the first pulse is 0.
     """
     steps = safe_angle(products)
     total = steps.to(torch.float64).cumsum(-1).to(steps.dtype)

@@ -1,4 +1,4 @@
-"""The recommended estimate of a phase per pulse."""
+"""The recommended autofocus."""
 
 from __future__ import annotations
 
@@ -16,10 +16,16 @@ from torchsar.compensate.pulse_phase.verdict import Found, estimated
 from torchsar.core import Estimate
 from torchsar.metrics import entropy
 
+# floor of the entropy fixed point in mean powers, found by trial: a lower floor includes noise, a
+# higher one excludes weak scatterers
 _FLOOR = 2.5
+# floor of the first iterations where noise is weak, and their number: without them one scene of two
+# hundred ended in a wrong minimum
 _FIRST_FLOOR, _FIRST_ITERATIONS = 5.0, 6
+# on scenes at 30 dB, 3 of 32 trials of the entropy fixed point ended in a local minimum without
+# over-relaxation and none with this one
 _RELAXATION = 1.8
-_SLOPES = 48
+_SLOPES = 48  # slopes tried over one turn per pulse, found by trial: spacing against time
 
 
 def autofocus(
@@ -32,27 +38,44 @@ def autofocus(
     tolerance_rad: float = 1e-3,
     imaging: Imaging | None = None,
 ) -> Estimate:
-    """The recommended autofocus, with value["phase_rad"] (..., pulse) to be removed.
+    """Estimate the phase of each pulse; the recommended autofocus.
 
-    data: (..., pulse, range) complex, range-compressed and aligned.
+    Starts from `sca`. The entropy fixed point follows, with a low floor (with a higher one for the
+    first six iterations where noise is weak), until a trial no longer moves. The last iterations
+    take the phase of each pulse against a Wiener estimate of the scene, on an image of twice as
+    many cells. They reduce the error that remains after the entropy fixed point by half or more.
+    Differentiable without `imaging`.
 
-    Adjacent pulses (`sca`), then the entropy fixed point with one low floor (for six iterations a
-    higher one, where noise is weak) until a trial stands still (at most about `search` iterations:
-    hard cases of low SNR use them), then at most `polish` iterations against a Wiener estimate of
-    the scene on an image of twice as many cells, which lowers the floor that the entropy leaves by
-    half and more. start: (..., pulse) rad, by default that of `sca`, with which the result is
-    equivariant: any phase per pulse is removed, whatever its size.
+    Do not use it for homogeneous clutter that fills a large part of the Doppler band. Wrong phases
+    lower the entropy of such an image, and `ok` may be True although the phase is wrong.
 
-    imaging: an image formation in which scatterers keep still where they migrate through range
-    cells here, see `entropy_fixed_point`. It tells the slope of the phase over pulses as well,
-    since an image in a wrong place migrates wrongly: after the steps above, 48 slopes over one turn
-    a pulse are tried, the best refined, and both kinds of iterations run through `imaging`. Its
-    image must cover the whole unambiguous cross range.
+    Args:
+        data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
+        start: Phase to start from in rad, shape (..., pulse); by default that of `sca`, with which
+            the result is equivariant: any phase per pulse is removed, whatever its size.
+        search: Largest number of iterations of the entropy fixed point, approximately; only hard
+            cases of low SNR need them all.
+        polish: Largest number of iterations against the Wiener estimate.
+        search_tolerance_rad: Step in rad, rms over the pulses, below which the entropy fixed point
+            ends.
+        tolerance_rad: The same for the iterations against the Wiener estimate.
+        imaging: Image formation in which scatterers do not migrate, for data in which they migrate
+            through range cells; see `entropy_fixed_point`. Its image must cover the whole
+            unambiguous cross range. It also determines the slope of the phase over pulses, since a
+            displaced image has the wrong migration: after the steps above, 48 slopes over one turn
+            per pulse are tried, the best is refined, and both kinds of iterations are run with
+            `imaging`.
 
-    std: from two halves of the rows, close to the true error on targets of points. ok is False for
-    noise, for images no sharper than noise can be made, and for one row alone. Differentiable
-    without `imaging`. Raises TypeError or ValueError for samples that are not finite and complex,
-    or a start of another shape.
+    Returns:
+        `phase_rad` of shape (..., pulse), to be removed. Its standard deviation follows from two
+        halves of the range cells and is close to the true error on targets of points. `ok` is False
+        unless the image is 1.5 times sharper than noise can be made, more than one range cell
+        contributes to the sharpness, and the predicted Strehl ratio exceeds 0.8.
+
+    Raises:
+        TypeError: If the data are not complex or the start is not a tensor.
+        ValueError: If the data are empty or not finite, the start does not have one phase per
+            pulse, or a number of iterations is not a whole number of 0 or more.
     """
     pulses = prepare(data, "autofocus")
     refuse_odd_counts("autofocus", 0, search=search, polish=polish)
@@ -77,7 +100,7 @@ def autofocus(
         )
         if imaging is not None:
             through = Through(imaging)
-            phase, more = _Placed(through, runs(through, through))(rows, phase)
+            phase, more = _WithSlope(through, runs(through, through))(rows, phase)
             taken = taken + more
         return phase, taken, (lambda some, _, at: fixed_point(some, at, again)[0]) if polish else settled
 
@@ -85,11 +108,11 @@ def autofocus(
 
 
 def _first_floor(rows: Tensor) -> Tensor:
-    """Floor of the first iterations, (trial, 1, 1): higher where less than half of the range cells
-    hold the energy, that is little of it is noise.
+    """Floor of the first iterations, (trial, 1, 1).
 
-    From there, a low floor ends in a wrong minimum in one scene of two hundred; in much noise, a
-    high one hides the target.
+    It is higher where less than half of the range cells hold the energy, that is where noise is
+    weak. A low floor then ends in a wrong minimum in one scene of two hundred; in strong noise, a
+    high floor hides the target.
     """
     energy = (rows.detach().real.square() + rows.detach().imag.square()).sum(-1)
     share = energy / energy.sum(-1, keepdim=True).clamp_min(torch.finfo(energy.dtype).tiny)
@@ -98,9 +121,10 @@ def _first_floor(rows: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class _Placed:
-    """Slope and phase through an image formation in which scatterers do not migrate: the slope over
-    a turn, the phase, the slope again, the phase.
+class _WithSlope:
+    """Slope and phase with an image formation in which scatterers do not migrate.
+
+    Finds the slope over one turn, the phase, the slope again, and the phase again.
     """
 
     through: Through
@@ -118,9 +142,7 @@ class _Placed:
 
     @torch.no_grad()
     def _best_slope(self, rows: Tensor, phase: Tensor, step_rad: float, count: int) -> Tensor:
-        """The phase with the one of `count` slopes (rad per pulse) about its own that gives the
-        least entropy, per trial.
-        """
+        """The phase plus the slope, of `count` about its own, that gives the least entropy."""
         n = rows.shape[-1]
         ramp = torch.arange(n, dtype=phase.dtype, device=phase.device) - (n - 1) / 2
         best, least = phase, torch.full_like(phase[:, 0], torch.inf)

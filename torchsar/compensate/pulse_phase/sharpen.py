@@ -1,5 +1,7 @@
-"""Fixed points that sharpen the image: entropy (EFP), and the phase of each pulse against a Wiener
-estimate of the scene from the others.
+"""Fixed-point iterations that sharpen the image.
+
+The entropy fixed point, and the phase of each pulse against a Wiener estimate of the scene from the
+other pulses.
 """
 
 from __future__ import annotations
@@ -21,11 +23,16 @@ Weights = Callable[[Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Run:
-    """Fixed-point iterations with one kind of weights: weights(power, its mean) -> real weights of
-    the cells.
+    """Settings of fixed-point iterations with one kind of weights.
 
-    relaxation: share of the phase step that is taken. A trial ends after `iterations`, or once its
-    step is below tolerance_rad (rms over its pulses).
+    A trial ends after `iterations`, or once its step is below `tolerance_rad`.
+
+    Args:
+        weights: Function of the power of the cells and its mean that returns their real weights.
+        imaging: Image formation.
+        iterations: Largest number of iterations.
+        relaxation: Factor applied to the phase step.
+        tolerance_rad: Step in rad, rms over the pulses, below which a trial ends.
     """
 
     weights: Weights
@@ -36,9 +43,15 @@ class Run:
 
 
 def fixed_point(rows: Tensor, phase: Tensor, run: Run) -> tuple[Tensor, Tensor]:
-    """psi <- psi + relaxation * arg sum_n x conj(A^H (w A x)), x = rows exp(-j psi).
+    """Iterate psi <- psi + relaxation * arg sum_n x conj(A^H (w A x)), with x = rows exp(-j psi).
 
-    Phase (trial, pulse) and iterations taken (trial,).
+    Args:
+        rows: Pulses, shape (trial, range, pulse), complex.
+        phase: Phase to start from in rad, shape (trial, pulse).
+        run: Settings.
+
+    Returns:
+        The phase in rad, shape (trial, pulse), and the number of iterations, shape (trial,).
     """
     active = torch.ones_like(phase[:, 0], dtype=torch.bool)
     taken = torch.zeros_like(active, dtype=torch.int64)
@@ -54,7 +67,7 @@ def fixed_point(rows: Tensor, phase: Tensor, run: Run) -> tuple[Tensor, Tensor]:
 
 
 def _phase_step(rows: Tensor, mirrored: Tensor, phase: Tensor, run: Run) -> Tensor:
-    """arg sum_n x conj(model), with the turn of x taken out of the sum over rows.
+    """arg sum_n x conj(model); exp(-j psi) of x is applied after the sum over rows.
 
     mirrored: the conjugate of rows.
     """
@@ -65,8 +78,17 @@ def _phase_step(rows: Tensor, mirrored: Tensor, phase: Tensor, run: Run) -> Tens
 
 
 def weighted(image: Tensor, weights: Weights) -> Tensor:
-    """w(p / mean p) * image with p = |image|^2: real and imaginary parts apart, which on a CPU is
-    three times as fast as complex by real.
+    """Multiply an image by w(p / mean p), with p = |image|^2.
+
+    Real and imaginary parts are multiplied separately, which on a CPU is three times as fast as a
+    product of complex and real numbers.
+
+    Args:
+        image: Image, shape (..., range, Doppler), complex.
+        weights: Function of the power and its mean that returns the weights.
+
+    Returns:
+        The weighted image, same shape.
     """
     real, imag = image.real.contiguous(), image.imag.contiguous()
     power = torch.addcmul(real * real, imag, imag)
@@ -79,8 +101,10 @@ def weighted(image: Tensor, weights: Weights) -> Tensor:
 
 @dataclass(frozen=True)
 class LogAbove:
-    """ln(max(p, floor) / floor): the gradient of the entropy for cells above the floor (times the
-    mean power; a number or (trial, 1, 1)), nothing below it.
+    """Weights ln(max(p, floor) / floor): the gradient of the entropy above a floor, zero below it.
+
+    Args:
+        floor: Floor as a multiple of the mean power, a number or shape (trial, 1, 1).
     """
 
     floor: float | Tensor
@@ -91,12 +115,15 @@ class LogAbove:
 
 @dataclass(frozen=True)
 class Wiener:
-    """(p / (p + level * mean p))^2 of powers averaged over three range cells, less the mean of its
-    row.
+    """Weights (p / (p + level * mean p))^2 of locally averaged powers, minus their mean in the row.
 
-    Small where a cell holds no more than noise, constant where it holds much: a Wiener filter with
-    the local power as its prior. Without its mean the filter leaves a pulse out of the scene that
-    it is compared with, to first order, and steps need no relaxation.
+    Powers are averaged over three range cells. A weight is small where a cell holds no more than
+    noise and constant where it holds much more: a Wiener filter whose prior is the local power.
+    Subtracting the mean removes, to first order, the contribution of a pulse to the scene with
+    which it is compared; steps then need no relaxation.
+
+    Args:
+        level: Noise level as a multiple of the mean power.
     """
 
     level: float = 2.0
@@ -118,18 +145,34 @@ def entropy_fixed_point(
     tolerance_rad: float = 1e-3,
     imaging: Imaging | None = None,
 ) -> Estimate:
-    """Entropy fixed point (brief 002, section 7), with value["phase_rad"] (..., pulse) to be
-    removed. data: (..., pulse, range) complex.
+    """Estimate the phase of each pulse by a fixed-point iteration that lowers the image entropy.
 
-    Image, weights ln(max(p, floor) / floor) of its cells (p over its mean), back to pulses, phase
-    of each pulse against that: two transforms an iteration, no peaks, no windows. start: (...,
-    pulse) rad, by default that of `sca`, with which the result is equivariant. floors: (floor,
-    iterations) one after another; a trial passes on to the next once its steps are below
-    tolerance_rad rms. relaxation: over 1 it helps past local minima, 2 or more need not converge.
-    imaging: the image formation to sharpen, by default a transform along pulses; any object with
-    `image` and `adjoint` of (..., pulse, range) profiles, such as `torchsar.focus.PolarOperator`.
-    Differentiable. Raises TypeError or ValueError for samples that are not finite and complex, a
-    start of another shape, floors that are not positive.
+    Each iteration forms the image, weights its cells with ln(max(p, floor) / floor), where p is the
+    power over its mean, transforms back to pulses, and takes the phase of each pulse against the
+    result. It needs two transforms, no peaks and no windows. Differentiable.
+
+    Args:
+        data: Range-compressed and aligned pulses, shape (..., pulse, range), complex.
+        start: Phase to start from in rad, shape (..., pulse); by default that of `sca`, with which
+            the result is equivariant.
+        floors: Pairs (floor, iterations) that are used one after another. A trial proceeds to the
+            next once its steps are below `tolerance_rad`.
+        relaxation: Factor applied to the phase step. Above 1 it helps to pass local minima; at 2 or
+            more the iteration need not converge.
+        tolerance_rad: Step in rad, rms over the pulses, below which a trial ends a floor.
+        imaging: Image formation to sharpen, by default a transform along pulses; any object with
+            `image` and `adjoint` of profiles of shape (..., pulse, range), such as
+            `torchsar.focus.PolarOperator`.
+
+    Returns:
+        `phase_rad` of shape (..., pulse), to be removed, with its standard deviation. `ok` is False
+        unless the image is 1.5 times sharper than noise can be made, more than one range cell
+        contributes to the sharpness, and the predicted Strehl ratio exceeds 0.8.
+
+    Raises:
+        TypeError: If the data are not complex or the start is not a tensor.
+        ValueError: If the data are empty or not finite, the start does not have one phase per
+            pulse, or a floor, an iteration count or the relaxation is invalid.
     """
     pulses = prepare(data, "entropy_fixed_point")
     if not floors or not all(floor > 0 and count >= 1 for floor, count in floors) or not 0 < relaxation < 2:
@@ -148,7 +191,16 @@ def entropy_fixed_point(
 
 
 def in_turn(rows: Tensor, phase: Tensor, runs: Sequence[Run]) -> tuple[Tensor, Tensor]:
-    """One run after another: phase (trial, pulse) and iterations taken (trial,)."""
+    """Run several kinds of fixed-point iterations one after another.
+
+    Args:
+        rows: Pulses, shape (trial, range, pulse), complex.
+        phase: Phase to start from in rad, shape (trial, pulse).
+        runs: Settings, in order.
+
+    Returns:
+        The phase in rad, shape (trial, pulse), and the number of iterations, shape (trial,).
+    """
     total = torch.zeros_like(phase[:, 0], dtype=torch.int64)
     for run in runs:
         phase, taken = fixed_point(rows, phase, run)
@@ -157,5 +209,17 @@ def in_turn(rows: Tensor, phase: Tensor, runs: Sequence[Run]) -> tuple[Tensor, T
 
 
 def settled(rows: Tensor, present: Tensor, phase: Tensor) -> Tensor:
-    """Where the entropy takes a phase in four steps, by which other estimates are judged."""
+    """Continue a phase by four steps of the entropy fixed point.
+
+    Other estimators use this to predict their accuracy, see
+    `torchsar.compensate.pulse_phase.verdict`.
+
+    Args:
+        rows: Pulses, shape (trial, range, pulse), complex.
+        present: False for pulses without samples, shape (trial, pulse), bool; not used.
+        phase: Phase to start from in rad, shape (trial, pulse).
+
+    Returns:
+        The phase in rad, shape (trial, pulse).
+    """
     return fixed_point(rows, phase, Run(LogAbove(2.5), AlongPulses(), 4, 1.8, 0.0))[0]

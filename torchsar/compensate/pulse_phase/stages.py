@@ -1,5 +1,6 @@
-"""The autofocus family as stages: estimators of `phase_rad` that leave the signal alone, and the
-corrector that takes it out.
+"""Autofocus as stages: estimators of `phase_rad`, and the stage that removes it.
+
+The estimators leave the signal unchanged.
 """
 
 from __future__ import annotations
@@ -20,13 +21,22 @@ from torchsar.core import Estimate, Signal, Stage, real_dtype, refuse_non_finite
 
 
 def correct_pulse_phase(data: Tensor, phase_rad: Tensor) -> Tensor:
-    """data * exp(-j phase).
+    """Multiply pulses by exp(-j phase).
 
-    data: (..., pulse, range) complex; phase_rad: (..., pulse) or (pulse,), whole turns of which are
-    dropped in float64.
+    Whole turns of the phase are removed in float64. Differentiable in both arguments.
 
-    Differentiable in both (Ruan et al. 2013, text after Eq. 6). Raises ValueError where there is
-    not one phase a pulse.
+    Args:
+        data: Pulses, shape (..., pulse, range), complex.
+        phase_rad: Phases in rad, shape (..., pulse) or (pulse,).
+
+    Returns:
+        The corrected pulses, shape (..., pulse, range), complex.
+
+    Raises:
+        ValueError: If there is not one finite phase per pulse.
+
+    Reference:
+        Ruan et al. 2013, text after Eq. (6).
     """
     if not isinstance(phase_rad, Tensor) or phase_rad.shape[-1:] != data.shape[-2:-1]:
         got = tuple(phase_rad.shape) if isinstance(phase_rad, Tensor) else type(phase_rad).__name__
@@ -38,33 +48,53 @@ def correct_pulse_phase(data: Tensor, phase_rad: Tensor) -> Tensor:
 
 
 class CorrectPulsePhase(Stage):
-    """Takes a phase per pulse out of the data; the value `phase_rad` (..., pulse) comes from an
-    estimator before it.
-    """
+    """Removal of a phase per pulse by a connected value `phase_rad`; see `correct_pulse_phase`."""
 
     def forward(self, signal: Signal, phase_rad: Tensor) -> Signal:
+        """Remove the phase from a signal of axes (pulse, range).
+
+        Args:
+            signal: Pulses, shape (..., pulse, range), complex.
+            phase_rad: Phases in rad, shape (..., pulse).
+
+        Returns:
+            The corrected signal.
+        """
         return signal.with_data(correct_pulse_phase(signal.data, phase_rad).contiguous())
 
 
 class Sca(Stage):
-    """`sca`: phases between adjacent pulses, summed over range."""
+    """Phase per pulse by the spatial correlation algorithm; see `sca`."""
 
     provides = ("phase_rad",)
 
     def forward(self, signal: Signal) -> Estimate:
+        """Estimate `phase_rad` of a signal of axes (pulse, range)."""
         return sca(signal.data)
 
 
 def windows_of(windows: Literal["shrinking", "measured"] | list[float]) -> Windows:
-    """A window schedule by name, or a list of widths in cells."""
+    """Make a schedule of window widths from its name or a list.
+
+    Args:
+        windows: "shrinking", "measured", or widths in Doppler cells.
+
+    Returns:
+        The schedule.
+    """
     if isinstance(windows, str):
         return {"shrinking": Shrinking, "measured": Measured}[windows]()
     return Listed(tuple(windows))
 
 
 class Pga(Stage):
-    """`pga`: phase gradient autofocus from the data as they are, or from the value `start` (...,
-    pulse) where one is connected.
+    """Phase per pulse by phase gradient autofocus; see `pga`.
+
+    Args:
+        kernel: Kernel, see `pga`.
+        windows: "shrinking", "measured", or a list of widths in Doppler cells.
+        iterations: Largest number of iterations.
+        patience: Number of iterations without a lower entropy after which a trial ends.
     """
 
     provides = ("phase_rad",)
@@ -81,6 +111,15 @@ class Pga(Stage):
         self.windows, self.iterations, self.patience = windows_of(windows), iterations, patience
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
+        """Estimate `phase_rad` of a signal of axes (pulse, range).
+
+        Args:
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            start: Phase to start from in rad, shape (..., pulse); by default zero.
+
+        Returns:
+            The estimate of `pga`.
+        """
         return pga(
             signal.data,
             kernel=self.kernel,
@@ -92,7 +131,14 @@ class Pga(Stage):
 
 
 class PgaSca(Pga):
-    """`pga_sca`: phase gradient autofocus started from SCA."""
+    """Phase per pulse by phase gradient autofocus started from SCA; see `pga_sca`.
+
+    Args:
+        kernel: Kernel, see `pga`.
+        windows: "shrinking", "measured", or a list of widths in Doppler cells.
+        iterations: Largest number of iterations.
+        patience: Number of iterations without a lower entropy after which a trial ends.
+    """
 
     def __init__(
         self,
@@ -104,13 +150,24 @@ class PgaSca(Pga):
         super().__init__(kernel, windows, iterations, patience)
 
     def forward(self, signal: Signal) -> Estimate:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Estimate `phase_rad` of a signal of axes (pulse, range)."""
         return pga_sca(
             signal.data, kernel=self.kernel, windows=self.windows, iterations=self.iterations, patience=self.patience
         )
 
 
 class EntropyFixedPoint(Stage):
-    """`entropy_fixed_point` with one floor after another: floors[i] for iterations[i]."""
+    """Phase per pulse by the entropy fixed point; see `entropy_fixed_point`.
+
+    Args:
+        floors: Floors that are used one after another.
+        iterations: Largest number of iterations for each floor.
+        relaxation: Factor applied to the phase step.
+        imaging: Image formation to sharpen.
+
+    Raises:
+        ValueError: If there is not one number of iterations for each floor.
+    """
 
     provides = ("phase_rad",)
 
@@ -130,14 +187,27 @@ class EntropyFixedPoint(Stage):
         self.schedule, self.relaxation, self.imaging = tuple(zip(floors, iterations)), relaxation, imaging
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
+        """Estimate `phase_rad` of a signal of axes (pulse, range).
+
+        Args:
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
+
+        Returns:
+            The estimate of `entropy_fixed_point`.
+        """
         return entropy_fixed_point(
             signal.data, start=start, floors=self.schedule, relaxation=self.relaxation, imaging=self.imaging
         )
 
 
 class Autofocus(Stage):
-    """`autofocus`, the recommended estimator: adjacent pulses, entropy fixed point, Wiener estimate
-    of the scene.
+    """Phase per pulse by the recommended autofocus; see `autofocus`.
+
+    Args:
+        search: Largest number of iterations of the entropy fixed point, approximately.
+        polish: Largest number of iterations against the Wiener estimate.
+        imaging: Image formation to sharpen.
     """
 
     provides = ("phase_rad",)
@@ -147,12 +217,25 @@ class Autofocus(Stage):
         self.search, self.polish, self.imaging = search, polish, imaging
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
+        """Estimate `phase_rad` of a signal of axes (pulse, range).
+
+        Args:
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
+
+        Returns:
+            The estimate of `autofocus`.
+        """
         return autofocus(signal.data, start=start, search=self.search, polish=self.polish, imaging=self.imaging)
 
 
 class SharpestPhase(Stage):
-    """`sharpest_phase`: the phases of least power or amplitude entropy, or of most contrast, by
-    descent from SCA or the value `start`.
+    """Phase per pulse of least entropy or most contrast, by descent; see `sharpest_phase`.
+
+    Args:
+        objective: "power_entropy", "amplitude_entropy" or "contrast".
+        method: "lbfgs" or "adam".
+        steps: Largest number of steps.
     """
 
     provides = ("phase_rad",)
@@ -169,4 +252,13 @@ class SharpestPhase(Stage):
         self.steps = steps
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
+        """Estimate `phase_rad` of a signal of axes (pulse, range).
+
+        Args:
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
+
+        Returns:
+            The estimate of `sharpest_phase`.
+        """
         return sharpest_phase(signal.data, objective=self.objective, method=self.method, steps=self.steps, start=start)

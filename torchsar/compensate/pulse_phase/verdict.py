@@ -1,6 +1,4 @@
-"""Whether an estimated phase can be believed: how sharp the image became beyond what noise allows,
-and how well halves of the rows agree.
-"""
+"""Reliability of an estimated phase: image sharpness against noise, and agreement of two halves."""
 
 from __future__ import annotations
 
@@ -14,11 +12,15 @@ from torchsar.compensate.pulse_phase.data import Pulses, rotate
 from torchsar.core import Estimate, block_bytes_of, over_blocks
 from torchsar.metrics.phase import phase_rmse
 
-# entropy that the exponential distribution of a speckle cell's power lacks
+# difference of the entropies of a uniform row and of speckle, whose power has an exponential
+# distribution: 1 - Euler's constant
 SPECKLE_NATS = 1 - 0.5772156649015329
-LEAST_STREHL = 0.8
+LEAST_STREHL = 0.8  # Strehl ratio of a well-focused image, a convention (Marechal)
+# factor by which the sharpness must exceed that of noise: `sharpness_of_noise` errs by up to 15 %
 _MARGIN = 1.5
-_LEAST_ROWS = 1.5
+_LEAST_ROWS = 1.5  # a single row cannot separate phase errors from the scene; 1 is a single row
+# limits of `_drift`, found by trial: more rounds, or rounds after smaller steps, cost time and
+# rarely change the result
 _ROUNDS = 6
 _FAR_RAD = 0.1
 
@@ -28,12 +30,18 @@ Find = Callable[[Tensor, Tensor, Tensor | None], Found]
 
 
 def sharpness_beyond_speckle(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Entropy (nats) that an image (..., range, Doppler) lacks against speckle of the same row
-    energies, (...,).
+    """Compute by how much the entropy of an image lies below that of speckle.
 
-    An image whose rows are circular noise has 0 before any phase is fitted to it. Also returns over
-    how many rows its energy is spread, and over how many rows the sharpness is (1 where one bright
-    row makes all of it).
+    The speckle has the same row energies. An image whose rows are circular noise has 0 before any
+    phase is fitted to it.
+
+    Args:
+        image: Image, shape (..., range, Doppler), complex.
+
+    Returns:
+        The missing entropy in nats, the effective number of rows over which the energy is spread,
+        and the effective number of rows over which the missing entropy is spread (1 if one bright
+        row makes all of it); shape (...,) each, float64.
     """
     real, imag = image.real.contiguous(), image.imag.contiguous()
     power = real * real + imag * imag
@@ -49,19 +57,31 @@ def sharpness_beyond_speckle(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def sharpness_of_noise(rows: Tensor) -> Tensor:
-    """The same lack of entropy (nats) that the sharpest image of pure noise reaches, for an
-    effective number of rows.
+    """Compute the missing entropy of the sharpest image that can be made from pure noise.
 
-    Measured with the entropy fixed point on circular noise of 4 to 1024 rows and 64 to 1600 pulses
-    (0.94, 0.29, 0.10, 0.045, 0.019 nats at 4, 16, 64, 256, 1024 rows; the number of pulses hardly
-    matters); this fit is within 15 %.
+    A fit, within 15 %, to measurements with the entropy fixed point on circular noise of 4 to 1024
+    rows and 64 to 1600 pulses: 0.94, 0.29, 0.10, 0.045, 0.019 nats at 4, 16, 64, 256, 1024 rows.
+    The number of pulses has hardly any effect.
+
+    Args:
+        rows: Effective number of rows, shape (...,).
+
+    Returns:
+        The missing entropy in nats, shape (...,).
     """
     return 0.62 / torch.sqrt(rows) + 2.1 / rows
 
 
 def occupied_band(rows: Tensor) -> Tensor:
-    """Share of the range band that rows (trial, range, pulse) fill, (trial,): 1 / 4 of them are
-    independent in noise that is sampled four times too finely.
+    """Compute the share of the range band that the data occupy.
+
+    In noise that is sampled four times too finely, for example, 1 / 4 of the rows are independent.
+
+    Args:
+        rows: Pulses, shape (trial, range, pulse), complex.
+
+    Returns:
+        The share 0..1, shape (trial,), float64.
     """
     spectrum = torch.fft.fft(rows, dim=-2)
     density = (spectrum.real.square() + spectrum.imag.square()).mean(-1, dtype=torch.float64)
@@ -69,73 +89,85 @@ def occupied_band(rows: Tensor) -> Tensor:
 
 
 def estimated(pulses: Pulses, start: Tensor | None, find: Find, at_rest: bool = False) -> Estimate:
-    """Find a phase and judge it, by blocks of trials that stay in the cache (all at once where
-    gradients are wanted).
+    """Find a phase and predict its accuracy, in blocks of trials that fit into the cache.
 
-    find(rows, present, start): phase (trial, pulse), iterations taken (trial,), and `again`: what a
-    method finds from some of the rows beginning with a phase. It is run on two halves of the rows,
-    dealt out by their energy, whose noise is independent (less so where range is sampled finer than
-    the band asks for, which `occupied_band` makes up for): half of the difference of both, and how
-    far it moves away on all rows (nothing where the phase is at_rest under it), make the predicted
-    deviation. ok: the image is 1.5 times sharper than noise can be made, more than one row carries
-    it, and the deviation promises a Strehl ratio of 0.8. quality: that ratio, times the share of
-    the sharpness that noise does not explain. A pulse without samples has no phase of its own and
-    is marked in info["present"].
+    All trials are processed at once if gradients are wanted. The standard deviation combines two
+    measurements. One is half of the difference between estimates from two halves of the rows, dealt
+    out by their energy, whose noise is independent; `occupied_band` corrects for rows that are
+    sampled finer than their band requires. The other is how far the method moves its result on all
+    rows when it is continued.
+
+    Args:
+        pulses: The pulses.
+        start: Start of the estimate per trial, or None.
+        find: Function of (rows, present, start) that returns the phase (trial, pulse), the number
+            of iterations (trial,), and a function of (rows, present, phase) that continues the
+            method on some of the rows from that phase.
+        at_rest: True if continuing the method does not move its result; the second measurement is
+            then left out.
+
+    Returns:
+        `phase_rad` of shape (..., pulse) with its standard deviation. quality is the predicted
+        Strehl ratio times the share of the sharpness that noise does not explain. `ok` is False
+        unless the image is 1.5 times sharper than noise can be made, more than one row contributes
+        to the sharpness, and the standard deviation predicts a Strehl ratio above 0.8. info:
+        present, shape (..., pulse), False for pulses without samples, which have no phase of their
+        own; iterations, sharpness_nats, noise_sharpness_nats, effective_rows and telling_rows (rows
+        over which the sharpness is spread), shape (...,).
     """
     rows, present = pulses.rows, pulses.present
     if not len(rows) or pulses.n < 3:
-        return _gathered(pulses, [_nothing(rows)])
+        return _gathered(pulses, [_no_estimate(rows)])
     if len(rows) == 1 or (rows.requires_grad and torch.is_grad_enabled()):
-        return _gathered(pulses, [_judged(rows, present, start, find, at_rest)])
+        return _gathered(pulses, [_assessed(rows, present, start, find, at_rest)])
     height = max(1, block_bytes_of(rows.device) // (rows[0].numel() * rows.element_size()))
     parts = [slice(first, first + height) for first in range(0, len(rows), height)]
     done: dict[int, tuple[Tensor, ...]] = {}
 
     def work(part: slice) -> None:
-        done[part.start] = _judged(rows[part], present[part], None if start is None else start[part], find, at_rest)
+        done[part.start] = _assessed(rows[part], present[part], None if start is None else start[part], find, at_rest)
 
     with torch.no_grad():
         over_blocks(work, parts, rows)
     return _gathered(pulses, [done[part.start] for part in parts])
 
 
-def _judged(rows: Tensor, present: Tensor, start: Tensor | None, find: Find, at_rest: bool) -> tuple[Tensor, ...]:
-    """Phase, iterations, sharpness, rows of the energy and of the sharpness, deviation of every
-    trial.
-    """
+def _assessed(rows: Tensor, present: Tensor, start: Tensor | None, find: Find, at_rest: bool) -> tuple[Tensor, ...]:
+    """Phase, iterations, sharpness, effective rows of both, and standard deviation per trial."""
     phase, taken, again = find(rows, present, start)
     with torch.no_grad():
-        sharp, effective, telling = sharpness_beyond_speckle(torch.fft.fft(rotate(rows, phase), norm="ortho"))
+        sharp, effective, sharpness_rows = sharpness_beyond_speckle(torch.fft.fft(rotate(rows, phase), norm="ortho"))
         occupied = occupied_band(rows)
-        deviation = _disagreement(rows, present, phase, again) / occupied.sqrt()
+        std = _half_difference(rows, present, phase, again) / occupied.sqrt()
         if not at_rest:
-            deviation = torch.hypot(deviation, _drift(rows, present, phase, again))
-    return phase, taken, sharp, effective * occupied, telling, deviation
+            std = torch.hypot(std, _drift(rows, present, phase, again))
+    return phase, taken, sharp, effective * occupied, sharpness_rows, std
 
 
-def _nothing(rows: Tensor) -> tuple[Tensor, ...]:
-    """What `_judged` would return where no phase can be found: too few pulses, or no trials."""
+def _no_estimate(rows: Tensor) -> tuple[Tensor, ...]:
+    """The result of `_assessed` where no phase can be found: too few pulses, or no trials."""
     zero = torch.zeros(len(rows), dtype=torch.float64, device=rows.device)
     return rows[:, 0].real * 0, zero.long(), zero, zero, zero, zero + math.pi / math.sqrt(3)
 
 
 def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
-    phase, taken, sharp, effective, telling, deviation = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
+    """Estimate from the results of all blocks of trials."""
+    phase, taken, sharp, effective, sharpness_rows, std_rad = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
     present, shape = pulses.present, pulses.trials
     noise = sharpness_of_noise(effective.clamp_min(1))
-    learnable = present.sum(-1) >= 3
-    promised = torch.exp(-deviation.square())
-    quality = torch.where(learnable, promised * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1)), 0)
-    ok = learnable & (sharp > _MARGIN * noise) & (telling > _LEAST_ROWS) & (promised > LEAST_STREHL)
-    phase = torch.where(learnable[:, None], phase, 0)
+    enough_pulses = present.sum(-1) >= 3
+    strehl = torch.exp(-std_rad.square())
+    quality = torch.where(enough_pulses, strehl * (1 - (noise / sharp.clamp_min(1e-12)).clamp(0, 1)), 0)
+    ok = enough_pulses & (sharp > _MARGIN * noise) & (sharpness_rows > _LEAST_ROWS) & (strehl > LEAST_STREHL)
+    phase = torch.where(enough_pulses[:, None], phase, 0)
     info = {
         "iterations": taken,
         "sharpness_nats": sharp,
         "noise_sharpness_nats": noise,
         "effective_rows": effective,
-        "telling_rows": telling,
+        "telling_rows": sharpness_rows,
     }
-    std = deviation[:, None].expand(-1, pulses.n).to(phase.dtype)
+    std = std_rad[:, None].expand(-1, pulses.n).to(phase.dtype)
     return Estimate(
         value={"phase_rad": phase.reshape(*shape, pulses.n)},
         std={"phase_rad": std.reshape(*shape, pulses.n)},
@@ -148,9 +180,10 @@ def _gathered(pulses: Pulses, parts: Sequence[tuple[Tensor, ...]]) -> Estimate:
     )
 
 
-def _disagreement(rows: Tensor, present: Tensor, phase: Tensor, again: Again) -> Tensor:
-    """Half of the rms difference (rad) between the phases from two halves of the rows, (trial,); pi
-    / sqrt(3) where there is but one.
+def _half_difference(rows: Tensor, present: Tensor, phase: Tensor, again: Again) -> Tensor:
+    """Half of the rms difference (rad) between the phases from two halves of the rows, (trial,).
+
+    It is pi / sqrt(3), as for a random phase, if there is only one row.
     """
     if rows.shape[-2] < 2:
         return torch.full(rows.shape[:1], math.pi / math.sqrt(3), dtype=torch.float64, device=rows.device)
@@ -163,24 +196,25 @@ def _disagreement(rows: Tensor, present: Tensor, phase: Tensor, again: Again) ->
 
 
 def _drift(rows: Tensor, present: Tensor, phase: Tensor, again: Again) -> Tensor:
-    """How far (rad rms) `again` moves a phase on all rows, (trial,): once, then on while it goes
-    far and the phase might still pass as good.
+    """Distance in rad rms, (trial,), by which continuing the method moves its result on all rows.
 
-    Dense targets move slowly: PGA on 256 scatterers a row errs by 0.8 rad, of which the first round
-    shows 0.3.
+    It is continued while the steps are large and the phase might still count as reliable, because
+    it moves slowly on dense targets: PGA on 256 scatterers per row has an error of 0.8 rad, of
+    which the first round reveals 0.3.
     """
-    place, total = phase, torch.zeros(len(phase), dtype=torch.float64, device=phase.device)
-    going = torch.ones_like(total, dtype=torch.bool)
+    current, total = phase, torch.zeros(len(phase), dtype=torch.float64, device=phase.device)
+    active = torch.ones_like(total, dtype=torch.bool)
     for _ in range(_ROUNDS):
-        reached = again(rows, present, place)
-        step = phase_rmse(reached, place, present)
-        total = torch.where(going, phase_rmse(reached, phase, present), total)
-        going = going & (step > _FAR_RAD) & (torch.exp(-total.square()) > LEAST_STREHL)
-        if not bool(going.any()):
+        reached = again(rows, present, current)
+        step = phase_rmse(reached, current, present)
+        total = torch.where(active, phase_rmse(reached, phase, present), total)
+        active = active & (step > _FAR_RAD) & (torch.exp(-total.square()) > LEAST_STREHL)
+        if not bool(active.any()):
             break
-        place = reached
+        current = reached
     return total
 
 
 def _or_one(x: Tensor) -> Tensor:
+    """x where it is positive, else 1."""
     return torch.where(x > 0, x, 1)

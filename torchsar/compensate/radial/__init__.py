@@ -1,8 +1,9 @@
-"""Radial motion of a triangular-FMCW ladar: velocities at turning points from up and down sweeps,
-and what takes the motion out (system 000).
+"""Radial motion of a triangular-FMCW ladar, estimated from up and down sweeps and compensated.
+
+Velocities refer to the turning points, where the up sweep ends and the down sweep begins, and are
+positive for receding targets (dR/dt).
 """
 
-from torchsar.compensate.radial.bands import Bands, bands_of
 from torchsar.compensate.radial.compensate import compensate_motion
 from torchsar.compensate.radial.correlation import spectrum_correlation
 from torchsar.compensate.radial.equalise import equalise_pulses, pulse_gain
@@ -22,10 +23,9 @@ from torchsar.compensate.radial.stages import (
     SegmentedInterference,
     SpectrumCorrelation,
 )
-from torchsar.compensate.radial.trajectory import geometric_velocity_m_s, integrated_range, sweep_motion, turning_points
+from torchsar.compensate.radial.trajectory import geometric_velocity_m_s, integrated_range, turning_points
 
 __all__ = [
-    "Bands",
     "CompensateMotion",
     "EqualisePulses",
     "MirrorProduct",
@@ -35,7 +35,6 @@ __all__ = [
     "RadialMotion",
     "SegmentedInterference",
     "SpectrumCorrelation",
-    "bands_of",
     "compensate_motion",
     "equalise_pulses",
     "geometric_velocity_m_s",
@@ -48,6 +47,5 @@ __all__ = [
     "range_error",
     "segmented_interference",
     "spectrum_correlation",
-    "sweep_motion",
     "turning_points",
 ]

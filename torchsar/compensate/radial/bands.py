@@ -1,6 +1,4 @@
-"""Up sweeps and mirrored down sweeps of a window of ranges, on few samples and with the bulk of the
-Doppler shift taken out.
-"""
+"""Up sweeps and mirrored down sweeps of a range window, without the bulk of the Doppler shift."""
 
 from __future__ import annotations
 
@@ -13,30 +11,42 @@ from torch import Tensor
 from torchsar.core import Axis, cis, real_dtype, refuse_non_finite
 from torchsar.radar import TriangularLadar
 
+# periods over which envelopes are averaged, found by trial: more raise the SNR, fewer follow
+# vibration
 _BLOCK = 8
-# likeness of envelopes that noise alone does not reach, and share of the usual energy below which a
-# period shows no echo
-_ALIKE, _FAINT = 0.35, 0.3
-# likeness of the envelopes of one period that is trusted against that of its neighbours
+# correlation coefficient of averaged envelopes that noise alone does not reach, found by trial
+_ALIKE = 0.35
+# share of the usual energy below which a period contains no echo, found by trial
+_FAINT = 0.3
+# correlation coefficient of the envelopes of one period above which they overrule those of the
+# neighbouring periods, found by trial
 _SURELY_ALIKE = 0.7
-# bins: what lies further off is another scatterer, lit in one of the two sweeps only
+# lag in bins beyond which a match belongs to another scatterer, illuminated in one sweep only
 _FURTHEST = 14
 
 
 @dataclass(frozen=True)
 class Bands:
-    """Both sweeps of every period as the window of ranges makes them, without the Doppler shift of
-    a whole number of bins.
+    """Both sweeps of every period, filtered to a range window, without the bulk Doppler shift.
 
-    up, down: (..., pulse, m) samples over the sweep at `time_s` (m,), symmetric about its middle.
-    up is up(u) exp(-2j pi s u / T) and down is the MIRRORED sweep down(-u) exp(+2j pi s u / T), in
-    the sign of the paper ("lo_conj_echo"), each filtered to the lines of the window, times a power
-    of two of the trial that brings samples to about one. Both then have the beat of the range plus
-    and minus what is left of the Doppler shift, within about a bin of it, and the residual video
-    phase is removed unless it was to be kept. shift: (..., pulse) int64, s. lit: (..., pulse) bool,
-    False where no echo is seen and the shift is that of the neighbours. lines: number of kept bins;
-    first: beat of the first of them in bins of 1 / T; noise_lines: how many unfiltered lines let as
-    much noise through.
+    A bin is 1 / T, where T is the length of a sweep. `up` is up(u) exp(-2j pi s u / T) and `down`
+    is the mirrored sweep down(-u) exp(+2j pi s u / T), with u the time from the middle of the sweep
+    and s the shift. They follow the sign convention of Remote Sens. 2024, 16, 793 ("lo_conj_echo").
+    Both then have the beat frequency of the range plus and minus the remaining Doppler shift, which
+    is about a bin or less. The residual video phase is removed unless it was to be kept. Samples
+    are multiplied by a power of two per trial that brings them to about one.
+
+    Args:
+        up: Up sweeps, shape (..., pulse, m), complex, symmetric about the middle of the sweep.
+        down: Mirrored down sweeps, same shape.
+        time_s: Times of the samples from the middle of the sweep, shape (m,).
+        shift: Removed Doppler shift s in bins, shape (..., pulse), int64.
+        lit: False where no echo was found and the shift is that of the neighbouring periods, shape
+            (..., pulse), bool.
+        lines: Number of bins that the window keeps.
+        first: Beat frequency of the first of them, in bins.
+        noise_lines: Number of unfiltered bins that pass as much noise.
+        radar: Ladar parameters.
     """
 
     up: Tensor
@@ -51,37 +61,61 @@ class Bands:
 
     @property
     def shift_m_s(self) -> Tensor:
-        """Radial velocity of the shift that was taken out, (..., pulse) float64."""
+        """Radial velocity of the removed shift in m/s, receding positive, (..., pulse), float64."""
         return self.shift.to(torch.float64) * self.radar.ambiguous_velocity_m_s
 
     def product(self) -> Tensor:
-        """up conj(down), (..., pulse, m): equal optical frequencies meet, see `mirror_product`."""
+        """Multiply the up sweeps by the conjugate of the mirrored down sweeps.
+
+        Samples of equal optical frequency are multiplied, see `mirror_product`.
+
+        Returns:
+            The product, shape (..., pulse, m), complex.
+        """
         return self.up * self.down.conj()
 
     @property
     def inner(self) -> slice:
-        """Samples without the 1/32 at each end, where filters ring (brief 000, section 5b)."""
+        """Samples without the outer 1/32 at each end, where filters ring."""
         drop = round(self.time_s.shape[-1] / 32)
         return slice(drop, self.time_s.shape[-1] - drop)
 
 
 def canonical(sweeps: Tensor, radar: TriangularLadar) -> Tensor:
-    """The sweeps in the sign of the paper: a scatterer beyond the reference has a positive beat in
-    the up sweep.
+    """Convert sweeps to the sign convention of Remote Sens. 2024, 16, 793.
+
+    In that convention a scatterer beyond the reference range has a positive beat frequency in the
+    up sweep.
+
+    Args:
+        sweeps: Sweeps as recorded, any shape, complex.
+        radar: Ladar parameters.
+
+    Returns:
+        The sweeps, same shape.
     """
     return sweeps.conj() if radar.dechirp_sign == "echo_conj_lo" else sweeps
 
 
 def refuse_other_sweeps(sweeps: Tensor, radar: TriangularLadar, what: str, pulse: Axis | None = None) -> None:
-    """Raise TypeError or ValueError unless sweeps is finite and complex (..., 2, pulse, N) with the
-    N of the radar, and as many periods as the axis.
+    """Check the type and shape of sweeps.
+
+    Args:
+        sweeps: Sweeps, shape (..., 2, pulse, N), complex.
+        radar: Ladar parameters, which give N.
+        what: Name of the calling function for the error message.
+        pulse: Axis of the periods, or None.
+
+    Raises:
+        TypeError: If the sweeps are not a complex tensor.
+        ValueError: If the sweeps have another shape, are not finite, or do not match the axis.
     """
     n = radar.sweep_samples
     if not (isinstance(sweeps, Tensor) and sweeps.is_complex()):
         raise TypeError(
             f"{what} works on complex sweeps (..., 2, pulse, {n}), got "
-            f"{getattr(sweeps, 'dtype', type(sweeps).__name__)}; split the record of a real "
-            "detector first"
+            f"{getattr(sweeps, 'dtype', type(sweeps).__name__)}; separate the record "
+            "of a real detector into sweeps first"
         )
     if sweeps.ndim < 3 or sweeps.shape[-3] != 2 or sweeps.shape[-1] != n or sweeps.shape[-2] < 1:
         raise ValueError(
@@ -96,9 +130,18 @@ def refuse_other_sweeps(sweeps: Tensor, radar: TriangularLadar, what: str, pulse
 
 
 def window_lines(radar: TriangularLadar, window_m: tuple[float, float] | None) -> tuple[int, int]:
-    """First beat bin and number of bins of a window of relative ranges; the whole band for None.
+    """Convert a window of relative ranges to beat-frequency bins.
 
-    Raises ValueError for a window that is none.
+    Args:
+        radar: Ladar parameters.
+        window_m: Lowest and highest relative range in metres; None for the whole band.
+
+    Returns:
+        The first bin and the number of bins.
+
+    Raises:
+        ValueError: If the window is not an interval, exceeds the beat band, or holds fewer than
+            four range cells.
     """
     n = radar.sweep_samples
     if window_m is None:
@@ -126,8 +169,20 @@ def window_lines(radar: TriangularLadar, window_m: tuple[float, float] | None) -
 def inside(
     radar: TriangularLadar, window_m: tuple[float, float] | None, bins: int, per_line: float, device: torch.device
 ) -> Tensor:
-    """Mask (bins,) of a transform's bins, `per_line` of them a range cell and zero frequency first,
-    that lie in a window of relative ranges.
+    """Mark the bins of a transform that lie in a window of relative ranges.
+
+    Args:
+        radar: Ladar parameters.
+        window_m: Lowest and highest relative range in metres; None for the whole band.
+        bins: Length of the transform, zero frequency first.
+        per_line: Bins of the transform per range cell.
+        device: Device of the result.
+
+    Returns:
+        The mask, shape (bins,), bool.
+
+    Raises:
+        ValueError: As for `window_lines`.
     """
     first, lines = window_lines(radar, window_m)
     at = torch.arange(bins, device=device)
@@ -136,14 +191,20 @@ def inside(
 
 
 def bulk_shift(blocks: Tensor, pulses: int) -> tuple[Tensor, Tensor]:
-    """Doppler shift of every period in whole bins, and whether an echo is there to tell it: (...,
-    pulse) int64 and bool.
+    """Find the Doppler shift of every period in whole bins, from the envelopes of both sweeps.
 
-    blocks: (..., 2, block, N) power spectra, zero frequency first, the down sweep as recorded, mean
-    over 8 periods each (the last over what is left). The lag that makes up and down envelopes meet
-    is 2 fd (brief 000, section 5.4). Lags beyond half the band, which a circular correlation would
-    wrap, are told apart. Periods in which the envelopes do not resemble each other take the shift
-    of their neighbours.
+    The lag that aligns the up and down envelopes is 2 fd (Remote Sens. 2024, 16, 793, Eq. (13)).
+    Lags beyond half the band, which a circular correlation would wrap, are resolved by
+    zero-padding. Periods whose envelopes are not similar take the shift of their neighbours.
+
+    Args:
+        blocks: Power spectra, zero frequency first, the down sweep as recorded, each the mean over
+            8 periods (the last over the remaining ones), shape (..., 2, block, N).
+        pulses: Number of periods.
+
+    Returns:
+        The shift in bins, shape (..., pulse), int64, and whether the envelopes are similar, shape
+        (..., pulse), bool.
     """
     n = blocks.shape[-1]
     blocks = torch.stack([blocks[..., 0, :, :], blocks[..., 1, :, :].roll(-1, -1).flip(-1)], -3)
@@ -152,8 +213,8 @@ def bulk_shift(blocks: Tensor, pulses: int) -> tuple[Tensor, Tensor]:
     level = blocks.square().sum(-1).clamp_min(torch.finfo(blocks.dtype).tiny).sqrt()
     blocks = blocks / level[..., None]
     spectrum = torch.fft.rfft(blocks, 2 * n)
-    met = torch.fft.irfft(spectrum[..., 0, :, :] * spectrum[..., 1, :, :].conj(), 2 * n)
-    likeness, lag = met.max(-1)
+    correlation = torch.fft.irfft(spectrum[..., 0, :, :] * spectrum[..., 1, :, :].conj(), 2 * n)
+    likeness, lag = correlation.max(-1)
     lag = torch.where(lag >= n, lag - 2 * n, lag).to(torch.float64)
     alike = likeness > _ALIKE
     lag = filled(_median_of_three(filled(lag, alike)), alike)
@@ -163,8 +224,17 @@ def bulk_shift(blocks: Tensor, pulses: int) -> tuple[Tensor, Tensor]:
 
 
 def filled(values: Tensor, known: Tensor) -> Tensor:
-    """values (..., n) with those that are not known interpolated between their known neighbours,
-    held at the ends; as they are where none is known.
+    """Replace unknown values by interpolation between their known neighbours.
+
+    Values beyond the first and the last known one are set to these. If no value is known, all are
+    returned unchanged.
+
+    Args:
+        values: Values, shape (..., n).
+        known: False where a value is unknown, shape (..., n), bool.
+
+    Returns:
+        The values, shape (..., n).
     """
     n = values.shape[-1]
     index = torch.arange(n, device=values.device).expand(values.shape)
@@ -177,7 +247,7 @@ def filled(values: Tensor, known: Tensor) -> Tensor:
 
 
 def _median_of_three(x: Tensor) -> Tensor:
-    """Median of every entry along the last dim and its two neighbours; the ends as they are."""
+    """Median of every entry and its two neighbours along the last dimension; ends are unchanged."""
     if x.shape[-1] < 3:
         return x
     inner = torch.stack([x[..., :-2], x[..., 1:-1], x[..., 2:]]).median(0).values
@@ -185,8 +255,9 @@ def _median_of_three(x: Tensor) -> Tensor:
 
 
 def _through_blocks(values: Tensor, pulses: int) -> Tensor:
-    """Values (..., block) in the middles of blocks of periods as straight lines over the periods,
-    (..., pulse): the first and the last line go on to the ends.
+    """Values (..., block) at the middles of blocks, interpolated linearly to (..., pulse).
+
+    The first and the last straight line are continued to the ends.
     """
     if values.shape[-1] == 1:
         return values.expand(*values.shape[:-1], pulses)
@@ -206,22 +277,33 @@ def bands_of(
     oversampling: int = 1,
     video: bool = False,
 ) -> Bands:
-    """Bands of a window of relative ranges (m), the whole band for None.
+    """Filter both sweeps of every period to a window of relative ranges.
 
-    sweeps: (..., 2, pulse, N) as recorded. Differentiable but for the shift.
+    Differentiable except for the shift.
 
-    taper: share of the window that its raised-cosine edges take; 0 cuts sharply, which leaves
-    ringing at the ends of the sweep (the error floor of a mirror product at high SNR), 1 makes them
-    meet in the middle. oversampling: samples a line, rounded up to a power of two; products need 2.
-    video: keep the residual video phase, which single scatterers do not mind, and whose filter
-    rings at the ends of the sweep.
+    Args:
+        sweeps: Sweeps as recorded, shape (..., 2, pulse, N), complex.
+        radar: Ladar parameters.
+        window_m: Lowest and highest relative range in metres; None for the whole band.
+        taper: Share of the window that its raised-cosine edges take. 0 cuts sharply, which leaves
+            ringing at the ends of the sweep (the error floor of a mirror product at high SNR); at 1
+            the edges meet in the middle.
+        oversampling: Samples per bin, rounded up to a power of two. Products of sweeps need 2.
+        video: Keep the residual video phase. It does not affect single scatterers, and the filter
+            that removes it rings at the ends of the sweep.
+
+    Returns:
+        The filtered sweeps.
+
+    Raises:
+        ValueError: If the window is invalid, see `window_lines`.
     """
     first, lines = window_lines(radar, window_m)
     n = radar.sweep_samples
     data = canonical(sweeps, radar)
     spectrum, scale = torch.fft.fft(data), _scale(sweeps.detach())
     shift, alike = bulk_shift(_block_power(spectrum.detach(), scale), sweeps.shape[-2])
-    shift, certain = _followed(spectrum.detach(), scale, shift, first, lines)
+    shift, certain = _corrected_shift(spectrum.detach(), scale, shift, first, lines)
     m = 2 ** max(3, math.ceil(math.log2(oversampling * lines)))
     line = torch.arange(lines, device=sweeps.device)
     sides = torch.stack([shift, -shift], -2)
@@ -245,7 +327,7 @@ def bands_of(
         down,
         time_s,
         shift,
-        alike & (certain | ~_faint(up, down, alike)),
+        alike & (certain | ~_without_echo(up, down, alike)),
         lines,
         first,
         float(shape.square().sum()),
@@ -253,18 +335,17 @@ def bands_of(
     )
 
 
-def _faint(up: Tensor, down: Tensor, alike: Tensor) -> Tensor:
-    """Periods with a sweep of much less energy in the window than others have, (..., pulse) bool:
-    no scatterer is lit in it.
-    """
+def _without_echo(up: Tensor, down: Tensor, alike: Tensor) -> Tensor:
+    """Whether a sweep has much less energy in the window than usual, (..., pulse) bool: no echo."""
     both = torch.stack([(x.detach().real.square() + x.detach().imag.square()).sum(-1) for x in (up, down)])
     usual = torch.where(alike, both.mean(0), torch.nan).nanmedian(-1, keepdim=True).values
     return both.amin(0) < _FAINT * usual
 
 
 def _scale(sweeps: Tensor) -> Tensor:
-    """Power of two (..., 1, 1, 1) that brings samples of a trial to about one, so that their
-    squares neither under- nor overflow. The middle of every sweep tells.
+    """Power of two (..., 1, 1, 1) that brings the samples of a trial to about one.
+
+    Squares then neither underflow nor overflow. The level is measured in the middle of the sweeps.
     """
     middle = sweeps.shape[-1] // 2
     level = torch.view_as_real(sweeps[..., middle - 4 : middle + 4]).abs().amax((-4, -3, -2, -1))[..., None, None, None]
@@ -272,14 +353,13 @@ def _scale(sweeps: Tensor) -> Tensor:
 
 
 def _block_power(spectrum: Tensor, scale: Tensor) -> Tensor:
-    """Power spectra of Hann-windowed sweeps, mean over blocks of periods: (..., 2, pulse, N) ->
-    (..., 2, block, N).
+    """Power spectra of Hann-windowed sweeps, averaged over blocks of periods.
 
-    On the bins of a rectangular window, a peak between two of them loses more than half.
+    (..., 2, pulse, N) to (..., 2, block, N). With a rectangular window, a peak between two bins
+    would lose more than half of its power.
     """
-    parts = torch.view_as_real(spectrum).flatten(
-        -2
-    )  # real and imaginary parts in turn: the window is the same for both
+    # real and imaginary parts alternate; the window is the same for both
+    parts = torch.view_as_real(spectrum).flatten(-2)
     inner = _windowed_power(parts[..., :-4], parts[..., 2:-2], parts[..., 4:], scale)
     first, second, last_but_one, last = parts[..., :2], parts[..., 2:4], parts[..., -4:-2], parts[..., -2:]
     ends = _windowed_power(last, first, second, scale), _windowed_power(last_but_one, last, first, scale)
@@ -287,16 +367,17 @@ def _block_power(spectrum: Tensor, scale: Tensor) -> Tensor:
 
 
 def _windowed_power(before: Tensor, here: Tensor, after: Tensor, scale: Tensor) -> Tensor:
+    """Power of the Hann-windowed spectrum from three neighbouring bins, averaged over blocks."""
     windowed = torch.sub(here, before + after, alpha=0.5).mul_(scale)
     windowed = windowed.mul_(windowed)
     return torch.stack([part.mean(-2) for part in windowed.split(_BLOCK, -2)], -2)
 
 
-def _followed(spectrum: Tensor, scale: Tensor, shift: Tensor, first: int, lines: int) -> tuple[Tensor, Tensor]:
-    """The shift of every period corrected by the period's own envelopes, where these resemble each
-    other and meet two bins or more from where they should; and where they do.
+def _corrected_shift(spectrum: Tensor, scale: Tensor, shift: Tensor, first: int, lines: int) -> tuple[Tensor, Tensor]:
+    """The shift of every period, corrected by its own envelopes, and where it is certain.
 
-    Eight periods together see more, one alone follows vibration of a few periods.
+    It is corrected where the envelopes are similar and their lag is two bins or more. Eight periods
+    together have a higher SNR; one period alone follows a vibration of a few periods.
     """
     n = spectrum.shape[-1]
     sides = torch.stack([shift, -shift], -2)
@@ -318,8 +399,10 @@ def _followed(spectrum: Tensor, scale: Tensor, shift: Tensor, first: int, lines:
 def _line_phase(
     first: int, lines: int, m: int, sign: int, remove_video: bool, radar: TriangularLadar, like: Tensor
 ) -> Tensor:
-    """Per line of the up (sign 1) or mirrored down sweep (-1): removal of the residual video phase,
-    and the half-sample offset between the grids of n and of m samples.
+    """Phase factor of each bin of the up sweep (sign 1) or the mirrored down sweep (sign -1).
+
+    It removes the residual video phase and the half-sample offset between the grids of n and m
+    samples.
     """
     j = torch.arange(lines, dtype=torch.float64, device=like.device)
     beat_hz = (first + j) / radar.sweep_s
@@ -329,9 +412,7 @@ def _line_phase(
 
 
 def _raised_cosine(j: Tensor, lines: int, taper: float) -> Tensor:
-    """Window over lines 0..lines-1 whose edges of `taper` times half the window fall as a
-    cosine.
-    """
+    """Window over bins 0..lines-1 with cosine edges, each `taper` times half the window wide."""
     if not taper:
         return torch.ones_like(j)
     distance = (j - (lines - 1) / 2).abs() / ((lines + 1) / 2)
@@ -339,6 +420,6 @@ def _raised_cosine(j: Tensor, lines: int, taper: float) -> Tensor:
 
 
 def _beat_of_first(first: int, m: int, like: Tensor) -> Tensor:
-    """exp(2j pi first u / T) on the grid of m samples: lines count from zero beat again."""
+    """exp(2j pi first u / T) on the grid of m samples, so that bins count from zero beat again."""
     index = torch.arange(m, dtype=torch.float64, device=like.device) - (m - 1) / 2
     return torch.exp(2j * math.pi * ((first * index / m) % 1))

@@ -1,4 +1,4 @@
-"""Estimators over many trials, by blocks of them that stay in the cache."""
+"""Estimators over many trials, in blocks that fit into the cache."""
 
 from __future__ import annotations
 
@@ -9,41 +9,52 @@ from torch import Tensor
 
 from torchsar.core import Estimate, block_bytes_of, over_blocks, refuse_non_finite
 
-# a block of sweeps is so many times what one operation likes best: work on few trials costs more in
-# calls than it gains
+# size of a block over the size that is best for one operation, found by trial: smaller blocks cost
+# more in calls than they gain in the cache
 _BLOCKS = 16
 
 Estimator = Callable[[Tensor, Tensor | float], Estimate]
 
 
 def by_trials(estimator: Estimator, sweeps: Tensor, azimuth_m: Tensor | float) -> Estimate:
-    """estimator(sweeps, azimuth_m) by blocks of trials where no gradients are asked for, in as many
-    threads as torch uses: less time, less memory, the same values.
+    """Apply an estimator to blocks of trials, in as many threads as torch uses.
 
-    sweeps: (..., 2, pulse, N); azimuth_m: a number or one per trial (...,).
+    It takes less time and memory and gives the same values. All trials are processed at once if
+    gradients are required.
+
+    Args:
+        estimator: Function of (sweeps, azimuth_m) that returns an estimate.
+        sweeps: Sweeps, shape (..., 2, pulse, N), complex.
+        azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
+
+    Returns:
+        The estimate of all trials.
+
+    Raises:
+        ValueError: If `azimuth_m` is not finite, or neither one number nor one per trial.
     """
     trials, azimuth = sweeps.shape[:-3], torch.as_tensor(azimuth_m, dtype=torch.float64, device=sweeps.device)
-    _refuse_other_places(azimuth, trials)
+    _check_azimuth(azimuth, trials)
     height = max(1, _BLOCKS * block_bytes_of(sweeps.device) // (sweeps.shape[-3:].numel() * sweeps.element_size()))
     count = trials.numel()
     if count <= height or (torch.is_grad_enabled() and (sweeps.requires_grad or azimuth.requires_grad)):
         return estimator(sweeps, azimuth_m)
-    flat, places = sweeps.reshape(-1, *sweeps.shape[-3:]), azimuth.expand(trials).reshape(-1)
+    flat, azimuths = sweeps.reshape(-1, *sweeps.shape[-3:]), azimuth.expand(trials).reshape(-1)
     starts = range(0, count, height)
     parts: dict[int, Estimate] = {}
 
     def work(first: int) -> None:
         part = slice(first, first + height)
-        parts[first] = estimator(flat[part], places[part])
+        parts[first] = estimator(flat[part], azimuths[part])
 
     over_blocks(work, starts, sweeps)
     return Estimate.joined([parts[first] for first in starts], trials)
 
 
-def _refuse_other_places(azimuth_m: Tensor, trials: torch.Size) -> None:
-    """Raise ValueError unless there is one finite azimuth, or one a trial."""
+def _check_azimuth(azimuth_m: Tensor, trials: torch.Size) -> None:
+    """Raise ValueError unless there is one finite azimuth, or one per trial."""
     if azimuth_m.ndim and azimuth_m.shape != trials:
         raise ValueError(
-            f"azimuth_m must be one number (m) or one a trial {tuple(trials)}, got shape {tuple(azimuth_m.shape)}"
+            f"azimuth_m must be one number (m) or one per trial {tuple(trials)}, got shape {tuple(azimuth_m.shape)}"
         )
     refuse_non_finite(azimuth_m, "azimuth_m")

@@ -1,4 +1,4 @@
-"""Taking a known radial motion out of dechirped sweeps, exactly."""
+"""Exact compensation of a known radial motion in dechirped sweeps."""
 
 from __future__ import annotations
 
@@ -10,20 +10,39 @@ from torchsar.compensate.radial.trajectory import sweep_motion
 from torchsar.core import Axis, cis, linear_phasor, real_dtype, unit_phasor
 from torchsar.radar import TriangularLadar
 
-_NEGLIGIBLE_TURNS, _MANY_TURNS = {torch.float32: 1e-8, torch.float64: 1e-15}, 2.0
+# phases in turns that are lost in the rounding of a phasor, by precision
+_NEGLIGIBLE_TURNS = {torch.float32: 1e-8, torch.float64: 1e-15}
+_MANY_TURNS = 2.0  # phases beyond it need float64: the rounding of float32 grows with the phase
 
 
 def compensate_motion(
     sweeps: Tensor, velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis, carrier_only: bool = False
 ) -> Tensor:
-    """Sweeps times exp(-+ j 4 pi f(u) DR / c) at every sample, f(u) = fc +- K u, DR the integral of
-    the velocity (brief 000, erratum 11).
+    """Remove a radial motion from dechirped sweeps.
 
-    sweeps: (..., 2, pulse, N), up before down, in the radar's dechirp sign; velocity_m_s: (...,
-    pulse) at the turning points. Takes out the phase of the carrier, the motion of the envelope,
-    and acceleration inside sweeps. carrier_only: fc in place of f(u), the form that the paper
-    prints, which leaves the envelopes where motion took them. Differentiable. Raises TypeError or
-    ValueError for other sweeps or a velocity of another shape.
+    Every sample is multiplied by exp(-+ j 4 pi f(u) DR / c), where f(u) = fc +- K u and DR is the
+    integral of the velocity at that sample. This removes the phase of the carrier, the motion of
+    the envelope, and acceleration inside the sweeps. Differentiable.
+
+    Args:
+        sweeps: Sweeps, up before down, in the dechirp sign of the radar, shape (..., 2, pulse, N),
+            complex.
+        velocity_m_s: Radial velocity at the turning points in m/s, receding positive, shape (...,
+            pulse).
+        radar: Ladar parameters.
+        pulse: Axis of the periods.
+        carrier_only: Use fc in place of f(u), as the paper prints it. The envelopes then remain
+            displaced by the motion.
+
+    Returns:
+        The compensated sweeps, shape (..., 2, pulse, N), complex.
+
+    Raises:
+        TypeError: If the sweeps are not complex, or the velocity is not a real tensor.
+        ValueError: If the sweeps or the velocity have another shape or are not finite.
+
+    Reference:
+        Remote Sens. 2024, 16, 793, Eqs. (21) and (23), completed by the terms above.
     """
     refuse_other_sweeps(sweeps, radar, "compensate_motion", pulse)
     refuse_other_velocity(velocity_m_s, sweeps, "compensate_motion")
@@ -36,7 +55,17 @@ def compensate_motion(
 
 
 def refuse_other_velocity(velocity_m_s: Tensor, sweeps: Tensor, what: str) -> None:
-    """Raise ValueError unless there is one finite velocity a period."""
+    """Check that there is one finite velocity per period.
+
+    Args:
+        velocity_m_s: Velocities in m/s, shape (..., pulse).
+        sweeps: Sweeps, shape (..., 2, pulse, N).
+        what: Name of the calling function for the error message.
+
+    Raises:
+        TypeError: If the velocity is not a real tensor.
+        ValueError: If there is not one velocity per period, or a velocity is not finite.
+    """
     if not isinstance(velocity_m_s, Tensor) or velocity_m_s.is_complex():
         raise TypeError(
             f"{what} needs a tensor of real velocities (m/s), got "
@@ -44,22 +73,30 @@ def refuse_other_velocity(velocity_m_s: Tensor, sweeps: Tensor, what: str) -> No
         )
     if velocity_m_s.ndim < 1 or velocity_m_s.shape[-1] != sweeps.shape[-2]:
         raise ValueError(
-            f"{what} needs one velocity a period (..., {sweeps.shape[-2]}), got shape {tuple(velocity_m_s.shape)}"
+            f"{what} needs one velocity per period (..., {sweeps.shape[-2]}), got shape {tuple(velocity_m_s.shape)}"
         )
     try:
         finite = bool(torch.isfinite(velocity_m_s.detach()).all())
-    except RuntimeError:  # inside vmap a value cannot be looked at
+    except RuntimeError:  # inside vmap values cannot be read
         return
     if not finite:
         raise ValueError(
             f"{what}: {int((~torch.isfinite(velocity_m_s.detach())).sum())} velocities are NaN or "
-            "Inf; take an estimate whose `ok` is true, or settle them first"
+            "Inf; use an estimate whose `ok` is True, or replace them first"
         )
 
 
 def carrier_turns(motion: Tensor, radar: TriangularLadar, carrier_only: bool = False) -> Tensor:
-    """Turns 2 f(u) DR(u) / c as polynomials in u, (..., 2, pulse, 6), from the motion (..., 2,
-    pulse, 5) of `sweep_motion`.
+    """Compute the phase 2 f(u) DR(u) / c in turns, as polynomials in u.
+
+    Args:
+        motion: Coefficients of the range error in metres, shape (..., 2, pulse, 5), see
+            `sweep_motion`.
+        radar: Ladar parameters.
+        carrier_only: Use fc in place of f(u).
+
+    Returns:
+        Coefficients in turns, shape (..., 2, pulse, 6).
     """
     per_m = 2 * radar.carrier_hz / radar.wave_speed_m_s
     turns = torch.nn.functional.pad(motion * per_m, (0, 1))
@@ -72,12 +109,19 @@ def carrier_turns(motion: Tensor, radar: TriangularLadar, carrier_only: bool = F
 
 
 def polynomial_phasor(turns: Tensor, step_s: float, n: int, dtype: torch.dtype) -> Tensor:
-    """exp(2j pi sum_k turns[..., k] u^k) at u_i = (i - (n - 1) / 2) step_s, (..., n).
+    """Compute exp(2j pi sum_k turns[..., k] u^k) at u_i = (i - (n - 1) / 2) step_s.
 
-    turns: float64 (..., k).
+    Constant and slope are formed from short tables in float64. The higher terms are small and are
+    formed in the working precision; negligible ones are skipped.
 
-    Constant and slope by short float64 tables; what bends is small, and is turned in the working
-    precision, if it is there at all.
+    Args:
+        turns: Coefficients in turns, shape (..., k), float64.
+        step_s: Sample spacing in seconds.
+        n: Number of samples.
+        dtype: Complex type of the result.
+
+    Returns:
+        The phasor, shape (..., n), complex.
     """
     start = -(n - 1) / 2
     total = unit_phasor(turns[..., 0], dtype)[..., None] * linear_phasor(turns[..., 1] * step_s, start, n, dtype)
@@ -89,7 +133,7 @@ def polynomial_phasor(turns: Tensor, step_s: float, n: int, dtype: torch.dtype) 
         c = turns[..., k]
         if not turns.requires_grad and _largest(c) * edge**k <= _NEGLIGIBLE_TURNS[real]:
             continue
-        # a bend of many turns needs float64; a small one does not
+        # a term of many turns needs float64, a small one does not
         exact = real == torch.float64 or _largest(c) * edge**k > _MANY_TURNS
         term = c[..., None] * u**k if exact else (c * edge**k).to(real)[..., None] * (u / edge).pow(k).to(real)
         bend = term if bend is None else bend + term
@@ -103,7 +147,7 @@ def polynomial_phasor(turns: Tensor, step_s: float, n: int, dtype: torch.dtype) 
 
 
 def _largest(x: Tensor) -> float:
-    """Largest magnitude, infinite inside vmap, where a value cannot be looked at."""
+    """Largest magnitude; infinite inside vmap, where values cannot be read."""
     try:
         return float(x.detach().abs().max())
     except RuntimeError:

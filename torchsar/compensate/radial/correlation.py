@@ -1,6 +1,4 @@
-"""Radial velocity from the lag between the envelopes of up and down spectra: the reference method
-of the paper.
-"""
+"""Radial velocity by cross-correlation of up and down spectra, the paper's reference method."""
 
 from __future__ import annotations
 
@@ -16,7 +14,7 @@ from torchsar.compensate.radial.verdict import velocity_estimate
 from torchsar.core import Axis, Estimate
 from torchsar.radar import TriangularLadar
 
-_REACH = 4
+_REACH = 4  # bins about the removed shift that are searched; the shift is right to a bin or two
 
 
 def spectrum_correlation(
@@ -28,15 +26,32 @@ def spectrum_correlation(
     window_m: tuple[float, float] | None = None,
     azimuth_m: Tensor | float = 0.0,
 ) -> Estimate:
-    """Radial velocity at the turning points, value["velocity_m_s"] (..., pulse), from
-    cross-correlated range envelopes (paper, section 2.3.2; its reference [17]).
+    """Estimate the radial velocity from the lag between the range envelopes of both sweeps.
 
     The lag that aligns |S+(f)| with the mirrored |S-(-f)| is 2 fd. It is found on a grid of 1 /
-    (upsampling T): however strong the signal, an error of lambda / (4 upsampling T sqrt(12)) stays,
-    0.70 mm/s for the paper's system at 20, and slow motion dwells on one step of it. sweeps: (...,
-    2, pulse, N). window_m: relative ranges (low, high) m, None for the whole band. azimuth_m: x of
-    the scene's centre. Not differentiable: its values lie on a grid. Raises TypeError or ValueError
-    for other sweeps, a window that is none, or upsampling below 1.
+    (upsampling T). However strong the signal, an error of lambda / (4 upsampling T sqrt(12))
+    remains, 0.70 mm/s for the system of the paper and an upsampling of 20, and slow motion stays on
+    one step of the grid. Not differentiable.
+
+    Args:
+        sweeps: Sweeps, shape (..., 2, pulse, N), complex.
+        radar: Ladar parameters.
+        pulse: Axis of the periods.
+        upsampling: Upsampling of the spectra, 1..64.
+        window_m: Lowest and highest relative range in metres; None for the whole band.
+        azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
+
+    Returns:
+        `velocity_m_s` of shape (..., pulse) at the turning points, receding positive, with its
+        standard deviation. `ok` is False where the SNR after compression is below 14 dB, or no
+        scatterer is illuminated in any period.
+
+    Raises:
+        TypeError: If the sweeps are not complex.
+        ValueError: If the sweeps, the window or the upsampling are invalid.
+
+    Reference:
+        Remote Sens. 2024, 16, 793, section 2.3.2.
     """
     refuse_other_sweeps(sweeps, radar, "spectrum_correlation", pulse)
     if not (isinstance(upsampling, int) and 1 <= upsampling <= 64):
@@ -56,10 +71,16 @@ def spectrum_correlation(
 
 @torch.no_grad()
 def envelope_lag(bands: Bands, upsampling: int) -> Tensor:
-    """Lag of the up envelope behind the mirrored down envelope in bins of 1 / T, (..., pulse)
-    float64: 2 fd T of what the shift has left.
+    """Find the lag of the up envelope behind the mirrored down envelope.
 
-    Only lags within 4 bins of the shift are looked at; the shift itself is known to a bin or two.
+    Only lags within 4 bins are searched, because the removed shift is right to a bin or two.
+
+    Args:
+        bands: Filtered sweeps.
+        upsampling: Upsampling of the spectra.
+
+    Returns:
+        The lag 2 fd T of the remaining Doppler shift in bins of 1 / T, shape (..., pulse), float64.
     """
     m = bands.time_s.shape[-1]
     n = upsampling * m
@@ -67,7 +88,7 @@ def envelope_lag(bands: Bands, upsampling: int) -> Tensor:
     envelope = torch.fft.fft(both, n).abs()
     envelope = envelope - envelope.mean(-1, keepdim=True)
     spectrum = torch.fft.rfft(envelope)
-    met = torch.fft.irfft(spectrum[..., 0, :, :] * spectrum[..., 1, :, :].conj(), n)
+    correlation = torch.fft.irfft(spectrum[..., 0, :, :] * spectrum[..., 1, :, :].conj(), n)
     reach = min(_REACH * upsampling, n // 2 - 1)
-    near = torch.cat([met[..., -reach:], met[..., : reach + 1]], -1)
+    near = torch.cat([correlation[..., -reach:], correlation[..., : reach + 1]], -1)
     return (near.argmax(-1) - reach).to(torch.float64) / upsampling

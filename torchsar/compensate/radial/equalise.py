@@ -1,4 +1,4 @@
-"""The amplitude of every pulse against steady scatterers: scintillation and fading taken out."""
+"""Amplitude of every pulse relative to steady scatterers, and its correction."""
 
 from __future__ import annotations
 
@@ -10,38 +10,46 @@ from torch import Tensor
 from torchsar.compensate.pulse_phase.data import prepare
 from torchsar.core import Estimate, cis
 
-LEAST_GAIN = 0.05
-_PAD = 4
+LEAST_GAIN = 0.05  # least gain of a pulse: a lost pulse is not amplified more than 20 times
+_PAD = 4  # zero-padding of the transform: a peak is then found to an eighth of a cell
 
 
 def pulse_gain(data: Tensor) -> Estimate:
-    """Amplitude of every pulse, with value["gain"] (..., pulse), mean one, to be divided by.
+    """Estimate the amplitude of every pulse from steady scatterers.
 
-    data: (..., pulse, range) complex, focused but for amplitudes: compensated, deramped, its phases
-    corrected. Air and pointing make the echo scintillate, which changes the side lobes in azimuth
-    (a log-amplitude of 0.1 rms the first one by a decibel either way). The strongest scatterer of
-    each range cell is a tone of constant amplitude; one real factor a pulse is fitted to the tones
-    of all cells, each weighted by the share of its cell's energy that the tone explains. Never
-    below 0.05: a pulse that was lost is not blown up. Trials without steady scatterers, whose tones
-    explain less than half of the energy, keep gain one and are not ok.
+    Scintillation and pointing change the amplitude of the echo, which changes the side lobes in
+    azimuth (a log-amplitude of 0.1 rms changes the first side lobe by a decibel either way). The
+    strongest scatterer of each range cell is a tone of constant amplitude. One real factor per
+    pulse is fitted to the tones of all cells, each weighted by the share of the cell's energy that
+    the tone explains. Differentiable around the detached peaks.
 
-    quality: that share. Differentiable around the detached peaks. Raises TypeError or ValueError
-    for samples that are not finite and complex.
+    Args:
+        data: Pulses that are focused except for their amplitudes (compensated, deramped, phases
+            corrected), shape (..., pulse, range), complex.
+
+    Returns:
+        `gain` of shape (..., pulse), of mean one, to be divided by; never below 0.05, so that a
+        lost pulse is not amplified. quality is the share of the energy that the tones explain. `ok`
+        is False where that share is half or less; the gain is then one.
+
+    Raises:
+        TypeError: If the data are not complex.
+        ValueError: If the data are empty or not finite.
     """
     pulses = prepare(data, "pulse_gain")
     rows, n = pulses.rows, pulses.n
     best = torch.fft.fft(rows.detach(), _PAD * n).abs().argmax(-1)
     index = torch.arange(n, dtype=torch.float64, device=rows.device)
     turns = best.to(torch.float64)[..., None] * index / (_PAD * n)
-    still = rows * cis((-2 * math.pi * (turns - torch.round(turns))).to(rows.real.dtype))
-    level = still.mean(-1)
+    demodulated = rows * cis((-2 * math.pi * (turns - torch.round(turns))).to(rows.real.dtype))
+    level = demodulated.mean(-1)
     energy = (rows.real.square() + rows.imag.square()).sum(-1)
     power = level.real.square() + level.imag.square()
     tiny = torch.finfo(power.dtype).tiny
     share = n * power / energy.clamp_min(tiny)
     explained = ((n * power).sum(-1) / energy.sum(-1).clamp_min(tiny)).detach()
     weight = share.detach().square()
-    fitted = (weight[..., None] * (still * level.conj()[..., None]).real).sum(-2) / (weight * power).sum(
+    fitted = (weight[..., None] * (demodulated * level.conj()[..., None]).real).sum(-2) / (weight * power).sum(
         -1, keepdim=True
     ).clamp_min(tiny)
     gain = fitted / fitted.mean(-1, keepdim=True).clamp_min(LEAST_GAIN)
@@ -56,12 +64,20 @@ def pulse_gain(data: Tensor) -> Estimate:
 
 
 def equalise_pulses(data: Tensor, gain: Tensor) -> Tensor:
-    """data (..., pulse, range) over gain (..., pulse).
+    """Divide pulses by their gains.
 
-    Raises ValueError where a gain is not positive.
+    Args:
+        data: Pulses, shape (..., pulse, range), complex.
+        gain: Gains, shape (..., pulse).
+
+    Returns:
+        The equalised pulses, shape (..., pulse, range), complex.
+
+    Raises:
+        ValueError: If a gain is not positive.
     """
     if not bool((gain.detach() > 0).all()):
         raise ValueError(
-            f"gains of pulses must be positive, got {float(gain.detach().min()):g}; mark lost pulses instead"
+            f"gains of pulses must be positive, got {float(gain.detach().min()):g}; set lost pulses to zero instead"
         )
     return data / gain[..., None].to(data.real.dtype)

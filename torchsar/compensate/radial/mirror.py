@@ -16,10 +16,9 @@ from torchsar.core import Axis, Estimate, cis, take
 from torchsar.radar import TriangularLadar
 
 Intercept = Literal["known", "record", "free"]
-_PAD, _NEWTON = 2, 3
-# bins of 1 / T about the shift, which is known to a bin or two, in which the tone of the product is
-# sought
-_REACH = 6
+_PAD = 2  # zero-padding of the transform, enough for the Newton steps to converge
+_NEWTON = 3  # Newton steps, found by trial: enough to converge from the parabola
+_REACH = 6  # bins about the removed shift that are searched; the shift is right to a bin or two
 
 
 def mirror_product(
@@ -32,22 +31,37 @@ def mirror_product(
     taper: float = 1.0,
     azimuth_m: Tensor | float = 0.0,
 ) -> Estimate:
-    """Radial velocity at the turning points, value["velocity_m_s"] (..., pulse), for any scene in
-    range (brief 000, section 5a).
+    """Estimate the radial velocity from the product of the up sweep and the mirrored down sweep.
 
-    sweeps: (..., 2, pulse, N). z(u) = up(u) conj(down(-u)) pairs equal optical frequencies: z =
-    |scene(u)|^2 exp(-j 4 pi / c (fc + K u) (T - 2u) v), whatever lies in the window; acceleration
-    cancels about the turning point, jerk is left. intercept: "known" uses that z is real at the
-    turning point, which needs the trigger timing and lowers the variance four times; "free" takes
-    the slope alone; "record" estimates one constant offset for the whole record, for timing that is
-    not known but stands still. window_m: relative ranges (low, high), None for the whole band; it
-    follows the Doppler shift. taper: see `bands_of`. azimuth_m: x of the scene's centre, whose
-    geometric velocity is taken out.
+    z(u) = up(u) conj(down(-u)) multiplies samples of equal optical frequency. Therefore z =
+    |scene(u)|^2 exp(-j 4 pi / c (fc + K u) (T - 2u) v), whatever scatterers lie in the window.
+    Acceleration cancels about the turning point; jerk remains. Differentiable: the peak search is
+    detached, and Newton steps refine its result.
 
-    std: predicted from the measured SNR with the squaring loss. info: snr_db (post-compression),
-    shift, intercept_rad (...,) with "record". Differentiable: the peak search is detached, Newton
-    steps refine around it. Raises TypeError or ValueError for other sweeps or a window that is
-    none.
+    Args:
+        sweeps: Sweeps, shape (..., 2, pulse, N), complex.
+        radar: Ladar parameters.
+        pulse: Axis of the periods.
+        window_m: Lowest and highest relative range in metres; None for the whole band. The window
+            follows the Doppler shift.
+        intercept: "known" uses that z is real at the turning point, which requires accurate trigger
+            timing and lowers the variance by a factor of four. "free" uses the slope alone.
+            "record" estimates one constant phase for the whole record, for an unknown but constant
+            timing.
+        taper: Share of the window that its edges take, see `bands_of`.
+        azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,). Its geometric
+            velocity is subtracted.
+
+    Returns:
+        `velocity_m_s` of shape (..., pulse) at the turning points, receding positive. Its standard
+        deviation is predicted from the measured SNR and includes the squaring loss. `ok` is False
+        where the SNR after compression, less the squaring loss, is below 15 dB, or no scatterer is
+        illuminated in any period. info: snr_db (after compression), shift and, with "record",
+        intercept_rad, shape (...,).
+
+    Raises:
+        TypeError: If the sweeps are not complex.
+        ValueError: If the sweeps, the window or the intercept are invalid.
     """
     refuse_other_sweeps(sweeps, radar, "mirror_product", pulse)
     refuse_other_intercept(intercept)
@@ -59,13 +73,30 @@ def mirror_product(
 
 
 def refuse_other_intercept(intercept: str) -> None:
-    """Raise ValueError for what is no kind of intercept."""
+    """Check the name of a kind of intercept.
+
+    Args:
+        intercept: The name.
+
+    Raises:
+        ValueError: If the name is not "known", "record" or "free".
+    """
     if intercept not in get_args(Intercept):
         raise ValueError(f"intercept must be 'known', 'record' or 'free', got {intercept!r}")
 
 
 def mirror_estimate(bands: Bands, pulse: Axis, intercept: Intercept, azimuth_m: Tensor | float) -> Estimate:
-    """The estimate from bands of two samples a line."""
+    """Make the estimate of `mirror_product` from filtered sweeps.
+
+    Args:
+        bands: Sweeps with two samples per bin.
+        pulse: Axis of the periods.
+        intercept: Kind of intercept.
+        azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
+
+    Returns:
+        The estimate of `mirror_product`.
+    """
     velocity, info = mirror_velocity(bands, intercept)
     return velocity_estimate(
         velocity,
@@ -79,7 +110,15 @@ def mirror_estimate(bands: Bands, pulse: Axis, intercept: Intercept, azimuth_m: 
 
 
 def mirror_velocity(bands: Bands, intercept: Intercept) -> tuple[Tensor, dict[str, Tensor]]:
-    """Velocity (..., pulse) float64 with the geometric one in it, and what else was found."""
+    """Compute the velocity of `mirror_product`, with the geometric velocity still included.
+
+    Args:
+        bands: Sweeps with two samples per bin.
+        intercept: Kind of intercept.
+
+    Returns:
+        The velocity in m/s, receding positive, shape (..., pulse), float64, and entries for info.
+    """
     inner = bands.inner
     u = bands.time_s[inner]
     z = bands.product()[..., inner]
@@ -96,16 +135,14 @@ def mirror_velocity(bands: Bands, intercept: Intercept) -> tuple[Tensor, dict[st
 
 
 def _of_shift(bands: Bands, u: Tensor, like: Tensor) -> Tensor:
-    """What the shift of whole bins leaves in the product beyond its line: exp(2j pi s K u / fc (1 -
-    2u / T)), see brief 000, erratum 8.
-    """
+    """Phase factor that the removed shift s leaves: exp(2j pi s K u / fc (1 - 2u / T))."""
     radar = bands.radar
     small = 2 * math.pi * radar.chirp_rate_hz_s * u / radar.carrier_hz * (1 - 2 * u / radar.sweep_s)
     return cis((bands.shift.to(torch.float64)[..., None] * small).to(like.real.dtype))
 
 
 def _weights(u: Tensor, bands: Bands) -> Tensor:
-    """rad per m/s that a velocity turns the product by, (m,): -4 pi / c (fc + K u) (T - 2u)."""
+    """Derivative of the phase of the product with velocity, (m,): -4 pi / c (fc + K u) (T - 2u)."""
     radar = bands.radar
     return (
         -4 * math.pi / radar.wave_speed_m_s * (radar.carrier_hz + radar.chirp_rate_hz_s * u) * (radar.sweep_s - 2 * u)
@@ -113,12 +150,14 @@ def _weights(u: Tensor, bands: Bands) -> Tensor:
 
 
 def _turned(z: Tensor, u: Tensor, v: Tensor, bands: Bands) -> Tensor:
+    """The product with the phase of the velocity v removed."""
     return z * cis(-v[..., None].to(z.real.dtype) * _weights(u, bands).to(z.real.dtype))
 
 
 def _slope(z: Tensor, u: Tensor, bands: Bands, steps: int) -> Tensor:
-    """The velocity of greatest |sum z exp(-j w v)|, (..., pulse): the peak of a padded transform,
-    then Newton steps.
+    """The velocity (..., pulse) of greatest |sum z exp(-j w v)|.
+
+    The peak of a zero-padded transform, refined by Newton steps.
     """
     n, per = z.shape[-1], 4 * bands.radar.carrier_hz / bands.radar.wave_speed_m_s
     spectrum = torch.fft.fft(z.detach(), _PAD * n)
@@ -131,6 +170,7 @@ def _slope(z: Tensor, u: Tensor, bands: Bands, steps: int) -> Tensor:
 
 
 def _parabola(power: Tensor, best: Tensor) -> Tensor:
+    """Offset of the vertex of the parabola through a peak and its neighbours, in bins."""
     n = power.shape[-1]
     low, mid, high = (take(power, (best + k) % n) for k in (-1, 0, 1))
     bend = low - 2 * mid + high
@@ -138,8 +178,9 @@ def _parabola(power: Tensor, best: Tensor) -> Tensor:
 
 
 def _through_zero(z: Tensor, u: Tensor, v: Tensor, bands: Bands) -> Tensor:
-    """The velocity of greatest Re sum z exp(-j w v) next to v: the line through zero phase at the
-    turning point.
+    """The velocity of greatest Re sum z exp(-j w v) near v.
+
+    The phase of the product is then zero at the turning point.
     """
     w = _weights(u, bands).to(z.real.dtype)
     for _ in range(_NEWTON):

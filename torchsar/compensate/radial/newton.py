@@ -1,4 +1,4 @@
-"""Newton steps that refine a peak around which a coarse search was detached."""
+"""Newton steps that refine a peak after a coarse, detached search."""
 
 from __future__ import annotations
 
@@ -9,9 +9,18 @@ from torchsar.core import cis
 
 
 def climbed(x: Tensor, weights: Tensor, value: Tensor, steps: int) -> Tensor:
-    """The value v (...,) next to those given of greatest |sum_i x_i exp(-j w_i v)|, float64.
+    """Refine the value v of greatest |sum_i x_i exp(-j w_i v)| by Newton steps.
 
-    x: (..., m) complex; weights: (m,), w in rad per unit of the value. Differentiable.
+    Differentiable.
+
+    Args:
+        x: Samples, shape (..., m), complex.
+        weights: w in rad per unit of the value, shape (m,).
+        value: Values to start from, shape (...,).
+        steps: Number of Newton steps.
+
+    Returns:
+        The refined values, shape (...,), float64.
     """
     w = weights.to(x.real.dtype)
     for _ in range(steps):
@@ -24,6 +33,14 @@ def climbed(x: Tensor, weights: Tensor, value: Tensor, steps: int) -> Tensor:
 
 
 def step_uphill(gradient: Tensor, bend: Tensor) -> Tensor:
-    """A Newton step where the objective bends down, nothing elsewhere; float64."""
+    """Compute a Newton step where the objective is concave, and zero elsewhere.
+
+    Args:
+        gradient: First derivative.
+        bend: Second derivative.
+
+    Returns:
+        The step, float64.
+    """
     concave = bend < 0
     return torch.where(concave, -gradient / torch.where(concave, bend, -1), 0).to(torch.float64)

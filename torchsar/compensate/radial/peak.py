@@ -15,7 +15,10 @@ from torchsar.compensate.radial.verdict import velocity_estimate
 from torchsar.core import Axis, Estimate
 from torchsar.radar import TriangularLadar
 
-_PAD, _NEWTON, _REACH, _DARK = 2, 3, 2.0, 0.2
+_PAD = 2  # zero-padding of the transform, enough for the Newton steps to converge
+_NEWTON = 3  # Newton steps, found by trial: enough to converge
+_REACH = 2.0  # range cells about the peak of the whole record that are searched
+_DARK = 0.2  # share of the mean power below which a scatterer is not illuminated, found by trial
 
 
 def ml_peak(
@@ -26,15 +29,30 @@ def ml_peak(
     window_m: tuple[float, float] | None = None,
     azimuth_m: Tensor | float = 0.0,
 ) -> Estimate:
-    """Radial velocity at the turning points from periodogram peaks, value["velocity_m_s"] (...,
-    pulse) (brief 000, section 5b).
+    """Estimate the radial velocity from the periodogram peaks of both sweeps.
 
-    fd = (f'up - f'mirrored down) / 2 with each peak refined by Newton steps: for one scatterer the
-    maximum-likelihood estimate with unknown offsets. sweeps: (..., 2, pulse, N). window_m: relative
-    ranges (low, high) m to look for it, None for the whole band; nothing is filtered. The peak is
-    sought within two range cells of that of the whole record. azimuth_m: x of the scatterer.
-    Differentiable around the detached peaks. Raises TypeError or ValueError for other sweeps or a
-    window that is none.
+    fd = (f'up - f'mirrored down) / 2, with each peak refined by Newton steps. For one scatterer
+    this is the maximum-likelihood estimate with unknown offsets. The peak is searched within two
+    range cells of that of the whole record. Differentiable around the detached peaks.
+
+    Assumes one dominant scatterer; use `radial_motion` for extended scenes.
+
+    Args:
+        sweeps: Sweeps, shape (..., 2, pulse, N), complex.
+        radar: Ladar parameters.
+        pulse: Axis of the periods.
+        window_m: Lowest and highest relative range in metres in which the peak is searched; None
+            for the whole band. The sweeps are not filtered.
+        azimuth_m: Azimuth of the scatterer in metres, a number or shape (...,).
+
+    Returns:
+        `velocity_m_s` of shape (..., pulse) at the turning points, receding positive, with its
+        standard deviation. `ok` is False where the SNR after compression is below 14 dB, or no
+        scatterer is illuminated in any period.
+
+    Raises:
+        TypeError: If the sweeps are not complex.
+        ValueError: If the sweeps or the window are invalid.
     """
     refuse_other_sweeps(sweeps, radar, "ml_peak", pulse)
     window_lines(radar, window_m)
@@ -51,9 +69,17 @@ def ml_peak(
 
 
 def from_beats(up_hz: Tensor, down_hz: Tensor, bands: Bands) -> Tensor:
-    """Velocity (..., pulse) from the beats of up and mirrored down sweeps.
+    """Compute the velocity from the beat frequencies of up and mirrored down sweeps.
 
-    The range changes between their middles: factor 1 + B / (2 fc), erratum 8.
+    The range changes between the middles of both sweeps, which gives the factor 1 + B / (2 fc).
+
+    Args:
+        up_hz: Beat frequency of the up sweep in Hz, shape (..., pulse).
+        down_hz: Beat frequency of the mirrored down sweep in Hz, same shape.
+        bands: Filtered sweeps.
+
+    Returns:
+        The velocity in m/s, receding positive, shape (..., pulse).
     """
     radar = bands.radar
     doppler = bands.shift.to(torch.float64) / radar.sweep_s + (up_hz - down_hz) / 2
@@ -61,24 +87,40 @@ def from_beats(up_hz: Tensor, down_hz: Tensor, bands: Bands) -> Tensor:
 
 
 def shining(up: Tensor, down: Tensor) -> Tensor:
-    """Where a scatterer is lit in both sweeps: powers (..., pulse) of a fifth of their mean or
-    more.
+    """Mark the periods in which a scatterer is illuminated in both sweeps.
+
+    Its powers there are a fifth of their mean or more.
+
+    Args:
+        up: Power in the up sweeps, shape (..., pulse).
+        down: Power in the down sweeps, same shape.
+
+    Returns:
+        True where it is illuminated, shape (..., pulse), bool.
     """
     return torch.stack([power >= _DARK * power.mean(-1, keepdim=True) for power in (up, down)]).all(0) & (up + down > 0)
 
 
 def peak_frequencies(bands: Bands, window_m: tuple[float, float] | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Beat frequencies (Hz) of the strongest scatterer in the up and the mirrored down sweeps,
-    (..., pulse) float64 each, and where it is lit.
+    """Find the beat frequencies of the strongest scatterer in both sweeps.
+
+    Args:
+        bands: Filtered sweeps.
+        window_m: Lowest and highest relative range in metres in which it is searched; None for the
+            whole band.
+
+    Returns:
+        The frequencies in the up and the mirrored down sweeps in Hz, shape (..., pulse) each,
+        float64, and whether it is illuminated, shape (..., pulse), bool.
     """
     both = torch.stack([bands.up, bands.down], -3)
     m = both.shape[-1]
     spectrum = torch.fft.fft(both.detach(), _PAD * m)
     power = spectrum.real.square() + spectrum.imag.square()
-    sought = inside(bands.radar, window_m, _PAD * m, _PAD, both.device)
-    centre = torch.where(sought, power.mean((-3, -2), keepdim=True), -1).argmax(-1, keepdim=True)
-    away = (torch.arange(_PAD * m, device=both.device) - centre + _PAD * m // 2) % (_PAD * m) - _PAD * m // 2
-    peak, best = torch.where(away.abs() <= round(_REACH * _PAD), power, -1).max(-1)
+    searched = inside(bands.radar, window_m, _PAD * m, _PAD, both.device)
+    centre = torch.where(searched, power.mean((-3, -2), keepdim=True), -1).argmax(-1, keepdim=True)
+    distance = (torch.arange(_PAD * m, device=both.device) - centre + _PAD * m // 2) % (_PAD * m) - _PAD * m // 2
+    peak, best = torch.where(distance.abs() <= round(_REACH * _PAD), power, -1).max(-1)
     best = torch.where(best >= _PAD * m // 2, best - _PAD * m, best)
     frequency = best.to(torch.float64) / (_PAD * bands.radar.sweep_s)
     frequency = climbed(both, 2 * math.pi * bands.time_s, frequency, _NEWTON)

@@ -1,5 +1,6 @@
-"""The phase that a compensation by velocities leaves in each pulse: the step whose error does not
-accumulate.
+"""Residual phase of each pulse after a compensation by velocities.
+
+Its error does not accumulate over the record, unlike that of integrated velocities.
 """
 
 from __future__ import annotations
@@ -12,36 +13,52 @@ from torchsar.compensate.pulse_phase.imaging import AlongPulses
 from torchsar.compensate.pulse_phase.sharpen import Run, in_turn
 from torchsar.core import Estimate
 
+# standard deviation of the phase from which on it is not ok: a Strehl ratio of exp(-0.25) = 0.78
 ENOUGH_STD_RAD = 0.5
+# over-relaxation, found by trial: larger values converge faster, at 2 or more need not converge
 _RELAXATION = 1.7
-# what counts as scene: this share of the power of a typical bright cell, and so many times the mean
-# power
+# level of the Wiener weights, found by trial: this share of the power of a typical bright cell, and
+# at least so many times the mean power; higher levels exclude weak scatterers, lower ones include
+# noise
 _SHARE, _LEVEL = 0.02, 4.0
 
 
 def phase_polish(
     data: Tensor, *, start: Tensor | None = None, iterations: int = 80, tolerance_rad: float = 0.005
 ) -> Estimate:
-    """Phase of every pulse against the scene that all of them show, with value["phase_rad"] (...,
-    pulse) to be removed (brief 000, section 5c).
+    """Estimate the residual phase of each pulse against the scene that all pulses have in common.
 
-    data: (..., pulse, range) complex, compensated, compressed and deramped in azimuth, so that
-    scatterers are tones; a window of range cells about the scatterers costs less and shows more.
-    Integrated velocities leave a random walk of the order of a radian, whose phase steps are small:
-    no start by adjacent pulses is needed. Beyond a radian iterations may end in an image of two
-    peaks; a start (..., pulse) rad, such as that of `pga`, prevents it. Every iteration forms the
-    image, weighs its cells, goes back to pulses, and takes the phase of each pulse against that.
-    The weights are Wiener's, over-relaxed, until a trial's step is below tolerance_rad rms or
-    `iterations` are done; a cell counts as scene where it holds a fiftieth of a typical bright
-    cell, however wide the window. One step before, with the power over the maximum of the range
-    cell, settles trials of single points at once; the last five, with p / (p + p_max / 10) on twice
-    as many cells, let scatterers be that are lit for a part of the record only. Single points reach
-    the bound of the phase of one sweep, where the SNR after compression exceeds about 14 dB.
-    Constant and slope, which an image cannot tell from its own place, stay near zero.
+    Integrated velocities leave a random walk of the order of a radian with small phase steps, so no
+    start by adjacent pulses is needed. Beyond a radian, the iterations may end in an image with two
+    peaks; a start such as that of `pga` prevents this. Differentiable.
 
-    std: predicted from the energy of the cells above the noise. ok: it is below 0.5 rad. quality:
-    share of the energy in cells that stand out. Differentiable. Raises TypeError or ValueError for
-    samples that are not finite and complex, or counts below 1.
+    Every iteration forms the image, weights its cells, transforms back to pulses, and takes the
+    phase of each pulse against the result. The first step, with weights equal to the power over the
+    maximum of the range cell, already suffices for trials of single points. Over-relaxed steps with
+    Wiener weights follow; a cell counts as scene where it holds a fiftieth of a typical bright
+    cell, however wide the window. The last five steps, with weights p / (p + p_max / 10) on twice
+    as many cells, admit scatterers that are illuminated for a part of the record only.
+
+    Single points reach the bound of the phase of one sweep where the SNR after compression exceeds
+    about 14 dB. Constant and slope, which only shift the image, stay near zero.
+
+    Args:
+        data: Pulses, compensated, range-compressed and deramped in azimuth so that scatterers are
+            tones, shape (..., pulse, range), complex. A window of range cells about the scatterers
+            costs less and has a higher SNR.
+        start: Phase to start from in rad, shape (..., pulse); by default zero.
+        iterations: Largest number of iterations with Wiener weights.
+        tolerance_rad: Step in rad, rms over the pulses, below which a trial ends.
+
+    Returns:
+        `phase_rad` of shape (..., pulse), to be removed. Its standard deviation is predicted from
+        the energy of the cells above the noise. quality is the share of the energy in cells that
+        clearly exceed the noise. `ok` is False where the standard deviation is 0.5 rad or more.
+
+    Raises:
+        TypeError: If the data are not complex or the start is not a tensor.
+        ValueError: If the data are empty or not finite, the start does not have one phase per
+            pulse, or the number of iterations is not a whole number of 1 or more.
     """
     pulses = prepare(data, "phase_polish")
     refuse_odd_counts("phase_polish", 1, iterations=iterations)
@@ -65,17 +82,16 @@ def phase_polish(
 
 
 def _bright(power: Tensor) -> Tensor:
-    """Power of a typical bright cell: the mean over cells weighted with their own power, (trial, 1,
-    1).
-    """
+    """Power of a typical bright cell, (trial, 1, 1): the mean power weighted with the power."""
     return power.square().sum((-2, -1), keepdim=True) / power.sum((-2, -1), keepdim=True).clamp_min(
         torch.finfo(power.dtype).tiny
     )
 
 
 def _single_points(power: Tensor, mean: Tensor) -> Tensor:
-    """Power over that of the strongest cell of the range cell, in trials whose typical bright cell
-    is the brightest but for 3 dB; elsewhere as `_scene`.
+    """Power over the maximum of the range cell, for trials of few scatterers; else as `_scene`.
+
+    Trials of few scatterers are those whose typical bright cell is within 3 dB of the brightest.
     """
     peak = power.amax(-1, keepdim=True)
     few = _bright(power) > 0.5 * peak.amax(-2, keepdim=True)
@@ -83,8 +99,9 @@ def _single_points(power: Tensor, mean: Tensor) -> Tensor:
 
 
 def _scene(power: Tensor, mean: Tensor) -> Tensor:
-    """(p / (p + level))^2 of powers averaged over three range cells, less the mean of its row: a
-    pulse is left out of the scene that it is compared with.
+    """(p / (p + level))^2 of powers averaged over three range cells, minus the mean of its row.
+
+    Without the mean, a pulse does not contribute to the scene with which it is compared.
     """
     pairs = power + power.roll(1, -2)
     local = (pairs + pairs.roll(-1, -2)) / 4
@@ -96,19 +113,17 @@ def _scene(power: Tensor, mean: Tensor) -> Tensor:
 
 
 def _near_peak(power: Tensor, mean: Tensor) -> Tensor:
-    """Weights near one for cells within 10 dB of the strongest of their range cell, falling with
-    their power below.
-    """
+    """Weights near one within 10 dB of the strongest cell of a range cell, falling below."""
     peak = power.amax(-1, keepdim=True)
     return power / torch.where(peak > 0, power + 0.1 * peak, 1)
 
 
 def _confidence(rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Share of the energy that is scene, and the deviation of a pulse's phase, (trial,) float64
-    each. rows: (trial, range, pulse), corrected.
+    """Share of the energy that is scene, and standard deviation of the phase, (trial,) each.
 
-    Noise is the level that half of the cells of the image stay below; what stands out of it is
-    scene. A pulse knows its phase to 1 / sqrt(2 g), g its energy over the noise variance.
+    rows: (trial, range, pulse), corrected. The noise level is the median cell of the image; cells
+    that clearly exceed it are scene. The phase of a pulse is known to 1 / sqrt(2 g), where g is its
+    energy over the noise variance.
     """
     image = torch.fft.fft(rows, norm="ortho")
     power = (image.real.square() + image.imag.square()).to(torch.float64).flatten(-2)

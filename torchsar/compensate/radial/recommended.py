@@ -1,5 +1,6 @@
-"""The recommended estimate of the radial motion: velocities by the mirror product, then the phase
-of every pulse against the scene.
+"""The recommended estimate of the radial motion.
+
+Velocities by the mirror product, then the phase of every pulse against the scene.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.gradient import Listed, pga
+from torchsar.compensate.pulse_phase import Listed, pga
 from torchsar.compensate.radial.bands import Bands, bands_of, refuse_other_sweeps
 from torchsar.compensate.radial.blocks import by_trials
 from torchsar.compensate.radial.compensate import carrier_turns, polynomial_phasor
@@ -22,7 +23,12 @@ from torchsar.focus.triangular import deramp_azimuth, profile_axes
 from torchsar.metrics.ladar_bounds import integrated_range_detrended_bound_m
 from torchsar.radar import TriangularLadar, sweep_middles
 
-_FAR_RAD, _FEW_PERIODS, _WINDOWS = 0.4, 32, Listed((31.0, 21.0, 15.0, 9.0, 9.0, 9.0))
+# random walk of the integrated velocities beyond which the polish is started from PGA, found by
+# trial: beyond a radian the polish alone may end in an image of two peaks
+_FAR_RAD = 0.4
+_FEW_PERIODS = 32  # fewer periods are not started from PGA, whose first window is as wide
+# windows of PGA in Doppler cells, found by trial: a random walk blurs by few cells
+_WINDOWS = Listed((31.0, 21.0, 15.0, 9.0, 9.0, 9.0))
 
 
 def radial_motion(
@@ -37,19 +43,35 @@ def radial_motion(
     iterations: int = 80,
     tolerance_rad: float = 0.005,
 ) -> Estimate:
-    """The recommended estimate: value["velocity_m_s"] at the turning points and value["phase_rad"]
-    at the middles of the up sweeps, (..., pulse) each.
+    """Estimate the radial motion; the recommended estimator.
 
-    sweeps: (..., 2, pulse, N). `mirror_product` gives the velocities; their integral takes the
-    motion out of the range cells of window_m (None: the whole band), deramped in azimuth;
-    `phase_polish` finds what is left in each pulse, so that the error of the range does not grow
-    with the length of the record. All on the few lines of the window: a window that holds the scene
-    and little else costs less and stands more noise. The phase is to be removed after
-    `compensate_motion` by the velocities; `range_error` adds both up. intercept, taper, azimuth_m:
-    see `mirror_product`; iterations, tolerance_rad: see `phase_polish`.
+    `mirror_product` estimates the velocities. Their integral compensates the motion in the range
+    cells of the window, which are deramped in azimuth. `phase_polish` then estimates the residual
+    phase of each pulse, so that the range error does not grow with the length of the record. All
+    steps use only the few bins of the window: a window that holds the scene and little else costs
+    less and tolerates more noise. Differentiable around the detached peak search.
 
-    std: of both. ok: both can be trusted. quality: that of the velocities. Differentiable around
-    the detached peak search. Raises TypeError or ValueError for other sweeps or windows.
+    Args:
+        sweeps: Sweeps, shape (..., 2, pulse, N), complex.
+        radar: Ladar parameters.
+        pulse: Axis of the periods.
+        window_m: Lowest and highest relative range in metres; None for the whole band.
+        intercept: Kind of intercept, see `mirror_product`.
+        taper: Share of the window that its edges take, see `bands_of`.
+        azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
+        iterations: Largest number of iterations, see `phase_polish`.
+        tolerance_rad: Tolerance of the iterations in rad, see `phase_polish`.
+
+    Returns:
+        `velocity_m_s` at the turning points, receding positive, and `phase_rad` at the middles of
+        the up sweeps, shape (..., pulse) each, with standard deviations. The phase is to be removed
+        after `compensate_motion` by the velocities; `range_error` combines both. quality is that of
+        the velocities. `ok` is False where that of `mirror_product` is, or the phase has a standard
+        deviation of 0.5 rad or more.
+
+    Raises:
+        TypeError: If the sweeps are not complex.
+        ValueError: If the sweeps, the window or the intercept are invalid.
     """
     refuse_other_sweeps(sweeps, radar, "radial_motion", pulse)
     refuse_other_intercept(intercept)
@@ -62,8 +84,17 @@ def radial_motion(
 
 
 def polished(bands: Bands, coarse: Estimate, pulse: Axis, iterations: int, tolerance_rad: float) -> Estimate:
-    """An estimate of velocities and the phases that they leave in the up sweeps of the bands that
-    they come from.
+    """Add to estimated velocities the residual phases of the up sweeps.
+
+    Args:
+        bands: Filtered sweeps from which the velocities were estimated.
+        coarse: Estimate of the velocities.
+        pulse: Axis of the periods.
+        iterations: Largest number of iterations, see `phase_polish`.
+        tolerance_rad: Tolerance of the iterations in rad, see `phase_polish`.
+
+    Returns:
+        The estimate of `radial_motion`.
     """
     cells = deramped_lines(bands, coarse["velocity_m_s"], pulse)
     fine = phase_polish(
@@ -81,8 +112,9 @@ def polished(bands: Bands, coarse: Estimate, pulse: Axis, iterations: int, toler
 
 @torch.no_grad()
 def _start(cells: Tensor, coarse: Estimate, radar: TriangularLadar, pulse: Axis) -> Tensor | None:
-    """Phases (..., pulse) by PGA for trials whose velocities integrate to a random walk of more
-    than half a radian (brief 000, section 7), zero for the others.
+    """Phases (..., pulse) by PGA for trials whose velocities integrate to more than 0.4 rad.
+
+    The bound is that of the random walk of integrated velocities. Zero for the other trials.
     """
     drift = (
         4
@@ -99,29 +131,46 @@ def _start(cells: Tensor, coarse: Estimate, radar: TriangularLadar, pulse: Axis)
 
 
 def deramped_lines(bands: Bands, velocity_m_s: Tensor, pulse: Axis) -> Tensor:
-    """Range cells of the window (..., pulse, line) of the up sweeps, the motion and the azimuth
-    phase of a scatterer at azimuth zero taken out.
+    """Compute range cells of the up sweeps with the motion and the azimuth phase removed.
+
+    The azimuth phase is that of a scatterer at azimuth zero.
+
+    Args:
+        bands: Filtered sweeps.
+        velocity_m_s: Radial velocity at the turning points in m/s, shape (..., pulse).
+        pulse: Axis of the periods.
+
+    Returns:
+        Range cells of the window, shape (..., pulse, line), complex.
     """
     radar, m = bands.radar, bands.time_s.shape[-1]
     turns = carrier_turns(sweep_motion(velocity_m_s, radar, pulse), radar)[..., 0, :, :]
-    left = torch.cat(
+    remaining = torch.cat(
         [turns[..., :1], turns[..., 1:2] - (bands.shift.to(torch.float64) / radar.sweep_s)[..., None], turns[..., 2:]],
         -1,
     )
-    still = bands.up * polynomial_phasor(-left, radar.sweep_s / m, m, bands.up.dtype)
-    lines = torch.arange(bands.first, bands.first + bands.lines, device=still.device)
-    cells = torch.fft.fft(still)[..., lines % m] / m
+    compensated = bands.up * polynomial_phasor(-remaining, radar.sweep_s / m, m, bands.up.dtype)
+    lines = torch.arange(bands.first, bands.first + bands.lines, device=compensated.device)
+    cells = torch.fft.fft(compensated)[..., lines % m] / m
     middle, _ = profile_axes(pulse, radar)
     range_ = Axis("range", bands.lines, bands.first * radar.range_step_m, radar.range_step_m, "m")
     return deramp_azimuth(cells, radar, middle, range_)
 
 
 def range_error(estimate: Estimate, radar: TriangularLadar, pulse: Axis, at_s: Tensor) -> Tensor:
-    """Range error (m) at slow times at_s, any shape, of any estimate of the radial motion: (...,
-    *at_s.shape) float64.
+    """Compute the range error at any slow time from an estimate of the radial motion.
 
-    The integral of its velocities, zero at the first turning point, and lambda / (4 pi) times its
-    phases of pulses where it has them, by cubic splines.
+    It is the integral of the velocities, zero at the first turning point, plus lambda / (4 pi)
+    times the phases of the pulses if the estimate has them. Both are interpolated by cubic splines.
+
+    Args:
+        estimate: Estimate of `radial_motion` or another estimator of this package.
+        radar: Ladar parameters.
+        pulse: Axis of the periods.
+        at_s: Slow times in seconds, any shape.
+
+    Returns:
+        The range error in metres, shape (..., *at_s.shape), float64.
     """
     total = torch.zeros((), dtype=torch.float64, device=at_s.device)
     if "velocity_m_s" in estimate.value:

@@ -1,4 +1,4 @@
-"""Radial velocity by segmented interference: the method of the paper."""
+"""Radial velocity by segmented interference, the method of Remote Sens. 2024, 16, 793."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torchsar.radar import TriangularLadar
 
 Bins = Literal["peak", "sum"]
 Unwrap = Literal["gradient", "per_pulse"]
-_SUM_UPSAMPLING = 20
+_SUM_UPSAMPLING = 20  # of the spectra whose lag is removed first with "sum", as in section 3.3.2 of the paper
 
 
 def segmented_interference(
@@ -35,26 +35,47 @@ def segmented_interference(
     window_m: tuple[float, float] | None = None,
     azimuth_m: Tensor | float = 0.0,
 ) -> Estimate:
-    """Radial velocity at the turning points, value["velocity_m_s"] (..., pulse), from the phase
-    between half sweeps (paper, Eqs. 14 to 20, corrected).
+    """Estimate the radial velocity from the phase between the halves of both sweeps.
 
-    sweeps: (..., 2, pulse, N). phi = arg{U1 conj(D1) conj(U2 conj(D2))} of centre-referenced
-    spectra of the halves, the down sweep conjugated before its transform, is -2 pi T fd (brief 000,
-    errata 6 to 8). bins: "peak" reads it where up and down have their own peaks, for each of so
-    many `scatterers` apart by c / B or more, and adds their azimuth GRADIENTS with weights from
-    contrast (Eqs. 18, 19); "sum" adds the complex products of all bins, for dense scenes. padding:
-    zero-padding of the halves; hann: a Hann window over each half, where other scatterers are in
-    the window.
+    phi = arg{U1 conj(D1) conj(U2 conj(D2))} is -2 pi T fd. U and D are spectra of the halves of the
+    up sweep and of the down sweep, which is conjugated before its transform; each spectrum is
+    referenced to the centre of its half. Up and down sweeps are each evaluated at their own peaks.
+    The paper prints the equations without these corrections. Differentiable around the detached
+    peaks and integers.
 
-    unwrap: "gradient" as in the paper, the integer of the first period from the envelopes and
-    wrapped differences from there on, which slips where the velocity changes by lambda / (4 T) a
-    period or the SNR after compression is below 14 dB; "per_pulse" takes every integer from the
-    envelopes. info: phase_rad (..., pulse), integer (..., pulse), slips (...,), the periods where
-    gradient and envelopes disagree by a turn, dispersion (...,) and weights (..., scatterers),
-    means over the periods. A scatterer counts where it is lit.
+    For scenes with scatterers closer than c / B in range, use `bins="sum"` or `mirror_product`.
 
-    Differentiable around the detached peaks and integers. Raises TypeError or ValueError for other
-    sweeps, options or windows.
+    Args:
+        sweeps: Sweeps, shape (..., 2, pulse, N), complex.
+        radar: Ladar parameters.
+        pulse: Axis of the periods.
+        bins: "peak" reads the phase at the peaks of the strongest scatterers, which must be c / B
+            or more apart, and combines their azimuth gradients with weights from contrast (Eqs.
+            (18) and (19)). "sum" adds the complex products of all bins, for dense scenes.
+        unwrap: "gradient" takes the integer of the first period from the envelopes and adds wrapped
+            differences from there on, as in the paper. It slips where the velocity changes by
+            lambda / (4 T) per period, or the SNR after compression is below 14 dB. "per_pulse"
+            takes every integer from the envelopes.
+        scatterers: Number of scatterers with "peak". Each counts in periods where it is
+            illuminated.
+        padding: Zero-padding of the halves, 1..16.
+        hann: Apply a Hann window to each half, for windows with other scatterers.
+        window_m: Lowest and highest relative range in metres; None for the whole band.
+        azimuth_m: Azimuth of the scene centre in metres, a number or shape (...,).
+
+    Returns:
+        `velocity_m_s` of shape (..., pulse) at the turning points, receding positive, with its
+        standard deviation. `ok` is False where the SNR after compression is below 14 dB, or no
+        scatterer is illuminated in any period. info: phase_rad and integer, shape (..., pulse);
+        slips, the number of periods where gradient and envelopes disagree by a turn, and dispersion
+        of the amplitude, shape (...,); weights, shape (..., scatterers), means over the periods.
+
+    Raises:
+        TypeError: If the sweeps are not complex.
+        ValueError: If the sweeps, an option or the window are invalid.
+
+    Reference:
+        Remote Sens. 2024, 16, 793, Eqs. (14)-(20), corrected.
     """
     refuse_other_sweeps(sweeps, radar, "segmented_interference", pulse)
     if bins not in ("peak", "sum") or unwrap not in ("gradient", "per_pulse"):
@@ -72,9 +93,9 @@ def segmented_interference(
         windowed = bands_of(sweeps, radar, window_m, taper=0.0)
         coarse = envelope_lag(windowed, _SUM_UPSAMPLING if bins == "sum" else 4) / 2 + (windowed.shift - bands.shift)
         spectra = _halves(_shifted(bands, coarse) if bins == "sum" else bands, padding, hann)
-        sought = inside(radar, window_m, spectra[0].shape[-1], padding / 2, sweeps.device)
+        searched = inside(radar, window_m, spectra[0].shape[-1], padding / 2, sweeps.device)
         phases, weights = (
-            _summed(spectra, sought, coarse) if bins == "sum" else _at_peaks(spectra, sought, padding, scatterers)
+            _summed(spectra, searched, coarse) if bins == "sum" else _at_peaks(spectra, searched, padding, scatterers)
         )
         bands = replace(bands, lit=bands.lit & (weights > 0).any(-2))
         phase, integer, slips = _unwrapped(phases, weights, coarse, bands, unwrap)
@@ -100,19 +121,21 @@ def segmented_interference(
 
 
 def _halves(bands: Bands, padding: int, hann: bool) -> tuple[Tensor, ...]:
-    """Spectra of the first and second halves of up and mirrored down sweeps, each (..., pulse,
-    bin), phases referenced alike.
+    """Spectra of both halves of up and of mirrored down sweeps, (..., pulse, bin) each.
+
+    Their phases have the same reference.
     """
     h = bands.time_s.shape[-1] // 2
     window = torch.hann_window(h, periodic=False, dtype=bands.up.real.dtype, device=bands.up.device) if hann else None
     parts = [x[..., half] for x in (bands.up, bands.down) for half in (slice(0, h), slice(h, 2 * h))]
     up1, up2, down1, down2 = (torch.fft.fft(x if window is None else x * window, padding * h) for x in parts)
-    # halves of the conjugated down sweep are the conjugate halves of the mirrored one in the other
-    # order
+    # the halves of the conjugated down sweep are the conjugate halves of the mirrored sweep, in
+    # reverse order
     return up1, up2, down2, down1
 
 
 def _power(*parts: Tensor) -> Tensor:
+    """Sum of the powers of several spectra."""
     total = torch.zeros_like(parts[0].real)
     for x in parts:
         total = total + x.real.square() + x.imag.square()
@@ -120,81 +143,80 @@ def _power(*parts: Tensor) -> Tensor:
 
 
 def _shifted(bands: Bands, shift: Tensor) -> Bands:
-    """The bands with a further Doppler shift in bins, (..., pulse), taken out."""
+    """The sweeps with a further Doppler shift in bins, (..., pulse), removed."""
     angle = 2 * math.pi * shift[..., None] * (bands.time_s / bands.radar.sweep_s)
     turn = cis(angle.to(bands.up.real.dtype))
     return replace(bands, up=bands.up * turn.conj(), down=bands.down * turn)
 
 
-def _summed(halves: tuple[Tensor, ...], sought: Tensor, coarse: Tensor) -> tuple[Tensor, Tensor]:
-    """Phase (..., 1, pulse) between the products of up and down spectra, each summed over the bins
-    sought, of the two halves, and its weight, one everywhere.
+def _summed(halves: tuple[Tensor, ...], searched: Tensor, coarse: Tensor) -> tuple[Tensor, Tensor]:
+    """Phase (..., 1, pulse) between the halves from products summed over bins, and weights of one.
 
-    Summed before the halves meet: each product is the power spectrum of the scene times one phasor,
-    whatever the scene, once the Doppler shift `coarse` (bins) is out; that of a dense scene would
-    else decide where in its half the phase is read. The phase is given back what was taken out.
+    Up and down spectra are multiplied and summed before the halves are combined: each sum is then
+    the power spectrum of the scene times one phasor, whatever the scene, after the Doppler shift
+    `coarse` (bins) is removed. Otherwise a dense scene would determine where in its half the phase
+    is read. The removed phase is added again.
     """
-    up1, up2, down1, down2 = (x[..., sought] for x in halves)
+    up1, up2, down1, down2 = (x[..., searched] for x in halves)
     product = (up1 * down2.conj()).sum(-1) * (up2 * down1.conj()).sum(-1).conj()
     phase = (torch.angle(product).to(torch.float64) - 2 * math.pi * coarse)[..., None, :]
     return phase, torch.ones_like(phase)
 
 
-def _at_peaks(halves: tuple[Tensor, ...], sought: Tensor, padding: int, scatterers: int) -> tuple[Tensor, Tensor]:
-    """Phases at the own peaks of up and down spectra, and the weights of Eq.
+def _at_peaks(halves: tuple[Tensor, ...], searched: Tensor, padding: int, scatterers: int) -> tuple[Tensor, Tensor]:
+    """Phases at the peaks of up and of down spectra, and the weights of Eq. (18).
 
-    (18), zero in periods where a scatterer is dark, (..., scatterer, pulse) each.
+    Both are (..., scatterer, pulse). A weight is zero in periods where the scatterer is not
+    illuminated.
     """
     up1, up2, down1, down2 = halves
     up, down = _power(up1, up2), _power(down1, down2)
-    places = _strongest(torch.where(sought, (up + down).detach().mean(-2), -1), scatterers, padding)
+    peaks = _strongest(torch.where(searched, (up + down).detach().mean(-2), -1), scatterers, padding)
     reach = max(1, padding)
     phases, weights = [], []
-    for place in places.unbind(-1):
-        at_up, at_down = (_own_peak(power.detach(), place, reach) for power in (up, down))
+    for peak in peaks.unbind(-1):
+        at_up, at_down = (_own_peak(power.detach(), peak, reach) for power in (up, down))
         turn = _picked(up1 * up2.conj(), at_up) * _picked(down1 * down2.conj(), at_down)
         phases.append(torch.angle(turn).to(torch.float64))
-        weight = _contrast_about((up + down).detach().sqrt(), place, reach).to(torch.float64)
+        weight = _contrast_about((up + down).detach().sqrt(), peak, reach).to(torch.float64)
         weights.append(weight[..., None] * shining(_picked(up, at_up), _picked(down, at_down)))
     return torch.stack(phases, -2), torch.stack(weights, -2)
 
 
-def _strongest(profile: Tensor, count: int, apart: int) -> Tensor:
-    """Bins (..., count) of the greatest values of a circular profile (..., n), `apart` bins or more
-    from each other.
-    """
+def _strongest(profile: Tensor, count: int, spacing: int) -> Tensor:
+    """Bins (..., count) of the greatest values of a circular profile, at a spacing or more."""
     n = profile.shape[-1]
     left, found = profile.clone(), []
     index = torch.arange(n, device=profile.device)
     for _ in range(count):
         best = left.argmax(-1, keepdim=True)
         found.append(best)
-        away = ((index - best + n // 2) % n - n // 2).abs()
-        left = torch.where(away < 2 * apart, torch.full_like(left, -1.0), left)
+        distance = ((index - best + n // 2) % n - n // 2).abs()
+        left = torch.where(distance < 2 * spacing, torch.full_like(left, -1.0), left)
     return torch.cat(found, -1)
 
 
-def _own_peak(power: Tensor, place: Tensor, reach: int) -> Tensor:
-    """Bin (..., pulse) of the greatest power (..., pulse, n) within `reach` bins of a place
-    (...,).
-    """
+def _own_peak(power: Tensor, peak: Tensor, reach: int) -> Tensor:
+    """Bin (..., pulse) of the greatest power (..., pulse, n) near a peak (...,)."""
     n = power.shape[-1]
-    near = (place[..., None] + torch.arange(-reach, reach + 1, device=power.device)) % n
+    near = (peak[..., None] + torch.arange(-reach, reach + 1, device=power.device)) % n
     near = near[..., None, :].expand(*power.shape[:-1], -1)
     best = power.gather(-1, near).argmax(-1, keepdim=True)
     return near.gather(-1, best)[..., 0]
 
 
 def _picked(x: Tensor, index: Tensor) -> Tensor:
+    """Values at one index per period."""
     return x.gather(-1, index[..., None])[..., 0]
 
 
-def _contrast_about(amplitude: Tensor, place: Tensor, reach: int) -> Tensor:
-    """Standard deviation over mean of the amplitudes (..., pulse, n) in a window about a place
-    (...,): Eq. (18) made scale invariant (erratum 10).
+def _contrast_about(amplitude: Tensor, peak: Tensor, reach: int) -> Tensor:
+    """Standard deviation over mean of amplitudes (..., pulse, n) in a window about a peak (...,).
+
+    Eq. (18) of the paper, made independent of scale.
     """
     n = amplitude.shape[-1]
-    near = (place[..., None] + torch.arange(-4 * reach, 4 * reach + 1, device=amplitude.device)) % n
+    near = (peak[..., None] + torch.arange(-4 * reach, 4 * reach + 1, device=amplitude.device)) % n
     part = amplitude.gather(-1, near[..., None, :].expand(*amplitude.shape[:-1], -1))
     mean = part.mean((-2, -1))
     spread = (part - mean[..., None, None]).square().mean((-2, -1)).sqrt()
@@ -204,16 +226,16 @@ def _contrast_about(amplitude: Tensor, place: Tensor, reach: int) -> Tensor:
 def _unwrapped(
     phases: Tensor, weights: Tensor, coarse: Tensor, bands: Bands, unwrap: Unwrap
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """One phase and its integer a period, (..., pulse) each, and the count of disagreements (...,).
+    """One phase and its integer per period, (..., pulse) each, and the number of slips (...,).
 
-    coarse: fd T of the envelopes beyond the shift.
+    coarse: fd T of the envelopes beyond the removed shift.
     """
     turn = 2 * math.pi
     integer = torch.round(coarse[..., None, :] + phases.detach() / turn)
-    own = _weighted(phases - turn * integer, weights)  # phase less whole turns: fd T = -own / 2 pi
+    own = _weighted(phases - turn * integer, weights)  # phase minus whole turns: fd T = -own / 2 pi
     pairs = torch.minimum(weights[..., 1:], weights[..., :-1])
     step = _weighted(_wrapped(_steps(phases)), pairs)
-    # with the shift, which the gradient does not see
+    # with the removed shift, which the gradient of the phase does not contain
     beyond = own - turn * bands.shift.to(torch.float64)
     both = bands.lit[..., 1:] & bands.lit[..., :-1] & (pairs > 0).any(-2)
     step = torch.where(both, step, _steps(beyond))
@@ -227,23 +249,22 @@ def _unwrapped(
 
 
 def _weighted(x: Tensor, weights: Tensor) -> Tensor:
-    """Mean over scatterers (..., scatterer, pulse) -> (..., pulse), zero where none has weight."""
+    """Weighted mean over scatterers, (..., pulse); zero where all weights are zero."""
     return (x * weights).sum(-2) / weights.sum(-2).clamp_min(torch.finfo(weights.dtype).tiny)
 
 
 def _steps(x: Tensor) -> Tensor:
-    """From each entry to the next, none for a single one."""
+    """Differences between successive entries."""
     return x[..., 1:] - x[..., :-1]
 
 
 def _wrapped(x: Tensor) -> Tensor:
+    """Phases modulo 2 pi; the removed turns are detached."""
     return x - 2 * math.pi * torch.round(x.detach() / (2 * math.pi))
 
 
 def _dispersion(bands: Bands) -> Tensor:
-    """Standard deviation over mean, over periods, of the amplitude in the window: how unsteady the
-    echo is, (...,).
-    """
+    """Standard deviation over mean, (...,), of the amplitude in the window over the periods."""
     level = bands.up.detach().abs().mean(-1).to(torch.float64)
     mean = level.mean(-1)
     return torch.where(mean > 0, level.std(-1, correction=0) / torch.where(mean > 0, mean, 1), 0)

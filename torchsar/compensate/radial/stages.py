@@ -1,5 +1,6 @@
-"""Radial motion as stages: estimators of `velocity_m_s` that leave the sweeps alone, and what takes
-the motion out.
+"""Estimators and compensation of radial motion as stages.
+
+The estimators leave the sweeps unchanged.
 """
 
 from __future__ import annotations
@@ -18,10 +19,11 @@ from torchsar.core import Estimate, Signal, Stage
 from torchsar.radar import TriangularLadar
 
 Window = tuple[float, float] | list[float] | None
-SWEEPS = ("ramp", "pulse", "fast_time")
+SWEEPS = ("ramp", "pulse", "fast_time")  # axes of the signals of these stages
 
 
 def _window(window_m: Window) -> tuple[float, float] | None:
+    """A window as two floats; raises ValueError if it does not have two values."""
     if window_m is None:
         return None
     if len(window_m) != 2:
@@ -30,9 +32,7 @@ def _window(window_m: Window) -> tuple[float, float] | None:
 
 
 class _OfSweeps(Stage):
-    """An estimator of the radial velocity at the turning points, from both sweeps of a window of
-    relative ranges.
-    """
+    """An estimator of the radial velocity from both sweeps of a range window."""
 
     works_on = SWEEPS
     provides = ("velocity_m_s",)
@@ -45,7 +45,20 @@ class _OfSweeps(Stage):
 
 
 class MirrorProduct(_OfSweeps):
-    """`mirror_product`."""
+    """Radial velocity by the product of up and mirrored down sweeps; see `mirror_product`.
+
+    Provides `velocity_m_s` of shape (..., pulse) at the turning points, receding positive.
+
+    Args:
+        radar: Ladar parameters.
+        window_m: Lowest and highest relative range in metres; None for the whole band.
+        intercept: Kind of intercept: "known", "record" or "free".
+        taper: Share of the window that its edges take, see `bands_of`.
+        azimuth_m: Azimuth of the scene centre in metres.
+
+    Raises:
+        ValueError: If the window does not have two values.
+    """
 
     def __init__(
         self,
@@ -60,6 +73,7 @@ class MirrorProduct(_OfSweeps):
         self.taper = taper
 
     def forward(self, signal: Signal) -> Estimate:
+        """Estimate `velocity_m_s` from sweeps of axes (ramp, pulse, fast_time)."""
         return mirror_product(
             signal.data,
             self.radar,
@@ -72,8 +86,21 @@ class MirrorProduct(_OfSweeps):
 
 
 class RadialMotion(MirrorProduct):
-    """`radial_motion`, the recommended estimator: `velocity_m_s` for `CompensateMotion`, then
-    `phase_rad` for `CorrectPulsePhase`.
+    """Radial motion by the recommended estimator; see `radial_motion`.
+
+    Provides `velocity_m_s` for `CompensateMotion`, then `phase_rad` for `CorrectPulsePhase`.
+
+    Args:
+        radar: Ladar parameters.
+        window_m: Lowest and highest relative range in metres; None for the whole band.
+        intercept: Kind of intercept: "known", "record" or "free".
+        taper: Share of the window that its edges take, see `bands_of`.
+        azimuth_m: Azimuth of the scene centre in metres.
+        iterations: Largest number of iterations, see `phase_polish`.
+        tolerance_rad: Tolerance of the iterations in rad, see `phase_polish`.
+
+    Raises:
+        ValueError: If the window does not have two values.
     """
 
     provides = ("velocity_m_s", "phase_rad")
@@ -92,6 +119,7 @@ class RadialMotion(MirrorProduct):
         self.iterations, self.tolerance_rad = iterations, tolerance_rad
 
     def forward(self, signal: Signal) -> Estimate:
+        """Estimate velocities and phases from sweeps of axes (ramp, pulse, fast_time)."""
         return radial_motion(
             signal.data,
             self.radar,
@@ -106,17 +134,37 @@ class RadialMotion(MirrorProduct):
 
 
 class MlPeak(_OfSweeps):
-    """`ml_peak`."""
+    """Radial velocity by periodogram peaks of one scatterer; see `ml_peak`.
+
+    Args:
+        radar: Ladar parameters.
+        window_m: Lowest and highest relative range in metres; None for the whole band.
+        azimuth_m: Azimuth of the scatterer in metres.
+
+    Raises:
+        ValueError: If the window does not have two values.
+    """
 
     def __init__(self, radar: TriangularLadar, window_m: Window = None, azimuth_m: float = 0.0) -> None:
         super().__init__(radar, window_m, azimuth_m)
 
     def forward(self, signal: Signal) -> Estimate:
+        """Estimate `velocity_m_s` from sweeps of axes (ramp, pulse, fast_time)."""
         return ml_peak(signal.data, self.radar, signal.axis("pulse"), window_m=self.window_m, azimuth_m=self.azimuth_m)
 
 
 class SpectrumCorrelation(_OfSweeps):
-    """`spectrum_correlation`."""
+    """Radial velocity by cross-correlation of range envelopes; see `spectrum_correlation`.
+
+    Args:
+        radar: Ladar parameters.
+        upsampling: Upsampling of the spectra, 1..64.
+        window_m: Lowest and highest relative range in metres; None for the whole band.
+        azimuth_m: Azimuth of the scene centre in metres.
+
+    Raises:
+        ValueError: If the window does not have two values.
+    """
 
     def __init__(
         self, radar: TriangularLadar, upsampling: int = 20, window_m: Window = None, azimuth_m: float = 0.0
@@ -125,6 +173,7 @@ class SpectrumCorrelation(_OfSweeps):
         self.upsampling = upsampling
 
     def forward(self, signal: Signal) -> Estimate:
+        """Estimate `velocity_m_s` from sweeps of axes (ramp, pulse, fast_time)."""
         return spectrum_correlation(
             signal.data,
             self.radar,
@@ -136,7 +185,21 @@ class SpectrumCorrelation(_OfSweeps):
 
 
 class SegmentedInterference(_OfSweeps):
-    """`segmented_interference`."""
+    """Radial velocity by segmented interference; see `segmented_interference`.
+
+    Args:
+        radar: Ladar parameters.
+        bins: "peak" or "sum".
+        unwrap: "gradient" or "per_pulse".
+        scatterers: Number of scatterers with "peak".
+        padding: Zero-padding of the halves, 1..16.
+        hann: Apply a Hann window to each half.
+        window_m: Lowest and highest relative range in metres; None for the whole band.
+        azimuth_m: Azimuth of the scene centre in metres.
+
+    Raises:
+        ValueError: If the window does not have two values.
+    """
 
     def __init__(
         self,
@@ -155,6 +218,7 @@ class SegmentedInterference(_OfSweeps):
         self.scatterers, self.padding, self.hann = scatterers, padding, hann
 
     def forward(self, signal: Signal) -> Estimate:
+        """Estimate `velocity_m_s` from sweeps of axes (ramp, pulse, fast_time)."""
         return segmented_interference(
             signal.data,
             self.radar,
@@ -170,8 +234,11 @@ class SegmentedInterference(_OfSweeps):
 
 
 class CompensateMotion(Stage):
-    """`compensate_motion` by a connected value `velocity_m_s` (..., pulse) at the turning
-    points.
+    """Compensation of radial motion by a connected value `velocity_m_s`; see `compensate_motion`.
+
+    Args:
+        radar: Ladar parameters.
+        carrier_only: Compensate the phase of the carrier only.
     """
 
     works_on = SWEEPS
@@ -181,13 +248,30 @@ class CompensateMotion(Stage):
         self.radar, self.carrier_only = radar, carrier_only
 
     def forward(self, signal: Signal, velocity_m_s: Tensor) -> Signal:
+        """Compensate sweeps of axes (ramp, pulse, fast_time).
+
+        Args:
+            signal: Sweeps, shape (..., 2, pulse, N), complex.
+            velocity_m_s: Radial velocity at the turning points in m/s, receding positive, shape
+                (..., pulse).
+
+        Returns:
+            The compensated sweeps.
+        """
         return signal.with_data(
             compensate_motion(signal.data, velocity_m_s, self.radar, signal.axis("pulse"), self.carrier_only)
         )
 
 
 class PhasePolish(Stage):
-    """`phase_polish`: what a compensation by velocities has left in each pulse."""
+    """Residual phase of each pulse after a compensation by velocities; see `phase_polish`.
+
+    Provides `phase_rad` of shape (..., pulse).
+
+    Args:
+        iterations: Largest number of iterations with Wiener weights.
+        tolerance_rad: Step in rad, rms over the pulses, below which a trial ends.
+    """
 
     provides = ("phase_rad",)
 
@@ -196,20 +280,34 @@ class PhasePolish(Stage):
         self.iterations, self.tolerance_rad = iterations, tolerance_rad
 
     def forward(self, signal: Signal) -> Estimate:
+        """Estimate `phase_rad` of a signal of axes (pulse, range)."""
         return phase_polish(signal.data, iterations=self.iterations, tolerance_rad=self.tolerance_rad)
 
 
 class PulseGain(Stage):
-    """`pulse_gain`: how strong each pulse is."""
+    """Amplitude of every pulse; see `pulse_gain`.
+
+    Provides `gain` of shape (..., pulse).
+    """
 
     provides = ("gain",)
 
     def forward(self, signal: Signal) -> Estimate:
+        """Estimate `gain` of a signal of axes (pulse, range)."""
         return pulse_gain(signal.data)
 
 
 class EqualisePulses(Stage):
-    """`equalise_pulses` by a connected value `gain` (..., pulse)."""
+    """Division of every pulse by a connected value `gain`; see `equalise_pulses`."""
 
     def forward(self, signal: Signal, gain: Tensor) -> Signal:
+        """Equalise the pulses of a signal of axes (pulse, range).
+
+        Args:
+            signal: Pulses, shape (..., pulse, range), complex.
+            gain: Gains, shape (..., pulse).
+
+        Returns:
+            The equalised signal.
+        """
         return signal.with_data(equalise_pulses(signal.data, gain))

@@ -1,6 +1,4 @@
-"""From radial velocities at turning points to the range error at any time, and the geometry that an
-estimate contains.
-"""
+"""Range error from radial velocities at the turning points, and the geometric velocity."""
 
 from __future__ import annotations
 
@@ -15,7 +13,15 @@ from torchsar.radar import TriangularLadar, sweep_middles
 
 
 def turning_points(radar: TriangularLadar, pulse: Axis) -> Axis:
-    """Slow times of the turning points, half a period after the starts of the periods."""
+    """Compute the slow times of the turning points, half a period after the starts of the periods.
+
+    Args:
+        radar: Ladar parameters.
+        pulse: Axis of the periods.
+
+    Returns:
+        Axis of the turning points in seconds.
+    """
     return Axis("pulse", pulse.n, pulse.start + radar.period_s / 2, pulse.step, "s")
 
 
@@ -26,11 +32,20 @@ def geometric_velocity_m_s(
     relative_range_m: float = 0.0,
     device: torch.device | str | None = None,
 ) -> Tensor:
-    """Radial velocity V (V t - x) / R at the turning points of a scatterer that does not move,
-    (..., pulse) float64 (brief 000, erratum 14).
+    """Compute the radial velocity V (V t - x) / R of a static scatterer at the turning points.
 
-    azimuth_m: x, a number or one per trial. An estimate from the echo contains it; taken out as
-    motion it would remove the azimuth phase history.
+    An estimate from the echo contains it. If it were compensated as motion, the azimuth phase
+    history would be removed.
+
+    Args:
+        radar: Ladar parameters.
+        pulse: Axis of the periods.
+        azimuth_m: Azimuth x of the scatterer in metres, a number or shape (...,).
+        relative_range_m: Range beyond the reference range in metres.
+        device: Device of the result.
+
+    Returns:
+        The velocity in m/s, receding positive, shape (..., pulse), float64.
     """
     t = turning_points(radar, pulse).values(device)
     x = per_trial(azimuth_m, 1, t)
@@ -38,11 +53,19 @@ def geometric_velocity_m_s(
 
 
 def integrated_range(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis, at_s: Tensor) -> Tensor:
-    """Range error DR (m) at slow times at_s, any shape: the antiderivative of the cubic spline
-    through velocities (..., pulse) at turning points.
+    """Integrate radial velocities to the range error at any slow time.
 
-    Zero at the first turning point; (..., *at_s.shape) float64. A sum of rectangles instead is
-    wrong by micrometres (brief 000, section 5.5). Differentiable.
+    It is the antiderivative of the cubic spline through the velocities, zero at the first turning
+    point. A sum of rectangles has errors of micrometres. Differentiable.
+
+    Args:
+        velocity_m_s: Radial velocity at the turning points in m/s, shape (..., pulse).
+        radar: Ladar parameters.
+        pulse: Axis of the periods.
+        at_s: Slow times in seconds, any shape.
+
+    Returns:
+        The range error in metres, shape (..., *at_s.shape), float64.
     """
     grid = turning_points(radar, pulse)
     v = velocity_m_s.to(torch.float64)
@@ -52,18 +75,25 @@ def integrated_range(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis, 
 
 
 def sweep_motion(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis) -> Tensor:
-    """Coefficients (..., 2, pulse, 5) of DR(u) = sum_k c_k u^k over the up and the down sweep of
-    every period, u from the middle of the sweep.
+    """Compute the range error over both sweeps of every period as polynomials.
 
-    Exact for the spline: its knots are the turning points, so that each sweep lies in one piece.
-    velocity_m_s: (..., pulse) at the turning points.
+    DR(u) = sum_k c_k u^k, with u the time from the middle of the sweep. Exact for the spline: its
+    knots are the turning points, so each sweep lies in one piece.
+
+    Args:
+        velocity_m_s: Radial velocity at the turning points in m/s, shape (..., pulse).
+        radar: Ladar parameters.
+        pulse: Axis of the periods.
+
+    Returns:
+        Coefficients, shape (..., 2, pulse, 5), up before down, float64; c_k in m/s^k.
     """
     v = velocity_m_s.to(torch.float64)
     middles = sweep_middles(radar, pulse, v.device)
     if pulse.n == 1:
-        place = v[..., None, :] * (middles - turning_points(radar, pulse).start)
-        zero = torch.zeros_like(place)
-        return torch.stack([place, v[..., None, :].expand_as(place), zero, zero, zero], -1)
+        constant = v[..., None, :] * (middles - turning_points(radar, pulse).start)
+        zero = torch.zeros_like(constant)
+        return torch.stack([constant, v[..., None, :].expand_as(constant), zero, zero, zero], -1)
     grid = turning_points(radar, pulse)
     spline = UniformSpline(v, grid.start, grid.step)
     pieces = spline.pieces()
@@ -74,9 +104,9 @@ def sweep_motion(velocity_m_s: Tensor, radar: TriangularLadar, pulse: Axis) -> T
     until = torch.full((pulse.n,), radar.sweep_s / 2, dtype=torch.float64, device=v.device)
     until[-1] = pulse.step + radar.sweep_s / 2
     moved = torch.stack([_recentred(before, since), _recentred(after, until)], -3)
-    place = spline.integral(middles)
+    constant = spline.integral(middles)
     order = torch.arange(1, 5, dtype=torch.float64, device=v.device)
-    return torch.cat([place[..., None], moved / order], -1)
+    return torch.cat([constant[..., None], moved / order], -1)
 
 
 def _recentred(cubic: Tensor, at: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
-"""Rotation of a target that turns unevenly: searches for the least entropy, and maximum likelihood
-without a start.
+"""Rotation of a target with non-uniform rotation.
+
+Searches for the least image entropy, and maximum likelihood without a start.
 """
 
 from torchsar.compensate.rotation.chirplet import ChirpletClean, Chirplets, chirplet_clean
@@ -15,7 +16,7 @@ from torchsar.compensate.rotation.entropy_search import (
     newton_rotation,
     search_rotation,
 )
-from torchsar.compensate.rotation.image_entropy import ImageEntropy
+from torchsar.compensate.rotation.image_entropy import EntropyObjective, ImageEntropy
 from torchsar.compensate.rotation.recommended import coarse_rotation, phase_fit_rotation, uneven_rotation
 from torchsar.compensate.rotation.stages import (
     CoarseRotation,
@@ -24,11 +25,13 @@ from torchsar.compensate.rotation.stages import (
     UnevenRotation,
     rotating_autofocus,
 )
+from torchsar.compensate.rotation.unknowns import RotationParameters, Unknowns, k_name
 
 __all__ = [
     "ChirpletClean",
     "Chirplets",
     "CoarseRotation",
+    "EntropyObjective",
     "ImageEntropy",
     "PhaseFitRotation",
     "RotationAutofocus",
@@ -36,13 +39,16 @@ __all__ = [
     "RotationEvolution",
     "RotationGenetic",
     "RotationNewton",
+    "RotationParameters",
     "RotationSearch",
     "UnevenRotation",
+    "Unknowns",
     "chirplet_clean",
     "coarse_rotation",
     "descend_rotation",
     "evolve_rotation",
     "genetic_rotation",
+    "k_name",
     "newton_rotation",
     "phase_fit_rotation",
     "rotating_autofocus",

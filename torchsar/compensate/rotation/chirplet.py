@@ -1,5 +1,6 @@
-"""Adaptive chirplet imaging in the manner of CLEAN: every range bin as a sum of chirps, the
-strongest taken out first (the 'ACL' of brief 003).
+"""Adaptive chirplet imaging in the manner of CLEAN, a baseline.
+
+Every range cell is modelled as a sum of chirps, the strongest of which is removed first.
 """
 
 from __future__ import annotations
@@ -11,21 +12,25 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Axis, Signal, Stage, linear_phasor, real_dtype, refuse_non_finite, take, unit_phasor
+from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier
 from torchsar.radar import InverseRadar
 
-_PARTS = 4  # samples that a segment keeps in the fine search
-_PAD = 2
+_PARTS = 4  # samples that a segment keeps in the fine search, found by trial: reach against time
+_PAD = 2  # zero-padding of the transforms: a peak between two bins loses little power
 
 
 @dataclass(frozen=True)
 class Chirplets:
-    """Chirps found per range bin, strongest first as they came.
+    """Chirps found in every range cell, in the order in which they were found.
 
-    image: (..., lines, range). doppler_hz, rate_hz_s (Hz and Hz/s in the middle of the aperture,
-    positive where the phase falls, as in exp(-2j pi f t)) and the complex amplitude: (..., atom,
-    range); only atoms above the floor are in the image. residual_share: (...,) energy left over
-    that of the data.
+    Args:
+        image: Image of the chirps above the floor, shape (..., lines, range), complex.
+        doppler_hz: Frequency in Hz in the middle of the aperture, positive where the phase falls,
+            as in exp(-2j pi f t), shape (..., atom, range).
+        rate_hz_s: Rate in Hz/s, with the same sign convention, shape (..., atom, range).
+        amplitude: Amplitude, shape (..., atom, range), complex.
+        residual_share: Remaining energy over that of the data, shape (...,).
     """
 
     image: Tensor
@@ -45,22 +50,41 @@ def chirplet_clean(
     oversampling: float = 2.0,
     lines: int | None = None,
 ) -> Chirplets:
-    """Image of the chirps that make up range-compressed pulses. data: (..., pulse, range) complex.
+    """Form the image of the chirps that make up range-compressed pulses.
 
-    For each bin by itself: find the chirp a exp(-2j pi (f t + r t^2 / 2)) that carries most energy,
-    t from the middle of the aperture; take it out; again, `atoms` times. The image is what
-    unchirped tones a exp(-2j pi f t) give, of the Doppler in the middle of the aperture, with lines
-    as `torchsar.focus.matched_fourier` has them. sweep: largest |r| searched, as the share of the
-    pulse rate that a chirp sweeps during the aperture. floor_db: atoms this far below the strongest
-    of their trial are left out of the image.
+    In each range cell the chirp a exp(-2j pi (f t + r t^2 / 2)) of most energy is found, with t
+    from the middle of the aperture, and removed; this is repeated `atoms` times. The image is that
+    of unchirped tones a exp(-2j pi f t), with lines as those of `torchsar.focus.matched_fourier`.
+    Not differentiable.
 
-    A baseline: chirps have no cubic phase and scatterers of one bin are not told apart by what the
-    rotation says about all of them, so a target that turns with jerk leaves remains of its strong
-    scatterers, on which atoms are spent before weak scatterers are reached: the image is sparse. It
-    needs no model of the rotation, gives none, and costs two transforms of each bin per atom and
-    rate. Detached. Raises TypeError or ValueError for samples that are not complex and finite,
-    fewer than 16 pulses, or settings that make no sense. Remote Sens. 2025, 17, 3447, Fig. 6; the
-    search is ours: rates by segments without their phases, then on the whole aperture.
+    A baseline. Chirps have no cubic phase, and scatterers of one range cell are not separated by a
+    common rotation. A target whose rotation has jerk leaves residuals of its strong scatterers, on
+    which atoms are spent before weak scatterers are reached: the image is sparse. The method needs
+    no model of the rotation and gives none. It costs two transforms of each range cell per atom and
+    rate.
+
+    Args:
+        data: Range-compressed pulses, shape (..., pulse, range), complex.
+        prf_hz: Pulse repetition frequency in Hz.
+        atoms: Number of chirps per range cell.
+        sweep: Largest |r| that is searched, as the share of the pulse rate that a chirp sweeps
+            during the aperture.
+        floor_db: Chirps this far below the strongest one of their trial are left out of the image.
+        oversampling: Image lines per Doppler cell.
+        lines: Number of image lines about zero Doppler; by default all that the pulse rate holds.
+
+    Returns:
+        The chirps and their image.
+
+    Raises:
+        TypeError: If the data are not complex.
+        ValueError: If the data are not finite or hold fewer than 16 pulses, or an option is
+            invalid.
+
+    Reference:
+        Remote Sens. 2025, 17, 3447, Fig. 6 (the adaptive chirplet algorithm, ACL). The search
+        differs: rates are first found from segments without their phases, then on the whole
+        aperture.
     """
     _check(data, prf_hz, atoms, sweep, floor_db)
     n = data.shape[-2]
@@ -80,7 +104,7 @@ def chirplet_clean(
     for f, a in zip(frequency.unbind(-2), shown.unbind(-2), strict=True):
         tones = tones + a[..., None] * linear_phasor(-f, -search.middle, n, rows.dtype)
     even = torch.zeros(0, dtype=torch.float64, device=rows.device)
-    image = matched_fourier(tones.mT.contiguous(), even, prf_hz, oversampling=oversampling, lines=lines)
+    image = matched_fourier(tones.mT.contiguous(), even, prf_hz, lines=DopplerLines(oversampling, lines))
     return Chirplets(
         image, frequency * prf_hz, rate * prf_hz**2, amplitude, _energy(rows) / torch.where(energy > 0, energy, 1)
     )
@@ -88,13 +112,11 @@ def chirplet_clean(
 
 @dataclass(frozen=True)
 class _Search:
-    """Finds the strongest chirp of each row (..., pulse).
+    """Search for the strongest chirp of each row (..., pulse).
 
-    Frequencies in cycles a pulse, rates in cycles a pulse squared, times from the middle of the
-    aperture.
-
-    step: between coarse rates, so that a chirp half of it away drifts by half a Doppler cell of the
-    segments.
+    Frequencies are in cycles per pulse, rates in cycles per pulse squared, times from the middle of
+    the aperture. step: spacing of the coarse rates, such that a chirp half of it away drifts by
+    half a Doppler cell of the segments.
     """
 
     n: int
@@ -105,6 +127,7 @@ class _Search:
 
     @staticmethod
     def of(n: int, sweep: float, like: Tensor) -> _Search:
+        """Search for rows of n pulses; see `chirplet_clean` for sweep."""
         segments = max(4, 2 ** round(math.log2(n) / 2))
         step = segments / n**2
         count = math.ceil(sweep / n / step)
@@ -113,10 +136,12 @@ class _Search:
 
     @property
     def middle(self) -> float:
+        """Index of the middle of the aperture."""
         return (self.n - 1) / 2
 
     @property
     def times(self) -> Tensor:
+        """Times of the pulses from the middle of the aperture."""
         return torch.arange(self.n, dtype=torch.float64, device=self.rates.device) - self.middle
 
     def chirp(self, frequency: Tensor, rate: Tensor, dtype: torch.dtype) -> Tensor:
@@ -125,17 +150,17 @@ class _Search:
         return unit_phasor(-(frequency[..., None] * t + rate[..., None] * (0.5 * t.square())), dtype)
 
     def strongest(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Frequency and rate (...,), float64."""
+        """Frequency and rate (...,) of the strongest chirp, float64."""
         frequency, rate = self._coarse(rows)
         return self._fine(rows * self.chirp(frequency, rate, rows.dtype).conj(), frequency, rate)
 
     def _segmented(self, rows: Tensor, parts: int) -> Tensor:
-        """Rows with zeros behind as (..., parts, pulse)."""
+        """Rows padded with zeros, as (..., parts, pulse)."""
         length = self.segments * _PARTS * self.part
         return torch.nn.functional.pad(rows, (0, length - self.n)).unflatten(-1, (parts, -1))
 
     def _coarse(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Most power summed over segments, whose phases do not count."""
+        """Frequency and rate of most power, summed over segments without their phases."""
         best = torch.full(rows.shape[:-1], -1.0, dtype=real_dtype(rows.dtype), device=rows.device)
         frequency, rate = torch.zeros_like(best, dtype=torch.float64), torch.zeros_like(best, dtype=torch.float64)
         bins = _PAD * _PARTS * self.part
@@ -150,8 +175,10 @@ class _Search:
         return frequency, rate
 
     def _fine(self, rows: Tensor, frequency: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
-        """Adds what the rows, freed from their coarse chirp and thinned out, still turn: the
-        strongest of a grid of chirps over the whole aperture, and its vertex.
+        """The coarse frequency and rate, corrected by the strongest of a grid of chirps.
+
+        The rows have their coarse chirp removed and are decimated. The grid spans the whole
+        aperture; its maximum is interpolated by a parabola.
         """
         count = _PARTS * self.segments
         thin = self._segmented(rows, count).sum(-1)
@@ -177,8 +204,9 @@ def _signed(index: Tensor, n: int) -> Tensor:
 
 
 def _vertex(values: Tensor, index: Tensor, circular: bool) -> Tensor:
-    """Offset -0.5..0.5 of the parabola through the greatest value (..., n) and its neighbours; 0 at
-    an end that is none.
+    """Offset -0.5..0.5 of the parabola through a greatest value (..., n) and its neighbours.
+
+    It is 0 at an end of an axis that is not circular.
     """
     n = values.shape[-1]
     left, middle, right = (
@@ -190,10 +218,12 @@ def _vertex(values: Tensor, index: Tensor, circular: bool) -> Tensor:
 
 
 def _energy(rows: Tensor) -> Tensor:
+    """Energy of the rows of each trial."""
     return (rows.real.square() + rows.imag.square()).sum((-2, -1))
 
 
 def _check(data: Tensor, prf_hz: float, atoms: int, sweep: float, floor_db: float) -> None:
+    """Raise TypeError or ValueError for invalid data or options."""
     real_dtype(data.dtype)
     refuse_non_finite(data, "chirplet_clean")
     if data.ndim < 2 or data.shape[-2] < 16 or not data.shape[-1]:
@@ -203,13 +233,23 @@ def _check(data: Tensor, prf_hz: float, atoms: int, sweep: float, floor_db: floa
     if not (prf_hz > 0 and atoms >= 1 and 0 < sweep <= 1 and floor_db > 0):
         raise ValueError(
             "chirplet_clean needs a positive prf_hz and floor_db, one atom at least and a sweep "
-            f"in 0..1, got {prf_hz}, {floor_db}, {atoms} and {sweep}"
+            f"in 0..1, got prf_hz {prf_hz}, floor_db {floor_db}, atoms {atoms} and sweep {sweep}"
         )
 
 
 class ChirpletClean(Stage):
-    """`chirplet_clean` as image formation: (pulse, range) to (azimuth, range), azimuth in Hz,
-    Doppler in the middle of the aperture.
+    """Image formation by adaptive chirplets; see `chirplet_clean`.
+
+    Forms an image of axes (azimuth, range) with the Doppler in the middle of the aperture, in Hz,
+    along azimuth.
+
+    Args:
+        radar: Radar parameters.
+        atoms: Number of chirps per range cell.
+        sweep: Largest rate that is searched, see `chirplet_clean`.
+        floor_db: Chirps this far below the strongest one are left out of the image.
+        oversampling: Image lines per Doppler cell.
+        lines: Number of image lines about zero Doppler; by default all that the pulse rate holds.
     """
 
     def __init__(
@@ -232,6 +272,7 @@ class ChirpletClean(Stage):
         }
 
     def forward(self, signal: Signal) -> Signal:
+        """Form the image of a signal of axes (pulse, range)."""
         image = chirplet_clean(signal.data, self.radar.prf_hz, **self.options).image
         pulse, range_ = signal.axes
         step = 1 / (self.options["oversampling"] * pulse.n * pulse.step)

@@ -1,6 +1,4 @@
-"""How echoes of scatterers next to each other overlap: the sparse couplings of a joint
-least-squares step.
-"""
+"""Overlap of the echoes of neighbouring scatterers: couplings of a joint least-squares step."""
 
 from __future__ import annotations
 
@@ -13,19 +11,29 @@ from torch import Tensor
 
 from torchsar.compensate.rotation.motion import Sampling
 from torchsar.core import linear_phasor
+from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier
+from torchsar.focus.transforms import Gridding
 
-# scatterers further apart in Doppler do not couple; steps of the table per cell
-_NEAR_CELLS, _TABLE = 64, 16
+# Doppler cells beyond which the coupling of scatterers is neglected, found by trial: accuracy of a
+# step against time
+_NEAR_CELLS = 64
+_TABLE = 16  # steps of the table per Doppler cell, enough for linear interpolation
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """Scatterers close enough in Doppler to couple, each with itself among them: trial, first and
-    second of each pair (pair,).
+    """Pairs of scatterers that are close enough in Doppler to couple.
 
-    products: for bases n and m, conj(s_p) s_q sum over pulses of b_n b_m conj(e_p) e_q of unit
-    echoes e, (pair,), from tables over their distance.
+    Each scatterer also forms a pair with itself.
+
+    Args:
+        trial: Trial of each pair, shape (pair,).
+        first: First scatterer of each pair, shape (pair,).
+        second: Second scatterer of each pair, shape (pair,).
+        shape: Shape (trial, scatterer) of the scatterers.
+        products: For bases n and m, conj(s_p) s_q times the sum over pulses of b_n b_m conj(e_p)
+            e_q of unit echoes e, shape (pair,), from tables over their distance.
     """
 
     trial: Tensor
@@ -36,29 +44,53 @@ class Pairs:
 
     @staticmethod
     def find(sampling: Sampling, k: Tensor, amplitude: Tensor, cell: Tensor, bases: Tensor) -> Pairs:
-        """Of scatterers (trial, scatterer) of this amplitude and Doppler cell; bases: (trial, base,
-        pulse), zero in pulses that are not there.
+        """Find the pairs among scatterers.
+
+        Args:
+            sampling: Sampling of the data.
+            k: Warp, shape (trial, order - 1).
+            amplitude: Amplitudes, shape (trial, scatterer), complex; 0 for none.
+            cell: Doppler cells, shape (trial, scatterer).
+            bases: Basis functions, shape (trial, base, pulse); zero in pulses that are not present.
+
+        Returns:
+            The pairs.
         """
-        apart = cell[:, :, None] - cell[:, None]
-        live = amplitude != 0
-        trial, first, second = ((apart.abs() < _NEAR_CELLS) & live[:, :, None] & live[:, None]).nonzero(as_tuple=True)
-        place = apart[trial, first, second] * _TABLE + _NEAR_CELLS * _TABLE
-        whole = place.floor().long()
+        separation = cell[:, :, None] - cell[:, None]
+        used = amplitude != 0
+        trial, first, second = ((separation.abs() < _NEAR_CELLS) & used[:, :, None] & used[:, None]).nonzero(
+            as_tuple=True
+        )
+        position = separation[trial, first, second] * _TABLE + _NEAR_CELLS * _TABLE
+        whole = position.floor().long()
         weight = amplitude[trial, first].conj() * amplitude[trial, second]
         index = [(n, m) for n in range(bases.shape[1]) for m in range(n, bases.shape[1])]
         table = _product_tables(sampling, k, bases, index)
         low, high = table[trial, whole], table[trial, whole + 1]
-        values = ((low + (place - whole)[:, None] * (high - low)) * weight[:, None]).unbind(-1)
+        values = ((low + (position - whole)[:, None] * (high - low)) * weight[:, None]).unbind(-1)
         products = {pair: value for (n, m), value in zip(index, values) for pair in {(n, m), (m, n)}}
         return Pairs(trial, first, second, cell.shape, products)
 
     def of(self, values: Tensor, side: int) -> Tensor:
-        """A value (trial, scatterer) of the first (0) or second (1) of each pair."""
+        """Select a value of the first or the second scatterer of each pair.
+
+        Args:
+            values: Values, shape (trial, scatterer).
+            side: 0 for the first, 1 for the second.
+
+        Returns:
+            The values, shape (pair,).
+        """
         return values[self.trial, self.second if side else self.first]
 
     def matrix(self, blocks: list[list[Tensor]]) -> Tensor:
-        """Dense matrix of blocks of values of pairs, (trial, blocks * scatterer, blocks *
-        scatterer).
+        """Assemble a dense matrix from blocks of values of pairs.
+
+        Args:
+            blocks: Blocks by row and column, each of shape (pair,).
+
+        Returns:
+            The matrix, shape (trial, blocks * scatterer, blocks * scatterer).
         """
         count, n = self.shape[1], len(blocks)
         result = blocks[0][0].new_zeros(self.shape[0], n * count, n * count)
@@ -68,36 +100,57 @@ class Pairs:
         return result
 
     def per_scatterer(self, values: Tensor) -> Tensor:
-        """Sums over the second of pairs, (pair, n) -> (trial, scatterer, n)."""
+        """Sum over the second scatterer of pairs.
+
+        Args:
+            values: Values, shape (pair, n).
+
+        Returns:
+            The sums, shape (trial, scatterer, n).
+        """
         flat = values.new_zeros(self.shape[0] * self.shape[1], values.shape[-1])
         return flat.index_add(0, self.trial * self.shape[1] + self.first, values).unflatten(0, self.shape)
 
     def per_trial(self, values: Tensor) -> Tensor:
-        """Sums over pairs, (pair, n, m) -> (trial, n, m)."""
+        """Sum over pairs.
+
+        Args:
+            values: Values, shape (pair, n, m).
+
+        Returns:
+            The sums, shape (trial, n, m).
+        """
         return values.new_zeros(self.shape[0], *values.shape[1:]).index_add(0, self.trial, values)
 
 
 def _product_tables(sampling: Sampling, k: Tensor, bases: Tensor, index: list[tuple[int, int]]) -> Tensor:
-    """Sums over pulses of b_n b_m exp(2j pi c u) at steps of 1 / _TABLE cell c, (trial, step,
-    product).
+    """Sums over pulses of b_n b_m exp(2j pi c u), (trial, step, product).
+
+    The steps are 1 / _TABLE of a Doppler cell c.
     """
     first, second = (torch.tensor(side, device=bases.device) for side in zip(*index))
     scale = bases.abs().amax(-1, keepdim=True).clamp_min(1e-300)
     unit = bases / scale
     products = (unit[:, first] * unit[:, second]).mT.to(torch.complex128)
     lines = 2 * _NEAR_CELLS * _TABLE + 2
-    table = matched_fourier(products, k, sampling.prf_hz, oversampling=_TABLE, lines=lines, taps=6) * math.sqrt(
-        sampling.pulses
-    )
+    table = matched_fourier(
+        products, k, sampling.prf_hz, lines=DopplerLines(_TABLE, lines), transform=Gridding(6)
+    ) * math.sqrt(sampling.pulses)
     return table[:, 1:] * (scale[:, first] * scale[:, second]).mT
 
 
 def band_response(x: Tensor, cells: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Response of range cells to a scatterer x cells away, its band being the `cells` frequencies
-    that FFTs make of so many samples, and its first two derivatives.
+    """Compute the range response to a scatterer and its first two derivatives.
 
-    x: float64, any shape. The sinc of the signal model, periodic in the window as compressed pulses
-    are; complex128, unit peak.
+    The response is that of a flat band of `cells` frequencies, as FFTs of so many samples have
+    them: the sinc of the signal model, but periodic in the window as compressed pulses are.
+
+    Args:
+        x: Distance from the scatterer in range cells, any shape, float64.
+        cells: Number of range cells.
+
+    Returns:
+        The response, of unit peak, and its first and second derivative, same shape, complex128.
     """
     cycles = (torch.arange(cells, dtype=torch.float64, device=x.device) - cells // 2) / cells
     turn = 2j * math.pi * cycles

@@ -1,38 +1,60 @@
-"""The rotation of least image entropy, by every search that a paper has used: grid, genetic,
-differential evolution, Newton, quasi-Newton.
+"""Searches for the rotation of least image entropy.
+
+Grid search, genetic algorithm, differential evolution, Newton's method and L-BFGS.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from torchsar.compensate.rotation.image_entropy import ImageEntropy
-from torchsar.compensate.rotation.unknowns import Variables, k_name
+from torchsar.compensate.rotation.image_entropy import EntropyObjective, ImageEntropy
+from torchsar.compensate.rotation.unknowns import k_name
 from torchsar.core import Draws, Estimate, Signal, Stage, settle
 from torchsar.optim import Descent, Searched, differential_evolution, genetic, grid_search, lbfgs, newton
 from torchsar.radar import InverseRadar
 
 Vector = Sequence[float] | Tensor
 
-_EDGE = 1e-3  # of the width of a box: nearer to its edge a minimum is taken to lie outside
-_GAIN_NATS = 0.01  # by which compensation must lower the entropy at least
-# relative changes of the entropy that are left to rounding
-_STILL = {torch.complex64: 1e-8, torch.complex128: 1e-9}
-_FIRST_STEP = 0.3  # in units of the unknowns, of about a radian each
+# share of the width of a box from its edge within which a minimum is taken to lie outside, a
+# convention
+_EDGE = 1e-3
+# least fall of the entropy that counts as an effect of the compensation, found by trial: a smaller
+# one would accept more wrong results, a larger one reject more small effects
+_GAIN_NATS = 0.01
+# relative change of the entropy at which a descent ends, near its rounding
+_ROUNDING = {torch.complex64: 1e-8, torch.complex128: 1e-9}
+_FIRST_STEP = 0.3  # first step of a descent in units of the unknowns, of about a radian each
+# what the stages minimise by default: the published unknowns; a more accurate transform for
+# Newton's method, which needs second derivatives; unknowns with uncorrelated errors for a descent
+_PUBLISHED = EntropyObjective()
+_FOR_NEWTON = EntropyObjective(taps=6)
+_FOR_DESCENT = EntropyObjective(variables="shape")
 
 
 def search_rotation(figure: ImageEntropy, axes: Sequence[Vector], *, limit: int = 100_000) -> Estimate:
-    """The best of a full grid: one list of values per unknown of the figure, (m,) or (..., m) per
-    trial. Paper's size: 5 x 21 x 201.
+    """Find the rotation of least image entropy on a full grid.
 
-    Estimates as `genetic_rotation`; a best point at the end of an axis of several values is not ok.
-    info["entropy_grid_nats"]: (..., m_1, m_2, ...), the landscape.
+    The grid of the paper has 5 x 21 x 201 points.
+
+    Args:
+        figure: Entropy as a function of its unknowns.
+        axes: Values of each unknown, shape (m,) or (..., m) per trial.
+        limit: Largest number of evaluations per trial.
+
+    Returns:
+        An estimate as that of `genetic_rotation`. `ok` is False also where the best point lies at
+        the end of an axis of several values. info["entropy_grid_nats"], shape (..., m_1, m_2, ...),
+        is the entropy on the grid.
+
+    Raises:
+        ValueError: If there is not one list per unknown, or the grid exceeds the limit.
     """
-    _same_number(figure, axes, "search_rotation")
+    _check_axes(figure, axes, "search_rotation")
     values = [torch.as_tensor(axis, dtype=torch.float64, device=figure.range_m.device) for axis in axes]
     found = grid_search(figure, values, trials=figure.trials, limit=limit)
     ends = [(axis.amin(-1).expand(figure.trials), axis.amax(-1).expand(figure.trials)) for axis in values]
@@ -41,21 +63,32 @@ def search_rotation(figure: ImageEntropy, axes: Sequence[Vector], *, limit: int 
 
 
 def genetic_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: Draws, **options: Any) -> Estimate:
-    """The rotation that a genetic algorithm finds in a box: the published estimator (Remote Sens.
+    """Find the rotation of least image entropy in a box by a genetic algorithm.
 
-    2025, 17, 3447, section 3.3).
+    This is the published estimator.
 
-    figure: the entropy as a function of its unknowns. low, high: one value per unknown
-    (`figure.unknowns.names`), (n,) or (..., n). draws and options: as in `torchsar.optim.genetic`.
+    Args:
+        figure: Entropy as a function of its unknowns.
+        low: Lower bounds, one per unknown (`figure.unknowns.names`), shape (n,) or (..., n).
+        high: Upper bounds, same shape.
+        draws: Source of random numbers, see `torchsar.optim.genetic`.
+        options: Options of `torchsar.optim.genetic`.
 
-    value: omega_rad_s (...,) >= 0 (its sign cannot be seen: the image may be mirrored in cross
-    range) and yc_m (...,), where the range term is compensated; warp_k (..., order - 1) and its
-    entries k1_per_s, k2_per_s2, ... There are no predicted deviations: an entropy is no likelihood.
-    quality: by which share the exp(entropy) of the image, the cells it fills, falls against no
-    compensation. ok: it falls, and the minimum does not lie on the edge of the box. A figure of
-    coarse lines has its minimum at a wrong place (see `ImageEntropy`): ok does not say that the
-    value is free of bias. info: evaluations, entropy_nats, uncompensated_entropy_nats, on_edge
-    (..., n) and best_entropy_nats (..., generation).
+    Returns:
+        `warp_k`, shape (..., order - 1), and its entries `k1_per_s`, `k2_per_s2`, ...; with the
+        range term also `omega_rad_s`, shape (...,), made positive since its sign is not observable
+        (the image may be mirrored in cross range), and `yc_m`, shape (...,). There are no standard
+        deviations, because an entropy is not a likelihood. quality is the share by which the number
+        of cells that the image fills, exp(entropy), falls. `ok` is False where it does not fall, or
+        the minimum lies on the edge of the box; it does not exclude a bias by few image lines, see
+        `EntropyObjective`. info: evaluations, entropy_nats, uncompensated_entropy_nats, on_edge,
+        shape (..., n), and best_entropy_nats, shape (..., generation).
+
+    Raises:
+        ValueError: If there is not one bound per unknown, or an option is invalid.
+
+    Reference:
+        Remote Sens. 2025, 17, 3447, section 3.3.
     """
     low, high = _box(figure, low, high)
     found = genetic(figure, low, high, draws=draws, **options)
@@ -63,64 +96,106 @@ def genetic_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: 
 
 
 def evolve_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: Draws, **options: Any) -> Estimate:
-    """The same by differential evolution; options as in `torchsar.optim.differential_evolution`."""
+    """Find the rotation of least image entropy in a box by differential evolution.
+
+    Args:
+        figure: Entropy as a function of its unknowns.
+        low: Lower bounds, one per unknown, shape (n,) or (..., n).
+        high: Upper bounds, same shape.
+        draws: Source of random numbers, see `torchsar.optim.differential_evolution`.
+        options: Options of `torchsar.optim.differential_evolution`.
+
+    Returns:
+        An estimate as that of `genetic_rotation`.
+
+    Raises:
+        ValueError: If there is not one bound per unknown, or an option is invalid.
+    """
     low, high = _box(figure, low, high)
     found = differential_evolution(figure, low, high, draws=draws, **options)
     return _of_box(figure, found, low, high, best_entropy_nats=found.history)
 
 
 def newton_rotation(figure: ImageEntropy, start: Tensor, *, damped: bool = True, steps: int = 20) -> Estimate:
-    """The same by Newton's method from `start` (..., n), see `figure.start`: what the paper calls
-    Gauss-Newton, of which its Table 2 shows that it depends on the start.
+    """Find a rotation of least image entropy near a start by Newton's method.
 
-    damped=False diverges on most targets, from the truth as well: one direction is nearly flat.
-    Such trials are not ok and keep their last finite point, nor are those that use up their steps.
-    info["iterations"]: steps taken.
+    The paper calls it Gauss-Newton; its Table 2 shows that the result depends on the start.
+
+    Args:
+        figure: Entropy as a function of its unknowns.
+        start: Unknowns to start from, shape (..., n), see `figure.start`.
+        damped: Whether steps are damped. Undamped steps diverge on most targets, even from the true
+            rotation, because the entropy is nearly flat in one direction.
+        steps: Largest number of steps.
+
+    Returns:
+        An estimate as that of `genetic_rotation`. `ok` is False also where a trial diverges (it
+        keeps its last finite point) or uses up its steps. info["iterations"] is the number of
+        steps.
+
+    Raises:
+        ValueError: If the start does not have one value per unknown.
+
+    Reference:
+        Remote Sens. 2025, 17, 3447, Table 2.
     """
-    scaled = _Scaled(figure, _started(figure, start))
+    scaled = _Scaled(figure, _feasible_start(figure, start))
     return _of_descent(
-        figure, scaled, newton(scaled.single, scaled.start, damped=damped, steps=steps), steps, trusted=True
+        figure, scaled, newton(scaled.single, scaled.start, damped=damped, steps=steps), steps, use_own_ok=True
     )
 
 
 def descend_rotation(figure: ImageEntropy, start: Tensor, *, steps: int = 60, tolerance: float = 1e-4) -> Estimate:
-    """The same by L-BFGS with exact gradients from `start` (..., n): the minimum next to it.
+    """Find a rotation of least image entropy near a start by L-BFGS with exact gradients.
 
-    Best in the variables "shape".
+    Best in the variables "shape". With order 2 and without range term this is the second-order
+    method (SM) of the paper, whose k1 is not that of the target but about k1 + k2 T / 2.
 
-    tolerance: of the gradient against that at the start. Not ok where the steps run out. A figure
-    of order 2 without range term makes this the second-order method 'SM' of the paper, whose k1 is
-    not that of the target but about k1 + k2 T / 2.
+    Args:
+        figure: Entropy as a function of its unknowns.
+        start: Unknowns to start from, shape (..., n), see `figure.start`.
+        steps: Largest number of steps.
+        tolerance: Norm of the gradient, relative to that at the start, at which a trial ends.
+
+    Returns:
+        An estimate as that of `genetic_rotation`. `ok` is False also where a trial uses up its
+        steps.
+
+    Raises:
+        ValueError: If the start does not have one value per unknown.
     """
-    scaled = _Scaled(figure, _started(figure, start))
+    scaled = _Scaled(figure, _feasible_start(figure, start))
     found = lbfgs(
         scaled.with_gradient,
         scaled.start,
         steps=steps,
         first_step=_FIRST_STEP,
         gradient_tolerance=tolerance,
-        value_tolerance=_STILL[figure.dtype],
+        value_tolerance=_ROUNDING[figure.dtype],
         with_gradient=True,
     )
-    return _of_descent(figure, scaled, found, steps, trusted=False)
+    return _of_descent(figure, scaled, found, steps, use_own_ok=False)
 
 
 class _Scaled:
-    """A figure in units that make its unknowns about one."""
+    """An entropy in units that make its unknowns about one."""
 
     def __init__(self, figure: ImageEntropy, start: Tensor) -> None:
         self._figure, self.unit = figure, figure.units(start)
         self.start = start / self.unit
 
     def single(self, z: Tensor) -> Tensor:
+        """Entropy of one vector per trial."""
         return self._figure.single(z * self.unit)
 
     def with_gradient(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Entropy of one vector per trial and its gradient."""
         cost, gradient = self._figure.with_gradient(z * self.unit)
         return cost, gradient * self.unit
 
 
 def _of_box(figure: ImageEntropy, found: Searched, low: Tensor, high: Tensor, **info: Tensor) -> Estimate:
+    """Estimate from a search in a box; not ok where the best point lies on its edge."""
     width = high - low
     near = torch.minimum(found.x - low, high - found.x) <= _EDGE * width
     edge = near & (width > 0)
@@ -133,13 +208,13 @@ def _of_box(figure: ImageEntropy, found: Searched, low: Tensor, high: Tensor, **
     )
 
 
-def _of_descent(figure: ImageEntropy, scaled: _Scaled, found: Descent, steps: int, trusted: bool) -> Estimate:
-    """Not ok where the steps ran out.
+def _of_descent(figure: ImageEntropy, scaled: _Scaled, found: Descent, steps: int, use_own_ok: bool) -> Estimate:
+    """Estimate from a descent; not ok where the steps are used up.
 
-    trusted: whether the descent's own verdict counts; that of L-BFGS is about walls on its way,
-    which infeasible candidates are, too.
+    use_own_ok: whether the verdict of the descent counts. That of L-BFGS also reports infeasible
+    candidates on its path and does not count.
     """
-    ok = (found.ok if trusted else torch.isfinite(found.cost)) & (found.converged | (found.steps < steps))
+    ok = (found.ok if use_own_ok else torch.isfinite(found.cost)) & (found.converged | (found.steps < steps))
     return _estimate(
         figure,
         found.x * scaled.unit,
@@ -150,35 +225,36 @@ def _of_descent(figure: ImageEntropy, scaled: _Scaled, found: Descent, steps: in
 
 
 def _estimate(figure: ImageEntropy, x: Tensor, cost: Tensor, ok: Tensor, info: dict[str, Tensor]) -> Estimate:
-    turn, before = figure.turn(x.detach()), figure.uncompensated()
+    """Estimate from the best vectors and their entropies."""
+    rotation, before = figure.turn(x.detach()), figure.uncompensated()
     cost, finite = settle(cost.detach(), before)
     gain = before - cost
-    value = {"warp_k": turn.warp_k, **{k_name(i + 1): k for i, k in enumerate(turn.warp_k.unbind(-1))}}
+    value = {"warp_k": rotation.warp_k, **{k_name(i + 1): k for i, k in enumerate(rotation.warp_k.unbind(-1))}}
     if figure.unknowns.range_term:
-        value |= {"omega_rad_s": turn.omega_rad_s.abs(), "yc_m": turn.yc_m.clone()}
+        value |= {"omega_rad_s": rotation.omega_rad_s.abs(), "yc_m": rotation.yc_m.clone()}
     quality = (1 - torch.exp(-gain)).clamp(0, 1)
     return Estimate(
         value,
         quality,
-        ok & finite & turn.feasible & (gain > _GAIN_NATS),
+        ok & finite & rotation.feasible & (gain > _GAIN_NATS),
         info={**info, "entropy_nats": cost, "uncompensated_entropy_nats": before},
     )
 
 
 def _box(figure: ImageEntropy, low: Vector, high: Vector) -> tuple[Tensor, Tensor]:
+    """Both bounds as vectors of every trial."""
     return figure.spread(figure.unknowns.vector(low, "low")), figure.spread(figure.unknowns.vector(high, "high"))
 
 
-def _started(figure: ImageEntropy, start: Tensor) -> Tensor:
-    """A start (..., n) for every trial; where its own warp is not monotonic that of even rotation
-    takes its place.
-    """
+def _feasible_start(figure: ImageEntropy, start: Tensor) -> Tensor:
+    """A start (..., n) for every trial; uniform rotation where its own warp is not monotonic."""
     x = figure.spread(figure.unknowns.vector(start, "start").detach())
-    turn = figure.turn(x)
-    return torch.where(turn.feasible[..., None], x, 0)
+    rotation = figure.turn(x)
+    return torch.where(rotation.feasible[..., None], x, 0)
 
 
-def _same_number(figure: ImageEntropy, axes: Sequence[Any], who: str) -> None:
+def _check_axes(figure: ImageEntropy, axes: Sequence[Any], who: str) -> None:
+    """Raise ValueError unless there is one list of values per unknown."""
     names = figure.unknowns.names
     if len(axes) != len(names):
         raise ValueError(
@@ -187,47 +263,40 @@ def _same_number(figure: ImageEntropy, axes: Sequence[Any], who: str) -> None:
 
 
 class _Search(Stage):
-    """What every search for the rotation is told about the image; see `ImageEntropy`."""
+    """A search for the rotation that minimises an image entropy."""
 
-    def __init__(
-        self,
-        radar: InverseRadar,
-        order: int,
-        range_term: bool,
-        yc_m: float | None,
-        variables: Variables,
-        oversampling: float,
-        lines: int | None,
-        taps: int,
-    ) -> None:
+    def __init__(self, radar: InverseRadar, objective: EntropyObjective) -> None:
         super().__init__()
-        self.radar, self.order, self.range_term = radar, order, range_term
-        self.options = {
-            "order": order,
-            "range_term": range_term,
-            "variables": variables,
-            "oversampling": oversampling,
-            "lines": lines,
-            "taps": taps,
-        }
-        self.yc_m = yc_m
+        self.radar, self.objective = radar, objective
         self.provides = (
             "warp_k",
-            *(k_name(i) for i in range(1, order)),
-            *(("omega_rad_s", "yc_m") if range_term else ()),
+            *(k_name(i) for i in range(1, objective.order)),
+            *(("omega_rad_s", "yc_m") if objective.range_term else ()),
         )
 
     def figure(self, signal: Signal, yc_m: Tensor | None) -> ImageEntropy:
-        """yc_m: a connected value is that of the centre deviation, unless it is searched for."""
-        known = self.yc_m if yc_m is None or self.yc_m is None else yc_m
-        return ImageEntropy.of(signal, self.radar, yc_m=known, **self.options)
+        """Entropy of a signal; a connected yc_m replaces a known one of the settings."""
+        known = self.objective.yc_m if yc_m is None or self.objective.yc_m is None else yc_m
+        return ImageEntropy.of(signal, self.radar, replace(self.objective, yc_m=known))
 
 
 class RotationSearch(_Search):
-    """`search_rotation` on counts[i] values from low[i] to high[i], one entry per unknown: omega
-    (rad/s), k1, k2, ... and yc where it is None (see `Unknowns`).
+    """Rotation of least image entropy on a grid; see `search_rotation`.
 
-    yc_m: the known centre deviation; a connected value goes before it; None searches for it.
+    The grid has counts[i] values from low[i] to high[i], one entry per unknown: omega (rad/s), k1,
+    k2, ..., and yc if it is an unknown (see `Unknowns`).
+
+    Args:
+        radar: Radar parameters.
+        low: Lower ends of the grid.
+        high: Upper ends of the grid.
+        counts: Numbers of values.
+        objective: Settings of the entropy. A connected `yc_m` replaces that of the settings unless
+            it is an unknown.
+        limit: Largest number of evaluations per trial.
+
+    Raises:
+        ValueError: If low, high and counts differ in length, or a count is below 1.
     """
 
     def __init__(
@@ -236,16 +305,10 @@ class RotationSearch(_Search):
         low: list[float],
         high: list[float],
         counts: list[int],
-        order: int = 3,
-        range_term: bool = True,
-        yc_m: float | None = 0.0,
-        variables: Variables = "raw",
-        oversampling: float = 2.0,
-        lines: int | None = None,
-        taps: int = 4,
+        objective: EntropyObjective = _PUBLISHED,
         limit: int = 100_000,
     ) -> None:
-        super().__init__(radar, order, range_term, yc_m, variables, oversampling, lines, taps)
+        super().__init__(radar, objective)
         if not len(low) == len(high) == len(counts) or any(count < 1 for count in counts):
             raise ValueError(
                 "a grid needs as many values in low, high and counts, and counts of at least 1, got "
@@ -255,13 +318,34 @@ class RotationSearch(_Search):
         self.limit = limit
 
     def forward(self, signal: Signal, yc_m: Tensor | None = None) -> Estimate:
+        """Estimate the rotation from a signal of axes (pulse, range).
+
+        Args:
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            yc_m: Range centre deviation in metres known a priori, shape (...,).
+
+        Returns:
+            The estimate of `search_rotation`.
+        """
         return search_rotation(self.figure(signal, yc_m), self.axes, limit=self.limit)
 
 
 class RotationGenetic(_Search):
-    """`genetic_rotation` in the box low..high, one entry per unknown as in `RotationSearch`.
+    """Rotation of least image entropy in a box by a genetic algorithm; see `genetic_rotation`.
 
-    All trials see the random numbers of `seed`.
+    All trials use the same random numbers.
+
+    Args:
+        radar: Radar parameters.
+        low: Lower bounds, one per unknown as in `RotationSearch`.
+        high: Upper bounds.
+        objective: Settings of the entropy. A connected `yc_m` replaces that of the settings unless
+            it is an unknown.
+        population: Number of candidates in a generation.
+        generations: Number of generations.
+        elites: Number of best candidates that pass unchanged to the next generation.
+        selection: Selection of parents, "tournament" or "roulette".
+        seed: Seed of the random numbers.
     """
 
     def __init__(
@@ -269,31 +353,45 @@ class RotationGenetic(_Search):
         radar: InverseRadar,
         low: list[float],
         high: list[float],
-        order: int = 3,
-        range_term: bool = True,
-        yc_m: float | None = 0.0,
-        variables: Variables = "raw",
-        oversampling: float = 2.0,
-        lines: int | None = None,
-        taps: int = 4,
+        objective: EntropyObjective = _PUBLISHED,
         population: int = 30,
         generations: int = 30,
         elites: int = 2,
         selection: Literal["tournament", "roulette"] = "tournament",
         seed: int = 1,
     ) -> None:
-        super().__init__(radar, order, range_term, yc_m, variables, oversampling, lines, taps)
+        super().__init__(radar, objective)
         self.low, self.high, self.seed = tuple(low), tuple(high), seed
         self.rules = {"population": population, "generations": generations, "elites": elites, "selection": selection}
 
     def forward(self, signal: Signal, yc_m: Tensor | None = None) -> Estimate:
+        """Estimate the rotation from a signal of axes (pulse, range).
+
+        Args:
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            yc_m: Range centre deviation in metres known a priori, shape (...,).
+
+        Returns:
+            The estimate of `genetic_rotation`.
+        """
         return genetic_rotation(self.figure(signal, yc_m), self.low, self.high, draws=Draws(self.seed), **self.rules)
 
 
 class RotationEvolution(_Search):
-    """`evolve_rotation` in the box low..high, one entry per unknown as in `RotationSearch`.
+    """Rotation of least image entropy in a box by differential evolution; see `evolve_rotation`.
 
-    All trials see the random numbers of `seed`.
+    All trials use the same random numbers.
+
+    Args:
+        radar: Radar parameters.
+        low: Lower bounds, one per unknown as in `RotationSearch`.
+        high: Upper bounds.
+        objective: Settings of the entropy. A connected `yc_m` replaces that of the settings unless
+            it is an unknown.
+        population: Number of candidates in a generation.
+        generations: Number of generations.
+        strategy: Mutation strategy, "rand1bin" or "best1bin".
+        seed: Seed of the random numbers.
     """
 
     def __init__(
@@ -301,37 +399,41 @@ class RotationEvolution(_Search):
         radar: InverseRadar,
         low: list[float],
         high: list[float],
-        order: int = 3,
-        range_term: bool = True,
-        yc_m: float | None = 0.0,
-        variables: Variables = "raw",
-        oversampling: float = 2.0,
-        lines: int | None = None,
-        taps: int = 4,
+        objective: EntropyObjective = _PUBLISHED,
         population: int = 24,
         generations: int = 36,
         strategy: Literal["rand1bin", "best1bin"] = "rand1bin",
         seed: int = 1,
     ) -> None:
-        super().__init__(radar, order, range_term, yc_m, variables, oversampling, lines, taps)
+        super().__init__(radar, objective)
         self.low, self.high, self.seed = tuple(low), tuple(high), seed
         self.rules = {"population": population, "generations": generations, "strategy": strategy}
 
     def forward(self, signal: Signal, yc_m: Tensor | None = None) -> Estimate:
+        """Estimate the rotation from a signal of axes (pulse, range).
+
+        Args:
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            yc_m: Range centre deviation in metres known a priori, shape (...,).
+
+        Returns:
+            The estimate of `evolve_rotation`.
+        """
         return evolve_rotation(self.figure(signal, yc_m), self.low, self.high, draws=Draws(self.seed), **self.rules)
 
 
 class _Descending(_Search):
-    """A search from a start [omega (rad/s), k1, k2, ...], without omega where there is no range
-    term; connected values go before its entries.
+    """A search from a start, [omega (rad/s), k1, k2, ...], without omega if there is no range term.
+
+    Connected values take precedence over the entries of the start.
     """
 
-    def __init__(self, start: list[float] | None, *image: Any) -> None:
-        super().__init__(*image)
-        wanted = self.order - 1 + self.range_term
+    def __init__(self, radar: InverseRadar, objective: EntropyObjective, start: list[float] | None) -> None:
+        super().__init__(radar, objective)
+        wanted = objective.order - 1 + objective.range_term
         if start is not None and len(start) != wanted:
             raise ValueError(
-                f"a start needs the {wanted} values {'omega, ' if self.range_term else ''}k1, k2, "
+                f"a start needs the {wanted} values {'omega, ' if objective.range_term else ''}k1, k2, "
                 f"..., got {list(start)}"
             )
         self.begin = None if start is None else torch.tensor(start, dtype=torch.float64)
@@ -339,9 +441,9 @@ class _Descending(_Search):
     def started(
         self, figure: ImageEntropy, omega_rad_s: Tensor | None, warp_k: Tensor | None, yc_m: Tensor | None
     ) -> Tensor:
-        """The vector to start from.
+        """The vector to start from, of connected values or else those of the start.
 
-        Raises ValueError where a value is neither connected nor in the start.
+        Raises ValueError if neither gives a value.
         """
         omega = self._given()[0] if omega_rad_s is None else omega_rad_s
         k = self._given()[1] if warp_k is None else warp_k
@@ -353,40 +455,46 @@ class _Descending(_Search):
         return figure.start(omega, k, yc_m)
 
     def _given(self) -> tuple[Tensor | float | None, Tensor | None]:
-        """Rate and warp of the start, or what stands in for them: the rate that the radar is told;
-        nothing where there is nothing to know.
+        """Rate and warp of the start.
+
+        Where the start does not give them: the rate of the radar, an empty warp for order 1, else
+        None.
         """
-        rate = self.radar.rotation_rad_s if self.range_term else 0.0
+        rate = self.radar.rotation_rad_s if self.objective.range_term else 0.0
         if self.begin is None:
-            return rate, torch.zeros(0, dtype=torch.float64) if self.order == 1 else None
-        first = int(self.range_term)
+            return rate, torch.zeros(0, dtype=torch.float64) if self.objective.order == 1 else None
+        first = int(self.objective.range_term)
         return self.begin[0] if first else rate, self.begin[first:]
 
 
 class RotationNewton(_Descending):
-    """`newton_rotation` from `start`, [omega (rad/s), k1, k2, ...] (no omega without range term),
-    in raw or well-conditioned variables.
+    """Rotation of least image entropy near a start by Newton's method; see `newton_rotation`.
 
-    Values connected (omega_rad_s, warp_k, yc_m) go before the entries of the start, and
-    rotation_rad_s of the radar stands in for an omega that is missing. yc_m: as in
-    `RotationSearch`; where it is searched for, it starts from the connected value or 0.
+    Connected values (omega_rad_s, warp_k, yc_m) take precedence over the entries of the start. If
+    the start and the connected values give no rate, rotation_rad_s of the radar is used.
+
+    Args:
+        radar: Radar parameters.
+        start: Start [omega (rad/s), k1, k2, ...], without omega if there is no range term; None if
+            the values are connected.
+        objective: Settings of the entropy, by default with six taps. If yc is an unknown, it starts
+            from the connected value or 0.
+        damped: Whether steps are damped.
+        steps: Largest number of steps.
+
+    Raises:
+        ValueError: If the start does not have one value per unknown.
     """
 
     def __init__(
         self,
         radar: InverseRadar,
         start: list[float] | None = None,
-        order: int = 3,
-        range_term: bool = True,
-        yc_m: float | None = 0.0,
-        variables: Variables = "raw",
-        oversampling: float = 2.0,
-        lines: int | None = None,
-        taps: int = 6,
+        objective: EntropyObjective = _FOR_NEWTON,
         damped: bool = True,
         steps: int = 20,
     ) -> None:
-        super().__init__(start, radar, order, range_term, yc_m, variables, oversampling, lines, taps)
+        super().__init__(radar, objective, start)
         self.damped, self.steps = damped, steps
 
     def forward(
@@ -396,6 +504,20 @@ class RotationNewton(_Descending):
         warp_k: Tensor | None = None,
         yc_m: Tensor | None = None,
     ) -> Estimate:
+        """Estimate the rotation from a signal of axes (pulse, range).
+
+        Args:
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            omega_rad_s: Rotation rate in rad/s to start from, shape (...,).
+            warp_k: Warp to start from, shape (..., order - 1).
+            yc_m: Range centre deviation in metres, shape (...,).
+
+        Returns:
+            The estimate of `newton_rotation`.
+
+        Raises:
+            ValueError: If a value of the start is neither given nor connected.
+        """
         figure = self.figure(signal, yc_m)
         return newton_rotation(
             figure, self.started(figure, omega_rad_s, warp_k, yc_m), damped=self.damped, steps=self.steps
@@ -403,25 +525,29 @@ class RotationNewton(_Descending):
 
 
 class RotationDescent(_Descending):
-    """`descend_rotation` from a start, given or connected as in `RotationNewton`.
+    """Rotation of least image entropy near a start by L-BFGS; see `descend_rotation`.
 
-    With order=2 and range_term=False: the second-order method 'SM'.
+    With order 2 and without range term it is the second-order method (SM) of the paper.
+
+    Args:
+        radar: Radar parameters.
+        start: Start as in `RotationNewton`.
+        objective: Settings of the entropy, by default with the variables "shape". If yc is an
+            unknown, it starts from the connected value or 0.
+        steps: Largest number of steps.
+
+    Raises:
+        ValueError: If the start does not have one value per unknown.
     """
 
     def __init__(
         self,
         radar: InverseRadar,
         start: list[float] | None = None,
-        order: int = 3,
-        range_term: bool = True,
-        yc_m: float | None = 0.0,
-        variables: Variables = "shape",
-        oversampling: float = 2.0,
-        lines: int | None = None,
-        taps: int = 4,
+        objective: EntropyObjective = _FOR_DESCENT,
         steps: int = 60,
     ) -> None:
-        super().__init__(start, radar, order, range_term, yc_m, variables, oversampling, lines, taps)
+        super().__init__(radar, objective, start)
         self.steps = steps
 
     def forward(
@@ -431,5 +557,19 @@ class RotationDescent(_Descending):
         warp_k: Tensor | None = None,
         yc_m: Tensor | None = None,
     ) -> Estimate:
+        """Estimate the rotation from a signal of axes (pulse, range).
+
+        Args:
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            omega_rad_s: Rotation rate in rad/s to start from, shape (...,).
+            warp_k: Warp to start from, shape (..., order - 1).
+            yc_m: Range centre deviation in metres, shape (...,).
+
+        Returns:
+            The estimate of `descend_rotation`.
+
+        Raises:
+            ValueError: If a value of the start is neither given nor connected.
+        """
         figure = self.figure(signal, yc_m)
         return descend_rotation(figure, self.started(figure, omega_rad_s, warp_k, yc_m), steps=self.steps)

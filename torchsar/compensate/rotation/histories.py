@@ -1,11 +1,10 @@
-"""Phase least squares: the phase histories of bright isolated scatterers, fitted by what an error
-of the motion does to each of them.
+"""Phase least squares on the phase histories of bright isolated scatterers.
 
-A window about a focused scatterer, transformed back, is its history over the aperture. What is left
-in it beyond a constant and a line is -2 pi c du/dk dk at Doppler cell c, and (c4/2) (y dw + dv)
-phi^2 at range y. Products of a history with itself a sixth of the aperture later need no
-unwrapping, and start from any rate: even the range term of a motion that is not known at all, w =
-0, bends phases by little in that time.
+A window about a focused scatterer, transformed back, is its history over the aperture. An error of
+the motion leaves in it, beyond a constant and a line, the phase -2 pi c du/dk dk at Doppler cell c
+and (c4/2) (y dw + dv) phi^2 at range y, where c4 = 4 pi / lambda. The fit uses products of a
+history with itself a sixth of the aperture later, which need no unwrapping. It can start from any
+rate: even the range term of an unknown rotation, w = 0, changes the phase by little in that time.
 """
 
 from __future__ import annotations
@@ -20,12 +19,15 @@ from torchsar.compensate.rotation.motion import Motion, Sampling, Warped, image_
 from torchsar.compensate.rotation.peaks import Peaks, find_peaks, noise_power, threshold
 from torchsar.core.warp import warp, warp_rate
 
-_OVERSAMPLING = 2
-_ISOLATED = 0.5  # of the amplitude of the brightest within the windows
-_ENDS = 16  # the window smears a history at both ends, by this part of it
-_ROBUST_ROUNDS = 3
-_NOTHING = 1e-7  # of an eigenvalue of a normal matrix of unit diagonal
-_SHARE_LOST = 0.01  # of an unknown in a direction
+_OVERSAMPLING = 2  # image lines per Doppler cell, found by trial: accuracy of peaks against time
+# least amplitude of an isolated scatterer over the largest one within its window, found by trial
+_ISOLATED = 0.5
+_ENDS = 16  # a window smears a history at both ends by 1/16 of its length, which is left out
+_ROBUST_ROUNDS = 3  # reweighted fits, found by trial: enough to exclude outliers
+# eigenvalue of a normal matrix of unit diagonal below which its direction is not determined: above
+# the rounding of float64, below any real information
+_NO_INFORMATION = 1e-7
+_SHARE_LOST = 0.01  # share of an unknown in such a direction beyond which it is not determined
 
 
 def refined_by_histories(
@@ -37,12 +39,18 @@ def refined_by_histories(
     count: int = 128,
     half_cells: int = 24,
 ) -> tuple[Motion, Tensor]:
-    """One step of phase least squares from `motion`, on data (trial, pulse, range).
+    """Perform one step of phase least squares.
 
-    Returns the motion and the number of scatterers used (trial,).
+    Args:
+        data: Range-compressed pulses, shape (trial, pulse, range), complex.
+        sampling: Sampling of the data.
+        motion: Motion to start from.
+        free_centre: Whether the range centre deviation is estimated.
+        count: Largest number of scatterers.
+        half_cells: Half width of a window in Doppler cells, wide enough for the error of the start.
 
-    count: scatterers at most; half_cells: half width of a window in Doppler cells, wide enough for
-    the error of the start.
+    Returns:
+        The motion, and the number of scatterers that were used, shape (trial,).
     """
     image = image_of(data, sampling, motion, oversampling=_OVERSAMPLING)
     power = image.abs().square()
@@ -60,9 +68,7 @@ def refined_by_histories(
 
 
 def _histories(image: Tensor, peaks: Peaks, half_cells: int) -> tuple[Tensor, Tensor]:
-    """Histories (trial, peak, 2 half_cells) of windows about peaks, and where on the aperture their
-    samples lie, u (sample,).
-    """
+    """Histories (trial, peak, 2 half_cells) of windows about peaks, and u of their samples."""
     lines = torch.arange(2 * half_cells * _OVERSAMPLING, device=image.device) - half_cells * _OVERSAMPLING
     row = peaks.line[..., None] + lines
     inside = (row >= 0) & (row < image.shape[1])
@@ -76,8 +82,9 @@ def _histories(image: Tensor, peaks: Peaks, half_cells: int) -> tuple[Tensor, Te
 
 
 def _bases(motion: Motion, sampling: Sampling, cells: Tensor, range_m: Tensor, u: Tensor, free_centre: bool) -> Tensor:
-    """Phase (rad) per unit of each unknown, (trial, peak, unknown, sample): k1, k2, ..., w, then v
-    where it is free.
+    """Phase (rad) per unit of each unknown, (trial, peak, unknown, sample).
+
+    The unknowns are k1, k2, ..., w, and v if it is free.
     """
     warped = Warped.of(motion.k, _times_at(u, motion.k, sampling.duration_s), sampling.duration_s)
     square = 2 * math.pi * sampling.turns_per_square * warped.phi.square()[:, None]
@@ -89,7 +96,7 @@ def _bases(motion: Motion, sampling: Sampling, cells: Tensor, range_m: Tensor, u
 
 
 def _times_at(u: Tensor, k: Tensor, duration_s: float) -> Tensor:
-    """Times at which the normalised warp is u, by Newton steps. (trial, sample)."""
+    """Times (trial, sample) at which the normalised warp is u, by Newton steps."""
     whole = warp(torch.tensor([duration_s], dtype=torch.float64, device=k.device), k)
     time = (u * duration_s).expand(k.shape[0], -1)
     for _ in range(8):
@@ -98,10 +105,7 @@ def _times_at(u: Tensor, k: Tensor, duration_s: float) -> Tensor:
 
 
 def _fitted(history: Tensor, bases: Tensor, used: Tensor) -> Tensor:
-    """Robust weighted least squares on phases between samples a sixth of the histories apart.
-
-    (trial, unknown).
-    """
+    """Robust weighted least squares, (trial, unknown), on phases a sixth of the histories apart."""
     lag = max(1, history.shape[-1] // 6)
     product = history[..., lag:] * history[..., :-lag].conj()
     whole = product.sum(-1, keepdim=True)
@@ -117,28 +121,40 @@ def _fitted(history: Tensor, bases: Tensor, used: Tensor) -> Tensor:
         change = solved(
             torch.einsum("bpij,bpkj->bik", weighted, difference), torch.einsum("bpij,bpj->bi", weighted, angle)
         )
-        rest = angle - torch.einsum("bi,bpij->bpj", change, difference)
-        scale = 3 * rest.abs().flatten(1).median(-1).values[:, None, None].clamp_min(1e-12)
-        weight = weight / (1 + (rest / scale).square())
+        residual = angle - torch.einsum("bi,bpij->bpj", change, difference)
+        scale = 3 * residual.abs().flatten(1).median(-1).values[:, None, None].clamp_min(1e-12)
+        weight = weight / (1 + (residual / scale).square())
     return change
 
 
 def solved(normal: Tensor, right: Tensor) -> Tensor:
-    """Solution of small normal equations (trial, n, n), (trial, n); directions that nothing is
-    known about stay at zero.
+    """Solve small normal equations.
+
+    Args:
+        normal: Normal matrices, shape (trial, n, n).
+        right: Right-hand sides, shape (trial, n).
+
+    Returns:
+        The solution, shape (trial, n); zero along directions that the data do not determine.
     """
     inverse, _ = inverted(normal)
     return (inverse @ right[..., None])[..., 0]
 
 
 def inverted(normal: Tensor) -> tuple[Tensor, Tensor]:
-    """Inverse of small normal matrices (trial, n, n) without the directions that nothing is known
-    about, and which unknowns have a part in those, (trial, n) bool.
+    """Invert small normal matrices without the directions that the data do not determine.
+
+    Args:
+        normal: Normal matrices, shape (trial, n, n).
+
+    Returns:
+        The inverse, shape (trial, n, n), and which unknowns contribute to the excluded directions,
+        shape (trial, n), bool.
     """
     scale = normal.diagonal(dim1=-2, dim2=-1)
     root = torch.where(scale > 0, scale, 1).rsqrt()
     value, vector = torch.linalg.eigh(normal * root[:, :, None] * root[:, None])
-    known = value > _NOTHING
+    known = value > _NO_INFORMATION
     inverse = (vector * torch.where(known, 1 / torch.where(known, value, 1), 0)[:, None]) @ vector.mT
     lost = (~known[:, None] & (vector.square() > _SHARE_LOST)).any(-1)
     return inverse * root[:, :, None] * root[:, None], lost

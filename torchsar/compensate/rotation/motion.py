@@ -1,6 +1,4 @@
-"""What estimators of uneven rotation share: how the data are sampled, the motion in the form in
-which it enters phases, and its removal.
-"""
+"""Common parts of the estimators of non-uniform rotation: sampling, motion, and its removal."""
 
 from __future__ import annotations
 
@@ -12,19 +10,26 @@ from torch import Tensor
 
 from torchsar.core import outer_phasor, phasor_tables, unit_phasor
 from torchsar.core.warp import warp
+from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import matched_fourier
+from torchsar.focus.transforms import Gridding
 from torchsar.focus.warped_sums import slow_times
 
-SEARCH_EPS = 1e-3  # of the transform: enough for estimates; images take less
-LEAST_PULSES = 8
+SEARCH_EPS = 1e-3  # accuracy of the transform in estimates; images use a better one
+LEAST_PULSES = 8  # least number of pulses, a convention
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """Where the samples of a recording lie.
+    """Sampling of a recording.
 
-    first_m, step_m: range of cell 0 and of one cell, from where the processor takes the centre to
-    be.
+    Args:
+        wavelength_m: Wavelength in metres.
+        prf_hz: Pulse repetition frequency in Hz.
+        pulses: Number of pulses.
+        cells: Number of range cells.
+        first_m: Range of cell 0 in metres, from the assumed rotation centre.
+        step_m: Range spacing of the cells in metres.
     """
 
     wavelength_m: float
@@ -36,28 +41,50 @@ class Sampling:
 
     @property
     def duration_s(self) -> float:
+        """Duration of the aperture in seconds."""
         return self.pulses / self.prf_hz
 
     @property
     def turns_per_square(self) -> float:
-        """Turns of phase per metre of range and rad^2: half of 2 / wavelength."""
+        """Phase in turns per metre of range and rad^2: half of 2 / wavelength."""
         return 1 / self.wavelength_m
 
     def times(self, device: torch.device) -> Tensor:
+        """Compute the slow times of the pulses in seconds, shape (pulse,).
+
+        Args:
+            device: Device of the result.
+
+        Returns:
+            The times, from 0 at the first pulse.
+        """
         return slow_times(self.pulses, self.prf_hz, device)
 
     def range_m(self, cell: Tensor) -> Tensor:
+        """Convert range cells to range in metres.
+
+        Args:
+            cell: Range cells, any shape.
+
+        Returns:
+            The range, same shape.
+        """
         return self.first_m + self.step_m * cell
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Rotation in the form in which phases are linear in it: the warp k (trial, order - 1), w =
-    Om^2 and v (trial,), float64.
+    """Rotation in the form in which phases are linear in it.
 
-    The range term of a scatterer at y_n is (c4/2) (w (y_n + centre_m) + v) phi^2: centre_m (trial,)
-    is the range centre deviation that is known, v what is found beyond it. Only w and v show in
-    data; both may start at zero, and may come out negative where noise is all there is.
+    The range term of a scatterer at y_n is (c4/2) (w (y_n + centre_m) + v) phi^2, with c4 = 4 pi /
+    lambda. Only w and v show in the data. Both may start at zero, and may become negative where the
+    data are noise.
+
+    Args:
+        k: Warp, shape (trial, order - 1), float64.
+        w: Square of the rotation rate in rad^2/s^2, shape (trial,), float64.
+        v: w times the range centre deviation found beyond `centre_m`, shape (trial,), float64.
+        centre_m: Range centre deviation known a priori in metres, shape (trial,), float64.
     """
 
     k: Tensor
@@ -67,27 +94,44 @@ class Motion:
 
     @staticmethod
     def still(k: Tensor, centre_m: Tensor | None = None) -> Motion:
-        """A warp, and no rate yet."""
+        """Make a motion with a warp and rate zero.
+
+        Args:
+            k: Warp, shape (trial, order - 1).
+            centre_m: Range centre deviation known a priori in metres, shape (trial,); by default 0.
+
+        Returns:
+            The motion.
+        """
         zero = k.new_zeros(k.shape[0])
         return Motion(k, zero, zero, zero if centre_m is None else centre_m)
 
     @property
     def omega_rad_s(self) -> Tensor:
+        """Rotation rate at the first pulse in rad/s, shape (trial,); nearly 0 where w < 0."""
         return self.w.clamp_min(torch.finfo(torch.float64).tiny).sqrt()
 
     @property
     def offset(self) -> Tensor:
-        """w yc, what the centre adds to w y_n."""
+        """The product w yc, which the centre adds to w y_n, shape (trial,)."""
         return self.w * self.centre_m + self.v
 
     @property
     def yc_m(self) -> Tensor:
-        """The range centre deviation; the known one where the rate is not positive."""
+        """Range centre deviation in metres, shape (trial,); `centre_m` where w <= 0."""
         return self.centre_m + torch.where(self.w > 0, self.v / torch.where(self.w > 0, self.w, 1), 0)
 
     def possible(self, sampling: Sampling) -> Tensor:
-        """Whether the numbers are finite and the range term changes by less than half a turn from
-        pulse to pulse in every cell, as in data it must, (trial,).
+        """Check whether a motion can occur in the data.
+
+        Its numbers must be finite, and the range term must change by less than half a turn from
+        pulse to pulse in every cell.
+
+        Args:
+            sampling: Sampling of the data.
+
+        Returns:
+            True where the motion is possible, shape (trial,), bool.
         """
         ends = sampling.range_m(torch.tensor([0.0, sampling.cells - 1.0], dtype=torch.float64, device=self.w.device))
         whole = warp(torch.tensor([sampling.duration_s], dtype=torch.float64, device=self.w.device), self.k)
@@ -95,15 +139,27 @@ class Motion:
         return torch.isfinite(self.k).all(-1) & (turns < sampling.pulses / 4).all(-1)
 
     def where(self, keep: Tensor, other: Motion) -> Motion:
-        """This motion in trials where `keep` (trial,) holds, the other elsewhere."""
+        """Combine two motions by trial.
+
+        Args:
+            keep: True where this motion is kept, shape (trial,), bool.
+            other: The motion of the other trials.
+
+        Returns:
+            The motion.
+        """
         w, v = (torch.where(keep, getattr(self, name), getattr(other, name)) for name in ("w", "v"))
         return Motion(torch.where(keep[:, None], self.k, other.k), w, v, self.centre_m)
 
 
 @dataclass(frozen=True)
 class Warped:
-    """The warp at some times (trial, m): phi (s), u = phi / phi(T), and du/dk_i (trial, order - 1,
-    m).
+    """The warp of slow time at some times.
+
+    Args:
+        phi: Warp in seconds, shape (trial, m).
+        u: Normalised warp phi / phi(T), shape (trial, m).
+        slopes: Derivatives du/dk_i, shape (trial, order - 1, m).
     """
 
     phi: Tensor
@@ -112,7 +168,16 @@ class Warped:
 
     @staticmethod
     def of(k: Tensor, times_s: Tensor, duration_s: float) -> Warped:
-        """times_s: (m,) or (trial, m)."""
+        """Evaluate a warp.
+
+        Args:
+            k: Warp, shape (trial, order - 1).
+            times_s: Times in seconds, shape (m,) or (trial, m).
+            duration_s: Duration T of the aperture in seconds.
+
+        Returns:
+            The warp at these times.
+        """
         end = torch.tensor([duration_s], dtype=torch.float64, device=k.device)
         whole, phi = warp(end, k), warp(times_s, k)
         u = phi / whole
@@ -125,8 +190,16 @@ class Warped:
 
 
 def without_range_term(data: Tensor, sampling: Sampling, motion: Motion, phi: Tensor) -> Tensor:
-    """data (trial, pulse, range) times exp(-j (c4/2) (w y_n + offset) phi^2). phi: (trial,
-    pulse).
+    """Multiply data by exp(-j (c4/2) (w y_n + offset) phi^2).
+
+    Args:
+        data: Range-compressed pulses, shape (trial, pulse, range), complex.
+        sampling: Sampling of the data.
+        motion: Motion.
+        phi: Warp in seconds, shape (trial, pulse).
+
+    Returns:
+        The data without the range term, shape (trial, pulse, range), complex.
     """
     square = -sampling.turns_per_square * phi.square()
     fine, coarse = phasor_tables(
@@ -138,14 +211,22 @@ def without_range_term(data: Tensor, sampling: Sampling, motion: Motion, phi: Te
 
 
 def image_of(data: Tensor, sampling: Sampling, motion: Motion, oversampling: float = 2.0) -> Tensor:
-    """Image (trial, line, range) of data (trial, pulse, range) with this motion taken out, lines of
-    1 / oversampling Doppler cells about zero.
+    """Form the image of data with a motion compensated.
+
+    Args:
+        data: Range-compressed pulses, shape (trial, pulse, range), complex.
+        sampling: Sampling of the data.
+        motion: Motion.
+        oversampling: Image lines per Doppler cell.
+
+    Returns:
+        The image, shape (trial, line, range), with zero Doppler in the middle.
     """
     phi = warp(sampling.times(data.device), motion.k)
     return matched_fourier(
         without_range_term(data, sampling, motion, phi),
         motion.k,
         sampling.prf_hz,
-        oversampling=oversampling,
-        eps=SEARCH_EPS,
+        lines=DopplerLines(oversampling),
+        transform=Gridding(eps=SEARCH_EPS),
     )

@@ -1,6 +1,4 @@
-"""Bright scatterers of an image: local maxima that stand out of the noise and of the side lobes
-about them.
-"""
+"""Bright scatterers of an image: local maxima above the noise and the side lobes about them."""
 
 from __future__ import annotations
 
@@ -11,14 +9,18 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-_SAMPLED = 1 << 16
-_CANDIDATES = 4  # looked at for each peak that is wanted
+_SAMPLED = 1 << 16  # pixels from which the median is taken: its error is then below a percent
+_CANDIDATES = 4  # local maxima that are examined for each peak that is wanted, found by trial
 
 
 @dataclass(frozen=True)
 class Peaks:
-    """Brightest first, (trial, peak): power (0 where there is none), line and range cell
-    (int64).
+    """Peaks of an image, brightest first.
+
+    Args:
+        power: Power, shape (trial, peak); 0 where there is none.
+        line: Image line, shape (trial, peak), int64.
+        cell: Range cell, shape (trial, peak), int64.
     """
 
     power: Tensor
@@ -26,31 +28,62 @@ class Peaks:
     cell: Tensor
 
     def first(self, count: Tensor) -> Peaks:
-        """The brightest `count` (trial,) of each trial."""
+        """Keep the brightest peaks of each trial.
+
+        Args:
+            count: Number of peaks to keep, shape (trial,).
+
+        Returns:
+            The peaks.
+        """
         power = torch.where(torch.arange(self.power.shape[-1], device=count.device) < count[:, None], self.power, 0)
         width = max(1, int((power > 0).sum(-1).max()))
         return Peaks(power[:, :width], self.line[:, :width], self.cell[:, :width])
 
 
 def noise_power(power: Tensor) -> Tensor:
-    """Mean power of circular Gaussian noise from the median over an image (trial, line, range) that
-    scatterers leave mostly empty. (trial,).
+    """Estimate the mean power of circular Gaussian noise from the median over an image.
+
+    Assumes that scatterers leave most of the image empty.
+
+    Args:
+        power: Power of the image, shape (trial, line, range).
+
+    Returns:
+        The noise power, shape (trial,).
     """
     every = power.flatten(1)
     return every[:, :: max(1, every.shape[-1] // _SAMPLED)].median(-1).values / math.log(2)
 
 
 def threshold(power: Tensor) -> float:
-    """Powers over the noise's that its pixels exceed once in some ten images."""
+    """Compute the power over that of the noise which noise exceeds once in about ten images.
+
+    Args:
+        power: Power of the image, shape (trial, line, range).
+
+    Returns:
+        The ratio.
+    """
     return math.log(power[0].numel()) + 2.5
 
 
 def find_peaks(power: Tensor, floor: Tensor, count: int, share: float, lines: int, cells: int) -> Peaks:
-    """Up to `count` local maxima above `floor` (trial,), each at least share^2 of the largest power
-    within +-lines and +-cells.
+    """Find local maxima above the noise.
 
-    power: (trial, line, range). Strong scatterers hide weaker ones and their own side lobes; those
-    come out once the strong ones are removed.
+    Strong scatterers hide weaker ones and their own side lobes. The weaker ones are found after the
+    strong ones are removed.
+
+    Args:
+        power: Power of the image, shape (trial, line, range).
+        floor: Least power of a peak, shape (trial,).
+        count: Largest number of peaks.
+        share: Least amplitude of a peak over that of the largest amplitude in its neighbourhood.
+        lines: Half width of the neighbourhood in lines.
+        cells: Half width of the neighbourhood in range cells.
+
+    Returns:
+        The peaks.
     """
     n_line, n_cell = power.shape[1:]
     maxima = torch.where(_local_maximum(power) & (power > floor[:, None, None]), power, 0).flatten(1)
@@ -71,6 +104,6 @@ def find_peaks(power: Tensor, floor: Tensor, count: int, share: float, lines: in
 
 
 def _local_maximum(power: Tensor) -> Tensor:
-    """Where a pixel is not below the four next to it, (trial, line, range) bool."""
+    """Whether a pixel is not below its four neighbours, (trial, line, range) bool."""
     along, across = pad(power, (0, 0, 1, 1)), pad(power, (1, 1, 0, 0))
     return (power >= along[:, :-2]) & (power > along[:, 2:]) & (power >= across[..., :-2]) & (power > across[..., 2:])

@@ -1,6 +1,4 @@
-"""The recommended estimator of uneven rotation: without a start and without a box, from short
-sections to maximum likelihood.
-"""
+"""The recommended estimator of non-uniform rotation, and its first steps alone."""
 
 from __future__ import annotations
 
@@ -20,16 +18,19 @@ from torchsar.core import Estimate, block_bytes_of, over_blocks, refuse_non_fini
 from torchsar.core.warp import k_of_shape, shape_of
 from torchsar.metrics import entropy
 
-LEAST_SCATTERERS = 3
-MOST_RATE_ERROR = 0.05  # predicted, of omega, beyond which images cannot be scaled
-_LEAST_EXPLAINED = 0.4  # of the energy above the noise
-_ENTROPY_ROUNDING = 1e-3
-_BLOCKS = 8  # a block of trials is so many times what one operation likes best
-_STANDING_STILL, _STILL_RAD = (
-    3.0,
-    0.02,
-)  # deviations, or phase of the scatterers: the last step of a fit that has come to an end
-_HISTORY_STEPS = 4
+LEAST_SCATTERERS = 3  # fewer do not determine the rotation reliably, a convention
+# relative standard deviation of the rate beyond which images cannot be scaled, a convention
+MOST_RATE_ERROR = 0.05
+# least share of the energy above the noise that the scatterers explain, found by trial: a lower
+# share accepts wrong focus, a higher one rejects targets of many faint scatterers
+_LEAST_EXPLAINED = 0.4
+_ENTROPY_ROUNDING = 1e-3  # tolerance in nats of a comparison of entropies in float32
+# size of a block of trials over the size that is best for one operation, found by trial
+_BLOCKS = 8
+# last step of a fit that has converged, in standard deviations or as a phase of the scatterers in
+# rad, found by trial
+_REST_STDS, _REST_RAD = 3.0, 0.02
+_HISTORY_STEPS = 4  # steps of phase least squares, found by trial: enough to converge
 
 Part = Callable[[Tensor, Sampling, Tensor | None], Estimate]
 
@@ -45,28 +46,43 @@ def uneven_rotation(
     scatterers: int | None = None,
     rounds: int = ROUNDS,
 ) -> Estimate:
-    """Rotation of a target that turns unevenly, (Om, k1, k2, ...) at the first pulse, and the range
-    centre deviation yc, from range-compressed pulses.
+    """Estimate the rotation of a target with non-uniform rotation; the recommended estimator.
 
-    data: complex (..., pulse, range); range_m: y_n, float64 (range,), evenly spaced; yc_m: the
-    known deviation (m), a number or (...,), or None to estimate it. order: of the warp, 1 (even),
-    2, 3 or more. Three steps: correlation of spectra of short sections (`coarse_warp`), phase least
-    squares of bright scatterers (`refined_by_histories`), and maximum likelihood of the motion and
-    every scatterer (`fit_scatterers`: `scatterers` at most, in `rounds` steps; both buy accuracy
-    with time).
+    Needs no start and no search box. Three steps: correlation of the spectra of short sections
+    (`coarse_warp`), phase least squares of bright scatterers (`refined_by_histories`), and maximum
+    likelihood of the motion and every scatterer (`fit_scatterers`).
 
-    value: omega_rad_s (its sign cannot be seen: images may be mirrored in cross range), warp_k
-    (..., order - 1) and its entries k1_per_s, k2_per_s2, ..., and yc_m. std: the deviations that
-    the Fisher information of the scatterers found predicts. quality: share of the energy above the
-    noise that these scatterers explain. ok: at least 3 of them, 40 % of the energy explained,
-    entropy no higher than without compensation, and Om known to 5 %. info: focused (k and yc serve
-    to form an image, whose scale is unknown where ok is False all the same), scatterers,
-    noise_power, steps, entropy_nats, uncompensated_entropy_nats. Needs scatterers apart in range:
-    Om shows only in the curvature that grows with range, and not at all where all lie in one range
-    cell and yc is unknown. Raises TypeError or ValueError for data that are not finite, complex, of
-    8 pulses at least.
+    Needs scatterers at several ranges: the rate shows only in the curvature that grows with range,
+    and not at all if all scatterers lie in one range cell and yc is unknown.
+
+    Args:
+        data: Range-compressed pulses, shape (..., pulse, range), complex, at least 8 pulses.
+        wavelength_m: Wavelength in metres.
+        prf_hz: Pulse repetition frequency in Hz.
+        range_m: Range coordinates y_n of the cells in metres, evenly spaced, shape (range,).
+        order: Order of the warp: 1 for uniform rotation, 2, 3 or more.
+        yc_m: Range centre deviation in metres if known a priori, a number or shape (...,); None
+            estimates it.
+        scatterers: Largest number of scatterers; more are more accurate and take longer.
+        rounds: Largest number of maximum-likelihood steps.
+
+    Returns:
+        `omega_rad_s` at the first pulse, shape (...,), whose sign is not observable (the image may
+        be mirrored in cross range); `warp_k`, shape (..., order - 1), and its entries `k1_per_s`,
+        `k2_per_s2`, ...; and `yc_m`, shape (...,). Standard deviations follow from the Fisher
+        information of the scatterers found. quality is the share of the energy above the noise that
+        these scatterers explain. info["focused"] is False where fewer than 3 scatterers are found,
+        they explain less than 40 % of the energy, the entropy is higher than without compensation,
+        or the fit has not converged. `ok` is False there, and where the standard deviation of the
+        rate is 5 % or more; k and yc may then still serve to form an image, whose scale is unknown.
+        Further info: scatterers, noise_power, steps, entropy_nats, uncompensated_entropy_nats.
+
+    Raises:
+        TypeError: If the data are not complex.
+        ValueError: If the data, the range axis or `yc_m` are invalid, or a number is not a whole
+            number of 1 or more.
     """
-    _refuse_less("uneven_rotation", 1, order=order, rounds=rounds, scatterers=1 if scatterers is None else scatterers)
+    _check_counts("uneven_rotation", 1, order=order, rounds=rounds, scatterers=1 if scatterers is None else scatterers)
 
     def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Estimate:
         motion, _ = refined_by_histories(
@@ -87,13 +103,31 @@ def coarse_rotation(
     order: int = 3,
     yc_m: Tensor | float | None = None,
 ) -> Estimate:
-    """The first step of `uneven_rotation` alone, `coarse_warp`: k1 and k2 to about a percent; omega
-    is not looked at and stays 0. ok: entropy lower than without compensation.
+    """Estimate k1 and k2 from the spectra of short sections, the first step of `uneven_rotation`.
+
+    They are accurate to about a percent of the rate. The rate is not estimated and is 0.
+
+    Args:
+        data: Range-compressed pulses, shape (..., pulse, range), complex, at least 8 pulses.
+        wavelength_m: Wavelength in metres.
+        prf_hz: Pulse repetition frequency in Hz.
+        range_m: Range coordinates y_n of the cells in metres, evenly spaced, shape (range,).
+        order: Order of the warp.
+        yc_m: Range centre deviation in metres if known a priori, a number or shape (...,).
+
+    Returns:
+        The values of `uneven_rotation`. `ok` is False where the entropy is higher than without
+        compensation.
+
+    Raises:
+        TypeError: If the data are not complex.
+        ValueError: If the data, the range axis or `yc_m` are invalid, or the order is not a whole
+            number of 1 or more.
     """
-    _refuse_less("coarse_rotation", 1, order=order)
+    _check_counts("coarse_rotation", 1, order=order)
 
     def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Estimate:
-        return _judged(rows, sampling, _start(rows, sampling, order, known))
+        return _assessed(rows, sampling, _start(rows, sampling, order, known))
 
     return _over_trials("coarse_rotation", find, data, wavelength_m, prf_hz, range_m, yc_m)
 
@@ -109,23 +143,43 @@ def phase_fit_rotation(
     steps: int = _HISTORY_STEPS,
     half_cells: int = 24,
 ) -> Estimate:
-    """The first two steps of `uneven_rotation` alone: coarse, then `steps` of phase least squares
-    on windows of half_cells to either side. Half of the time, two to twenty times the error.
+    """Estimate the rotation by the first two steps of `uneven_rotation`.
+
+    Takes half of the time of `uneven_rotation`, with two to twenty times its error.
+
+    Args:
+        data: Range-compressed pulses, shape (..., pulse, range), complex, at least 8 pulses.
+        wavelength_m: Wavelength in metres.
+        prf_hz: Pulse repetition frequency in Hz.
+        range_m: Range coordinates y_n of the cells in metres, evenly spaced, shape (range,).
+        order: Order of the warp.
+        yc_m: Range centre deviation in metres if known a priori, a number or shape (...,); None
+            estimates it.
+        steps: Number of steps of phase least squares.
+        half_cells: Half width of the windows about scatterers in Doppler cells, at least 4.
+
+    Returns:
+        The values of `uneven_rotation`. `ok` is False where the entropy is higher than without
+        compensation.
+
+    Raises:
+        TypeError: If the data are not complex.
+        ValueError: If the data, the range axis or `yc_m` are invalid, or a number is too small.
     """
-    _refuse_less("phase_fit_rotation", 1, order=order, steps=steps)
-    _refuse_less("phase_fit_rotation", 4, half_cells=half_cells)
+    _check_counts("phase_fit_rotation", 1, order=order, steps=steps)
+    _check_counts("phase_fit_rotation", 4, half_cells=half_cells)
 
     def find(rows: Tensor, sampling: Sampling, known: Tensor | None) -> Estimate:
         motion = _start(rows, sampling, order, known)
         for _ in range(steps):
             motion, _ = refined_by_histories(rows, sampling, motion, free_centre=known is None, half_cells=half_cells)
-        return _judged(rows, sampling, motion)
+        return _assessed(rows, sampling, motion)
 
     return _over_trials("phase_fit_rotation", find, data, wavelength_m, prf_hz, range_m, yc_m)
 
 
 def _start(rows: Tensor, sampling: Sampling, order: int, known: Tensor | None) -> Motion:
-    """The coarse warp in `order` terms, and no rate yet."""
+    """The coarse warp in `order` terms, with rate zero."""
     k = (
         coarse_warp(rows, sampling.prf_hz)
         if order > 1
@@ -145,7 +199,7 @@ def _over_trials(
     range_m: Tensor,
     yc_m: Tensor | float | None,
 ) -> Estimate:
-    """find(rows, sampling, known centre) by blocks of trials, each over its own largest sample."""
+    """find(rows, sampling, known centre) in blocks of trials, each over its largest sample."""
     sampling = _checked(name, data, wavelength_m, prf_hz, range_m)
     trials, rows = data.shape[:-2], data.detach().reshape(-1, *data.shape[-2:])
     known = (
@@ -157,9 +211,8 @@ def _over_trials(
     @torch.no_grad()
     def work(first: int) -> None:
         part = slice(first, first + height)
-        peak = torch.maximum(rows[part].real.abs(), rows[part].imag.abs()).amax(
-            (-2, -1), keepdim=True
-        )  # |z| itself may overflow
+        # |z| itself may overflow
+        peak = torch.maximum(rows[part].real.abs(), rows[part].imag.abs()).amax((-2, -1), keepdim=True)
         found = find(rows[part] / torch.where(peak > 0, peak, 1), sampling, None if known is None else known[part])
         scaled = (
             {"noise_power": found.info["noise_power"] * peak[:, 0, 0].double().square()}
@@ -173,23 +226,25 @@ def _over_trials(
     return Estimate.joined([parts[first] for first in starts], trials)
 
 
-def _refuse_less(name: str, least: int, **counts: int) -> None:
+def _check_counts(name: str, least: int, **counts: int) -> None:
+    """Raise ValueError unless numbers are integers of at least `least`."""
     for what, count in counts.items():
         if isinstance(count, bool) or not isinstance(count, int) or count < least:
             raise ValueError(f"{name}: {what} must be a whole number of {least} or more, got {count!r}")
 
 
 def _centre(name: str, yc_m: Tensor, trials: torch.Size) -> Tensor:
-    """The known deviation of every trial, (trial,)."""
+    """The range centre deviation known a priori for every trial, (trial,)."""
     refuse_non_finite(yc_m, f"{name}: yc_m")
     if yc_m.ndim and yc_m.shape != trials:
         raise ValueError(
-            f"{name}: yc_m must be one number (m) or one a trial {tuple(trials)}, got shape {tuple(yc_m.shape)}"
+            f"{name}: yc_m must be one number (m) or one per trial {tuple(trials)}, got shape {tuple(yc_m.shape)}"
         )
     return yc_m.expand(trials).reshape(-1)
 
 
 def _checked(name: str, data: Tensor, wavelength_m: float, prf_hz: float, range_m: Tensor) -> Sampling:
+    """Sampling of the data; raises TypeError or ValueError for invalid input."""
     if not isinstance(data, Tensor) or not data.is_complex():
         raise TypeError(
             f"{name} works on complex range-compressed samples (..., pulse, range), got "
@@ -221,19 +276,19 @@ def _checked(name: str, data: Tensor, wavelength_m: float, prf_hz: float, range_
 
 
 def _estimate(rows: Tensor, sampling: Sampling, fit: Fit, free_centre: bool) -> Estimate:
-    """Estimate with deviations and verdict of a fit."""
-    found = _judged(rows, sampling, fit.motion)
-    live = fit.scatterers.amplitude != 0
-    count = live.sum(-1)
+    """Estimate from a fit, with standard deviations and reliability."""
+    found = _assessed(rows, sampling, fit.motion)
+    used = fit.scatterers.amplitude != 0
+    count = used.sum(-1)
     present = (rows != 0).any(-1).sum(-1)
     energy = fit.scatterers.amplitude.abs().square().sum(-1) * present
     explained = energy / _energy(rows, fit.noise, present)
-    resting = (fit.last_step <= _STANDING_STILL) | (
-        fit.last_step * (fit.noise / (2 * energy.clamp_min(torch.finfo(torch.float64).tiny))).sqrt() <= _STILL_RAD
+    converged = (fit.last_step <= _REST_STDS) | (
+        fit.last_step * (fit.noise / (2 * energy.clamp_min(torch.finfo(torch.float64).tiny))).sqrt() <= _REST_RAD
     )
     quality = settle(explained.clamp(0, 1), 0.0)[0]
-    std = _deviations(fit, free_centre)
-    focused = found.ok & (count >= LEAST_SCATTERERS) & (quality >= _LEAST_EXPLAINED) & resting
+    std = _standard_deviations(fit, free_centre)
+    focused = found.ok & (count >= LEAST_SCATTERERS) & (quality >= _LEAST_EXPLAINED) & converged
     scaled = (std["omega_rad_s"] < MOST_RATE_ERROR * fit.motion.omega_rad_s) & (fit.motion.w > 0)
     info = {**found.info, "focused": focused, "scatterers": count, "noise_power": fit.noise, "steps": fit.steps}
     return Estimate(found.value, quality, focused & scaled, std, info)
@@ -245,9 +300,10 @@ def _energy(rows: Tensor, noise: Tensor, present: Tensor) -> Tensor:
     return (power - noise * present * rows.shape[-1]).clamp_min(1e-3 * power).clamp_min(torch.finfo(torch.float64).tiny)
 
 
-def _deviations(fit: Fit, free_centre: bool) -> dict[str, Tensor]:
-    """From the covariance of (k, w, v) to that of what is reported; infinite where nothing is
-    known.
+def _standard_deviations(fit: Fit, free_centre: bool) -> dict[str, Tensor]:
+    """Standard deviations of the values, from the covariance of (k, w, v).
+
+    They are infinite where the data do not determine a value.
     """
     motion, order = fit.motion, fit.motion.k.shape[-1]
     known = (fit.scatterers.amplitude != 0).any(-1)
@@ -271,10 +327,8 @@ def _deviations(fit: Fit, free_centre: bool) -> dict[str, Tensor]:
     return {name: torch.where(torch.isnan(value), math.inf, value) for name, value in named.items()}
 
 
-def _judged(rows: Tensor, sampling: Sampling, motion: Motion) -> Estimate:
-    """A motion as an estimate, ok where its image has no more entropy than that of even rotation
-    without compensation.
-    """
+def _assessed(rows: Tensor, sampling: Sampling, motion: Motion) -> Estimate:
+    """A motion as an estimate; ok where its entropy is not above that without compensation."""
     motion = replace(motion, k=settle(motion.k, 0.0)[0], w=settle(motion.w, 0.0)[0], v=settle(motion.v, 0.0)[0])
     before = entropy(torch.fft.fft(rows, 2 * sampling.pulses, dim=-2))
     after = entropy(image_of(rows, sampling, motion))

@@ -1,12 +1,11 @@
-"""Maximum likelihood of the motion and of every scatterer together: amplitude, Doppler cell and
-range of each, and the rotation that all share.
+"""Maximum likelihood of the rotation and of every scatterer together.
 
-Each round removes the model of all scatterers known so far from the data, finds further ones in the
-image of what is left, and takes a Gauss-Newton step of everything at once: amplitudes and places of
-all scatterers and the motion, with the couplings of those next to each other. Steps come from the
-exact residual, so that neighbours and side lobes leave no error at the end; what range terms change
-in the curvature, a few percent, is left out. Assumes range-compressed echoes of a flat band that
-fills the cells (`band_response`).
+The unknowns are the amplitude, Doppler cell and range of each scatterer, and the common rotation.
+Each round subtracts the model of all known scatterers from the data, finds further scatterers in
+the image of the residual, and takes a Gauss-Newton step of all unknowns at once, with the couplings
+of neighbouring scatterers. Steps follow from the exact residual, so neighbours and side lobes leave
+no error at the end. The change of the curvature by range terms, a few percent, is neglected.
+Assumes range-compressed echoes of a flat band that fills the cells (`band_response`).
 """
 
 from __future__ import annotations
@@ -24,33 +23,42 @@ from torchsar.compensate.rotation.peaks import find_peaks, noise_power, threshol
 from torchsar.core import real_dtype, reduced_turns
 from torchsar.core.warp import least_rate
 
-_OVERSAMPLING = 2
-# a new scatterer is at least this part of the brightest about it
+_OVERSAMPLING = 2  # image lines per Doppler cell, found by trial: accuracy of peaks against time
+# a new scatterer has at least this share of the largest amplitude within so many lines and range
+# cells, found by trial: side lobes are excluded until their scatterer is subtracted
 _SHARE, _LINES, _CELLS = 0.5, 24, 2
-MOST, ROUNDS = 800, 6
-_FEWEST = 128
-# of the data for each scatterer, so that a fit costs as much as some twenty images
+MOST, ROUNDS = 800, 6  # largest number of scatterers, number of steps; accuracy against time
+_FEWEST = 128  # default number of scatterers on small data, found by trial
+# samples of the data per scatterer, so that a fit costs as much as about twenty images
 _SAMPLES_EACH = 1450
-_SEARCHES = {
-    0: 0.1,
-    2: 0.6,
-    4: 1.0,
-    # rounds that look for further scatterers, up to which part of all: the brightest alone bring
-    # the
-    # motion near; the rounds between settle what was found
-}
-_BLOCK_BYTES = 1 << 19
-_APART = 0.5  # cells, in Doppler and in range
-_STEP = 0.3  # cells that a scatterer moves at most in a step
+# rounds that search for further scatterers, and the share of their number up to which they do: the
+# brightest alone bring the motion near, and the rounds between let it converge
+_SEARCHES = {0: 0.1, 2: 0.6, 4: 1.0}
+_BLOCK_BYTES = 1 << 19  # phasors of a block of pulses that fit into the cache
+_APART = 0.5  # Doppler and range cells within which scatterers are not resolved
+_STEP = 0.3  # largest motion of a scatterer in one step, in cells: beyond it the model is not linear
+# added to the diagonal, relative: it keeps the curvature positive definite; the steps, which follow
+# from the exact residual, converge all the same
 _RIDGE = 1e-3
-_LEAST_RATE = 0.05
-_AGREES = 5.0  # deviations by which the curvature of a scatterer may lie off
-_SETTLED = 0.2  # of its deviation: steps of the motion below it end a trial
+_LEAST_RATE = 0.05  # least rate over that at the start; slower motions would nearly reverse
+# standard deviations by which the curvature of a scatterer may differ before it loses weight, found
+# by trial
+_AGREES = 5.0
+# power of errors of the model over that of the brightest scatterer, found by trial: weaker noise
+# does not limit the fit, and residuals below it are no scatterers and no evidence against one
+_MODEL = 1e-4
+_SETTLED = 0.2  # steps of the motion below this share of its standard deviation end a trial
 
 
 @dataclass(frozen=True)
 class Scatterers:
-    """(trial, scatterer): complex128 amplitude (0: none), Doppler cell and range cell, float64."""
+    """Scatterers of every trial.
+
+    Args:
+        amplitude: Amplitude, shape (trial, scatterer), complex128; 0 for none.
+        cell: Doppler cell, shape (trial, scatterer), float64.
+        row: Range cell, shape (trial, scatterer), float64.
+    """
 
     amplitude: Tensor
     cell: Tensor
@@ -58,11 +66,27 @@ class Scatterers:
 
     @staticmethod
     def none(like: Tensor) -> Scatterers:
+        """Make an empty set of scatterers.
+
+        Args:
+            like: Data, shape (trial, ...), which give trials and device.
+
+        Returns:
+            The scatterers, shape (trial, 0).
+        """
         empty = torch.zeros(like.shape[0], 0, dtype=torch.float64, device=like.device)
         return Scatterers(empty.to(torch.complex128), empty, empty)
 
     def joined(self, new: Scatterers, closed: Tensor) -> Scatterers:
-        """These and the new ones; trials that are `closed` (trial,) take none."""
+        """Append further scatterers.
+
+        Args:
+            new: The new scatterers.
+            closed: True for trials that take no new ones, shape (trial,), bool.
+
+        Returns:
+            All scatterers.
+        """
         added = torch.where(closed[:, None], 0, new.amplitude)
         return Scatterers(
             torch.cat([self.amplitude, added], -1),
@@ -71,8 +95,12 @@ class Scatterers:
         )
 
     def apart(self) -> Scatterers:
-        """Without those that lie within the resolution of a brighter one: such pairs grow against
-        each other without end, and pull the motion along.
+        """Remove scatterers that lie within the resolution of a brighter one.
+
+        The amplitudes of such pairs grow against each other without limit and bias the motion.
+
+        Returns:
+            The remaining scatterers.
         """
         level = self.amplitude.abs()
         near = ((self.cell[:, :, None] - self.cell[:, None]).abs() < _APART) & (
@@ -84,11 +112,17 @@ class Scatterers:
 
 @dataclass(frozen=True)
 class Fit:
-    """Where a fit has come to.
+    """State of a fit.
 
-    covariance: of (k1, k2, ..., w, v), the free ones, per unit noise power; noise: per sample,
-    (trial,); steps: taken; last_step: largest of the shared unknowns, in their deviations,
-    (trial,).
+    Args:
+        motion: Motion.
+        scatterers: Scatterers.
+        covariance: Covariance of the free ones of (k1, k2, ..., w, v) per unit noise power, shape
+            (trial, unknown, unknown).
+        noise: Noise power per sample, shape (trial,).
+        steps: Number of steps taken, shape (trial,).
+        settled: True for trials that have ended, shape (trial,), bool.
+        last_step: Largest step of the common unknowns in their standard deviations, shape (trial,).
     """
 
     motion: Motion
@@ -109,11 +143,21 @@ def fit_scatterers(
     count: int | None = None,
     rounds: int = ROUNDS,
 ) -> Fit:
-    """Maximum likelihood from `start`, on data (trial, pulse, range); a trial ends when its motion
-    moves by less than a fifth of its deviation.
+    """Fit the motion and all scatterers by maximum likelihood.
 
-    count: scatterers at most, which grow over the first rounds, by default one for every 1450
-    samples, 128 to 800; rounds: steps at most.
+    A trial ends when its motion moves by less than a fifth of its standard deviation.
+
+    Args:
+        data: Range-compressed pulses, shape (trial, pulse, range), complex.
+        sampling: Sampling of the data.
+        start: Motion to start from.
+        free_centre: Whether the range centre deviation is estimated.
+        count: Largest number of scatterers, reached over the first rounds; by default one for every
+            1450 samples, within 128..800.
+        rounds: Largest number of steps.
+
+    Returns:
+        The fit.
     """
     count = min(MOST, max(_FEWEST, sampling.pulses * sampling.cells // _SAMPLES_EACH)) if count is None else count
     unknowns = _Unknowns(start.k.shape[-1], free_centre)
@@ -124,21 +168,21 @@ def fit_scatterers(
     never = torch.zeros(trials, dtype=torch.bool, device=device)
     fit = Fit(start, Scatterers.none(data), covariance, noise, never.long(), never, noise)
     residual, step = data, None
-    for turn in range(rounds + 1):
+    for iteration in range(rounds + 1):
         new, noise = None, fit.noise
-        if turn in _SEARCHES:
-            new, noise = _standing_out(residual, sampling, fit, present, math.ceil(count * _SEARCHES[turn]))
+        if iteration in _SEARCHES:
+            new, noise = _new_scatterers(residual, sampling, fit, present, math.ceil(count * _SEARCHES[iteration]))
         if step is not None:
-            fit = _advanced(
+            fit = _after_step(
                 fit,
-                step.taken(fit.noise if turn >= max(_SEARCHES) else None),
+                step.taken(fit.noise if iteration >= max(_SEARCHES) else None),
                 noise,
                 sampling,
-                search_over=turn > max(_SEARCHES),
+                search_over=iteration > max(_SEARCHES),
             )
         if new is not None:
             fit = replace(fit, scatterers=fit.scatterers.joined(new, fit.settled).apart(), noise=noise)
-        if turn == rounds or bool(fit.settled.all()):
+        if iteration == rounds or bool(fit.settled.all()):
             break
         residual, step = _Step.of(data, sampling, fit, present, unknowns)
     return fit
@@ -146,25 +190,34 @@ def fit_scatterers(
 
 @dataclass(frozen=True)
 class _Unknowns:
-    """What all scatterers share: as many k, the rate w, and v where the centre is free."""
+    """The unknowns that all scatterers have in common.
+
+    k terms of the warp, the rate w, and v if the centre is free.
+    """
 
     k: int
     centre: bool
 
     @property
     def size(self) -> int:
+        """Number of common unknowns."""
         return self.k + 1 + self.centre
 
 
-def _standing_out(
+def _new_scatterers(
     residual: Tensor, sampling: Sampling, fit: Fit, present: Tensor, bound: int
 ) -> tuple[Scatterers, Tensor]:
-    """Scatterers that stand out of the residual, in no trial more than make `bound` with those that
-    it has, and the noise power per sample (trial,).
+    """Scatterers that clearly exceed the residual, and the noise power per sample (trial,).
+
+    At most `bound` per trial, including those already fitted.
     """
     image = image_of(residual, sampling, fit.motion, oversampling=_OVERSAMPLING)
     power = image.real.square() + image.imag.square()
-    floor = noise_power(power).double()  # of a pixel: pulses that are not there bring none
+    brightest = torch.cat(
+        [fit.scatterers.amplitude.abs().square(), power.flatten(1).amax(-1, keepdim=True) / sampling.pulses], -1
+    )
+    # of a pixel; missing pulses add no noise
+    floor = torch.maximum(noise_power(power).double(), _MODEL * brightest.amax(-1))
     noise = torch.minimum(fit.noise, floor / present.double().mean(-1).clamp_min(1e-3))
     known = (fit.scatterers.amplitude != 0).sum(-1)
     peaks = find_peaks(power, (floor * threshold(power)).to(power.dtype), bound, _SHARE, _LINES, _CELLS).first(
@@ -178,9 +231,7 @@ def _standing_out(
 
 
 def _envelopes(sampling: Sampling, row: Tensor) -> tuple[Tensor, Tensor]:
-    """Responses of the range cells to scatterers at `row` and their derivatives in row, (trial,
-    scatterer, range) complex128 each.
-    """
+    """Range responses to scatterers at `row` and derivatives, (trial, scatterer, range) each."""
     value, slope, _ = band_response(
         torch.arange(sampling.cells, dtype=row.dtype, device=row.device) - row[..., None], sampling.cells
     )
@@ -188,11 +239,11 @@ def _envelopes(sampling: Sampling, row: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _phasors(left: Tensor, right: Tensor, dtype: torch.dtype) -> Tensor:
-    """exp(2j pi left @ right), (trial, pulse, scatterer), of a short block of pulses: its first
-    pulse in float64, the differences from it, a few turns, in the working precision.
+    """exp(2j pi left @ right), (trial, pulse, scatterer), for a short block of pulses.
 
-    left: float64 (trial, pulse, 2) turns per unit of right, (trial, 2, scatterer). Twice as fast as
-    `core.unit_phasor` of every element.
+    left: float64 (trial, pulse, 2) turns per unit of right, (trial, 2, scatterer). The first pulse
+    is computed in float64, the differences from it, a few turns, in the working precision. Twice as
+    fast as `core.unit_phasor` of every element.
     """
     working = real_dtype(dtype)
     begin = reduced_turns(left[:, :1] @ right).to(working)
@@ -203,11 +254,11 @@ def _phasors(left: Tensor, right: Tensor, dtype: torch.dtype) -> Tensor:
 
 @dataclass(frozen=True)
 class _Step:
-    """The residual's moments against what each unknown changes, and the curvature.
+    """Gradient and curvature of the likelihood with respect to all unknowns.
 
-    moments: (trial, scatterer, base), sums over pulses of base * conj(echo) * residual at the
-    scatterer's range, bases 1, u, du/dk..., phi^2; shift: the same of base 1 with the derivative of
-    the envelope.
+    moments: (trial, scatterer, base), sums over pulses of base * conj(echo) * residual at the range
+    of the scatterer, for the bases 1, u, du/dk..., phi^2. shift: the same of base 1 with the
+    derivative of the envelope.
     """
 
     sampling: Sampling
@@ -221,8 +272,9 @@ class _Step:
 
     @staticmethod
     def of(data: Tensor, sampling: Sampling, fit: Fit, present: Tensor, unknowns: _Unknowns) -> tuple[Tensor, _Step]:
-        """The residual of the data and the step from it, in one pass over blocks of pulses whose
-        echoes stay in the cache.
+        """The residual of the data and the step from it, in one pass over blocks of pulses.
+
+        The echoes of a block stay in the cache.
         """
         motion, found = fit.motion, fit.scatterers
         warped = Warped.of(motion.k, sampling.times(data.device), sampling.duration_s)
@@ -263,11 +315,11 @@ class _Step:
         )
 
     def taken(self, noise: Tensor | None = None) -> tuple[Motion, Scatterers, Tensor, Tensor]:
-        """Motion and scatterers after the step, the step of the shared unknowns, and their
-        covariance per unit noise power.
+        """Motion and scatterers after the step, step of the common unknowns, their covariance.
 
-        noise: per sample (trial,); with it, scatterers whose own curvature disagrees with the step
-        (several in one resolution cell) lose their say in rate and centre.
+        The covariance is per unit noise power. noise: per sample (trial,). If it is given,
+        scatterers whose own curvature disagrees with the step (several in one resolution cell) lose
+        weight in rate and centre.
         """
         slopes, factor = self._slopes(), _Factor.of(self._local())
         found = self._solved(slopes, factor)
@@ -277,8 +329,9 @@ class _Step:
         return self._solved(slopes, factor)
 
     def _agreement(self, slopes: Tensor, change: Tensor, noise: Tensor) -> Tensor:
-        """Weights 0..1 (trial, scatterer) by how far the curvature of each scatterer alone lies
-        from what the step gives it, in its deviations.
+        """Weights 0..1 (trial, scatterer) by how well the curvature of a scatterer fits the step.
+
+        The difference is measured in its standard deviations.
         """
         power = self.found.amplitude.abs().square()
         turned = (self.found.amplitude.conj()[..., None] * self.moments).imag
@@ -291,7 +344,7 @@ class _Step:
         return 1 / (1 + off.square() * 2 * power * curvature / noise[:, None] / _AGREES**2)
 
     def _solved(self, slopes: Tensor, factor: _Factor) -> tuple[Motion, Scatterers, Tensor, Tensor]:
-        """The step for these coefficients of the shared unknowns."""
+        """The step for these coefficients of the common unknowns."""
         found = self.found
         cross, shared = self._shared(slopes)
         turned = found.amplitude.conj()[..., None] * self.moments
@@ -304,17 +357,18 @@ class _Step:
             (joint[..., -1] - (joint[..., :-1] @ change[..., None])[..., 0]).unflatten(-1, (4, -1)).unbind(-2)
         )
         amplitude = found.amplitude * torch.complex(1 + grow, turn)
-        place = (found.row + row.clamp(-_STEP, _STEP)).clamp(0, self.sampling.cells - 1)
+        position = (found.row + row.clamp(-_STEP, _STEP)).clamp(0, self.sampling.cells - 1)
         return (
             self._moved(change),
-            Scatterers(amplitude, found.cell + line.clamp(-_STEP, _STEP), place),
+            Scatterers(amplitude, found.cell + line.clamp(-_STEP, _STEP), position),
             change,
             _covariance(schur),
         )
 
     def _local(self) -> Tensor:
-        """Gauss-Newton curvature of growth, turn, Doppler cell and row of all scatterers, (trial, 4
-        scatterer, 4 scatterer).
+        """Gauss-Newton curvature of the scatterers' unknowns, (trial, 4 scatterer, 4 scatterer).
+
+        The unknowns are relative amplitude, phase, Doppler cell and range cell.
         """
         overlap, slope, bend = self._overlaps()
         pairs = self.pairs
@@ -332,9 +386,8 @@ class _Step:
         ]
         local = pairs.matrix(rows)
         diagonal = local.diagonal(dim1=-2, dim2=-1)
-        diagonal += torch.where(
-            diagonal > 0, _RIDGE * diagonal, 1.0
-        )  # no scatterer, or one range cell that tells nothing of range
+        # zero without a scatterer, or with one range cell, which does not determine range
+        diagonal += torch.where(diagonal > 0, _RIDGE * diagonal, 1.0)
         return local
 
     def _overlaps(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -343,15 +396,15 @@ class _Step:
         return band_response(self.pairs.of(row, 0) - self.pairs.of(row, 1), self.sampling.cells)
 
     def _shared(self, slopes: Tensor) -> tuple[Tensor, Tensor]:
-        """Curvature between the scatterers' unknowns and the shared ones (trial, 4 scatterer,
-        unknown), and of the shared ones (trial, unknown, unknown).
+        """Curvature between scatterers and common unknowns, and of the common unknowns.
+
+        (trial, 4 scatterer, unknown) and (trial, unknown, unknown).
         """
         pairs = self.pairs
         overlap, slope, _ = self._overlaps()
         size = slopes.shape[-1]
-        column, row = (
-            slopes[pairs.trial, scatterer] for scatterer in (pairs.second, pairs.first)
-        )  # (pair, unknown, base)
+        # (pair, unknown, base)
+        column, row = (slopes[pairs.trial, scatterer] for scatterer in (pairs.second, pairs.first))
         seen, bowed = (
             sum(pairs.products[(base, n)][:, None] * column[..., n] for n in range(2, size)) for base in (0, 1)
         )
@@ -373,13 +426,15 @@ class _Step:
         return cross, pairs.per_trial(both)
 
     def _moved(self, change: Tensor) -> Motion:
+        """The motion after a step of the common unknowns."""
         order, motion = self.unknowns.k, self.motion
         v = motion.v + (change[:, -1] if self.unknowns.centre else 0)
         return replace(motion, k=motion.k + change[:, :order], w=motion.w + change[:, order], v=v)
 
     def _slopes(self) -> Tensor:
-        """Coefficients of the bases in the phase per unit of each shared unknown, (trial,
-        scatterer, unknown, base).
+        """Coefficients of the bases in the phase per unit of each common unknown.
+
+        (trial, scatterer, unknown, base).
         """
         order, found = self.unknowns.k, self.found
         slopes = found.cell.new_zeros(*found.cell.shape, self.unknowns.size, order + 3)
@@ -393,8 +448,9 @@ class _Step:
 
 @dataclass(frozen=True)
 class _Factor:
-    """A symmetric matrix (trial, n, n) made ready to solve with: its Cholesky factor, or None where
-    rounding has left it indefinite.
+    """A symmetric matrix (trial, n, n), factorised.
+
+    factor: its Cholesky factor, or None where rounding has made the matrix indefinite.
     """
 
     matrix: Tensor
@@ -402,42 +458,44 @@ class _Factor:
 
     @staticmethod
     def of(matrix: Tensor) -> _Factor:
+        """Factorise a matrix."""
         factor, failed = torch.linalg.cholesky_ex(matrix)
         return _Factor(matrix, None if bool(failed.any()) else factor)
 
     def solve(self, right: Tensor) -> Tensor:
+        """Solution for right-hand sides."""
         return (
             torch.linalg.solve(self.matrix, right) if self.factor is None else torch.cholesky_solve(right, self.factor)
         )
 
 
 def _covariance(normal: Tensor) -> Tensor:
-    """Of the shared unknowns per unit noise power, infinite for those that nothing is known
-    about.
-    """
+    """Covariance of the common unknowns per unit noise power; infinite if undetermined."""
     inverse, lost = inverted(normal)
     return inverse / 2 + torch.diag_embed(torch.where(lost, math.inf, 0.0))
 
 
-def _advanced(
+def _after_step(
     fit: Fit, taken: tuple[Motion, Scatterers, Tensor, Tensor], noise: Tensor, sampling: Sampling, search_over: bool
 ) -> Fit:
-    """The fit after a step; settled trials, and steps to a motion that turns back, stay where they
-    are.
+    """The fit after a step.
+
+    Trials that have ended, and steps to a motion that reverses its direction, leave the fit
+    unchanged.
     """
     motion, found, change, covariance = taken
-    sane = (
+    valid = (
         torch.isfinite(change).all(-1)
         & motion.possible(sampling)
         & (least_rate(motion.k, sampling.duration_s) > _LEAST_RATE)
     )
-    deviation = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt() * noise.sqrt()[:, None]
-    step = torch.where(sane, (change.abs() / deviation.clamp_min(torch.finfo(torch.float64).tiny)).amax(-1), math.inf)
+    std = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt() * noise.sqrt()[:, None]
+    step = torch.where(valid, (change.abs() / std.clamp_min(torch.finfo(torch.float64).tiny)).amax(-1), math.inf)
     active, old = ~fit.settled, fit.scatterers
-    pick = (active & sane)[:, None]
+    pick = (active & valid)[:, None]
     pairs = ((found.amplitude, old.amplitude), (found.cell, old.cell), (found.row, old.row))
     return Fit(
-        motion=motion.where(active & sane, fit.motion),
+        motion=motion.where(active & valid, fit.motion),
         scatterers=Scatterers(*(torch.where(pick, new, before) for new, before in pairs)).apart(),
         covariance=torch.where(active[:, None, None], covariance, fit.covariance),
         noise=torch.where(active, noise, fit.noise),

@@ -1,6 +1,4 @@
-"""Estimators of uneven rotation as stages, and the uniform autofocus of a target that turns
-unevenly.
-"""
+"""Estimators of non-uniform rotation as stages, and the autofocus of such a target."""
 
 from __future__ import annotations
 
@@ -9,53 +7,68 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchsar.compensate.pulse_phase import autofocus
 from torchsar.compensate.pulse_phase.data import prepare, rotate, starting_phase
 from torchsar.compensate.pulse_phase.imaging import Through
 from torchsar.compensate.pulse_phase.pairs import pair_phase
-from torchsar.compensate.pulse_phase.recommended import autofocus
 from torchsar.compensate.pulse_phase.sharpen import LogAbove, Run, Wiener, in_turn
 from torchsar.compensate.rotation.motion import SEARCH_EPS
 from torchsar.compensate.rotation.recommended import coarse_rotation, phase_fit_rotation, uneven_rotation
 from torchsar.compensate.rotation.scatterers import ROUNDS
 from torchsar.compensate.rotation.unknowns import k_name
 from torchsar.core import Estimate, Signal, Stage
+from torchsar.focus.image_lines import DopplerLines
 from torchsar.focus.matched_fourier import MatchedFourierOperator, range_phase
+from torchsar.focus.transforms import Gridding
 from torchsar.metrics import entropy
 from torchsar.radar import InverseRadar
 
-_FLOOR, _RELAXATION = 2.0, 1.8  # of the entropy fixed point, as in `autofocus`
-_SEARCH_TOLERANCE_RAD, _TOLERANCE_RAD = 0.01, 1e-3
+# of the entropy fixed point: the relaxation of `autofocus`, and the last floor of
+# `entropy_fixed_point`
+_FLOOR, _RELAXATION = 2.0, 1.8
+_SEARCH_TOLERANCE_RAD, _TOLERANCE_RAD = 0.01, 1e-3  # the defaults of `autofocus`
 
 
 class _Rotation(Stage):
-    """yc_m: the known range centre deviation (m), or None to estimate it; a connected value goes
-    before it.
+    """An estimator of the rotation; a connected yc_m takes precedence over its own.
+
+    yc_m: the range centre deviation (m) known a priori, or None to estimate it.
     """
 
     def __init__(self, radar: InverseRadar, order: int, yc_m: float | None) -> None:
         super().__init__()
         if order < 1:
-            raise ValueError(f"a rotation needs an order of 1 (even) or more, got {order}")
+            raise ValueError(f"a rotation needs an order of 1 (uniform) or more, got {order}")
         self.radar, self.order, self.yc_m = radar, order, yc_m
         self.provides = ("omega_rad_s", "warp_k", "yc_m", *(k_name(i) for i in range(1, order)))
 
-    def told(self, signal: Signal, yc_m: Tensor | None) -> dict[str, Any]:
-        """What the function is told about the signal."""
-        place = signal.axis("range").values(signal.data.device)
+    def settings(self, signal: Signal, yc_m: Tensor | None) -> dict[str, Any]:
+        """Arguments of the estimating function from the signal, the radar and the stage."""
+        range_m = signal.axis("range").values(signal.data.device)
         centre = self.yc_m if yc_m is None else yc_m
         return {
             "wavelength_m": self.radar.wavelength_m,
             "prf_hz": 1 / signal.axis("pulse").step,
-            "range_m": place,
+            "range_m": range_m,
             "order": self.order,
             "yc_m": centre,
         }
 
 
 class UnevenRotation(_Rotation):
-    """`uneven_rotation`, the recommended estimator.
+    """Non-uniform rotation by the recommended estimator; see `uneven_rotation`.
 
-    scatterers, rounds: what it may spend, see there.
+    Provides omega_rad_s, warp_k, its entries, and yc_m.
+
+    Args:
+        radar: Radar parameters.
+        order: Order of the warp.
+        yc_m: Range centre deviation in metres if known a priori; None estimates it.
+        scatterers: Largest number of scatterers.
+        rounds: Largest number of maximum-likelihood steps.
+
+    Raises:
+        ValueError: If the order is below 1.
     """
 
     def __init__(
@@ -70,21 +83,52 @@ class UnevenRotation(_Rotation):
         self.scatterers, self.rounds = scatterers, rounds
 
     def forward(self, signal: Signal, yc_m: Tensor | None = None) -> Estimate:
-        return uneven_rotation(signal.data, **self.told(signal, yc_m), scatterers=self.scatterers, rounds=self.rounds)
+        """Estimate the rotation from a signal of axes (pulse, range).
+
+        Args:
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            yc_m: Range centre deviation in metres known a priori, shape (...,).
+
+        Returns:
+            The estimate of `uneven_rotation`.
+        """
+        return uneven_rotation(
+            signal.data, **self.settings(signal, yc_m), scatterers=self.scatterers, rounds=self.rounds
+        )
 
 
 class CoarseRotation(_Rotation):
-    """`coarse_rotation`: k1 and k2 from sections of the aperture, without a rate."""
+    """k1 and k2 from sections of the aperture, without a rate; see `coarse_rotation`.
+
+    Args:
+        radar: Radar parameters.
+        order: Order of the warp.
+
+    Raises:
+        ValueError: If the order is below 1.
+    """
 
     def __init__(self, radar: InverseRadar, order: int = 3) -> None:
         super().__init__(radar, order, None)
 
     def forward(self, signal: Signal) -> Estimate:
-        return coarse_rotation(signal.data, **self.told(signal, None))
+        """Estimate k1 and k2 from a signal of axes (pulse, range)."""
+        return coarse_rotation(signal.data, **self.settings(signal, None))
 
 
 class PhaseFitRotation(_Rotation):
-    """`phase_fit_rotation`: coarse, then phase least squares of bright scatterers."""
+    """Non-uniform rotation by phase least squares of bright scatterers; see `phase_fit_rotation`.
+
+    Args:
+        radar: Radar parameters.
+        order: Order of the warp.
+        yc_m: Range centre deviation in metres if known a priori; None estimates it.
+        steps: Number of steps of phase least squares.
+        half_cells: Half width of the windows about scatterers in Doppler cells.
+
+    Raises:
+        ValueError: If the order is below 1.
+    """
 
     def __init__(
         self, radar: InverseRadar, order: int = 3, yc_m: float | None = None, steps: int = 4, half_cells: int = 24
@@ -93,17 +137,30 @@ class PhaseFitRotation(_Rotation):
         self.steps, self.half_cells = steps, half_cells
 
     def forward(self, signal: Signal, yc_m: Tensor | None = None) -> Estimate:
-        return phase_fit_rotation(signal.data, **self.told(signal, yc_m), steps=self.steps, half_cells=self.half_cells)
+        """Estimate the rotation from a signal of axes (pulse, range).
+
+        Args:
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            yc_m: Range centre deviation in metres known a priori, shape (...,).
+
+        Returns:
+            The estimate of `phase_fit_rotation`.
+        """
+        return phase_fit_rotation(
+            signal.data, **self.settings(signal, yc_m), steps=self.steps, half_cells=self.half_cells
+        )
 
 
 class RotationAutofocus(Stage):
-    """A phase per pulse that all scatterers share, sharpened on the image with the rotation taken
-    out; by `autofocus` where no rotation is connected yet.
+    """Phase per pulse common to all scatterers, from the image with the rotation compensated.
 
-    Connected: omega_rad_s, warp_k, yc_m, and phase_rad (..., pulse) to start from. search, polish:
-    iterations of the entropy fixed point and of the Wiener estimate. A phase that is free in every
-    pulse takes all of the range centre deviation with it: fix yc in estimators that take turns with
-    this one.
+    Provides `phase_rad`. Uses `autofocus` if no rotation is connected. A free phase per pulse
+    absorbs the range centre deviation: fix yc in estimators that alternate with this one.
+
+    Args:
+        radar: Radar parameters.
+        search: Largest number of iterations of the entropy fixed point.
+        polish: Largest number of iterations against the Wiener estimate.
     """
 
     provides = ("phase_rad",)
@@ -120,6 +177,19 @@ class RotationAutofocus(Stage):
         warp_k: Tensor | None = None,
         yc_m: Tensor | None = None,
     ) -> Estimate:
+        """Estimate `phase_rad` of a signal of axes (pulse, range).
+
+        Args:
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            phase_rad: Phase to start from in rad, shape (..., pulse).
+            omega_rad_s: Rotation rate in rad/s, shape (...,); without it the range term is not
+                compensated.
+            warp_k: Warp, shape (..., order - 1).
+            yc_m: Range centre deviation in metres, shape (...,); by default 0.
+
+        Returns:
+            The estimate of `rotating_autofocus` or `autofocus`.
+        """
         if warp_k is None:
             return autofocus(signal.data, start=phase_rad)
         prf_hz, data = 1 / signal.axis("pulse").step, signal.data
@@ -140,15 +210,30 @@ class RotationAutofocus(Stage):
 def rotating_autofocus(
     data: Tensor, prf_hz: float, warp_k: Tensor, start: Tensor | None = None, search: int = 60, polish: int = 20
 ) -> Estimate:
-    """Phase per pulse (..., pulse) of data (..., pulse, range) without its range term, judged by
-    the matched Fourier transform with warp_k (trial, order - 1).
+    """Estimate the phase per pulse that sharpens the matched Fourier transform of a known warp.
 
-    start: (..., pulse) rad, by default that of adjacent pulses. quality: by which share the cells
-    that the image fills fall; ok: they do not grow.
+    Args:
+        data: Range-compressed pulses without their range term, shape (..., pulse, range), complex.
+        prf_hz: Pulse repetition frequency in Hz.
+        warp_k: Warp, shape (trial, order - 1).
+        start: Phase to start from in rad, shape (..., pulse); by default that of adjacent pulses.
+        search: Largest number of iterations of the entropy fixed point.
+        polish: Largest number of iterations against the Wiener estimate.
+
+    Returns:
+        `phase_rad` of shape (..., pulse), to be removed. quality is the share by which the number
+        of cells that the image fills, exp(entropy), falls. `ok` is False where it grows.
+
+    Raises:
+        TypeError: If the data are not complex or the start is not a tensor.
+        ValueError: If the data are empty or not finite, or the start does not have one phase per
+            pulse.
     """
     pulses = prepare(data, "rotating_autofocus")
     through = Through(
-        MatchedFourierOperator(warp_k, pulses.n, prf_hz, dtype=data.dtype, oversampling=1.0, eps=SEARCH_EPS)
+        MatchedFourierOperator(
+            warp_k, pulses.n, prf_hz, dtype=data.dtype, lines=DopplerLines(1.0), transform=Gridding(eps=SEARCH_EPS)
+        )
     )
     begin = starting_phase(start, pulses, "rotating_autofocus")
     begin = pair_phase(pulses.rows, pulses.present) if begin is None else begin

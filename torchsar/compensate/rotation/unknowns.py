@@ -1,4 +1,4 @@
-"""Which numbers a search for the rotation moves, and what rotation they stand for."""
+"""The unknowns of a search for the rotation, and the rotation that they describe."""
 
 from __future__ import annotations
 
@@ -14,13 +14,19 @@ from torchsar.core.warp import k_of_shape, least_rate, shape_of, warp
 
 Variables = Literal["raw", "shape"]
 
-# slope of the warp at the first pulse over its mean one, below which the shape has no k
+# slope of the warp at the first pulse over its mean slope below which k would be infinite: k is
+# relative to the rate at the first pulse
 _LEAST_START = 1e-6
 
 
-class Turn(NamedTuple):
-    """A rotation per trial: omega_rad_s (...,), warp_k (..., order - 1), yc_m (...,), and whether
-    its warp grows all the time; where not, k is 0.
+class RotationParameters(NamedTuple):
+    """A rotation per trial.
+
+    Args:
+        omega_rad_s: Rotation rate at the first pulse in rad/s, shape (...,).
+        warp_k: Warp, shape (..., order - 1); 0 where the rotation is not feasible.
+        yc_m: Range centre deviation in metres, shape (...,).
+        feasible: True where the warp grows at all times, shape (...,), bool.
     """
 
     omega_rad_s: Tensor
@@ -31,14 +37,24 @@ class Turn(NamedTuple):
 
 @dataclass(frozen=True)
 class Unknowns:
-    """The vector (..., n) that is searched, in this order, over an aperture of duration_s.
+    """The vector of unknowns (..., n) of a search over an aperture.
 
-    "raw": omega (rad/s), k1, k2, ... (1/s, 1/s^2, ...), yc (m). "shape": the total angle A = omega
-    * phi(T) (rad), the Legendre shape q2, q3, ... of the warp (`torchsar.core.warp.shape_of`), yc
-    (m): errors of k1 and k2 pull against each other (dk1 about -T/2 dk2), those of q2 and q3 do
-    not. order: of the warp, 1 being even rotation. range_term: whether the range-dependent phase is
-    compensated; without it omega and yc leave no trace in the entropy and are no unknowns. yc:
-    whether the centre deviation is searched, else it is known.
+    In the variables "raw" it is omega (rad/s), k1, k2, ... (1/s, 1/s^2, ...), yc (m). In the
+    variables "shape" it is the total angle A = omega * phi(T) (rad), the Legendre shape q2, q3, ...
+    of the warp (`torchsar.core.warp.shape_of`), yc (m). Errors of k1 and k2 are correlated (dk1 is
+    about -T/2 dk2); those of q2 and q3 are not.
+
+    Args:
+        duration_s: Duration of the aperture in seconds.
+        order: Order of the warp; 1 is uniform rotation.
+        range_term: Whether the range-dependent phase is compensated. Without it, omega and yc do
+            not affect the entropy and are not unknowns.
+        yc: Whether the range centre deviation is an unknown; otherwise it is known a priori.
+        variables: "raw" or "shape".
+
+    Raises:
+        ValueError: If there is nothing to search for, `yc` is an unknown without the range term, or
+            the variables are unknown.
     """
 
     duration_s: float
@@ -57,7 +73,7 @@ class Unknowns:
             )
         if self.yc and not self.range_term:
             raise ValueError(
-                "the centre deviation shows in the range term alone; leave yc known, or compensate the range term"
+                "the centre deviation appears in the range term alone; give a known yc, or compensate the range term"
             )
         if self.variables not in ("raw", "shape"):
             raise ValueError(f"variables {self.variables!r} are not known; choose 'raw' or 'shape'")
@@ -73,35 +89,61 @@ class Unknowns:
             *(("yc_m",) if self.yc else ()),
         )
 
-    def turn(self, x: Tensor, yc_m: Tensor) -> Turn:
-        """The rotation that x (..., n) stands for, with the known yc_m (...,) where it is no
-        unknown. Differentiable where feasible.
+    def turn(self, x: Tensor, yc_m: Tensor) -> RotationParameters:
+        """Convert unknowns to the rotation that they describe.
+
+        Differentiable where feasible.
+
+        Args:
+            x: Unknowns, shape (..., n).
+            yc_m: Range centre deviation in metres, shape (...,), used if it is not an unknown.
+
+        Returns:
+            The rotation.
         """
         size, k, yc = self._parts(x, yc_m)
         finite = torch.isfinite(x).all(-1)
         k = torch.where(finite[..., None], k, 0)
         if self.variables == "shape":
-            starts = _starts(k)
-            finite, k = finite & starts, k_of_shape(torch.where(starts[..., None], k, 0), self.duration_s)
+            grows = _grows_at_start(k)
+            finite, k = finite & grows, k_of_shape(torch.where(grows[..., None], k, 0), self.duration_s)
         feasible = finite & (least_rate(k, self.duration_s) > 0)
         k = torch.where(feasible[..., None], k, 0)
         size = torch.where(feasible, size, 0)
-        return Turn(
+        return RotationParameters(
             size / self._phi(k) if self.variables == "shape" else size, k, torch.where(feasible, yc, 0), feasible
         )
 
     def at(self, omega_rad_s: Tensor, warp_k: Tensor, yc_m: Tensor) -> Tensor:
-        """The vector (..., n) of a rotation. Inverse of `turn`."""
+        """Convert a rotation to unknowns; the inverse of `turn`.
+
+        Args:
+            omega_rad_s: Rotation rate in rad/s, shape (...,).
+            warp_k: Warp, shape (..., order - 1).
+            yc_m: Range centre deviation in metres, shape (...,).
+
+        Returns:
+            The unknowns, shape (..., n).
+        """
         size = omega_rad_s * self._phi(warp_k) if self.variables == "shape" else omega_rad_s
         k = shape_of(warp_k, self.duration_s) if self.variables == "shape" else warp_k
         columns = [*((size,) if self.range_term else ()), *k.unbind(-1), *((yc_m,) if self.yc else ())]
         return torch.stack(torch.broadcast_tensors(*columns), -1)
 
     def units(self, x: Tensor, wavelength_m: float, extent_m: float, n_pulse: int) -> Tensor:
-        """Steps (..., n) that bend the phase of an outer scatterer by about a radian, for a target
-        as wide as the pulse rate carries and extent_m deep.
+        """Compute steps that change the phase of an outer scatterer by about a radian.
 
-        Of omega or A at most its size in x (..., n); of yc at most the extent.
+        The target is assumed to be as wide as the pulse rate allows. Steps of omega or A are at
+        most its size in x, those of yc at most the depth.
+
+        Args:
+            x: Unknowns, shape (..., n).
+            wavelength_m: Wavelength in metres.
+            extent_m: Depth of the target in metres.
+            n_pulse: Number of pulses.
+
+        Returns:
+            The steps, shape (..., n).
         """
         bend = 4 / n_pulse
         parts = [self._k_unit(i) * bend if self.variables == "raw" else bend for i in range(1, self.order)]
@@ -120,9 +162,17 @@ class Unknowns:
         return math.factorial(2 * i + 2) / (2 * math.factorial(i + 1) * self.duration_s**i)
 
     def vector(self, values: Sequence[float] | Tensor, what: str) -> Tensor:
-        """Numbers, one per unknown, as float64 (..., n).
+        """Convert numbers, one per unknown, to a vector.
 
-        Raises ValueError naming the unknowns where their count differs.
+        Args:
+            values: The numbers, shape (..., n).
+            what: Name of the argument for the error message.
+
+        Returns:
+            The vector, shape (..., n), float64.
+
+        Raises:
+            ValueError: If there is not one value per unknown.
         """
         x = torch.as_tensor(values, dtype=torch.float64)
         if x.ndim == 0 or x.shape[-1] != len(self.names):
@@ -132,6 +182,7 @@ class Unknowns:
         return x
 
     def _parts(self, x: Tensor, yc_m: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Rate or angle, warp or shape, and range centre deviation of the unknowns."""
         first = 1 if self.range_term else 0
         size = x[..., 0] if self.range_term else torch.zeros_like(x[..., 0])
         return size, x[..., first : first + self.order - 1], x[..., -1] if self.yc else yc_m.expand(x.shape[:-1])
@@ -142,13 +193,21 @@ class Unknowns:
 
 
 def k_name(i: int) -> str:
-    """Name of k_i with its unit: k1_per_s, k2_per_s2, ..."""
+    """Name k_i with its unit: k1_per_s, k2_per_s2, and so on.
+
+    Args:
+        i: Number of the term, from 1.
+
+    Returns:
+        The name.
+    """
     return f"k{i}_per_s{i if i > 1 else ''}"
 
 
-def _starts(shape: Tensor) -> Tensor:
-    """Whether the warp of a shape (..., order - 1) grows at the first pulse: 1 + sum q_j P_j'(-1) >
-    0, P_j'(-1) = -(-1)^j j (j + 1) / 2.
+def _grows_at_start(shape: Tensor) -> Tensor:
+    """Whether the warp of a shape (..., order - 1) grows at the first pulse.
+
+    The condition is 1 + sum q_j P_j'(-1) > 0, with P_j'(-1) = -(-1)^j j (j + 1) / 2.
     """
     j = torch.arange(2, shape.shape[-1] + 2, dtype=shape.dtype, device=shape.device)
     slope = torch.where(j.remainder(2) == 0, -0.5, 0.5) * j * (j + 1)

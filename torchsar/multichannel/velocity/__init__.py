@@ -1,4 +1,4 @@
-"""Velocity and place of moving points before several channels along track."""
+"""Velocity and position estimation of moving points with several channels along track."""
 
 from torchsar.multichannel.velocity.along_track import along_track_velocity
 from torchsar.multichannel.velocity.aperture import Dwell, ElementBeam

@@ -1,8 +1,11 @@
-"""Along-track velocity of a moving point by the power of its deramped tone: autofocus for one known
-phase history, no reconstruction needed.
+"""Along-track velocity of a moving point by the power of its deramped tone.
 
-Source: brief 001, Velocity (u_a): tone power over a grid, coarse to fine. It never inverts a band
-matrix, so that speeds at which channels sample the same places do it no harm.
+This is azimuth autofocus with a known form of the phase history. It inverts no band matrix, so that
+it also works at speeds at which the channels sample the same positions.
+
+Reference:
+    Remote Sens. 2020, 12, 1703, section 4.2, which prescribes autofocus for this velocity
+    component.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from torchsar.multichannel.velocity.interferometry import DETECTED_DB
 from torchsar.multichannel.velocity.model import energy_ratio_db, point_phasor
 from torchsar.radar import BistaticRadar
 
-_TINY = torch.finfo(torch.float64).tiny
+_TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
 
 
 def along_track_velocity(
@@ -33,21 +36,35 @@ def along_track_velocity(
     step_m_s: float = 0.5,
     fine: int = 3,
 ) -> Estimate:
-    """u_a within +-half_m_s of the start, u_r and y0 being those of the start.
+    """Estimate the along-track speed u_a, with u_r and y0 as in the start.
 
-    data: complex (..., channel, pulse), transmit range removed.
+    A grid of step_m_s is followed by `fine` grids of five points, each a fifth as wide, and by a
+    parabola. The curvature of the phase is what is measured: an acceleration along the line of
+    sight has the same effect (0.05 m/s^2 as 0.42 m/s in the geometry of the paper).
 
-    A grid of step_m_s, then `fine` grids of five, each a fifth as wide, and a parabola. std: from
-    the curvature of the likelihood of the tone. ok: not at the end of the search, and the tone
-    stands above the threshold. What is measured is the curvature of the phase: an acceleration
-    along the line of sight looks the same (brief 001: 0.05 m/s^2 as 0.42 m/s).
+    Args:
+        data: Channels without the transmit range, shape (..., channel, pulse), complex.
+        radar: Instrument.
+        start: Motion about which u_a is searched, shape (...,).
+        aperture: Expected amplitude over slow time.
+        half_m_s: Half width of the search in m/s.
+        step_m_s: Step of the first grid in m/s.
+        fine: Number of finer grids.
+
+    Returns:
+        `u_a_m_s` of shape (...,), positive in the direction of the receiver, with its standard
+        deviation from the curvature of the likelihood. `info` holds `snr_db` and `at_the_end`. `ok`
+        is False where the tone has less than 19 dB over all samples, or the maximum lies at an end
+        of the search.
+
+    Raises:
+        ValueError: If `half_m_s` is not positive, or the search reaches the speed of the receiver.
     """
     if not half_m_s > 0:
         raise ValueError(
-            f"half_m_s of a search along track must be positive, got {half_m_s}; where u_a is "
-            "known there is nothing to search"
+            f"half_m_s of a search along track must be positive, got {half_m_s}; omit the estimator where u_a is known"
         )
-    # refuses a search up to the receiver's speed
+    # raises ValueError for a search up to the speed of the receiver
     PointMotion.of(radar, data, 0.0, start.u_a_m_s + half_m_s)
     data = data.to(torch.complex128)
     centre = start.u_a_m_s.expand(data.shape[:-2])
@@ -67,13 +84,11 @@ def along_track_velocity(
             step * torch.arange(-2, 3, dtype=torch.float64, device=data.device),
         )
     found = torch.where(top.energy > 0, top.u_a_m_s.clamp(centre - half_m_s, centre + half_m_s), centre)
-    return _judged(data, radar, replace(start, u_a_m_s=found), aperture, top.energy, top.curvature, ended)
+    return _estimate_at(data, radar, replace(start, u_a_m_s=found), aperture, top.energy, top.curvature, ended)
 
 
 class _Top(NamedTuple):
-    """Of tone energies over a grid, per trial: where they peak, how high, how sharply, and whether
-    that is an end of the grid.
-    """
+    """Maximum of tone energies over a grid: position, height, curvature, end of grid."""
 
     u_a_m_s: Tensor
     energy: Tensor
@@ -84,24 +99,32 @@ class _Top(NamedTuple):
 def _best(
     data: Tensor, radar: BistaticRadar, start: PointMotion, aperture: Aperture, centre: Tensor, offsets: Tensor
 ) -> _Top:
-    """By the greatest of the grid centre + offsets (even steps) and a parabola through its
-    neighbours.
-    """
+    """Find the maximum over the grid centre + offsets, refined by a parabola."""
     power = torch.stack(
         [tone_power(data, radar, replace(start, u_a_m_s=centre + offset), aperture) for offset in offsets]
     )
     at, step = power.argmax(0), offsets[1] - offsets[0]
     inner = at.clamp(1, len(offsets) - 2)
     low, middle, high = (power.gather(0, (inner + shift)[None])[0] for shift in (-1, 0, 1))
-    bend = (low - 2 * middle + high).clamp_max(-_TINY)
+    curvature = (low - 2 * middle + high).clamp_max(-_TINY)
     edge = at != inner
-    peak = offsets[inner] + step * (0.5 * (low - high) / bend).clamp(-1, 1)
-    return _Top(centre + torch.where(edge, offsets[at], peak), middle, -bend / step.square(), edge)
+    peak = offsets[inner] + step * (0.5 * (low - high) / curvature).clamp(-1, 1)
+    return _Top(centre + torch.where(edge, offsets[at], peak), middle, -curvature / step.square(), edge)
 
 
 def tone_power(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture) -> Tensor:
-    """Greatest energy of a tone in the deramped data, summed over channels, (...,): energy of the
-    point where the curvature is right.
+    """Return the greatest energy of a tone in the deramped data, summed over channels.
+
+    It equals the energy of the point where the curvature of the phase is right.
+
+    Args:
+        data: Channels, shape (..., channel, pulse), complex.
+        radar: Instrument.
+        motion: Motion of the point, shape (...,).
+        aperture: Expected amplitude over slow time.
+
+    Returns:
+        Energy, shape (...,).
     """
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
     weight = aperture.weight(radar, motion, time_s)
@@ -110,22 +133,25 @@ def tone_power(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture
     return spectrum.amax(-1) / weight.square().sum(-1).clamp_min(_TINY)
 
 
-def _judged(
+def _estimate_at(
     data: Tensor,
     radar: BistaticRadar,
     motion: PointMotion,
     aperture: Aperture,
     energy: Tensor,
-    bend: Tensor,
+    curvature: Tensor,
     ended: Tensor,
 ) -> Estimate:
+    """Form the estimate at the maximum and judge it."""
     weight = aperture.weight(radar, motion, radar.pulse_axis(data.shape[-1]).values(data.device))[..., None, :]
-    shines = (weight != 0).expand(data.shape)
-    noise = ((data.abs().square() * shines).sum((-2, -1)) - energy).clamp_min(0) / shines.sum((-2, -1)).clamp_min(1)
+    illuminated = (weight != 0).expand(data.shape)
+    noise = ((data.abs().square() * illuminated).sum((-2, -1)) - energy).clamp_min(0) / illuminated.sum(
+        (-2, -1)
+    ).clamp_min(1)
     snr = energy_ratio_db(energy, noise)
     value = {"u_a_m_s": motion.u_a_m_s}
     ok = (snr >= DETECTED_DB) & ~ended
-    std = torch.where(energy > 0, torch.sqrt(noise / bend.clamp_min(_TINY)), torch.inf)
+    std = torch.where(energy > 0, torch.sqrt(noise / curvature.clamp_min(_TINY)), torch.inf)
     return Estimate(
         value, torch.sigmoid((snr - DETECTED_DB) / 3), ok, {"u_a_m_s": std}, {"snr_db": snr, "at_the_end": ended}
     )
@@ -134,7 +160,19 @@ def _judged(
 def motion_from(
     radar: BistaticRadar, data: Tensor, u_r_m_s: Number, u_a_m_s: Number, y0_m: Number, range_m: Number | None
 ) -> PointMotion:
-    """A motion of the data's trials from values that a chain may connect."""
+    """Return the motion of each trial of the data from values given to a stage.
+
+    Args:
+        radar: Instrument.
+        data: Channels, shape (..., channel, pulse).
+        u_r_m_s: Slant-range speed in m/s, closing positive.
+        u_a_m_s: Along-track speed in m/s.
+        y0_m: Along-track position at t = 0 in metres.
+        range_m: Closest range in metres, None for the reference range of the radar.
+
+    Raises:
+        ValueError: If the motion is impossible, see `PointMotion.of`.
+    """
     return PointMotion.of(radar, data, u_r_m_s, u_a_m_s, y0_m, range_m).each(
         lambda value: value.expand(data.shape[:-2])
     )

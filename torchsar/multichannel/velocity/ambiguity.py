@@ -1,5 +1,7 @@
-"""Whether a velocity that is known modulo lambda PRF lies whole pulse rates off: judged by the
-cubic phase of the range history, which neither Doppler nor channels show.
+"""Detection of Doppler ambiguities by the cubic phase of the range history.
+
+The channels measure the slant-range velocity modulo lambda PRF. Neither the Doppler frequency nor
+the phases across the channels show the ambiguity number, but the cubic phase does.
 """
 
 from __future__ import annotations
@@ -16,25 +18,40 @@ from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.bank import tone_energy
 from torchsar.radar import BistaticRadar
 
-_AROUND_M_S, _STEP_M_S, _REACH_M = 22.0, 0.5, 150.0
-_CLEARLY = 1.3
-_FASTEST = 0.9  # of the receiver: fits that failed may end anywhere
+# Half width of the search in u_a: an assumed u_a may be wrong by the usual bounds of +-20 m/s.
+_U_A_HALF_M_S = 22.0
+# Step of the search in u_a and reach in y0, as in the defaults of `Search`.
+_U_A_STEP_M_S, _REACH_M = 0.5, 150.0
+# Found by trial at -14 to 20 dB per sample: the right number explains 2.6 to 5.3 times as much
+# energy as a wrong one that was assumed, other numbers at most 1.07 times as much.
+_ENERGY_RATIO = 1.3
+# Largest u_a tried, relative to the speed of the receiver: a failed fit may end at any speed.
+_FASTEST = 0.9
 
 
 def better_pulse_rate(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture) -> Tensor:
-    """How many pulse rates (..., whole, -1..1) must be added to the Doppler of a fitted motion to
-    explain clearly more of data (..., channel, pulse); 0 where it is right as it is.
+    """Return the ambiguity number that explains clearly more of the data than a fitted motion.
 
-    One pulse rate is lambda PRF of slant-range velocity. Each alternative has the direction that
-    the channels measured, and the best along-track speed within 22 m/s of the one that keeps the
-    curvature of the phase: what an estimator was told of it may be wrong.
+    One PRF corresponds to lambda PRF of slant-range velocity. Each alternative has the look angle
+    measured by the channels, and the best along-track speed within 22 m/s of the one that keeps the
+    curvature of the phase, since the along-track speed that an estimator assumed may be wrong.
+
+    Args:
+        data: Channels, shape (..., channel, pulse), complex.
+        radar: Instrument.
+        motion: Fitted motion, shape (...,).
+        aperture: Expected amplitude over slow time.
+
+    Returns:
+        Number of PRFs to add to the Doppler, -1, 0 or 1, float64 (...,); 0 where the motion is
+        right.
     """
     begin = motion.each(lambda value: value.expand(data.shape[:-2])[..., None])
     offsets = torch.arange(
-        -_AROUND_M_S, _AROUND_M_S + _STEP_M_S / 2, _STEP_M_S, dtype=torch.float64, device=data.device
+        -_U_A_HALF_M_S, _U_A_HALF_M_S + _U_A_STEP_M_S / 2, _U_A_STEP_M_S, dtype=torch.float64, device=data.device
     )
     level = data.abs().amax((-2, -1), keepdim=True)
-    # its squares must fit into single precision
+    # scaled so that squares fit into single precision
     data, energies = data / torch.where(level > 0, level, 1.0), []
     for number in (-1, 0, 1):
         u_r = begin.u_r_m_s + number * radar.ambiguous_velocity_m_s
@@ -49,24 +66,33 @@ def better_pulse_rate(data: Tensor, radar: BistaticRadar, motion: PointMotion, a
             )
         )
     energy = torch.stack(energies)
-    return torch.where(energy.amax(0) > _CLEARLY * energy[1], energy.argmax(0) - 1, 0).to(torch.float64)
+    return torch.where(energy.amax(0) > _ENERGY_RATIO * energy[1], energy.argmax(0) - 1, 0).to(torch.float64)
 
 
 def warned_of_ambiguity(
     estimate: Estimate, data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture
 ) -> Estimate:
-    """The estimate with `pulse_rates` in its info, not ok where they are not zero; warns if there
-    are such trials.
+    """Add the ambiguity number to an estimate and warn where it is not zero.
+
+    Args:
+        estimate: Estimate of the velocity.
+        data: Channels, shape (..., channel, pulse), complex.
+        radar: Instrument.
+        motion: Fitted motion, shape (...,).
+        aperture: Expected amplitude over slow time.
+
+    Returns:
+        The estimate with `pulse_rates` in its info; `ok` is False where it is not zero.
     """
     off = better_pulse_rate(data, radar, motion, aperture)
     wrong = (off != 0) & estimate.ok
     if bool(wrong.any()):
         span, count = radar.ambiguous_velocity_m_s, f"{int(wrong.sum())} of {wrong.numel()} trials"
         what = (
-            f"in {count} the slant-range velocity is whole pulse rates, {span:.4g} m/s each, off: "
-            f"values here are known modulo {span:.4g} m/s alone"
+            f"in {count} the slant-range velocity is off by whole pulse rates (multiples of "
+            f"{span:.4g} m/s), which this estimator cannot resolve"
         )
         warnings.warn(
-            f"{what}; search farther (MovingPointVelocity), or resolve the range walk (WalkAmbiguity)", stacklevel=4
+            f"{what}; use a wider search (MovingPointVelocity), or the range walk (WalkAmbiguity)", stacklevel=4
         )
     return replace(estimate, ok=estimate.ok & (off == 0), info={**estimate.info, "pulse_rates": off})

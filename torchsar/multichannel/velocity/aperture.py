@@ -1,6 +1,4 @@
-"""Which pulses of a moving point count, and how much: the amplitude that its echo is expected to
-have over slow time.
-"""
+"""Expected amplitude of the echo of a moving point over slow time."""
 
 from __future__ import annotations
 
@@ -15,18 +13,34 @@ from torchsar.radar import BistaticRadar
 
 
 class Aperture(Protocol):
-    """Expected amplitude (..., pulse) of a point over slow time (pulse,), about the time at which
-    it is abeam.
-    """
+    """Expected amplitude of a point over slow time, about the time at which it is abeam."""
 
-    def weight(self, radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor: ...
+    def weight(self, radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
+        """Return the expected amplitude.
+
+        Args:
+            radar: Instrument.
+            motion: Motion of the point, shape (...,).
+            time_s: Slow time in seconds, float64 (pulse,).
+
+        Returns:
+            Amplitude, float64 (..., pulse).
+        """
+        ...
 
 
 @dataclass(frozen=True)
 class Dwell:
-    """Equal amplitude for duration_s about the time abeam, none beyond.
+    """Equal amplitude for a duration about the time abeam, zero outside.
 
-    How its edges move with the place is never used to find the place.
+    The edges depend on the position of the point, but estimators do not use them to find that
+    position.
+
+    Args:
+        duration_s: Duration in seconds.
+
+    Raises:
+        ValueError: If the duration is not positive and finite.
     """
 
     duration_s: float
@@ -34,26 +48,30 @@ class Dwell:
     def __post_init__(self) -> None:
         if not 0 < self.duration_s < float("inf"):
             raise ValueError(
-                f"an aperture needs a positive, finite duration_s, got {self.duration_s}; ElementBeam() has no ends"
+                f"an aperture needs a positive, finite duration_s, got {self.duration_s}; ElementBeam() is unlimited"
             )
 
     def weight(self, radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
+        """Return 1 within the duration and 0 outside, see `Aperture.weight`."""
         since = time_s - _abeam_s(motion)[..., None]
         return (since.abs() < self.duration_s / 2).to(torch.float64)
 
 
 @dataclass(frozen=True)
 class ElementBeam:
-    """The one-way pattern of a channel's aperture, sinc(element sin(look) / lambda), side lobes and
-    their signs included.
+    """One-way pattern of the aperture of a channel, sinc(element sin(look) / lambda).
+
+    Side lobes and their signs are included.
     """
 
     def weight(self, radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
+        """Return the amplitude pattern, see `Aperture.weight`; not differentiable in the motion."""
         along = motion.along_m_s.detach()[..., None] * time_s - motion.y0_m.detach()[..., None]
         across = motion.range_m.detach()[..., None] - motion.u_r_m_s.detach()[..., None] * time_s
-        place = radar.element_m * along / torch.sqrt(along.square() + across.square()) / radar.wavelength_m
-        return torch.sinc(place)
+        turns = radar.element_m * along / torch.sqrt(along.square() + across.square()) / radar.wavelength_m
+        return torch.sinc(turns)
 
 
 def _abeam_s(motion: PointMotion) -> Tensor:
+    """Return the time at which a point is abeam in seconds."""
     return (motion.y0_m / motion.along_m_s).detach()

@@ -1,6 +1,4 @@
-"""The likelihood of a moving point as a differentiable objective, and its maximum by a descent on
-gradients of autograd.
-"""
+"""Likelihood of a moving point as a differentiable objective, and its maximum by gradients."""
 
 from __future__ import annotations
 
@@ -16,15 +14,24 @@ from torchsar.multichannel.velocity.model import UNKNOWNS, estimate_of, moved, p
 from torchsar.optim import lbfgs
 from torchsar.radar import BistaticRadar
 
-_TINY = torch.finfo(torch.float64).tiny
+_TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
 
 
 def explained_energy(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: Tensor) -> Tensor:
-    """Energy of data (..., channel, pulse) that a point of this motion explains with its best
-    complex amplitude, (...,): the log-likelihood but for constants.
+    """Return the energy of the data that a point explains with its best complex amplitude.
 
-    weight: expected amplitude (..., pulse), `aperture.weight(...)` at the start of a search: where
-    it ends must say nothing about the place. Differentiable in data and motion.
+    Up to constants this is the log-likelihood. Differentiable in data and motion.
+
+    Args:
+        data: Channels, shape (..., channel, pulse), complex.
+        radar: Instrument.
+        motion: Motion of the point, shape (...,).
+        weight: Expected amplitude, shape (..., pulse): `aperture.weight(...)` at the start of a
+            search and fixed from then on, so that the ends of the aperture do not determine the
+            position.
+
+    Returns:
+        Energy, shape (...,).
     """
     time_s, weight = radar.pulse_axis(data.shape[-1]).values(data.device), weight[..., None, :]
     total = weight.square().expand(data.shape).sum((-2, -1)).clamp_min(_TINY)
@@ -41,12 +48,29 @@ def gradient_likelihood(
     unknowns: tuple[str, ...] = UNKNOWNS,
     steps: int = 60,
 ) -> Estimate:
-    """Maximum likelihood near `start` by limited-memory BFGS: the check of `maximum_likelihood`,
-    and the pattern for objectives of your own. Arguments as there.
+    """Maximise the likelihood near `start` by limited-memory BFGS on autograd gradients.
+
+    This checks `maximum_likelihood`, which is faster, and is the pattern for other objectives.
+
+    Args:
+        data: Channels without the transmit range, shape (..., channel, pulse), complex.
+        radar: Instrument.
+        start: Starting motion, shape (...,), as close as for `maximum_likelihood`.
+        aperture: Expected amplitude over slow time.
+        unknowns: Names of the parameters to estimate among `u_r_m_s`, `u_a_m_s`, `y0_m`.
+        steps: Largest number of steps.
+
+    Returns:
+        `u_r_m_s`, `u_a_m_s`, `y0_m` of shape (...,) with standard deviations of the unknowns.
+        `info` holds `snr_db`, `noise_power` and `converged`. `ok` is False where the search failed
+        or the point has less than 19 dB over all samples.
+
+    Raises:
+        ValueError: If `unknowns` holds other names or a name twice.
     """
     energy = data.abs().to(torch.float64).square().sum((-2, -1)).clamp_min(_TINY)
     at_start = maximum_likelihood(data, radar, start, aperture, unknowns, steps=0)
-    # unknowns are nearly alike in their phases: in units of their deviations the objective is round
+    # the phases of the unknowns are nearly alike: in whitened units the objective is isotropic
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
     weight = aperture.weight(radar, at_start.motion, time_s)
     echo = weight[..., None, :] * point_phasor(radar, at_start.motion, time_s, torch.complex128)

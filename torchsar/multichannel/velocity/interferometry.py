@@ -1,8 +1,8 @@
-"""Along-track interferometry: slant-range velocity from the Doppler of a deramped point, corrected
-by the direction that the phase across the channels gives.
+"""Along-track interferometry: slant-range velocity from the Doppler of a deramped point.
 
-Source: brief 001, Velocity (ATI): a tone F and a phase slope -2 pi dx dy / (lambda R0) over the
-channels' places; u_r <- u_r + lambda F - v dy / R0, y0 <- y0 + dy.
+The Doppler is corrected by the look angle, which the phases across the channels measure. A residual
+tone F and a phase slope -2 pi dx dy / (lambda R0) over the channel positions give the update u_r <-
+u_r + lambda F - v dy / R0, y0 <- y0 + dy.
 """
 
 from __future__ import annotations
@@ -20,45 +20,60 @@ from torchsar.multichannel.velocity.aperture import Aperture
 from torchsar.multichannel.velocity.model import Found, covariance_of, estimate_of, phase_slopes, point_phasor
 from torchsar.radar import BistaticRadar
 
+# Zero padding: the parabola then errs by at most 0.004 of a Doppler cell, without padding by 0.23.
 _PAD = 4
-_TINY = torch.finfo(torch.float64).tiny
+_TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
+# Detection threshold over all samples, -15 dB per sample with three channels and 810 pulses: below
+# it the strongest tone is often one of noise.
 DETECTED_DB = 19.0
 
 
 def interferometry(
     data: Tensor, radar: BistaticRadar, start: PointMotion, aperture: Aperture, passes: int = 4
 ) -> Estimate:
-    """u_r and y0 of one point per trial; u_a stays that of the start.
+    """Estimate u_r and y0 of one point per trial by along-track interferometry.
 
-    data: complex (..., channel, pulse), transmit range removed.
+    The first pass uses all pulses, later ones the aperture about the position found. u_r is
+    measured modulo lambda PRF and returned within half of that about the start. u_a is that of the
+    start.
 
-    The first pass takes all pulses, later ones the aperture about the place found. u_r is known
-    modulo lambda PRF and comes within half of that about the start. ok: the tone stands above the
-    threshold of 19 dB over all samples (brief 001). std: of the estimator's own phases, from the
-    noise that is left. Raises ValueError for one channel.
+    Args:
+        data: Channels without the transmit range, shape (..., channel, pulse), complex.
+        radar: Instrument with at least two channels.
+        start: Starting motion, shape (...,).
+        aperture: Expected amplitude over slow time.
+        passes: Number of passes.
+
+    Returns:
+        `u_r_m_s` (closing positive), `u_a_m_s` and `y0_m` of shape (...,). Standard deviations of
+        u_r and y0 follow from the residual noise. `info` holds `snr_db` and `noise_power`. `ok` is
+        False where the tone has less than 19 dB over all samples.
+
+    Raises:
+        ValueError: If the radar has a single channel.
     """
     if radar.channels < 2:
         raise ValueError(
-            "interferometry needs two channels or more: one channel cannot tell a place from a "
-            "velocity; use the reconstruction with velocities that are told"
+            "interferometry needs two channels or more, got 1: one channel cannot separate position and "
+            "velocity; give the velocities to the reconstruction instead"
         )
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
     motion, data = start, data.to(torch.complex128)
     for number in range(passes):
         weight = torch.ones_like(time_s) if number == 0 else aperture.weight(radar, motion, time_s)
         motion = _improved(data, radar, motion, weight, time_s)
-    found = _judged(data, radar, motion, aperture.weight(radar, motion, time_s), time_s)
+    found = _fit_at(data, radar, motion, aperture.weight(radar, motion, time_s), time_s)
     snr = found.snr_db
     return estimate_of(found, snr >= DETECTED_DB, _quality(snr))
 
 
 def _quality(snr_db: Tensor) -> Tensor:
-    """0..1: half at the threshold."""
+    """Map the SNR to 0..1, with one half at the threshold."""
     return torch.sigmoid((snr_db - DETECTED_DB) / 3)
 
 
 def _improved(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: Tensor, time_s: Tensor) -> PointMotion:
-    """One pass: tone, phase slope, and the motion that they mean."""
+    """Take one pass: estimate tone and phase slope, and update the motion."""
     deramped = data * point_phasor(radar, motion, time_s, data.dtype).conj() * weight[..., None, :]
     tone_hz = tone_frequency(deramped, radar.prf_hz)
     turn = torch.exp(-2j * math.pi * tone_hz[..., None] * time_s)
@@ -70,8 +85,16 @@ def _improved(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: T
 
 
 def tone_frequency(tones: Tensor, rate_hz: float) -> Tensor:
-    """Frequency (Hz) at which the power summed over channels is greatest, (..., channel, sample) ->
-    (...,): padded FFT and a parabola.
+    """Estimate the frequency of a tone whose power is summed over channels.
+
+    A zero-padded FFT is followed by a parabola through its maximum.
+
+    Args:
+        tones: Samples, shape (..., channel, sample), complex.
+        rate_hz: Sampling rate in Hz.
+
+    Returns:
+        Frequency in Hz within +-rate / 2, shape (...,).
     """
     n = tones.shape[-1]
     length = smooth_length(_PAD * n)
@@ -80,45 +103,45 @@ def tone_frequency(tones: Tensor, rate_hz: float) -> Tensor:
     low, middle, high = (power.gather(-1, (at + shift) % length)[..., 0] for shift in (-1, 0, 1))
     bend = (low - 2 * middle + high).clamp_max(-_TINY)
     fine = (0.5 * (low - high) / bend).clamp(-0.5, 0.5)
-    place = at[..., 0] + fine
-    return torch.remainder(place + length / 2, length).sub(length / 2) * (rate_hz / length)
+    position = at[..., 0] + fine
+    return torch.remainder(position + length / 2, length).sub(length / 2) * (rate_hz / length)
 
 
-def _slope(values: Tensor, place_m: Tensor) -> Tensor:
-    """Phase slope (rad/m) of complex values (..., channel) over their places, by the phases of
-    neighbours in place, weighted by power and spacing.
-    """
-    order = place_m.argsort()
-    values, place_m = values[..., order], place_m[order]
+def _slope(values: Tensor, position_m: Tensor) -> Tensor:
+    """Return the phase slope in rad/m of values (..., channel) over the channel positions."""
+    order = position_m.argsort()
+    values, position_m = values[..., order], position_m[order]
     step = values[..., 1:] * values[..., :-1].conj()
-    first = torch.angle((step / place_m.diff()).sum(-1)) if len(set(place_m.diff().tolist())) == 1 else None
+    first = torch.angle((step / position_m.diff()).sum(-1)) if len(set(position_m.diff().tolist())) == 1 else None
     if first is not None:
-        rough = first / place_m.diff()[0]
+        rough = first / position_m.diff()[0]
     else:
-        weight = step.abs() * place_m.diff()
-        rough = (torch.angle(step) * weight).sum(-1) / (weight * place_m.diff()).sum(-1).clamp_min(_TINY)
-    return rough + _straight(values * torch.exp(-1j * rough[..., None] * place_m), place_m)
+        weight = step.abs() * position_m.diff()
+        rough = (torch.angle(step) * weight).sum(-1) / (weight * position_m.diff()).sum(-1).clamp_min(_TINY)
+    return rough + _straight(values * torch.exp(-1j * rough[..., None] * position_m), position_m)
 
 
-def _straight(values: Tensor, place_m: Tensor) -> Tensor:
-    """Slope of phases that are small already, by weighted least squares about their mean."""
+def _straight(values: Tensor, position_m: Tensor) -> Tensor:
+    """Return the slope of small phases by weighted least squares about their mean."""
     phase = torch.angle(values * values.sum(-1, keepdim=True).conj())
     weight = values.abs()
     total = weight.sum(-1, keepdim=True).clamp_min(_TINY)
-    centred = place_m - (weight * place_m).sum(-1, keepdim=True) / total
+    centred = position_m - (weight * position_m).sum(-1, keepdim=True) / total
     return (weight * centred * phase).sum(-1) / (weight * centred.square()).sum(-1).clamp_min(_TINY)
 
 
-def _judged(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: Tensor, time_s: Tensor) -> Found:
-    """What the motion explains, and deviations of u_r and y0 by tone and slope."""
+def _fit_at(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: Tensor, time_s: Tensor) -> Found:
+    """Return the fit at a motion, with covariances of u_r and y0 from tone and slope."""
     weight = weight[..., None, :]
-    shines = (weight != 0).expand(data.shape)
+    illuminated = (weight != 0).expand(data.shape)
     energy_of_weight = weight.square().expand(data.shape).sum((-2, -1)).clamp_min(_TINY)
     amplitude = (weight * data * point_phasor(radar, motion, time_s, data.dtype).conj()).sum(
         (-2, -1)
     ) / energy_of_weight
     energy = amplitude.abs().square() * energy_of_weight
-    noise = ((data.abs().square() * shines).sum((-2, -1)) - energy).clamp_min(0) / shines.sum((-2, -1)).clamp_min(1)
+    noise = ((data.abs().square() * illuminated).sum((-2, -1)) - energy).clamp_min(0) / illuminated.sum(
+        (-2, -1)
+    ).clamp_min(1)
     slopes = phase_slopes(radar, motion, time_s, ("u_r_m_s", "y0_m")) * weight[..., None, :, :]
     total = (weight.square()[..., None, :, :] * torch.ones_like(slopes)).sum((-2, -1), keepdim=True).clamp_min(_TINY)
     flat = (

@@ -1,8 +1,7 @@
-"""Maximum likelihood of velocity and place of a moving point by Gauss-Newton steps, its complex
-amplitude profiled out, in white noise or in clutter of known covariance.
+"""Maximum likelihood of velocity and position of a moving point by Gauss-Newton steps.
 
-Source: brief 001, Velocity (ML). In white noise it reaches the Cramer-Rao bound of
-`metrics.bistatic_bounds`.
+The complex amplitude is eliminated, and noise is white or clutter of known covariance. In white
+noise the estimate reaches the Cramer-Rao bound of `metrics.bistatic_bounds`.
 """
 
 from __future__ import annotations
@@ -28,14 +27,19 @@ from torchsar.multichannel.velocity.model import (
 from torchsar.multichannel.velocity.whitening import Whitening
 from torchsar.radar import BistaticRadar
 
-_TINY = torch.finfo(torch.float64).tiny
-_HALVINGS = 4
+_TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
+_HALVINGS = 4  # trials of a step: whole, half, quarter, eighth; then it is omitted
 
 
 @dataclass(frozen=True)
 class PointFit:
-    """Of data at a motion, per trial: amplitude, energy explained, gradient (..., unknown) and
-    normal matrix (..., unknown, unknown) of half the explained energy.
+    """Fit of a point at a given motion, per trial.
+
+    Args:
+        amplitude: Complex amplitude, shape (...,).
+        energy: Explained energy, shape (...,).
+        gradient: Gradient of half the explained energy, shape (..., unknown).
+        normal: Normal matrix of half the explained energy, shape (..., unknown, unknown).
     """
 
     amplitude: Tensor
@@ -53,15 +57,29 @@ def maximum_likelihood(
     whitening: Whitening | None = None,
     steps: int = 12,
 ) -> Found:
-    """The most likely motion near `start`, whose residual tone (du_r + v dy0 / R0) / lambda must
-    lie within half a Doppler cell: 0.03 m/s at 4.5 s. `interferometry` and `bank_search` do.
+    """Find the most likely motion near `start`.
 
-    data: complex (..., channel, pulse), slow time zero at pulse n // 2, transmit range removed.
-    aperture: expected amplitude. unknowns: of u_r_m_s, u_a_m_s, y0_m, what is estimated; the rest
-    stays at the start. whitening: covariance of what is not the point, None for white noise. The
-    expected amplitude stays where the start puts it: where it ends says nothing about the place. A
-    step is halved, or not taken, in trials where it explains no more energy than before, so that
-    neighbours change nothing.
+    The residual tone (du_r + v dy0 / R0) / lambda of the start must lie within half a Doppler cell,
+    0.03 m/s at 4.5 s; `interferometry` and `bank_search` give such starts. The expected amplitude
+    stays where the start places it, so that the ends of the aperture do not determine the position.
+    A step that does not explain more energy is halved or omitted, separately in each trial.
+
+    Args:
+        data: Channels with slow time zero at pulse n // 2 and without the transmit range, shape
+            (..., channel, pulse), complex.
+        radar: Instrument.
+        start: Starting motion, shape (...,).
+        aperture: Expected amplitude over slow time.
+        unknowns: Names of the parameters to estimate among `u_r_m_s`, `u_a_m_s`, `y0_m`; the others
+            keep the values of the start.
+        whitening: Clutter covariance, None for white noise.
+        steps: Number of Gauss-Newton steps.
+
+    Returns:
+        The fit with motion, amplitude, residual noise power and covariance of the unknowns.
+
+    Raises:
+        ValueError: If `unknowns` holds other names or a name twice.
     """
     problem = PointLikelihood.of(data, radar, start, aperture, unknowns, whitening)
     motion = start.each(lambda value: value.expand(data.shape[:-2]))
@@ -75,10 +93,16 @@ def maximum_likelihood(
 
 @dataclass(frozen=True)
 class PointLikelihood:
-    """Data (..., channel, pulse), whitened where there is a covariance, and all that stays the same
-    from step to step of a search.
+    """Likelihood of a point, with all that stays the same during a search.
 
-    weight: expected amplitude (..., 1, pulse); unknowns: of u_r_m_s, u_a_m_s, y0_m.
+    Args:
+        data: Channels, shape (..., channel, pulse), complex128, or their whitened spectra (...,
+            channel, bin) where there is a covariance.
+        radar: Instrument.
+        weight: Expected amplitude, shape (..., 1, pulse).
+        time_s: Slow time in seconds, float64 (pulse,).
+        unknowns: Names of the parameters to estimate.
+        whitening: Clutter covariance, None for white noise.
     """
 
     data: Tensor
@@ -97,6 +121,7 @@ class PointLikelihood:
         unknowns: tuple[str, ...],
         whitening: Whitening | None,
     ) -> PointLikelihood:
+        """Prepare the likelihood of data; arguments as in `maximum_likelihood`."""
         refuse_unknowns(unknowns)
         time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
         weight = aperture.weight(radar, start, time_s)[..., None, :]
@@ -106,7 +131,7 @@ class PointLikelihood:
         )
 
     def fit(self, motion: PointMotion) -> PointFit:
-        """Least squares of the amplitude at a motion, and its slopes by the unknowns."""
+        """Fit the amplitude at a motion by least squares, with derivatives by the unknowns."""
         slopes = phase_slopes(self.radar, motion, self.time_s, self.unknowns)
         phasor = point_phasor(self.radar, motion, self.time_s, torch.complex128)
         if self.whitening is None:
@@ -117,23 +142,25 @@ class PointLikelihood:
         )
 
     def noise_power(self, fit: PointFit) -> Tensor:
-        """Power per sample that the point leaves, where it shines; relative to the covariance where
-        there is one.
+        """Return the residual power per sample where the point is illuminated.
+
+        With a covariance the power is relative to it.
+
+        Args:
+            fit: Fit at a motion.
         """
         power = self.data.abs().square()
-        shines = (
+        illuminated = (
             torch.ones_like(power)
             if self.whitening is not None
             else (self.weight != 0).expand(power.shape).to(power.dtype)
         )
-        left = (power * shines).sum((-2, -1)) - fit.energy
-        return left.clamp_min(0) / shines.sum((-2, -1)).clamp_min(1)
+        left = (power * illuminated).sum((-2, -1)) - fit.energy
+        return left.clamp_min(0) / illuminated.sum((-2, -1)).clamp_min(1)
 
 
 def _white(deramped: Tensor, weight: Tensor, slopes: Tensor) -> PointFit:
-    """In white noise all happens on the deramped data, which are constant where the motion is
-    right.
-    """
+    """Fit in white noise on deramped data, which are constant where the motion is right."""
     power = weight.square().expand(deramped.shape)
     total = power.sum((-2, -1)).clamp_min(_TINY)
     amplitude = (weight * deramped).sum((-2, -1)) / total
@@ -150,7 +177,7 @@ def _white(deramped: Tensor, weight: Tensor, slopes: Tensor) -> PointFit:
 
 
 def _coloured(data: Tensor, model: Tensor, columns: Tensor) -> PointFit:
-    """The same on whitened data, model and columns (..., unknown, channel, bin)."""
+    """Fit on whitened data, model and derivatives (..., unknown, channel, bin)."""
     x, s, d = data.flatten(-2), model.flatten(-2), columns.flatten(-2)
     total = s.abs().square().sum(-1).clamp_min(_TINY)
     amplitude = (s.conj() * x).sum(-1) / total
@@ -163,7 +190,7 @@ def _coloured(data: Tensor, model: Tensor, columns: Tensor) -> PointFit:
 
 
 def _stepped(problem: PointLikelihood, motion: PointMotion, fit: PointFit) -> tuple[PointMotion, PointFit]:
-    """One Gauss-Newton step, halved where it explains less."""
+    """Take one Gauss-Newton step, halved in trials where it explains less energy."""
     step = _bounded(solved(fit.normal, fit.gradient[..., None])[..., 0], motion, problem.unknowns)
     pending = torch.ones_like(fit.energy, dtype=torch.bool)
     for _ in range(_HALVINGS):
@@ -185,9 +212,7 @@ def _stepped(problem: PointLikelihood, motion: PointMotion, fit: PointFit) -> tu
 
 
 def _bounded(step: Tensor, motion: PointMotion, unknowns: tuple[str, ...]) -> Tensor:
-    """Steps that stay far from the receiver's speed: at most a tenth of the speed past the point
-    along track.
-    """
+    """Limit steps in u_a to a tenth of the along-track speed of the receiver past the point."""
     if "u_a_m_s" not in unknowns:
         return step
     at = unknowns.index("u_a_m_s")

@@ -1,6 +1,4 @@
-"""The echo of one moving point in all channels as a model with unknown velocity and place, and data
-with its phase taken out.
-"""
+"""Model of the echo of one moving point in all channels, and least-squares tools for its fit."""
 
 from __future__ import annotations
 
@@ -18,8 +16,18 @@ UNKNOWNS = ("u_r_m_s", "u_a_m_s", "y0_m")
 
 
 def point_phasor(radar: BistaticRadar, motion: PointMotion, time_s: Tensor, dtype: torch.dtype) -> Tensor:
-    """exp(-j 2 pi / lambda (R_m(t) - R_ref)) of a point of this motion, (..., channel, pulse) of
-    `dtype`; R_ref: the radar's reference range.
+    """Return the phase history exp(-j 2 pi / lambda (R_m(t) - R_ref)) of a point.
+
+    R_ref is the reference range of the radar.
+
+    Args:
+        radar: Instrument.
+        motion: Motion of the point, shape (...,).
+        time_s: Slow time in seconds, float64 (pulse,).
+        dtype: Complex dtype of the result.
+
+    Returns:
+        Phasor, shape (..., channel, pulse), complex.
     """
     u_r, u_a, y0, near = (
         value[..., None, None] for value in (motion.u_r_m_s, motion.u_a_m_s, motion.y0_m, motion.range_m)
@@ -33,8 +41,16 @@ def point_phasor(radar: BistaticRadar, motion: PointMotion, time_s: Tensor, dtyp
 def phase_slopes(
     radar: BistaticRadar, motion: PointMotion, time_s: Tensor, unknowns: tuple[str, ...] = UNKNOWNS
 ) -> Tensor:
-    """Derivatives of the phase of `point_phasor` by the unknowns (rad per unit), float64 (...,
-    unknown, channel, pulse).
+    """Return the derivatives of the phase of `point_phasor` by the unknowns.
+
+    Args:
+        radar: Instrument.
+        motion: Motion of the point, shape (...,).
+        time_s: Slow time in seconds, float64 (pulse,).
+        unknowns: Names among `u_r_m_s`, `u_a_m_s`, `y0_m`.
+
+    Returns:
+        Derivatives in radians per unit, float64 (..., unknown, channel, pulse).
     """
     u_r, v, y0, near = (
         value[..., None, None] for value in (motion.u_r_m_s, motion.along_m_s, motion.y0_m, motion.range_m)
@@ -48,8 +64,15 @@ def phase_slopes(
 
 @dataclass(frozen=True)
 class Found:
-    """A fitted point per trial: its motion, complex amplitude (...,), the power per sample that it
-    leaves unexplained, and covariance of the unknowns.
+    """Fitted point per trial.
+
+    Args:
+        motion: Motion, shape (...,).
+        amplitude: Complex amplitude, shape (...,).
+        noise_power: Residual power per sample, shape (...,).
+        covariance: Covariance of the unknowns, shape (..., unknown, unknown).
+        energy: Explained energy, shape (...,).
+        unknowns: Names of the estimated parameters.
     """
 
     motion: PointMotion
@@ -61,37 +84,56 @@ class Found:
 
     @property
     def snr_db(self) -> Tensor:
-        """Of the point over all its samples together, within +-300 dB: what decides whether it was
-        found at all.
-        """
+        """SNR of the point over all its samples in dB, within +-300 dB; it decides on detection."""
         return energy_ratio_db(self.energy, self.noise_power)
 
 
 def energy_ratio_db(energy: Tensor, noise_power: Tensor) -> Tensor:
-    """In dB, within +-300 dB; -300 dB where there is neither."""
+    """Return an energy over a noise power in dB, within +-300 dB; -300 dB where both are zero."""
     return 10 * torch.log10((energy / noise_power.clamp_min(torch.finfo(torch.float64).tiny)).clamp(1e-30, 1e30))
 
 
 def covariance_of(normal: Tensor, noise_power: Tensor) -> Tensor:
-    """Of the unknowns of a fit with normal matrices (..., n, n) of half the explained energy,
-    variances infinite where data say nothing.
+    """Return the covariance of the unknowns of a fit.
+
+    Args:
+        normal: Normal matrices of half the explained energy, shape (..., n, n).
+        noise_power: Noise power per sample, shape (...,).
+
+    Returns:
+        Covariances, shape (..., n, n), infinite for unknowns that the data do not determine.
     """
-    silent = torch.diag_embed((normal.diagonal(dim1=-2, dim2=-1) <= 0).to(normal.dtype)) > 0
+    undetermined = torch.diag_embed((normal.diagonal(dim1=-2, dim2=-1) <= 0).to(normal.dtype)) > 0
     eye = torch.eye(normal.shape[-1], dtype=normal.dtype, device=normal.device)
-    return torch.where(silent, torch.inf, noise_power[..., None, None] / 2 * solved(normal, eye.expand(normal.shape)))
+    return torch.where(
+        undetermined, torch.inf, noise_power[..., None, None] / 2 * solved(normal, eye.expand(normal.shape))
+    )
 
 
 def solved(normal: Tensor, right: Tensor) -> Tensor:
-    """normal^-1 right (..., n, k), with a floor for unknowns that data hardly tell apart; those
-    that they say nothing about keep what is on the right.
+    """Solve normal x = right with a floor for unknowns that can hardly be separated.
+
+    Unknowns that the data do not determine return their right-hand side.
+
+    Args:
+        normal: Normal matrices, shape (..., n, n).
+        right: Right-hand sides, shape (..., n, k).
+
+    Returns:
+        Solutions, shape (..., n, k).
     """
     unit, scale = _of_unit_diagonal(normal)
     return scale[..., :, None] * torch.linalg.solve(unit, scale[..., :, None] * right)
 
 
 def round_units(normal: Tensor) -> Tensor:
-    """Combinations (..., unknown, n) of the unknowns in which the explained energy falls off alike
-    in all directions.
+    """Return combinations of the unknowns in which the explained energy falls off equally.
+
+    Args:
+        normal: Normal matrices, shape (..., n, n).
+
+    Returns:
+        Combinations, shape (..., unknown, n).
     """
     unit, scale = _of_unit_diagonal(normal)
     units = scale[..., :, None] * torch.linalg.inv(torch.linalg.cholesky(unit)).mT
@@ -99,9 +141,7 @@ def round_units(normal: Tensor) -> Tensor:
 
 
 def _of_unit_diagonal(normal: Tensor) -> tuple[Tensor, Tensor]:
-    """Matrices with a unit diagonal and a floor, and the scale (..., n) on either side that makes
-    them.
-    """
+    """Return matrices of unit diagonal, with a floor, and the scale (..., n) on either side."""
     diagonal = normal.diagonal(dim1=-2, dim2=-1)
     scale = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
     unit = normal * scale[..., :, None] * scale[..., None, :] + torch.diag_embed((diagonal <= 0).to(normal.dtype))
@@ -109,18 +149,18 @@ def _of_unit_diagonal(normal: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def refuse_unknowns(unknowns: tuple[str, ...]) -> None:
-    """Raise ValueError unless these are some of UNKNOWNS, each once."""
+    """Raise ValueError unless the names are among UNKNOWNS, each once."""
     if not unknowns or len(set(unknowns)) != len(unknowns) or not set(unknowns) <= set(UNKNOWNS):
-        raise ValueError(f"unknowns names some of {UNKNOWNS}, each once, got {tuple(unknowns)}")
+        raise ValueError(f"unknowns must be names among {UNKNOWNS}, each once, got {tuple(unknowns)}")
 
 
 def moved(motion: PointMotion, step: Tensor, unknowns: tuple[str, ...]) -> PointMotion:
-    """The motion with `step` (..., unknown) added."""
+    """Return the motion with `step` (..., unknown) added to the unknowns."""
     return replace(motion, **{name: getattr(motion, name) + step[..., i] for i, name in enumerate(unknowns)})
 
 
 def chosen(motion: PointMotion, other: PointMotion, first: Tensor) -> PointMotion:
-    """Per trial the one or the other: `motion` where first (...,) is True."""
+    """Select one of two motions per trial: `motion` where first (...,) is True, else `other`."""
     pairs = {
         name: torch.where(first, getattr(motion, name), getattr(other, name))
         for name in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
@@ -129,12 +169,20 @@ def chosen(motion: PointMotion, other: PointMotion, first: Tensor) -> PointMotio
 
 
 def estimate_of(found: Found, ok: Tensor, quality: Tensor, **info: Tensor) -> Estimate:
-    """An Estimate of u_r_m_s, u_a_m_s and y0_m, with predicted deviations of those that were
-    estimated.
+    """Form an estimate of u_r_m_s, u_a_m_s and y0_m from a fit.
+
+    Args:
+        found: Fit of the point.
+        ok: Whether each trial is reliable, bool (...,).
+        quality: Quality of each trial in 0..1, shape (...,).
+        info: Further tensors for the info.
+
+    Returns:
+        The estimate, with standard deviations of the unknowns of the fit.
     """
     motion = found.motion
     shape = ok.shape
     value = {name: getattr(motion, name).expand(shape) for name in UNKNOWNS}
-    deviation = found.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
-    std = {name: deviation[..., i] for i, name in enumerate(found.unknowns)}
+    std_all = found.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    std = {name: std_all[..., i] for i, name in enumerate(found.unknowns)}
     return Estimate(value, quality, ok, std, {"snr_db": found.snr_db, "noise_power": found.noise_power, **info})

@@ -1,5 +1,7 @@
-"""Velocity and place of a moving point told nothing: a bank over velocities, then maximum
-likelihood, in white noise or in clutter whose covariance the data give.
+"""Velocity and position of a moving point without prior knowledge.
+
+A bank of velocities is followed by maximum likelihood, in white noise or in clutter whose
+covariance is estimated from the data.
 """
 
 from __future__ import annotations
@@ -19,9 +21,12 @@ from torchsar.multichannel.velocity.model import UNKNOWNS, Found, chosen, estima
 from torchsar.multichannel.velocity.whitening import Whitening, sample_whitening
 from torchsar.radar import BistaticRadar
 
+# Aperture of the first search: integration time of Remote Sens. 2020, 12, 1703, Table 1.
 _COARSE_S = 4.5
-_ROUNDS = 2
-_CENTRED, _FEW = 4, 4
+_ROUNDS = 2  # refinements of the residual covariance
+# Refits about the position found, with so many Gauss-Newton steps each: a round reduces the bias of
+# the position to a third, four rounds to about 1 %.
+_CENTRED_ROUNDS, _CENTRED_STEPS = 4, 4
 
 
 def moving_point_velocity(
@@ -33,17 +38,33 @@ def moving_point_velocity(
     range_m: Number | None = None,
     whitening: Whitening | None = None,
 ) -> Estimate:
-    """u_r, u_a and y0 of the strongest moving point per trial, no start needed.
+    """Estimate u_r, u_a and y0 of the strongest moving point per trial, without a starting value.
 
-    data: complex (..., channel, pulse), slow time zero at pulse n // 2, transmit range removed.
-    aperture: expected amplitude over slow time. search: what the bank covers, by default three
-    pulse rates of u_r, whose ambiguity modulo lambda PRF the cubic phase of the range history
-    resolves. u_a_m_s: where it is known, None to estimate it. whitening: covariance of the clutter,
-    from neighbouring lines, say; None to take it from what the point leaves of the data themselves:
-    the point is sought in white noise and in the covariance of the data, both are refined against
-    what they leave, and the more likely one is taken, per trial. ok: found above the threshold of
-    19 dB over all samples, inside of the search, and with a predicted deviation of u_r below its
-    half width (one channel cannot). info: snr_db, noise_power, coloured (clutter was found).
+    If no covariance is given, the point is sought in white noise and in the covariance of the data;
+    both fits are refined with the covariance of their residuals, and the more likely one is used,
+    per trial.
+
+    Args:
+        data: Channels with slow time zero at pulse n // 2 and without the transmit range, shape
+            (..., channel, pulse), complex.
+        radar: Instrument.
+        aperture: Expected amplitude over slow time.
+        search: Extent of the bank, by default three PRFs of u_r, whose ambiguity modulo lambda PRF
+            the cubic phase of the range history resolves.
+        u_a_m_s: Along-track speed in m/s where it is known a priori, None to estimate it.
+        range_m: Closest range in metres, None for the reference range of the radar.
+        whitening: Clutter covariance, for example from neighbouring range lines; None to estimate
+            it from the data.
+
+    Returns:
+        `u_r_m_s` (closing positive), `u_a_m_s` and `y0_m` of shape (...,), with standard
+        deviations. `info` holds `snr_db`, `noise_power` and `coloured` (True where clutter was
+        found). `ok` is False where the point has less than 19 dB over all samples, the estimate
+        lies outside the search, or the standard deviation of u_r exceeds the half width of the
+        search, as with a single channel.
+
+    Raises:
+        ValueError: If the search reaches the speed of the receiver.
     """
     search = search or Search(u_r_m_s=1.5 * radar.ambiguous_velocity_m_s)
     unknowns = UNKNOWNS if u_a_m_s is None else ("u_r_m_s", "y0_m")
@@ -61,15 +82,15 @@ def moving_point_velocity(
     if not bool(plain.coloured.any()):
         return job.estimate(plain.found, plain.coloured)
     other = job.refined(job.found(sample_whitening(job.data, radar)))
-    first = ~plain.coloured | (plain.log_det <= other.log_det)  # whatever the other trials are
-    return job.estimate(_either(plain.found, other.found, first), torch.where(first, plain.coloured, other.coloured))
+    first = ~plain.coloured | (plain.log_det <= other.log_det)  # independent of the other trials
+    return job.estimate(
+        _chosen_fit(plain.found, other.found, first), torch.where(first, plain.coloured, other.coloured)
+    )
 
 
 @dataclass(frozen=True)
 class _Refined:
-    """A point fitted in the covariance of what it leaves; log_det: of that covariance, (...,): the
-    less, the likelier; coloured: it is not white.
-    """
+    """Fit in the covariance of its residual, log determinant (smaller is likelier), and colour."""
 
     found: Found
     log_det: Tensor
@@ -89,37 +110,37 @@ class _Job:
     unknowns: tuple[str, ...]
 
     def found(self, whitening: Whitening | None) -> Found:
-        """Bank on the middle of the aperture, then maximum likelihood there and on the whole."""
+        """Search the bank on the middle of the aperture, then fit there and on all of it."""
         coarse = self.aperture if isinstance(self.aperture, Dwell) else Dwell(_COARSE_S)
         start, _ = bank_search(self.data, self.radar, coarse, self.search, self.u_a_m_s, self.range_m, whitening)
         near = maximum_likelihood(self.data, self.radar, start, coarse, self.unknowns, whitening)
         return maximum_likelihood(self.data, self.radar, near.motion, self.aperture, self.unknowns, whitening)
 
     def centred(self, found: Found, whitening: Whitening) -> Found:
-        """The fit again with the aperture about the place found: in clutter an expected amplitude
-        that lies off drags the place along, to a third in each round.
+        """Repeat the fit with the aperture about the position found.
+
+        In clutter a displaced expected amplitude biases the position; each round reduces this bias
+        to a third.
         """
-        for _ in range(_CENTRED):
+        for _ in range(_CENTRED_ROUNDS):
             found = maximum_likelihood(
-                self.data, self.radar, found.motion, self.aperture, self.unknowns, whitening, _FEW
+                self.data, self.radar, found.motion, self.aperture, self.unknowns, whitening, _CENTRED_STEPS
             )
         return found
 
     def refined(self, found: Found) -> _Refined:
-        """The fit again in the covariance of what it left, twice: where that is white nothing
-        changes.
-        """
+        """Repeat the fit twice in the covariance of its residual, where that is not white."""
         whitening = sample_whitening(self.left(found), self.radar)
         for _ in range(_ROUNDS):
             if not bool(whitening.coloured.any()):
                 break
             again = maximum_likelihood(self.data, self.radar, found.motion, self.aperture, self.unknowns, whitening)
-            found = _either(again, found, whitening.coloured)
+            found = _chosen_fit(again, found, whitening.coloured)
             whitening = sample_whitening(self.left(found), self.radar)
         return _Refined(found, whitening.log_det, whitening.coloured)
 
     def left(self, found: Found) -> Tensor:
-        """Data without the point."""
+        """Return the data without the fitted point."""
         time_s = self.radar.pulse_axis(self.data.shape[-1]).values(self.data.device)
         weight = self.aperture.weight(self.radar, found.motion, time_s)[..., None, :]
         return self.data - found.amplitude[..., None, None] * weight * point_phasor(
@@ -127,22 +148,23 @@ class _Job:
         )
 
     def estimate(self, found: Found, coloured: Tensor) -> Estimate:
+        """Form the estimate and judge it."""
         snr = found.snr_db
         inside = found.motion.u_r_m_s.abs() <= self.search.u_r_m_s + self.search.u_r_step_m_s
         if "u_a_m_s" in self.unknowns:
             inside = inside & (
                 (found.motion.u_a_m_s - self.u_a_m_s).abs() <= self.search.u_a_m_s + self.search.u_a_step_m_s
             )
-        told = (
+        determined = (
             found.covariance[..., 0, 0].sqrt() <= self.search.u_r_m_s + self.search.u_r_step_m_s
-        )  # one channel tells no velocity from a place
+        )  # False for one channel, which cannot separate velocity and position
         return estimate_of(
-            found, inside & told & (snr >= DETECTED_DB), torch.sigmoid((snr - DETECTED_DB) / 3), coloured=coloured
+            found, inside & determined & (snr >= DETECTED_DB), torch.sigmoid((snr - DETECTED_DB) / 3), coloured=coloured
         )
 
 
-def _either(a: Found, b: Found, first: Tensor) -> Found:
-    """Per trial the one or the other fit."""
+def _chosen_fit(a: Found, b: Found, first: Tensor) -> Found:
+    """Select one of two fits per trial."""
 
     def pick(x: Tensor, y: Tensor) -> Tensor:
         return torch.where(first[(...,) + (None,) * (x.ndim - first.ndim)], x, y)

@@ -1,10 +1,12 @@
-"""Slant-range velocity by the signal intensity ratio: a spectrum rebuilt with the right velocity
-gathers inside the processed band.
+"""Slant-range velocity by the signal intensity ratio (SIR) of reconstructed spectra.
 
-Source: Remote Sens. 2020, 12, 1703, Eqs. (37)-(39). Data are demodulated by the Doppler centre of
-each candidate before they are rebuilt (see `reconstruct`), so that the band edges do not jump from
-bin to bin, and the ratio is continuous in the velocity. A stationary scene beside the target, which
-gathers at u_r = 0, misleads it.
+A spectrum that is reconstructed with the right velocity concentrates in the processed band. Data
+are demodulated by the Doppler centre of each candidate before reconstruction (see `reconstruct`),
+so that the band edges do not jump between bins and the ratio is continuous in the velocity. A
+stationary scene beside the target concentrates at u_r = 0 and biases the estimate towards zero.
+
+Reference:
+    Remote Sens. 2020, 12, 1703, Eqs. (37)-(39).
 """
 
 from __future__ import annotations
@@ -24,15 +26,24 @@ from torchsar.multichannel.velocity.aperture import Dwell
 from torchsar.optim.scalar import grid_minimum, parabola_minimum
 from torchsar.radar import BistaticRadar
 
-_TOLERANCE_M_S = 1e-4
+_TOLERANCE_M_S = 1e-4  # of the maximum, well below the 0.06 m/s of error without noise
+# Half step of the derivatives for the standard deviation, found by trial: at 17 dB per sample 0.5
+# m/s predicts 0.065 m/s where 0.051 m/s is measured; 0.25 and 1 m/s predict 0.12 and 0.036 m/s.
 _CURVE_M_S = 0.5
-_GROUPS = 16
+_GROUPS = 16  # of the jackknife: 8 and 32 groups give the same standard deviation within 6 %
 
 
 @dataclass(frozen=True)
 class Intensity:
-    """Energies and summed amplitudes of a rebuilt spectrum inside and outside of the processed
-    band, (...,) each, and how many samples either has.
+    """Energies and summed amplitudes of a spectrum inside and outside the processed band.
+
+    Args:
+        energy_in: Energy inside the band, shape (...,).
+        energy_out: Energy outside the band, shape (...,).
+        amplitude_in: Sum of the amplitudes inside the band, shape (...,).
+        amplitude_out: Sum of the amplitudes outside the band, shape (...,).
+        bins_in: Number of samples inside the band.
+        bins_out: Number of samples outside the band.
     """
 
     energy_in: Tensor
@@ -44,11 +55,11 @@ class Intensity:
 
     @property
     def total(self) -> Intensity:
-        """Summed over the last dim."""
+        """Sum over the last dimension."""
         return self._each(lambda x: x.sum(-1))
 
     def summed(self, weight: Tensor) -> Intensity:
-        """Summed over the last dim with weights (last, group): (..., group)."""
+        """Sum over the last dimension with weights (last, group), to shape (..., group)."""
         return self._each(lambda x: x @ weight)
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> Intensity:
@@ -63,30 +74,42 @@ class Intensity:
 
     @property
     def power_ratio(self) -> Tensor:
-        """Gamma 1, Eq. (37); 0 for no data."""
+        """Power ratio Gamma 1, Eq. (37); 0 for zero data."""
         return self.energy_in / self.energy_out.clamp_min(torch.finfo(self.energy_out.dtype).tiny)
 
     @property
     def amplitude_ratio(self) -> Tensor:
-        """Gamma 2, Eq. (38): mean amplitude inside over mean amplitude outside; 0 for no data."""
+        """Ratio Gamma 2 of the mean amplitudes inside and outside, Eq. (38); 0 for zero data."""
         outside = self.amplitude_out.clamp_min(torch.finfo(self.amplitude_out.dtype).tiny)
         return self.bins_out / self.bins_in * self.amplitude_in / outside
 
     @property
     def ratio(self) -> Tensor:
-        """Gamma, the product."""
+        """Product Gamma = Gamma 1 Gamma 2."""
         return self.power_ratio * self.amplitude_ratio
 
 
 def signal_intensity(
     data: Tensor, radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, bandwidth_hz: float
 ) -> Intensity:
-    """Inside and outside of bandwidth_hz about the Doppler centre of the motion that the spectrum
-    is rebuilt with, (...,).
+    """Return intensities inside and outside a band about the Doppler centre of a motion.
 
-    data: complex (..., channel, pulse, range), lines of a target together, transmit range removed.
-    Differentiable in data and motion. Raises ValueError where the rebuilt band does not exceed
-    bandwidth_hz, or the bands cannot be told apart by so many channels.
+    The spectrum is reconstructed with the same motion. Differentiable in data and motion.
+
+    Args:
+        data: Range lines of one target without the transmit range, shape (..., channel, pulse,
+            range), complex.
+        radar: Instrument.
+        motion: Motion assumed, shape (...,).
+        rebuild: Reconstruction method.
+        bandwidth_hz: Processed Doppler bandwidth in Hz.
+
+    Returns:
+        Intensities of shape (...,).
+
+    Raises:
+        ValueError: If the reconstructed band does not exceed `bandwidth_hz`, or there are too few
+            channels for the bands.
     """
     return _intensity_of_bins(data, radar, motion, rebuild, bandwidth_hz).total
 
@@ -94,7 +117,7 @@ def signal_intensity(
 def _intensity_of_bins(
     data: Tensor, radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, bandwidth_hz: float
 ) -> Intensity:
-    """As `signal_intensity`, of each alias frequency: (..., pulse)."""
+    """Return the intensities of each alias frequency, (..., pulse); see `signal_intensity`."""
     refuse_full_band(radar, rebuild, bandwidth_hz)
     n = data.shape[-2]
     spectrum = reconstruct_lines(data, radar, motion, rebuild)
@@ -107,32 +130,43 @@ def _intensity_of_bins(
 
 
 def refuse_full_band(radar: BistaticRadar, rebuild: Rebuild, bandwidth_hz: float) -> None:
-    """Raise ValueError where nothing of the rebuilt band lies outside of the processed one."""
+    """Raise ValueError unless part of the reconstructed band lies outside the processed band."""
     if not 0 < bandwidth_hz < rebuild.bands * radar.prf_hz:
         band = f"{rebuild.bands} bands of {radar.prf_hz:g} Hz"
         raise ValueError(
-            "the intensity ratio compares what lies inside bandwidth_hz with what lies outside, "
+            "the intensity ratio compares the spectrum inside bandwidth_hz with the rest, "
             f"but {band} leave nothing outside {bandwidth_hz:g} Hz; rebuild more bands, or "
             "integrate less"
         )
 
 
 class SignalIntensityRatio(Stage):
-    """u_r_m_s that maximises Gamma over search_m_s, per trial, from a grid and parabolas about its
-    best point: axes (channel, pulse[, range]).
+    """Estimator of u_r that maximises the intensity ratio Gamma, per trial.
 
-    bandwidth_hz: processed Doppler bandwidth V^2 T / (lambda R0). rebuild: LeastSquares(3) by
-    default, since two bands leave little outside. search_m_s: least and largest velocity, None for
-    all that is unambiguous, +-lambda PRF / 2. step_m_s: of the grid. Values of forward: u_a_m_s and
-    y0_m, what is known of the rest of the motion.
+    A grid over the search is followed by parabolas about its best point. Prefer `Interferometry` or
+    `MovingPointVelocity`: the ratio needs about 15 dB more SNR (its threshold lies at 0 to +7 dB
+    per sample), below its threshold it is biased by more than the standard deviation indicates, and
+    with stationary clutter beside the target its maximum lies at u_r = 0. Without noise it errs by
+    up to 0.06 m/s, since echoes beyond the reconstructed bands alias into them. The record must
+    contain the whole dwell of the target.
 
-    std: of noise, from how the maximum moves as parts of the spectrum are left out. quality: 1 -
-    median / largest Gamma over the grid. Not ok: trials without data, whose value is the middle of
-    the search, with the best point at an end of it, and of a quality below `least_quality`. Its
-    threshold lies at about 0 to +7 dB a sample, 15 dB above interferometry between the channels;
-    below it estimates are biased by more than std says. Without noise it errs by up to 0.06 m/s:
-    what a gate leaves beyond the rebuilt bands aliases into them. Records that end inside the
-    target's gate disturb it. Raises ValueError as `signal_intensity`.
+    Args:
+        radar: Instrument.
+        bandwidth_hz: Processed Doppler bandwidth V^2 T / (lambda R0) in Hz.
+        rebuild: Reconstruction method, `LeastSquares(3)` by default, since two bands leave little
+            outside the processed band.
+        search_m_s: Least and largest velocity in m/s, None for the unambiguous interval +-lambda
+            PRF / 2.
+        step_m_s: Step of the grid in m/s.
+        range_m: Closest range in metres, None for the reference range of the radar.
+        least_quality: Least quality of a reliable estimate.
+
+    Raises:
+        ValueError: If the search holds fewer than two steps, the reconstructed band does not exceed
+            `bandwidth_hz`, or there are too few channels for the bands.
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, Eqs. (37)-(39).
     """
 
     works_on = ("channel", "pulse")
@@ -161,7 +195,7 @@ class SignalIntensityRatio(Stage):
         low, high = self.search_m_s
         if not (low < high and 0 < step_m_s <= (high - low) / 2):
             raise ValueError(
-                "search_m_s is (least, largest) velocity with two steps of step_m_s between, got "
+                "search_m_s must be (least, largest) velocity with at least two steps of step_m_s between, got "
                 f"{self.search_m_s} and {step_m_s}"
             )
         why = self.rebuild.refusal(radar.channels)
@@ -170,6 +204,23 @@ class SignalIntensityRatio(Stage):
         refuse_full_band(radar, self.rebuild, bandwidth_hz)
 
     def forward(self, signal: Signal, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
+        """Estimate u_r from channels with the axes (channel, pulse[, range]).
+
+        Args:
+            signal: Channels without the transmit range.
+            u_a_m_s: Along-track speed in m/s, shape (...,) or a number.
+            y0_m: Along-track position at t = 0 in metres, shape (...,) or a number.
+
+        Returns:
+            `u_r_m_s` of shape (...,), closing positive, with a jackknife standard deviation. The
+            quality is 1 - median / largest Gamma over the grid. `info` holds `log_ratio` over the
+            grid and `pulse_rates`. `ok` is False for zero data (whose value is the middle of the
+            search), a maximum at an end of the search, a quality below `least_quality`, or a
+            velocity off by whole PRFs.
+
+        Raises:
+            ValueError: If the reconstruction is singular.
+        """
         lines = signal.data if "range" in signal.names else signal.data[..., None]
         middle = sum(self.search_m_s) / 2
         start = torch.full(signal.trials, middle, dtype=torch.float64, device=lines.device)
@@ -186,48 +237,50 @@ class SignalIntensityRatio(Stage):
         reach = (self.search_m_s[1] - self.search_m_s[0]) / 2
         coarse, costs = grid_minimum(cost, start, reach, 2 * round(reach / self.step_m_s) + 1)
         fine, _ = parabola_minimum(cost, coarse, self.step_m_s / 2, _TOLERANCE_M_S)
-        found = self._estimate(fine, coarse, costs, lines, _deviation(intensity, fine))
-        return self._minding_ambiguity(found, lines, u_a_m_s, y0_m)
+        found = self._estimate(fine, coarse, costs, lines, _standard_deviation(intensity, fine))
+        return self._checked_for_ambiguity(found, lines, u_a_m_s, y0_m)
 
-    def _minding_ambiguity(self, found: Estimate, lines: Tensor, u_a_m_s: Number, y0_m: Number) -> Estimate:
-        """Not ok, with a warning, where the strongest line shows that the velocity lies whole pulse
-        rates off.
-        """
+    def _checked_for_ambiguity(self, found: Estimate, lines: Tensor, u_a_m_s: Number, y0_m: Number) -> Estimate:
+        """Check the estimate for a velocity off by whole PRFs on the strongest range line."""
         motion = self._motion(lines, found["u_r_m_s"], u_a_m_s, y0_m)
         line = take(lines.movedim(-1, -3), lines.detach().abs().square().sum((-3, -2)).argmax(-1), -3)
         dwell_s = self.bandwidth_hz * self.radar.wavelength_m * self.radar.reference_range_m / self.radar.speed_m_s**2
         return warned_of_ambiguity(found, line, self.radar, motion, Dwell(dwell_s))
 
     def _motion(self, lines: Tensor, u_r_m_s: Tensor, u_a_m_s: Number, y0_m: Number) -> PointMotion:
+        """Return the motion with a candidate of u_r."""
         return PointMotion.of(self.radar, lines, u_r_m_s, u_a_m_s, y0_m, self.range_m)
 
     def _estimate(self, fine: Tensor, coarse: Tensor, costs: Tensor, lines: Tensor, std: Tensor) -> Estimate:
+        """Form the estimate and judge it."""
         low, high = self.search_m_s
-        there = lines.detach().abs().amax((-3, -2, -1)) > 0
-        value = torch.where(there, fine.clamp(low, high), (low + high) / 2)
-        quality = torch.where(there, 1 - torch.exp(costs.amin(-1) - costs.median(-1).values), 0.0).clamp(0, 1)
+        has_data = lines.detach().abs().amax((-3, -2, -1)) > 0
+        value = torch.where(has_data, fine.clamp(low, high), (low + high) / 2)
+        quality = torch.where(has_data, 1 - torch.exp(costs.amin(-1) - costs.median(-1).values), 0.0).clamp(0, 1)
         inside = (coarse - low).abs().minimum((coarse - high).abs()) > self.step_m_s / 2
         return Estimate(
             {"u_r_m_s": value},
             quality,
-            there & inside & (quality >= self.least_quality),
+            has_data & inside & (quality >= self.least_quality),
             {"u_r_m_s": std},
             {"log_ratio": -costs},
         )
 
 
-def _deviation(intensity: Callable[[Tensor], Intensity], value: Tensor) -> Tensor:
-    """Deviation (...,) of the maximum of log Gamma from how much it moves as each of _GROUPS
-    interleaved groups of alias frequencies, of independent noise, is left out (jackknife).
+def _standard_deviation(intensity: Callable[[Tensor], Intensity], value: Tensor) -> Tensor:
+    """Return the jackknife standard deviation (...,) of the maximum of log Gamma.
+
+    Each of _GROUPS interleaved groups of alias frequencies, whose noise is independent, is left out
+    in turn.
     """
     low, middle, high = (_left_out(intensity(value + shift)) for shift in (-_CURVE_M_S, 0.0, _CURVE_M_S))
-    slope, bend = (high - low) / (2 * _CURVE_M_S), (low - 2 * middle + high).mean(-1) / _CURVE_M_S**2
+    slope, curvature = (high - low) / (2 * _CURVE_M_S), (low - 2 * middle + high).mean(-1) / _CURVE_M_S**2
     spread = (slope - slope.mean(-1, keepdim=True)).square().sum(-1) * (_GROUPS - 1) / _GROUPS
-    return torch.where(bend < 0, spread.sqrt() / torch.where(bend < 0, -bend, 1), torch.inf)
+    return torch.where(curvature < 0, spread.sqrt() / torch.where(curvature < 0, -curvature, 1), torch.inf)
 
 
 def _left_out(bins: Intensity) -> Tensor:
-    """log Gamma (..., group) of all alias frequencies but those of one group."""
+    """Return log Gamma (..., group) of all alias frequencies but those of one group."""
     n = bins.energy_in.shape[-1]
     group = torch.arange(n, device=bins.energy_in.device) % _GROUPS
     kept = (group[:, None] != torch.arange(_GROUPS, device=group.device)).to(torch.float64)

@@ -1,9 +1,8 @@
-"""How many pulse rates the Doppler of a moving point exceeds its samples by, from its walk through
-range: what the channels cannot say.
+"""PRF ambiguity number of a moving point from its range walk.
 
-One ambiguity is lambda PRF of slant-range velocity, which walks through lambda PRF T metres of
-range: far more than a range cell. The number with which the migration is taken out gathers the
-point in one line. Source: brief 001, Velocity (unambiguous interval).
+One ambiguity is lambda PRF of slant-range velocity, which gives lambda PRF T metres of range walk:
+far more than a range cell. Migration correction with the right number concentrates the point in one
+range line.
 """
 
 from __future__ import annotations
@@ -16,20 +15,28 @@ from torchsar.multichannel.migration import Frame, Keystone, Migration, correct_
 from torchsar.multichannel.motion import Number, PointMotion
 from torchsar.radar import BistaticRadar
 
-_TINY = torch.finfo(torch.float64).tiny
+_TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
 
 
 def walk_ambiguity(
     data: Tensor, frame: Frame, reference: PointMotion, most: int = 2, migration: Migration | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The number of -most..most with which the strongest point of each trial stands still.
+    """Find the ambiguity number for which the strongest point stays in one range line.
 
-    data: (..., channel, pulse, range), range compressed, transmit range removed.
+    The criterion is the energy of the strongest line, so that neither phase nor aliasing matter.
 
-    Returns (ambiguity, contrast, line), each (...,): the whole number, float64; how far, in
-    deviations of what noise does, its strongest line stands above that of the next best number; the
-    index of its line. Judged by the energy of the strongest line, so that neither phase nor
-    aliasing matter.
+    Args:
+        data: Range-compressed channels without the transmit range, shape (..., channel, pulse,
+            range), complex.
+        frame: Geometry of the data.
+        reference: Motion of the reference, shape (...,).
+        most: Largest ambiguity number tried, to either side.
+        migration: Method of migration correction, `Keystone(whole_swath=False)` by default.
+
+    Returns:
+        Three tensors (...,): the ambiguity number, float64; the excess of its strongest line over
+            that of the next best number, in standard deviations of the noise; and the index of its
+            line.
     """
     numbers = torch.arange(-most, most + 1, dtype=torch.float64, device=data.device)
     energies = torch.stack(
@@ -40,27 +47,35 @@ def walk_ambiguity(
     )
     strongest, line = energies.max(-1)
     best, margin = best_of(-strongest, numbers[(...,) + (None,) * (strongest.ndim - 1)].expand(strongest.shape))
-    deviation = _typical_deviation(energies[most])
-    return best, margin / deviation, line.gather(0, (best + most).long()[None])[0]
+    noise_std = _noise_std(energies[most])
+    return best, margin / noise_std, line.gather(0, (best + most).long()[None])[0]
 
 
 def _line_energy(data: Tensor) -> Tensor:
+    """Return the energy of each range line, (..., range)."""
     return data.abs().to(torch.float64).square().sum((-3, -2))
 
 
-def _typical_deviation(energy: Tensor) -> Tensor:
-    """Deviation of the energies of lines (..., range) that hold noise alone, by their median."""
+def _noise_std(energy: Tensor) -> Tensor:
+    """Return the standard deviation of the energies of lines (..., range) with noise alone.
+
+    It is estimated from their median absolute deviation.
+    """
     middle = energy.median(-1, keepdim=True).values
     return (1.4826 * (energy - middle).abs().median(-1).values).clamp_min(1e-12 * middle[..., 0]).clamp_min(_TINY)
 
 
 class WalkAmbiguity(Stage):
-    """`walk_ambiguity` as an estimator of `ambiguity`, what `CorrectMigration` takes.
+    """Estimator of the ambiguity number for `CorrectMigration`; see `walk_ambiguity`.
 
-    most: pulse rates to either side; range_m: of the reference, None for the radar's.
+    Args:
+        radar: Instrument.
+        most: Largest ambiguity number tried, to either side.
+        range_m: Closest range of the reference in metres, None for the reference range of the
+            radar.
 
-    ok: the best number stands out by five deviations of noise. With a wrong number a point keeps
-    the walk of so many pulse rates.
+    Raises:
+        ValueError: If `most` is below 1.
     """
 
     works_on = ("channel", "pulse", "range")
@@ -69,10 +84,22 @@ class WalkAmbiguity(Stage):
     def __init__(self, radar: BistaticRadar, most: int = 2, range_m: float | None = None) -> None:
         super().__init__()
         if most < 1:
-            raise ValueError(f"a search for the ambiguity number needs most of 1 or more, got {most}")
+            raise ValueError(f"most must be 1 or more, the largest ambiguity number to try, got {most}")
         self.radar, self.most, self.range_m = radar, most, range_m
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
+        """Estimate the ambiguity number.
+
+        Args:
+            signal: Range-compressed channels with the axes (channel, pulse, range).
+            u_r_m_s: Slant-range speed of the reference in m/s, shape (...,) or a number.
+            u_a_m_s: Along-track speed of the reference in m/s, same shape.
+            y0_m: Along-track position of the reference at t = 0 in metres, same shape.
+
+        Returns:
+            `ambiguity` of shape (...,). `info` holds `line` and `contrast`. `ok` is False where the
+            best number exceeds the next one by less than five standard deviations of the noise.
+        """
         reference = PointMotion.of(self.radar, signal.data, u_r_m_s, u_a_m_s, y0_m, self.range_m)
         number, contrast, line = walk_ambiguity(signal.data, Frame.of(self.radar, signal), reference, self.most)
         return Estimate(

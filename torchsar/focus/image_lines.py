@@ -1,0 +1,174 @@
+"""Azimuth lines of an image formed by the matched Fourier transform, in Doppler or in metres.
+
+Notation of the Reference: Om is the rotation rate at the first pulse, phi(t) the warp of
+`core.warp.warp`, T = pulses / PRF the aperture time. Image lines are counted in cells of 1 / T,
+the Doppler at the mean rotation rate Om phi(T) / T.
+
+Reference:
+    Remote Sens. 2025, 17, 3447, Eqs. (9)-(10).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchsar.core import per_trial
+from torchsar.focus.nufft import smooth_length
+from torchsar.focus.warped_sums import whole_warp
+
+
+def lines_for(cells: float, oversampling: float = 2.0) -> int:
+    """Return the number of image lines that cover the Doppler band of a target.
+
+    Use it where the target occupies less than the pulse rate.
+
+    Args:
+        cells: Half width of the band in Doppler cells 1 / T; the lines cover -cells..cells.
+        oversampling: Lines per Doppler cell.
+
+    Returns:
+        An even number of lines, with a fast FFT.
+
+    Raises:
+        ValueError: If `cells` or `oversampling` is not positive.
+    """
+    if not (math.isfinite(cells) and cells > 0 and oversampling > 0):
+        raise ValueError(
+            f"lines need a positive number of cells and a positive oversampling, got {cells} and {oversampling}"
+        )
+    return 2 * smooth_length(math.ceil(cells * oversampling) + 1)
+
+
+def mean_rate(omega_rad_s: Tensor | float, k: Tensor, duration_s: float) -> Tensor:
+    """Return the mean rotation rate over the aperture, Om phi(T) / T.
+
+    This rate scales the Doppler axis of `matched_fourier`, and of an image formed without the warp,
+    to cross range.
+
+    Args:
+        omega_rad_s: Rotation rate at the first pulse in rad/s, shape (...,) or a number.
+        k: Coefficients of the warp, shape (..., order - 1).
+        duration_s: Aperture time T in seconds.
+
+    Returns:
+        Mean rotation rate in rad/s, shape (...,), float64.
+    """
+    total = whole_warp(k.to(torch.float64), duration_s)[..., 0]
+    return per_trial(omega_rad_s, 0, total) * total / duration_s
+
+
+def cross_range_of(
+    doppler_hz: Tensor | float, omega_rad_s: Tensor | float, k: Tensor, wavelength_m: float, duration_s: float
+) -> Tensor:
+    """Convert Doppler frequencies of the image axis to cross range, wavelength f / (2 mean rate).
+
+    The relative error of the cross range is minus that of the rate. The data do not show the sign
+    of the rotation rate: the image may be mirrored in cross range.
+
+    Args:
+        doppler_hz: Doppler frequencies in Hz, shape (f,) or a number.
+        omega_rad_s: Rotation rate at the first pulse in rad/s, shape (...,) or a number.
+        k: Coefficients of the warp, shape (..., order - 1).
+        wavelength_m: Carrier wavelength in metres.
+        duration_s: Aperture time in seconds.
+
+    Returns:
+        Cross range in metres, shape (..., f), or (...,) for a single frequency.
+    """
+    rate = mean_rate(omega_rad_s, k, duration_s)
+    doppler = torch.as_tensor(doppler_hz, dtype=torch.float64, device=rate.device)
+    return wavelength_m / 2 * doppler / (rate[..., None] if doppler.ndim else rate)
+
+
+@dataclass(frozen=True)
+class DopplerLines:
+    """Image lines at equal steps of Doppler.
+
+    Line `number // 2` is Doppler zero. Every trial has the same Doppler axis.
+
+    Args:
+        oversampling: Lines per Doppler cell 1 / T.
+        lines: Number of lines about Doppler zero; None for the whole pulse rate,
+            round(oversampling * pulses).
+
+    Raises:
+        ValueError: If `oversampling` is not positive or `lines` is below 1.
+    """
+
+    oversampling: float = 2.0
+    lines: int | None = None
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.oversampling) and self.oversampling > 0) or (
+            self.lines is not None and self.lines < 1
+        ):
+            raise ValueError(
+                f"oversampling must be positive and lines at least 1, got {self.oversampling} and {self.lines}"
+            )
+
+    def number(self, n_pulse: int) -> int:
+        """Return the number of image lines.
+
+        Args:
+            n_pulse: Number of pulses.
+        """
+        return self.lines or round(self.oversampling * n_pulse)
+
+    def cells_per_line(self, k: Tensor, duration_s: float) -> Tensor:
+        """Return the step between lines in Doppler cells 1 / T, a float64 scalar tensor.
+
+        Args:
+            k: Coefficients of the warp, shape (..., order - 1), float64.
+            duration_s: Aperture time T in seconds.
+        """
+        return torch.as_tensor(1 / self.oversampling, dtype=torch.float64, device=k.device)
+
+
+@dataclass(frozen=True)
+class CrossRangeLines:
+    """Image lines at equal steps of cross range in metres, the same axis for all trials.
+
+    Line i lies at (i - count // 2) step_m.
+
+    Args:
+        step_m: Step between lines in metres.
+        count: Number of lines.
+        omega_rad_s: Rotation rate at the first pulse in rad/s, shape (...,) or a number.
+        wavelength_m: Carrier wavelength in metres.
+
+    Raises:
+        ValueError: If `step_m` is not positive or `count` is below 1.
+    """
+
+    step_m: float
+    count: int
+    omega_rad_s: Tensor | float
+    wavelength_m: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.step_m) and self.step_m > 0 and self.count >= 1):
+            raise ValueError(
+                "lines in metres need a positive step and at least one line, got a step of "
+                f"{self.step_m} m and {self.count} lines"
+            )
+
+    def number(self, n_pulse: int) -> int:
+        """Return the number of image lines, which does not depend on the number of pulses.
+
+        Args:
+            n_pulse: Number of pulses.
+        """
+        return self.count
+
+    def cells_per_line(self, k: Tensor, duration_s: float) -> Tensor:
+        """Return the step between lines in Doppler cells 1 / T, shape (...,), float64.
+
+        Args:
+            k: Coefficients of the warp, shape (..., order - 1), float64.
+            duration_s: Aperture time T in seconds.
+        """
+        return 2 * self.step_m / self.wavelength_m * duration_s * mean_rate(self.omega_rad_s, k, duration_s)

@@ -1,0 +1,248 @@
+"""Velocities and images of single moving points before several channels, against the truth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Chain, Estimate, Signal, Trace, take
+from torchsar.metrics.replicas import azimuth_response, replica_level, replica_zones
+from torchsar.multichannel.azimuth import FocusAzimuth
+from torchsar.multichannel.motion import PointMotion
+from torchsar.multichannel.reconstruct import Reconstruct
+from torchsar.multichannel.response import condition_number, noise_gain_db
+from torchsar.radar import BistaticRadar
+
+# symbols of the unknowns, by their names in truth and estimates
+UNKNOWNS = {"u_r_m_s": "u_r", "u_a_m_s": "u_a", "y0_m": "y0"}
+# of a sinc: -3 dB width in null spacings, and side lobes by 20 nulls to either side
+_WIDTH, _PSLR_DB, _ISLR_DB = 0.8859, -13.26, -9.92
+
+
+def error_name(key: str, what: str = "error") -> str:
+    """Name of the error of an unknown: u_r_m_s becomes u_r_error_m_s."""
+    return f"{UNKNOWNS[key]}_{what}{key.removeprefix(UNKNOWNS[key])}"
+
+
+@dataclass(frozen=True)
+class FoundMotion:
+    """What the estimators of a chain found of one point a row.
+
+    Args:
+        value: Estimates by name, (row,); values that were known a priori are left out.
+        std: Their predicted standard deviations.
+        ok: Whether the estimates are reliable, (row,).
+    """
+
+    value: Mapping[str, Tensor]
+    std: Mapping[str, Tensor]
+    ok: Mapping[str, Tensor]
+
+    @staticmethod
+    def by(estimates: Mapping[str, Estimate]) -> FoundMotion:
+        """From the estimates of a chain by stage; later ones replace earlier ones."""
+        last = {key: e for e in estimates.values() for key in UNKNOWNS if key in e.std}
+        return FoundMotion(
+            {key: e.value[key] for key, e in last.items()},
+            {key: e.std[key] for key, e in last.items()},
+            {key: e.ok for key, e in last.items()},
+        )
+
+    def errors(self, truth: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Errors and predicted standard deviations, (row,) each."""
+        errors = {error_name(key): value - truth[key] for key, value in self.value.items()}
+        return {**errors, **{error_name(key, "std"): std for key, std in self.std.items()}}
+
+
+@dataclass(frozen=True)
+class FocusedPoint:
+    """How a chain formed its image of a point.
+
+    Args:
+        stage: Name of the reconstruction among the stages.
+        rebuild: The reconstruction.
+        focus: The focusing.
+        rebuilt_for: Motion (row,) that the reconstruction was given.
+        focused_for: Motion (row,) that the focusing was given.
+    """
+
+    stage: str
+    rebuild: Reconstruct
+    focus: FocusAzimuth
+    rebuilt_for: PointMotion
+    focused_for: PointMotion
+
+    @staticmethod
+    def of(chain: Chain, trace: Trace, radar: BistaticRadar) -> FocusedPoint | None:
+        """From a chain and what it made; None where it has no reconstruction and focusing."""
+        kinds = (Reconstruct, FocusAzimuth)
+        rebuild, focus = ([n for n, stage in chain.stages.items() if isinstance(stage, kind)] for kind in kinds)
+        if not rebuild or not focus:
+            return None
+        stages: Any = chain.stages
+        given = [_given(chain, names[-1], trace, radar) for names in (rebuild, focus)]
+        return FocusedPoint(rebuild[-1], stages[rebuild[-1]], stages[focus[-1]], *given)
+
+    @property
+    def bands(self) -> int:
+        """Number of Doppler bands that are rebuilt."""
+        return self.rebuild.rebuild.bands
+
+    @property
+    def processed_hz(self) -> float:
+        """Doppler band that is focused."""
+        rebuilt = self.bands * self.rebuild.radar.prf_hz
+        return min(rebuilt, self.focus.bandwidth_hz or rebuilt)
+
+    def conditioning(self) -> dict[str, Tensor]:
+        """Condition number, where an inverse is taken, and noise gain, (row,) each."""
+        radar, motion = self.rebuild.radar, self.rebuilt_for
+        found = {"noise_gain_db": noise_gain_db(radar, motion, self.rebuild.rebuild)}
+        known = (
+            {"condition_number": condition_number(radar, motion, self.bands)} if self.bands <= radar.channels else {}
+        )
+        return {**known, **found}
+
+
+def _given(chain: Chain, stage: str, trace: Trace, radar: BistaticRadar) -> PointMotion:
+    """The motion that a stage of a chain worked with, (row,)."""
+    values = {key: trace.values[source] for key, source in chain.uses[stage].items() if key in UNKNOWNS}
+    data, rows = trace.inputs[stage].data, trace.inputs[stage].trials
+    motion = PointMotion.of(radar, data, **values, range_m=getattr(chain.stages[stage], "range_m", None))
+    return motion.each(lambda value: value.expand(rows))
+
+
+@dataclass(frozen=True)
+class PeakCuts:
+    """Cuts through the peak of images, one a row.
+
+    Args:
+        azimuth: Cut along azimuth, (row, azimuth), over x = v t with the true v = V_R - u_a.
+        step_m, start_m: Step and first value of x in metres, (row,).
+        range: Cut along range, (row, range); None for azimuth-only images.
+        range_axis: First value and step of the range axis in metres.
+    """
+
+    azimuth: Tensor
+    step_m: Tensor
+    start_m: Tensor
+    range: Tensor | None
+    range_axis: tuple[float, float]
+
+    @staticmethod
+    def of(image: Signal, along_m_s: Tensor, speed_m_s: float) -> PeakCuts:
+        """From images.
+
+        Args:
+            image: Images (row, azimuth[, range]), azimuth in metres at the receiver's speed.
+            along_m_s: v of the true targets, (row,).
+            speed_m_s: Speed V_R of the receiver.
+        """
+        axis, scale = image.axes[0], along_m_s / speed_m_s
+        if "range" not in image.names:
+            return PeakCuts(image.data, axis.step * scale, axis.start * scale, None, (0.0, 0.0))
+        power, across = image.data.abs(), image.axes[1]
+        row, line = power.amax(-1).argmax(-1), power.amax(-2).argmax(-1)
+        cuts = (take(image.data, line), axis.step * scale, axis.start * scale, take(image.data, row, -2))
+        return PeakCuts(*cuts, (across.start, across.step))
+
+
+def point_responses(
+    image: Signal, focused: FocusedPoint, truth: Mapping[str, Tensor], integration_s: Tensor | float | None, orders: int
+) -> dict[str, Tensor]:
+    """Measure responses, false targets and positions in images of single points.
+
+    Args:
+        image: Images (row, azimuth[, range]) without noise.
+        focused: How they were formed.
+        truth: True `u_r_m_s`, `u_a_m_s`, `y0_m` and `range_m`, (row,) each.
+        integration_s: Time in seconds for which targets are lit, a number or (row,); None for the
+            pattern of the elements.
+        orders: Replicas are sought up to so many pulse rates away.
+
+    Returns:
+        Figures by name, (row,) each; NaN for images without any energy.
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, Table 4.
+    """
+    seen = image.data.abs().flatten(len(image.trials)).amax(-1) > 0
+    found = _responses(image, focused, truth, integration_s, orders)
+    return {name: torch.where(seen, value, math.nan) for name, value in found.items()}
+
+
+def _responses(
+    image: Signal, focused: FocusedPoint, truth: Mapping[str, Tensor], integration_s: Tensor | float | None, orders: int
+) -> dict[str, Tensor]:
+    radar, motion = focused.rebuild.radar, focused.focused_for
+    along = radar.speed_m_s - truth["u_a_m_s"]
+    cuts = PeakCuts.of(image, along, radar.speed_m_s)
+    response = azimuth_response(cuts.azimuth, 1.0)
+    metrics = {
+        "irw_azimuth_m": response["irw_m"] * cuts.step_m,
+        "pslr_azimuth_db": response["pslr_db"],
+        "islr_azimuth_db": response["islr_db"],
+        "mfta_db": _false_targets(cuts, focused, truth, integration_s, orders),
+    }
+    image_s = (cuts.start_m + response["position_m"] * cuts.step_m) / along
+    if cuts.range is None:
+        return {**metrics, "position_error_m": motion.place_m(image_s) - truth["y0_m"]}
+    across = azimuth_response(cuts.range, cuts.range_axis[1], cuts.range_axis[0])
+    metrics |= {
+        "irw_range_m": across["irw_m"] / 2,
+        "pslr_range_db": across["pslr_db"],
+        "islr_range_db": across["islr_db"],
+    }
+    motion = replace(motion, range_m=across["position_m"])
+    closest = torch.sqrt(across["position_m"].square() - motion.place_m(image_s).square())
+    position = replace(motion, range_m=closest).place_m(image_s)
+    return {**metrics, "position_error_m": position - truth["y0_m"], "range_error_m": closest - truth["range_m"]}
+
+
+def _false_targets(
+    cuts: PeakCuts,
+    focused: FocusedPoint,
+    truth: Mapping[str, Tensor],
+    integration_s: Tensor | float | None,
+    orders: int,
+) -> Tensor:
+    """Level (row,) of the largest replica, NaN for images too short to hold any."""
+    radar, used = focused.rebuild.radar, focused.focused_for
+    given = {"integration_s": integration_s, "focused_at": (used.u_r_m_s, used.u_a_m_s), "orders": range(1, orders + 1)}
+    true = (truth[key] for key in (*UNKNOWNS, "range_m"))
+    zones = replica_zones(radar, focused.bands, *true, axis_speed_m_s=radar.speed_m_s - truth["u_a_m_s"], **given)
+    samples = zones / cuts.step_m[:, None, None]
+    peak = cuts.azimuth.abs().argmax(-1)[:, None, None]
+    if not bool(((samples[..., 1:] + peak >= 0) & (samples[..., :1] + peak < cuts.azimuth.shape[-1])).any()):
+        return torch.full_like(cuts.step_m, math.nan)
+    return replica_level(cuts.azimuth, 1.0, samples)["mfta_db"]
+
+
+def ideal_responses(
+    radar: BistaticRadar, u_r_m_s: float, u_a_m_s: float, integration_s: float | None, processed_hz: float, ranges: bool
+) -> dict[str, float]:
+    """Figures of a point that is rebuilt and focused without any error: widths of sincs.
+
+    Args:
+        radar: The instrument.
+        u_r_m_s: Slant-range speed in m/s.
+        u_a_m_s: Along-track speed in m/s.
+        integration_s: Time for which it is lit; None for the pattern of the elements.
+        processed_hz: Processed Doppler band.
+        ranges: Whether images have a range axis.
+    """
+    along, band = radar.speed_m_s - u_a_m_s, math.inf
+    if integration_s is not None:
+        band = (along**2 + u_r_m_s**2) * integration_s / (radar.wavelength_m * radar.reference_range_m)
+    found = {"irw_azimuth_m": _WIDTH * along / min(band, processed_hz)}
+    found |= {"pslr_azimuth_db": _PSLR_DB, "islr_azimuth_db": _ISLR_DB}
+    found |= dict.fromkeys(("u_r_error_m_s", "u_a_error_m_s", "position_error_m"), 0.0)
+    if ranges:
+        found |= {"irw_range_m": _WIDTH * radar.wave_speed_m_s / (2 * radar.pulse.bandwidth_hz)}
+        found |= {"pslr_range_db": _PSLR_DB, "islr_range_db": _ISLR_DB, "range_error_m": 0.0}
+    return found

@@ -1,0 +1,263 @@
+"""What a chain found out about the radial motion of a triangular-sweep ladar, against the truth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.radial import integrated_range
+from torchsar.core import Axis, Chain, Signal, Trace, unit_phasor
+from torchsar.metrics.impulse import impulse_response
+from torchsar.radar import TriangularLadar, sweep_middles
+
+SWEEPS = ("ramp", "pulse", "fast_time")
+# scatterers more than 10 dB below the strongest do not lead an estimator
+_LEADING = 10 ** (-10 / 20)
+
+
+@dataclass(frozen=True)
+class Course:
+    """The motion as a chain found it, beside the true one.
+
+    Args:
+        pulse: Starts of the periods.
+        velocity_m_s: Estimated velocity at the turning points, (..., pulse), receding positive;
+            None where the chain estimates none.
+        velocity_error_m_s: Estimated minus true velocity, likewise.
+        error_m: Range error at the middles of the up sweeps, (..., pulse).
+        coarse_m: The same without the phases that were removed from pulses.
+        lit: Periods in which a leading scatterer is lit, bool (..., pulse).
+    """
+
+    pulse: Axis
+    velocity_m_s: Tensor | None
+    velocity_error_m_s: Tensor | None
+    error_m: Tensor
+    coarse_m: Tensor
+    lit: Tensor
+
+    @property
+    def detrended_m(self) -> Tensor:
+        """Range error without constant and slope, (..., pulse), zero where nothing is lit."""
+        mean, slope, k = self._line(self.error_m)
+        return torch.where(self.lit, self.error_m - mean[..., None] - slope[..., None] * k, 0)
+
+    @property
+    def slope_m_s(self) -> Tensor:
+        """Slope of the range error over slow time, (...,)."""
+        return self._line(self.error_m)[1] / self.pulse.step
+
+    @property
+    def coarse_slope_m_s(self) -> Tensor:
+        """Slope of what velocities alone leave, (...,): phases of pulses move no envelope."""
+        return self._line(self.coarse_m)[1] / self.pulse.step
+
+    @property
+    def largest_m(self) -> Tensor:
+        """Largest distance of the range error from its first lit value, (...,)."""
+        at = self.lit.to(torch.int8).argmax(-1, keepdim=True).expand(*self.error_m.shape[:-1], 1)
+        return torch.where(self.lit, (self.error_m - self.error_m.gather(-1, at)).abs(), 0).amax(-1)
+
+    def rms(self, x: Tensor) -> Tensor:
+        """Root mean square of x (..., pulse) over the lit pulses, (...,)."""
+        return (torch.where(self.lit, x.square(), 0).sum(-1) / self._count).sqrt()
+
+    def metrics(self, radar: TriangularLadar) -> dict[str, Tensor]:
+        """Figures of the motion, (...,) each.
+
+        Args:
+            radar: The instrument, whose wavelength turns ranges into phases.
+
+        Returns:
+            `velocity_rmse_m_s` (where a velocity was estimated), `range_error_max_m`,
+            `range_error_detrended_rms_m` and `residual_phase_rms_rad`.
+        """
+        left = self.rms(self.detrended_m)
+        error = self.velocity_error_m_s
+        return {
+            **({} if error is None else {"velocity_rmse_m_s": self.rms(error)}),
+            "range_error_max_m": self.largest_m,
+            "range_error_detrended_rms_m": left,
+            "residual_phase_rms_rad": 4 * math.pi / radar.wavelength_m * left,
+        }
+
+    def first(self) -> Course:
+        """The course of the first trial."""
+        names = ("velocity_m_s", "velocity_error_m_s", "error_m", "coarse_m", "lit")
+        parts = {name: getattr(self, name) for name in names}
+        rows = {name: None if x is None else x.reshape(-1, x.shape[-1])[0].cpu() for name, x in parts.items()}
+        return replace(self, **rows)
+
+    @property
+    def _count(self) -> Tensor:
+        return self.lit.sum(-1).clamp_min(1)
+
+    def _line(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Least-squares line through the lit pulses: mean, slope per pulse, and the pulses counted
+        from the middle of the lit ones.
+        """
+        k = torch.arange(x.shape[-1], dtype=torch.float64, device=x.device).expand(self.lit.shape)
+        k = k - (torch.where(self.lit, k, 0).sum(-1) / self._count)[..., None]
+        mean = torch.where(self.lit, x, 0).sum(-1) / self._count
+        slope = torch.where(self.lit, x * k, 0).sum(-1) / torch.where(self.lit, k.square(), 0).sum(-1).clamp_min(1)
+        return mean, slope, k
+
+
+def leading(level: Tensor) -> Tensor:
+    """Scatterers within 10 dB of the strongest.
+
+    Args:
+        level: Amplitudes, (..., target).
+
+    Returns:
+        bool (..., target).
+    """
+    return (level >= _LEADING * level.amax(-1, keepdim=True)) & (level > 0)
+
+
+def lit_periods(radar: TriangularLadar, pulse: Axis, azimuth_m: Tensor, range_m: Tensor) -> Tensor:
+    """Periods in which the beam lights any of some scatterers at the turning points.
+
+    Args:
+        radar: The instrument.
+        pulse: Starts of the periods.
+        azimuth_m: Positions along track in metres, (..., target).
+        range_m: Ranges relative to the reference range in metres, (..., target).
+
+    Returns:
+        bool (..., pulse).
+    """
+    turning = pulse.values(azimuth_m.device) + radar.period_s / 2
+    across = radar.speed_m_s * turning[:, None] - azimuth_m[..., None, :]
+    half = math.inf if radar.beam_rad is None else radar.beam_rad / 2
+    return (across.abs() <= half * (radar.reference_range_m + range_m)[..., None, :]).any(-1)
+
+
+def course_of(chain: Chain, trace: Trace, truth: Mapping[str, Tensor], radar: TriangularLadar, clean: bool) -> Course:
+    """The motion as a chain found it, beside the true one.
+
+    Args:
+        chain: The chain.
+        trace: What it made of a recording.
+        truth: True values of that recording, as the simulation gives them.
+        radar: The instrument.
+        clean: Whether the chain ran on the recording without motion.
+
+    Raises:
+        ValueError: If the chain never has separated sweeps.
+    """
+    pulse = _sweeps_axis(trace)
+    velocity = _summed(chain, trace, "velocity_m_s")
+    phase = _summed(chain, trace, "phase_rad", used_only=trace.signal.names != SWEEPS)
+    up, true = (truth[name][..., : pulse.n] for name in ("range_error_up_m", "velocity_m_s"))
+    up, true = (torch.zeros_like(x) if clean else x for x in (up, true))
+    taken = _compensated(chain, trace)
+    moved = torch.zeros_like(up)
+    if taken is not None:
+        moved = integrated_range(taken, radar, pulse, sweep_middles(radar, pulse)[0])
+    coarse = error = moved - up
+    if phase is not None:
+        per_m = 4 * math.pi / radar.wavelength_m
+        error = _unwrapped(coarse * per_m + phase) / per_m
+    shines = leading(truth["amplitude"].abs())
+    azimuth = torch.where(shines, truth["azimuth_m"], math.inf)  # others are never in the beam
+    lit = lit_periods(radar, pulse, azimuth, truth["range_m"].expand(azimuth.shape)).expand(error.shape)
+    return Course(pulse, velocity, None if velocity is None else velocity - true, error, coarse, lit)
+
+
+def target_responses(
+    image: Signal,
+    positions_m: Mapping[str, tuple[Tensor, Tensor]],
+    course: Course,
+    radar: TriangularLadar,
+    sidelobe_nulls: int,
+    search_m: float,
+) -> dict[str, dict[str, Tensor]]:
+    """Responses of named targets in an image, sought where what is left of the motion moves them.
+
+    Echo phases 4 pi DR / lambda with the slope -e' of DR shift azimuth by -e' R / V, and beats by
+    2 e' / lambda.
+
+    Args:
+        image: Image (azimuth, range).
+        positions_m: Azimuth and relative range in metres, (...,) each, by name.
+        course: What is left of the motion.
+        radar: The instrument.
+        sidelobe_nulls: Extent of the side lobes in null spacings.
+        search_m: How far from the predicted position a response is sought.
+
+    Returns:
+        Figures of `impulse_response` by name; targets outside the image are left out.
+    """
+    found, finer = {}, finer_in_range(image)
+    for name, (azimuth, range_) in positions_m.items():
+        along = azimuth + course.slope_m_s * (radar.reference_range_m + range_) / max(radar.speed_m_s, 1e-30)
+        beyond = range_ - course.coarse_slope_m_s * radar.carrier_hz / radar.chirp_rate_hz_s
+        pairs = zip((azimuth, range_), image.axes, strict=True)
+        if all(bool(((x >= axis.start) & (x <= axis.stop)).all()) for x, axis in pairs):
+            at = [x.clamp(axis.start, axis.stop) for x, axis in zip((along, beyond), image.axes, strict=True)]
+            given = {"sidelobe_nulls": sidelobe_nulls, "search_m": search_m, "centre_turns": (None, 0.0)}
+            figures = impulse_response(finer, (at[0], at[1]), **given)  # pyright: ignore[reportArgumentType]
+            found[name] = {key: value for key, value in figures.items() if key != "peak"}
+    return found
+
+
+def finer_in_range(image: Signal) -> Signal:
+    """The image on half the range step, exact for profiles that were not cropped.
+
+    Full-band profiles have no guard band, which measured slices need.
+
+    Args:
+        image: Image (azimuth, range).
+
+    Returns:
+        Image with twice the range samples, complex128.
+    """
+    azimuth, range_ = image.axes
+    n, data = range_.n, image.data.to(torch.complex128)
+    cell = torch.arange(2 * n, dtype=torch.float64, device=data.device)
+    half = (n - 1) / (2 * n)  # the middle of the sweep, in turns a cell
+    sweeps = torch.fft.ifft(data * unit_phasor(-half * cell[:n], torch.complex128))
+    fine = torch.fft.fft(sweeps, 2 * n) * unit_phasor(half / 2 * cell, torch.complex128)
+    return Signal(fine, (azimuth, Axis("range", 2 * n, range_.start, range_.step / 2, range_.unit)))
+
+
+def _unwrapped(phase: Tensor) -> Tensor:
+    """Phases (..., n) with steps within half a turn, beginning where they begin."""
+    step = torch.diff(phase)
+    step = step - 2 * math.pi * torch.round(step / (2 * math.pi))
+    return torch.cat([phase[..., :1], phase[..., :1] + step.cumsum(-1)], -1)
+
+
+def _sweeps_axis(trace: Trace) -> Axis:
+    """Starts of the periods of the last separated sweeps."""
+    found = [signal for signal in (*trace.inputs.values(), *trace.outputs.values()) if signal.names == SWEEPS]
+    if not found:
+        raise ValueError(
+            f"the method never has separated sweeps {SWEEPS}; begin its chain with split_sweeps if the world has a record"
+        )
+    return found[-1].axis("pulse")
+
+
+def _compensated(chain: Chain, trace: Trace) -> Tensor | None:
+    """Velocity that was removed, or for a chain without an image would be, (..., pulse)."""
+    used = {key for uses in chain.uses.values() for key in uses}
+    return _summed(chain, trace, "velocity_m_s") if "velocity_m_s" in used or trace.signal.names == SWEEPS else None
+
+
+def _summed(chain: Chain, trace: Trace, name: str, used_only: bool = False) -> Tensor | None:
+    """Sum over the stages that use a value of what they are given; without any, the last estimate
+    of it; None where there is none.
+    """
+    taken = [
+        trace.values[uses[name]].to(torch.float64)
+        for stage, uses in chain.uses.items()
+        if name in uses and stage in trace.outputs
+    ]
+    if not taken and not used_only:
+        taken = [e.value[name].to(torch.float64) for e in trace.estimates.values() if name in e.value][-1:]
+    return torch.stack(taken).sum(0) if taken else None

@@ -1,0 +1,226 @@
+"""What a chain found out about a non-uniform rotation, against the truth, and cuts through targets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.rotation import CoarseRotation, k_name
+from torchsar.core import Chain, Estimate, Signal, unit_phasor
+from torchsar.focus.image_lines import mean_rate
+
+# the usual -3 dB, as a ratio of powers
+_HALF_POWER = 10 ** (-3.0 / 10)
+# chosen: points of a cut per line of the image, and lines beside it that keep its ends undisturbed
+_FINER, _MARGIN = 8, 64
+# fewer lines than this do not show a main lobe with its side lobes
+_FEWEST = 8
+
+
+@dataclass(frozen=True)
+class FoundRotation:
+    """A rotation as the estimators of a chain found it.
+
+    Args:
+        omega_rad_s: Rate at the first pulse in rad/s, (...,); None where no estimator looks for it.
+        warp_k: k1, k2, ..., (..., order - 1), likewise.
+        yc_m: Range centre deviation in metres, (...,), likewise.
+        std: Standard deviations of those values that estimators predict.
+    """
+
+    omega_rad_s: Tensor | None
+    warp_k: Tensor | None
+    yc_m: Tensor | None
+    std: Mapping[str, Tensor]
+
+    @staticmethod
+    def by(chain: Chain, estimates: Mapping[str, Estimate]) -> FoundRotation:
+        """From the estimates of a chain by stage; later ones replace earlier ones."""
+        found: dict[str, Tensor] = {}
+        std: dict[str, Tensor] = {}
+        for name, estimate in estimates.items():
+            stage = chain.stages[name]
+            held = set() if getattr(stage, "yc_m", 0.0) is None else {"yc_m"}
+            held |= {"omega_rad_s", "yc_m"} if isinstance(stage, CoarseRotation) else set()
+            for key in estimate.value.keys() - held:
+                found[key] = estimate.value[key]
+                std.pop(key, None)
+                std.update({key: estimate.std[key]} if key in estimate.std else {})
+        return FoundRotation(found.get("omega_rad_s"), found.get("warp_k"), found.get("yc_m"), std)
+
+    def rate(self, duration_s: float) -> Tensor | None:
+        """Mean rate over the record in rad/s, (...,); NaN where the estimate is not positive, None
+        where there is none.
+        """
+        if self.omega_rad_s is None or self.warp_k is None:
+            return None
+        rate = mean_rate(self.omega_rad_s, self.warp_k, duration_s)
+        return torch.where(rate > 0, rate, torch.nan)
+
+    def errors(
+        self, truth: Mapping[str, Tensor], duration_s: float, assumed_rad_s: float | None = None
+    ) -> dict[str, Tensor]:
+        """Errors and predicted standard deviations.
+
+        Args:
+            truth: True `omega_rad_s`, `warp_k`, `yc_m` and mean rate `rotation_rad_s`, as the
+                simulation gives them.
+            duration_s: Length of the record in seconds.
+            assumed_rad_s: What the radar takes the rate to be, for chains that find none.
+
+        Returns:
+            Figures by name, (...,) each, in % of the truth; of a k whose true value is zero in its
+            own unit, under `k1_error_per_s`, `k2_error_per_s2`, ... Where some trials have a k of
+            zero and others not, both names are there, NaN where they do not apply.
+        """
+        found: dict[str, Tensor] = {}
+        if self.omega_rad_s is not None:
+            found["omega_error_percent"] = 100 * (self.omega_rad_s / truth["omega_rad_s"] - 1)
+            if "omega_rad_s" in self.std:
+                found["omega_std_percent"] = _percent(self.std["omega_rad_s"], self.omega_rad_s)
+        if self.warp_k is not None:
+            stds = self.std.get("warp_k")
+            for i, k in enumerate(self.warp_k.unbind(-1), 1):
+                true = true_k(truth, i)
+                std = None if stds is None else stds[..., i - 1]
+                for name, scale in k_scales(i, true).items():
+                    found[name] = (k - true) * scale
+                    if std is not None:
+                        own = _percent(std, k) if name.endswith("percent") else std
+                        found[name.replace("error", "std")] = torch.where(scale.isnan(), torch.nan, own)
+        if self.yc_m is not None:
+            found["yc_error_m"] = self.yc_m - truth["yc_m"]
+            found.update({"yc_std_m": self.std["yc_m"]} if "yc_m" in self.std else {})
+        rate = self.rate(duration_s)
+        if rate is None and assumed_rad_s is not None:
+            rate = torch.full_like(truth["rotation_rad_s"], assumed_rad_s)
+        if rate is not None:
+            found["cross_range_scale_error_percent"] = 100 * (truth["rotation_rad_s"] / rate - 1)
+        return found
+
+
+def true_k(truth: Mapping[str, Tensor], i: int) -> Tensor:
+    """True k_i, (...,); zero beyond the order of the true rotation."""
+    k = truth["warp_k"]
+    return k[..., i - 1] if i <= k.shape[-1] else torch.zeros_like(truth["omega_rad_s"])
+
+
+def k_scales(i: int, true: Tensor) -> dict[str, Tensor]:
+    """Names of errors of k_i, and what an error in its own unit is multiplied with, (...,) each; NaN
+    in trials that a name does not apply to.
+    """
+    zero, own = true == 0, k_name(i).replace("_", "_error_", 1)
+    found = {} if bool(zero.all()) else {f"k{i}_error_percent": torch.where(zero, torch.nan, 100 / true.abs())}
+    return found | ({own: torch.where(zero, 1.0, torch.nan).to(true)} if bool(zero.any()) else {})
+
+
+def _percent(std: Tensor, value: Tensor) -> Tensor:
+    return torch.where(value != 0, 100 * std / value.abs(), 100.0)
+
+
+@dataclass(frozen=True)
+class CrossRangeCut:
+    """Cuts through a point target along cross range, interpolated.
+
+    Args:
+        offset_m: Distance from the true position in metres, (trial, point).
+        line: Complex samples, (trial, point).
+        inside: Points within the search, bool (trial, point).
+    """
+
+    offset_m: Tensor
+    line: Tensor
+    inside: Tensor
+
+    @property
+    def figures(self) -> dict[str, Tensor]:
+        """`peak` (amplitude), `irw_azimuth_m` between the first crossings of -3 dB beside the peak,
+        and `pslr_azimuth_db`, the strongest response beyond the first minima beside it, (trial,)
+        each.
+        """
+        power = torch.where(self.inside, self.line.abs().square(), 0)
+        top = power.argmax(-1, keepdim=True)
+        peak = power.gather(-1, top)
+        ends = [self._reach(power, top, peak, side) for side in (1, -1)]
+        step = self.offset_m[:, 1] - self.offset_m[:, 0]
+        index = torch.arange(power.shape[-1], device=power.device)
+        beside = torch.where((index > ends[0][1]) | (index < ends[1][1]), power, 0).amax(-1)
+        ratio = beside / peak[:, 0].clamp_min(torch.finfo(power.dtype).tiny)
+        return {
+            "peak": peak[:, 0].sqrt(),
+            "irw_azimuth_m": (ends[0][0] - ends[1][0])[:, 0] * step,
+            "pslr_azimuth_db": 10 * torch.log10(ratio.clamp_min(1e-30)),
+        }
+
+    def _reach(self, power: Tensor, top: Tensor, peak: Tensor, side: int) -> tuple[Tensor, Tensor]:
+        """Fractional index of half power and index of the first minimum to one side, (trial, 1)."""
+        n, index = power.shape[-1], torch.arange(power.shape[-1], device=power.device)
+        before = power.roll(side, -1)  # the neighbour towards the peak
+        beyond, last = (index - top) * side > 0, n if side > 0 else -1
+        edge = torch.where(self.inside, index, 0 if side > 0 else n - 1)
+        edge = edge.amax(-1, keepdim=True) if side > 0 else edge.amin(-1, keepdim=True)
+
+        def first(where: Tensor) -> Tensor:
+            at = torch.where(where & beyond & self.inside, index, last)
+            return at.amin(-1, keepdim=True) if side > 0 else at.amax(-1, keepdim=True)
+
+        half = first(power < _HALF_POWER * peak)
+        there = half != last
+        at = half.clamp(0, n - 1)
+        high, low = before.gather(-1, at), power.gather(-1, at)
+        part = (high - _HALF_POWER * peak) / torch.where(high > low, high - low, 1)
+        crossing = torch.where(there, half - side + side * part, edge)
+        rise = first(power > before)
+        return crossing, torch.where(rise != last, rise - side, edge)
+
+
+def cross_range_cut(
+    image: Signal,
+    x_m: Tensor,
+    y_m: Tensor,
+    metres_per_unit: Tensor,
+    search_m: float,
+    centre_turns: float = 0.0,
+) -> CrossRangeCut | None:
+    """Cut images along cross range through the range cell nearest to a target.
+
+    Args:
+        image: Images (trial, azimuth, range).
+        x_m: True cross range in metres, (trial,).
+        y_m: True range in metres, (trial,).
+        metres_per_unit: Metres for one unit of the azimuth axis, (trial,): wavelength / (2 rate)
+            for an axis in Hz.
+        search_m: Half length of the cut in metres.
+        centre_turns: Middle of the spectrum of the lines in turns per line; the matched Fourier
+            transform has its band at 0..1 of the aperture.
+
+    Returns:
+        The cuts; None where an image has fewer than 8 lines within search_m of the target.
+    """
+    along, across = image.axes
+    n, device = along.n, image.data.device
+    start, step = along.start * metres_per_unit, along.step * metres_per_unit
+    middle = ((x_m - start) / step).round().long()
+    reach = (search_m / step).ceil().long()
+    first, last = (middle - reach).clamp(0, n), (middle + reach + 1).clamp(0, n)
+    if not bool((last - first >= _FEWEST).all()):
+        return None
+    longest = int((last - first).max())
+    margin = max(_MARGIN, longest)
+    size = min(n, longest + 2 * margin)
+    low = (first - margin).clamp(0, n - size)
+    column = across.index_of(y_m).round().long().clamp(0, across.n - 1)
+    rows = low[:, None] + torch.arange(size, device=device)
+    trial = torch.arange(len(rows), device=device)[:, None]
+    line = image.data[trial, rows, column[:, None]].to(torch.complex128)
+    index = torch.arange(size, dtype=torch.float64, device=device)
+    spectrum = torch.fft.fft(line * unit_phasor(-centre_turns * index, line.dtype))
+    half = (size + 1) // 2
+    gap = spectrum.new_zeros((len(rows), (_FINER - 1) * size))
+    fine = torch.fft.ifft(torch.cat([spectrum[:, :half], gap, spectrum[:, half:]], -1)) * _FINER
+    places = low[:, None] + torch.arange(fine.shape[-1], dtype=torch.float64, device=device) / _FINER
+    inside = (places >= first[:, None]) & (places <= last[:, None] - 1)
+    return CrossRangeCut(start[:, None] + step[:, None] * places - x_m[:, None], fine, inside)

@@ -1,0 +1,276 @@
+"""Images of moving ships on a sea, against the truth: velocities, positions, false targets, the sea."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Signal
+from torchsar.multichannel.body import Extraction, centred_motion, chip_about
+from torchsar.multichannel.migration import Frame
+from torchsar.multichannel.motion import PointMotion
+from torchsar.multichannel.stationary import StationaryImage
+from torchsar.radar import BistaticRadar
+
+# half extents in azimuth and range, in metres, in which levels are measured: the sea about a ship,
+# the ship itself, a replica; and in which a ship and its blurred replicas are sought
+NEAR_M, SHIP_M, REPLICA_M = (400.0, 30.0), (60.0, 12.0), (100.0, 40.0)
+_SHOWN_M, _SPREAD_M = (250.0, 60.0), (150.0, 110.0)
+# speeds |u_r| and |u_a| in m/s up to which a ship counts as at rest, as in `ImageMovers`
+_SLOWEST_M_S = (0.3, 1.0)
+
+
+@dataclass(frozen=True)
+class ImagePosition:
+    """A position in an image.
+
+    Args:
+        azimuth_m: x = V_R t in metres.
+        range_m: Closest range in metres.
+    """
+
+    azimuth_m: float
+    range_m: float
+
+    @staticmethod
+    def of(motion: PointMotion) -> ImagePosition:
+        """Where the image of everything at rest shows a motion."""
+        return ImagePosition(motion.speed_m_s * float(motion.image_s), float(motion.closest_m))
+
+    def window(self, image: Signal, reach_m: tuple[float, float]) -> tuple[Tensor, Tensor]:
+        """Rows (row, 1) and columns of an image within reach_m of the position."""
+        azimuth, range_ = (axis.values(image.data.device) for axis in image.axes)
+        rows = ((azimuth - self.azimuth_m).abs() < reach_m[0]).nonzero()
+        return rows, ((range_ - self.range_m).abs() < reach_m[1]).nonzero()[:, 0]
+
+    def power(self, image: Signal, reach_m: tuple[float, float]) -> float:
+        """Mean power within reach_m, zero outside of the image."""
+        cut = image.data[self.window(image, reach_m)]
+        return float(cut.abs().square().to(torch.float64).mean()) if cut.numel() else 0.0
+
+    def centroid(self, image: Signal, reach_m: tuple[float, float]) -> ImagePosition:
+        """Centre of power within reach_m, the position itself where there is none."""
+        rows, columns = self.window(image, reach_m)
+        power = image.data[rows, columns].abs().square().to(torch.float64)
+        total = power.sum()
+        if not float(total) > 0:
+            return self
+        azimuth, range_ = (axis.values(image.data.device) for axis in image.axes)
+        along, across = (power.sum(1) * azimuth[rows[:, 0]]).sum(), (power.sum(0) * range_[columns]).sum()
+        return ImagePosition(float(along / total), float(across / total))
+
+
+@dataclass(frozen=True)
+class Ship:
+    """The truth about a ship.
+
+    Args:
+        motion: Motion of its middle, () each.
+        scatterers_m: Along-track position and closest range of the centre of its scatterers' powers.
+        echo: Its echo alone (channel, pulse, range), without the transmit range.
+    """
+
+    motion: PointMotion
+    scatterers_m: tuple[float, float]
+    echo: Signal
+
+    @property
+    def moves(self) -> bool:
+        """Whether it is faster than what counts as at rest."""
+        fast = (self.motion.u_r_m_s.abs() > _SLOWEST_M_S[0], self.motion.u_a_m_s.abs() > _SLOWEST_M_S[1])
+        return any(map(bool, fast))
+
+
+@dataclass(frozen=True)
+class ShownShip:
+    """What a ship looks like without sea and noise.
+
+    Args:
+        ship: The ship.
+        centre: Motion of the intensity centroid of its own image, by its true velocities.
+        image: Position in the image of everything at rest.
+        replica: Position of the strongest replica, one or two pulse rates away.
+        away_m: Distance of the first replica, measured on x = V_R t, and predicted on
+            x = (V_R - u_a) t.
+    """
+
+    ship: Ship
+    centre: PointMotion
+    image: ImagePosition
+    replica: ImagePosition
+    away_m: tuple[float, float]
+
+    @staticmethod
+    def of(radar: BistaticRadar, ship: Ship, data: Signal, extraction: Extraction) -> ShownShip:
+        """From the ship and the whole recording, whose sea weights the image of the ship.
+
+        Args:
+            radar: The instrument.
+            ship: The ship.
+            data: The recording (channel, pulse, range), without the transmit range.
+            extraction: Extent of a ship in the data.
+        """
+        image, motion = StationaryImage(radar)(ship.echo), ship.motion
+        shown = ImagePosition.of(motion).centroid(image, _SHOWN_M)
+        predicted = radar.prf_hz * radar.wavelength_m * float(motion.range_m) / float(motion.along_m_s)
+        off = predicted * radar.speed_m_s / float(motion.along_m_s)
+        first, *_ = replicas = [_repeated(image, shown, order * off) for order in (1, 2)]
+        strongest = max(replicas, key=lambda position: position.power(image, REPLICA_M))
+        frame = Frame.of(radar, data)
+        chip = chip_about(data.data, frame, motion, extraction)
+        own = centred_motion(replace(chip, cells=chip_about(ship.echo.data, frame, motion, extraction).cells))
+        return ShownShip(ship, own, shown, strongest, (abs(first.azimuth_m - shown.azimuth_m), predicted))
+
+    def metrics(self) -> dict[str, float]:
+        """What only the echo decides: displacements and distances of replicas."""
+        y0, along = float(self.centre.y0_m), float(self.centre.along_m_s)
+        shown = {
+            "image_position_m": self.image.azimuth_m,
+            "displacement_m": self.image.azimuth_m - y0,
+            "displacement_vt_m": along * float(self.centre.image_s) - y0,
+        }
+        away = {"replica_distance_m": self.away_m[0], "replica_distance_vt_m": self.away_m[1]}
+        return {**shown, **away} if self.ship.moves else shown
+
+
+def _repeated(image: Signal, shown: ImagePosition, off_m: float) -> ImagePosition:
+    """Where a replica lies off_m to either side of the image itself, on the side where it is
+    stronger: it is wide in range, since its migration is that of another band.
+    """
+    sides = [replace(shown, azimuth_m=shown.azimuth_m + side * off_m) for side in (-1, 1)]
+    return max(sides, key=lambda position: position.power(image, _SPREAD_M)).centroid(image, _SPREAD_M)
+
+
+@dataclass(frozen=True)
+class FoundTarget:
+    """A target that a method found.
+
+    Args:
+        motion: Its motion, () each.
+        u_r_std_m_s: Predicted standard deviation of the slant-range speed; 0 where there is none.
+        ok: Whether the estimate is reliable.
+    """
+
+    motion: PointMotion
+    u_r_std_m_s: float
+    ok: bool
+
+
+@dataclass(frozen=True)
+class MadeScene:
+    """What a method made of a scene.
+
+    Args:
+        conventional: Image (azimuth, range) of everything as if at rest.
+        rest: Image without the moving targets.
+        fused: Image with every moving target at its position.
+        targets: What it found; None for a method that does not look for targets.
+    """
+
+    conventional: Signal
+    rest: Signal
+    fused: Signal
+    targets: Sequence[FoundTarget] | None = None
+
+
+def matched(
+    targets: Sequence[FoundTarget], ships: Mapping[str, ShownShip], match_m: tuple[float, float]
+) -> dict[str, FoundTarget | None]:
+    """Assign targets to ships by where the image of everything at rest shows both.
+
+    Args:
+        targets: Reliable targets.
+        ships: The ships.
+        match_m: Largest distances in azimuth and range.
+
+    Returns:
+        By ship the nearest target in units of match_m, each target once; None where there is none.
+    """
+    pairs = []
+    for name, shown in ships.items():
+        own = ImagePosition.of(shown.centre)
+        for i, target in enumerate(targets):
+            at = ImagePosition.of(target.motion)
+            away = max(abs(own.azimuth_m - at.azimuth_m) / match_m[0], abs(own.range_m - at.range_m) / match_m[1])
+            pairs += [(away, name, i)] if away < 1 else []
+    found: dict[str, FoundTarget | None] = dict.fromkeys(ships)
+    taken = set()
+    for _, name, i in sorted(pairs):
+        if found[name] is None and i not in taken:
+            found[name] = targets[i]
+            taken.add(i)
+    return found
+
+
+def ship_metrics(shown: ShownShip, found: FoundTarget | None, made: MadeScene, still: Signal) -> dict[str, float]:
+    """Figures of one ship.
+
+    A ship that is not found counts as at rest where the image of everything at rest shows it.
+
+    Args:
+        shown: The truth.
+        found: The target that belongs to it.
+        made: What the method made of the scene.
+        still: Image, rebuilt as the method rebuilds, of what does not move.
+
+    Returns:
+        Errors, levels and distances by name, in m/s, m and dB.
+    """
+    return {**shown.metrics(), **_errors(shown, found, made.targets is not None), **_levels(shown, made, still)}
+
+
+def _errors(shown: ShownShip, found: FoundTarget | None, estimates: bool) -> dict[str, float]:
+    true, scatterers = shown.centre, shown.ship.scatterers_m
+    u_r, u_a, y0, near = 0.0, 0.0, shown.image.azimuth_m, shown.image.range_m
+    if found is not None:
+        names = ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
+        u_r, u_a, y0, near = (float(getattr(found.motion, name)) for name in names)
+    along, across = y0 - float(true.y0_m), near - float(true.range_m)
+    positions = {
+        "position_error_m": math.hypot(along, across),
+        "along_error_m": along,
+        "range_error_m": across,
+        "scatterers_error_m": math.hypot(y0 - scatterers[0], near - scatterers[1]),
+    }
+    if not estimates:
+        return positions
+    errors = {"u_r_error_m_s": u_r - float(true.u_r_m_s), "u_a_error_m_s": u_a - float(true.u_a_m_s)}
+    std = {} if found is None or not found.u_r_std_m_s > 0 else {"u_r_std_m_s": found.u_r_std_m_s}
+    return {
+        **errors,
+        **positions,
+        **std,
+        "found": float(found is not None),
+        "ok": float(found is not None and found.ok),
+    }
+
+
+def _levels(shown: ShownShip, made: MadeScene, still: Signal) -> dict[str, float]:
+    """What images hold where a ship is, was shown, and repeats."""
+
+    def of_lines(at: ImagePosition, reach_m: float) -> float:
+        """Mean power of what does not move in the lines within reach_m."""
+        return at.power(still, (math.inf, reach_m))
+
+    true = ImagePosition(float(shown.centre.y0_m), float(shown.centre.range_m))
+    levels = {"contrast_db": _db(true.power(made.fused, SHIP_M), of_lines(true, SHIP_M[1]))}
+    if not shown.ship.moves:
+        return levels
+    left, before = (still.with_data(image.data - still.data) for image in (made.rest, made.conventional))
+    at, again = ImagePosition.of(shown.centre), shown.replica
+    sea, floor = at.power(still, NEAR_M), of_lines(again, REPLICA_M[1])
+    levels |= {
+        "sea_error_db": _db(at.power(left, NEAR_M), sea),
+        "sea_error_before_db": _db(at.power(before, NEAR_M), sea),
+    }
+    levels |= {"hole_db": _db(at.power(made.rest, SHIP_M), at.power(still, SHIP_M))}
+    replicas = {"replica_db": made.fused, "replica_before_db": made.conventional, "replica_left_db": left}
+    return {**levels, **{name: _db(again.power(image, REPLICA_M), floor) for name, image in replicas.items()}}
+
+
+def _db(power: float, reference: float) -> float:
+    return 10 * math.log10(max(power, 1e-30) / max(reference, 1e-30))

@@ -1,0 +1,215 @@
+"""Parameters that may differ between the trials of a batch: validation and broadcasting.
+
+A constructor parameter annotated `Tensor | float` is a number, equal in all trials, or a tensor of
+shape (...,) with one value per trial.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from functools import cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Draws, Recording, per_trial
+
+# types that hold no parameters per trial
+_PLAIN = (float, int, str, type(None))
+
+
+def refuse_unless(sentence: str, value: Tensor | float, within: Callable[[Any], Any], advice: str = "") -> None:
+    """Raise ValueError unless every entry of a parameter satisfies a condition.
+
+    Args:
+        sentence: Statement of what is expected; the message is "{sentence}, got {offending value};
+            {advice}".
+        value: Number, or one value per trial, shape (...,).
+        within: Condition for a number or, entry by entry, for a tensor.
+        advice: What to try instead, empty for no advice.
+
+    Raises:
+        ValueError: If an entry violates the condition; the message holds the first such entry.
+    """
+    if isinstance(value, float | int) and within(value) is True:
+        return
+    x = torch.as_tensor(value, dtype=torch.float64).detach()
+    good = within(x)
+    if bool(good.all()):
+        return
+    got = f"{value}"
+    if isinstance(value, Tensor):
+        at = (~good).nonzero()[0].tolist()
+        where = f" at index {at[0] if len(at) == 1 else tuple(at)}" if at else ""
+        got = f"{float(x.expand(good.shape)[tuple(at)]):g}{where}"
+    raise ValueError(f"{sentence}, got {got}" + (f"; {advice}" if advice else ""))
+
+
+def refuse_unless_finite(
+    what: str, value: Tensor | float | Sequence[Tensor | float] | None, least: float = -math.inf
+) -> None:
+    """Raise ValueError unless every entry of a parameter is finite and not below a limit.
+
+    Args:
+        what: Name of the parameter for the message.
+        value: Number, one value per trial of shape (...,), a sequence of such values, or None,
+            which is accepted.
+        least: Smallest accepted value.
+
+    Raises:
+        ValueError: If an entry is not finite or below `least`.
+    """
+    if isinstance(value, list | tuple):
+        if all(isinstance(entry, float | int) and math.isfinite(entry) and entry >= least for entry in value):
+            return
+        for entry in value:
+            refuse_unless_finite(what, entry, least)
+    elif value is not None:
+        bound = "" if least == -math.inf else f" of {least:g} or more"
+        sentence = f"{what} must be a finite number{bound}, or one per trial"
+        refuse_unless(sentence, value, lambda x: finite(x) & (x >= least))  # type: ignore[arg-type]
+
+
+def finite(x: Any) -> Any:
+    """Return whether a number, or each entry of a tensor, is finite.
+
+    Args:
+        x: Number or tensor of any shape.
+
+    Returns:
+        bool, or a bool tensor of the shape of x.
+    """
+    return abs(x) < math.inf
+
+
+def positive(x: Any) -> Any:
+    """Return whether a number, or each entry of a tensor, is positive and finite.
+
+    Args:
+        x: Number or tensor of any shape.
+
+    Returns:
+        bool, or a bool tensor of the shape of x.
+    """
+    return (x > 0) & (x < math.inf)
+
+
+def with_dims(value: Tensor | float, dims: int, like: Tensor) -> Tensor | float:
+    """Return a per-trial tensor in a form that broadcasts against data, and a number unchanged.
+
+    Args:
+        value: Number, or one value per trial, shape (...,).
+        dims: Number of trailing dimensions of the data.
+        like: Tensor that gives the device.
+
+    Returns:
+        The number itself, or float64 of shape (..., 1, ..., 1) with `dims` trailing dimensions of
+        length one.
+    """
+    if isinstance(value, float | int):
+        return value
+    value = per_trial(value, 0, like)
+    return value[(...,) + (None,) * dims] if value.ndim else value
+
+
+def either(
+    value: Tensor | float, of_number: Callable[[float], float], of_tensor: Callable[[Tensor], Tensor]
+) -> Tensor | float:
+    """Apply a function to a number, or its torch counterpart to a per-trial tensor.
+
+    Args:
+        value: Number, or one value per trial, shape (...,).
+        of_number: Function of a number, such as `math.cos`.
+        of_tensor: Function of a float64 tensor, such as `torch.cos`.
+
+    Returns:
+        A number, or a float64 tensor of shape (...,).
+    """
+    return of_tensor(value.to(torch.float64)) if isinstance(value, Tensor) else of_number(value)
+
+
+def stacked(values: Sequence[Tensor | float] | Tensor, device: torch.device | str | None = None) -> Tensor:
+    """Stack numbers and per-trial tensors along a new last dimension.
+
+    Args:
+        values: Numbers or tensors of shape (...,), one per entry; a tensor of shape (..., entry) is
+            only converted.
+        device: Device of the result.
+
+    Returns:
+        Float64, shape (..., entry).
+    """
+    if isinstance(values, Tensor):
+        return values.to(device, torch.float64)
+    if all(isinstance(value, int | float) for value in values):
+        return torch.tensor(list(values), dtype=torch.float64, device=device)
+    entries = [torch.as_tensor(value, dtype=torch.float64, device=device) for value in values]
+    return torch.stack(torch.broadcast_tensors(*entries), -1)
+
+
+def refuse_other_trials(thing: object, draws: Draws, recording: Recording | None = None) -> None:
+    """Raise ValueError if a per-trial parameter has another length than the trials.
+
+    The trials are those of the recording, otherwise those of the draws. Without either, the
+    parameters must agree among themselves. Parameters are found by their annotations in
+    dataclasses, and in the sequences, mappings and dataclasses that these hold.
+
+    Args:
+        thing: Dataclass with parameters, such as a world or an impairment.
+        draws: Random draws of the simulation.
+        recording: Recording that an impairment is applied to, None for a world.
+
+    Raises:
+        ValueError: If a parameter has neither one value nor one for each trial.
+    """
+    drawn = () if draws.trials is None else (len(draws.trials),)
+    trials = drawn if recording is None else tuple(recording.signal.trials) or drawn
+    shapes = list(_per_trial_shapes(thing))
+    for name, shape in shapes:
+        if trials and shape and shape[-1] not in (1, trials[-1]):
+            whose = "draws" if trials == drawn else "recording"
+            raise ValueError(
+                f"{name} must be a number or one for each of the {trials[-1]} trials of the {whose}, "
+                f"got shape {tuple(shape)}"
+            )
+    if not trials and len({shape[-1] for _, shape in shapes if shape and shape[-1] != 1}) > 1:
+        found = ", ".join(f"{name} {tuple(shape)}" for name, shape in shapes if shape)
+        raise ValueError(f"parameters per trial must have one length, got the shapes {found}")
+
+
+def _per_trial_shapes(thing: object) -> Iterator[tuple[str, torch.Size]]:
+    """Names and trial dimensions of the per-trial parameters of an object and of its parts."""
+    if isinstance(thing, Mapping):
+        thing = list(thing.values())
+    if isinstance(thing, list | tuple):
+        for part in thing:
+            yield from _per_trial_shapes(part)
+    elif is_dataclass(thing) and not isinstance(thing, type):
+        for field, behind in _parameters(type(thing)):
+            value = getattr(thing, field, None)
+            if not isinstance(value, _PLAIN):
+                yield from _shapes_of(f"{field} of {type(thing).__name__}", value, behind)
+
+
+def _shapes_of(name: str, value: object, behind: int) -> Iterator[tuple[str, torch.Size]]:
+    """Name and trial dimensions of each tensor in a field; `behind` dimensions are no trials."""
+    if isinstance(value, Tensor):
+        yield name, value.shape[: max(0, value.ndim - behind)]
+    elif isinstance(value, list | tuple):
+        for entry in value:
+            if not isinstance(entry, _PLAIN):
+                yield from _shapes_of(name, entry, 0)
+    else:
+        yield from _per_trial_shapes(value)
+
+
+@cache
+def _parameters(kind: type) -> tuple[tuple[str, int], ...]:
+    """Fields of a dataclass, each with the number of trailing dimensions that are no trials."""
+    # a tensor has only trial dims in `Tensor | float`, one more in any other annotation, such as
+    # `Sequence[Tensor | float] | Tensor`; `Any` (an image) is not checked
+    annotations = [(field.name, str(field.type).replace("torch.", "")) for field in fields(kind)]
+    return tuple((name, 0 if text.startswith("Tensor | float") else 1) for name, text in annotations if text != "Any")

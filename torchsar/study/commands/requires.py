@@ -1,0 +1,148 @@
+"""`torchsar requires`: what a scene requires of its models and methods, before anything runs."""
+
+from __future__ import annotations
+
+import logging
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from torchsar.study.output.arrays import write_json
+from torchsar.study.output.folder import fresh_result
+from torchsar.study.settings.cases import ALL, cases_of
+from torchsar.study.settings.errors import ConfigError, one_line
+from torchsar.study.settings.sections import Loaded
+from torchsar.study.trials.auto import cheapest, choices_of, tolerance_of, within
+from torchsar.study.trials.bench import Bench
+from torchsar.study.trials.system import Choice
+
+log = logging.getLogger("torchsar")
+FILES = ("config.yaml", "requires.json", "requires.txt")
+
+
+def requires(loaded: Loaded, out: Path, device: str = "cpu") -> str:
+    """Limits, neglected phases and recommended choices of every case, as text.
+
+    Args:
+        loaded: The config.
+        out: The folder for config.yaml, requires.json and requires.txt.
+        device: Where a recording is processed, whose Doppler and velocity are estimated first.
+
+    Returns:
+        The text of requires.txt.
+
+    Raises:
+        ConfigError: If the config is invalid, or the system predicts nothing for a recording.
+    """
+    with fresh_result(out, "requires", FILES) as folder:
+        benches = {name: Bench(case, device) for name, case in cases_of(loaded).items()}
+        trees = {name: needs(bench) for name, bench in benches.items()}
+        text = "\n\n".join(_text(loaded.name if name == ALL else name, tree) for name, tree in trees.items())
+        (folder / "config.yaml").write_text(loaded.text(), encoding="utf-8")
+        (folder / "requires.txt").write_text(text + "\n", encoding="utf-8")
+        write_json(folder / "requires.json", trees)
+    return text
+
+
+def needs(bench: Bench) -> dict[str, Any]:
+    """What one case requires, as it stands in requires.json."""
+    tolerance = tolerance_of(bench.loaded)
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            limits = bench.system.limits(bench)
+            rows, choices = bench.system.requirements(bench), choices_of(bench)
+    except ConfigError:
+        raise
+    except (ValueError, TypeError) as error:
+        raise ConfigError(f"{bench.file}: {one_line(error)}") from None
+    return {
+        "limits": [{**asdict(one), "verdict": one.verdict, "methods": list(names)} for one, names in limits.items()],
+        "requirements": [{**asdict(row), "ok": row.ok, "verdict": row.verdict} for row in rows],
+        "choices": [_choice(choice, tolerance) for choice in choices],
+        "warnings": [one_line(w.message) for w in caught if isinstance(w.message, Warning)],
+    }
+
+
+def _choice(choice: Choice, tolerance: Mapping[str, float]) -> dict[str, Any]:
+    alternatives = [
+        {"name": one.name, "neglects": one.neglects, "loss": one.loss, "within_tolerance": within(one.loss, tolerance)}
+        for one in choice.alternatives
+        if one.loss is not None
+    ]
+    taken = cheapest(choice, tolerance).name if alternatives else None
+    return {"name": choice.name, "at": choice.at, "alternatives": alternatives, "recommended": taken}
+
+
+def refuse_beyond_limits(bench: Bench, case: str) -> None:
+    """Refuse a case beyond a limit that stops a method; warn of the other limits.
+
+    A method that the config names in beyond_limits is shown beyond its limits on purpose.
+
+    Raises:
+        ConfigError: With the limit, what it comes to and what helps.
+    """
+    where = "" if case == ALL else f"cases.{case}: "
+    try:
+        limits = bench.system.limits(bench)
+    except ValueError as error:
+        raise ConfigError(f"{bench.file}: {where}{one_line(error)}") from None
+    for limit, methods in limits.items():
+        shown = (*bench.config.beyond_limits, *(n for n, m in bench.config.processor.items() if m.input == "clean"))
+        stopped = [name for name in methods if name not in shown]
+        if limit.verdict == "refuse" and stopped:
+            raise ConfigError(
+                f"{bench.file}: {where}processor.{stopped[0]}: {limit.sentence} (or name the method in beyond_limits)"
+            )
+        if limit.verdict != "ok":
+            log.warning("warning: %s%s", where, limit.sentence)
+
+
+def _text(name: str, tree: Mapping[str, Any]) -> str:
+    parts = [name]
+    if tree["limits"]:
+        parts += [*_limit_lines(tree["limits"]), ""]
+    if tree["requirements"]:
+        parts += _requirement_lines(tree["requirements"])
+    for choice in tree["choices"]:
+        if choice["alternatives"]:
+            parts += ["", *_choice_lines(choice)]
+    return "\n".join([*parts, *(f"warning: {text}" for text in tree["warnings"])])
+
+
+def _limit_lines(limits: Sequence[Mapping[str, Any]]) -> list[str]:
+    wide = 2 + max(len(row["name"]) for row in limits)
+    lines = [f"{'limit':<{wide}}{'value':>12}{'limit':>14} {'unit':<8}{'verdict':<9}consequence; remedy (methods)"]
+    names = [row["name"] for row in limits]
+    for row in limits:
+        concerned = f"({', '.join(row['methods'])})"
+        then = concerned if names.count(row["name"]) > 1 else ""
+        if row["verdict"] != "ok":
+            then = f"{row['consequence']}; {row['remedy']} {concerned}"
+        least = (">= " if row["at_least"] else "< ") + format(row["limit"], ".4g")
+        lines.append(
+            f"{row['name']:<{wide}}{row['value']:>12.4g}{least:>14} {row['unit']:<8}{row['verdict']:<9}{then}".rstrip()
+        )
+    return lines
+
+
+def _requirement_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    wide = 2 + max(len(row["verdict"]) for row in rows)
+    lines = [f"{'simplification':<34}{'neglected phase':>16}{'range cells':>13}  {'verdict':<{wide}}neglects"]
+    for row in rows:
+        cells = "" if math.isnan(row["range_cells"]) else f"{row['range_cells']:.3g}"
+        phase = f"{row['phase_rad']:>12.3g} rad"
+        lines.append(f"{row['effect']:<34}{phase}{cells:>13}  {row['verdict']:<{wide}}{row['neglects']}")
+    return lines
+
+
+def _choice_lines(choice: Mapping[str, Any]) -> list[str]:
+    lines = [f"{choice['name']} (auto at {choice['at']}): {choice['recommended']}"]
+    for row in choice["alternatives"]:
+        loss = ", ".join(f"{name} {value:.3g}" for name, value in row["loss"].items()) or "exact"
+        verdict = "enough" if row["within_tolerance"] else "too much"
+        lines.append(f"  {row['name']:<34}{loss:<36}{verdict:<10}{row['neglects']}".rstrip())
+    return lines

@@ -1,0 +1,223 @@
+"""`torchsar run`: every method on every case, from config to report."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Draws
+from torchsar.study.commands.requires import refuse_beyond_limits
+from torchsar.study.output.arrays import write_arrays, write_json
+from torchsar.study.output.folder import fresh_result
+from torchsar.study.output.pictures import draw_all
+from torchsar.study.output.progress import Steps, Ticker
+from torchsar.study.output.report import run_fields, write_page
+from torchsar.study.settings.cases import ALL, cases_of, key_of
+from torchsar.study.settings.sections import Loaded
+from torchsar.study.trials.batch import OK, Batch, Found, Result, joined_found, joined_metrics, summary
+from torchsar.study.trials.bench import Bench
+from torchsar.study.trials.system import per_trial_first
+
+log = logging.getLogger("torchsar")
+FILES = ("config.yaml", "metrics.json", "arrays.zarr", "figures", "report.html")
+# batches of runs are as large as this in their largest tensor: large enough to cost no calls, small
+# beside the memory of any machine that holds one trial
+_BATCH_BYTES = 256 << 20
+# longer estimates than this stand in metrics.json by their mean; arrays.zarr holds all of them
+_LISTED = 16
+
+
+def run(loaded: Loaded, out: Path, command: str = "torchsar run", device: str = "cpu") -> Path:
+    """Run every method on every case and write the result into a folder.
+
+    Args:
+        loaded: The config.
+        out: The folder; config.yaml, metrics.json, arrays.zarr, figures/ and report.html appear
+            there whole or not at all.
+        command: What the report says it was made with.
+        device: Where the trials are computed.
+
+    Returns:
+        The path of the report.
+
+    Raises:
+        ConfigError: For whatever the user can put right, limits that the scene exceeds included.
+    """
+    began = time.perf_counter()
+    with fresh_result(out, "run", FILES) as folder:
+        cases = cases_of(loaded)
+        progress = Steps([])
+
+        def announce(method: str, stage: str) -> None:
+            progress.begin(_step(method, stage))
+
+        benches = {name: Bench(case, device, announce) for name, case in cases.items()}
+        for name, bench in benches.items():
+            refuse_beyond_limits(bench, name)
+            for sentence in bench.chosen:
+                log.info("%s", sentence)
+        progress = Steps([step for bench in benches.values() for step in _steps(bench)])
+        with Ticker(lambda: progress.say()):
+            results = {name: _case(bench, name) for name, bench in benches.items()}
+        tree = metrics_tree(loaded, results)
+        (folder / "config.yaml").write_text(loaded.text(), encoding="utf-8")
+        write_json(folder / "metrics.json", tree)
+        kept = {case: loaded.system.pictured(r) for case, r in results.items()}
+        images = {key_of(case, name): image for case, of in kept.items() for name, image in of.items()}
+        truth = {key_of(case, name): value for case, r in results.items() for name, value in _first_truth(r).items()}
+        write_arrays(folder / "arrays.zarr", images, truth, _first_estimates(results))
+        pictures = draw_all(loaded.system.pictures(results), folder / "figures")
+        fields = run_fields(tree, loaded.system.columns, loaded.system.target_columns)
+        notes = [*(("Chosen", text) for text in tree["chosen"]), *loaded.system.notes(tree)]
+        definitions = tree["definitions"]
+        page = {"title": loaded.config.title, "command": command, "definitions": definitions, "config": loaded.text()}
+        write_page(folder / "report.html", "run.html.j2", pictures, folder / "figures", notes=notes, **page, **fields)
+    log.info("finished in %.0f s", time.perf_counter() - began)
+    return out / "report.html"
+
+
+def _step(method: str, stage: str) -> str:
+    return f"{method}, {stage}" if method else stage
+
+
+def _chunks(bench: Bench) -> list[range]:
+    """The trials of a case in batches."""
+    count = 1 if bench.recording is not None else bench.world().trials
+    height = max(1, min(count, _BATCH_BYTES // max(1, bench.bytes_per_trial)))
+    return [range(first, min(first + height, count)) for first in range(0, count, height)]
+
+
+def _steps(bench: Bench) -> list[str]:
+    of_batch = [_step(name, stage) for name, chain in bench.chains.items() for stage in chain.stages]
+    return ["simulation" if bench.recording is None else "recording", *of_batch] * len(_chunks(bench))
+
+
+def _case(bench: Bench, name: str) -> Result:
+    """All trials of one case, a batch at a time."""
+    began, system = time.perf_counter(), bench.system
+    first: Batch | None = None
+    metrics: dict[str, list[Mapping[str, Tensor]]] = {}
+    targets: dict[str, dict[str, list[Mapping[str, Tensor]]]] = {}
+    estimates: dict[str, list[Mapping[str, Found]]] = {}
+    truth: list[Mapping[str, Tensor]] = []
+    for chunk in _chunks(bench):
+        keep = bench.chains if first is None else ()
+        batch = bench.batch(Draws(bench.config.seed, system.address, chunk), keep=keep, detail=True)
+        first = first or batch
+        truth.append(_scalars(batch))
+        for method, outcome in batch.outcomes.items():
+            metrics.setdefault(method, []).append(outcome.metrics)
+            estimates.setdefault(method, []).append(system.found(bench, outcome, batch.trials))
+            for target, found in outcome.judged.targets.items():
+                targets.setdefault(method, {}).setdefault(target, []).append(found)
+    assert first is not None
+    whole = {method: joined_metrics(parts) for method, parts in metrics.items()}
+    of_targets = {method: {t: joined_metrics(parts) for t, parts in of.items()} for method, of in targets.items()}
+    found = {method: joined_found(parts) for method, parts in estimates.items()}
+    result = Result(bench, first, whole, of_targets, found, joined_metrics(truth))
+    _warn_of_doubt(name, result)
+    log.info("%s: %.1f s", bench.loaded.name if name == ALL else name, time.perf_counter() - began)
+    return result
+
+
+def _warn_of_doubt(case: str, result: Result) -> None:
+    """Name the estimators of the recommended method that are unreliable in some trials."""
+    doubted = {
+        n: int((~e.ok.bool()).sum()) for n, e in result.first_of("recommended").estimates.items() if not e.ok.all()
+    }
+    verdicts = result.metrics["recommended"].get(OK)
+    if verdicts is not None and not bool((verdicts > 0).all()):
+        count, where = int((verdicts == 0).sum()), "" if case == ALL else f"{case}: "
+        stages = f" ({', '.join(doubted)})" if doubted else ""
+        log.warning(
+            "warning: %srecommended: estimates unreliable in %d of %d trials%s", where, count, len(verdicts), stages
+        )
+
+
+def _scalars(batch: Batch) -> dict[str, Tensor]:
+    """True values that are one number a trial."""
+    n = batch.trials.count
+    values = {name: per_trial_first(torch.as_tensor(value), n) for name, value in batch.trials.truth.items()}
+    return {name: x.reshape(n).cpu() for name, x in values.items() if x.numel() == n and not x.is_complex()}
+
+
+def _first_truth(result: Result) -> dict[str, Tensor]:
+    """All that is true of the first trial."""
+    n = result.first.trials.count
+    return {name: per_trial_first(torch.as_tensor(v), n)[0] for name, v in result.first.trials.truth.items()}
+
+
+def _first_estimates(results: Mapping[str, Result]) -> dict[str, dict[str, Tensor]]:
+    """Estimates of the first trial by method, then by case and name."""
+    found: dict[str, dict[str, Tensor]] = {}
+    for case, result in results.items():
+        for method, values in result.estimates.items():
+            found.setdefault(method, {}).update({key_of(case, name): value.value[0] for name, value in values.items()})
+    return found
+
+
+def metrics_tree(loaded: Loaded, results: Mapping[str, Result]) -> dict[str, Any]:
+    """The content of metrics.json: `metrics` of a method are those of the first case."""
+    first = next(iter(results.values()))
+    methods = {name: _method_tree(method.title, name, results) for name, method in loaded.config.processor.items()}
+    truth = {key_of(c, name): _listed(value) for c, result in results.items() for name, value in result.truth.items()}
+    shown = {
+        "metrics": f"methods.NAME.metrics are means over trials of the first case, {next(iter(results))!r}; every case is "
+        "in methods.NAME.cases, with standard deviations over trials as _sd",
+        "estimates": f"of more than {_LISTED} numbers a trial the mean and the rms standard deviation; all are in arrays.zarr",
+        "ok": "whether all estimators of the method call their estimates reliable; a share over trials",
+        "seconds": "wall time of the chain of the method per trial; estimates that methods share count in each",
+        "targets_outside": "named targets that lie outside the image of the method, or are never in the beam",
+    }
+    return {
+        "methods": methods,
+        "published": getattr(first.bench.judging, "published", {}),
+        "published_targets": getattr(first.bench.judging, "published_targets", {}),
+        "theory": {key_of(case, n): row for case, r in results.items() for n, row in loaded.system.theory(r).items()},
+        "truth": truth,
+        "definitions": {**shown, **loaded.system.definitions, **loaded.system.extra_definitions(first.bench)},
+        "trials": len(next(iter(first.metrics["recommended"].values()))),
+        "chosen": [sentence for result in results.values() for sentence in result.bench.chosen],
+    }
+
+
+def _method_tree(title: str, name: str, results: Mapping[str, Result]) -> dict[str, Any]:
+    cases = {case: summary(result.metrics[name]) for case, result in results.items()}
+    outcomes = {case: result.first_of(name) for case, result in results.items()}
+    first = next(iter(outcomes.values()))
+    targets = {
+        key_of(case, target): summary(metrics)
+        for case, result in results.items()
+        for target, metrics in result.targets.get(name, {}).items()
+    }
+    estimates = {key_of(c, key): _entry(found) for c, r in results.items() for key, found in r.estimates[name].items()}
+    return {
+        "title": title,
+        "metrics": next(iter(cases.values())),
+        "cases": cases,
+        "estimates": estimates,
+        "targets": targets,
+        "targets_outside": [key_of(case, target) for case, o in outcomes.items() for target in o.judged.outside],
+        "seconds_by_stage": dict(first.seconds),
+        "failed": "; ".join(key_of(case, o.failed) for case, o in outcomes.items() if o.failed),
+    }
+
+
+def _entry(found: Found) -> dict[str, Any]:
+    """Value, standard deviation and verdict of an estimate: lists over trials, or one entry."""
+    value, std = found.value, found.std
+    if value[0].numel() > _LISTED:
+        value = value.double().flatten(1).mean(1)
+        std = None if std is None else std.double().flatten(1).square().mean(1).sqrt()
+    return {"value": _listed(value), "std": _listed(std), "ok": _listed(found.ok)}
+
+
+def _listed(x: Tensor | None) -> Any:
+    listed: Sequence[Any] | None = None if x is None else x.tolist()
+    return listed[0] if listed is not None and len(listed) == 1 else listed

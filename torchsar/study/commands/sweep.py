@@ -1,0 +1,257 @@
+"""`torchsar sweep`: a Monte Carlo sweep, from config to report."""
+
+from __future__ import annotations
+
+import logging
+import signal
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from torch import Tensor
+
+from torchsar.core import Draws
+from torchsar.study.montecarlo.engines import engine
+from torchsar.study.montecarlo.grid import Grid, make_grid
+from torchsar.study.montecarlo.loop import SWEEP_FILES, Interrupted, Plan, open_store, run_plan
+from torchsar.study.montecarlo.pictures import draw_sweep
+from torchsar.study.montecarlo.record import OK, Record
+from torchsar.study.montecarlo.report import write_sweep_report
+from torchsar.study.montecarlo.stopping import Stop
+from torchsar.study.montecarlo.summary import summary_tree
+from torchsar.study.montecarlo.work import BOUNDS, SAVED, Chunk, Work
+from torchsar.study.output.arrays import write_json
+from torchsar.study.output.folder import opened
+from torchsar.study.settings.errors import ConfigError, did_you_mean
+from torchsar.study.settings.sections import Config, Loaded, Sweep
+from torchsar.study.trials.batch import Outcome
+from torchsar.study.trials.bench import Bench
+
+log = logging.getLogger("torchsar")
+# what only says how much is computed or shown does not belong to the identity of results
+_NOT_IDENTITY = ("sweep", "trade", "title", "seed", "cases", "beyond_limits")
+_FIXED = ("sweep", "seed", "data", "title", "trade", "system", "cases")
+
+
+class SweepTrial:
+    """The trial function of a config: simulates, runs and judges one batch of a sweep.
+
+    Args:
+        loaded: The config.
+        device: Where batches are computed.
+    """
+
+    def __init__(self, loaded: Loaded, device: str = "cpu") -> None:
+        self.loaded, self.device = loaded, device
+        self._benches: dict[str, Bench] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What travels to other processes; benches are built where they are used."""
+        return {"loaded": self.loaded, "device": self.device, "_benches": {}}
+
+    def may_differ(self, key: str) -> bool:
+        """Whether the value of a key may differ between the trials of a batch."""
+        section, _, rest = key.partition(".")
+        return section == "world" and self.loaded.system.sections["world"].takes_tensor(
+            rest.split("."), self.loaded.config.world
+        )
+
+    def bench(self, fixed: Mapping[str, Any]) -> Bench:
+        """The bench of a case of the grid, built once."""
+        key = repr(fixed)
+        if key not in self._benches:
+            self._benches[key] = Bench(self.loaded.changed(fixed), self.device)
+        return self._benches[key]
+
+    def bytes_per_trial(self, fixed: Mapping[str, Any]) -> int:
+        """Bytes of the largest tensor of a trial, by which batches are cut."""
+        return self.bench(fixed).bytes_per_trial
+
+    def __call__(self, parameters: Mapping[str, Any], draws: Draws) -> dict[str, Any]:
+        given = {k.removeprefix("world."): v for k, v in parameters.items() if isinstance(v, Tensor)}
+        bench = self.bench({key: value for key, value in parameters.items() if not isinstance(value, Tensor)})
+        save = bench.config.sweep.save
+        batch = bench.batch(draws, given, keep=bench.chains if save.trials else ())
+        found: dict[str, Any] = {name: outcome.metrics for name, outcome in batch.outcomes.items()}
+        saved = {name: _saved(o, save.taps) for name, o in batch.outcomes.items()} if save.trials else {}
+        return {**found, BOUNDS: bench.system.bounds(bench, batch), SAVED: saved}
+
+
+def _saved(outcome: Outcome, taps: list[str]) -> dict[str, Tensor]:
+    """The last signal of a method, and the outputs of the stages that sweep.save.taps names."""
+    if outcome.signal is None:
+        return {}
+    outputs = {} if outcome.trace is None else outcome.trace.outputs
+    return {"last": outcome.signal.data, **{stage: outputs[stage].data for stage in taps if stage in outputs}}
+
+
+def sweep(
+    loaded: Loaded,
+    out: Path,
+    resume: bool = False,
+    workers: int | None = None,
+    cluster: str | None = None,
+    threads: int = 1,
+    device: str = "cpu",
+    command: str = "torchsar sweep",
+) -> Path:
+    """Run the sweep of a config.
+
+    Args:
+        loaded: The config.
+        out: The folder: results.zarr grows there while the sweep runs and is never replaced;
+            config.yaml, summary.json, figures/ and report.html appear at the end.
+        resume: Whether a sweep that is there is gone on with.
+        workers: Processes of this machine; None computes in this one.
+        cluster: Address of a running dask scheduler instead.
+        threads: Threads of torch in each process.
+        device: Where batches are computed.
+        command: What the report says it was made with.
+
+    Returns:
+        The path of the report.
+
+    Raises:
+        ConfigError: For what the user can put right.
+        Interrupted: After Ctrl-C, with a sentence that says how to go on.
+    """
+    settings, trial = loaded.config.sweep, SweepTrial(loaded, device)
+    grid = sweep_grid(loaded, trial)
+    stop = None if settings.stop is None else Stop(**settings.stop.model_dump())
+    plan = Plan(
+        grid, settings.trials, loaded.config.seed, settings.chunk, stop, frozenset(settings.save.trials), device
+    )
+    _refuse_missing(loaded, plan, trial)
+    config_text = loaded.text()
+    about = {"title": loaded.config.title, "config": config_text, "dtype": loaded.config.precision}
+    _announce(grid, settings.trials)
+    try:
+        with opened(out, "sweep", SWEEP_FILES) as folder, _terminated_like_interrupted():
+            store = open_store(folder, plan, identity(loaded), resume)
+            store.note(**about)
+            record = run_plan(plan, trial, store, engine(workers, cluster, threads), loaded.name)
+            record.about = {**record.about, **about}
+            with folder.staged() as new:
+                report(record.select(grid.labels), loaded, new, config_text, command)
+    except Interrupted as stopped:
+        raise Interrupted(f"{stopped} in {out}; go on with --resume") from None
+    except KeyboardInterrupt:  # a second Ctrl-C, or one while the report was made
+        raise Interrupted(f"what is marked done is in {out}; go on with --resume") from None
+    except OSError as error:
+        raise ConfigError(
+            f"{out}: the report cannot be written ({error.strerror or error}); the trials are recorded, make it with "
+            "--resume"
+        ) from error
+    return out / "report.html"
+
+
+def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
+    """The grid of a config's sweep; every key and value is checked and every case built.
+
+    Raises:
+        ConfigError: If the sweep cannot be run as it is written.
+    """
+    given, file = loaded.config.sweep.grid, loaded.file
+    if loaded.config.data.file is not None:
+        raise ConfigError(f"{file}: a sweep simulates its trials; give 'radar' and 'world' and no data.file")
+    if loaded.config.cases:
+        raise ConfigError(
+            f"{file}: cases belong to runs; sweep over the keys that they change, and add cases={{}} to leave them out"
+        )
+    taken = next((name for name in loaded.config.processor if name in (BOUNDS, SAVED)), None)
+    if taken is not None:
+        raise ConfigError(
+            f"{file}: processor.{taken}: in a sweep this name is taken by a part of the results; choose another"
+        )
+    for key in given:
+        _refuse_fixed(key, loaded)
+    loaded.system.check_sweep(loaded, given)
+    grid = make_grid(given, [key for key in given if trial.may_differ(key)], f"{file}: sweep")
+    for parameter in grid.parameters:
+        for value in parameter.values:
+            loaded.changed({parameter.name: value})
+    for case in grid.cases():
+        there = {stage for chain in trial.bench(case.fixed).chains.values() for stage in chain.stages}
+        for tap in loaded.config.sweep.save.taps:
+            if tap not in there:
+                raise ConfigError(
+                    f"{file}: sweep.save.taps names {tap!r}, which is no stage of a method{did_you_mean(tap, there)}"
+                )
+    return grid
+
+
+def _refuse_fixed(key: str, loaded: Loaded) -> None:
+    if key.split(".")[0] in _FIXED or key == "world.trials":
+        raise ConfigError(f"{loaded.file}: sweep: the key {key!r} cannot be swept")
+    if "." not in key and key not in Config.model_fields:
+        raise ConfigError(
+            f"{loaded.file}: sweep.{key} is neither a setting of the sweep nor a key of the "
+            f"config{did_you_mean(key, (*Sweep.model_fields, *Config.model_fields))}"
+        )
+
+
+def _refuse_missing(loaded: Loaded, plan: Plan, trial: SweepTrial) -> None:
+    """Refuse a metric that no trial gives, by the first trial of the sweep, before all others."""
+    settings = loaded.config.sweep
+    asked = [("sweep.success", name) for name in settings.success] + [("sweep.show", name) for name in settings.show]
+    asked += [] if settings.stop is None else [("sweep.stop.metric", settings.stop.metric)]
+    if not asked:
+        return
+    cases = tuple(plan.grid.cases())
+    batched = {p.name: p.values for p in plan.grid.parameters if p.batched}
+    work = Work(trial, cases, batched, plan.grid.names, plan.seed, plan.device)
+    outcome = work.compute(Chunk(0, (0,), (0,)))
+    given = {metric for metrics in outcome.values.values() for metric in metrics if metric != OK}
+    for where, metric in asked:
+        if metric not in given:
+            raise ConfigError(
+                f"{loaded.file}: {where} names {metric!r}, which no trial gives{did_you_mean(metric, given)}"
+            )
+
+
+def identity(loaded: Loaded) -> dict[str, Any]:
+    """What results depend on besides the grid: seed and resolved config."""
+    tree = loaded.config.model_dump()
+    return {"seed": loaded.config.seed, "config": {k: v for k, v in tree.items() if k not in _NOT_IDENTITY}}
+
+
+def report(record: Record, loaded: Loaded, out: Path, config_text: str, command: str) -> None:
+    """Write config.yaml, summary.json, figures/ and report.html of a record into a folder."""
+    titles = {f"method {name}": method.title for name, method in loaded.config.processor.items() if method.title}
+    summary = summary_tree(record, loaded.config.sweep.success, {"snr": loaded.system.definitions["snr"], **titles})
+    pictures = draw_sweep(summary, out / "figures", loaded.config.sweep.show)
+    (out / "config.yaml").write_text(config_text, encoding="utf-8")
+    write_json(out / "summary.json", summary)
+    write_sweep_report(out / "report.html", summary, pictures, out / "figures", config_text, command)
+
+
+def _announce(grid: Grid, trials: int) -> None:
+    together = [f"{p.name} ({len(p.labels)})" for p in grid.parameters if p.batched]
+    apart = [f"{p.name} ({len(p.labels)})" for p in grid.parameters if not p.batched]
+    log.info(
+        "%d points of %d trials; values that share batches: %s; cases of their own: %s",
+        len(grid.points()),
+        trials,
+        ", ".join(together) or "none",
+        ", ".join(apart) or "none",
+    )
+
+
+@contextmanager
+def _terminated_like_interrupted() -> Iterator[None]:
+    """A batch system ends jobs with SIGTERM: record what there is, as after Ctrl-C."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    try:
+        earlier = signal.signal(signal.SIGTERM, stop)
+    except ValueError:  # not in the main thread
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, earlier)

@@ -1,0 +1,196 @@
+"""`torchsar trade`: what each alternative costs and what it loses, beside an exact yardstick."""
+
+from __future__ import annotations
+
+import logging
+import math
+import platform
+import statistics
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchsar import plot
+from torchsar.study.output.arrays import write_json
+from torchsar.study.output.folder import fresh_result
+from torchsar.study.output.numbers import number
+from torchsar.study.output.progress import Steps, Ticker
+from torchsar.study.output.report import installed_version
+from torchsar.study.settings.cases import cases_of
+from torchsar.study.settings.errors import ConfigError, one_line
+from torchsar.study.settings.sections import Loaded
+from torchsar.study.trials.auto import choices_of, tolerance_of, within
+from torchsar.study.trials.bench import Bench
+from torchsar.study.trials.system import EXACT_DB, Alternative, Choice, Measured
+
+log = logging.getLogger("torchsar")
+FILES = ("config.yaml", "trade.json", "trade.txt", "figures")
+# what the work of an alternative raises where it cannot be done on this scene
+_FAILURES = (ValueError, TypeError, KeyError, RuntimeError, ArithmeticError)
+Row = dict[str, Any]
+
+
+def trade(loaded: Loaded, out: Path, device: str = "cpu") -> str:
+    """Time and loss of the alternatives of the first case, as text.
+
+    Every alternative is timed `trade.repeats` times, in turn with the others; its loss is measured
+    against the yardstick at the worst position of the scene. The cheapest alternative whose losses
+    are all within `trade.tolerance` is recommended.
+
+    Args:
+        loaded: The config.
+        out: The folder for config.yaml, trade.json, trade.txt and figures/.
+        device: Where the work is done.
+
+    Returns:
+        The text of trade.txt.
+
+    Raises:
+        ConfigError: If the config is invalid, or there is nothing to compare.
+    """
+    with fresh_result(out, "trade", FILES) as folder:
+        bench = Bench(next(iter(cases_of(loaded).values())), device)
+        tolerance = tolerance_of(loaded)
+        choices = [choice for choice in choices_of(bench) if choice.measured is not None]
+        if not choices:
+            raise ConfigError(f"{loaded.file}: there are no alternatives to compare for this config")
+        tables = {choice.name: compared(choice, bench, tolerance) for choice in choices}
+        text = "\n\n".join(_text(name, rows) for name, rows in tables.items())
+        (folder / "config.yaml").write_text(loaded.text(), encoding="utf-8")
+        (folder / "trade.txt").write_text(text + "\n", encoding="utf-8")
+        first, *others = tables
+        machine = {"machine": platform.processor() or platform.machine(), "torch": torch.__version__}
+        machine |= {"threads": torch.get_num_threads(), "device": device, "torchsar-lab": installed_version()}
+        tree = {"choice": first, "alternatives": tables[first], "others": {name: tables[name] for name in others}}
+        write_json(
+            folder / "trade.json", {**tree, "tolerance": tolerance, "seed": loaded.config.seed, "machine": machine}
+        )
+        (folder / "figures").mkdir()
+        for number_, (name, rows) in enumerate(tables.items(), 1):
+            _draw(name, rows, tolerance, folder / "figures" / f"{number_:02d}_{'_'.join(name.split())}.png")
+    return text
+
+
+@torch.no_grad()
+def compared(choice: Choice, bench: Bench, tolerance: Mapping[str, float]) -> list[Row]:
+    """The alternatives of one choice, timed and judged, the cheapest acceptable one marked."""
+    repeats = bench.config.trade.repeats
+    first = [] if choice.yardstick is None else [choice.yardstick]
+    order = [*first, *reversed(choice.alternatives)]  # the best first: what the others are compared with
+    names = [f"{choice.name}: {one.name}" for one in order]
+    progress = Steps([f"{choice.name}: preparation", *names * repeats])
+    with Ticker(progress.say):
+        progress.begin(f"{choice.name}: preparation")
+        assert choice.measured is not None
+        try:
+            measured = choice.measured()
+        except _FAILURES as error:
+            raise ConfigError(f"{bench.file}: {one_line(error)}") from error
+        timings: dict[str, list[tuple[float, float]]] = {one.name: [] for one in order}
+        rows: dict[str, Row] = {}
+        for turn in range(repeats):
+            for one, name in zip(order, names, strict=True):
+                if turn == 0 or not rows[one.name]["failed"]:
+                    progress.begin(name)
+                    rows[one.name] = _timed(one, measured, timings[one.name])
+                    if turn == 0:
+                        log.info("%s", _line(rows[one.name]))
+    for name, times in timings.items():
+        if times:
+            rows[name].update(
+                cpu_s=statistics.median(t[0] for t in times), wall_s=statistics.median(t[1] for t in times)
+            )
+    found = [rows[one.name] for one in (*first, *choice.alternatives)]
+    for row in found:
+        row["within_tolerance"] = not row["failed"] and within(row["loss"], tolerance)
+    kept = [row for row in found if row["within_tolerance"]]
+    for row in found:
+        row["recommended"] = bool(kept) and row is min(kept, key=lambda r: r["cpu_s"])
+    return found
+
+
+def _timed(one: Alternative, measured: Measured, times: list[tuple[float, float]]) -> Row:
+    """One repeat of an alternative; a failure, or a loss that is not a number, is said in the row."""
+    row: Row = {"name": one.name, "neglects": one.neglects, "cpu_s": None, "wall_s": None, "peak_bytes": None}
+    row |= {"loss": {}, "predicted": one.loss, "failed": ""}
+    try:
+        peak, began = _Peak(), (time.process_time(), time.perf_counter())
+        with peak:
+            result = measured.run(one)
+        spent = (time.process_time() - began[0], time.perf_counter() - began[1])
+        times.append((spent[0] / measured.share(one), spent[1] / measured.share(one)))
+        loss = {name: float(value) for name, value in measured.loss(one, result).items()}
+    except _FAILURES as error:
+        times.clear()
+        return {**row, "failed": one_line(error)}
+    wrong = [name for name, value in loss.items() if math.isnan(value) or value == math.inf]
+    return {**row, "peak_bytes": peak.bytes, "loss": loss, "failed": f"{wrong[0]} is not finite" if wrong else ""}
+
+
+class _Peak:
+    """Peak memory that the work adds: of the device where there is one, else of the process."""
+
+    bytes: int | None = None
+
+    def __enter__(self) -> None:
+        self._gpu = torch.cuda.is_available() and torch.cuda.is_initialized()
+        if self._gpu:
+            torch.cuda.reset_peak_memory_stats()
+        self._before = _resident("VmRSS", reset=True)
+
+    def __exit__(self, *_: object) -> None:
+        after = torch.cuda.max_memory_allocated() if self._gpu else _resident("VmHWM")
+        self.bytes = None if after is None else after - (0 if self._gpu else self._before or 0)
+
+
+def _resident(field: str, reset: bool = False) -> int | None:
+    """Resident memory of this process (VmRSS) or its peak since the last reset (VmHWM), in bytes;
+    None on systems that do not tell.
+    """
+    try:
+        if reset:
+            Path("/proc/self/clear_refs").write_text("5")
+        text = Path("/proc/self/status").read_text()
+    except OSError:
+        return None
+    return next((1024 * int(line.split()[1]) for line in text.splitlines() if line.startswith(f"{field}:")), None)
+
+
+def _line(row: Row) -> str:
+    if row["failed"]:
+        return f"{row['name']}: failed: {row['failed']}"
+    return f"{row['name']}: " + ", ".join(f"{name} {_loss(value)}" for name, value in row["loss"].items())
+
+
+def _loss(value: float) -> str:
+    return "exact" if value <= EXACT_DB else number(value)
+
+
+def _text(name: str, rows: Sequence[Row]) -> str:
+    metrics = list(dict.fromkeys(metric for row in rows for metric in row["loss"]))
+    wide = 2 + max(len(row["name"]) for row in rows)
+    head = f"{'alternative':<{wide}}{'CPU (ms)':>10}{'wall (ms)':>11}" + "".join(f"{metric:>24}" for metric in metrics)
+    lines = [name.upper(), f"{head}  verdict"]
+    for row in rows:
+        if row["failed"]:
+            lines.append(f"{row['name']:<{wide}}failed: {row['failed']}")
+            continue
+        cells = "".join(f"{_loss(row['loss'][m]) if m in row['loss'] else '–':>24}" for m in metrics)
+        verdict = "recommended" if row["recommended"] else "within tolerance" if row["within_tolerance"] else "too much"
+        lines.append(f"{row['name']:<{wide}}{1e3 * row['cpu_s']:>10.2f}{1e3 * row['wall_s']:>11.2f}{cells}  {verdict}")
+    return "\n".join(lines)
+
+
+def _draw(name: str, rows: Sequence[Row], tolerance: Mapping[str, float], path: Path) -> None:
+    """Loss over time, with the Pareto front and the tolerance."""
+    metric = next((metric for row in rows for metric in row["loss"] if metric in tolerance), None)
+    kept = [row for row in rows if not row["failed"] and metric in row["loss"]]
+    if metric is not None and kept:
+        loss = [row["loss"][metric] for row in kept]
+        figure = plot.trade(
+            [r["name"] for r in kept], [r["cpu_s"] for r in kept], loss, metric, name, tolerance[metric]
+        )
+        plot.save(figure, path)

@@ -1,1 +1,0 @@
-"""Azimuth-multichannel bistatic radar with moving targets (system 001): `system: geo`."""

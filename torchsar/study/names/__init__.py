@@ -1,0 +1,1 @@
+"""What a config may name: stages, scenes, motions, impairments and the like."""

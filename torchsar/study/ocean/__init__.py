@@ -1,1 +1,0 @@
-"""Ships on a sea before azimuth-multichannel bistatic radar (system 001): `system: geo_ocean`."""

@@ -1,0 +1,145 @@
+"""Reports: one HTML file each, with its pictures inside."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Protocol
+
+import jinja2
+import torch
+
+from torchsar.study.output.numbers import MISSING, number, quantity, scale_of
+from torchsar.study.output.pictures import Picture
+
+# tiles above the tables show at most so many figures: two rows of four on a wide screen
+_TILES = 8
+
+
+class Column(Protocol):
+    """How a figure is shown."""
+
+    @property
+    def label(self) -> str: ...
+
+    @property
+    def unit(self) -> str: ...
+
+
+Shown = Mapping[str, Column]
+
+
+def installed_version() -> str:
+    """The version of this distribution."""
+    try:
+        return version("torchsar-lab")
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def write_page(path: Path, template: str, pictures: Sequence[Picture], figures: Path, **fields: Any) -> None:
+    """Write one HTML file that is self-contained: it loads no external resources.
+
+    Args:
+        path: Where to write it.
+        template: A file of `templates` that extends base.html.j2.
+        pictures: Pictures in the order of reading.
+        figures: The folder that holds them.
+        fields: What the template shows; the base shows `title`, `command`, `definitions` and
+            `config`.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("torchsar.study.output", "templates"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["number"] = number
+    shown = [{"title": p.title, "caption": p.caption, "source": _embedded(figures / p.file)} for p in pictures]
+    made = f"torchsar-lab {installed_version()}, torch {torch.__version__}, {datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
+    text = environment.get_template(template).render(pictures=shown, made=made, **fields)
+    path.write_text(text, encoding="utf-8")
+
+
+def _embedded(path: Path) -> str:
+    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
+
+
+def run_fields(metrics: Mapping[str, Any], columns: Shown, target_columns: Shown) -> dict[str, Any]:
+    """What the template of a run shows, from the content of metrics.json."""
+    methods = metrics["methods"]
+    best, cases = methods["recommended"], list(methods["recommended"]["cases"])
+    shown = {key: column for key, column in columns.items() if best["metrics"].get(key) is not None}
+    tiles = [(quantity(best["metrics"][key], c.unit), c.label) for key, c in list(shown.items())[:_TILES]]
+    rows = {name: method["cases"] for name, method in methods.items()}
+    published = metrics["published"]
+    tables = (
+        [_one_table(rows, columns, published, cases[0])]
+        if len(cases) == 1
+        else _tables(rows, columns, published, "case")
+    )
+    of_targets = {name: method["targets"] for name, method in methods.items() if method["targets"]}
+    theory = {"theory": metrics["theory"]} if metrics.get("theory") else {}
+    return {
+        "tiles": tiles,
+        "cases": cases,
+        "tables": tables,
+        "target_tables": _tables({**of_targets, **theory}, target_columns, metrics["published_targets"], "target"),
+        "methods": methods,
+        "best": best,
+        "metrics": metrics,
+    }
+
+
+def _row(name: str, cells: list[str], soft: bool = False) -> dict[str, Any]:
+    return {"name": name, "cells": cells, "soft": soft}
+
+
+def _cell(row: Mapping[str, Any], key: str, factor: float) -> str:
+    value, sd = row.get(key), row.get(f"{key}_sd")
+    if not isinstance(value, (int, float)):
+        return number(value)
+    return number(value * factor, None if sd is None or key == "seconds" else sd * factor)
+
+
+def _tables(rows: Mapping[str, Any], columns: Shown, published: Mapping[str, Any], first: str) -> list[dict[str, Any]]:
+    """A table for each figure: a row for each case or target, a column for each method.
+
+    Args:
+        rows: Method -> case or target -> figure -> number.
+        columns: The figures.
+        published: Figure -> case or target -> method -> what the source published.
+        first: What a row stands for.
+    """
+    tables = []
+    for key, column in columns.items():
+        names = [name for name, of in rows.items() if any(row.get(key) is not None for row in of.values())]
+        keys = list(dict.fromkeys(one for name in names for one in rows[name]))
+        factor, unit = scale_of([rows[name].get(one, {}).get(key) for name in names for one in keys], column.unit)
+        body = [_row(o, [_cell(rows[n].get(o, {}), key, factor) for n in names]) for o in keys]
+        for one, source in published.get(key, {}).items():
+            cells = [_cell(source, name, factor) for name in names]
+            body.append(_row(f"{one}, published", cells, soft=True))
+        if names:
+            title = f"{column.label} ({unit})" if unit else column.label
+            tables.append({"title": title, "first": first, "columns": names, "rows": body})
+    return tables
+
+
+def _one_table(rows: Mapping[str, Any], columns: Shown, published: Mapping[str, Any], case: str) -> dict[str, Any]:
+    """One table for one case: a row for each figure, a column for each method."""
+    names, body = list(rows), []
+    for key, column in columns.items():
+        values = [rows[name][case].get(key) for name in names]
+        factor, unit = scale_of([v for v in values if isinstance(v, (int, float))], column.unit)
+        label, source = f"{column.label} ({unit})" if unit else column.label, published.get(key, {}).get(case, {})
+        if any(value is not None for value in values):
+            body.append(_row(label, [_cell(rows[name][case], key, factor) for name in names]))
+        if source:
+            cells = [_cell(source, name, factor) if name in source else MISSING for name in names]
+            body.append(_row(f"{label}, published", cells, soft=True))
+    return {"title": "", "first": "figure", "columns": names, "rows": body}

@@ -1,1 +1,0 @@
-"""Targets that turn unevenly (system 003): `system: isal_rotation`."""

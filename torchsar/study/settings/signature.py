@@ -1,0 +1,328 @@
+"""Config sections that are constructors: keys, types, defaults and errors come from signatures."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import re
+import types
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from pydantic import BaseModel, ValidationError, create_model
+from torch import Tensor
+
+from torchsar.study.settings.errors import ConfigError, did_you_mean, one_line
+from torchsar.study.settings.sentences import Strict, sentence
+
+_SCALARS = (float, int, str, bool, type(None))
+_YAML = (float, int, str, bool, type(None), tuple, list)
+# where it stands for a name, the cheapest choice that the scene allows is taken
+AUTO = "auto"
+Given = Mapping[str, Tensor]
+_NOTHING: Given = {}
+
+
+@dataclass(frozen=True)
+class Key:
+    """One parameter of a constructor as a key of a config.
+
+    Args:
+        type: Type of the value in YAML.
+        default: The default in YAML's terms; `...` where the key is required.
+        inner: What describes the value: a section, or a catalogue to choose from; None for plain
+            values.
+        many: "mapping" or "sequence" where the value is a mapping of names to such things, after
+            what the constructor takes.
+        per_trial: Whether the constructor takes a tensor with one entry per trial for a number.
+        as_tensor: Whether the constructor takes a tensor for a list of numbers.
+    """
+
+    type: Any
+    default: Any
+    inner: Section | Catalogue | None = None
+    many: str = ""
+    per_trial: bool = False
+    as_tensor: bool = False
+
+
+class Section:
+    """The keys of a config section, which are the parameters of a constructor.
+
+    Args:
+        target: A class or factory function.
+        given: Parameters that do not come from the config.
+        automatic: Keys that may be left to choose, `auto`.
+    """
+
+    def __init__(self, target: Callable[..., Any], given: Sequence[str] = (), automatic: Sequence[str] = ()) -> None:
+        self.target, self.given, self.automatic = target, frozenset(given), automatic
+
+    @cached_property
+    def keys(self) -> dict[str, Key]:
+        """The keys by name. Raises TypeError for a required parameter that YAML cannot hold."""
+        fields = dataclasses.is_dataclass(self.target) or not inspect.isclass(self.target)
+        hints = typing.get_type_hints(self.target if fields else self.target.__init__, include_extras=True)
+        found = {}
+        for parameter in inspect.signature(self.target).parameters.values():
+            if parameter.name in self.given or parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
+                continue
+            key = _key(hints.get(parameter.name, Any), _default(self.target, parameter))
+            if key is not None:
+                found[parameter.name] = key
+            elif parameter.default is parameter.empty:
+                raise TypeError(
+                    f"{self.target.__name__}: its parameter {parameter.name!r} of type {hints.get(parameter.name)} "
+                    "cannot be written in a config; register a factory instead"
+                )
+        return found
+
+    @cached_property
+    def model(self) -> type[BaseModel]:
+        fields: dict[str, Any] = {name: (key.type, key.default) for name, key in self.keys.items()}
+        return create_model(getattr(self.target, "__name__", "section"), __base__=Strict, **fields)
+
+    def check(self, tree: Any, where: str, file: str) -> dict[str, Any]:
+        """The complete keys of a section, defaults filled in.
+
+        Raises:
+            ConfigError: Naming file, key, value and what is accepted.
+        """
+        open_keys = [key for key in self.automatic if isinstance(tree, dict) and tree.get(key) == AUTO]
+        fixed = {key: value for key, value in tree.items() if key not in open_keys} if open_keys else tree
+        try:
+            values = self.model.model_validate(fixed).model_dump() | dict.fromkeys(open_keys, AUTO)
+        except ValidationError as error:
+            raise ConfigError(sentence(error, self.model, file, where)) from None
+        for name, key in self.keys.items():
+            place, value = f"{where}.{name}" if where else name, values[name]
+            if key.inner is None or value is None or name in open_keys:
+                continue
+            if key.many:
+                values[name] = {part: key.inner.check(v, f"{place}.{part}", file) for part, v in value.items()}
+            else:
+                values[name] = key.inner.check(value, place, file)
+        return values
+
+    def make(self, values: Mapping[str, Any], where: str, file: str, given: Given = _NOTHING, **context: Any) -> Any:
+        """The object that checked keys describe.
+
+        Args:
+            values: The keys, as `check` returns them.
+            where: Dotted path of the section, for messages.
+            file: Name of the config, for messages.
+            given: Tensors with one entry per trial, by dotted key below this section.
+            context: Values of parameters that do not come from the config.
+
+        Raises:
+            ConfigError: With what the constructor says.
+        """
+        made = {name: self._made(name, values[name], where, file, below(given, name)) for name in self.keys}
+        accepted = inspect.signature(self.target).parameters
+        made.update({name: value for name, value in context.items() if name in accepted})
+        try:
+            return self.target(**{**made, **{name: value for name, value in given.items() if "." not in name}})
+        except (ValueError, TypeError) as error:
+            text = one_line(error)
+            raise ConfigError(f"{file}: {text if text.startswith(f'{where}.') else f'{where}: {text}'}") from None
+
+    def _made(self, name: str, value: Any, where: str, file: str, given: Given) -> Any:
+        key, where = self.keys[name], f"{where}.{name}"
+        if value is None or key.inner is None:
+            return _converted(value, key, given)
+        if not key.many:
+            return key.inner.make(value, where, file, given)
+        parts = {part: key.inner.make(v, f"{where}.{part}", file, below(given, part)) for part, v in value.items()}
+        return parts if key.many == "mapping" else list(parts.values())
+
+    def takes_tensor(self, path: Sequence[str], values: Mapping[str, Any]) -> bool:
+        """Whether the number at a path below this section may differ between trials."""
+        key = self.keys.get(path[0])
+        if key is None or (values.get(path[0]) is None and len(path) > 1):
+            return False
+        rest, value = path[1:], values[path[0]]
+        if key.inner is None:
+            index = rest[0] if rest else None
+            return key.per_trial and (index is None) == (not isinstance(value, list)) and _is_index(index, value)
+        if key.many:
+            if not rest or rest[0] not in value:
+                return False
+            rest, value = rest[1:], value[rest[0]]
+        return bool(rest) and key.inner.takes_tensor(rest, value)
+
+
+class Catalogue:
+    """Names to constructors, one of which a config chooses.
+
+    Args:
+        what: What an entry is, for messages.
+        key: The key that names the choice.
+        entries: Names to classes or factories.
+        given: Parameters that do not come from the config.
+        automatic: Keys, `ENTRY.key`, that may be left to choose, `auto`.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        key: str,
+        entries: Mapping[str, Callable[..., Any]],
+        given: Sequence[str] = (),
+        automatic: Sequence[str] = (),
+    ) -> None:
+        self.what, self.key, self.entries = what, key, dict(entries)
+        free = [key.split(".") for key in automatic]
+        self.sections = {
+            n: Section(target, given, [k for m, k in free if m == n]) for n, target in self.entries.items()
+        }
+
+    def check(self, entry: Any, where: str, file: str) -> dict[str, Any]:
+        """An entry {key: name, ...} with all keys of that name filled in.
+
+        Raises:
+            ConfigError: Naming file, key and what is accepted.
+        """
+        if isinstance(entry, str):
+            entry = {self.key: entry}
+        if not isinstance(entry, dict):
+            raise ConfigError(f"{file}: {where} must be a mapping with the key {self.key!r}, got {entry!r}")
+        if self.key not in entry:
+            raise ConfigError(f"{file}: {where} lacks the key {self.key!r}{did_you_mean('', self.entries)}")
+        name, rest = entry[self.key], {key: value for key, value in entry.items() if key != self.key}
+        if name == AUTO:
+            return entry
+        if not isinstance(name, str) or name not in self.entries:
+            raise ConfigError(
+                f"{file}: {where}.{self.key} names an unknown {self.what} {name!r}{did_you_mean(str(name), self.entries)}"
+            )
+        return {self.key: name, **self.sections[name].check(rest, where, file)}
+
+    def make(self, entry: Mapping[str, Any], where: str, file: str, given: Given = _NOTHING, **context: Any) -> Any:
+        """The object that a checked entry describes; see `Section.make`."""
+        rest = {key: value for key, value in entry.items() if key != self.key}
+        return self.sections[entry[self.key]].make(rest, where, file, given, **context)
+
+    def takes_tensor(self, path: Sequence[str], entry: Mapping[str, Any]) -> bool:
+        """Whether the number at a path below an entry may differ between trials."""
+        return entry[self.key] in self.sections and self.sections[entry[self.key]].takes_tensor(path, entry)
+
+    def describe(self, value: Any) -> dict[str, Any] | None:
+        """The entry that stands for a frozen object, None where no entry makes such objects."""
+        name = next((name for name, target in self.entries.items() if target is type(value)), None)
+        return None if name is None else {self.key: name, **_described(value)}
+
+
+def below(given: Given, name: str) -> dict[str, Tensor]:
+    """The part of dotted keys that lies below a name."""
+    return {key.partition(".")[2]: value for key, value in given.items() if key.startswith(f"{name}.")}
+
+
+def _key(hint: Any, default: Any) -> Key | None:
+    """The key for a type, None where YAML cannot hold it."""
+    arms, plain = _arms(hint), _plain(hint)
+    if plain is not None:
+        scalars = {item for arm in arms for item in (_arms(typing.get_args(arm)[0]) if _is_list(arm) else [arm])}
+        as_tensor = Tensor in arms and not any(map(_is_list, arms))
+        value = list(default) if isinstance(default, tuple) else default
+        return Key(plain, value, per_trial={float, Tensor} <= scalars, as_tensor=as_tensor)
+    classes = [arm for arm in arms if dataclasses.is_dataclass(arm)]
+    if len(classes) > 1:
+        inner, many = Catalogue("choice", "kind", {_snake(c.__name__): c for c in classes}), ""
+    else:
+        inner, many = next((found for found in map(_inner, arms) if found[0] is not None), (None, ""))
+    if inner is None:
+        return None
+    kind = Any if isinstance(inner, Catalogue) and not many else dict[str, Any]
+    kind = kind | None if None in (default, *(None for arm in arms if arm is not hint)) else kind
+    return Key(kind, _described_default(default, inner, many), inner, many)
+
+
+def _inner(hint: Any) -> tuple[Section | Catalogue | None, str]:
+    """What describes a value of a type, and whether it is one of many."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Annotated:
+        return next(((extra, "") for extra in args[1:] if isinstance(extra, Catalogue)), (None, ""))
+    if origin in (Mapping, dict) and args[0] is str:
+        return _inner(args[1])[0], "mapping"
+    if origin in (Sequence, list):
+        return _inner(args[0])[0], "sequence"
+    return (Section(hint), "") if dataclasses.is_dataclass(hint) else (None, "")
+
+
+def _described_default(default: Any, inner: Section | Catalogue, many: str) -> Any:
+    if default is ... or default is None:
+        return default
+    if many:
+        return {} if not default else None
+    return inner.describe(default) if isinstance(inner, Catalogue) else _described(default)
+
+
+def _described(value: Any) -> dict[str, Any]:
+    """The fields of a frozen object in YAML's terms."""
+    found = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    return {name: list(x) if isinstance(x, tuple) else x for name, x in found.items() if isinstance(x, _YAML)}
+
+
+def _default(target: Callable[..., Any], parameter: inspect.Parameter) -> Any:
+    """The default of a parameter, also where a dataclass makes it; `...` where it is required."""
+    if parameter.default is parameter.empty:
+        return ...
+    if dataclasses.is_dataclass(target):
+        field = next((f for f in dataclasses.fields(target) if f.name == parameter.name), None)
+        if field is not None and field.default_factory is not dataclasses.MISSING:
+            return field.default_factory()
+    return parameter.default
+
+
+def _arms(hint: Any) -> list[Any]:
+    """The members of a union without None, else the type itself."""
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return [arm for arm in typing.get_args(hint) if arm is not type(None)]
+    return [hint]
+
+
+def _is_list(hint: Any) -> bool:
+    return typing.get_origin(hint) in (list, tuple, Sequence) and bool(typing.get_args(hint))
+
+
+def _plain(hint: Any) -> Any | None:
+    """The part of a type that YAML can hold as it is, None where there is nothing.
+
+    Tensors become numbers or lists of numbers.
+    """
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if hint in _SCALARS or origin is typing.Literal:
+        return hint
+    if hint is Tensor:
+        return list[float]
+    if origin in (typing.Union, types.UnionType):
+        arms = [arm for arm in args if not (arm is Tensor and float in args)]
+        kept = [plain for plain in map(_plain, arms) if plain is not None]
+        return typing.Union[tuple(kept)] if any(k is not type(None) for k in kept) else None  # noqa: UP007
+    if _is_list(hint):
+        item = _plain(args[0])
+        return None if item is None else list[item]
+    if origin in (dict, Mapping) and args and args[0] is str:
+        item = _plain(args[1])
+        return None if item is None else dict[str, item]
+    return None
+
+
+def _converted(value: Any, key: Key, given: Given) -> Any:
+    """A list as a tuple, with tensors where trials differ; the value itself otherwise."""
+    if isinstance(value, list):
+        value = [given.get(str(i), item) for i, item in enumerate(value)]
+        return torch.tensor(value, dtype=torch.float64) if key.as_tensor else tuple(value)
+    return value
+
+
+def _is_index(text: str | None, value: Any) -> bool:
+    return text is None or (text.isdecimal() and int(text) < len(value))
+
+
+def _snake(name: str) -> str:
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()

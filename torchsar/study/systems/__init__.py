@@ -1,0 +1,1 @@
+"""The systems: what is physics in an experiment."""

@@ -1,0 +1,280 @@
+"""System 001: azimuth-multichannel SAR with a far transmitter, moving points one at a time
+(Remote Sens. 2020, 12, 1703).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Chain, Draws, Signal, Trace, per_trial
+from torchsar.focus.ladar_requirements import Limit
+from torchsar.focus.requirements import Requirement
+from torchsar.metrics import bistatic_bounds
+from torchsar.metrics.moving_point import (
+    UNKNOWNS,
+    FocusedPoint,
+    FoundMotion,
+    error_name,
+    ideal_responses,
+    point_responses,
+)
+from torchsar.multichannel import ElementPattern, FlatBand
+from torchsar.multichannel.response import clutter_covariance
+from torchsar.radar import BistaticRadar
+from torchsar.study.names.registry import MULTICHANNEL_IMPAIRMENTS
+from torchsar.study.output.pictures import Drawn
+from torchsar.study.settings.errors import ConfigError
+from torchsar.study.settings.sections import Loaded
+from torchsar.study.systems.geo import choices, figures
+from torchsar.study.systems.geo.radar import bistatic_radar
+from torchsar.study.systems.geo.world import TRUTHS, Points, compression_gain_db
+from torchsar.study.trials.batch import Batch, Found, Judged, Outcome, Result, Trials
+from torchsar.study.trials.bench import Bench
+from torchsar.study.trials.system import Choice, Column, System
+
+# Doppler bands that hold clutter seen through a pattern
+_CLUTTER_BANDS = 5
+_IMAGES = (("azimuth",), ("azimuth", "range"))
+
+
+@dataclass(frozen=True)
+class Judging:
+    """How results are judged.
+
+    Args:
+        orders: How many pulse rates away replicas are sought.
+        published_targets: Figure -> target -> method -> what the source published.
+    """
+
+    orders: int = 3
+    published_targets: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.orders < 1:
+            raise ValueError(f"metrics.orders must be at least 1, got {self.orders}")
+
+
+class View(NamedTuple):
+    """What pictures need of a method: its clean images, rebuilt spectra, and how they were made."""
+
+    image: Signal | None
+    spectrum: Signal | None
+    focused: FocusedPoint | None
+
+
+class Geo(System):
+    """Moving points before several channels."""
+
+    name = "geo"
+    about = "moving points before several channels along track, a far transmitter"
+    Radar = staticmethod(bistatic_radar)
+    World = Points
+    Judging = Judging
+    impairments = MULTICHANNEL_IMPAIRMENTS
+    images = _IMAGES
+    truths = TRUTHS
+    peak = 12.0
+    tolerance = {"image_error_db": -20.0, "echo_error_db": -20.0, "mfta_db": -50.0, "width_change_percent": 1.0}
+    exact = {
+        "world.receive": {"kind": "exact"},
+        "transmit_range_remove.order": {"order": None},
+        "migration_correct.kind": {"kind": "keystone"},
+    }
+    definitions = {
+        "snr": "power of the target over noise variance in one range-compressed sample of one channel, dB (snr_db). Raw, "
+        "before compression, it is 10 log10(B tau_p) less (raw_scnr_db): 27 dB at 50 MHz and 10 us. Sample of azimuth-only "
+        "data: of the compressed peak line. scr_db: power of the target over that of the sea in such a sample",
+        "targets": "every target is recorded and processed alone, with noise of its own; figures of a method are means over "
+        "its targets",
+        "velocities": "u_r: closing slant-range speed towards the receiver's closest point; u_a: along track, positive with "
+        "the receiver; y0: position along track at t = 0, the middle pulse",
+        "responses": "irw, pslr, islr, mfta and noise-free positions are measured on the image of the CLEAN echo (same "
+        "impairment, no noise, no sea), rebuilt and focused with every value held that the method estimated from the NOISY "
+        "one: image noise would hide false targets below about -60 dB",
+        "irw_azimuth_m": "3 dB width on the axis x = (V_R - u_a) t of the true target; theory 0.886 v / B, B the processed "
+        "Doppler band within the target's",
+        "pslr_azimuth_db": "largest side lobe over the peak; theory, a sinc: -13.26 dB",
+        "islr_azimuth_db": "energy of 20 side lobes to either side over that of the main lobe; theory, a sinc: -9.92 dB",
+        "mfta_db": "largest replica in the zones of +-1..metrics.orders pulse rates from the peak over the peak, as far as "
+        "the image reaches",
+        "u_r_error_m_s": "estimated minus true u_r; u_a_error_m_s, y0_error_m alike. Only of methods that estimate it",
+        "predicted": "u_r_std_m_s, u_a_std_m_s, y0_std_m: standard deviations that the method itself predicts",
+        "position_error_m": "position along track at t = 0 from the measured peak after location correction by the method's "
+        "own velocities, minus the truth",
+        "range": "irw_range_m, pslr_range_db, islr_range_db on the axis c tau / 2, on which the width of a sinc is "
+        "0.886 c / (2 B); range_error_m: of the receive path at t = 0",
+        "condition_number": "of the band matrix at the velocities used; not given for mmse, which inverts no such matrix",
+        "noise_gain_db": "noise of a rebuilt bin against ideal uniform sampling by as many channels, mean over bins",
+        "theory": "a target that is rebuilt and focused without error",
+        "bounds": "Cramer-Rao for known noise or clutter, complex amplitude and y0 unknown; u_a unknown too, or known, as "
+        "named",
+        "published": "figures of Remote Sens. 2020, 12, 1703; its SCNR is read as raw",
+    }
+    target_columns = {
+        "irw_azimuth_m": Column("width in azimuth along the track that the target sees", "m"),
+        "pslr_azimuth_db": Column("PSLR in azimuth", "dB"),
+        "islr_azimuth_db": Column("ISLR in azimuth", "dB"),
+        "mfta_db": Column("largest false target (MFTA)", "dB", drawn="mean"),
+        "u_r_error_m_s": Column("error of the slant-range velocity", "m/s", drawn="rms"),
+        "u_a_error_m_s": Column("error of the along-track velocity", "m/s", drawn="rms"),
+        "position_error_m": Column("error of the position along track", "m", drawn="rms"),
+        "irw_range_m": Column("width in range, axis c tau / 2", "m"),
+        "pslr_range_db": Column("PSLR in range", "dB"),
+        "islr_range_db": Column("ISLR in range", "dB"),
+        "range_error_m": Column("error of the range", "m"),
+        "condition_number": Column("condition number of the reconstruction"),
+        "noise_gain_db": Column("noise gain of the reconstruction", "dB"),
+        "u_r_std_m_s": Column("predicted error of the slant-range velocity", "m/s"),
+        "u_a_std_m_s": Column("predicted error of the along-track velocity", "m/s"),
+        "ok": Column("share of trials called reliable"),
+    }
+    columns = {**target_columns, "seconds": Column("time of a trial", "s")}
+
+    def samples(self, world: Points, radar: BistaticRadar) -> int:
+        return len(world.targets) * radar.channels * world.pulses * (world.samples or 1)
+
+    def check_sweep(self, loaded: Loaded, grid: Mapping[str, Any]) -> None:
+        targets = list(loaded.config.world["targets"])
+        if len(targets) > 1:
+            raise ConfigError(
+                f"{loaded.file}: world.targets: a sweep follows one target, and there are {', '.join(targets)}; keep one of "
+                "them"
+            )
+
+    def simulate(self, bench: Bench, world: Points, draws: Draws) -> Trials:
+        return world.trials_of(bench.radar, draws, bench.dtype, bench.device)
+
+    def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
+        chain, truth, world = bench.chains[name], trials.truth, bench.world()
+        rows, view = trace.signal.trials, View(None, None, None)
+        metrics = FoundMotion.by(trace.estimates).errors(truth)
+        focused = FocusedPoint.of(chain, trace, bench.radar)
+        if focused is not None:
+            metrics |= {key: value.expand(rows) for key, value in focused.conditioning().items()}
+        if focused is not None and trace.signal.names in _IMAGES:
+            clean = bench.config.processor[name].input == "clean" or trials.own.snr_db is None
+            alone = trace if clean else chain.trace(trials.own.alone, _held(chain, trace))
+            lit = trials.own.integration_s
+            metrics |= point_responses(alone.signal, focused, truth, lit, bench.judging.orders)
+            view = View(alone.signal, alone.outputs[focused.stage], focused)
+        verdicts = {}
+        if trace.estimates:
+            found = [estimate.ok.expand(rows) for estimate in trace.estimates.values()]
+            verdicts = {"ok": torch.stack(found).all(0).reshape(trials.count, -1)}
+        table = {key: value.reshape(trials.count, -1) for key, value in metrics.items()}
+        whole = {key: value.double().nanmean(-1) for key, value in table.items()}
+        each = {**table, **verdicts}
+        targets = {t: {key: x[:, i] for key, x in each.items()} for i, t in enumerate(world.targets)}
+        missing = [t for t, row in targets.items() if not all(_seen(value) for value in row.values())]
+        shown = {t: {key: x for key, x in row.items() if _seen(x)} for t, row in targets.items()}
+        return Judged(whole, shown, missing, view)
+
+    def found(self, bench: Bench, outcome: Outcome, trials: Trials) -> dict[str, Found]:
+        motion, n = FoundMotion.by(outcome.estimates), trials.count
+        table: dict[str, Found] = {}
+        for i, target in enumerate(bench.world().targets):
+            for key, value in motion.value.items():
+                parts = (value, motion.std[key], motion.ok[key].expand(value.shape))
+                table[f"{target}.{key}"] = Found(*(x.reshape(n, -1)[:, i] for x in parts))
+        return table
+
+    def bounds(self, bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
+        """Lower bounds of the errors for the unknowns that any method has; none without noise."""
+        truth, world, radar = batch.trials.truth, bench.world(), bench.radar
+        metrics = [outcome.metrics for outcome in batch.outcomes.values()]
+        kinds: dict[str, tuple[str, ...]] = {}
+        if any("u_a_error_m_s" in of for of in metrics):
+            kinds["Cramer-Rao"] = tuple(UNKNOWNS)
+        if any("u_r_error_m_s" in of and "u_a_error_m_s" not in of for of in metrics):
+            kinds["Cramer-Rao, u_a known"] = ("u_r_m_s", "y0_m")
+        found: dict[str, dict[str, Tensor]] = {}
+        if batch.trials.own.snr_db is None:
+            return found
+        snr = 10 ** (per_trial(batch.trials.own.snr_db, 0, truth["u_r_m_s"]) / 10)
+        given = {"integration_s": batch.trials.own.integration_s, "covariance": _clutter(batch.trials.own.world, radar)}
+        point = [truth[key] for key in TRUTHS]
+        for title, unknown in kinds.items():
+            bound = bistatic_bounds(radar, world.pulses, snr, *point, unknown=unknown, **given)
+            for key, value in bound.items():
+                found.setdefault(error_name(key), {})[title] = value.expand(truth["u_r_m_s"].shape)
+        return {key: named for key, named in found.items() if any(key in of for of in metrics)}
+
+    def limits(self, bench: Bench) -> Mapping[Limit, Sequence[str]]:
+        return choices.limits(bench)
+
+    def requirements(self, bench: Bench) -> Sequence[Requirement]:
+        return choices.requirements(bench)
+
+    def choices(self, bench: Bench) -> Sequence[Choice]:
+        return choices.choices(bench)
+
+    def theory(self, result: Result) -> Mapping[str, Mapping[str, float]]:
+        """Of the recommended method, where it makes an image."""
+        focused, truth = result.first_of("recommended").judged.view.focused, result.first.trials.truth
+        own, world = result.first.trials.own, result.bench.world()
+        if focused is None:
+            return {}
+        lit = None if own.integration_s is None else float(torch.as_tensor(own.integration_s).reshape(-1)[0])
+        rows = {
+            target: [float(truth[f"{target}.{key}"][0]) for key in ("u_r_m_s", "u_a_m_s")] for target in world.targets
+        }
+        known = (lit, focused.processed_hz, world.samples is not None)
+        return {target: ideal_responses(result.bench.radar, *row, *known) for target, row in rows.items()}
+
+    def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
+        return figures.pictures(results, self.target_columns)
+
+    def pictured(self, result: Result) -> dict[str, Signal]:
+        shots = figures.shots(result)
+        return {f"{name}/{target}": shot.image for name, of in shots.items() for target, shot in of.items()}
+
+    def notes(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        levels = metrics["definitions"]
+        text = "Echoes are free of noise."
+        if "snr_db" in levels:
+            text = f"A target stands {levels['snr_db']:.4g} dB above the noise in a range-compressed sample of one channel, "
+            text += f"{levels['raw_scnr_db']:.4g} dB before compression."
+        yield "Signal to noise", text
+
+    def extra_definitions(self, bench: Bench) -> Mapping[str, Any]:
+        """SNR both ways, and the range to the transmitter, as numbers."""
+        snr, gain = bench.world().snr_db(bench.radar), compression_gain_db(bench.radar)
+        transmit = {f"transmit_range_k{i}": k for i, k in enumerate(bench.radar.transmit_range, 1)}
+        levels = (
+            {"compression_gain_db": gain} if snr is None else {"snr_db": float(snr), "raw_scnr_db": float(snr) - gain}
+        )
+        return {"orders": bench.judging.orders, **levels, **transmit}
+
+
+def _held(chain: Chain, trace: Trace) -> dict[str, Tensor]:
+    """Everything that a chain was given or has estimated."""
+    estimates = {f"{stage}.{key}": v for stage, e in trace.estimates.items() for key, v in e.value.items()}
+    sources = {source for uses in chain.uses.values() for source in uses.values() if source.startswith("given.")}
+    return {**estimates, **{source: trace.values[source] for source in sources}}
+
+
+def _seen(value: Tensor) -> bool:
+    return bool(torch.isfinite(value.double()).all())
+
+
+def _clutter(world: Points, radar: BistaticRadar) -> Tensor | None:
+    """Covariance of white noise of unit variance and the sea, across channels, by Doppler bin."""
+    if world.sea is None:
+        return None
+    gate = world.gate if world.sea_gate is None else world.sea_gate
+    lit = getattr(gate, "duration_s", None)
+    band = None if lit is None else radar.speed_m_s**2 * lit / (radar.wavelength_m * radar.reference_range_m)
+    prior = ElementPattern() if band is None else FlatBand(band)
+    clutter = clutter_covariance(radar, prior, world.pulses, _CLUTTER_BANDS)
+    level = 10 ** (torch.as_tensor(world.sea.power_db, dtype=torch.float64) / 10)
+    mean = clutter.diagonal(dim1=-2, dim2=-1).real.mean()
+    return clutter * (level[..., None, None, None] / mean) + torch.eye(radar.channels, dtype=clutter.dtype)
+
+
+SYSTEM = Geo

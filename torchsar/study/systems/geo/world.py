@@ -1,0 +1,212 @@
+"""The world of moving points before several channels: section `world`, and its simulation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Annotated, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Draws, Recording, Truth, unit_phasor
+from torchsar.echo import Impairment, apply_impairments, sea_echo, simulate_bistatic
+from torchsar.radar import BistaticRadar
+from torchsar.scene import BandLimited, BistaticWorld, ExactRange, Gate, MovingPoints, PolynomialTransmit, Sea
+from torchsar.scene.moving import ReceiveRange
+from torchsar.study.names.registry import GATES, MULTICHANNEL_IMPAIRMENTS, RECEIVE_RANGES, SEAS
+from torchsar.study.trials.batch import Trials
+from torchsar.study.trials.system import World
+
+# true values that processors may be given, and that metrics.json names of each target
+TRUTHS = ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
+
+
+@dataclass(frozen=True)
+class Target:
+    """A point of amplitude 1 in uniform motion.
+
+    Args:
+        u_r_m_s: Slant-range speed, closing positive.
+        u_a_m_s: Along-track speed, positive in the direction of the receiver.
+        azimuth_m: Along-track position at t = 0.
+        range_m: Closest range beyond the reference range.
+    """
+
+    u_r_m_s: Tensor | float = 0.0
+    u_a_m_s: Tensor | float = 0.0
+    azimuth_m: Tensor | float = 0.0
+    range_m: Tensor | float = 0.0
+
+
+@dataclass(frozen=True)
+class Level:
+    """Receiver noise; at most one level is given, in dB.
+
+    Args:
+        snr_db: Target over noise in a sample of one channel after range compression.
+        raw_scnr_db: The same before it, 10 log10(B tau_p) less.
+        scr_db: Target over sea in a sample after range compression.
+    """
+
+    snr_db: Tensor | float | None = None
+    raw_scnr_db: Tensor | float | None = None
+    scr_db: Tensor | float | None = None
+
+    def __post_init__(self) -> None:
+        given = [one.name for one in fields(self) if getattr(self, one.name) is not None]
+        if len(given) > 1:
+            raise ValueError(
+                f"world.noise: {given[0]} and {given[1]} both say how strong a target is; give one of snr_db, raw_scnr_db "
+                "and scr_db, and leave the others null"
+            )
+
+
+class Own(NamedTuple):
+    """What the judge needs: the impaired echo of the targets alone, their SNR (row,) in dB, and the
+    world with the numbers of each trial.
+    """
+
+    alone: Recording
+    snr_db: Tensor | None
+    world: Points
+
+    @property
+    def integration_s(self) -> Tensor | float | None:
+        """Time for which targets are lit; None for a pattern."""
+        return self.world.integration_s
+
+
+@dataclass(frozen=True, kw_only=True)
+class Points(World):
+    """What is true about moving points. Every target is recorded alone, with noise and sea of its
+    own, which follow its name.
+
+    Args:
+        pulses: Pulses of the record.
+        samples: Range lines; None for the peak line alone, azimuth only.
+        kind: Range-compressed data, or full chirps, which need samples of two pulses more.
+        targets: Targets by name.
+        gate: What lights the targets.
+        sea: Surface at rest; None for none.
+        sea_gate: What lights the sea; None for the gate of the targets.
+        receive: Model of the range to the receiver.
+        transmit_range: True k1, k2, ... of the range to the transmitter; None for those of the
+            ephemeris of the radar.
+        noise: Level of the noise.
+        impairments: What happens to the recording, in order.
+    """
+
+    pulses: int
+    samples: int | None = None
+    kind: Literal["compressed", "full"] = "compressed"
+    targets: Mapping[str, Target]
+    gate: Annotated[Gate, GATES] = field(default_factory=lambda: BandLimited(4.5))
+    sea: Annotated[Sea, SEAS] | None = None
+    sea_gate: Annotated[Gate, GATES] | None = None
+    receive: Annotated[ReceiveRange, RECEIVE_RANGES] = field(default_factory=ExactRange)
+    transmit_range: Sequence[Tensor | float] | None = None
+    noise: Level = field(default_factory=Level)
+    impairments: Mapping[str, Annotated[Impairment, MULTICHANNEL_IMPAIRMENTS]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.pulses < 1 or not self.targets or (self.samples is not None and self.samples < 1):
+            raise ValueError(f"world needs targets, pulses and samples, got {self.pulses} and {self.samples}")
+        if self.noise.scr_db is not None and self.sea is None:
+            raise ValueError("world.noise.scr_db is the level of targets over a sea; give world.sea, or snr_db instead")
+        if self.sea is not None and all(getattr(self.noise, one.name) is None for one in fields(Level)):
+            raise ValueError(
+                "world.noise: the level of a sea counts from the noise; give snr_db, raw_scnr_db or scr_db"
+            )
+        if self.sea is not None and self.kind == "full":
+            raise ValueError("world.sea is added to range-compressed echoes; take kind: compressed")
+        beyond = any(bool((torch.as_tensor(target.range_m) != 0).any()) for target in self.targets.values())
+        if self.samples is None and (self.kind == "full" or beyond):
+            raise ValueError(
+                "world.samples: azimuth-only data (null) know one range, the reference_range_m of the radar; give samples, "
+                "or leave range_m and kind: full out"
+            )
+
+    @property
+    def integration_s(self) -> Tensor | float | None:
+        """Time for which targets are lit; None for a pattern."""
+        return self.gate.duration_s if isinstance(self.gate, BandLimited) else None
+
+    def snr_db(self, radar: BistaticRadar) -> Tensor | float | None:
+        """SNR of a range-compressed sample of one channel; None for no noise."""
+        noise = self.noise
+        if noise.raw_scnr_db is not None:
+            return noise.raw_scnr_db + compression_gain_db(radar)
+        if noise.scr_db is not None and self.sea is not None:
+            return noise.scr_db + self.sea.power_db
+        return noise.snr_db
+
+    def trials_of(self, radar: BistaticRadar, draws: Draws, dtype: torch.dtype, device: str = "cpu") -> Trials:
+        """Rows (trial, target), flattened: with noise and sea, and without, and the truth."""
+        rows, count = _row_draws(draws, self.targets), len(draws.trials or (0,))
+        snr = _per_row(self.snr_db(radar), len(self.targets), count)
+        transmit = None if self.transmit_range is None else PolynomialTransmit(self.transmit_range)
+        world = BistaticWorld(self.points(count), self.gate, None, snr, self.receive, transmit)
+        size = (self.pulses, self.samples)
+        noisy, truth = simulate_bistatic(radar, world, *size, rows, kind=self.kind, dtype=dtype, device=device)
+        assert truth.clean is not None
+        if self.sea is not None:
+            noisy = replace(
+                noisy, signal=noisy.signal.with_data(noisy.signal.data + self._sea(rows, snr, truth, noisy))
+            )
+        values = {name: value[..., 0] for name, value in truth.values.items() if name in TRUTHS}
+        named = {
+            f"{target}.{name}": x.reshape(count, -1)[:, i]
+            for name, x in values.items()
+            for i, target in enumerate(self.targets)
+        }
+        values = {**values, **named, "noise_std": truth.values["noise_std"]}
+        alone = truth.clean
+        if self.impairments:
+            (noisy, known), (alone, _) = (apply_impairments(one, self.impairments, rows) for one in (noisy, alone))
+            values.update(known)
+        return Trials(noisy, truth.clean, values, count, Own(alone, snr, self))
+
+    def points(self, count: int) -> MovingPoints:
+        """The targets, one a row (trial, target), flattened."""
+
+        def rows(name: str) -> Tensor:
+            each = [
+                torch.as_tensor(getattr(one, name), dtype=torch.float64).expand(count) for one in self.targets.values()
+            ]
+            return torch.stack(each, -1).reshape(-1, 1)
+
+        return MovingPoints(rows("u_r_m_s"), rows("u_a_m_s"), rows("azimuth_m"), rows("range_m"))
+
+    def _sea(self, rows: Draws, snr: Tensor | None, truth: Truth, recording: Recording) -> Tensor:
+        """Echo of the sea with the range to the transmitter on its carrier."""
+        assert self.sea is not None and snr is not None
+        signal, gate = recording.signal, self.gate if self.sea_gate is None else self.sea_gate
+        sea = replace(self.sea, power_db=self.sea.power_db - snr)  # pyright: ignore[reportCallIssue]
+        where = (rows.part("sea"), signal.data.dtype, signal.data.device)
+        echo = sea_echo(sea, recording.radar, self.pulses, self.samples, gate, *where)  # pyright: ignore
+        turned = unit_phasor(-truth.values["transmit_range_m"] / recording.radar.wavelength_m, signal.data.dtype)
+        return echo * (turned[..., None] if "range" in signal.names else turned)
+
+
+def compression_gain_db(radar: BistaticRadar) -> float:
+    """10 log10(B tau_p): what range compression adds to a raw SNR."""
+    return 10 * math.log10(radar.pulse.bandwidth_hz * radar.pulse.duration_s)
+
+
+def _per_row(level: Tensor | float | None, targets: int, count: int) -> Tensor | None:
+    if level is None:
+        return None
+    return torch.as_tensor(level, dtype=torch.float64).expand(count).repeat_interleave(targets)
+
+
+def _row_draws(draws: Draws, names: Mapping[str, Target]) -> Draws:
+    """One address for each trial and target, trials outermost; a target keeps its draws whatever
+    others there are.
+    """
+    trials = list(draws.trials if draws.trials is not None else [0])
+    cases = draws.case if isinstance(draws.case, tuple) else (draws.case,) * len(trials)
+    addresses = tuple(f"{case}/{name}" for case in cases for name in names)
+    return Draws(draws.seed, addresses, [trial for trial in trials for _ in names])

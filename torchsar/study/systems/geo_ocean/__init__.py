@@ -1,0 +1,268 @@
+"""System 001 as a whole scene: moving ships on a sea before several channels
+(Remote Sens. 2020, 12, 1703, Figs 13 and 18).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Chain, Draws, Signal, Trace
+from torchsar.focus.ladar_requirements import Limit
+from torchsar.focus.requirements import Requirement
+from torchsar.metrics.ship_scene import FoundTarget, MadeScene, matched, ship_metrics
+from torchsar.multichannel import Extraction, PointMotion, StationaryImage
+from torchsar.multichannel.response import LeastSquares, condition_number, noise_gain_db
+from torchsar.multichannel.scene_image import MoversImage
+from torchsar.radar import BistaticRadar
+from torchsar.study.output.pictures import Drawn
+from torchsar.study.settings.errors import ConfigError
+from torchsar.study.systems.geo.radar import bistatic_radar
+from torchsar.study.systems.geo_ocean import choices, figures
+from torchsar.study.systems.geo_ocean.world import TRUTHS, Ocean
+from torchsar.study.trials.batch import IMAGE, Batch, Found, Judged, Outcome, Result, Trials
+from torchsar.study.trials.bench import Bench
+from torchsar.study.trials.system import Choice, Column, System
+
+# the largest tensors of a frame over its raw data: images of twice the lines, and segments of ships
+_PEAK = 40.0
+
+
+@dataclass(frozen=True)
+class Judging:
+    """How results are judged.
+
+    Args:
+        match_m: How far, along track and in range, a target that was found may appear from where a
+            ship appears.
+        published_targets: Figure -> ship -> method -> what the source published.
+    """
+
+    match_m: Sequence[float] = (150.0, 40.0)
+    published_targets: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if len(self.match_m) != 2 or not all(x > 0 for x in self.match_m):
+            raise ValueError(f"metrics.match_m needs two positive distances, got {list(self.match_m)}")
+
+
+class View(NamedTuple):
+    """What pictures need of a method: its images, and targets by ship, of every trial."""
+
+    made: Sequence[MadeScene]
+    found: Sequence[Mapping[str, FoundTarget | None]]
+
+
+class GeoOcean(System):
+    """Ships on a sea."""
+
+    name = "geo_ocean"
+    about = "moving ships on a sea before several channels along track, whole scenes"
+    Radar = staticmethod(bistatic_radar)
+    World = Ocean
+    Judging = Judging
+    ending = "movers_image or stationary_image"
+    truths = TRUTHS
+    peak = _PEAK
+    tolerance = {"image_error_db": -20.0, "position_error_m": 10.0, "sea_error_db": -10.0}
+    exact = {"transmit_range_remove.order": {"order": None}, "stationary_image.form": {"form": "stolt"}}
+    definitions = {
+        "snr": "the sea has unit mean power in a range-compressed sample of one channel; scr_db: mean power of a sample of a "
+        "ship's lines over it; cnr_db: sea over noise",
+        "velocities": "u_r: closing slant-range speed; u_a: along track, positive with the receiver; y0: position along track "
+        "at t = 0, the middle pulse; range: closest one of the track at rest",
+        "matching": "a target that was found belongs to the nearest ship in the image of everything at rest, within "
+        "metrics.match_m; found: share of ships with one. A ship that is not found counts as at rest where that image shows "
+        "it: its errors are minus its velocities and its displacement, ok is False. false_targets: targets that belong to no "
+        "ship",
+        "u_r_error_m_s": "estimated minus true u_r; u_a_error_m_s alike. Figures of a method are means over its ships",
+        "position_error_m": "distance, along track and range together, of the position given to a ship from the intensity "
+        "centroid of the ship's own echo, without sea and noise, imaged in the same way by its true velocities: its "
+        "scatterers have random phases and interfere, and no image shows the centroid of their powers. along_error_m, "
+        "range_error_m: its parts, signed",
+        "scatterers_error_m": "the same distance from the centroid of the scatterers' powers",
+        "image_position_m": "intensity centroid along x = V_R t, near the predicted position, of the image of the ship's own "
+        "echo as if it were at rest; displacement_m: that minus the true y0; displacement_vt_m: what the motion predicts on "
+        "the axis x = (V_R - u_a) t, which the source prints",
+        "replica_distance_m": "distance on x = V_R t of the stronger first replica from the image itself, centroids of the "
+        "same image; replica_distance_vt_m: PRF lambda R0 / (V_R - u_a), on the axis of the source. A blurred ship that "
+        "reaches beyond the rebuilt band loses one end to its replica: measured centroids then lie nearer than predicted",
+        "replica_db": "mean power of the final image within 100 m along track and 40 m in range of the strongest replica one "
+        "or two pulse rates away, over the sea's in the same lines; the sea itself has 0 dB, spread by its texture by about "
+        "1 dB. replica_before_db: of the image of everything at rest; replica_left_db: of the difference from the image of "
+        "what does not move",
+        "sea_error_db": "power of the difference of the image without movers from the image of what does not move, over the "
+        "power of the latter, within 400 m along track and 30 m in range of where the image at rest showed the ship; "
+        "sea_error_before_db: the same without removal. Of ships that move",
+        "hole_db": "power of the image without movers within 60 m and 12 m of where the image at rest showed the ship, over "
+        "that of the sea there: 0 dB is untouched",
+        "contrast_db": "mean power of the final image within 60 m and 12 m of the true position over the sea's in the same "
+        "lines",
+        "condition_number": "of the band matrix that rebuilds what is at rest (absent for mmse, which inverts no such "
+        "matrix); noise_gain_db: noise of a rebuilt bin against ideal uniform sampling",
+        "published": "figures of Remote Sens. 2020, 12, 1703, Fig. 18, whose azimuth is x = (V_R - u_a) t",
+    }
+    target_columns = {
+        "u_r_error_m_s": Column("error of the slant-range velocity", "m/s", drawn="rms"),
+        "u_a_error_m_s": Column("error of the along-track velocity", "m/s", drawn="rms"),
+        "position_error_m": Column("error of the position", "m", drawn="rms"),
+        "along_error_m": Column("of it along track", "m"),
+        "range_error_m": Column("of it in range", "m"),
+        "scatterers_error_m": Column("error of the position against the scatterers' powers", "m"),
+        "displacement_vt_m": Column(
+            "displacement in the image of everything at rest, predicted, axis (V_R - u_a) t", "m"
+        ),
+        "replica_distance_vt_m": Column("distance of the false target, predicted, same axis", "m"),
+        "displacement_m": Column("displacement, measured, axis V_R t", "m"),
+        "replica_distance_m": Column("distance of the false target, measured, axis V_R t", "m"),
+        "replica_before_db": Column("false target over the sea, image of everything at rest", "dB"),
+        "replica_db": Column("false target over the sea, final image", "dB", drawn="mean"),
+        "replica_left_db": Column("remainder of the false target over the sea", "dB"),
+        "sea_error_db": Column("error of the sea about a ship that was removed", "dB", drawn="mean"),
+        "sea_error_before_db": Column("the same before it was removed", "dB"),
+        "hole_db": Column("sea where the ship was shown against the true sea", "dB"),
+        "contrast_db": Column("ship over the sea at its true position, final image", "dB", drawn="mean"),
+        "u_r_std_m_s": Column("predicted error of the slant-range velocity", "m/s"),
+        "found": Column("share of ships found"),
+    }
+    columns = {
+        **target_columns,
+        "false_targets": Column("targets that belong to no ship"),
+        "condition_number": Column("condition number of the reconstruction of what is at rest"),
+        "noise_gain_db": Column("noise gain of that reconstruction", "dB"),
+        "ok": Column("share of trials with every ship found and called reliable"),
+        "seconds": Column("time of a trial", "s"),
+    }
+
+    def samples(self, world: Ocean, radar: BistaticRadar) -> int:
+        return radar.channels * world.pulses * world.samples
+
+    def check(self, bench: Bench) -> None:
+        for name, chain in bench.chains.items():
+            *before, last = chain.stages
+            if not isinstance(chain.stages[last], (StationaryImage, MoversImage)):
+                raise ConfigError(
+                    f"{bench.file}: processor.{name}: system geo_ocean makes images of scenes; end the chain with "
+                    f"{self.ending}, not with {last!r}"
+                )
+            for stage in before:
+                if chain.uses[stage] or getattr(chain.stages[stage], "provides", ()):
+                    raise ConfigError(
+                        f"{bench.file}: processor.{name}.stages.{stage}: stages before {last!r} may neither estimate nor use "
+                        "values; leave it out"
+                    )
+
+    def simulate(self, bench: Bench, world: Ocean, draws: Draws) -> Trials:
+        return world.trials_of(bench.radar, draws, _extraction(bench), bench.dtype, bench.device)
+
+    def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
+        made, stage = _scenes(bench, trace), at_rest(bench.chains[name])
+        rows, views, reach = [], [], (float(bench.judging.match_m[0]), float(bench.judging.match_m[1]))
+        for scene, frame in zip(made, trials.own, strict=True):
+            still = frame.still_image(stage)
+            found = matched([target for target in scene.targets or () if target.ok], frame.ships, reach)
+            rows.append({ship: ship_metrics(shown, found[ship], scene, still) for ship, shown in frame.ships.items()})
+            views.append(found)
+        ships = {ship: _stacked([row[ship] for row in rows]) for ship in bench.world().targets}
+        names = dict.fromkeys(key for of in ships.values() for key in of)
+        whole = {k: torch.stack([of[k] for of in ships.values() if k in of]).nanmean(0) for k in names}
+        whole |= _conditioning(bench.radar, stage)
+        if any(scene.targets is not None for scene in made):
+            counts = [len(s.targets or ()) - sum(t is not None for t in f.values()) for s, f in zip(made, views)]
+            whole["false_targets"] = torch.tensor(counts, dtype=torch.float64)
+            whole["ok"] = torch.stack([of["ok"] > 0 for of in ships.values()]).all(0)
+        if not detail:
+            whole |= {f"{ship}.{key}": x for ship, of in ships.items() for key, x in of.items() if key != "ok"}
+        whole = {key: value.expand(trials.count) for key, value in whole.items()}
+        return Judged(whole, ships, view=View(made, views))
+
+    def found(self, bench: Bench, outcome: Outcome, trials: Trials) -> dict[str, Found]:
+        """Motions of the targets that belong to ships; NaN where a ship was not found."""
+        if outcome.failed or outcome.judged.view.made[0].targets is None:
+            return {}
+        rows = outcome.judged.view.found
+        table: dict[str, Found] = {}
+        for ship in bench.world().targets:
+            ok = torch.tensor([row[ship] is not None and bool(row[ship].ok) for row in rows])
+            for key in TRUTHS:
+                values = [math.nan if row[ship] is None else float(getattr(row[ship].motion, key)) for row in rows]
+                table[f"{ship}.{key}"] = Found(torch.tensor(values, dtype=torch.float64), None, ok)
+        return table
+
+    def limits(self, bench: Bench) -> Mapping[Limit, Sequence[str]]:
+        return choices.limits(bench)
+
+    def requirements(self, bench: Bench) -> Sequence[Requirement]:
+        return choices.requirements(bench)
+
+    def choices(self, bench: Bench) -> Sequence[Choice]:
+        return choices.choices(bench)
+
+    def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
+        return figures.pictures(results, self.target_columns)
+
+    def pictured(self, result: Result) -> dict[str, Signal]:
+        images = {}
+        for name, outcome in result.first.outcomes.items():
+            if not outcome.failed:
+                scene = outcome.judged.view.made[0]
+                images |= {f"{name}/fused": scene.fused, **({f"{name}/rest": scene.rest} if scene.targets else {})}
+        return images
+
+    def notes(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        text = "Errors of positions count from what the image of the ship's own echo would show: its scatterers interfere, and "
+        yield "Positions", f"{text}no image shows the centre of their powers."
+
+
+def at_rest(chain: Chain) -> StationaryImage:
+    """How a chain images what is at rest."""
+    last: Any = list(chain.stages.values())[-1]
+    return last.flow.image if isinstance(last, MoversImage) else last
+
+
+def _extraction(bench: Bench) -> Extraction:
+    """Of the recommended method, which also images the ships' own echoes."""
+    last: Any = list(bench.chains["recommended"].stages.values())[-1]
+    return last.flow.extraction if isinstance(last, MoversImage) else Extraction()
+
+
+def _scenes(bench: Bench, trace: Trace) -> list[MadeScene]:
+    """What a method made of every trial."""
+    data, axes = trace.signal.data.reshape(-1, *trace.signal.data.shape[-2:]), trace.signal.axes
+    if not trace.estimates:
+        return [MadeScene(*(Signal(image, axes),) * 3) for image in data]
+    (estimate,) = trace.estimates.values()
+    info = {name: x.reshape(len(data), *x.shape[len(trace.signal.trials) :]) for name, x in estimate.info.items()}
+    values = [estimate.value[key].reshape(len(data), -1) for key in TRUTHS]
+    std, ok = estimate.std["u_r_m_s"].reshape(len(data), -1), estimate.ok.reshape(len(data), -1)
+    scenes = []
+    for i, image in enumerate(data):
+        there = (info["level"][i] > 0).nonzero()[:, 0].tolist()
+        motions = [PointMotion(*(x[i, j] for x in values), bench.radar.speed_m_s) for j in there]
+        targets = [FoundTarget(m, float(std[i, j]), bool(ok[i, j])) for m, j in zip(motions, there, strict=True)]
+        images = (info["conventional"][i], info["rest"][i], image)
+        scenes.append(MadeScene(*(Signal(x, axes) for x in images), targets))
+    return scenes
+
+
+def _stacked(rows: Sequence[Mapping[str, float]]) -> dict[str, Tensor]:
+    """Figures of several trials by name; NaN where a trial lacks one."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    return {n: torch.tensor([row.get(n, math.nan) for row in rows], dtype=torch.float64) for n in names}
+
+
+def _conditioning(radar: BistaticRadar, stage: StationaryImage) -> dict[str, Tensor]:
+    """Of the reconstruction of what is at rest."""
+    motion = PointMotion.of(radar, torch.zeros((), dtype=torch.float64))
+    gain = {"noise_gain_db": noise_gain_db(radar, motion, stage.rebuild)}
+    if not isinstance(stage.rebuild, LeastSquares):
+        return gain
+    return {"condition_number": condition_number(radar, motion, stage.rebuild.bands), **gain}
+
+
+SYSTEM = GeoOcean

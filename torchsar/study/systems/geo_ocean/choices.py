@@ -1,0 +1,193 @@
+"""What ships on a sea require of their processor, and the alternatives that it may choose."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Draws, Signal
+from torchsar.echo import bistatic_echo
+from torchsar.focus.ladar_requirements import Limit
+from torchsar.focus.requirements import Aperture, Requirement, phase_error_db
+from torchsar.metrics import error_db
+from torchsar.metrics.ship_scene import FoundTarget, MadeScene, matched, ship_metrics
+from torchsar.multichannel import (
+    ImageMovers,
+    MultichannelUse,
+    RemoveTransmitRange,
+    SceneImage,
+    StationaryImage,
+    multichannel_limits,
+    multichannel_requirements,
+)
+from torchsar.multichannel.scene_image import MoversImage
+from torchsar.multichannel.stationary import two_way_radar
+from torchsar.scene import BandLimited, MovingPoints
+from torchsar.study.settings.errors import ConfigError
+from torchsar.study.trials.bench import Bench
+from torchsar.study.trials.system import Alternative, Choice, Measured
+
+# integration time (s) of the source, for scenes that are seen through a pattern
+_PATTERN_S = 4.5
+# segments (s) of slow time and half extents (m) of the lines of a ship that are compared
+_SEGMENTS_S, _LINES_M = (0.3, 0.6, 1.2), (30.0, 60.0)
+# no keystone transform is used, and bands are separated only for what is at rest
+_NOT_HERE = (
+    "tone left for the keystone transform",
+    "condition number within the velocities",
+    "singular speeds along track within the search",
+)
+
+
+def limits(bench: Bench) -> dict[Limit, list[str]]:
+    """Limits, each with the methods that it concerns."""
+    found: dict[Limit, list[str]] = {}
+    for name in bench.chains:
+        for limit in (*multichannel_limits(bench.radar, _use_of(bench, name)), *_swath_limits(bench, name)):
+            if limit.name not in _NOT_HERE:
+                found.setdefault(limit, []).append(name)
+    return found
+
+
+def requirements(bench: Bench) -> Sequence[Requirement]:
+    """What simplifications neglect; nothing where no aperture forms."""
+    use = _use_of(bench, "recommended")
+    return multichannel_requirements(bench.radar, use) if bench.radar.speed_m_s > use.u_a_m_s[1] else ()
+
+
+def _last(bench: Bench, name: str) -> Any:
+    return list(bench.chains[name].stages.values())[-1]
+
+
+def _integration_s(bench: Bench) -> float | None:
+    gate = bench.world().gate
+    return float(gate.duration_s) if isinstance(gate, BandLimited) else None
+
+
+def _use_of(bench: Bench, name: str) -> MultichannelUse:
+    """How a method uses the radar: what is at rest it rebuilds as such, moving ships it images by
+    their own velocities without any reconstruction.
+    """
+    world, last, lit = bench.world(), _last(bench, name), _integration_s(bench)
+    ships, moving = list(world.targets.values()), isinstance(last, MoversImage)
+    spans = [[float(getattr(ship, key)) for ship in ships] for key in ("u_r_m_s", "u_a_m_s")]
+    return MultichannelUse(
+        world.pulses,
+        lit or _PATTERN_S,
+        (last.flow.image if moving else last).rebuild,
+        lit is None,
+        *((min(x), max(x)) for x in spans),
+        y0_m=max(abs(float(ship.azimuth_m)) for ship in ships),
+        swath_m=max(abs(float(ship.range_m)) for ship in ships),
+        snr_db=float(world.sea.power_db) + max(float(ship.scr_db) for ship in ships),
+        clutter=True,
+        estimators=("whitened",) if moving else (),
+        dtype=bench.dtype,
+    )
+
+
+def _swath_limits(bench: Bench, name: str) -> list[Limit]:
+    """Moving ships are sought only where they lie in the swath whatever their velocity."""
+    last, radar = _last(bench, name), bench.radar
+    if not isinstance(last, MoversImage):
+        return []
+    extraction, need = last.flow.extraction, 0.0
+    for ship in bench.world().targets.values():
+        abeam_s = abs(float(ship.azimuth_m)) / radar.speed_m_s
+        walk = extraction.range_m + radar.ambiguous_velocity_m_s / 2 * (abeam_s + extraction.integration_s / 2)
+        curve = (extraction.integration_s * radar.speed_m_s) ** 2 / (8 * radar.reference_range_m)
+        need = max(need, abs(float(ship.range_m)) + walk + curve)
+    what = "ships beyond the part of the swath in which targets are sought are not found"
+    remedy = "record more range samples, or bring the ships nearer to the middle"
+    half = bench.world().samples / 2 * radar.range_step_m
+    return [Limit("half of the swath about the ships", half, need, "m", "warn", what, remedy, at_least=True)]
+
+
+def choices(bench: Bench) -> list[Choice]:
+    """Settings of the recommended flow on its first scene, and the form of the image at rest."""
+    forms = [
+        Alternative(
+            "bulk", {"form": "bulk"}, {"image_error_db": _bulk_db(bench)}, "change of migration over the swath"
+        ),
+        Alternative("stolt", {"form": "stolt"}, {}),
+    ]
+    found = [Choice("image of what is at rest", "stationary_image.form", forms, partial(_forms, bench))]
+    if isinstance(_last(bench, "recommended"), MoversImage):
+        flow = _last(bench, "recommended").flow
+        settings = {f"segments of {x:g} s": {"extraction": replace(flow.extraction, segment_s=x)} for x in _SEGMENTS_S}
+        settings |= {f"lines within {x:g} m": {"extraction": replace(flow.extraction, range_m=x)} for x in _LINES_M}
+        settings |= {"set to zero": {"removal": "zero"}, "double precision": {"dtype": torch.complex128}}
+        flows = [Alternative(name, keys) for name, keys in {**settings, "as the config has it": {}}.items()]
+        found.append(Choice("settings of the flow", "movers_image", flows, partial(_flows, bench)))
+    return found
+
+
+def _bulk_db(bench: Bench) -> float:
+    """Error of the response of a point at the edge of the swath."""
+    radar, half = bench.radar, bench.world().samples / 2 * bench.radar.range_step_m
+    middle, last = radar.reference_range_m, _last(bench, "recommended")
+    bands = (last.flow.image if isinstance(last, MoversImage) else last).rebuild.bands
+    two_way = two_way_radar(radar, bands, middle - half)
+    lit = _integration_s(bench) or _PATTERN_S
+    aperture = Aperture.of(two_way, middle, 0.0, radar.speed_m_s, 0.0, lit)
+    return phase_error_db(aperture.bulk_residual_rad(half))
+
+
+def _forms(bench: Bench) -> Measured:
+    """Images of points at rest at both edges of the swath by each form, against the exact one."""
+    radar, world, last = bench.radar, bench.world(), _last(bench, "recommended")
+    axes = radar.axes(world.pulses, world.samples)
+    edge = 0.9 * world.samples / 2 * radar.range_step_m
+    points = MovingPoints([[0.0], [0.0]], [[0.0], [0.0]], [[0.0], [0.0]], [[-edge], [edge]])  # pyright: ignore
+    rebuild = (last.flow.image if isinstance(last, MoversImage) else last).rebuild
+
+    def echo(dtype: torch.dtype) -> Signal:
+        movers = points.movers(radar, Draws(0))
+        return Signal(bistatic_echo(movers, radar, world.pulses, world.samples, gate=world.gate, dtype=dtype), axes)
+
+    # the transmit range is common to everything, and left out
+    remove, data = RemoveTransmitRange(radar), echo(torch.complex128)
+    exact, signal = StationaryImage(radar, rebuild)(remove(data)).data, remove(echo(bench.dtype))
+
+    def run(one: Alternative) -> Tensor:
+        return StationaryImage(radar, rebuild, one.keys["form"])(signal).data
+
+    return Measured(run, lambda one, image: {"image_error_db": float(error_db(image.to(exact), exact).max())})
+
+
+def _flows(bench: Bench) -> Measured:
+    """The recommended flow with one setting changed at a time."""
+    flow, trials = _last(bench, "recommended").flow, bench.trials(Draws(bench.config.seed, "trade", [0]))
+    (frame,), clean = trials.own, RemoveTransmitRange(bench.radar)(trials.recording.signal)
+    kept: Mapping[str, Any] = {
+        "extraction": flow.extraction,
+        "detector": flow.detector,
+        "rebuild": flow.image.rebuild,
+        "removal": flow.removal,
+        "u_a_half_m_s": flow.u_a_half_m_s,
+    }
+    reach = (float(bench.judging.match_m[0]), float(bench.judging.match_m[1]))
+    if not any(shown.ship.moves for shown in frame.ships.values()):
+        raise ConfigError(f"{bench.file}: settings of the flow are compared on ships that move; let a ship move")
+
+    def run(one: Alternative) -> SceneImage:
+        keys = {**kept, **one.keys}
+        signal = Signal(clean.data[0].to(keys.pop("dtype", bench.dtype)), clean.axes)
+        return ImageMovers(bench.radar, **keys)(signal)
+
+    def loss(one: Alternative, made: SceneImage) -> dict[str, float]:
+        targets = [FoundTarget(body.motion, float(body.u_r_std_m_s), bool(body.ok)) for body in made.bodies]
+        scene = MadeScene(made.conventional, made.rest, made.fused, targets)
+        found, still = matched([t for t in targets if t.ok], frame.ships, reach), frame.still_image(flow.image)
+        rows = [
+            ship_metrics(shown, found[name], scene, still) for name, shown in frame.ships.items() if shown.ship.moves
+        ]
+        return {key: max(row[key] for row in rows) for key in ("position_error_m", "sea_error_db")}
+
+    return Measured(run, loss)

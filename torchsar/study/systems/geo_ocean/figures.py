@@ -1,0 +1,115 @@
+"""The pictures of a run of ships on a sea: whole scenes by every method, the flow, ships."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchsar import plot
+from torchsar.core import Signal
+from torchsar.metrics.ship_scene import ImagePosition, MadeScene, ShownShip
+from torchsar.study.output.pictures import Drawn, comparisons, within
+from torchsar.study.settings.cases import titled, word_of
+from torchsar.study.systems.geo.figures import by_target
+from torchsar.study.trials.batch import Result
+
+# half extents in azimuth and range (m) of pictures of ships, and of the boxes about them
+_SHIP_M, _BOX_M = (150.0, 60.0), (120.0, 60.0)
+# levels over the sea (dB) that are shown of scenes, and their largest number of blocks to a side
+_UP_DB, _DOWN_DB, _BLOCKS = 25.0, -10.0, 300
+
+
+def pictures(results: Mapping[str, Result], columns: Mapping[str, Any]) -> Iterator[Callable[[], Drawn]]:
+    """Makers of all pictures."""
+    for case, result in results.items():
+        for make in (_flow, _methods, _ships):
+            yield partial(make, case, result)
+    yield partial(comparisons, by_target(results), columns)
+
+
+def _made(result: Result) -> dict[str, MadeScene]:
+    """The first scene by every method."""
+    return {n: outcome.judged.view.made[0] for n, outcome in result.first.outcomes.items() if not outcome.failed}
+
+
+def _shown(result: Result) -> Mapping[str, ShownShip]:
+    return result.first.trials.own[0].ships
+
+
+def _true(shown: ShownShip) -> ImagePosition:
+    return ImagePosition(float(shown.centre.y0_m), float(shown.centre.range_m))
+
+
+def _over_sea(image: Signal) -> Signal:
+    """Root mean square over blocks, over that of the median block, limited to what is shown."""
+    view = plot.quicklook(image, _BLOCKS)
+    level = view.data.abs().to(torch.float64)
+    level = level / level.median().clamp_min(1e-300)
+    return view.with_data(level.clamp(10 ** (_DOWN_DB / 20), 10 ** (_UP_DB / 20)).to(torch.complex64))
+
+
+def _boxes(positions: Sequence[ImagePosition]) -> tuple[np.ndarray, np.ndarray]:
+    """Outlines of windows about positions as one broken line."""
+    along, across = _BOX_M
+    x, y = across * np.array([-1, 1, 1, -1, -1, np.nan]), along * np.array([-1, -1, 1, 1, -1, np.nan])
+    parts = [(p.range_m + x, p.azimuth_m + y) for p in positions]
+    empty = np.zeros(0)
+    return np.concatenate([empty, *(p[0] for p in parts)]), np.concatenate([empty, *(p[1] for p in parts)])
+
+
+def _marked(result: Result, title: str, image: Signal, apparent: bool) -> dict[str, Any]:
+    """An image with outlines about true positions, and about where an image of everything at rest
+    shows ships and their replicas.
+    """
+    ships = list(_shown(result).values())
+    lines = {"true position": _boxes([_true(one) for one in ships])}
+    if apparent:
+        moving = [one for one in ships if one.ship.moves]
+        lines["apparent position"] = _boxes([ImagePosition.of(one.centre) for one in moving])
+        lines["false target"] = _boxes([one.replica for one in moving])
+    return {"title": title, "signal": _over_sea(image), "lines": lines}
+
+
+def _flow(case: str, result: Result) -> Drawn:
+    made = _made(result).get("recommended")
+    if made is not None:
+        steps = {"everything at rest": made.conventional, "without moving ships": made.rest, "fused": made.fused}
+        parts = [_marked(result, title, image, title != "fused") for title, image in steps.items()]
+        caption = (
+            "Azimuth (m, up) over range (m), root mean square over blocks, 35 dB. First: everything focused as if at "
+        )
+        caption += (
+            "rest; closing ships appear beside their positions, with false targets. Second: the echo of what moves is "
+        )
+        caption += "subtracted. Third: every moving ship is at its position."
+        figure = plot.overlays(parts, 3, _UP_DB - _DOWN_DB)
+        yield f"flow_{word_of(case)}", titled("The recommended flow", case), caption, figure
+
+
+def _methods(case: str, result: Result) -> Drawn:
+    parts = [_marked(result, name, made.fused, False) for name, made in _made(result).items()]
+    if parts:
+        caption = (
+            "The final image of every method. The inverse of three bands raises the level of the whole scene; zeroing "
+        )
+        caption += "leaves holes in the sea."
+        figure = plot.overlays(parts, 3, _UP_DB - _DOWN_DB)
+        yield f"methods_{word_of(case)}", titled("Final images", case), caption, figure
+
+
+def _ships(case: str, result: Result) -> Drawn:
+    parts, made = [], _made(result)
+    for name, shown in _shown(result).items():
+        for method in (one for one in ("conventional", "recommended") if one in made):
+            at = ImagePosition.of(shown.centre) if method == "conventional" else _true(shown)
+            reach = zip(("azimuth", "range"), (at.azimuth_m, at.range_m), _SHIP_M, strict=True)
+            spans = {axis: (middle - half, middle + half) for axis, middle, half in reach}
+            parts.append({"title": f"{name}, {method}", "signal": within(made[method].fused, spans), "lines": {}})
+    if parts:
+        caption = "Each ship where the image of everything at rest shows it (conventional) and at its position "
+        caption += "(recommended), in dB of its own peak."
+        yield f"ships_{word_of(case)}", titled("Ships", case), caption, plot.overlays(parts, 2, 40.0)

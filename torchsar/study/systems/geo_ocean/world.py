@@ -1,0 +1,177 @@
+"""The world of ships on a sea: section `world`, and its simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Draws, Recording, Signal
+from torchsar.echo import bistatic_echo, simulate_bistatic
+from torchsar.metrics.ship_scene import Ship, ShownShip
+from torchsar.multichannel import Extraction, PointMotion, RemoveTransmitRange, StationaryImage
+from torchsar.multichannel.response import Rebuild
+from torchsar.radar import BistaticRadar
+from torchsar.scene import BandLimited, BistaticWorld, Fleet, Gate, KSea, Movers, Sea
+from torchsar.scene import Ship as ShipOfPoints
+from torchsar.study.names.registry import GATES, SEAS
+from torchsar.study.trials.batch import Trials
+from torchsar.study.trials.system import World
+
+# true values of the ships that processors may be given
+TRUTHS = ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
+
+
+@dataclass(frozen=True)
+class Vessel:
+    """A ship of random scatterers.
+
+    Args:
+        u_r_m_s: Slant-range speed, closing positive.
+        u_a_m_s: Along-track speed, positive in the direction of the receiver.
+        azimuth_m: Along-track position of its middle at t = 0.
+        range_m: Closest range of its middle beyond the reference range.
+        scr_db: Mean power of a sample of one of its lines over that of the sea.
+        length_m: Length along track.
+        range_cells: Lines that it covers.
+        count: Scatterers.
+        cell_m: Distance of its lines.
+    """
+
+    u_r_m_s: Tensor | float = 0.0
+    u_a_m_s: Tensor | float = 0.0
+    azimuth_m: Tensor | float = 0.0
+    range_m: Tensor | float = 0.0
+    scr_db: Tensor | float = 10.0
+    length_m: Tensor | float = 100.0
+    range_cells: int = 4
+    count: int = 15
+    cell_m: Tensor | float = 6.0
+
+    def __post_init__(self) -> None:
+        self.points()
+
+    def points(self) -> ShipOfPoints:
+        """The ship as the echo simulation takes it."""
+        motion = (self.u_r_m_s, self.u_a_m_s, self.azimuth_m, self.range_m)
+        return ShipOfPoints(*motion, self.length_m, self.range_cells, self.count, self.cell_m, self.scr_db)
+
+
+@dataclass
+class Frame:
+    """One trial: what ships look like, and the recording without those that move.
+
+    Args:
+        ships: By name.
+        still: What is recorded without ships that move (channel, pulse, range), without the
+            transmit range.
+        images: Images of it, by reconstruction and form, as they are needed.
+    """
+
+    ships: Mapping[str, ShownShip]
+    still: Signal
+    images: dict[tuple[Rebuild, str], Signal] = field(default_factory=dict)
+
+    def still_image(self, stage: StationaryImage) -> Signal:
+        """The image of what does not move, rebuilt as a method rebuilds."""
+        kind = (stage.rebuild, stage.form)
+        if kind not in self.images:
+            self.images[kind] = stage(self.still)
+        return self.images[kind]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ocean(World):
+    """What is true about ships on a sea, all in one scene. The unit is the mean power of the sea.
+
+    Args:
+        pulses: Pulses of the record.
+        samples: Range lines.
+        targets: Ships by name.
+        gate: What lights ships and sea.
+        sea: The sea; its cnr_db is its power over the noise.
+    """
+
+    pulses: int
+    samples: int
+    targets: Mapping[str, Vessel]
+    gate: Annotated[Gate, GATES] = field(default_factory=lambda: BandLimited(4.5))
+    sea: Annotated[Sea, SEAS] = field(default_factory=lambda: KSea(power_db=30.0))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.pulses < 1 or self.samples < 1 or not self.targets:
+            raise ValueError(f"world needs targets, pulses and samples, got {self.pulses} and {self.samples}")
+
+    def trials_of(
+        self, radar: BistaticRadar, draws: Draws, extraction: Extraction, dtype: torch.dtype, device: str = "cpu"
+    ) -> Trials:
+        """Recordings of the whole scene, and the truth of every ship.
+
+        Args:
+            radar: The instrument.
+            draws: Noise and sea follow seed and trial, and each ship its name.
+            extraction: Extent of a ship in the data, for images of its own echo.
+            dtype: Complex type of the recording.
+            device: Where it is computed.
+        """
+        trials = list(draws.trials if draws.trials is not None else [0])
+        cases = draws.case if isinstance(draws.case, tuple) else (draws.case,) * len(trials)
+        # every trial is a case of its own, so that a scene has one address for all that it draws
+        scenes = Draws(draws.seed, tuple(f"{c}/{t}" for c, t in zip(cases, trials, strict=True)), [0] * len(trials))
+        fleet = Fleet({name: vessel.points() for name, vessel in self.targets.items()})
+        world = BistaticWorld(fleet, self.gate, replace(self.sea, power_db=0.0), snr_db=self.sea.power_db)  # pyright: ignore
+        size = (self.pulses, self.samples)
+        recording, _ = simulate_bistatic(radar, world, *size, scenes, dtype=dtype, device=device)
+        count, data, real = len(trials), recording.signal, recording.signal.data.real
+        remove, ships, still = RemoveTransmitRange(radar), dict[str, list[Ship]](), data.data
+        clean = remove(data)
+        for name, part in fleet.parts.items():
+            movers = part.movers(radar, scenes.part(name)).each(lambda x: x.expand(count, -1))
+            vessel = self.targets[name]
+            near = torch.as_tensor(vessel.range_m, dtype=torch.float64) + radar.reference_range_m
+            motion = PointMotion.of(radar, real, vessel.u_r_m_s, vessel.u_a_m_s, vessel.azimuth_m, near)
+            motion = motion.each(lambda x: x.expand(count))
+            echo = data.with_data(
+                bistatic_echo(movers, radar, *size, gate=self.gate, dtype=dtype).expand(data.data.shape)
+            )
+            removed = remove(echo)
+            ships[name] = [_ship(radar, motion, movers, removed, i) for i in range(count)]
+            moves = torch.tensor([ship.moves for ship in ships[name]], device=real.device)
+            still = still - torch.where(moves[:, None, None, None], echo.data, 0)
+        rest = remove(data.with_data(still))
+        frames = [
+            Frame(
+                {
+                    name: ShownShip.of(radar, of[i], Signal(clean.data[i], clean.axes), extraction)
+                    for name, of in ships.items()
+                },
+                Signal(rest.data[i], rest.axes),
+            )
+            for i in range(count)
+        ]
+        return Trials(recording, recording, _truth(ships, frames), count, frames)
+
+
+def _ship(radar: BistaticRadar, motion: PointMotion, movers: Movers, echo: Signal, i: int) -> Ship:
+    """One ship of one trial, with the centre of its scatterers' powers."""
+    power = movers.amplitude[i].abs().square()
+    centre = [(power * x[i]).sum() / power.sum() for x in (movers.y0_m, movers.closest_m(radar))]
+    return Ship(motion.each(lambda x: x[i]), (float(centre[0]), float(centre[1])), Signal(echo.data[i], echo.axes))
+
+
+def _truth(ships: Mapping[str, list[Ship]], frames: list[Frame]) -> dict[str, Tensor]:
+    """Motions of the middles (trial, ship), and of each ship's intensity centroid, (trial,)."""
+    middles = {
+        key: torch.stack([torch.stack([getattr(s.motion, key) for s in of]) for of in ships.values()], -1)
+        for key in TRUTHS
+    }
+    own = {
+        f"{name}.{key}": torch.stack([getattr(frame.ships[name].centre, key) for frame in frames])
+        for name in ships
+        for key in TRUTHS
+    }
+    return {**middles, **own}

@@ -1,0 +1,169 @@
+"""System 002: inverse synthetic aperture ladar, phase errors from pulse to pulse (Ruan et al. 2013)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate import autofocus
+from torchsar.core import Chain, Draws, Recording, Signal, Trace
+from torchsar.focus.inverse_requirements import inverse_requirements
+from torchsar.focus.requirements import Requirement
+from torchsar.io import read_inverse
+from torchsar.metrics import contrast, entropy, phase_rmse, residual_phase, strehl
+from torchsar.metrics.bounds import pulse_phase_bound_of_scene_rad, pulse_phase_bound_rad
+from torchsar.radar import InverseRadar, geometry_of
+from torchsar.scene import PhaseOnly, Sinusoid, displacement_m
+from torchsar.study.names.factories import with_wavelength
+from torchsar.study.names.registry import TARGET_IMPAIRMENTS
+from torchsar.study.output.pictures import Drawn, comparisons
+from torchsar.study.settings.errors import ConfigError
+from torchsar.study.systems.isal import figures, judge
+from torchsar.study.systems.isal.judge import received, whole_phase
+from torchsar.study.systems.isal.world import Target, echo_choice
+from torchsar.study.trials.batch import IMAGE, Batch, Judged, Result, Trials
+from torchsar.study.trials.bench import Bench
+from torchsar.study.trials.system import Alternative, Choice, Column, Measured, System
+
+_GEOMETRY = ("frequency_hz", "angle_rad", "position_m", "reference_m")
+# iterations of `autofocus`: its own 120 and 20, and what less gives
+_EFFORTS = ((0, 5), (10, 5), (30, 10), (120, 10), (120, 20))
+
+
+@dataclass(frozen=True)
+class Judging:
+    """How images are judged.
+
+    Args:
+        reference: The method whose image of the same scene is the ideal one.
+        published: Figure -> case -> method -> what the source published.
+    """
+
+    reference: str | None = None
+    published: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
+
+
+class Isal(System):
+    """Phase errors of a turning target."""
+
+    name = "isal"
+    about = "a turning target with a phase error in every pulse, simulated or recorded range profiles"
+    Radar = staticmethod(with_wavelength(InverseRadar))
+    World = Target
+    Judging = Judging
+    impairments = TARGET_IMPAIRMENTS
+    reads = "range profile or phase history"
+    ending = "azimuth_transform or target_image"
+    tolerance = {"echo_error_db": -20.0, "residual_phase_rms_rad": 0.1}
+    exact = {"world.fidelity": {"kind": "dechirped"}}
+    definitions = {
+        "snr": "mean power of all range-compressed samples over noise variance, dB",
+        "entropy": "-sum p ln p, p = |I|^2 / sum |I|^2 over the whole image, nats",
+        "entropy_above_ideal_nats": "entropy less that of the error-free image of the same scene and noise; it depends on "
+        "the position of the image between cells by some 0.03",
+        "contrast": "standard deviation over mean of the intensity |I|^2",
+        "residual_phase_rms_rad": "rms over pulses of the phases that all corrections together removed, minus the truth, "
+        "constant and linear term removed on the circle; lost pulses do not count",
+        "residual_phase_std_rad": "the standard deviation that the method itself predicts for it",
+        "strehl": "|mean exp(j residual)|^2 over pulses; success is 0.8 and more, about 0.47 rad rms",
+        "entropy_above_clean_nats": "entropy less that which the same method reaches on the recording without the injected "
+        "phases",
+        "agreement_rad": "rms of (estimate - injected phase) less the estimate on the recording without injected phases: 0 "
+        "for a method that errors cannot influence",
+        "published": "figures of Ruan et al. 2013, Table 1, less the entropy of 7.2 nats that the paper implies for the "
+        "error-free image",
+    }
+    columns = {
+        "entropy_above_ideal_nats": Column("entropy above the ideal image", "nats", drawn="mean"),
+        "entropy_above_clean_nats": Column("entropy above the method's own result without injected phases", "nats"),
+        "residual_phase_rms_rad": Column("residual phase, rms", "rad", drawn="mean"),
+        "agreement_rad": Column("influence of the injected phases, rms", "rad", drawn="mean"),
+        "residual_phase_std_rad": Column("predicted residual phase, rms", "rad"),
+        "strehl": Column("Strehl ratio"),
+        "entropy_nats": Column("entropy", "nats"),
+        "contrast": Column("contrast of the intensity"),
+        "ok": Column("share of trials called reliable"),
+        "seconds": Column("time of a trial", "s"),
+    }
+
+    def read(self, path: str, dtype: torch.dtype) -> Recording:
+        return read_inverse(path, dtype)
+
+    def context(self, recording: Recording) -> dict[str, Any]:
+        known = {name: recording.aux[name] for name in _GEOMETRY if name in recording.aux}
+        return {"geometry": geometry_of(**known) if known else None}
+
+    def samples(self, world: Target, radar: InverseRadar) -> int:
+        return world.pulses * world.samples
+
+    def simulate(self, bench: Bench, world: Target, draws: Draws) -> Trials:
+        return world.trials_of(bench.radar, draws, bench.dtype, bench.device)
+
+    def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
+        return judge.judge(bench, name, trace, trials)
+
+    def bounds(self, bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
+        return judge.bounds(bench, batch)
+
+    def requirements(self, bench: Bench) -> Sequence[Requirement]:
+        if bench.recording is not None:
+            raise ConfigError(
+                f"{bench.file}: requires predicts what a simulation needs; of a recording neither the extents of the "
+                "target nor its motion are known"
+            )
+        radar, world = bench.radar, bench.world()
+        across, along = world.edge(Draws(bench.config.seed))
+        time_s = torch.arange(4 * world.pulses, dtype=torch.float64) / (4 * radar.prf_hz)
+        moved = displacement_m(world.motion, time_s)
+        slope = torch.gradient(moved, spacing=(time_s,))[0]
+        bend = torch.gradient(slope, spacing=(time_s,))[0]
+        shaken = [(float(m.amplitude_m), float(m.frequency_hz)) for m in world.motion if isinstance(m, Sinusoid)]
+        speeds = (0.0, 0.0) if shaken else (float(slope.abs().max()), float(bend.abs().max()))
+        rate = None if world.rotation_rad_s is None else float(torch.as_tensor(world.rotation_rad_s).abs().max())
+        size = (world.pulses, world.samples, 2 * max(across, 1e-9), 2 * max(along, 1e-9))
+        return inverse_requirements(radar, *size, *speeds, shaken, rate)
+
+    def choices(self, bench: Bench) -> Sequence[Choice]:
+        if bench.recording is not None:
+            raise ConfigError(
+                f"{bench.file}: alternatives are compared with true phases, which a recording does not tell; take a config "
+                "that simulates"
+            )
+        efforts = [Alternative(f"autofocus, search {s}, polish {p}", {"search": s, "polish": p}) for s, p in _EFFORTS]
+        return [
+            echo_choice(bench),
+            Choice("effort of autofocus", "autofocus.search", efforts, partial(_efforts, bench)),
+        ]
+
+    def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
+        yield partial(figures.target, next(iter(results.values())))
+        yield partial(comparisons, results, self.columns)
+        for case, result in results.items():
+            yield partial(figures.images, case, result)
+            yield partial(figures.phases, case, result)
+
+
+def _efforts(bench: Bench) -> Measured:
+    """`autofocus` with fewer iterations, on trials at the level of phases."""
+    world, draws = bench.world(), Draws(bench.config.seed, "trade", range(bench.config.trade.trials))
+    trials = replace(world, fidelity=PhaseOnly()).trials_of(bench.radar, draws, bench.dtype, bench.device)
+    data, truth, present = trials.recording.signal.data, whole_phase(trials), received(trials)
+
+    def error(phase: Tensor) -> Tensor:
+        return phase_rmse(phase, truth, present)
+
+    best = error(autofocus(data, search=_EFFORTS[-1][0], polish=_EFFORTS[-1][1])["phase_rad"])
+
+    def loss(one: Alternative, phase: Tensor) -> dict[str, float]:
+        return {"residual_phase_rms_rad": float((error(phase) - best).max())}
+
+    return Measured(lambda one: autofocus(data, **one.keys)["phase_rad"], loss)
+
+
+SYSTEM = Isal

@@ -1,0 +1,120 @@
+"""Figures of one method on turning targets: phases against the truth, images, bounds."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Chain, Draws, Trace
+from torchsar.metrics import contrast, entropy, phase_rmse, residual_phase, strehl
+from torchsar.metrics.bounds import pulse_phase_bound_of_scene_rad, pulse_phase_bound_rad
+from torchsar.radar import InverseRadar
+from torchsar.scene import PhaseOnly
+from torchsar.study.trials.batch import IMAGE, Batch, Judged, Trials
+from torchsar.study.trials.bench import Bench
+
+# the bound with unknown amplitudes inverts a matrix of this size: a second on one core
+_MOST_SCATTERERS, _MOST_PULSES = 1200, 800
+
+
+def judge(bench: Bench, name: str, trace: Trace, trials: Trials) -> Judged:
+    """Residual phases of a method, and its image; the view is the phase that it removes."""
+    chain, clean = bench.chains[name], bench.config.processor[name].input == "clean"
+    true, present = whole_phase(trials), received(trials)
+    truth = torch.zeros_like(true) if clean else true
+    found = estimated_phase(chain, trace, true)
+    residual = residual_phase(found, truth, present)
+    metrics = {"residual_phase_rms_rad": phase_rmse(found, truth, present), "strehl": strehl_over(residual, present)}
+    for estimate in trace.estimates.values():
+        if "phase_rad" in estimate.std:
+            metrics["residual_phase_std_rad"] = estimate.std["phase_rad"].mean(-1)
+    if trace.signal.names == IMAGE:
+        metrics.update(entropy_nats=entropy(trace.signal), contrast=contrast(trace.signal))
+    if bench.recording is not None:
+        own = trace if clean else chain.trace(trials.clean)
+        metrics["entropy_above_clean_nats"] = metrics["entropy_nats"] - entropy(own.signal)
+        agreement = phase_rmse(found - truth, estimated_phase(chain, own, true), present)
+        metrics["agreement_rad"] = agreement
+    return Judged({key: x.double().expand(trials.count) for key, x in metrics.items()}, view=found)
+
+
+def bounds(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
+    """Of the residual phase: with a known scene, and with unknown amplitudes; the latter's ratio
+    to the former comes from one scene of the case, scenes differ by a percent.
+    """
+    std, data = batch.trials.truth["noise_std"], batch.trials.clean.signal.data
+    if not bool((std > 0).all()):
+        return {}
+    power = (torch.view_as_real(data).double().square().sum(-1).mean((-2, -1)) - std.square()).clamp_min(1e-300)
+    known = pulse_phase_bound_rad(power / std.square(), data.shape[-1])
+    ratio = bench.memo("bound ratio", lambda: _bound_ratio(bench))
+    free = {} if ratio is None else {"amplitudes unknown (Cramer-Rao)": known * ratio}
+    return {"residual_phase_rms_rad": {"scene known": known, **free}}
+
+
+def whole_phase(trials: Trials) -> Tensor:
+    """The phase error of every pulse with those of impairments, (trial, pulse)."""
+    phases = [value for name, value in trials.truth.items() if name == "phase_rad" or name.endswith(".phase_rad")]
+    pulses = trials.recording.signal.data.shape[:-1]
+    whole = torch.zeros(pulses, dtype=torch.float64, device=trials.recording.signal.data.device)
+    return (whole + sum(phases)).reshape(trials.count, -1)
+
+
+def received(trials: Trials) -> Tensor | None:
+    """Pulses that no impairment lost, bool (trial, pulse); None where all were received."""
+    lost = [value for name, value in trials.truth.items() if name.endswith(".present")]
+    return torch.stack(lost).all(0).reshape(-1, lost[0].shape[-1]) if lost else None
+
+
+def estimated_phase(chain: Chain, trace: Trace, like: Tensor) -> Tensor:
+    """Phase that a chain removes from each pulse, shaped as `like`: the sum over its correctors.
+
+    Of a chain without a corrector the last estimate of a phase, which it would remove; zero where
+    there is none. A phase that only starts another estimator does not count.
+    """
+    taken = [
+        trace.values[uses["phase_rad"]]
+        for name, uses in chain.uses.items()
+        if "phase_rad" in uses and name in trace.outputs
+    ]
+    found = taken or [e.value["phase_rad"] for e in trace.estimates.values() if "phase_rad" in e.value][-1:]
+    return sum((phase.to(torch.float64).reshape(like.shape) for phase in found), torch.zeros_like(like))
+
+
+def strehl_over(residual: Tensor, present: Tensor | None) -> Tensor:
+    """Strehl ratio over the pulses that were received."""
+    if present is None:
+        return strehl(residual)
+    counted = torch.where(present, torch.polar(torch.ones_like(residual), residual), 0).sum(-1)
+    return (counted.abs() / present.sum(-1).clamp_min(1)).square()
+
+
+def _bound_ratio(bench: Bench) -> float | None:
+    """Bound of unknown amplitudes over that of a known scene, from the scene of an address of its
+    own; None where it would take too long.
+    """
+    size, world, radar = bench.world(), bench.world().of(bench.radar), bench.radar
+    scene = world.scene.scatterers(Draws(bench.config.seed, "bound"))
+    few = scene.amplitude.shape[-1] <= _MOST_SCATTERERS and 2 < size.pulses <= _MOST_PULSES
+    if not isinstance(world.fidelity, PhaseOnly) or not few:
+        return None
+    rate = float((radar.rotation_rad_s if world.rotation_rad_s is None else world.rotation_rad_s) or 0.0)
+    azimuth, response = _scene_matrices(radar, rate, scene.azimuth_m, scene.range_m, size.pulses, size.samples)
+    power = ((azimuth * scene.amplitude) @ response).abs().square().mean()
+    whole = pulse_phase_bound_of_scene_rad(azimuth, response, scene.amplitude, 1.0)
+    return float(whole / pulse_phase_bound_rad(power, size.samples))
+
+
+def _scene_matrices(
+    radar: InverseRadar, rate: float, x: Tensor, y: Tensor, pulses: int, samples: int
+) -> tuple[Tensor, Tensor]:
+    """Azimuth phasors (pulse, target) and range responses (target, range) of scatterers."""
+    theta = rate * (torch.arange(pulses, dtype=torch.float64) - pulses // 2) / radar.prf_hz
+    ranges = x * torch.sin(theta)[:, None] + y * (torch.cos(theta)[:, None] - 1)
+    azimuth = torch.polar(torch.ones_like(ranges), -4 * math.pi / radar.wavelength_m * ranges)
+    cells = torch.arange(samples, dtype=torch.float64) - samples // 2
+    shifts = -2 * math.pi / samples * (y / radar.range_step_m)[:, None] * cells
+    back = 2 * math.pi / samples * cells[:, None] * cells
+    return azimuth, torch.polar(torch.ones_like(shifts), shifts) @ torch.polar(torch.ones_like(back), back) / samples

@@ -1,0 +1,109 @@
+"""The world of a turning target: section `world`, and its simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Draws
+from torchsar.echo import Impairment, simulate_turntable
+from torchsar.focus import CompressDechirped
+from torchsar.metrics import error_db
+from torchsar.radar import InverseRadar
+from torchsar.scene import Dechirped, Motion, PhaseOnly, Points, Scene, Together, TurntableWorld
+from torchsar.scene.turntable import Fidelity
+from torchsar.scene.vibration import PulsePhase
+from torchsar.study.names.registry import FIDELITIES, MOTIONS, SCENES, START_PHASES, TARGET_IMPAIRMENTS
+from torchsar.study.trials.batch import Trials
+from torchsar.study.trials.bench import Bench
+from torchsar.study.trials.system import Alternative, Choice, Measured, Noise, World
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target(World):
+    """What is true about a target that turns while it moves along the line of sight.
+
+    Args:
+        pulses: Pulses of the record.
+        samples: Range cells of each.
+        scene: Scenes by name, which turn together.
+        motion: Motions along the line of sight by name; they add up.
+        start_phase: Random phases of the pulses by name; they add up.
+        fidelity: How finely the echo is modelled.
+        rotation_rad_s: True rotation rate; None for what the radar takes it to be.
+        noise: Mean power of all range-compressed samples over noise variance.
+        impairments: What happens to the recording, in order.
+    """
+
+    pulses: int
+    samples: int
+    scene: Mapping[str, Annotated[Scene, SCENES]]
+    motion: Sequence[Annotated[Motion, MOTIONS]] = ()
+    start_phase: Sequence[Annotated[PulsePhase, START_PHASES]] = ()
+    fidelity: Annotated[Fidelity, FIDELITIES] = field(default_factory=PhaseOnly)
+    rotation_rad_s: Tensor | float | None = None
+    noise: Noise = field(default_factory=Noise)
+    impairments: Mapping[str, Annotated[Impairment, TARGET_IMPAIRMENTS]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.pulses < 1 or self.samples < 1 or not self.scene:
+            raise ValueError(f"a target needs a scene, pulses and samples, got {self.pulses} x {self.samples}")
+
+    def of(self, radar: InverseRadar) -> TurntableWorld:
+        """The world as the echo simulation takes it."""
+        scene, noise = Together(self.scene), self.noise.snr_db
+        return TurntableWorld(scene, self.rotation_rad_s, self.motion, self.start_phase, noise, self.fidelity)
+
+    def trials_of(self, radar: InverseRadar, draws: Draws, dtype: torch.dtype, device: str = "cpu") -> Trials:
+        """Recordings with and without errors of phase and motion, and the truth."""
+        world, size = self.of(radar), (self.pulses, self.samples)
+        recording, truth = simulate_turntable(radar, world, *size, draws, self.impairments, dtype, device)
+        assert truth.clean is not None
+        return Trials(recording, truth.clean, truth.values, len(draws.trials or (0,)), world)
+
+    def edge(self, draws: Draws) -> tuple[float, float]:
+        """Cross range and range (m) of a scatterer at the corner of the target."""
+        scene = Together(self.scene).scatterers(draws)
+        return tuple(float(x.abs().max()) for x in (scene.azimuth_m, scene.range_m))  # pyright: ignore[reportReturnType]
+
+
+def echo_choice(bench: Bench) -> Choice:
+    """Phases of range-compressed pulses alone, or dechirped pulses with all motion inside them."""
+    world, radar = bench.world(), bench.radar
+    edge = world.edge(Draws(bench.config.seed))
+    lost = None
+    if radar.pulse_s is not None:
+        lost = {"echo_error_db": PhaseOnly().neglected_db(radar, world.of(radar), world.pulses, *edge)}
+    alternatives = [
+        Alternative("phase_only", {"kind": "phase_only"}, lost, "migration, motion inside pulses"),
+        Alternative("dechirped", {"kind": "dechirped"}, {}),
+    ]
+
+    def measured() -> Measured:
+        own = world.fidelity if isinstance(world.fidelity, Dechirped) else Dechirped()
+        levels = {"phase_only": PhaseOnly(), "dechirped": own}
+        point = replace(
+            world, scene={"edge": Points([edge[0]], [edge[1]])}, noise=Noise(), start_phase=(), impairments={}
+        )
+        # the velocity that compression takes out is that of the receiver's track
+        compress = CompressDechirped(
+            radar, velocity_m_s=sum(m.coefficients_m[0] for m in own.track) if own.track else None
+        )
+
+        def made(name: str, of: Any, dtype: torch.dtype) -> Tensor:
+            signal = replace(of, fidelity=levels[name]).trials_of(radar, Draws(0), dtype).recording.signal
+            return (compress(signal) if "fast_time" in signal.names else signal).data
+
+        exact = made("dechirped", point, torch.complex128)
+
+        def loss(one: Alternative, _: Any) -> dict[str, float]:
+            return {"echo_error_db": float(error_db(made(one.keys["kind"], point, torch.complex128), exact))}
+
+        return Measured(lambda one: made(one.keys["kind"], world, bench.dtype), loss)
+
+    return Choice("echo model", "world.fidelity", alternatives, None if radar.pulse_s is None else measured)

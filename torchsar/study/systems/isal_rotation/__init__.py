@@ -1,0 +1,255 @@
+"""System 003: inverse synthetic aperture ladar of a target with non-uniform rotation
+(Remote Sens. 2025, 17, 3447).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Draws, Trace
+from torchsar.focus.ladar_requirements import Limit
+from torchsar.focus.matched_fourier import MatchedFourier
+from torchsar.focus.requirements import Requirement
+from torchsar.metrics import contrast, entropy, rotation_bounds
+from torchsar.metrics.rotation import CrossRangeCut, FoundRotation, cross_range_cut, k_scales, true_k
+from torchsar.radar import InverseRadar
+from torchsar.study.names.factories import with_wavelength
+from torchsar.study.names.registry import TARGET_IMPAIRMENTS
+from torchsar.study.output.pictures import Drawn
+from torchsar.study.settings.errors import ConfigError
+from torchsar.study.systems.isal_rotation import choices, figures
+from torchsar.study.systems.isal_rotation.world import Rotating
+from torchsar.study.trials.batch import IMAGE, Batch, Judged, Outcome, Result, Trials
+from torchsar.study.trials.bench import Bench
+from torchsar.study.trials.system import Choice, Column, System
+
+# an image of a wrong rotation is one with so much less entropy than the right one, and k1 so far off
+_TRAP_NATS, _TRAP_PERCENT = 0.005, 1.0
+# limits that concern only methods which estimate something
+_OF_ESTIMATORS = {"scatterers above the noise": "warp_k", "range term, pi lambda sigma_y / ra^2": "omega_rad_s"}
+
+
+@dataclass(frozen=True)
+class Judging:
+    """How results are judged.
+
+    Args:
+        reference: The method whose image of the same scene is the ideal one.
+        search_m: How far along cross range from its position the response of a point target is
+            sought.
+        published: Figure -> case -> method -> what the source published.
+        published_targets: Figure -> target -> method -> the same of point targets.
+    """
+
+    reference: str | None = None
+    search_m: float = 0.1
+    published: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
+    published_targets: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
+
+
+class View(NamedTuple):
+    """What pictures need of a method: mean rates (trial,) by which images are scaled, and cuts."""
+
+    rate: Tensor
+    cuts: Mapping[str, CrossRangeCut]
+
+
+class IsalRotation(System):
+    """Rotation of a target, estimated from its echoes."""
+
+    name = "isal_rotation"
+    about = "a target whose rotation changes its rate during the record"
+    Radar = staticmethod(with_wavelength(InverseRadar))
+    World = Rotating
+    Judging = Judging
+    impairments = TARGET_IMPAIRMENTS
+    ending = "matched_fourier"
+    truths = ("omega_rad_s", "warp_k", "warp_k1", "yc_m")
+    peak = 12.0
+    tolerance = {"echo_error_db": -20.0, "image_error_db": -20.0, "peak_loss_db": 0.25, "k1_error_percent": 0.1}
+    exact = {
+        "world.fidelity": {"kind": "dechirped", "track_m": None},
+        "rotation.order": {"order": 4},
+        "matched_fourier.transform": {"transform": {"kind": "explicit_sum"}},
+    }
+    definitions = {
+        "snr": "mean power of all range-compressed samples over noise variance, dB; the same before and after a unitary "
+        "transform along range",
+        "rotation": "theta = omega (t + k1 t^2 / 2! + k2 t^3 / 3! + ...), t = 0 at the first pulse: k1, k2 are the TRUE "
+        "derivatives of the rate over the rate at the first pulse",
+        "mirror": "only omega^2 shows in the data: omega is given positive, and an image may be mirrored in cross range",
+        "omega_error_percent": "estimated minus true rate at the first pulse, % of the truth",
+        "k1_error_percent": "estimated minus true k1, % of the truth (k1_error_per_s, 1/s, where the truth is 0); k2 and so "
+        "on alike",
+        "yc_error_m": "estimated minus true range centre deviation: a scatterer at range y of the window turns at y + yc "
+        "from the centre",
+        "cross_range_scale_error_percent": "lengths in an image scaled by the method's own mean rate, less the true ones, %; "
+        "of methods without a rate that of radar.rotation_rad_s",
+        "predicted": "omega_std_percent, k1_std_percent, yc_std_m, ...: standard deviations that the method itself predicts, "
+        "% of its estimate",
+        "entropy_nats": "-sum p ln p, p = |I|^2 / sum |I|^2 over the whole image, nats; it grows with the lines of an image, "
+        "ln 2 nats from oversampling 1 to 2",
+        "entropy_above_ideal_nats": "entropy less that of the metrics.reference image of the same scene and noise",
+        "contrast": "standard deviation over mean of the intensity |I|^2",
+        "targets": "cut along cross range through the range cell of a point target, metres by the method's own rate, by the "
+        "true mean rate where it finds none",
+        "peak_db": "interpolated peak of the cut within metrics.search_m of the true position, relative to that of the "
+        "reference",
+        "irw_azimuth_m": "width between the first crossings of -3 dB beside the peak of the cut",
+        "pslr_azimuth_db": "strongest response beyond the first minima beside the peak, over the peak",
+        "evaluations": "evaluations of the objective that a search reports",
+        "bounds": "Cramer-Rao, noise known, complex amplitudes and cross ranges of resolved scatterers unknown; overlapping "
+        "neighbours raise it",
+        "published": "figures of Remote Sens. 2025, 17, 3447",
+    }
+    columns = {
+        "omega_error_percent": Column("error of the rate", "%", drawn="rms"),
+        "k1_error_percent": Column("error of k1", "%", drawn="rms"),
+        "k2_error_percent": Column("error of k2", "%", drawn="rms"),
+        "entropy_nats": Column("entropy", "nats", drawn="mean"),
+        "contrast": Column("contrast of the intensity"),
+        "seconds": Column("time of a trial", "s"),
+        "entropy_above_ideal_nats": Column("entropy above the ideal image", "nats"),
+        "cross_range_scale_error_percent": Column("error of the cross-range scale", "%"),
+        "k1_error_per_s": Column("error of k1, whose true value is 0", "1/s", drawn="rms"),
+        "k2_error_per_s2": Column("error of k2, whose true value is 0", "1/s^2", drawn="rms"),
+        "k3_error_per_s3": Column("error of k3, whose true value is 0", "1/s^3"),
+        "yc_error_m": Column("error of the range centre deviation", "m"),
+        "omega_std_percent": Column("predicted error of the rate", "%"),
+        "k1_std_percent": Column("predicted error of k1", "%"),
+        "k2_std_percent": Column("predicted error of k2", "%"),
+        "yc_std_m": Column("predicted error of the range centre deviation", "m"),
+        "evaluations": Column("evaluations of the objective"),
+        "ok": Column("share of trials called reliable"),
+    }
+    target_columns = {
+        "peak_db": Column("peak relative to the ideal image", "dB"),
+        "irw_azimuth_m": Column("width in cross range", "m"),
+        "pslr_azimuth_db": Column("PSLR in cross range", "dB"),
+    }
+
+    def samples(self, world: Rotating, radar: InverseRadar) -> int:
+        return world.pulses * world.samples
+
+    def simulate(self, bench: Bench, world: Rotating, draws: Draws) -> Trials:
+        made = world.trials_of(bench.radar, draws, bench.dtype, bench.device)
+        made.truth["warp_k1"] = made.truth["warp_k"][..., :1]  # pyright: ignore[reportIndexIssue]
+        return made
+
+    def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
+        chain, truth, count = bench.chains[name], trials.truth, trials.count
+        duration_s = bench.world().pulses / bench.radar.prf_hz
+        found = FoundRotation.by(chain, trace.estimates)
+        metrics = found.errors(truth, duration_s, bench.radar.rotation_rad_s)
+        seen = [e.info["evaluations"].double() for e in trace.estimates.values() if "evaluations" in e.info]
+        metrics |= {"evaluations": sum(x.expand(count) for x in seen)} if seen else {}  # pyright: ignore
+        rate = _scale_rate(found, truth, duration_s, bench.radar.rotation_rad_s, count)
+        if trace.signal.names != IMAGE:
+            return Judged(_expanded(metrics, count), view=View(rate, {}))
+        metrics |= {"entropy_nats": entropy(trace.signal), "contrast": contrast(trace.signal)}
+        named = bench.world().named_points if detail else {}
+        cuts = {target: self._cut(bench, name, trace, truth, i, rate) for target, i in named.items()}
+        shown = {target: cut for target, cut in cuts.items() if cut is not None}
+        targets = {target: cut.figures for target, cut in shown.items()}
+        return Judged(_expanded(metrics, count), targets, [n for n in cuts if n not in shown], View(rate, shown))
+
+    def _cut(
+        self, bench: Bench, name: str, trace: Trace, truth: Mapping[str, Tensor], target: int, rate: Tensor
+    ) -> CrossRangeCut | None:
+        stages, image = bench.chains[name].stages.values(), trace.signal
+        lines = [stage.oversampling for stage in stages if isinstance(stage, MatchedFourier)]
+        x, y = (truth[key][..., target].expand(len(rate)) for key in ("cross_range_m", "range_m"))
+        scale = bench.radar.wavelength_m / (2 * rate) if image.axes[0].unit == "Hz" else torch.ones_like(rate)
+        flat = image.with_data(image.data.reshape(-1, *image.data.shape[-2:]).expand(len(rate), -1, -1))
+        return cross_range_cut(flat, x, y, scale, bench.judging.search_m, 0.5 / lines[-1] if lines else 0.0)
+
+    def compare(self, bench: Bench, outcome: Outcome, ideal: Outcome | None) -> Judged:
+        judged, levels = super().compare(bench, outcome, ideal), {} if ideal is None else ideal.judged.targets
+        targets = {}
+        for target, row in judged.targets.items():
+            level = levels[target]["peak"] if target in levels else torch.ones_like(row["peak"])
+            peak = {"peak_db": 20 * torch.log10((row["peak"] / level).clamp_min(1e-15))}
+            targets[target] = peak | {key: value for key, value in row.items() if key != "peak"}
+        return Judged(judged.metrics, targets, judged.outside, judged.view)
+
+    def bounds(self, bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
+        truth, std = batch.trials.truth, batch.trials.truth["noise_std"]
+        if not bool((std > 0).all()):
+            return {}
+        radar, count = bench.radar, batch.trials.count
+        scatterers = (truth["cross_range_m"], truth["range_m"], truth["amplitude"], std)
+        known = {"wavelength_m": radar.wavelength_m, "prf_hz": radar.prf_hz, "n_pulse": bench.world().pulses}
+        rotation = (truth["omega_rad_s"], truth["warp_k"], truth["yc_m"])
+        bound = rotation_bounds(*scatterers, *rotation, **known, free_centre=_looks_for_centre(bench))
+        found = {"omega_error_percent": bound["omega_rad_s"] * 100 / truth["omega_rad_s"]}
+        for i, (_, value) in enumerate(((n, v) for n, v in bound.items() if n.startswith("k")), 1):
+            found |= {name: value * scale for name, scale in k_scales(i, true_k(truth, i)).items()}
+        found |= {"yc_error_m": bound["yc_m"]} if "yc_m" in bound else {}
+        return {name: {"Cramer-Rao": value.expand(count)} for name, value in found.items()}
+
+    def limits(self, bench: Bench) -> Mapping[Limit, Sequence[str]]:
+        found: dict[Limit, Sequence[str]] = {}
+        for limit in choices.limits(bench):
+            estimated = _OF_ESTIMATORS.get(limit.name)
+            found[limit] = [n for n, chain in bench.chains.items() if estimated is None or _provides(chain, estimated)]
+        return found
+
+    def requirements(self, bench: Bench) -> Sequence[Requirement]:
+        return choices.requirements(bench)
+
+    def choices(self, bench: Bench) -> Sequence[Choice]:
+        return choices.choices(bench)
+
+    def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
+        return figures.pictures(results, self.columns)
+
+    def notes(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        """Where an image of a wrong rotation has less entropy than the right one."""
+        methods, reference = metrics["methods"], metrics["definitions"]["reference"]
+        for case in methods[reference]["cases"] if reference else ():
+            rows = {name: method["cases"][case] for name, method in methods.items()}
+            trapped = [
+                f"{name} ({row['entropy_above_ideal_nats']:.3f} nats, k1 {row['k1_error_percent']:.2g} % off)"
+                for name, row in rows.items()
+                if row.get("entropy_above_ideal_nats", 0.0) < -_TRAP_NATS
+                and abs(row.get("k1_error_percent", 0.0)) > _TRAP_PERCENT
+            ]
+            if trapped:
+                text = "Wrong rotations give less entropy here than the right one, on the grid of its image: "
+                yield f"Entropy trap, case {case}", f"{text}{', '.join(trapped)}. A finer grid takes this away."
+
+    def extra_definitions(self, bench: Bench) -> Mapping[str, Any]:
+        return {"reference": bench.judging.reference, "search_m": bench.judging.search_m}
+
+
+def _expanded(metrics: Mapping[str, Tensor], count: int) -> dict[str, Tensor]:
+    return {name: value.expand(count) for name, value in metrics.items()}
+
+
+def _scale_rate(
+    found: FoundRotation, truth: Mapping[str, Tensor], duration_s: float, assumed: float | None, count: int
+) -> Tensor:
+    """Mean rate by which images are drawn in metres: the method's own, that of the radar, else the
+    true one.
+    """
+    other = truth["rotation_rad_s"] if not assumed else torch.full_like(truth["rotation_rad_s"], assumed)
+    own = found.rate(duration_s)
+    return (other if own is None else torch.where(own > 0, own, other)).expand(count)
+
+
+def _provides(chain: Any, value: str) -> bool:
+    return any(value in getattr(stage, "provides", ()) for stage in chain.stages.values())
+
+
+def _looks_for_centre(bench: Bench) -> bool:
+    """Whether any estimator of the config looks for the range centre deviation."""
+    stages = (stage for chain in bench.chains.values() for stage in chain.stages.values())
+    return any(getattr(s, "yc_m", 0.0) is None and "yc_m" in getattr(s, "provides", ()) for s in stages)
+
+
+SYSTEM = IsalRotation

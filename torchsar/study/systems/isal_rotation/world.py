@@ -1,0 +1,90 @@
+"""The world of a target with non-uniform rotation: section `world`, and its simulation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Draws
+from torchsar.radar import InverseRadar
+from torchsar.scene import Points, PolynomialRotation, Scatterers, Scene, Together, TurntableWorld
+from torchsar.study.systems.isal.world import Target
+
+
+@dataclass(frozen=True)
+class OneScene:
+    """The scene that a seed draws, the same in every trial."""
+
+    scene: Scene
+    seed: int
+
+    def scatterers(self, draws: Draws) -> Scatterers:
+        return self.scene.scatterers(Draws(self.seed))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rotating(Target):
+    """What is true about a target with non-uniform rotation.
+
+    Args:
+        rotation: Rate at the first pulse, and its derivatives over the rate.
+        centre_deviation_m: How much farther from the centre of rotation scatterers are than the
+            range axis says, yc.
+        scene_seed: None for scenes that differ from trial to trial; the seed of one scene for all
+            trials, which then differ in noise alone.
+    """
+
+    rotation: PolynomialRotation
+    centre_deviation_m: Tensor | float = 0.0
+    scene_seed: int | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.rotation_rad_s is not None:
+            raise ValueError("world.rotation_rad_s is the rate of a uniform rotation; give world.rotation alone")
+        if not bool((torch.as_tensor(self.rotation.omega_rad_s) > 0).all()):
+            raise ValueError(
+                f"world.rotation.omega_rad_s must be positive, got {self.rotation.omega_rad_s}; only its square shows in data"
+            )
+
+    def of(self, radar: InverseRadar) -> TurntableWorld:
+        self.rotation.refuse_turning_back(self.pulses / radar.prf_hz)
+        scene: Scene = Together(self.scene)
+        scene = scene if self.scene_seed is None else OneScene(scene, self.scene_seed)
+        effects = (self.motion, self.start_phase, self.noise.snr_db, self.fidelity)
+        return TurntableWorld(scene, None, *effects, self.rotation, self.centre_deviation_m)
+
+    @property
+    def named_points(self) -> dict[str, int]:
+        """Names `part.number` of explicit points, whose response is worth measuring, and their
+        indices among all scatterers.
+        """
+        names: dict[str, int] = {}
+        first = 0
+        for part, one in self.scene.items():
+            if isinstance(one, Points):
+                names.update({f"{part}.{i}": first + i for i in range(len(one.azimuth_m))})
+            first += one.scatterers(Draws(0)).range_m.shape[-1]
+        return names
+
+    def noise_std(self, amplitude: Tensor) -> float:
+        """Of a sample, from the mean power of scatterers spread over the range cells."""
+        snr_db = self.noise.snr_db
+        if snr_db is None:
+            return 0.0
+        return math.sqrt(float(amplitude.abs().square().sum()) / self.samples) * 10 ** (-float(snr_db) / 20)
+
+
+def k_of(rotation: PolynomialRotation) -> Tensor:
+    """k1, k2, ... of the first trial."""
+    k = rotation.warp_k(torch.zeros(0, dtype=torch.float64))
+    return k.reshape(-1, k.shape[-1])[0] if k.numel() else k.reshape(-1)[:0]
+
+
+def first_values(values: Mapping[str, Tensor], *names: str) -> list[Tensor]:
+    """Values of the first trial, (target,) each."""
+    return [values[name].reshape(-1, values[name].shape[-1])[0].cpu() for name in names]

@@ -1,0 +1,252 @@
+"""System 000: synthetic aperture ladar with a symmetric triangular sweep, radial motion estimated
+from every period (Remote Sens. 2024, 16, 793).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.radial import SpectrumCorrelation
+from torchsar.core import Draws, Trace
+from torchsar.focus.ladar_requirements import Limit
+from torchsar.focus.requirements import Requirement
+from torchsar.metrics import (
+    contrast,
+    entropy,
+    range_per_sweep_bound_m,
+    velocity_free_offset_bound_m_s,
+    velocity_known_offset_bound_m_s,
+    velocity_segmented_bound_m_s,
+)
+from torchsar.metrics.radial_motion import Course, course_of, target_responses
+from torchsar.radar import TriangularLadar
+from torchsar.scene import Points
+from torchsar.study.names.factories import with_wavelength
+from torchsar.study.names.registry import group_of
+from torchsar.study.output.pictures import Drawn
+from torchsar.study.settings.errors import ConfigError, did_you_mean
+from torchsar.study.systems.sal import figures, limits
+from torchsar.study.systems.sal.world import Ground
+from torchsar.study.trials.batch import IMAGE, Batch, Judged, Result, Trials
+from torchsar.study.trials.bench import Bench
+from torchsar.study.trials.system import Choice, Column, System
+
+log = logging.getLogger("torchsar")
+# stages that work on deramped profiles, and cannot tell whether they are
+_OF_DERAMPED = ("azimuth_matched_filter", "phase_polish")
+# a wrong image is one that leaves more than this, and has less entropy by more than this
+_TRAPPED_RAD, _TRAPPED_NATS = 1.0, 0.02
+
+
+@dataclass(frozen=True)
+class Judging:
+    """How results are judged.
+
+    Args:
+        reference: The method whose image of the same scene is the ideal one.
+        target: The point target whose response is shown.
+        sidelobe_nulls: Extent of the side lobes in null spacings.
+        search_m: How far from its predicted position a response is sought.
+        published: Figure -> case -> method -> what the source published.
+    """
+
+    reference: str | None = None
+    target: str | None = None
+    sidelobe_nulls: int = 10
+    search_m: float = 0.02
+    published: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
+
+
+class Sal(System):
+    """Radial motion of a triangular-sweep ladar."""
+
+    name = "sal"
+    about = "synthetic aperture ladar with a triangular sweep, whose line of sight moves"
+    Radar = staticmethod(with_wavelength(TriangularLadar))
+    World = Ground
+    Judging = Judging
+    ending = "azimuth_matched_filter"
+    tolerance = {"echo_error_db": -20.0, "velocity_rmse_m_s": 1e-4}
+    exact = {"world.fidelity": {"kind": "every_sample", "without": []}}
+    definitions = {
+        "snr": "per sample before any compression, of a scatterer of amplitude 1 against the variance of the complex "
+        "noise, dB",
+        "velocity_rmse_m_s": "rms over periods with a lit scatterer (within 10 dB of the strongest) of the estimated minus "
+        "the true radial velocity of the motion at the turning points, receding positive",
+        "range_error": "estimated minus true motion at the middles of the up sweeps: integral of the velocity that was "
+        "compensated plus lambda / (4 pi) times the phases that were removed from pulses, known modulo a turn and unwrapped "
+        "along pulses against the truth",
+        "range_error_max_m": "largest distance of the range error from its value at the first lit pulse, over lit pulses",
+        "range_error_detrended_rms_m": "rms over lit pulses of the range error without constant and slope, which only turn "
+        "and shift the image",
+        "residual_phase_rms_rad": "4 pi / lambda times range_error_detrended_rms_m",
+        "entropy_nats": "-sum p ln p, p = |I|^2 / sum |I|^2 over the whole image, nats",
+        "entropy_above_ideal_nats": "entropy less that of the same scene and noise without motion",
+        "contrast": "standard deviation over mean of the AMPLITUDE |I|",
+        "irw": "-3 dB width of the impulse response, m",
+        "pslr": "strongest side lobe over the main lobe, dB",
+        "islr": "energy of the side lobes over that of the main lobe (null to null), dB",
+        "position": "responses are sought about the true position, shifted by what is left of the motion: its mean velocity "
+        "v shifts azimuth by v R / V and range by 2 v / (lambda K) beat hertz",
+        "published": "figures of Remote Sens. 2024, 16, 793; its entropies depend on the size of the image and the noise, "
+        "only their order compares",
+    }
+    columns = {
+        "residual_phase_rms_rad": Column("residual phase, rms without constant and slope", "rad", drawn="mean"),
+        "pslr_azimuth_db": Column("PSLR in azimuth", "dB"),
+        "irw_azimuth_m": Column("width in azimuth", "m"),
+        "velocity_rmse_m_s": Column("velocity error, rms", "m/s", drawn="rms"),
+        "entropy_above_ideal_nats": Column("entropy above the ideal image", "nats", drawn="mean"),
+        "range_error_detrended_rms_m": Column("range error, rms without constant and slope", "m"),
+        "range_error_max_m": Column("range error, largest", "m"),
+        "islr_azimuth_db": Column("ISLR in azimuth", "dB"),
+        "irw_range_m": Column("width in range", "m"),
+        "pslr_range_db": Column("PSLR in range", "dB"),
+        "islr_range_db": Column("ISLR in range", "dB"),
+        "entropy_nats": Column("entropy", "nats"),
+        "contrast": Column("contrast of the amplitude"),
+        "targets_outside": Column("targets outside the image"),
+        "ok": Column("share of trials called reliable"),
+        "seconds": Column("time of a trial", "s"),
+    }
+    target_columns = {
+        key: Column(label, unit)
+        for key, label, unit in (
+            ("irw_azimuth_m", "width in azimuth", "m"),
+            ("pslr_azimuth_db", "PSLR in azimuth", "dB"),
+            ("islr_azimuth_db", "ISLR in azimuth", "dB"),
+            ("irw_range_m", "width in range", "m"),
+            ("pslr_range_db", "PSLR in range", "dB"),
+            ("islr_range_db", "ISLR in range", "dB"),
+        )
+    }
+
+    def samples(self, world: Ground, radar: TriangularLadar) -> int:
+        per_period = 2 * radar.sweep_samples
+        if world.record is not None:
+            block = world.record.block_s or (1 if radar.keep_every == 1 else 2) * radar.period_s
+            per_period = round(block * radar.sample_rate_hz)
+        return world.periods * per_period
+
+    def bytes_per_trial(self, bench: Bench) -> int:
+        """Noise in double precision, or spectra that are upsampled over the whole band."""
+        world, radar = bench.world(), bench.radar
+        stages = [stage for chain in bench.chains.values() for stage in chain.stages.values()]
+        wide = [s.upsampling for s in stages if isinstance(s, SpectrumCorrelation) and s.window_m is None]
+        upsampled = max(wide, default=0) * radar.sweep_samples * world.periods
+        return int(max(1.25 * self.samples(world, radar), upsampled) * torch.complex128.itemsize)
+
+    def check(self, bench: Bench) -> None:
+        world, target, file = bench.world(), bench.judging.target, bench.file
+        if target is not None and target not in world.named_points:
+            raise ConfigError(
+                f"{file}: metrics.target names {target!r}, which is no point target of the "
+                f"scene{did_you_mean(target, world.named_points)}"
+            )
+        for name, method in bench.config.processor.items():
+            before: list[str] = []
+            for key, entry in (method.stages or {}).items():
+                stage, times = entry["stage"], before.count("deramp_azimuth")
+                if stage in _OF_DERAMPED and times != 1 and not any(group_of(other) == "own" for other in before):
+                    raise ConfigError(
+                        f"{file}: processor.{name}.stages.{key}: {stage} works on profiles deramped once, here {times} "
+                        "times; put one deramp_azimuth between compress_sweeps and it"
+                    )
+                before.append(stage)
+        if world.record is None and bench.radar.detection == "real":
+            log.warning(
+                "warning: %s: radar.detection is 'real', but separated sweeps are complex; give world.record for what a real "
+                "detector records",
+                file,
+            )
+
+    def simulate(self, bench: Bench, world: Ground, draws: Draws) -> Trials:
+        return world.trials_of(bench.radar, draws, bench.dtype, bench.device)
+
+    def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
+        clean, settings = bench.config.processor[name].input == "clean", bench.judging
+        course = course_of(bench.chains[name], trace, trials.truth, bench.radar, clean)
+        metrics = course.metrics(bench.radar)
+        if trace.signal.names != IMAGE:
+            return _expanded(metrics, {}, (), course, trials.count)
+        metrics |= {"entropy_nats": entropy(trace.signal), "contrast": contrast(trace.signal, of="amplitude")}
+        truth, named = trials.truth, bench.world().named_points
+        at = {
+            t: tuple(truth[k][..., i].expand(trace.signal.trials) for k in ("azimuth_m", "range_m"))
+            for t, i in named.items()
+        }
+        nulls = settings.sidelobe_nulls
+        targets = target_responses(trace.signal, at, course, bench.radar, nulls, settings.search_m)  # pyright: ignore
+        shown = targets.get(settings.target or "", {})
+        metrics |= {key: value for key, value in shown.items() if key.startswith(("irw", "pslr", "islr"))}
+        return _expanded(metrics, targets, [t for t in named if t not in targets], course, trials.count)
+
+    def bounds(self, bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
+        """Of scenes of one point, whose energy every estimator can use."""
+        truth, radar, std = batch.trials.truth, bench.radar, batch.trials.truth["noise_std"]
+        points = all(isinstance(scene, Points) for scene in bench.world().scene.values())
+        if truth["range_m"].shape[-1] != 1 or not points or not bool((std > 0).all()):
+            return {}
+        snr = truth["amplitude"][..., 0].abs().square() / std.square()
+        of_sweep = (snr, radar.sweep_samples, radar.wavelength_m)
+        return {
+            "velocity_rmse_m_s": {
+                "segmented interference": velocity_segmented_bound_m_s(*of_sweep, radar.sweep_s),
+                "unknown offsets": velocity_free_offset_bound_m_s(*of_sweep, radar.sweep_s),
+                "known offset": velocity_known_offset_bound_m_s(*of_sweep, radar.sweep_s),
+            },
+            "range_error_detrended_rms_m": {"phase of one sweep": range_per_sweep_bound_m(*of_sweep)},
+        }
+
+    def limits(self, bench: Bench) -> Mapping[Limit, Sequence[str]]:
+        return limits.limits(bench, self._moved(bench))
+
+    def requirements(self, bench: Bench) -> Sequence[Requirement]:
+        return limits.requirements(bench, self._moved(bench))
+
+    def choices(self, bench: Bench) -> Sequence[Choice]:
+        return limits.choices(bench, self._moved(bench))
+
+    def _moved(self, bench: Bench) -> limits.Moved:
+        return bench.memo("moved", lambda: limits.moved(bench))
+
+    def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
+        return figures.pictures(results, self.columns)
+
+    def notes(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        """Where a wrong image has less entropy than the right one."""
+        methods, reference = metrics["methods"], metrics["definitions"]["reference"]
+        for case, ideal in (methods[reference]["cases"] if reference else {}).items():
+            rows = {name: method["cases"][case] for name, method in methods.items() if name != reference}
+            least = ideal.get("entropy_nats", 0.0) - _TRAPPED_NATS
+            trapped = [
+                f"{name} {row['entropy_nats']:.2f} nats with {row['residual_phase_rms_rad']:.3g} rad left"
+                for name, row in rows.items()
+                if row.get("entropy_nats", least) < least and row["residual_phase_rms_rad"] > _TRAPPED_RAD
+            ]
+            if trapped:
+                text = f"Wrong images have less entropy here than the right one ({ideal['entropy_nats']:.2f} nats): "
+                text += f"{', '.join(trapped)}. Judge by what is left of the motion, by entropy second."
+                yield f"Entropy trap, case {case}", text
+
+    def extra_definitions(self, bench: Bench) -> Mapping[str, Any]:
+        judging = bench.judging
+        shown = {"reference": judging.reference, "target": judging.target}
+        return {"islr_extent_nulls": judging.sidelobe_nulls, **shown}
+
+
+def _expanded(
+    metrics: Mapping[str, Tensor], targets: Mapping[str, Any], outside: Sequence[str], course: Course, count: int
+) -> Judged:
+    """Figures with one entry a trial, also where trials share their value."""
+    rows = {name: {key: value.expand(count) for key, value in of.items()} for name, of in targets.items()}
+    return Judged({key: value.expand(count) for key, value in metrics.items()}, rows, outside, course)
+
+
+SYSTEM = Sal

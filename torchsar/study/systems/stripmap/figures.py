@@ -1,0 +1,280 @@
+"""The pictures of a run of a strip."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchsar import plot
+from torchsar.core import Signal
+from torchsar.metrics.cuts import impulse_cuts
+from torchsar.metrics.spectra import azimuth_spectrum, phase_increments, range_spectrum
+from torchsar.repair.response import band_grid
+from torchsar.study.names.registry import group_of
+from torchsar.study.output.pictures import Drawn, comparisons
+from torchsar.study.settings.cases import titled, word_of
+from torchsar.study.systems.stripmap.judge import focus_name, window
+from torchsar.study.trials.batch import IMAGE, Result, image_of
+
+# cells to either side of a peak that cuts show
+_CELLS = 24
+_CUT_METHODS = ("clean", "none", "baseline", "recommended")
+
+
+@dataclass(frozen=True)
+class Strip:
+    """What the pictures of one case are drawn from: its first trial."""
+
+    case: str
+    result: Result
+
+    @property
+    def radar(self) -> Any:
+        return self.result.bench.radar
+
+    @property
+    def stages(self) -> Mapping[str, Mapping[str, Any]]:
+        return self.result.bench.config.processor["recommended"].stages or {}
+
+    @property
+    def scale(self) -> dict[str, Any]:
+        """Scenes of known points are shown below their peak; of others the brightest thousandth
+        saturates.
+        """
+        known = bool(self.result.targets)
+        return {"percentile": 100.0 if known else 99.9, "dynamic_range_db": 60.0 if known else 50.0}
+
+    def images(self) -> dict[str, Signal]:
+        """Judged parts of the images of all methods but reruns."""
+        methods, margin = self.result.bench.config.processor, self.result.bench.judging.margin
+        images = {name: image for name, image in self.result.images.items() if methods[name].rerun is None}
+        return {name: image.crop(**window(image, self.radar, margin)) for name, image in images.items()}
+
+    def step(self, name: str, output: bool) -> Signal:
+        """What went into a stage of the recommended chain, or came out of it."""
+        trace = self.result.first_of("recommended").trace
+        assert trace is not None
+        return image_of((trace.outputs if output else trace.inputs)[name])
+
+    def strongest(self) -> tuple[str, float, float]:
+        """Name, azimuth and range (m) of the strongest target, else of the brightest point."""
+        targets = self.result.first_of("recommended").judged.targets
+        image = self.images()["recommended"]
+        if targets:
+            name = max(targets, key=lambda name: float(targets[name]["peak_db"][0]))
+            at = self.result.bench.system.position_of(self.result, name)
+            return f"target {name}", *at
+        row, column = divmod(int(image.data.abs().argmax()), image.axes[1].n)
+        at = [axis.start + i * axis.step for axis, i in zip(image.axes, (row, column), strict=True)]
+        return "the brightest point of the window", at[0], at[1]
+
+
+def pictures(results: Mapping[str, Result], columns: Mapping[str, Any]) -> Iterator[Callable[[], Drawn]]:
+    """Makers of all pictures."""
+    makers = (_images, _cuts, _squint, _doppler_spectrum, _increments, _corrections, _contaminated_line)
+    for case, result in results.items():
+        for make in (*makers, _response, _image_corrections, _velocity):
+            yield partial(_of_case, make, Strip(case, result))
+    if len(results) > 1:
+        yield partial(comparisons, results, columns, "clean")
+
+
+def _of_case(make: Callable[[Strip], Drawn], strip: Strip) -> Drawn:
+    """Pictures with the name of their case."""
+    word = "" if len(strip.case) == 3 and strip.case == "all" else f"_{word_of(strip.case)}"
+    for name, title, caption, figure in make(strip):
+        yield f"{name}{word}", titled(title, strip.case), caption, figure
+
+
+def _images(strip: Strip) -> Drawn:
+    shown = strip.images()
+    caption = (
+        "The image of the recommended method over the judged window: range to the right, azimuth upward, in metres; "
+    )
+    caption += "amplitude in dB."
+    title = strip.result.bench.config.processor["recommended"].title or "recommended"
+    yield "image", "Focused image", caption, plot.image(shown["recommended"], title=title, **strip.scale)
+    if len(shown) > 1:
+        caption = f"All images on one scale, that of '{next(iter(shown))}'."
+        yield "methods", "The same scene by every method", caption, plot.images(shown, **strip.scale)
+
+
+def _cuts(strip: Strip) -> Drawn:
+    label, *at = strip.strongest()
+    images = {name: image for name, image in strip.result.images.items() if name in _CUT_METHODS}
+    found = {name: impulse_cuts(image, (at[0], at[1])) for name, image in images.items()}
+    parts = []
+    for axis in IMAGE:
+        reach = _CELLS * images["recommended"].axis(axis).step
+        series = {name: _near(*cuts[axis], reach) for name, cuts in found.items()}
+        parts.append({"series": series, "xlabel": f"{axis} from the peak (m)", "ylabel": "dB", "title": axis})
+        parts[-1]["ylim"] = (-50, 3)
+    caption = f"Cuts through {label}, band-limited interpolation by 16; 0 dB is each curve's own peak."
+    yield "cuts", "Impulse-response cuts", caption, plot.panels(parts)
+
+
+def _near(x: Any, y: Any, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    x, y = plot.array(x), plot.decibel(y)
+    return x[np.abs(x) <= reach], y[np.abs(x) <= reach]
+
+
+def _squint(strip: Strip) -> Drawn:
+    """The recommended image beside the rerun that ignores the Doppler centroid."""
+    margin = strip.result.bench.judging.margin
+    for name, method in strip.result.bench.config.processor.items():
+        if method.rerun is not None and any(key.endswith("doppler_hz") for key in method.rerun.given):
+            wrong = strip.result.images[name]
+            shown = {"squint taken into account": strip.images()["recommended"]}
+            shown[method.title or name] = wrong.crop(**window(wrong, strip.radar, margin))
+            caption = "Left: focused about the estimated Doppler centroid. Right: the same data focused as if the beam "
+            caption += "looked straight to the side: displaced, smeared, with ghosts."
+            yield "squint", "With and without the squint", caption, plot.images(shown, **strip.scale)
+
+
+def _baseband(strip: Strip) -> tuple[float, float] | None:
+    """Doppler centroid that the recommended image was focused with: absolute, and within one PRF."""
+    centroid = strip.result.first_of("recommended").judged.view.doppler_hz
+    if centroid is None:
+        return None
+    value, prf = float(centroid[0]), strip.radar.prf_hz
+    return value, value - prf * round(value / prf)
+
+
+def _focus_input(strip: Strip) -> Signal:
+    return strip.step(focus_name(strip.result.bench.chains["recommended"]), output=False)
+
+
+def _doppler_spectrum(strip: Strip) -> Drawn:
+    centroid = _baseband(strip)
+    if centroid is None:
+        return
+    frequency, power = azimuth_spectrum(_focus_input(strip))
+    level = 10 * np.log10(np.maximum(plot.array(power), np.finfo(np.float32).tiny))
+    turns = round((centroid[0] - centroid[1]) / strip.radar.prf_hz)
+    title = f"centroid {centroid[0]:.1f} Hz = {centroid[1]:.1f} Hz {'-' if turns < 0 else '+'} {abs(turns)} PRF"
+    caption = (
+        "Azimuth power spectrum of the data that are focused, averaged over range. The dashed line is the Doppler "
+    )
+    caption += "centroid inside one PRF; the ambiguity is found from range migration."
+    series, marks = {"mean over range": (plot.array(frequency), level)}, {"centroid": centroid[1]}
+    figure = plot.curves(series, "baseband Doppler (Hz)", "power (dB)", title, marks)
+    yield "doppler_spectrum", "Doppler spectrum", caption, figure
+
+
+def _increments(strip: Strip) -> Drawn:
+    time_s, phase = phase_increments(_focus_input(strip))
+    prf, centroid = strip.radar.prf_hz, _baseband(strip)
+    doppler = plot.array(phase) * prf / (2 * math.pi)
+    series: dict[str, tuple[np.ndarray, np.ndarray]] = {"blocks of lines": (plot.array(time_s), doppler)}
+    if centroid is not None:
+        series["estimate"] = (plot.array(time_s), np.full(len(doppler), centroid[1]))
+        doppler -= prf * np.round((doppler - centroid[1]) / prf)
+    caption = (
+        "Mean phase increment between adjacent lines, in Hz (PRF times increment over 2 pi), for blocks of lines along "
+    )
+    caption += "the strip. The scene makes it fluctuate; the estimate averages it."
+    figure = plot.curves(series, "slow time (s)", "increment (Hz)")
+    yield "phase_increments", "Phase increments along the strip", caption, figure
+
+
+def _changed(strip: Strip, names: tuple[str, ...], groups: tuple[str, ...]) -> Iterator[tuple[str, Signal, Signal]]:
+    """Stages of the recommended chain that changed signals of these axes, with input and output."""
+    for name, entry in strip.stages.items():
+        before, after = strip.step(name, False), strip.step(name, True)
+        same = before.data.shape == after.data.shape and torch.equal(before.data, after.data)
+        if before.names == after.names == names and group_of(entry["stage"]) in groups and not same:
+            yield name, before, after
+
+
+def _corrections(strip: Strip) -> Drawn:
+    for name, before, after in _changed(strip, ("pulse", "range"), ("repair", "own")):
+        power = [x.data.abs().square().sum(-1).double().cpu().numpy() for x in (before, after)]
+        median = np.median(power[0][power[0] > 0]) if (power[0] > 0).any() else 1.0
+        lines = [(np.arange(len(p)), 10 * np.log10(np.maximum(p / median, 1e-6))) for p in power]
+        spectra = [plot.array(range_spectrum(x)) for x in (before, after)]
+        top = float(spectra[0].max()) or 1.0
+        bands = [(_frequency_mhz(strip, len(s)), 10 * np.log10(np.maximum(s / top, 1e-12))) for s in spectra]
+        parts = [
+            {"series": dict(zip(("before", "after"), drawn)), "xlabel": xlabel, "ylabel": ylabel, "title": title}
+            for drawn, xlabel, ylabel, title in (
+                (lines, "line", "power (dB over the median line)", "power of the lines"),
+                (bands, "range frequency (MHz)", "power (dB)", "mean range spectrum"),
+            )
+        ]
+        caption = f"Stage '{name}' ({strip.stages[name]['stage']}): left, power of every line; right, range spectrum averaged "
+        caption += "over the lines."
+        yield f"correction_{name}", f"Correction: {name}", caption, plot.panels(parts)
+
+
+def _frequency_mhz(strip: Strip, n: int) -> np.ndarray:
+    return plot.array(torch.fft.fftshift(strip.radar.range_frequency_hz(n))) / 1e6
+
+
+def _contaminated_line(strip: Strip) -> Drawn:
+    """The range spectrum of the line that an interference correction changed most."""
+    for name, before, after in _changed(strip, ("pulse", "range"), ("repair", "own")):
+        if "interference" not in f"{strip.stages[name]['stage']} {name}":
+            continue
+        removed = (before.data - after.data).abs().square().sum(-1)
+        line = int(removed.argmax())
+        top = float(torch.fft.fft(before.data[line]).abs().max()) or 1.0
+        series = {
+            label: (
+                _frequency_mhz(strip, s.axes[1].n),
+                plot.decibel(torch.fft.fftshift(torch.fft.fft(s.data[line])), top),
+            )
+            for label, s in (("before", before), ("after", after))
+        }
+        caption = f"Range spectrum of line {line}, the one from which most was removed ({int((removed > 0).sum())} of "
+        caption += f"{len(removed)} lines were changed)."
+        figure = plot.curves(series, "range frequency (MHz)", "dB", f"line {line}")
+        yield "contaminated_line", "Spectrum of a contaminated line", caption, figure
+
+
+def _response(strip: Strip) -> Drawn:
+    """Estimated response of the channel over range frequency, beside the truth where it is known."""
+    band_mhz = plot.array(band_grid()) * strip.radar.pulse.bandwidth_hz / 2e6
+    truth, parts = strip.result.first.trials.truth, []
+    for estimate in strip.result.first_of("recommended").estimates.values():
+        for key, label in (("phase_rad", "phase (rad)"), ("amplitude", "amplitude")):
+            value = estimate.value.get(key)
+            if value is None or value.shape[-1:] != band_mhz.shape:
+                continue
+            true = [v for name, v in truth.items() if name.endswith(f".{key}") and v.shape[-1:] == band_mhz.shape]
+            curves = {"estimate": value, **({"truth": true[0]} if true else {})}
+            series = {n: (band_mhz, plot.array(v.reshape(-1, v.shape[-1])[0])) for n, v in curves.items()}
+            parts.append({"series": series, "xlabel": "range frequency (MHz)", "ylabel": label, "title": label})
+    if parts:
+        caption = "Phase and amplitude over the band of the pulse, as found from bright points of the image."
+        yield "response", "Response of the whole channel", caption, plot.panels(parts)
+
+
+def _image_corrections(strip: Strip) -> Drawn:
+    """Range cut through the strongest target before and after a correction of the image."""
+    for name, before, after in _changed(strip, IMAGE, ("repair",)):
+        label, *at = strip.strongest()
+        cuts = {when: impulse_cuts(x, (at[0], at[1]))["range"] for when, x in (("before", before), ("after", after))}
+        series = {when: (plot.array(offset), plot.decibel(level)) for when, (offset, level) in cuts.items()}
+        caption = f"Stage '{name}' ({strip.stages[name]['stage']}): range cut through {label} before and after."
+        figure = plot.curves(series, "range from the peak (m)", "dB", ylim=(-50, 3))
+        yield f"correction_{name}", f"Correction: {name}", caption, figure
+
+
+def _velocity(strip: Strip) -> Drawn:
+    """Entropy over velocity, where an estimator kept its grid."""
+    for name, estimate in strip.result.first_of("recommended").estimates.items():
+        if "grid_velocity_m_s" in estimate.info and "grid_entropy" in estimate.info:
+            keys = ("grid_velocity_m_s", "grid_entropy")
+            grid, cost = (plot.array(estimate.info[k].reshape(-1, estimate.info[k].shape[-1])[0]) for k in keys)
+            order, value = np.argsort(grid), float(estimate.value["velocity_m_s"].reshape(-1)[0])
+            caption = "Entropy of a small group of range lines over effective velocity, as the search evaluated it; the dashed "
+            caption += "line is the refined minimum."
+            series, marks = {"entropy": (grid[order], cost[order])}, {"estimate": value}
+            figure = plot.curves(series, "effective velocity (m/s)", "entropy (nats)", f"{value:.2f} m/s", marks)
+            yield f"{name}_entropy", "Effective velocity by minimum entropy", caption, figure

@@ -1,0 +1,230 @@
+"""Figures of one method on strips: estimates against the truth, images, responses of points."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchsar.compensate.doppler import wrap_hz
+from torchsar.core import Chain, Signal, Trace
+from torchsar.focus import ClosestRange
+from torchsar.metrics import contrast, correlation, entropy, error_db, impulse_response
+from torchsar.radar import StripmapRadar
+from torchsar.study.trials.batch import IMAGE, Judged, Outcome, Trials
+from torchsar.study.trials.bench import Bench
+
+log = logging.getLogger("torchsar")
+_UNIT = re.compile(r"_(hz|m_s|m|s|rad|deg|db)$")
+# a window of fewer lines or samples says nothing of an image
+_LEAST = 32
+_FIGURES = ("irw_azimuth_m", "irw_range_m", "pslr_azimuth_db", "pslr_range_db", "islr_azimuth_db", "islr_range_db")
+
+
+@dataclass(frozen=True)
+class Margin:
+    """Lines and samples at the edges of the image that the metrics leave out."""
+
+    first_lines: int = 0
+    last_lines: int = 0
+    first_samples: int = 0
+    last_samples: int = 0
+
+
+@dataclass(frozen=True)
+class Judging:
+    """How images are judged.
+
+    Args:
+        margin: None leaves out lines without a full aperture and samples without a full pulse.
+        reference: The method that image errors and peaks are relative to.
+        sidelobe_nulls: Extent of the side lobes in null spacings.
+        found_within_m: How far from its position a target counts as found.
+        found_above_db: How far below the reference's its peak may lie.
+        published: Figure -> case -> method -> what the source published.
+    """
+
+    margin: Margin | None = None
+    reference: str | None = None
+    sidelobe_nulls: int = 10
+    found_within_m: float = 10.0
+    found_above_db: float = -6.0
+    published: Mapping[str, Mapping[str, Mapping[str, float | str]]] = field(default_factory=dict)
+
+
+def window(image: Signal, radar: StripmapRadar, margin: Margin | None) -> dict[str, tuple[int, int]]:
+    """Lines and samples that are judged: those with a full pulse and a full aperture, or what the
+    margin leaves. An axis of which fewer than 32 would be left is judged whole.
+    """
+    lines, samples = (axis.n for axis in image.axes)
+    if margin is None:
+        edge = min(radar.aperture_lines(image.axes[1].start) // 2, lines // 4)
+        margin = Margin(first_lines=edge, last_lines=edge, last_samples=radar.pulse_samples)
+    spans = {"azimuth": (lines, margin.first_lines, margin.last_lines)}
+    spans["range"] = (samples, margin.first_samples, margin.last_samples)
+    kept = {axis: (first, n - last) for axis, (n, first, last) in spans.items()}
+    for axis, (first, last) in kept.items():
+        if last - first < _LEAST:
+            log.debug("a margin leaves %d of the image along %s: that axis is judged whole", last - first, axis)
+            kept[axis] = (0, spans[axis][0])
+    return kept
+
+
+@dataclass(frozen=True)
+class Used:
+    """What the focusing stage of a chain worked with, (trial,) each, and the view of a method."""
+
+    doppler_hz: Tensor | None
+    velocity_m_s: Tensor
+    frame_hz: Tensor
+
+    @staticmethod
+    def by(chain: Chain, trace: Trace, radar: StripmapRadar, count: int) -> Used:
+        name = focus_name(chain)
+        stage, connected = focuser_of(chain.stages[name]), chain.uses[name]
+
+        def value(key: str, default: Any) -> Any:
+            found = trace.values[connected[key]] if key in connected else getattr(stage, key, default)
+            return None if found is None else torch.as_tensor(found, dtype=torch.float64).detach().expand(count)
+
+        doppler = value("doppler_hz", None)
+        frame = getattr(stage, "frame_hz", None)
+        frame = radar.pointing_doppler_hz if frame is None else frame
+        frame = torch.zeros(count, dtype=torch.float64) if frame is None and doppler is None else frame
+        frame = doppler if frame is None else torch.as_tensor(frame, dtype=torch.float64).expand(count)
+        assert frame is not None
+        return Used(doppler, value("velocity_m_s", radar.velocity_m_s), frame)
+
+    def metrics(self, radar: StripmapRadar) -> dict[str, Tensor]:
+        """Doppler centroid, squint and velocity that the image was focused with."""
+        found = {"effective_velocity_m_s": self.velocity_m_s}
+        if self.doppler_hz is not None:
+            sine = radar.sin_squint(self.doppler_hz, self.velocity_m_s).clamp(-1, 1)
+            found["doppler_centroid_hz"] = self.doppler_hz
+            found["doppler_baseband_hz"] = wrap_hz(self.doppler_hz, radar.prf_hz)
+            found["squint_deg"] = torch.rad2deg(torch.asin(sine))
+        return found
+
+
+def focus_name(chain: Chain) -> str:
+    """The stage that makes the image: the last one with a Doppler of its own, else the last."""
+    focusing = [name for name, stage in chain.stages.items() if hasattr(focuser_of(stage), "frame_hz")]
+    return focusing[-1] if focusing else list(chain.stages)[-1]
+
+
+def focuser_of(stage: nn.Module) -> nn.Module:
+    """The stage itself, or the focuser that it wraps."""
+    return getattr(stage, "focuser", stage)
+
+
+def judge(bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
+    """Figures of one method; detail: those of point targets as well."""
+    chain, n = bench.chains[name], trials.count
+    metrics = estimation_metrics(trace, trials, bench.radar.prf_hz)
+    if trace.signal.names != IMAGE:
+        return Judged(metrics)
+    used = Used.by(chain, trace, bench.radar, n)
+    image = trace.signal.crop(**window(trace.signal, bench.radar, bench.judging.margin))
+    metrics.update(used.metrics(bench.radar), entropy_nats=entropy(image).expand(n), contrast=contrast(image).expand(n))
+    if not detail:
+        return Judged(metrics, view=used)
+    targets, outside = _targets(bench, chain, trace.signal, used, trials)
+    return Judged(metrics, targets, outside, used)
+
+
+def estimation_metrics(trace: Trace, trials: Trials, prf_hz: float) -> dict[str, Tensor]:
+    """Scalar estimates by name and their errors; a name that two stages give is the later one's."""
+    n, truth = trials.count, trials.truth
+    found = {key: v for estimate in trace.estimates.values() for key, v in estimate.value.items()}
+    values = {key: v.double().expand(n) for key, v in found.items() if v.shape == trace.signal.trials}
+    metrics = dict(values)
+    for key, value in values.items():
+        if key in truth and truth[key].numel() in (1, n):
+            metrics[error_name(key)] = value - truth[key].to(value)
+    doppler = values.get("doppler_hz", values.get("doppler_baseband_hz"))
+    if doppler is not None and "doppler_hz" in truth:
+        metrics["doppler_baseband_error_hz"] = wrap_hz(doppler - truth["doppler_hz"].to(doppler), prf_hz)
+    return metrics
+
+
+def error_name(name: str) -> str:
+    """'doppler_hz' -> 'doppler_error_hz'."""
+    return _UNIT.sub(r"_error_\1", name) if _UNIT.search(name) else f"{name}_error"
+
+
+def compare(bench: Bench, outcome: Outcome, ideal: Outcome | None) -> Judged:
+    """The figures of a method with those against the reference, and over its targets."""
+    judged = over_targets(bench, outcome.judged, None if ideal is None else ideal.judged)
+    pair = [None if one is None else one.signal for one in (outcome, ideal)]
+    if pair[0] is pair[1] or not all(signal is not None and signal.names == IMAGE for signal in pair):
+        return judged
+    part = window(pair[0], bench.radar, bench.judging.margin)
+    pair = [signal.crop(**part).to(torch.complex128) for signal in pair]  # sums over millions of pixels
+    count = len(judged.metrics["seconds"])
+    found = {"image_error_db": error_db(*pair), "image_correlation": correlation(*pair)}
+    return replace(judged, metrics={**judged.metrics, **{name: value.expand(count) for name, value in found.items()}})
+
+
+def positions(chain: Chain, used: Used, bench: Bench, trials: Trials) -> tuple[Tensor, Tensor]:
+    """Azimuth and range (m), (trial, target), where a method should show the point targets."""
+    index = torch.tensor(list(bench.world().named_points.values()))
+    zero, closest, velocity = (trials.truth[key] for key in ("zero_doppler_s", "closest_range_m", "velocity_m_s"))
+    zero, closest = (x[..., index].expand(trials.count, -1) for x in (zero, closest))
+    azimuth, slant = bench.radar.image_position(
+        zero, closest, used.frame_hz[:, None], velocity.expand(trials.count)[:, None]
+    )
+    flat = any(isinstance(stage, ClosestRange) for stage in chain.stages.values())
+    return azimuth, closest if flat else slant
+
+
+def _targets(
+    bench: Bench, chain: Chain, image: Signal, used: Used, trials: Trials
+) -> tuple[dict[str, dict[str, Tensor]], list[str]]:
+    """Figures of every point target inside the image, and the names of those outside."""
+    names = [] if bench.recording is not None else list(bench.world().named_points)
+    if not names:
+        return {}, []
+    places = positions(chain, used, bench, trials)
+    inside = torch.stack([(x >= a.start) & (x <= a.stop) for x, a in zip(places, image.axes)]).all(0).all(0)
+    kept = [name for name, within in zip(names, inside.tolist()) if within]
+    outside = [name for name in names if name not in kept]
+    if not kept:
+        return {}, outside
+    at = tuple(x[:, inside] if image.trials else x[0, inside] for x in places)
+    figures = impulse_response(image, (at[0], at[1]), sidelobe_nulls=bench.judging.sidelobe_nulls)
+    figures = {key: value.reshape(trials.count, -1) for key, value in figures.items()}
+    table = {key: figures[key] for key in _FIGURES}
+    for axis, x in zip(("azimuth", "range"), places):
+        table[f"position_error_{axis}_m"] = figures[f"position_{axis}_m"] - x[:, inside]
+    table["peak_db"] = 20 * torch.log10(figures["peak"].abs().clamp_min(1e-300))
+    return {name: {key: value[:, i] for key, value in table.items()} for i, name in enumerate(kept)}, outside
+
+
+def over_targets(bench: Bench, judged: Judged, ideal: Judged | None) -> Judged:
+    """The figures of a method with peaks relative to the reference's, which of the targets were found, and
+    medians over those.
+    """
+    settings, targets = bench.judging, {}
+    for name, row in judged.targets.items():
+        level = 0.0 if ideal is None or name not in ideal.targets else ideal.targets[name]["peak_db"]
+        peak = row["peak_db"] - level
+        away = torch.hypot(row["position_error_azimuth_m"], row["position_error_range_m"])
+        seen = (away <= settings.found_within_m) & ((peak >= settings.found_above_db) | (ideal is None))
+        targets[name] = {**row, "peak_db": peak, "found": seen.double()}
+    if not targets:
+        return judged
+    found = torch.stack([row["found"] for row in targets.values()])  # (target, trial)
+    metrics = {"targets": torch.full_like(found[0], len(targets)), "targets_found": found.sum(0)}
+    for key in (*_FIGURES, "position_error_azimuth_m", "position_error_range_m"):
+        values = torch.stack([row[key] for row in targets.values()])
+        kept = torch.where(found > 0, values, torch.nan)
+        if key in _FIGURES:
+            metrics[key] = kept.nanmedian(0).values
+        else:
+            metrics[key.replace("_m", "_rms_m")] = kept.square().nanmean(0).sqrt()
+    return Judged({**judged.metrics, **metrics}, targets, judged.outside, judged.view)

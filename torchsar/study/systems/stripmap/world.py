@@ -1,0 +1,91 @@
+"""The world of a stripmap radar: section `world`, and its simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Draws
+from torchsar.echo import Impairment, apply_impairments, simulate
+from torchsar.radar import StripmapRadar
+from torchsar.scene import AlwaysLit, Beam, Hyperbola, Path, Points, RandomPoints, Scene, StripmapWorld, Together
+from torchsar.study.names.registry import BEAMS, IMPAIRMENTS, PATHS, SCENES
+from torchsar.study.trials.batch import Trials
+from torchsar.study.trials.system import Noise, World
+
+
+@dataclass(frozen=True, kw_only=True)
+class Strip(World):
+    """What is true about a strip.
+
+    Args:
+        lines: Pulses of the record.
+        samples: Range samples of each.
+        scene: Scenes by name, seen together.
+        beam: What lights them.
+        path: How finely the range follows the straight path.
+        velocity_m_s: True effective velocity; None for the radar's nominal one.
+        doppler_hz: True Doppler of the beam centre; None for the nominal pointing.
+        squint_deg: Squint of the beam centre, in place of doppler_hz.
+        noise: Mean signal power per lit raw sample over noise variance.
+        impairments: What happens to the recording, in order.
+    """
+
+    lines: int
+    samples: int
+    scene: Mapping[str, Annotated[Scene, SCENES]]
+    beam: Annotated[Beam, BEAMS] = field(default_factory=AlwaysLit)
+    path: Annotated[Path, PATHS] = field(default_factory=Hyperbola)
+    velocity_m_s: Tensor | float | None = None
+    doppler_hz: Tensor | float | None = None
+    squint_deg: Tensor | float | None = None
+    noise: Noise = field(default_factory=Noise)
+    impairments: Mapping[str, Annotated[Impairment, IMPAIRMENTS]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.lines < 2 or self.samples < 2 or not self.scene:
+            raise ValueError(
+                f"a strip needs a scene and at least 2 lines of 2 samples, got {self.lines} x {self.samples}"
+            )
+        if self.doppler_hz is not None and self.squint_deg is not None:
+            raise ValueError("doppler_hz and squint_deg both say where the beam looks; give one of them")
+        if self.squint_deg is not None and bool((torch.as_tensor(self.squint_deg).abs() >= 90).any()):
+            raise ValueError(f"squint_deg must lie between -90 and 90 degrees, got {self.squint_deg}")
+
+    def doppler(self, radar: StripmapRadar) -> Tensor | float | None:
+        """True Doppler of the beam centre, 2 v sin(squint) / lambda where a squint is given."""
+        if self.squint_deg is None:
+            return self.doppler_hz
+        velocity = radar.velocity_m_s if self.velocity_m_s is None else self.velocity_m_s
+        squint = torch.deg2rad(torch.as_tensor(self.squint_deg, dtype=torch.float64))
+        return 2 * velocity * torch.sin(squint) / radar.wavelength_m
+
+    def of(self, radar: StripmapRadar) -> StripmapWorld:
+        """The world as the echo simulation takes it."""
+        doppler, scene = self.doppler(radar), Together(self.scene)
+        return StripmapWorld(scene, self.beam, self.path, self.velocity_m_s, doppler, self.noise.snr_db)
+
+    def trials_of(self, radar: StripmapRadar, draws: Draws, dtype: torch.dtype, device: str) -> Trials:
+        """Recordings with and without impairments, and the truth."""
+        world, size = self.of(radar), (self.lines, self.samples)
+        recording, truth = simulate(radar, world, *size, draws, self.impairments, dtype, device)
+        assert truth.clean is not None
+        clean, _ = apply_impairments(truth.clean, {}, draws)
+        return Trials(recording, clean, truth.values, len(draws.trials or (0,)), world)
+
+    @property
+    def named_points(self) -> dict[str, int]:
+        """Names of the point targets, `part.number`, and their indices among all scatterers."""
+        names: dict[str, int] = {}
+        first = 0
+        for part, scene in self.scene.items():
+            count = len(scene.azimuth_m) if isinstance(scene, Points) else getattr(scene, "count", 0)
+            if isinstance(scene, (Points, RandomPoints)):
+                names.update({f"{part}.{i}": first + i for i in range(count)})
+            first += count
+        return names

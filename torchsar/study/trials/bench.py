@@ -1,0 +1,260 @@
+"""The bench: radar, world and chains of one case, built once, and batches of trials on it."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import takewhile
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Chain, Draws, Estimate, Recording, Trace
+from torchsar.echo import apply_impairments
+from torchsar.study.settings.errors import ConfigError, one_line
+from torchsar.study.settings.sections import Loaded, Method
+from torchsar.study.trials.auto import resolved
+from torchsar.study.trials.batch import Batch, Judged, Outcome, Trials, not_an_image, verdict
+from torchsar.study.trials.chains import build_chains, true_names, unknown_attribute
+
+log = logging.getLogger("torchsar")
+Announce = Callable[[str, str], Any]
+# what a stage that cannot work on its data raises; a RuntimeError is what torch itself refuses
+_FAILURES = (ValueError, TypeError, KeyError, RuntimeError)
+
+
+class Bench:
+    """Radar, world and chains of one case, on one device.
+
+    Args:
+        loaded: The config of the case; `auto` in it is settled here.
+        device: Where its trials are computed.
+        announce: Called with a method and a stage whenever a stage begins.
+
+    Attributes:
+        chosen: What `auto` was settled to, in sentences.
+
+    Raises:
+        ConfigError: If anything that the config names cannot be built.
+    """
+
+    def __init__(self, loaded: Loaded, device: str = "cpu", announce: Announce = lambda *_: None) -> None:
+        self.system, self.device, self.announce = loaded.system, device, announce
+        self.loaded, self.chosen = resolved(loaded, lambda plain: Bench(plain, device))
+        config, self.file = self.loaded.config, self.loaded.file
+        self.config, self.dtype = config, getattr(torch, config.precision)
+        self.judging = self._made("metrics")
+        self.recording = self._read() if config.data.file is not None else None
+        if self.recording is None:
+            self.radar, self._still = self._made("radar"), self._made("world")
+            self._refuse_oversize()
+        else:
+            self.radar, self._still = self.recording.radar, None
+        context = {} if self.recording is None else self.system.context(self.recording)
+        chains = build_chains(self.loaded, radar=self.radar, **context)
+        self.chains: dict[str, Chain] = {name: chain.to(device) for name, chain in chains.items()}
+        made = self.system.impairments.make
+        entries = config.data.impairments.items()
+        self.impairments = {name: made(entry, f"data.impairments.{name}", self.file) for name, entry in entries}
+        self._memo: dict[str, Any] = {}
+        self._refuse_reference()
+        self.system.check(self)
+
+    def memo(self, name: str, make: Callable[[], Any]) -> Any:
+        """Something that is made once for this bench."""
+        if name not in self._memo:
+            self._memo[name] = make()
+        return self._memo[name]
+
+    def _made(self, section: str, given: Mapping[str, Tensor] | None = None) -> Any:
+        values = getattr(self.config, section)
+        return self.system.sections[section].make(values, section, self.file, given or {})
+
+    def _read(self) -> Recording:
+        try:
+            return self.system.read(self.config.data.file, self.dtype)
+        except (ValueError, OSError) as error:
+            text = one_line(error).removeprefix("data.file: ")
+            raise ConfigError(f"{self.file}: data.file: {text}") from None
+
+    def _refuse_oversize(self) -> None:
+        """Raw data larger than the memory of the machine are a slip of the pen."""
+        try:
+            memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        except (AttributeError, ValueError, OSError):  # not known on every system
+            return
+        size = 8 * self.system.samples(self._still, self.radar)
+        if size > memory:
+            raise ConfigError(
+                f"{self.file}: world: the raw data of a trial take {size / 1e9:.3g} GB, and this machine has "
+                f"{memory / 1e9:.3g} GB; give the world fewer pulses or samples"
+            )
+
+    def _refuse_reference(self) -> None:
+        reference = getattr(self.judging, "reference", None)
+        if reference is not None and self.config.processor[reference].input != "clean":
+            raise ConfigError(
+                f"{self.file}: metrics.reference names {reference!r}, whose image is not the ideal one; name a method "
+                "with 'input: clean'"
+            )
+
+    def world(self, given: Mapping[str, Tensor] | None = None) -> Any:
+        """The world of the config.
+
+        Args:
+            given: Tensors (trial,) that replace numbers, by dotted key below `world`.
+        """
+        return self._made("world", given) if given else self._still
+
+    @property
+    def bytes_per_trial(self) -> int:
+        """Bytes of the largest tensor that a trial needs."""
+        if self.recording is not None:
+            return self.recording.signal.data.numel() * self.recording.signal.data.element_size()
+        return self.system.bytes_per_trial(self)
+
+    def trials(self, draws: Draws, given: Mapping[str, Tensor] | None = None) -> Trials:
+        """The trials of the draws, simulated, or recorded with the impairments of the config."""
+        if self.recording is None:
+            return self.system.simulate(self, self.world(given), draws)
+        impaired, truth = apply_impairments(self.recording, self.impairments, replace(draws, trials=None))
+        return Trials(impaired, self.recording, truth)
+
+    @torch.no_grad()
+    def batch(
+        self,
+        draws: Draws,
+        given: Mapping[str, Tensor] | None = None,
+        keep: Collection[str] = (),
+        detail: bool = False,
+        methods: Collection[str] = (),
+    ) -> Batch:
+        """Simulate a batch of trials, and run and judge every method on it.
+
+        Args:
+            draws: Random numbers, whose trials are those of the batch.
+            given: Tensors (trial,) in place of numbers of the world, by dotted key below `world`.
+            keep: Methods whose traces are kept.
+            detail: Whether figures of single targets are wanted as well, and a method whose chain
+                does not end with an image is refused: for runs.
+            methods: The methods to run; none named means all.
+
+        Raises:
+            ConfigError: If the world, the recommended method or every method fails.
+        """
+        self.announce("", "recording" if self.recording is not None else "simulation")
+        with self._named("world"):
+            trials = self.trials(draws, given)
+        outcomes: dict[str, Outcome] = {}
+        later = [method.rerun.method for method in self.config.processor.values() if method.rerun is not None]
+        for name, method in self.config.processor.items():
+            if methods and name not in methods:
+                continue
+            outcomes[name] = self._outcome(name, method, trials, outcomes, detail)
+            for other in outcomes:
+                if other not in (name, *keep, *later):
+                    outcomes[other] = replace(outcomes[other], trace=None)
+        return Batch(trials, self._compared(outcomes))
+
+    def _outcome(
+        self, name: str, method: Method, trials: Trials, earlier: Mapping[str, Outcome], detail: bool
+    ) -> Outcome:
+        try:
+            trace, estimates, seconds = self._run(name, method, trials, earlier)
+            if detail and self.system.ending and trace.signal.names not in self.system.images:
+                raise ConfigError(
+                    f"processor.{name}, {not_an_image(trace.signal, self.system.ending)} (a sweep needs none)"
+                )
+            judged = self.system.judge(self, name, replace(trace, estimates=estimates), trials, detail)
+        except AttributeError as error:
+            raise ConfigError(
+                f"{self.file}: processor.{name}: {unknown_attribute(error, {'radar': self.radar})}"
+            ) from None
+        except ConfigError as error:
+            raise ConfigError(str(error) if str(error).startswith(self.file) else f"{self.file}: {error}") from error
+        except _FAILURES as error:
+            if name == "recommended" or os.environ.get("TORCHSAR_DEBUG"):
+                raise ConfigError(f"{self.file}: processor.{name}: {one_line(error)}") from error
+            log.warning("warning: %s failed: %s", name, one_line(error))
+            no = torch.zeros(trials.count, dtype=torch.bool)
+            return Outcome(Judged({"ok": no}), failed=one_line(error))
+        spent = sum(seconds.values()) / trials.count
+        known = {"seconds": torch.full((trials.count,), spent, dtype=torch.float64), **verdict(estimates, trials.count)}
+        judged = replace(judged, metrics={**known, **judged.metrics})
+        left = [stage for stage in trace.inputs if trace.outputs[stage] is trace.inputs[stage]]
+        return Outcome(judged, estimates, trace.signal, seconds, trace, left)
+
+    def _run(
+        self, name: str, method: Method, trials: Trials, earlier: Mapping[str, Outcome]
+    ) -> tuple[Trace, Mapping[str, Estimate], Mapping[str, float]]:
+        """The trace of a method with its estimates and times; those that an earlier method has made
+        already, with the same stages on the same data, are taken over.
+        """
+        chain, recording = self.chains[name], trials.clean if method.input == "clean" else trials.recording
+        if method.rerun is not None:
+            source = earlier[method.rerun.method].trace
+            if source is None:
+                raise ValueError(f"the method {method.rerun.method!r}, part of which is run again, failed")
+            given = {k: torch.tensor(v, dtype=torch.float64, device=self.device) for k, v in method.rerun.given.items()}
+            began = time.perf_counter()
+            image = chain.rerun(source, method.rerun.start, given=given)
+            spent = {"rerun": time.perf_counter() - began}
+            outputs = {list(chain.stages)[-1]: image}
+            return Trace({}, outputs, {}, {**source.values, **given}, spent, {}), {}, spent
+        shared = self._shared(method, earlier)
+        held = {f"{stage}.{key}": value for stage, e in shared.estimates.items() for key, value in e.value.items()}
+        true = {f"given.{key}": trials.truth[key] for key in true_names(chain)}
+        with self._announced(chain, name):
+            trace = chain.trace(recording, {**held, **true})
+        spent = {stage: shared.seconds[stage] for stage in shared.estimates}
+        return trace, {**shared.estimates, **trace.estimates}, {**trace.seconds, **spent}
+
+    def _shared(self, method: Method, earlier: Mapping[str, Outcome]) -> Outcome:
+        """Estimates of the earlier method whose chain begins with the most of the same stages."""
+        best, found = [], Outcome(Judged({}))
+        for name, outcome in earlier.items():
+            other = self.config.processor[name]
+            if other.input == method.input and other.stages and not outcome.failed:
+                same = takewhile(lambda pair: pair[0] == pair[1], zip(method.stages.items(), other.stages.items()))
+                common = [stage for (stage, _), _ in same]
+                best, found = (common, outcome) if len(common) > len(best) else (best, found)
+        kept = {stage: e for stage, e in found.estimates.items() if stage in best and stage in found.reusable}
+        return replace(found, estimates=kept)
+
+    def _compared(self, outcomes: Mapping[str, Outcome]) -> dict[str, Outcome]:
+        """The outcomes with figures against the reference."""
+        reference = getattr(self.judging, "reference", None)
+        ideal = outcomes.get(reference or "")
+        ideal = None if ideal is None or ideal.failed else ideal
+        return {
+            name: outcome if outcome.failed else replace(outcome, judged=self.system.compare(self, outcome, ideal))
+            for name, outcome in outcomes.items()
+        }
+
+    @contextmanager
+    def _named(self, what: str) -> Iterator[None]:
+        """What the simulation refuses, as a sentence about the config."""
+        try:
+            yield
+        except ConfigError:
+            raise
+        except _FAILURES as error:
+            raise ConfigError(f"{self.file}: {what}: {one_line(error).removeprefix(f'{what}: ')}") from error
+
+    @contextmanager
+    def _announced(self, chain: Chain, method: str) -> Iterator[None]:
+        """Announce each stage as it begins."""
+        hooks = [
+            stage.register_forward_pre_hook(lambda *_, name=name: self.announce(method, name))
+            for name, stage in chain.stages.items()
+        ]
+        try:
+            yield
+        finally:
+            for hook in hooks:
+                hook.remove()

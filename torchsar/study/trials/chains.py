@@ -1,0 +1,103 @@
+"""From a checked config to chains of stages."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+from torch import nn
+
+from torchsar.core import Chain, use
+from torchsar.study.settings.errors import ConfigError, did_you_mean, one_line
+from torchsar.study.settings.sections import Loaded, Method
+
+# a chain names what it must be given from outside `given.NAME`; a config, the true values `truth.NAME`
+_TRUTH, _GIVEN = "truth.", "given."
+
+
+def build_chains(loaded: Loaded, **context: Any) -> dict[str, Chain]:
+    """The chain of every method; a rerun has that of the method whose part it runs.
+
+    Args:
+        loaded: The config.
+        context: What constructors of stages take from the recording, such as `radar`.
+
+    Raises:
+        ConfigError: If a key, a connection or a held value is not accepted.
+    """
+    chains: dict[str, Chain] = {}
+    for name, method in loaded.config.processor.items():
+        where = f"{loaded.file}: processor.{name}"
+        if method.rerun is None:
+            chains[name] = _chain(loaded, method, f"processor.{name}", context)
+        else:
+            chains[name] = chains[method.rerun.method]
+            offered = {f"{n}.{key}" for n, stage in chains[name].stages.items() for key in provides(stage)}
+            unknown = next((value for value in method.rerun.given if value not in offered), None)
+            if unknown is not None:
+                raise ConfigError(
+                    f"{where}.rerun.given.{unknown} is no value of that chain{did_you_mean(unknown, offered)}"
+                )
+    return chains
+
+
+def provides(stage: nn.Module) -> Collection[str]:
+    """Names of the values that a stage estimates."""
+    return getattr(stage, "provides", ())
+
+
+def true_names(chain: Chain) -> set[str]:
+    """Names of the true values that a chain uses."""
+    sources = {source for uses in chain.uses.values() for source in uses.values()}
+    return {source.removeprefix(_GIVEN) for source in sources if source.startswith(_GIVEN)}
+
+
+def _chain(loaded: Loaded, method: Method, where: str, context: Mapping[str, Any]) -> Chain:
+    built = {}
+    for name, entry in (method.stages or {}).items():
+        place = f"{where}.stages.{name}"
+        if not name.isidentifier():
+            raise ConfigError(
+                f"{loaded.file}: {place}: a stage name is a word of letters, digits and '_', not starting with a digit"
+            )
+        rest = {key: value for key, value in entry.items() if key != "uses"}
+        try:
+            stage = loaded.system.stages.make(rest, place, loaded.file, **context)
+        except AttributeError as error:
+            raise ConfigError(f"{loaded.file}: {place}: {unknown_attribute(error, context)}") from None
+        built[name] = use(stage, **_sources(entry.get("uses", {}), method, loaded, place))
+    try:
+        return Chain(**built)
+    except (ValueError, TypeError) as error:
+        raise ConfigError(f"{loaded.file}: {where}: {one_line(error)}") from None
+
+
+def _sources(uses: Mapping[str, str], method: Method, loaded: Loaded, where: str) -> dict[str, str]:
+    """Where a stage takes its values from; true values only in a method that is an oracle."""
+    found = {}
+    for key, source in uses.items():
+        true = source.startswith(_TRUTH)
+        name = source.removeprefix(_TRUTH)
+        if true and not method.oracle:
+            raise ConfigError(
+                f"{loaded.file}: {where}.uses.{key}: {source} is known to an oracle only; give the method 'oracle: true' "
+                "if it is to show what could be had at best"
+            )
+        if true and name not in loaded.system.truths:
+            raise ConfigError(
+                f"{loaded.file}: {where}.uses.{key}: {name!r} is no true value{did_you_mean(name, loaded.system.truths)}"
+            )
+        found[key] = f"{_GIVEN}{name}" if true else source
+    return found
+
+
+def unknown_attribute(error: AttributeError, context: Mapping[str, Any]) -> str:
+    """The sentence for a stage that asks its radar for what only another system's radar has.
+
+    Any other AttributeError is a fault of the program and is raised again.
+    """
+    if error.obj is not context.get("radar") or error.obj is None:
+        raise error
+    return (
+        f"this stage needs radar.{error.name}, which a radar of this system does not have; it belongs to another system"
+    )

@@ -1,0 +1,271 @@
+"""What a system brings: the sections of its configs, its world, its judge and what it may choose."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from torchsar.core import Draws, Recording, Signal, Trace
+from torchsar.study.names.registry import stages
+from torchsar.study.output.pictures import Drawn
+from torchsar.study.settings.sections import Loaded
+from torchsar.study.settings.signature import Catalogue, Section
+from torchsar.study.trials.batch import IMAGE, Batch, Found, Judged, Outcome, Result, Trials
+
+if TYPE_CHECKING:
+    from torchsar.focus.ladar_requirements import Limit
+    from torchsar.focus.requirements import Requirement
+    from torchsar.study.trials.bench import Bench
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Receiver noise.
+
+    Args:
+        snr_db: Signal-to-noise ratio in dB, as the system defines it; None for no noise.
+    """
+
+    snr_db: Tensor | float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class World:
+    """Base of the section `world` of every system: what is true and no processor may see.
+
+    Args:
+        trials: Trials of each case of a run; a sweep has its own number.
+    """
+
+    trials: int = 1
+
+    def __post_init__(self) -> None:
+        if self.trials < 1:
+            raise ValueError(f"world.trials must be at least 1, got {self.trials}")
+
+
+@dataclass(frozen=True)
+class Column:
+    """A figure as reports and pictures show it.
+
+    Args:
+        label: What it is.
+        unit: Its unit, for tables and axes; SI units get prefixes where they stand alone.
+        digits: Digits after the point.
+        drawn: How methods are compared in a picture: "" not at all, "mean" or "rms" over trials.
+    """
+
+    label: str
+    unit: str = ""
+    digits: int = 3
+    drawn: str = ""
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """One way to do what a choice is about.
+
+    Args:
+        name: For tables.
+        keys: What stands in the config for it, in the mapping that the choice is made in.
+        loss: Predicted loss by metric; None where nothing is predicted.
+        neglects: What it leaves out.
+    """
+
+    name: str
+    keys: Mapping[str, Any] = field(default_factory=dict)
+    loss: Mapping[str, float] | None = None
+    neglects: str = ""
+
+
+# levels below this are differences of rounding at most
+EXACT_DB = -280.0
+
+
+@dataclass(frozen=True)
+class Measured:
+    """How the alternatives of a choice are compared.
+
+    Args:
+        run: Does the work of one alternative, which is timed; the yardstick is run as well.
+        loss: Loss by metric of a result of `run`, against the yardstick.
+        share: Share of the whole work that `run` does of an alternative; its times are divided by it.
+    """
+
+    run: Callable[[Alternative], Any]
+    loss: Callable[[Alternative, Any], Mapping[str, float]]
+    share: Callable[[Alternative], float] = lambda alternative: 1.0
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A decision that a config takes, with its alternatives from the cheapest to the best one.
+
+    Args:
+        name: For tables.
+        at: Where `auto` may be written: a dotted key of the world such as `world.fidelity`, or
+            `stage`, or `STAGE.key` for a key of stages of that name.
+        alternatives: The cheapest first, the best one last.
+        measured: Prepares their comparison, which may take long.
+        yardstick: What they are compared with, where that is none of them.
+    """
+
+    name: str
+    at: str
+    alternatives: Sequence[Alternative]
+    measured: Callable[[], Measured] | None = None
+    yardstick: Alternative | None = None
+
+
+class System(ABC):
+    """Base of the systems: what is physics. Commands, batches, stores and reports exist once.
+
+    Class attributes:
+        name: The value of the key `system`.
+        about: One line for `torchsar list`.
+        Radar, World, Judging: Constructors of the sections radar, world and metrics.
+        impairments: What may be put into a recording by data.impairments.
+        reads: What data.file holds; empty where no recordings are read.
+        ending: Stages that end a chain with an image; empty where a run needs none.
+        truths: Names of true values that oracles may use.
+        definitions: Of figures, by name, for metrics.json and reports.
+        columns: Figures that reports show, by metric.
+        target_columns: Those of named targets.
+        tolerance: Largest acceptable loss by metric, by default.
+        exact: Where `auto` may be written (see `Choice.at`), with the keys of the exact choice.
+        images: Axes of signals that count as images.
+        address: The address of the random numbers of runs.
+        peak: The largest tensor of a trial over its raw data, as measured.
+    """
+
+    name: ClassVar[str]
+    about: ClassVar[str]
+    Radar: ClassVar[Callable[..., Any]]
+    World: ClassVar[Callable[..., Any]]
+    Judging: ClassVar[Callable[..., Any]]
+    impairments: ClassVar[Catalogue] = Catalogue("impairment", "kind", {})
+    reads: ClassVar[str] = ""
+    ending: ClassVar[str] = ""
+    truths: ClassVar[Sequence[str]] = ()
+    definitions: ClassVar[Mapping[str, Any]]
+    columns: ClassVar[Mapping[str, Column]]
+    target_columns: ClassVar[Mapping[str, Column]] = {}
+    tolerance: ClassVar[Mapping[str, float]] = {}
+    exact: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
+    images: ClassVar[Sequence[tuple[str, ...]]] = (IMAGE,)
+    address: ClassVar[str | int] = "run"
+    peak: ClassVar[float] = 8.0
+
+    @cached_property
+    def sections(self) -> dict[str, Section]:
+        return {"radar": Section(self.Radar), "world": Section(self.World), "metrics": Section(self.Judging)}
+
+    @property
+    def stages(self) -> Catalogue:
+        return stages()
+
+    @property
+    def recording_impairments(self) -> Catalogue:
+        return self.impairments
+
+    # physics, by every system
+
+    @abstractmethod
+    def simulate(self, bench: Bench, world: Any, draws: Draws) -> Trials:
+        """Simulate the trials of the draws; numbers of the world may differ from trial to trial."""
+
+    @abstractmethod
+    def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
+        """Compare what a method found with the truth; detail: of single targets as well."""
+
+    @abstractmethod
+    def samples(self, world: Any, radar: Any) -> int:
+        """Samples of the raw data of one trial."""
+
+    def bytes_per_trial(self, bench: Bench) -> int:
+        """Bytes of the largest tensor that a trial needs."""
+        return int(self.peak * self.samples(bench.world(), bench.radar) * bench.dtype.itemsize)
+
+    # physics, where a system has it
+
+    def read(self, path: str, dtype: torch.dtype) -> Recording:
+        """The recording in a file. Raises ValueError or OSError."""
+        raise NotImplementedError(f"system {self.name} reads no recordings")
+
+    def context(self, recording: Recording) -> dict[str, Any]:
+        """What stages take from a recording besides its radar."""
+        return {}
+
+    def check(self, bench: Bench) -> None:
+        """Refuse what the constructors cannot see. Raises ConfigError."""
+
+    def check_sweep(self, loaded: Loaded, grid: Mapping[str, Any]) -> None:
+        """Refuse a grid that contradicts itself. Raises ConfigError."""
+
+    def compare(self, bench: Bench, outcome: Outcome, ideal: Outcome | None) -> Judged:
+        """The figures of a method with those against the method that metrics.reference names."""
+        judged, key = outcome.judged, "entropy_nats"
+        if ideal is None or ideal is outcome or key not in judged.metrics or key not in ideal.metrics:
+            return judged
+        above = judged.metrics[key] - ideal.metrics[key]
+        return replace(judged, metrics={**judged.metrics, "entropy_above_ideal_nats": above})
+
+    def bounds(self, bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
+        """Lower bounds of errors: metric -> name of the bound -> (trial,)."""
+        return {}
+
+    def found(self, bench: Bench, outcome: Outcome, trials: Trials) -> dict[str, Found]:
+        """What the estimators of a method found, by `stage.value`."""
+        n, table = trials.count, {}
+        for stage, estimate in outcome.estimates.items():
+            for key, value in estimate.value.items():
+                std = estimate.std.get(key)
+                ok = estimate.ok.expand(n) if estimate.ok.numel() in (1, n) else None
+                table[f"{stage}.{key}"] = Found(
+                    *(None if x is None else per_trial_first(x, n) for x in (value, std)), ok
+                )  # pyright: ignore[reportArgumentType]
+        return table
+
+    def limits(self, bench: Bench) -> Mapping[Limit, Sequence[str]]:
+        """Limits of methods in this scene, each with the methods that it concerns."""
+        return {}
+
+    def requirements(self, bench: Bench) -> Sequence[Requirement]:
+        """What each simplification neglects in this scene."""
+        return ()
+
+    def choices(self, bench: Bench) -> Sequence[Choice]:
+        """Decisions that the config takes, the most important one first."""
+        return ()
+
+    def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
+        """Makers of the pictures of a run, in the order of reading; results by case."""
+        yield from ()
+
+    def pictured(self, result: Result) -> dict[str, Signal]:
+        """The images of a case that are kept, those of the first trial, by path."""
+        return result.images
+
+    def theory(self, result: Result) -> Mapping[str, Mapping[str, float]]:
+        """Figures of named targets without any error, by target."""
+        return {}
+
+    def notes(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        """(title, text) of what a reader of the report should know."""
+        yield from ()
+
+    def extra_definitions(self, bench: Bench) -> Mapping[str, Any]:
+        """Definitions that depend on the config."""
+        return {}
+
+
+def per_trial_first(x: Tensor, count: int) -> Tensor:
+    """A tensor with a leading dim of trials, made where there is none."""
+    x = x.detach()
+    return x if x.ndim and x.shape[0] == count else x[None].expand(count, *x.shape)
