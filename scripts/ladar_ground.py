@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import nn
+from torchsar.study.sal.judge import Course, course_of, finer_in_range, motion_metrics
 
 from torchsar import plot
 from torchsar.compensate import CorrectPulsePhase
@@ -44,7 +45,6 @@ from torchsar.scene import (
     RetroAndBrokenLine,
     Sinusoid,
 )
-from torchsar.study.sal.judge import Course, course_of, finer_in_range, motion_metrics
 
 RADAR = TriangularLadar(
     LIGHT_M_S / 1.55e-6, 5e9, 32e-6, 150e6, speed_m_s=3.125, reference_range_m=4339.5, keep_every=4, detection="real"

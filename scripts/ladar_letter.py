@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import torch
+from torchsar.study.sal.judge import course_of, finer_in_range, motion_metrics
 
 from torchsar import plot
 from torchsar.compensate import CorrectPulsePhase
@@ -25,7 +26,6 @@ from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
 from torchsar.metrics import contrast, entropy
 from torchsar.radar import LIGHT_M_S, TriangularLadar
 from torchsar.scene import LadarWorld, LetterE, Polynomial, QuadraticInSweep, Sinusoid
-from torchsar.study.sal.judge import course_of, finer_in_range, motion_metrics
 
 RADAR = TriangularLadar(
     LIGHT_M_S / 1.55e-6, bandwidth_hz=5e9, period_s=16e-6, sample_rate_hz=64e6, speed_m_s=60.0, reference_range_m=3000.0

@@ -19,6 +19,8 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
+from torchsar.study.cuts import impulse_cuts
+from torchsar.study.sal.judge import Course, course_of, finer_in_range, motion_metrics
 
 from torchsar import plot
 from torchsar.compensate import CorrectPulsePhase
@@ -29,8 +31,6 @@ from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
 from torchsar.metrics import impulse_response
 from torchsar.radar import LIGHT_M_S, TriangularLadar
 from torchsar.scene import LadarWorld, Points, Polynomial, QuadraticInSweep, Sinusoid
-from torchsar.study.cuts import impulse_cuts
-from torchsar.study.sal.judge import Course, course_of, finer_in_range, motion_metrics
 
 RADAR = TriangularLadar(
     LIGHT_M_S / 1.55e-6, bandwidth_hz=5e9, period_s=16e-6, sample_rate_hz=64e6, speed_m_s=60.0, reference_range_m=3000.0

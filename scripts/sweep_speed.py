@@ -18,14 +18,14 @@ from contextlib import nullcontext
 from dataclasses import replace
 
 import torch
-
 from torchsar.study.config import load
+from torchsar.study.stripmap.trials import StripmapTrials
+from torchsar.study.sweeping import sweep_grid
+
 from torchsar.study.montecarlo.chunks import rows_by_bytes
 from torchsar.study.montecarlo.engines import Engine, InProcess, engine
 from torchsar.study.montecarlo.grid import Grid
 from torchsar.study.montecarlo.loop import Plan, run_plan
-from torchsar.study.stripmap.trials import StripmapTrials
-from torchsar.study.sweeping import sweep_grid
 
 
 def first_point(grid: Grid) -> Grid:

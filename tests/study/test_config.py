@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-
-from tests.study.tiny import TINY, write_tiny
 from torchsar.study.build import build_chain, resolved
 from torchsar.study.config import load
-from torchsar.study.settings.errors import ConfigError
-from torchsar.study.settings.text import dump, override, packaged_configs, parse
 from torchsar.study.stripmap.build import build_radar
 from torchsar.study.stripmap.run import prepare
+
+from tests.study.tiny import TINY, write_tiny
+from torchsar.study.settings.errors import ConfigError
+from torchsar.study.settings.text import dump, override, packaged_configs, parse
 from torchsar.study.systems import system_of
 
 

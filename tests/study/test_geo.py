@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from torchsar.study.config import load
+from torchsar.study.geo.build import Echoes, row_draws
+from torchsar.study.geo.judge import theory
+from torchsar.study.geo.requires import Needs, heed_limits
+from torchsar.study.geo.trials import GeoTrials, clutter_covariance, run_batch
 
 from torchsar.cli import main
 from torchsar.core import Draws, Signal
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.response import condition_number
 from torchsar.scene import BandLimited, Pattern
-from torchsar.study.config import load
-from torchsar.study.geo.build import Echoes, row_draws
-from torchsar.study.geo.judge import theory
-from torchsar.study.geo.requires import Needs, heed_limits
-from torchsar.study.geo.trials import GeoTrials, clutter_covariance, run_batch
 from torchsar.study.montecarlo import sweep
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.systems import system_of

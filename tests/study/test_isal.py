@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from torchsar.study.config import load
+from torchsar.study.isal.trials import IsalTrials
 
 from torchsar.cli import main
 from torchsar.focus import TargetImage
 from torchsar.io import read_inverse
 from torchsar.radar import geometry_of
-from torchsar.study.config import load
-from torchsar.study.isal.trials import IsalTrials
 from torchsar.study.montecarlo import sweep
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.text import find_config, read_tree

@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 import torch
 import yaml
-
-from torchsar.cli import main
-from torchsar.core import Axis, Draws, Signal
-from torchsar.multichannel.motion import PointMotion
 from torchsar.study.config import load
 from torchsar.study.ocean.build import Ocean
 from torchsar.study.ocean.judge import Place, shown_at
 from torchsar.study.ocean.requires import heed_limits, needs_of
 from torchsar.study.ocean.trials import OceanTrials
+
+from torchsar.cli import main
+from torchsar.core import Axis, Draws, Signal
+from torchsar.multichannel.motion import PointMotion
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.systems import system_of
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 import torch
-
-from torchsar.core import Stage
 from torchsar.study.catalogue import Catalogue
 from torchsar.study.registry import BEAMS, GROUPS, IMPAIRMENTS, PATHS, SCENES, group_of, stages
+
+from torchsar.core import Stage
 from torchsar.study.settings.errors import ConfigError
 
 OWN = '''

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from torchsar.study.config import load
+from torchsar.study.rotation.judge import cut_through
+from torchsar.study.rotation.requires import heed_limits
+from torchsar.study.rotation.trials import RotationTrials, run_batch
 
 from torchsar.cli import main
 from torchsar.core import Axis, Draws, Signal
 from torchsar.focus.rotation_requirements import least_order, rotation_limits, rotation_requirements
 from torchsar.radar import LIGHT_M_S, InverseRadar
-from torchsar.study.config import load
 from torchsar.study.montecarlo import sweep
-from torchsar.study.rotation.judge import cut_through
-from torchsar.study.rotation.requires import heed_limits
-from torchsar.study.rotation.trials import RotationTrials, run_batch
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.systems import system_of
 

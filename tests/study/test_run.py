@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
+from torchsar.study.config import load
+from torchsar.study.stripmap.run import run
 
 from tests.study.tiny import write_tiny
-from torchsar.study.config import load
 from torchsar.study.settings.errors import ConfigError
-from torchsar.study.stripmap.run import run
 
 
 @pytest.fixture(scope="module")

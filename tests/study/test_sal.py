@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 import torch
 import yaml
-
-from torchsar.cli import main
-from torchsar.core import Axis, Draws, Signal
-from torchsar.metrics import impulse_response
 from torchsar.study.case_report import tables
 from torchsar.study.config import load
-from torchsar.study.montecarlo import sweep
 from torchsar.study.registry import CALIBRATIONS, LOG_AMPLITUDES, RADIAL_MOTIONS, SWEEP_ERRORS, SWEEP_FIDELITIES
 from torchsar.study.sal.build import Ladar
 from torchsar.study.sal.judge import course_of, finer_in_range
 from torchsar.study.sal.report import entropy_traps
 from torchsar.study.sal.requires import Needs, heed_limits
 from torchsar.study.sal.trials import SalTrials, run_batch
+
+from torchsar.cli import main
+from torchsar.core import Axis, Draws, Signal
+from torchsar.metrics import impulse_response
+from torchsar.study.montecarlo import sweep
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.systems import system_of
 

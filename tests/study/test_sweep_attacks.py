@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torchsar.study.config import load
 
 from tests.study.tiny import write_tiny
 from torchsar.cli import main
-from torchsar.study.config import load
 from torchsar.study.montecarlo import Stop, read_sweep, sweep
 from torchsar.study.montecarlo.engines import _refuse_unsendable, engine, refuse_unguarded
 from torchsar.study.montecarlo.grid import address, check_name, make_grid

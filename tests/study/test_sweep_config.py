@@ -8,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from torchsar.study.config import load
+from torchsar.study.stripmap.trials import StripmapTrials, error_name
+from torchsar.study.sweeping import sweep_grid
 
 from tests.study.tiny import TINY, write_tiny
 from torchsar.cli import main
-from torchsar.study.config import load
 from torchsar.study.montecarlo import Record, differences, read_sweep
 from torchsar.study.montecarlo.engines import InProcess
 from torchsar.study.montecarlo.loop import Plan, run_plan
 from torchsar.study.settings.errors import ConfigError
-from torchsar.study.stripmap.trials import StripmapTrials, error_name
-from torchsar.study.sweeping import sweep_grid
 
 SWEEP = {"world.noise.snr_db": [0.0, 20.0], "world.doppler_hz": [-20.0, 30.0], "trials": 6}
 SMALL = ["sweep.world.noise.snr_db=[-10.0, 10.0]", "sweep.world.squint_deg=[0.25]"]

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from torchsar.study.pictures import Picture
 
 from torchsar.study.montecarlo.pictures import axis_label, draw_sweep, panels_beside, read_summary
 from torchsar.study.montecarlo.record import Record
 from torchsar.study.montecarlo.report import figure, with_interval, write_sweep_report
 from torchsar.study.montecarlo.summary import summary_tree
 from torchsar.study.output.arrays import write_json
-from torchsar.study.pictures import Picture
 
 GRID = {"world.noise.snr_db": (20.0, -10.0, 5.0), "world.squint_deg": (0.0, 3.0), "world.scene": ("point", "speckle")}
 SESSION = {"device": "cpu", "versions": {"torch": "2.13.0"}, "seconds": 4.0, "trials": 470}

@@ -11,10 +11,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-
-from torchsar.core import Draws
 from torchsar.study.config import Loaded, load
 from torchsar.study.rotation.trials import Batch, RotationTrials, error_bounds, run_batch, target_figures
+
+from torchsar.core import Draws
 
 
 def kept(loaded: Loaded, methods: Sequence[str]) -> Loaded:

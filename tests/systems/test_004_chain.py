@@ -8,7 +8,6 @@ import json
 from pathlib import Path
 
 import pytest
-
 from torchsar.study.config import load
 from torchsar.study.stripmap.run import run
 

@@ -24,7 +24,7 @@ from torchsar.study.montecarlo.stopping import Stop, looks
 from torchsar.study.montecarlo.store import Store, cut_off, empty, read_sweep
 from torchsar.study.montecarlo.work import Chunk, Outcome, Trial, Work
 from torchsar.study.output.folder import ResultFolder, opened
-from torchsar.study.report import installed_version
+from torchsar.study.output.report import installed_version
 from torchsar.study.settings.errors import ConfigError, did_you_mean
 
 log = logging.getLogger("torchsar")

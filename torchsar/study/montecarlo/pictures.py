@@ -13,7 +13,7 @@ import numpy as np
 
 from torchsar import plot
 from torchsar.study.montecarlo.statistics import LEVEL
-from torchsar.study.pictures import Picture
+from torchsar.study.output.pictures import Picture
 
 PANELS = 6
 _UNITS = {

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from torchsar.study.montecarlo.pictures import axis_label
-from torchsar.study.pictures import Picture
-from torchsar.study.report import write_page
+from torchsar.study.output.pictures import Picture
+from torchsar.study.output.report import write_page
 
 MISSING = "–"
 _NOT_SHOWN = ("title", "config", "identity", "sessions", "chunk_rows")

@@ -9,7 +9,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Recording, Signal
+from torchsar.core import Draws, Signal
 from torchsar.echo import bistatic_echo, simulate_bistatic
 from torchsar.metrics.ship_scene import Ship, ShownShip
 from torchsar.multichannel import Extraction, PointMotion, RemoveTransmitRange, StationaryImage

@@ -19,8 +19,16 @@ from torchsar.focus.requirements import Requirement
 from torchsar.metrics import error_db
 from torchsar.metrics.radial_motion import leading, lit_periods
 from torchsar.radar import TriangularLadar
-from torchsar.scene import EverySample, Extremes, LinearInSweep, OnePerPeriod, OnePerSweep, Points, QuadraticInSweep
-from torchsar.scene import drawn_motion
+from torchsar.scene import (
+    EverySample,
+    Extremes,
+    LinearInSweep,
+    OnePerPeriod,
+    OnePerSweep,
+    Points,
+    QuadraticInSweep,
+    drawn_motion,
+)
 from torchsar.scene.ladar import Effect
 from torchsar.scene.vibration import displacement_m
 from torchsar.study.systems.sal.world import Ground
