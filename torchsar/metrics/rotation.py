@@ -1,4 +1,4 @@
-"""What a chain found out about a non-uniform rotation, against the truth, and cuts through targets."""
+"""Errors of estimated non-uniform rotations, and cuts through point targets."""
 
 from __future__ import annotations
 
@@ -109,8 +109,8 @@ def true_k(truth: Mapping[str, Tensor], i: int) -> Tensor:
 
 
 def k_scales(i: int, true: Tensor) -> dict[str, Tensor]:
-    """Names of errors of k_i, and what an error in its own unit is multiplied with, (...,) each; NaN
-    in trials that a name does not apply to.
+    """Names of errors of k_i, and the factor for an error in its own unit, (...,) each; NaN in
+    trials that a name does not apply to.
     """
     zero, own = true == 0, k_name(i).replace("_", "_error_", 1)
     found = {} if bool(zero.all()) else {f"k{i}_error_percent": torch.where(zero, torch.nan, 100 / true.abs())}

@@ -1,4 +1,7 @@
-"""Images of moving ships on a sea, against the truth: velocities, positions, false targets, the sea."""
+"""Images of moving ships on a sea, compared with the truth.
+
+Figures of velocities, positions, false targets and of the sea itself.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +73,7 @@ class Ship:
 
     Args:
         motion: Motion of its middle, () each.
-        scatterers_m: Along-track position and closest range of the centre of its scatterers' powers.
+        scatterers_m: Along-track position and closest range of the centroid of its power.
         echo: Its echo alone (channel, pulse, range), without the transmit range.
     """
 

@@ -1,4 +1,7 @@
-"""The systems by name, and the way from a file to a checked config: the one place that knows all."""
+"""The systems by name, and the way from a file to a checked config.
+
+This is the only module that knows every system.
+"""
 
 from __future__ import annotations
 

@@ -120,7 +120,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Found:
-    """An estimate by name: value and predicted standard deviation (trial, ...), verdict (trial,)."""
+    """One estimate: value and predicted standard deviation (trial, ...), and verdict (trial,)."""
 
     value: Tensor
     std: Tensor | None

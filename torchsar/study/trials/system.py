@@ -1,4 +1,4 @@
-"""What a system brings: the sections of its configs, its world, its judge and what it may choose."""
+"""What a system defines: sections of its configs, world, judge, bounds, limits, alternatives."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class Measured:
     Args:
         run: Does the work of one alternative, which is timed; the yardstick is run as well.
         loss: Loss by metric of a result of `run`, against the yardstick.
-        share: Share of the whole work that `run` does of an alternative; its times are divided by it.
+        share: Share of the whole work that `run` does of an alternative; times are divided by it.
     """
 
     run: Callable[[Alternative], Any]

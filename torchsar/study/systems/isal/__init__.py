@@ -1,8 +1,9 @@
-"""System 002: inverse synthetic aperture ladar, phase errors from pulse to pulse (Ruan et al. 2013)."""
+"""Inverse synthetic aperture ladar, phase errors from pulse to pulse
+(Ruan et al. 2013).
+"""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -12,12 +13,11 @@ import torch
 from torch import Tensor
 
 from torchsar.compensate import autofocus
-from torchsar.core import Chain, Draws, Recording, Signal, Trace
+from torchsar.core import Draws, Recording, Trace
 from torchsar.focus.inverse_requirements import inverse_requirements
 from torchsar.focus.requirements import Requirement
 from torchsar.io import read_inverse
-from torchsar.metrics import contrast, entropy, phase_rmse, residual_phase, strehl
-from torchsar.metrics.bounds import pulse_phase_bound_of_scene_rad, pulse_phase_bound_rad
+from torchsar.metrics import phase_rmse
 from torchsar.radar import InverseRadar, geometry_of
 from torchsar.scene import PhaseOnly, Sinusoid, displacement_m
 from torchsar.study.names.factories import with_wavelength
@@ -27,7 +27,7 @@ from torchsar.study.settings.errors import ConfigError
 from torchsar.study.systems.isal import figures, judge
 from torchsar.study.systems.isal.judge import received, whole_phase
 from torchsar.study.systems.isal.world import Target, echo_choice
-from torchsar.study.trials.batch import IMAGE, Batch, Judged, Result, Trials
+from torchsar.study.trials.batch import Batch, Judged, Result, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.system import Alternative, Choice, Column, Measured, System
 
@@ -65,19 +65,19 @@ class Isal(System):
     definitions = {
         "snr": "mean power of all range-compressed samples over noise variance, dB",
         "entropy": "-sum p ln p, p = |I|^2 / sum |I|^2 over the whole image, nats",
-        "entropy_above_ideal_nats": "entropy less that of the error-free image of the same scene and noise; it depends on "
-        "the position of the image between cells by some 0.03",
+        "entropy_above_ideal_nats": "entropy less that of the error-free image of the same scene and noise; it "
+        "depends on the position of the image between cells by some 0.03",
         "contrast": "standard deviation over mean of the intensity |I|^2",
-        "residual_phase_rms_rad": "rms over pulses of the phases that all corrections together removed, minus the truth, "
-        "constant and linear term removed on the circle; lost pulses do not count",
+        "residual_phase_rms_rad": "rms over pulses of the phases that all corrections together removed, minus "
+        "the truth, constant and linear term removed on the circle; lost pulses do not count",
         "residual_phase_std_rad": "the standard deviation that the method itself predicts for it",
         "strehl": "|mean exp(j residual)|^2 over pulses; success is 0.8 and more, about 0.47 rad rms",
-        "entropy_above_clean_nats": "entropy less that which the same method reaches on the recording without the injected "
-        "phases",
-        "agreement_rad": "rms of (estimate - injected phase) less the estimate on the recording without injected phases: 0 "
-        "for a method that errors cannot influence",
-        "published": "figures of Ruan et al. 2013, Table 1, less the entropy of 7.2 nats that the paper implies for the "
-        "error-free image",
+        "entropy_above_clean_nats": "entropy less that which the same method reaches on the recording without "
+        "the injected phases",
+        "agreement_rad": "rms of (estimate - injected phase) less the estimate on the recording without "
+        "injected phases: 0 for a method that errors cannot influence",
+        "published": "figures of Ruan et al. 2013, Table 1, less the entropy of 7.2 nats that the paper implies "
+        "for the error-free image",
     }
     columns = {
         "entropy_above_ideal_nats": Column("entropy above the ideal image", "nats", drawn="mean"),
@@ -132,8 +132,8 @@ class Isal(System):
     def choices(self, bench: Bench) -> Sequence[Choice]:
         if bench.recording is not None:
             raise ConfigError(
-                f"{bench.file}: alternatives are compared with true phases, which a recording does not tell; take a config "
-                "that simulates"
+                f"{bench.file}: alternatives are compared with true phases, which a recording does not tell; "
+                "take a config that simulates"
             )
         efforts = [Alternative(f"autofocus, search {s}, polish {p}", {"search": s, "polish": p}) for s, p in _EFFORTS]
         return [

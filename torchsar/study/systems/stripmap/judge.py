@@ -206,8 +206,8 @@ def _targets(
 
 
 def over_targets(bench: Bench, judged: Judged, ideal: Judged | None) -> Judged:
-    """The figures of a method with peaks relative to the reference's, which of the targets were found, and
-    medians over those.
+    """The figures of a method with peaks relative to the reference's, which of the targets were
+    found, and medians over those.
     """
     settings, targets = bench.judging, {}
     for name, row in judged.targets.items():
