@@ -12,6 +12,8 @@ import math
 import torch
 from torch import Tensor
 
+from torchsar.radar import InverseRadar
+
 Value = Tensor | float
 
 
@@ -146,3 +148,32 @@ def pulse_phase_bound_of_scene_rad(azimuth: Tensor, range_: Tensor, amplitude: T
     free = torch.linalg.qr(torch.stack([torch.ones_like(k), k - k.mean()], -1), mode="complete").Q[:, 2:]
     variance = torch.linalg.inv(free.mT @ information @ free)
     return torch.sqrt(variance.diagonal(dim1=-2, dim2=-1).sum(-1) / n)
+
+
+def turntable_responses(
+    radar: InverseRadar, rotation_rad_s: float, azimuth_m: Tensor, range_m: Tensor, pulses: int, samples: int
+) -> tuple[Tensor, Tensor]:
+    """Compute the responses of scatterers on a turntable, over pulses and over range samples.
+
+    Echoes are taken at the level of phases: every scatterer stays in its range cell.
+
+    Args:
+        radar: Instrument; its wavelength and range step are used.
+        rotation_rad_s: Constant rotation rate in rad/s.
+        azimuth_m: Cross-range positions, shape (target,), m.
+        range_m: Range positions, shape (target,), m.
+        pulses: Number of pulses, centred on time zero.
+        samples: Number of range samples, centred on range zero.
+
+    Returns:
+        Phasors over pulses, shape (pulse, target), and range responses, shape (target, range),
+        complex128, as `pulse_phase_bound_of_scene_rad` takes them.
+    """
+    theta = rotation_rad_s * (torch.arange(pulses, dtype=torch.float64) - pulses // 2) / radar.prf_hz
+    ranges = azimuth_m * torch.sin(theta)[:, None] + range_m * (torch.cos(theta)[:, None] - 1)
+    phasors = torch.polar(torch.ones_like(ranges), -4 * math.pi / radar.wavelength_m * ranges)
+    cells = torch.arange(samples, dtype=torch.float64) - samples // 2
+    shifts = -2 * math.pi / samples * (range_m / radar.range_step_m)[:, None] * cells
+    back = 2 * math.pi / samples * cells[:, None] * cells
+    responses = torch.polar(torch.ones_like(shifts), shifts) @ torch.polar(torch.ones_like(back), back) / samples
+    return phasors, responses

@@ -91,13 +91,19 @@ def phase_rmse(estimate_rad: Tensor, reference_rad: Tensor, present: Tensor | No
     return (residual.square().sum(-1) / count).sqrt()
 
 
-def strehl(residual_rad: Tensor) -> Tensor:
+def strehl(residual_rad: Tensor, present: Tensor | None = None) -> Tensor:
     """Compute the Strehl ratio |mean exp(j residual)|^2 over pulses.
 
     Args:
         residual_rad: Residual phases, shape (..., pulse).
+        present: False for pulses that do not count, bool, broadcastable to the phases; None if all
+            pulses count.
 
     Returns:
-        Strehl ratio, shape (...,), float64: 1 without error, 0.8 for about 0.47 rad rms.
+        Strehl ratio, shape (...,), float64: 1 without error, 0.8 for about 0.47 rad rms; 0 where
+        no pulse counts.
     """
-    return unit_phasor(residual_rad.to(torch.float64) / (2 * math.pi), torch.complex128).mean(-1).abs().square()
+    phasor = unit_phasor(residual_rad.to(torch.float64) / (2 * math.pi), torch.complex128)
+    if present is None:
+        return phasor.mean(-1).abs().square()
+    return (torch.where(present, phasor, 0).sum(-1).abs() / present.sum(-1).clamp_min(1)).square()

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal
+from torchsar.core import Signal, Trace
 from torchsar.multichannel.body import Extraction, centred_motion, chip_about
 from torchsar.multichannel.migration import Frame
 from torchsar.multichannel.motion import PointMotion
@@ -178,6 +178,33 @@ class MadeScene:
     rest: Signal
     fused: Signal
     targets: Sequence[FoundTarget] | None = None
+
+
+def made_scenes(trace: Trace, speed_m_s: float) -> list[MadeScene]:
+    """Collect what a method made of every trial.
+
+    Args:
+        trace: Of a chain that ends with an image of what is at rest, or with `MoversImage`.
+        speed_m_s: Speed of the platform along its track, m/s.
+
+    Returns:
+        One scene for each trial.
+    """
+    data, axes = trace.signal.data.reshape(-1, *trace.signal.data.shape[-2:]), trace.signal.axes
+    if not trace.estimates:
+        return [MadeScene(*(Signal(image, axes),) * 3) for image in data]
+    (estimate,) = trace.estimates.values()
+    info = {name: x.reshape(len(data), *x.shape[len(trace.signal.trials) :]) for name, x in estimate.info.items()}
+    values = [estimate.value[key].reshape(len(data), -1) for key in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")]
+    std, ok = estimate.std["u_r_m_s"].reshape(len(data), -1), estimate.ok.reshape(len(data), -1)
+    scenes = []
+    for i, image in enumerate(data):
+        there = (info["level"][i] > 0).nonzero()[:, 0].tolist()
+        motions = [PointMotion(*(x[i, j] for x in values), speed_m_s) for j in there]
+        targets = [FoundTarget(m, float(std[i, j]), bool(ok[i, j])) for m, j in zip(motions, there, strict=True)]
+        images = (info["conventional"][i], info["rest"][i], image)
+        scenes.append(MadeScene(*(Signal(x, axes) for x in images), targets))
+    return scenes
 
 
 def matched(

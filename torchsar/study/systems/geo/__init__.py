@@ -101,7 +101,7 @@ class Geo(System):
         "the processed Doppler band within the target's",
         "pslr_azimuth_db": "largest side lobe over the peak; theory, a sinc: -13.26 dB",
         "islr_azimuth_db": "energy of 20 side lobes to either side over that of the main lobe; theory, a sinc: "
-                           "-9.92 dB",
+        "-9.92 dB",
         "mfta_db": "largest replica in the zones of +-1..metrics.orders pulse rates from the peak over the "
         "peak, as far as the image reaches",
         "u_r_error_m_s": "estimated minus true u_r; u_a_error_m_s, y0_error_m alike. Only of methods that estimate it",
@@ -111,7 +111,7 @@ class Geo(System):
         "range": "irw_range_m, pslr_range_db, islr_range_db on the axis c tau / 2, on which the width of a sinc is "
         "0.886 c / (2 B); range_error_m: of the receive path at t = 0",
         "condition_number": "of the band matrix at the velocities used; not given for mmse, which inverts no "
-                            "such matrix",
+        "such matrix",
         "noise_gain_db": "noise of a rebuilt bin against ideal uniform sampling by as many channels, mean over bins",
         "theory": "a target that is rebuilt and focused without error",
         "bounds": "Cramer-Rao for known noise or clutter, complex amplitude and y0 unknown; u_a unknown too, or "

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchsar.core import Chain, Draws, Signal, Trace
 from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Requirement
-from torchsar.metrics.ship_scene import FoundTarget, MadeScene, matched, ship_metrics
+from torchsar.metrics.ship_scene import FoundTarget, MadeScene, made_scenes, matched, ship_metrics
 from torchsar.multichannel import Extraction, PointMotion, StationaryImage
 from torchsar.multichannel.response import LeastSquares, condition_number, noise_gain_db
 from torchsar.multichannel.scene_image import MoversImage
@@ -162,7 +162,7 @@ class GeoOcean(System):
         return world.trials_of(bench.radar, draws, _extraction(bench), bench.dtype, bench.device)
 
     def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
-        made, stage = _scenes(bench, trace), at_rest(bench.chains[name])
+        made, stage = made_scenes(trace, bench.radar.speed_m_s), at_rest(bench.chains[name])
         rows, views, reach = [], [], (float(bench.judging.match_m[0]), float(bench.judging.match_m[1]))
         for scene, frame in zip(made, trials.own, strict=True):
             still = frame.still_image(stage)
@@ -231,25 +231,6 @@ def _extraction(bench: Bench) -> Extraction:
     """Of the recommended method, which also images the ships' own echoes."""
     last: Any = list(bench.chains["recommended"].stages.values())[-1]
     return last.flow.extraction if isinstance(last, MoversImage) else Extraction()
-
-
-def _scenes(bench: Bench, trace: Trace) -> list[MadeScene]:
-    """What a method made of every trial."""
-    data, axes = trace.signal.data.reshape(-1, *trace.signal.data.shape[-2:]), trace.signal.axes
-    if not trace.estimates:
-        return [MadeScene(*(Signal(image, axes),) * 3) for image in data]
-    (estimate,) = trace.estimates.values()
-    info = {name: x.reshape(len(data), *x.shape[len(trace.signal.trials) :]) for name, x in estimate.info.items()}
-    values = [estimate.value[key].reshape(len(data), -1) for key in TRUTHS]
-    std, ok = estimate.std["u_r_m_s"].reshape(len(data), -1), estimate.ok.reshape(len(data), -1)
-    scenes = []
-    for i, image in enumerate(data):
-        there = (info["level"][i] > 0).nonzero()[:, 0].tolist()
-        motions = [PointMotion(*(x[i, j] for x in values), bench.radar.speed_m_s) for j in there]
-        targets = [FoundTarget(m, float(std[i, j]), bool(ok[i, j])) for m, j in zip(motions, there, strict=True)]
-        images = (info["conventional"][i], info["rest"][i], image)
-        scenes.append(MadeScene(*(Signal(x, axes) for x in images), targets))
-    return scenes
 
 
 def _stacked(rows: Sequence[Mapping[str, float]]) -> dict[str, Tensor]:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
 from torchsar.core import Chain, Draws, Trace
 from torchsar.metrics import contrast, entropy, phase_rmse, residual_phase, strehl
-from torchsar.metrics.bounds import pulse_phase_bound_of_scene_rad, pulse_phase_bound_rad
-from torchsar.radar import InverseRadar
+from torchsar.metrics.bounds import pulse_phase_bound_of_scene_rad, pulse_phase_bound_rad, turntable_responses
 from torchsar.scene import PhaseOnly
 from torchsar.study.trials.batch import IMAGE, Batch, Judged, Trials
 from torchsar.study.trials.bench import Bench
@@ -26,7 +23,7 @@ def judge(bench: Bench, name: str, trace: Trace, trials: Trials) -> Judged:
     truth = torch.zeros_like(true) if clean else true
     found = estimated_phase(chain, trace, true)
     residual = residual_phase(found, truth, present)
-    metrics = {"residual_phase_rms_rad": phase_rmse(found, truth, present), "strehl": strehl_over(residual, present)}
+    metrics = {"residual_phase_rms_rad": phase_rmse(found, truth, present), "strehl": strehl(residual, present)}
     for estimate in trace.estimates.values():
         if "phase_rad" in estimate.std:
             metrics["residual_phase_std_rad"] = estimate.std["phase_rad"].mean(-1)
@@ -83,14 +80,6 @@ def estimated_phase(chain: Chain, trace: Trace, like: Tensor) -> Tensor:
     return sum((phase.to(torch.float64).reshape(like.shape) for phase in found), torch.zeros_like(like))
 
 
-def strehl_over(residual: Tensor, present: Tensor | None) -> Tensor:
-    """Strehl ratio over the pulses that were received."""
-    if present is None:
-        return strehl(residual)
-    counted = torch.where(present, torch.polar(torch.ones_like(residual), residual), 0).sum(-1)
-    return (counted.abs() / present.sum(-1).clamp_min(1)).square()
-
-
 def _bound_ratio(bench: Bench) -> float | None:
     """Bound of unknown amplitudes over that of a known scene, from the scene of an address of its
     own; None where it would take too long.
@@ -101,20 +90,7 @@ def _bound_ratio(bench: Bench) -> float | None:
     if not isinstance(world.fidelity, PhaseOnly) or not few:
         return None
     rate = float((radar.rotation_rad_s if world.rotation_rad_s is None else world.rotation_rad_s) or 0.0)
-    azimuth, response = _scene_matrices(radar, rate, scene.azimuth_m, scene.range_m, size.pulses, size.samples)
+    azimuth, response = turntable_responses(radar, rate, scene.azimuth_m, scene.range_m, size.pulses, size.samples)
     power = ((azimuth * scene.amplitude) @ response).abs().square().mean()
     whole = pulse_phase_bound_of_scene_rad(azimuth, response, scene.amplitude, 1.0)
     return float(whole / pulse_phase_bound_rad(power, size.samples))
-
-
-def _scene_matrices(
-    radar: InverseRadar, rate: float, x: Tensor, y: Tensor, pulses: int, samples: int
-) -> tuple[Tensor, Tensor]:
-    """Azimuth phasors (pulse, target) and range responses (target, range) of scatterers."""
-    theta = rate * (torch.arange(pulses, dtype=torch.float64) - pulses // 2) / radar.prf_hz
-    ranges = x * torch.sin(theta)[:, None] + y * (torch.cos(theta)[:, None] - 1)
-    azimuth = torch.polar(torch.ones_like(ranges), -4 * math.pi / radar.wavelength_m * ranges)
-    cells = torch.arange(samples, dtype=torch.float64) - samples // 2
-    shifts = -2 * math.pi / samples * (y / radar.range_step_m)[:, None] * cells
-    back = 2 * math.pi / samples * cells[:, None] * cells
-    return azimuth, torch.polar(torch.ones_like(shifts), shifts) @ torch.polar(torch.ones_like(back), back) / samples
