@@ -1,6 +1,7 @@
 """Descriptions of instruments: radars and ladars, their geometry, timing, orbits and waveforms."""
 
 from torchsar.radar.bistatic import BistaticRadar, polynomial_range, receive_range
+from torchsar.radar.ephemeris import Ephemeris
 from torchsar.radar.inverse import InverseRadar
 from torchsar.radar.ladar import TriangularLadar, sweep_middles
 from torchsar.radar.orbit import Orbit, orbit_range, range_coefficients, seen_point
@@ -20,6 +21,7 @@ from torchsar.radar.waveform import LinearFM
 __all__ = [
     "LIGHT_M_S",
     "BistaticRadar",
+    "Ephemeris",
     "FarField",
     "InverseRadar",
     "LinearFM",
