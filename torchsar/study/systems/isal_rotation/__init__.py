@@ -21,12 +21,12 @@ from torchsar.radar import InverseRadar
 from torchsar.study.names.factories import with_wavelength
 from torchsar.study.names.registry import TARGET_IMPAIRMENTS
 from torchsar.study.output.pictures import Drawn
-from torchsar.study.settings.errors import ConfigError
 from torchsar.study.systems.isal_rotation import choices, figures
 from torchsar.study.systems.isal_rotation.world import Rotating
 from torchsar.study.trials.batch import IMAGE, Batch, Judged, Outcome, Result, Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.system import Choice, Column, System
+from torchsar.study.trials.choice import Choice
+from torchsar.study.trials.system import Column, System
 
 # an image of a wrong rotation is one with so much less entropy than the right one, and k1 so far off
 _TRAP_NATS, _TRAP_PERCENT = 0.005, 1.0
