@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
@@ -117,7 +117,6 @@ class ToneSystem(System):
     about = "a tone in noise, its frequency estimated"
     Radar = Receiver
     World = Tone
-    stages = Catalogue("stage", "stage", {"strongest_line": StrongestLine}, ["radar"], ["strongest_line.padding"])
     tolerance = {"grid_error_hz": 0.05}
     exact = {"strongest_line.padding": {"padding": 64}}
     definitions = {
@@ -130,6 +129,10 @@ class ToneSystem(System):
         "ok": Column("share of trials called reliable"),
         "seconds": Column("time of a trial", "s"),
     }
+
+    @cached_property
+    def stages(self) -> Catalogue:
+        return Catalogue("stage", "stage", {"strongest_line": StrongestLine}, ["radar"], ["strongest_line.padding"])
 
     def samples(self, world: Tone, radar: Receiver) -> int:
         return world.samples
@@ -161,8 +164,8 @@ class ToneSystem(System):
         return {Limit("SNR of the spectrum", peak, DETECTION_DB, "dB", "refuse", *said, True): list(bench.chains)}
 
     def requirements(self, bench: Bench) -> Sequence[Requirement]:
-        far = [stage.padding for chain in bench.chains.values() for stage in chain.stages.values()]
-        said = "phase over the record between tone and nearest line", math.pi / (2 * min(far)), math.nan, math.pi / 4
+        least = min(entry["padding"] for m in bench.config.processor.values() for entry in (m.stages or {}).values())
+        said = "phase over the record between tone and nearest line", math.pi / (2 * least), math.nan, math.pi / 4
         return [Requirement("lines of the spectrum", *said, "raise the padding")]
 
     def choices(self, bench: Bench) -> Sequence[Choice]:

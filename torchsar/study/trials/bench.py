@@ -202,10 +202,8 @@ class Bench:
                 raise ValueError(f"the method {method.rerun.method!r}, part of which is run again, failed")
             given = {k: torch.tensor(v, dtype=torch.float64, device=self.device) for k, v in method.rerun.given.items()}
             began = time.perf_counter()
-            image = chain.rerun(source, method.rerun.start, given=given)
-            spent = {"rerun": time.perf_counter() - began}
-            outputs = {list(chain.stages)[-1]: image}
-            return Trace({}, outputs, {}, {**source.values, **given}, spent, {}), {}, spent
+            again = chain.retrace(source, method.rerun.start, given)
+            return again, {}, {"rerun": time.perf_counter() - began}
         shared = self._shared(method, earlier)
         held = {f"{stage}.{key}": value for stage, e in shared.estimates.items() for key, value in e.value.items()}
         true = {f"given.{key}": trials.truth[key] for key in true_names(chain)}
@@ -220,7 +218,9 @@ class Bench:
         for name, outcome in earlier.items():
             other = self.config.processor[name]
             if other.input == method.input and other.stages and not outcome.failed:
-                same = takewhile(lambda pair: pair[0] == pair[1], zip(method.stages.items(), other.stages.items()))
+                same = takewhile(
+                    lambda pair: pair[0] == pair[1], zip((method.stages or {}).items(), other.stages.items())
+                )
                 common = [stage for (stage, _), _ in same]
                 best, found = (common, outcome) if len(common) > len(best) else (best, found)
         kept = {stage: e for stage, e in found.estimates.items() if stage in best and stage in found.reusable}

@@ -118,6 +118,10 @@ class System(ABC):
     address: ClassVar[str | int] = "run"
     peak: ClassVar[float] = 8.0
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Other processes make the system anew from its class, which is all that there is of it."""
+        return type(self), ()
+
     @cached_property
     def sections(self) -> dict[str, Section]:
         return {"radar": Section(self.Radar), "world": Section(self.World), "metrics": Section(self.Judging)}
@@ -180,12 +184,11 @@ class System(ABC):
         """What the estimators of a method found, by `stage.value`."""
         n, table = trials.count, {}
         for stage, estimate in outcome.estimates.items():
+            ok = estimate.ok.expand(n) if estimate.ok.numel() in (1, n) else None
             for key, value in estimate.value.items():
                 std = estimate.std.get(key)
-                ok = estimate.ok.expand(n) if estimate.ok.numel() in (1, n) else None
-                table[f"{stage}.{key}"] = Found(
-                    *(None if x is None else per_trial_first(x, n) for x in (value, std)), ok
-                )  # pyright: ignore[reportArgumentType]
+                spread = None if std is None else per_trial_first(std, n)
+                table[f"{stage}.{key}"] = Found(per_trial_first(value, n), spread, ok)
         return table
 
     def limits(self, bench: Bench) -> Mapping[Limit, Sequence[str]]:
