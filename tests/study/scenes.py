@@ -24,12 +24,12 @@ _TRUE_FOCUS = {
 STRIPMAP: dict = {
     **TINY,
     "system": "stripmap",
-    "world": {**TINY["world"], "doppler_hz": 12.0},
+    "world": {**TINY["world"], "doppler_hz": 4.0},
     "processor": {
         **TINY["processor"],
         "clean": {"input": "clean", "oracle": True, "stages": {"focus": _TRUE_FOCUS}},
         "squint_ignored": {
-            "rerun": {"method": "recommended", "start": "focus", "given": {"doppler.doppler_baseband_hz": 6.0}}
+            "rerun": {"method": "recommended", "start": "focus", "given": {"doppler.doppler_baseband_hz": 12.0}}
         },
     },
     "metrics": {"reference": "clean", "published": {"targets_found": {"one": {"recommended": "all"}}}},
