@@ -19,7 +19,7 @@ from torchsar.echo import apply_impairments
 from torchsar.study.settings.errors import ConfigError, one_line
 from torchsar.study.settings.sections import Loaded, Method
 from torchsar.study.trials.auto import resolved
-from torchsar.study.trials.batch import Batch, Judged, Outcome, Trials, not_an_image, verdict
+from torchsar.study.trials.batch import Batch, Judged, Outcome, Trials, fault_of_image, verdict
 from torchsar.study.trials.chains import build_chains, true_names, unknown_attribute
 
 log = logging.getLogger("torchsar")
@@ -166,10 +166,10 @@ class Bench:
     ) -> Outcome:
         try:
             trace, estimates, seconds = self._run(name, method, trials, earlier)
-            if detail and self.system.ending and trace.signal.names not in self.system.images:
-                raise ConfigError(
-                    f"processor.{name}, {not_an_image(trace.signal, self.system.ending)} (a sweep needs none)"
-                )
+            system = self.system
+            fault = fault_of_image(trace.signal, system.images, system.ending) if detail and system.ending else ""
+            if fault:
+                raise ConfigError(f"processor.{name}, {fault}")
             judged = self.system.judge(self, name, replace(trace, estimates=estimates), trials, detail)
         except AttributeError as error:
             raise ConfigError(
