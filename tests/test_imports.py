@@ -1,10 +1,11 @@
-"""What may import what, and what the package needs."""
+"""What may import what, what the package needs, and how large `study` may be."""
 
 from __future__ import annotations
 
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -40,15 +41,29 @@ def _module(path: Path) -> str:
     return ".".join(part for part in parts if part != "__init__")
 
 
+@cache
+def _nodes(path: Path) -> list[ast.AST]:
+    return list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+
+
+@cache
 def _imports(path: Path) -> set[str]:
     found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in _nodes(path):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative imports hide what is imported"
             found |= {f"{node.module}.{alias.name}" for alias in node.names} | {node.module or ""}
     return found
+
+
+# study/ from the ground up: a floor imports itself and what stands below it
+FLOORS = ("settings", "names", "output", "montecarlo", "trials", "systems", "commands", "table")
+# a system that builds on another one, by name
+SHARED = {"isal_rotation": {"isal"}, "geo_ocean": {"geo"}}
+# statements that `study`, and its systems alone, may have at most
+MOST_STATEMENTS = {"torchsar.study": 6500, "torchsar.study.systems": 3500}
 
 
 def test_core_and_stages_need_only_torch_and_numpy() -> None:
@@ -93,3 +108,101 @@ def test_only_plot_imports_matplotlib() -> None:
     for path in PACKAGE.rglob("*.py"):
         if path.name != "plot.py":
             assert not any(name.startswith("matplotlib") for name in _imports(path)), path
+
+
+class _Study:
+    """The modules of `study` with what each of them imports, lazily in functions or for types alone
+    included.
+    """
+
+    def __init__(self) -> None:
+        self.paths = {_module(path): path for path in sorted((PACKAGE / "study").rglob("*.py"))}
+        self.imports = {name: self._of(name) for name in self.paths}
+
+    def _of(self, name: str) -> set[str]:
+        """A package that only hands out its own submodules is not itself imported by them."""
+        found = set()
+        for node in _nodes(self.paths[name]):
+            if isinstance(node, ast.Import):
+                found |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                below = {f"{node.module}.{alias.name}" for alias in node.names}
+                modules = below & set(self.paths)
+                found |= modules if modules == below else {*modules, node.module or ""}
+        return {module for module in found if module.startswith("torchsar.")} - {name}
+
+    def circle(self) -> list[str]:
+        """Modules that import each other around, empty where there are none."""
+        done: set[str] = set()
+
+        def walk(name: str, way: list[str]) -> list[str]:
+            if name in way:
+                return [*way[way.index(name) :], name]
+            if name in done:
+                return []
+            found = (walk(other, [*way, name]) for other in sorted(self.imports[name] & set(self.paths)))
+            circle = next((circle for circle in found if circle), [])
+            done.add(name)
+            return circle
+
+        return next((circle for circle in (walk(name, []) for name in self.paths) if circle), [])
+
+
+STUDY = _Study()
+
+
+def _floor(module: str) -> str:
+    return module.split(".")[2] if module.count(".") > 1 else "face"
+
+
+def test_study_has_no_import_circle() -> None:
+    assert not STUDY.circle(), " -> ".join(STUDY.circle())
+
+
+def test_a_circle_would_be_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    imports = dict(STUDY.imports)
+    imports["torchsar.study.settings.errors"] = {"torchsar.study.table"}
+    monkeypatch.setattr(STUDY, "imports", imports)
+    assert STUDY.circle()[0] == STUDY.circle()[-1] and "torchsar.study.settings.errors" in STUDY.circle()
+
+
+def test_study_imports_go_downward() -> None:
+    """The face, `torchsar.study` itself, hands out names of `montecarlo` and stands on top."""
+    order = {floor: i for i, floor in enumerate((*FLOORS, "face"))}
+    for name, imports in STUDY.imports.items():
+        for other in imports:
+            assert not other.startswith("torchsar.cli"), f"{name} imports the command line"
+            if other.startswith("torchsar.study"):
+                assert order[_floor(other)] <= order[_floor(name)], f"{name} imports {other}, which stands above it"
+
+
+def test_only_the_table_names_the_systems() -> None:
+    for name, imports in STUDY.imports.items():
+        for other in (one for one in imports if _floor(one) == "systems"):
+            system, used = (one.split(".")[3] for one in (name, other)) if _floor(name) == "systems" else ("", other)
+            assert used in {system} | SHARED.get(system, set()), f"{name} imports {other}"
+    shown = {floor: {name for name in STUDY.paths if _floor(name) == floor} for floor in FLOORS}
+    for name in set().union(*shown.values()) - shown["table"] - shown["systems"]:
+        assert "torchsar.study.systems." not in STUDY.paths[name].read_text(encoding="utf-8"), name
+
+
+def test_the_monte_carlo_loop_knows_no_physics() -> None:
+    for name, imports in STUDY.imports.items():
+        if _floor(name) == "montecarlo":
+            outside = {
+                one for one in imports if not one.startswith(("torchsar.study", "torchsar.core", "torchsar.plot"))
+            }
+            assert not outside and "torchsar.study.names" not in {one.rpartition(".")[0] for one in imports}, name
+
+
+def test_types_come_by_plain_imports() -> None:
+    """An import for types alone would hide a circle; the face needs one to stay lazy."""
+    for name, path in STUDY.paths.items():
+        assert ("TYPE_CHECKING" in path.read_text(encoding="utf-8")) == (name == "torchsar.study"), name
+
+
+@pytest.mark.parametrize("package", MOST_STATEMENTS)
+def test_study_keeps_to_its_size(package: str) -> None:
+    counted = [path for name, path in STUDY.paths.items() if f"{name}.".startswith(f"{package}.")]
+    count = sum(isinstance(node, ast.stmt) for path in counted for node in _nodes(path))
+    assert count <= MOST_STATEMENTS[package], f"{package} has {count} statements"

@@ -213,15 +213,41 @@ class Chain(nn.Module):
         Raises:
             KeyError: If a stage or a given value has an unknown name.
         """
+        part, values = self._part(trace, start, stop, given)
+        return self._run(part, trace.inputs[start], values, set(given or {}), None)
+
+    def retrace(self, trace: Trace, start: str, given: Mapping[str, Tensor] | None = None) -> Trace:
+        """Repeat the stages from one of them to the end and return every intermediate result.
+
+        Args:
+            trace: Result of `trace`.
+            start: Name of the first stage to repeat.
+            given: Values by name that replace those of the trace.
+
+        Returns:
+            Signals before `start` as in `trace`, and all results of the repeated stages.
+
+        Raises:
+            KeyError: If a stage or a given value has an unknown name.
+        """
+        part, values = self._part(trace, start, None, given)
+        log = _Log(*({k: x for k, x in of.items() if k not in part} for of in (trace.inputs, trace.outputs)))
+        self._run(part, trace.inputs[start], values, set(given or {}), log)
+        return Trace(log.inputs, log.outputs, log.estimates, values, log.seconds, log.bytes)
+
+    def _part(
+        self, trace: Trace, start: str, stop: str | None, given: Mapping[str, Tensor] | None
+    ) -> tuple[list[str], dict[str, Tensor]]:
+        """The stages that a rerun repeats, and the values that it starts with."""
         names = list(self.stages)
         for name in (start, stop or start):
             if name not in names:
                 raise KeyError(f"the chain has the stages {names}, not {name!r}")
-        part = names[names.index(start) : names.index(stop) + 1 if stop else None]
         unknown = set(given or {}) - set(trace.values)
         if unknown:
             raise KeyError(f"given {sorted(unknown)}, but the trace holds the values {sorted(trace.values)}")
-        return self._run(part, trace.inputs[start], {**trace.values, **(given or {})}, set(given or {}), None)
+        part = names[names.index(start) : names.index(stop) + 1 if stop else None]
+        return part, {**trace.values, **(given or {})}
 
     def _refuse_unknown(self, given: Mapping[str, Tensor] | None, aux: Mapping[str, Tensor]) -> None:
         """Reject given values that no stage provides or uses and no recording holds."""

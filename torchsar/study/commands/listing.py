@@ -23,6 +23,8 @@ def listing(systems: Mapping[str, System]) -> str:
     for name, system in systems.items():
         parts.append(f"  {name:<25}{system.about}")
         parts += [f"  {'':<25}  {section}: {_keys(keys)}" for section, keys in system.sections.items()]
+        own = [stage for stage in system.stages.entries if stage not in stages().entries]
+        parts += [f"  {'':<25}  stage {stage}: {_keys(system.stages.sections[stage])}" for stage in own]
     for group in (*GROUPS, "own"):
         names = [name for name in stages().entries if group_of(name) == group]
         parts += ["", f"STAGES, {group}", *(_line(stages(), name) for name in names)] if names else []

@@ -17,7 +17,7 @@ from torchsar.study.settings.errors import ConfigError, one_line
 from torchsar.study.settings.sections import Loaded
 from torchsar.study.trials.auto import cheapest, choices_of, tolerance_of, within
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.system import Choice
+from torchsar.study.trials.choice import Choice
 
 log = logging.getLogger("torchsar")
 FILES = ("config.yaml", "requires.json", "requires.txt")

@@ -24,7 +24,7 @@ from torchsar.study.settings.errors import ConfigError, one_line
 from torchsar.study.settings.sections import Loaded
 from torchsar.study.trials.auto import choices_of, tolerance_of, within
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.system import EXACT_DB, Alternative, Choice, Measured
+from torchsar.study.trials.choice import EXACT_DB, Alternative, Choice, Measured
 
 log = logging.getLogger("torchsar")
 FILES = ("config.yaml", "trade.json", "trade.txt", "figures")

@@ -89,6 +89,6 @@ def within(signal: Signal, spans: Mapping[str, tuple[float, float]]) -> Signal:
     for axis in signal.axes:
         if axis.name in spans:
             first, last = (round(float(axis.index_of(edge))) for edge in spans[axis.name])
-            first = min(max(first, 0), axis.n - 2)
+            first = min(max(first, 0), max(axis.n - 2, 0))
             cut[axis.name] = (first, min(max(last + 1, first + 2), axis.n))
     return signal.crop(**cut)

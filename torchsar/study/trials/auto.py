@@ -8,7 +8,7 @@ from typing import Any
 from torchsar.study.settings.errors import ConfigError, one_line
 from torchsar.study.settings.sections import Config, Loaded
 from torchsar.study.settings.signature import AUTO
-from torchsar.study.trials.system import Alternative, Choice
+from torchsar.study.trials.choice import Alternative, Choice
 
 
 def tolerance_of(loaded: Loaded) -> dict[str, float]:

@@ -120,7 +120,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Found:
-    """One estimate: value and predicted standard deviation (trial, ...), and verdict (trial,)."""
+    """An estimate by name: value and predicted standard deviation (trial, ...), `ok` (trial,)."""
 
     value: Tensor
     std: Tensor | None
@@ -182,6 +182,13 @@ def image_of(signal: Signal, trial: int = 0) -> Signal:
     return signal.with_data(signal.data.reshape(-1, *signal.data.shape[len(signal.trials) :])[trial])
 
 
-def not_an_image(signal: Signal, ending: str) -> str:
-    """What is wrong with a last signal that is no image."""
-    return f"whose last stage gives the axes {signal.names}, not an image {IMAGE}; end its chain with {ending}"
+def fault_of_image(signal: Signal, images: Sequence[tuple[str, ...]], ending: str) -> str:
+    """What is wrong with a last signal as an image; empty where nothing is."""
+    if signal.names not in images:
+        return (
+            f"whose last stage gives the axes {signal.names}, not an image {IMAGE}; end its chain with {ending} (a "
+            "sweep needs none)"
+        )
+    odd = [axis.name for axis in signal.axes if not math.isfinite(axis.step * axis.n)]
+    said = "; check the carrier, the pulse rate and the rotation of the radar"
+    return f"whose image has cells of infinite size along {odd[0]}{said}" if odd else ""

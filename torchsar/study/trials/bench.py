@@ -19,7 +19,7 @@ from torchsar.echo import apply_impairments
 from torchsar.study.settings.errors import ConfigError, one_line
 from torchsar.study.settings.sections import Loaded, Method
 from torchsar.study.trials.auto import resolved
-from torchsar.study.trials.batch import Batch, Judged, Outcome, Trials, not_an_image, verdict
+from torchsar.study.trials.batch import Batch, Judged, Outcome, Trials, fault_of_image, verdict
 from torchsar.study.trials.chains import build_chains, true_names, unknown_attribute
 
 log = logging.getLogger("torchsar")
@@ -166,10 +166,10 @@ class Bench:
     ) -> Outcome:
         try:
             trace, estimates, seconds = self._run(name, method, trials, earlier)
-            if detail and self.system.ending and trace.signal.names not in self.system.images:
-                raise ConfigError(
-                    f"processor.{name}, {not_an_image(trace.signal, self.system.ending)} (a sweep needs none)"
-                )
+            system = self.system
+            fault = fault_of_image(trace.signal, system.images, system.ending) if detail and system.ending else ""
+            if fault:
+                raise ConfigError(f"processor.{name}, {fault}")
             judged = self.system.judge(self, name, replace(trace, estimates=estimates), trials, detail)
         except AttributeError as error:
             raise ConfigError(
@@ -202,10 +202,8 @@ class Bench:
                 raise ValueError(f"the method {method.rerun.method!r}, part of which is run again, failed")
             given = {k: torch.tensor(v, dtype=torch.float64, device=self.device) for k, v in method.rerun.given.items()}
             began = time.perf_counter()
-            image = chain.rerun(source, method.rerun.start, given=given)
-            spent = {"rerun": time.perf_counter() - began}
-            outputs = {list(chain.stages)[-1]: image}
-            return Trace({}, outputs, {}, {**source.values, **given}, spent, {}), {}, spent
+            again = chain.retrace(source, method.rerun.start, given)
+            return again, {}, {"rerun": time.perf_counter() - began}
         shared = self._shared(method, earlier)
         held = {f"{stage}.{key}": value for stage, e in shared.estimates.items() for key, value in e.value.items()}
         true = {f"given.{key}": trials.truth[key] for key in true_names(chain)}
@@ -220,7 +218,9 @@ class Bench:
         for name, outcome in earlier.items():
             other = self.config.processor[name]
             if other.input == method.input and other.stages and not outcome.failed:
-                same = takewhile(lambda pair: pair[0] == pair[1], zip(method.stages.items(), other.stages.items()))
+                same = takewhile(
+                    lambda pair: pair[0] == pair[1], zip((method.stages or {}).items(), other.stages.items())
+                )
                 common = [stage for (stage, _), _ in same]
                 best, found = (common, outcome) if len(common) > len(best) else (best, found)
         kept = {stage: e for stage, e in found.estimates.items() if stage in best and stage in found.reusable}

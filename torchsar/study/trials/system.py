@@ -1,27 +1,26 @@
-"""What a system defines: sections of its configs, world, judge, bounds, limits, alternatives."""
+"""What a system brings: the sections of its configs, its world, its judge and what it may choose."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from functools import cached_property, partial
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from torchsar.core import Draws, Recording, Signal, Trace
+from torchsar.focus.ladar_requirements import Limit
+from torchsar.focus.requirements import Requirement
 from torchsar.study.names.registry import stages
-from torchsar.study.output.pictures import Drawn
+from torchsar.study.output.pictures import Drawn, comparisons
 from torchsar.study.settings.sections import Loaded
 from torchsar.study.settings.signature import Catalogue, Section
 from torchsar.study.trials.batch import IMAGE, Batch, Found, Judged, Outcome, Result, Trials
-
-if TYPE_CHECKING:
-    from torchsar.focus.ladar_requirements import Limit
-    from torchsar.focus.requirements import Requirement
-    from torchsar.study.trials.bench import Bench
+from torchsar.study.trials.bench import Bench
+from torchsar.study.trials.choice import Choice
 
 
 @dataclass(frozen=True)
@@ -51,6 +50,19 @@ class World:
 
 
 @dataclass(frozen=True)
+class Judging:
+    """Section `metrics` of the systems that need no more: how results are judged.
+
+    Args:
+        reference: The method whose image of the same scene is the ideal one.
+        published: Figure -> case -> method -> what the source published.
+    """
+
+    reference: str | None = None
+    published: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Column:
     """A figure as reports and pictures show it.
 
@@ -65,62 +77,6 @@ class Column:
     unit: str = ""
     digits: int = 3
     drawn: str = ""
-
-
-@dataclass(frozen=True)
-class Alternative:
-    """One way to do what a choice is about.
-
-    Args:
-        name: For tables.
-        keys: What stands in the config for it, in the mapping that the choice is made in.
-        loss: Predicted loss by metric; None where nothing is predicted.
-        neglects: What it leaves out.
-    """
-
-    name: str
-    keys: Mapping[str, Any] = field(default_factory=dict)
-    loss: Mapping[str, float] | None = None
-    neglects: str = ""
-
-
-# levels below this are differences of rounding at most
-EXACT_DB = -280.0
-
-
-@dataclass(frozen=True)
-class Measured:
-    """How the alternatives of a choice are compared.
-
-    Args:
-        run: Does the work of one alternative, which is timed; the yardstick is run as well.
-        loss: Loss by metric of a result of `run`, against the yardstick.
-        share: Share of the whole work that `run` does of an alternative; times are divided by it.
-    """
-
-    run: Callable[[Alternative], Any]
-    loss: Callable[[Alternative, Any], Mapping[str, float]]
-    share: Callable[[Alternative], float] = lambda alternative: 1.0
-
-
-@dataclass(frozen=True)
-class Choice:
-    """A decision that a config takes, with its alternatives from the cheapest to the best one.
-
-    Args:
-        name: For tables.
-        at: Where `auto` may be written: a dotted key of the world such as `world.fidelity`, or
-            `stage`, or `STAGE.key` for a key of stages of that name.
-        alternatives: The cheapest first, the best one last.
-        measured: Prepares their comparison, which may take long.
-        yardstick: What they are compared with, where that is none of them.
-    """
-
-    name: str
-    at: str
-    alternatives: Sequence[Alternative]
-    measured: Callable[[], Measured] | None = None
-    yardstick: Alternative | None = None
 
 
 class System(ABC):
@@ -148,7 +104,7 @@ class System(ABC):
     about: ClassVar[str]
     Radar: ClassVar[Callable[..., Any]]
     World: ClassVar[Callable[..., Any]]
-    Judging: ClassVar[Callable[..., Any]]
+    Judging: ClassVar[Callable[..., Any]] = Judging
     impairments: ClassVar[Catalogue] = Catalogue("impairment", "kind", {})
     reads: ClassVar[str] = ""
     ending: ClassVar[str] = ""
@@ -161,6 +117,10 @@ class System(ABC):
     images: ClassVar[Sequence[tuple[str, ...]]] = (IMAGE,)
     address: ClassVar[str | int] = "run"
     peak: ClassVar[float] = 8.0
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Other processes make the system anew from its class, which is all that there is of it."""
+        return type(self), ()
 
     @cached_property
     def sections(self) -> dict[str, Section]:
@@ -224,12 +184,11 @@ class System(ABC):
         """What the estimators of a method found, by `stage.value`."""
         n, table = trials.count, {}
         for stage, estimate in outcome.estimates.items():
+            ok = estimate.ok.expand(n) if estimate.ok.numel() in (1, n) else None
             for key, value in estimate.value.items():
                 std = estimate.std.get(key)
-                ok = estimate.ok.expand(n) if estimate.ok.numel() in (1, n) else None
-                table[f"{stage}.{key}"] = Found(
-                    *(None if x is None else per_trial_first(x, n) for x in (value, std)), ok
-                )  # pyright: ignore[reportArgumentType]
+                spread = None if std is None else per_trial_first(std, n)
+                table[f"{stage}.{key}"] = Found(per_trial_first(value, n), spread, ok)
         return table
 
     def limits(self, bench: Bench) -> Mapping[Limit, Sequence[str]]:
@@ -246,7 +205,7 @@ class System(ABC):
 
     def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
         """Makers of the pictures of a run, in the order of reading; results by case."""
-        yield from ()
+        yield partial(comparisons, results, self.columns)
 
     def pictured(self, result: Result) -> dict[str, Signal]:
         """The images of a case that are kept, those of the first trial, by path."""

@@ -35,7 +35,8 @@ from torchsar.study.systems.geo.radar import bistatic_radar
 from torchsar.study.systems.geo.world import TRUTHS, Points, compression_gain_db
 from torchsar.study.trials.batch import Batch, Found, Judged, Outcome, Result, Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.system import Choice, Column, System
+from torchsar.study.trials.choice import Choice
+from torchsar.study.trials.system import Column, System
 
 # Doppler bands that hold clutter seen through a pattern
 _CLUTTER_BANDS = 5

@@ -49,7 +49,7 @@ from torchsar.scene.moving import ReceiveRange
 from torchsar.study.systems.geo.world import Level, Points
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.system import Alternative, Choice, Measured
+from torchsar.study.trials.choice import Alternative, Choice, Measured
 
 _ESTIMATORS: dict[type, Estimator] = {
     SignalIntensityRatio: "sir",

@@ -27,7 +27,8 @@ from torchsar.study.systems.geo_ocean import choices, figures
 from torchsar.study.systems.geo_ocean.world import TRUTHS, Ocean
 from torchsar.study.trials.batch import Found, Judged, Outcome, Result, Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.system import Choice, Column, System
+from torchsar.study.trials.choice import Choice
+from torchsar.study.trials.system import Column, System
 
 # the largest tensors of a frame over its raw data: images of twice the lines, and segments of ships
 _PEAK = 40.0

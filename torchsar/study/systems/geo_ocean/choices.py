@@ -30,7 +30,7 @@ from torchsar.multichannel.stationary import two_way_radar
 from torchsar.scene import BandLimited, MovingPoints
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.system import Alternative, Choice, Measured
+from torchsar.study.trials.choice import Alternative, Choice, Measured
 
 # integration time (s) of the source, for scenes that are seen through a pattern
 _PATTERN_S = 4.5

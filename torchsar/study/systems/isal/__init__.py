@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -29,24 +29,12 @@ from torchsar.study.systems.isal.judge import received, whole_phase
 from torchsar.study.systems.isal.world import Target, echo_choice
 from torchsar.study.trials.batch import Batch, Judged, Result, Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.system import Alternative, Choice, Column, Measured, System
+from torchsar.study.trials.choice import Alternative, Choice, Measured
+from torchsar.study.trials.system import Column, System
 
 _GEOMETRY = ("frequency_hz", "angle_rad", "position_m", "reference_m")
 # iterations of `autofocus`: its own 120 and 20, and what less gives
 _EFFORTS = ((0, 5), (10, 5), (30, 10), (120, 10), (120, 20))
-
-
-@dataclass(frozen=True)
-class Judging:
-    """How images are judged.
-
-    Args:
-        reference: The method whose image of the same scene is the ideal one.
-        published: Figure -> case -> method -> what the source published.
-    """
-
-    reference: str | None = None
-    published: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
 
 
 class Isal(System):
@@ -56,7 +44,6 @@ class Isal(System):
     about = "a turning target with a phase error in every pulse, simulated or recorded range profiles"
     Radar = staticmethod(with_wavelength(InverseRadar))
     World = Target
-    Judging = Judging
     impairments = TARGET_IMPAIRMENTS
     reads = "range profile or phase history"
     ending = "azimuth_transform or target_image"

@@ -20,7 +20,8 @@ from torchsar.scene.vibration import PulsePhase
 from torchsar.study.names.registry import FIDELITIES, MOTIONS, SCENES, START_PHASES, TARGET_IMPAIRMENTS
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.system import Alternative, Choice, Measured, Noise, World
+from torchsar.study.trials.choice import Alternative, Choice, Measured
+from torchsar.study.trials.system import Noise, World
 
 
 @dataclass(frozen=True, kw_only=True)

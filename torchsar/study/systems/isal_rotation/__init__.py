@@ -25,7 +25,8 @@ from torchsar.study.systems.isal_rotation import choices, figures
 from torchsar.study.systems.isal_rotation.world import Rotating
 from torchsar.study.trials.batch import IMAGE, Batch, Judged, Outcome, Result, Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.system import Choice, Column, System
+from torchsar.study.trials.choice import Choice
+from torchsar.study.trials.system import Column, System
 
 # a wrong rotation is one whose image has so much less entropy than the right one, with k1 so
 # far off

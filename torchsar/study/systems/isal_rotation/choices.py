@@ -32,7 +32,8 @@ from torchsar.study.systems.isal.world import echo_choice
 from torchsar.study.systems.isal_rotation.world import Rotating, first_values, k_of
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.system import Alternative, Choice, Measured, Noise
+from torchsar.study.trials.choice import Alternative, Choice, Measured
+from torchsar.study.trials.system import Noise
 
 # products of pulses, lines and range cells up to which the sum itself is the yardstick
 _EXPLICIT = 3e8

@@ -35,7 +35,8 @@ from torchsar.study.systems.sal import figures, limits
 from torchsar.study.systems.sal.world import Ground
 from torchsar.study.trials.batch import IMAGE, Batch, Judged, Result, Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.system import Choice, Column, System
+from torchsar.study.trials.choice import Choice
+from torchsar.study.trials.system import Column, System
 
 log = logging.getLogger("torchsar")
 # stages that work on deramped profiles, and cannot tell whether they are

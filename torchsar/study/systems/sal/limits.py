@@ -33,7 +33,8 @@ from torchsar.scene.ladar import Effect
 from torchsar.scene.vibration import displacement_m
 from torchsar.study.systems.sal.world import Ground
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.system import Alternative, Choice, Measured, Noise
+from torchsar.study.trials.choice import Alternative, Choice, Measured
+from torchsar.study.trials.system import Noise
 
 # derivatives of the motion are differences on so many times a period, on as many times as fit here
 _TIMES_A_PERIOD, _MOST_TIMES = 16, 1 << 22

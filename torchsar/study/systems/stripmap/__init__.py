@@ -25,7 +25,8 @@ from torchsar.study.systems.stripmap.choices import Probe, choices
 from torchsar.study.systems.stripmap.world import Strip
 from torchsar.study.trials.batch import Batch, Judged, Outcome, Result, Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.system import Choice, Column, System
+from torchsar.study.trials.choice import Choice
+from torchsar.study.trials.system import Column, System
 
 
 class Stripmap(System):

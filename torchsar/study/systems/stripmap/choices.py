@@ -22,7 +22,7 @@ from torchsar.repair.jitter import BandLimited, Exact, Lagrange
 from torchsar.scene import Dwell, Hyperbola, Parabola, Points, StripmapWorld
 from torchsar.study.names.registry import FOCUS
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.system import Alternative, Choice, Measured
+from torchsar.study.trials.choice import Alternative, Choice, Measured
 
 # half of the lines and cells of the patches on which images are compared: they hold the main lobe
 # and a dozen side lobes at any usual sampling
