@@ -18,7 +18,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import nn
-from torchsar.study.sal.judge import Course, course_of, finer_in_range, motion_metrics
 
 from torchsar import plot
 from torchsar.compensate import CorrectPulsePhase
@@ -34,6 +33,7 @@ from torchsar.core import Axis, Chain, Draws, Recording, Signal, Stage, Trace, T
 from torchsar.echo import simulate_ladar_record
 from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
 from torchsar.metrics import contrast, entropy, impulse_response
+from torchsar.metrics.radial_motion import Course, course_of, finer_in_range
 from torchsar.radar import LIGHT_M_S, TriangularLadar
 from torchsar.repair import BlankTurningPoints, CircularShift, SplitSweeps
 from torchsar.scene import (
@@ -146,7 +146,7 @@ def judge(trace: Trace, course: Course) -> dict[str, float]:
     found = {"entropy": entropy(trace.signal), "contrast": contrast(trace.signal, of="amplitude"), **response}
     return {
         **{name: float(x) for name, x in found.items() if name != "peak"},
-        "residual": float(motion_metrics(course, RADAR)["residual_phase_rms_rad"]),
+        "residual": float(course.metrics(RADAR)["residual_phase_rms_rad"]),
     }
 
 
@@ -300,7 +300,8 @@ def main(arguments: list[str] | None = None) -> None:
         chains = methods(radar)
         traces = {name: chain.trace(given.get(name, recording)) for name, chain in chains.items()}
         courses = {
-            name: course_of(chain, traces[name], truth, radar, clean=name == "ideal") for name, chain in chains.items()
+            name: course_of(chain, traces[name], truth.values, radar, clean=name == "ideal")
+            for name, chain in chains.items()
         }
         show({name: judge(trace, courses[name]) for name, trace in traces.items()})
         draw_separation(recording, options.out)

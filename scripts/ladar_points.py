@@ -19,8 +19,6 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from torchsar.study.cuts import impulse_cuts
-from torchsar.study.sal.judge import Course, course_of, finer_in_range, motion_metrics
 
 from torchsar import plot
 from torchsar.compensate import CorrectPulsePhase
@@ -29,6 +27,8 @@ from torchsar.core import Chain, Draws, Signal, Trace, Truth, use
 from torchsar.echo import simulate_ladar, simulate_ladar_record
 from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
 from torchsar.metrics import impulse_response
+from torchsar.metrics.cuts import impulse_cuts
+from torchsar.metrics.radial_motion import Course, course_of, finer_in_range
 from torchsar.radar import LIGHT_M_S, TriangularLadar
 from torchsar.scene import LadarWorld, Points, Polynomial, QuadraticInSweep, Sinusoid
 
@@ -186,7 +186,7 @@ def judge(image: Signal, course: Course) -> list[float]:
     left of it (rad) without constant and slope.
     """
     response = impulse_response(image, (0.0, 1.5), sidelobe_nulls=NULLS, search_m=0.2, centre_turns=(None, 0.0))
-    left = motion_metrics(course, RADAR)
+    left = course.metrics(RADAR)
     return [
         *(float(response[name]) for name in PUBLISHED),
         float(left["range_error_max_m"]),
@@ -223,7 +223,7 @@ def main(arguments: list[str] | None = None) -> None:
     recording, truth = simulate_ladar(radar, world, n_period, Draws(options.seed))
     chains = methods(radar)
     traces = {name: chain.trace(recording) for name, chain in chains.items()}
-    courses = {name: course_of(chain, traces[name], truth, radar, clean=False) for name, chain in chains.items()}
+    courses = {name: course_of(chain, traces[name], truth.values, radar, clean=False) for name, chain in chains.items()}
     columns = {
         "published": [*PUBLISHED.values(), 2e-7, math.nan],
         **{name: judge(trace.signal, courses[name]) for name, trace in traces.items()},

@@ -19,7 +19,6 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from torchsar.study.factories import rotation_and_phase
 
 from torchsar import plot
 from torchsar.compensate import autofocus, correct_pulse_phase
@@ -38,6 +37,7 @@ from torchsar.focus.matched_fourier import MatchedFourier, RangePhase
 from torchsar.metrics import contrast, entropy
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.scene import Points, PolynomialRotation, TurntableWorld
+from torchsar.study.names.factories import rotation_and_phase
 
 RADAR = InverseRadar(LIGHT_M_S / 1.55e-6, LIGHT_M_S / (2 * 0.015), 50e3)
 CUBES = Points(azimuth_m=[-0.06, -0.03, 0.0, 0.03, 0.06], range_m=[0.09, -0.12, 0.0, 0.06, -0.06], random_phase=True)
