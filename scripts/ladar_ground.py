@@ -129,7 +129,7 @@ def recorded(radar: TriangularLadar, n_period: int, seed: int) -> tuple[Recordin
     """Some periods of a continuous record, in blocks that hold a period from the trigger on."""
     world = LadarWorld(RetroAndBrokenLine(), MOTION, LogAmplitude(0.1), snr_db=0.0, fidelity=EverySample())
     return simulate_ladar_record(
-        radar, world, n_period, Draws(seed), block_s=BLOCK_S, trigger_s=TRIGGER_S, told_trigger=True
+        radar, world, n_period, Draws(seed), block_s=BLOCK_S, trigger_s=TRIGGER_S, trigger_known=True
     )
 
 

@@ -78,8 +78,8 @@ class Profile:
             line.abs() / math.sqrt(pulse.n),
         )
 
-    def near(self, place_m: float, reach_m: float) -> Profile:
-        inside = (self.cross_range_m - place_m).abs() <= reach_m
+    def near(self, position_m: float, reach_m: float) -> Profile:
+        inside = (self.cross_range_m - position_m).abs() <= reach_m
         return Profile(self.cross_range_m[inside], self.amplitude[inside])
 
     def figures(self) -> tuple[float, float, float]:

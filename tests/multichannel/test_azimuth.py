@@ -59,7 +59,7 @@ def test_a_point_off_the_middle(y0):
     )
     motion = motion_of(RADAR, 10.0, 5.0, y0)
     assert found.image_s == pytest.approx(float(motion.image_s), abs=2e-5)
-    assert float(motion.place_m(motion.image_s)) == pytest.approx(y0, abs=1e-9)
+    assert float(motion.position_m(motion.image_s)) == pytest.approx(y0, abs=1e-9)
 
 
 def test_the_filter_needs_the_along_track_position():

@@ -103,7 +103,7 @@ def test_with_a_known_along_track_speed():
 
 @pytest.mark.parametrize("snr_db", [-10.0, 0.0, 17.0])
 def test_interferometry_within_twice_the_bound(snr_db):
-    estimate = Interferometry(RADAR, GATE, mind_ambiguity=False)(noisy(snr_db, 60, u_r=10.0))
+    estimate = Interferometry(RADAR, GATE, check_ambiguity=False)(noisy(snr_db, 60, u_r=10.0))
     ratio = rms(estimate.value["u_r_m_s"] - 10) / bound(snr_db, ("u_r_m_s", "y0_m"), u_r=10.0)["u_r_m_s"]
     assert 0.7 < ratio < 2.2 and bool(estimate.ok.all())
 

@@ -1,4 +1,4 @@
-"""Images of moving ships on a sea, against the truth: velocities, positions, false targets, the sea."""
+"""Images of moving ships on a sea compared with the truth."""
 
 from __future__ import annotations
 
@@ -70,7 +70,8 @@ class Ship:
 
     Args:
         motion: Motion of its middle, () each.
-        scatterers_m: Along-track position and closest range of the centre of its scatterers' powers.
+        scatterers_m: Along-track position and closest range of the centre of the powers of its
+            scatterers.
         echo: Its echo alone (channel, pulse, range), without the transmit range.
     """
 
