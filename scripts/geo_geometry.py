@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.multichannel.motion import PointMotion
+from torchsar.multichannel import PointMotion
 from torchsar.multichannel.response import doppler_centre_hz, shared_response
 from torchsar.radar import (
     BistaticRadar,

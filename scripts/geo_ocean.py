@@ -23,10 +23,7 @@ import torch
 from torchsar import plot
 from torchsar.core import Draws, Signal
 from torchsar.echo import simulate_bistatic
-from torchsar.multichannel.body import Body, Extraction
-from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.scene_image import Detector, ImageMovers, SceneImage
-from torchsar.multichannel.transmit import RemoveTransmitRange
+from torchsar.multichannel import Body, Detector, Extraction, ImageMovers, PointMotion, RemoveTransmitRange, SceneImage
 from torchsar.radar import BistaticRadar, LinearFM
 from torchsar.scene import BandLimited, BistaticWorld, Fleet, KSea, Ship
 

@@ -23,10 +23,16 @@ from torchsar import plot
 from torchsar.core import Draws, Signal
 from torchsar.echo import simulate_bistatic
 from torchsar.metrics import replica_level, replica_zones
-from torchsar.multichannel.azimuth import FocusAzimuth
-from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import Reconstruct
-from torchsar.multichannel.response import LeastSquares, MinimumMeanSquare, Rebuild, condition_number, noise_gain_db
+from torchsar.multichannel import (
+    FocusAzimuth,
+    LeastSquares,
+    MinimumMeanSquare,
+    PointMotion,
+    Reconstruct,
+    condition_number,
+    noise_gain_db,
+)
+from torchsar.multichannel.response import Rebuild
 from torchsar.multichannel.velocity.sir import Intensity, signal_intensity
 from torchsar.radar import BistaticRadar, LinearFM
 from torchsar.scene import BandLimited, BistaticWorld, Gate, MovingPoints, Pattern

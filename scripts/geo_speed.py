@@ -25,19 +25,23 @@ from torchsar import plot
 from torchsar.core import Draws, Signal, Stage
 from torchsar.echo import simulate_bistatic
 from torchsar.metrics import bistatic_bounds
-from torchsar.multichannel.azimuth import FocusAzimuth
-from torchsar.multichannel.migration import CorrectMigration, Keystone, Migration, NoMigration, StaticBulk
-from torchsar.multichannel.reconstruct import Reconstruct
-from torchsar.multichannel.response import LeastSquares
-from torchsar.multichannel.velocity.aperture import Dwell
-from torchsar.multichannel.velocity.bank import Search
-from torchsar.multichannel.velocity.sir import SignalIntensityRatio
-from torchsar.multichannel.velocity.stages import (
+from torchsar.multichannel import (
+    CorrectMigration,
+    Dwell,
+    FocusAzimuth,
     GradientVelocity,
     Interferometry,
+    Keystone,
+    LeastSquares,
     LikelihoodVelocity,
     MovingPointVelocity,
+    NoMigration,
+    Reconstruct,
+    Search,
+    SignalIntensityRatio,
+    StaticBulk,
 )
+from torchsar.multichannel.migration import Migration
 from torchsar.radar import BistaticRadar, LinearFM
 from torchsar.scene import BandLimited, BistaticWorld, MovingPoints
 

@@ -25,12 +25,17 @@ from torchsar import plot
 from torchsar.core import Axis, Draws, Signal, take
 from torchsar.echo import simulate_bistatic
 from torchsar.metrics import azimuth_response, replica_level, replica_zones
-from torchsar.multichannel.azimuth import FocusAzimuth, focus_azimuth, image_axis
-from torchsar.multichannel.migration import CorrectMigration, Keystone
-from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import Reconstruct
-from torchsar.multichannel.response import LeastSquares
-from torchsar.multichannel.transmit import RemoveTransmitRange
+from torchsar.multichannel import (
+    CorrectMigration,
+    FocusAzimuth,
+    Keystone,
+    LeastSquares,
+    PointMotion,
+    Reconstruct,
+    RemoveTransmitRange,
+    focus_azimuth,
+)
+from torchsar.multichannel.azimuth import image_axis
 from torchsar.radar import BistaticRadar, LinearFM
 from torchsar.scene import BandLimited, BistaticWorld, MovingPoints
 

@@ -29,12 +29,16 @@ from torchsar import plot
 from torchsar.core import Chain, Draws, Signal, Stage, use
 from torchsar.echo import simulate_bistatic
 from torchsar.metrics import bistatic_bounds
-from torchsar.multichannel.migration import CorrectMigration, Keystone
-from torchsar.multichannel.velocity.aperture import Dwell
-from torchsar.multichannel.velocity.bank import Search
-from torchsar.multichannel.velocity.sir import SignalIntensityRatio
-from torchsar.multichannel.velocity.stages import Interferometry, MovingPointVelocity
-from torchsar.multichannel.velocity.walk import WalkAmbiguity
+from torchsar.multichannel import (
+    CorrectMigration,
+    Dwell,
+    Interferometry,
+    Keystone,
+    MovingPointVelocity,
+    Search,
+    SignalIntensityRatio,
+    WalkAmbiguity,
+)
 from torchsar.radar import BistaticRadar, LinearFM
 from torchsar.scene import BandLimited, BistaticWorld, MovingPoints
 

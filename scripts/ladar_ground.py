@@ -20,9 +20,9 @@ import torch
 from torch import nn
 
 from torchsar import plot
-from torchsar.compensate import CorrectPulsePhase
-from torchsar.compensate.radial import (
+from torchsar.compensate import (
     CompensateMotion,
+    CorrectPulsePhase,
     EqualisePulses,
     PulseGain,
     RadialMotion,

@@ -17,8 +17,13 @@ from pathlib import Path
 import torch
 
 from torchsar import plot
-from torchsar.compensate import CorrectPulsePhase
-from torchsar.compensate.radial import CompensateMotion, RadialMotion, SegmentedInterference, SpectrumCorrelation
+from torchsar.compensate import (
+    CompensateMotion,
+    CorrectPulsePhase,
+    RadialMotion,
+    SegmentedInterference,
+    SpectrumCorrelation,
+)
 from torchsar.core import Axis, Chain, Draws, Signal, Trace, use
 from torchsar.echo import simulate_ladar
 from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth

@@ -21,8 +21,7 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.compensate import CorrectPulsePhase
-from torchsar.compensate.radial import CompensateMotion, RadialMotion, SegmentedInterference
+from torchsar.compensate import CompensateMotion, CorrectPulsePhase, RadialMotion, SegmentedInterference
 from torchsar.core import Chain, Draws, Signal, Trace, Truth, use
 from torchsar.echo import simulate_ladar, simulate_ladar_record
 from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth

@@ -24,6 +24,7 @@ from torchsar.core import Draws, Recording, Signal
 from torchsar.echo import (
     ChannelImbalance,
     ChannelResponse,
+    Impairment,
     LostGaps,
     LostLines,
     PeriodicJitter,
@@ -32,7 +33,6 @@ from torchsar.echo import (
     WideInterferer,
     apply_impairments,
 )
-from torchsar.echo.stripmap import Impairment
 from torchsar.focus import OmegaK
 from torchsar.io import read_stripmap
 from torchsar.metrics import correlation

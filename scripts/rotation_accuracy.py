@@ -25,9 +25,8 @@ from torch import Tensor
 from torchsar import plot
 from torchsar.core import Draws, Signal
 from torchsar.echo import simulate_turntable
-from torchsar.focus.image_lines import DopplerLines
-from torchsar.focus.matched_fourier import matched_fourier, range_phase
-from torchsar.focus.transforms import CompiledNufft, ExplicitSum, Gridding, Resampling, Transform
+from torchsar.focus import CompiledNufft, DopplerLines, ExplicitSum, Gridding, Resampling, matched_fourier, range_phase
+from torchsar.focus.transforms import Transform
 from torchsar.metrics import entropy
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld

@@ -21,19 +21,19 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.compensate import autofocus, correct_pulse_phase
-from torchsar.compensate.rotation import (
+from torchsar.compensate import (
     EntropyObjective,
     ImageEntropy,
+    autofocus,
     coarse_rotation,
+    correct_pulse_phase,
     descend_rotation,
     genetic_rotation,
     uneven_rotation,
 )
 from torchsar.core import Axis, Draws, Estimate, Signal, Truth
 from torchsar.echo import simulate_turntable
-from torchsar.focus.image_lines import mean_rate
-from torchsar.focus.matched_fourier import MatchedFourier, RangePhase
+from torchsar.focus import MatchedFourier, RangePhase, mean_rate
 from torchsar.metrics import contrast, entropy
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.scene import Points, PolynomialRotation, TurntableWorld

@@ -25,7 +25,7 @@ from pathlib import Path
 import torch
 
 from torchsar import plot
-from torchsar.compensate.rotation import (
+from torchsar.compensate import (
     EntropyObjective,
     ImageEntropy,
     coarse_rotation,

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.compensate.rotation import EntropyObjective, ImageEntropy
+from torchsar.compensate import EntropyObjective, ImageEntropy
 from torchsar.core import Draws, Signal
 from torchsar.echo import simulate_turntable
 from torchsar.radar import LIGHT_M_S, InverseRadar

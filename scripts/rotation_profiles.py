@@ -19,11 +19,10 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.compensate.rotation import uneven_rotation
+from torchsar.compensate import uneven_rotation
 from torchsar.core import Axis, Draws, Signal
 from torchsar.echo import simulate_turntable
-from torchsar.focus.image_lines import DopplerLines, cross_range_of
-from torchsar.focus.matched_fourier import matched_fourier, range_phase
+from torchsar.focus import DopplerLines, cross_range_of, matched_fourier, range_phase
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.scene import Points, PolynomialRotation, Satellite, TurntableWorld
 

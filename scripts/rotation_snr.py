@@ -24,13 +24,11 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.compensate.rotation import EntropyObjective, ImageEntropy, genetic_rotation, uneven_rotation
+from torchsar.compensate import EntropyObjective, ImageEntropy, genetic_rotation, uneven_rotation
 from torchsar.core import Axis, Draws, Estimate, Signal, Truth
 from torchsar.echo import simulate_turntable
-from torchsar.focus.image_lines import mean_rate
-from torchsar.focus.matched_fourier import MatchedFourier, RangePhase
-from torchsar.metrics import impulse_response
-from torchsar.metrics.rotation_bounds import rotation_bounds
+from torchsar.focus import MatchedFourier, RangePhase, mean_rate
+from torchsar.metrics import impulse_response, rotation_bounds
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
 

@@ -9,18 +9,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchsar.compensate.envelope import (
+from torchsar.compensate import (
     AlignEnvelopes,
     ShiftRange,
     align_envelopes,
     align_mean,
     align_running,
+    correct_pulse_phase,
     drift_cells,
     refine_alignment,
     shift_range,
 )
 from torchsar.compensate.envelope_fit import Envelopes, robust_fit
-from torchsar.compensate.pulse_phase import correct_pulse_phase
 from torchsar.core import Axis, Chain, Draws, Signal, use
 from torchsar.echo import simulate_turntable
 from torchsar.focus import CompressDechirped, azimuth_transform

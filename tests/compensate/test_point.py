@@ -11,7 +11,7 @@ from torchsar.compensate import PointDoppler, doppler_at
 from torchsar.core import Draws, Signal
 from torchsar.echo import simulate, target_energy
 from torchsar.focus import OmegaK
-from torchsar.metrics.bounds import reference_doppler_std_hz, tone_frequency_bound_hz
+from torchsar.metrics import reference_doppler_std_hz, tone_frequency_bound_hz
 from torchsar.radar import LinearFM, StripmapRadar
 from torchsar.scene import Dwell, Points, StripmapWorld
 

@@ -9,13 +9,7 @@ import torch
 
 from tests.compensate.radials import GATE, rms, seen, without_line
 from tests.echo.ladars import COMMON, direct_sweeps, table1
-from torchsar.compensate.radial import (
-    compensate_motion,
-    integrated_range,
-    radial_motion,
-    range_error,
-    turning_points,
-)
+from torchsar.compensate import compensate_motion, integrated_range, radial_motion, range_error, turning_points
 from torchsar.compensate.radial.compensate import polynomial_phasor
 from torchsar.compensate.radial.trajectory import sweep_motion
 from torchsar.core import Axis, Estimate

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchsar.compensate.rotation import (
+from torchsar.compensate import (
     EntropyObjective,
     ImageEntropy,
     RotationDescent,
@@ -17,16 +17,16 @@ from torchsar.compensate.rotation import (
     RotationGenetic,
     RotationNewton,
     RotationSearch,
-    Unknowns,
     descend_rotation,
     evolve_rotation,
     genetic_rotation,
     newton_rotation,
     search_rotation,
 )
+from torchsar.compensate.rotation import Unknowns
 from torchsar.core import Chain, Draws, Estimate, Signal, use
 from torchsar.core.warp import shape_of, warp
-from torchsar.metrics.image import entropy
+from torchsar.metrics import entropy
 from torchsar.radar import LIGHT_M_S, InverseRadar
 
 F64 = torch.float64

@@ -25,9 +25,9 @@ from tests.compensate.turning import (
     target,
     targets,
 )
-from torchsar.compensate import CorrectPulsePhase
-from torchsar.compensate.rotation import (
+from torchsar.compensate import (
     CoarseRotation,
+    CorrectPulsePhase,
     PhaseFitRotation,
     RotationAutofocus,
     UnevenRotation,

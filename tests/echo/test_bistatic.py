@@ -9,7 +9,7 @@ import torch
 
 from torchsar.core import Draws
 from torchsar.echo import bistatic_echo, simulate_bistatic
-from torchsar.focus.reference import flat_reference, matched_reference, range_compress
+from torchsar.focus import flat_reference, matched_reference, range_compress
 from torchsar.radar import BistaticRadar, LinearFM, Orbit, range_coefficients, seen_point
 from torchsar.scene import (
     BandLimited,
@@ -17,6 +17,7 @@ from torchsar.scene import (
     Fleet,
     GroundMovers,
     KSea,
+    Movers,
     MovingPoints,
     MovingScene,
     OrbitTransmit,
@@ -25,7 +26,6 @@ from torchsar.scene import (
     Ship,
     TaylorRange,
 )
-from torchsar.scene.moving import Movers
 
 C = 3e8
 SPEED, NEAR = 300.0, 5000.0

@@ -12,7 +12,7 @@ import torch
 
 from tests.compensate.radials import ESTIMATORS, GATE, seen, velocity_rms
 from tests.echo.ladars import table1
-from torchsar.compensate.radial import compensate_motion, radial_motion
+from torchsar.compensate import compensate_motion, radial_motion
 from torchsar.core import Estimate, Signal
 from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
 from torchsar.scene import LinearInSweep, Points, Polynomial

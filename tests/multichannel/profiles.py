@@ -8,10 +8,7 @@ import torch
 
 from tests.multichannel.helpers import azimuth_echo
 from torchsar.metrics import replicas
-from torchsar.multichannel.azimuth import focus_azimuth
-from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import reconstruct
-from torchsar.multichannel.response import doppler_offsets
+from torchsar.multichannel import PointMotion, doppler_offsets, focus_azimuth, reconstruct
 
 BAND_HZ, GATE_S, LONG = 337.5, 4.5, 3600
 

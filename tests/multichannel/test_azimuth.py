@@ -14,11 +14,19 @@ import torch
 from tests.multichannel.helpers import azimuth_echo, compressed_echo, published_radar, range_of, time_of
 from tests.multichannel.profiles import BAND_HZ, GATE_S, LONG, figures_of, focused, measured, motion_of
 from torchsar.core import Signal
-from torchsar.multichannel.azimuth import FocusAzimuth, azimuth_filter, focus_azimuth
-from torchsar.multichannel.migration import CorrectMigration, Keystone
-from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import Reconstruct, reconstruct
-from torchsar.multichannel.response import LeastSquares, MinimumMeanSquare, doppler_offsets
+from torchsar.multichannel import (
+    CorrectMigration,
+    FocusAzimuth,
+    Keystone,
+    LeastSquares,
+    MinimumMeanSquare,
+    PointMotion,
+    Reconstruct,
+    azimuth_filter,
+    doppler_offsets,
+    focus_azimuth,
+    reconstruct,
+)
 
 F64 = torch.float64
 RADAR = published_radar()

@@ -8,18 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchsar.multichannel.body import (
-    Extraction,
-    Segments,
-    body_echo,
-    body_image,
-    centred_motion,
-    chip_about,
-    find_body,
-    known_body,
-)
-from torchsar.multichannel.migration import Frame
-from torchsar.multichannel.motion import PointMotion
+from torchsar.multichannel import Extraction, Frame, PointMotion, body_echo, find_body
+from torchsar.multichannel.body import Segments, body_image, centred_motion, chip_about, known_body
 
 from .helpers import compressed_echo
 from .ocean import EXTRACTION, GATE_S, RADAR, frame_of, ship

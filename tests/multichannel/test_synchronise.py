@@ -9,13 +9,8 @@ import torch
 
 from tests.multichannel.helpers import compressed_echo, published_radar
 from torchsar.core import Signal
-from torchsar.multichannel.compress import CompressChannels
-from torchsar.multichannel.synchronise import (
-    EstimateSynchronisation,
-    RemoveSynchronisation,
-    estimate_synchronisation,
-    remove_synchronisation,
-)
+from torchsar.multichannel import CompressChannels, EstimateSynchronisation, RemoveSynchronisation
+from torchsar.multichannel.synchronise import estimate_synchronisation, remove_synchronisation
 
 RADAR = published_radar()
 
