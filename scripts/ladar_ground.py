@@ -59,7 +59,7 @@ MOTION = (
 TRIGGER_S, BLOCK_S = 5.3e-6, 40e-6
 RETRO, SCENE_M = (10.0, 11.3), (9.8, 11.8)
 # extent of side lobes for the ISLR: -12.84 dB for a sinc, 3 give -11.54 and 10 give -10.17; the
-# paper does not say
+# paper does not give it
 NULLS = 2
 TABLE_5 = {"uncompensated": (13.0434, 0.3207), "cross-correlation": (12.0239, 0.3300), "segmented": (11.9251, 0.4100)}
 TABLE_6 = {

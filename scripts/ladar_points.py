@@ -42,7 +42,7 @@ MOTION = (
     Sinusoid(10e-6, 330.0, math.degrees(1.0)),
 )  # 0.35 m/s and 20 m/s^2
 # extent of side lobes for the ISLR: -12.84 dB for a sinc, 3 give -11.54 and 10 give -10.17; the
-# paper does not say
+# paper does not give it
 NULLS = 2
 PUBLISHED = {
     "irw_range_m": 0.030,
@@ -79,7 +79,7 @@ def methods(radar: TriangularLadar) -> dict[str, Chain]:
 def draw_frequencies(out: Path, draws: Draws) -> None:
     """Figure 2: the triangle and its echo, and the dechirped beat at rest and in motion.
 
-    50 MHz in place of 5 GHz, so that the delay can be seen.
+    50 MHz instead of 5 GHz, so that the delay can be seen.
     """
     radar, range_m = replace(RADAR, bandwidth_hz=50e6), 150.0
     time_s = torch.linspace(0, 3 * radar.period_s, 1500, dtype=torch.float64)
@@ -136,8 +136,8 @@ def near(signal: Signal) -> Signal:
 def around(image: Signal, azimuth_m: float, range_m: float) -> Signal:
     """Four cells to either side of a point."""
     bounds = {}
-    for axis, place, reach in zip(image.axes, (azimuth_m, range_m), (0.024, 0.12), strict=True):
-        first, last = (round(float(axis.index_of(place + side))) for side in (-reach, reach))
+    for axis, position, reach in zip(image.axes, (azimuth_m, range_m), (0.024, 0.12), strict=True):
+        first, last = (round(float(axis.index_of(position + side))) for side in (-reach, reach))
         bounds[axis.name] = (max(first, 0), min(last, axis.n))
     return image.crop(**bounds)
 

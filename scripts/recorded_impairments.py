@@ -1,5 +1,4 @@
-"""Impair a recorded raw block, repair it, and compare the images: one line per impairment of brief
-004.
+"""Impair a recorded raw block, correct it, and compare the images: one line per impairment.
 
     python scripts/recorded_impairments.py PATH.npz [--seed 0] [--only lost tone] [--threads 2]
 

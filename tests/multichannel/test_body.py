@@ -110,7 +110,8 @@ def test_a_body_that_cannot_be_found_is_not_ok() -> None:
 
 
 def test_a_motion_that_leaves_the_record_ends_the_search() -> None:
-    """Seed 110 drives the search to a motion that no pulse illuminates; it used to go on forever."""
+    """Seed 110 drives the search to a motion that no pulse illuminates; it used to go on forever.
+    """
     data = frame_of({}, seed=110)
     body = find_body(data.data, Frame.of(RADAR, data), 0.0, 5000.0, EXTRACTION)
     assert not bool(body.ok)
