@@ -199,12 +199,12 @@ def test_the_grid_search_returns_the_entropy_on_the_grid() -> None:
 
 def test_the_centre_deviation_is_found_jointly() -> None:
     data = target(yc_m=1.5)
-    blind, told, joint = (
+    ignored, known, joint = (
         descend_rotation(of, of.start(OMEGA, K))
         for of in (figure(data, variables="shape", yc_m=yc) for yc in (0.0, 1.5, None))
     )
-    assert joint.info["entropy_nats"] < blind.info["entropy_nats"] - 5e-3
-    assert abs(float(joint["yc_m"]) - 1.5) < 0.3 and told["yc_m"] == 1.5 and blind["yc_m"] == 0
+    assert joint.info["entropy_nats"] < ignored.info["entropy_nats"] - 5e-3
+    assert abs(float(joint["yc_m"]) - 1.5) < 0.3 and known["yc_m"] == 1.5 and ignored["yc_m"] == 0
 
 
 def test_second_order_finds_the_middle_rate() -> None:

@@ -634,10 +634,10 @@ def test_vmap_equals_batch(case: Case) -> None:
 def test_non_finite_input_is_refused(case: Case, bad: float) -> None:
     stage, signal = case.build(), entering(case, raw(2, n_range=case.n_range))
     data = signal.data.clone()
-    place = (1, *(0,) * (data.ndim - 3), *(min(i, n - 1) for i, n in zip((3, 5), data.shape[1:][-2:])))
-    data[place] = bad
+    position = (1, *(0,) * (data.ndim - 3), *(min(i, n - 1) for i, n in zip((3, 5), data.shape[1:][-2:])))
+    data[position] = bad
     with pytest.raises(
-        ValueError, match=r"1 of \d+ samples are NaN or Inf, the first at index " + re.escape(str(place))
+        ValueError, match=r"1 of \d+ samples are NaN or Inf, the first at index " + re.escape(str(position))
     ):
         stage(signal.with_data(data), **case.values(signal))
 

@@ -120,7 +120,7 @@ def test_band_weights_peak_at_one_and_hold_the_band():
 
 @pytest.mark.parametrize(("reference", "within"), [(flat_reference, 2e-3), (matched_reference, 0.05)])
 def test_full_echoes_compress_to_the_compressed_ones(reference, within):
-    """Both ways of synthesis are equivalent."""
+    """Both methods of synthesis are equivalent."""
     radar = radar_of(pulse=LinearFM(50e6, 10e-6))
     raw = simulated(radar=radar, n_range=1500, n_pulse=12, kind="full")[0].signal
     data = range_compress(raw.data, reference(radar.pulse, 1500, radar.sampling_hz))

@@ -158,11 +158,11 @@ def test_every_line_is_focused_for_the_range_of_one_target():
     near = spectrum.axis("range").values()
     for range_m, of in ((None, 0), (5150.0, 1)):
         image = FocusAzimuth(RADAR, bandwidth_hz=BAND_HZ)(spectrum, u_r_m_s=10.0, range_m=range_m)
-        place, r0, amplitude = image.axis("azimuth").values(), points[of]["r0"], points[of].get("amplitude", 1.0)
+        position, r0, amplitude = image.axis("azimuth").values(), points[of]["r0"], points[of].get("amplitude", 1.0)
         columns = [image.data[:, int((near - point["r0"]).abs().argmin())].abs() for point in points]
         assert float(columns[of].max()) > 0.9 * amplitude * GATE_S * math.sqrt(300**2 / (0.24 * r0))
         assert float(columns[1 - of].max()) < 0.4 * GATE_S * math.sqrt(300**2 / (0.24 * 5000))
-        assert float(place[int(columns[of].argmax())]) == pytest.approx(300 * 10 * r0 / (300**2 + 100), abs=0.5)
+        assert float(position[int(columns[of].argmax())]) == pytest.approx(300 * 10 * r0 / (300**2 + 100), abs=0.5)
 
 
 def test_gradients():
