@@ -88,7 +88,7 @@ def main() -> None:
     )
     print(
         f"{'method':<24}{'ms a trial':>11}{'iterations':>12}{'bare transforms':>17}"
-        f"{'ratio':>7}{'median error (rad)':>20}{'trusted':>9}"
+        f"{'ratio':>7}{'median error (rad)':>20}{'reliable':>9}"
     )
     for name, estimate in found.items():
         count = float(estimate.info["iterations"].double().mean())

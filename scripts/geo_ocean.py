@@ -1,13 +1,12 @@
 """Moving ships on a sea before a GEO spaceborne-airborne bistatic radar: figure 18 of Remote Sens.
-
 2020, 12, 1703.
 
     python scripts/geo_ocean.py [--out geo_ocean] [--seed 1] [--small]
 
-Ship 1 rests, ship 2 closes at 10 m/s, ship 3 closes at 10 m/s and moves along track at 10 m/s.
-Focused as if everything stood still, ships that close appear beside their places and are repeated;
-the flow of figure 13 finds what moves, takes its echo out, and pictures it in its place. The source
-prints azimuth on x = (V_R - u_a) t of each target.
+Ship 1 rests, ship 2 closes at 10 m/s, ship 3 closes at 10 m/s and moves along track at 10 m/s. In
+an image focused for targets at rest, approaching ships are displaced and repeated; the method of
+figure 13 detects moving targets, removes their echoes, and images them at their true positions. The
+source prints azimuth on x = (V_R - u_a) t of each target.
 """
 
 from __future__ import annotations
@@ -23,10 +22,7 @@ import torch
 from torchsar import plot
 from torchsar.core import Draws, Signal
 from torchsar.echo import simulate_bistatic
-from torchsar.multichannel.body import Body, Extraction
-from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.scene_image import Detector, ImageMovers, SceneImage
-from torchsar.multichannel.transmit import RemoveTransmitRange
+from torchsar.multichannel import Body, Detector, Extraction, ImageMovers, PointMotion, RemoveTransmitRange, SceneImage
 from torchsar.radar import BistaticRadar, LinearFM
 from torchsar.scene import BandLimited, BistaticWorld, Fleet, KSea, Ship
 
@@ -153,8 +149,8 @@ def levelled(image: Signal) -> Signal:
 
 
 def draw(setting: Setting, made: SceneImage, path: Path) -> None:
-    """The image of everything at rest, what does not move, and all in place, with outlines about
-    true places.
+    """Images focused for targets at rest, without the moving targets, and with these at their
+    positions; outlines about the true positions.
     """
     outlines = [
         np.array(
@@ -169,7 +165,7 @@ def draw(setting: Setting, made: SceneImage, path: Path) -> None:
     named = {"everything at rest": made.conventional, "without movers": made.rest, "fused": made.fused}
     figure = plot.overlays(
         [
-            {"title": title, "signal": levelled(image), "lines": {"true place": (joined[0], joined[1])}}
+            {"title": title, "signal": levelled(image), "lines": {"true position": (joined[0], joined[1])}}
             for title, image in named.items()
         ],
         3,

@@ -1,11 +1,12 @@
-"""Rebuilding the Doppler band of moving points from few channels: figures 10 to 12 and 17 of Remote
-Sens. 2020, 12, 1703, and how well posed it is.
+"""Reconstruction of the Doppler band of moving points from few channels, and its condition: figures
+10 to 12 and 17 of Remote Sens. 2020, 12, 1703.
 
     python scripts/geo_reconstruction.py [--out geo_reconstruction] [--small]
 
 Azimuth only, without noise. "Band-limited": the target is seen for 4.5 s; "pattern": through the
 pattern of the elements, in records of 20 s, so that replicas up to three pulse rates away have
-their own places. MFTA: largest false target against the peak. N: Doppler bands that are rebuilt.
+their own positions. MFTA: largest false target against the peak. N: Doppler bands that are
+reconstructed.
 """
 
 from __future__ import annotations
@@ -23,10 +24,16 @@ from torchsar import plot
 from torchsar.core import Draws, Signal
 from torchsar.echo import simulate_bistatic
 from torchsar.metrics import replica_level, replica_zones
-from torchsar.multichannel.azimuth import FocusAzimuth
-from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import Reconstruct
-from torchsar.multichannel.response import LeastSquares, MinimumMeanSquare, Rebuild, condition_number, noise_gain_db
+from torchsar.multichannel import (
+    FocusAzimuth,
+    LeastSquares,
+    MinimumMeanSquare,
+    PointMotion,
+    Reconstruct,
+    condition_number,
+    noise_gain_db,
+)
+from torchsar.multichannel.response import Rebuild
 from torchsar.multichannel.velocity.sir import Intensity, signal_intensity
 from torchsar.radar import BistaticRadar, LinearFM
 from torchsar.scene import BandLimited, BistaticWorld, Gate, MovingPoints, Pattern
@@ -44,36 +51,39 @@ UNEVEN = replace(RADAR, channel_m=(-0.8, 0.0, 0.75))
 INTEGRATION_S, BANDWIDTH_HZ, RECORD_S = 4.5, 337.5, 20.0
 GATES: dict[str, Gate] = {"band-limited": BandLimited(INTEGRATION_S), "pattern": Pattern()}
 TRUE_M_S, GUESSES_M_S = 10.0, (5.0, 8.0, 10.0)
-BRIEF_SIR = {
+EXPECTED_SIR = {
     "band-limited": (24.5, 14.8, 39.2),
     "pattern": (7.3, 4.4, 11.6),
 }  # dB, peak of Gamma1, Gamma2, Gamma over their value at 0 m/s
 PUBLISHED_MFTA = {"band-limited": "below -60 dB", "pattern": "below -25 dB"}
-BRIEF_PRF = (125.0, 160.0, 170.0, 180.0, 185.0, 187.0, 190.0, 195.0, 200.0, 250.0)
-BRIEF_CONDITION = {  # at BRIEF_PRF, condition number and noise gain (dB)
+EXPECTED_PRF = (125.0, 160.0, 170.0, 180.0, 185.0, 187.0, 190.0, 195.0, 200.0, 250.0)
+EXPECTED_CONDITION = {  # at EXPECTED_PRF, condition number and noise gain (dB)
     3: ((1, 2.7, 4.3, 10.2, 30.6, 153, 30.6, 10.2, 6.1, 1), (0, 2.6, 5.5, 12.2, 21.6, 35.5, 21.6, 12.2, 8.0, 0)),
     2: ((1, 1.31, 1.37, 1.41, 1.41, 1.41, 1.41, 1.41, 1.39, 1), (0, 0.3, 0.4, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 0)),
 }
 
 
 @dataclass(frozen=True)
-class Way:
-    """How bands are told apart. moving: with the velocity of the target, else as if it
-    stood still.
+class Method:
+    """How bands are separated.
+
+    Args:
+        rebuild: Reconstruction of the bands.
+        moving: Whether the velocity of the target is used; otherwise it is assumed at rest.
     """
 
     rebuild: Rebuild
     moving: bool
 
 
-WAYS = {
-    "conventional, N = 3": Way(LeastSquares(3), False),
-    "conventional, N = 2": Way(LeastSquares(2), False),
-    "proposed, N = 3": Way(LeastSquares(3), True),
-    "proposed, N = 2": Way(LeastSquares(2), True),
-    "proposed, MMSE, N = 5": Way(MinimumMeanSquare(5), True),
+METHODS = {
+    "conventional, N = 3": Method(LeastSquares(3), False),
+    "conventional, N = 2": Method(LeastSquares(2), False),
+    "proposed, N = 3": Method(LeastSquares(3), True),
+    "proposed, N = 2": Method(LeastSquares(2), True),
+    "proposed, MMSE, N = 5": Method(MinimumMeanSquare(5), True),
 }
-BRIEF_MFTA = {  # (gate, way) -> at (2, 10, 20) m/s for conventional, (0, 10, 20) for proposed
+EXPECTED_MFTA = {  # (gate, method) -> at (2, 10, 20) m/s for conventional, (0, 10, 20) for proposed
     ("band-limited", "conventional, N = 3"): (-17.7, -6.3, -1.1),
     ("band-limited", "conventional, N = 2"): (-41.6, -19.5, -1.1),
     ("band-limited", "proposed, N = 3"): (-63.8, -55.9, -47.6),
@@ -101,41 +111,41 @@ def spectrum(data: Signal, rebuild: Rebuild, u_r_m_s: Tensor | float) -> Signal:
         return Reconstruct(RADAR, rebuild)(data, u_r_m_s)
 
 
-def replicas_db(data: Signal, u_r_m_s: Tensor, way: Way, gate: Gate) -> Tensor:
+def replicas_db(data: Signal, u_r_m_s: Tensor, method: Method, gate: Gate) -> Tensor:
     """MFTA within three pulse rates, (trial,)."""
-    assumed = u_r_m_s if way.moving else torch.zeros_like(u_r_m_s)
-    image = FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(spectrum(data, way.rebuild, assumed), assumed)
+    assumed = u_r_m_s if method.moving else torch.zeros_like(u_r_m_s)
+    image = FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(spectrum(data, method.rebuild, assumed), assumed)
     seen = INTEGRATION_S if isinstance(gate, BandLimited) else None
     zones = replica_zones(
-        RADAR, way.rebuild.bands, u_r_m_s, integration_s=seen, focused_at=(assumed, 0.0), orders=(1, 2, 3)
+        RADAR, method.rebuild.bands, u_r_m_s, integration_s=seen, focused_at=(assumed, 0.0), orders=(1, 2, 3)
     )
     return replica_level(image.data, image.axis("azimuth").step, zones)["mfta_db"]
 
 
 def false_targets(speeds: Tensor) -> dict[str, dict[str, Tensor]]:
-    """MFTA (dB) by gate and way over u_r, (speed,)."""
+    """MFTA (dB) by gate and method over u_r, (speed,)."""
     found = {}
     for name, gate in GATES.items():
         data = simulated(speeds, gate, RECORD_S)
-        found[name] = {label: replicas_db(data, speeds, way, gate) for label, way in WAYS.items()}
+        found[name] = {label: replicas_db(data, speeds, method, gate) for label, method in METHODS.items()}
     return found
 
 
 def show_false_targets(speeds: Tensor, found: Mapping[str, Mapping[str, Tensor]]) -> None:
     print(f"{'MFTA (dB) over u_r (m/s)':36}" + "".join(f"{float(u):>8g}" for u in speeds))
-    for gate, ways in found.items():
-        for label, levels in ways.items():
+    for gate, methods in found.items():
+        for label, levels in methods.items():
             print(f"{f'{gate}: {label}':36}" + "".join(f"{float(level):>8.1f}" for level in levels))
-            known = zip((0 if label.startswith("proposed") else 2, 10, 20), BRIEF_MFTA[gate, label], strict=True)
-            print(f"{'  brief 001':36}" + "".join(f"   {level:g} at {u:g} m/s" for u, level in known))
+            known = zip((0 if label.startswith("proposed") else 2, 10, 20), EXPECTED_MFTA[gate, label], strict=True)
+            print(f"{'  expected':36}" + "".join(f"   {level:g} at {u:g} m/s" for u, level in known))
         print(f"{'  published, proposed':36}   {PUBLISHED_MFTA[gate]}")
 
 
 def draw_false_targets(speeds: Tensor, found: Mapping[str, Mapping[str, Tensor]], out: Path) -> None:
     """Figure 17."""
     parts = []
-    for gate, ways in found.items():
-        series = {label: (plot.array(speeds), plot.array(levels)) for label, levels in ways.items()}
+    for gate, methods in found.items():
+        series = {label: (plot.array(speeds), plot.array(levels)) for label, levels in methods.items()}
         parts.append(
             {"series": series, "xlabel": "u_r (m/s)", "ylabel": "MFTA (dB)", "title": gate, "ylim": (-80.0, 45.0)}
         )
@@ -182,10 +192,10 @@ def ratios_db(found: Intensity) -> dict[str, Tensor]:
 def draw_ratios(data: Mapping[str, Signal], guesses: Tensor, out: Path) -> None:
     """Figure 12, and where the curves peak."""
     parts = []
-    print(f"\n{'intensity ratio':26}{'peak (m/s)':>12}{'over 0 m/s (dB)':>18}{'brief 001 (dB)':>18}")
+    print(f"\n{'intensity ratio':26}{'peak (m/s)':>12}{'over 0 m/s (dB)':>18}{'expected (dB)':>18}")
     for gate, signal in data.items():
         curves = ratios_db(intensity(signal, guesses))
-        for (name, curve), known in zip(curves.items(), BRIEF_SIR[gate], strict=True):
+        for (name, curve), known in zip(curves.items(), EXPECTED_SIR[gate], strict=True):
             print(
                 f"{f'{gate}: {name}':26}{float(guesses[curve.argmax()]):>12.2f}"
                 f"{float(curve.max() - curve[0]):>18.1f}{known:>18.1f}"
@@ -195,8 +205,8 @@ def draw_ratios(data: Mapping[str, Signal], guesses: Tensor, out: Path) -> None:
             {"series": series, "xlabel": "u_r of the reconstruction (m/s)", "ylabel": "ratio (dB)", "title": gate}
         )
     print(
-        "the brief's figures are those of three bands and nothing beyond; what aliases from "
-        "further out lowers band-limited peaks by as much as shown"
+        "the expected figures are those of three bands without any energy beyond them; bands "
+        "further out alias into these and lower the band-limited peaks by as much as shown"
     )
     plot.save(plot.panels(parts), out / "figure_12.png")
 
@@ -204,34 +214,34 @@ def draw_ratios(data: Mapping[str, Signal], guesses: Tensor, out: Path) -> None:
 def conditions(radar: BistaticRadar, rates: Tensor, bands: int) -> tuple[Tensor, Tensor]:
     """Condition number and noise gain (dB) of least squares for points at rest over pulse rates."""
     radars = [replace(radar, prf_hz=float(prf)) for prf in rates]
-    still = PointMotion.of(radar, torch.zeros((), dtype=torch.float64))
-    return torch.stack([condition_number(r, still, bands) for r in radars]), torch.stack(
-        [noise_gain_db(r, still, LeastSquares(bands)) for r in radars]
+    at_rest = PointMotion.of(radar, torch.zeros((), dtype=torch.float64))
+    return torch.stack([condition_number(r, at_rest, bands) for r in radars]), torch.stack(
+        [noise_gain_db(r, at_rest, LeastSquares(bands)) for r in radars]
     )
 
 
 def show_conditions() -> None:
-    rates = torch.tensor(BRIEF_PRF, dtype=torch.float64)
-    print(f"\n{'pulse rate (Hz)':30}" + "".join(f"{prf:>8g}" for prf in BRIEF_PRF))
-    for bands, known in BRIEF_CONDITION.items():
+    rates = torch.tensor(EXPECTED_PRF, dtype=torch.float64)
+    print(f"\n{'pulse rate (Hz)':30}" + "".join(f"{prf:>8g}" for prf in EXPECTED_PRF))
+    for bands, known in EXPECTED_CONDITION.items():
         for name, values, expected in zip(
             ("condition", "noise gain (dB)"), conditions(RADAR, rates, bands), known, strict=True
         ):
             print(f"{f'N = {bands}, {name}':30}" + "".join(f"{float(x) + 0.0:>8.2f}" for x in values))
-            print(f"{'  brief 001':30}" + "".join(f"{x:>8g}" for x in expected))
+            print(f"{'  expected':30}" + "".join(f"{x:>8g}" for x in expected))
         print(
             f"{f'N = {bands}, uneven, condition':30}"
             + "".join(f"{float(x):>8.2f}" for x in conditions(UNEVEN, rates, bands)[0])
         )
     print(
-        "uneven: channels at -0.8, 0, 0.75 m; brief 001 at 180 Hz: 5.8 with N = 3, 1.39 with "
-        "N = 2; their outer two sample the same places at 300 / 1.55 = 193.5 Hz"
+        "uneven: channels at -0.8, 0, 0.75 m; expected at 180 Hz: 5.8 with N = 3, 1.39 with "
+        "N = 2; their outer two sample the same positions at 300 / 1.55 = 193.5 Hz"
     )
 
 
 def draw_conditions(rates: Tensor, out: Path) -> None:
-    """Condition and noise gain over the pulse rate; even channels sample the same places twice at
-    187.5 Hz.
+    """Condition and noise gain over the pulse rate; even channels sample the same positions twice
+    at 187.5 Hz.
     """
     cases = {
         f"N = {bands}, {name}": conditions(radar, rates, bands)
@@ -260,7 +270,9 @@ def main(arguments: list[str] | None = None) -> None:
     speeds = shown if options.small else torch.linspace(-20, 20, 41, dtype=torch.float64)
     found = false_targets(speeds)
     at = [int((speeds == u).nonzero()) for u in shown]
-    show_false_targets(shown, {gate: {way: levels[at] for way, levels in ways.items()} for gate, ways in found.items()})
+    show_false_targets(
+        shown, {gate: {method: levels[at] for method, levels in methods.items()} for gate, methods in found.items()}
+    )
     draw_false_targets(speeds, found, options.out)
 
     moving = torch.tensor([TRUE_M_S], dtype=torch.float64)

@@ -25,19 +25,23 @@ from torchsar import plot
 from torchsar.core import Draws, Signal, Stage
 from torchsar.echo import simulate_bistatic
 from torchsar.metrics import bistatic_bounds
-from torchsar.multichannel.azimuth import FocusAzimuth
-from torchsar.multichannel.migration import CorrectMigration, Keystone, Migration, NoMigration, StaticBulk
-from torchsar.multichannel.reconstruct import Reconstruct
-from torchsar.multichannel.response import LeastSquares
-from torchsar.multichannel.velocity.aperture import Dwell
-from torchsar.multichannel.velocity.bank import Search
-from torchsar.multichannel.velocity.sir import SignalIntensityRatio
-from torchsar.multichannel.velocity.stages import (
+from torchsar.multichannel import (
+    CorrectMigration,
+    Dwell,
+    FocusAzimuth,
     GradientVelocity,
     Interferometry,
+    Keystone,
+    LeastSquares,
     LikelihoodVelocity,
     MovingPointVelocity,
+    NoMigration,
+    Reconstruct,
+    Search,
+    SignalIntensityRatio,
+    StaticBulk,
 )
+from torchsar.multichannel.migration import Migration
 from torchsar.radar import BistaticRadar, LinearFM
 from torchsar.scene import BandLimited, BistaticWorld, MovingPoints
 
@@ -59,9 +63,9 @@ MIGRATIONS: dict[str, Migration] = {
     "static bulk, one reference": StaticBulk(),
     "none": NoMigration(),
 }
-# a trial; the brief's SIR tries 94 velocities
-BRIEF_MS = {"SIR": 21.0, "ATI": 2.6, "ML from ATI": 36.0}
-BRIEF_ERROR_DB = {2: -134.0, 3: -125.0}
+# of a trial, from a separate program, whose SIR tries 94 velocities
+EXPECTED_MS = {"SIR": 21.0, "ATI": 2.6, "ML from ATI": 36.0}
+EXPECTED_ERROR_DB = {2: -134.0, 3: -125.0}
 
 
 def best_s(work: Callable[[], object], rounds: int) -> float:
@@ -102,7 +106,7 @@ def precision(trials: int, rounds: int) -> None:
     """The chain by precision and bands, beside its transforms."""
     print(
         f"{'azimuth chain':28}{'chain (ms/line)':>17}{'FFTs (ms/line)':>17}{'ratio':>8}"
-        f"{'error (dB)':>12}{'brief (dB)':>12}"
+        f"{'error (dB)':>12}{'expected (dB)':>12}"
     )
     for bands in (2, 3):
         exact = image(azimuth_lines(trials, torch.complex128), bands)
@@ -114,7 +118,7 @@ def precision(trials: int, rounds: int) -> None:
             )
             name = f"N = {bands}, {str(dtype).removeprefix('torch.')}"
             tail = (
-                f"{error_db(image(signal, bands), exact):>12.1f}{BRIEF_ERROR_DB[bands]:>12.0f}"
+                f"{error_db(image(signal, bands), exact):>12.1f}{EXPECTED_ERROR_DB[bands]:>12.0f}"
                 if dtype == torch.complex64
                 else f"{'-':>12}{'-':>12}"
             )
@@ -179,7 +183,7 @@ def show_migration(offsets: Sequence[float], n_range: int, rounds: int, out: Pat
 
 
 def estimators(search: Search | None) -> dict[str, Callable[[Signal], Tensor]]:
-    """u_r (trial,) of azimuth lines; The others know the along-track velocity; "nothing told", bank
+    """u_r (trial,) of azimuth lines; "no prior knowledge", bank
     and ML too, seeks it.
     """
     aperture = Dwell(INTEGRATION_S)
@@ -199,12 +203,12 @@ def estimators(search: Search | None) -> dict[str, Callable[[Signal], Tensor]]:
         "ML from ATI": refined(LikelihoodVelocity(RADAR, aperture, unknowns=known)),
         "bank and ML": lambda signal: MovingPointVelocity(RADAR, aperture, u_a_m_s=0.0)(signal)["u_r_m_s"],
         "ML from ATI, by autograd": refined(GradientVelocity(RADAR, aperture, unknowns=known)),
-        "nothing told": lambda signal: MovingPointVelocity(RADAR, aperture, search=search)(signal)["u_r_m_s"],
+        "no prior knowledge": lambda signal: MovingPointVelocity(RADAR, aperture, search=search)(signal)["u_r_m_s"],
     }
 
 
-def bound_m_s(told: bool) -> float:
-    unknown = ("u_r_m_s", "y0_m") if told else ("u_r_m_s", "u_a_m_s", "y0_m")
+def bound_m_s(known: bool) -> float:
+    unknown = ("u_r_m_s", "y0_m") if known else ("u_r_m_s", "u_a_m_s", "y0_m")
     return float(
         bistatic_bounds(RADAR, N_PULSE, 10 ** (SNR_DB / 10), U_R_M_S, integration_s=INTEGRATION_S, unknown=unknown)[
             "u_r_m_s"
@@ -215,7 +219,7 @@ def bound_m_s(told: bool) -> float:
 def show_estimators(trials: int, search: Search | None, out: Path) -> None:
     """Time of a trial in a batch, and rms error at 7 dB a sample after range compression."""
     print(
-        f"{f'velocity, {SNR_DB:g} dB a sample':28}{'ms a trial':>17}{'brief (ms)':>12}"
+        f"{f'velocity, {SNR_DB:g} dB a sample':28}{'ms a trial':>17}{'expected (ms)':>12}"
         f"{'rms (m/s)':>12}{'bound (m/s)':>13}"
     )
     signal, found = azimuth_lines(trials, torch.complex128, SNR_DB), {}
@@ -223,10 +227,10 @@ def show_estimators(trials: int, search: Search | None, out: Path) -> None:
         began = time.perf_counter()
         errors = estimator(signal) - U_R_M_S
         found[name] = (time.perf_counter() - began) / trials, float(errors.square().mean().sqrt())
-        known = f"{BRIEF_MS[name]:g}" if name in BRIEF_MS else "-"
+        known = f"{EXPECTED_MS[name]:g}" if name in EXPECTED_MS else "-"
         print(
             f"{name:28}{1e3 * found[name][0]:>17.1f}{known:>12}{found[name][1]:>12.4f}"
-            f"{bound_m_s(not name.endswith('nothing told')):>13.4f}"
+            f"{bound_m_s(not name.endswith('no prior knowledge')):>13.4f}"
         )
     draw_trade(found, out)
 

@@ -3,10 +3,10 @@
 
     python scripts/geo_targets.py [--out geo_targets] [--small]
 
-Channels are rebuilt and focused as if everything stood still, and with the velocities of each
-target (u_r closing, u_a along track, m/s). The first blurs what moves along track and repeats what
-moves along range; the second does neither. Range resolutions are those of the axis c tau / 2, half
-of the receive path; azimuth is x = v t.
+Channels are reconstructed and focused as for targets at rest, and with the velocities of each
+target (u_r closing, u_a along track, m/s). The first blurs targets that move along track and
+repeats those that move along range; the second does neither. Range resolutions are those of the
+axis c tau / 2, half of the receive path; azimuth is x = v t.
 """
 
 from __future__ import annotations
@@ -25,12 +25,17 @@ from torchsar import plot
 from torchsar.core import Axis, Draws, Signal, take
 from torchsar.echo import simulate_bistatic
 from torchsar.metrics import azimuth_response, replica_level, replica_zones
-from torchsar.multichannel.azimuth import FocusAzimuth, focus_azimuth, image_axis
-from torchsar.multichannel.migration import CorrectMigration, Keystone
-from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import Reconstruct
-from torchsar.multichannel.response import LeastSquares
-from torchsar.multichannel.transmit import RemoveTransmitRange
+from torchsar.multichannel import (
+    CorrectMigration,
+    FocusAzimuth,
+    Keystone,
+    LeastSquares,
+    PointMotion,
+    Reconstruct,
+    RemoveTransmitRange,
+    focus_azimuth,
+)
+from torchsar.multichannel.azimuth import image_axis
 from torchsar.radar import BistaticRadar, LinearFM
 from torchsar.scene import BandLimited, BistaticWorld, MovingPoints
 
@@ -46,7 +51,7 @@ RADAR = BistaticRadar(
 )
 INTEGRATION_S, BANDWIDTH_HZ = 4.5, 337.5
 SPEEDS = {"at rest": (0.0, 0.0), "P1": (0.0, 10.0), "P2": (10.0, 0.0), "P3": (10.0, 5.0), "P4": (5.0, 10.0)}
-PLACES = {
+POSITIONS = {
     "P1": (-300.0, 60.0),
     "P2": (-150.0, -60.0),
     "P3": (150.0, 60.0),
@@ -79,7 +84,7 @@ class Batch:
 
     @property
     def values(self) -> dict[str, Tensor]:
-        """What stages are told of the targets, (trial,) each."""
+        """Values of the targets that stages use, (trial,) each."""
         u_r, u_a = torch.tensor(list(self.speeds.values()), dtype=torch.float64).T
         return {"u_r_m_s": u_r, "u_a_m_s": u_a}
 
@@ -113,11 +118,11 @@ def simulated(speeds: Mapping[str, tuple[float, float]], n_pulse: int, n_range: 
     return Batch(speeds, received(world, n_pulse, n_range, len(speeds)))
 
 
-def products(batch: Batch, way: str) -> list[Product]:
+def products(batch: Batch, method: str) -> list[Product]:
     """With two and three bands, "conventional" (as if at rest) or "proposed" (with the
     velocities).
     """
-    values = batch.values if way == "proposed" else {}
+    values = batch.values if method == "proposed" else {}
     standing = CorrectMigration(RADAR, Keystone(whole_swath=False))(batch.channels, **values)
     return [product(standing, bands, values) for bands in (2, 3)]
 
@@ -177,11 +182,11 @@ def measured(batch: Batch, made: Product) -> Tensor:
 def show(batch: Batch, made: Mapping[str, Product], bands: int) -> None:
     """Table 4 with so many bands."""
     print(f"{f'Table 4, N = {bands} (m, dB)':28}" + "".join(f"{name:>10}" for name in FIGURES))
-    for way, one in made.items():
+    for method, one in made.items():
         for name, row in zip(batch.speeds, measured(batch, one), strict=True):
-            print(f"{f'{way} {name}':28}" + "".join(f"{float(x):>10.2f}" for x in row))
-            if name in PUBLISHED[way]:
-                known = PUBLISHED[way][name]
+            print(f"{f'{method} {name}':28}" + "".join(f"{float(x):>10.2f}" for x in row))
+            if name in PUBLISHED[method]:
+                known = PUBLISHED[method][name]
                 print(
                     f"{'  published':28}"
                     + "".join(
@@ -191,12 +196,12 @@ def show(batch: Batch, made: Mapping[str, Product], bands: int) -> None:
     print()
 
 
-def near(image: Signal, along_m: float, range_m: float, place: int) -> Signal:
+def near(image: Signal, along_m: float, range_m: float, trial: int) -> Signal:
     """Surroundings of the peak of one trial, azimuth and range counted from it, range on the axis c
     tau / 2.
     """
     azimuth, range_ = image.axes
-    data = image.data[place]
+    data = image.data[trial]
     peak = divmod(int(data.abs().argmax()), data.shape[-1])
     reach = round(along_m / azimuth.step), round(2 * range_m / range_.step)
     first = [max(at - side, 0) for at, side in zip(peak, reach, strict=True)]
@@ -223,21 +228,21 @@ def finer(image: Signal, factor: int = 8) -> Signal:
     return Signal(data, tuple(axes))
 
 
-def spectrum_2d(made: Product, place: int) -> Signal:
+def spectrum_2d(made: Product, trial: int) -> Signal:
     """Rebuilt spectrum of one trial over Doppler (against the centre) and range frequency."""
     doppler, range_ = made.spectrum.axes
-    data = torch.fft.fftshift(torch.fft.fft(made.spectrum.data[place]), dim=-1)
+    data = torch.fft.fftshift(torch.fft.fft(made.spectrum.data[trial]), dim=-1)
     step = RADAR.sampling_hz / range_.n / 1e6
     return Signal(data, (doppler, Axis("range frequency", range_.n, -(range_.n // 2) * step, step, "MHz")))
 
 
-def draw_target(made: Product, place: int, title: str, path: Path, reach_m: float) -> None:
+def draw_target(made: Product, trial: int, title: str, path: Path, reach_m: float) -> None:
     """Spectrum, image to reach_m along azimuth, and azimuth profile of a target."""
-    profile, azimuth = brightest(made.image)[place], made.image.axis("azimuth")
+    profile, azimuth = brightest(made.image)[trial], made.image.axis("azimuth")
     curve = (plot.array(azimuth.values()), plot.decibel(profile))
     parts = [
-        {"title": f"{title}: spectrum", "signal": spectrum_2d(made, place), "lines": {}},
-        {"title": "image about the peak", "signal": finer(near(made.image, reach_m, 30.0, place)), "lines": {}},
+        {"title": f"{title}: spectrum", "signal": spectrum_2d(made, trial), "lines": {}},
+        {"title": "image about the peak", "signal": finer(near(made.image, reach_m, 30.0, trial)), "lines": {}},
         {
             "series": {"": curve},
             "xlabel": "azimuth (m)",
@@ -249,46 +254,46 @@ def draw_target(made: Product, place: int, title: str, path: Path, reach_m: floa
     plot.save(plot.overlays(parts, columns=3, dynamic_range_db=50), path)
 
 
-def draw_single(batch: Batch, by_way: Mapping[str, Product], places: Sequence[int], out: Path) -> None:
-    """Of the targets at these places of the batch figures 5 to 7 (conventional) and 14, 15
+def draw_single(batch: Batch, by_method: Mapping[str, Product], trials: Sequence[int], out: Path) -> None:
+    """Of the targets of these numbers in the batch, figures 5 to 7 (conventional) and 14, 15
     (proposed), their contours in one picture.
     """
     names, contours = list(batch.speeds), {}
-    for way, figures in (("conventional", {0: 5, 1: 6, 2: 7}), ("proposed", {1: 14, 2: 15})):
-        made = by_way[way]
-        for place, figure in figures.items():
-            if place not in places:
+    for method, figures in (("conventional", {0: 5, 1: 6, 2: 7}), ("proposed", {1: 14, 2: 15})):
+        made = by_method[method]
+        for trial, figure in figures.items():
+            if trial not in trials:
                 continue
-            u_r, u_a = batch.speeds[names[place]]
-            title = f"({u_r:g}, {u_a:g}) m/s, {way}"
-            blurred = way == "conventional" and u_a != 0
-            draw_target(made, place, title, out / f"figure_{figure:02}.png", 60.0 if blurred else 15.0)
-            contours[f"{figure}: {title}"] = finer(near(made.image, 60.0 if blurred else 6.0, 15.0, place))
+            u_r, u_a = batch.speeds[names[trial]]
+            title = f"({u_r:g}, {u_a:g}) m/s, {method}"
+            blurred = method == "conventional" and u_a != 0
+            draw_target(made, trial, title, out / f"figure_{figure:02}.png", 60.0 if blurred else 15.0)
+            contours[f"{figure}: {title}"] = finer(near(made.image, 60.0 if blurred else 6.0, 15.0, trial))
     plot.save(plot.contours(contours), out / "contours.png")
 
 
 def draw_scene(n_pulse: int, n_range: int, out: Path) -> None:
     """Figure 16: four targets in one scene, and each with its own velocities."""
-    azimuth, range_ = zip(*PLACES.values(), strict=True)
-    u_r, u_a = zip(*(SPEEDS[name] for name in PLACES), strict=True)
+    azimuth, range_ = zip(*POSITIONS.values(), strict=True)
+    u_r, u_a = zip(*(SPEEDS[name] for name in POSITIONS), strict=True)
     world = BistaticWorld(MovingPoints(u_r, u_a, azimuth, range_), BandLimited(INTEGRATION_S))
     data = received(world, n_pulse, n_range)
-    still = FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(Reconstruct(RADAR)(CorrectMigration(RADAR)(data)))
-    lines = {name: (np.full(2, x), np.array([-115.0, 115.0])) for name, (x, _) in PLACES.items()}
+    at_rest = FocusAzimuth(RADAR, bandwidth_hz=BANDWIDTH_HZ)(Reconstruct(RADAR)(CorrectMigration(RADAR)(data)))
+    lines = {name: (np.full(2, x), np.array([-115.0, 115.0])) for name, (x, _) in POSITIONS.items()}
     part = {
         "title": "four targets as if at rest; lines: true azimuth",
-        "signal": transposed(relative(still)),
+        "signal": transposed(relative(at_rest)),
         "lines": lines,
     }
     plot.save(plot.overlays([part], columns=1, dynamic_range_db=50), out / "figure_16.png")
     plot.save(
-        plot.contours({name: own_image(data, name) for name in PLACES}, columns=4), out / "figure_16_contours.png"
+        plot.contours({name: own_image(data, name) for name in POSITIONS}, columns=4), out / "figure_16_contours.png"
     )
 
 
 def own_image(data: Signal, name: str) -> Signal:
-    """A target of the scene, found where it appears, focused with its own velocities and place."""
-    (u_r, u_a), (y0, beyond) = SPEEDS[name], PLACES[name]
+    """A target of the scene, found where it appears, focused with its velocities and position."""
+    (u_r, u_a), (y0, beyond) = SPEEDS[name], POSITIONS[name]
     values, range_m = {"u_r_m_s": u_r, "u_a_m_s": u_a, "y0_m": y0}, RADAR.reference_range_m + beyond
     standing = CorrectMigration(RADAR, Keystone(whole_swath=False), range_m=range_m)(data, **values)
     image = product(standing, 2, values, range_m).image
@@ -299,9 +304,9 @@ def own_image(data: Signal, name: str) -> Signal:
     return finer(near(part.with_data(part.data[None]), 6.0, 15.0, 0))
 
 
-def around(axis: Axis, place: float, reach: float) -> tuple[int, int]:
-    """First sample, and the one behind the last, within reach of a place."""
-    first, last = (round(float(axis.index_of(place + side))) for side in (-reach, reach))
+def around(axis: Axis, position: float, reach: float) -> tuple[int, int]:
+    """First sample, and the one behind the last, within reach of a position."""
+    first, last = (round(float(axis.index_of(position + side))) for side in (-reach, reach))
     return max(first, 0), min(last, axis.n)
 
 
@@ -332,8 +337,8 @@ def main(arguments: list[str] | None = None) -> None:
 
     n_pulse, n_range = (1080, 48) if options.small else (1800, 96)
     batch = simulated(SPEEDS, n_pulse, n_range)
-    made = {way: products(batch, way) for way in PUBLISHED}
-    two, three = ({way: both[i] for way, both in made.items()} for i in range(2))
+    made = {method: products(batch, method) for method in PUBLISHED}
+    two, three = ({method: both[i] for method, both in made.items()} for i in range(2))
     show(batch, two, 2)
     show(batch, three, 3)
     print(

@@ -1,15 +1,14 @@
-"""Slant-range velocity of moving targets from three channels: Tables 2 and 3 of Remote Sens.
-
-2020, 12, 1703, bounds, and velocities beyond the ambiguity.
+"""Slant-range velocity of moving targets from three channels: Tables 2 and 3 of Remote Sens. 2020,
+12, 1703, bounds, and velocities beyond the ambiguity.
 
     python scripts/geo_velocity.py [--out geo_velocity] [--trials 24] [--seed 1] [--small]
 
 The signal intensity ratio (SIR) is the paper's estimator; along-track interferometry (ATI) and
-maximum likelihood (ML) are told the same, the along-track velocity; "nothing told" is the
-recommended estimator that finds u_r, u_a and the place at once. White noise, a target seen for 4.5
-s. SCNR is read as that of a raw sample, which range compression improves by 10 lg(B tau) = 27 dB.
-Errors are means of |error| over trials, bounds are Cramer-Rao deviations times sqrt(2 / pi), the
-mean |error| of a Gaussian.
+maximum likelihood (ML) know the along-track velocity a priori as well; "no prior knowledge" is the
+recommended estimator, which finds u_r, u_a and the position at once. White noise, a target seen for
+4.5 s. SCNR is read as that of a raw sample, which range compression improves by 10 lg(B tau) = 27
+dB. Errors are means of |error| over trials, bounds are Cramer-Rao standard deviations times sqrt(2
+/ pi), the mean |error| of a Gaussian.
 """
 
 from __future__ import annotations
@@ -29,12 +28,16 @@ from torchsar import plot
 from torchsar.core import Chain, Draws, Signal, Stage, use
 from torchsar.echo import simulate_bistatic
 from torchsar.metrics import bistatic_bounds
-from torchsar.multichannel.migration import CorrectMigration, Keystone
-from torchsar.multichannel.velocity.aperture import Dwell
-from torchsar.multichannel.velocity.bank import Search
-from torchsar.multichannel.velocity.sir import SignalIntensityRatio
-from torchsar.multichannel.velocity.stages import Interferometry, MovingPointVelocity
-from torchsar.multichannel.velocity.walk import WalkAmbiguity
+from torchsar.multichannel import (
+    CorrectMigration,
+    Dwell,
+    Interferometry,
+    Keystone,
+    MovingPointVelocity,
+    Search,
+    SignalIntensityRatio,
+    WalkAmbiguity,
+)
 from torchsar.radar import BistaticRadar, LinearFM
 from torchsar.scene import BandLimited, BistaticWorld, MovingPoints
 
@@ -72,13 +75,15 @@ AMBIGUOUS_M_S = (25.0, -35.0)
 
 
 def estimators(radar: BistaticRadar, along_m_s: float) -> dict[str, Stage]:
-    """By name; the first three are told u_a = 0, the last one seeks it within +-along_m_s."""
+    """By name; the first three know u_a = 0 a priori, the last one searches for it within
+    +-along_m_s.
+    """
     aperture, reach = Dwell(INTEGRATION_S), Search(u_r_m_s=radar.ambiguous_velocity_m_s / 2, u_a_m_s=along_m_s)
     return {
         "SIR": SignalIntensityRatio(radar, BANDWIDTH_HZ),
         "ATI": Interferometry(radar, aperture),
         "ML": MovingPointVelocity(radar, aperture, search=reach, u_a_m_s=0.0),
-        "nothing told": MovingPointVelocity(radar, aperture, search=reach),
+        "no prior knowledge": MovingPointVelocity(radar, aperture, search=reach),
     }
 
 
@@ -88,9 +93,9 @@ def simulated(radar: BistaticRadar, u_r_m_s: float, snr_db: float, draws: Draws,
     return simulate_bistatic(radar, world, round(RECORD_S * radar.prf_hz), n_range, draws)[0].signal
 
 
-def mean_bound(radar: BistaticRadar, u_r_m_s: float, scnr_db: float, told: bool) -> float:
-    """Least mean |error| of u_r (m/s), u_a told or not."""
-    unknown = ("u_r_m_s", "y0_m") if told else ("u_r_m_s", "u_a_m_s", "y0_m")
+def mean_bound(radar: BistaticRadar, u_r_m_s: float, scnr_db: float, known: bool) -> float:
+    """Least mean |error| of u_r (m/s), u_a known a priori or not."""
+    unknown = ("u_r_m_s", "y0_m") if known else ("u_r_m_s", "u_a_m_s", "y0_m")
     snr = 10 ** ((scnr_db + GAIN_DB) / 10)
     return MEAN_OF_DEVIATION * float(
         bistatic_bounds(
@@ -143,11 +148,11 @@ def part(
     return {"title": title, "x": np.array(x), "series": series, "bounds": lines}
 
 
-def bounds_of(radar: BistaticRadar, places: Sequence[tuple[float, float]]) -> dict[str, list[float]]:
-    """At (u_r, SCNR), with u_a told and not."""
+def bounds_of(radar: BistaticRadar, points: Sequence[tuple[float, float]]) -> dict[str, list[float]]:
+    """At (u_r, SCNR), with u_a known a priori and not."""
     return {
-        name: [mean_bound(radar, u_r, scnr, told) for u_r, scnr in places]
-        for name, told in (("bound, u_a told", True), ("bound, nothing told", False))
+        name: [mean_bound(radar, u_r, scnr, known) for u_r, scnr in points]
+        for name, known in (("bound, u_a known", True), ("bound, no prior knowledge", False))
     }
 
 

@@ -18,12 +18,11 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import nn
-from torchsar.study.sal.judge import Course, course_of, finer_in_range, motion_metrics
 
 from torchsar import plot
-from torchsar.compensate import CorrectPulsePhase
-from torchsar.compensate.radial import (
+from torchsar.compensate import (
     CompensateMotion,
+    CorrectPulsePhase,
     EqualisePulses,
     PulseGain,
     RadialMotion,
@@ -34,6 +33,7 @@ from torchsar.core import Axis, Chain, Draws, Recording, Signal, Stage, Trace, T
 from torchsar.echo import simulate_ladar_record
 from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
 from torchsar.metrics import contrast, entropy, impulse_response
+from torchsar.metrics.radial_motion import Course, course_of, finer_in_range
 from torchsar.radar import LIGHT_M_S, TriangularLadar
 from torchsar.repair import BlankTurningPoints, CircularShift, SplitSweeps
 from torchsar.scene import (
@@ -59,7 +59,7 @@ MOTION = (
 TRIGGER_S, BLOCK_S = 5.3e-6, 40e-6
 RETRO, SCENE_M = (10.0, 11.3), (9.8, 11.8)
 # extent of side lobes for the ISLR: -12.84 dB for a sinc, 3 give -11.54 and 10 give -10.17; the
-# paper does not say
+# paper does not give it
 NULLS = 2
 TABLE_5 = {"uncompensated": (13.0434, 0.3207), "cross-correlation": (12.0239, 0.3300), "segmented": (11.9251, 0.4100)}
 TABLE_6 = {
@@ -129,7 +129,7 @@ def recorded(radar: TriangularLadar, n_period: int, seed: int) -> tuple[Recordin
     """Some periods of a continuous record, in blocks that hold a period from the trigger on."""
     world = LadarWorld(RetroAndBrokenLine(), MOTION, LogAmplitude(0.1), snr_db=0.0, fidelity=EverySample())
     return simulate_ladar_record(
-        radar, world, n_period, Draws(seed), block_s=BLOCK_S, trigger_s=TRIGGER_S, told_trigger=True
+        radar, world, n_period, Draws(seed), block_s=BLOCK_S, trigger_s=TRIGGER_S, trigger_known=True
     )
 
 
@@ -146,7 +146,7 @@ def judge(trace: Trace, course: Course) -> dict[str, float]:
     found = {"entropy": entropy(trace.signal), "contrast": contrast(trace.signal, of="amplitude"), **response}
     return {
         **{name: float(x) for name, x in found.items() if name != "peak"},
-        "residual": float(motion_metrics(course, RADAR)["residual_phase_rms_rad"]),
+        "residual": float(course.metrics(RADAR)["residual_phase_rms_rad"]),
     }
 
 
@@ -300,7 +300,8 @@ def main(arguments: list[str] | None = None) -> None:
         chains = methods(radar)
         traces = {name: chain.trace(given.get(name, recording)) for name, chain in chains.items()}
         courses = {
-            name: course_of(chain, traces[name], truth, radar, clean=name == "ideal") for name, chain in chains.items()
+            name: course_of(chain, traces[name], truth.values, radar, clean=name == "ideal")
+            for name, chain in chains.items()
         }
         show({name: judge(trace, courses[name]) for name, trace in traces.items()})
         draw_separation(recording, options.out)

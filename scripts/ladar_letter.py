@@ -15,15 +15,20 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import torch
-from torchsar.study.sal.judge import course_of, finer_in_range, motion_metrics
 
 from torchsar import plot
-from torchsar.compensate import CorrectPulsePhase
-from torchsar.compensate.radial import CompensateMotion, RadialMotion, SegmentedInterference, SpectrumCorrelation
+from torchsar.compensate import (
+    CompensateMotion,
+    CorrectPulsePhase,
+    RadialMotion,
+    SegmentedInterference,
+    SpectrumCorrelation,
+)
 from torchsar.core import Axis, Chain, Draws, Signal, Trace, use
 from torchsar.echo import simulate_ladar
 from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
 from torchsar.metrics import contrast, entropy
+from torchsar.metrics.radial_motion import course_of, finer_in_range
 from torchsar.radar import LIGHT_M_S, TriangularLadar
 from torchsar.scene import LadarWorld, LetterE, Polynomial, QuadraticInSweep, Sinusoid
 
@@ -91,7 +96,7 @@ def run(
     traces, figures = {}, {}
     for name, chain in methods().items():
         traces[name] = chain.trace(truth.clean if name == "ideal" else recording)
-        left = motion_metrics(course_of(chain, traces[name], truth, RADAR, clean=name == "ideal"), RADAR)
+        left = course_of(chain, traces[name], truth.values, RADAR, clean=name == "ideal").metrics(RADAR)
         image = traces[name].signal
         figures[name] = (
             float(entropy(image)),

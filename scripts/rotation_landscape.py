@@ -6,8 +6,7 @@ it is and how it leans.
 
 Cuts through the truth over k1, k2, the Legendre coefficients q2 and q3 of the warp, and the rate,
 for image lines of 1, 1/2 and 1/4 of a Doppler cell; a map over k1 and k2 with its oblique valley;
-and the gradient of automatic differentiation beside differences. A satellite of 300 scatterers
-("mid" of brief 003).
+and the gradient of automatic differentiation beside differences. A satellite of 300 scatterers.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.compensate.rotation import EntropyObjective, ImageEntropy
+from torchsar.compensate import EntropyObjective, ImageEntropy
 from torchsar.core import Draws, Signal
 from torchsar.echo import simulate_turntable
 from torchsar.radar import LIGHT_M_S, InverseRadar
@@ -153,9 +152,9 @@ def lean(ratio: Tensor, grid: Tensor) -> float:
     """dk1 / dk2 (s) along the valley, by least squares on where each row of constant k2 is
     least.
     """
-    place = ratio[grid.argmin(-1)]
-    inside = (place > ratio[0]) & (place < ratio[-1])
-    x, y = 1000 * (ratio[inside] - ratio[inside].mean()), 10 * (place[inside] - place[inside].mean())
+    lowest = ratio[grid.argmin(-1)]
+    inside = (lowest > ratio[0]) & (lowest < ratio[-1])
+    x, y = 1000 * (ratio[inside] - ratio[inside].mean()), 10 * (lowest[inside] - lowest[inside].mean())
     return float((x * y).sum() / (x * x).sum())
 
 
@@ -171,7 +170,7 @@ def main(arguments: list[str] | None = None) -> None:
     signal, radar = simulated("tiny" if options.small else "mid", options.seed, options.snr_db)
     found = cuts(signal, radar, 11 if options.small else 41)
     print(
-        f"{'place of the least entropy (%)':32}"
+        f"{'minimum of the entropy (%)':32}"
         + "".join(f"{f'os {o:g}':>10}" for o in OVERSAMPLINGS)
         + f"{'minima inside the cut':>26}"
     )

@@ -19,11 +19,10 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.compensate.rotation import uneven_rotation
+from torchsar.compensate import uneven_rotation
 from torchsar.core import Axis, Draws, Signal
 from torchsar.echo import simulate_turntable
-from torchsar.focus.image_lines import DopplerLines, cross_range_of
-from torchsar.focus.matched_fourier import matched_fourier, range_phase
+from torchsar.focus import DopplerLines, cross_range_of, matched_fourier, range_phase
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.scene import Points, PolynomialRotation, Satellite, TurntableWorld
 
@@ -44,7 +43,7 @@ NAMES = {
     "azimuth": "order 3, azimuth",
     "full": "order 3, two-dimensional",
 }
-# brief 003, experiment 1: peak (dB), width (mm), highest side lobe (dB) at 12 m and at 0 m
+# from a separate simulation: peak (dB), width (mm), highest side lobe (dB) at 12 m and at 0 m
 EXPECTED = {
     "none": ((-29.7, 655, 0.0), (-4.1, 6.7, -16.0)),
     "order 2": ((-15.4, 8.3, -2.1), None),
@@ -78,8 +77,8 @@ class Profile:
             line.abs() / math.sqrt(pulse.n),
         )
 
-    def near(self, place_m: float, reach_m: float) -> Profile:
-        inside = (self.cross_range_m - place_m).abs() <= reach_m
+    def near(self, centre_m: float, reach_m: float) -> Profile:
+        inside = (self.cross_range_m - centre_m).abs() <= reach_m
         return Profile(self.cross_range_m[inside], self.amplitude[inside])
 
     def figures(self) -> tuple[float, float, float]:
@@ -149,15 +148,15 @@ def table(profiles: Mapping[str, Profile]) -> None:
 def draw_profiles(profiles: Mapping[str, Profile], names: Sequence[str], reach_m: Sequence[float], path: Path) -> None:
     """Profiles of the three points, beside each other, each within its reach."""
     parts = []
-    for place, reach in zip(PLACES_M, reach_m, strict=True):
-        near = {NAMES[name]: profiles[name].near(place, reach) for name in names}
+    for centre, reach in zip(PLACES_M, reach_m, strict=True):
+        near = {NAMES[name]: profiles[name].near(centre, reach) for name in names}
         series = {name: (plot.array(p.cross_range_m), plot.decibel(p.amplitude, 1.0)) for name, p in near.items()}
         parts.append(
             {
                 "series": series,
                 "xlabel": "cross range (m)",
                 "ylabel": "amplitude (dB of an ideal point)",
-                "title": f"x = {place:g} m",
+                "title": f"x = {centre:g} m",
                 "ylim": (-50.0, 3.0),
             }
         )
@@ -183,9 +182,9 @@ def whole_image(
         target, rotation=PolynomialRotation(OMEGA_RAD_S, WARP_K), centre_deviation_m=yc_m, snr_db=snr_db
     )
     signal = simulate_turntable(radar, world, n_pulse, n_range, Draws(1, trials=[0] * len(yc_m)))[0].signal
-    told = {"wavelength_m": radar.wavelength_m, "prf_hz": radar.prf_hz, "range_m": signal.axis("range").values()}
+    given = {"wavelength_m": radar.wavelength_m, "prf_hz": radar.prf_hz, "range_m": signal.axis("range").values()}
     return {
-        name: uneven_rotation(signal.data, **told, yc_m=known)["omega_rad_s"] / OMEGA_RAD_S
+        name: uneven_rotation(signal.data, **given, yc_m=known)["omega_rad_s"] / OMEGA_RAD_S
         for name, known in (("ignored", 0.0), ("estimated", None))
     }
 

@@ -1,13 +1,12 @@
-"""A satellite that turns unevenly: figures 4 to 9 of Remote Sens.
-
-2025, 17, 3447, with a procedural satellite in place of the one that is not published.
+"""A satellite that turns unevenly: figures 4 to 9 of Remote Sens. 2025, 17, 3447, with a procedural
+satellite instead of the one that is not published.
 
     python scripts/rotation_satellite.py [--out rotation_satellite] [--target full] [--seed 1]
     [--snr-db 20] [--small]
 
 The image without compensation, as a sum of chirplets (ACL), with the acceleration alone taken out
 (SM), and with the recommended estimate of the whole rotation; entropy and contrast of each beside
-those of brief 003, and the places of both panel tips in the image that is scaled to metres.
+expected ones, and the positions of both panel tips in the image that is scaled to metres.
 """
 
 from __future__ import annotations
@@ -20,19 +19,19 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.compensate import autofocus, correct_pulse_phase
-from torchsar.compensate.rotation import (
+from torchsar.compensate import (
     EntropyObjective,
     ImageEntropy,
+    autofocus,
     chirplet_clean,
     coarse_rotation,
+    correct_pulse_phase,
     descend_rotation,
     uneven_rotation,
 )
 from torchsar.core import Axis, Draws, Estimate, Signal, Truth
 from torchsar.echo import simulate_turntable
-from torchsar.focus.image_lines import mean_rate
-from torchsar.focus.matched_fourier import MatchedFourier, RangePhase
+from torchsar.focus import MatchedFourier, RangePhase, mean_rate
 from torchsar.metrics import contrast, entropy, impulse_response
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
@@ -52,7 +51,7 @@ EXPECTED = {
     "SM, order 2": (10.05, 9.4),
     "order 3, azimuth": (7.79, 25.0),
     "order 3, two-dimensional": (7.766, 25.3),
-}  # brief 003, "mid"
+}  # from a separate simulation of this scene
 FIGURES = {
     "no compensation": "figure_05.png",
     "chirplets (ACL)": "figure_06.png",
@@ -66,11 +65,11 @@ def second_order(signal: Signal, radar: InverseRadar) -> Estimate:
     entropy. It is not k1 of the target but about k1 + k2 T / 2.
     """
     figure = ImageEntropy.of(signal, radar, EntropyObjective(order=2, range_term=False))
-    start = coarse_rotation(signal.data, order=2, **told(signal, radar))
+    start = coarse_rotation(signal.data, order=2, **known_of(signal, radar))
     return descend_rotation(figure, figure.start(0.0, start["warp_k"]))
 
 
-def told(signal: Signal, radar: InverseRadar) -> dict:
+def known_of(signal: Signal, radar: InverseRadar) -> dict:
     return {"wavelength_m": radar.wavelength_m, "prf_hz": radar.prf_hz, "range_m": signal.axis("range").values()}
 
 
@@ -79,11 +78,11 @@ def images(signal: Signal, radar: InverseRadar, estimate: Estimate, atoms: int) 
     focus, flat = MatchedFourier(radar), RangePhase(radar)
     rotation = {name: estimate[name] for name in ("omega_rad_s", "warp_k", "yc_m")}
     chirplets = chirplet_clean(signal.data, radar.prf_hz, atoms=atoms).image
-    still = focus(signal)
+    uncompensated = focus(signal)
     uniform = correct_pulse_phase(signal.data, autofocus(signal.data)["phase_rad"])
     return {
-        "no compensation": still,
-        "chirplets (ACL)": still.with_data(chirplets),
+        "no compensation": uncompensated,
+        "chirplets (ACL)": uncompensated.with_data(chirplets),
         "uniform autofocus": focus(signal.with_data(uniform)),
         "SM, order 2": focus(signal, second_order(signal, radar)["warp_k"]),
         "order 3, azimuth": focus(signal, rotation["warp_k"]),
@@ -159,8 +158,8 @@ def tips(image: Signal, truth: Truth) -> dict[float, float]:
 
 
 def table(raw: Mapping[str, Signal], target: str) -> None:
-    """Entropy and contrast of every image, beside the brief's."""
-    print(f"{target + ' target':26}{'entropy':>10}{'contrast':>10}{'brief':>10}{'brief':>10}")
+    """Entropy and contrast of every image, beside expected ones."""
+    print(f"{target + ' target':26}{'entropy':>10}{'contrast':>10}{'expected':>10}{'expected':>10}")
     for name, image in raw.items():
         known = EXPECTED.get(name) if target == "mid" else None
         print(
@@ -175,7 +174,7 @@ def report(estimate: Estimate, image: Signal, truth: Truth) -> None:
     print(
         "ok" if bool(estimate.ok) else "NOT ok",
         "; tips:",
-        ", ".join(f"{seen:.3f} m for {place:.3f} m" for place, seen in tips(image, truth).items()),
+        ", ".join(f"{seen:.3f} m for {true:.3f} m" for true, seen in tips(image, truth).items()),
     )
 
 
@@ -186,7 +185,7 @@ def main(arguments: list[str] | None = None) -> None:
         "--target",
         choices=TARGETS,
         default="full",
-        help="how finely the satellite is sampled; the brief's figures are of mid",
+        help="how finely the satellite is sampled; the expected figures are of mid",
     )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument(
@@ -203,7 +202,7 @@ def main(arguments: list[str] | None = None) -> None:
     world = TurntableWorld(satellite, rotation=ROTATION, snr_db=options.snr_db)
     recording, truth = simulate_turntable(radar, world, n_pulse, n_range, Draws(options.seed))
     signal = recording.signal
-    estimate = uneven_rotation(signal.data, **told(signal, radar))
+    estimate = uneven_rotation(signal.data, **known_of(signal, radar))
     raw = images(signal, radar, estimate, atoms=4 if options.small else 16)
     table(raw, target)
     rate = mean_rate(estimate["omega_rad_s"], estimate["warp_k"], n_pulse / prf_hz)

@@ -1,5 +1,4 @@
 """Uneven rotation by signal-to-noise ratio: figures 13 to 17 and Tables 3 and 4 of Remote Sens.
-
 2025, 17, 3447.
 
     python scripts/rotation_snr.py [--out rotation_snr] [--seed 1] [--trials 100] [--genetic-trials
@@ -24,13 +23,11 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.compensate.rotation import EntropyObjective, ImageEntropy, genetic_rotation, uneven_rotation
+from torchsar.compensate import EntropyObjective, ImageEntropy, genetic_rotation, uneven_rotation
 from torchsar.core import Axis, Draws, Estimate, Signal, Truth
 from torchsar.echo import simulate_turntable
-from torchsar.focus.image_lines import mean_rate
-from torchsar.focus.matched_fourier import MatchedFourier, RangePhase
-from torchsar.metrics import impulse_response
-from torchsar.metrics.rotation_bounds import rotation_bounds
+from torchsar.focus import MatchedFourier, RangePhase, mean_rate
+from torchsar.metrics import impulse_response, rotation_bounds
 from torchsar.radar import LIGHT_M_S, InverseRadar
 from torchsar.scene import PolynomialRotation, Satellite, TurntableWorld
 
@@ -112,22 +109,22 @@ def errors(find: Finder, target: Target, snr_db: float, seed: int, trials: int) 
 def bounds(target: Target, snr_db: float, seed: int, trials: int) -> dict[str, Tensor]:
     """Cramer-Rao bounds in %, root of the mean square over scenes."""
     _, truth = target.simulated(snr_db, seed, range(min(trials, BATCH)))
-    places = (
+    positions = (
         truth.values[name]
         for name in ("cross_range_m", "range_m", "amplitude", "noise_std", "omega_rad_s", "warp_k", "yc_m")
     )
     least = rotation_bounds(
-        *places, wavelength_m=target.radar.wavelength_m, prf_hz=target.prf_hz, n_pulse=target.n_pulse
+        *positions, wavelength_m=target.radar.wavelength_m, prf_hz=target.prf_hz, n_pulse=target.n_pulse
     )
     return {name: 100 * least[name].square().mean().sqrt() / TRUE[name] for name in TRUE}
 
 
 def head() -> None:
-    print(f"{'error (%), mean +- deviation':30}{'trials':>8}" + "".join(f"{name:>20}" for name in NAMES.values()))
+    print(f"{'error (%), mean +- std':30}{'trials':>8}" + "".join(f"{name:>20}" for name in NAMES.values()))
 
 
 def rows(snr_db: float, found: Mapping[tuple[str, float], Mapping[str, Tensor]], least: Mapping[str, Tensor]) -> None:
-    """Table 3, one SNR: mean and deviation of every error, and the bound."""
+    """Table 3, one SNR: mean and standard deviation of every error, and the bound."""
     for (method, at), error in found.items():
         if at == snr_db:
             cells = [f"{float(e.mean()):.3f} +- {float(e.std()):.3f}" for e in error.values()]
@@ -141,7 +138,9 @@ def rows(snr_db: float, found: Mapping[tuple[str, float], Mapping[str, Tensor]],
 def draw_errors(
     found: Mapping[tuple[str, float], Mapping[str, Tensor]], least: Mapping[float, Mapping[str, Tensor]], out: Path
 ) -> None:
-    """Figure 13: estimates over truth with their deviations; and rms errors beside the bound."""
+    """Figure 13: estimates over truth with their standard deviations; and rms errors beside the
+    bound.
+    """
     methods, snr = list(dict.fromkeys(method for method, _ in found)), list(least)
     estimates, rms = [], []
     for name, title in NAMES.items():
@@ -162,8 +161,8 @@ def draw_errors(
 
 
 def spread(error: Tensor) -> Tensor:
-    """Of errors in %: mean of the estimate over the truth, that less and plus a deviation; rms
-    error, and that less and plus its own deviation.
+    """Of errors in %: mean of the estimate over the truth, and the same less and plus a standard
+    deviation; rms error, and the same less and plus its own standard deviation.
     """
     mean, std, rms = error.mean(), error.std(), error.square().mean().sqrt()
     own = rms / math.sqrt(2 * len(error))
@@ -174,7 +173,7 @@ def full_target(target: Target, seed: int, scenes: int, out: Path) -> None:
     """Table 4 and figures 14 to 17."""
     print(
         f"\n{'tip of the full target':30}{'scenes':>8}{'rms error (%)':>20}{'bound (%)':>20}"
-        f"{'seen, scene 1 (m)':>20}{'published (%)':>20}{'trusted':>9}"
+        f"{'seen, scene 1 (m)':>20}{'published (%)':>20}{'reliable':>9}"
     )
     shown = {}
     for snr in SNR_DB:
@@ -184,10 +183,10 @@ def full_target(target: Target, seed: int, scenes: int, out: Path) -> None:
         image = focused(signal, target.radar, found, 0)
         shown[f"{snr:g} dB"] = image
         rms, bound = 100 * (1 / scale - 1).square().mean().sqrt(), bounds(target, snr, seed, scenes)["omega_rad_s"]
-        trusted = found.ok.double().mean()
+        reliable = found.ok.double().mean()
         print(
             f"{f'{snr:g} dB':30}{scenes:>8}{float(rms):>20.3f}{float(bound):>20.3f}"
-            f"{tip(image, truth):>20.4f}{PUBLISHED_TIP.get(snr, '-'):>20}{float(trusted):>9.2f}",
+            f"{tip(image, truth):>20.4f}{PUBLISHED_TIP.get(snr, '-'):>20}{float(reliable):>9.2f}",
             flush=True,
         )
     plot.save(plot.images(shown, 45, 2, percentile=100), out / "figure_14_17.png")

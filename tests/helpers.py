@@ -46,7 +46,7 @@ def small_radar(**changes: object) -> StripmapRadar:
 
 
 def kondor_radar(**changes: object) -> StripmapRadar:
-    """The Kondor-like sensor of brief 004 with a short pulse."""
+    """A sensor like Kondor with a short pulse."""
     values: dict = {
         "carrier_hz": 3.2e9,
         "pulse": LinearFM(200e6, 3e-6),
@@ -81,8 +81,8 @@ def small_recording(
 
 
 def small_ladar(**changes: object) -> TriangularLadar:
-    """The simulated ladar of brief 000 with 32 samples a sweep: a beat band of half a metre to
-    either side.
+    """The simulated ladar of Remote Sens. 2024, 16, 793, with 32 samples a sweep: a beat band of
+    half a metre to either side.
     """
     values: dict = {
         "carrier_hz": LIGHT_M_S / 1.55e-6,
@@ -115,7 +115,7 @@ def small_ladar_recording(
 
 
 def small_bistatic(**changes: object) -> BistaticRadar:
-    """The receiver of brief 001 with a short pulse."""
+    """The receiver of Remote Sens. 2020, 12, 1703, with a short pulse."""
     values: dict = {
         "carrier_hz": 1.25e9,
         "pulse": LinearFM(50e6, 0.2e-6),

@@ -3,46 +3,70 @@
 from __future__ import annotations
 
 import re
+import runpy
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+
+import pytest
+import torch
+
+from torchsar.study.commands.sweep import SweepTrial, sweep_grid
+from torchsar.study.table import load
+from torchsar.study.trials.bench import Bench
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def test_first_image_is_the_script_of_the_readme_and_runs(tmp_path: Path) -> None:
+Printed = Callable[[Path, list[str]], str]
+
+
+@pytest.fixture
+def printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Printed:
+    """What a script prints that runs as the main program, in this process and an empty folder."""
+
+    def run(script: Path, arguments: list[str]) -> str:
+        threads = torch.get_num_threads()
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", [str(script), *arguments])
+        try:
+            runpy.run_path(str(script), run_name="__main__")
+        finally:
+            torch.set_num_threads(threads)
+        return capsys.readouterr().out
+
+    return run
+
+
+def test_first_image_is_the_script_of_the_readme_and_runs(printed: Printed, tmp_path: Path) -> None:
     script = ROOT / "scripts" / "first_image.py"
     assert script.read_text(encoding="utf-8") in (ROOT / "README.md").read_text(encoding="utf-8")
-    done = subprocess.run([sys.executable, str(script)], cwd=tmp_path, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr[-1000:]
-    found = re.match(r"Doppler ([-\d.]+) Hz, true ([-\d.]+) Hz", done.stdout)
+    found = re.match(r"Doppler ([-\d.]+) Hz, true ([-\d.]+) Hz", printed(script, []))
     assert found and abs(float(found[1]) - float(found[2])) < 5
     assert (tmp_path / "first_image.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_the_config_of_the_readme_is_accepted(tmp_path: Path) -> None:
-    from torchsar.study.config import load
-    from torchsar.study.stripmap.run import check
-    from torchsar.study.sweeping import sweep_grid
-
     whole, swept = readme_blocks("yaml")
     path = tmp_path / "readme.yaml"
     path.write_text(whole, encoding="utf-8")
-    check(load(str(path)))
+    assert list(Bench(load(path)).chains) == ["recommended"]
     path.write_text(whole + swept, encoding="utf-8")
-    assert sweep_grid(load(str(path))).shape == (3, 2, 2)
+    loaded = load(path)
+    assert sweep_grid(loaded, SweepTrial(loaded)).shape == (3, 2, 2)
 
 
 def readme_blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
 
 
-def test_the_sweep_of_the_readme_runs(tmp_path: Path) -> None:
-    script = next(block for block in readme_blocks("python") if "def trial(" in block)
-    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr[-1000:]
+def test_the_sweep_of_the_readme_runs(printed: Printed, tmp_path: Path) -> None:
+    script = tmp_path / "sweep.py"
+    script.write_text(next(block for block in readme_blocks("python") if "def trial(" in block), encoding="utf-8")
+    text = printed(script, [])
     assert (tmp_path / "out" / "mean" / "results.zarr").is_dir()
-    rmse = [float(x) for x in re.findall(r"\d\.\d+(?:e-\d+)?", done.stdout)]
+    rmse = [float(x) for x in re.findall(r"\d\.\d+(?:e-\d+)?", text)]
     # the median of Gaussian noise is worse than the mean
     assert rmse[0] < 0.15 and rmse[3] > rmse[0]
 
@@ -65,22 +89,12 @@ def test_the_benchmark_of_sweeps_runs(tmp_path: Path) -> None:
         assert re.search(rf"^{name} +\d+ +\d+\.\d+", done.stdout, re.MULTILINE), done.stdout
 
 
-def test_autofocus_is_composed(tmp_path: Path) -> None:
-    command = [
-        sys.executable,
-        str(ROOT / "scripts" / "compose_autofocus.py"),
-        "--trials",
-        "2",
-        "--candidates",
-        "2",
-        "--pulses",
-        "64",
-    ]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr[-1000:]
+def test_autofocus_is_composed(printed: Printed, tmp_path: Path) -> None:
+    arguments = ["--trials", "2", "--candidates", "2", "--pulses", "64"]
+    text = printed(ROOT / "scripts" / "compose_autofocus.py", arguments)
     rows = {
         line[:32].strip(): [float(x) for x in line[32:].split()]
-        for line in done.stdout.splitlines()
+        for line in text.splitlines()
         if re.search(r"\d\.\d{3}$", line)
     }
     assert all(len(row) == 6 for row in rows.values()) and len(rows) == 6
@@ -89,24 +103,12 @@ def test_autofocus_is_composed(tmp_path: Path) -> None:
     assert (tmp_path / "compose_autofocus.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_benchmark_of_ladar_estimators_runs(tmp_path: Path) -> None:
-    command = [
-        sys.executable,
-        str(ROOT / "scripts" / "ladar_speed.py"),
-        "--trials",
-        "2",
-        "--rounds",
-        "1",
-        "--periods",
-        "32",
-    ]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr[-1000:]
+def test_the_benchmark_of_ladar_estimators_runs(printed: Printed) -> None:
+    arguments = ["--trials", "2", "--rounds", "1", "--periods", "32"]
+    text = printed(ROOT / "scripts" / "ladar_speed.py", arguments)
     for precision in ("complex64", "complex128"):
-        assert re.search(rf"^{precision}: 2 trials of 32 periods x 2 x 512 samples", done.stdout, re.MULTILINE), (
-            done.stdout
-        )
-    over = [float(x) for x in re.findall(r"^radial_motion(?: +[\d.]+){3} +([\d.]+)", done.stdout, re.MULTILINE)]
+        assert re.search(rf"^{precision}: 2 trials of 32 periods x 2 x 512 samples", text, re.MULTILINE), text
+    over = [float(x) for x in re.findall(r"^radial_motion(?: +[\d.]+){3} +([\d.]+)", text, re.MULTILINE)]
     # of the bound with unknown phases; known ones halve it
     assert len(over) == 2 and all(0.4 < x < 0.7 for x in over)
 
@@ -114,3 +116,16 @@ def test_the_benchmark_of_ladar_estimators_runs(tmp_path: Path) -> None:
 def test_readme_points_at_files_that_exist() -> None:
     for target in re.findall(r"\]\(([^)#]+)\)", (ROOT / "README.md").read_text(encoding="utf-8")):
         assert target.startswith("http") or (ROOT / target).exists(), target
+
+
+@pytest.mark.parametrize("script", sorted((ROOT / "scripts").glob("*.py")), ids=lambda path: path.stem)
+def test_scripts_name_their_options(script: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    text = script.read_text(encoding="utf-8")
+    assert text.startswith('"""')
+    if "argparse" not in text:
+        return
+    monkeypatch.setattr(sys, "argv", [str(script), "--help"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(script), run_name="__main__")
+    assert ended.value.code == 0
+    assert "usage: " in capsys.readouterr().out

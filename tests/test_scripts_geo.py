@@ -49,7 +49,7 @@ def test_targets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert level < -65 and three[f"proposed {name}"][-1] < -45
     assert [two[f"conventional {name}"][-1] for name in ("P1", "P2", "P4")] == pytest.approx(
         [-45.6, -19.4, -23.1], abs=1.5
-    )  # brief 001
+    )
     assert two["conventional P1"][0] > 50 and two["conventional P2"][0] < 1.1
 
 
@@ -87,8 +87,8 @@ def test_velocity(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     second, third, beyond = (rows(part, 34) for part in text.split("\n\n"))
     assert second["published"] == [1.33, 0.19] and third["published"] == [0.19, 0.15]
     assert second["ML"][0] < 1 and second["ML"][1] < 0.1 and second["SIR"][1] < 0.3
-    assert second["bound, u_a told"][0] == pytest.approx(10 * second["bound, u_a told"][1], rel=0.02)
-    assert all(a < b for a, b in zip(second["bound, u_a told"], second["bound, nothing told"], strict=True))
+    assert second["bound, u_a known"][0] == pytest.approx(10 * second["bound, u_a known"][1], rel=0.02)
+    assert all(a < b for a, b in zip(second["bound, u_a known"], second["bound, no prior knowledge"], strict=True))
     assert beyond["bank and likelihood"] == pytest.approx([25, -35], abs=0.1) and beyond[
         "range walk, interferometry"
     ] == pytest.approx([25, -35], abs=0.2)

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
-EXIT_BAD_INPUT = 2
+EXIT_BAD_INPUT = 2  # the status of argparse for a command line that it rejects
 _COMMANDS = {
     "run": "run an experiment and write its images, figures and report",
     "sweep": "run the Monte Carlo sweep of a config: many trials of every point of its grid",
@@ -21,7 +21,11 @@ _COMMANDS = {
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """The command line.
+
+    Returns:
+        Parser of all commands.
+    """
     top = argparse.ArgumentParser(prog="torchsar", description="Synthetic aperture radar experiments from a config.")
     top.add_argument("--version", action="store_true", help="print the version and end")
     top.add_argument(

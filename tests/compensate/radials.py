@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from tests.echo.ladars import COMMON, table1
-from torchsar.compensate.radial import (
+from torchsar.compensate import (
     mirror_product,
     ml_peak,
     radial_motion,

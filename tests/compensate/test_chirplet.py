@@ -8,11 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchsar.compensate.rotation import ChirpletClean, chirplet_clean
+from torchsar.compensate import ChirpletClean, chirplet_clean
 from torchsar.core import Signal
 from torchsar.core.warp import warp
-from torchsar.focus.matched_fourier import matched_fourier
-from torchsar.metrics.image import entropy
+from torchsar.focus import matched_fourier
+from torchsar.metrics import entropy
 from torchsar.radar import LIGHT_M_S, InverseRadar
 
 F64 = torch.float64

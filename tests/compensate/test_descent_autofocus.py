@@ -8,8 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchsar.compensate import CorrectPulsePhase, Sca
-from torchsar.compensate.pulse_phase import (
+from torchsar.compensate import (
+    CorrectPulsePhase,
+    Sca,
     entropy_fixed_point,
     maximum_contrast,
     minimum_entropy,

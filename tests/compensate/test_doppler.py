@@ -23,12 +23,7 @@ from torchsar.core import Chain, Draws, Recording, Signal, use
 from torchsar.echo import simulate
 from torchsar.focus import OmegaK
 from torchsar.io import read_stripmap
-from torchsar.metrics.bounds import (
-    beam_centre_bound_hz,
-    reference_doppler_std_hz,
-    tone_frequency_bound_hz,
-    velocity_bound_m_s,
-)
+from torchsar.metrics import beam_centre_bound_hz, reference_doppler_std_hz, tone_frequency_bound_hz, velocity_bound_m_s
 from torchsar.optim import gradient_minimum, grid_minimum, parabola_minimum
 from torchsar.radar import LIGHT_M_S, LinearFM, StripmapRadar
 from torchsar.scene import Dwell, RandomPoints, StripmapWorld

@@ -9,18 +9,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchsar.compensate.envelope import (
+from torchsar.compensate import (
     AlignEnvelopes,
     ShiftRange,
     align_envelopes,
     align_mean,
     align_running,
+    correct_pulse_phase,
     drift_cells,
     refine_alignment,
     shift_range,
 )
 from torchsar.compensate.envelope_fit import Envelopes, robust_fit
-from torchsar.compensate.pulse_phase import correct_pulse_phase
 from torchsar.core import Axis, Chain, Draws, Signal, use
 from torchsar.echo import simulate_turntable
 from torchsar.focus import CompressDechirped, azimuth_transform
@@ -122,11 +122,11 @@ def test_correlations_equal_direct_sums() -> None:
 
 def test_parabola_finds_the_peak_between_samples() -> None:
     """The peak of a smooth envelope is found to 0.001 cell at any position."""
-    place = torch.linspace(-31.9, 31.9, 301, dtype=torch.float64)
+    position = torch.linspace(-31.9, 31.9, 301, dtype=torch.float64)
     lines = torch.exp(-(((torch.arange(64) - 32) / 2.0) ** 2)).to(DOUBLE).expand(1, 301, -1)
-    pulses = Envelopes.of(shift_range(lines, place))
+    pulses = Envelopes.of(shift_range(lines, position))
     found = pulses.peak(pulses.spectra * Envelopes.of(lines).spectra[:, :1].conj())
-    assert float((found - place).abs().max()) < 1e-3
+    assert float((found - position).abs().max()) < 1e-3
 
 
 @pytest.mark.parametrize("method", SINGLE.values(), ids=list(SINGLE))

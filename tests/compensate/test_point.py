@@ -11,7 +11,7 @@ from torchsar.compensate import PointDoppler, doppler_at
 from torchsar.core import Draws, Signal
 from torchsar.echo import simulate, target_energy
 from torchsar.focus import OmegaK
-from torchsar.metrics.bounds import reference_doppler_std_hz, tone_frequency_bound_hz
+from torchsar.metrics import reference_doppler_std_hz, tone_frequency_bound_hz
 from torchsar.radar import LinearFM, StripmapRadar
 from torchsar.scene import Dwell, Points, StripmapWorld
 
@@ -55,13 +55,15 @@ def test_doppler_at_inverts_the_image_position() -> None:
         ahead = velocity * (zero_s - crossing_s)
         doppler = 2 * velocity / RADAR.wavelength_m * ahead / math.hypot(closest_m, ahead)
         for frame_hz in (0.0, 652.0, -900.0):
-            place = RADAR.image_position(
+            position = RADAR.image_position(
                 torch.tensor(zero_s, dtype=torch.float64),
                 torch.tensor(closest_m, dtype=torch.float64),
                 frame_hz,
                 velocity,
             )
-            assert float(doppler_at(RADAR, *place, frame_hz, velocity, crossing_s)) == pytest.approx(doppler, abs=1e-7)
+            assert float(doppler_at(RADAR, *position, frame_hz, velocity, crossing_s)) == pytest.approx(
+                doppler, abs=1e-7
+            )
 
 
 def test_a_frame_is_required() -> None:

@@ -9,13 +9,7 @@ import torch
 
 from tests.compensate.radials import GATE, rms, seen, without_line
 from tests.echo.ladars import COMMON, direct_sweeps, table1
-from torchsar.compensate.radial import (
-    compensate_motion,
-    integrated_range,
-    radial_motion,
-    range_error,
-    turning_points,
-)
+from torchsar.compensate import compensate_motion, integrated_range, radial_motion, range_error, turning_points
 from torchsar.compensate.radial.compensate import polynomial_phasor
 from torchsar.compensate.radial.trajectory import sweep_motion
 from torchsar.core import Axis, Estimate
@@ -37,10 +31,10 @@ def true_motion(radar, n, motion=COMMON):
 
 def test_the_spline_integrates_to_picometres_and_rectangles_to_micrometres() -> None:
     """A cubic spline through the velocities is exact to picometres, a sum of rectangles is not."""
-    pulse, v, place = true_motion(RADAR, 512)
+    pulse, v, position = true_motion(RADAR, 512)
     at = sweep_middles(RADAR, pulse)
     zero = turning_points(RADAR, pulse).values()[:1]
-    true = place(at) - place(zero)
+    true = position(at) - position(zero)
     assert float((integrated_range(v, RADAR, pulse, at) - true).abs().max()) < 1e-12
     rectangles = torch.cat([torch.zeros(1, dtype=torch.float64), v.cumsum(0)[:-1]]) * pulse.step
     assert 1e-6 < float((rectangles - true[0]).abs().max()) < 6e-6
@@ -70,19 +64,19 @@ def test_compensated_sweeps_equal_static_ones(sign, motion) -> None:
     moving, still = direct_sweeps(s, radar, 24, motion), direct_sweeps(s, radar, 24)
     if sign == "echo_conj_lo":
         moving, still = moving.conj(), still.conj()
-    pulse, v, place = true_motion(radar, 24, motion)
+    pulse, v, position = true_motion(radar, 24, motion)
     found = compensate_motion(moving, v, radar, pulse)
     zero = turning_points(radar, pulse).values()[:1]
-    constant = 4 * math.pi * float(place(zero)) / radar.wavelength_m * (1 if sign == "lo_conj_echo" else -1)
+    constant = 4 * math.pi * float(position(zero)) / radar.wavelength_m * (1 if sign == "lo_conj_echo" else -1)
     left = torch.angle(
         found
         * still.conj()
         * torch.polar(torch.ones(1, dtype=torch.float64), -torch.tensor([constant], dtype=torch.float64))
     )
     # video phase of K (2 DR / c)^2 / 2 turns, and f(u) times the offset at the first turning point
-    moved = (place(sweep_middles(radar, pulse)) * 2 / radar.wave_speed_m_s).abs().max()
+    moved = (position(sweep_middles(radar, pulse)) * 2 / radar.wave_speed_m_s).abs().max()
     video = math.pi * radar.chirp_rate_hz_s * float(moved) ** 2
-    band = math.pi * radar.bandwidth_hz * 2 * float(place(zero).abs()) / radar.wave_speed_m_s
+    band = math.pi * radar.bandwidth_hz * 2 * float(position(zero).abs()) / radar.wave_speed_m_s
     assert float(left.abs().max()) < 1.05 * (video + band) + 1e-6
     assert (
         float(
@@ -148,14 +142,14 @@ def test_a_large_trial_does_not_degrade_small_quadratic_terms() -> None:
 
 
 def test_range_error_adds_velocities_and_phases() -> None:
-    pulse, v, place = true_motion(RADAR, 64)
+    pulse, v, position = true_motion(RADAR, 64)
     at = sweep_middles(RADAR, pulse)[0]
     bump = 3e-8 * torch.sin(2 * math.pi * 5 * torch.arange(64, dtype=torch.float64) / 64)
     phase = 4 * math.pi / RADAR.wavelength_m * bump
     one = torch.ones((), dtype=torch.bool)
     both = range_error(Estimate({"velocity_m_s": v, "phase_rad": phase}, one.double(), one), RADAR, pulse, at)
     torch.testing.assert_close(
-        both, place(at) - place(turning_points(RADAR, pulse).values()[:1]) + bump, atol=1e-12, rtol=0
+        both, position(at) - position(turning_points(RADAR, pulse).values()[:1]) + bump, atol=1e-12, rtol=0
     )
 
 

@@ -7,7 +7,7 @@ import torch
 
 from tests.compensate.radials import ESTIMATORS, GATE, ONE, rms, seen, velocity_rms
 from tests.echo.ladars import COMMON, table1
-from torchsar.compensate.radial import geometric_velocity_m_s
+from torchsar.compensate import geometric_velocity_m_s
 from torchsar.compensate.radial.peak import from_beats
 from torchsar.scene import Points, Polynomial
 

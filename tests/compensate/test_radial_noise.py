@@ -7,8 +7,8 @@ import torch
 
 from tests.compensate.radials import ESTIMATORS, range_rms, seen, velocity_rms
 from tests.echo.ladars import table1
-from torchsar.compensate.radial import radial_motion
-from torchsar.metrics.ladar_bounds import (
+from torchsar.compensate import radial_motion
+from torchsar.metrics import (
     integrated_range_detrended_bound_m,
     range_per_sweep_bound_m,
     velocity_free_offset_bound_m_s,

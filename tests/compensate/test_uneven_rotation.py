@@ -25,9 +25,9 @@ from tests.compensate.turning import (
     target,
     targets,
 )
-from torchsar.compensate import CorrectPulsePhase
-from torchsar.compensate.rotation import (
+from torchsar.compensate import (
     CoarseRotation,
+    CorrectPulsePhase,
     PhaseFitRotation,
     RotationAutofocus,
     UnevenRotation,
@@ -280,10 +280,10 @@ def test_the_autofocus_compensates_the_rotation() -> None:
     assert found.ok and off_the_warp(found["phase_rad"] - walk, phi) < 0.1
     blind = RotationAutofocus(RADAR)(signal_of(impaired))
     assert off_the_warp(blind["phase_rad"] - walk, phi) > 0.3, "an autofocus without the rotation leaves a larger error"
-    told = RotationAutofocus(RADAR)(
+    known = RotationAutofocus(RADAR)(
         signal_of(impaired), omega_rad_s=torch.tensor(OMEGA, dtype=F64), warp_k=K, yc_m=torch.tensor(0.0, dtype=F64)
     )
-    torch.testing.assert_close(told["phase_rad"], found["phase_rad"], atol=1e-6, rtol=0)
+    torch.testing.assert_close(known["phase_rad"], found["phase_rad"], atol=1e-6, rtol=0)
 
 
 def off_the_warp(error: Tensor, phi: Tensor) -> float:
@@ -335,7 +335,7 @@ def test_invalid_input_is_rejected() -> None:
 
 
 @pytest.mark.parametrize("snr_db", [60.0, 100.0, None])
-def test_noise_below_the_errors_of_the_model_spoils_nothing(snr_db: float | None) -> None:
+def test_noise_below_the_errors_of_the_model_changes_no_estimate(snr_db: float | None) -> None:
     """Residuals of the model are neither scatterers nor evidence against one."""
     x, y = torch.tensor([-0.3, 0.0, 0.3], dtype=F64), torch.full((3,), 1.2, dtype=F64)
     clean = echo(x, y, torch.ones(3, dtype=torch.complex128), yc_m=10.8)

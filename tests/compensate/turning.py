@@ -31,8 +31,8 @@ def points(seed: int = 0, count: int = 30) -> tuple[Tensor, Tensor, Tensor]:
 def echo(x: Tensor, y: Tensor, amplitude: Tensor, k: Tensor = K, yc_m: float = 0.0, n_pulse: int = PULSES) -> Tensor:
     """Echo of points, (pulse, range) complex128."""
     angle = OMEGA * warp(torch.arange(n_pulse, dtype=F64) / PRF, k)
-    way = x[:, None] * torch.sin(angle) - (y + yc_m)[:, None] * 2 * torch.sin(angle / 2).square()
-    return (torch.exp(-4j * math.pi / WAVELENGTH * way) * amplitude[:, None]).mT @ response(
+    path_m = x[:, None] * torch.sin(angle) - (y + yc_m)[:, None] * 2 * torch.sin(angle / 2).square()
+    return (torch.exp(-4j * math.pi / WAVELENGTH * path_m) * amplitude[:, None]).mT @ response(
         (RANGE_M - y[:, None]) / CELL, BINS
     )
 

@@ -24,36 +24,34 @@ from tests.helpers import (
 )
 from torchsar.compensate import (
     Autofocus,
+    ChirpletClean,
+    CoarseRotation,
     CompensateMotion,
     CorrectPulsePhase,
     DopplerCentroid,
     EffectiveVelocity,
     EnergyCentre,
     EntropyFixedPoint,
+    EntropyObjective,
     MirrorProduct,
     MlPeak,
     Pga,
     PgaSca,
+    PhaseFitRotation,
     PhaseIncrement,
     PhasePolish,
     PointDoppler,
     RadialMotion,
     RangeDependentCentroid,
-    Sca,
-    SegmentedInterference,
-    SpectrumCorrelation,
-)
-from torchsar.compensate.rotation import (
-    ChirpletClean,
-    CoarseRotation,
-    EntropyObjective,
-    PhaseFitRotation,
     RotationAutofocus,
     RotationDescent,
     RotationEvolution,
     RotationGenetic,
     RotationNewton,
     RotationSearch,
+    Sca,
+    SegmentedInterference,
+    SpectrumCorrelation,
     UnevenRotation,
 )
 from torchsar.core import Alternate, Estimate, Signal, Stage, Turn, real_dtype
@@ -72,29 +70,35 @@ from torchsar.focus import (
     RangeCompress,
     RangeDoppler,
     RangePhase,
+    TargetImage,
 )
-from torchsar.focus.target import TargetImage
-from torchsar.multichannel.azimuth import FocusAzimuth
-from torchsar.multichannel.balance import CorrectBalance, EstimateBalance
-from torchsar.multichannel.compress import CompressChannels
-from torchsar.multichannel.migration import CorrectMigration, Keystone
-from torchsar.multichannel.plan import FocusPlan
-from torchsar.multichannel.reconstruct import Reconstruct
-from torchsar.multichannel.response import FlatBand, LeastSquares, MinimumMeanSquare
-from torchsar.multichannel.stationary import StationaryImage
-from torchsar.multichannel.synchronise import EstimateSynchronisation, RemoveSynchronisation
-from torchsar.multichannel.transmit import AzimuthScaling, RemoveTransmitRange
-from torchsar.multichannel.velocity.aperture import Dwell
-from torchsar.multichannel.velocity.bank import Search
-from torchsar.multichannel.velocity.sir import SignalIntensityRatio
-from torchsar.multichannel.velocity.stages import (
+from torchsar.multichannel import (
     AlongTrackAutofocus,
+    AzimuthScaling,
+    CompressChannels,
+    CorrectBalance,
+    CorrectMigration,
+    Dwell,
+    EstimateBalance,
+    EstimateSynchronisation,
+    FlatBand,
+    FocusAzimuth,
+    FocusPlan,
     GradientVelocity,
     Interferometry,
+    Keystone,
+    LeastSquares,
     LikelihoodVelocity,
+    MinimumMeanSquare,
     MovingPointVelocity,
+    Reconstruct,
+    RemoveSynchronisation,
+    RemoveTransmitRange,
+    Search,
+    SignalIntensityRatio,
+    StationaryImage,
+    WalkAmbiguity,
 )
-from torchsar.multichannel.velocity.walk import WalkAmbiguity
 from torchsar.radar import InverseRadar
 from torchsar.repair import (
     BandLimitedFill,
@@ -630,10 +634,10 @@ def test_vmap_equals_batch(case: Case) -> None:
 def test_non_finite_input_is_refused(case: Case, bad: float) -> None:
     stage, signal = case.build(), entering(case, raw(2, n_range=case.n_range))
     data = signal.data.clone()
-    place = (1, *(0,) * (data.ndim - 3), *(min(i, n - 1) for i, n in zip((3, 5), data.shape[1:][-2:])))
-    data[place] = bad
+    position = (1, *(0,) * (data.ndim - 3), *(min(i, n - 1) for i, n in zip((3, 5), data.shape[1:][-2:])))
+    data[position] = bad
     with pytest.raises(
-        ValueError, match=r"1 of \d+ samples are NaN or Inf, the first at index " + re.escape(str(place))
+        ValueError, match=r"1 of \d+ samples are NaN or Inf, the first at index " + re.escape(str(position))
     ):
         stage(signal.with_data(data), **case.values(signal))
 

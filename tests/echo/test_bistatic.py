@@ -9,7 +9,7 @@ import torch
 
 from torchsar.core import Draws
 from torchsar.echo import bistatic_echo, simulate_bistatic
-from torchsar.focus.reference import flat_reference, matched_reference, range_compress
+from torchsar.focus import flat_reference, matched_reference, range_compress
 from torchsar.radar import BistaticRadar, LinearFM, Orbit, range_coefficients, seen_point
 from torchsar.scene import (
     BandLimited,
@@ -17,6 +17,7 @@ from torchsar.scene import (
     Fleet,
     GroundMovers,
     KSea,
+    Movers,
     MovingPoints,
     MovingScene,
     OrbitTransmit,
@@ -25,7 +26,6 @@ from torchsar.scene import (
     Ship,
     TaylorRange,
 )
-from torchsar.scene.moving import Movers
 
 C = 3e8
 SPEED, NEAR = 300.0, 5000.0
@@ -120,7 +120,7 @@ def test_band_weights_peak_at_one_and_hold_the_band():
 
 @pytest.mark.parametrize(("reference", "within"), [(flat_reference, 2e-3), (matched_reference, 0.05)])
 def test_full_echoes_compress_to_the_compressed_ones(reference, within):
-    """Both ways of synthesis are equivalent."""
+    """Both methods of synthesis are equivalent."""
     radar = radar_of(pulse=LinearFM(50e6, 10e-6))
     raw = simulated(radar=radar, n_range=1500, n_pulse=12, kind="full")[0].signal
     data = range_compress(raw.data, reference(radar.pulse, 1500, radar.sampling_hz))

@@ -7,7 +7,7 @@ import torch
 
 from tests.helpers import small_radar
 from torchsar.core import Draws, Recording, Signal
-from torchsar.echo.interference import Quantiser, Tone, WideInterferer
+from torchsar.echo import Quantiser, Tone, WideInterferer
 
 RADAR = small_radar()
 

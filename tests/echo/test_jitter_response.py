@@ -9,9 +9,8 @@ import torch
 
 from tests.helpers import small_recording
 from torchsar.core import Draws
-from torchsar.echo.channels import ChannelImbalance
-from torchsar.echo.jitter import PeriodicJitter, sample_unevenly
-from torchsar.echo.response import ChannelResponse
+from torchsar.echo import ChannelImbalance, ChannelResponse, PeriodicJitter
+from torchsar.echo.jitter import sample_unevenly
 from torchsar.metrics import error_db
 
 OFFSETS = torch.tensor([0.0, 0.18, -0.12, 0.07], dtype=torch.float64)

@@ -116,7 +116,7 @@ def test_triggers_differ_between_trials_and_are_recorded_only_on_request() -> No
     assert "trigger_s" not in together.aux and together.signal.data.shape == (3, 4, 9600)
     for i in range(3):
         alone, known = simulate_ladar_record(
-            COMPLEX4, world, 4, Draws(2, trials=[i]), trigger_s=float(trigger[i]), told_trigger=True, dtype=DOUBLE
+            COMPLEX4, world, 4, Draws(2, trials=[i]), trigger_s=float(trigger[i]), trigger_known=True, dtype=DOUBLE
         )
         torch.testing.assert_close(together.signal.data[i], alone.signal.data[0], atol=1e-8, rtol=0)
         for name in ("velocity_m_s", "range_error_m", "range_error_up_m", "log_amplitude"):

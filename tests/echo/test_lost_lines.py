@@ -7,8 +7,7 @@ import torch
 
 from tests.helpers import small_radar
 from torchsar.core import Draws, Recording, Signal
-from torchsar.echo import apply_impairments
-from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedLines
+from torchsar.echo import CorruptedNumbers, LostGaps, LostLines, RepeatedLines, apply_impairments
 
 N = 200
 

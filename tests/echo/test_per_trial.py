@@ -820,7 +820,7 @@ def test_trigger_times_differ_between_trials(trigger_s: tuple[float, ...]) -> No
 
     def run(trigger: Any, draws: Draws) -> Outputs:
         return outputs(
-            simulate_ladar_record(LADAR, world, 4, draws, trigger_s=trigger, told_trigger=True, dtype=DOUBLE)
+            simulate_ladar_record(LADAR, world, 4, draws, trigger_s=trigger, trigger_known=True, dtype=DOUBLE)
         )
 
     assert_trials_equal_numbers(run, double(*trigger_s), trigger_s)

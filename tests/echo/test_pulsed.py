@@ -10,7 +10,7 @@ import torch
 from tests.helpers import kondor_radar, small_radar
 from torchsar.core import Draws
 from torchsar.echo import SimulatedPairs, simulate, stripmap_echo
-from torchsar.echo.stripmap import _line_length, lit_power, place
+from torchsar.echo.stripmap import _line_length, lit_power, path_geometry
 from torchsar.metrics import error_db
 from torchsar.scene import (
     AlwaysLit,
@@ -31,7 +31,7 @@ def direct(radar, world, n_pulse, n_range, draws):
     s = world.scene.scatterers(draws)
     doppler = 0.0 if world.doppler_hz is None else world.doppler_hz
     v = radar.velocity_m_s if world.velocity_m_s is None else world.velocity_m_s
-    p = place(s, radar, n_pulse, n_range, doppler, v)
+    p = path_geometry(s, radar, n_pulse, n_range, doppler, v)
     n = _line_length(p, radar, n_range)
     f = torch.fft.fftfreq(n, 1 / radar.sampling_hz, dtype=torch.float64)
     t = torch.arange(n_pulse, dtype=torch.float64) / radar.prf_hz
@@ -98,7 +98,7 @@ def test_echo_is_differentiable_in_positions_velocity_and_doppler():
 
     def echo(azimuth, range_, velocity, doppler):
         world = StripmapWorld(Points([], []), AlwaysLit(), velocity_m_s=velocity, doppler_hz=doppler)
-        placed = place(type(base)(azimuth, range_, base.amplitude), radar, 3, 30, doppler, velocity)
+        placed = path_geometry(type(base)(azimuth, range_, base.amplitude), radar, 3, 30, doppler, velocity)
         return stripmap_echo(placed, world, radar, 3, 30, torch.complex128)
 
     values = (

@@ -14,8 +14,7 @@ from torchsar.core import Draws
 from torchsar.echo import sea_echo, simulate_bistatic
 from torchsar.echo.sea import _Light, _Lines
 from torchsar.radar import LIGHT_M_S, BistaticRadar, LinearFM, receive_range
-from torchsar.scene import BandLimited, BistaticWorld, ImageReflectivity, KSea, Pattern
-from torchsar.scene.sea import Sea
+from torchsar.scene import BandLimited, BistaticWorld, ImageReflectivity, KSea, Pattern, Sea
 
 
 def geo_radar(**changes: Any) -> BistaticRadar:

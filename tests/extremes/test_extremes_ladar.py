@@ -12,7 +12,7 @@ import torch
 
 from tests.compensate.radials import ESTIMATORS, GATE, seen, velocity_rms
 from tests.echo.ladars import table1
-from torchsar.compensate.radial import compensate_motion, radial_motion
+from torchsar.compensate import compensate_motion, radial_motion
 from torchsar.core import Estimate, Signal
 from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
 from torchsar.scene import LinearInSweep, Points, Polynomial
@@ -75,7 +75,7 @@ def test_nothing(name) -> None:
 
 @pytest.mark.parametrize("name", IDS)
 def test_noise_from_none_to_nothing_else(name) -> None:
-    """From 100 dB down the error never falls with the noise rising, and what is trusted is
+    """From 100 dB down the error never falls with the noise rising, and what counts as reliable is
     right.
     """
     errors = []
@@ -124,9 +124,12 @@ def test_a_velocity_of_a_kilometre_a_second_is_taken_out_exactly() -> None:
     back = compensate_motion(there, -v, RADAR, pulse)
     assert float((back - 1).abs().max()) < 1e-5
     t = pulse.values()[:, None] + RADAR.fast_time_axis().values() + RADAR.period_s / 4
-    place = 1000.0 * (t - pulse.start - RADAR.period_s / 2)
+    position = 1000.0 * (t - pulse.start - RADAR.period_s / 2)
     turns = (
-        -2 * (RADAR.carrier_hz + RADAR.chirp_rate_hz_s * RADAR.fast_time_axis().values()) / RADAR.wave_speed_m_s * place
+        -2
+        * (RADAR.carrier_hz + RADAR.chirp_rate_hz_s * RADAR.fast_time_axis().values())
+        / RADAR.wave_speed_m_s
+        * position
     )
     assert (
         float(

@@ -29,7 +29,7 @@ def test_levels_pass_linearly_in_single_precision(scale):
 def focused_point(
     near_range_m: float, velocity_m_s: float, squint_deg: float = 0.0, dtype: torch.dtype = torch.complex128
 ):
-    """One point with a time-bandwidth product of 50; returns (radar, image, its place).
+    """One point with a time-bandwidth product of 50; returns (radar, image, its position).
 
     The PRF holds the Doppler band of the aperture and its spread over range frequency, f_dc B / f0,
     with a margin of 1.5.

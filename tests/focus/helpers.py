@@ -101,6 +101,6 @@ def phase_error_deg(image: Tensor, case: PointCase, cell: float) -> float:
     """Phase of the image at the true position of a target relative to -4 pi R / lambda, in
     degrees.
     """
-    place = (torch.tensor([float(v)], dtype=torch.float64) for v in (case.line, cell))
-    value = at_position(image, *place)[0, 0]
+    position = (torch.tensor([float(v)], dtype=torch.float64) for v in (case.line, cell))
+    value = at_position(image, *position)[0, 0]
     return math.degrees(math.remainder(float(torch.angle(value)) - case.phase_rad(cell), 2 * math.pi))

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from tests.repair.triangles import ground, table1
-from torchsar.focus.ladar_requirements import ladar_limits, ladar_requirements
+from torchsar.focus import ladar_limits, ladar_requirements
 
 
 def rows(radar=None, n_period=1024, ranges=(1.5, 1.5), **bounds):

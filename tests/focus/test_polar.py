@@ -161,10 +161,10 @@ def test_a_point_appears_at_its_position_with_x_along_range():
         ),
         angle_rad=angle,
     )
-    for turn, place in ((0.0, (-1.0, 2.0)), (math.pi / 2, (-2.0, -1.0)), (math.pi, (1.0, -2.0))):
+    for turn, position in ((0.0, (-1.0, 2.0)), (math.pi / 2, (-2.0, -1.0)), (math.pi, (1.0, -2.0))):
         image = PolarFormat(6.0, 0.5, range_axis_rad=turn, window="none", geometry=geometry)(echo.signal)
         line, cell = divmod(int(image.data.abs().argmax()), image.axes[1].n)
-        assert (float(image.axes[0].values()[line]), float(image.axes[1].values()[cell])) == place
+        assert (float(image.axes[0].values()[line]), float(image.axes[1].values()[cell])) == position
 
 
 def test_operator_is_reused_for_its_geometry_and_dtype_only():

@@ -9,8 +9,7 @@ import torch
 
 from torchsar.compensate import autofocus
 from torchsar.core import Signal, unit_phasor
-from torchsar.focus import AzimuthTransform
-from torchsar.focus.target import TargetImage
+from torchsar.focus import AzimuthTransform, TargetImage
 from torchsar.metrics import correlation, entropy, phase_rmse
 from torchsar.radar import LIGHT_M_S, InverseRadar, geometry_of, range_profiles
 

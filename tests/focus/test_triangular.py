@@ -12,8 +12,15 @@ from torch import Tensor
 
 from tests.echo.ladars import DOUBLE, direct_sweeps, table1
 from torchsar.core import Axis, Signal
-from torchsar.focus import AzimuthMatchedFilter, CompressSweeps, azimuth_matched_filter, compress_sweeps, deramp_azimuth
-from torchsar.focus.triangular import profile_axes, video_filter
+from torchsar.focus import (
+    AzimuthMatchedFilter,
+    CompressSweeps,
+    azimuth_matched_filter,
+    compress_sweeps,
+    deramp_azimuth,
+    profile_axes,
+)
+from torchsar.focus.triangular import video_filter
 from torchsar.scene import Polynomial, Scatterers
 
 RADAR = table1(speed_m_s=0.0)
@@ -116,9 +123,9 @@ def test_three_points_focus_at_their_positions() -> None:
     signal = CompressSweeps(MOVING, window_m=(0.5, 2.5))(Signal(direct_sweeps(s, MOVING, 400), MOVING.sweep_axes(400)))
     assert signal.axis("pulse").start == pytest.approx(MOVING.sweep_axes(400)[1].start + MOVING.period_s / 4)
     image = AzimuthMatchedFilter(MOVING, 40e-6)(signal.with_data(deramp_azimuth(signal.data, MOVING, *signal.axes)))
-    for at, (place, range_m) in enumerate(zip(x, (1.2, 1.5, 1.8), strict=True)):
+    for at, (position, range_m) in enumerate(zip(x, (1.2, 1.5, 1.8), strict=True)):
         row, column = (
-            round(float(axis.index_of(value))) for axis, value in zip(image.axes, (place, range_m), strict=True)
+            round(float(axis.index_of(value))) for axis, value in zip(image.axes, (position, range_m), strict=True)
         )
         near = image.data[row - 4 : row + 5, column - 1 : column + 2].abs()
         assert float(near.max()) == pytest.approx((0.7, 1.0, 0.5)[at], rel=0.06)

@@ -11,10 +11,7 @@ import torch
 
 from tests.multichannel.helpers import azimuth_echo, published_radar
 from torchsar.metrics import azimuth_response, replica_level, replica_zones
-from torchsar.multichannel.azimuth import focus_azimuth
-from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import reconstruct
-from torchsar.multichannel.response import LeastSquares, doppler_offsets
+from torchsar.multichannel import LeastSquares, PointMotion, doppler_offsets, focus_azimuth, reconstruct
 
 F64 = torch.float64
 RADAR = published_radar()

@@ -8,8 +8,7 @@ import torch
 
 from torchsar.core import Draws, Signal
 from torchsar.echo import simulate_bistatic
-from torchsar.multichannel.body import Extraction
-from torchsar.multichannel.scene_image import Detector, ImageMovers
+from torchsar.multichannel import Detector, Extraction, ImageMovers
 from torchsar.scene import BandLimited, BistaticWorld, Fleet, KSea, Ship
 
 from .helpers import published_radar

@@ -8,10 +8,7 @@ import torch
 
 from tests.multichannel.helpers import azimuth_echo
 from torchsar.metrics import replicas
-from torchsar.multichannel.azimuth import focus_azimuth
-from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import reconstruct
-from torchsar.multichannel.response import doppler_offsets
+from torchsar.multichannel import PointMotion, doppler_offsets, focus_azimuth, reconstruct
 
 BAND_HZ, GATE_S, LONG = 337.5, 4.5, 3600
 
@@ -43,8 +40,8 @@ def figures_of(image, radar, bands, u_r=0.0, u_a=0.0, y0=0.0, gate_s: float | No
         radar, bands, u_r, u_a, y0, integration_s=gate_s, focused_at=used, axis_speed_m_s=along
     )
     mfta = replicas.replica_level(image, step, zones)["mfta_db"]
-    irw, pslr, islr, place = (float(response[name]) for name in ("irw_m", "pslr_db", "islr_db", "position_m"))
-    return Figures(irw, pslr, islr, float(mfta), place / along, complex(response["peak"]))
+    irw, pslr, islr, position = (float(response[name]) for name in ("irw_m", "pslr_db", "islr_db", "position_m"))
+    return Figures(irw, pslr, islr, float(mfta), position / along, complex(response["peak"]))
 
 
 def measured(radar, rebuild, u_r=0.0, u_a=0.0, y0=0.0, n_pulse=LONG, band_hz: float | None = BAND_HZ, used=None):

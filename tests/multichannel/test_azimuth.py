@@ -14,11 +14,19 @@ import torch
 from tests.multichannel.helpers import azimuth_echo, compressed_echo, published_radar, range_of, time_of
 from tests.multichannel.profiles import BAND_HZ, GATE_S, LONG, figures_of, focused, measured, motion_of
 from torchsar.core import Signal
-from torchsar.multichannel.azimuth import FocusAzimuth, azimuth_filter, focus_azimuth
-from torchsar.multichannel.migration import CorrectMigration, Keystone
-from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import Reconstruct, reconstruct
-from torchsar.multichannel.response import LeastSquares, MinimumMeanSquare, doppler_offsets
+from torchsar.multichannel import (
+    CorrectMigration,
+    FocusAzimuth,
+    Keystone,
+    LeastSquares,
+    MinimumMeanSquare,
+    PointMotion,
+    Reconstruct,
+    azimuth_filter,
+    doppler_offsets,
+    focus_azimuth,
+    reconstruct,
+)
 
 F64 = torch.float64
 RADAR = published_radar()
@@ -59,7 +67,7 @@ def test_a_point_off_the_middle(y0):
     )
     motion = motion_of(RADAR, 10.0, 5.0, y0)
     assert found.image_s == pytest.approx(float(motion.image_s), abs=2e-5)
-    assert float(motion.place_m(motion.image_s)) == pytest.approx(y0, abs=1e-9)
+    assert float(motion.position_m(motion.image_s)) == pytest.approx(y0, abs=1e-9)
 
 
 def test_the_filter_needs_the_along_track_position():
@@ -150,11 +158,11 @@ def test_every_line_is_focused_for_the_range_of_one_target():
     near = spectrum.axis("range").values()
     for range_m, of in ((None, 0), (5150.0, 1)):
         image = FocusAzimuth(RADAR, bandwidth_hz=BAND_HZ)(spectrum, u_r_m_s=10.0, range_m=range_m)
-        place, r0, amplitude = image.axis("azimuth").values(), points[of]["r0"], points[of].get("amplitude", 1.0)
+        position, r0, amplitude = image.axis("azimuth").values(), points[of]["r0"], points[of].get("amplitude", 1.0)
         columns = [image.data[:, int((near - point["r0"]).abs().argmin())].abs() for point in points]
         assert float(columns[of].max()) > 0.9 * amplitude * GATE_S * math.sqrt(300**2 / (0.24 * r0))
         assert float(columns[1 - of].max()) < 0.4 * GATE_S * math.sqrt(300**2 / (0.24 * 5000))
-        assert float(place[int(columns[of].argmax())]) == pytest.approx(300 * 10 * r0 / (300**2 + 100), abs=0.5)
+        assert float(position[int(columns[of].argmax())]) == pytest.approx(300 * 10 * r0 / (300**2 + 100), abs=0.5)
 
 
 def test_gradients():

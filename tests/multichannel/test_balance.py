@@ -9,8 +9,14 @@ import torch
 
 from tests.multichannel.helpers import published_radar
 from torchsar.core import Signal
-from torchsar.multichannel.balance import CorrectBalance, EstimateBalance, correct_balance, estimate_balance
-from torchsar.multichannel.response import ElementPattern, FlatBand
+from torchsar.multichannel import (
+    CorrectBalance,
+    ElementPattern,
+    EstimateBalance,
+    FlatBand,
+    correct_balance,
+    estimate_balance,
+)
 
 PHASE, GAIN, DELAY = (
     torch.tensor(x, dtype=torch.float64) for x in ([0.3, 0.0, -0.5], [0.5, 0.0, -1.0], [2e-9, 0.0, -9e-9])

@@ -8,18 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchsar.multichannel.body import (
-    Extraction,
-    Segments,
-    body_echo,
-    body_image,
-    centred_motion,
-    chip_about,
-    find_body,
-    known_body,
-)
-from torchsar.multichannel.migration import Frame
-from torchsar.multichannel.motion import PointMotion
+from torchsar.multichannel import Extraction, Frame, PointMotion, body_echo, find_body
+from torchsar.multichannel.body import Segments, body_image, centred_motion, chip_about, known_body
 
 from .helpers import compressed_echo
 from .ocean import EXTRACTION, GATE_S, RADAR, frame_of, ship
@@ -88,10 +78,10 @@ def test_position_and_amplitude_of_a_point() -> None:
     assert float(body.motion.y0_m) == pytest.approx(20.0, abs=0.05) and float(body.motion.range_m) == pytest.approx(
         5010.0, abs=0.5
     )
-    place = torch.linspace(10.0, 30.0, 81, dtype=torch.float64)
-    image = body_image(body, place, EXTRACTION).abs()
+    position = torch.linspace(10.0, 30.0, 81, dtype=torch.float64)
+    image = body_image(body, position, EXTRACTION).abs()
     row, line = divmod(int(image.argmax()), image.shape[1])
-    assert float(place[row]) == pytest.approx(20.0, abs=0.3) and float(image.max()) == pytest.approx(1.0, abs=0.05)
+    assert float(position[row]) == pytest.approx(20.0, abs=0.3) and float(image.max()) == pytest.approx(1.0, abs=0.05)
     assert float(body.chip.range_m[line]) == pytest.approx(5010.0, abs=2.6)
 
 
@@ -120,7 +110,7 @@ def test_a_body_that_cannot_be_found_is_not_ok() -> None:
 
 
 def test_a_motion_that_leaves_the_record_ends_the_search() -> None:
-    """Seed 110 drives the search to a motion that no pulse illuminates; it used to go on forever."""
+    """Seed 110 drives the search to a motion that no pulse illuminates; it once never ended."""
     data = frame_of({}, seed=110)
     body = find_body(data.data, Frame.of(RADAR, data), 0.0, 5000.0, EXTRACTION)
     assert not bool(body.ok)

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from torchsar.core import Axis, Signal
-from torchsar.multichannel.detection import contrast, detect
+from torchsar.multichannel import detect
+from torchsar.multichannel.detection import contrast
 
 AXES = (Axis("azimuth", 800, -400.0, 1.0, "m"), Axis("range", 64, 5000.0, 5.0, "m"))
 
@@ -26,8 +27,8 @@ def test_bright_positions_are_detected_strongest_first() -> None:
     patch(data, 150.0, 5200.0, 20.0)
     found = detect(Signal(data, AXES), apart_m=(100.0, 30.0))
     assert len(found) == 2 and found[0].contrast_db > found[1].contrast_db > 10
-    for place, (azimuth, range_) in zip(found, ((150.0, 5200.0), (-100.0, 5100.0)), strict=True):
-        assert abs(place.azimuth_m - azimuth) < 15 and abs(place.range_m - range_) < 5
+    for position, (azimuth, range_) in zip(found, ((150.0, 5200.0), (-100.0, 5100.0)), strict=True):
+        assert abs(position.azimuth_m - azimuth) < 15 and abs(position.range_m - range_) < 5
 
 
 def test_neighbours_are_one_detection_and_most_limits_the_number() -> None:

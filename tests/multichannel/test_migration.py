@@ -11,19 +11,21 @@ import torch
 from tests.multichannel.helpers import compressed_echo, published_radar
 from torchsar.core import Signal
 from torchsar.metrics import impulse_response
-from torchsar.multichannel.azimuth import focus_azimuth, image_axis
-from torchsar.multichannel.migration import (
+from torchsar.multichannel import (
     CorrectMigration,
     Frame,
     Keystone,
+    LeastSquares,
     NoMigration,
+    PointMotion,
     StaticBulk,
     ambiguity_number,
     correct_migration,
+    focus_azimuth,
+    reconstruct_lines,
 )
-from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import doppler_axis, reconstruct_lines
-from torchsar.multichannel.response import LeastSquares
+from torchsar.multichannel.azimuth import image_axis
+from torchsar.multichannel.reconstruct import doppler_axis
 
 RADAR = published_radar()
 N = 960

@@ -9,6 +9,7 @@ import torch
 
 from torchsar.core import Signal
 from torchsar.multichannel import (
+    AzimuthPlan,
     ElementPattern,
     FocusAzimuth,
     FocusPlan,
@@ -17,7 +18,6 @@ from torchsar.multichannel import (
     PointMotion,
     Reconstruct,
 )
-from torchsar.multichannel.plan import AzimuthPlan
 from torchsar.multichannel.response import Rebuild
 from torchsar.radar import BistaticRadar, LinearFM
 

@@ -11,9 +11,14 @@ import torch
 from tests.multichannel.helpers import azimuth_echo, published_radar, range_of, time_of
 from tests.multichannel.profiles import motion_of
 from torchsar.core import Axis, Signal
-from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import Reconstruct, reconstruct, reconstruct_lines
-from torchsar.multichannel.response import LeastSquares, MinimumMeanSquare
+from torchsar.multichannel import (
+    LeastSquares,
+    MinimumMeanSquare,
+    PointMotion,
+    Reconstruct,
+    reconstruct,
+    reconstruct_lines,
+)
 
 F64 = torch.float64
 quiet = pytest.mark.filterwarnings("ignore:at a pulse rate of")

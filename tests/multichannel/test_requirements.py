@@ -10,16 +10,18 @@ import torch
 
 from tests.multichannel.helpers import azimuth_echo, published_radar
 from torchsar.metrics import replica_level, replica_zones
-from torchsar.multichannel.azimuth import focus_azimuth
-from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import reconstruct
-from torchsar.multichannel.requirements import (
+from torchsar.multichannel import (
+    LeastSquares,
+    MinimumMeanSquare,
     MultichannelUse,
+    PointMotion,
+    doppler_offsets,
+    focus_azimuth,
     multichannel_limits,
     multichannel_requirements,
-    singular_speeds_m_s,
+    reconstruct,
 )
-from torchsar.multichannel.response import LeastSquares, MinimumMeanSquare, doppler_offsets
+from torchsar.multichannel.requirements import singular_speeds_m_s
 
 RADAR = published_radar(transmit_range=(-243.0, 0.0208, 1e-6, 1e-9))
 STILL: dict[str, Any] = {"u_r_m_s": (0.0, 0.0), "u_a_m_s": (0.0, 0.0)}

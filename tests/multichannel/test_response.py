@@ -9,20 +9,19 @@ import torch
 
 from tests.multichannel.helpers import azimuth_echo, published_radar, range_of
 from tests.multichannel.profiles import LONG, figures_of, focused, motion_of
-from torchsar.multichannel.azimuth import azimuth_filter
-from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.response import (
+from torchsar.multichannel import (
     ElementPattern,
     FlatBand,
     LeastSquares,
     MinimumMeanSquare,
+    PointMotion,
+    azimuth_filter,
     band_matrix,
     condition_number,
     doppler_offsets,
-    first_bin,
     noise_gain_db,
-    shared_response,
 )
+from torchsar.multichannel.response import first_bin, shared_response
 
 F64, C128 = torch.float64, torch.complex128
 PRF = (125.0, 160.0, 170.0, 180.0, 185.0, 187.0, 187.5, 190.0, 195.0, 200.0, 250.0)

@@ -10,10 +10,8 @@ import pytest
 import torch
 
 from torchsar.core import Signal
-from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.response import LeastSquares, MinimumMeanSquare
-from torchsar.multichannel.scene_image import ImageMovers, SceneImage, placed
-from torchsar.multichannel.stationary import StationaryImage
+from torchsar.multichannel import ImageMovers, LeastSquares, MinimumMeanSquare, PointMotion, SceneImage, StationaryImage
+from torchsar.multichannel.scene_image import placed
 
 from .helpers import published_radar
 from .ocean import EXTRACTION, RADAR, flow, frame_of, ship

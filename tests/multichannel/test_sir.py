@@ -10,9 +10,9 @@ import torch
 
 from tests.multichannel.helpers import azimuth_echo, published_radar, range_of, time_of
 from torchsar.core import Signal
-from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.response import LeastSquares, MinimumMeanSquare, first_bin
-from torchsar.multichannel.velocity.sir import SignalIntensityRatio, signal_intensity
+from torchsar.multichannel import LeastSquares, MinimumMeanSquare, PointMotion, SignalIntensityRatio
+from torchsar.multichannel.response import first_bin
+from torchsar.multichannel.velocity.sir import signal_intensity
 
 F64 = torch.float64
 RADAR = published_radar()

@@ -10,10 +10,14 @@ import torch
 from tests.multichannel.helpers import compressed_echo, published_radar
 from torchsar.core import centred_ifft
 from torchsar.metrics import impulse_response
-from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import reconstruct_lines
-from torchsar.multichannel.response import LeastSquares, MinimumMeanSquare
-from torchsar.multichannel.stationary import StationaryImage, stationary_image
+from torchsar.multichannel import (
+    LeastSquares,
+    MinimumMeanSquare,
+    PointMotion,
+    StationaryImage,
+    reconstruct_lines,
+    stationary_image,
+)
 
 RADAR = published_radar()
 

@@ -9,13 +9,8 @@ import torch
 
 from tests.multichannel.helpers import compressed_echo, published_radar
 from torchsar.core import Signal
-from torchsar.multichannel.compress import CompressChannels
-from torchsar.multichannel.synchronise import (
-    EstimateSynchronisation,
-    RemoveSynchronisation,
-    estimate_synchronisation,
-    remove_synchronisation,
-)
+from torchsar.multichannel import CompressChannels, EstimateSynchronisation, RemoveSynchronisation
+from torchsar.multichannel.synchronise import estimate_synchronisation, remove_synchronisation
 
 RADAR = published_radar()
 
@@ -79,11 +74,11 @@ def test_phase_and_delay_are_removed_from_all_channels():
     signal = compressed_echo(RADAR, 40, 96, [{"r0": 5020.0}])
     phase, delay = (x[0] for x in errors(1, 40))
     f = torch.fft.fftfreq(96, 1 / RADAR.sampling_hz, dtype=torch.float64)
-    spoiled = (
+    drifting = (
         torch.fft.ifft(torch.fft.fft(signal.data) * torch.exp(-2j * math.pi * delay[:, None] * f))
         * torch.exp(1j * phase)[:, None]
     )
-    both = signal.with_data(torch.stack([spoiled, 2 * spoiled]))
+    both = signal.with_data(torch.stack([drifting, 2 * drifting]))
     direct = direct_path(phase, delay).expand(2, -1, -1)
     estimate = EstimateSynchronisation(RADAR)(both, direct)
     out = RemoveSynchronisation(RADAR)(both, phase_rad=estimate["phase_rad"], delay_s=estimate["delay_s"])

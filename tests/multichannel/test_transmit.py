@@ -9,16 +9,18 @@ import torch
 
 from tests.multichannel.helpers import azimuth_echo, compressed_echo, published_radar, time_of
 from torchsar.core import Signal
-from torchsar.multichannel.azimuth import azimuth_filter
-from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import reconstruct
-from torchsar.multichannel.response import LeastSquares, doppler_centre_hz, doppler_offsets
-from torchsar.multichannel.transmit import (
+from torchsar.multichannel import (
     AzimuthScaling,
+    LeastSquares,
+    PointMotion,
     RemoveTransmitRange,
-    neglected_transmit_phase_rad,
+    azimuth_filter,
+    doppler_offsets,
+    reconstruct,
     remove_transmit_range,
 )
+from torchsar.multichannel.response import doppler_centre_hz
+from torchsar.multichannel.transmit import neglected_transmit_phase_rad
 
 K = (-243.0, 0.0208, -1.3e-6, 2e-9)
 N = 900

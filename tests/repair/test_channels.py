@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from torchsar.core import Chain, Draws, Recording, use
-from torchsar.echo.channels import ChannelImbalance
+from torchsar.echo import ChannelImbalance
 from torchsar.io import read_stripmap
 from torchsar.metrics import correlation
-from torchsar.repair.channels import CorrectImbalance, EstimateImbalance, correct_imbalance, estimate_imbalance
+from torchsar.repair import CorrectImbalance, EstimateImbalance, correct_imbalance, estimate_imbalance
 
 DEGREE = math.pi / 180
 

@@ -10,15 +10,15 @@ from torch import Tensor
 
 from tests.helpers import small_radar, small_recording
 from torchsar.core import Chain, Draws, Recording, Signal, use
-from torchsar.echo import apply_impairments, simulate
-from torchsar.echo.lines import LostGaps, LostLines
-from torchsar.focus import OmegaK, matched_reference, omega_k
-from torchsar.focus.defocus import InvertibleOmegaK, all_pass, defocus_omega_k
+from torchsar.echo import LostGaps, LostLines, apply_impairments, simulate
+from torchsar.focus import InvertibleOmegaK, OmegaK, defocus_omega_k, matched_reference, omega_k
+from torchsar.focus.defocus import all_pass
 from torchsar.io import read_stripmap
 from torchsar.metrics import correlation, error_db
-from torchsar.repair.fill import (
+from torchsar.repair import (
     BandLimitedFill,
     LinearFill,
+    LineIntegrity,
     SparseFill,
     ZeroFill,
     band_limited_fill,
@@ -26,7 +26,6 @@ from torchsar.repair.fill import (
     sparse_fill,
     zero_fill,
 )
-from torchsar.repair.lines import LineIntegrity
 from torchsar.scene import Dwell, RandomPoints, Speckle, StripmapWorld, Together
 
 RADAR = small_radar()

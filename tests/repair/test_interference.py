@@ -9,12 +9,11 @@ import torch
 
 from tests.helpers import kondor_radar, small_recording
 from torchsar.core import Chain, Draws, Recording, Signal, use
-from torchsar.echo import simulate
-from torchsar.echo.interference import Quantiser, Tone, WideInterferer
+from torchsar.echo import Quantiser, Tone, WideInterferer, simulate
 from torchsar.focus import OmegaK
 from torchsar.io import read_stripmap
-from torchsar.metrics.image import error_db
-from torchsar.repair.interference import (
+from torchsar.metrics import error_db
+from torchsar.repair import (
     DropInterference,
     NotchInterference,
     SubtractInterference,

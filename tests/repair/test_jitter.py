@@ -8,21 +8,24 @@ import pytest
 import torch
 
 from torchsar.core import Chain, Draws, use
-from torchsar.echo.jitter import PeriodicJitter, sample_unevenly
+from torchsar.echo import PeriodicJitter
+from torchsar.echo.jitter import sample_unevenly
 from torchsar.io import read_stripmap
 from torchsar.metrics import correlation, error_db
-from torchsar.repair.jitter import (
+from torchsar.repair import (
     BandLimited,
     CorrectJitter,
     Exact,
     Lagrange,
+    PilotJitter,
     correct_jitter,
     correct_jitter_band_limited,
     correct_jitter_exact,
     correct_jitter_lagrange,
+    estimate_jitter_blind,
+    estimate_jitter_pilot,
 )
-from torchsar.repair.jitter_blind import detect_jitter_period, estimate_jitter_blind
-from torchsar.repair.jitter_pilot import PilotJitter, estimate_jitter_pilot
+from torchsar.repair.jitter_blind import detect_jitter_period
 
 OFFSETS = torch.tensor([0.0, 0.18, -0.12, 0.07], dtype=torch.float64)
 

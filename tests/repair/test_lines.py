@@ -8,9 +8,9 @@ from torch import Tensor
 
 from tests.helpers import small_radar
 from torchsar.core import Draws, Estimate, Recording, Signal
-from torchsar.echo import apply_impairments
-from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedLines
-from torchsar.repair.lines import LineIntegrity, line_integrity, place_per_line
+from torchsar.echo import CorruptedNumbers, LostGaps, LostLines, RepeatedLines, apply_impairments
+from torchsar.repair import LineIntegrity, line_integrity
+from torchsar.repair.lines import place_per_line
 
 N = 600
 

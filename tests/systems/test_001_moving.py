@@ -78,7 +78,7 @@ def test_estimators_stand_where_the_bound_lets_them() -> None:
             "u_r_m_s"
         ]
     )
-    simple = multichannel.Interferometry(RADAR, multichannel.Dwell(4.5), mind_ambiguity=False)
+    simple = multichannel.Interferometry(RADAR, multichannel.Dwell(4.5), check_ambiguity=False)
     ml, ati = (float((stage(signal)["u_r_m_s"] - 10).square().mean().sqrt()) / bound for stage in (known, simple))
     assert 0.8 < ml < 1.3 and ati < 2.2
 

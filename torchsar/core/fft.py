@@ -106,6 +106,9 @@ def from_frequency(signal: Signal, name: str) -> Signal:
         signal: Signal with a frequency axis made by `to_frequency`.
         name: Name of the frequency axis.
 
+    Returns:
+        Signal on the original axis, same shape.
+
     Raises:
         KeyError: If the signal has no axis of that name.
     """

@@ -88,7 +88,7 @@ def ladar_record(
     _refuse_record(scatterers, radar, n_period, motion, without)
     parts = []
     trials = torch.broadcast_shapes(
-        paths.place.shape[:-2], paths.knots.shape[:-2], scatterers.amplitude.shape[:-1]
+        paths.start_m.shape[:-2], paths.knots.shape[:-2], scatterers.amplitude.shape[:-1]
     ).numel()
     height = max(1, _BLOCK_BYTES // (8 * n_sample * trials))
     for first in range(0, n_period, height):
@@ -144,7 +144,7 @@ class BlockPaths:
     """Ranges of scatterers in blocks of a record.
 
     Args:
-        place: Relative range at the start of the block in metres, shape (..., pulse, target),
+        start_m: Relative range at the start of the block in metres, shape (..., pulse, target),
             float64.
         speed: First derivative there in m/s, same shape.
         bend: Half the second derivative in m/s^2, same shape.
@@ -157,7 +157,7 @@ class BlockPaths:
         wave_speed_m_s: Speed of light in m/s.
     """
 
-    place: Tensor
+    start_m: Tensor
     speed: Tensor
     bend: Tensor
     knots: Tensor
@@ -229,7 +229,7 @@ class BlockPaths:
             self,
             **{
                 name: getattr(self, name)[..., first:last, :]
-                for name in ("place", "speed", "bend", "knots", "shrink", "lit")
+                for name in ("start_m", "speed", "bend", "knots", "shrink", "lit")
             },
         )
 
@@ -251,8 +251,10 @@ class BlockPaths:
         Returns:
             2 RD / c in seconds, shape (..., pulse, n).
         """
-        place, speed, bend, shrink = (v[..., target, None] for v in (self.place, self.speed, self.bend, self.shrink))
-        range_m = place + self.offsets_s * (speed + bend * self.offsets_s) + motion_m
+        start_m, speed, bend, shrink = (
+            v[..., target, None] for v in (self.start_m, self.speed, self.bend, self.shrink)
+        )
+        range_m = start_m + self.offsets_s * (speed + bend * self.offsets_s) + motion_m
         return 2 / self.wave_speed_m_s * shrink * range_m
 
 
@@ -261,7 +263,7 @@ def _blocks(
 ) -> Tensor:
     """Sum over scatterers, one after the other, in blocks of the record."""
     total, motion = 0.0, paths.motion_m()
-    for target in range(paths.place.shape[-1]):
+    for target in range(paths.start_m.shape[-1]):
         turns = reduced_turns(ramps.turns(paths.delay_s(target, motion), error))
         weight = amplitude[..., target, None, None] * paths.lit[..., target, None]
         total = total + (
@@ -322,7 +324,7 @@ def simulate_ladar_record(
     draws: Draws,
     block_s: float | None = None,
     trigger_s: Tensor | float = 0.0,
-    told_trigger: bool = False,
+    trigger_known: bool = False,
     impairments: Mapping[str, Impairment] | None = None,
     dtype: torch.dtype = torch.complex64,
     device: torch.device | str | None = None,
@@ -343,7 +345,7 @@ def simulate_ladar_record(
         trigger_s: Time from the start of a block to the start of an up-sweep in seconds, a number
             or one value per trial. Whole samples, zero among them, put samples on the symmetric
             grid of separated sweeps.
-        told_trigger: Whether the recording holds the trigger times, as aux `trigger_s`.
+        trigger_known: Whether the recording holds the trigger times, as aux `trigger_s`.
         impairments: Impairments by name, applied in order.
         dtype: Complex dtype of the recording, or of which it has the real dtype.
         device: Device of the recording.
@@ -410,7 +412,7 @@ def simulate_ladar_record(
         clean + noise,
         axes,
         radar,
-        {**aux, "trigger_s": trigger} if told_trigger else aux,
+        {**aux, "trigger_s": trigger} if trigger_known else aux,
         values,
         impairments,
         draws,

@@ -48,7 +48,7 @@ class Placed:
     amplitude: Tensor
 
 
-def place(
+def path_geometry(
     scatterers: Scatterers,
     radar: StripmapRadar,
     n_pulse: int,
@@ -331,7 +331,7 @@ def simulate(
     scatterers = world.scene.scatterers(draws)
     scatterers = Scatterers(*(x.to(device) for x in (scatterers.azimuth_m, scatterers.range_m, scatterers.amplitude)))
     _refuse_impossible(scatterers, radar, n_range, radar.sin_squint(doppler, velocity))
-    placed = place(scatterers, radar, n_pulse, n_range, doppler, velocity)
+    placed = path_geometry(scatterers, radar, n_pulse, n_range, doppler, velocity)
     if bool((placed.closest_m <= 0).any()):
         raise ValueError(
             f"a target lies behind the radar, at a range of {float(placed.closest_m.min()):.4g} "

@@ -161,7 +161,7 @@ def turntable_echo(
 
 
 @dataclass(frozen=True)
-class PulseWay:
+class PulseRange:
     """Range of the whole target relative to the reference during pulses.
 
     Args:
@@ -177,7 +177,7 @@ class PulseWay:
     @staticmethod
     def of(
         motion: Sequence[Motion], track: Sequence[Motion], pulse_s: Tensor, fast_s: Tensor, half_s: float
-    ) -> PulseWay:
+    ) -> PulseRange:
         """Evaluate the motion during pulses.
 
         Args:
@@ -193,7 +193,7 @@ class PulseWay:
         start, middle, end = (displacement_m(motion, pulse_s + shift) for shift in (-half_s, 0.0, half_s))
         speed = (end - start) / (2 * half_s)
         bend = displacement_m(motion, pulse_s[:, None] + fast_s) - middle[..., None] - speed[..., None] * fast_s
-        return PulseWay(middle - displacement_m(track, pulse_s), speed, bend)
+        return PulseRange(middle - displacement_m(track, pulse_s), speed, bend)
 
 
 def dechirped_echo(
@@ -258,7 +258,7 @@ def dechirped_echo(
     pulse_s = torch.arange(n_pulse, dtype=torch.float64, device=x.device) / radar.prf_hz
     parts = []
     for pulses in _pulse_blocks(n_pulse, x.shape[-1] * 2 * math.isqrt(n_fast)):
-        path = PulseWay.of(motion, track, pulse_s[pulses], fast_s, half_s)
+        path = PulseRange.of(motion, track, pulse_s[pulses], fast_s, half_s)
         lines = ScattererLines.of(radar, x, y, lever, turn[pulses], path)
         total = _sum_of_lines(lines, amplitude, path.bend_m, fast_s, dtype)
         parts.append(total * unit_phasor(_common_turns(radar, path, fast_s), dtype))
@@ -284,7 +284,9 @@ class ScattererLines:
     bend: Tensor
 
     @staticmethod
-    def of(radar: InverseRadar, x: Tensor, y: Tensor, lever: Tensor, turn: PulseTurn, way: PulseWay) -> ScattererLines:
+    def of(
+        radar: InverseRadar, x: Tensor, y: Tensor, lever: Tensor, turn: PulseTurn, path: PulseRange
+    ) -> ScattererLines:
         """Form the phases for a rotation of second order within the pulse.
 
         The range is along + across (rate t' + acceleration t'^2 / 2) - towards (rate t')^2 / 2.
@@ -295,7 +297,7 @@ class ScattererLines:
             y: Ranges from the middle of the window in metres, same shape.
             lever: Ranges from the centre of rotation in metres, same shape.
             turn: Rotation of each pulse.
-            way: Motion during each pulse.
+            path: Range of the target during each pulse.
 
         Returns:
             Phases of all scatterers.
@@ -306,7 +308,7 @@ class ScattererLines:
             turn.rate_rad_s[..., None],
             turn.acceleration_rad_s2[..., None],
         )
-        middle, speed = way.middle_m[..., None], way.speed_m_s[..., None]
+        middle, speed = path.middle_m[..., None], path.speed_m_s[..., None]
         sin, drop = torch.sin(theta), 2 * torch.sin(theta / 2).square()
         change = x * sin - lever * drop
         along, towards, across = change + y, change + lever, x - x * drop - lever * sin
@@ -325,7 +327,7 @@ class ScattererLines:
         return ScattererLines(start, slope, curve, 2 * video * along)
 
 
-def _common_turns(radar: InverseRadar, path: PulseWay, fast_s: Tensor) -> Tensor:
+def _common_turns(radar: InverseRadar, path: PulseRange, fast_s: Tensor) -> Tensor:
     """Cycles by the motion of the whole target, (*trials, pulse, fast_time)."""
     delay = 2 / radar.wave_speed_m_s * (path.middle_m[..., None] + path.speed_m_s[..., None] * fast_s + path.bend_m)
     return -delay * (radar.carrier_hz + radar.chirp_rate_hz_s * (fast_s - delay / 2))

@@ -353,6 +353,9 @@ def smooth_length(n: int) -> int:
     Args:
         n: Least length.
 
+    Returns:
+        Length, at most 2 n.
+
     Raises:
         ValueError: If n is below 1.
     """

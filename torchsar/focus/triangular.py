@@ -98,6 +98,9 @@ def profile_axes(pulse: Axis, radar: TriangularLadar, ramp: Ramp = "up") -> tupl
         pulse: Pulse axis of the sweeps.
         radar: Radar of the recording.
         ramp: "up" or "down".
+
+    Returns:
+        Axes of slow time and of relative range.
     """
     n = radar.sweep_samples
     middle = Axis("pulse", pulse.n, pulse.start + _EPOCH[ramp] * radar.period_s, pulse.step, "s")

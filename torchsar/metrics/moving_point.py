@@ -25,7 +25,15 @@ _WIDTH, _PSLR_DB, _ISLR_DB = 0.8859, -13.26, -9.92
 
 
 def error_name(key: str, what: str = "error") -> str:
-    """Name of the error of an unknown: u_r_m_s becomes u_r_error_m_s."""
+    """Return the name of the error of an unknown: u_r_m_s becomes u_r_error_m_s.
+
+    Args:
+        key: Name of the unknown in truth and estimates, one of UNKNOWNS.
+        what: "error", or "std" for a predicted standard deviation.
+
+    Returns:
+        Name of the figure.
+    """
     return f"{UNKNOWNS[key]}_{what}{key.removeprefix(UNKNOWNS[key])}"
 
 
@@ -191,7 +199,7 @@ def _responses(
     }
     image_s = (cuts.start_m + response["position_m"] * cuts.step_m) / along
     if cuts.range is None:
-        return {**metrics, "position_error_m": motion.place_m(image_s) - truth["y0_m"]}
+        return {**metrics, "position_error_m": motion.position_m(image_s) - truth["y0_m"]}
     across = azimuth_response(cuts.range, cuts.range_axis[1], cuts.range_axis[0])
     metrics |= {
         "irw_range_m": across["irw_m"] / 2,
@@ -199,8 +207,8 @@ def _responses(
         "islr_range_db": across["islr_db"],
     }
     motion = replace(motion, range_m=across["position_m"])
-    closest = torch.sqrt(across["position_m"].square() - motion.place_m(image_s).square())
-    position = replace(motion, range_m=closest).place_m(image_s)
+    closest = torch.sqrt(across["position_m"].square() - motion.position_m(image_s).square())
+    position = replace(motion, range_m=closest).position_m(image_s)
     return {**metrics, "position_error_m": position - truth["y0_m"], "range_error_m": closest - truth["range_m"]}
 
 
@@ -235,6 +243,10 @@ def ideal_responses(
         integration_s: Time for which it is lit; None for the pattern of the elements.
         processed_hz: Processed Doppler band.
         ranges: Whether images have a range axis.
+
+    Returns:
+        Widths in metres, side-lobe levels in dB and errors of zero, by the names of the figures of
+        an image.
     """
     along, band = radar.speed_m_s - u_a_m_s, math.inf
     if integration_s is not None:

@@ -1,4 +1,4 @@
-"""What a chain found out about the radial motion of a triangular-sweep ladar, against the truth."""
+"""Estimates of the radial motion of a triangular-sweep ladar compared with the truth."""
 
 from __future__ import annotations
 
@@ -142,10 +142,13 @@ def course_of(chain: Chain, trace: Trace, truth: Mapping[str, Tensor], radar: Tr
 
     Args:
         chain: The chain.
-        trace: What it made of a recording.
+        trace: Its intermediate signals and estimates for a recording.
         truth: True values of that recording, as the simulation gives them.
         radar: The instrument.
         clean: Whether the chain ran on the recording without motion.
+
+    Returns:
+        The motion, shape (..., pulse).
 
     Raises:
         ValueError: If the chain never has separated sweeps.
@@ -238,8 +241,8 @@ def _sweeps_axis(trace: Trace) -> Axis:
     found = [signal for signal in (*trace.inputs.values(), *trace.outputs.values()) if signal.names == SWEEPS]
     if not found:
         raise ValueError(
-            f"the method never has separated sweeps {SWEEPS}; begin its chain with split_sweeps if the world "
-            "has a record"
+            f"the method never has separated sweeps {SWEEPS}; begin its chain with split_sweeps if "
+            "the world has a record"
         )
     return found[-1].axis("pulse")
 

@@ -1,4 +1,4 @@
-"""Errors of estimated non-uniform rotations, and cuts through point targets."""
+"""Estimates of a non-uniform rotation compared with the truth, and cuts through targets."""
 
 from __future__ import annotations
 
@@ -103,14 +103,31 @@ class FoundRotation:
 
 
 def true_k(truth: Mapping[str, Tensor], i: int) -> Tensor:
-    """True k_i, (...,); zero beyond the order of the true rotation."""
+    """True k_i, (...,); zero beyond the order of the true rotation.
+
+    Args:
+        truth: True `warp_k` (..., order - 1) and `omega_rad_s` (...,).
+        i: Number of the coefficient, from 1.
+
+    Returns:
+        k_i in 1 / s^i, shape (...,).
+    """
     k = truth["warp_k"]
     return k[..., i - 1] if i <= k.shape[-1] else torch.zeros_like(truth["omega_rad_s"])
 
 
 def k_scales(i: int, true: Tensor) -> dict[str, Tensor]:
-    """Names of errors of k_i, and the factor for an error in its own unit, (...,) each; NaN in
-    trials that a name does not apply to.
+    """Factors that turn an error of k_i in its own unit into the figures of that error.
+
+    The figure is in % of the true value, or in its own unit where that is zero. Factors are NaN in
+    trials to which a name does not apply.
+
+    Args:
+        i: Number of the coefficient, from 1.
+        true: True values, shape (...,).
+
+    Returns:
+        Factors by the name of the error, shape (...,) each.
     """
     zero, own = true == 0, k_name(i).replace("_", "_error_", 1)
     found = {} if bool(zero.all()) else {f"k{i}_error_percent": torch.where(zero, torch.nan, 100 / true.abs())}
@@ -221,6 +238,6 @@ def cross_range_cut(
     half = (size + 1) // 2
     gap = spectrum.new_zeros((len(rows), (_FINER - 1) * size))
     fine = torch.fft.ifft(torch.cat([spectrum[:, :half], gap, spectrum[:, half:]], -1)) * _FINER
-    places = low[:, None] + torch.arange(fine.shape[-1], dtype=torch.float64, device=device) / _FINER
-    inside = (places >= first[:, None]) & (places <= last[:, None] - 1)
-    return CrossRangeCut(start[:, None] + step[:, None] * places - x_m[:, None], fine, inside)
+    position = low[:, None] + torch.arange(fine.shape[-1], dtype=torch.float64, device=device) / _FINER
+    inside = (position >= first[:, None]) & (position <= last[:, None] - 1)
+    return CrossRangeCut(start[:, None] + step[:, None] * position - x_m[:, None], fine, inside)

@@ -1,7 +1,4 @@
-"""Images of moving ships on a sea, compared with the truth.
-
-Figures of velocities, positions, false targets and of the sea itself.
-"""
+"""Images of moving ships on a sea compared with the truth."""
 
 from __future__ import annotations
 
@@ -73,7 +70,8 @@ class Ship:
 
     Args:
         motion: Motion of its middle, () each.
-        scatterers_m: Along-track position and closest range of the centroid of its power.
+        scatterers_m: Along-track position and closest range of the centre of the powers of its
+            scatterers.
         echo: Its echo alone (channel, pulse, range), without the transmit range.
     """
 

@@ -143,6 +143,9 @@ def image_axis(radar: BistaticRadar, doppler: Axis) -> Axis:
     Args:
         radar: Instrument.
         doppler: Doppler axis of the spectrum.
+
+    Returns:
+        Azimuth axis with as many samples as the Doppler axis.
     """
     time = doppler.dual()
     return Axis("azimuth", time.n, time.start * radar.speed_m_s, time.step * radar.speed_m_s, "m")

@@ -180,7 +180,7 @@ class Chip:
         Returns:
             Phasors relative to the deramp, complex128 (..., tone, channel).
         """
-        position = self.place_m(motion, tone_hz) - self.motion.y0_m
+        position = self.position_m(motion, tone_hz) - self.motion.y0_m
         return unit_phasor(
             -position[..., None]
             * self.radar.channels_at(position.device)
@@ -188,7 +188,7 @@ class Chip:
             torch.complex128,
         )
 
-    def place_m(self, motion: PointMotion, tone_hz: Tensor) -> Tensor:
+    def position_m(self, motion: PointMotion, tone_hz: Tensor) -> Tensor:
         """Return the along-track positions at t = 0 of tones.
 
         Args:
@@ -542,13 +542,19 @@ def centred_motion(chip: Chip) -> PointMotion:
     """Return the motion of a chip with the position and range of the middle of its bright pixels.
 
     The middle is weighted by intensity. Without bright pixels the motion is unchanged.
+
+    Args:
+        chip: Cut of the data about one body.
+
+    Returns:
+        Motion, shape () each.
     """
     picture = chip.picture()
     weight = picture.level * picture.bright
     total = weight.sum()
     if not float(total) > 0:
         return chip.motion
-    position = (weight.sum(0) * chip.place_m(chip.motion, picture.tone_hz)).sum() / total
+    position = (weight.sum(0) * chip.position_m(chip.motion, picture.tone_hz)).sum() / total
     near = (weight.sum(1) * chip.range_m).sum() / total
     return replace(chip.motion, y0_m=position, range_m=near)
 
@@ -561,6 +567,9 @@ def known_body(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extr
         frame: Geometry of the data.
         motion: Known motion of the body.
         extraction: Extent of the body.
+
+    Returns:
+        Body without an uncertainty of its velocity.
 
     Raises:
         ValueError: As in `chip_about`.
@@ -609,12 +618,12 @@ def _shifted_back(data: Tensor, frame: Frame, motion: PointMotion) -> Tensor:
     return torch.fft.ifft(torch.fft.fft(data) * phasor)
 
 
-def body_image(body: Body, place_m: Tensor, extraction: Extraction) -> Tensor:
+def body_image(body: Body, position_m: Tensor, extraction: Extraction) -> Tensor:
     """Return the complex image of a body at given along-track positions, with the sea suppressed.
 
     Args:
         body: Body.
-        place_m: Along-track positions at t = 0 in metres, float64 (position,).
+        position_m: Along-track positions at t = 0 in metres, float64 (position,).
         extraction: Extent of the body.
 
     Returns:
@@ -622,6 +631,6 @@ def body_image(body: Body, place_m: Tensor, extraction: Extraction) -> Tensor:
     """
     chip, motion = body.chip, body.chip.motion
     echo, time_s = chip.echo(chip.cells)[:, chip.lit], chip.time_s[chip.lit]
-    hz = (place_m - motion.y0_m) * motion.along_m_s / (chip.radar.wavelength_m * motion.range_m)
+    hz = (position_m - motion.y0_m) * motion.along_m_s / (chip.radar.wavelength_m * motion.range_m)
     kernel = torch.exp(-2j * math.pi * hz[:, None] * time_s)
     return (kernel @ echo.mT) / (extraction.integration_s * chip.radar.prf_hz)

@@ -109,7 +109,7 @@ class PointMotion:
         cross = self.along_m_s * self.range_m - self.u_r_m_s * self.y0_m
         return cross / self.square_m2_s2.sqrt()
 
-    def place_m(self, image_s: Tensor) -> Tensor:
+    def position_m(self, image_s: Tensor) -> Tensor:
         """Return the along-track position y0 at t = 0 of a point that appears at a given slow time.
 
         This is the location correction. Eq. (30) is printed with the opposite sign: on x = V_R t a

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchsar.core import Signal, Stage, block_bytes_of, unit_phasor
 from torchsar.multichannel.azimuth import azimuth_filter, image_axis
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import doppler_axis, mind_condition, refuse_shifted
+from torchsar.multichannel.reconstruct import check_condition, doppler_axis, refuse_shifted
 from torchsar.multichannel.response import LeastSquares, Rebuild, doppler_centre_hz, doppler_offsets, shared_response
 from torchsar.radar import BistaticRadar
 
@@ -178,7 +178,7 @@ class FocusPlan(Stage):
         """
         kept = None if self._plan is None else (self._plan.n_pulse, self._plan.matrix.dtype, self._plan.matrix.device)
         if self._plan is None or kept != (data.shape[-1], data.dtype, data.device):
-            mind_condition(self.radar, self.motion, self.rebuild, data.dtype)
+            check_condition(self.radar, self.motion, self.rebuild, data.dtype)
             motion = self.motion.each(lambda value: value.to(data.device))
             self._plan = AzimuthPlan(self.radar, motion, data.shape[-1], self.rebuild, self.bandwidth_hz, data.dtype)
         return self._plan

@@ -162,7 +162,7 @@ class Reconstruct(Stage):
                 zero at pulse n // 2.
         """
         motion = PointMotion.of(self.radar, signal.data, u_r_m_s, u_a_m_s, y0_m, self.range_m)
-        mind_condition(self.radar, motion, self.rebuild, signal.data.dtype)
+        check_condition(self.radar, motion, self.rebuild, signal.data.dtype)
         refuse_shifted(self.radar, signal.axis("pulse"))
         n = signal.axis("pulse").n
         doppler = doppler_axis(self.radar, n, self.rebuild.bands)
@@ -177,6 +177,10 @@ def refuse_shifted(radar: BistaticRadar, pulse: Axis) -> None:
     """Raise ValueError unless slow time is zero at pulse n // 2 and pulses come at the radar's PRF.
 
     Phases are counted from slow time zero.
+
+    Args:
+        radar: Instrument.
+        pulse: Slow-time axis of the data.
     """
     expected = radar.pulse_axis(pulse.n)
     if (
@@ -213,7 +217,7 @@ def doppler_axis(radar: BistaticRadar, n_pulse: int, bands: int) -> Axis:
     )
 
 
-def mind_condition(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, dtype: torch.dtype) -> None:
+def check_condition(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, dtype: torch.dtype) -> None:
     """Check the condition number of a least-squares reconstruction.
 
     A warning is given where it exceeds 5 in some trials. `MinimumMeanSquare` has no such limit.

@@ -37,6 +37,13 @@ def first_bin(n_pulse: int, bands: int) -> int:
     """Return the index of the lowest Doppler bin relative to the centre.
 
     The bands * n_pulse bins rise from this index, PRF / n_pulse apart.
+
+    Args:
+        n_pulse: Number of pulses.
+        bands: Number of Doppler bands.
+
+    Returns:
+        Index, not positive.
     """
     return -(bands * n_pulse // 2)
 

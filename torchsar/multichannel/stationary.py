@@ -19,7 +19,7 @@ from torch import Tensor
 from torchsar.core import Axis, Signal, Stage, centred_ifft
 from torchsar.focus import omega_k, omega_k_stolt
 from torchsar.multichannel.motion import PointMotion
-from torchsar.multichannel.reconstruct import mind_condition, reconstruct_lines, refuse_shifted
+from torchsar.multichannel.reconstruct import check_condition, reconstruct_lines, refuse_shifted
 from torchsar.multichannel.response import LeastSquares, Rebuild
 from torchsar.radar import BistaticRadar, StripmapRadar
 
@@ -152,7 +152,7 @@ class StationaryImage(Stage):
                 reconstruction singular, or `form` is unknown.
         """
         refuse_shifted(self.radar, signal.axis("pulse"))
-        mind_condition(self.radar, PointMotion.of(self.radar, signal.data.real), self.rebuild, signal.data.dtype)
+        check_condition(self.radar, PointMotion.of(self.radar, signal.data.real), self.rebuild, signal.data.dtype)
         return self.focused(
             reconstruct_lines(signal.data, self.radar, PointMotion.of(self.radar, signal.data.real), self.rebuild),
             signal,
@@ -177,6 +177,9 @@ def stationary_axis(radar: BistaticRadar, pulse: Axis, bands: int) -> Axis:
         radar: Instrument.
         pulse: Slow-time axis of the data.
         bands: Number of bands; the image has bands * pulse samples.
+
+    Returns:
+        Azimuth axis of the image.
     """
     n = bands * pulse.n
     step = radar.speed_m_s / (bands * radar.prf_hz)

@@ -109,6 +109,9 @@ def neglected_transmit_phase_rad(radar: BistaticRadar, order: int, integration_s
         radar: Instrument.
         order: Highest order that is removed.
         integration_s: Integration time centred on t = 0 in seconds.
+
+    Returns:
+        Upper bound of the phase in rad.
     """
     half = integration_s / 2
     return (

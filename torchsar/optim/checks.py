@@ -84,6 +84,9 @@ def described(value: Any) -> str:
 
     Args:
         value: Any value.
+
+    Returns:
+        A few words for a message.
     """
     return f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
 

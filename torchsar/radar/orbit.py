@@ -130,7 +130,14 @@ def _newton(anomaly: Tensor, mean_rad: Tensor, eccentricity: Tensor) -> Tensor:
 
 
 def gravity_m_s2(position_m: Tensor) -> Tensor:
-    """Return the gravitational acceleration in m/s^2 at positions (..., 3) in metres."""
+    """Return the gravitational acceleration in m/s^2 at positions (..., 3) in metres.
+
+    Args:
+        position_m: Positions in metres from the centre of the Earth, shape (..., 3).
+
+    Returns:
+        Acceleration in m/s^2, shape (..., 3).
+    """
     return -EARTH_GRAVITY_M3_S2 * position_m / torch.linalg.vector_norm(position_m, dim=-1, keepdim=True) ** 3
 
 
@@ -150,7 +157,14 @@ def turned_with_earth(point_m: Tensor, time_s: Tensor) -> Tensor:
 
 
 def earth_velocity_m_s(point_m: Tensor) -> Tensor:
-    """Return the inertial velocity in m/s of points (..., 3) that rotate with the Earth."""
+    """Return the inertial velocity in m/s of points (..., 3) that rotate with the Earth.
+
+    Args:
+        point_m: Inertial positions in metres, shape (..., 3).
+
+    Returns:
+        Velocity in m/s, shape (..., 3).
+    """
     x, y, z = point_m.unbind(-1)
     return EARTH_RATE_RAD_S * torch.stack([-y, x, torch.zeros_like(z)], -1)
 

@@ -37,6 +37,12 @@ def frequency_samples(profiles: Tensor) -> Tensor:
     """Transform range profiles (..., n) to frequency samples, the inverse of `range_profiles`.
 
     The transform is unitary, so that it is also the adjoint.
+
+    Args:
+        profiles: Range profiles, shape (..., n), complex.
+
+    Returns:
+        Frequency samples, shape (..., n), complex.
     """
     return centred_fft(profiles) / math.sqrt(profiles.shape[-1])
 
@@ -46,6 +52,9 @@ def frequency_step_hz(frequency_hz: Tensor) -> float:
 
     Args:
         frequency_hz: Frequencies in Hz, shape (n,).
+
+    Returns:
+        Step in Hz.
 
     Raises:
         ValueError: If there are fewer than two frequencies, one of them is not positive, or the
@@ -345,6 +354,9 @@ def geometry_of(
         reference_m: Ranges of the profiles in metres, float64 (pulse,), by default the distance of
             the antenna from the scene centre.
         height_m: Coordinate z of the ground points in metres.
+
+    Returns:
+        Turntable geometry for angles, spotlight geometry for antenna positions.
 
     Raises:
         ValueError: If the frequencies are missing, or not exactly one of angles and positions is

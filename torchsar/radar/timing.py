@@ -118,6 +118,9 @@ def off_nadir_ground_m(height_m: float, off_nadir_deg: float) -> float:
         height_m: Height of the satellite in metres.
         off_nadir_deg: Angle between the line of sight and the nadir in degrees.
 
+    Returns:
+        Distance along the ground from the nadir point in metres.
+
     Raises:
         ValueError: If the line of sight misses the Earth.
     """

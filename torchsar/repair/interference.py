@@ -72,6 +72,9 @@ def find_contamination(raw: Tensor, threshold: float = THRESHOLD) -> Contaminati
     Args:
         raw: Raw lines, shape (..., pulse, range), complex.
         threshold: Power over the mean level of clutter.
+
+    Returns:
+        Contaminated cells (..., pulse, range) and lines (..., pulse).
     """
     with torch.no_grad():
         power = line_spectra(raw)
@@ -90,6 +93,9 @@ def notch_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
     Args:
         raw: Raw lines, shape (..., pulse, range), complex.
         threshold: Power over the mean level of clutter.
+
+    Returns:
+        Lines of the same shape, with the lines that were changed or are missing.
     """
     found = find_contamination(raw, threshold)
     touched = _contaminated(raw.detach(), found, threshold)
@@ -110,6 +116,9 @@ def drop_interference(raw: Tensor, threshold: float = THRESHOLD) -> Repaired:
     Args:
         raw: Raw lines, shape (..., pulse, range), complex.
         threshold: Power over the mean level of clutter.
+
+    Returns:
+        Lines of the same shape, with the lines that were changed or are missing.
     """
     found = find_contamination(raw, threshold)
     touched = _contaminated(raw.detach(), found, threshold)
@@ -131,6 +140,9 @@ def subtract_interference(raw: Tensor, threshold: float = THRESHOLD, most_tones:
         raw: Raw lines, shape (..., pulse, range), complex.
         threshold: Power over the mean level of clutter.
         most_tones: Largest number of tones in a line.
+
+    Returns:
+        Lines of the same shape, with the lines that were changed or are missing.
     """
     found = find_contamination(raw, threshold)
     if not anything(found.lines):

@@ -177,6 +177,9 @@ def fit_tone(lines: Tensor, cell: Tensor, present: Tensor, level: Level) -> Tone
         cell: Cell of an n-point FFT, shape (..., pulse), int64.
         present: Lines that may hold a tone, shape (..., pulse), bool.
         level: Robust level of the clean spectra.
+
+    Returns:
+        One tone for each line, present only where it is steady.
     """
     n = lines.shape[-1]
     signed = torch.where(cell > n // 2, cell - n, cell).to(torch.float64)
@@ -239,6 +242,9 @@ def pooled(tone: Tone, n: int, position: Tensor) -> Tone:
         tone: Tone with values of single lines.
         n: Number of samples of a line.
         position: Line numbers, shape (..., pulse), float64.
+
+    Returns:
+        Tone with averaged frequency and drift.
     """
     frequency = smooth_track(tone.frequency, _to_frequency(tone.noise_rad, n), tone.present, position)
     return replace(
@@ -290,6 +296,9 @@ def window_sums(half: int) -> Callable[[Tensor], Tensor]:
 
     Args:
         half: Half width of the window in lines.
+
+    Returns:
+        Function that maps (..., n) to sums of the same shape.
     """
 
     def sums(x: Tensor) -> Tensor:
@@ -324,6 +333,9 @@ def find_tones(
         position: Line numbers, shape (..., pulse), if the lines are a selection.
         most: Largest number of tones in a line.
         threshold: Power over the mean level of clutter.
+
+    Returns:
+        Tones, at most `most`, each with values (..., pulse).
     """
     rest, tones, n = lines.detach(), [], lines.shape[-1]
     blocked = torch.zeros(lines.shape, dtype=torch.bool, device=lines.device)
@@ -391,6 +403,9 @@ def refit(lines: Tensor, tones: list[Tone], position: Tensor, rounds: int = 2) -
         tones: Tones of the lines.
         position: Line numbers, shape (..., pulse), float64.
         rounds: Number of passes over all tones, if a line holds more than one.
+
+    Returns:
+        Tones in the same order.
     """
     n, tones = lines.shape[-1], list(tones)
     if not tones:
@@ -466,6 +481,9 @@ def anything(mask: Tensor) -> bool:
 
     Args:
         mask: Any shape, bool.
+
+    Returns:
+        Whether any entry is, or may be, True.
     """
     try:
         return bool(mask.any())

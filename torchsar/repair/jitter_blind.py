@@ -72,6 +72,9 @@ def cyclic_fit(y: Tensor, period: int) -> CyclicFit:
     Args:
         y: Lines, shape (..., pulse, range), complex.
         period: Period M in samples.
+
+    Returns:
+        Coefficients of the jitter and their variance.
     """
     n = y.shape[-1] - y.shape[-1] % period
     spectrum = torch.fft.fft(y[..., :n]).to(torch.complex128)

@@ -165,6 +165,9 @@ def line_integrity(
             numbers need more.
         longest_gap: Largest step between neighbours that is not taken for an error.
 
+    Returns:
+        Plan that assigns the received lines to rows of the grid.
+
     Raises:
         ValueError: If the numbers do not fit the lines or are not integers, the longest gap is less
             than one, or fewer than half of the numbers are accepted in every trial.

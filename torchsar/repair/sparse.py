@@ -40,7 +40,14 @@ def unit_level(lines: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def power_of(x: Tensor) -> Tensor:
-    """Return |x|^2 of complex samples of any shape."""
+    """Return |x|^2 of complex samples of any shape.
+
+    Args:
+        x: Samples, any shape, complex.
+
+    Returns:
+        Powers, same shape, real.
+    """
     return x.real.square() + x.imag.square()
 
 

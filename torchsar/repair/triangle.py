@@ -133,6 +133,9 @@ def is_contiguous(block_samples: int, radar: TriangularLadar) -> bool:
     Args:
         block_samples: Number of samples of a block.
         radar: Ladar.
+
+    Returns:
+        True if every period is kept and a block is as long as a period.
     """
     return radar.keep_every == 1 and block_samples == 2 * radar.sweep_samples
 

@@ -155,7 +155,7 @@ class Movers:
         """
         return radar.reference_range_m + self.range_m
 
-    def place_m(self, time_s: Tensor) -> Tensor:
+    def position_m(self, time_s: Tensor) -> Tensor:
         """Return the along-track position without the part u_a t.
 
         Args:
@@ -178,7 +178,7 @@ class Movers:
             v t - y0 - dx_m in metres, shape (..., channel, pulse, target).
         """
         travelled = (radar.speed_m_s - self.u_a_m_s[..., None, None, :]) * time_s[:, None]
-        return travelled - self.place_m(time_s) - radar.channels_at(time_s.device)[:, None, None]
+        return travelled - self.position_m(time_s) - radar.channels_at(time_s.device)[:, None, None]
 
     def excess_m(self, time_s: Tensor, radar: BistaticRadar) -> Tensor:
         """Return the exact range to the receiver beyond the closest range.
@@ -192,7 +192,7 @@ class Movers:
         """
         u_r, u_a, closest = (x[..., None, None, :] for x in (self.u_r_m_s, self.u_a_m_s, self.closest_m(radar)))
         channel = radar.channels_at(time_s.device)[:, None, None]
-        excess = receive_range(time_s[:, None], u_r, u_a, self.place_m(time_s), closest, radar.speed_m_s, channel)
+        excess = receive_range(time_s[:, None], u_r, u_a, self.position_m(time_s), closest, radar.speed_m_s, channel)
         if self.bend is None:
             return excess
         range_m, square = closest + excess, self.bend.square_m2(time_s)

@@ -131,6 +131,7 @@ class _Boom:
         return _on_lines(torch.stack([root, tip - arm]), torch.stack([tip, tip + arm]), _spread(u[..., 0]))
 
 
+# -1 and 1: signs of cross range on the sides of the two panels
 _PARTS: Mapping[str, _Part] = {
     "bus": _Bus(),
     "panel_left": _Panel(-1.0),

@@ -170,6 +170,9 @@ def motion_from(
         y0_m: Along-track position at t = 0 in metres.
         range_m: Closest range in metres, None for the reference range of the radar.
 
+    Returns:
+        Motion, shape (...,) each.
+
     Raises:
         ValueError: If the motion is impossible, see `PointMotion.of`.
     """

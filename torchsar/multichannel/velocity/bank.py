@@ -100,7 +100,7 @@ def bank_search(
             u_a = torch.as_tensor(u_a_m_s, dtype=torch.float64, device=data.device)[..., None] + offsets
             there = PointMotion.of(radar, data, u_r, u_a, 0.0, None if range_m is None else per_trial(range_m, 1, data))
             if image_s is not None:
-                there = replace(there, y0_m=there.place_m(per_trial(image_s, 1, data)))
+                there = replace(there, y0_m=there.position_m(per_trial(image_s, 1, data)))
             # a search that is the same for all trials needs the pulses of its aperture only
             pulses = (
                 _illuminated(aperture.weight(radar, there, time_s))

@@ -89,7 +89,15 @@ class Found:
 
 
 def energy_ratio_db(energy: Tensor, noise_power: Tensor) -> Tensor:
-    """Return an energy over a noise power in dB, within +-300 dB; -300 dB where both are zero."""
+    """Return an energy over a noise power in dB, within +-300 dB; -300 dB where both are zero.
+
+    Args:
+        energy: Energies, any shape, float64.
+        noise_power: Noise powers in the same unit, a shape that broadcasts.
+
+    Returns:
+        Ratios in dB, the broadcast shape.
+    """
     return 10 * torch.log10((energy / noise_power.clamp_min(torch.finfo(torch.float64).tiny)).clamp(1e-30, 1e30))
 
 
@@ -149,18 +157,40 @@ def _of_unit_diagonal(normal: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def refuse_unknowns(unknowns: tuple[str, ...]) -> None:
-    """Raise ValueError unless the names are among UNKNOWNS, each once."""
+    """Raise ValueError unless the names are among UNKNOWNS, each once.
+
+    Args:
+        unknowns: Names.
+    """
     if not unknowns or len(set(unknowns)) != len(unknowns) or not set(unknowns) <= set(UNKNOWNS):
         raise ValueError(f"unknowns must be names among {UNKNOWNS}, each once, got {tuple(unknowns)}")
 
 
 def moved(motion: PointMotion, step: Tensor, unknowns: tuple[str, ...]) -> PointMotion:
-    """Return the motion with `step` (..., unknown) added to the unknowns."""
+    """Return the motion with `step` (..., unknown) added to the unknowns.
+
+    Args:
+        motion: Motion, shape (...,) each.
+        step: Steps in the units of the unknowns, shape (..., unknown).
+        unknowns: Names of the unknowns, in the order of the steps.
+
+    Returns:
+        Motion after the step.
+    """
     return replace(motion, **{name: getattr(motion, name) + step[..., i] for i, name in enumerate(unknowns)})
 
 
 def chosen(motion: PointMotion, other: PointMotion, first: Tensor) -> PointMotion:
-    """Select one of two motions per trial: `motion` where first (...,) is True, else `other`."""
+    """Select one of two motions per trial: `motion` where first (...,) is True, else `other`.
+
+    Args:
+        motion: First motion, shape (...,) each.
+        other: Second motion, same shape.
+        first: Where the first motion is taken, shape (...,), bool.
+
+    Returns:
+        Motion, shape (...,) each.
+    """
     pairs = {
         name: torch.where(first, getattr(motion, name), getattr(other, name))
         for name in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchsar.core import Estimate, Signal, Stage, take
 from torchsar.multichannel.motion import Number, PointMotion
-from torchsar.multichannel.reconstruct import mind_condition, reconstruct_lines
+from torchsar.multichannel.reconstruct import check_condition, reconstruct_lines
 from torchsar.multichannel.response import LeastSquares, Rebuild, doppler_offsets
 from torchsar.multichannel.velocity.ambiguity import warned_of_ambiguity
 from torchsar.multichannel.velocity.aperture import Dwell
@@ -130,7 +130,13 @@ def _intensity_of_bins(
 
 
 def refuse_full_band(radar: BistaticRadar, rebuild: Rebuild, bandwidth_hz: float) -> None:
-    """Raise ValueError unless part of the reconstructed band lies outside the processed band."""
+    """Raise ValueError unless part of the reconstructed band lies outside the processed band.
+
+    Args:
+        radar: Instrument.
+        rebuild: Reconstruction of the Doppler bands.
+        bandwidth_hz: Processed Doppler band in Hz.
+    """
     if not 0 < bandwidth_hz < rebuild.bands * radar.prf_hz:
         band = f"{rebuild.bands} bands of {radar.prf_hz:g} Hz"
         raise ValueError(
@@ -224,7 +230,7 @@ class SignalIntensityRatio(Stage):
         lines = signal.data if "range" in signal.names else signal.data[..., None]
         middle = sum(self.search_m_s) / 2
         start = torch.full(signal.trials, middle, dtype=torch.float64, device=lines.device)
-        mind_condition(self.radar, self._motion(lines, start, u_a_m_s, y0_m), self.rebuild, lines.dtype)
+        check_condition(self.radar, self._motion(lines, start, u_a_m_s, y0_m), self.rebuild, lines.dtype)
 
         def intensity(u_r_m_s: Tensor) -> Intensity:
             return _intensity_of_bins(

@@ -88,15 +88,15 @@ class Interferometry(_Velocity):
         radar: Instrument.
         aperture: Expected amplitude over slow time.
         range_m: Closest range in metres, None for that of the line or the reference range.
-        mind_ambiguity: Whether to check for a velocity off by whole PRFs (about 10 ms per trial): a
-            warning is then given and `ok` is False.
+        check_ambiguity: Whether to check for a velocity off by whole PRFs (about 10 ms per trial):
+            a warning is then given and `ok` is False.
     """
 
     def __init__(
-        self, radar: BistaticRadar, aperture: Aperture, range_m: float | None = None, mind_ambiguity: bool = True
+        self, radar: BistaticRadar, aperture: Aperture, range_m: float | None = None, check_ambiguity: bool = True
     ) -> None:
         super().__init__(radar, aperture, range_m)
-        self.mind_ambiguity = mind_ambiguity
+        self.check_ambiguity = check_ambiguity
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
         """Estimate u_r and y0 near a start.
@@ -114,7 +114,7 @@ class Interferometry(_Velocity):
         data, radar, start, aperture = self.begin(signal, u_r_m_s, u_a_m_s, y0_m)
         found = interferometry(data, radar, start, aperture)
         there = replace(start, u_r_m_s=found["u_r_m_s"], y0_m=found["y0_m"])
-        return warned_of_ambiguity(found, data, radar, there, aperture) if self.mind_ambiguity else found
+        return warned_of_ambiguity(found, data, radar, there, aperture) if self.check_ambiguity else found
 
 
 class AlongTrackAutofocus(_Velocity):

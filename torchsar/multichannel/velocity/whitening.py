@@ -94,6 +94,9 @@ def sample_whitening(data: Tensor, radar: BistaticRadar, samples: int = _SAMPLES
         data: Channels, shape (..., channel, pulse), complex.
         radar: Instrument.
         samples: Number of neighbouring bins averaged.
+
+    Returns:
+        Whitening of each Doppler bin, as from `line_whitening`.
     """
     return line_whitening(data[..., None, :, :], radar, samples)
 

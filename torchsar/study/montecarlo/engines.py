@@ -18,8 +18,8 @@ from torchsar.study.settings.errors import ConfigError
 
 log = logging.getLogger("torchsar")
 Task = tuple[Chunk, int | None]
-_QUEUE = 4
-_DEATHS = 10
+_QUEUE = 4  # chunks sent ahead per worker, so that none waits for the next one
+_DEATHS = 10  # workers lost with a chunk before the chunk itself is taken for the cause
 _UNGUARDED = (
     "a script that starts workers is read again by each of them; put its call of "
     "sweep(...) below the line: if __name__ == '__main__':"
