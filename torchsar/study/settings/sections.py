@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, Protocol
 from pydantic import Field, ValidationError, model_validator
 
 from torchsar.study.settings.errors import ConfigError, did_you_mean
+from torchsar.study.settings.plausible import refuse_implausible
 from torchsar.study.settings.sentences import Strict, sentence
 from torchsar.study.settings.signature import Catalogue, Section
 from torchsar.study.settings.text import dump
@@ -240,6 +241,7 @@ def checked(tree: Any, system: Sections, file: str) -> Config:
     _check_source(config, system, file)
     sections = {name: getattr(config, name) for name in system.sections}
     made = {n: None if tree is None else system.sections[n].check(tree, n, file) for n, tree in sections.items()}
+    refuse_implausible(config.system, made["radar"], made["world"], file)
     found = config.data.impairments
     kept = {n: system.recording_impairments.check(entry, f"data.impairments.{n}", file) for n, entry in found.items()}
     methods = {name: _method(method, f"processor.{name}", system, file) for name, method in config.processor.items()}
