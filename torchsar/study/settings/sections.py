@@ -15,6 +15,8 @@ from torchsar.study.settings.sentences import Strict, sentence
 from torchsar.study.settings.signature import Catalogue, Section
 from torchsar.study.settings.text import dump
 
+# how true values were named before they had a name of their own
+_OLD_TRUTH = "aux.true_"
 # names that group results, and therefore cannot be those of methods
 RESERVED = ("truth", "estimate")
 
@@ -257,6 +259,10 @@ def _method(method: Method, where: str, system: Sections, file: str) -> Method:
         uses = entry.get("uses", {})
         if not (isinstance(uses, dict) and all(isinstance(source, str) for source in uses.values())):
             raise ConfigError(f"{file}: {where}.stages.{name}.uses must map values to 'stage.value', got {uses!r}")
+        old = next((source for source in uses.values() if source.startswith(_OLD_TRUTH)), None)
+        if old is not None:
+            new = f"truth.{old.removeprefix(_OLD_TRUTH)}"
+            raise ConfigError(f"{file}: {where}.stages.{name}.uses: {old!r} is now called {new!r}; rename it")
         rest = {key: value for key, value in entry.items() if key != "uses"}
         stages[name] = {**system.stages.check(rest, f"{where}.stages.{name}", file), **({"uses": uses} if uses else {})}
     return method.model_copy(update={"stages": stages or None})
