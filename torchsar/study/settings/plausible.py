@@ -34,6 +34,8 @@ _RANGES: Sequence[tuple[str, float, float, str]] = (
     ("*.radar.wave_speed_m_s", 1e8, 3.1e8, "the speed of light in glass, air or space"),
     ("sal.radar.carrier_hz", 1e12, 1e16, "light from the far infrared to the ultraviolet"),
     ("sal.radar.wavelength_m", 3e-8, 3e-4, "light from the far infrared to the ultraviolet"),
+    ("isal*.radar.carrier_hz", 3e8, 1e16, "waves short enough to show the shape of a target"),
+    ("isal*.radar.wavelength_m", 3e-8, 1.0, "waves short enough to show the shape of a target"),
     ("geo*.radar.carrier_hz", 2e7, 3e11, "waves from the lowest radar band to millimetres"),
     ("*.radar.carrier_hz", 2e7, 1e16, "waves from the lowest radar band to the ultraviolet"),
     ("*.radar.wavelength_m", 3e-8, 15.0, "waves from the lowest radar band to the ultraviolet"),
