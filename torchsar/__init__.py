@@ -5,26 +5,22 @@
     image = chain(recording)
 
 Only torch and numpy are required. `torchsar.plot` also needs matplotlib, and `torchsar.study` the
-packages of the extra `study`; both are imported on first use.
+packages of the extra `study`. Every subpackage is imported on first use, so that the command line
+answers at once.
 """
 
 from __future__ import annotations
 
 import importlib
-from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
-from torchsar import compensate, core, echo, focus, io, metrics, multichannel, radar, repair, scene
-from torchsar.core import Axis, Chain, Draws, Estimate, Recording, Signal, Stage, Trace, Truth, use
+if TYPE_CHECKING:
+    from torchsar import compensate, core, echo, focus, io, metrics, multichannel, radar, repair, scene
+    from torchsar.core import Axis, Chain, Draws, Estimate, Recording, Signal, Stage, Trace, Truth, use
 
 __version__ = "0.1.0"
-_ON_FIRST_USE = ("plot", "study")
-
-
-def __getattr__(name: str) -> ModuleType:
-    if name in _ON_FIRST_USE:
-        return importlib.import_module(f"torchsar.{name}")
-    raise AttributeError(f"module 'torchsar' has no attribute {name!r}")
-
+# subpackages that are no part of the public face: what they need is not always installed
+_ON_REQUEST = ("optim", "plot", "study")
 
 __all__ = [
     "Axis",
@@ -48,3 +44,16 @@ __all__ = [
     "scene",
     "use",
 ]
+_OF_CORE = ("Axis", "Chain", "Draws", "Estimate", "Recording", "Signal", "Stage", "Trace", "Truth", "use")
+
+
+def __getattr__(name: str) -> Any:
+    if name in _OF_CORE:
+        return getattr(importlib.import_module("torchsar.core"), name)
+    if name in __all__ or name in _ON_REQUEST:
+        return importlib.import_module(f"torchsar.{name}")
+    raise AttributeError(f"module 'torchsar' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__, *_ON_REQUEST})

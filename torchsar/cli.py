@@ -8,8 +8,10 @@ import os
 import shlex
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 EXIT_BAD_INPUT = 2  # the status of argparse for a command line that it rejects
 _COMMANDS = {
@@ -83,8 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ImportError as error:
         return _fail(f"{error}; install the extra: pip install 'torchsar-lab[study]'")
     try:
-        _log_to_stderr()
-        with warnings.catch_warnings():
+        with _log_to_stderr(), warnings.catch_warnings():
             warnings.showwarning = _show_warning
             return _dispatch(options, "torchsar " + shlex.join(given))
     except ImportError as error:
@@ -112,9 +113,14 @@ def _parse(given: Sequence[str]) -> argparse.Namespace:
 
 
 def _dispatch(options: argparse.Namespace, command: str) -> int:
+    from torchsar.study.settings.text import experiments, find_config
+
+    if options.command == "list":  # its first part and a name that is not known come before torch, too
+        print(experiments(), flush=True)
+    else:
+        find_config(options.config)
     import torch
 
-    from torchsar.study.settings.errors import ConfigError
     from torchsar.study.table import load, systems
 
     if options.threads is not None:
@@ -124,10 +130,7 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
 
         print(listing(systems))
         return 0
-    try:
-        torch.empty(0, device=options.device)
-    except (RuntimeError, AssertionError) as error:
-        raise ConfigError(f"--device {options.device} cannot be used here: {str(error).splitlines()[0]}") from None
+    _refuse_device(options.device, torch)
     loaded = load(options.config, options.overrides)
     out = options.out or _folder(options.command, loaded.name)
     if options.command == "run":
@@ -148,27 +151,50 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
     return 0
 
 
+def _refuse_device(name: str, torch: Any) -> None:
+    """Refuse a device on which nothing can be computed: an empty tensor would do on any."""
+    from torchsar.study.settings.errors import ConfigError
+
+    try:
+        torch.zeros(1, dtype=torch.complex128, device=name).abs().item()
+    except (RuntimeError, AssertionError, TypeError, ImportError) as error:
+        reason = str(error).splitlines()[0].rstrip(".")
+        raise ConfigError(f"--device {name} cannot be used here: {reason}; leave it out to use the processor") from None
+
+
 def _fail(sentence: str) -> int:
     print(f"torchsar: {' '.join(sentence.split())}", file=sys.stderr)
     return EXIT_BAD_INPUT
 
 
-def _log_to_stderr() -> None:
+@contextmanager
+def _log_to_stderr() -> Iterator[None]:
+    """The log of the program as lines on stderr, the same warning only once."""
     from torchsar.study.settings.errors import ConfigError
 
-    log = logging.getLogger("torchsar")
-    if not log.handlers:
-        handler = logging.StreamHandler()
-        handler.setFormatter(logging.Formatter("torchsar: %(message)s"))
-        log.addHandler(handler)
     level = os.environ.get("TORCHSAR_LOG", "INFO").upper()
     if level not in logging.getLevelNamesMapping():
         raise ConfigError(f"TORCHSAR_LOG={level} is no level of the log; choose DEBUG, INFO, WARNING or ERROR")
+    log, handler, shown = logging.getLogger("torchsar"), logging.StreamHandler(), set[str]()
+
+    def is_new(record: logging.LogRecord) -> bool:
+        text, known = record.getMessage(), len(shown)
+        if record.levelno >= logging.WARNING:
+            shown.add(text)
+        return record.levelno < logging.WARNING or len(shown) > known
+
+    handler.setFormatter(logging.Formatter("torchsar: %(message)s"))
+    handler.addFilter(is_new)
     log.setLevel(level)
+    log.addHandler(handler)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    """A Python warning as one line of the log, without the place in the code."""
+    """A Python warning as one line of the log, without the position in the code."""
     logging.getLogger("torchsar").warning("warning: %s", " ".join(str(message).split()))
 
 

@@ -5,21 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from torchsar.study.build import build_chain, resolved
-from torchsar.study.config import load
-from torchsar.study.stripmap.build import build_radar
-from torchsar.study.stripmap.run import prepare
 
 from tests.study.tiny import TINY, write_tiny
+from torchsar.core import Draws
+from torchsar.study.commands.sweep import SweepTrial, sweep_grid
+from torchsar.study.settings.cases import cases_of
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.text import dump, override, packaged_configs, parse
-from torchsar.study.systems import system_of
+from torchsar.study.table import load
+from torchsar.study.trials.bench import Bench
 
 
 def refused(tmp_path: Path, *assignments: str, **changes: object) -> str:
     with pytest.raises(ConfigError) as error:
-        loaded = load(str(write_tiny(tmp_path, **changes)), assignments)
-        prepare(loaded)
+        bench = Bench(load(str(write_tiny(tmp_path, **changes)), assignments))
+        bench.batch(Draws(1, "test", range(1)), detail=True)
     text = str(error.value)
     assert "\n" not in text
     return text
@@ -70,22 +70,26 @@ def test_override_through_a_value_is_refused() -> None:
 
 @pytest.mark.parametrize("name", sorted(packaged_configs()))
 def test_packaged_configs_are_complete(name: str) -> None:
+    # any file where a recording is asked for: only its presence is checked here
+    recorded = [f"data.file={__file__}"] if "\nradar:" not in packaged_configs()[name].read_text() else []
     for spelled in (name, f"{name}.yaml", f"configs/{name}.yaml"):
-        # any file: only its presence is checked here
-        loaded = load(spelled, [f"data.file={__file__}"])
+        loaded = load(spelled, recorded)
         assert "recommended" in loaded.config.processor
-    if loaded.config.radar is not None:
-        system_of(loaded).check(loaded)
-        assert parse(dump(resolved(loaded)), name)["seed"] == loaded.config.seed
+    again = loaded.text()
+    assert dump(parse(again, name)) == again
+    if loaded.config.sweep.grid:
+        assert len(sweep_grid(loaded, SweepTrial(loaded)).points()) > 1
+    elif not recorded:
+        assert all(Bench(case).chains for case in cases_of(loaded).values())
 
 
-def test_resolved_config_runs_to_the_same_chain(tmp_path: Path) -> None:
+def test_a_resolved_config_reads_as_itself(tmp_path: Path) -> None:
     loaded = load(str(write_tiny(tmp_path)))
     again = tmp_path / "again.yaml"
-    again.write_text(dump(resolved(loaded)), encoding="utf-8")
+    again.write_text(loaded.text(), encoding="utf-8")
     second = load(str(again))
-    assert resolved(second) == resolved(loaded)
-    assert resolved(second)["processor"]["recommended"]["stages"]["focus"]["velocity_m_s"] is None
+    assert second.config == loaded.config
+    assert second.config.processor["recommended"].stages["focus"]["velocity_m_s"] is None  # pyright: ignore
 
 
 def test_unknown_config_names_what_there_is() -> None:
@@ -99,7 +103,7 @@ def test_unknown_config_names_what_there_is() -> None:
         (["world.noise.snr_dbb=3"], ["tiny.yaml", "'world.noise.snr_dbb' is not known", "did you mean 'snr_db'"]),
         (["world.noise.snr_db=loud"], ["'world.noise.snr_db' has the value 'loud'", "valid number"]),
         (["world.noise.snr_db=.nan"], ["world.noise.snr_db", "finite"]),
-        (["radar.prf_hz=-4"], ["'radar.prf_hz' has the value -4", "greater than 0"]),
+        (["radar.prf_hz=-4"], ["radar.prf_hz must be a positive number", "-4"]),
         (["radar.pulse.direction=2"], ["radar.pulse.direction", "1 or -1"]),
         (["radar.pulse.bandwidth_hz=60e6"], ["radar:", "exceeds the complex sampling rate"]),
         (["world.lines=abc"], ["'world.lines' has the value 'abc'", "integer"]),
@@ -142,9 +146,9 @@ def test_unknown_config_names_what_there_is() -> None:
         (["=3"], ["is not an override"]),
         ([".seed=3"], ["'.seed=3' is not an override"]),
         (["world=3"], ["'world' has the value 3", "mapping of keys"]),
-        (["world.scene={}"], ["'world.scene' has the value {}", "not an empty one"]),
+        (["world.scene={}"], ["world", "a strip needs a scene"]),
         (["data.file=/tmp"], ["data.file", "'/tmp' is no file"]),
-        (["world.lines=1000000000000"], ["world", "1000000000000 lines of 128 samples", "GB"]),
+        (["world.lines=1000000000000"], ["world", "raw data of a trial take 1.02e+06 GB"]),
         (["world.scene.points.azimuth_m=[1.0, 2.0, 3.0]"], ["world.scene.points", "as many ranges", "[3, 2]"]),
         (["world.scene.points.range_m=[-5000.0, 0.0]"], ["world", "behind the radar"]),
         (["world.scene.field.count=0"], ["world.scene.field", "count=0"]),
@@ -152,7 +156,7 @@ def test_unknown_config_names_what_there_is() -> None:
         (["world.scene.field.level_db=9999.0"], ["world.scene.field", "level_db", "9999"]),
         (["world.beam.dwell_s=-1.0"], ["world.beam", "dwell_s", "-1.0"]),
         (["world.doppler_hz=3000.0"], ["world", "Doppler", "squint beyond 90 degrees"]),
-        (["radar.pulse.duration_s=1.0"], ["world", "a line of 128 samples does not hold the pulse of 50000000"]),
+        (["radar.pulse.duration_s=4e-6"], ["world", "a line of 128 samples does not hold the pulse of 200"]),
         (
             ["world.impairments={x: {kind: periodic_jitter, offset_samples: []}}"],
             ["world.impairments.x", "at least one offset"],
@@ -171,6 +175,98 @@ def test_mistakes_are_named(tmp_path: Path, assignments: list[str], expected: li
         assert part in text
 
 
+@pytest.mark.parametrize(
+    "assignments, expected",
+    [
+        (["world.damages={}"], ["'world.damages' is now called 'impairments'"]),
+        (["data.damages={}"], ["'data.damages' is now called 'impairments'"]),
+        (["processor.clean.input=damaged"], ["should be 'impaired', as it is now called"]),
+        (
+            ["processor.recommended.stages.focus.uses.doppler_hz=aux.true_doppler_hz"],
+            ["'aux.true_doppler_hz' is now called 'truth.doppler_hz'"],
+        ),
+        (
+            ["processor.recommended.stages.r={stage: rotation_descent, order: 2}"],
+            ["'processor.recommended.stages.r.order' is now called 'objective.order'"],
+        ),
+        (["world.noise.order=2"], ["'world.noise.order' is not known"]),
+    ],
+)
+def test_old_names_are_given_the_new_ones(tmp_path: Path, assignments: list[str], expected: list[str]) -> None:
+    text = refused(tmp_path, *assignments)
+    assert all(part in text for part in expected), text
+
+
+# a config of each system, and a number of it in another unit: kHz for Hz, km for m, ...
+MISTAKEN = {
+    "stripmap_damaged": [
+        ("radar.prf_hz=0.4", "1 Hz to 1e+08 Hz", "did you mean 0.4 kHz, which is 400?"),
+        ("radar.prf_hz=2.0", "Doppler band of an aperture over the pulse rate", "radar.prf_hz (2 Hz) to 7.47 Hz"),
+        ("radar.velocity_m_s=7.0", "radar.velocity_m_s (7 m/s)", "at least 0.01"),
+        ("radar.near_range_m=700.0", "radar.near_range_m (700 m)", "at most 100"),
+        ("radar.pulse.duration_s=3.0", "1e-10 s to 0.1 s", "did you mean 3 ms"),
+        ("radar.sampling_hz=250e9", "the sampling rate over the bandwidth is 1.25e+03", "at most 500"),
+        ("world.scene.points.range_m=[7e6]", "world.scene.points.range_m is 7e+06 m", "at most 1e+06 m"),
+        ("world.noise.snr_db=2000.0", "2000 dB", "at most 400 dB"),
+        ("sweep.world.noise.snr_db=[0.0, 2000.0]", "2000 dB", "at most 400 dB"),
+    ],
+    "isal_table1": [
+        ("radar.carrier_hz=193.4", "3e+08 Hz to 1e+16 Hz", "did you mean 193.4 MHz"),
+        ("radar.prf_hz=2.0", "the Doppler band of the scene over the pulse rate", "2 Hz"),
+        ("radar.pulse_s=0.1", "the share of time that a pulse takes is 200", "at most 1"),
+        ("world.scene.aircraft.length_m=190.0", "190 m", "at most 100"),
+    ],
+    "isal_satellite": [
+        ("radar.wavelength_m=1.55", "3e-08 m to 1 m", "did you mean 1.55 um"),
+        ("radar.prf_hz=500.0", "500 Hz", "at most 100"),
+        ("world.rotation.omega_rad_s=20000.0", "20000 rad/s", "at most 1000 rad/s"),
+    ],
+    "sal_points": [
+        ("radar.wavelength_m=1.55", "3e-08 m to 0.0003 m", "did you mean 1.55 um, which is 1.55e-06?"),
+        ("radar.period_s=16.0", "1e-08 s to 0.01 s", "did you mean 16 us"),
+        ("world.motion.slow.amplitude_m=160.0", "160 m", "at most 0.1 m"),
+    ],
+    "geo_point_targets": [
+        ("radar.prf_hz=0.18", "0.18 Hz", "did you mean 0.18 kHz, which is 180?"),
+        ("radar.speed_m_s=0.3", "0.3 m/s", "5 m/s to 2000 m/s"),
+        ("world.targets.at_2.u_r_m_s=2e4", "20000 m/s", "at most 2000 m/s"),
+    ],
+    "geo_velocity_prf": [("sweep.radar.prf_hz=[180.0, 0.18]", "0.18 Hz", "did you mean 0.18 kHz")],
+    "geo_ocean": [
+        ("radar.reference_range_m=5.7", "5.7 m", "did you mean 5.7 km, which is 5700?"),
+        ("world.gate.duration_s=4500.0", "4500 s", "at most 100"),
+        ("world.sea.cell_m=[2e4, 20.0]", "20000 m", "at most 1000 m"),
+    ],
+}
+
+
+@pytest.mark.parametrize("name", MISTAKEN)
+def test_numbers_of_no_use_are_refused_with_their_unit(name: str) -> None:
+    for assignment, *expected in MISTAKEN[name]:
+        with pytest.raises(ConfigError) as error:
+            loaded = load(name, [assignment, *(["cases={}"] if assignment.startswith("sweep") else [])])
+            sweep_grid(loaded, SweepTrial(loaded))
+        assert all(part in str(error.value) for part in expected), str(error.value)
+
+
+@pytest.mark.parametrize(
+    "assignment",
+    [
+        "radar.prf_hz=10.0",
+        "radar.pulse.bandwidth_hz=1e6",
+        "world.noise.snr_db=-60.0",
+        "world.noise.snr_db=null",
+        "world.velocity_m_s=100.0",
+        "world.doppler_hz=-150.0",
+        "world.scene.points.azimuth_m=[0.0, -1e-9]",
+        "world.beam={kind: dwell, dwell_s: 0.02}",
+        "world.scene.field.azimuth_extent_m=1e-6",
+    ],
+)
+def test_unusual_numbers_are_accepted(assignment: str, tmp_path: Path) -> None:
+    assert Bench(load(str(write_tiny(tmp_path)), [assignment])).chains
+
+
 def test_missing_sections_are_named(tmp_path: Path) -> None:
     assert "'world' is missing" in refused(tmp_path, world=None)
     assert "'radar' is missing" in refused(tmp_path, radar=None)
@@ -180,9 +276,6 @@ def test_missing_sections_are_named(tmp_path: Path) -> None:
 
 
 def test_chain_of_a_method_is_built_as_written(tmp_path: Path) -> None:
-    loaded = load(str(write_tiny(tmp_path)))
-    chain = build_chain(
-        loaded.config.processor["recommended"], "processor.recommended", loaded.file, radar=build_radar(loaded)
-    )
+    chain = Bench(load(str(write_tiny(tmp_path)))).chains["recommended"]
     assert list(chain.stages) == ["doppler", "focus"]
     assert chain.uses["focus"] == {"doppler_hz": "doppler.doppler_baseband_hz"}

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from torchsar.study.catalogue import Catalogue
-from torchsar.study.registry import BEAMS, GROUPS, IMPAIRMENTS, PATHS, SCENES, group_of, stages
 
 from torchsar.core import Stage
+from torchsar.study.names.registry import GROUPS, WORLD, group_of, stages
 from torchsar.study.settings.errors import ConfigError
+from torchsar.study.settings.signature import Catalogue, Section
 
 OWN = '''
 from torchsar.core import Stage
@@ -28,10 +28,10 @@ class Louder(Stage):
 '''
 
 
-@pytest.mark.parametrize("catalogue", [stages(), SCENES, BEAMS, PATHS, IMPAIRMENTS], ids=lambda c: c.what)
+@pytest.mark.parametrize("catalogue", [stages(), *WORLD.values()], ids=["stages", *WORLD])
 def test_every_entry_has_keys_that_yaml_can_hold(catalogue: Catalogue) -> None:
-    for name in catalogue.entries:
-        assert catalogue.model(name).model_fields is not None
+    for section in catalogue.sections.values():
+        assert set(section.model.model_fields) == set(section.keys)
 
 
 def test_every_stage_belongs_to_one_group() -> None:
@@ -55,15 +55,27 @@ class Sample(Stage):
 
 def test_signatures_become_keys_and_values_become_what_they_ask_for() -> None:
     catalogue = Catalogue("stage", "stage", {"sample": Sample}, given=("radar",))
-    assert set(catalogue.model("sample").model_fields) == {"count", "level", "table", "pair"}
-    made = catalogue.make(
-        {"stage": "sample", "level": 2.5, "table": [1.0, 2.0], "pair": [3, 4]}, "here", "file", radar="the radar"
+    keys = catalogue.sections["sample"].keys
+    assert set(keys) == {"count", "level", "table", "pair"}
+    assert [name for name, key in keys.items() if key.per_trial] == ["level"]
+    entry = catalogue.check(
+        {"stage": "sample", "level": 2.5, "table": [1.0, 2.0], "pair": [3, 4]}, "here", "file"
     )
+    made = catalogue.make(entry, "here", "file", radar="the radar")
     assert made.radar == "the radar" and made.count == 3 and made.level == 2.5 and made.pair == (3, 4)
     assert made.table.dtype == torch.float64 and made.table.tolist() == [1.0, 2.0]
+    level = torch.tensor([1.0, 2.0])
+    assert catalogue.make(entry, "here", "file", {"level": level}, radar=0).level is level
     for wrong in ({"count": 1.5}, {"count": True}, {"pair": 3}, {"level": "x"}, {"radar": 1}):
         with pytest.raises(ConfigError, match="here"):
-            catalogue.make({"stage": "sample", **wrong}, "here", "file", radar="the radar")
+            catalogue.check({"stage": "sample", **wrong}, "here", "file")
+
+
+def test_a_parameter_that_yaml_cannot_hold_is_a_fault_of_the_program() -> None:
+    def takes_function(law: type) -> None: ...
+
+    with pytest.raises(TypeError, match="'law'.*register a factory"):
+        assert Section(takes_function).keys
 
 
 def test_own_stage_joins_through_the_entry_point(tmp_path: Path) -> None:
@@ -73,13 +85,13 @@ def test_own_stage_joins_through_the_entry_point(tmp_path: Path) -> None:
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: louder\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text("[torchsar.stages]\nlouder = louder:Louder\n")
     code = (
-        "from torchsar.study.registry import stages, group_of; s = "
-        "stages().make({'stage': 'louder', 'gain': 3.0}, 'x', 'f'); print(s.gain, "
-        "group_of('louder'))"
+        "from torchsar.study.names.registry import stages, group_of; s = "
+        "stages().make({'stage': 'louder', 'gain': 3.0}, 'x', 'f'); print(s.gain, group_of('louder'))"
     )
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
         [sys.executable, "-c", code],
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        env={**os.environ, "PYTHONPATH": path},
         capture_output=True,
         text=True,
         timeout=120,

@@ -1,54 +1,80 @@
-"""`torchsar list`: experiments, systems, stages and world objects with their keys, data files."""
+"""`torchsar list`: systems, stages and parts of worlds with their keys, and the data files."""
 
 from __future__ import annotations
 
 import inspect
+import re
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from torchsar.io import inverse, recorded
 from torchsar.study.names.registry import GROUPS, WORLD, group_of, stages
 from torchsar.study.settings.signature import Catalogue, Section
-from torchsar.study.settings.text import packaged_configs, read_tree
 from torchsar.study.trials.system import System
+
+# a key in a docstring's list of arguments: its name at four columns, further lines at more
+_ARGUMENT = re.compile(r"^ {4}((?:\w+, )*\w+): (.*(?:\n {5,}.*)*)", re.MULTILINE)
 
 
 def listing(systems: Mapping[str, System]) -> str:
-    """The whole list as text."""
-    parts = ["EXPERIMENTS (torchsar run NAME; those marked [sweep] are for torchsar sweep NAME)"]
-    for name, path in packaged_configs().items():
-        tree = read_tree(path)
-        parts.append(f"  {name:<25}{tree.get('title', '')}{' [sweep]' if 'sweep' in tree else ''}")
-    parts += ["", "SYSTEMS (the key system of a config; keys marked * may differ from trial to trial)"]
+    """The list as text, after the packaged configs."""
+    lines = ["", "SYSTEMS (the key `system` of a config; a number marked * may differ from trial to trial)"]
     for name, system in systems.items():
-        parts.append(f"  {name:<25}{system.about}")
-        parts += [f"  {'':<25}  {section}: {_keys(keys)}" for section, keys in system.sections.items()]
+        lines.append(f"  {name:<26}{system.about}")
+        for section, keys in system.sections.items():
+            lines += [f"    {section}", *_keys(keys)]
         own = [stage for stage in system.stages.entries if stage not in stages().entries]
-        parts += [f"  {'':<25}  stage {stage}: {_keys(system.stages.sections[stage])}" for stage in own]
+        lines += ["    stages of its own", *_entries(system.stages, own)] if own else []
     for group in (*GROUPS, "own"):
         names = [name for name in stages().entries if group_of(name) == group]
-        parts += ["", f"STAGES, {group}", *(_line(stages(), name) for name in names)] if names else []
+        lines += ["", f"STAGES, {group} (processor.METHOD.stages)", *_entries(stages(), names)] if names else []
     for title, catalogue in WORLD.items():
-        parts += ["", title, *(_line(catalogue, name) for name in catalogue.entries)]
-    parts += ["", "DATA (data.file=PATH, a numpy archive)"]
+        lines += ["", title, *_entries(catalogue, catalogue.entries)]
+    lines += ["", "DATA (data.file=PATH, a numpy archive)"]
     for name, reader in (("stripmap", recorded.read_stripmap), ("isal", inverse.read_inverse)):
-        schema = "\n".join(inspect.cleandoc(reader.__doc__ or "").split("\n\n")[1:])
-        parts += [f"  system {name}", textwrap.indent(schema, "    ")]
-    return "\n".join(parts)
+        schema = inspect.cleandoc(reader.__doc__ or "").split("\n\n")[1]
+        lines += [f"  system {name}", textwrap.indent(schema, "    ")]
+    return "\n".join(lines)
 
 
-def _line(catalogue: Catalogue, name: str) -> str:
-    about = (inspect.getdoc(catalogue.entries[name]) or "").split("\n\n")[0].replace("`", "").replace("\n", " ")
-    return f"  {name:<25}{about}\n  {'':<25}  keys: {_keys(catalogue.sections[name])}"
+def _entries(catalogue: Catalogue, names: Any) -> list[str]:
+    lines = []
+    for name in names:
+        about = _plain((inspect.getdoc(catalogue.entries[name]) or "").split("\n\n")[0])
+        lines += [f"  {name:<26}{about.removeprefix('Impairment: ')}", *_keys(catalogue.sections[name])]
+    return lines
 
 
-def _keys(section: Section) -> str:
-    keys = []
+def _keys(section: Section, above: str = "") -> list[str]:
+    """A line for each key: its default, and what its constructor says of it; `NAME` is for names
+    that a config gives.
+    """
+    said, lines = _arguments(section.target), []
     for name, key in section.keys.items():
-        shown = f"{name}*" if key.per_trial else name
-        keys.append(shown if key.default is ... else f"{shown}={_short(key.default)}")
-    return ", ".join(keys) or "none"
+        shown = f"{above}{name}{'*' if key.per_trial else ''}"
+        shown += "" if key.default is ... else f"={_short(key.default)}"
+        lines.append(f"      {shown:<30} {said.get(name, '')}".rstrip())
+        if isinstance(key.inner, Section):
+            lines += _keys(key.inner, f"{above}{name}.{'NAME.' if key.many else ''}")
+    return lines
+
+
+def _arguments(target: Callable[..., Any]) -> dict[str, str]:
+    """The first sentence on each argument in a docstring, those of base classes among them."""
+    found: dict[str, str] = {}
+    docs = [getattr(one, "__doc__", None) or "" for one in reversed(getattr(target, "__mro__", (target,)))]
+    for names, text in (match for doc in docs for match in _ARGUMENT.findall(inspect.cleandoc(doc))):
+        sentence = re.split(r"(?<=\.)\s+(?=[A-Z])", _plain(text))[0].removesuffix(".")
+        found.update(dict.fromkeys(names.split(", "), sentence))
+    return found
+
+
+def _plain(text: str) -> str:
+    return " ".join(text.replace("`", "").split())
 
 
 def _short(value: object) -> str:
+    if isinstance(value, Mapping):
+        return str(value.get("kind", "{}"))
     return {None: "null", True: "true", False: "false"}[value] if isinstance(value, bool | None) else str(value)

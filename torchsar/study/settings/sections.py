@@ -10,10 +10,13 @@ from typing import Annotated, Any, Literal, Protocol
 from pydantic import Field, ValidationError, model_validator
 
 from torchsar.study.settings.errors import ConfigError, did_you_mean
+from torchsar.study.settings.plausible import refuse_implausible
 from torchsar.study.settings.sentences import Strict, sentence
 from torchsar.study.settings.signature import Catalogue, Section
 from torchsar.study.settings.text import dump
 
+# how true values were named before they had a name of their own
+_OLD_TRUTH = "aux.true_"
 # names that group results, and therefore cannot be those of methods
 RESERVED = ("truth", "estimate")
 
@@ -240,6 +243,7 @@ def checked(tree: Any, system: Sections, file: str) -> Config:
     _check_source(config, system, file)
     sections = {name: getattr(config, name) for name in system.sections}
     made = {n: None if tree is None else system.sections[n].check(tree, n, file) for n, tree in sections.items()}
+    refuse_implausible(config.system, made["radar"], made["world"], file)
     found = config.data.impairments
     kept = {n: system.recording_impairments.check(entry, f"data.impairments.{n}", file) for n, entry in found.items()}
     methods = {name: _method(method, f"processor.{name}", system, file) for name, method in config.processor.items()}
@@ -255,6 +259,10 @@ def _method(method: Method, where: str, system: Sections, file: str) -> Method:
         uses = entry.get("uses", {})
         if not (isinstance(uses, dict) and all(isinstance(source, str) for source in uses.values())):
             raise ConfigError(f"{file}: {where}.stages.{name}.uses must map values to 'stage.value', got {uses!r}")
+        old = next((source for source in uses.values() if source.startswith(_OLD_TRUTH)), None)
+        if old is not None:
+            new = f"truth.{old.removeprefix(_OLD_TRUTH)}"
+            raise ConfigError(f"{file}: {where}.stages.{name}.uses: {old!r} is now called {new!r}; rename it")
         rest = {key: value for key, value in entry.items() if key != "uses"}
         stages[name] = {**system.stages.check(rest, f"{where}.stages.{name}", file), **({"uses": uses} if uses else {})}
     return method.model_copy(update={"stages": stages or None})

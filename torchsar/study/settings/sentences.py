@@ -17,6 +17,7 @@ RENAMED = {
     "told": "trigger_known",
     "published_ideal": "published.entropy_above_ideal_nats",
     "damaged": "impaired",
+    **{key: f"objective.{key}" for key in ("order", "range_term", "yc_m", "variables", "oversampling", "lines", "taps")},
 }
 
 
@@ -45,8 +46,9 @@ def sentence(error: ValidationError, model: type[BaseModel], file: str, where: s
     names, section = _descend(model, path)
     key, kind, given = ".".join(([where] if where else []) + names), worst["type"], worst.get("input")
     if kind == "extra_forbidden":
-        if path[-1] in RENAMED:
-            return f"{file}: key {key!r} is now called {RENAMED[path[-1]]!r}; rename it"
+        new = RENAMED.get(path[-1], "")
+        if section is not None and new.split(".")[0] in section.model_fields:
+            return f"{file}: key {key!r} is now called {new!r}; rename it"
         return f"{file}: key {key!r} is not known{did_you_mean(path[-1], section.model_fields if section else ())}"
     if kind == "missing":
         return f"{file}: key {key!r} is missing"

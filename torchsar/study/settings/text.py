@@ -97,6 +97,15 @@ def packaged_configs() -> dict[str, Path]:
     }
 
 
+def experiments() -> str:
+    """The packaged configs with their titles, for `torchsar list`."""
+    lines = ["EXPERIMENTS (torchsar run NAME; those marked [sweep] are for torchsar sweep NAME)"]
+    for name, path in packaged_configs().items():
+        tree = read_tree(path)
+        lines.append(f"  {name:<25}{tree.get('title', '')}{' [sweep]' if 'sweep' in tree else ''}")
+    return "\n".join(lines)
+
+
 def find_config(name: str) -> Path:
     """A file by its path, else a packaged config by its name, 'stripmap_damaged' or
     'configs/stripmap_damaged.yaml'.
