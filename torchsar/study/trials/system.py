@@ -76,12 +76,14 @@ class Alternative:
         keys: What stands in the config for it, in the mapping that the choice is made in.
         loss: Predicted loss by metric; None where nothing is predicted.
         neglects: What it leaves out.
+        effect: The row of the requirements about the same, which is then judged by this loss.
     """
 
     name: str
     keys: Mapping[str, Any] = field(default_factory=dict)
     loss: Mapping[str, float] | None = None
     neglects: str = ""
+    effect: str = ""
 
 
 # levels below this are differences of rounding at most
