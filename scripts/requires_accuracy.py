@@ -60,9 +60,9 @@ def _spread(u: float, low: float, high: float) -> float:
 
 
 def stripmap(p: Mapping[str, float]) -> dict[str, Any]:
-    """A slow platform; the record holds one aperture and the swath."""
+    """A slow platform, squinted by up to 8 degrees; the record holds one aperture and the swath."""
     wavelength, bandwidth = 3e8 / 3.2e9, p["bandwidth_hz"]
-    velocity, near = 120.0, p["near_range_m"]
+    velocity, near, squint = 120.0, p["near_range_m"], 8 * p["squint"] ** 3
     rate = 2 * velocity**2 / (wavelength * near)
     aperture = p["doppler_band_hz"] / rate
     prf = 1.4 * p["doppler_band_hz"]
@@ -73,13 +73,13 @@ def stripmap(p: Mapping[str, float]) -> dict[str, Any]:
         "radar.prf_hz": prf,
         "radar.velocity_m_s": velocity,
         "radar.near_range_m": near,
-        "radar.pointing_doppler_hz": 2 * velocity / wavelength * math.sin(math.radians(p["squint_deg"])),
+        "radar.pointing_doppler_hz": 2 * velocity / wavelength * math.sin(math.radians(squint)),
         "radar.integration_s": aperture,
         "world.lines": math.ceil(1.5 * aperture * prf),
         "world.samples": math.ceil((p["swath_m"] / 1.2e8 + 0.4e-6) * bandwidth) + 64,
         "world.velocity_m_s": velocity,
         "world.doppler_hz": None,
-        "world.squint_deg": p["squint_deg"],
+        "world.squint_deg": squint,
         "world.beam": {"kind": "dwell", "dwell_s": aperture},
         "world.impairments": {},
         "world.scene": {"points": {"kind": "points", "azimuth_m": [0.0], "range_m": [0.0]}},
@@ -107,13 +107,15 @@ def isal(p: Mapping[str, float]) -> dict[str, Any]:
 
 def isal_rotation(p: Mapping[str, float]) -> dict[str, Any]:
     """Scatterers on two levers, whose angle has three terms."""
-    x, y = p["cross_range_m"], p["lever_m"]
+    y, cell, time_s = p["lever_m"], 1.5e8 / p["bandwidth_hz"], 0.02
+    fastest = 1 + p["k1"] * time_s + p["k2"] * time_s**2 / 2 + p["k3"] * time_s**3 / 6
+    x = p["band_share"] * 1.55e-6 * 50e3 / (4 * p["omega_rad_s"] * fastest)
     return {
         "radar.prf_hz": 50.0e3,
         "radar.bandwidth_hz": p["bandwidth_hz"],
         "radar.pulse_s": 10e-6,
         "world.pulses": 1000,
-        "world.samples": 16,
+        "world.samples": math.ceil(y / cell) + 8,
         "world.scene": {"points": {"kind": "points", "azimuth_m": [-x, 0.3 * x, x], "range_m": [-y / 4, y / 4, y / 2]}},
         "world.centre_deviation_m": y / 2,
         "world.rotation": {"omega_rad_s": p["omega_rad_s"], "k": [p["k1"], p["k2"], p["k3"]]},
@@ -181,7 +183,7 @@ FAMILIES: dict[str, Family] = {
     "stripmap": Family(
         "stripmap_damaged",
         {
-            "squint_deg": (-8.0, 8.0),
+            "squint": (-1.0, 1.0),
             "bandwidth_hz": (20e6, 200e6),
             "near_range_m": (2e3, 12e3),
             "doppler_band_hz": (60.0, 300.0),
@@ -204,7 +206,7 @@ FAMILIES: dict[str, Family] = {
     "isal_rotation": Family(
         "isal_rotation_points",
         {
-            "cross_range_m": (0.05, 5.0),
+            "band_share": (0.01, 0.9),
             "lever_m": (0.2, 20.0),
             "omega_rad_s": (0.005, 0.1),
             "bandwidth_hz": (1e7, 1e9),

@@ -6,7 +6,7 @@ import logging
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +59,18 @@ def needs(bench: Bench) -> dict[str, Any]:
         raise
     except (ValueError, TypeError) as error:
         raise ConfigError(f"{bench.file}: {one_line(error)}") from None
+    losses = {
+        one.effect: (loss, tolerance[metric])
+        for choice in choices
+        for one in choice.alternatives
+        for metric, loss in (one.loss or {}).items()
+    }
+    rows = [
+        replace(row, error_db=losses[row.effect][0], tolerance_db=losses[row.effect][1])
+        if row.effect in losses
+        else row
+        for row in rows
+    ]
     return {
         "limits": [{**asdict(one), "verdict": one.verdict, "methods": list(names)} for one, names in limits.items()],
         "requirements": [{**asdict(row), "ok": row.ok, "verdict": row.verdict} for row in rows],

@@ -24,11 +24,16 @@ from torchsar.core import Draws, Estimate
 from torchsar.core.warp import k_of_shape, shape_of, warp
 from torchsar.focus import DopplerLines, ExplicitSum, Gridding, Resampling, matched_fourier, range_phase
 from torchsar.focus.ladar_requirements import Limit
-from torchsar.focus.requirements import Requirement, phase_error_db
-from torchsar.focus.rotation_requirements import rotation_limits, rotation_requirements
+from torchsar.focus.requirements import Requirement
+from torchsar.focus.rotation_requirements import (
+    order_loss_db,
+    range_term_loss_db,
+    rotation_limits,
+    rotation_requirements,
+)
 from torchsar.metrics import error_db, rotation_bounds
 from torchsar.scene import PhaseOnly, Points
-from torchsar.study.systems.isal.world import echo_choice
+from torchsar.study.systems.isal.world import echo_choices
 from torchsar.study.systems.isal_rotation.world import Rotating, first_values, k_of
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.bench import Bench
@@ -36,6 +41,8 @@ from torchsar.study.trials.system import Alternative, Choice, Measured, Noise
 
 # products of pulses, lines and range cells up to which the sum itself is the yardstick
 _EXPLICIT = 3e8
+# orders of the rotation that are compared, and more where the target has more
+_ORDERS = 4
 # largest width of kernels that are compared
 _TAPS = (2, 3, 4, 5, 6, 7, 8)
 # lines so fine that a peak between two of them loses less than 0.01 dB
@@ -67,8 +74,7 @@ def requirements(bench: Bench) -> Sequence[Requirement]:
 
 def choices(bench: Bench) -> list[Choice]:
     """Order of the rotation, range term, transform, estimator, and echo model."""
-    most = max(4, 1 + len(_rotation(bench.world())[1]))
-    orders = [_order(bench, order) for order in range(1, most + 1)]
+    orders = [_order(order, bench) for order in range(1, max(_ORDERS, 1 + len(_rotation(bench.world())[1])) + 1)]
     kernels = {f"gridding, {taps} taps": Gridding(taps=taps) for taps in _TAPS}
     transforms = [
         *(
@@ -78,9 +84,12 @@ def choices(bench: Bench) -> list[Choice]:
         *(Alternative(name, _gridding(one), _aliased(one)) for name, one in kernels.items()),
         Alternative("the sum itself", {"transform": {"kind": "explicit_sum"}}, {}),
     ]
+    lever, off_cell = _levers(bench)
     range_terms = [
-        Alternative("azimuth only", {"range_term": False}, {"peak_loss_db": _range_term_db(bench)}, "the range term"),
-        Alternative("azimuth and range", {"range_term": True}, {}),
+        Alternative(
+            "azimuth only", {"range_term": False}, _range_term_loss(bench, lever), "the range term", "azimuth only"
+        ),
+        Alternative("azimuth and range", {"range_term": True}, _range_term_loss(bench, off_cell), "range in a cell"),
     ]
     found = [Alternative(name, {"estimator": work}) for name, work in _ESTIMATORS.items()]
     return [
@@ -88,8 +97,18 @@ def choices(bench: Bench) -> list[Choice]:
         Choice("range term", "range_phase", range_terms, partial(_range_terms, bench)),
         Choice("transform", "matched_fourier.transform", transforms, partial(_transforms, bench)),
         Choice("estimator of the rotation", "estimator", found, partial(_estimates, bench)),
-        echo_choice(bench),
+        *echo_choices(bench),
     ]
+
+
+def _order(order: int, bench: Bench) -> Alternative:
+    """The rotation cut to an order, and what the outermost scatterer loses."""
+    (omega, k, _), world, radar = _rotation(bench.world()), bench.world(), bench.radar
+    lost, across = {}, float(_scatterers(bench)[0].abs().max())
+    if order <= min(len(k), _ORDERS):
+        about = (world.pulses / radar.prf_hz, omega, across, radar.wavelength_m)
+        lost = {"peak_loss_db": order_loss_db(k, order, *about)}
+    return Alternative(f"order {order}", {"order": order}, lost, "higher orders", f"warp of order {order}")
 
 
 _KINDS = ("linear", "spline")
@@ -123,20 +142,6 @@ def _rotation(world: Rotating) -> tuple[float, Tensor, float]:
     return omega, k_of(world.rotation), yc
 
 
-def _times(bench: Bench) -> Tensor:
-    return torch.arange(bench.world().pulses, dtype=torch.float64) / bench.radar.prf_hz
-
-
-def _order(bench: Bench, order: int) -> Alternative:
-    """The rotation cut to an order, with the error of the response of the outermost scatterer."""
-    (omega, k, _), time_s = _rotation(bench.world()), _times(bench)
-    left = warp(time_s, k) - warp(time_s, _cut(k, order, bench))
-    across = float(_scatterers(bench)[0].abs().max())
-    loss = phase_error_db(4 * math.pi / bench.radar.wavelength_m * across * omega * left)
-    exact = order > len(k)
-    return Alternative(f"order {order}", {"order": order}, {} if exact else {"image_error_db": loss}, "higher orders")
-
-
 def _cut(k: Tensor, order: int, bench: Bench) -> Tensor:
     """The warp of an order that lies nearest in least squares over the record: its first Legendre
     terms, or itself where it has no more.
@@ -147,16 +152,16 @@ def _cut(k: Tensor, order: int, bench: Bench) -> Tensor:
     return k_of_shape(shape_of(k, duration_s)[..., : order - 1], duration_s) if order > 1 else k[..., :0]
 
 
-def _range_term_db(bench: Bench) -> float:
-    """Loss of the peak of the scatterer farthest from the centre, in dB, by its range term without
-    the line in the warp that only shifts it.
-    """
-    (omega, k, yc), y = _rotation(bench.world()), _scatterers(bench)[1]
-    phi = warp(_times(bench), k)
-    phase = 2 * math.pi / bench.radar.wavelength_m * float((y + yc).abs().max()) * (omega * phi).square()
-    line = torch.stack([torch.ones_like(phi), phi / phi.abs().max().clamp_min(1e-300)], -1)
-    phase = phase - line @ torch.linalg.lstsq(line, phase[:, None]).solution[:, 0]
-    return -20 * math.log10(max(float(torch.polar(torch.ones_like(phase), phase).mean().abs()), 1e-15))
+def _levers(bench: Bench) -> tuple[float, float]:
+    """Largest distances (m) of scatterers from the centre of rotation, and from range cells."""
+    y, cell = _scatterers(bench)[1], bench.radar.range_step_m
+    return float((y + _rotation(bench.world())[2]).abs().max()), float((y - cell * (y / cell).round()).abs().max())
+
+
+def _range_term_loss(bench: Bench, lever_m: float) -> dict[str, float]:
+    omega, k, _ = _rotation(bench.world())
+    time_s = torch.arange(bench.world().pulses, dtype=torch.float64) / bench.radar.prf_hz
+    return {"peak_loss_db": range_term_loss_db(warp(time_s, k), omega, lever_m, bench.radar.wavelength_m)}
 
 
 def _alone(bench: Bench, along: float, across: float) -> Trials:
@@ -179,39 +184,46 @@ def _without_range_term(bench: Bench, trials: Trials) -> Tensor:
     return range_phase(signal.data, *about, truth["omega_rad_s"], truth["warp_k"], truth["yc_m"])
 
 
+def _peak_losses(
+    bench: Bench, target: int, best: Alternative, made: Callable[[Trials, Alternative], tuple[Tensor, Tensor]]
+) -> Measured:
+    """Loss of the peak of one scatterer; `made` gives the data and the warp of an alternative."""
+    (x, y, _), prf = _scatterers(bench), bench.radar.prf_hz
+    alone, whole = _alone(bench, float(y[target]), float(x[target])), bench.trials(_draws(bench))
+
+    def peak(one: Alternative) -> float:
+        return float(matched_fourier(*made(alone, one), prf, lines=_FINE).abs().max())
+
+    top = peak(best)
+    return Measured(
+        lambda one: matched_fourier(*made(whole, one), prf),
+        lambda one, _: {"peak_loss_db": 20 * math.log10(top / peak(one))},
+    )
+
+
 def _orders(bench: Bench) -> Measured:
     """Images of the outermost scatterer by the true rotation cut to each order."""
-    x, y, _ = _scatterers(bench)
-    far = int(x.abs().argmax())
-    trials = _alone(bench, float(y[far]), float(x[far]))
-    data, k = _without_range_term(bench, trials), trials.truth["warp_k"]
-    exact = matched_fourier(data, k, bench.radar.prf_hz)
-    whole = bench.trials(_draws(bench)).clean.signal.data
 
-    def run(one: Alternative) -> Tensor:
-        return matched_fourier(whole, _cut(k, one.keys["order"], bench), bench.radar.prf_hz)
+    def made(trials: Trials, one: Alternative) -> tuple[Tensor, Tensor]:
+        k = trials.truth["warp_k"]
+        return _without_range_term(bench, trials), _cut(k, one.keys.get("order", 1 + k.shape[-1]), bench)
 
-    def loss(one: Alternative, _: Tensor) -> dict[str, float]:
-        made = matched_fourier(data, _cut(k, one.keys["order"], bench), bench.radar.prf_hz)
-        return {"image_error_db": float(error_db(made, exact))}
-
-    return Measured(run, loss)
+    return _peak_losses(bench, int(_scatterers(bench)[0].abs().argmax()), Alternative("all orders"), made)
 
 
 def _range_terms(bench: Bench) -> Measured:
     """Images of the scatterer farthest from the centre with and without its range term."""
-    x, y, _ = _scatterers(bench)
-    far = int((y + _rotation(bench.world())[2]).abs().argmax())
-    trials = _alone(bench, float(y[far]), float(x[far]))
-    k, data = trials.truth["warp_k"], {False: trials.clean.signal.data, True: _without_range_term(bench, trials)}
-    top = {key: float(matched_fourier(x, k, bench.radar.prf_hz, lines=_FINE).abs().max()) for key, x in data.items()}
-    whole = bench.trials(_draws(bench))
 
-    def run(one: Alternative) -> Tensor:
-        made = _without_range_term(bench, whole) if one.keys["range_term"] else whole.clean.signal.data
-        return matched_fourier(made, k, bench.radar.prf_hz)
+    def made(trials: Trials, one: Alternative) -> tuple[Tensor, Tensor]:
+        data = trials.clean.signal.data
+        if "range_term" not in one.keys:
+            data = data.abs().to(data.dtype)
+        elif one.keys["range_term"]:
+            data = _without_range_term(bench, trials)
+        return data, trials.truth["warp_k"]
 
-    return Measured(run, lambda one, _: {"peak_loss_db": 20 * math.log10(top[True] / top[one.keys["range_term"]])})
+    far = int((_scatterers(bench)[1] + _rotation(bench.world())[2]).abs().argmax())
+    return _peak_losses(bench, far, Alternative("all pulses in phase"), made)
 
 
 def _transforms(bench: Bench) -> Measured:
