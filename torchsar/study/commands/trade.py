@@ -7,13 +7,14 @@ import math
 import platform
 import statistics
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from torchsar import plot
+from torchsar.core.memory import PeakMemory
 from torchsar.study.output.arrays import write_json
 from torchsar.study.output.folder import fresh_result
 from torchsar.study.output.numbers import number
@@ -30,6 +31,8 @@ log = logging.getLogger("torchsar")
 FILES = ("config.yaml", "trade.json", "trade.txt", "figures")
 # what the work of an alternative raises where it cannot be done on this scene
 _FAILURES = (ValueError, TypeError, KeyError, RuntimeError, ArithmeticError)
+# work is repeated for so long (s) that its time is known to a percent or so
+_LEAST_S = 0.1
 Row = dict[str, Any]
 
 
@@ -117,10 +120,8 @@ def _timed(one: Alternative, measured: Measured, times: list[tuple[float, float]
     row: Row = {"name": one.name, "neglects": one.neglects, "cpu_s": None, "wall_s": None, "peak_bytes": None}
     row |= {"loss": {}, "predicted": one.loss, "failed": ""}
     try:
-        peak, began = _Peak(), (time.process_time(), time.perf_counter())
-        with peak:
-            result = measured.run(one)
-        spent = (time.process_time() - began[0], time.perf_counter() - began[1])
+        with PeakMemory() as peak:
+            spent, result = _spent(lambda: measured.run(one), _LEAST_S if times else 0.0)
         times.append((spent[0] / measured.share(one), spent[1] / measured.share(one)))
         loss = {name: float(value) for name, value in measured.loss(one, result).items()}
     except _FAILURES as error:
@@ -130,33 +131,14 @@ def _timed(one: Alternative, measured: Measured, times: list[tuple[float, float]
     return {**row, "peak_bytes": peak.bytes, "loss": loss, "failed": f"{wrong[0]} is not finite" if wrong else ""}
 
 
-class _Peak:
-    """Peak memory that the work adds: of the device where there is one, else of the process."""
-
-    bytes: int | None = None
-
-    def __enter__(self) -> None:
-        self._gpu = torch.cuda.is_available() and torch.cuda.is_initialized()
-        if self._gpu:
-            torch.cuda.reset_peak_memory_stats()
-        self._before = _resident("VmRSS", reset=True)
-
-    def __exit__(self, *_: object) -> None:
-        after = torch.cuda.max_memory_allocated() if self._gpu else _resident("VmHWM")
-        self.bytes = None if after is None else after - (0 if self._gpu else self._before or 0)
-
-
-def _resident(field: str, reset: bool = False) -> int | None:
-    """Resident memory of this process (VmRSS) or its peak since the last reset (VmHWM), in bytes;
-    None on systems that do not tell.
-    """
-    try:
-        if reset:
-            Path("/proc/self/clear_refs").write_text("5")
-        text = Path("/proc/self/status").read_text()
-    except OSError:
-        return None
-    return next((1024 * int(line.split()[1]) for line in text.splitlines() if line.startswith(f"{field}:")), None)
+def _spent(work: Callable[[], Any], least_s: float) -> tuple[tuple[float, float], Any]:
+    """CPU and wall time of the work, a mean over so many runs as take a given time, and its result."""
+    began, runs = (time.process_time(), time.perf_counter()), 0
+    while True:
+        result, runs = work(), runs + 1
+        spent = (time.process_time() - began[0], time.perf_counter() - began[1])
+        if spent[0] >= least_s:
+            return (spent[0] / runs, spent[1] / runs), result
 
 
 def _line(row: Row) -> str:
