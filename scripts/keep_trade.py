@@ -85,10 +85,8 @@ def table(folder: Path) -> Iterator[str]:
             one, best = next((row for row in rows if row["recommended"]), None), rows[-1]
             if one is not None:
                 loss = ", ".join(f"{name} {value:.3g}" for name, value in one["loss"].items())
-                yield (
-                    f"| `{system}` | {choice} | {one['name']} | {1e3 * one['cpu_s']:.3g} ms | {loss} | {best['name']} | "
-                    f"{1e3 * best['cpu_s']:.3g} ms |"
-                )
+                times = [f"{1e3 * row['cpu_s']:.3g} ms" for row in (one, best)]
+                yield f"| `{system}` | {choice} | {one['name']} | {times[0]} | {loss} | {best['name']} | {times[1]} |"
 
 
 def main() -> None:

@@ -48,9 +48,10 @@ class Family:
     spans: Spans
     overrides: Callable[[Mapping[str, float]], Mapping[str, Any]]
 
-    def scenes(self, count: int) -> Iterator[dict[str, float]]:
-        """The first points of the scrambled Sobol sequence of seed 1."""
-        for point in torch.quasirandom.SobolEngine(len(self.spans), scramble=True, seed=1).draw(count).tolist():
+    def scenes(self, count: int, first: int = 0) -> Iterator[dict[str, float]]:
+        """Successive points of the scrambled Sobol sequence of seed 1."""
+        sequence = torch.quasirandom.SobolEngine(len(self.spans), scramble=True, seed=1).fast_forward(first)
+        for point in sequence.draw(count).tolist():
             yield {name: _spread(u, *span) for u, (name, span) in zip(point, self.spans.items(), strict=True)}
 
 
@@ -294,10 +295,12 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {key: x if x is None else float(f"{x:.4g}") for key, x in {**counts, **shares, **error}.items()}
 
 
-def assessed(system: str, scenes: int) -> dict[str, Any]:
-    """The rows of all scenes of a system and their summary, by choice as well."""
+def assessed(system: str, scenes: int, first: int = 0) -> dict[str, Any]:
+    """The rows of so many scenes of a system from the first one on, and their summary, by choice as
+    well.
+    """
     rows: list[dict[str, Any]] = []
-    for number, parameters in enumerate(FAMILIES[system].scenes(scenes), 1):
+    for number, parameters in enumerate(FAMILIES[system].scenes(scenes, first), 1):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             found = list(compared(system, parameters))
@@ -325,7 +328,7 @@ def main() -> None:
         lines = [f'"{key}": {json.dumps(value)}' for key, value in found.items()]
         lines.append('"comparisons": [\n' + ",\n".join(json.dumps(row) for row in rows) + "\n]")
         (options.folder / f"{system}.json").write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
-        print(json.dumps({key: value for key, value in found.items()}, indent=1))
+        print(json.dumps(found, indent=1))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Errors that simplified ranges make in the responses of moving points, predicted without echoes."""
+"""Errors of the responses of moving points by simplified ranges, predicted without echoes."""
 
 from __future__ import annotations
 

@@ -15,9 +15,10 @@ import torch
 
 from torchsar import plot
 from torchsar.core.memory import PeakMemory
+from torchsar.study.commands.requires import aligned
 from torchsar.study.output.arrays import write_json
 from torchsar.study.output.folder import fresh_result
-from torchsar.study.output.numbers import number
+from torchsar.study.output.numbers import MISSING, number
 from torchsar.study.output.progress import Steps, Ticker
 from torchsar.study.output.report import installed_version
 from torchsar.study.settings.cases import cases_of
@@ -103,9 +104,8 @@ def compared(choice: Choice, bench: Bench, tolerance: Mapping[str, float]) -> li
                         log.info("%s", _line(rows[one.name]))
     for name, times in timings.items():
         if times:
-            rows[name].update(
-                cpu_s=statistics.median(t[0] for t in times), wall_s=statistics.median(t[1] for t in times)
-            )
+            cpu, wall = (statistics.median(part) for part in zip(*times, strict=True))
+            rows[name].update(cpu_s=cpu, wall_s=wall)
     found = [rows[one.name] for one in (*first, *choice.alternatives)]
     for row in found:
         row["within_tolerance"] = not row["failed"] and within(row["loss"], tolerance)
@@ -153,17 +153,15 @@ def _loss(value: float) -> str:
 
 def _text(name: str, rows: Sequence[Row]) -> str:
     metrics = list(dict.fromkeys(metric for row in rows for metric in row["loss"]))
-    wide = 2 + max(len(row["name"]) for row in rows)
-    head = f"{'alternative':<{wide}}{'CPU (ms)':>10}{'wall (ms)':>11}" + "".join(f"{metric:>24}" for metric in metrics)
-    lines = [name.upper(), f"{head}  verdict"]
-    for row in rows:
-        if row["failed"]:
-            lines.append(f"{row['name']:<{wide}}failed: {row['failed']}")
-            continue
-        cells = "".join(f"{_loss(row['loss'][m]) if m in row['loss'] else '–':>24}" for m in metrics)
-        verdict = "recommended" if row["recommended"] else "within tolerance" if row["within_tolerance"] else "too much"
-        lines.append(f"{row['name']:<{wide}}{1e3 * row['cpu_s']:>10.2f}{1e3 * row['wall_s']:>11.2f}{cells}  {verdict}")
-    return "\n".join(lines)
+    table = [("alternative", "CPU (ms)", "wall (ms)", *metrics, "verdict"), *(_cells(row, metrics) for row in rows)]
+    return "\n".join([name.upper(), *aligned(table, right=range(1, 3 + len(metrics)))])
+
+
+def _cells(row: Row, metrics: Sequence[str]) -> tuple[str, ...]:
+    verdict = "recommended" if row["recommended"] else "within tolerance" if row["within_tolerance"] else "too much"
+    times = [MISSING if row[key] is None else f"{1e3 * row[key]:.2f}" for key in ("cpu_s", "wall_s")]
+    losses = [_loss(row["loss"][metric]) if metric in row["loss"] else MISSING for metric in metrics]
+    return row["name"], *times, *losses, f"failed: {row['failed']}" if row["failed"] else verdict
 
 
 def _draw(name: str, rows: Sequence[Row], tolerance: Mapping[str, float], path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -11,17 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.compensate.rotation import (
-    EntropyObjective,
-    ImageEntropy,
-    coarse_rotation,
-    descend_rotation,
-    genetic_rotation,
-    phase_fit_rotation,
-    uneven_rotation,
-)
+from torchsar.compensate.rotation import coarse_rotation, phase_fit_rotation, uneven_rotation
+from torchsar.compensate.rotation.baselines import descent_near_truth, genetic_near_truth
 from torchsar.core import Draws, Estimate
-from torchsar.core.warp import k_of_shape, shape_of, warp
+from torchsar.core.warp import cut_warp, warp
 from torchsar.focus import DopplerLines, ExplicitSum, Gridding, Resampling, matched_fourier, range_phase
 from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Requirement
@@ -47,9 +40,8 @@ _ORDERS = 4
 _TAPS = (2, 3, 4, 5, 6, 7, 8)
 # lines so fine that a peak between two of them loses less than 0.01 dB
 _FINE = DopplerLines(16.0)
-# a genetic search that is short enough to compare: population, generations, part of the truth to
-# each side
-_GENETIC = (10, 4, 0.1)
+# estimators that start near the truth, by name
+_DESCENT, _GENETIC = "descent from 0.95 of the truth", "genetic 10 x 4, +-10 % about the truth"
 
 
 def limits(bench: Bench) -> tuple[Limit, ...]:
@@ -142,16 +134,6 @@ def _rotation(world: Rotating) -> tuple[float, Tensor, float]:
     return omega, k_of(world.rotation), yc
 
 
-def _cut(k: Tensor, order: int, bench: Bench) -> Tensor:
-    """The warp of an order that lies nearest in least squares over the record: its first Legendre
-    terms, or itself where it has no more.
-    """
-    duration_s = bench.world().pulses / bench.radar.prf_hz
-    if order > k.shape[-1]:
-        return k
-    return k_of_shape(shape_of(k, duration_s)[..., : order - 1], duration_s) if order > 1 else k[..., :0]
-
-
 def _levers(bench: Bench) -> tuple[float, float]:
     """Largest distances (m) of scatterers from the centre of rotation, and from range cells."""
     y, cell = _scatterers(bench)[1], bench.radar.range_step_m
@@ -204,9 +186,11 @@ def _peak_losses(
 def _orders(bench: Bench) -> Measured:
     """Images of the outermost scatterer by the true rotation cut to each order."""
 
+    duration_s = bench.world().pulses / bench.radar.prf_hz
+
     def made(trials: Trials, one: Alternative) -> tuple[Tensor, Tensor]:
         k = trials.truth["warp_k"]
-        return _without_range_term(bench, trials), _cut(k, one.keys.get("order", 1 + k.shape[-1]), bench)
+        return _without_range_term(bench, trials), cut_warp(k, one.keys.get("order", 1 + k.shape[-1]), duration_s)
 
     return _peak_losses(bench, int(_scatterers(bench)[0].abs().argmax()), Alternative("all orders"), made)
 
@@ -247,41 +231,15 @@ def _draws(bench: Bench) -> Draws:
     return Draws(bench.config.seed, "trade", range(bench.config.trade.trials))
 
 
-Known = Mapping[str, Any]
-Estimator = Callable[[Tensor, Known, Mapping[str, Tensor]], Estimate]
-
-
-def _entropy(data: Tensor, known: Known, variables: str) -> ImageEntropy:
-    about = {key: value for key, value in known.items() if key not in ("yc_m", "order")}
-    settings = EntropyObjective(order=known["order"], yc_m=known["yc_m"] or 0.0, variables=variables)
-    return ImageEntropy(data, settings, **about)
-
-
-def _descent(data: Tensor, known: Known, truth: Mapping[str, Tensor]) -> Estimate:
-    """From 0.95 of the truth."""
-    objective = _entropy(data, known, "shape")
-    return descend_rotation(objective, objective.start(0.95 * truth["omega_rad_s"], 0.95 * truth["warp_k"], None))
-
-
-def _genetic(data: Tensor, known: Known, truth: Mapping[str, Tensor]) -> Estimate:
-    """In a box about the truth."""
-    population, generations, part = _GENETIC
-    objective = _entropy(data, known, "raw")
-    centre = torch.cat([truth["omega_rad_s"][..., None], truth["warp_k"]], -1)
-    box = part * torch.where(centre != 0, centre.abs(), 1)
-    size = {"population": population, "generations": generations}
-    return genetic_rotation(objective, centre - box, centre + box, draws=Draws(1), **size)
-
-
-_ESTIMATORS: dict[str, Estimator] = {
-    "coarse": lambda data, known, _: coarse_rotation(data, **known),
-    "phase fit": lambda data, known, _: phase_fit_rotation(data, **known),
-    "recommended, 30 scatterers": lambda data, known, _: uneven_rotation(data, **known, scatterers=30),
-    "recommended, 1 round": lambda data, known, _: uneven_rotation(data, **known, rounds=1),
-    "recommended": lambda data, known, _: uneven_rotation(data, **known),
-    "recommended, complex128": lambda data, known, _: uneven_rotation(data.to(torch.complex128), **known),
-    "descent from 0.95 of the truth": _descent,
-    "genetic 10 x 4, +-10 % about the truth": _genetic,
+_ESTIMATORS: dict[str, Callable[..., Estimate]] = {
+    "coarse": coarse_rotation,
+    "phase fit": phase_fit_rotation,
+    "recommended, 30 scatterers": partial(uneven_rotation, scatterers=30),
+    "recommended, 1 round": partial(uneven_rotation, rounds=1),
+    "recommended": uneven_rotation,
+    "recommended, complex128": lambda data, **known: uneven_rotation(data.to(torch.complex128), **known),
+    _DESCENT: descent_near_truth,
+    _GENETIC: genetic_near_truth,
 }
 
 
@@ -293,18 +251,21 @@ def _estimates(bench: Bench) -> Measured:
     yc = next((entry.get("yc_m") for entry in stages if str(entry["stage"]).startswith("rotation")), None)
     known = {"wavelength_m": radar.wavelength_m, "prf_hz": radar.prf_hz, "range_m": signal.axis("range").values()}
     known |= {"yc_m": yc, "order": max(2, truth["warp_k"].shape[-1] + 1)}
+    true = {name: truth[name] for name in ("omega_rad_s", "warp_k")}
+
+    def rms(x: Tensor) -> float:
+        return float(x.square().mean().sqrt())
 
     def loss(one: Alternative, estimate: Estimate) -> dict[str, float]:
         rows = {}
         if one.name != "coarse":  # which does not look at the rate
-            rows["omega_error_percent"] = _rms(100 * (estimate["omega_rad_s"] / truth["omega_rad_s"] - 1))
+            rows["omega_error_percent"] = rms(100 * (estimate["omega_rad_s"] / truth["omega_rad_s"] - 1))
         for i, k in enumerate(truth["warp_k"].unbind(-1)[:2]):
             if bool((k != 0).all()):
-                rows[f"k{i + 1}_error_percent"] = _rms(100 * (estimate["warp_k"][..., i] - k) / k.abs())
+                rows[f"k{i + 1}_error_percent"] = rms(100 * (estimate["warp_k"][..., i] - k) / k.abs())
         return rows
 
-    return Measured(lambda one: one.keys["estimator"](signal.data, known, truth), loss)
+    def run(one: Alternative) -> Estimate:
+        return one.keys["estimator"](signal.data, **known, **(true if one.name in (_DESCENT, _GENETIC) else {}))
 
-
-def _rms(x: Tensor) -> float:
-    return float(x.square().mean().sqrt())
+    return Measured(run, loss)
