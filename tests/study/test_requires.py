@@ -24,9 +24,9 @@ PLACES: dict[tuple[str, str], tuple[str, str, list[str]]] = {
     ("stripmap", "world.path"): ("stripmap_damaged", "world.path.kind", []),
     ("isal", "world.fidelity"): ("isal_table1", "world.fidelity.kind", []),
     ("isal_rotation", "world.fidelity"): ("isal_corner_cubes", "world.fidelity.kind", ["radar.pulse_s=1e-6"]),
-    ("isal_rotation", "rotation.order"): ("isal_corner_cubes", "processor.recommended.stages.rotation.order", []),
+    ("isal_rotation", "rotation.order"): ("isal_rotation_points", "processor.recommended.stages.rotation.order", []),
     ("isal_rotation", "matched_fourier.transform"): (
-        "isal_corner_cubes",
+        "isal_rotation_points",
         "processor.recommended.stages.image.transform",
         [],
     ),
