@@ -6,6 +6,7 @@ import importlib.util
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,17 +14,22 @@ ROOT = Path(__file__).resolve().parents[1]
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]\d+)?")
 
 
-def run(name: str, folder: Path, figures: set[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """What a script prints with --small, after a look at its figures."""
+def script(name: str) -> Any:
+    """A script of the repository as a module."""
     spec = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
     assert spec and spec.loader
-    script = importlib.util.module_from_spec(spec)
-    sys.modules[name] = script  # where dataclasses look up their annotations
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # where dataclasses look up their annotations
     try:
-        spec.loader.exec_module(script)
+        spec.loader.exec_module(module)
     finally:
         del sys.modules[name]
-    script.main(["--small", "--out", str(folder / "figures")])
+    return module
+
+
+def run(name: str, folder: Path, figures: set[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """What a script prints with --small, after a look at its figures."""
+    script(name).main(["--small", "--out", str(folder / "figures")])
     drawn = sorted((folder / "figures").iterdir())
     assert {path.stem for path in drawn} == figures
     assert all(path.read_bytes().startswith(b"\x89PNG") and path.stat().st_size > 5000 for path in drawn)

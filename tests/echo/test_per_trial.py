@@ -688,6 +688,7 @@ NOT_PER_TRIAL = {
     (Extremes, "velocity_change_m_s"): "the reach of a whole batch",
     (Extremes, "acceleration_m_s2"): "the reach of a whole batch",
     (Extremes, "jerk_m_s3"): "the reach of a whole batch",
+    (Extremes, "displacement_m"): "the reach of a whole batch",
     (RangeHistory, "start_s"): "start of the slow-time axis, which all trials share",
 }
 

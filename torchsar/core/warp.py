@@ -182,3 +182,20 @@ def _legendre_of(k: Tensor, duration_s: float) -> tuple[Tensor, Tensor]:
 def _on(like: Tensor, values: np.ndarray) -> Tensor:
     """Values as a tensor with the dtype and device of another one."""
     return torch.as_tensor(values, dtype=like.dtype, device=like.device)
+
+
+def cut_warp(k: Tensor, order: int, duration_s: float) -> Tensor:
+    """The warp of an order that lies nearest to another one in least squares over the record: its
+    first Legendre terms, or itself where it has no more.
+
+    Args:
+        k: Coefficients k1, k2, ... of a warp, shape (..., coefficient).
+        order: Order of the nearest warp, 1 or more.
+        duration_s: Length of the record in seconds.
+
+    Returns:
+        Coefficients, shape (..., order - 1) at most.
+    """
+    if order > k.shape[-1]:
+        return k
+    return k_of_shape(shape_of(k, duration_s)[..., : order - 1], duration_s) if order > 1 else k[..., :0]

@@ -10,7 +10,7 @@ from torchsar.echo.channel_errors import ChannelErrors, PolynomialDrift, Sinusoi
 from torchsar.echo.channels import ChannelImbalance
 from torchsar.echo.interference import Quantiser, Tone, WideInterferer
 from torchsar.echo.jitter import PeriodicJitter
-from torchsar.echo.ladar import ladar_echo, simulate_ladar
+from torchsar.echo.ladar import ladar_echo, range_model_error_db, simulate_ladar
 from torchsar.echo.ladar_record import ladar_record, simulate_ladar_record
 from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedLines
 from torchsar.echo.pairs import SimulatedPairs
@@ -51,6 +51,7 @@ __all__ = [
     "dechirped_echo",
     "ladar_echo",
     "ladar_record",
+    "range_model_error_db",
     "sea_echo",
     "simulate",
     "simulate_bistatic",

@@ -29,6 +29,8 @@ _TABLE_BYTES = 8 << 20
 _DEFAULT = LinearInSweep()
 # sign of the sweep rate in up-sweeps and down-sweeps
 _RATES = (1.0, -1.0)
+# periods and samples of a sweep, by choice, on which the error of a range model is evaluated
+_ERROR_PERIODS, _ERROR_SAMPLES = 256, 16
 
 
 def ladar_echo(
@@ -79,6 +81,51 @@ def ladar_echo(
     else:
         echo = _sum_of_lines(lines, s, sweep_error, lit, radar, dtype)
     return echo.conj().resolve_conj() if radar.dechirp_sign == "echo_conj_lo" else echo
+
+
+def range_model_error_db(
+    scatterers: Scatterers,
+    radar: TriangularLadar,
+    n_period: int,
+    motion: Sequence[Motion] = (),
+    fidelity: Fidelity = _DEFAULT,
+) -> float:
+    """Predict the relative error that a range model makes in the echo of one scatterer.
+
+    It is 1 - |mean exp(j phi)|^2 in dB, where phi is the phase by which the model differs from the
+    range at every sample with all effects: one complex gain of the whole echo counts as no error.
+    The phase is evaluated on a part of the periods and of the samples of a sweep.
+
+    Args:
+        scatterers: One scatterer without trial dimensions, shape (1,).
+        radar: Ladar.
+        n_period: Number of kept periods.
+        motion: Motions along the line of sight.
+        fidelity: Model of the range within a sweep.
+
+    Returns:
+        Error in dB; -300 dB where there is none.
+
+    Raises:
+        ValueError: If the beam never illuminates the scatterer.
+    """
+    pulse = radar.sweep_axes(n_period)[1]
+    middle_s = sweep_middles(radar, pulse)[:, :: max(1, n_period // _ERROR_PERIODS)]
+    u = radar.fast_time_axis().values()[:: max(1, radar.sweep_samples // _ERROR_SAMPLES)]
+    time_s = middle_s[..., None] + u
+    exact, model = (RangeHistory(scatterers, radar, motion, pulse.start, without) for without in ((), fidelity.without))
+    if isinstance(fidelity, EverySample):
+        turns = _sample_turns(model, None, time_s, u)[..., 0]
+    else:
+        lines = SweepLines.of(model, fidelity, middle_s)
+        turns = lines.start + lines.slope * u
+        turns = turns if lines.curve is None else turns + lines.curve[..., None] * u.square()
+    lit = lit_by(scatterers, radar, middle_s).expand(turns.shape).to(torch.float64)
+    if not bool(lit.any()):
+        raise ValueError("the beam never illuminates the scatterer whose echo is compared; widen the beam or move it")
+    error = unit_phasor(turns - _sample_turns(exact, None, time_s, u)[..., 0], torch.complex128)
+    mean = (lit * error).sum().abs() / lit.sum()
+    return 10 * math.log10(max(1 - float(mean) ** 2, 1e-30))
 
 
 def lit_by(s: Scatterers, radar: TriangularLadar, time_s: Tensor) -> Tensor:

@@ -28,9 +28,9 @@ class Requirement:
         range_cells: The same in range cells; nan where it is not a shift.
         tolerance_rad: Tolerated phase in rad.
         remedy: Remedy where the simplification is not permissible.
-        error_db: Relative error in dB that the phase makes in the response of a point where it is
-            largest, see `phase_error_db`; nan where it is not predicted.
-        tolerance_db: Tolerated error in dB.
+        error_db: Loss in dB of the response of a point where the phase is largest: its relative
+            error, see `phase_error_db`, or the loss of its peak; nan where it is not predicted.
+        tolerance_db: Tolerated loss in dB.
     """
 
     effect: str

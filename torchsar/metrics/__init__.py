@@ -9,7 +9,7 @@ from torchsar.metrics.bounds import (
     tone_frequency_bound_hz,
     velocity_bound_m_s,
 )
-from torchsar.metrics.image import contrast, correlation, entropy, error_db
+from torchsar.metrics.image import contrast, correlation, entropy, error_after_gain_db, error_db
 from torchsar.metrics.impulse import impulse_response
 from torchsar.metrics.ladar_bounds import (
     integrated_range_detrended_bound_m,
@@ -29,6 +29,7 @@ __all__ = [
     "contrast",
     "correlation",
     "entropy",
+    "error_after_gain_db",
     "error_db",
     "impulse_response",
     "integrated_range_detrended_bound_m",

@@ -212,3 +212,19 @@ def error_db(image: Tensor | Signal, reference: Tensor | Signal) -> Tensor:
     norm = _norm(b / scale)
     ratio = _norm((a - b) / scale) / torch.where(norm > 0, norm, 1)
     return 20 * torch.log10(ratio.clamp_min(torch.finfo(ratio.dtype).tiny))
+
+
+def error_after_gain_db(images: Tensor, references: Tensor) -> Tensor:
+    """Compute the relative errors of images after the one complex gain that fits them all best.
+
+    Focusers and echo models may differ by such a constant without any loss.
+
+    Args:
+        images: Images, shape (..., azimuth, range), complex.
+        references: Reference images, same size.
+
+    Returns:
+        Error in dB, shape (...,), float64.
+    """
+    gain = (images.conj() * references).sum() / images.abs().square().sum()
+    return error_db(images * gain, references)

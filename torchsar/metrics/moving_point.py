@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Chain, Estimate, Signal, Trace, take
+from torchsar.metrics.image import error_db
 from torchsar.metrics.replicas import azimuth_response, replica_level, replica_zones
 from torchsar.multichannel.azimuth import FocusAzimuth
 from torchsar.multichannel.motion import PointMotion
@@ -229,6 +230,18 @@ def _false_targets(
     if not bool(((samples[..., 1:] + peak >= 0) & (samples[..., :1] + peak < cuts.azimuth.shape[-1])).any()):
         return torch.full_like(cuts.step_m, math.nan)
     return replica_level(cuts.azimuth, 1.0, samples)["mfta_db"]
+
+
+def worst_image_error_db(image: Signal, exact: Signal) -> float:
+    """Relative error in dB of the worst of several images of points.
+
+    Args:
+        image: Images of one point a row, (row, azimuth) or (row, azimuth, range).
+        exact: Reference images of the same size.
+    """
+    two = [x.data.to(torch.complex128).reshape(len(x.data), -1, x.data.shape[-1]) for x in (image, exact)]
+    two = [x if "range" in image.names else x.mT for x in two]
+    return float(error_db(*two).max())
 
 
 def ideal_responses(

@@ -10,6 +10,7 @@ from torchsar.multichannel.balance import CorrectBalance, EstimateBalance, corre
 from torchsar.multichannel.body import Body, Extraction, body_echo, find_body
 from torchsar.multichannel.compress import CompressChannels
 from torchsar.multichannel.detection import Detection, detect
+from torchsar.multichannel.known_motion import known_motion_chain
 from torchsar.multichannel.migration import (
     CorrectMigration,
     Frame,
@@ -119,6 +120,7 @@ __all__ = [
     "line_whitening",
     "maximum_likelihood",
     "moving_point_velocity",
+    "known_motion_chain",
     "multichannel_limits",
     "multichannel_requirements",
     "noise_gain_db",

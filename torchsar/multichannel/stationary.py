@@ -12,12 +12,14 @@ Reference:
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from torch import Tensor
 
 from torchsar.core import Axis, Signal, Stage, centred_ifft
 from torchsar.focus import omega_k, omega_k_stolt
+from torchsar.focus.ladar_requirements import Limit
+from torchsar.focus.requirements import Aperture, phase_error_db
 from torchsar.multichannel.motion import PointMotion
 from torchsar.multichannel.reconstruct import check_condition, reconstruct_lines, refuse_shifted
 from torchsar.multichannel.response import LeastSquares, Rebuild
@@ -184,3 +186,54 @@ def stationary_axis(radar: BistaticRadar, pulse: Axis, bands: int) -> Axis:
     n = bands * pulse.n
     step = radar.speed_m_s / (bands * radar.prf_hz)
     return Axis("azimuth", n, -(n // 2) * step, step, "m")
+
+
+def bulk_error_db(radar: BistaticRadar, bands: int, half_swath_m: float, integration_s: float) -> float:
+    """Predict the error of the image of a point at rest at the edge of the swath by the bulk form.
+
+    Args:
+        radar: Receiver.
+        bands: Doppler bands that are reconstructed.
+        half_swath_m: Half of the swath in metres.
+        integration_s: Integration time in seconds.
+
+    Returns:
+        Relative error of the response in dB.
+    """
+    middle = radar.reference_range_m
+    two_way = two_way_radar(radar, bands, middle - half_swath_m)
+    aperture = Aperture.of(two_way, middle, 0.0, radar.speed_m_s, 0.0, integration_s)
+    return phase_error_db(aperture.bulk_residual_rad(half_swath_m))
+
+
+def swath_limit(
+    radar: BistaticRadar,
+    half_swath_m: float,
+    positions_m: Sequence[tuple[float, float]],
+    range_m: float,
+    integration_s: float,
+) -> Limit:
+    """Limit of the swath within which moving ships are found whatever their velocity.
+
+    Args:
+        radar: Receiver.
+        half_swath_m: Half of the swath in metres.
+        positions_m: Along-track position and range from the middle of each ship in metres.
+        range_m: Half extent in range that is extracted about a ship in metres.
+        integration_s: Integration time in seconds.
+    """
+    curve = (integration_s * radar.speed_m_s) ** 2 / (8 * radar.reference_range_m)
+    walks = [
+        abs(off) + radar.ambiguous_velocity_m_s / 2 * (abs(along) / radar.speed_m_s + integration_s / 2)
+        for along, off in positions_m
+    ]
+    return Limit(
+        "half of the swath about the ships",
+        half_swath_m,
+        range_m + curve + max(walks),
+        "m",
+        "warn",
+        "ships beyond the part of the swath in which targets are sought are not found",
+        "record more range samples, or bring the ships nearer to the middle",
+        at_least=True,
+    )

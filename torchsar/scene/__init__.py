@@ -42,6 +42,7 @@ from torchsar.scene.ladar import (
     SweepError,
 )
 from torchsar.scene.ladar_targets import LetterE, RetroAndBrokenLine
+from torchsar.scene.lit_points import LitPoints
 from torchsar.scene.moving import (
     Bend,
     ExactRange,
@@ -97,6 +98,7 @@ __all__ = [
     "LadarWorld",
     "LetterE",
     "LinearInSweep",
+    "LitPoints",
     "LogAmplitude",
     "MeasuredTrack",
     "Motion",

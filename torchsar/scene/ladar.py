@@ -17,6 +17,8 @@ from torchsar.scene.trials import refuse_unless, refuse_unless_finite
 from torchsar.scene.vibration import Motion, displacement_m
 
 Effect = Literal["residual_video", "hyperbola", "flight"]
+# derivatives of the motion are differences of so many values per period, at most so many in all
+_TIMES_A_PERIOD, _MOST_TIMES = 16, 1 << 22
 # time step of the difference that gives the range rate, by choice: short against any motion, while
 # rounding of a range of 1 m costs 2e-10 m/s
 _SHORT_S = 1e-6
@@ -36,6 +38,7 @@ class Extremes:
             second.
         acceleration_m_s2: Largest magnitude of the radial acceleration.
         jerk_m_s3: Largest magnitude of its derivative.
+        displacement_m: Extent of the displacement along the line of sight in metres.
     """
 
     range_m: tuple[float, float] = (0.0, 0.0)
@@ -44,6 +47,42 @@ class Extremes:
     velocity_change_m_s: float = 0.0
     acceleration_m_s2: float = 0.0
     jerk_m_s3: float = 0.0
+    displacement_m: float = 0.0
+
+    @staticmethod
+    def of(
+        radar: TriangularLadar,
+        motion: Sequence[Motion],
+        n_period: int,
+        range_m: tuple[float, float],
+        azimuth_m: float,
+    ) -> Extremes:
+        """Determine the extremes of a motion by differences of its displacement.
+
+        Args:
+            radar: Ladar.
+            motion: Motions along the line of sight; the first trial counts.
+            n_period: Number of kept periods.
+            range_m: Smallest and largest relative range in metres.
+            azimuth_m: Largest magnitude of the azimuth of the scatterers in metres.
+        """
+        span_s = n_period * radar.pulse_step_s
+        n = min(max(8, n_period * radar.keep_every * _TIMES_A_PERIOD), _MOST_TIMES)
+        time_s = torch.arange(n, dtype=torch.float64) * (span_s / n)
+        course = displacement_m(motion, time_s).reshape(-1, n)[0]
+        velocity = torch.gradient(course, spacing=span_s / n)[0]
+        # differences of differences are less accurate at the ends
+        acceleration = torch.gradient(velocity, spacing=span_s / n)[0][2:-2]
+        jerk = torch.gradient(acceleration, spacing=span_s / n)[0][2:-2]
+        return Extremes(
+            range_m,
+            radar.speed_m_s * span_s / 2 + azimuth_m,
+            float(velocity.abs().max()),
+            float(velocity.max() - velocity.min()),
+            float(acceleration.abs().max()),
+            float(jerk.abs().max()) if len(jerk) else 0.0,
+            float(course.max() - course.min()),
+        )
 
 
 def omitted_phase_rad(without: Sequence[Effect], radar: TriangularLadar, extremes: Extremes) -> dict[str, float]:
@@ -141,6 +180,30 @@ class RangeHistory:
 
 
 Lines = tuple[Tensor, Tensor, Tensor | None]
+
+
+def refuse_unseen_ranges(radar: TriangularLadar, near_m: float, far_m: float) -> None:
+    """Refuse scatterers that no sweep can show, even at rest.
+
+    Args:
+        radar: Ladar.
+        near_m: Smallest relative range in metres.
+        far_m: Largest relative range in metres.
+
+    Raises:
+        ValueError: If a scatterer lies behind the ladar, or its beat frequency aliases.
+    """
+    if near_m <= -radar.reference_range_m:
+        raise ValueError(
+            f"world: a scatterer at the relative range {near_m:g} m lies behind the ladar, whose reference range is "
+            f"{radar.reference_range_m:g} m; ranges of scatterers are relative to it"
+        )
+    reach = radar.sample_rate_hz / 2 / radar.beat_hz(1.0)
+    if max(-near_m, far_m) >= reach:
+        raise ValueError(
+            f"world: scatterers lie from {near_m:g} to {far_m:g} m, and beats of relative ranges beyond {reach:.4g} m "
+            "alias; bring the reference range nearer, or sample faster"
+        )
 
 
 class Fidelity(Protocol):

@@ -106,6 +106,28 @@ class Parabola:
         """
         return closest_m + (velocity_m_s * since_s).square() / (2 * closest_m)
 
+    def neglected_db(
+        self, radar: StripmapRadar, doppler_hz: float, velocity_m_s: float, range_m: float, dwell_s: float
+    ) -> float:
+        """Predict the relative error of the echo of a target, mean |exp(j phi) - 1|^2 in dB.
+
+        Args:
+            radar: Radar.
+            doppler_hz: Doppler of the beam centre in Hz.
+            velocity_m_s: Effective velocity in m/s.
+            range_m: Slant range of the target at the beam centre in metres.
+            dwell_s: Time for which the target is illuminated in seconds.
+
+        Returns:
+            Error in dB.
+        """
+        sine = radar.sin_squint(doppler_hz, velocity_m_s)
+        closest, velocity = range_m * torch.sqrt(1 - sine**2), torch.tensor(velocity_m_s)
+        since = range_m * sine / velocity_m_s + dwell_s * torch.linspace(-0.5, 0.5, 65, dtype=torch.float64)
+        wrong = self.range_m(since, closest, velocity) - Hyperbola().range_m(since, closest, velocity)
+        error = float((2 - 2 * torch.cos(4 * math.pi / radar.wavelength_m * wrong)).mean())
+        return 10 * math.log10(max(error, 1e-30))
+
     def neglected_phase_rad(self, radar: StripmapRadar, range_m: float, since_s: float) -> float:
         """Return the phase of the difference to the hyperbola at the end of the aperture.
 

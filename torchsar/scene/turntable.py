@@ -78,7 +78,8 @@ class PhaseOnly:
         self, radar: InverseRadar, world: TurntableWorld, n_pulse: int, cross_range_m: float, range_m: float
     ) -> float:
         """Relative error of the echo of one scatterer: mean |exp(j phi) - 1|^2 in dB, phi being the
-        phase by which its dechirped echo differs from this model.
+        phase by which its dechirped echo differs from this model after compression, which removes
+        the residual video phase.
 
         Evaluated on a grid of pulses and of times inside them; a constant velocity that the
         receiver's track follows is left out, see `Dechirped`.
@@ -86,6 +87,7 @@ class PhaseOnly:
         pulse = torch.linspace(0, n_pulse - 1, min(n_pulse, _GRID), dtype=torch.float64)[:, None]
         inside = torch.linspace(-0.5, 0.5, _GRID, dtype=torch.float64) * _pulse_s(radar)
         track = world.fidelity.track if isinstance(world.fidelity, Dechirped) else ()
+        lever_m = range_m + float(torch.as_tensor(world.centre_deviation_m).reshape(-1)[0])
 
         def range_at(time_s: Tensor) -> Tensor:
             if world.rotation is None:
@@ -94,11 +96,11 @@ class PhaseOnly:
             else:
                 theta = world.rotation.angle(time_s).reshape(-1, *time_s.shape)[0]
             moved = displacement_m(world.motion, time_s).reshape(-1, *time_s.shape)[0]
-            return cross_range_m * torch.sin(theta) + range_m * torch.cos(theta) + moved
+            return range_m + cross_range_m * torch.sin(theta) + lever_m * (torch.cos(theta) - 1) + moved
 
         middle, reference = range_at(pulse / radar.prf_hz), displacement_m(track, pulse / radar.prf_hz)
         delay = 2 * (range_at(pulse / radar.prf_hz + inside) - reference) / radar.wave_speed_m_s
-        exact = radar.carrier_hz * delay + radar.chirp_rate_hz_s * (inside * delay - delay.square() / 2)
+        exact = radar.carrier_hz * delay + radar.chirp_rate_hz_s * inside * delay
         rest = 2 * range_m / radar.wave_speed_m_s
         model = radar.carrier_hz * 2 * (middle - reference) / radar.wave_speed_m_s
         model = model + radar.chirp_rate_hz_s * inside * rest

@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import math
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +59,18 @@ def needs(bench: Bench) -> dict[str, Any]:
         raise
     except (ValueError, TypeError) as error:
         raise ConfigError(f"{bench.file}: {one_line(error)}") from None
+    losses = {
+        one.effect: (loss, tolerance[metric])
+        for choice in choices
+        for one in choice.alternatives
+        for metric, loss in (one.loss or {}).items()
+    }
+    rows = [
+        replace(row, error_db=losses[row.effect][0], tolerance_db=losses[row.effect][1])
+        if row.effect in losses
+        else row
+        for row in rows
+    ]
     return {
         "limits": [{**asdict(one), "verdict": one.verdict, "methods": list(names)} for one, names in limits.items()],
         "requirements": [{**asdict(row), "ok": row.ok, "verdict": row.verdict} for row in rows],
@@ -104,45 +116,42 @@ def refuse_beyond_limits(bench: Bench, case: str) -> None:
 def _text(name: str, tree: Mapping[str, Any]) -> str:
     parts = [name]
     if tree["limits"]:
-        parts += [*_limit_lines(tree["limits"]), ""]
+        head = ("limit", "value", "limit", "unit", "verdict", "consequence; remedy (methods)")
+        parts += [*aligned([head, *_limit_rows(tree["limits"])], right=(1, 2)), ""]
     if tree["requirements"]:
-        parts += _requirement_lines(tree["requirements"])
+        head = ("simplification", "neglected phase", "range cells", "verdict", "neglects")
+        parts += aligned([head, *_requirement_rows(tree["requirements"])], right=(1, 2))
     for choice in tree["choices"]:
         if choice["alternatives"]:
-            parts += ["", *_choice_lines(choice)]
+            parts += ["", f"{choice['name']} (auto at {choice['at']}): {choice['recommended']}"]
+            parts += aligned([_alternative_row(row) for row in choice["alternatives"]])
     return "\n".join([*parts, *(f"warning: {text}" for text in tree["warnings"])])
 
 
-def _limit_lines(limits: Sequence[Mapping[str, Any]]) -> list[str]:
-    wide = 2 + max(len(row["name"]) for row in limits)
-    lines = [f"{'limit':<{wide}}{'value':>12}{'limit':>14} {'unit':<8}{'verdict':<9}consequence; remedy (methods)"]
+def aligned(rows: Sequence[Sequence[str]], right: Collection[int] = ()) -> list[str]:
+    """Lines of a table; the columns of the given numbers are aligned to the right."""
+    wide = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = [[x.rjust(w) if i in right else x.ljust(w) for i, (x, w) in enumerate(zip(row, wide))] for row in rows]
+    return ["  ".join(line).rstrip() for line in lines]
+
+
+def _limit_rows(limits: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, ...]]:
     names = [row["name"] for row in limits]
     for row in limits:
         concerned = f"({', '.join(row['methods'])})"
         then = concerned if names.count(row["name"]) > 1 else ""
         if row["verdict"] != "ok":
             then = f"{row['consequence']}; {row['remedy']} {concerned}"
-        least = (">= " if row["at_least"] else "< ") + format(row["limit"], ".4g")
-        lines.append(
-            f"{row['name']:<{wide}}{row['value']:>12.4g}{least:>14} {row['unit']:<8}{row['verdict']:<9}{then}".rstrip()
-        )
-    return lines
+        least = f"{'>=' if row['at_least'] else '<'} {row['limit']:.4g}"
+        yield row["name"], f"{row['value']:.4g}", least, row["unit"], row["verdict"], then
 
 
-def _requirement_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    wide = 2 + max(len(row["verdict"]) for row in rows)
-    lines = [f"{'simplification':<34}{'neglected phase':>16}{'range cells':>13}  {'verdict':<{wide}}neglects"]
+def _requirement_rows(rows: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, ...]]:
     for row in rows:
         cells = "" if math.isnan(row["range_cells"]) else f"{row['range_cells']:.3g}"
-        phase = f"{row['phase_rad']:>12.3g} rad"
-        lines.append(f"{row['effect']:<34}{phase}{cells:>13}  {row['verdict']:<{wide}}{row['neglects']}")
-    return lines
+        yield row["effect"], f"{row['phase_rad']:.3g} rad", cells, row["verdict"], row["neglects"]
 
 
-def _choice_lines(choice: Mapping[str, Any]) -> list[str]:
-    lines = [f"{choice['name']} (auto at {choice['at']}): {choice['recommended']}"]
-    for row in choice["alternatives"]:
-        loss = ", ".join(f"{name} {value:.3g}" for name, value in row["loss"].items()) or "exact"
-        verdict = "enough" if row["within_tolerance"] else "too much"
-        lines.append(f"  {row['name']:<34}{loss:<36}{verdict:<10}{row['neglects']}".rstrip())
-    return lines
+def _alternative_row(row: Mapping[str, Any]) -> tuple[str, ...]:
+    loss = ", ".join(f"{name} {value:.3g}" for name, value in row["loss"].items()) or "exact"
+    return f"  {row['name']}", loss, "enough" if row["within_tolerance"] else "too much", row["neglects"]

@@ -7,16 +7,18 @@ import math
 import platform
 import statistics
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from torchsar import plot
+from torchsar.core.memory import PeakMemory
+from torchsar.study.commands.requires import aligned
 from torchsar.study.output.arrays import write_json
 from torchsar.study.output.folder import fresh_result
-from torchsar.study.output.numbers import number
+from torchsar.study.output.numbers import MISSING, number
 from torchsar.study.output.progress import Steps, Ticker
 from torchsar.study.output.report import installed_version
 from torchsar.study.settings.cases import cases_of
@@ -30,6 +32,8 @@ log = logging.getLogger("torchsar")
 FILES = ("config.yaml", "trade.json", "trade.txt", "figures")
 # what the work of an alternative raises where it cannot be done on this scene
 _FAILURES = (ValueError, TypeError, KeyError, RuntimeError, ArithmeticError)
+# work is repeated for so long (s) that its time is known to a percent or so
+_LEAST_S = 0.1
 Row = dict[str, Any]
 
 
@@ -100,9 +104,8 @@ def compared(choice: Choice, bench: Bench, tolerance: Mapping[str, float]) -> li
                         log.info("%s", _line(rows[one.name]))
     for name, times in timings.items():
         if times:
-            rows[name].update(
-                cpu_s=statistics.median(t[0] for t in times), wall_s=statistics.median(t[1] for t in times)
-            )
+            cpu, wall = (statistics.median(part) for part in zip(*times, strict=True))
+            rows[name].update(cpu_s=cpu, wall_s=wall)
     found = [rows[one.name] for one in (*first, *choice.alternatives)]
     for row in found:
         row["within_tolerance"] = not row["failed"] and within(row["loss"], tolerance)
@@ -117,10 +120,8 @@ def _timed(one: Alternative, measured: Measured, times: list[tuple[float, float]
     row: Row = {"name": one.name, "neglects": one.neglects, "cpu_s": None, "wall_s": None, "peak_bytes": None}
     row |= {"loss": {}, "predicted": one.loss, "failed": ""}
     try:
-        peak, began = _Peak(), (time.process_time(), time.perf_counter())
-        with peak:
-            result = measured.run(one)
-        spent = (time.process_time() - began[0], time.perf_counter() - began[1])
+        with PeakMemory() as peak:
+            spent, result = _spent(lambda: measured.run(one), _LEAST_S if times else 0.0)
         times.append((spent[0] / measured.share(one), spent[1] / measured.share(one)))
         loss = {name: float(value) for name, value in measured.loss(one, result).items()}
     except _FAILURES as error:
@@ -130,33 +131,14 @@ def _timed(one: Alternative, measured: Measured, times: list[tuple[float, float]
     return {**row, "peak_bytes": peak.bytes, "loss": loss, "failed": f"{wrong[0]} is not finite" if wrong else ""}
 
 
-class _Peak:
-    """Peak memory that the work adds: of the device where there is one, else of the process."""
-
-    bytes: int | None = None
-
-    def __enter__(self) -> None:
-        self._gpu = torch.cuda.is_available() and torch.cuda.is_initialized()
-        if self._gpu:
-            torch.cuda.reset_peak_memory_stats()
-        self._before = _resident("VmRSS", reset=True)
-
-    def __exit__(self, *_: object) -> None:
-        after = torch.cuda.max_memory_allocated() if self._gpu else _resident("VmHWM")
-        self.bytes = None if after is None else after - (0 if self._gpu else self._before or 0)
-
-
-def _resident(field: str, reset: bool = False) -> int | None:
-    """Resident memory of this process (VmRSS) or its peak since the last reset (VmHWM), in bytes;
-    None on systems that do not tell.
-    """
-    try:
-        if reset:
-            Path("/proc/self/clear_refs").write_text("5")
-        text = Path("/proc/self/status").read_text()
-    except OSError:
-        return None
-    return next((1024 * int(line.split()[1]) for line in text.splitlines() if line.startswith(f"{field}:")), None)
+def _spent(work: Callable[[], Any], least_s: float) -> tuple[tuple[float, float], Any]:
+    """CPU and wall time of the work, a mean over so many runs as take a given time, and its result."""
+    began, runs = (time.process_time(), time.perf_counter()), 0
+    while True:
+        result, runs = work(), runs + 1
+        spent = (time.process_time() - began[0], time.perf_counter() - began[1])
+        if spent[0] >= least_s:
+            return (spent[0] / runs, spent[1] / runs), result
 
 
 def _line(row: Row) -> str:
@@ -171,17 +153,15 @@ def _loss(value: float) -> str:
 
 def _text(name: str, rows: Sequence[Row]) -> str:
     metrics = list(dict.fromkeys(metric for row in rows for metric in row["loss"]))
-    wide = 2 + max(len(row["name"]) for row in rows)
-    head = f"{'alternative':<{wide}}{'CPU (ms)':>10}{'wall (ms)':>11}" + "".join(f"{metric:>24}" for metric in metrics)
-    lines = [name.upper(), f"{head}  verdict"]
-    for row in rows:
-        if row["failed"]:
-            lines.append(f"{row['name']:<{wide}}failed: {row['failed']}")
-            continue
-        cells = "".join(f"{_loss(row['loss'][m]) if m in row['loss'] else '–':>24}" for m in metrics)
-        verdict = "recommended" if row["recommended"] else "within tolerance" if row["within_tolerance"] else "too much"
-        lines.append(f"{row['name']:<{wide}}{1e3 * row['cpu_s']:>10.2f}{1e3 * row['wall_s']:>11.2f}{cells}  {verdict}")
-    return "\n".join(lines)
+    table = [("alternative", "CPU (ms)", "wall (ms)", *metrics, "verdict"), *(_cells(row, metrics) for row in rows)]
+    return "\n".join([name.upper(), *aligned(table, right=range(1, 3 + len(metrics)))])
+
+
+def _cells(row: Row, metrics: Sequence[str]) -> tuple[str, ...]:
+    verdict = "recommended" if row["recommended"] else "within tolerance" if row["within_tolerance"] else "too much"
+    times = [MISSING if row[key] is None else f"{1e3 * row[key]:.2f}" for key in ("cpu_s", "wall_s")]
+    losses = [_loss(row["loss"][metric]) if metric in row["loss"] else MISSING for metric in metrics]
+    return row["name"], *times, *losses, f"failed: {row['failed']}" if row["failed"] else verdict
 
 
 def _draw(name: str, rows: Sequence[Row], tolerance: Mapping[str, float], path: Path) -> None:

@@ -63,6 +63,9 @@ def resolved(loaded: Loaded, bench_of: Callable[[Loaded], Any]) -> tuple[Loaded,
         )
     bench = bench_of(loaded.changed({path: {**entry, **exact[at]} for at, path, entry in places}, "auto"))
     choices = {choice.at: choice for choice in choices_of(bench)}
+    fixed = next((path for at, path, _ in places if at not in choices), None)
+    if fixed is not None:
+        raise ConfigError(f"{loaded.file}: {fixed} is 'auto', and nothing is to choose there in this config; name it")
     tolerance, changes, said = tolerance_of(loaded), {}, []
     for at, path, entry in places:
         taken = cheapest(choices[at], tolerance)

@@ -16,12 +16,14 @@ class Alternative:
         keys: What stands in the config for it, in the mapping that the choice is made in.
         loss: Predicted loss by metric; None where nothing is predicted.
         neglects: What it leaves out.
+        effect: The row of the requirements about the same, which is then judged by this loss.
     """
 
     name: str
     keys: Mapping[str, Any] = field(default_factory=dict)
     loss: Mapping[str, float] | None = None
     neglects: str = ""
+    effect: str = ""
 
 
 # levels below this are differences of rounding at most
@@ -35,7 +37,7 @@ class Measured:
     Args:
         run: Does the work of one alternative, which is timed; the yardstick is run as well.
         loss: Loss by metric of a result of `run`, against the yardstick.
-        share: Share of the whole work that `run` does of an alternative; its times are divided by it.
+        share: Share of the whole work that `run` does of an alternative; times are divided by it.
     """
 
     run: Callable[[Alternative], Any]

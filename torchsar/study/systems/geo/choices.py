@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from torchsar.core import Alternate, Chain, Draws, Signal, use
+from torchsar.core import Alternate, Chain, Draws, Signal
 from torchsar.focus.ladar_requirements import Limit
-from torchsar.focus.requirements import Requirement, phase_error_db
+from torchsar.focus.requirements import Requirement
 from torchsar.metrics import error_db
-from torchsar.metrics.moving_point import FocusedPoint, PeakCuts, point_responses
+from torchsar.metrics.moving_point import FocusedPoint, PeakCuts, point_responses, worst_image_error_db
 from torchsar.metrics.replicas import azimuth_response
 from torchsar.multichannel import (
-    CompressChannels,
     CorrectMigration,
     FlatBand,
     FocusAzimuth,
@@ -28,8 +26,8 @@ from torchsar.multichannel import (
     MultichannelUse,
     NoMigration,
     Reconstruct,
-    RemoveTransmitRange,
     StaticBulk,
+    known_motion_chain,
     multichannel_limits,
     multichannel_requirements,
 )
@@ -43,10 +41,8 @@ from torchsar.multichannel.velocity import (
     SignalIntensityRatio,
 )
 from torchsar.multichannel.velocity.migrating import MigratingLines
-from torchsar.radar import receive_range
-from torchsar.scene import ExactRange, TaylorRange
-from torchsar.scene.moving import ReceiveRange
-from torchsar.study.systems.geo.world import Level, Points
+from torchsar.scene import BandLimited, ExactRange, LitPoints, TaylorRange
+from torchsar.study.systems.geo.world import TRUTHS, Level, Points
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured
@@ -63,10 +59,13 @@ _ESTIMATORS: dict[type, Estimator] = {
 _PATTERN_S = 4.5
 # range lines on which two-dimensional chains are compared; they hold the migration of any aperture
 _LINES = 128
-# samples of slow time and of the band on which neglected phases are evaluated
-_TIMES, _BAND = 129, 17
-_GIVEN = {name: f"given.{name}" for name in ("u_r_m_s", "u_a_m_s", "y0_m")}
-_MIGRATIONS = {"none": NoMigration(), "static_bulk": StaticBulk(True), "keystone": Keystone(True)}
+# corrections of range migration, and the rows of the requirements that are about their losses
+_MIGRATIONS = {
+    "none": (NoMigration(), "no range migration correction"),
+    "static_bulk": (StaticBulk(True), "static bulk correction, velocity unknown"),
+    "keystone": (Keystone(True), ""),
+}
+_DIMENSIONS = ("azimuth only", "range lines", "full chirps")
 
 
 def limits(bench: Bench) -> dict[Limit, list[str]]:
@@ -123,39 +122,53 @@ def _stages(chain: Chain) -> Iterable[Any]:
 
 def choices(bench: Bench) -> list[Choice]:
     """The decisions of a config, on its targets without noise, with their true velocities."""
-    radar, channels = bench.radar, bench.radar.channels
+    world, radar, band = bench.world(), bench.radar, _bandwidth_hz(bench)
+    movers = world.points(1).movers(radar, Draws(0))
+    seen, focused = (LitPoints(movers, world.gate, radar, world.pulses, hz) for hz in (None, band))
     orders = [
-        Alternative(f"order {order}", {"order": order}, {"image_error_db": _transmit_db(bench, order)}, "higher orders")
-        for order in range(len(radar.transmit_range))
+        Alternative(
+            f"order {n}",
+            {"order": n},
+            {"image_error_db": focused.transmit_order_db(n)},
+            "higher orders",
+            f"transmit range of order {n}",
+        )
+        for n in range(len(radar.transmit_range))
     ]
-    orders.append(Alternative("all orders", {"order": None}, {}))
     migrations = [
-        Alternative(name, {"kind": name}, {"image_error_db": _migration_db(bench, name)}, "migration that remains")
-        for name in ("none", "static_bulk")
+        Alternative(
+            kind,
+            {"kind": kind},
+            {"image_error_db": focused.migration_db(kind == "static_bulk", known=_follows(bench))},
+            "migration that remains",
+            _MIGRATIONS[kind][1],
+        )
+        for kind in ("none", "static_bulk")
     ]
-    migrations.append(Alternative("keystone", {"kind": "keystone", "whole_swath": True}, {}))
     series = [
         Alternative(
-            f"order {n}", {"kind": "taylor", "order": n}, {"echo_error_db": _series_db(bench, n)}, "higher orders"
+            f"order {n}",
+            {"kind": "taylor", "order": n},
+            {"echo_error_db": seen.receive_model_db(TaylorRange(n))},
+            "higher orders",
         )
         for n in (2, 4)
     ]
-    rebuilds = [
-        Alternative(f"least squares, {n} band{'s' * (n > 1)}", {"rebuild": LeastSquares(n)})
-        for n in range(1, channels + 1)
-    ]
-    rebuilds.append(Alternative("least mean square, pattern, 5 bands", {"rebuild": MinimumMeanSquare(5)}))
-    if (band := _bandwidth_hz(bench)) is not None:
-        prior = MinimumMeanSquare(5, prior=FlatBand(band))
-        rebuilds.append(Alternative("least mean square, flat band, 5 bands", {"rebuild": prior}))
-    dimensions = [Alternative(name, {"dimensions": name}) for name in ("azimuth only", "range lines", "full chirps")]
+    rebuilds = {f"least squares, {n} band{'s' * (n > 1)}": LeastSquares(n) for n in range(1, radar.channels + 1)}
+    rebuilds["least mean square, pattern, 5 bands"] = MinimumMeanSquare(5)
+    if band is not None:
+        rebuilds["least mean square, flat band, 5 bands"] = MinimumMeanSquare(5, prior=FlatBand(band))
+    rebuilt = [Alternative(name, {"rebuild": one}) for name, one in rebuilds.items()]
+    dimensions = [Alternative(name, {"dimensions": name}) for name in _DIMENSIONS]
     precisions = [Alternative(name, {"precision": name}) for name in ("complex64", "complex128")]
-    exact = Alternative("exact", {"kind": "exact"}, {})
+    orders.append(Alternative("all orders", {"order": None}, {}))
+    migrations.append(Alternative("keystone", {"kind": "keystone", "whole_swath": True}, {}))
+    series.append(Alternative("exact", {"kind": "exact"}, {}))
     return [
         Choice("order of the transmit range", "transmit_range_remove.order", orders, partial(_orders, bench)),
         Choice("range migration", "migration_correct.kind", migrations, partial(_migrated, bench)),
-        Choice("reconstruction", "rebuild_bands", rebuilds, partial(_rebuilt, bench)),
-        Choice("range to the receiver", "world.receive", [*series, exact], partial(_received, bench)),
+        Choice("reconstruction", "rebuild_bands", rebuilt, partial(_rebuilt, bench)),
+        Choice("range to the receiver", "world.receive", series, partial(_received, bench)),
         Choice("dimensions", "world.samples", dimensions, partial(_dimensions, bench)),
         Choice("precision", "precision", precisions, partial(_precisions, bench)),
     ]
@@ -166,54 +179,10 @@ def _bandwidth_hz(bench: Bench) -> float | None:
     return next((stage.bandwidth_hz for stage in stages if isinstance(stage, FocusAzimuth)), None)
 
 
-# predicted losses, of the worst target of the world
-
-
-def _times(bench: Bench) -> Tensor:
-    lit = bench.world().integration_s
-    return (_PATTERN_S if lit is None else float(lit)) * torch.linspace(-0.5, 0.5, _TIMES, dtype=torch.float64)
-
-
-def _histories(bench: Bench, model: ReceiveRange) -> Tensor:
-    """Ranges to the receiver beyond the closest ones, (target, channel, pulse)."""
-    world = bench.world()
-    movers = world.points(1).movers(bench.radar, Draws(0)).each(lambda x: x.reshape(-1))
-    return (model.range_m(movers, _times(bench), bench.radar) - movers.range_m).movedim(-1, 0)
-
-
-def _transmit_db(bench: Bench, order: int) -> float:
-    """By the orders of the transmit range that are left, over the time for which targets are lit."""
-    left, time_s = bench.radar.transmit_range[order:], _times(bench)
-    metres = sum((k * time_s ** (order + i) for i, k in enumerate(left, 1)), torch.zeros_like(time_s))
-    return phase_error_db(2 * math.pi / bench.radar.wavelength_m * metres)
-
-
-def _migration_db(bench: Bench, kind: str) -> float:
-    """By the migration that is left over the band; a shift of pulses leaves none where the method
-    knows the velocity, and the walk of the target where it does not.
-    """
-    radar, time_s = bench.radar, _times(bench)
-    band = torch.linspace(-0.5, 0.5, _BAND, dtype=torch.float64) * 2 * math.pi * radar.pulse.bandwidth_hz
-    left = _histories(bench, ExactRange())
-    if kind == "static_bulk":
-        at_rest = receive_range(time_s, 0.0, 0.0, 0.0, radar.reference_range_m, radar.speed_m_s, 0.0)
-        left = torch.zeros_like(left) if _follows(bench) else left - at_rest
-    return max(phase_error_db(band / radar.wave_speed_m_s * path[..., None]) for path in left)
-
-
 def _follows(bench: Bench) -> bool:
     """Whether the recommended method corrects migration by an estimated velocity."""
     chain = bench.chains["recommended"]
     return any(isinstance(chain.stages[n], CorrectMigration) and bool(used) for n, used in chain.uses.items())
-
-
-def _series_db(bench: Bench, order: int) -> float:
-    """By the orders of the receive range that an echo leaves out."""
-    left = _histories(bench, TaylorRange(order)) - _histories(bench, ExactRange())
-    return max(phase_error_db(2 * math.pi / bench.radar.wavelength_m * path) for path in left)
-
-
-# measured losses, of the worst target of the world
 
 
 def _alone(bench: Bench, dtype: torch.dtype | None = None, fastest: bool = False, **changes: Any) -> Trials:
@@ -228,65 +197,48 @@ def _alone(bench: Bench, dtype: torch.dtype | None = None, fastest: bool = False
     return replace(world, **changes).trials_of(bench.radar, draws, dtype or bench.dtype)
 
 
-def _image(
-    bench: Bench,
-    trials: Trials,
-    rebuild: Any = None,
-    migration: Any = None,
-    order: int | None = None,
-    full: bool = False,
-    follow: bool = True,
-) -> tuple[Signal, FocusedPoint]:
-    """Images of the targets with their true velocities; migration None for azimuth-only data."""
-    radar = bench.radar
-    stages: dict[str, nn.Module] = {"compress": CompressChannels(radar, "flat")} if full else {}
-    stages["remove"] = RemoveTransmitRange(radar, order)
-    if migration is not None:
-        stages["correct"] = use(CorrectMigration(radar, migration), **(_GIVEN if follow else {}))
-    stages["rebuild"] = use(Reconstruct(radar, rebuild or LeastSquares(min(2, radar.channels))), **_GIVEN)
-    stages["focus"] = use(FocusAzimuth(radar, _bandwidth_hz(bench)), **_GIVEN, range_m="given.range_m")
-    chain = Chain(**stages)
-    known = {f"given.{name}": trials.truth[name] for name in (*_GIVEN, "range_m")}
-    trace = chain.trace(trials.clean, known)
-    focused = FocusedPoint.of(chain, trace, radar)
+def _image(bench: Bench, trials: Trials, rebuild: Any = None, **settings: Any) -> tuple[Signal, FocusedPoint]:
+    """Images of the targets with their true velocities."""
+    best = LeastSquares(min(2, bench.radar.channels))
+    chain = known_motion_chain(bench.radar, rebuild or best, _bandwidth_hz(bench), **settings)
+    trace = chain.trace(trials.clean, {f"given.{name}": trials.truth[name] for name in TRUTHS})
+    focused = FocusedPoint.of(chain, trace, bench.radar)
     assert focused is not None
     return trace.signal, focused
 
 
-def _worst_db(image: Signal, exact: Signal) -> float:
-    """Largest difference of the images of a target."""
-    two = [x.data.to(torch.complex128).reshape(len(x.data), -1, x.data.shape[-1]) for x in (image, exact)]
-    two = [x if "range" in image.names else x.mT for x in two]
-    return float(error_db(*two).max())
-
-
-def _compared(bench: Bench, exact: Signal, work: Any) -> Measured:
-    return Measured(work, lambda one, image: {"image_error_db": _worst_db(image, exact)})
+def _compared(exact: Signal, work: Callable[[Alternative], Signal]) -> Measured:
+    return Measured(work, lambda one, image: {"image_error_db": worst_image_error_db(image, exact)})
 
 
 def _orders(bench: Bench) -> Measured:
     trials = _alone(bench)
-    return _compared(bench, _image(bench, trials)[0], lambda one: _image(bench, trials, order=one.keys["order"])[0])
+    return _compared(_image(bench, trials)[0], lambda one: _image(bench, trials, order=one.keys["order"])[0])
 
 
 def _migrated(bench: Bench) -> Measured:
-    trials = _alone(bench, fastest=True, samples=_LINES)
+    """Against the response along azimuth times that along range, which migration leaves alone.
 
-    def run(one: Alternative) -> Signal:
-        return _image(bench, trials, migration=_MIGRATIONS[one.keys["kind"]], follow=_follows(bench))[0]
-
-    line, lines = _image(bench, _alone(bench, torch.complex128, fastest=True))[0], trials.clean.signal.axes[2]
-    # without migration the response is that along azimuth times that along range
+    Targets are lit for the band that is focused: replicas of other bands migrate in their own way.
+    """
+    lit = bench.world().integration_s
+    size = {"gate": BandLimited(_PATTERN_S if lit is None else lit)}
+    trials = _alone(bench, samples=max(_LINES, bench.world().samples or 0), **size)
+    line, lines = _image(bench, _alone(bench, torch.complex128, **size))[0], trials.clean.signal.axes[2]
     beyond = lines.values() - trials.truth["range_m"][:, None]
     across = torch.sinc(beyond / (bench.radar.wave_speed_m_s / bench.radar.pulse.bandwidth_hz))
     exact = Signal(line.data[..., None] * across[:, None], (*line.axes, lines))
-    return _compared(bench, exact, run)
+    follow = _follows(bench)
+    return _compared(
+        exact, lambda one: _image(bench, trials, migration=_MIGRATIONS[one.keys["kind"]][0], follow=follow)[0]
+    )
 
 
 def _precisions(bench: Bench) -> Measured:
     trials = {name: _alone(bench, getattr(torch, name)) for name in ("complex64", "complex128")}
-    exact = _image(bench, trials["complex128"])[0]
-    return _compared(bench, exact, lambda one: _image(bench, trials[one.keys["precision"]])[0])
+    return _compared(
+        _image(bench, trials["complex128"])[0], lambda one: _image(bench, trials[one.keys["precision"]])[0]
+    )
 
 
 def _rebuilt(bench: Bench) -> Measured:
@@ -302,24 +254,21 @@ def _rebuilt(bench: Bench) -> Measured:
 
 def _received(bench: Bench) -> Measured:
     """Echoes by each model of the receive range."""
-    models = {"order 2": TaylorRange(2), "order 4": TaylorRange(4), "exact": ExactRange()}
-    exact = _alone(bench, torch.complex128).clean.signal.data
 
-    def loss(one: Alternative, _: Trials) -> dict[str, float]:
-        made = _alone(bench, torch.complex128, receive=models[one.name]).clean.signal.data
-        return {"echo_error_db": float(error_db(made, exact).max())}
+    def echo(one: Alternative, dtype: torch.dtype | None = None) -> Tensor:
+        model = TaylorRange(one.keys["order"]) if one.keys["kind"] == "taylor" else ExactRange()
+        return _alone(bench, dtype, receive=model).clean.signal.data
 
-    return Measured(lambda one: _alone(bench, receive=models[one.name]), loss)
+    exact = _alone(bench, torch.complex128, receive=ExactRange()).clean.signal.data
+    return Measured(echo, lambda one, _: {"echo_error_db": float(error_db(echo(one, torch.complex128), exact).max())})
 
 
 def _dimensions(bench: Bench) -> Measured:
     """The same targets by azimuth-only data, range-compressed lines and full chirps."""
-    radar = bench.radar
     # echoes begin at the middle of the axis
-    longer = _LINES + 2 * radar.pulse.n_samples(radar.sampling_hz)
-    sizes = {"azimuth only": {}, "range lines": {"samples": _LINES}}
-    sizes["full chirps"] = {"samples": longer, "kind": "full"}
-    trials = {name: _alone(bench, fastest=True, **size) for name, size in sizes.items()}
+    longer = _LINES + 2 * bench.radar.pulse.n_samples(bench.radar.sampling_hz)
+    sizes = ({}, {"samples": _LINES}, {"samples": longer, "kind": "full"})
+    trials = {name: _alone(bench, fastest=True, **size) for name, size in zip(_DIMENSIONS, sizes, strict=True)}
 
     def run(one: Alternative) -> Signal:
         kind = one.keys["dimensions"]

@@ -71,7 +71,7 @@ class GeoOcean(System):
     truths = TRUTHS
     peak = _PEAK
     tolerance = {"image_error_db": -20.0, "position_error_m": 10.0, "sea_error_db": -10.0}
-    exact = {"transmit_range_remove.order": {"order": None}, "stationary_image.form": {"form": "stolt"}}
+    exact = {"stationary_image.form": {"form": "stolt"}}
     definitions = {
         "snr": "the sea has unit mean power in a range-compressed sample of one channel; scr_db: mean power of "
         "a sample of a ship's lines over it; cnr_db: sea over noise",

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchsar.core import Draws, Signal
 from torchsar.echo import bistatic_echo
 from torchsar.focus.ladar_requirements import Limit
-from torchsar.focus.requirements import Aperture, Requirement, phase_error_db
+from torchsar.focus.requirements import Requirement
 from torchsar.metrics import error_db
 from torchsar.metrics.ship_scene import FoundTarget, MadeScene, matched, ship_metrics
 from torchsar.multichannel import (
@@ -26,7 +26,7 @@ from torchsar.multichannel import (
     multichannel_requirements,
 )
 from torchsar.multichannel.scene_image import MoversImage
-from torchsar.multichannel.stationary import two_way_radar
+from torchsar.multichannel.stationary import bulk_error_db, swath_limit
 from torchsar.scene import BandLimited, MovingPoints
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.trials.bench import Bench
@@ -93,27 +93,20 @@ def _use_of(bench: Bench, name: str) -> MultichannelUse:
 
 def _swath_limits(bench: Bench, name: str) -> list[Limit]:
     """Moving ships are sought only where they lie in the swath whatever their velocity."""
-    last, radar = _last(bench, name), bench.radar
+    last, world = _last(bench, name), bench.world()
     if not isinstance(last, MoversImage):
         return []
-    extraction, need = last.flow.extraction, 0.0
-    for ship in bench.world().targets.values():
-        abeam_s = abs(float(ship.azimuth_m)) / radar.speed_m_s
-        walk = extraction.range_m + radar.ambiguous_velocity_m_s / 2 * (abeam_s + extraction.integration_s / 2)
-        curve = (extraction.integration_s * radar.speed_m_s) ** 2 / (8 * radar.reference_range_m)
-        need = max(need, abs(float(ship.range_m)) + walk + curve)
-    what = "ships beyond the part of the swath in which targets are sought are not found"
-    remedy = "record more range samples, or bring the ships nearer to the middle"
-    half = bench.world().samples / 2 * radar.range_step_m
-    return [Limit("half of the swath about the ships", half, need, "m", "warn", what, remedy, at_least=True)]
+    extraction, half = last.flow.extraction, world.samples / 2 * bench.radar.range_step_m
+    ships = [(float(ship.azimuth_m), float(ship.range_m)) for ship in world.targets.values()]
+    return [swath_limit(bench.radar, half, ships, extraction.range_m, extraction.integration_s)]
 
 
 def choices(bench: Bench) -> list[Choice]:
     """Settings of the recommended flow on its first scene, and the form of the image at rest."""
+    radar, world, lit = bench.radar, bench.world(), _integration_s(bench) or _PATTERN_S
+    lost = bulk_error_db(radar, _rebuild(bench).bands, world.samples / 2 * radar.range_step_m, lit)
     forms = [
-        Alternative(
-            "bulk", {"form": "bulk"}, {"image_error_db": _bulk_db(bench)}, "change of migration over the swath"
-        ),
+        Alternative("bulk", {"form": "bulk"}, {"image_error_db": lost}, "change of migration over the swath"),
         Alternative("stolt", {"form": "stolt"}, {}),
     ]
     found = [Choice("image of what is at rest", "stationary_image.form", forms, partial(_forms, bench))]
@@ -127,35 +120,27 @@ def choices(bench: Bench) -> list[Choice]:
     return found
 
 
-def _bulk_db(bench: Bench) -> float:
-    """Error of the response of a point at the edge of the swath."""
-    radar, half = bench.radar, bench.world().samples / 2 * bench.radar.range_step_m
-    middle, last = radar.reference_range_m, _last(bench, "recommended")
-    bands = (last.flow.image if isinstance(last, MoversImage) else last).rebuild.bands
-    two_way = two_way_radar(radar, bands, middle - half)
-    lit = _integration_s(bench) or _PATTERN_S
-    aperture = Aperture.of(two_way, middle, 0.0, radar.speed_m_s, 0.0, lit)
-    return phase_error_db(aperture.bulk_residual_rad(half))
+def _rebuild(bench: Bench) -> Any:
+    """The reconstruction of what is at rest by the recommended method."""
+    last = _last(bench, "recommended")
+    return (last.flow.image if isinstance(last, MoversImage) else last).rebuild
 
 
 def _forms(bench: Bench) -> Measured:
     """Images of points at rest at both edges of the swath by each form, against the exact one."""
-    radar, world, last = bench.radar, bench.world(), _last(bench, "recommended")
+    radar, world, rebuild = bench.radar, bench.world(), _rebuild(bench)
     axes = radar.axes(world.pulses, world.samples)
     edge = 0.9 * world.samples / 2 * radar.range_step_m
     points = MovingPoints([[0.0], [0.0]], [[0.0], [0.0]], [[0.0], [0.0]], [[-edge], [edge]])  # pyright: ignore
-    rebuild = (last.flow.image if isinstance(last, MoversImage) else last).rebuild
-
-    def echo(dtype: torch.dtype) -> Signal:
-        movers = points.movers(radar, Draws(0))
-        return Signal(bistatic_echo(movers, radar, world.pulses, world.samples, gate=world.gate, dtype=dtype), axes)
-
+    echo = bistatic_echo(
+        points.movers(radar, Draws(0)), radar, world.pulses, world.samples, gate=world.gate, dtype=torch.complex128
+    )
     # the transmit range is common to everything, and left out
-    remove, data = RemoveTransmitRange(radar), echo(torch.complex128)
-    exact, signal = StationaryImage(radar, rebuild)(remove(data)).data, remove(echo(bench.dtype))
+    signal = RemoveTransmitRange(radar)(Signal(echo, axes))
+    exact, used = StationaryImage(radar, rebuild)(signal).data, signal.to(bench.dtype)
 
     def run(one: Alternative) -> Tensor:
-        return StationaryImage(radar, rebuild, one.keys["form"])(signal).data
+        return StationaryImage(radar, rebuild, one.keys["form"])(used).data
 
     return Measured(run, lambda one, image: {"image_error_db": float(error_db(image.to(exact), exact).max())})
 

@@ -26,7 +26,7 @@ from torchsar.study.output.pictures import Drawn, comparisons
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.systems.isal import figures, judge
 from torchsar.study.systems.isal.judge import received, whole_phase
-from torchsar.study.systems.isal.world import Target, echo_choice
+from torchsar.study.systems.isal.world import Target, echo_choices
 from torchsar.study.trials.batch import Batch, Judged, Result, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured
@@ -124,7 +124,7 @@ class Isal(System):
             )
         efforts = [Alternative(f"autofocus, search {s}, polish {p}", {"search": s, "polish": p}) for s, p in _EFFORTS]
         return [
-            echo_choice(bench),
+            *echo_choices(bench),
             Choice("effort of autofocus", "autofocus.search", efforts, partial(_efforts, bench)),
         ]
 

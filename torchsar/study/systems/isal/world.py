@@ -73,15 +73,23 @@ class Target(World):
         return tuple(float(x.abs().max()) for x in (scene.azimuth_m, scene.range_m))  # pyright: ignore[reportReturnType]
 
 
-def echo_choice(bench: Bench) -> Choice:
-    """Phases of range-compressed pulses alone, or dechirped pulses with all motion inside them."""
+def echo_choices(bench: Bench) -> list[Choice]:
+    """Phases of range-compressed pulses alone, or dechirped pulses with all motion inside them,
+    which need the length of a pulse.
+    """
     world, radar = bench.world(), bench.radar
+    if radar.pulse_s is None:
+        return []
     edge = world.edge(Draws(bench.config.seed))
-    lost = None
-    if radar.pulse_s is not None:
-        lost = {"echo_error_db": PhaseOnly().neglected_db(radar, world.of(radar), world.pulses, *edge)}
+    lost = {"echo_error_db": PhaseOnly().neglected_db(radar, world.of(radar), world.pulses, *edge)}
     alternatives = [
-        Alternative("phase_only", {"kind": "phase_only"}, lost, "migration, motion inside pulses"),
+        Alternative(
+            "phase_only",
+            {"kind": "phase_only"},
+            lost,
+            "migration, motion inside pulses",
+            "fixed envelopes (phase_only)",
+        ),
         Alternative("dechirped", {"kind": "dechirped"}, {}),
     ]
 
@@ -107,4 +115,4 @@ def echo_choice(bench: Bench) -> Choice:
 
         return Measured(lambda one: made(one.keys["kind"], world, bench.dtype), loss)
 
-    return Choice("echo model", "world.fidelity", alternatives, None if radar.pulse_s is None else measured)
+    return [Choice("echo model", "world.fidelity", alternatives, measured)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -11,24 +11,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.compensate.rotation import (
-    EntropyObjective,
-    ImageEntropy,
-    coarse_rotation,
-    descend_rotation,
-    genetic_rotation,
-    phase_fit_rotation,
-    uneven_rotation,
-)
+from torchsar.compensate.rotation import coarse_rotation, phase_fit_rotation, uneven_rotation
+from torchsar.compensate.rotation.baselines import descent_near_truth, genetic_near_truth
 from torchsar.core import Draws, Estimate
-from torchsar.core.warp import k_of_shape, shape_of, warp
+from torchsar.core.warp import cut_warp, warp
 from torchsar.focus import DopplerLines, ExplicitSum, Gridding, Resampling, matched_fourier, range_phase
 from torchsar.focus.ladar_requirements import Limit
-from torchsar.focus.requirements import Requirement, phase_error_db
-from torchsar.focus.rotation_requirements import rotation_limits, rotation_requirements
+from torchsar.focus.requirements import Requirement
+from torchsar.focus.rotation_requirements import (
+    order_loss_db,
+    range_term_loss_db,
+    rotation_limits,
+    rotation_requirements,
+)
 from torchsar.metrics import error_db, rotation_bounds
 from torchsar.scene import PhaseOnly, Points
-from torchsar.study.systems.isal.world import echo_choice
+from torchsar.study.systems.isal.world import echo_choices
 from torchsar.study.systems.isal_rotation.world import Rotating, first_values, k_of
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.bench import Bench
@@ -37,13 +35,14 @@ from torchsar.study.trials.system import Noise
 
 # products of pulses, lines and range cells up to which the sum itself is the yardstick
 _EXPLICIT = 3e8
+# orders of the rotation that are compared, and more where the target has more
+_ORDERS = 4
 # largest width of kernels that are compared
 _TAPS = (2, 3, 4, 5, 6, 7, 8)
 # lines so fine that a peak between two of them loses less than 0.01 dB
 _FINE = DopplerLines(16.0)
-# a genetic search that is short enough to compare: population, generations, part of the truth to
-# each side
-_GENETIC = (10, 4, 0.1)
+# estimators that start near the truth, by name
+_DESCENT, _GENETIC = "descent from 0.95 of the truth", "genetic 10 x 4, +-10 % about the truth"
 
 
 def limits(bench: Bench) -> tuple[Limit, ...]:
@@ -68,8 +67,7 @@ def requirements(bench: Bench) -> Sequence[Requirement]:
 
 def choices(bench: Bench) -> list[Choice]:
     """Order of the rotation, range term, transform, estimator, and echo model."""
-    most = max(4, 1 + len(_rotation(bench.world())[1]))
-    orders = [_order(bench, order) for order in range(1, most + 1)]
+    orders = [_order(order, bench) for order in range(1, max(_ORDERS, 1 + len(_rotation(bench.world())[1])) + 1)]
     kernels = {f"gridding, {taps} taps": Gridding(taps=taps) for taps in _TAPS}
     transforms = [
         *(
@@ -79,9 +77,12 @@ def choices(bench: Bench) -> list[Choice]:
         *(Alternative(name, _gridding(one), _aliased(one)) for name, one in kernels.items()),
         Alternative("the sum itself", {"transform": {"kind": "explicit_sum"}}, {}),
     ]
+    lever, off_cell = _levers(bench)
     range_terms = [
-        Alternative("azimuth only", {"range_term": False}, {"peak_loss_db": _range_term_db(bench)}, "the range term"),
-        Alternative("azimuth and range", {"range_term": True}, {}),
+        Alternative(
+            "azimuth only", {"range_term": False}, _range_term_loss(bench, lever), "the range term", "azimuth only"
+        ),
+        Alternative("azimuth and range", {"range_term": True}, _range_term_loss(bench, off_cell), "range in a cell"),
     ]
     found = [Alternative(name, {"estimator": work}) for name, work in _ESTIMATORS.items()]
     return [
@@ -89,8 +90,18 @@ def choices(bench: Bench) -> list[Choice]:
         Choice("range term", "range_phase", range_terms, partial(_range_terms, bench)),
         Choice("transform", "matched_fourier.transform", transforms, partial(_transforms, bench)),
         Choice("estimator of the rotation", "estimator", found, partial(_estimates, bench)),
-        echo_choice(bench),
+        *echo_choices(bench),
     ]
+
+
+def _order(order: int, bench: Bench) -> Alternative:
+    """The rotation cut to an order, and what the outermost scatterer loses."""
+    (omega, k, _), world, radar = _rotation(bench.world()), bench.world(), bench.radar
+    lost, across = {}, float(_scatterers(bench)[0].abs().max())
+    if order <= min(len(k), _ORDERS):
+        about = (world.pulses / radar.prf_hz, omega, across, radar.wavelength_m)
+        lost = {"peak_loss_db": order_loss_db(k, order, *about)}
+    return Alternative(f"order {order}", {"order": order}, lost, "higher orders", f"warp of order {order}")
 
 
 _KINDS = ("linear", "spline")
@@ -124,40 +135,16 @@ def _rotation(world: Rotating) -> tuple[float, Tensor, float]:
     return omega, k_of(world.rotation), yc
 
 
-def _times(bench: Bench) -> Tensor:
-    return torch.arange(bench.world().pulses, dtype=torch.float64) / bench.radar.prf_hz
+def _levers(bench: Bench) -> tuple[float, float]:
+    """Largest distances (m) of scatterers from the centre of rotation, and from range cells."""
+    y, cell = _scatterers(bench)[1], bench.radar.range_step_m
+    return float((y + _rotation(bench.world())[2]).abs().max()), float((y - cell * (y / cell).round()).abs().max())
 
 
-def _order(bench: Bench, order: int) -> Alternative:
-    """The rotation cut to an order, with the error of the response of the outermost scatterer."""
-    (omega, k, _), time_s = _rotation(bench.world()), _times(bench)
-    left = warp(time_s, k) - warp(time_s, _cut(k, order, bench))
-    across = float(_scatterers(bench)[0].abs().max())
-    loss = phase_error_db(4 * math.pi / bench.radar.wavelength_m * across * omega * left)
-    exact = order > len(k)
-    return Alternative(f"order {order}", {"order": order}, {} if exact else {"image_error_db": loss}, "higher orders")
-
-
-def _cut(k: Tensor, order: int, bench: Bench) -> Tensor:
-    """The warp of an order that lies nearest in least squares over the record: its first Legendre
-    terms, or itself where it has no more.
-    """
-    duration_s = bench.world().pulses / bench.radar.prf_hz
-    if order > k.shape[-1]:
-        return k
-    return k_of_shape(shape_of(k, duration_s)[..., : order - 1], duration_s) if order > 1 else k[..., :0]
-
-
-def _range_term_db(bench: Bench) -> float:
-    """Loss of the peak of the scatterer farthest from the centre, in dB, by its range term without
-    the line in the warp that only shifts it.
-    """
-    (omega, k, yc), y = _rotation(bench.world()), _scatterers(bench)[1]
-    phi = warp(_times(bench), k)
-    phase = 2 * math.pi / bench.radar.wavelength_m * float((y + yc).abs().max()) * (omega * phi).square()
-    line = torch.stack([torch.ones_like(phi), phi / phi.abs().max().clamp_min(1e-300)], -1)
-    phase = phase - line @ torch.linalg.lstsq(line, phase[:, None]).solution[:, 0]
-    return -20 * math.log10(max(float(torch.polar(torch.ones_like(phase), phase).mean().abs()), 1e-15))
+def _range_term_loss(bench: Bench, lever_m: float) -> dict[str, float]:
+    omega, k, _ = _rotation(bench.world())
+    time_s = torch.arange(bench.world().pulses, dtype=torch.float64) / bench.radar.prf_hz
+    return {"peak_loss_db": range_term_loss_db(warp(time_s, k), omega, lever_m, bench.radar.wavelength_m)}
 
 
 def _alone(bench: Bench, along: float, across: float) -> Trials:
@@ -180,39 +167,48 @@ def _without_range_term(bench: Bench, trials: Trials) -> Tensor:
     return range_phase(signal.data, *about, truth["omega_rad_s"], truth["warp_k"], truth["yc_m"])
 
 
+def _peak_losses(
+    bench: Bench, target: int, best: Alternative, made: Callable[[Trials, Alternative], tuple[Tensor, Tensor]]
+) -> Measured:
+    """Loss of the peak of one scatterer; `made` gives the data and the warp of an alternative."""
+    (x, y, _), prf = _scatterers(bench), bench.radar.prf_hz
+    alone, whole = _alone(bench, float(y[target]), float(x[target])), bench.trials(_draws(bench))
+
+    def peak(one: Alternative) -> float:
+        return float(matched_fourier(*made(alone, one), prf, lines=_FINE).abs().max())
+
+    top = peak(best)
+    return Measured(
+        lambda one: matched_fourier(*made(whole, one), prf),
+        lambda one, _: {"peak_loss_db": 20 * math.log10(top / peak(one))},
+    )
+
+
 def _orders(bench: Bench) -> Measured:
     """Images of the outermost scatterer by the true rotation cut to each order."""
-    x, y, _ = _scatterers(bench)
-    far = int(x.abs().argmax())
-    trials = _alone(bench, float(y[far]), float(x[far]))
-    data, k = _without_range_term(bench, trials), trials.truth["warp_k"]
-    exact = matched_fourier(data, k, bench.radar.prf_hz)
-    whole = bench.trials(_draws(bench)).clean.signal.data
 
-    def run(one: Alternative) -> Tensor:
-        return matched_fourier(whole, _cut(k, one.keys["order"], bench), bench.radar.prf_hz)
+    duration_s = bench.world().pulses / bench.radar.prf_hz
 
-    def loss(one: Alternative, _: Tensor) -> dict[str, float]:
-        made = matched_fourier(data, _cut(k, one.keys["order"], bench), bench.radar.prf_hz)
-        return {"image_error_db": float(error_db(made, exact))}
+    def made(trials: Trials, one: Alternative) -> tuple[Tensor, Tensor]:
+        k = trials.truth["warp_k"]
+        return _without_range_term(bench, trials), cut_warp(k, one.keys.get("order", 1 + k.shape[-1]), duration_s)
 
-    return Measured(run, loss)
+    return _peak_losses(bench, int(_scatterers(bench)[0].abs().argmax()), Alternative("all orders"), made)
 
 
 def _range_terms(bench: Bench) -> Measured:
     """Images of the scatterer farthest from the centre with and without its range term."""
-    x, y, _ = _scatterers(bench)
-    far = int((y + _rotation(bench.world())[2]).abs().argmax())
-    trials = _alone(bench, float(y[far]), float(x[far]))
-    k, data = trials.truth["warp_k"], {False: trials.clean.signal.data, True: _without_range_term(bench, trials)}
-    top = {key: float(matched_fourier(x, k, bench.radar.prf_hz, lines=_FINE).abs().max()) for key, x in data.items()}
-    whole = bench.trials(_draws(bench))
 
-    def run(one: Alternative) -> Tensor:
-        made = _without_range_term(bench, whole) if one.keys["range_term"] else whole.clean.signal.data
-        return matched_fourier(made, k, bench.radar.prf_hz)
+    def made(trials: Trials, one: Alternative) -> tuple[Tensor, Tensor]:
+        data = trials.clean.signal.data
+        if "range_term" not in one.keys:
+            data = data.abs().to(data.dtype)
+        elif one.keys["range_term"]:
+            data = _without_range_term(bench, trials)
+        return data, trials.truth["warp_k"]
 
-    return Measured(run, lambda one, _: {"peak_loss_db": 20 * math.log10(top[True] / top[one.keys["range_term"]])})
+    far = int((_scatterers(bench)[1] + _rotation(bench.world())[2]).abs().argmax())
+    return _peak_losses(bench, far, Alternative("all pulses in phase"), made)
 
 
 def _transforms(bench: Bench) -> Measured:
@@ -236,41 +232,15 @@ def _draws(bench: Bench) -> Draws:
     return Draws(bench.config.seed, "trade", range(bench.config.trade.trials))
 
 
-Known = Mapping[str, Any]
-Estimator = Callable[[Tensor, Known, Mapping[str, Tensor]], Estimate]
-
-
-def _entropy(data: Tensor, known: Known, variables: str) -> ImageEntropy:
-    about = {key: value for key, value in known.items() if key not in ("yc_m", "order")}
-    settings = EntropyObjective(order=known["order"], yc_m=known["yc_m"] or 0.0, variables=variables)
-    return ImageEntropy(data, settings, **about)
-
-
-def _descent(data: Tensor, known: Known, truth: Mapping[str, Tensor]) -> Estimate:
-    """From 0.95 of the truth."""
-    objective = _entropy(data, known, "shape")
-    return descend_rotation(objective, objective.start(0.95 * truth["omega_rad_s"], 0.95 * truth["warp_k"], None))
-
-
-def _genetic(data: Tensor, known: Known, truth: Mapping[str, Tensor]) -> Estimate:
-    """In a box about the truth."""
-    population, generations, part = _GENETIC
-    objective = _entropy(data, known, "raw")
-    centre = torch.cat([truth["omega_rad_s"][..., None], truth["warp_k"]], -1)
-    box = part * torch.where(centre != 0, centre.abs(), 1)
-    size = {"population": population, "generations": generations}
-    return genetic_rotation(objective, centre - box, centre + box, draws=Draws(1), **size)
-
-
-_ESTIMATORS: dict[str, Estimator] = {
-    "coarse": lambda data, known, _: coarse_rotation(data, **known),
-    "phase fit": lambda data, known, _: phase_fit_rotation(data, **known),
-    "recommended, 30 scatterers": lambda data, known, _: uneven_rotation(data, **known, scatterers=30),
-    "recommended, 1 round": lambda data, known, _: uneven_rotation(data, **known, rounds=1),
-    "recommended": lambda data, known, _: uneven_rotation(data, **known),
-    "recommended, complex128": lambda data, known, _: uneven_rotation(data.to(torch.complex128), **known),
-    "descent from 0.95 of the truth": _descent,
-    "genetic 10 x 4, +-10 % about the truth": _genetic,
+_ESTIMATORS: dict[str, Callable[..., Estimate]] = {
+    "coarse": coarse_rotation,
+    "phase fit": phase_fit_rotation,
+    "recommended, 30 scatterers": partial(uneven_rotation, scatterers=30),
+    "recommended, 1 round": partial(uneven_rotation, rounds=1),
+    "recommended": uneven_rotation,
+    "recommended, complex128": lambda data, **known: uneven_rotation(data.to(torch.complex128), **known),
+    _DESCENT: descent_near_truth,
+    _GENETIC: genetic_near_truth,
 }
 
 
@@ -282,18 +252,21 @@ def _estimates(bench: Bench) -> Measured:
     yc = next((entry.get("yc_m") for entry in stages if str(entry["stage"]).startswith("rotation")), None)
     known = {"wavelength_m": radar.wavelength_m, "prf_hz": radar.prf_hz, "range_m": signal.axis("range").values()}
     known |= {"yc_m": yc, "order": max(2, truth["warp_k"].shape[-1] + 1)}
+    true = {name: truth[name] for name in ("omega_rad_s", "warp_k")}
+
+    def rms(x: Tensor) -> float:
+        return float(x.square().mean().sqrt())
 
     def loss(one: Alternative, estimate: Estimate) -> dict[str, float]:
         rows = {}
         if one.name != "coarse":  # which does not look at the rate
-            rows["omega_error_percent"] = _rms(100 * (estimate["omega_rad_s"] / truth["omega_rad_s"] - 1))
+            rows["omega_error_percent"] = rms(100 * (estimate["omega_rad_s"] / truth["omega_rad_s"] - 1))
         for i, k in enumerate(truth["warp_k"].unbind(-1)[:2]):
             if bool((k != 0).all()):
-                rows[f"k{i + 1}_error_percent"] = _rms(100 * (estimate["warp_k"][..., i] - k) / k.abs())
+                rows[f"k{i + 1}_error_percent"] = rms(100 * (estimate["warp_k"][..., i] - k) / k.abs())
         return rows
 
-    return Measured(lambda one: one.keys["estimator"](signal.data, known, truth), loss)
+    def run(one: Alternative) -> Estimate:
+        return one.keys["estimator"](signal.data, **known, **(true if one.name in (_DESCENT, _GENETIC) else {}))
 
-
-def _rms(x: Tensor) -> float:
-    return float(x.square().mean().sqrt())
+    return Measured(run, loss)

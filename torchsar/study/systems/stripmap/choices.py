@@ -1,9 +1,8 @@
-"""What a strip may choose: the form of the focusing, precision, range history, jitter correction."""
+"""What a strip may choose: form of the focusing, precision, range history, jitter correction."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -14,9 +13,9 @@ from torch import Tensor
 from torchsar.core import Draws, Recording, Signal, Truth
 from torchsar.echo import simulate
 from torchsar.echo.jitter import sample_unevenly
-from torchsar.focus import Backproject
-from torchsar.focus.requirements import Requirement, full_swath_m, phase_error_db, requirements
-from torchsar.metrics import error_db
+from torchsar.focus.patches import HALF, PointPatches
+from torchsar.focus.requirements import Requirement, full_swath_m, requirements
+from torchsar.metrics import error_after_gain_db, error_db
 from torchsar.radar import StripmapRadar
 from torchsar.repair.jitter import BandLimited, Exact, Lagrange
 from torchsar.scene import Dwell, Hyperbola, Parabola, Points, StripmapWorld
@@ -24,27 +23,9 @@ from torchsar.study.names.registry import FOCUS
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured
 
-# half of the lines and cells of the patches on which images are compared: they hold the main lobe
-# and a dozen side lobes at any usual sampling
-_HALF = 16
 # a period of four timing offsets (samples) as in Tsvetkov 2017, and raw lines enough to time them
 _OFFSETS, _LINES = (0.0, 0.18, -0.12, 0.07), 1024
 FORMS = {"range_doppler": "range-Doppler", "omega_k": "bulk + refocus (omega_k)", "omega_k_stolt": ""}
-
-
-@dataclass(frozen=True)
-class SmoothBand:
-    """Weight of one PRF of Doppler with a raised-cosine roll-off over its outer eighths.
-
-    A sharp end would put Fresnel ripple of its own on the yardstick; targets that are lit within
-    the inner three quarters of the PRF keep their full weight.
-    """
-
-    width_hz: float
-
-    def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
-        outer = ((doppler_offset_hz.abs() - 3 * self.width_hz / 8) / (self.width_hz / 8)).clamp(0, 1)
-        return 0.5 * (1 + torch.cos(math.pi * outer))
 
 
 @dataclass(frozen=True)
@@ -55,11 +36,13 @@ class Probe:
         radar: The instrument.
         world: The points, seen with the true Doppler and velocity.
         size: Lines and samples.
+        edges_m: Ranges of the points from the middle of the fully compressed part of a line.
     """
 
     radar: StripmapRadar
     world: StripmapWorld
     size: tuple[int, int]
+    edges_m: tuple[float, ...] = (0.0,)
 
     @staticmethod
     def of(bench: Bench) -> Probe:
@@ -76,14 +59,19 @@ class Probe:
             doppler, velocity = float(used.doppler_hz or 0.0), float(used.velocity_m_s)
             dwell = radar.integration_s or 0.75 * radar.aperture_s(radar.near_range_m)
             seen = StripmapWorld(Points([0.0], [0.0]), Dwell(dwell), Hyperbola(), velocity, doppler)
-        probe = Probe(radar, replace(seen, scene=Points([0.0], [0.0]), snr_db=None), size)
-        axes, margin = radar.raw_axes(*size), (_HALF + 1) * radar.range_step_m
-        dwell = getattr(seen.beam, "dwell_s", None) or radar.integration_s or radar.aperture_s(radar.near_range_m)
-        near, far = full_swath_m(radar, axes, *probe.motion, dwell)
-        # positions count from the middle of the fully compressed part of a line
+        probe = Probe(radar, replace(seen, snr_db=None), size)
+        margin = (HALF + 1) * radar.range_step_m
+        near, far = full_swath_m(radar, radar.raw_axes(*size), *probe.motion, probe.dwell_s)
         middle = radar.near_range_m + max(0, size[1] - radar.pulse_samples) / 2 * radar.range_step_m
-        edges = [min(0.0, near - middle + margin), 0.0, max(0.0, far - middle - margin)]
-        return replace(probe, world=replace(probe.world, scene=Points([0.0] * 3, edges)))
+        edges = (min(0.0, near - middle + margin), 0.0, max(0.0, far - middle - margin))
+        return replace(probe, world=replace(probe.world, scene=Points([0.0] * 3, [*edges])), edges_m=edges)
+
+    @property
+    def dwell_s(self) -> float:
+        """Time for which targets are lit."""
+        radar = self.radar
+        known = getattr(self.world.beam, "dwell_s", None) or radar.integration_s
+        return float(known or radar.aperture_s(radar.near_range_m))
 
     @property
     def motion(self) -> tuple[float, float]:
@@ -96,6 +84,18 @@ class Probe:
     def recorded(self, dtype: torch.dtype, **changes: Any) -> tuple[Recording, Truth]:
         return simulate(self.radar, replace(self.world, **changes), *self.size, Draws(0), dtype=dtype)
 
+    def seen(self) -> tuple[Signal, PointPatches, tuple[Tensor, Tensor]]:
+        """Raw data in double precision, the patches about the points, Doppler and velocity."""
+        recording, truth = self.recorded(torch.complex128)
+        of = truth.values
+        known = (of["doppler_hz"], of["velocity_m_s"])
+        at = (of["zero_doppler_s"], of["closest_range_m"])
+        return recording.signal, PointPatches.about(self.radar, self.size, *at, *known), known
+
+    def focused(self, form: str, signal: Signal, known: tuple[Tensor, Tensor]) -> Tensor:
+        """The image by a form, with given Doppler and velocity."""
+        return FOCUS[form](self.radar, "matched", velocity_m_s=known[1], doppler_hz=known[0])(signal).data
+
     def rows(self) -> tuple[Requirement, ...]:
         """What each simplification neglects for this size, Doppler and velocity."""
         return requirements(self.radar, self.radar.raw_axes(*self.size), *self.motion)
@@ -107,25 +107,25 @@ def _first(x: Tensor | float) -> float:
 
 def choices(bench: Bench, rows: Mapping[str, Requirement]) -> list[Choice]:
     """The decisions of a config; rows: what simplifications neglect, by effect."""
-
     forms = [
         Alternative(
-            name,
-            {"stage": name},
-            {"image_error_db": rows[row].error_db} if row else {},
-            rows[row].neglects if row else "",
+            name, {"stage": name}, {"image_error_db": rows[row].error_db} if row else {}, _neglects(rows, row), row
         )
         for name, row in FORMS.items()
     ]
     exact = Alternative("backprojection, complex128, times extrapolated from patches")
-    found = [Choice("focusing form", "stage", forms, partial(_forms, bench), exact)]
     precisions = [Alternative(name, {"precision": name}) for name in ("complex64", "complex128")]
-    found.append(Choice("precision", "precision", precisions, partial(_precisions, bench)))
-    histories = [
-        Alternative("parabola", {"kind": "parabola"}, {"echo_error_db": _parabola_db(bench)}, "higher orders"),
-        Alternative("hyperbola", {"kind": "hyperbola"}, {}),
+    found = [
+        Choice("focusing form", "stage", forms, partial(_forms, bench), exact),
+        Choice("precision", "precision", precisions, partial(_precisions, bench)),
     ]
     if bench.recording is None:
+        probe = Probe.of(bench)
+        lost = Parabola().neglected_db(bench.radar, *probe.motion, bench.radar.near_range_m, probe.dwell_s)
+        histories = [
+            Alternative("parabola", {"kind": "parabola"}, {"echo_error_db": lost}, "higher orders"),
+            Alternative("hyperbola", {"kind": "hyperbola"}, {}),
+        ]
         found.append(Choice("range history", "world.path", histories, partial(_histories, bench)))
     stages = (bench.config.processor["recommended"].stages or {}).values()
     if any(entry["stage"].startswith("jitter_") for entry in stages):
@@ -134,80 +134,56 @@ def choices(bench: Bench, rows: Mapping[str, Requirement]) -> list[Choice]:
     return found
 
 
+def _neglects(rows: Mapping[str, Requirement], row: str) -> str:
+    return rows[row].neglects if row else ""
+
+
 def _forms(bench: Bench) -> Measured:
     """Whole images by each form against backprojection of patches about the points."""
     probe = Probe.of(bench)
-    recording, truth = probe.recorded(torch.complex128)
-    known = {key: truth.values[key] for key in ("velocity_m_s", "doppler_hz")}
-    spots = _spots(probe, truth)
-    signal = recording.signal.to(bench.dtype)
-    exact = _stacked([_yardstick(recording, spot, known) for spot in spots])
+    raw, patches, known = probe.seen()
+    signal, exact = raw.to(bench.dtype), patches.exact(raw, *known)
 
     def run(one: Alternative) -> Tensor:
-        if not one.keys:
-            return _stacked([_yardstick(recording, spot, known) for spot in spots])
-        return FOCUS[one.keys["stage"]](probe.radar, "matched", known["velocity_m_s"], known["doppler_hz"])(signal).data
+        return probe.focused(one.keys["stage"], signal, known) if one.keys else patches.exact(raw, *known)
 
     def loss(one: Alternative, image: Tensor) -> dict[str, float]:
-        patches = _patches(image, spots) if one.keys else image
-        return {"image_error_db": _worst_db(patches, exact)}
+        made = patches.cut(image) if one.keys else image
+        return {"image_error_db": float(error_after_gain_db(made, exact).max())}
 
-    def share(one: Alternative) -> float:
-        return 1.0 if one.keys else exact.numel() / signal.data.numel()
-
-    return Measured(run, loss, share)
+    return Measured(run, loss, lambda one: 1.0 if one.keys else exact.numel() / signal.data.numel())
 
 
 def _precisions(bench: Bench) -> Measured:
     """The recommended form in single precision against double precision."""
     probe = Probe.of(bench)
-    recording, truth = probe.recorded(torch.complex128)
+    raw, patches, known = probe.seen()
     names = [entry["stage"] for entry in (bench.config.processor["recommended"].stages or {}).values()]
     form = next((name for name in names if name in FORMS), "omega_k")
-    stage = FOCUS[form](probe.radar, "matched", truth.values["velocity_m_s"], truth.values["doppler_hz"])
-    signals = {name: recording.signal.to(getattr(torch, name)) for name in ("complex64", "complex128")}
-    spots, exact = _spots(probe, truth), stage(signals["complex128"]).data
-
-    def run(one: Alternative) -> Tensor:
-        return stage(signals[one.keys["precision"]]).data
+    signals = {name: raw.to(getattr(torch, name)) for name in ("complex64", "complex128")}
+    exact = patches.cut(probe.focused(form, raw, known))
 
     def loss(one: Alternative, image: Tensor) -> dict[str, float]:
-        return {"image_error_db": _worst_db(_patches(image, spots), _patches(exact, spots))}
+        return {"image_error_db": float(error_after_gain_db(patches.cut(image), exact).max())}
 
-    return Measured(run, loss)
-
-
-def _parabola_db(bench: Bench) -> float:
-    """Error of the echo of the nearest target by a parabola about its closest approach."""
-    radar, (doppler, velocity) = bench.radar, Probe.of(bench).motion
-    slant, sine = radar.near_range_m, radar.sin_squint(doppler, velocity)
-    closest = slant * torch.sqrt(1 - sine**2)
-    dwell = getattr(bench.world().beam, "dwell_s", radar.aperture_s(slant))
-    since = slant * sine / velocity + dwell * torch.linspace(-0.5, 0.5, 65, dtype=torch.float64)
-    ranges = [path.range_m(since, closest, torch.tensor(velocity)) for path in (Hyperbola(), Parabola())]
-    return phase_error_db(4 * math.pi / radar.wavelength_m * (ranges[1] - ranges[0]))
+    return Measured(lambda one: probe.focused(form, signals[one.keys["precision"]], known), loss)
 
 
 def _histories(bench: Bench) -> Measured:
     """Echoes by each range history, point by point."""
     probe, paths = Probe.of(bench), {"parabola": Parabola(), "hyperbola": Hyperbola()}
-    exact = _by_point(probe, Hyperbola())
+    alone = [replace(probe, world=replace(probe.world, scene=Points([0.0], [r]))) for r in probe.edges_m]
 
-    def run(one: Alternative) -> Tensor:
-        return probe.recorded(bench.dtype, path=paths[one.keys["kind"]])[0].signal.data
+    def echoes(path: str) -> list[Tensor]:
+        return [point.recorded(torch.complex128, path=paths[path])[0].signal.data for point in alone]
+
+    exact = echoes("hyperbola")
 
     def loss(one: Alternative, _: Tensor) -> dict[str, float]:
-        made = _by_point(probe, paths[one.keys["kind"]])
+        made = echoes(one.keys["kind"])
         return {"echo_error_db": max(float(error_db(a, b)) for a, b in zip(made, exact, strict=True))}
 
-    return Measured(run, loss)
-
-
-def _by_point(probe: Probe, path: Any) -> list[Tensor]:
-    scene = probe.world.scene
-    assert isinstance(scene, Points)
-    alone = [Points([x], [r]) for x, r in zip(scene.azimuth_m, scene.range_m, strict=True)]
-    return [probe.recorded(torch.complex128, path=path, scene=one)[0].signal.data for one in alone]
+    return Measured(lambda one: probe.recorded(bench.dtype, path=paths[one.keys["kind"]])[0].signal.data, loss)
 
 
 _CORRECTORS: dict[str, Any] = {
@@ -233,43 +209,3 @@ def _jitter(bench: Bench) -> Measured:
         return uneven if corrector is None else corrector(uneven, offsets)
 
     return Measured(run, lambda one, fixed: {"data_error_db": float(error_db(fixed, raw))})
-
-
-def _spots(probe: Probe, truth: Truth) -> list[tuple[int, int]]:
-    """Line and cell at which images show the points."""
-    values, radar = truth.values, probe.radar
-    frame = radar.pointing_doppler_hz
-    at = radar.image_position(
-        values["zero_doppler_s"],
-        values["closest_range_m"],
-        values["doppler_hz"] if frame is None else frame,
-        values["velocity_m_s"],
-    )
-    axes = radar.image_axes(radar.raw_axes(*probe.size))
-    lines, cells = (axis.index_of(x).round().long().tolist() for axis, x in zip(axes, at, strict=True))
-    return [(min(max(line, _HALF), probe.size[0] - _HALF), cell) for line, cell in zip(lines, cells, strict=True)]
-
-
-def _yardstick(recording: Recording, spot: tuple[int, int], known: Mapping[str, Tensor]) -> Tensor:
-    lines, cells = ((i - _HALF, i + _HALF) for i in spot)
-    doppler, band = known["doppler_hz"], SmoothBand(recording.radar.prf_hz)
-    stage = Backproject(
-        recording.radar, "matched", known["velocity_m_s"], doppler, lines=lines, cells=cells, aperture=band
-    )
-    return stage(Signal(recording.signal.data, recording.signal.axes)).data
-
-
-def _patches(image: Tensor, spots: Sequence[tuple[int, int]]) -> Tensor:
-    return _stacked([image[i - _HALF : i + _HALF, j - _HALF : j + _HALF] for i, j in spots])
-
-
-def _stacked(patches: Sequence[Tensor]) -> Tensor:
-    return torch.stack([patch.to(torch.complex128) for patch in patches])
-
-
-def _worst_db(patches: Tensor, exact: Tensor) -> float:
-    """Largest error of a patch, with the one complex gain that fits all patches best: focusers
-    differ by a constant of their transforms.
-    """
-    gain = (patches.conj() * exact).sum() / patches.abs().square().sum()
-    return float(error_db(patches * gain, exact).max())

@@ -1,0 +1,51 @@
+"""Searches for a rotation that start near the truth: what they cost and lose at best."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchsar.compensate.rotation.entropy_search import descend_rotation, genetic_rotation
+from torchsar.compensate.rotation.image_entropy import EntropyObjective, ImageEntropy
+from torchsar.core import Draws, Estimate
+
+# a genetic search that is short enough to compare: population, generations, part of the truth to
+# each side
+_POPULATION, _GENERATIONS, _PART = 10, 4, 0.1
+
+
+def _entropy(
+    data: Tensor,
+    variables: str,
+    wavelength_m: float,
+    prf_hz: float,
+    range_m: Tensor,
+    yc_m: float | None,
+    order: int,
+) -> ImageEntropy:
+    settings = EntropyObjective(order=order, yc_m=yc_m or 0.0, variables=variables)
+    return ImageEntropy(data, settings, wavelength_m=wavelength_m, prf_hz=prf_hz, range_m=range_m)
+
+
+def descent_near_truth(data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, **known: object) -> Estimate:
+    """Descend from 0.95 of the true rotation.
+
+    Args:
+        data: Range-compressed pulses, shape (..., pulse, range).
+        omega_rad_s: True rate at the first pulse in rad/s, shape (...,).
+        warp_k: True coefficients of the warp, shape (..., coefficient).
+        known: wavelength_m, prf_hz, range_m, yc_m and order, as `uneven_rotation` takes them.
+    """
+    objective = _entropy(data, "shape", **known)  # pyright: ignore[reportArgumentType]
+    return descend_rotation(objective, objective.start(0.95 * omega_rad_s, 0.95 * warp_k, None))
+
+
+def genetic_near_truth(data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, **known: object) -> Estimate:
+    """Search within 10 % of the true rotation by 10 individuals in 4 generations; the arguments of
+    `descent_near_truth`.
+    """
+    objective = _entropy(data, "raw", **known)  # pyright: ignore[reportArgumentType]
+    centre = torch.cat([omega_rad_s[..., None], warp_k], -1)
+    box = _PART * torch.where(centre != 0, centre.abs(), 1)
+    size = {"population": _POPULATION, "generations": _GENERATIONS}
+    return genetic_rotation(objective, centre - box, centre + box, draws=Draws(1), **size)

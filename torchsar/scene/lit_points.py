@@ -1,0 +1,96 @@
+"""Errors of the responses of moving points by simplified ranges, predicted without echoes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from torchsar.radar import BistaticRadar, receive_range
+from torchsar.scene.bistatic import Gate
+from torchsar.scene.moving import ExactRange, Movers, ReceiveRange
+
+# pulses, by choice, and frequencies over the band on which neglected phases are evaluated
+_PULSES, _BAND = 513, 17
+
+
+@dataclass(frozen=True)
+class LitPoints:
+    """Moving points, one per row, with the times at which they are illuminated and processed.
+
+    Each error is that of the worst point: the mean of |exp(j phi) - 1|^2 in dB over the pulses,
+    weighted by the power of the gate, where phi is the neglected phase.
+
+    Args:
+        movers: Points, shape (row, 1).
+        gate: Illumination of the points.
+        radar: Receiver.
+        n_pulse: Number of pulses.
+        processed_hz: Doppler band that is focused; None for all that is illuminated.
+    """
+
+    movers: Movers
+    gate: Gate
+    radar: BistaticRadar
+    n_pulse: int
+    processed_hz: float | None = None
+
+    @cached_property
+    def time_s(self) -> Tensor:
+        """Slow times in seconds, shape (time,)."""
+        step = max(1, self.n_pulse // _PULSES)
+        return self.radar.pulse_axis(self.n_pulse).values()[::step]
+
+    @cached_property
+    def weight(self) -> Tensor:
+        """Power of the illumination, zero outside the processed band, shape (row, time)."""
+        power = self.gate.weight(self.movers, self.time_s, self.radar)[..., 0].square().mean(-2)
+        if self.processed_hz is None:
+            return power
+        along = self.radar.speed_m_s - self.movers.u_a_m_s
+        half_s = self.processed_hz * self.radar.wavelength_m * self.radar.reference_range_m / (2 * along.square())
+        return power * ((self.time_s - self.movers.y0_m / along).abs() <= half_s)
+
+    def _worst_db(self, phase_rad: Tensor) -> float:
+        """Error of the worst point for phases (row or 1, time, any)."""
+        square = (2 - 2 * torch.cos(phase_rad)).mean(-1)
+        error = (self.weight * square).sum(-1) / self.weight.sum(-1).clamp_min(torch.finfo(torch.float64).tiny)
+        return 10 * math.log10(max(float(error.max()), 1e-30))
+
+    def transmit_order_db(self, order: int) -> float:
+        """Predict the error of a response when the transmit range is removed to a given order.
+
+        Args:
+            order: Number of orders that are removed.
+        """
+        left = self.radar.transmit_range[order:]
+        metres = sum((k * self.time_s ** (order + i) for i, k in enumerate(left, 1)), torch.zeros_like(self.time_s))
+        return self._worst_db(2 * math.pi / self.radar.wavelength_m * metres[None, :, None])
+
+    def migration_db(self, bulk: bool, known: bool = False) -> float:
+        """Predict the error of a response by range migration that remains.
+
+        Args:
+            bulk: Whether the migration of one motion is corrected in all points; otherwise none is.
+            known: Whether that motion is the true one of each point; otherwise it is that of a
+                point at rest at y0 = 0.
+        """
+        radar, frequency_hz = self.radar, torch.linspace(-0.5, 0.5, _BAND, dtype=torch.float64)
+        left = ExactRange().range_m(self.movers, self.time_s, radar).mean(-3) - self.movers.range_m[..., None, :]
+        if bulk:
+            rest = receive_range(self.time_s, 0.0, 0.0, 0.0, radar.reference_range_m, radar.speed_m_s, 0.0)
+            left = torch.zeros_like(left) if known else left - rest[:, None]
+        return self._worst_db(2 * math.pi * radar.pulse.bandwidth_hz / radar.wave_speed_m_s * frequency_hz * left)
+
+    def receive_model_db(self, model: ReceiveRange) -> float:
+        """Predict the error of the echo by a model of the range to the receiver.
+
+        Args:
+            model: Model of the range.
+        """
+        left = (one.range_m(self.movers, self.time_s, self.radar) for one in (model, ExactRange()))
+        phase = 2 * math.pi / self.radar.wavelength_m * torch.sub(*left)[..., 0].mT
+        return self._worst_db(phase)
