@@ -145,16 +145,14 @@ def test_quicklook_is_small_and_square_in_metres():
 
 def test_requirements_of_the_published_radar():
     """With r0 = 700 km, T_c = 1.5 s and dr = 5 km the migration differs by 0.14 m, a quarter of a
-    cell. The phase of bulk + refocus is below the usual pi / 4, but its error of -16 dB is above
-    the tolerated -20 dB; the squint walks 80 to 90 cells.
+    cell, so that bulk + refocus suffices; the squint walks 80 to 90 cells.
     """
     radar = StripmapRadar(
         3.2e9, LinearFM(200e6, 5e-6), 250e6, 4000.0, 7000.0, 695e3, pointing_doppler_hz=0.0, integration_s=1.5
     )
     rows = {row.effect: row for row in requirements(radar, radar.raw_axes(4096, 16678))}
     bulk = rows["bulk + refocus (omega_k)"]
-    assert bulk.range_cells * radar.range_step_m == pytest.approx(0.14, abs=0.005)
-    assert bulk.phase_rad < math.pi / 4 and bulk.error_db == pytest.approx(-16.0, abs=0.1) and not bulk.ok
+    assert bulk.ok and bulk.range_cells * radar.range_step_m == pytest.approx(0.14, abs=0.005)
     doppler = 2 * 7000 * math.sin(math.radians(0.3)) / radar.wavelength_m
     walk = next(
         row for row in requirements(radar, radar.raw_axes(4096, 16678), doppler) if row.effect == "squint ignored"
