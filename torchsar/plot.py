@@ -171,9 +171,6 @@ def image(signal: Signal, dynamic_range_db: float = 50.0, title: str = "", perce
         dynamic_range_db: Lowest level, in dB below 0 dB.
         title: Title of the figure.
         percentile: Percentile of the amplitude that is 0 dB.
-
-    Returns:
-        Figure; `save` writes it to a file.
     """
     figure, (axes,) = _panels(1, 1, (7.2, 6.2))
     shown = _show(axes, _first(signal), dynamic_range_db, title, percentile=percentile)
@@ -204,9 +201,6 @@ def images(
         columns: Number of images in a row.
         percentile: Percentile of the amplitude that is 0 dB.
         reference: Title of the image whose percentile counts; by default the first.
-
-    Returns:
-        Figure; `save` writes it to a file.
     """
     rows = math.ceil(len(signals) / columns)
     figure, panels = _panels(rows, min(columns, len(signals)), (4.6 * min(columns, len(signals)), 3.9 * rows))
@@ -231,9 +225,6 @@ def contours(
         signals: Signals with two axes, by title; the first trial of each is drawn.
         levels_db: Levels of the lines, in dB relative to the peak of each image, rising.
         columns: Number of images in a row.
-
-    Returns:
-        Figure; `save` writes it to a file.
     """
     rows = math.ceil(len(signals) / columns)
     figure, panels = _panels(rows, min(columns, len(signals)), (3.3 * min(columns, len(signals)), 3.1 * rows))
@@ -303,9 +294,6 @@ def overlays(parts: Sequence[Mapping[str, Any]], columns: int = 2, dynamic_range
             (x, y), and may have `ylim`. A panel without `signal` has the arguments of `curves`.
         columns: Number of panels in a row.
         dynamic_range_db: Lowest level, in dB below the peak.
-
-    Returns:
-        Figure; `save` writes it to a file.
     """
     rows = math.ceil(len(parts) / columns)
     figure, panels = _panels(rows, min(columns, len(parts)), (4.4 * min(columns, len(parts)), 3.2 * rows))
@@ -360,9 +348,6 @@ def curves(
         title: Title of the panel.
         marks: Positions of vertical lines by name, in the unit of x.
         ylim: Limits of the vertical axis.
-
-    Returns:
-        Figure; `save` writes it to a file.
     """
     figure, (axes,) = _panels(1, 1, (7.2, 3.2))
     draw_curves(axes, series, xlabel, ylabel, title, marks, ylim)
@@ -389,9 +374,6 @@ def places(
         ylabel: Label of the vertical axis, with unit.
         title: Title of the figure.
         aspect: "equal" for one scale on both axes, "auto" otherwise.
-
-    Returns:
-        Figure; `save` writes it to a file.
     """
     figure, (axes,) = _panels(1, 1, (5.4, 5.0))
     axes.scatter(x, y, s=14 * size / max(float(size.max()), 1e-300), color=COLOURS[0], linewidths=0)
@@ -406,9 +388,6 @@ def panels(parts: Sequence[Mapping[str, Any]], columns: int = 2) -> Figure:
     Args:
         parts: Panels, each with the arguments of `curves`.
         columns: Number of panels in a row.
-
-    Returns:
-        Figure; `save` writes it to a file.
     """
     rows = math.ceil(len(parts) / columns)
     figure, axes = _panels(rows, min(columns, len(parts)), (4.6 * min(columns, len(parts)), 3.0 * rows))
@@ -476,9 +455,6 @@ def trade(
         ylabel: Label of the vertical axis, with unit.
         title: Title of the figure.
         tolerance: Largest acceptable loss, drawn as a dashed line.
-
-    Returns:
-        Figure; `save` writes it to a file.
     """
     figure, (axes,) = _panels(1, 1, (7.2, 4.2))
     points = sorted(zip(seconds, loss, strict=True))
@@ -517,9 +493,6 @@ def error_curves(
         log_x: Whether the horizontal axes are logarithmic.
         log_y: Whether the vertical axes are logarithmic.
         ylim: Limits of the vertical axes.
-
-    Returns:
-        Figure; `save` writes it to a file.
     """
     figure, axes = _grid(len(parts), (7.2, 3.6), 3.0)
     for one, part in zip(axes, parts, strict=False):
@@ -684,9 +657,6 @@ def heat_map(
         label: Label of the colour scale, with unit.
         log: Whether the colour scale is logarithmic.
         limits: Ends of the colour scale; by default those of the values.
-
-    Returns:
-        Figure; `save` writes it to a file.
     """
     shown = [_drawable(part["z"], log) for part in parts]
     norm = _norm(np.stack(shown) if limits is None else np.asarray(limits), log)
@@ -743,8 +713,5 @@ def array(x: Tensor) -> np.ndarray:
 
     Args:
         x: Tensor, any shape.
-
-    Returns:
-        Array of the same shape and precision.
     """
     return torch.as_tensor(x).detach().cpu().resolve_conj().numpy()

@@ -14,7 +14,7 @@ from torchsar.study.montecarlo.record import Record
 from torchsar.study.montecarlo.statistics import half_width_ratio
 from torchsar.study.settings.errors import ConfigError
 
-FIRST_LOOK = 50  # trials; fewer give no interval of a standard deviation worth a decision
+FIRST_LOOK = 50
 
 
 @dataclass(frozen=True)
