@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from torchsar import plot
+from torchsar.compensate.velocity import EffectiveVelocity
 from torchsar.core import Signal
 from torchsar.metrics.cuts import impulse_cuts
 from torchsar.metrics.spectra import azimuth_spectrum, phase_increments, range_spectrum
@@ -24,6 +25,9 @@ from torchsar.study.trials.batch import IMAGE, Result, image_of
 
 # cells to either side of a peak that cuts show
 _CELLS = 24
+# the curve of the velocity search about the estimate: half its extent in steps of the grid, and its
+# points, of which the middle one is the estimate
+_NEAR_STEPS, _NEAR_POINTS = 1.5, 41
 _CUT_METHODS = ("clean", "none", "baseline", "recommended")
 
 
@@ -96,8 +100,8 @@ def _images(strip: Strip) -> Drawn:
     shown = strip.images()
     caption = (
         "The image of the recommended method over the judged window: range to the right, azimuth upward, in metres; "
+        "amplitude in dB."
     )
-    caption += "amplitude in dB."
     title = strip.result.bench.config.processor["recommended"].title or "recommended"
     yield "image", "Focused image", caption, plot.image(shown["recommended"], title=title, **strip.scale)
     if len(shown) > 1:
@@ -132,8 +136,10 @@ def _squint(strip: Strip) -> Drawn:
             wrong = strip.result.images[name]
             shown = {"squint taken into account": strip.images()["recommended"]}
             shown[method.title or name] = wrong.crop(**window(wrong, strip.radar, margin))
-            caption = "Left: focused about the estimated Doppler centroid. Right: the same data focused as if the beam "
-            caption += "looked straight to the side: displaced, smeared, with ghosts."
+            caption = (
+                "Left: focused about the estimated Doppler centroid. Right: the same data focused as if the beam "
+                "looked straight to the side: displaced, smeared, with ghosts."
+            )
             yield "squint", "With and without the squint", caption, plot.images(shown, **strip.scale)
 
 
@@ -160,8 +166,8 @@ def _doppler_spectrum(strip: Strip) -> Drawn:
     title = f"centroid {centroid[0]:.1f} Hz = {centroid[1]:.1f} Hz {'-' if turns < 0 else '+'} {abs(turns)} PRF"
     caption = (
         "Azimuth power spectrum of the data that are focused, averaged over range. The dashed line is the Doppler "
+        "centroid inside one PRF; the ambiguity is found from range migration."
     )
-    caption += "centroid inside one PRF; the ambiguity is found from range migration."
     series, marks = {"mean over range": (plot.array(frequency), level)}, {"centroid": centroid[1]}
     figure = plot.curves(series, "baseband Doppler (Hz)", "power (dB)", title, marks)
     yield "doppler_spectrum", "Doppler spectrum", caption, figure
@@ -177,8 +183,8 @@ def _increments(strip: Strip) -> Drawn:
         doppler -= prf * np.round((doppler - centroid[1]) / prf)
     caption = (
         "Mean phase increment between adjacent lines, in Hz (PRF times increment over 2 pi), for blocks of lines along "
+        "the strip. The scene makes it fluctuate; the estimate averages it."
     )
-    caption += "the strip. The scene makes it fluctuate; the estimate averages it."
     figure = plot.curves(series, "slow time (s)", "increment (Hz)")
     yield "phase_increments", "Phase increments along the strip", caption, figure
 
@@ -207,8 +213,10 @@ def _corrections(strip: Strip) -> Drawn:
                 (bands, "range frequency (MHz)", "power (dB)", "mean range spectrum"),
             )
         ]
-        caption = f"Stage '{name}' ({strip.stages[name]['stage']}): left, power of every line; right, range spectrum averaged "
-        caption += "over the lines."
+        caption = (
+            f"Stage '{name}' ({strip.stages[name]['stage']}): left, power of every line; right, range spectrum averaged "
+            "over the lines."
+        )
         yield f"correction_{name}", f"Correction: {name}", caption, plot.panels(parts)
 
 
@@ -231,8 +239,10 @@ def _contaminated_line(strip: Strip) -> Drawn:
             )
             for label, s in (("before", before), ("after", after))
         }
-        caption = f"Range spectrum of line {line}, the one from which most was removed ({int((removed > 0).sum())} of "
-        caption += f"{len(removed)} lines were changed)."
+        caption = (
+            f"Range spectrum of line {line}, the one from which most was removed ({int((removed > 0).sum())} of "
+            f"{len(removed)} lines were changed)."
+        )
         figure = plot.curves(series, "range frequency (MHz)", "dB", f"line {line}")
         yield "contaminated_line", "Spectrum of a contaminated line", caption, figure
 
@@ -267,14 +277,22 @@ def _image_corrections(strip: Strip) -> Drawn:
 
 
 def _velocity(strip: Strip) -> Drawn:
-    """Entropy over velocity, where an estimator kept its grid."""
-    for name, estimate in strip.result.first_of("recommended").estimates.items():
-        if "grid_velocity_m_s" in estimate.info and "grid_entropy" in estimate.info:
-            keys = ("grid_velocity_m_s", "grid_entropy")
-            grid, cost = (plot.array(estimate.info[k].reshape(-1, estimate.info[k].shape[-1])[0]) for k in keys)
-            order, value = np.argsort(grid), float(estimate.value["velocity_m_s"].reshape(-1)[0])
-            caption = "Entropy of a small group of range lines over effective velocity, as the search evaluated it; the dashed "
-            caption += "line is the refined minimum."
-            series, marks = {"entropy": (grid[order], cost[order])}, {"estimate": value}
-            figure = plot.curves(series, "effective velocity (m/s)", "entropy (nats)", f"{value:.2f} m/s", marks)
-            yield f"{name}_entropy", "Effective velocity by minimum entropy", caption, figure
+    """Entropy over velocity, finely about the estimate."""
+    bench, first = strip.result.bench, strip.result.first_of("recommended")
+    chain = bench.chains["recommended"]
+    for name, stage in chain.stages.items():
+        if not isinstance(stage, EffectiveVelocity) or first.trace is None:
+            continue
+        estimate, source = first.estimates[name], chain.uses[name].get("doppler_hz")
+        value, grid = estimate.value["velocity_m_s"].reshape(-1)[:1], estimate.info["grid_velocity_m_s"]
+        near = value + torch.linspace(-_NEAR_STEPS, _NEAR_STEPS, _NEAR_POINTS).to(grid) * (grid[1] - grid[0])
+        velocity = torch.cat([grid, near]).sort().values
+        doppler = None if source is None else first.trace.values[source].reshape(-1)[0]
+        entropy = stage.entropy(strip.step(name, output=False), velocity, doppler)
+        series, marks = {"entropy": (plot.array(velocity), plot.array(entropy))}, {"estimate": float(value)}
+        figure = plot.curves(series, "effective velocity (m/s)", "entropy (nats)", f"{float(value):.2f} m/s", marks)
+        caption = (
+            "Entropy of a small group of range lines over effective velocity: on the grid of the search, and finer about "
+            "the estimate, which is the dashed line."
+        )
+        yield f"{name}_entropy", "Effective velocity by minimum entropy", caption, figure
