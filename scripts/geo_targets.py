@@ -246,7 +246,7 @@ def draw_target(made: Product, place: int, title: str, path: Path, reach_m: floa
             "ylim": (-80.0, 2.0),
         },
     ]
-    plot.save(plot.overlays(parts, columns=3, dynamic_range_db=50), path)
+    plot.save(plot.overlays(parts, dynamic_range_db=50), path, columns=3)
 
 
 def draw_single(batch: Batch, by_way: Mapping[str, Product], places: Sequence[int], out: Path) -> None:
@@ -280,9 +280,9 @@ def draw_scene(n_pulse: int, n_range: int, out: Path) -> None:
         "signal": transposed(relative(still)),
         "lines": lines,
     }
-    plot.save(plot.overlays([part], columns=1, dynamic_range_db=50), out / "figure_16.png")
+    plot.save(plot.overlays([part], dynamic_range_db=50), out / "figure_16.png", columns=1)
     plot.save(
-        plot.contours({name: own_image(data, name) for name in PLACES}, columns=4), out / "figure_16_contours.png"
+        plot.contours({name: own_image(data, name) for name in PLACES}), out / "figure_16_contours.png", columns=4
     )
 
 

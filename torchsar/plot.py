@@ -47,6 +47,8 @@ _ELONGATED = 4.0
 _BLOCKS_PER_INCH = 90
 # letters that fit in an inch: of titles, and of words side by side below an axis, found by trial
 _LETTERS, _WORDS_FIT = 11.0, 12.0
+# points of a scene that are drawn small
+_MANY = 20
 # cells of a heat map, and those of a row, whose numbers fit into a panel
 _CELLS = 48, 7
 # appearance by choice
@@ -455,7 +457,9 @@ def places(
     ratio = float(np.ptp(y)) / max(float(np.ptp(x)), 1e-300) if aspect == "equal" else 0.8
     height = min(max((_ALONE - 0.9) * ratio, 1.2), _HIGHEST) + _BELOW
     figure, axes = _figure(_ALONE, height, aspect == "equal")
-    axes.scatter(x, y, s=14 * size / max(float(size.max()), 1e-300), color=COLOURS[0], linewidths=0)
+    largest = 14 if len(x) > _MANY else 40
+    axes.scatter(x, y, s=largest * size / max(float(size.max()), 1e-300), color=COLOURS[0], linewidths=0)
+    axes.margins(0.08)
     axes.set(xlabel=xlabel, ylabel=ylabel, title=title, aspect=aspect)
     return figure
 

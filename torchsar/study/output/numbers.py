@@ -87,7 +87,8 @@ def number(value: Any, sd: Any = None, factor: float = 1.0) -> str:
 def quantity(value: Any, unit: str, sd: Any = None) -> str:
     """A number, or a list of them, with its unit in the prefix that suits it: 17.58 um/s."""
     factor, unit = scale_of([*_numbers(value), *_numbers(sd)], unit)
-    return f"{number(value, sd, factor)} {unit if _numbers(value) else ''}".strip()
+    text = number(value, sd, factor)
+    return f"{text} {unit}".strip() if any(map(math.isfinite, _numbers(value))) else text
 
 
 def _numbers(value: Any) -> list[float]:

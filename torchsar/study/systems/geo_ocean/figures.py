@@ -105,7 +105,7 @@ def _ships(case: str, result: Result) -> Drawn:
             parts.append({"title": f"{name}, {method}", "signal": plot.within(made[method].fused, spans), "lines": {}})
     if parts:
         caption = (
-            "Each ship where the image of everything at rest shows it (conventional) and at its position (recommended), "
-            "in dB of its own peak."
+            "Each ship where the image of everything at rest shows it (conventional) and at its position "
+            "(recommended), in dB of its own peak."
         )
         yield f"ships_{word_of(case)}", titled("Ships", case), caption, plot.overlays(parts)

@@ -1,4 +1,4 @@
-"""The pictures of a run of turning targets: images of every case, and what is left of the phases."""
+"""The pictures of a run of turning targets: images of every case, and residual phases."""
 
 from __future__ import annotations
 
@@ -56,10 +56,11 @@ def phases(case: str, result: Result) -> Drawn:
     found = {name: outcome.judged.view for name, outcome in result.first.outcomes.items() if not outcome.failed}
     left = {n: residual_phase(phase[0].cpu(), true) for n, phase in found.items() if n not in ("none", "ideal")}
     parts = [_panel("phase error put in, modulo a turn", {"true": (pulses, plot.array(inside))})]
-    for title, near in (("what the best methods leave of it", True), ("what the others leave", False)):
+    for title, near in (("residual phase, best methods", True), ("residual phase, other methods", False)):
         kept = {n: x for n, x in left.items() if (float(x.square().mean().sqrt()) < _NEAR_RAD) == near}
         if kept:
-            parts.append(_panel(title, {name: (pulses, plot.array(x)) for name, x in kept.items()}))
+            named = title if len(kept) > 1 else f"{title}: {next(iter(kept))}"
+            parts.append(_panel(named, {name: (pulses, plot.array(x)) for name, x in kept.items()}))
     caption = "Constant and linear terms are removed on the circle: they only turn and shift the image."
     yield f"phases_{word_of(case)}", titled("Phase errors", case), caption, plot.panels(parts)
 

@@ -1,4 +1,4 @@
-"""The pictures of a run of a rotating target: images in metres, one end enlarged, cuts through points."""
+"""The pictures of a run of a rotating target: images in metres, one end, cuts through points."""
 
 from __future__ import annotations
 
@@ -109,6 +109,8 @@ def _panels(target: str, cuts: Mapping[str, CrossRangeCut]) -> list[dict[str, An
             offset, inside = cuts[name].offset_m[0], cuts[name].inside[0]
             kept = inside & (offset.abs() <= 25 * width)
             series[name] = (plot.array(offset[kept]), plot.decibel(cuts[name].line[0][kept], top))
-        parts.append({"series": series, "xlabel": "cross range from the true position (m)", "ylabel": "dB"})
-        parts[-1] |= {"title": target, "ylim": (-50.0, 3.0)}
+        xlabel = "cross range from the true position (m)"
+        parts.append(
+            {"series": series, "xlabel": xlabel, "ylabel": "level (dB)", "title": target, "ylim": (-50.0, 3.0)}
+        )
     return parts

@@ -128,8 +128,8 @@ def _motion(case: str, result: Result) -> Drawn:
     quarter = 1e6 * result.bench.radar.wavelength_m / 4
     caption = (
         "Estimates of the first trial against the truth, methods of like error together; periods without a lit "
-        "scatterer are left out. Range errors without constant and slope, which only turn and shift the image. A quarter "
-        f"of the wavelength is {quarter:.2g} um."
+        "scatterer are left out. Range errors without constant and slope, which only turn and shift the image. A "
+        f"quarter of the wavelength is {quarter:.2g} um."
     )
     yield f"motion_{word_of(case)}", titled("Motion and what is left of it", case), caption, plot.panels(parts)
 
@@ -172,8 +172,8 @@ def _slices(case: str, result: Result) -> Drawn:
         names = [*(["ideal"] if "ideal" in cuts else []), *others[first : first + 4]]
         for axis in ("azimuth", "range"):
             series = {n: (plot.array(cuts[n][axis][0]), plot.decibel(plot.array(cuts[n][axis][1]))) for n in names}
-            parts.append({"series": series, "xlabel": f"{axis} from the peak (m)", "ylabel": "dB", "title": axis})
-            parts[-1]["ylim"] = (-40.0, 2.0)
+            shown = {"xlabel": f"{axis} from the peak (m)", "ylabel": "level (dB)", "title": axis, "ylim": (-40.0, 2.0)}
+            parts.append({"series": series, **shown})
     if parts:
         caption = (
             "Slices through the strongest response near the predicted one, over ten side lobes to either side; 0 dB is "

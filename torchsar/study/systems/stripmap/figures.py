@@ -23,8 +23,6 @@ from torchsar.study.settings.cases import titled, word_of
 from torchsar.study.systems.stripmap.judge import focus_name, window
 from torchsar.study.trials.batch import IMAGE, Result, image_of
 
-# cells to either side of a peak that cuts show
-_CELLS = 24
 # the curve of the velocity search about the estimate: half its extent in steps of the grid, and its
 # points, of which the middle one is the estimate
 _NEAR_STEPS, _NEAR_POINTS = 1.5, 41
@@ -91,7 +89,7 @@ def pictures(results: Mapping[str, Result], columns: Mapping[str, Any]) -> Itera
 
 def _of_case(make: Callable[[Strip], Drawn], strip: Strip) -> Drawn:
     """Pictures with the name of their case."""
-    word = "" if len(strip.case) == 3 and strip.case == "all" else f"_{word_of(strip.case)}"
+    word = "" if strip.case == "all" else f"_{word_of(strip.case)}"
     for name, title, caption, figure in make(strip):
         yield f"{name}{word}", titled(title, strip.case), caption, figure
 
@@ -113,19 +111,18 @@ def _cuts(strip: Strip) -> Drawn:
     label, *at = strip.strongest()
     images = {name: image for name, image in strip.result.images.items() if name in _CUT_METHODS}
     found = {name: impulse_cuts(image, (at[0], at[1])) for name, image in images.items()}
-    parts = []
-    for axis in IMAGE:
-        reach = _CELLS * images["recommended"].axis(axis).step
-        series = {name: _near(*cuts[axis], reach) for name, cuts in found.items()}
-        parts.append({"series": series, "xlabel": f"{axis} from the peak (m)", "ylabel": "dB", "title": axis})
-        parts[-1]["ylim"] = (-50, 3)
+    parts = [
+        {
+            "series": {name: (plot.array(cuts[axis][0]), plot.decibel(cuts[axis][1])) for name, cuts in found.items()},
+            "xlabel": f"{axis} from the peak (m)",
+            "ylabel": "level (dB)",
+            "title": axis,
+            "ylim": (-50, 3),
+        }
+        for axis in IMAGE
+    ]
     caption = f"Cuts through {label}, band-limited interpolation by 16; 0 dB is each curve's own peak."
     yield "cuts", "Impulse-response cuts", caption, plot.panels(parts)
-
-
-def _near(x: Any, y: Any, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    x, y = plot.array(x), plot.decibel(y)
-    return x[np.abs(x) <= reach], y[np.abs(x) <= reach]
 
 
 def _squint(strip: Strip) -> Drawn:
@@ -137,14 +134,14 @@ def _squint(strip: Strip) -> Drawn:
             shown = {"squint taken into account": strip.images()["recommended"]}
             shown[method.title or name] = wrong.crop(**window(wrong, strip.radar, margin))
             caption = (
-                "Left: focused about the estimated Doppler centroid. Right: the same data focused as if the beam "
+                "First: focused about the estimated Doppler centroid. Second: the same data focused as if the beam "
                 "looked straight to the side: displaced, smeared, with ghosts."
             )
             yield "squint", "With and without the squint", caption, plot.images(shown, **strip.scale)
 
 
 def _baseband(strip: Strip) -> tuple[float, float] | None:
-    """Doppler centroid that the recommended image was focused with: absolute, and within one PRF."""
+    """Doppler centroid that the recommended image is focused with: absolute, and in one PRF."""
     centroid = strip.result.first_of("recommended").judged.view.doppler_hz
     if centroid is None:
         return None
@@ -214,8 +211,8 @@ def _corrections(strip: Strip) -> Drawn:
             )
         ]
         caption = (
-            f"Stage '{name}' ({strip.stages[name]['stage']}): left, power of every line; right, range spectrum averaged "
-            "over the lines."
+            f"Stage '{name}' ({strip.stages[name]['stage']}). First: power of every line. Second: range spectrum "
+            "averaged over the lines."
         )
         yield f"correction_{name}", f"Correction: {name}", caption, plot.panels(parts)
 
@@ -243,16 +240,16 @@ def _contaminated_line(strip: Strip) -> Drawn:
             f"Range spectrum of line {line}, the one from which most was removed ({int((removed > 0).sum())} of "
             f"{len(removed)} lines were changed)."
         )
-        figure = plot.curves(series, "range frequency (MHz)", "dB", f"line {line}")
+        figure = plot.curves(series, "range frequency (MHz)", "level (dB)", f"line {line}")
         yield "contaminated_line", "Spectrum of a contaminated line", caption, figure
 
 
 def _response(strip: Strip) -> Drawn:
-    """Estimated response of the channel over range frequency, beside the truth where it is known."""
+    """Estimated response of the channel over range frequency, beside the truth if it is known."""
     band_mhz = plot.array(band_grid()) * strip.radar.pulse.bandwidth_hz / 2e6
     truth, parts = strip.result.first.trials.truth, []
     for estimate in strip.result.first_of("recommended").estimates.values():
-        for key, label in (("phase_rad", "phase (rad)"), ("amplitude", "amplitude")):
+        for key, label in (("phase_rad", "phase (rad)"), ("amplitude", "amplitude (1)")):
             value = estimate.value.get(key)
             if value is None or value.shape[-1:] != band_mhz.shape:
                 continue
@@ -272,7 +269,7 @@ def _image_corrections(strip: Strip) -> Drawn:
         cuts = {when: impulse_cuts(x, (at[0], at[1]))["range"] for when, x in (("before", before), ("after", after))}
         series = {when: (plot.array(offset), plot.decibel(level)) for when, (offset, level) in cuts.items()}
         caption = f"Stage '{name}' ({strip.stages[name]['stage']}): range cut through {label} before and after."
-        figure = plot.curves(series, "range from the peak (m)", "dB", ylim=(-50, 3))
+        figure = plot.curves(series, "range from the peak (m)", "level (dB)", ylim=(-50, 3))
         yield f"correction_{name}", f"Correction: {name}", caption, figure
 
 
@@ -292,7 +289,7 @@ def _velocity(strip: Strip) -> Drawn:
         series, marks = {"entropy": (plot.array(velocity), plot.array(entropy))}, {"estimate": float(value)}
         figure = plot.curves(series, "effective velocity (m/s)", "entropy (nats)", f"{float(value):.2f} m/s", marks)
         caption = (
-            "Entropy of a small group of range lines over effective velocity: on the grid of the search, and finer about "
-            "the estimate, which is the dashed line."
+            "Entropy of a small group of range lines over effective velocity: on the grid of the search, and finer "
+            "about the estimate, which is the dashed line."
         )
         yield f"{name}_entropy", "Effective velocity by minimum entropy", caption, figure
