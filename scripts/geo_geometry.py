@@ -96,7 +96,7 @@ def draw_timing(diagram: TimingDiagram, out: Path) -> None:
         "y": plot.array(diagram.ground_m / 1e3),
         "z": plot.array(lost.mT),
     }
-    figure = plot.heat_map(
+    (figure,) = plot.heat_map(
         [part],
         "pulse rate (Hz)",
         "ground from nadir (km)",
@@ -187,7 +187,7 @@ def draw_parameters(speed: Tensor, point: PointMotion, name: str, path: Path) ->
         }
         for series, unit, title in values
     ]
-    plot.save(plot.panels(parts, columns=3), path)
+    plot.save(plot.panels(parts), path, columns=3)
 
 
 def worst_phase_rad(u_r: Tensor | float, u_a: Tensor | float) -> Tensor:
@@ -223,7 +223,7 @@ def draw_errors(speed: Tensor, out: Path) -> None:
         },
         {"series": channels, "xlabel": "u_r (m/s)", "ylabel": "phase (rad)", "title": "imbalance of channels by u_r"},
     ]
-    plot.save(plot.panels(parts, columns=3), out / "figure_08.png")
+    plot.save(plot.panels(parts), out / "figure_08.png", columns=3)
 
 
 def show_timing(diagram: TimingDiagram) -> None:

@@ -168,10 +168,9 @@ def draw(setting: Setting, made: SceneImage, path: Path) -> None:
             {"title": title, "signal": levelled(image), "lines": {"true position": (joined[0], joined[1])}}
             for title, image in named.items()
         ],
-        3,
         35.0,
     )
-    plot.save(figure, path)
+    plot.save(figure, path, columns=3)
     print(f"wrote {path}")
 
 

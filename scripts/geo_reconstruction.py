@@ -173,7 +173,7 @@ def draw_spectra(data: Mapping[str, Signal], out: Path) -> None:
                     "ylim": (-60.0, 20.0),
                 }
             )
-        plot.save(plot.panels(parts, columns=3), out / f"figure_{figure}.png")
+        plot.save(plot.panels(parts), out / f"figure_{figure}.png", columns=3)
 
 
 def intensity(signal: Signal, guesses: Tensor) -> Intensity:

@@ -251,7 +251,7 @@ def draw_target(made: Product, trial: int, title: str, path: Path, reach_m: floa
             "ylim": (-80.0, 2.0),
         },
     ]
-    plot.save(plot.overlays(parts, columns=3, dynamic_range_db=50), path)
+    plot.save(plot.overlays(parts, dynamic_range_db=50), path, columns=3)
 
 
 def draw_single(batch: Batch, by_method: Mapping[str, Product], trials: Sequence[int], out: Path) -> None:
@@ -285,9 +285,9 @@ def draw_scene(n_pulse: int, n_range: int, out: Path) -> None:
         "signal": transposed(relative(at_rest)),
         "lines": lines,
     }
-    plot.save(plot.overlays([part], columns=1, dynamic_range_db=50), out / "figure_16.png")
+    plot.save(plot.overlays([part], dynamic_range_db=50), out / "figure_16.png", columns=1)
     plot.save(
-        plot.contours({name: own_image(data, name) for name in POSITIONS}, columns=4), out / "figure_16_contours.png"
+        plot.contours({name: own_image(data, name) for name in POSITIONS}), out / "figure_16_contours.png", columns=4
     )
 
 

@@ -207,7 +207,7 @@ def draw_images(traces: Mapping[str, Trace], out: Path) -> None:
     """Figures 16 and 18: range profiles and images."""
     names = ["uncompensated", "cross-correlation", "segmented", "recommended"]
     profiles = {name: in_milliseconds(traces[name].outputs["compress"]) for name in names[:3]}
-    plot.save(plot.images(profiles, dynamic_range_db=45, columns=3, percentile=100), out / "figure_16.png")
+    plot.save(plot.images(profiles, dynamic_range_db=45, percentile=100), out / "figure_16.png", columns=3)
     plot.save(
         plot.images(
             {name: finer_in_range(traces[name].signal) for name in names},
@@ -250,7 +250,7 @@ def draw_motion(courses: Mapping[str, Course], truth: Truth, out: Path) -> None:
                 "title": title,
             }
         )
-    plot.save(plot.panels(parts, columns=3), out / "figure_17.png")
+    plot.save(plot.panels(parts), out / "figure_17.png", columns=3)
 
 
 def draw_slices(traces: Mapping[str, Trace], out: Path) -> None:

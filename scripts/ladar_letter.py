@@ -131,13 +131,13 @@ def draw(traces: Mapping[str, Trace], scene: LetterE, out: Path) -> None:
     )
     names = ["uncompensated", "cross-correlation", "segmented, summed"]
     profiles = {name: in_milliseconds(about_letter(traces[name].outputs["compress"])) for name in names}
-    plot.save(plot.images(profiles, dynamic_range_db=40, columns=3, percentile=100), out / "figure_11.png")
+    plot.save(plot.images(profiles, dynamic_range_db=40, percentile=100), out / "figure_11.png", columns=3)
     images = {
         name: about_letter(finer_in_range(finer_in_range(traces[name].signal)))
         for name in [*names, "segmented, at one peak", "recommended", "ideal"]
     }
     plot.save(
-        plot.images(images, dynamic_range_db=25, columns=3, percentile=100, reference="ideal"), out / "figure_12.png"
+        plot.images(images, dynamic_range_db=25, percentile=100, reference="ideal"), out / "figure_12.png", columns=3
     )
 
 

@@ -98,7 +98,7 @@ def draw_frequencies(out: Path, draws: Draws) -> None:
         spectrum = plot.short_time_spectrum(record.signal.data.flatten(), radar.sample_rate_hz)
         theory = {"theory": (us, plot.array(sent - echo + 1e-6 * radar.doppler_hz(speed)))}
         parts.append({"title": title, "signal": spectrum, "lines": theory, "ylim": (-15.0, 20.0)})
-    plot.save(plot.overlays(parts, columns=3), out / "figure_02.png")
+    plot.save(plot.overlays(parts), out / "figure_02.png", columns=3)
 
 
 def triangle_hz(time_s: Tensor, radar: TriangularLadar) -> Tensor:
@@ -119,7 +119,9 @@ def draw_images(traces: Mapping[str, Trace], out: Path) -> None:
     )
     points = {f"point at {r:g} m": around(after, x, r) for x, r in zip(SCENE.azimuth_m, SCENE.range_m, strict=True)}
     plot.save(
-        plot.contours({"no compensation": before, "segmented interference": after, **points}), out / "figure_08.png"
+        plot.contours({"no compensation": before, "segmented interference": after, **points}),
+        out / "figure_08.png",
+        columns=3,
     )
 
 
@@ -162,7 +164,7 @@ def draw_motion(courses: Mapping[str, Course], truth: Truth, out: Path) -> None:
                 "title": title,
             }
         )
-    plot.save(plot.panels(parts, columns=3), out / "figure_06.png")
+    plot.save(plot.panels(parts), out / "figure_06.png", columns=3)
 
 
 def draw_slices(image: Signal, ideal: Signal, out: Path) -> None:

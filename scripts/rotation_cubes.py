@@ -186,7 +186,7 @@ def draw_profiles(found: Results, truth: Truth, path: Path) -> None:
                 "ylim": (-40.0, 1.0),
             }
         )
-    plot.save(plot.panels(parts, columns=3), path)
+    plot.save(plot.panels(parts), path, columns=3)
 
 
 def profile(image: Signal, y_m: float, reach_m: float = 0.006) -> tuple:
@@ -225,7 +225,7 @@ def main(arguments: list[str] | None = None) -> None:
         title: close(scaled(found.images[name], found.estimates.get(name, truth.values)))
         for title, name in names.items()
     }
-    plot.save(plot.images(shown, 40, 2, percentile=100), options.out / "figure_19.png")
+    plot.save(plot.images(shown, 40, percentile=100), options.out / "figure_19.png")
     draw_profiles(found, truth, options.out / "figure_20.png")
 
 

@@ -136,7 +136,7 @@ def draw(found: dict[tuple[str, float], Cut], ratio: Tensor, grid: Tensor, out: 
                 "marks": {"truth": 1.0},
             }
         )
-    plot.save(plot.panels(parts, columns=3), out / "cuts.png")
+    plot.save(plot.panels(parts), out / "cuts.png", columns=3)
     part = {
         "title": "image lines half a Doppler cell apart",
         "x": plot.array(ratio),

@@ -160,7 +160,7 @@ def draw_profiles(profiles: Mapping[str, Profile], names: Sequence[str], reach_m
                 "ylim": (-50.0, 3.0),
             }
         )
-    plot.save(plot.panels(parts, columns=3), path)
+    plot.save(plot.panels(parts), path, columns=3)
 
 
 def one_cell(yc_m: Tensor, y_m: float) -> Tensor:

@@ -125,7 +125,7 @@ def draw_images(shown: Mapping[str, Signal], half_width_m: float, out: Path) -> 
         parts = {
             region: cropped(shown[name], *edges, half_width_m) for region, edges in ({name: WHOLE} | REGIONS).items()
         }
-        plot.save(plot.images(parts, 40, 3, percentile=100), out / file)
+        plot.save(plot.images(parts, 40, percentile=100), out / file, columns=3)
     compared = [
         cropped(shown[name], *edges, half_width_m)
         for edges in (WHOLE, REGIONS["A, tip of a panel"])
@@ -136,10 +136,10 @@ def draw_images(shown: Mapping[str, Signal], half_width_m: float, out: Path) -> 
         plot.images(
             {title: over_peak(image) for title, image in zip(titles, compared, strict=True)},
             40,
-            len(FIGURES),
             percentile=100,
         ),
         out / "methods.png",
+        columns=len(FIGURES),
     )
     best = cropped(shown["order 3, two-dimensional"], *WHOLE, half_width_m)
     plot.save(plot.image(best, 40, "scaled to metres", percentile=100), out / "figure_09.png")

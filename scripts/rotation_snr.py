@@ -189,7 +189,7 @@ def full_target(target: Target, seed: int, scenes: int, out: Path) -> None:
             f"{tip(image, truth):>20.4f}{PUBLISHED_TIP.get(snr, '-'):>20}{float(reliable):>9.2f}",
             flush=True,
         )
-    plot.save(plot.images(shown, 45, 2, percentile=100), out / "figure_14_17.png")
+    plot.save(plot.images(shown, 45, percentile=100), out / "figure_14_17.png")
 
 
 def focused(signal: Signal, radar: InverseRadar, found: Estimate, trial: int) -> Signal:

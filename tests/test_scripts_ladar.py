@@ -110,14 +110,14 @@ def test_contours_and_overlays_draw() -> None:
     blob = torch.exp(-(axes[0].values()[:, None].square() + (axes[1].values() - 1.5).square()) / 0.2).to(
         torch.complex64
     )
-    drawn = plot.contours({"a": Signal(blob, axes), "b": Signal(blob[None], axes)}, columns=2)
-    assert [axes.get_title() for axes in drawn.axes] == ["a", "b"]
-    assert len(drawn.axes[0].collections) and drawn.axes[0].get_xlabel() == "range (m)"
+    drawn = plot.contours({"a": Signal(blob, axes), "b": Signal(blob[None], axes)})
+    assert [figure.axes[0].get_title() for figure in drawn] == ["a", "b"]
+    assert len(drawn[0].axes[0].collections) and drawn[0].axes[0].get_xlabel() == "range (m)"
     line = np.array([0.0, 2.0]), np.array([0.0, 0.5])
     parts = [
         {"title": "with", "signal": Signal(blob, axes), "lines": {"line": line}},
         {"series": {"line": line}, "xlabel": "x", "ylabel": "y", "title": "without"},
     ]
-    laid = plot.overlays(parts)
-    assert laid.axes[0].get_images() and len(laid.axes[0].get_lines()) == 1 and not laid.axes[1].get_images()
-    assert laid.axes[0].get_xlim() == pytest.approx((-0.05, 2.95))
+    over, beside = (figure.axes[0] for figure in plot.overlays(parts))
+    assert over.get_images() and len(over.get_lines()) == 1 and not beside.get_images()
+    assert over.get_xlim() == pytest.approx((-0.05, 2.95))

@@ -1,6 +1,8 @@
 """Figures of images, curves and sweeps; the only module that imports the plotting library.
 
-Each function that draws takes signals or arrays and returns a matplotlib Figure.
+Each function that draws takes signals or arrays and returns a matplotlib Figure, or a list of them,
+one for each panel, so that a page can set the panels side by side or below each other. `save`
+writes either into one file.
 """
 
 from __future__ import annotations
@@ -9,7 +11,7 @@ import functools
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -21,8 +23,10 @@ try:
     from cycler import cycler
     from matplotlib import rc_context
     from matplotlib.axes import Axes
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.colors import LogNorm, Normalize
     from matplotlib.figure import Figure
+    from matplotlib.image import imsave
     from matplotlib.ticker import FuncFormatter, LogFormatterSciNotation, LogLocator, NullFormatter
 except ImportError as error:
     raise ImportError("torchsar.plot needs matplotlib: pip install 'torchsar-lab[study]'") from error
@@ -32,8 +36,21 @@ INK, ACCENT, SECOND, THIRD, FAINT = "#1f2933", "#0b6e99", "#d1495b", "#e09f3e", 
 COLOURS = (ACCENT, SECOND, THIRD, "#4f7942", "#6a4c93", FAINT, "#8d5524", "#1aa6a6")
 # seven markers beside eight colours: more than eight curves still differ
 MARKERS, DASHES = "osD^vPX", ("--", ":", "-.")
-# letters of all words that fit side by side under one panel, found by trial; more are turned
-_WORDS_FIT = 90
+# widths in inches of a figure alone and of one panel among several: text of 9 points has at least 9
+# pixels where a page of 420 pixels leaves 386 of them
+_ALONE, _PANEL = 5.2, 3.9
+# inches beside and below images for labels and the colour scale, and the largest height of an image
+_BESIDE, _BELOW, _HIGHEST = 1.55, 0.85, 4.6
+# pictures to scale become illegible when they are more elongated than this
+_ELONGATED = 4.0
+# blocks of images per inch of a figure, fewer than pixels, so that no block is lost in drawing
+_BLOCKS_PER_INCH = 90
+# letters that fit in an inch: of titles, and of words side by side below an axis, found by trial
+_LETTERS, _WORDS_FIT = 11.0, 12.0
+# points of a scene that are drawn small
+_MANY = 20
+# cells of a heat map, and those of a row, whose numbers fit into a panel
+_CELLS = 48, 7
 # appearance by choice
 _STYLE: Any = {
     "font.size": 9,
@@ -49,28 +66,40 @@ _STYLE: Any = {
     "xtick.color": INK,
     "ytick.color": INK,
     "legend.frameon": False,
-    "legend.fontsize": 8,
+    "legend.fontsize": 9,
     "lines.linewidth": 1.2,
     "figure.facecolor": "white",
     "axes.prop_cycle": cycler(color=COLOURS),
 }
 
 
-def _styled(draw: Callable[..., Figure]) -> Callable[..., Figure]:
+Drawn = TypeVar("Drawn", Figure, list[Figure])
+
+
+def _styled(draw: Callable[..., Drawn]) -> Callable[..., Drawn]:
     """Run a drawing function in the style of this module, without a change of global settings."""
 
     @functools.wraps(draw)
-    def styled(*args: Any, **options: Any) -> Figure:
+    def styled(*args: Any, **options: Any) -> Drawn:
         with rc_context(_STYLE):
             return draw(*args, **options)
 
     return styled
 
 
-def _panels(rows: int, columns: int, size: tuple[float, float], sharey: bool = False) -> tuple[Figure, list[Axes]]:
-    """Figure with a grid of axes."""
-    figure = Figure(figsize=size, layout="constrained")
-    return figure, list(figure.subplots(rows, columns, squeeze=False, sharey=sharey).flat)
+def _figure(width: float, height: float, to_scale: bool = False) -> tuple[Figure, Axes]:
+    """Figure of one panel, with its axes."""
+    figure = Figure(figsize=(width, height), layout="compressed" if to_scale else "constrained")
+    return figure, figure.subplots()
+
+
+def _width(count: int) -> float:
+    """Width in inches of each of several panels."""
+    return _ALONE if count == 1 else _PANEL
+
+
+def _wrapped(title: str, width: float) -> str:
+    return textwrap.fill(title, round(_LETTERS * width))
 
 
 def decibel(x: Tensor | np.ndarray, reference: float | None = None) -> np.ndarray:
@@ -110,6 +139,69 @@ def quicklook(signal: Signal, largest: int = 900) -> Signal:
     return Signal(data, tuple(axes))
 
 
+def span(positions: Tensor, margin: float) -> tuple[float, float]:
+    """From the first to the last of some positions, with a margin on both sides.
+
+    Args:
+        positions: Positions on an axis, any shape.
+        margin: Distance in the unit of the axis.
+    """
+    return float(positions.min()) - margin, float(positions.max()) + margin
+
+
+def within(signal: Signal, spans: Mapping[str, tuple[float, float]]) -> Signal:
+    """Cut out the part of a signal between two positions on some axes.
+
+    Args:
+        signal: Signal to crop.
+        spans: First and last position by the name of the axis; names that the signal does not have
+            are ignored.
+
+    Returns:
+        The part that lies inside the signal, at least two samples of each axis.
+    """
+    cut = {}
+    for axis in signal.axes:
+        if axis.name in spans:
+            first, last = (round(float(axis.index_of(edge))) for edge in spans[axis.name])
+            first = min(max(first, 0), max(axis.n - 2, 0))
+            cut[axis.name] = (first, min(max(last + 1, first + 2), axis.n))
+    return signal.crop(**cut)
+
+
+def boxes(centres: Sequence[tuple[float, float]], half_x: float, half_y: float) -> tuple[np.ndarray, np.ndarray]:
+    """Outline rectangles about positions as one broken line, for `overlays`.
+
+    Args:
+        centres: Positions (x, y).
+        half_x: Half width of the rectangles.
+        half_y: Half height of the rectangles.
+    """
+    x, y = half_x * np.array([-1, 1, 1, -1, -1, np.nan]), half_y * np.array([-1, -1, 1, 1, -1, np.nan])
+    at = np.asarray(centres, dtype=float).reshape(-1, 2)
+    return (at[:, :1] + x).ravel(), (at[:, 1:] + y).ravel()
+
+
+def alike(curves: Mapping[str, tuple[Any, Tensor]], largest: int = 4) -> list[dict[str, tuple[Any, Tensor]]]:
+    """Group curves whose largest values are within a decade, so that each panel shows its curves.
+
+    Args:
+        curves: Curves (x, y) by name; y, shape (n,), may have NaN.
+        largest: Largest number of curves in a group.
+
+    Returns:
+        Groups of curves, the smallest first; in each the largest curve first.
+    """
+    size = {name: float(torch.nan_to_num(y).abs().max()) for name, (_, y) in curves.items()}
+    groups: list[list[str]] = []
+    for name in sorted(size, key=lambda name: size[name]):
+        if groups and len(groups[-1]) < largest and size[name] < 10 * max(size[groups[-1][0]], 1e-300):
+            groups[-1].append(name)
+        else:
+            groups.append([name])
+    return [{name: curves[name] for name in reversed(group)} for group in groups]
+
+
 def _extent(signal: Signal, origin: Sequence[float]) -> tuple[float, float, float, float]:
     """Edges of an image for imshow, relative to an origin of the axes."""
     vertical, horizontal = signal.axes
@@ -122,30 +214,45 @@ def _extent(signal: Signal, origin: Sequence[float]) -> tuple[float, float, floa
     )
 
 
-def _show(
-    axes: Axes,
-    signal: Signal,
-    dynamic_range_db: float,
-    title: str,
-    reference: float | None = None,
-    percentile: float = 100.0,
-) -> Any:
-    """Draw one image into existing axes."""
-    view = quicklook(signal)
-    amplitude = view.data.cpu().numpy()
-    top = (
-        reference
-        if reference is not None
-        else float(np.percentile(amplitude, percentile)) or float(amplitude.max(initial=1.0))
-    )
+def _to_scale(signal: Signal) -> float | None:
+    """Height over width where both axes can have one scale; None for different units or shapes
+    that are too elongated.
+    """
+    vertical, horizontal = signal.axes
+    ratio = vertical.n * vertical.step / (horizontal.n * horizontal.step)
+    fits = vertical.unit == horizontal.unit and 1 / _ELONGATED <= ratio <= _ELONGATED
+    return ratio if fits else None
+
+
+def level(signal: Signal, percentile: float = 100.0, width: float = _PANEL) -> float:
+    """Compute the amplitude that is 0 dB in pictures of a signal.
+
+    Args:
+        signal: Signal with two axes; the first trial counts.
+        percentile: Percentile of the amplitude.
+        width: Width of the figure in inches, on which the averaging in blocks depends.
+
+    Returns:
+        The amplitude; 1 where the signal is zero.
+    """
+    amplitude = quicklook(_first(signal), round(_BLOCKS_PER_INCH * width)).data.cpu().numpy()
+    return float(np.percentile(amplitude, percentile)) or float(amplitude.max(initial=0.0)) or 1.0
+
+
+def _show(signal: Signal, width: float, dynamic_range_db: float, title: str, top: float, label: str) -> Figure:
+    """Draw the first trial of a signal into a new figure, to scale where that is possible."""
+    signal = _first(signal)
+    view, ratio = quicklook(signal, round(_BLOCKS_PER_INCH * width)), _to_scale(signal)
+    height = min((width - _BESIDE) * (ratio or 0.8), _HIGHEST) + _BELOW
+    figure, axes = _figure(width, height, ratio is not None)
     origin = (0.0, signal.axes[1].start if signal.axes[1].start > 1e4 else 0.0)
     shown = axes.imshow(
-        decibel(amplitude, top),
+        decibel(view.data.cpu().numpy(), top),
         cmap="gray",
         vmin=-dynamic_range_db,
         vmax=0,
         origin="lower",
-        aspect="auto",
+        aspect="auto" if ratio is None else "equal",
         extent=_extent(view, origin),
         interpolation="nearest",
     )
@@ -153,18 +260,25 @@ def _show(
     axes.set(
         xlabel=f"{signal.axes[1].name}{beyond} ({signal.axes[1].unit})",
         ylabel=f"{signal.axes[0].name} ({signal.axes[0].unit})",
-        title=title,
+        title=_wrapped(title, width),
     )
     axes.grid(False)
-    return shown
+    figure.colorbar(shown, ax=axes, label=label, fraction=0.05, pad=0.02)
+    return figure
+
+
+def _below(percentile: float) -> str:
+    """Label of a colour scale."""
+    return "dB below the peak" if percentile == 100 else f"dB below percentile {percentile:g}"
 
 
 @_styled
 def image(signal: Signal, dynamic_range_db: float = 50.0, title: str = "", percentile: float = 99.9) -> Figure:
     """Draw an image or raw data in dB, range horizontal, azimuth or slow time vertical.
 
-    0 dB is a high percentile of the amplitude, so that a few bright ships do not darken the land;
-    100, the peak, suits scenes of points. The first trial of a batch is drawn.
+    Both axes have one scale where both are in metres and the image is not too elongated. 0 dB is a
+    high percentile of the amplitude, so that a few bright ships do not darken the land; 100, the
+    peak, suits scenes of points. The first trial of a batch is drawn.
 
     Args:
         signal: Signal with two axes, shape (..., azimuth, range).
@@ -172,64 +286,42 @@ def image(signal: Signal, dynamic_range_db: float = 50.0, title: str = "", perce
         title: Title of the figure.
         percentile: Percentile of the amplitude that is 0 dB.
     """
-    figure, (axes,) = _panels(1, 1, (7.2, 6.2))
-    shown = _show(axes, _first(signal), dynamic_range_db, title, percentile=percentile)
-    figure.colorbar(
-        shown,
-        ax=axes,
-        label="amplitude (dB below the peak)"
-        if percentile == 100
-        else f"amplitude (dB below the {percentile:g}th percentile)",
-        shrink=0.8,
-    )
-    return figure
+    top = level(signal, percentile, _ALONE)
+    return _show(signal, _ALONE, dynamic_range_db, title, top, _below(percentile))
 
 
 @_styled
 def images(
     signals: Mapping[str, Signal],
     dynamic_range_db: float = 50.0,
-    columns: int = 2,
     percentile: float = 99.9,
     reference: str | None = None,
-) -> Figure:
-    """Draw several images side by side on one scale.
+) -> list[Figure]:
+    """Draw several images on one scale of levels, a figure each.
 
     Args:
         signals: Signals with two axes, by title; the first trial of each is drawn.
         dynamic_range_db: Lowest level, in dB below 0 dB.
-        columns: Number of images in a row.
         percentile: Percentile of the amplitude that is 0 dB.
         reference: Title of the image whose percentile counts; by default the first.
     """
-    rows = math.ceil(len(signals) / columns)
-    figure, panels = _panels(rows, min(columns, len(signals)), (4.6 * min(columns, len(signals)), 3.9 * rows))
-    scale = quicklook(_first(signals[reference or next(iter(signals))])).data.cpu().numpy()
-    top = float(np.percentile(scale, percentile)) or None
-    shown: Any = None
-    for axes, (title, signal) in zip(panels, signals.items(), strict=False):
-        shown = _show(axes, _first(signal), dynamic_range_db, title, top)
-    for axes in panels[len(signals) :]:
-        axes.set_visible(False)
-    figure.colorbar(shown, ax=panels, label="amplitude (dB)", shrink=0.6)
-    return figure
+    width = _width(len(signals))
+    top = level(signals[reference or next(iter(signals))], percentile, width)
+    return [_show(signal, width, dynamic_range_db, title, top, "dB") for title, signal in signals.items()]
 
 
 @_styled
-def contours(
-    signals: Mapping[str, Signal], levels_db: Sequence[float] = (-30, -20, -13, -3), columns: int = 3
-) -> Figure:
+def contours(signals: Mapping[str, Signal], levels_db: Sequence[float] = (-30, -20, -13, -3)) -> list[Figure]:
     """Draw lines of equal amplitude of several images, range horizontal, azimuth vertical.
 
     Args:
-        signals: Signals with two axes, by title; the first trial of each is drawn.
+        signals: Signals with two axes, by title; the first trial of each is drawn, a figure each.
         levels_db: Levels of the lines, in dB relative to the peak of each image, rising.
-        columns: Number of images in a row.
     """
-    rows = math.ceil(len(signals) / columns)
-    figure, panels = _panels(rows, min(columns, len(signals)), (3.3 * min(columns, len(signals)), 3.1 * rows))
-    for axes, (title, signal) in zip(panels, signals.items(), strict=False):
-        vertical, horizontal = signal.axes
+    figures, width = [], _width(len(signals))
+    for title, signal in signals.items():
+        (vertical, horizontal), ratio = signal.axes, _to_scale(signal)
+        figure, axes = _figure(width, min((width - 0.8) * (ratio or 0.8), _HIGHEST) + 1.1)
         drawn = axes.contour(
             array(horizontal.values()),
             array(vertical.values()),
@@ -239,23 +331,15 @@ def contours(
             linewidths=1.0,
         )
         axes.set(
-            xlabel=f"{horizontal.name} ({horizontal.unit})", ylabel=f"{vertical.name} ({vertical.unit})", title=title
+            xlabel=f"{horizontal.name} ({horizontal.unit})",
+            ylabel=f"{vertical.name} ({vertical.unit})",
+            title=_wrapped(title, width),
+            aspect="auto" if ratio is None else "equal",
         )
-        _legend_levels(figure, drawn, levels_db, once=axes is panels[0])
-    for axes in panels[len(signals) :]:
-        axes.set_visible(False)
-    return figure
-
-
-def _legend_levels(figure: Figure, drawn: Any, levels_db: Sequence[float], once: bool) -> None:
-    """One legend of the levels for all panels."""
-    if once:
-        figure.legend(
-            drawn.legend_elements()[0],
-            [f"{level:g} dB" for level in levels_db],
-            loc="outside lower center",
-            ncols=len(levels_db),
-        )
+        names = [f"{level:g} dB" for level in levels_db]
+        figure.legend(drawn.legend_elements()[0], names, loc="outside lower center", ncols=len(names))
+        figures.append(figure)
+    return figures
 
 
 def short_time_spectrum(samples: Tensor, rate_hz: float, width: int = 64, hop: int = 4) -> Signal:
@@ -286,43 +370,38 @@ def short_time_spectrum(samples: Tensor, rate_hz: float, width: int = 64, hop: i
 
 
 @_styled
-def overlays(parts: Sequence[Mapping[str, Any]], columns: int = 2, dynamic_range_db: float = 40.0) -> Figure:
+def overlays(parts: Sequence[Mapping[str, Any]], dynamic_range_db: float = 40.0) -> list[Figure]:
     """Draw images, each in dB of its own peak, with dashed lines over them.
 
     Args:
-        parts: Panels. Each has `title`, `signal` with two axes, `lines`, a mapping from names to
-            (x, y), and may have `ylim`. A panel without `signal` has the arguments of `curves`.
-        columns: Number of panels in a row.
+        parts: Panels, a figure each. Each has `title`, `signal` with two axes, `lines`, a mapping
+            from names to (x, y), and may have `ylim`. A panel without `signal` has the arguments
+            of `curves`.
         dynamic_range_db: Lowest level, in dB below the peak.
     """
-    rows = math.ceil(len(parts) / columns)
-    figure, panels = _panels(rows, min(columns, len(parts)), (4.4 * min(columns, len(parts)), 3.2 * rows))
-    shown: Any = None
-    for axes, part in zip(panels, parts, strict=False):
+    figures, width = [], _width(len(parts))
+    for part in parts:
         if "signal" not in part:
-            draw_curves(axes, **part)
+            figures.append(_curves(width, **part))
             continue
-        shown = _show(axes, _first(part["signal"]), dynamic_range_db, part["title"])
-        _draw_over(axes, part["lines"], part.get("ylim"))
-    for axes in panels[len(parts) :]:
-        axes.set_visible(False)
-    if shown is not None:
-        figure.colorbar(shown, ax=panels, label="amplitude (dB below the peak)", shrink=0.8)
-    return figure
+        top = level(part["signal"], width=width)
+        figures.append(_show(part["signal"], width, dynamic_range_db, part["title"], top, _below(100)))
+        _draw_over(figures[-1], part["lines"], part.get("ylim"))
+    return figures
 
 
 def _draw_over(
-    axes: Axes, lines: Mapping[str, tuple[np.ndarray, np.ndarray]], ylim: tuple[float, float] | None
+    figure: Figure, lines: Mapping[str, tuple[np.ndarray, np.ndarray]], ylim: tuple[float, float] | None
 ) -> None:
     """Draw dashed lines over an image without a change of its limits."""
+    axes = figure.axes[0]
     limits = axes.get_xlim(), axes.get_ylim()
     for i, (name, (x, y)) in enumerate(lines.items()):
         axes.plot(
             x, y, label=name, color=COLOURS[(i + 1) % len(COLOURS)], linestyle=DASHES[i % len(DASHES)], linewidth=1.2
         )
     axes.set(xlim=limits[0], ylim=ylim or limits[1])
-    if lines:
-        axes.legend(loc="upper right", labelcolor="white")
+    _legend_below(figure, axes, least=1)
 
 
 def _first(signal: Signal) -> Signal:
@@ -341,6 +420,8 @@ def curves(
 ) -> Figure:
     """Draw curves into one panel.
 
+    The first curve is the widest, so that it stays visible under others.
+
     Args:
         series: Curves (x, y) by name, each a pair of arrays of shape (n,).
         xlabel: Label of the horizontal axis, with unit.
@@ -349,9 +430,7 @@ def curves(
         marks: Positions of vertical lines by name, in the unit of x.
         ylim: Limits of the vertical axis.
     """
-    figure, (axes,) = _panels(1, 1, (7.2, 3.2))
-    draw_curves(axes, series, xlabel, ylabel, title, marks, ylim)
-    return figure
+    return _curves(_ALONE, series, xlabel, ylabel, title, marks, ylim)
 
 
 @_styled
@@ -375,51 +454,37 @@ def places(
         title: Title of the figure.
         aspect: "equal" for one scale on both axes, "auto" otherwise.
     """
-    figure, (axes,) = _panels(1, 1, (5.4, 5.0))
-    axes.scatter(x, y, s=14 * size / max(float(size.max()), 1e-300), color=COLOURS[0], linewidths=0)
+    ratio = float(np.ptp(y)) / max(float(np.ptp(x)), 1e-300) if aspect == "equal" else 0.8
+    height = min(max((_ALONE - 0.9) * ratio, 1.2), _HIGHEST) + _BELOW
+    figure, axes = _figure(_ALONE, height, aspect == "equal")
+    largest = 14 if len(x) > _MANY else 40
+    axes.scatter(x, y, s=largest * size / max(float(size.max()), 1e-300), color=COLOURS[0], linewidths=0)
+    axes.margins(0.08)
     axes.set(xlabel=xlabel, ylabel=ylabel, title=title, aspect=aspect)
     return figure
 
 
 @_styled
-def panels(parts: Sequence[Mapping[str, Any]], columns: int = 2) -> Figure:
+def panels(parts: Sequence[Mapping[str, Any]]) -> list[Figure]:
     """Draw several panels of curves.
 
     Args:
-        parts: Panels, each with the arguments of `curves`.
-        columns: Number of panels in a row.
+        parts: Panels, a figure each, with the arguments of `curves`.
     """
-    rows = math.ceil(len(parts) / columns)
-    figure, axes = _panels(rows, min(columns, len(parts)), (4.6 * min(columns, len(parts)), 3.0 * rows))
-    for one, part in zip(axes, parts, strict=False):
-        draw_curves(one, **part)
-    for one in axes[len(parts) :]:
-        one.set_visible(False)
-    return figure
+    return [_curves(_width(len(parts)), **part) for part in parts]
 
 
-def draw_curves(
-    axes: Axes,
+def _curves(
+    width: float,
     series: Mapping[str, tuple[np.ndarray, np.ndarray]],
     xlabel: str,
     ylabel: str,
     title: str = "",
     marks: Mapping[str, float] | None = None,
     ylim: tuple[float, float] | None = None,
-) -> None:
-    """Draw curves into existing axes.
-
-    The first curve is the widest, so that it stays visible under others.
-
-    Args:
-        axes: Axes of matplotlib.
-        series: As in `curves`.
-        xlabel: As in `curves`.
-        ylabel: As in `curves`.
-        title: As in `curves`.
-        marks: As in `curves`.
-        ylim: As in `curves`.
-    """
+) -> Figure:
+    """Draw curves into a new figure; the arguments are those of `curves`."""
+    figure, axes = _figure(width, 0.68 * width)
     for i, (name, (x, y)) in enumerate(series.items()):
         axes.plot(
             x,
@@ -430,11 +495,11 @@ def draw_curves(
         )
     for i, (name, position) in enumerate((marks or {}).items()):
         axes.axvline(position, color=COLOURS[(len(series) + i) % len(COLOURS)], linestyle="--", linewidth=1, label=name)
-    axes.set(xlabel=xlabel, ylabel=ylabel, title=title)
+    axes.set(xlabel=xlabel, ylabel=ylabel, title=_wrapped(title, width))
     if ylim is not None:
         axes.set_ylim(*ylim)
-    if len(series) + len(marks or {}) > 1:
-        axes.legend(loc="best")
+    _legend_below(figure, axes)
+    return figure
 
 
 @_styled
@@ -456,7 +521,7 @@ def trade(
         title: Title of the figure.
         tolerance: Largest acceptable loss, drawn as a dashed line.
     """
-    figure, (axes,) = _panels(1, 1, (7.2, 4.2))
+    figure, axes = _figure(_ALONE, 3.6)
     points = sorted(zip(seconds, loss, strict=True))
     front = [(s, e) for i, (s, e) in enumerate(points) if all(e < other for _, other in points[:i])]
     axes.step([s for s, _ in front], [e for _, e in front], where="post", color=FAINT, linewidth=1, zorder=0)
@@ -478,56 +543,38 @@ def error_curves(
     log_x: bool = False,
     log_y: bool = False,
     ylim: tuple[float, float] | None = None,
-) -> Figure:
+) -> list[Figure]:
     """Draw errors of algorithms with their intervals over one parameter.
 
-    Numbers give lines with bands, words dots with bars; all panels share the vertical axis. Values
-    that are not finite, or not positive on a logarithmic axis, are left out.
+    Numbers give lines with bands, words dots with bars; all panels have one vertical scale. Values
+    that are not finite, or not positive on a logarithmic axis, are left out, and so are panels
+    without any value.
 
     Args:
-        parts: Panels. Each has `title`; `x`, numbers (n,) or words; `series`, a mapping from names
-            to values (n,) and intervals (n, 2); and `bounds`, a mapping from names to values (n,),
-            drawn dark and dashed.
+        parts: Panels, a figure each. Each has `title`; `x`, numbers (n,) or words; `series`, a
+            mapping from names to values (n,) and intervals (n, 2); and `bounds`, a mapping from
+            names to values (n,), drawn dark and dashed.
         xlabel: Label of the horizontal axes, with unit.
         ylabel: Label of the vertical axes, with unit.
         log_x: Whether the horizontal axes are logarithmic.
         log_y: Whether the vertical axes are logarithmic.
         ylim: Limits of the vertical axes.
     """
-    figure, axes = _grid(len(parts), (7.2, 3.6), 3.0)
-    for one, part in zip(axes, parts, strict=False):
+    filled = [part for part in parts if any(np.isfinite(_drawable(y, log_y)).any() for y, _ in part["series"].values())]
+    figures, width = [], _width(len(filled))
+    for part in filled:
+        figure, axes = _figure(width, 0.62 * width)
         draw = _draw_dots if any(isinstance(x, str) for x in part["x"]) else _draw_bands
-        draw(one, part["x"], part["series"], part["bounds"], log_y)
-        if not any(np.isfinite(_drawable(y, log_y)).any() for y, _ in part["series"].values()):
-            one.text(0.5, 0.5, "no value to show", transform=one.transAxes, ha="center", va="center", color=FAINT)
-    for one in axes[: len(parts)]:
-        _scale_axes(one, np.asarray(parts[0]["x"]), log_x, log_y, ylim)
-    _name_axes(axes, [part["title"] for part in parts], xlabel, ylabel)
-    _legend_below(figure, axes)
-    return figure
-
-
-def _columns(count: int) -> int:
-    """Number of panels in a row: up to three, two if there are four panels."""
-    return count if count < 4 else 2 if count == 4 else 3
-
-
-def _grid(count: int, single: tuple[float, float], height: float) -> tuple[Figure, list[Axes]]:
-    """Axes for a number of panels; further axes of the grid are hidden."""
-    rows = math.ceil(count / _columns(count))
-    figure, axes = _panels(rows, _columns(count), single if count == 1 else (9.6, height * rows + 0.5), sharey=True)
-    for one in axes[count:]:
-        one.set_visible(False)
-    return figure, axes
-
-
-def _name_axes(axes: Sequence[Axes], titles: Sequence[str], xlabel: str, ylabel: str) -> None:
-    """Set titles, wrapped to the width of a panel, and labels at the outer edges of the grid."""
-    columns = _columns(len(titles))
-    for i, title in enumerate(titles):
-        axes[i].set_title(textwrap.fill(title, {1: 84, 2: 46}.get(columns, 30)))
-        axes[i].set_xlabel(xlabel if i + columns >= len(titles) else "")
-        axes[i].set_ylabel(textwrap.fill(ylabel, 38) if i % columns == 0 else "")
+        draw(axes, part["x"], part["series"], part["bounds"], log_y)
+        axes.set_yscale("log" if log_y else "linear")
+        axes.set(xlabel=xlabel, ylabel=textwrap.fill(ylabel, 34), title=_wrapped(part["title"], width))
+        figures.append(figure)
+    ends = [figure.axes[0].get_ylim() for figure in figures]
+    common = ylim or (min((low for low, _ in ends), default=0.0), max((high for _, high in ends), default=1.0))
+    for figure in figures:
+        _scale_axes(figure.axes[0], np.asarray(filled[0]["x"]), log_x, log_y, common)
+        _legend_below(figure, figure.axes[0])
+    return figures
 
 
 def _drawable(y: Any, log: bool) -> np.ndarray:
@@ -596,13 +643,17 @@ def _draw_dots(
     axes.set_xticks(
         np.arange(len(x)),
         x,
-        **({"rotation": 40, "ha": "right"} if sum(len(word) + 2 for word in x) > _WORDS_FIT else {}),
+        **(
+            {"rotation": 40, "ha": "right"}
+            if sum(len(word) + 2 for word in x) > _WORDS_FIT * axes.get_figure().get_figwidth()  # pyright: ignore
+            else {}
+        ),
     )
     axes.set_xlim(-0.6, len(x) - 0.4)
     axes.grid(False, axis="x")
 
 
-def _scale_axes(axes: Axes, x: np.ndarray, log_x: bool, log_y: bool, ylim: tuple[float, float] | None) -> None:
+def _scale_axes(axes: Axes, x: np.ndarray, log_x: bool, log_y: bool, ylim: tuple[float, float]) -> None:
     """Set scales, ticks and limits."""
     if x.dtype.kind != "U":
         axes.set_xscale("log" if log_x else "linear")
@@ -610,30 +661,27 @@ def _scale_axes(axes: Axes, x: np.ndarray, log_x: bool, log_y: bool, ylim: tuple
         if len(x) <= 8 and np.diff(position).min(initial=np.inf) > 0.08 * np.ptp(position):
             axes.set_xticks(x, [f"{value:g}" for value in x])
             axes.xaxis.set_minor_formatter(NullFormatter())
-    if log_y:
-        axes.set_yscale("log")
-        low, high = axes.get_ylim()
-        if high < 1000 * low:
-            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high > 10 * low else (1, 1.5, 2, 3, 4, 5, 6, 8)))
-            plain = low >= 1e-3 and high < 1e5
-            axes.yaxis.set_major_formatter(
-                FuncFormatter(lambda value, _: f"{value:g}")
-                if plain
-                else LogFormatterSciNotation(minor_thresholds=(math.inf, math.inf))
-            )
-            axes.yaxis.set_minor_formatter(NullFormatter())
-    if ylim is not None:
-        axes.set_ylim(*ylim)
-
-
-def _legend_below(figure: Figure, axes: Sequence[Axes]) -> None:
-    """One legend for all panels below them, if there are several entries."""
-    found = {label: handle for one in axes for handle, label in zip(*one.get_legend_handles_labels(), strict=True)}
-    if len(found) > 1:
-        fitting = int(12 * figure.get_figwidth() / (6 + max(map(len, found))))
-        figure.legend(
-            list(found.values()), list(found), loc="outside lower center", ncols=max(1, min(fitting, len(found)))
+    axes.set_ylim(*ylim)
+    if log_y and ylim[1] < 1000 * ylim[0]:
+        subs = (1, 2, 5) if ylim[1] > 10 * ylim[0] else (1, 1.5, 2, 3, 4, 5, 6, 8)
+        axes.yaxis.set_major_locator(LogLocator(subs=subs))
+        axes.yaxis.set_major_formatter(
+            FuncFormatter(lambda value, _: f"{value:g}")
+            if ylim[0] >= 1e-3 and ylim[1] < 1e5
+            else LogFormatterSciNotation(minor_thresholds=(math.inf, math.inf))
         )
+        axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _legend_below(figure: Figure, axes: Axes, least: int = 2) -> None:
+    """Legend below the axes, for which the figure grows, if there are enough entries."""
+    handles, names = axes.get_legend_handles_labels()
+    if len(names) < least:
+        return
+    fitting = int(_LETTERS * figure.get_figwidth() / (5 + max(map(len, names))))
+    columns = max(1, min(fitting, len(names)))
+    figure.set_figheight(figure.get_figheight() + 0.19 * math.ceil(len(names) / columns))
+    figure.legend(handles, names, loc="outside lower center", ncols=columns)
 
 
 @_styled
@@ -644,30 +692,32 @@ def heat_map(
     label: str,
     log: bool = False,
     limits: tuple[float, float] | None = None,
-) -> Figure:
+) -> list[Figure]:
     """Draw coloured cells over two parameters, all panels on one colour scale.
 
-    Panels of up to 48 cells show their numbers. Values that are not finite, or not positive on a
-    logarithmic scale, stay white.
+    Panels of few cells show their numbers. Values that are not finite, or not positive on a
+    logarithmic scale, stay white; panels without any value are left out.
 
     Args:
-        parts: Panels. Each has `title`, `x` (n,), `y` (m,) and `z` (m, n).
+        parts: Panels, a figure each. Each has `title`, `x` (n,), `y` (m,) and `z` (m, n).
         xlabel: Label of the horizontal axes, with unit.
         ylabel: Label of the vertical axes, with unit.
         label: Label of the colour scale, with unit.
         log: Whether the colour scale is logarithmic.
         limits: Ends of the colour scale; by default those of the values.
     """
-    shown = [_drawable(part["z"], log) for part in parts]
-    norm = _norm(np.stack(shown) if limits is None else np.asarray(limits), log)
-    figure, axes = _grid(len(parts), (7.2, 4.2), 2.9)
-    mesh: Any = None
-    for one, part, z in zip(axes, parts, shown, strict=False):
-        mesh = one.imshow(z, norm=norm, cmap="viridis", origin="lower", aspect="auto", interpolation="nearest")
-        _label_cells(one, part, z, norm)
-    figure.colorbar(mesh, ax=axes, label=label, shrink=0.9)
-    _name_axes(axes, [part["title"] for part in parts], xlabel, ylabel)
-    return figure
+    shown = [(part, _drawable(part["z"], log)) for part in parts]
+    shown = [(part, z) for part, z in shown if np.isfinite(z).any()]
+    figures, width = [], _width(len(shown))
+    norm = _norm(np.concatenate([z.ravel() for _, z in shown] if limits is None else [np.asarray(limits)]), log)
+    for part, z in shown:
+        figure, axes = _figure(width, 0.68 * width)
+        mesh = axes.imshow(z, norm=norm, cmap="viridis", origin="lower", aspect="auto", interpolation="nearest")
+        _label_cells(axes, part, z, norm)
+        figure.colorbar(mesh, ax=axes, label=textwrap.fill(label, 30), fraction=0.05, pad=0.02)
+        axes.set(xlabel=xlabel, ylabel=textwrap.fill(ylabel, 30), title=_wrapped(part["title"], width))
+        figures.append(figure)
+    return figures
 
 
 def _norm(z: np.ndarray, log: bool) -> Normalize:
@@ -678,12 +728,12 @@ def _norm(z: np.ndarray, log: bool) -> Normalize:
 
 
 def _label_cells(axes: Axes, part: Mapping[str, Any], z: np.ndarray, norm: Normalize) -> None:
-    """Set ticks at values of the parameters and, for up to 48 cells, write their numbers."""
+    """Set ticks at values of the parameters and, for few cells, write their numbers."""
     for axis, values in ((axes.xaxis, part["x"]), (axes.yaxis, part["y"])):
         step = math.ceil(len(values) / 8)
         axis.set_ticks(np.arange(0, len(values), step), [f"{value:g}" for value in values[::step]])
     axes.grid(False)
-    if z.size <= 48:
+    if z.size <= _CELLS[0] and z.shape[1] <= _CELLS[1]:
         for (row, column), value in np.ndenumerate(z):
             if np.isfinite(value):
                 axes.text(
@@ -692,20 +742,42 @@ def _label_cells(axes: Axes, part: Mapping[str, Any], z: np.ndarray, norm: Norma
                     f"{value:.2g}" if abs(value) < 100 else f"{value:.0f}",
                     ha="center",
                     va="center",
-                    fontsize=7,
+                    fontsize=8,
                     color=INK if norm(value) > 0.6 else "white",
                 )
 
 
-def save(figure: Figure, path: Any, dpi: int = 110) -> None:
-    """Write a figure to a file.
+def save(figure: Figure | Sequence[Figure], path: Any, dpi: int = 120, columns: int = 2) -> None:
+    """Write a figure to a file, or several as one picture.
 
     Args:
-        figure: Figure to write.
+        figure: Figure to write, or panels that are set side by side, row by row.
         path: Path of the file; its suffix gives the format.
         dpi: Resolution in dots per inch.
+        columns: Number of panels in a row.
     """
-    figure.savefig(path, dpi=dpi)
+    if isinstance(figure, Figure):
+        figure.savefig(path, dpi=dpi)
+        return
+    drawn = [_pixels(one, dpi) for one in figure]
+    rows = [drawn[first : first + columns] for first in range(0, len(drawn), columns)]
+    wide = [max(row[i].shape[1] for row in rows if i < len(row)) for i in range(len(rows[0]))]
+    sheet = np.full((sum(max(len(one) for one in row) for row in rows), sum(wide), 4), 255, np.uint8)
+    above = 0
+    for row in rows:
+        for i, one in enumerate(row):
+            left = sum(wide[:i])
+            sheet[above : above + len(one), left : left + one.shape[1]] = one
+        above += max(len(one) for one in row)
+    imsave(path, sheet, dpi=dpi)
+
+
+def _pixels(figure: Figure, dpi: int) -> np.ndarray:
+    """A figure as colours, shape (height, width, 4)."""
+    figure.set_dpi(dpi)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())
 
 
 def array(x: Tensor) -> np.ndarray:

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from torchsar.study.pictures import Picture
 
 from torchsar.study.montecarlo.pictures import axis_label, draw_sweep, panels_beside, read_summary
 from torchsar.study.montecarlo.record import Record
 from torchsar.study.montecarlo.report import figure, with_interval, write_sweep_report
 from torchsar.study.montecarlo.summary import summary_tree
 from torchsar.study.output.arrays import write_json
+from torchsar.study.output.pictures import Picture
 
 GRID = {"world.noise.snr_db": (20.0, -10.0, 5.0), "world.squint_deg": (0.0, 3.0), "world.scene": ("point", "speckle")}
 SESSION = {"device": "cpu", "versions": {"torch": "2.13.0"}, "seconds": 4.0, "trials": 470}
@@ -195,12 +195,13 @@ SWEEPS = {
 
 
 def check_pictures(pictures: list[Picture], folder: Path, expected: list[str]) -> None:
-    assert sorted(p.file for p in pictures) == sorted(path.name for path in folder.iterdir())
-    assert all((folder / p.file).read_bytes().startswith(b"\x89PNG") for p in pictures)
+    files = [file for p in pictures for file in p.files]
+    assert sorted(files) == sorted(path.name for path in folder.iterdir())
+    assert all((folder / file).read_bytes().startswith(b"\x89PNG") for file in files)
     for pattern in expected:
-        assert any(re.search(pattern, p.file) for p in pictures), pattern
+        assert any(re.search(pattern, file) for file in files), pattern
     assert all("trials a point" in p.caption for p in pictures)
-    assert all("95%" in p.caption for p in pictures if "_map_" not in p.file)
+    assert all("95%" in p.caption for p in pictures if "_map_" not in p.files[0])
 
 
 def test_three_parameters_have_curves_shares_and_maps(drawn: tuple[Path, list[Picture]]) -> None:
@@ -221,7 +222,7 @@ def test_every_sweep_has_its_pictures(
 
 
 def test_errors_are_drawn_unless_something_else_is_asked_for(summary: dict[str, Any], tmp_path: Path) -> None:
-    files = [p.file for p in draw_sweep(summary, tmp_path / "a")]
+    files = [p.files[0] for p in draw_sweep(summary, tmp_path / "a")]
     assert any("doppler_error_hz" in name for name in files) and not any("entropy" in name for name in files)
 
 

@@ -215,13 +215,7 @@ class EffectiveVelocity(Stage):
             shape (...,).
         """
         raw = signal.data.detach()
-        radar = self._focuser[0].radar
-        doppler = torch.as_tensor(
-            (radar.pointing_doppler_hz or 0.0) if doppler_hz is None else doppler_hz,
-            dtype=torch.float64,
-            device=raw.device,
-        )
-        doppler = doppler.detach().expand(raw.shape[:-2])
+        radar, doppler = self._focuser[0].radar, self._doppler(raw, doppler_hz)
         group, dwell = self.group(raw)
         value, std, costs = minimum_entropy_velocity(
             group, doppler, dwell, self.reach_m_s, self.refine, self.tolerance_m_s
@@ -239,3 +233,27 @@ class EffectiveVelocity(Stage):
             {"velocity_m_s": std},
             {"grid_velocity_m_s": grid, "grid_entropy": costs, "group_start": group.start},
         )
+
+    @torch.no_grad()
+    def entropy(self, signal: Signal, velocity_m_s: Tensor, doppler_hz: Tensor | None = None) -> Tensor:
+        """Evaluate what the search minimises, for curves.
+
+        Args:
+            signal: Lines, shape (..., pulse, range), complex.
+            velocity_m_s: Effective velocities in m/s, shape (n,).
+            doppler_hz: As in `forward`.
+
+        Returns:
+            The objective in nats, shape (..., n).
+        """
+        raw = signal.data.detach()
+        doppler = self._doppler(raw, doppler_hz)
+        group, dwell = self.group(raw)
+        blocks = velocity_objective(group, doppler, dwell)
+        return torch.stack([blocks(v.to(doppler).expand(doppler.shape)).sum(-1) for v in velocity_m_s], -1)
+
+    def _doppler(self, raw: Tensor, doppler_hz: Tensor | None) -> Tensor:
+        """The given Doppler centroid, or that of the pointing, shape (...,)."""
+        pointing = self._focuser[0].radar.pointing_doppler_hz or 0.0
+        given = torch.as_tensor(pointing if doppler_hz is None else doppler_hz, dtype=torch.float64, device=raw.device)
+        return given.detach().expand(raw.shape[:-2])

@@ -1,4 +1,4 @@
-"""Cuts through an impulse response, for drawing."""
+"""Impulse responses on finer grids, for drawing."""
 
 from __future__ import annotations
 
@@ -7,33 +7,91 @@ import math
 import torch
 from torch import Tensor
 
-from torchsar.core import Signal, cis
+from torchsar.core import Axis, Signal, cis
 from torchsar.metrics.impulse import impulse_response
 
-_REACH, _FACTOR = 32, 16
+# samples to either side that a cut has at least, and further ones that its interpolation needs
+_LEAST, _MORE = 24, 8
+# null spacings to either side that a cut has: ten side lobes and half of the main lobe
+_NULLS = 11
+# positions of a cut per sample
+_FACTOR = 16
+# -3 dB width of a response over the spacing of its nulls
+_WIDTH = 0.886
 
 
 def impulse_cuts(image: Signal, at_m: tuple[float, float]) -> dict[str, tuple[Tensor, Tensor]]:
-    """Per axis of an unbatched image: offsets (m) from the peak nearest to at_m, and the
-    interpolated complex cut through it.
+    """Cut through the response nearest to a position, along both axes of an image.
 
-    Band-limited interpolation by 16 about the centre of the local spectrum, over 32 samples to each
-    side (less at the edges).
+    The cuts are interpolated by 16 within the band about the centre of the local spectrum. They
+    reach over ten side lobes of a rectangular band, and over 24 samples at least, less at the
+    edges.
+
+    Args:
+        image: Image of one trial, (first, second).
+        at_m: Coordinates on the two axes in metres.
+
+    Returns:
+        By the name of the axis: offsets (m) from the peak and the complex cut, shape (n,) each.
     """
     measured = impulse_response(image, at_m)
-    places = [float(axis.index_of(measured[f"position_{axis.name}_m"])) for axis in image.axes]
-    firsts = [max(0, min(round(p) - _REACH, axis.n - 2 * _REACH)) for p, axis in zip(places, image.axes)]
-    patch = image.data[firsts[0] : firsts[0] + 2 * _REACH, firsts[1] : firsts[1] + 2 * _REACH].to(torch.complex128)
+    positions, windows, reaches = [], [], []
+    for axis in image.axes:
+        nulls = float(measured[f"irw_{axis.name}_m"]) / _WIDTH / axis.step
+        reach = min(max(_LEAST, math.ceil(_NULLS * nulls)), axis.n // 2) if math.isfinite(nulls) else _LEAST
+        at = float(axis.index_of(measured[f"position_{axis.name}_m"]))
+        first = max(0, min(round(at) - reach - _MORE, axis.n - 2 * (reach + _MORE)))
+        windows.append(slice(first, first + 2 * (reach + _MORE)))
+        positions.append(at - first)
+        reaches.append(reach)
+    patch = image.data[windows[0], windows[1]].to(torch.complex128)
     tones = [_centre_turns(patch, dim) for dim in (0, 1)]
-    local = [p - first for p, first in zip(places, firsts)]
     cuts: dict[str, tuple[Tensor, Tensor]] = {}
     for dim, axis in enumerate(image.axes):
-        other = 1 - dim
-        through = _kernel(torch.tensor([local[other]], dtype=torch.float64), patch.shape[other], tones[other])[0]
+        other, steps = 1 - dim, reaches[dim] * _FACTOR
+        through = _kernel(torch.tensor([positions[other]], dtype=torch.float64), patch.shape[other], tones[other])[0]
         line = (patch * (through[None, :] if dim == 0 else through[:, None])).sum(other)
-        offsets = torch.arange(-(_REACH - 8) * _FACTOR, (_REACH - 8) * _FACTOR + 1, dtype=torch.float64) / _FACTOR
-        cuts[axis.name] = (offsets * axis.step, _kernel(local[dim] + offsets, line.shape[0], tones[dim]) @ line)
+        offsets = torch.arange(-steps, steps + 1, dtype=torch.float64) / _FACTOR
+        offsets = offsets[(positions[dim] + offsets >= 0) & (positions[dim] + offsets <= len(line) - 1)]
+        cuts[axis.name] = (offsets * axis.step, _kernel(positions[dim] + offsets, len(line), tones[dim]) @ line)
     return cuts
+
+
+def finer(line: Tensor, factor: int) -> Tensor:
+    """Interpolate a cut within its band, which is centred on zero.
+
+    Args:
+        line: Samples, shape (n,), continued periodically.
+        factor: Samples of the result per sample.
+
+    Returns:
+        The cut, shape (factor n,), complex128; its level is that of `line` over factor.
+    """
+    n = len(line)
+    spectrum = torch.fft.fftshift(torch.fft.fft(line.to(torch.complex128)))
+    before = (factor * n) // 2 - n // 2
+    wide = torch.nn.functional.pad(spectrum, (before, (factor - 1) * n - before))
+    return torch.fft.ifft(torch.fft.ifftshift(wide))
+
+
+def about_peak(image: Signal, reach: tuple[float, float], samples: int) -> Signal:
+    """Interpolate an image about its strongest sample.
+
+    Args:
+        image: Image of one trial, (first, second).
+        reach: Half extents along the axes, in their units.
+        samples: Samples of the result along either axis.
+
+    Returns:
+        The part about the peak, complex128, on axes of offsets from it.
+    """
+    peak = divmod(int(image.data.abs().argmax()), image.axes[1].n)
+    kernels, axes = [], []
+    for axis, at, half in zip(image.axes, peak, reach, strict=True):
+        offset = torch.linspace(-half, half, samples, dtype=torch.float64)
+        kernels.append(_kernel(at + offset / axis.step, axis.n, 0.0))
+        axes.append(Axis(axis.name, samples, -half, 2 * half / (samples - 1), axis.unit))
+    return Signal(kernels[0] @ image.data.to(torch.complex128) @ kernels[1].mT, tuple(axes))
 
 
 def _centre_turns(patch: Tensor, dim: int) -> float:

@@ -228,3 +228,26 @@ def error_after_gain_db(images: Tensor, references: Tensor) -> Tensor:
     """
     gain = (images.conj() * references).sum() / images.abs().square().sum()
     return error_db(images * gain, references)
+
+
+def rolled_to(image: Signal, reference: Signal) -> Signal:
+    """Shift an image along azimuth to where another one of the same scene lies.
+
+    A slope of the phase over pulses shifts an image in a circle and changes nothing else.
+
+    Args:
+        image: Image (azimuth, range).
+        reference: Image on the same axes.
+
+    Returns:
+        The image, rolled by whole samples until the circular centres of the energies agree.
+    """
+    shift = round((_circular_centre(reference) - _circular_centre(image)) * image.axes[0].n)
+    return image.with_data(image.data.roll(shift, 0))
+
+
+def _circular_centre(image: Signal) -> float:
+    """Circular centre of the energy along azimuth, in parts of the image's height."""
+    n, power = image.axes[0].n, image.data.abs().double().square().sum(-1)
+    turns = torch.arange(n, dtype=torch.float64, device=power.device) / n
+    return float(torch.angle(torch.polar(power, 2 * torch.pi * turns).sum())) / (2 * torch.pi)

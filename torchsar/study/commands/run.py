@@ -173,7 +173,8 @@ def metrics_tree(loaded: Loaded, results: Mapping[str, Result]) -> dict[str, Any
         "estimates": f"of more than {_LISTED} numbers a trial the mean and the rms standard deviation; all are in arrays.zarr",
         "ok": "whether all estimators of the method call their estimates reliable; a share over trials",
         "seconds": "wall time of the chain of the method per trial; estimates that methods share count in each",
-        "targets_outside": "named targets that lie outside the image of the method, or are never in the beam",
+        "targets_outside": "named targets that lie outside the image of the method, or are never in the beam; "
+        "of a case their number",
     }
     return {
         "methods": methods,
@@ -188,8 +189,10 @@ def metrics_tree(loaded: Loaded, results: Mapping[str, Result]) -> dict[str, Any
 
 
 def _method_tree(title: str, name: str, results: Mapping[str, Result]) -> dict[str, Any]:
-    cases = {case: summary(result.metrics[name]) for case, result in results.items()}
     outcomes = {case: result.first_of(name) for case, result in results.items()}
+    outside = {case: outcome.judged.outside for case, outcome in outcomes.items()}
+    counted = {case: {"targets_outside": len(names)} if names else {} for case, names in outside.items()}
+    cases = {case: {**summary(result.metrics[name]), **counted[case]} for case, result in results.items()}
     first = next(iter(outcomes.values()))
     targets = {
         key_of(case, target): summary(metrics)
@@ -203,7 +206,7 @@ def _method_tree(title: str, name: str, results: Mapping[str, Result]) -> dict[s
         "cases": cases,
         "estimates": estimates,
         "targets": targets,
-        "targets_outside": [key_of(case, target) for case, o in outcomes.items() for target in o.judged.outside],
+        "targets_outside": [key_of(case, target) for case, names in outside.items() for target in names],
         "seconds_by_stage": dict(first.seconds),
         "failed": "; ".join(key_of(case, o.failed) for case, o in outcomes.items() if o.failed),
     }

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import itertools
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,50 +13,10 @@ import numpy as np
 
 from torchsar import plot
 from torchsar.study.montecarlo.statistics import LEVEL
-from torchsar.study.output.pictures import Picture
+from torchsar.study.output.numbers import name_and_unit
+from torchsar.study.output.pictures import Drawn, Picture, draw_all
 
 PANELS = 6
-_UNITS = {
-    "_rad_s": "rad/s",
-    "_m_s2": "m/s²",
-    "_m_s": "m/s",
-    "_hz": "Hz",
-    "_db": "dB",
-    "_nats": "nats",
-    "_rad": "rad",
-    "_deg": "deg",
-    "_m": "m",
-    "_s": "s",
-}
-_ACRONYMS = {
-    word.lower(): word
-    for word in (
-        "Doppler",
-        "SNR",
-        "PRF",
-        "RMS",
-        "IRW",
-        "PSLR",
-        "ISLR",
-        "RCS",
-        "SIR",
-        "CNR",
-        "SCR",
-        "SCNR",
-        "MFTA",
-        "ADC",
-    )
-}
-
-
-def name_and_unit(name: str) -> tuple[str, str]:
-    """What the last part of a dotted name says, and its unit: 'world.noise.snr_db' -> ('SNR',
-    'dB').
-    """
-    last = name.rpartition(".")[2]
-    suffix = next((suffix for suffix in _UNITS if last.endswith(suffix) and last != suffix), "")
-    words = last.removesuffix(suffix).strip("_").split("_")
-    return " ".join(_ACRONYMS.get(word, word) for word in words), _UNITS.get(suffix, "")
 
 
 def axis_label(name: str) -> str:
@@ -172,9 +132,6 @@ def _index(labels: Mapping[str, list[float | str]], parameters: Mapping[str, flo
     return tuple(values.index(parameters[name]) for name, values in labels.items())
 
 
-Drawn = Iterator[tuple[str, str, str, Any]]
-
-
 def draw_sweep(summary: Mapping[str, Any], folder: Path, show: Sequence[str] = ()) -> list[Picture]:
     """The pictures of a sweep as PNG files in the folder (made if need be), in the order of
     reading.
@@ -182,14 +139,9 @@ def draw_sweep(summary: Mapping[str, Any], folder: Path, show: Sequence[str] = (
     show: the metrics to draw, in this order; by default the errors, and where nothing is called an
     error everything that was measured.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    cube, pictures = read_summary(summary), []
+    cube = read_summary(summary)
     wanted = show or [metric for metric in cube.figures if "error" in metric] or list(cube.figures)
-    for name, title, caption, figure in _all(cube, wanted):
-        file = f"{len(pictures) + 1:02d}_{re.sub(r'[^A-Za-z0-9_.-]+', '_', name)}.png"
-        plot.save(figure, folder / file)
-        pictures.append(Picture(file, title[:1].upper() + title[1:], caption))
-    return pictures
+    return draw_all([partial(_all, cube, wanted)], folder)
 
 
 def _all(cube: Cube, wanted: Sequence[str]) -> Drawn:
@@ -201,7 +153,7 @@ def _all(cube: Cube, wanted: Sequence[str]) -> Drawn:
         if "success_share" in fields:
             limit = np.nanmax(fields["success_limit"])
             words = (
-                f"share of trials with {name_and_unit(metric)[0]} within {limit:g} {name_and_unit(metric)[1]}".rstrip()
+                f"share of trials trusted and within {limit:g} {name_and_unit(metric)[1]}: {name_and_unit(metric)[0]}"
             )
             yield from _curves(cube, Quantity(metric, "success_share", "success_interval", words))
         for x, y in itertools.combinations(cube.numeric, 2):

@@ -10,6 +10,39 @@ MISSING = "–"
 # units that take a prefix; those of levels, shares and angles in degrees take none
 _PREFIXED = ("m", "s", "Hz", "rad", "B")
 _PREFIXES = {-12: "p", -9: "n", -6: "u", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
+# endings of names and their units, the longer one of two that end alike first
+_UNITS = {
+    "_rad_s": "rad/s",
+    "_m_s2": "m/s²",
+    "_m_s": "m/s",
+    "_hz": "Hz",
+    "_db": "dB",
+    "_nats": "nats",
+    "_rad": "rad",
+    "_deg": "deg",
+    "_m": "m",
+    "_s": "s",
+}
+# words that are not written in small letters
+_ACRONYMS = {
+    word.lower(): word
+    for word in (
+        "Doppler",
+        "SNR",
+        "PRF",
+        "RMS",
+        "IRW",
+        "PSLR",
+        "ISLR",
+        "RCS",
+        "SIR",
+        "CNR",
+        "SCR",
+        "SCNR",
+        "MFTA",
+        "ADC",
+    )
+}
 
 
 def scale_of(values: Sequence[float | None], unit: str) -> tuple[float, str]:
@@ -21,20 +54,29 @@ def scale_of(values: Sequence[float | None], unit: str) -> tuple[float, str]:
     return 10.0**-power, _PREFIXES[power] + unit
 
 
-def number(value: Any, sd: float | None = None) -> str:
+def number(value: Any, sd: Any = None, factor: float = 1.0) -> str:
     """A number for reading; text passes, and what is missing is a dash.
 
-    With a standard deviation it has that one's two leading digits, else four digits of its own.
+    Args:
+        value: A number, text, a verdict, or a list of these.
+        sd: Its standard deviation, whose two leading digits both are rounded to; without one the
+            number has four digits.
+        factor: What numbers are multiplied by.
     """
-    if value is None or (isinstance(value, float) and not math.isfinite(value)):
-        return MISSING
+    if isinstance(value, (list, tuple)):
+        sds = sd if isinstance(sd, (list, tuple)) else [sd] * len(value)
+        return ", ".join(number(v, s, factor) for v, s in zip(value, sds, strict=True))
     if isinstance(value, (str, bool)):
         return value if isinstance(value, str) else "yes" if value else "no"
-    if isinstance(value, (list, tuple)):
-        return ", ".join(number(v) for v in value)
+    if value is None or not math.isfinite(value):
+        return MISSING
+    value = value * factor
     if sd is not None and math.isfinite(sd) and sd > 0:
-        digits = max(0, 1 - math.floor(math.log10(sd)))
-        return f"{value:,.{digits}f} ± {sd:.{digits}f}" if digits < 10 else f"{value:.4g} ± {sd:.2g}"
+        sd = float(f"{sd * factor:.1e}")
+        digits = 1 - math.floor(math.log10(sd))
+        if digits < 10:
+            return " ± ".join(f"{round(x, digits):,.{max(0, digits)}f}" for x in (value, sd))
+        return f"{value:.4g} ± {sd:.2g}"
     if float(value).is_integer() and abs(value) < 1e6:
         return f"{int(value)}"
     if not 1e-3 <= abs(value) < 1e6:
@@ -42,9 +84,24 @@ def number(value: Any, sd: float | None = None) -> str:
     return f"{value:,.{max(0, 3 - math.floor(math.log10(abs(value))))}f}"
 
 
-def quantity(value: Any, unit: str, sd: float | None = None) -> str:
-    """A number with its unit, in the prefix that suits it: 17.58 um/s."""
-    if not isinstance(value, (int, float)):
-        return number(value)
-    factor, unit = scale_of([value], unit)
-    return f"{number(value * factor, None if sd is None else sd * factor)} {unit}".strip()
+def quantity(value: Any, unit: str, sd: Any = None) -> str:
+    """A number, or a list of them, with its unit in the prefix that suits it: 17.58 um/s."""
+    factor, unit = scale_of([*_numbers(value), *_numbers(sd)], unit)
+    text = number(value, sd, factor)
+    return f"{text} {unit}".strip() if any(map(math.isfinite, _numbers(value))) else text
+
+
+def _numbers(value: Any) -> list[float]:
+    if isinstance(value, (list, tuple)):
+        return [x for one in value for x in _numbers(one)]
+    return [value] if isinstance(value, (int, float)) and not isinstance(value, bool) else []
+
+
+def name_and_unit(name: str) -> tuple[str, str]:
+    """What the last part of a dotted name says, and its unit: 'world.noise.snr_db' -> ('SNR',
+    'dB').
+    """
+    last = name.rpartition(".")[2]
+    suffix = next((suffix for suffix in _UNITS if last.endswith(suffix) and last != suffix), "")
+    words = last.removesuffix(suffix).strip("_").split("_")
+    return " ".join(_ACRONYMS.get(word, word) for word in words), _UNITS.get(suffix, "")

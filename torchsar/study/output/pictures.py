@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,32 +14,38 @@ import torch
 from torchsar import plot
 from torchsar.core import Signal
 
+# comparisons of values that span more than this factor have a logarithmic axis
+_DECADES = 100.0
 Drawn = Iterator[tuple[str, str, str, Any]]
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure file and what a reader should see in it."""
+    """Figure files that are shown beside each other, and what a reader should see in them."""
 
-    file: str
+    files: tuple[str, ...]
     title: str
     caption: str
 
 
 def draw_all(makers: Iterable[Callable[[], Drawn]], folder: Path) -> list[Picture]:
-    """Every picture that the makers have the material for, as PNG files in a new folder.
+    """Every picture that the makers have the material for, as PNG files in a folder.
 
     Args:
-        makers: Each yields (name, title, caption, figure), or nothing.
-        folder: Where to write.
+        makers: Each yields (name, title, caption, figure), or nothing; a list of figures is one
+            picture of several panels.
+        folder: Where to write; made if need be.
     """
-    folder.mkdir()
-    pictures = []
-    for make in makers:
-        for name, title, caption, figure in make():
-            file = f"{len(pictures) + 1:02d}_{name}.png"
+    folder.mkdir(parents=True, exist_ok=True)
+    pictures: list[Picture] = []
+    for name, title, caption, drawn in (one for make in makers for one in make()):
+        stem = f"{len(pictures) + 1:02d}_{re.sub(r'[^A-Za-z0-9_.-]+', '_', name)}"
+        panels = drawn if isinstance(drawn, list) else [drawn]
+        files = tuple(f"{stem}_{i}.png" if len(panels) > 1 else f"{stem}.png" for i in range(1, len(panels) + 1))
+        for file, figure in zip(files, panels, strict=True):
             plot.save(figure, folder / file)
-            pictures.append(Picture(file, title, caption))
+        if files:
+            pictures.append(Picture(files, title[:1].upper() + title[1:], caption))
     return pictures
 
 
@@ -58,37 +65,25 @@ def comparisons(results: Mapping[str, Any], columns: Mapping[str, Any], without:
         if not column.drawn or not names:
             continue
 
-        def level(values: Any, rms: bool = column.drawn == "rms") -> float:
+        def mean(values: Any, rms: bool = column.drawn == "rms") -> float:
             there = torch.empty(0) if values is None else values[torch.isfinite(values)]
             return float("nan") if not len(there) else float(there.square().mean().sqrt() if rms else there.mean())
 
-        table = {name: np.array([level(row.get(name)) for row in rows.values()]) for name in names}
+        table = {name: np.array([mean(row.get(name)) for row in rows.values()]) for name in names}
         x, series = list(rows), table
         if len(x) == 1:
             x, series = names, {"": np.array([table[name][0] for name in names])}
-        if not np.isfinite(np.concatenate(list(series.values()))).any():
-            continue
         drawn = {name: (y, np.stack([y, y], -1)) for name, y in series.items()}
-        log = column.drawn == "rms" and any(bool((y > 0).any()) for y in series.values())
+        known = np.concatenate([y[np.isfinite(y)] for y in series.values()])
+        log = len(known) > 0 and known.min() > 0 and (column.drawn == "rms" or known.max() > _DECADES * known.min())
         label = f"{column.label} ({column.unit})" if column.unit else column.label
         said = "Root mean square" if column.drawn == "rms" else "Mean"
         part = {"title": "", "x": x, "series": drawn, "bounds": {}}
-        figure = plot.error_curves([part], "", label, log_y=log)
-        yield key, column.label[0].upper() + column.label[1:], f"{said} over trials of the {label}, by method.", figure
+        figures = plot.error_curves([part], "", label, log_y=log)
+        yield key, column.label, f"{said} over trials of the {label}, by method.", figures
 
 
 def first_named(images: Mapping[str, Signal], name: str = "ideal") -> dict[str, Signal]:
     """Images with that of one method in front, where there is one."""
     front = {name: images[name]} if name in images else {}
     return {**front, **images}
-
-
-def within(signal: Signal, spans: Mapping[str, tuple[float, float]]) -> Signal:
-    """The part of a signal between two positions on some axes, at least two samples of each."""
-    cut = {}
-    for axis in signal.axes:
-        if axis.name in spans:
-            first, last = (round(float(axis.index_of(edge))) for edge in spans[axis.name])
-            first = min(max(first, 0), max(axis.n - 2, 0))
-            cut[axis.name] = (first, min(max(last + 1, first + 2), axis.n))
-    return signal.crop(**cut)

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import jinja2
 import torch
 
-from torchsar.study.output.numbers import MISSING, number, quantity, scale_of
+from torchsar.study.output.numbers import MISSING, name_and_unit, number, quantity, scale_of
 from torchsar.study.output.pictures import Picture
 
 # tiles above the tables show at most so many figures: two rows of four on a wide screen
@@ -59,7 +59,10 @@ def write_page(path: Path, template: str, pictures: Sequence[Picture], figures: 
         lstrip_blocks=True,
     )
     environment.filters["number"] = number
-    shown = [{"title": p.title, "caption": p.caption, "source": _embedded(figures / p.file)} for p in pictures]
+    shown = [
+        {"title": p.title, "caption": p.caption, "sources": [_embedded(figures / file) for file in p.files]}
+        for p in pictures
+    ]
     made = f"torchsar-lab {installed_version()}, torch {torch.__version__}, {datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
     text = environment.get_template(template).render(pictures=shown, made=made, **fields)
     path.write_text(text, encoding="utf-8")
@@ -74,7 +77,8 @@ def run_fields(metrics: Mapping[str, Any], columns: Shown, target_columns: Shown
     methods = metrics["methods"]
     best, cases = methods["recommended"], list(methods["recommended"]["cases"])
     shown = {key: column for key, column in columns.items() if best["metrics"].get(key) is not None}
-    tiles = [(quantity(best["metrics"][key], c.unit), c.label) for key, c in list(shown.items())[:_TILES]]
+    first = best["metrics"]
+    tiles = [(quantity(first[key], c.unit, _sd(first, key)), c.label) for key, c in list(shown.items())[:_TILES]]
     rows = {name: method["cases"] for name, method in methods.items()}
     published = metrics["published"]
     tables = (
@@ -91,6 +95,10 @@ def run_fields(metrics: Mapping[str, Any], columns: Shown, target_columns: Shown
         "target_tables": _tables({**of_targets, **theory}, target_columns, metrics["published_targets"], "target"),
         "methods": methods,
         "best": best,
+        "estimates": [
+            (name, quantity(found["value"], name_and_unit(name)[1], found["std"]), found["ok"])
+            for name, found in best["estimates"].items()
+        ],
         "metrics": metrics,
     }
 
@@ -99,11 +107,13 @@ def _row(name: str, cells: list[str], soft: bool = False) -> dict[str, Any]:
     return {"name": name, "cells": cells, "soft": soft}
 
 
+def _sd(row: Mapping[str, Any], key: str) -> float | None:
+    """Standard deviation over trials; times have none, which would be that of the machine."""
+    return None if key == "seconds" else row.get(f"{key}_sd")
+
+
 def _cell(row: Mapping[str, Any], key: str, factor: float) -> str:
-    value, sd = row.get(key), row.get(f"{key}_sd")
-    if not isinstance(value, (int, float)):
-        return number(value)
-    return number(value * factor, None if sd is None or key == "seconds" else sd * factor)
+    return number(row.get(key), _sd(row, key), factor)
 
 
 def _tables(rows: Mapping[str, Any], columns: Shown, published: Mapping[str, Any], first: str) -> list[dict[str, Any]]:
@@ -135,7 +145,7 @@ def _one_table(rows: Mapping[str, Any], columns: Shown, published: Mapping[str, 
     names, body = list(rows), []
     for key, column in columns.items():
         values = [rows[name][case].get(key) for name in names]
-        factor, unit = scale_of([v for v in values if isinstance(v, (int, float))], column.unit)
+        factor, unit = scale_of(values, column.unit)
         label, source = f"{column.label} ({unit})" if unit else column.label, published.get(key, {}).get(case, {})
         if any(value is not None for value in values):
             body.append(_row(label, [_cell(rows[name][case], key, factor) for name in names]))

@@ -1,9 +1,9 @@
-"""The pictures of a run of moving points: profiles with false targets, main lobes, images, spectra."""
+"""The pictures of a run of moving points: profiles, main lobes, images and spectra."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from torchsar import plot
-from torchsar.core import Axis, Signal
+from torchsar.core import Signal
+from torchsar.metrics.cuts import about_peak, finer
 from torchsar.metrics.moving_point import PeakCuts
 from torchsar.study.output.pictures import Drawn, comparisons
 from torchsar.study.settings.cases import key_of, titled, word_of
@@ -43,10 +44,13 @@ class Shot:
     spectrum: Signal
 
 
-def shots(result: Result) -> dict[str, dict[str, Shot]]:
+Shots = dict[str, dict[str, Shot]]
+
+
+def shots(result: Result) -> Shots:
     """Every target by every method that makes images."""
     targets, truth, radar = list(result.bench.world().targets), result.first.trials.truth, result.bench.radar
-    found: dict[str, dict[str, Shot]] = {}
+    found: Shots = {}
     for name, outcome in result.first.outcomes.items():
         view = outcome.judged.view
         if outcome.failed or view.image is None:
@@ -85,102 +89,78 @@ def by_target(results: Mapping[str, Result]) -> dict[str, Any]:
     return rows
 
 
-def _pair(result: Result) -> dict[str, dict[str, Shot]]:
+def _pair(result: Result) -> Shots:
     """The conventional method beside the recommended one, or what there is of them."""
     found = shots(result)
     chosen = [name for name in ("conventional", "recommended") if name in found] or list(found)[:2]
     return {name: found[name] for name in chosen}
 
 
-def _targets(found: Mapping[str, Mapping[str, Shot]]) -> Sequence[str]:
-    return list(next(iter(found.values()), {}))
-
-
-def _panel(title: str, xlabel: str, series: Mapping[str, Any], low: float) -> dict[str, Any]:
-    return {"series": series, "xlabel": xlabel, "ylabel": "dB", "title": title, "ylim": (low, 3.0)}
+def _panels(found: Shots, curve: Callable[[Shot], tuple[Any, Any]], xlabel: str, low: float) -> list[dict[str, Any]]:
+    """A panel for each target, a curve of levels in dB for each method."""
+    return [
+        {
+            "title": target,
+            "series": {name: curve(of[target]) for name, of in found.items()},
+            "xlabel": xlabel,
+            "ylabel": "level (dB)",
+            "ylim": (low, 3.0),
+        }
+        for target in next(iter(found.values()), {})
+    ]
 
 
 def _profiles(case: str, result: Result) -> Drawn:
-    found, parts = _pair(result), []
-    for target in _targets(found):
-        series = {}
-        for name, of in found.items():
-            level = plot.decibel(of[target].profile, float(of[target].profile.abs().max()))
-            series[name] = (plot.array(of[target].along_m), np.maximum(level, _LOW_DB))
-        parts.append(_panel(target, "x = (V_R - u_a) t (m)", series, _LOW_DB))
-    if parts:
-        caption = (
-            "Azimuth profiles through the peak of images without noise, each in dB of its own peak. False targets lie "
-        )
-        caption += (
-            "about 720 m a pulse rate from it at the parameters of the source; the humps near 1330 m of a target cut "
-        )
-        caption += "by a gate are tails of its band, beyond the rebuilt one, folded back from the ends of the gate."
-        yield f"profiles_{word_of(case)}", titled("False targets", case), caption, plot.panels(parts, columns=2)
+    def curve(shot: Shot) -> tuple[Any, Any]:
+        return plot.array(shot.along_m), np.maximum(plot.decibel(shot.profile), _LOW_DB)
+
+    caption = (
+        "Azimuth profiles through the peak of images without noise, each in dB of its own peak. False targets lie "
+        "about 720 m a pulse rate from it at the parameters of the source; the humps near 1330 m of a target cut "
+        "by a gate are tails of its band, beyond the rebuilt one, folded back from the ends of the gate."
+    )
+    figures = plot.panels(_panels(_pair(result), curve, "x = (V_R - u_a) t (m)", _LOW_DB))
+    yield f"profiles_{word_of(case)}", titled("False targets", case), caption, figures
 
 
 def _main_lobes(case: str, result: Result) -> Drawn:
-    found, parts = shots(result), []
-    for target in _targets(found):
-        series = {}
-        for name, of in found.items():
-            shot = of[target]
-            peak = float(shot.along_m[int(shot.profile.abs().argmax())])
-            offset, level = _finer(shot)
-            near = np.abs(offset - peak) <= _NEAR_M
-            series[name] = (offset[near] - peak, level[near])
-        parts.append(_panel(target, "x from the peak (m)", series, -40.0))
-    if parts:
-        caption = "The same profiles about their peaks, by every method."
-        yield f"main_lobes_{word_of(case)}", titled("Main lobes", case), caption, plot.panels(parts, columns=2)
+    def curve(shot: Shot) -> tuple[Any, Any]:
+        fine, first = finer(shot.profile, _FINER), int(shot.profile.abs().argmax())
+        offset = float(shot.along_m[1] - shot.along_m[0]) * (np.arange(len(fine)) / _FINER - first)
+        near = np.abs(offset) <= _NEAR_M
+        return offset[near], plot.decibel(fine)[near]
 
-
-def _finer(shot: Shot) -> tuple[np.ndarray, np.ndarray]:
-    """The profile eight times as finely sampled, dB of its peak."""
-    n = len(shot.profile)
-    spectrum = torch.fft.fftshift(torch.fft.fft(shot.profile.to(torch.complex128)))
-    before = (_FINER * n) // 2 - n // 2
-    wide = torch.nn.functional.pad(spectrum, (before, (_FINER - 1) * n - before))
-    fine, step = torch.fft.ifft(torch.fft.ifftshift(wide)), float(shot.along_m[1] - shot.along_m[0]) / _FINER
-    return float(shot.along_m[0]) + step * np.arange(len(fine)), plot.decibel(fine)
+    figures = plot.panels(_panels(shots(result), curve, "x from the peak (m)", -40.0))
+    caption = "The same profiles about their peaks, by every method."
+    yield f"main_lobes_{word_of(case)}", titled("Main lobes", case), caption, figures
 
 
 def _contours(case: str, result: Result) -> Drawn:
     """About the peaks of two-dimensional images."""
     found = _pair(result)
-    images = {f"{target}, {name}": of[target].image for target in _targets(found) for name, of in found.items()}
+    images = {
+        f"{target}, {name}": of[target].image for target in next(iter(found.values()), {}) for name, of in found.items()
+    }
     cut = {title: _about_peak(image) for title, image in images.items() if "range" in image.names}
     if cut:
         caption = (
             "About the peak of images without noise, range on the axis c tau / 2; interpolated. Conventional images of "
+            "fast targets are defocused and lie elsewhere."
         )
-        caption += "fast targets are defocused and lie elsewhere."
-        yield f"contours_{word_of(case)}", titled("Contours", case), caption, plot.contours(cut, columns=4)
+        yield f"contours_{word_of(case)}", titled("Contours", case), caption, plot.contours(cut)
 
 
 def _about_peak(image: Signal) -> Signal:
     """The part about the peak, on a finer grid; offsets from the peak, range halved."""
-    azimuth, across = image.axes
-    row, line = divmod(int(image.data.abs().argmax()), across.n)
-    kernels, axes = [], []
-    halves = ((azimuth, row, _ALONG_M, 1.0), (across, line, 2 * _ACROSS_M, 0.5))
-    for axis, peak, reach, scale in halves:
-        offset = torch.linspace(-reach, reach, _SAMPLES, dtype=torch.float64)
-        places = peak + offset / axis.step
-        kernels.append(torch.sinc(places[:, None] - torch.arange(axis.n, dtype=torch.float64)).to(torch.complex128))
-        axes.append(Axis(axis.name, _SAMPLES, -reach * scale, 2 * reach * scale / (_SAMPLES - 1), "m"))
-    return Signal(kernels[0] @ image.data.to(torch.complex128) @ kernels[1].mT, tuple(axes))
+    part = about_peak(image, (_ALONG_M, 2 * _ACROSS_M), _SAMPLES)
+    range_ = part.axes[1]
+    return Signal(part.data, (part.axes[0], replace(range_, start=range_.start / 2, step=range_.step / 2)))
 
 
 def _spectra(case: str, result: Result) -> Drawn:
-    found, parts = _pair(result), []
-    for target in _targets(found):
-        series = {}
-        for name, of in found.items():
-            spectrum = of[target].spectrum
-            level = np.maximum(plot.decibel(spectrum.data), _SPECTRUM_DB)
-            series[name] = (plot.array(spectrum.axes[0].values()), level)
-        parts.append(_panel(target, "Doppler from the centre (Hz)", series, _SPECTRUM_DB))
-    if parts:
-        caption = "Rebuilt Doppler spectra of echoes without noise. Energy out of its band makes false targets."
-        yield f"spectra_{word_of(case)}", titled("Rebuilt spectra", case), caption, plot.panels(parts, columns=2)
+    def curve(shot: Shot) -> tuple[Any, Any]:
+        return plot.array(shot.spectrum.axes[0].values()), np.maximum(plot.decibel(shot.spectrum.data), _SPECTRUM_DB)
+
+    figures = plot.panels(_panels(_pair(result), curve, "Doppler from the centre (Hz)", _SPECTRUM_DB))
+    caption = "Rebuilt Doppler spectra of echoes without noise. Energy out of its band makes false targets."
+    yield f"spectra_{word_of(case)}", titled("Rebuilt spectra", case), caption, figures

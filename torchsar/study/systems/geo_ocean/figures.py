@@ -12,7 +12,7 @@ import torch
 from torchsar import plot
 from torchsar.core import Signal
 from torchsar.metrics.ship_scene import ImagePosition, MadeScene, ShownShip
-from torchsar.study.output.pictures import Drawn, comparisons, within
+from torchsar.study.output.pictures import Drawn, comparisons
 from torchsar.study.settings.cases import titled, word_of
 from torchsar.study.systems.geo.figures import by_target
 from torchsar.study.trials.batch import Result
@@ -54,11 +54,7 @@ def _over_sea(image: Signal) -> Signal:
 
 def _boxes(positions: Sequence[ImagePosition]) -> tuple[np.ndarray, np.ndarray]:
     """Outlines of windows about positions as one broken line."""
-    along, across = _BOX_M
-    x, y = across * np.array([-1, 1, 1, -1, -1, np.nan]), along * np.array([-1, -1, 1, 1, -1, np.nan])
-    parts = [(p.range_m + x, p.azimuth_m + y) for p in positions]
-    empty = np.zeros(0)
-    return np.concatenate([empty, *(p[0] for p in parts)]), np.concatenate([empty, *(p[1] for p in parts)])
+    return plot.boxes([(p.range_m, p.azimuth_m) for p in positions], _BOX_M[1], _BOX_M[0])
 
 
 def _marked(result: Result, title: str, image: Signal, apparent: bool) -> dict[str, Any]:
@@ -81,13 +77,11 @@ def _flow(case: str, result: Result) -> Drawn:
         parts = [_marked(result, title, image, title != "fused") for title, image in steps.items()]
         caption = (
             "Azimuth (m, up) over range (m), root mean square over blocks, 35 dB. First: everything focused as if at "
-        )
-        caption += (
             "rest; closing ships appear beside their positions, with false targets. Second: the echo of what moves is "
+            "subtracted. Third: every moving ship is at its position."
         )
-        caption += "subtracted. Third: every moving ship is at its position."
-        figure = plot.overlays(parts, 3, _UP_DB - _DOWN_DB)
-        yield f"flow_{word_of(case)}", titled("The recommended flow", case), caption, figure
+        figures = plot.overlays(parts, _UP_DB - _DOWN_DB)
+        yield f"flow_{word_of(case)}", titled("The recommended flow", case), caption, figures
 
 
 def _methods(case: str, result: Result) -> Drawn:
@@ -95,10 +89,10 @@ def _methods(case: str, result: Result) -> Drawn:
     if parts:
         caption = (
             "The final image of every method. The inverse of three bands raises the level of the whole scene; zeroing "
+            "leaves holes in the sea."
         )
-        caption += "leaves holes in the sea."
-        figure = plot.overlays(parts, 3, _UP_DB - _DOWN_DB)
-        yield f"methods_{word_of(case)}", titled("Final images", case), caption, figure
+        figures = plot.overlays(parts, _UP_DB - _DOWN_DB)
+        yield f"methods_{word_of(case)}", titled("Final images", case), caption, figures
 
 
 def _ships(case: str, result: Result) -> Drawn:
@@ -108,8 +102,10 @@ def _ships(case: str, result: Result) -> Drawn:
             at = ImagePosition.of(shown.centre) if method == "conventional" else _true(shown)
             reach = zip(("azimuth", "range"), (at.azimuth_m, at.range_m), _SHIP_M, strict=True)
             spans = {axis: (middle - half, middle + half) for axis, middle, half in reach}
-            parts.append({"title": f"{name}, {method}", "signal": within(made[method].fused, spans), "lines": {}})
+            parts.append({"title": f"{name}, {method}", "signal": plot.within(made[method].fused, spans), "lines": {}})
     if parts:
-        caption = "Each ship where the image of everything at rest shows it (conventional) and at its position "
-        caption += "(recommended), in dB of its own peak."
-        yield f"ships_{word_of(case)}", titled("Ships", case), caption, plot.overlays(parts, 2, 40.0)
+        caption = (
+            "Each ship where the image of everything at rest shows it (conventional) and at its position "
+            "(recommended), in dB of its own peak."
+        )
+        yield f"ships_{word_of(case)}", titled("Ships", case), caption, plot.overlays(parts)

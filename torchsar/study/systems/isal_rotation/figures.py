@@ -1,4 +1,4 @@
-"""The pictures of a run of a rotating target: images in metres, one end enlarged, cuts through points."""
+"""The pictures of a run of a rotating target: images in metres, one end, cuts through points."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from torchsar import plot
 from torchsar.core import Axis, Signal
 from torchsar.metrics.rotation import CrossRangeCut
-from torchsar.study.output.pictures import Drawn, comparisons, first_named, within
+from torchsar.study.output.pictures import Drawn, comparisons, first_named
 from torchsar.study.settings.cases import titled, word_of
 from torchsar.study.systems.isal.figures import target
 from torchsar.study.systems.isal_rotation.world import first_values
@@ -55,12 +55,12 @@ def _images(case: str, result: Result) -> Drawn:
     images = _in_metres(result)
     reach, cell = _MARGIN * float(across.abs().max()), next(iter(images.values())).axes[1].step
     spans = {"cross range": (-reach, reach), "range": (float(along.min()) - 2 * cell, float(along.max()) + 2 * cell)}
-    shown = {name: within(image, spans) for name, image in images.items()}
+    shown = {name: plot.within(image, spans) for name, image in images.items()}
     caption = (
         "The first trial, all on one scale, that of the first, in dB. Cross range by each method's own rate, by the "
+        "true mean rate where it finds none; it may be mirrored."
     )
-    caption += "true mean rate where it finds none; it may be mirrored."
-    figure = plot.images(shown, dynamic_range_db=35.0, columns=4)
+    figure = plot.images(shown, dynamic_range_db=35.0)
     yield f"images_{word_of(case)}", titled("Images by every method", case), caption, figure
 
 
@@ -75,12 +75,12 @@ def _end(case: str, result: Result) -> Drawn:
     images = _in_metres(result)
     beside = max(4 * next(iter(images.values())).axes[1].step, _END_HALF * float(along.abs().max()))
     spans = {"cross range": (x - half, x + half), "range": (y - beside, y + beside)}
-    shown = {name: within(image, spans) for name, image in images.items()}
+    shown = {name: plot.within(image, spans) for name, image in images.items()}
     caption = (
         f"About the scatterer at {x:.2f} m of cross range and {y:.2f} m of range. An error of the rate moves it, one "
+        "of k1 and k2 smears it."
     )
-    caption += "of k1 and k2 smears it."
-    figure = plot.images(shown, dynamic_range_db=35.0, columns=4, percentile=100)
+    figure = plot.images(shown, dynamic_range_db=35.0, percentile=100)
     yield f"end_{word_of(case)}", titled("One end of the target, enlarged", case), caption, figure
 
 
@@ -94,10 +94,9 @@ def _slices(case: str, result: Result) -> Drawn:
     if parts:
         caption = (
             "Cuts through the range cell of each point target, offsets from the true position; 0 dB is the peak of the "
+            "first method."
         )
-        caption += "first method."
-        figure = plot.panels(parts, columns=2)
-        yield f"slices_{word_of(case)}", titled("Responses of point targets", case), caption, figure
+        yield f"slices_{word_of(case)}", titled("Responses of point targets", case), caption, plot.panels(parts)
 
 
 def _panels(target: str, cuts: Mapping[str, CrossRangeCut]) -> list[dict[str, Any]]:
@@ -110,6 +109,8 @@ def _panels(target: str, cuts: Mapping[str, CrossRangeCut]) -> list[dict[str, An
             offset, inside = cuts[name].offset_m[0], cuts[name].inside[0]
             kept = inside & (offset.abs() <= 25 * width)
             series[name] = (plot.array(offset[kept]), plot.decibel(cuts[name].line[0][kept], top))
-        parts.append({"series": series, "xlabel": "cross range from the true position (m)", "ylabel": "dB"})
-        parts[-1] |= {"title": target, "ylim": (-50.0, 3.0)}
+        xlabel = "cross range from the true position (m)"
+        parts.append(
+            {"series": series, "xlabel": xlabel, "ylabel": "level (dB)", "title": target, "ylim": (-50.0, 3.0)}
+        )
     return parts

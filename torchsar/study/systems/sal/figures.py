@@ -13,13 +13,16 @@ from torch import Tensor
 from torchsar import plot
 from torchsar.core import Axis, Signal
 from torchsar.metrics.cuts import impulse_cuts
-from torchsar.metrics.radial_motion import Course
-from torchsar.study.output.pictures import Drawn, comparisons, first_named, within
+from torchsar.metrics.radial_motion import Course, finer_in_range
+from torchsar.study.output.pictures import Drawn, comparisons, first_named
 from torchsar.study.settings.cases import titled, word_of
 from torchsar.study.trials.batch import Result, image_of
 
-# metres about the scatterers that pictures show, and how much farther residual motion moves beats
-_MARGIN_M, _MOVED_M = 0.35, 0.3
+# about the scatterers pictures show so many samples in azimuth and cells in range, and this part of
+# the extent of the scene
+_SAMPLES, _CELLS, _PART = 24, 6, 0.1
+# level below which images show nothing: side lobes of responses without a window lie above it
+_LOW_DB = 30.0
 Lines = Mapping[str, tuple[Axis, Tensor]]
 
 
@@ -53,13 +56,23 @@ def _target(result: Result) -> Drawn:
     yield "target", "Target", caption, figure
 
 
-def _about_scene(signal: Signal, result: Result, moved_m: float) -> Signal:
-    """The part of an image or of profiles about the scatterers."""
+def _about_scene(signal: Signal, result: Result) -> Signal:
+    """The part of an image or of profiles about the scatterers, and where residual motion shifts
+    them: in range by its velocity, in azimuth by its slope, if the image is in focus.
+    """
     azimuth, range_m, _ = _scatterers(result)
-    low, high = float(range_m.min()) - _MARGIN_M, float(range_m.max()) + _MARGIN_M + moved_m
-    reach = float(azimuth.abs().max()) + _MARGIN_M
-    along = {"azimuth": (-reach, reach)} if signal.axes[0].name == "azimuth" else {}
-    return within(signal, {**along, "range": (low, high)})
+    focused = [
+        c for c in _courses(result).values() if float(c.rms(c.detrended_m)) < result.bench.radar.wavelength_m / 8
+    ]
+    slopes = torch.stack([c.slope_m_s.cpu().reshape(()) for c in focused]) if focused else torch.zeros(1).to(azimuth)
+    far = (result.bench.radar.reference_range_m + range_m) / max(result.bench.radar.speed_m_s, 1e-30)
+    azimuth = torch.cat([azimuth, (azimuth + slopes[:, None] * far).flatten()])
+    radar, velocity = result.bench.radar, result.first.trials.truth["velocity_m_s"]
+    shift = velocity[:1].cpu() * radar.carrier_hz / radar.chirp_rate_hz_s
+    shifted = torch.cat([range_m + shift.min().clamp(max=0.0), range_m + shift.max().clamp(min=0.0)])
+    along = _SAMPLES * signal.axes[0].step + _PART * float(azimuth.max() - azimuth.min())
+    across = _CELLS * radar.range_step_m + _PART * float(range_m.max() - range_m.min())
+    return plot.within(signal, {"azimuth": plot.span(azimuth, along), "range": plot.span(shifted, across)})
 
 
 def _profiles(case: str, result: Result) -> Drawn:
@@ -70,13 +83,13 @@ def _profiles(case: str, result: Result) -> Drawn:
         known = [s for s in found.values() if signal is not None and s.data.shape == signal.data.shape]
         if signal is not None and not any(torch.equal(s.data, signal.data) for s in known):
             found[name] = signal
-    shown = {name: _in_milliseconds(_about_scene(s, result, _MOVED_M)) for name, s in first_named(found).items()}
+    shown = {name: _in_milliseconds(_about_scene(s, result)) for name, s in first_named(found).items()}
     if shown:
         caption = (
             "Range profiles of the up sweeps of the first trial, of methods that differ before any correction of pulse "
+            "phases, in dB of the peak of the first panel. Motion shifts the beat frequency by 2 v / lambda."
         )
-        caption += "phases, in dB of the peak of the first panel. Motion moves the beat by 2 v / lambda."
-        figure = plot.images(shown, dynamic_range_db=40.0, columns=3, percentile=100)
+        figure = plot.images(shown, dynamic_range_db=40.0, percentile=100)
         yield f"profiles_{word_of(case)}", titled("Range profiles over slow time", case), caption, figure
 
 
@@ -86,10 +99,13 @@ def _in_milliseconds(signal: Signal) -> Signal:
 
 
 def _images(case: str, result: Result) -> Drawn:
-    shown = {n: _about_scene(image, result, _MOVED_M) for n, image in first_named(result.images).items()}
-    caption = "The first trial; all images on one scale, that of the first, in dB. A slope of the range error shifts an image "
-    caption += "along azimuth, which is no error of focus."
-    figure = plot.images(shown, dynamic_range_db=40.0, columns=3, percentile=100)
+    finer = {name: finer_in_range(finer_in_range(image)) for name, image in first_named(result.images).items()}
+    shown = {name: _about_scene(image, result) for name, image in finer.items()}
+    caption = (
+        "The first trial on a quarter of the range step; all images on one scale, that of the first, in dB. A slope of "
+        "the range error shifts an image along azimuth, which is no error of focus."
+    )
+    figure = plot.images(shown, dynamic_range_db=_LOW_DB, percentile=100)
     yield f"images_{word_of(case)}", titled("Images by every method", case), caption, figure
 
 
@@ -109,16 +125,13 @@ def _motion(case: str, result: Result) -> Drawn:
     parts += _by_size("estimated minus true velocity", "mm/s", errors)
     left = {name: (c.pulse, 1e6 * _lit_only(c, c.detrended_m)) for name, c in courses.items()}
     parts += _by_size("range error left", "um", left)
-    wavelength = 1e6 * result.bench.radar.wavelength_m
-    caption = "Estimates of the first trial against the truth, methods of like error together; periods without a lit "
-    caption += "scatterer are left out. Range errors without constant and slope, which only turn and shift the image. A quarter "
-    caption += f"of the wavelength is {wavelength / 4:.2g} um."
-    yield (
-        f"motion_{word_of(case)}",
-        titled("Motion and what is left of it", case),
-        caption,
-        plot.panels(parts, columns=2),
+    quarter = 1e6 * result.bench.radar.wavelength_m / 4
+    caption = (
+        "Estimates of the first trial against the truth, methods of like error together; periods without a lit "
+        "scatterer are left out. Range errors without constant and slope, which only turn and shift the image. A "
+        f"quarter of the wavelength is {quarter:.2g} um."
     )
+    yield f"motion_{word_of(case)}", titled("Motion and what is left of it", case), caption, plot.panels(parts)
 
 
 def _rms(course: Course) -> Tensor:
@@ -133,20 +146,18 @@ def _lit_only(course: Course, x: Tensor | None) -> Tensor:
 
 def _panel(title: str, unit: str, lines: Lines) -> dict[str, object]:
     series = {name: (1e3 * plot.array(axis.values()), plot.array(y)) for name, (axis, y) in lines.items()}
-    return {"series": series, "xlabel": "slow time (ms)", "ylabel": unit, "title": title}
+    return {
+        "series": series,
+        "xlabel": "slow time (ms)",
+        "ylabel": f"{title.partition(':')[0]} ({unit})",
+        "title": title,
+    }
 
 
 def _by_size(title: str, unit: str, lines: Lines) -> list[dict[str, object]]:
-    """Panels of up to four methods each whose largest values are alike, the smallest first."""
-    size = {name: float(torch.nan_to_num(y).abs().max()) for name, (_, y) in lines.items()}
-    groups: list[list[str]] = []
-    for name in sorted(size, key=lambda name: size[name]):
-        if groups and len(groups[-1]) < 4 and size[name] < 10 * max(size[groups[-1][0]], 1e-300):
-            groups[-1].append(name)
-        else:
-            groups.append([name])
-    heads = [title if len(group) > 1 else f"{title}: {group[0]}" for group in groups]
-    return [_panel(h, unit, {name: lines[name] for name in reversed(g)}) for h, g in zip(heads, groups, strict=True)]
+    """Panels of methods whose largest values are alike, the smallest first."""
+    groups = plot.alike(lines)
+    return [_panel(title if len(group) > 1 else f"{title}: {next(iter(group))}", unit, group) for group in groups]
 
 
 def _slices(case: str, result: Result) -> Drawn:
@@ -161,9 +172,11 @@ def _slices(case: str, result: Result) -> Drawn:
         names = [*(["ideal"] if "ideal" in cuts else []), *others[first : first + 4]]
         for axis in ("azimuth", "range"):
             series = {n: (plot.array(cuts[n][axis][0]), plot.decibel(plot.array(cuts[n][axis][1]))) for n in names}
-            parts.append({"series": series, "xlabel": f"{axis} from the peak (m)", "ylabel": "dB", "title": axis})
-            parts[-1]["ylim"] = (-40.0, 2.0)
+            shown = {"xlabel": f"{axis} from the peak (m)", "ylabel": "level (dB)", "title": axis, "ylim": (-40.0, 2.0)}
+            parts.append({"series": series, **shown})
     if parts:
-        caption = "Slices through the strongest response near the predicted one; 0 dB is each curve's own peak. Methods by what "
-        caption += "they leave of the motion, the best first."
+        caption = (
+            "Slices through the strongest response near the predicted one, over ten side lobes to either side; 0 dB is "
+            "each curve's own peak. Methods by what they leave of the motion, the best first."
+        )
         yield f"slices_{word_of(case)}", titled(f"Response of {target}", case), caption, plot.panels(parts)

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from torchsar import plot
+from torchsar.compensate.velocity import EffectiveVelocity
 from torchsar.core import Signal
 from torchsar.metrics.cuts import impulse_cuts
 from torchsar.metrics.spectra import azimuth_spectrum, phase_increments, range_spectrum
@@ -22,8 +23,9 @@ from torchsar.study.settings.cases import titled, word_of
 from torchsar.study.systems.stripmap.judge import focus_name, window
 from torchsar.study.trials.batch import IMAGE, Result, image_of
 
-# cells to either side of a peak that cuts show
-_CELLS = 24
+# the curve of the velocity search about the estimate: half its extent in steps of the grid, and its
+# points, of which the middle one is the estimate
+_NEAR_STEPS, _NEAR_POINTS = 1.5, 41
 _CUT_METHODS = ("clean", "none", "baseline", "recommended")
 
 
@@ -87,7 +89,7 @@ def pictures(results: Mapping[str, Result], columns: Mapping[str, Any]) -> Itera
 
 def _of_case(make: Callable[[Strip], Drawn], strip: Strip) -> Drawn:
     """Pictures with the name of their case."""
-    word = "" if len(strip.case) == 3 and strip.case == "all" else f"_{word_of(strip.case)}"
+    word = "" if strip.case == "all" else f"_{word_of(strip.case)}"
     for name, title, caption, figure in make(strip):
         yield f"{name}{word}", titled(title, strip.case), caption, figure
 
@@ -96,8 +98,8 @@ def _images(strip: Strip) -> Drawn:
     shown = strip.images()
     caption = (
         "The image of the recommended method over the judged window: range to the right, azimuth upward, in metres; "
+        "amplitude in dB."
     )
-    caption += "amplitude in dB."
     title = strip.result.bench.config.processor["recommended"].title or "recommended"
     yield "image", "Focused image", caption, plot.image(shown["recommended"], title=title, **strip.scale)
     if len(shown) > 1:
@@ -109,19 +111,18 @@ def _cuts(strip: Strip) -> Drawn:
     label, *at = strip.strongest()
     images = {name: image for name, image in strip.result.images.items() if name in _CUT_METHODS}
     found = {name: impulse_cuts(image, (at[0], at[1])) for name, image in images.items()}
-    parts = []
-    for axis in IMAGE:
-        reach = _CELLS * images["recommended"].axis(axis).step
-        series = {name: _near(*cuts[axis], reach) for name, cuts in found.items()}
-        parts.append({"series": series, "xlabel": f"{axis} from the peak (m)", "ylabel": "dB", "title": axis})
-        parts[-1]["ylim"] = (-50, 3)
+    parts = [
+        {
+            "series": {name: (plot.array(cuts[axis][0]), plot.decibel(cuts[axis][1])) for name, cuts in found.items()},
+            "xlabel": f"{axis} from the peak (m)",
+            "ylabel": "level (dB)",
+            "title": axis,
+            "ylim": (-50, 3),
+        }
+        for axis in IMAGE
+    ]
     caption = f"Cuts through {label}, band-limited interpolation by 16; 0 dB is each curve's own peak."
     yield "cuts", "Impulse-response cuts", caption, plot.panels(parts)
-
-
-def _near(x: Any, y: Any, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    x, y = plot.array(x), plot.decibel(y)
-    return x[np.abs(x) <= reach], y[np.abs(x) <= reach]
 
 
 def _squint(strip: Strip) -> Drawn:
@@ -132,13 +133,15 @@ def _squint(strip: Strip) -> Drawn:
             wrong = strip.result.images[name]
             shown = {"squint taken into account": strip.images()["recommended"]}
             shown[method.title or name] = wrong.crop(**window(wrong, strip.radar, margin))
-            caption = "Left: focused about the estimated Doppler centroid. Right: the same data focused as if the beam "
-            caption += "looked straight to the side: displaced, smeared, with ghosts."
+            caption = (
+                "First: focused about the estimated Doppler centroid. Second: the same data focused as if the beam "
+                "looked straight to the side: displaced, smeared, with ghosts."
+            )
             yield "squint", "With and without the squint", caption, plot.images(shown, **strip.scale)
 
 
 def _baseband(strip: Strip) -> tuple[float, float] | None:
-    """Doppler centroid that the recommended image was focused with: absolute, and within one PRF."""
+    """Doppler centroid that the recommended image is focused with: absolute, and in one PRF."""
     centroid = strip.result.first_of("recommended").judged.view.doppler_hz
     if centroid is None:
         return None
@@ -160,8 +163,8 @@ def _doppler_spectrum(strip: Strip) -> Drawn:
     title = f"centroid {centroid[0]:.1f} Hz = {centroid[1]:.1f} Hz {'-' if turns < 0 else '+'} {abs(turns)} PRF"
     caption = (
         "Azimuth power spectrum of the data that are focused, averaged over range. The dashed line is the Doppler "
+        "centroid inside one PRF; the ambiguity is found from range migration."
     )
-    caption += "centroid inside one PRF; the ambiguity is found from range migration."
     series, marks = {"mean over range": (plot.array(frequency), level)}, {"centroid": centroid[1]}
     figure = plot.curves(series, "baseband Doppler (Hz)", "power (dB)", title, marks)
     yield "doppler_spectrum", "Doppler spectrum", caption, figure
@@ -177,8 +180,8 @@ def _increments(strip: Strip) -> Drawn:
         doppler -= prf * np.round((doppler - centroid[1]) / prf)
     caption = (
         "Mean phase increment between adjacent lines, in Hz (PRF times increment over 2 pi), for blocks of lines along "
+        "the strip. The scene makes it fluctuate; the estimate averages it."
     )
-    caption += "the strip. The scene makes it fluctuate; the estimate averages it."
     figure = plot.curves(series, "slow time (s)", "increment (Hz)")
     yield "phase_increments", "Phase increments along the strip", caption, figure
 
@@ -207,8 +210,10 @@ def _corrections(strip: Strip) -> Drawn:
                 (bands, "range frequency (MHz)", "power (dB)", "mean range spectrum"),
             )
         ]
-        caption = f"Stage '{name}' ({strip.stages[name]['stage']}): left, power of every line; right, range spectrum averaged "
-        caption += "over the lines."
+        caption = (
+            f"Stage '{name}' ({strip.stages[name]['stage']}). First: power of every line. Second: range spectrum "
+            "averaged over the lines."
+        )
         yield f"correction_{name}", f"Correction: {name}", caption, plot.panels(parts)
 
 
@@ -231,18 +236,20 @@ def _contaminated_line(strip: Strip) -> Drawn:
             )
             for label, s in (("before", before), ("after", after))
         }
-        caption = f"Range spectrum of line {line}, the one from which most was removed ({int((removed > 0).sum())} of "
-        caption += f"{len(removed)} lines were changed)."
-        figure = plot.curves(series, "range frequency (MHz)", "dB", f"line {line}")
+        caption = (
+            f"Range spectrum of line {line}, the one from which most was removed ({int((removed > 0).sum())} of "
+            f"{len(removed)} lines were changed)."
+        )
+        figure = plot.curves(series, "range frequency (MHz)", "level (dB)", f"line {line}")
         yield "contaminated_line", "Spectrum of a contaminated line", caption, figure
 
 
 def _response(strip: Strip) -> Drawn:
-    """Estimated response of the channel over range frequency, beside the truth where it is known."""
+    """Estimated response of the channel over range frequency, beside the truth if it is known."""
     band_mhz = plot.array(band_grid()) * strip.radar.pulse.bandwidth_hz / 2e6
     truth, parts = strip.result.first.trials.truth, []
     for estimate in strip.result.first_of("recommended").estimates.values():
-        for key, label in (("phase_rad", "phase (rad)"), ("amplitude", "amplitude")):
+        for key, label in (("phase_rad", "phase (rad)"), ("amplitude", "amplitude (1)")):
             value = estimate.value.get(key)
             if value is None or value.shape[-1:] != band_mhz.shape:
                 continue
@@ -262,19 +269,27 @@ def _image_corrections(strip: Strip) -> Drawn:
         cuts = {when: impulse_cuts(x, (at[0], at[1]))["range"] for when, x in (("before", before), ("after", after))}
         series = {when: (plot.array(offset), plot.decibel(level)) for when, (offset, level) in cuts.items()}
         caption = f"Stage '{name}' ({strip.stages[name]['stage']}): range cut through {label} before and after."
-        figure = plot.curves(series, "range from the peak (m)", "dB", ylim=(-50, 3))
+        figure = plot.curves(series, "range from the peak (m)", "level (dB)", ylim=(-50, 3))
         yield f"correction_{name}", f"Correction: {name}", caption, figure
 
 
 def _velocity(strip: Strip) -> Drawn:
-    """Entropy over velocity, where an estimator kept its grid."""
-    for name, estimate in strip.result.first_of("recommended").estimates.items():
-        if "grid_velocity_m_s" in estimate.info and "grid_entropy" in estimate.info:
-            keys = ("grid_velocity_m_s", "grid_entropy")
-            grid, cost = (plot.array(estimate.info[k].reshape(-1, estimate.info[k].shape[-1])[0]) for k in keys)
-            order, value = np.argsort(grid), float(estimate.value["velocity_m_s"].reshape(-1)[0])
-            caption = "Entropy of a small group of range lines over effective velocity, as the search evaluated it; the dashed "
-            caption += "line is the refined minimum."
-            series, marks = {"entropy": (grid[order], cost[order])}, {"estimate": value}
-            figure = plot.curves(series, "effective velocity (m/s)", "entropy (nats)", f"{value:.2f} m/s", marks)
-            yield f"{name}_entropy", "Effective velocity by minimum entropy", caption, figure
+    """Entropy over velocity, finely about the estimate."""
+    bench, first = strip.result.bench, strip.result.first_of("recommended")
+    chain = bench.chains["recommended"]
+    for name, stage in chain.stages.items():
+        if not isinstance(stage, EffectiveVelocity) or first.trace is None:
+            continue
+        estimate, source = first.estimates[name], chain.uses[name].get("doppler_hz")
+        value, grid = estimate.value["velocity_m_s"].reshape(-1)[:1], estimate.info["grid_velocity_m_s"]
+        near = value + torch.linspace(-_NEAR_STEPS, _NEAR_STEPS, _NEAR_POINTS).to(grid) * (grid[1] - grid[0])
+        velocity = torch.cat([grid, near]).sort().values
+        doppler = None if source is None else first.trace.values[source].reshape(-1)[0]
+        entropy = stage.entropy(strip.step(name, output=False), velocity, doppler)
+        series, marks = {"entropy": (plot.array(velocity), plot.array(entropy))}, {"estimate": float(value)}
+        figure = plot.curves(series, "effective velocity (m/s)", "entropy (nats)", f"{float(value):.2f} m/s", marks)
+        caption = (
+            "Entropy of a small group of range lines over effective velocity: on the grid of the search, and finer "
+            "about the estimate, which is the dashed line."
+        )
+        yield f"{name}_entropy", "Effective velocity by minimum entropy", caption, figure
