@@ -291,16 +291,19 @@ def _fast_length(n: int) -> int:
 
 
 def _sum_over_range(cells: Tensor, turns: Tensor, dtype: torch.dtype) -> Tensor:
-    """sum_j cells_j exp(2j pi turns (j - n // 2)): (..., row, n) -> (..., row, frequency)."""
+    """sum_j cells_j exp(2j pi turns (j - n // 2)): (..., 2, row, n) -> (..., 2, row, frequency).
+
+    One trial after the other, so that sums round equally in batches of every size.
+    """
     n = cells.shape[-1]
     m = 2 ** round(math.log2(n) / 2)
     count = -(-n // m)
     fine, coarse = linear_phasor(turns, 0, m, dtype), linear_phasor(m * turns, -(n // 2) / m, count, dtype)
-    parts = pad(cells, (0, m * count - n)).reshape(-1, cells.shape[-2], count, m)
-    inner = fine @ parts.permute(1, 3, 0, 2).flatten(-2)
-    return torch.einsum("fktc,fkc->tfk", inner.unflatten(-1, (-1, count)), coarse).reshape(
-        *cells.shape[:-1], turns.shape[-1]
-    )
+    sums = []
+    for pair in pad(cells, (0, m * count - n)).reshape(-1, *cells.shape[-3:-1], count, m):
+        inner = (fine @ pair.permute(1, 3, 0, 2).flatten(-2)).unflatten(-1, (-1, count))
+        sums.append(torch.einsum("fktc,fkc->tfk", inner, coarse))
+    return torch.stack(sums).reshape(*cells.shape[:-1], turns.shape[-1])
 
 
 def _fold(spectra: Tensor, bins: _Bins, radar: BistaticRadar) -> Tensor:

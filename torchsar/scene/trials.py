@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -178,6 +178,39 @@ def refuse_other_trials(thing: object, draws: Draws, recording: Recording | None
     if not trials and len({shape[-1] for _, shape in shapes if shape and shape[-1] != 1}) > 1:
         found = ", ".join(f"{name} {tuple(shape)}" for name, shape in shapes if shape)
         raise ValueError(f"parameters per trial must have one length, got the shapes {found}")
+
+
+def repeated(thing: Any, times: int) -> Any:
+    """Return an object whose parameters per trial hold each of their entries several times.
+
+    Parameters are found as in `refuse_other_trials`. They serve where each trial of a world is
+    simulated as several rows, such as one for each of its targets.
+
+    Args:
+        thing: Dataclass with parameters, or a sequence or mapping of such.
+        times: Number of rows of each trial.
+
+    Returns:
+        The object with tensors of shape (trial, ...) as tensors of shape (trial * times, ...), in
+        which the rows of a trial follow each other; without any, the object itself.
+    """
+    if not any(shape for _, shape in _per_trial_shapes(thing)):
+        return thing
+    if isinstance(thing, Mapping):
+        return {name: repeated(part, times) for name, part in thing.items()}
+    if isinstance(thing, list | tuple):
+        return type(thing)(repeated(part, times) for part in thing)
+    held = {name: (getattr(thing, name, None), behind) for name, behind in _parameters(type(thing))}
+    return replace(thing, **{name: _repeated(value, times, behind) for name, (value, behind) in held.items()})
+
+
+def _repeated(value: Any, times: int, behind: int) -> Any:
+    """A field with its entries repeated; the last `behind` dimensions of a tensor are no trials."""
+    if isinstance(value, Tensor):
+        return value.repeat_interleave(times, 0) if value.ndim > behind else value
+    if isinstance(value, list | tuple):
+        return type(value)(_repeated(entry, times, 0) for entry in value)
+    return repeated(value, times)
 
 
 def _per_trial_shapes(thing: object) -> Iterator[tuple[str, torch.Size]]:

@@ -11,6 +11,7 @@ Assumes range-compressed echoes of a flat band that fills the cells (`band_respo
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -252,6 +253,19 @@ def _phasors(left: Tensor, right: Tensor, dtype: torch.dtype) -> Tensor:
     return torch.complex(torch.cos(angle), torch.sin(angle))
 
 
+def _blocks(data: Tensor, scatterers: int) -> Iterator[tuple[slice, slice]]:
+    """Trials and pulses of blocks whose phasors fit into the cache.
+
+    How pulses are divided does not depend on the number of trials, so that sums round equally.
+    """
+    trials, pulses, line = data.shape[0], data.shape[1], data.element_size() * max(1, scatterers)
+    height = min(pulses, max(16, _BLOCK_BYTES // line))
+    some = max(1, _BLOCK_BYTES // (line * height))
+    for trial in range(0, trials, some):
+        for first in range(0, pulses, height):
+            yield slice(trial, trial + some), slice(first, first + height)
+
+
 @dataclass(frozen=True)
 class _Step:
     """Gradient and curvature of the likelihood with respect to all unknowns.
@@ -293,14 +307,13 @@ class _Step:
         residual = torch.empty_like(data)
         moments = data.real.new_zeros(data.shape[0], bases.shape[1], 2 * found.cell.shape[-1])
         shift = data.new_zeros(envelope.shape)
-        height = max(16, _BLOCK_BYTES // (data.element_size() * max(1, found.cell.numel())))
-        for first in range(0, sampling.pulses, height):
-            part = slice(first, first + height)
-            turned_back = _phasors(back_turns[:, part], right, data.dtype)
-            rest = (data[:, part] - (turned_back @ weighted).conj()) * present[:, part, None]
-            residual[:, part] = rest
-            moments += real_bases[:, :, part] @ torch.view_as_real((rest @ back) * turned_back).flatten(-2)
-            shift += turned_back.mT @ rest
+        for some, part in _blocks(data, found.cell.shape[-1]):
+            turned_back = _phasors(back_turns[some, part], right[some], data.dtype)
+            rest = (data[some, part] - (turned_back @ weighted[some]).conj()) * present[some, part, None]
+            residual[some, part] = rest
+            projected = torch.view_as_real((rest @ back[some]) * turned_back).flatten(-2)
+            moments[some] += real_bases[some, :, part] @ projected
+            shift[some] += turned_back.mT @ rest
         moments = torch.view_as_complex(moments.unflatten(-1, (-1, 2)).to(torch.float64))
         shifts = (shift.to(torch.complex128) * slope.conj()).sum(-1)
         return residual, _Step(

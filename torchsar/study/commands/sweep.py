@@ -54,9 +54,7 @@ class SweepTrial:
     def may_differ(self, key: str) -> bool:
         """Whether the value of a key may differ between the trials of a batch."""
         section, _, rest = key.partition(".")
-        return section == "world" and self.loaded.system.sections["world"].takes_tensor(
-            rest.split("."), self.loaded.config.world
-        )
+        return section == "world" and self.loaded.system.may_differ(rest, self.loaded.config.world)
 
     def bench(self, fixed: Mapping[str, Any]) -> Bench:
         """The bench of a case of the grid, built once."""

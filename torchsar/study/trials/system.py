@@ -148,6 +148,13 @@ class System(ABC):
     def samples(self, world: Any, radar: Any) -> int:
         """Samples of the raw data of one trial."""
 
+    def may_differ(self, path: str, world: Mapping[str, Any]) -> bool:
+        """Whether a number of the world, by dotted key, may differ between the trials of a batch.
+
+        By default its constructor decides; one that gives arrays their shape may not.
+        """
+        return self.sections["world"].takes_tensor(path.split("."), world)
+
     def bytes_per_trial(self, bench: Bench) -> int:
         """Bytes of the largest tensor that a trial needs."""
         return int(self.peak * self.samples(bench.world(), bench.radar) * bench.dtype.itemsize)

@@ -150,6 +150,12 @@ class Geo(System):
                 "keep one of them"
             )
 
+    def may_differ(self, path: str, world: Mapping[str, Any]) -> bool:
+        """A gate decides how many cells of a sea it lights, and thus makes cases."""
+        lights_sea = "gate." if world["sea_gate"] is None else "sea_gate."
+        shapes = world["sea"] is not None and path.startswith(lights_sea)
+        return not shapes and super().may_differ(path, world)
+
     def simulate(self, bench: Bench, world: Points, draws: Draws) -> Trials:
         return world.trials_of(bench.radar, draws, bench.dtype, bench.device)
 

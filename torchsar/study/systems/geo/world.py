@@ -15,6 +15,7 @@ from torchsar.echo import Impairment, apply_impairments, sea_echo, simulate_bist
 from torchsar.radar import BistaticRadar
 from torchsar.scene import BandLimited, BistaticWorld, ExactRange, Gate, MovingPoints, PolynomialTransmit, Sea
 from torchsar.scene.moving import ReceiveRange
+from torchsar.scene.trials import repeated
 from torchsar.study.names.registry import GATES, MULTICHANNEL_IMPAIRMENTS, RECEIVE_RANGES, SEAS
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.system import World
@@ -65,7 +66,7 @@ class Level:
 
 class Own(NamedTuple):
     """What the judge needs: the impaired echo of the targets alone, their SNR (row,) in dB, and the
-    world with the numbers of each trial.
+    world with the numbers of each row.
     """
 
     alone: Recording
@@ -146,15 +147,17 @@ class Points(World):
     def trials_of(self, radar: BistaticRadar, draws: Draws, dtype: torch.dtype, device: str = "cpu") -> Trials:
         """Rows (trial, target), flattened: with noise and sea, and without, and the truth."""
         rows, count = _row_draws(draws, self.targets), len(draws.trials or (0,))
-        snr = _per_row(self.snr_db(radar), len(self.targets), count)
-        transmit = None if self.transmit_range is None else PolynomialTransmit(self.transmit_range)
-        world = BistaticWorld(self.points(count), self.gate, None, snr, self.receive, transmit)
+        own: Points = repeated(self, len(self.targets))  # each row has the numbers of its trial
+        level = own.snr_db(radar)
+        snr = None if level is None else torch.as_tensor(level, dtype=torch.float64).expand(len(rows.trials or ()))
+        transmit = None if own.transmit_range is None else PolynomialTransmit(own.transmit_range)
+        world = BistaticWorld(self.points(count), own.gate, None, snr, own.receive, transmit)
         size = (self.pulses, self.samples)
         noisy, truth = simulate_bistatic(radar, world, *size, rows, kind=self.kind, dtype=dtype, device=device)
         assert truth.clean is not None
         if self.sea is not None:
             noisy = replace(
-                noisy, signal=noisy.signal.with_data(noisy.signal.data + self._sea(rows, snr, truth, noisy))
+                noisy, signal=noisy.signal.with_data(noisy.signal.data + own._sea(rows, snr, truth, noisy))
             )
         values = {name: value[..., 0] for name, value in truth.values.items() if name in TRUTHS}
         named = {
@@ -164,10 +167,10 @@ class Points(World):
         }
         values = {**values, **named, "noise_std": truth.values["noise_std"]}
         alone = truth.clean
-        if self.impairments:
-            (noisy, known), (alone, _) = (apply_impairments(one, self.impairments, rows) for one in (noisy, alone))
+        if own.impairments:
+            (noisy, known), (alone, _) = (apply_impairments(one, own.impairments, rows) for one in (noisy, alone))
             values.update(known)
-        return Trials(noisy, truth.clean, values, count, Own(alone, snr, self))
+        return Trials(noisy, truth.clean, values, count, Own(alone, snr, own))
 
     def points(self, count: int) -> MovingPoints:
         """The targets, one a row (trial, target), flattened."""
@@ -194,12 +197,6 @@ class Points(World):
 def compression_gain_db(radar: BistaticRadar) -> float:
     """10 log10(B tau_p): what range compression adds to a raw SNR."""
     return 10 * math.log10(radar.pulse.bandwidth_hz * radar.pulse.duration_s)
-
-
-def _per_row(level: Tensor | float | None, targets: int, count: int) -> Tensor | None:
-    if level is None:
-        return None
-    return torch.as_tensor(level, dtype=torch.float64).expand(count).repeat_interleave(targets)
 
 
 def _row_draws(draws: Draws, names: Mapping[str, Target]) -> Draws:

@@ -159,6 +159,10 @@ class GeoOcean(System):
                         "estimate nor use values; leave it out"
                     )
 
+    def may_differ(self, path: str, world: Mapping[str, Any]) -> bool:
+        """The gate decides how many cells of the sea it lights, and thus makes cases."""
+        return not path.startswith("gate.") and super().may_differ(path, world)
+
     def simulate(self, bench: Bench, world: Ocean, draws: Draws) -> Trials:
         return world.trials_of(bench.radar, draws, _extraction(bench), bench.dtype, bench.device)
 
