@@ -787,3 +787,35 @@ def array(x: Tensor) -> np.ndarray:
         x: Tensor, any shape.
     """
     return torch.as_tensor(x).detach().cpu().resolve_conj().numpy()
+
+
+# units by the last words of a name, the longest first
+_UNITS = {
+    "_rad_s": "rad/s",
+    "_m_s2": "m/s²",
+    "_m_s": "m/s",
+    "_hz": "Hz",
+    "_db": "dB",
+    "_nats": "nats",
+    "_rad": "rad",
+    "_deg": "deg",
+    "_m": "m",
+    "_s": "s",
+}
+# words of names that are not written in small letters
+_WRITTEN = ["Doppler", "SNR", "PRF", "RMS", "IRW", "PSLR", "ISLR", "RCS", "SIR", "CNR", "SCR", "SCNR", "MFTA", "ADC"]
+_ACRONYMS = {word.lower(): word for word in _WRITTEN}
+
+
+def name_and_unit(name: str) -> tuple[str, str]:
+    """What the last part of a name says, and its unit: 'world.noise.snr_db' -> ('SNR', 'dB')."""
+    last = name.rpartition(".")[2]
+    suffix = next((suffix for suffix in _UNITS if last.endswith(suffix) and last != suffix), "")
+    words = last.removesuffix(suffix).strip("_").split("_")
+    return " ".join(_ACRONYMS.get(word, word) for word in words), _UNITS.get(suffix, "")
+
+
+def axis_label(name: str) -> str:
+    """'doppler_error_hz' -> 'Doppler error (Hz)'."""
+    words, unit = name_and_unit(name)
+    return f"{words} ({unit})" if unit else words

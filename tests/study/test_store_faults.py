@@ -56,10 +56,10 @@ def writes(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
 
 def held_rows_are(held: Record, reference: Record) -> None:
     for index in np.argwhere(held.done):
-        place = reference.place({name: known[i] for (name, known), i in zip(held.labels.items(), index)})
+        position = reference.index_of({name: known[i] for (name, known), i in zip(held.labels.items(), index)})
         for name, values in held.metrics.items():
             np.testing.assert_array_equal(
-                values[(slice(None), *index)], reference.metrics[name][(slice(None), *place, index[-1])]
+                values[(slice(None), *index)], reference.metrics[name][(slice(None), *position, index[-1])]
             )
 
 

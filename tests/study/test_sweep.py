@@ -15,10 +15,9 @@ import zarr
 from tests.study import toy
 from torchsar.core import Draws
 from torchsar.study.montecarlo import Record, Stop, differences, read_sweep, sweep
-from torchsar.study.montecarlo.chunks import CACHE_BYTES, cut, probed_bytes, rows_by_bytes
 from torchsar.study.montecarlo.grid import address, make_grid
-from torchsar.study.montecarlo.stopping import looks
-from torchsar.study.montecarlo.work import Work
+from torchsar.study.montecarlo.loop import looks
+from torchsar.study.montecarlo.work import CACHE_BYTES, Work, cut, probed_bytes, rows_by_bytes
 from torchsar.study.settings.errors import ConfigError
 
 

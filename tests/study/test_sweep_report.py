@@ -13,7 +13,7 @@ import pytest
 
 from torchsar.study.montecarlo.pictures import axis_label, draw_sweep, panels_beside, read_summary
 from torchsar.study.montecarlo.record import Record
-from torchsar.study.montecarlo.report import figure, with_interval, write_sweep_report
+from torchsar.study.montecarlo.report import with_interval, write_sweep_report
 from torchsar.study.montecarlo.summary import summary_tree
 from torchsar.study.output.arrays import write_json
 from torchsar.study.output.pictures import Picture

@@ -11,6 +11,7 @@ from torchsar.metrics.bounds import (
 )
 from torchsar.metrics.image import contrast, correlation, entropy, error_after_gain_db, error_db
 from torchsar.metrics.impulse import impulse_response
+from torchsar.metrics.intervals import finite_rms, half_width_ratio, share_interval, trial_statistics
 from torchsar.metrics.ladar_bounds import (
     integrated_range_detrended_bound_m,
     range_per_sweep_bound_m,
@@ -31,6 +32,8 @@ __all__ = [
     "entropy",
     "error_after_gain_db",
     "error_db",
+    "finite_rms",
+    "half_width_ratio",
     "impulse_response",
     "integrated_range_detrended_bound_m",
     "phase_rmse",
@@ -43,8 +46,10 @@ __all__ = [
     "replica_zones",
     "residual_phase",
     "rotation_bounds",
+    "share_interval",
     "strehl",
     "tone_frequency_bound_hz",
+    "trial_statistics",
     "velocity_bound_m_s",
     "velocity_free_offset_bound_m_s",
     "velocity_known_offset_bound_m_s",

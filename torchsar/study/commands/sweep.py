@@ -15,13 +15,12 @@ from torch import Tensor
 from torchsar.core import Draws
 from torchsar.study.montecarlo.engines import engine
 from torchsar.study.montecarlo.grid import Grid, make_grid
-from torchsar.study.montecarlo.loop import SWEEP_FILES, Interrupted, Plan, open_store, run_plan
+from torchsar.study.montecarlo.loop import SWEEP_FILES, Interrupted, Plan, Stop, open_store, run_plan
 from torchsar.study.montecarlo.pictures import draw_sweep
-from torchsar.study.montecarlo.record import OK, Record
+from torchsar.study.montecarlo.record import Record
 from torchsar.study.montecarlo.report import write_sweep_report
-from torchsar.study.montecarlo.stopping import Stop
-from torchsar.study.montecarlo.summary import summary_tree
-from torchsar.study.montecarlo.work import BOUNDS, SAVED, Chunk, Work
+from torchsar.study.montecarlo.summary import summary_of
+from torchsar.study.montecarlo.work import BOUNDS, SAVED
 from torchsar.study.output.arrays import write_json
 from torchsar.study.output.folder import opened
 from torchsar.study.settings.errors import ConfigError, did_you_mean
@@ -118,10 +117,12 @@ def sweep(
     settings, trial = loaded.config.sweep, SweepTrial(loaded, device)
     grid = sweep_grid(loaded, trial)
     stop = None if settings.stop is None else Stop(**settings.stop.model_dump())
-    plan = Plan(
-        grid, settings.trials, loaded.config.seed, settings.chunk, stop, frozenset(settings.save.trials), device
-    )
-    _refuse_missing(loaded, plan, trial)
+    needs = [("success", name) for name in settings.success] + [("show", name) for name in settings.show]
+    needs += [] if settings.stop is None else [("stop.metric", settings.stop.metric)]
+    asked = tuple((f"{loaded.file}: sweep.{key}", metric) for key, metric in needs)
+    save = frozenset(settings.save.trials)
+    plan = Plan(grid, settings.trials, loaded.config.seed, settings.chunk, stop, save, device, asked)
+    plan.refuse_missing(trial)
     config_text = loaded.text()
     about = {"title": loaded.config.title, "config": config_text, "dtype": loaded.config.precision}
     _announce(grid, settings.trials)
@@ -129,7 +130,7 @@ def sweep(
         with opened(out, "sweep", SWEEP_FILES) as folder, _terminated_like_interrupted():
             store = open_store(folder, plan, identity(loaded), resume)
             store.note(**about)
-            record = run_plan(plan, trial, store, engine(workers, cluster, threads), loaded.name)
+            record = run_plan(plan, trial, store, engine(workers, cluster, threads))
             record.about = {**record.about, **about}
             with folder.staged() as new:
                 report(record.select(grid.labels), loaded, new, config_text, command)
@@ -190,25 +191,6 @@ def _refuse_fixed(key: str, loaded: Loaded) -> None:
         )
 
 
-def _refuse_missing(loaded: Loaded, plan: Plan, trial: SweepTrial) -> None:
-    """Refuse a metric that no trial gives, by the first trial of the sweep, before all others."""
-    settings = loaded.config.sweep
-    asked = [("sweep.success", name) for name in settings.success] + [("sweep.show", name) for name in settings.show]
-    asked += [] if settings.stop is None else [("sweep.stop.metric", settings.stop.metric)]
-    if not asked:
-        return
-    cases = tuple(plan.grid.cases())
-    batched = {p.name: p.values for p in plan.grid.parameters if p.batched}
-    work = Work(trial, cases, batched, plan.grid.names, plan.seed, plan.device)
-    outcome = work.compute(Chunk(0, (0,), (0,)))
-    given = {metric for metrics in outcome.values.values() for metric in metrics if metric != OK}
-    for where, metric in asked:
-        if metric not in given:
-            raise ConfigError(
-                f"{loaded.file}: {where} names {metric!r}, which no trial gives{did_you_mean(metric, given)}"
-            )
-
-
 def identity(loaded: Loaded) -> dict[str, Any]:
     """What results depend on besides the grid: seed and resolved config."""
     tree = loaded.config.model_dump()
@@ -218,22 +200,25 @@ def identity(loaded: Loaded) -> dict[str, Any]:
 def report(record: Record, loaded: Loaded, out: Path, config_text: str, command: str) -> None:
     """Write config.yaml, summary.json, figures/ and report.html of a record into a folder."""
     titles = {f"method {name}": method.title for name, method in loaded.config.processor.items() if method.title}
-    summary = summary_tree(record, loaded.config.sweep.success, {"snr": loaded.system.definitions["snr"], **titles})
+    summary = summary_of(record, loaded.config.sweep.success)
+    tree = summary.tree(record.about, {"snr": loaded.system.definitions["snr"], **titles})
     pictures = draw_sweep(summary, out / "figures", loaded.config.sweep.show)
     (out / "config.yaml").write_text(config_text, encoding="utf-8")
-    write_json(out / "summary.json", summary)
-    write_sweep_report(out / "report.html", summary, pictures, out / "figures", config_text, command)
+    write_json(out / "summary.json", tree)
+    write_sweep_report(out / "report.html", tree, pictures, out / "figures", config_text, command)
 
 
 def _announce(grid: Grid, trials: int) -> None:
-    together = [f"{p.name} ({len(p.labels)})" for p in grid.parameters if p.batched]
-    apart = [f"{p.name} ({len(p.labels)})" for p in grid.parameters if not p.batched]
+    kinds = {True: [], False: []}
+    for p in grid.parameters:
+        kinds[p.batched].append(f"{p.name} ({len(p.labels)})")
+    together, apart = (", ".join(kinds[batched]) or "none" for batched in (True, False))
     log.info(
         "%d points of %d trials; values that share batches: %s; cases of their own: %s",
         len(grid.points()),
         trials,
-        ", ".join(together) or "none",
-        ", ".join(apart) or "none",
+        together,
+        apart,
     )
 
 

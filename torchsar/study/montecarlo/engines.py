@@ -9,12 +9,12 @@ import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
-from torchsar.study.montecarlo.work import Chunk, Outcome, Work
-from torchsar.study.settings.errors import ConfigError
+from torchsar.study.montecarlo.work import Chunk, Computed, Work
+from torchsar.study.settings.errors import ConfigError, one_line
 
 log = logging.getLogger("torchsar")
 Task = tuple[Chunk, int | None]
@@ -26,18 +26,6 @@ _UNGUARDED = (
 )
 
 
-class Engine(Protocol):
-    """Computes chunks in any order; how many processes and threads in each are for the record."""
-
-    @property
-    def workers(self) -> int: ...
-
-    @property
-    def threads(self) -> int: ...
-
-    def results(self, work: Work, tasks: Iterable[Task]) -> Iterator[tuple[Chunk, Outcome]]: ...
-
-
 @dataclass(frozen=True)
 class InProcess:
     """One chunk after the other in this process."""
@@ -45,17 +33,16 @@ class InProcess:
     threads: int = 1
     workers: int = 1
 
-    def results(self, work: Work, tasks: Iterable[Task]) -> Iterator[tuple[Chunk, Outcome]]:
+    def results(self, work: Work, tasks: Iterable[Task]) -> Iterator[tuple[Chunk, Computed]]:
         before = torch.get_num_threads()
         torch.set_num_threads(self.threads)
         try:
-            for chunk, fits in tasks:
-                yield chunk, work.compute(chunk, fits)
+            yield from ((chunk, work.compute(chunk, fits)) for chunk, fits in tasks)
         finally:
             torch.set_num_threads(before)
 
 
-def _compute(chunk: Chunk, fits: int | None) -> Outcome:
+def _compute(chunk: Chunk, fits: int | None) -> Computed:
     """Runs in a worker, with the work that its plugin holds."""
     from distributed import get_worker
 
@@ -106,7 +93,7 @@ class Distributed:
     threads: int = 1
     own: bool = False
 
-    def results(self, work: Work, tasks: Iterable[Task]) -> Iterator[tuple[Chunk, Outcome]]:
+    def results(self, work: Work, tasks: Iterable[Task]) -> Iterator[tuple[Chunk, Computed]]:
         from distributed import KilledWorker, as_completed
 
         _refuse_unsendable(work)
@@ -125,15 +112,18 @@ class Distributed:
             for future in done:
                 chunk = waiting.pop(future)
                 try:
-                    outcome = future.result()
+                    computed = future.result()
                 except KilledWorker:
                     for half in _after_deaths(chunk):
                         submit((half, len(half)))
                     continue
-                yield chunk, outcome
+                yield chunk, computed
                 submit(next(source, None))
         finally:
             self.client.cancel(list(waiting), force=True)
+
+
+Engine = InProcess | Distributed
 
 
 def _refuse_unsendable(work: Work) -> None:
@@ -145,7 +135,7 @@ def _refuse_unsendable(work: Work) -> None:
     except Exception as error:  # objects raise what they like when they are pickled
         raise ConfigError(
             "the trial function and its grid cannot be sent to other processes "
-            f"({' '.join(str(error).split())}); make such objects inside the function"
+            f"({one_line(error)}); make such objects inside the function"
         ) from error
 
 
@@ -178,13 +168,17 @@ def _after_deaths(chunk: Chunk) -> Iterator[Chunk]:
 
 @contextmanager
 def engine(workers: int | None = None, cluster: str | None = None, threads: int = 1) -> Iterator[Engine]:
-    """In this process by default; `workers` local processes; or the workers of a running scheduler
-    at `cluster`.
+    """Where chunks are computed.
 
-    threads: of torch in each process. One is the default: batches that fit the cache gain nothing
-    from more (two took 1.4 times as long on two cores), and results then do not depend on the
-    number of cores. Raises ConfigError where dask.distributed is missing or the address does not
-    answer.
+    Args:
+        workers: Processes of this machine; None computes in this one.
+        cluster: Address of a running scheduler, whose workers are used instead.
+        threads: Threads of torch in each process. One is the default: batches that fit the cache
+            gain nothing from more (two took 1.4 times as long on two cores), and results then do
+            not depend on the number of cores.
+
+    Raises:
+        ConfigError: If dask.distributed is missing or the address does not answer.
     """
     for name, value in (("workers", workers), ("threads", threads)):
         if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
@@ -202,51 +196,30 @@ def engine(workers: int | None = None, cluster: str | None = None, threads: int 
         raise ConfigError(
             "several processes need dask.distributed; install the extra: pip install 'torchsar-lab[cluster]'"
         ) from None
-    with (
-        _local(distributed, workers, threads)
-        if workers is not None
-        else _remote(distributed, str(cluster), threads) as chosen
-    ):
+    local = _local(distributed, workers or 1, threads)
+    with local if cluster is None else _remote(distributed, cluster, threads) as chosen:
         yield chosen
-
-
-def _settings(threads: int) -> dict[str, Any]:
-    """Of local workers.
-
-    dask lets malloc hand memory back at once, which doubled the time of these chains: every
-    operation faulted its pages in anew.
-    """
-    kept = dict.fromkeys(("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_"), 256 << 20)
-    environment = {**dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads), **kept}
-    return {"distributed.nanny.pre-spawn-environ": environment, "distributed.scheduler.allowed-failures": _DEATHS}
 
 
 @contextmanager
 def _local(distributed: Any, workers: int, threads: int) -> Iterator[Engine]:
     from dask import config
 
-    with (
-        config.set(_settings(threads)),
-        _cluster(distributed, workers) as local,
-        distributed.Client(local) as client,
-    ):
-        yield Distributed(client, workers, threads, own=True)
-
-
-def _cluster(distributed: Any, workers: int) -> Any:
-    try:
-        return distributed.LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            processes=True,
-            dashboard_address=":0",
-            silence_logs=50,
-            memory_limit=0,
-        )
-    except RuntimeError as error:
-        raise ConfigError(
-            f"the worker processes did not start ({' '.join(str(error).split())}); {_UNGUARDED}"
-        ) from None
+    # dask lets malloc hand memory back at once, which doubled the time of chains: every operation
+    # faulted its pages in anew
+    environment = {
+        **dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads),
+        **dict.fromkeys(("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_"), 256 << 20),
+    }
+    settings = {"distributed.nanny.pre-spawn-environ": environment, "distributed.scheduler.allowed-failures": _DEATHS}
+    wanted = {"threads_per_worker": 1, "processes": True, "dashboard_address": ":0", "silence_logs": 50}
+    with config.set(settings):
+        try:
+            cluster = distributed.LocalCluster(n_workers=workers, memory_limit=0, **wanted)
+        except RuntimeError as error:
+            raise ConfigError(f"the worker processes did not start ({one_line(error)}); {_UNGUARDED}") from None
+        with cluster, distributed.Client(cluster) as client:
+            yield Distributed(client, workers, threads, own=True)
 
 
 @contextmanager
@@ -255,8 +228,7 @@ def _remote(distributed: Any, address: str, threads: int) -> Iterator[Engine]:
         client = distributed.Client(address, timeout=20)
     except (OSError, ValueError) as error:
         raise ConfigError(
-            f"--cluster {address} does not answer ({' '.join(str(error).split())}); start a "
-            "scheduler there, or leave --cluster out"
+            f"--cluster {address} does not answer ({one_line(error)}); start a scheduler there, or leave --cluster out"
         ) from None
     with client:
         client.wait_for_workers(1, timeout=600)

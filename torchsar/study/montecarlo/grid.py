@@ -7,6 +7,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from typing import Any
 
 from torchsar.study.settings.errors import ConfigError
 
+# names of dims and parts of results
 RESERVED = ("algorithm", "trial", "method", "ok", "done", "saved")
 _LONGEST = 200  # bytes: file systems end at 255, and bounds and figures add words
 
@@ -22,11 +24,12 @@ _LONGEST = 200  # bytes: file systems end at 255, and bounds and figures add wor
 class Parameter:
     """One dimension of a sweep.
 
-    labels: numbers or words that name the values in results; values: what the trial is given.
-
-    batched: the values reach the trial as one tensor with an entry per row, so that one batch may
-    hold several of them; others are given as they are, and each of their values is a case of its
-    own.
+    Args:
+        name: Its name.
+        labels: Numbers or words that name the values in results.
+        values: What the trial is given.
+        batched: Whether the values reach the trial as one tensor with an entry per row, so that one
+            batch may hold several of them; else each value is a case of its own.
     """
 
     name: str
@@ -37,7 +40,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Point:
-    """One place of the grid: index along every parameter, and the address of its random numbers."""
+    """One point of the grid: index along every parameter, and the address of its random numbers."""
 
     index: tuple[int, ...]
     address: str
@@ -70,9 +73,7 @@ class Grid:
         return {p.name: p.labels for p in self.parameters}
 
     def points(self) -> list[Point]:
-        """Every point, each with an address made of names and values alone: it stays when the grid
-        grows.
-        """
+        """Every point; its address, made of names and values alone, stays in larger grids."""
         return [
             Point(index, address({p.name: p.values[i] for p, i in zip(self.parameters, index)}))
             for index in itertools.product(*map(range, self.shape))
@@ -110,9 +111,8 @@ def _plain(x: Any) -> Any:
         return {str(k): _plain(v) for k, v in x.items()}
     if isinstance(x, (list, tuple)):
         return [_plain(v) for v in x]
-    if isinstance(x, bool) or x is None or isinstance(x, str):
-        return x
-    if isinstance(x, int) and abs(x) > 2**53:  # beyond this, a float would make neighbours alike
+    # beyond 2^53, a float would make neighbouring whole numbers alike
+    if x is None or isinstance(x, (bool, str)) or (isinstance(x, int) and abs(x) > 2**53):
         return x
     if isinstance(x, (int, float)):
         return float(x) + 0.0  # the sum makes -0.0 and 0.0, which are equal, alike
@@ -122,90 +122,87 @@ def _plain(x: Any) -> Any:
 def make_grid(
     values: Mapping[str, Sequence[Any] | Mapping[str, Any]], batched: Sequence[str] = (), where: str = "grid"
 ) -> Grid:
-    """A grid from {name: values}; a mapping {label: value} names values that are no numbers or
-    words themselves.
+    """A grid from the values of every parameter.
 
-    batched: names whose values reach the trial as per-row tensors. Raises ConfigError for a
-    parameter without values, a value given twice, a reserved name, or a batched parameter that is
-    no number.
+    Args:
+        values: {name: values}, or {name: {label: value}} for values that are no numbers or words.
+        batched: Names whose values reach the trial as tensors with an entry per row.
+        where: What errors name.
+
+    Raises:
+        ConfigError: If a parameter has no values, a value is given twice, a name is reserved, or a
+            batched parameter is no number.
     """
     if not isinstance(values, Mapping):
         raise ConfigError(f"{where} must be a mapping of names to lists of values, got {values!r}")
     if isinstance(batched, str):
         raise ConfigError(f"{where}: batched must be a list of names, got {batched!r}; write [{batched!r}]")
-    unknown = [name for name in batched if name not in values]
-    if unknown:
-        raise ConfigError(
-            f"{where}: batched names {unknown[0]!r}, which is no parameter of the grid "
-            f"({', '.join(values) or 'it has none'})"
-        )
+    unknown = next((name for name in batched if name not in values), None)
+    if unknown is not None:
+        known = ", ".join(values) or "it has none"
+        raise ConfigError(f"{where}: batched names {unknown!r}, which is no parameter of the grid ({known})")
     return Grid(tuple(_parameter(name, given, name in batched, f"{where}: {name}") for name, given in values.items()))
 
 
 def check_name(name: Any, taken: Sequence[str], where: str, kind: str) -> None:
-    """Raise ConfigError for a name under which the store could not keep an array: each is a folder
-    of its own.
+    """Refuse a name under which the store could not keep an array: each is a folder of its own.
+
+    Args:
+        name: The name.
+        taken: Names that are in use.
+        where: What the error names.
+        kind: What is to bear the name.
+
+    Raises:
+        ConfigError: If the name is taken, no word, or too long.
     """
+    why = ""
     if name in taken:
+        why = "which names a dimension or a part of the results; choose another name"
+    elif not isinstance(name, str) or name in ("", ".", "..", "zarr.json") or re.search("^__|[/\0]", name):
+        why = "since names are words without '/' that do not begin with '__'"
+    elif len(name.encode()) > _LONGEST:
+        why = f"since it has {len(name.encode())} bytes; use {_LONGEST} at most"
+    if why:
         raise ConfigError(
-            f"{where}: a {kind} cannot be called {name!r}, which names a dimension or a part of "
-            "the results; choose another name"
+            f"{where}: a {kind} cannot be called {name if not isinstance(name, str) else name[:40]!r}, {why}"
         )
-    if (
-        not isinstance(name, str)
-        or not name
-        or "/" in name
-        or "\0" in name
-        or name in (".", "..", "zarr.json")
-        or name.startswith("__")
-    ):
-        raise ConfigError(
-            f"{where}: a {kind} cannot be called {name!r}; its name is a word without '/' that does not begin with '__'"
-        )
-    if len(name.encode()) > _LONGEST:
-        raise ConfigError(
-            f"{where}: the name of the {kind} {name[:40]!r}... has {len(name.encode())} bytes; use {_LONGEST} at most"
-        )
-
-
-def _pairs(given: Any, where: str) -> list[tuple[float | str, Any]]:
-    """Labels and values, numpy's and torch's numbers as Python's own."""
-    if not isinstance(given, Mapping) and hasattr(given, "tolist"):
-        given = given.tolist()
-    if isinstance(given, (str, bytes)) or not isinstance(given, (Mapping, Sequence)):
-        raise ConfigError(f"{where} must be a list of values or a mapping of labels to values, got {given!r}")
-    if isinstance(given, Mapping):
-        return [(_label(label, where), _bare(value)) for label, value in given.items()]
-    return [(_label(_bare(value), where), _bare(value)) for value in given]
 
 
 def _bare(value: Any) -> Any:
+    """A number of numpy or torch as Python's own."""
     return value.tolist() if hasattr(value, "tolist") and getattr(value, "ndim", 1) == 0 else value
 
 
 def _parameter(name: str, given: Any, batched: bool, where: str) -> Parameter:
     check_name(name, RESERVED, where, "parameter")
-    pairs = _pairs(given, where)
-    if not pairs:
-        raise ConfigError(f"{where} has no values; give at least one")
-    labels, values = tuple(label for label, _ in pairs), tuple(value for _, value in pairs)
-    nameless = next((value for value in values if " at 0x" in canonical(value)), None)
-    if nameless is not None:
-        raise ConfigError(
-            f"{where} holds {nameless!r}, whose text is another in every process, and random "
-            "numbers follow it; give numbers, words, lists, mappings or dataclasses"
-        )
-    for known in (labels, tuple(map(canonical, values))):
-        twice = next((label for i, label in enumerate(known) if label in known[:i]), None)
-        if twice is not None:
-            raise ConfigError(f"{where} holds {twice} twice; give each value once")
-    if len({isinstance(label, str) for label in labels}) > 1:
-        raise ConfigError(f"{where} mixes numbers and words; name all of its values: {{label: value, ...}}")
-    if batched and not all(_is_number(v) for v in values):
-        raise ConfigError(
-            f"{where} becomes a tensor with an entry per trial, so its values must be finite "
-            f"numbers, got {list(values)}"
-        )
+    given = given.tolist() if not isinstance(given, Mapping) and hasattr(given, "tolist") else given
+    if isinstance(given, (str, bytes)) or not isinstance(given, (Mapping, Sequence)):
+        raise ConfigError(f"{where} must be a list of values or a mapping of labels to values, got {given!r}")
+    values = tuple(map(_bare, given.values() if isinstance(given, Mapping) else given))
+    labels = tuple(_label(label, where) for label in (given if isinstance(given, Mapping) else values))
+    texts = tuple(map(canonical, values))
+    nameless = next((value for value, text in zip(values, texts) if " at 0x" in text), None)
+    twice = next((one for known in (labels, texts) for i, one in enumerate(known) if one in known[:i]), None)
+    for wrong, text in (
+        (not values, "has no values; give at least one"),
+        (
+            nameless is not None,
+            f"holds {nameless!r}, whose text is another in every process, and random numbers follow it; give numbers, "
+            "words, lists, mappings or dataclasses",
+        ),
+        (twice is not None, f"holds {twice} twice; give each value once"),
+        (
+            len({isinstance(label, str) for label in labels}) > 1,
+            "mixes numbers and words; name all of its values: {label: value, ...}",
+        ),
+        (
+            batched and not all(map(_is_number, values)),
+            f"becomes a tensor with an entry per trial, so its values must be finite numbers, got {list(values)}",
+        ),
+    ):
+        if wrong:
+            raise ConfigError(f"{where} {text}")
     return Parameter(name, labels, values, batched)
 
 
@@ -214,12 +211,11 @@ def _is_number(value: Any) -> bool:
 
 
 def _label(value: Any, where: str) -> float | str:
-    if isinstance(value, str):
-        return value
+    value = _bare(value)
     if _is_number(value):
         return float(value) + 0.0
-    if isinstance(value, bool) or value is None:
-        return {True: "true", False: "false", None: "null"}[value]
-    if isinstance(value, (list, tuple)):
+    if isinstance(value, str):
+        return value
+    if value is None or isinstance(value, (bool, list, tuple)):
         return canonical(value)
     raise ConfigError(f"{where} holds the value {value!r}, which names nothing; write {{label: value, ...}}")

@@ -4,31 +4,34 @@ from __future__ import annotations
 
 import logging
 import platform
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 
-from torchsar.study.montecarlo.chunks import cut, probed_bytes, rows_by_bytes
+from torchsar.metrics import half_width_ratio
 from torchsar.study.montecarlo.engines import Engine, Task, engine, refuse_unguarded
 from torchsar.study.montecarlo.grid import Grid, make_grid
-from torchsar.study.montecarlo.progress import Progress
 from torchsar.study.montecarlo.record import OK, Record
-from torchsar.study.montecarlo.stopping import Stop, looks
 from torchsar.study.montecarlo.store import Store, cut_off, empty, read_sweep
-from torchsar.study.montecarlo.work import Chunk, Outcome, Trial, Work
+from torchsar.study.montecarlo.work import Chunk, Computed, Outcome, Trial, Work, cut, probed_bytes, rows_by_bytes
 from torchsar.study.output.folder import ResultFolder, opened
+from torchsar.study.output.progress import Count, Ticker
 from torchsar.study.output.report import installed_version
 from torchsar.study.settings.errors import ConfigError, did_you_mean
 
 log = logging.getLogger("torchsar")
+# chunks that wait to be written together at most: what they hold must stay small beside a chunk
 _WAITING = 256
+# trials after which points are looked at first; fewer say too little of an interval
+FIRST_LOOK = 50
+SWEEP_FILES = ("config.yaml", "summary.json", "figures", "report.html")
 
 
 class Interrupted(KeyboardInterrupt):
@@ -36,13 +39,66 @@ class Interrupted(KeyboardInterrupt):
 
 
 @dataclass(frozen=True)
+class Stop:
+    """Ends a point when half of the 95 % interval of a statistic is small against the statistic.
+
+    Points are looked at after 50, 100, 200, 400, ... trials in the order of their numbers, and
+    never in between; every algorithm that has the metric must agree. An rmse that rare outliers
+    make up is settled before they come: with one error in a hundred 100 times as large and
+    relative = 0.19, four points of ten end at 50 trials without one. Below a threshold SNR take
+    the median, or a smaller relative (0.1 takes 100 trials or more).
+
+    Args:
+        metric: The metric.
+        relative: Largest half width over the statistic.
+        statistic: "rmse", "mean" or "median".
+
+    Raises:
+        ConfigError: If one of them is impossible.
+    """
+
+    metric: str
+    relative: float
+    statistic: Literal["rmse", "mean", "median"] = "rmse"
+
+    def __post_init__(self) -> None:
+        if self.statistic not in ("rmse", "mean", "median"):
+            raise ConfigError(f"stop.statistic must be rmse, mean or median, got {self.statistic!r}")
+        if not isinstance(self.relative, (int, float)) or not 0 < self.relative < 1:
+            raise ConfigError(f"stop.relative must lie between 0 and 1, got {self.relative!r}")
+
+    def reached(self, record: Record, point: tuple[int, ...], trials: int, seed: int) -> bool:
+        """Whether the first `trials` trials of a point say enough."""
+        values = record.metrics[self.metric][(slice(None), *point, slice(0, trials))]
+        values = values[np.isfinite(values).any(-1)]
+        return bool(len(values)) and bool((half_width_ratio(values, self.statistic, seed) < self.relative).all())
+
+
+def looks(trials: int, stop: Stop | None) -> list[int]:
+    """Numbers of trials after which points are looked at; the last is the limit."""
+    levels, level = [], FIRST_LOOK
+    while stop is not None and level < trials:
+        levels.append(level)
+        level *= 2
+    return [*levels, trials]
+
+
+@dataclass(frozen=True)
 class Plan:
-    """What a sweep is to compute, apart from where.
+    """What a sweep is to compute.
 
-    chunk: rows a batch, None to choose by bytes; save: trials whose arrays are kept.
+    Args:
+        grid: The points.
+        trials: Trials of each point.
+        seed: Of all random numbers.
+        chunk: Rows of a batch, None to choose by bytes.
+        stop: When a point has seen enough trials.
+        save: Trials whose arrays are kept.
+        device: Where batches are computed.
+        needs: Metrics that are asked for, each with the key that asks for it.
 
-    needs: (where it is said, metric) of what something after the sweep asks for; the first batch
-    must give it.
+    Raises:
+        ConfigError: If a number or the device is impossible.
     """
 
     grid: Grid
@@ -58,20 +114,35 @@ class Plan:
         for name, value, least in (("trials", self.trials, 1), ("chunk", self.chunk, 1), ("seed", self.seed, 0)):
             if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < least):
                 raise ConfigError(f"sweep: {name} must be a whole number of at least {least}, got {value!r}")
-        absent = next(
-            (t for t in self.save if isinstance(t, bool) or not isinstance(t, int) or not 0 <= t < self.trials), None
-        )
+        absent = next((t for t in self.save if type(t) is not int or not 0 <= t < self.trials), None)
         if absent is not None:
             raise ConfigError(
-                f"sweep: save names trial {absent!r}, and a point has the trials 0 to "
-                f"{self.trials - 1}; name some of these"
+                f"sweep: save names trial {absent!r}, and a point has the trials 0 to {self.trials - 1}; name some of "
+                "these"
             )
         try:
             torch.empty(0, device=torch.device(self.device))
         except (RuntimeError, AssertionError, TypeError) as error:
-            raise ConfigError(
-                f"sweep: the device {self.device!r} cannot be used here: {str(error).splitlines()[0]}"
-            ) from None
+            text = str(error).splitlines()[0]
+            raise ConfigError(f"sweep: the device {self.device!r} cannot be used here: {text}") from None
+
+    def work(self, trial: Trial) -> Work:
+        """What processes need in order to compute its chunks."""
+        batched = {p.name: p.values for p in self.grid.parameters if p.batched}
+        cases = tuple(self.grid.cases())
+        return Work(trial, cases, batched, self.grid.names, self.seed, self.device, self.save)
+
+    def refuse_missing(self, trial: Trial) -> None:
+        """Refuse metrics that are asked for and that the first trial, computed here, does not give.
+
+        Raises:
+            ConfigError: With the first such metric.
+        """
+        parts = self.work(trial).compute(Chunk(0, (0,), (0,))).parts if self.needs else []
+        given = {metric for part in parts for metrics in part.values.values() for metric in metrics if metric != OK}
+        for where, metric in self.needs:
+            if metric not in given:
+                raise ConfigError(f"{where} names {metric!r}, which no trial gives{did_you_mean(metric, given)}")
 
 
 def sweep(
@@ -92,53 +163,59 @@ def sweep(
     device: str = "cpu",
     config: Mapping[str, Any] | None = None,
 ) -> Record:
-    """Run `trial(parameters, draws)` over a grid of parameters, many trials at once, and return the
-    labelled results.
+    """Run a trial function over a grid of parameters, many trials at once.
 
-    trial: gets the parameters of a batch by name, and `Draws` whose trials are the rows of that
-    batch; returns {metric: (rows,) tensor}, or {algorithm: {metric: tensor}} to compare algorithms
-    on the same noise. `ok` (bool) is an algorithm's own verdict. Two further keys: "bounds"
-    {metric: {name: (rows,) tensor}}, and "saved" {algorithm: {name: (rows, ...) tensor}}, kept for
-    the trials in `save`. grid: {name: values}, or {name: {label: value}} for values that are no
-    numbers or words. batched: names whose values come as one float64 tensor (rows,); any other
-    value comes as it is, one case after the other. trials: per point; more trials on a finished
-    sweep extend it. stop: ends a point early. chunk: rows a batch (default: by bytes). out: folder
-    for results.zarr; None keeps the results in memory only. resume: go on with what is there.
-    workers, cluster: processes of this machine, or the address of a dask scheduler; threads: of
-    torch in each process. config: whatever else the results depend on; resuming with another one is
-    refused.
+    Random numbers depend on (seed, purpose, parameters, trial) alone.
 
-    Random numbers depend on (seed, purpose, parameters, trial) alone. Raises ConfigError for bad
-    input, Interrupted after Ctrl-C.
+    Args:
+        trial: Gets the parameters of a batch by name, and `Draws` whose trials are the rows of that
+            batch. Returns {metric: (rows,) tensor}, or {algorithm: {metric: tensor}} to compare
+            algorithms on the same noise; `ok` (bool) is an algorithm's own verdict. Two further
+            keys: "bounds" {metric: {name: (rows,) tensor}}, and "saved" {algorithm: {name:
+            (rows, ...) tensor}}, kept for the trials in `save`.
+        grid: {name: values}, or {name: {label: value}} for values that are no numbers or words.
+        trials: Trials of each point; more of them on a finished sweep extend it.
+        seed: Of all random numbers.
+        batched: Names whose values come as one float64 tensor (rows,); any other value comes as it
+            is, one case after the other.
+        out: Folder for results.zarr; None keeps the results in memory only.
+        resume: Whether a sweep that is there is gone on with.
+        chunk: Rows of a batch; None to choose by bytes.
+        workers: Processes of this machine; None computes in this one.
+        cluster: Address of a running dask scheduler instead.
+        threads: Threads of torch in each process.
+        stop: Ends points early.
+        save: Trials whose arrays are kept.
+        device: Where batches are computed.
+        config: Whatever else the results depend on; resuming with another one is refused.
+
+    Returns:
+        The labelled results.
+
+    Raises:
+        ConfigError: For bad input.
+        Interrupted: After Ctrl-C.
     """
     if workers is not None:
         refuse_unguarded()
-    _refuse_types(trial, stop, save, config, out)
-    plan = Plan(make_grid(grid, batched), trials, seed, chunk, stop, frozenset(save), device)
-    identity = {
-        "seed": seed,
-        "trial": getattr(trial, "__qualname__", type(trial).__qualname__),
-        "config": dict(config or {}),
-    }
+    for name, good, expected, given in (
+        ("trial", callable(trial), "be a function of (parameters, draws)", trial),
+        ("stop", stop is None or isinstance(stop, Stop), "be a Stop, such as Stop('error_m', 0.05)", stop),
+        ("save", isinstance(save, Iterable), "list the numbers of trials", save),
+        ("config", isinstance(config or {}, Mapping), "be a mapping of whatever else results depend on", config),
+    ):
+        if not good:
+            raise ConfigError(f"sweep: {name} must {expected}, got {given!r}")
+    if out is None and set(save):
+        raise ConfigError("sweep: save keeps arrays in the folder of the sweep; give out as well")
+    needs = () if stop is None else (("stop.metric", stop.metric),)
+    plan = Plan(make_grid(grid, batched), trials, seed, chunk, stop, frozenset(save), device, needs)
+    plan.refuse_missing(trial)
+    name = getattr(trial, "__qualname__", type(trial).__qualname__)
+    identity = {"seed": seed, "trial": name, "config": dict(config or {})}
     with nullcontext() if out is None else opened(Path(out), "sweep", SWEEP_FILES) as folder:
         store = None if folder is None else open_store(folder, plan, identity, resume)
         return run_plan(plan, trial, store, engine(workers, cluster, threads)).select(plan.grid.labels)
-
-
-def _refuse_types(trial: Any, stop: Any, save: Any, config: Any, out: Any) -> None:
-    if not callable(trial):
-        raise ConfigError(f"sweep: the trial must be a function of (parameters, draws), got {trial!r}")
-    if stop is not None and not isinstance(stop, Stop):
-        raise ConfigError(f"sweep: stop must be a Stop, such as Stop('error_m', 0.05), got {stop!r}")
-    if not isinstance(save, Iterable):
-        raise ConfigError(f"sweep: save must list the numbers of trials, got {save!r}")
-    if out is None and set(save):
-        raise ConfigError("sweep: save keeps arrays in the folder of the sweep; give out as well")
-    if config is not None and not isinstance(config, Mapping):
-        raise ConfigError(f"sweep: config must be a mapping of whatever else the results depend on, got {config!r}")
-
-
-SWEEP_FILES = ("config.yaml", "summary.json", "figures", "report.html")
 
 
 def open_store(folder: ResultFolder, plan: Plan, identity: Mapping[str, Any], resume: bool) -> Store:
@@ -162,27 +239,26 @@ def open_store(folder: ResultFolder, plan: Plan, identity: Mapping[str, Any], re
     return Store.create(path, plan.grid, plan.trials, identity)
 
 
-def run_plan(
-    plan: Plan, trial: Trial, store: Store | None, engine: AbstractContextManager[Engine], title: str = "sweep"
-) -> Record:
-    """Compute what is missing and return the whole record, which may hold more labels than the
-    plan's grid after a resume.
+def run_plan(plan: Plan, trial: Trial, store: Store | None, engine: AbstractContextManager[Engine]) -> Record:
+    """Compute what is missing.
+
+    Args:
+        plan: What to compute.
+        trial: The trial function.
+        store: Where results are kept; None keeps them in memory only.
+        engine: Where chunks are computed.
+
+    Returns:
+        The whole record, which may hold more labels than the plan's grid after a resume.
+
+    Raises:
+        Interrupted: After Ctrl-C.
     """
     record = empty(plan.grid.labels, plan.trials) if store is None else store.record
-    cases = tuple(plan.grid.cases())
-    work = Work(
-        trial,
-        cases,
-        {p.name: p.values for p in plan.grid.parameters if p.batched},
-        plan.grid.names,
-        plan.seed,
-        plan.device,
-        plan.save,
-    )
-    run = _Run(plan, work, record, store)
+    run = _Run(plan, plan.work(trial), record, store)
     try:
         with engine as chosen:
-            run.all_levels(chosen, title)
+            run.all_levels(chosen)
     except KeyboardInterrupt:
         run.settle()
         raise Interrupted(f"{int(record.done.sum())} trials are recorded") from None
@@ -196,162 +272,108 @@ class _Run:
 
     def __init__(self, plan: Plan, work: Work, record: Record, store: Store | None) -> None:
         self.plan, self.work, self.record, self.store = plan, work, record, store
-        self.places = [[record.place(plan.grid.labels_at(p)) for p in case.points] for case in work.cases]
+        self.points = [[record.index_of(plan.grid.labels_at(p)) for p in case.points] for case in work.cases]
         self.active = [set(range(len(case.points))) for case in work.cases]
         self.fits: dict[int, int] = {}
         self.rows: dict[int, int] = {}
-        self.waiting: list[tuple[Chunk, Outcome]] = []
-        self.settled_at: dict[tuple[int, int], int] = {}
+        self.waiting: list[Outcome] = []
+        self.warned: set[str] = set()
 
-    def all_levels(self, engine: Engine, title: str) -> None:
-        if self.record.algorithms:
-            self._refuse_missing(self.record.metrics)
-        levels = sorted(
-            {
-                *looks(self.plan.trials, self.plan.stop),
-                *(n for n in self.record.about.get("finished", []) if n < self.plan.trials),
-            }
-        )
-        progress, began, first = (
-            Progress(title, self._expected(levels[-1]), self._recorded(levels[-1])),
-            time.perf_counter(),
-            0,
-        )
+    def all_levels(self, engine: Engine) -> None:
+        """Compute all trials, with looks at the points that may end early in between."""
+        stops = looks(self.plan.trials, self.plan.stop)
+        known = (n for n in self.record.about.get("finished", []) if n < self.plan.trials)
+        levels = sorted({*stops, *known})
+        done = sum(int(self.record.done[(*p, slice(0, levels[-1]))].sum()) for points in self.points for p in points)
+        count = Count("trials", self.plan.trials * sum(map(len, self.points)), done)
         session = self._session(engine)
         try:
-            for last in levels:
-                for chunk, outcome in engine.results(self.work, self._tasks(first, last)):
-                    self._enter(chunk, outcome)
-                    progress.advance(len(chunk), outcome.seconds)
-                self.settle()
-                self._finished(last)
-                if last in looks(self.plan.trials, self.plan.stop)[:-1]:
-                    self._drop_settled(last)
-                    progress.expect(self._expected(levels[-1]))
-                first = last
+            with Ticker(count.say):
+                for first, last in pairwise((0, *levels)):
+                    for chunk, computed in engine.results(self.work, self._tasks(first, last)):
+                        self._enter(chunk, computed)
+                        count.advance(len(chunk))
+                        log.debug("%s", count.say())
+                    self.settle()
+                    # batches never reach across a level that all points got to, so that an
+                    # extended sweep runs the same ones however often it is resumed
+                    self._about(finished=sorted({*self.record.about.get("finished", []), last}))
+                    if last in stops[:-1]:
+                        count.total -= (self.plan.trials - last) * self._drop_settled(last)
         finally:
-            progress.close()
-            self._note(
-                {
-                    **session,
-                    "seconds": time.perf_counter() - began,
-                    "trials": progress.done - progress.began_with,
-                    "chunk_rows": {str(k): v for k, v in self.rows.items()},
-                }
-            )
-
-    def _expected(self, trials: int) -> int:
-        """Trials that the sweep will hold if no further point ends early."""
-        return sum(
-            self.settled_at.get((case, p), trials)
-            for case, places in enumerate(self.places)
-            for p in range(len(places))
-        )
-
-    def _finished(self, trials: int) -> None:
-        """Remember that all points got this far: batches never reach across, so that an extension
-        of a sweep runs the same ones however often it is resumed.
-        """
-        finished = sorted({*self.record.about.get("finished", []), trials})
-        self._about(finished=finished)
-
-    def _recorded(self, trials: int) -> int:
-        return sum(
-            int(self.record.done[(*place, slice(0, trials))].sum()) for places in self.places for place in places
-        )
+            rows = {str(case): n for case, n in self.rows.items()}
+            session = {**session, "seconds": count.seconds, "trials": count.new, "chunk_rows": rows}
+            self._about(seed=self.plan.seed, sessions=[*self.record.about.get("sessions", []), session])
 
     def _tasks(self, first: int, last: int) -> Iterator[Task]:
         """Chunks of one level without the rows that are done."""
         for number, case in enumerate(self.work.cases):
-            missing = any(
-                not self.record.done[(*self.places[number][p], slice(first, last))].all() for p in self.active[number]
-            )
-            if not missing:
+            done = self.record.done
+            at = self.points[number]
+            if all(done[(*at[p], slice(first, last))].all() for p in self.active[number]):
                 continue
-            self.rows[number] = (
-                self.plan.chunk
-                or self.rows.get(number)
-                or rows_by_bytes(probed_bytes(self.work, number), self.plan.device)
-            )
+            rows = self.plan.chunk or self.rows.get(number)
+            self.rows[number] = rows or rows_by_bytes(probed_bytes(self.work, number), self.plan.device)
             for whole in cut(number, case, self.active[number], first, last, self.rows[number]):
-                keep = [
-                    i
-                    for i, (p, t) in enumerate(zip(whole.points, whole.trials))
-                    if not self.record.done[(*self.places[number][p], t)]
-                ]
-                if keep:
-                    yield (
-                        Chunk(number, tuple(whole.points[i] for i in keep), tuple(whole.trials[i] for i in keep)),
-                        self.fits.get(number),
-                    )
+                missing = [(p, t) for p, t in zip(whole.points, whole.trials) if not done[(*at[p], t)]]
+                if missing:
+                    points, trials = zip(*missing)
+                    yield Chunk(number, points, trials), self.fits.get(number)
 
-    def _enter(self, chunk: Chunk, outcome: Outcome) -> None:
+    def _enter(self, chunk: Chunk, computed: Computed) -> None:
         """Take in a chunk; it waits with others until writing them together is cheap."""
-        if not self.record.algorithms and not self.waiting:
-            self._refuse_missing({metric for metrics in outcome.values.values() for metric in metrics if metric != OK})
-        if outcome.fits is not None and outcome.fits < self.fits.get(chunk.case, len(chunk)):
-            log.warning("warning: %d trials at once do not fit into memory; going on with %d", len(chunk), outcome.fits)
-            self.fits[chunk.case] = outcome.fits
-        self.waiting.append((chunk, outcome))
+        for text in computed.warnings:
+            if text not in self.warned:
+                log.warning("warning: %s", text)
+        self.warned.update(computed.warnings)
+        fits = computed.fits
+        if fits is not None and fits < self.fits.get(chunk.case, len(chunk)):
+            log.warning("warning: %d trials at once do not fit into memory; going on with %d", len(chunk), fits)
+            self.fits[chunk.case] = fits
+        self.waiting += computed.parts
         if len(self.waiting) >= _WAITING or (self.store is not None and self.store.due):
             self.settle()
 
     def settle(self) -> None:
         """Enter what waits into the record and the store.
 
-        The store is told first: a second Ctrl-C in between may then leave rows that are announced
-        and not done, never the reverse.
+        The store is informed first: a second Ctrl-C in between may then leave rows that are
+        announced and not done, never the reverse.
         """
         while self.waiting:
-            chunk, outcome = self.waiting.pop(0)
-            places = [self.places[chunk.case][p] for p in chunk.points]
+            part = self.waiting.pop(0)
+            chunk, known = part.chunk, self.work.cases[part.chunk.case].points
+            points = [self.points[chunk.case][p] for p in chunk.points]
             if self.store is not None:
-                self.store.entered(places, chunk.trials)
-                points = self.work.cases[chunk.case].points
-                for row, arrays in outcome.saved.items():
-                    self.store.save(self.plan.grid.labels_at(points[chunk.points[row]]), chunk.trials[row], arrays)
-            self.record.add(places, chunk.trials, outcome.values, outcome.bounds)
+                self.store.entered(points, chunk.trials)
+                for row, arrays in part.saved.items():
+                    self.store.save(self.plan.grid.labels_at(known[chunk.points[row]]), chunk.trials[row], arrays)
+            self.record.add(points, chunk.trials, part.values, part.bounds)
         if self.store is not None:
             self.store.flush()
 
-    def _refuse_missing(self, given: Iterable[str]) -> None:
-        """given: the metrics that trials give."""
-        stop = (("stop.metric", self.plan.stop.metric),) if self.plan.stop else ()
-        for where, metric in (*self.plan.needs, *stop):
-            if metric not in given:
-                raise ConfigError(f"{where} names {metric!r}, which no trial gives{did_you_mean(metric, given)}")
-
-    def _drop_settled(self, trials: int) -> None:
+    def _drop_settled(self, trials: int) -> int:
+        """End the points that have seen enough; returns how many."""
         assert self.plan.stop is not None
-        for case, (places, active) in enumerate(zip(self.places, self.active)):
-            ended = {p for p in active if self.plan.stop.reached(self.record, places[p], trials, self.plan.seed)}
-            self.settled_at.update({(case, p): trials for p in ended})
+        dropped = 0
+        for points, active in zip(self.points, self.active):
+            ended = {p for p in active if self.plan.stop.reached(self.record, points[p], trials, self.plan.seed)}
             active -= ended
+            dropped += len(ended)
+        return dropped
 
     def _session(self, engine: Engine) -> dict[str, Any]:
-        gpu = (
-            {"gpu": torch.cuda.get_device_name(self.plan.device)}
-            if torch.device(self.plan.device).type == "cuda"
-            else {}
-        )
+        device = torch.device(self.plan.device)
+        versions = {"torchsar-lab": installed_version(), "torch": torch.__version__, "numpy": np.__version__}
         return {
             "began": datetime.now(UTC).isoformat(timespec="seconds"),
             "device": self.plan.device,
-            **gpu,
+            **({"gpu": torch.cuda.get_device_name(device)} if device.type == "cuda" else {}),
             "workers": engine.workers,
             "threads": engine.threads,
             "machine": platform.machine(),
-            "versions": {
-                "torchsar-lab": installed_version(),
-                "torch": torch.__version__,
-                "numpy": np.__version__,
-                "python": platform.python_version(),
-            },
+            "versions": {**versions, "python": platform.python_version()},
         }
-
-    def _note(self, session: Mapping[str, Any]) -> None:
-        """What this session was, beside those before it."""
-        self._about(seed=self.plan.seed, sessions=[*self.record.about.get("sessions", []), session])
 
     def _about(self, **attributes: Any) -> None:
         self.record.about = {**self.record.about, **attributes}

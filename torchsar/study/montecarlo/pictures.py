@@ -3,29 +3,29 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from torchsar import plot
-from torchsar.study.montecarlo.statistics import LEVEL
-from torchsar.study.output.numbers import name_and_unit
+from torchsar.metrics.intervals import LEVEL
+from torchsar.plot import axis_label, name_and_unit
+from torchsar.study.montecarlo.summary import Summary
 from torchsar.study.output.pictures import Drawn, Picture, draw_all
 
+# more panels in one figure are too small to read
 PANELS = 6
 
 
-def axis_label(name: str) -> str:
-    """'doppler_error_hz' -> 'doppler error (Hz)'."""
-    words, unit = name_and_unit(name)
-    return f"{words} ({unit})" if unit else words
+def label_text(label: float | str) -> str:
+    """A value of a parameter as results show it."""
+    return label if isinstance(label, str) else f"{label:g}"
 
 
-def value_label(name: str, label: float | str) -> str:
+def _value_text(name: str, label: float | str) -> str:
     """One value of a parameter, for reading: 'squint 3 deg', 'scene: point'."""
     words, unit = name_and_unit(name)
     return f"{words}: {label}" if isinstance(label, str) else f"{words} {label:g} {unit}".rstrip()
@@ -33,7 +33,15 @@ def value_label(name: str, label: float | str) -> str:
 
 @dataclass(frozen=True)
 class Quantity:
-    """What is drawn of a metric: a field of the summary and the field of its interval."""
+    """What is drawn of a metric.
+
+    Args:
+        metric: Its name.
+        field: The field of its figures.
+        interval: The field of the interval.
+        words: What stands before the name of the metric; for a share, all that is said.
+        log: Whether its axis is logarithmic.
+    """
 
     metric: str
     field: str
@@ -42,325 +50,240 @@ class Quantity:
     log: bool = False
 
     @property
-    def label(self) -> str:
-        return self.words + axis_label(self.metric) if not self.field.endswith("share") else self.words
+    def is_share(self) -> bool:
+        return self.field.endswith("share")
 
-    @property
-    def title(self) -> str:
-        return self.words + name_and_unit(self.metric)[0] if not self.field.endswith("share") else self.words
-
-
-def main_quantity(metric: str, bounded: bool = False) -> Quantity:
-    """RMSE on a logarithmic axis for errors about zero; the median of everything else, errors that
-    are ratios in dB among them.
-
-    bounded: whether the metric has bounds, which make a logarithmic axis of their own right.
-    """
-    if "error" in metric and not metric.endswith("_db"):
-        return Quantity(metric, "rmse", "interval", "RMSE of ", log=True)
-    return Quantity(metric, "median", "median_interval", "median of ", log=bounded)
+    def named(self, name: str) -> str:
+        """Its words with the name of its metric."""
+        return self.words if self.is_share else self.words + name
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One place along the parameters that are not axes of a figure: its title and index by
-    parameter.
+    """One position along the parameters that are not axes of a figure.
+
+    Args:
+        title: What the position is.
+        index: Index by parameter.
     """
 
     title: str
     index: Mapping[str, int]
 
 
-@dataclass(frozen=True)
-class Cube:
-    """A summary as arrays.
+class SweepPictures:
+    """Draws the figures of a sweep.
 
-    figures: metric -> field -> (algorithm, *parameters, ...); bounds: metric -> name ->
-    (*parameters).
+    Args:
+        summary: What is drawn.
     """
 
-    algorithms: list[str]
-    labels: dict[str, list[float | str]]
-    figures: dict[str, dict[str, np.ndarray]]
-    bounds: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
-
-    @property
-    def numeric(self) -> list[str]:
-        """Parameters with two numbers or more."""
-        return [name for name, labels in self.labels.items() if len(labels) > 1 and not isinstance(labels[0], str)]
-
-    @property
-    def worded(self) -> list[str]:
-        """Parameters with two words or more."""
-        return [name for name, labels in self.labels.items() if len(labels) > 1 and isinstance(labels[0], str)]
+    def __init__(self, summary: Summary) -> None:
+        self.algorithms, self.labels = list(summary.algorithms), summary.labels
+        self.figures, self.bounds = summary.figures, summary.bounds
+        several = {name: labels for name, labels in self.labels.items() if len(labels) > 1}
+        self.numeric = [name for name, labels in several.items() if not isinstance(labels[0], str)]
+        self.worded = [name for name in several if name not in self.numeric]
+        self.fixed = {name: 0 for name in self.labels if name not in several}
 
     def order(self, name: str) -> np.ndarray:
         """Indices that sort a parameter's numbers; words stay as they are."""
         labels = self.labels[name]
         return np.arange(len(labels)) if isinstance(labels[0], str) else np.argsort(np.asarray(labels, dtype=float))
 
+    def sorted_labels(self, name: str) -> list[Any]:
+        """The values of a parameter in the order in which they are drawn."""
+        return [self.labels[name][i] for i in self.order(name)]
+
     def cut(self, array: np.ndarray, panel: Panel, over: str, lead: int = 1) -> np.ndarray:
-        """Along one sorted parameter, the others at the panel's place.
+        """The part of an array along one sorted parameter, the others at the panel's position.
 
-        lead: dims before the parameters.
+        Args:
+            array: (..., *parameters, ...).
+            panel: The position.
+            over: The parameter; none for an array at one position.
+            lead: Dims before the parameters.
         """
-        place = tuple(self.order(name) if name == over else panel.index[name] for name in self.labels)
-        return array[(slice(None),) * lead + place]
+        index = tuple(self.order(name) if name == over else panel.index[name] for name in self.labels)
+        return array[(slice(None),) * lead + index]
 
+    def all(self, wanted: Sequence[str]) -> Drawn:
+        """Of each metric its curves, its success and its heat maps; last the verdicts."""
+        for metric in wanted:
+            fields, (name, unit) = self.figures[metric], name_and_unit(metric)
+            quantity = main_quantity(metric, bool(self.bounds.get(metric)))
+            yield from self.curves(quantity)
+            if "success_share" in fields:
+                within = f"{np.nanmax(fields['success_limit']):g} {unit}".rstrip()
+                words = f"share of trials trusted and within {within}: {name}"
+                yield from self.curves(Quantity(metric, "success_share", "success_interval", words))
+            for x, y in itertools.combinations(self.numeric, 2):
+                yield from self.heat_maps(quantity, x, y)
+        for metric in itertools.islice(self.figures, 1):
+            yield from self.curves(Quantity(metric, "ok_share", "ok_interval", "share of trusted trials"))
 
-def read_summary(summary: Mapping[str, Any]) -> Cube:
-    """The arrays of a summary, made by `summary_tree` or read from its file."""
-    labels = {name: list(values) for name, values in summary["parameters"].items()}
-    algorithms, shape = list(summary["algorithms"]), tuple(len(values) for values in labels.values())
-    cube = Cube(algorithms, labels, {})
-    for point in summary["points"]:
-        at = (algorithms.index(point["algorithm"]), *_index(labels, point["parameters"]))
-        fields = cube.figures.setdefault(point["metric"], {})
-        for name, value in point.items():
-            if name not in ("algorithm", "parameters", "metric"):
-                number = np.array(value, dtype=np.float64)
-                fields.setdefault(name, np.full((len(algorithms), *shape, *number.shape), np.nan))[at] = number
-    for bound in summary["bounds"]:
-        known = cube.bounds.setdefault(bound["metric"], {})
-        known.setdefault(bound["bound"], np.full(shape, np.nan))[_index(labels, bound["parameters"])] = np.array(
-            bound["rms"], dtype=np.float64
-        )
-    return cube
-
-
-def _index(labels: Mapping[str, list[float | str]], parameters: Mapping[str, float | str]) -> tuple[int, ...]:
-    return tuple(values.index(parameters[name]) for name, values in labels.items())
-
-
-def draw_sweep(summary: Mapping[str, Any], folder: Path, show: Sequence[str] = ()) -> list[Picture]:
-    """The pictures of a sweep as PNG files in the folder (made if need be), in the order of
-    reading.
-
-    show: the metrics to draw, in this order; by default the errors, and where nothing is called an
-    error everything that was measured.
-    """
-    cube = read_summary(summary)
-    wanted = show or [metric for metric in cube.figures if "error" in metric] or list(cube.figures)
-    return draw_all([partial(_all, cube, wanted)], folder)
-
-
-def _all(cube: Cube, wanted: Sequence[str]) -> Drawn:
-    """Of each metric its curves, its success and its heat maps; last what the algorithms trust."""
-    for metric in wanted:
-        fields = cube.figures[metric]
-        quantity = main_quantity(metric, bool(cube.bounds.get(metric)))
-        yield from _curves(cube, quantity)
-        if "success_share" in fields:
-            limit = np.nanmax(fields["success_limit"])
-            words = (
-                f"share of trials trusted and within {limit:g} {name_and_unit(metric)[1]}: {name_and_unit(metric)[0]}"
-            )
-            yield from _curves(cube, Quantity(metric, "success_share", "success_interval", words))
-        for x, y in itertools.combinations(cube.numeric, 2):
-            yield from _heat_maps(cube, quantity, x, y)
-    if cube.figures:
-        yield from _curves(
-            cube, Quantity(next(iter(cube.figures)), "ok_share", "ok_interval", "share of trusted trials")
-        )
-
-
-# --- curves
-# --------------------------------------------------------------------------------------------------
-
-
-def _curves(cube: Cube, quantity: Quantity) -> Drawn:
-    """Over every parameter with two numbers or more; without any, over the one with the
-    most words.
-    """
-    values = cube.figures[quantity.metric][quantity.field]
-    if not np.isfinite(values).any():
-        return
-    longest = max(cube.worded, key=lambda name: len(cube.labels[name]), default=None)
-    for over in cube.numeric or [longest]:
-        panels, note = panels_beside(cube, {over})
-        pages = [panels[i : i + PANELS] for i in range(0, len(panels), PANELS)]
-        for page, some in enumerate(pages, 1):
+    def curves(self, quantity: Quantity) -> Drawn:
+        """Over every parameter with two numbers or more; without any, over words."""
+        if not np.isfinite(self.values(quantity)).any():
+            return
+        longest = max(self.worded, key=lambda name: len(self.labels[name]), default="")
+        ylim = (-0.04, 1.04) if quantity.is_share else None
+        for over in self.numeric or [longest]:
+            panels, note = self.panels_beside({over})
             name = quantity.field if quantity.field == "ok_share" else f"{quantity.metric}_{quantity.field}"
-            name += f"_over_{over.rpartition('.')[2]}" if over else ""
-            title = (
-                quantity.title
-                + (f" over {name_and_unit(over)[0]}" if over else "")
-                + (f" ({page} of {len(pages)})" if len(pages) > 1 else "")
+            along = over and f" over {name_and_unit(over)[0]}"
+            for page, some in _paged(panels, PANELS):
+                parts = [self.part(quantity, panel, over) for panel in some]
+                label, x = quantity.named(axis_label(quantity.metric)), over and axis_label(over)
+                figure = plot.error_curves(parts, x, label, self.is_log(over), self.has_positive(quantity), ylim)
+                title = quantity.named(name_and_unit(quantity.metric)[0]) + along + page
+                end = over and f"_over_{over.rpartition('.')[2]}"
+                yield name + end, title, self.caption(quantity) + note, figure
+
+    def values(self, quantity: Quantity) -> np.ndarray:
+        """What is drawn, (algorithm, *parameters)."""
+        return self.figures[quantity.metric][quantity.field]
+
+    def part(self, quantity: Quantity, panel: Panel, over: str) -> dict[str, Any]:
+        """Every algorithm along one parameter, or side by side where there is none."""
+        fields = self.figures[quantity.metric]
+        y, interval = (self.cut(fields[name], panel, over) for name in (quantity.field, quantity.interval))
+        bounds = self.bounds.get(quantity.metric, {}) if quantity.log else {}
+        bounds = {name: self.cut(rms, panel, over, lead=0) for name, rms in bounds.items()}
+        if not over:
+            series = {quantity.named(name_and_unit(quantity.metric)[0]): (y, interval)}
+            bounds = {name: np.full(len(y), rms) for name, rms in bounds.items()}
+            return {"title": "", "x": self.algorithms, "series": series, "bounds": bounds}
+        x = self.sorted_labels(over)
+        series = {name: (y[i], interval[i]) for i, name in enumerate(self.algorithms)}
+        x = x if over in self.worded else np.asarray(x, dtype=float)
+        return {"title": panel.title, "x": x, "series": series, "bounds": bounds}
+
+    def has_positive(self, quantity: Quantity) -> bool:
+        """Whether there is something to draw on a logarithmic axis, and one is wanted."""
+        return quantity.log and bool((self.values(quantity) > 0).any())
+
+    def is_log(self, over: str) -> bool:
+        """Positive numbers over two decades and more, unless they are logarithms themselves."""
+        if over not in self.numeric or over.endswith("_db"):
+            return False
+        values = np.asarray(self.labels[over], dtype=float)
+        return bool((values > 0).all() and values.max() >= 100 * values.min())
+
+    def panels_beside(self, over: Collection[str]) -> tuple[list[Panel], str]:
+        """A panel for every position along the other parameters, words first.
+
+        Beyond six panels each other parameter of numbers shows its first, middle and last value,
+        then first and last, then the middle one.
+
+        Returns:
+            The panels, and a sentence on what is left out or fixed.
+        """
+        others = [name for name in (*self.worded, *self.numeric) if name not in over]
+        chosen, positions = {}, []
+        for pick in (lambda n: range(n), lambda n: [0, n // 2, n - 1], lambda n: [0, n - 1], lambda n: [n // 2]):
+            thin = {name: dict.fromkeys(pick(len(self.labels[name]))) for name in others if name in self.numeric}
+            chosen = {name: self.order(name)[list(thin[name])] if name in thin else self.order(name) for name in others}
+            positions = [dict(zip(others, map(int, index))) for index in itertools.product(*chosen.values())]
+            if len(positions) <= PANELS:
+                break
+        panels = [Panel(self._texts(position), self.fixed | position) for position in positions]
+        thinned = (
+            f" Of {len(self.labels[n])} values of {name_and_unit(n)[0]} this shows "
+            f"{', '.join(f'{self.labels[n][i]:g}' for i in shown)}; the table holds all."
+            for n, shown in chosen.items()
+            if len(shown) < len(self.labels[n])
+        )
+        return panels, "".join(thinned) + (f" Throughout: {self._texts(self.fixed)}." if self.fixed else "")
+
+    def _texts(self, index: Mapping[str, int]) -> str:
+        return ", ".join(_value_text(name, self.labels[name][i]) for name, i in index.items())
+
+    def caption(self, quantity: Quantity) -> str:
+        """What a reader should see, the interval's level and the number of trials."""
+        trials = self.trials(quantity.metric)
+        if quantity.is_share:
+            meaning = (
+                "Trusted: the algorithm itself calls its estimate reliable (ok); within: the error keeps to the limit."
+                if quantity.field == "success_share"
+                else "Trusted: the algorithm itself calls its estimate reliable (ok), right or wrong."
             )
-            yield name, title, _caption(cube, quantity) + note, _curve_figure(cube, quantity, over, some)
+            return f"Share of {trials}, with exact {LEVEL:.0%} intervals. {meaning}"
+        title = quantity.named(name_and_unit(quantity.metric)[0])
+        text = f"{title[:1].upper() + title[1:]} over {trials}, reliable or not, with {LEVEL:.0%} intervals."
+        text += "" if quantity.field == "median" else " Lower is better."
+        if self.has_positive(quantity) and (self.values(quantity) == 0).any():
+            text += " Zeros cannot be shown on the logarithmic axis."
+        if quantity.log and self.bounds.get(quantity.metric):
+            text += (
+                " Dark lines are bounds: a curve that lies on one cannot be improved without bias, and where it "
+                "departs from it the algorithm has its threshold."
+            )
+        return text
 
+    def trials(self, metric: str) -> str:
+        """How many trials points have."""
+        done = self.figures[metric]["trials"]
+        few, many = int(done.min()), int(done.max())
+        return f"{many} trials a point" if few == many else f"{few} to {many} trials a point"
 
-def _curve_figure(cube: Cube, quantity: Quantity, over: str | None, panels: list[Panel]) -> Any:
-    log_y = quantity.log and _has_positive(cube, quantity)
-    ylim = (-0.04, 1.04) if quantity.field.endswith("share") else None
-    make = _part_over_algorithms if over is None else _part
-    parts = [make(cube, quantity, panel, over or "") for panel in panels]
-    return plot.error_curves(
-        parts, axis_label(over) if over else "", quantity.label, _is_logarithmic(cube, over), log_y, ylim
-    )
-
-
-def _part(cube: Cube, quantity: Quantity, panel: Panel, over: str) -> dict[str, Any]:
-    """Every algorithm along one parameter."""
-    fields = cube.figures[quantity.metric]
-    y, interval = (cube.cut(fields[name], panel, over) for name in (quantity.field, quantity.interval))
-    bounds = cube.bounds.get(quantity.metric, {}) if quantity.log else {}
-    labels = [cube.labels[over][i] for i in cube.order(over)]
-    return {
-        "title": panel.title,
-        "x": labels if isinstance(labels[0], str) else np.asarray(labels, dtype=float),
-        "series": {name: (y[i], interval[i]) for i, name in enumerate(cube.algorithms)},
-        "bounds": {name: cube.cut(values, panel, over, lead=0) for name, values in bounds.items()},
-    }
-
-
-def _part_over_algorithms(cube: Cube, quantity: Quantity, panel: Panel, over: str) -> dict[str, Any]:
-    """The algorithms side by side, for a sweep of one place."""
-    place = (slice(None), *(panel.index[name] for name in cube.labels))
-    y, interval = (cube.figures[quantity.metric][name][place] for name in (quantity.field, quantity.interval))
-    bounds = cube.bounds.get(quantity.metric, {}) if quantity.log else {}
-    return {
-        "title": "",
-        "x": cube.algorithms,
-        "series": {quantity.title: (y, interval)},
-        "bounds": {name: np.full(len(y), values[place[1:]]) for name, values in bounds.items()},
-    }
-
-
-def _has_positive(cube: Cube, quantity: Quantity) -> bool:
-    return bool((cube.figures[quantity.metric][quantity.field] > 0).any())
-
-
-def _is_logarithmic(cube: Cube, over: str | None) -> bool:
-    """Positive numbers over two decades and more, unless they are logarithms themselves."""
-    if over not in cube.numeric or over.endswith("_db"):
-        return False
-    values = np.asarray(cube.labels[over], dtype=float)
-    return bool((values > 0).all() and values.max() >= 100 * values.min())
-
-
-def panels_beside(cube: Cube, over: set[Any]) -> tuple[list[Panel], str]:
-    """A panel for every place along the other parameters, words first, and a sentence on what is
-    left out or fixed.
-
-    Beyond six panels each other parameter of numbers shows its first, middle and last value, then
-    first and last, then the middle one.
-    """
-    others = [name for name in (*cube.worded, *cube.numeric) if name not in over]
-    fixed = {name: 0 for name, labels in cube.labels.items() if len(labels) == 1}
-    for keep in (10**9, 3, 2, 1):
-        chosen = {name: _some(cube.order(name), keep if name in cube.numeric else 10**9) for name in others}
-        places = [dict(zip(others, index, strict=True)) for index in itertools.product(*chosen.values())]
-        if len(places) <= PANELS:
-            break
-    panels = [
-        Panel(", ".join(value_label(name, cube.labels[name][i]) for name, i in place.items()), fixed | place)
-        for place in places
-    ]
-    return panels, _left_out(cube, chosen) + _held(cube, fixed)
-
-
-def _some(indices: np.ndarray, keep: int) -> list[int]:
-    """First, middle and last of them (3), first and last (2), the middle one (1), or all."""
-    if keep >= len(indices):
-        return indices.tolist()
-    picks = {3: [0, len(indices) // 2, -1], 2: [0, -1], 1: [len(indices) // 2]}
-    return [int(indices[i]) for i in picks[keep]]
-
-
-def _left_out(cube: Cube, chosen: Mapping[str, list[int]]) -> str:
-    thinned = [name for name, shown in chosen.items() if len(shown) < len(cube.labels[name])]
-    sentences = (
-        f" Of {len(cube.labels[n])} values of {name_and_unit(n)[0]} this shows "
-        f"{', '.join(f'{cube.labels[n][i]:g}' for i in chosen[n])}; the table holds all."
-        for n in thinned
-    )
-    return "".join(sentences)
-
-
-def _held(cube: Cube, fixed: Mapping[str, int]) -> str:
-    return f" Throughout: {', '.join(value_label(name, cube.labels[name][0]) for name in fixed)}." if fixed else ""
-
-
-def _caption(cube: Cube, quantity: Quantity) -> str:
-    """What a reader should see, the interval's level and the number of trials."""
-    trials = _trials(cube, quantity.metric)
-    if quantity.field.endswith("share"):
-        success = (
-            " Success means trusted by the algorithm and within the limit."
-            if quantity.field == "success_share"
-            else " Trusted is what the algorithm itself says of a trial, right or wrong."
-        )
-        return f"Share of {trials}, with exact {LEVEL:.0%} intervals.{success}"
-    below = "" if quantity.field == "median" else " Lower is better."
-    bounds = (
-        " Dark lines are bounds: a curve that lies on one cannot be improved without bias, "
-        "and where it departs from it the algorithm has its threshold."
-    )
-    has_bounds = quantity.log and bool(cube.bounds.get(quantity.metric))
-    some_zero = (
-        quantity.log
-        and _has_positive(cube, quantity)
-        and bool((cube.figures[quantity.metric][quantity.field] == 0).any())
-    )
-    zeros = " Zeros have no place on the logarithmic axis." if some_zero else ""
-    return (
-        f"{quantity.title[:1].upper() + quantity.title[1:]} over {trials}, trusted or not, "
-        f"with {LEVEL:.0%} intervals.{below}{zeros}{bounds if has_bounds else ''}"
-    )
-
-
-def _trials(cube: Cube, metric: str) -> str:
-    done = cube.figures[metric]["trials"]
-    few, many = int(done.min()), int(done.max())
-    return f"{many} trials a point" if few == many else f"{few} to {many} trials a point"
-
-
-# --- heat maps
-# --------------------------------------------------------------------------------------------------
-
-
-def _heat_maps(cube: Cube, quantity: Quantity, x: str, y: str) -> Drawn:
-    """One panel an algorithm and place along the other parameters; all pages share one colour
-    scale.
-    """
-    values = cube.figures[quantity.metric][quantity.field]
-    log = quantity.log and _has_positive(cube, quantity)
-    known = values[np.isfinite(values) & ((values > 0) | (not log))]
-    if not known.size:
-        return
-    panels, note = panels_beside(cube, {x, y})
-    per_page = max(1, PANELS // len(cube.algorithms))
-    pages = [panels[i : i + per_page] for i in range(0, len(panels), per_page)]
-    for page, some in enumerate(pages, 1):
-        parts = [
-            _heat_part(cube, values[i], panel, x, y, name) for panel in some for i, name in enumerate(cube.algorithms)
-        ]
-        title = f"{quantity.title} over {name_and_unit(x)[0]} and {name_and_unit(y)[0]}" + (
-            f" ({page} of {len(pages)})" if len(pages) > 1 else ""
-        )
+    def heat_maps(self, quantity: Quantity, x: str, y: str) -> Drawn:
+        """One panel for each algorithm and position; all pages share one colour scale."""
+        values, log = self.values(quantity), self.has_positive(quantity)
+        known = values[np.isfinite(values) & ((values > 0) | (not log))]
+        if not known.size:
+            return
+        panels, note = self.panels_beside({x, y})
+        title = quantity.named(name_and_unit(quantity.metric)[0])
         caption = (
-            f"{quantity.title[:1].upper() + quantity.title[1:]} over "
-            f"{_trials(cube, quantity.metric)}, all panels on one{' logarithmic' if log else ''} "
-            f"colour scale, dark for small.{note}"
+            f"{title[:1].upper() + title[1:]} over {self.trials(quantity.metric)}, all panels on one"
+            f"{' logarithmic' if log else ''} colour scale, dark for small.{note}"
         )
-        figure = plot.heat_map(
-            parts, axis_label(x), axis_label(y), quantity.label, log, (float(known.min()), float(known.max()))
-        )
-        yield f"{quantity.metric}_map_{x.rpartition('.')[2]}_{y.rpartition('.')[2]}", title, caption, figure
+        label, scale = quantity.named(axis_label(quantity.metric)), (float(known.min()), float(known.max()))
+        name = f"{quantity.metric}_map_{x.rpartition('.')[2]}_{y.rpartition('.')[2]}"
+        for page, some in _paged(panels, max(1, PANELS // len(self.algorithms))):
+            parts = [self.map_part(values[i], p, x, y, name) for p in some for i, name in enumerate(self.algorithms)]
+            figure = plot.heat_map(parts, axis_label(x), axis_label(y), label, log, scale)
+            yield name, f"{title} over {name_and_unit(x)[0]} and {name_and_unit(y)[0]}{page}", caption, figure
+
+    def map_part(self, values: np.ndarray, panel: Panel, x: str, y: str, algorithm: str) -> dict[str, Any]:
+        """One panel of a heat map; values: (*parameters)."""
+        names = list(self.labels)
+        z = np.moveaxis(values, (names.index(y), names.index(x)), (0, 1))
+        z = z[(slice(None), slice(None), *(panel.index[name] for name in names if name not in (x, y)))]
+        title = f"{algorithm}; {panel.title}" if panel.title else algorithm
+        z = z[np.ix_(self.order(y), self.order(x))]
+        return {"title": title, "x": self.sorted_labels(x), "y": self.sorted_labels(y), "z": z}
 
 
-def _heat_part(cube: Cube, values: np.ndarray, panel: Panel, x: str, y: str, algorithm: str) -> dict[str, Any]:
-    """values: (*parameters)."""
-    names = list(cube.labels)
-    z = np.moveaxis(values, (names.index(y), names.index(x)), (0, 1))
-    z = z[(slice(None), slice(None), *(panel.index[name] for name in names if name not in (x, y)))][
-        np.ix_(cube.order(y), cube.order(x))
-    ]
-    sorted_labels = {name: [cube.labels[name][i] for i in cube.order(name)] for name in (x, y)}
-    return {
-        "title": f"{algorithm}; {panel.title}" if panel.title else algorithm,
-        "x": sorted_labels[x],
-        "y": sorted_labels[y],
-        "z": z,
-    }
+def main_quantity(metric: str, bounded: bool = False) -> Quantity:
+    """RMSE on a logarithmic axis for errors about zero; the median of everything else.
+
+    Args:
+        metric: Its name; errors that are ratios in dB are no errors about zero.
+        bounded: Whether it has bounds, which make a logarithmic axis useful by themselves.
+    """
+    if "error" in metric and not metric.endswith("_db"):
+        return Quantity(metric, "rmse", "interval", "RMSE of ", log=True)
+    return Quantity(metric, "median", "median_interval", "median of ", log=bounded)
+
+
+def _paged(panels: Sequence[Panel], size: int) -> Iterator[tuple[str, Sequence[Panel]]]:
+    """The panels of each page, with the end of its title."""
+    count = -(-len(panels) // size)
+    for page in range(count):
+        yield f" ({page + 1} of {count})" if count > 1 else "", panels[page * size : (page + 1) * size]
+
+
+def draw_sweep(summary: Summary, folder: Path, show: Sequence[str] = ()) -> list[Picture]:
+    """The pictures of a sweep as PNG files in a new folder, in the order of reading.
+
+    Args:
+        summary: What is drawn.
+        folder: Where to write.
+        show: The metrics to draw, in this order; by default the errors, and where nothing is called
+            an error everything that was measured.
+    """
+    wanted = show or [metric for metric in summary.figures if "error" in metric] or list(summary.figures)
+
+    return draw_all([lambda: SweepPictures(summary).all(wanted)], folder)

@@ -1,4 +1,4 @@
-"""What a sweep has found, in memory: labelled arrays with trials last."""
+"""Results of a sweep in memory, as labelled arrays with trials last, and how two of them differ."""
 
 from __future__ import annotations
 
@@ -19,11 +19,15 @@ Labels = dict[str, tuple[float | str, ...]]
 class Record:
     """Results of a sweep. A trial that has not run is NaN in every metric and False in `done`.
 
-    labels: values of every parameter, numbers or words, in the order of the dims. metrics: name ->
-    float64 (algorithm, *parameters, trial). ok: bool of the same shape, what the algorithm itself
-    says of the trial. bounds: metric -> name of the bound -> float64 (*parameters, trial). done:
-    bool (*parameters, trial); points that ended early have fewer trials than others. about: what
-    the run was: title, resolved config, hash, seed, versions, device, dtype, timings.
+    Args:
+        algorithms: Names, along the first dim of metrics.
+        labels: Values of every parameter, numbers or words, in the order of the dims.
+        done: Which trials have run, bool (*parameters, trial); points that ended early have fewer
+            than others.
+        ok: What the algorithm itself says of each trial, bool (algorithm, *parameters, trial).
+        metrics: By name, float64 of the same shape as `ok`.
+        bounds: By metric and name of the bound, float64 (*parameters, trial).
+        about: What the run was: title, resolved config, hash, seed, versions, device, timings.
     """
 
     algorithms: tuple[str, ...]
@@ -47,65 +51,67 @@ class Record:
         """An array of NaN with the dims of a metric, or those of a bound."""
         return np.full(self.ok.shape if by_algorithm else self.done.shape, np.nan)
 
-    def place(self, labels: Mapping[str, float | str]) -> tuple[int, ...]:
+    def index_of(self, labels: Mapping[str, float | str]) -> tuple[int, ...]:
         """Index of a point, from its labels by parameter."""
         return tuple(known.index(labels[name]) for name, known in self.labels.items())
 
     def add(
         self,
-        places: Sequence[tuple[int, ...]],
+        points: Sequence[tuple[int, ...]],
         trials: Sequence[int],
         values: Mapping[str, Mapping[str, Sequence[float]]],
         bounds: Mapping[str, Mapping[str, Sequence[float]]],
     ) -> None:
-        """Enter rows: values by algorithm and metric, bounds by metric and name, each (rows,).
+        """Enter rows.
 
-        An algorithm without `ok` stands for all it gives.
+        Args:
+            points: Index of the point of each row.
+            trials: Trial number of each row.
+            values: By algorithm and metric, (rows,); without `ok` every trial counts as reliable.
+            bounds: By metric and name, (rows,).
+
+        Raises:
+            ConfigError: If the algorithms are not those of the rows before, or a name is taken.
         """
         if not self.algorithms:
             self.algorithms, self.ok = tuple(values), np.zeros((len(values), *self.done.shape), bool)
         if set(values) != set(self.algorithms):
-            foreign = next((a for a in values if a not in self.algorithms), None)
-            gave = (
-                f"results of the algorithm {foreign!r}"
-                if foreign is not None
-                else f"results of {', '.join(values)} alone"
-            )
+            new = next((repr(a) for a in values if a not in self.algorithms), None)
+            gave = f"{', '.join(values)} alone" if new is None else f"the algorithm {new}"
             raise ConfigError(
-                f"a trial gave {gave}, those before it of {', '.join(self.algorithms)}; return the "
-                "same algorithms in every trial"
+                f"a trial gave results of {gave}, those before it of {', '.join(self.algorithms)}; return the same "
+                "algorithms in every trial"
             )
-        rows = np.ravel_multi_index(
-            tuple(zip(*((*place, trial) for place, trial in zip(places, trials)))), self.done.shape
-        )
-        for algorithm, metrics in values.items():
-            number = self.algorithms.index(algorithm)
-            self.ok[number].reshape(-1)[rows] = metrics.get(OK, True)
-            for metric, found in metrics.items():
+        indices = zip(*((*point, trial) for point, trial in zip(points, trials)))
+        rows = np.ravel_multi_index(tuple(indices), self.done.shape)
+        for number, algorithm in enumerate(self.algorithms):
+            self.ok[number].reshape(-1)[rows] = values[algorithm].get(OK, True)
+            for metric, found in values[algorithm].items():
                 if metric != OK:
-                    self._metric(metric)[number].reshape(-1)[rows] = found
+                    self._array(self.metrics, metric, metric)[number].reshape(-1)[rows] = found
         for metric, named in bounds.items():
+            known = self.bounds.setdefault(metric, {})
             for name, found in named.items():
-                self._bound(metric, name).reshape(-1)[rows] = found
+                self._array(known, name, bound_name(metric, name)).reshape(-1)[rows] = found
         self.done.reshape(-1)[rows] = True
 
-    def _metric(self, name: str) -> np.ndarray:
-        if name not in self.metrics:
-            self._refuse_name(name, "metric")
-            self.metrics[name] = self.blank()
-        return self.metrics[name]
+    def _array(self, known: dict[str, np.ndarray], name: str, stored: str) -> np.ndarray:
+        """A known array, or a new one, whose name in the store must not be that of another one."""
+        if name not in known:
+            kind = "metric" if known is self.metrics else "bound"
+            check_name(stored, (*RESERVED, *self.labels, *self.variables()), "the trial function", kind)
+            known[name] = self.blank(kind == "metric")
+        return known[name]
 
-    def _bound(self, metric: str, name: str) -> np.ndarray:
-        named = self.bounds.setdefault(metric, {})
-        if name not in named:
-            self._refuse_name(bound_name(metric, name), "bound")
-            named[name] = self.blank(False)
-        return named[name]
-
-    def _refuse_name(self, name: Any, kind: str) -> None:
-        """A new array may not stand in the place of another one."""
-        bounds = [bound_name(metric, bound) for metric, named in self.bounds.items() for bound in named]
-        check_name(name, (*RESERVED, *self.labels, *self.metrics, *bounds), "the trial function", kind)
+    def variables(self) -> dict[str, tuple[np.ndarray, tuple[str, ...], dict[str, str]]]:
+        """Every array of results by its name in the store: data, dims, and what it is."""
+        found = {OK: (self.ok, self.dims, {"kind": OK})}
+        found |= {name: (x, self.dims, {"kind": "metric"}) for name, x in self.metrics.items()}
+        for metric, named in self.bounds.items():
+            for name, x in named.items():
+                about = {"kind": "bound", "bound_of": metric, "bound": name}
+                found[bound_name(metric, name)] = (x, self.dims[1:], about)
+        return found
 
     def grown(self, labels: Labels, trials: int) -> Record:
         """The same results where there is room for more: labels begin with those of this record."""
@@ -114,7 +120,8 @@ class Record:
     def select(self, labels: Labels) -> Record:
         """The part of these labels, in their order."""
         index = [[self.labels[name].index(label) for label in wanted] for name, wanted in labels.items()]
-        return self._mapped(lambda x: x[_mesh(index, x.ndim - self.done.ndim, x.shape)], labels)
+        every = range(self.trials)
+        return self._mapped(lambda x: x[np.ix_(*map(range, x.shape[: x.ndim - self.done.ndim]), *index, every)], labels)
 
     def _mapped(self, change: Any, labels: Labels) -> Record:
         bounds = {metric: {name: change(x) for name, x in named.items()} for metric, named in self.bounds.items()}
@@ -128,28 +135,21 @@ class Record:
         )
 
     def to_xarray(self) -> Any:
-        """An xarray.Dataset with the dims (algorithm, *parameters, trial); bounds carry the
-        attributes `bound_of` and `bound`. Needs the extra `xarray`.
+        """An xarray.Dataset with the dims (algorithm, *parameters, trial).
+
+        Bounds have the attributes `bound_of` and `bound`.
+
+        Raises:
+            ImportError: If the extra `xarray` is not installed.
         """
         try:
             import xarray
         except ImportError:
             raise ImportError("labelled reading needs xarray: pip install 'torchsar-lab[xarray]'") from None
-        arrays: dict[str, Any] = {
-            OK: (self.dims, self.ok),
-            "done": (self.dims[1:], self.done),
-            **{name: (self.dims, x) for name, x in self.metrics.items()},
-        }
-        for metric, named in self.bounds.items():
-            for name, x in named.items():
-                arrays[bound_name(metric, name)] = (self.dims[1:], x, {"bound_of": metric, "bound": name})
+        coordinates = {"algorithm": self.algorithms, **self.labels, "trial": range(self.trials)}
         return xarray.Dataset(
-            arrays,
-            {
-                "algorithm": list(self.algorithms),
-                **{k: list(v) for k, v in self.labels.items()},
-                "trial": np.arange(self.trials),
-            },
+            {"done": (self.dims[1:], self.done), **{name: (d, x, a) for name, (x, d, a) in self.variables().items()}},
+            {name: list(values) for name, values in coordinates.items()},
         )
 
 
@@ -166,5 +166,51 @@ def _enlarged(x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return out
 
 
-def _mesh(index: list[list[int]], leading: int, shape: tuple[int, ...]) -> Any:
-    return np.ix_(*(range(n) for n in shape[:leading]), *index, range(shape[-1]))
+@dataclass(frozen=True)
+class Difference:
+    """One trial of one algorithm that two records give differently."""
+
+    metric: str
+    algorithm: str
+    parameters: dict[str, float | str]
+    trial: int
+    values: tuple[float, float]
+
+
+def differences(a: Record, b: Record, tolerance: float) -> list[Difference]:
+    """Trials that both records hold and that differ.
+
+    Two runs in batches of other sizes or with other threads differ by rounding alone, except in
+    trials in which a choice (a peak, a candidate, an end of iterations) depends on less than that;
+    those are found here. Errors are compared on the scale of the largest error of their metric and
+    point: each is a small difference of two large numbers.
+
+    Args:
+        a: The one record.
+        b: The other record.
+        tolerance: Largest difference of a metric over the larger magnitude; `ok` must be equal.
+
+    Raises:
+        ConfigError: If the records are not of one grid.
+    """
+    if a.labels != b.labels or a.algorithms != b.algorithms:
+        raise ConfigError(
+            f"records of different sweeps cannot be compared: {a.algorithms} over {a.labels} and "
+            f"{b.algorithms} over {b.labels}"
+        )
+    n = min(a.trials, b.trials)
+    both = a.done[..., :n] & b.done[..., :n]
+    pairs = {name: (a.metrics[name], b.metrics[name], tolerance) for name in a.metrics if name in b.metrics}
+    pairs[OK] = (a.ok.astype(float), b.ok.astype(float), 0.0)
+    found = []
+    for name, (x, y, allowed) in pairs.items():
+        x, y = x[..., :n], y[..., :n]
+        scale = np.fmax(np.abs(x), np.abs(y))
+        if "error" in name:
+            scale = np.fmax.reduce(scale, axis=-1, keepdims=True, initial=0.0)
+        apart = both & ~((np.abs(x - y) <= allowed * scale) | (np.isnan(x) & np.isnan(y)) | (x == y))
+        for algorithm, *point, trial in np.argwhere(apart).tolist():
+            parameters = {p: labels[i] for (p, labels), i in zip(a.labels.items(), point)}
+            values = float(x[(algorithm, *point, trial)]), float(y[(algorithm, *point, trial)])
+            found.append(Difference(name, a.algorithms[algorithm], parameters, trial, values))
+    return found

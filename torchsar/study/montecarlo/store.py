@@ -20,29 +20,34 @@ import numpy as np
 import zarr
 
 from torchsar.study.montecarlo.grid import Grid, address, canonical
-from torchsar.study.montecarlo.record import OK, Labels, Record, bound_name
-from torchsar.study.settings.errors import ConfigError
+from torchsar.study.montecarlo.record import OK, Labels, Record
+from torchsar.study.settings.errors import ConfigError, one_line
 
 FORMAT = 1
+# numbers in a zarr chunk at most: half a megabyte, which is written whole for every change
 _CHUNK_NUMBERS = 1 << 16
+# writing takes half a percent of the time at most
 _SHARE_FOR_WRITING = 0.005
 _DONE, _SAVED = "done", "saved"
 
 
 class Store:
-    """results.zarr of one sweep, open for writing.
-
-    Made by `create` or `resume`; `record` is what it holds.
+    """results.zarr of one sweep, open for writing; made by `create` or `resume`.
 
     Root attributes: format, identity and hash (what the results depend on), labels and values of
     the parameters, algorithms, trials, about, sessions. Arrays: one a metric, `ok`, one a bound,
     the coordinates. Group `done`: by index of the point, the ranges of trials that are recorded.
     Group `saved`: images and taps of chosen trials.
+
+    Args:
+        root: The group.
+        record: What it holds.
     """
 
     def __init__(self, root: zarr.Group, record: Record) -> None:
         self.root, self.record = root, record
-        self._marks = attributes(root[_DONE])
+        self.path = Path(str(root.store_path).removeprefix("file://"))
+        self._marks = _attributes(root[_DONE])
         self._dirty: set[tuple[int, ...]] = set()
         self._window: tuple[int, int] | None = None
         self._arrays: dict[str, zarr.Array] = {}
@@ -51,7 +56,11 @@ class Store:
 
     @classmethod
     def create(cls, path: Path, grid: Grid, trials: int, identity: Mapping[str, Any]) -> Store:
-        """A new store. Raises ConfigError where the folder cannot be written."""
+        """A new store.
+
+        Raises:
+            ConfigError: If the folder cannot be written.
+        """
         record = empty(grid.labels, trials)
         with _writing(path):
             root = zarr.open_group(str(path), mode="w", zarr_format=3)
@@ -62,70 +71,54 @@ class Store:
     def resume(cls, path: Path, grid: Grid, trials: int, identity: Mapping[str, Any]) -> Store:
         """The store that is there, with room for new labels and trials.
 
-        Raises ConfigError where it belongs to another config.
+        Raises:
+            ConfigError: If it belongs to another config.
         """
         root = _opened(path, "r+")
-        held = attributes(root)
-        refuse_another(path, held["identity"], _plain(identity), held["values"], _values(grid))
+        _refuse_another(path, _attributes(root), _plain(identity), _values(grid))
         record = _loaded(root, path)
-        labels = {
-            name: (*known, *(label for label in grid.labels[name] if label not in known))
-            for name, known in record.labels.items()
-        }
+        labels = {name: tuple(dict.fromkeys((*known, *grid.labels[name]))) for name, known in record.labels.items()}
         with _writing(path):
             return cls(root, record.grown(labels, max(trials, record.trials)))._begun(grid, identity)
 
     def _begun(self, grid: Grid, identity: Mapping[str, Any]) -> Store:
-        values = {
-            name: {**attributes(self.root).get("values", {}).get(name, {}), **named}
-            for name, named in _values(grid).items()
-        }
-        self.root.update_attributes(
-            {"format": FORMAT, "identity": _plain(identity), "hash": hash_of(identity), "values": values}
-        )
+        known = _attributes(self.root).get("values", {})
+        values = {name: {**known.get(name, {}), **named} for name, named in _values(grid).items()}
+        about = {"format": FORMAT, "identity": _plain(identity), "hash": address(identity), "values": values}
+        self.root.update_attributes(about)
         self.record.about = _about(self.root)
         self._describe()
-        for name, labels in self.record.labels.items():
-            self._put(name, np.array(labels), (name,))
-        self._put("trial", np.arange(self.record.trials), ("trial",))
-        for name, (data, dims, about) in self._variables().items() if self.record.algorithms else ():
-            self._array(name, data, dims, about)
+        for name, labels in (*self.record.labels.items(), ("trial", range(self.record.trials))):
+            self._put(name, np.array(labels))
+        for name, variable in self.record.variables().items() if self.record.algorithms else ():
+            self._array(name, *variable)
         return self
 
     def _describe(self) -> None:
-        self.root.update_attributes(
-            {
-                "labels": {k: list(v) for k, v in self.record.labels.items()},
-                "trials": self.record.trials,
-                "algorithms": list(self.record.algorithms),
-            }
-        )
+        labels = {name: list(values) for name, values in self.record.labels.items()}
+        algorithms = list(self.record.algorithms)
+        self.root.update_attributes({"labels": labels, "trials": self.record.trials, "algorithms": algorithms})
 
     def note(self, **about: Any) -> None:
-        """Root attributes: what the run was."""
+        """Set root attributes: what the run was."""
         with _writing(self.path):
-            self.root.update_attributes(_plain_values(about))
-
-    @property
-    def path(self) -> Path:
-        """Where it lies."""
-        return Path(str(self.root.store_path).removeprefix("file://"))
-
-    # writing
-    # ----------------------------------------------------------------------------------------------
+            self.root.update_attributes(json.loads(json.dumps(about, default=str)))
 
     @property
     def due(self) -> bool:
         """Whether writing costs less than half a percent of the time since the last writing."""
         return time.perf_counter() - self._last > self._cost / _SHARE_FOR_WRITING
 
-    def entered(self, places: Iterable[tuple[int, ...]], trials: Sequence[int]) -> None:
-        """Rows have entered the record, to be written by the next `flush`."""
-        self._dirty.update(places)
-        first, last = min(trials), max(trials) + 1
-        self._window = (
-            (first, last) if self._window is None else (min(first, self._window[0]), max(last, self._window[1]))
-        )
+    def entered(self, points: Iterable[tuple[int, ...]], trials: Sequence[int]) -> None:
+        """Rows have entered the record, to be written by the next `flush`.
+
+        Args:
+            points: Index of the point of each row.
+            trials: Trial number of each row.
+        """
+        self._dirty.update(points)
+        first, last = self._window or (trials[0], 0)
+        self._window = min(first, *trials), max(last, max(trials) + 1)
 
     def save(self, labels: Mapping[str, float | str], trial: int, arrays: Mapping[str, np.ndarray]) -> None:
         """Keep arrays of one trial, to be written before it is marked done."""
@@ -133,10 +126,9 @@ class Store:
 
     def flush(self) -> None:
         """Write what has entered the record, then mark it done, in one file."""
-        if self._window is None:
-            return
-        with _writing(self.path):
-            self._flush(*self._window)
+        if self._window is not None:
+            with _writing(self.path):
+                self._flush(*self._window)
 
     def _flush(self, first: int, last: int) -> None:
         """The trials first..last-1.
@@ -147,41 +139,28 @@ class Store:
         began = time.perf_counter()
         if list(self.record.algorithms) != self.root.attrs.get("algorithms"):
             self._describe()
-            self._put("algorithm", np.array(self.record.algorithms), ("algorithm",))
-        variables = self._variables()
-        for name, (data, dims, about) in variables.items():
-            self._write(name, data, dims, about, first, last)
+            self._put("algorithm", np.array(self.record.algorithms))
+        variables = self.record.variables()
+        for name, variable in variables.items():
+            self._write(name, variable, first, last)
         if list(variables) != self.root.attrs.get("arrays"):
             self.root.update_attributes({"arrays": list(variables)})
-        self._write_saved()
-        self._marks.update({",".join(map(str, place)): _spans(self.record.done[place]) for place in self._dirty})
+        for path, about, arrays in self._pending:
+            group = self.root.require_group(f"{_SAVED}/{path}")
+            group.attrs.put(about)
+            for name, data in arrays.items():
+                group.create_array(name, data=data, overwrite=True)
+        self._marks.update({",".join(map(str, point)): _spans(self.record.done[point]) for point in self._dirty})
         self.root[_DONE].update_attributes(self._marks)
-        self._dirty, self._window = set(), None
+        self._dirty, self._window, self._pending = set(), None, []
         self._last = time.perf_counter()
         self._cost = self._last - began
 
-    def _variables(self) -> dict[str, tuple[np.ndarray, tuple[str, ...], dict[str, Any]]]:
-        record = self.record
-        found = {
-            OK: (record.ok, record.dims, {"kind": OK}),
-            **{name: (x, record.dims, {"kind": "metric"}) for name, x in record.metrics.items()},
-        }
-        for metric, named in record.bounds.items():
-            found.update(
-                {
-                    bound_name(metric, name): (x, record.dims[1:], {"kind": "bound", "bound_of": metric, "bound": name})
-                    for name, x in named.items()
-                }
-            )
-        return found
-
-    def _write(
-        self, name: str, data: np.ndarray, dims: tuple[str, ...], about: dict[str, Any], first: int, last: int
-    ) -> None:
+    def _write(self, name: str, variable: tuple[np.ndarray, Any, Any], first: int, last: int) -> None:
         """The trials first..last-1 of all points, widened to whole chunks of the array, so that
         nothing is read back.
         """
-        array = self._array(name, data, dims, about)
+        array, data = self._array(name, *variable), variable[0]
         step = array.chunks[-1]
         window = (..., slice(first // step * step, min(-(-last // step) * step, data.shape[-1])))
         array[window] = data[window]
@@ -191,58 +170,36 @@ class Store:
         much as writing it.
         """
         if name not in self._arrays:
-            self._arrays[name] = self._opened_array(name, data, dims, about)
+            leading = tuple(max(1, min(n, 64)) for n in data.shape[:-1])
+            chunk = max(1, min(data.shape[-1], 1024, _CHUNK_NUMBERS // max(1, int(np.prod(leading)))))
+            made: dict[str, Any] = {"shape": data.shape, "dtype": data.dtype, "chunks": (*leading, chunk)}
+            made["fill_value"] = False if data.dtype == bool else np.nan
+            made |= {"dimension_names": dims, "attributes": about, "compressors": None}
+            known: Any = self.root.get(name)
+            self._arrays[name] = self.root.create_array(name, **made) if known is None else known
         if self._arrays[name].shape != data.shape:
             self._arrays[name].resize(data.shape)
         return self._arrays[name]
 
-    def _opened_array(self, name: str, data: np.ndarray, dims: tuple[str, ...], about: dict[str, Any]) -> zarr.Array:
-        if name in self.root:
-            return self.root[name]  # pyright: ignore[reportReturnType]
-        leading = tuple(max(1, min(n, 64)) for n in data.shape[:-1])
-        chunk = max(1, min(data.shape[-1], 1024, _CHUNK_NUMBERS // max(1, int(np.prod(leading)))))
-        fill = False if data.dtype == bool else np.nan
-        return self.root.create_array(
-            name,
-            shape=data.shape,
-            dtype=data.dtype,
-            chunks=(*leading, chunk),
-            dimension_names=dims,
-            attributes=about,
-            fill_value=fill,
-            compressors=None,
-        )
-
-    def _put(self, name: str, values: np.ndarray, dims: tuple[str, ...]) -> None:
+    def _put(self, name: str, values: np.ndarray) -> None:
         """A coordinate, whole."""
-        if values.dtype.kind == "U":
-            values = (
-                values.astype(np.dtypes.StringDType()) if hasattr(np.dtypes, "StringDType") else values.astype(object)
-            )
+        dtype: Any = values.dtype
+        if dtype.kind == "U":
+            dtype, values = str, values.astype(getattr(np.dtypes, "StringDType", lambda: object)())
         with warnings.catch_warnings():
             # zarr warns that texts are not in version 3 of the specification yet
             warnings.simplefilter("ignore")
-            array = self.root.create_array(
-                name,
-                shape=values.shape,
-                dtype=str if values.dtype.kind in "TO" else values.dtype,
-                chunks=values.shape,
-                dimension_names=dims,
-                overwrite=True,
-            )
+            made: dict[str, Any] = {"shape": values.shape, "dtype": dtype, "chunks": values.shape}
+            array = self.root.create_array(name, dimension_names=(name,), overwrite=True, **made)
             array[...] = values
-
-    def _write_saved(self) -> None:
-        for path, about, arrays in self._pending:
-            group = self.root.require_group(f"{_SAVED}/{path}")
-            group.attrs.put(_plain_values(about))
-            for name, data in arrays.items():
-                group.create_array(name, data=data, overwrite=True)
-        self._pending = []
 
 
 def empty(labels: Labels, trials: int) -> Record:
-    """A record in which nothing has run. Raises ConfigError where it does not fit into memory."""
+    """A record in which nothing has run.
+
+    Raises:
+        ConfigError: If it does not fit into memory.
+    """
     shape = (*map(len, labels.values()), trials)
     try:
         return Record((), dict(labels), np.zeros(shape, bool), np.zeros((0, *shape), bool))
@@ -256,27 +213,20 @@ def empty(labels: Labels, trials: int) -> Record:
 def read_sweep(path: Path | str) -> Record:
     """The record in a results.zarr, or in the folder of a sweep, finished or not.
 
-    Raises ConfigError where there is none.
+    Raises:
+        ConfigError: If there is none.
     """
     path = Path(path) / "results.zarr" if (Path(path) / "results.zarr").exists() else Path(path)
     return _loaded(_opened(path, "r"), path)
 
 
-def attributes(node: Any) -> dict[str, Any]:
-    """Attributes of a group or an array, as a plain tree."""
-    return node.attrs.asdict()
-
-
 def cut_off(path: Path) -> bool:
-    """Whether a sweep of ours was killed while it made this store, before there was
-    anything in it.
-    """
+    """Whether a sweep of ours was killed while it made this store, before anything was in it."""
     made = {p.name for p in path.iterdir() if not p.name.endswith(".partial")} if path.is_dir() else {""}
-    if not made <= {"zarr.json", _DONE}:
+    root = path / "zarr.json"
+    if not made <= {root.name, _DONE}:
         return False
-    return "zarr.json" not in made or "labels" not in json.loads((path / "zarr.json").read_text(encoding="utf-8")).get(
-        "attributes", {}
-    )
+    return root.name not in made or "labels" not in json.loads(root.read_text("utf-8")).get("attributes", {})
 
 
 def _opened(path: Path, mode: Any) -> zarr.Group:
@@ -306,54 +256,53 @@ def _writing(path: Path) -> Iterator[None]:
 def _loaded(root: zarr.Group, path: Path) -> Record:
     """Everything on disk, without what is not marked done.
 
-    Raises ConfigError where files are missing or spoilt.
+    Raises:
+        ConfigError: If files are missing or broken.
     """
+    advice = "restore it, or begin anew in another folder"
     try:
-        missing = [name for name in (_DONE, *attributes(root).get("arrays", [])) if name not in root]
+        missing = [name for name in (_DONE, *_attributes(root).get("arrays", [])) if name not in root]
         if not missing:
             return _read(root)
     except (KeyError, ValueError, IndexError, TypeError, OSError) as error:
-        raise ConfigError(
-            f"{path} is damaged ({type(error).__name__}: {' '.join(str(error).split())}); restore "
-            "it, or begin anew in another folder"
-        ) from error
-    raise ConfigError(f"{path} is damaged: {missing[0]!r} is missing; restore it, or begin anew in another folder")
+        raise ConfigError(f"{path} is broken ({type(error).__name__}: {one_line(error)}); {advice}") from error
+    raise ConfigError(f"{path} is broken: {missing[0]!r} is missing; {advice}")
 
 
 def _read(root: zarr.Group) -> Record:
-    held = attributes(root)
+    held = _attributes(root)
     record = empty({name: tuple(labels) for name, labels in held["labels"].items()}, held["trials"])
-    for index, spans in attributes(root[_DONE]).items():
+    for index, spans in _attributes(root[_DONE]).items():
         for first, last in spans:
             record.done[(*map(int, filter(None, index.split(","))), slice(first, last))] = True
     record.algorithms = tuple(held["algorithms"])
     record.ok = np.zeros((len(record.algorithms), *record.done.shape), bool)
     with warnings.catch_warnings():
-        warnings.filterwarnings(
-            "ignore", message="Object at"
-        )  # a process that was killed while it wrote leaves half a file beside the old one
-        arrays = list(root.arrays())
+        # a process that was killed while it wrote leaves half a file beside the old one
+        warnings.filterwarnings("ignore", message="Object at")
+        arrays = dict(root.arrays())
     # a folder lists its files in any order
-    place = {name: i for i, name in enumerate(held.get("arrays", []))}
-    for name, array in sorted(arrays, key=lambda pair: place.get(pair[0], -1)):
-        kind = array.attrs.get("kind")
-        if kind == OK:
+    rank = {name: i for i, name in enumerate(held.get("arrays", []))}
+    for name, array in sorted(arrays.items(), key=lambda pair: rank.get(pair[0], -1)):
+        about = _attributes(array)
+        if about.get("kind") == OK:
             _restore(record.ok, array, record.done)
-        elif kind == "metric":
+        elif about.get("kind") == "metric":
             _restore(record.metrics.setdefault(name, record.blank()), array, record.done)
-        elif kind == "bound":
-            named = record.bounds.setdefault(str(array.attrs["bound_of"]), {})
-            _restore(named.setdefault(str(array.attrs["bound"]), record.blank(False)), array, record.done)
+        elif about.get("kind") == "bound":
+            named = record.bounds.setdefault(about["bound_of"], {})
+            _restore(named.setdefault(about["bound"], record.blank(False)), array, record.done)
     record.about = _about(root)
     return record
 
 
+def _attributes(node: Any) -> dict[str, Any]:
+    return node.attrs.asdict()
+
+
 def _about(root: zarr.Group) -> dict[str, Any]:
-    return {
-        key: value
-        for key, value in attributes(root).items()
-        if key not in ("labels", "values", "trials", "algorithms", "arrays", "format")
-    }
+    own = ("labels", "values", "trials", "algorithms", "arrays", "format")
+    return {key: value for key, value in _attributes(root).items() if key not in own}
 
 
 def _restore(target: np.ndarray, array: zarr.Array, done: np.ndarray) -> None:
@@ -370,45 +319,37 @@ def _spans(done: np.ndarray) -> list[list[int]]:
     return edges.reshape(-1, 2).tolist()
 
 
-def hash_of(identity: Mapping[str, Any]) -> str:
-    return address(identity)
-
-
-def refuse_another(
-    path: Path,
-    was: Mapping[str, Any],
-    now: Mapping[str, Any],
-    values_were: Mapping[str, Any],
-    values: Mapping[str, Any],
+def _refuse_another(
+    path: Path, held: Mapping[str, Any], identity: Mapping[str, Any], values: Mapping[str, Any]
 ) -> None:
-    """Raise ConfigError where results of two configs would mix; names what differs."""
-    if list(values_were) != list(values):
+    """Refuse to mix the results of two configs; the sentence names what differs."""
+    was = held["values"]
+    if list(was) != list(values):
         raise ConfigError(
-            f"{path} holds a sweep over {', '.join(values_were) or 'nothing'}, not over "
+            f"{path} holds a sweep over {', '.join(was) or 'nothing'}, not over "
             f"{', '.join(values) or 'nothing'}; choose another folder for the other sweep"
         )
     for name, named in values.items():
         for label, value in named.items():
-            if values_were[name].get(label, value) != value:
+            if was[name].get(label, value) != value:
                 raise ConfigError(
-                    f"{path} holds a sweep where {name} {label!r} is {_short(values_were[name][label])}, "
+                    f"{path} holds a sweep where {name} {label!r} is {_short(was[name][label])}, "
                     f"and now it is {_short(value)}; give the new value a name of its own"
                 )
-    differing = list(_differences(was, now))
+    differing = list(_differences(held["identity"], identity))
     if differing:
         more = f", and {len(differing) - 3} more" if len(differing) > 3 else ""
         raise ConfigError(
-            f"{path} holds a sweep of another config ({hash_of(was)}, now {hash_of(now)}): "
+            f"{path} holds a sweep of another config ({address(held['identity'])}, now {address(identity)}): "
             f"{'; '.join(differing[:3])}{more}; choose another folder, or set these back"
         )
 
 
-def _differences(was: Any, now: Any, where: str = "") -> Iterable[str]:
+def _differences(was: Any, now: Any, where: str = "") -> Iterator[str]:
     if isinstance(was, Mapping) and isinstance(now, Mapping):
         for key in dict.fromkeys((*was, *now)):
-            yield from _differences(
-                was.get(key, "absent"), now.get(key, "absent"), f"{where}.{key}" if where else str(key)
-            )
+            name = f"{where}.{key}" if where else str(key)
+            yield from _differences(was.get(key, "absent"), now.get(key, "absent"), name)
     elif was != now:
         yield f"{where} was {_short(was)} and is {_short(now)}"
 
@@ -425,7 +366,3 @@ def _values(grid: Grid) -> dict[str, dict[str, str]]:
 
 def _plain(identity: Mapping[str, Any]) -> dict[str, Any]:
     return json.loads(canonical(identity))
-
-
-def _plain_values(tree: Mapping[str, Any]) -> dict[str, Any]:
-    return json.loads(json.dumps(dict(tree), default=str))

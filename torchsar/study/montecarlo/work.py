@@ -1,37 +1,44 @@
-"""One chunk of a sweep, computed: rows in, plain arrays out. Runs in this process or in a
-worker.
-"""
+"""Chunks of a sweep: how many trials run at once, and how a chunk is computed in any process."""
 
 from __future__ import annotations
 
-import math
-import time
+import logging
+import warnings
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from contextlib import contextmanager
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from torchsar.core import Draws
 from torchsar.study.montecarlo.grid import Case
 from torchsar.study.montecarlo.record import OK
-from torchsar.study.settings.errors import ConfigError
+from torchsar.study.settings.errors import ConfigError, one_line
 
+log = logging.getLogger("torchsar")
 Trial = Callable[[Mapping[str, Any], Draws], Mapping[str, Any]]
+Numbers = dict[str, dict[str, list[float]]]
 BOUNDS, SAVED = "bounds", "saved"
-
-
-class TrialError(ConfigError):
-    """A trial function failed; the text says where, the cause what."""
+# larger batches leave the cache of a CPU and cost more per trial, as measured
+CACHE_BYTES = 12 << 20
+# of the free memory of a GPU, and tensors of the largest kind that chains hold at a time
+_GPU_SHARE, _LIVE_TENSORS = 0.5, 12
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Rows that run as one batch: a case, and for every row the place of its point in the case and
-    its trial number.
+    """Rows that run as one batch.
+
+    Args:
+        case: Number of the case that all rows belong to.
+        points: Number of the point of each row within the case.
+        trials: Trial number of each row.
     """
 
     case: int
@@ -49,21 +56,36 @@ class Chunk:
             yield Chunk(self.case, self.points[first:last], self.trials[first:last])
 
 
-@dataclass
+@dataclass(frozen=True)
 class Outcome:
-    """What a chunk gave.
+    """What one batch gave.
 
-    values: algorithm -> metric -> (rows,); bounds: metric -> name -> (rows,); saved: row ->
-    "algorithm.name" -> array.
-
-    fits: the largest batch that the memory was found to hold, None where nothing was too large.
+    Args:
+        chunk: Its rows.
+        values: By algorithm and metric, (rows,).
+        bounds: By metric and name, (rows,).
+        saved: Arrays by row and "algorithm.name".
     """
 
-    values: dict[str, dict[str, list[float]]] = field(default_factory=dict)
-    bounds: dict[str, dict[str, list[float]]] = field(default_factory=dict)
-    saved: dict[int, dict[str, np.ndarray]] = field(default_factory=dict)
-    seconds: float = 0.0
-    fits: int | None = None
+    chunk: Chunk
+    values: Numbers
+    bounds: Numbers
+    saved: dict[int, dict[str, np.ndarray]]
+
+
+@dataclass(frozen=True)
+class Computed:
+    """What a chunk gave.
+
+    Args:
+        parts: The batches that it was run in.
+        fits: The largest batch that fits into memory, None where nothing was too large.
+        warnings: What the trials logged as warnings.
+    """
+
+    parts: list[Outcome]
+    fits: int | None
+    warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -78,25 +100,25 @@ class Work:
     device: str = "cpu"
     save: frozenset[int] = frozenset()
 
-    def compute(self, chunk: Chunk, fits: int | None = None) -> Outcome:
-        """Run a chunk, in batches of at most `fits` rows; one that runs out of memory is halved,
-        and so are those after it.
+    def compute(self, chunk: Chunk, fits: int | None = None) -> Computed:
+        """Run a chunk in batches of at most `fits` rows; where memory ends, in halves from then on.
+
+        Raises:
+            ConfigError: If the trial function fails.
         """
-        began, first_fits = time.perf_counter(), fits
-        waiting, parts = [chunk], []
-        while waiting:
-            piece = waiting.pop(0)
-            if fits is not None and len(piece) > fits:
-                waiting = [*piece.pieces(fits), *waiting]
-                continue
-            outcome = self._attempt(piece)
-            if outcome is None:
-                fits, waiting = -(-len(piece) // 2), [piece, *waiting]
-            else:
-                parts.append((piece, outcome))
-        whole = _joined(parts)
-        whole.seconds, whole.fits = time.perf_counter() - began, fits if fits != first_fits else None
-        return whole
+        found, waiting, parts = fits, [chunk], []
+        with _warnings_kept() as said:
+            while waiting:
+                piece = waiting.pop(0)
+                if found is not None and len(piece) > found:
+                    waiting = [*piece.pieces(found), *waiting]
+                    continue
+                outcome = self._attempt(piece)
+                if outcome is None:
+                    found, waiting = -(-len(piece) // 2), [piece, *waiting]
+                else:
+                    parts.append(outcome)
+        return Computed(parts, found if found != fits else None, tuple(dict.fromkeys(said)))
 
     def _attempt(self, chunk: Chunk) -> Outcome | None:
         """The outcome of a batch, None where it does not fit into memory."""
@@ -104,11 +126,10 @@ class Work:
             return self._once(chunk)
         except Exception as error:
             if not _out_of_memory(error):
-                raise TrialError(
-                    f"{self._where(chunk)}: {type(error).__name__}: {' '.join(str(error).split()) or 'no message'}"
-                ) from error
+                text = f"{type(error).__name__}: {one_line(error) or 'no message'}"
+                raise ConfigError(f"{self._where(chunk)}: {text}") from error
         if len(chunk) == 1:
-            raise TrialError(
+            raise ConfigError(
                 f"{self._where(chunk)}: a single trial does not fit into the memory of {self.device}; "
                 "make the scene smaller"
             )
@@ -118,22 +139,17 @@ class Work:
 
     def _where(self, chunk: Chunk) -> str:
         points = ", ".join(f"{k}={v}" for k, v in self.cases[chunk.case].fixed.items())
-        return (
-            f"the trial function failed in trials {min(chunk.trials)} to "
-            f"{max(chunk.trials)}{' of ' + points if points else ''}"
-        )
+        of = f" of {points}" if points else ""
+        return f"the trial function failed in trials {min(chunk.trials)} to {max(chunk.trials)}{of}"
 
     def parameters(self, chunk: Chunk) -> dict[str, Any]:
-        """What the trial function is given: fixed values as they are, batched ones as float64
-        tensors (rows,).
-        """
+        """What the trial is given: fixed values as they are, batched ones as (rows,) float64."""
         case = self.cases[chunk.case]
         given: dict[str, Any] = dict(case.fixed)
         for name, values in self.batched.items():
             dim = self.names.index(name)
-            given[name] = torch.tensor(
-                [values[case.points[p].index[dim]] for p in chunk.points], dtype=torch.float64, device=self.device
-            )
+            rows = [values[case.points[p].index[dim]] for p in chunk.points]
+            given[name] = torch.tensor(rows, dtype=torch.float64, device=self.device)
         return {name: given[name] for name in self.names}
 
     def draws(self, chunk: Chunk) -> Draws:
@@ -142,10 +158,10 @@ class Work:
         return Draws(self.seed, tuple(points[p].address for p in chunk.points), list(chunk.trials))
 
     def _once(self, chunk: Chunk) -> Outcome:
-        given = self.trial(self.parameters(chunk), self.draws(chunk))
+        given, n = self.trial(self.parameters(chunk), self.draws(chunk)), len(chunk)
         if not isinstance(given, Mapping):
             raise ValueError(
-                f"a trial function returns {{metric: tensor}} or {{algorithm: {{metric: tensor}}}}, "
+                "a trial function returns {metric: tensor} or {algorithm: {metric: tensor}}, "
                 f"got {type(given).__name__}"
             )
         found = dict(given)
@@ -160,26 +176,35 @@ class Work:
             raise ValueError("a trial function gives at least one metric, and this one gave none")
         for name, tree in ((BOUNDS, bounds), (SAVED, saved)):
             if not isinstance(tree, Mapping) or not all(isinstance(named, Mapping) for named in tree.values()):
-                raise ValueError(
-                    f"{name!r} must be a mapping of mappings, "
-                    f"{'{metric: {name: tensor}}' if name == BOUNDS else '{algorithm: {name: tensor}}'}"
-                )
-        outcome = Outcome()
-        for algorithm, metrics in (nested or {_name(self.trial): found}).items():
-            outcome.values[algorithm] = {
-                metric: _rows(value, len(chunk), f"{algorithm}.{metric}") for metric, value in metrics.items()
-            }
-        outcome.bounds = {
-            metric: {name: _rows(v, len(chunk), f"bounds.{metric}.{name}") for name, v in named.items()}
-            for metric, named in bounds.items()
-        }
-        for row in (i for i, trial in enumerate(chunk.trials) if trial in self.save):
-            outcome.saved[row] = {
-                f"{algorithm}.{name}": _array(value, row, len(chunk), f"{SAVED}.{algorithm}.{name}")
-                for algorithm, named in saved.items()
-                for name, value in named.items()
-            }
-        return outcome
+                form = "{metric: {name: tensor}}" if name == BOUNDS else "{algorithm: {name: tensor}}"
+                raise ValueError(f"{name!r} must be a mapping of mappings, {form}")
+        kept = {f"{algorithm}.{name}": value for algorithm, named in saved.items() for name, value in named.items()}
+        rows = [row for row, trial in enumerate(chunk.trials) if trial in self.save]
+        return Outcome(
+            chunk,
+            _numbers(nested or {_name(self.trial): found}, n),
+            _numbers(bounds, n, f"{BOUNDS}."),
+            {row: {name: _array(value, row, n, f"{SAVED}.{name}") for name, value in kept.items()} for row in rows},
+        )
+
+
+@contextmanager
+def _warnings_kept() -> Iterator[list[str]]:
+    """Collect the warnings of the trials, so that a sweep can print each of them once."""
+    said: list[str] = []
+
+    def keep(record: logging.LogRecord) -> bool:
+        if record.levelno == logging.WARNING:
+            said.append(record.getMessage().removeprefix("warning: "))
+        return record.levelno != logging.WARNING
+
+    log.addFilter(keep)
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            yield said
+            said.extend(" ".join(str(warning.message).split()) for warning in caught)
+    finally:
+        log.removeFilter(keep)
 
 
 def _name(trial: Trial) -> str:
@@ -195,62 +220,30 @@ def _array(value: Any, row: int, rows: int, what: str) -> np.ndarray:
             f"{tuple(getattr(value, 'shape', ())) or type(value).__name__}"
         )
     one = value[row]
-    return (
-        one.to(torch.float32 if one.dtype == torch.bfloat16 else one.dtype).numpy(force=True)
-        if isinstance(one, Tensor)
-        else np.asarray(one)
-    )
+    if not isinstance(one, Tensor):
+        return np.asarray(one)
+    return one.to(torch.float32 if one.dtype == torch.bfloat16 else one.dtype).numpy(force=True)
+
+
+def _numbers(tree: Mapping[str, Mapping[str, Any]], rows: int, before: str = "") -> Numbers:
+    """Plain numbers for each row: lists, since that is the cheapest way out of torch."""
+    return {
+        outer: {inner: _rows(value, rows, f"{before}{outer}.{inner}") for inner, value in named.items()}
+        for outer, named in tree.items()
+    }
 
 
 def _rows(value: Any, rows: int, what: str) -> list[float]:
-    """One number per row; a list, since that is the cheapest way out of torch."""
+    expected = f"{what} must hold one real number for each of the {rows} trials, got"
     try:
         x = value if isinstance(value, Tensor) else torch.as_tensor(value)
     except (TypeError, RuntimeError, ValueError):
-        raise ValueError(
-            f"{what} must hold one real number for each of the {rows} trials, got {type(value).__name__}"
-        ) from None
+        raise ValueError(f"{expected} {type(value).__name__}") from None
     if x.is_complex() or x.shape not in ((rows,), ()):
-        raise ValueError(
-            f"{what} must hold one real number for each of the {rows} trials, got {x.dtype} of shape {tuple(x.shape)}"
-        )
+        raise ValueError(f"{expected} {x.dtype} of shape {tuple(x.shape)}")
     if what.endswith(f".{OK}") and x.dtype != torch.bool:
         raise ValueError(f"{what} must be bool, got {x.dtype}")
     return x.tolist() if x.ndim else [x.item()] * rows
-
-
-def _joined(parts: list[tuple[Chunk, Outcome]]) -> Outcome:
-    """The outcomes of pieces as one, in order."""
-    if len(parts) == 1:
-        return parts[0][1]
-    if any(set(o.values) != set(parts[0][1].values) for _, o in parts):
-        raise TrialError(
-            "trials gave results of "
-            f"{' and then of '.join(dict.fromkeys(', '.join(o.values) for _, o in parts))}; "
-            "return the same algorithms in every trial"
-        )
-    whole = Outcome(_columns([(o.values, len(c)) for c, o in parts]), _columns([(o.bounds, len(c)) for c, o in parts]))
-    start = 0
-    for chunk, outcome in parts:
-        whole.saved.update({start + row: arrays for row, arrays in outcome.saved.items()})
-        start += len(chunk)
-    return whole
-
-
-def _columns(parts: list[tuple[dict[str, dict[str, list[float]]], int]]) -> dict[str, dict[str, list[float]]]:
-    """The numbers of pieces and how many rows each has, one after the other; a name that only some
-    of them give is NaN in the others.
-    """
-    names = {
-        outer: dict.fromkeys(inner for tree, _ in parts for inner in tree.get(outer, {}))
-        for outer in dict.fromkeys(o for tree, _ in parts for o in tree)
-    }
-
-    def column(outer: str, inner: str) -> list[float]:
-        missing = True if inner == OK else math.nan
-        return [x for tree, rows in parts for x in tree.get(outer, {}).get(inner, [missing] * rows)]
-
-    return {outer: {inner: column(outer, inner) for inner in inners} for outer, inners in names.items()}
 
 
 def _out_of_memory(error: Exception) -> bool:
@@ -258,3 +251,54 @@ def _out_of_memory(error: Exception) -> bool:
     return isinstance(error, (MemoryError, torch.OutOfMemoryError)) or (
         isinstance(error, RuntimeError) and "allocate memory" in str(error)
     )
+
+
+class _Largest(TorchDispatchMode):
+    """Remembers the bytes of the largest tensor that any operation gives."""
+
+    bytes = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        for leaf in tree_leaves(result):
+            if isinstance(leaf, Tensor):
+                self.bytes = max(self.bytes, leaf.untyped_storage().nbytes())
+        return result
+
+
+def probed_bytes(work: Work, case: int) -> int:
+    """Bytes of the largest tensor of one trial, found by running it once.
+
+    A trial function with a method `bytes_per_trial(fixed)` saves that run.
+    """
+    known = getattr(work.trial, "bytes_per_trial", None)
+    if known is not None:
+        return max(1, int(known(work.cases[case].fixed)))
+    with _Largest() as largest:
+        work.compute(Chunk(case, (0,), (0,)))
+    return max(1, largest.bytes)
+
+
+def rows_by_bytes(bytes_per_trial: int, device: str) -> int:
+    """Trials of a batch.
+
+    Args:
+        bytes_per_trial: Bytes of the largest tensor of one trial.
+        device: On a CPU, that tensor of the whole batch fills CACHE_BYTES; on a GPU, about a dozen
+            of them fill half of the free memory.
+    """
+    if torch.device(device).type == "cuda":
+        free, _ = torch.cuda.mem_get_info(device)
+        return max(1, int(_GPU_SHARE * free / (_LIVE_TENSORS * bytes_per_trial)))
+    return max(1, CACHE_BYTES // bytes_per_trial)
+
+
+def cut(case: int, whole: Case, active: set[int], first: int, last: int, rows: int) -> Iterator[Chunk]:
+    """Chunks of at most `rows` rows: trials first..last-1 of the active points, point by point.
+
+    The cuts depend on these arguments alone, never on what has already been done, so that a resumed
+    sweep runs the same batches.
+    """
+    order = [(p, t) for p in range(len(whole.points)) if p in active for t in range(first, last)]
+    if order:
+        yield from Chunk(case, tuple(p for p, _ in order), tuple(t for _, t in order)).pieces(rows)

@@ -10,39 +10,6 @@ MISSING = "–"
 # units that take a prefix; those of levels, shares and angles in degrees take none
 _PREFIXED = ("m", "s", "Hz", "rad", "B")
 _PREFIXES = {-12: "p", -9: "n", -6: "u", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
-# endings of names and their units, the longer one of two that end alike first
-_UNITS = {
-    "_rad_s": "rad/s",
-    "_m_s2": "m/s²",
-    "_m_s": "m/s",
-    "_hz": "Hz",
-    "_db": "dB",
-    "_nats": "nats",
-    "_rad": "rad",
-    "_deg": "deg",
-    "_m": "m",
-    "_s": "s",
-}
-# words that are not written in small letters
-_ACRONYMS = {
-    word.lower(): word
-    for word in (
-        "Doppler",
-        "SNR",
-        "PRF",
-        "RMS",
-        "IRW",
-        "PSLR",
-        "ISLR",
-        "RCS",
-        "SIR",
-        "CNR",
-        "SCR",
-        "SCNR",
-        "MFTA",
-        "ADC",
-    )
-}
 
 
 def scale_of(values: Sequence[float | None], unit: str) -> tuple[float, str]:
@@ -95,13 +62,3 @@ def _numbers(value: Any) -> list[float]:
     if isinstance(value, (list, tuple)):
         return [x for one in value for x in _numbers(one)]
     return [value] if isinstance(value, (int, float)) and not isinstance(value, bool) else []
-
-
-def name_and_unit(name: str) -> tuple[str, str]:
-    """What the last part of a dotted name says, and its unit: 'world.noise.snr_db' -> ('SNR',
-    'dB').
-    """
-    last = name.rpartition(".")[2]
-    suffix = next((suffix for suffix in _UNITS if last.endswith(suffix) and last != suffix), "")
-    words = last.removesuffix(suffix).strip("_").split("_")
-    return " ".join(_ACRONYMS.get(word, word) for word in words), _UNITS.get(suffix, "")

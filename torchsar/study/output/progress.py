@@ -86,6 +86,42 @@ class Steps:
         return f"{step} for {clock(now - self._since)}, {clock(now - self._began)} in all{then}"
 
 
+class Count:
+    """Counts what is done of many equal things, such as trials; tells the time left from the pace.
+
+    Args:
+        unit: What is counted.
+        total: How many there are.
+        done: How many of them were done before.
+    """
+
+    def __init__(self, unit: str, total: int, done: int = 0) -> None:
+        self.unit, self.total, self.done, self._first = unit, total, done, done
+        self._began = self._since = time.perf_counter()
+
+    def advance(self, count: int) -> None:
+        """So many more are done."""
+        self.done, self._since = self.done + count, time.perf_counter()
+
+    @property
+    def new(self) -> int:
+        """How many were done since the beginning of this count."""
+        return self.done - self._first
+
+    @property
+    def seconds(self) -> float:
+        """Since the beginning of this count."""
+        return time.perf_counter() - self._began
+
+    def say(self) -> str:
+        """How many are done, and the time left."""
+        then, spent = "the time left is known after the first batch", self._since - self._began
+        if self.new:
+            left = (self.total - self.done) * spent / self.new - (time.perf_counter() - self._since)
+            then = f"{self.new / max(spent, 1e-9):.3g} {self.unit}/s, about {clock(max(left, 0.0))} left"
+        return f"{self.done} of {self.total} {self.unit} after {clock(self.seconds)}, {then}"
+
+
 def clock(seconds: float) -> str:
     """Minutes and seconds, with hours where there are any."""
     minutes, seconds = divmod(round(seconds), 60)

@@ -12,7 +12,8 @@ from typing import Any, Protocol
 import jinja2
 import torch
 
-from torchsar.study.output.numbers import MISSING, name_and_unit, number, quantity, scale_of
+from torchsar.plot import name_and_unit
+from torchsar.study.output.numbers import MISSING, number, quantity, scale_of
 from torchsar.study.output.pictures import Picture
 
 # tiles above the tables show at most so many figures: two rows of four on a wide screen
