@@ -24,7 +24,7 @@ def known_motion_chain(
 ) -> Chain:
     """Build the chain from channels to the images of points, each of known motion.
 
-    The chain takes `given.u_r_m_s`, `given.u_a_m_s`, `given.y0_m` and `given.range_m`, shape (row,).
+    The chain takes `given.u_r_m_s`, `u_a_m_s`, `y0_m` and `range_m` alike, shape (row,).
 
     Args:
         radar: Instrument.

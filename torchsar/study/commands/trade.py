@@ -116,7 +116,7 @@ def compared(choice: Choice, bench: Bench, tolerance: Mapping[str, float]) -> li
 
 
 def _timed(one: Alternative, measured: Measured, times: list[tuple[float, float]]) -> Row:
-    """One repeat of an alternative; a failure, or a loss that is not a number, is said in the row."""
+    """One repeat of an alternative; the row names a failure or a loss that is not finite."""
     row: Row = {"name": one.name, "neglects": one.neglects, "cpu_s": None, "wall_s": None, "peak_bytes": None}
     row |= {"loss": {}, "predicted": one.loss, "failed": ""}
     try:
@@ -132,7 +132,7 @@ def _timed(one: Alternative, measured: Measured, times: list[tuple[float, float]
 
 
 def _spent(work: Callable[[], Any], least_s: float) -> tuple[tuple[float, float], Any]:
-    """CPU and wall time of the work, a mean over so many runs as take a given time, and its result."""
+    """Mean CPU and wall time of the work over as many runs as take a given time, and its result."""
     began, runs = (time.process_time(), time.perf_counter()), 0
     while True:
         result, runs = work(), runs + 1
