@@ -1,7 +1,7 @@
 """Numbers of radar and world that no system can use: most often a unit that was mistaken.
 
-Each number with a unit has a range that goes to the ends of what instruments and scenes can be. Inside
-these ranges, numbers must fit one another: relations of them are products of powers.
+Each number with a unit has a range that goes to the ends of what instruments and scenes can be.
+Inside these ranges, numbers must fit one another: relations of them are products of powers.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class Relation:
     factor: float = 1.0
 
 
-# The limits are a hundred times wider than what gives good images; impaired and tiny scenes are usable.
+# limits a hundred times wider than what gives good images: impaired and tiny scenes are usable
 _CARRIER, _PRF, _RANGE = "radar.carrier_hz", "radar.prf_hz", "radar.reference_range_m"
 _RELATIONS = (
     *(Relation("the share of time that a pulse takes", {pulse: 1, _PRF: 1}, high=1.0)
@@ -152,11 +152,15 @@ def refuse_implausible(system: str, radar: Any, world: Any, file: str) -> None:
         numbers[key] = max(value, numbers.get(key, 0.0), key=abs)
         row = next((row for row in _RANGES if fnmatch(f"{system}.{key}", row[0])), None)
         if row is not None and value and not row[1] <= abs(value) <= row[2]:
-            raise ConfigError(f"{file}: {key} is {_outside(key, value, *row[1:3])} ({row[3]}){_meant(key, value, *row[1:3])}")
+            raise ConfigError(
+                f"{file}: {key} is {_outside(key, value, *row[1:3])} ({row[3]}){_meant(key, value, *row[1:3])}"
+            )
     span = [key for key in numbers if key.startswith("world.scene.") and key.endswith("_m")]
     farthest = max(span, key=lambda key: abs(numbers[key]), default="")
     for relation in _RELATIONS:
-        _refuse_relation(relation, {farthest if k == "world.scene" else k: p for k, p in relation.powers.items()}, numbers, file)
+        _refuse_relation(
+            relation, {farthest if k == "world.scene" else k: p for k, p in relation.powers.items()}, numbers, file
+        )
 
 
 def _refuse_relation(relation: Relation, powers: Mapping[str, int], numbers: Mapping[str, float], file: str) -> None:

@@ -17,7 +17,9 @@ RENAMED = {
     "told": "trigger_known",
     "published_ideal": "published.entropy_above_ideal_nats",
     "damaged": "impaired",
-    **{key: f"objective.{key}" for key in ("order", "range_term", "yc_m", "variables", "oversampling", "lines", "taps")},
+    **{
+        key: f"objective.{key}" for key in ("order", "range_term", "yc_m", "variables", "oversampling", "lines", "taps")
+    },
 }
 
 
