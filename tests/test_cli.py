@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import logging
+import resource
 import signal
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +23,82 @@ def spoken(capsys: pytest.CaptureFixture[str]) -> list[str]:
     return [line for line in capsys.readouterr().err.splitlines() if line.strip()]
 
 
-def test_list_names_experiments_stages_and_data_keys(capsys: pytest.CaptureFixture[str]) -> None:
+def test_list_explains_experiments_systems_stages_keys_and_data(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list"]) == 0
     text = capsys.readouterr().out
     for name in ("stripmap_damaged", "radarsat1", "omega_k", "doppler_centroid", "points", "dwell", "chirp_rate_hz_s"):
         assert name in text
+    for line in ("noise.snr_db*=null", "targets.NAME.u_r_m_s*=0.0", "prf_hz", "geo_ocean"):
+        assert f"  {line} " in text, line
+    keys = [line.split() for line in text.splitlines() if line.startswith("      ") and line[6] != " "]
+    silent = [words[0] for words in keys if len(words) == 1]
+    assert len(keys) > 500 and len(silent) < 0.12 * len(keys), silent
+
+
+def child_seconds(*arguments: str) -> tuple[float, subprocess.CompletedProcess[str]]:
+    """CPU time of the command in a process of its own, and what it said."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run(
+        [sys.executable, "-m", "torchsar.cli", *arguments], capture_output=True, text=True, timeout=120
+    )
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, done
+
+
+@pytest.mark.parametrize(
+    "arguments, status, said",
+    [
+        (["--help"], 0, "usage: torchsar"),
+        (["run", "--help"], 0, "--device"),
+        (["--version"], 0, "torchsar-lab "),
+        ([], 2, "a command is missing: choose one of run, sweep, requires, trade, list"),
+        (["walk"], 2, "invalid choice: 'walk'"),
+        (["run", "stripmap_damaged", "--speed"], 2, "unrecognized arguments: --speed"),
+        (["run", "nowhere"], 2, "there is no config file 'nowhere'"),
+    ],
+)
+def test_help_and_usage_errors_answer_at_once(arguments: list[str], status: int, said: str) -> None:
+    spent, done = child_seconds(*arguments)
+    assert done.returncode == status and said in done.stdout + done.stderr and "Traceback" not in done.stderr
+    assert spent < 0.5
+
+
+@pytest.mark.parametrize("command", ["run", "sweep", "requires", "trade", "list"])
+def test_the_first_line_comes_before_anything_heavy_is_imported(command: str, tmp_path: Path) -> None:
+    """torch cannot be imported here at all, and the first line is there, in a pipe."""
+    program = "import sys; sys.modules['torch'] = None; from torchsar.cli import main; main(sys.argv[1:])"
+    words = [command] if command == "list" else [command, str(write_tiny(tmp_path))]
+    done = subprocess.run([sys.executable, "-c", program, *words], capture_output=True, text=True, timeout=60)
+    assert ("EXPERIMENTS" in done.stdout) if command == "list" else (f"torchsar: {command} " in done.stderr)
+
+
+@pytest.mark.parametrize("device, said", [("cuda:99", "--device cuda:99"), ("meta", "--device meta"), ("best", "best")])
+def test_devices_that_cannot_compute_are_refused(
+    device: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", str(write_tiny(tmp_path)), "--device", device, "--out", str(tmp_path / "result")]) == 2
+    line = spoken(capsys)[-1]
+    assert said in line and "cannot be used here" in line and "leave it out" in line
+    assert [path.name for path in tmp_path.iterdir()] == ["tiny.yaml"]
+
+
+def test_a_warning_is_shown_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def warns(*_: object, **__: object) -> str:
+        for _ in range(3):
+            with warnings.catch_warnings():
+                warnings.simplefilter("always")
+                warnings.warn("aliased", stacklevel=1)
+            logging.getLogger("torchsar").warning("warning: recommended failed")
+            logging.getLogger("torchsar").info("again")
+        return "done"
+
+    monkeypatch.setattr("torchsar.study.commands.run.run", warns)
+    for _ in range(2):
+        assert main(["run", str(write_tiny(tmp_path)), "--out", str(tmp_path / "result")]) == 0
+        said = spoken(capsys)
+        assert [sum(text in line for line in said) for text in ("aliased", "recommended failed", "again")] == [1, 1, 3]
 
 
 def test_run_prints_where_the_report_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -49,7 +122,8 @@ def test_a_mistake_is_one_sentence_and_status_two(
 ) -> None:
     out = tmp_path / "result"
     assert main([command, str(write_tiny(tmp_path)), "radar.prf=3", "--out", str(out)]) == 2
-    lines = spoken(capsys)
+    first, *lines = spoken(capsys)
+    assert first.startswith(f"torchsar: {command} ")
     assert len(lines) == 1 and lines[0].startswith("torchsar: ") and "radar.prf" in lines[0] and "prf_hz" in lines[0]
     assert [path.name for path in tmp_path.iterdir()] == ["tiny.yaml"]
 
@@ -114,7 +188,7 @@ def test_bad_recordings_are_named(
             {"iq": np.concatenate([np.ones((90, 160, 2), np.float32), np.zeros((6, 160, 2), np.float32)])},
             ["raw.npz", "6 of 96 lines hold only zeros", "line 90"],
         ),
-        ({"pilot": np.zeros(4096, np.complex64)}, ["recommended", "'pilot' found nothing to trust"]),
+        ({"pilot": np.zeros(4096, np.complex64)}, ["recommended", "unreliable in 1 of 1 trials (pilot)"]),
     ],
 )
 def test_doubtful_recordings_are_named_in_a_warning(
@@ -125,8 +199,6 @@ def test_doubtful_recordings_are_named_in_a_warning(
         **FOCUS["recommended"]["stages"],
     }
     config = write_tiny(tmp_path, world=None, radar=None, metrics=None, processor={"recommended": {"stages": stages}})
-    # one of an earlier test writes to that test's stderr
-    logging.getLogger("torchsar").handlers.clear()
     assert (
         main(
             [
@@ -143,10 +215,10 @@ def test_doubtful_recordings_are_named_in_a_warning(
     assert len(said) == 1 and all(part in said[0] for part in expected)
 
 
-def test_aliasing_is_named_with_both_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    logging.getLogger("torchsar").handlers.clear()
-    assert main(["run", str(write_tiny(tmp_path)), "radar.prf_hz=10.0", "--out", str(tmp_path / "result")]) == 0
-    assert "warning: PRF 10 Hz is below the Doppler band 14.67" in capsys.readouterr().err
+def test_aliasing_is_named_with_both_figures(tmp_path: Path) -> None:
+    out = tmp_path / "result"
+    assert main(["requires", str(write_tiny(tmp_path)), "radar.prf_hz=10.0", "--out", str(out)]) == 0
+    assert "PRF 10 Hz is below the Doppler band 14.66" in (out / "requires.json").read_text()
 
 
 def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
@@ -163,10 +235,10 @@ def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
         str(tmp_path / "result"),
     ]
     running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=mind_interrupts)
-    assert running.stderr is not None and "simulating" in running.stderr.readline()
+    assert running.stderr is not None and "torchsar: run" in running.stderr.readline()
     running.send_signal(signal.SIGINT)
     _, said = running.communicate(timeout=60)
-    assert running.returncode == 130 and said.strip() == "torchsar: interrupted, nothing was written"
+    assert running.returncode == 130 and said.splitlines()[-1] == "torchsar: interrupted, nothing was written"
     assert [path.name for path in tmp_path.iterdir()] == ["tiny.yaml"]
 
 
@@ -192,69 +264,22 @@ def test_a_file_that_is_no_archive_is_named(tmp_path: Path, capsys: pytest.Captu
     assert "raw.npz" in spoken(capsys)[-1]
 
 
-def test_the_command_is_installed() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "torchsar.cli", "run", "nowhere"], capture_output=True, text=True, timeout=120
-    )
-    assert done.returncode == 2 and "nowhere" in done.stderr and "Traceback" not in done.stderr
-
-
 def test_requires_prints_the_table_and_writes_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "needs"
-    assert main(["requires", str(write_tiny(tmp_path)), "--out", str(out)]) == 0
-    text = capsys.readouterr().out
-    assert "squint ignored" in text and "omega_k" in text and text.strip().endswith(str(out))
-    table = json.loads((out / "requires.json").read_text())
-    assert {"effect", "phase_rad", "verdict"} <= set(table["requirements"][0])
 
-
-def test_requires_follows_the_scene(tmp_path: Path) -> None:
     def squint_phase(doppler_hz: float) -> float:
-        assert (
-            main(
-                [
-                    "requires",
-                    str(write_tiny(tmp_path)),
-                    f"world.doppler_hz={doppler_hz}",
-                    "--out",
-                    str(tmp_path / "needs"),
-                ]
-            )
-            == 0
-        )
-        rows = json.loads((tmp_path / "needs" / "requires.json").read_text())["requirements"]
+        given = [str(write_tiny(tmp_path)), f"world.doppler_hz={doppler_hz}", "--out", str(out)]
+        assert main(["requires", *given]) == 0
+        text = capsys.readouterr().out
+        assert "squint ignored" in text and "omega_k" in text and text.strip().endswith(str(out))
+        table = json.loads((out / "requires.json").read_text())
+        rows = [row for case in table.values() for row in case["requirements"]]
+        assert {"effect", "phase_rad", "verdict"} <= set(rows[0])
         return next(row["phase_rad"] for row in rows if row["effect"] == "squint ignored")
 
     assert squint_phase(100.0) == pytest.approx(2 * squint_phase(50.0), rel=0.05)
 
 
-def test_trade_starts_with_the_yardstick(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "trade"
-    beam = "world.beam.dwell_s=1.0"
-    assert (
-        main(
-            [
-                "trade",
-                str(write_tiny(tmp_path)),
-                beam,
-                "world.lines=640",
-                "world.samples=256",
-                "trade.repeats=1",
-                "--out",
-                str(out),
-            ]
-        )
-        == 0
-    )
-    table = json.loads((out / "trade.json").read_text())
-    assert table["focusing"][0]["name"].startswith("backprojection") and table["jitter"][0]["name"] == "uncorrected"
-    errors = {row["name"]: row["error_db"] for row in table["focusing"] + table["jitter"]}
-    assert errors["omega_k_stolt, complex128"] < -20
-    assert errors["exact"] < errors["Lagrange, 12 points"] < errors["Lagrange, 4 points"] < errors["uncorrected"]
-    assert {path.name for path in (out / "figures").iterdir()} == {"trade_focusing.png", "trade_jitter.png"}
-    assert "backprojection" in capsys.readouterr().out
-
-
-def test_trade_refuses_what_it_cannot_compare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["trade", str(write_tiny(tmp_path)), "trade.focusers=[omega]"]) == 2
-    assert "did you mean 'omega_k'" in spoken(capsys)[-1]
+def test_trade_refuses_what_it_does_not_know(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["trade", str(write_tiny(tmp_path)), "trade.focusers=[omega_k]"]) == 2
+    assert "'trade.focusers' is not known (accepted: repeats, tolerance, trials)" in spoken(capsys)[-1]

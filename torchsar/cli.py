@@ -13,6 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from torchsar.study.settings.errors import ConfigError
+
 EXIT_BAD_INPUT = 2  # the status of argparse for a command line that it rejects
 _COMMANDS = {
     "run": "run an experiment and write its images, figures and report",
@@ -78,13 +80,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         print(f"torchsar-lab {version('torchsar-lab')}")
         return 0
-    if options.command != "list":  # before torch is imported, which takes seconds
-        print(f"torchsar: {options.command} {options.config}", file=sys.stderr, flush=True)
     try:
-        from torchsar.study.settings.errors import ConfigError
-    except ImportError as error:
-        return _fail(f"{error}; install the extra: pip install 'torchsar-lab[study]'")
-    try:
+        if options.command != "list":  # before torch is imported, which takes seconds
+            print(f"torchsar: {options.command} {options.config}", file=sys.stderr, flush=True)
         with _log_to_stderr(), warnings.catch_warnings():
             warnings.showwarning = _show_warning
             return _dispatch(options, "torchsar " + shlex.join(given))
@@ -153,8 +151,6 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
 
 def _refuse_device(name: str, torch: Any) -> None:
     """Refuse a device on which nothing can be computed: an empty tensor would do on any."""
-    from torchsar.study.settings.errors import ConfigError
-
     try:
         torch.zeros(1, dtype=torch.complex128, device=name).abs().item()
     except (RuntimeError, AssertionError, TypeError, ImportError) as error:
@@ -170,8 +166,6 @@ def _fail(sentence: str) -> int:
 @contextmanager
 def _log_to_stderr() -> Iterator[None]:
     """The log of the program as lines on stderr, the same warning only once."""
-    from torchsar.study.settings.errors import ConfigError
-
     level = os.environ.get("TORCHSAR_LOG", "INFO").upper()
     if level not in logging.getLevelNamesMapping():
         raise ConfigError(f"TORCHSAR_LOG={level} is no level of the log; choose DEBUG, INFO, WARNING or ERROR")

@@ -211,13 +211,13 @@ MISTAKEN = {
         ("sweep.world.noise.snr_db=[0.0, 2000.0]", "2000 dB", "at most 400 dB"),
     ],
     "isal_table1": [
-        ("radar.carrier_hz=193.4", "3e+08 Hz to 1e+16 Hz", "did you mean 193.4 MHz"),
+        ("radar.carrier_hz=193.4", "3e+08 Hz to 1e+16 Hz", "did you mean 193.4 GHz"),
         ("radar.prf_hz=2.0", "the Doppler band of the scene over the pulse rate", "2 Hz"),
         ("radar.pulse_s=0.1", "the share of time that a pulse takes is 200", "at most 1"),
         ("world.scene.aircraft.length_m=190.0", "190 m", "at most 100"),
     ],
     "isal_satellite": [
-        ("radar.wavelength_m=1.55", "3e-08 m to 1 m", "did you mean 1.55 um"),
+        ("radar.wavelength_m=1.55", "3e-08 m to 1 m", "did you mean 1.55 mm"),
         ("radar.prf_hz=500.0", "500 Hz", "at most 100"),
         ("world.rotation.omega_rad_s=20000.0", "20000 rad/s", "at most 1000 rad/s"),
     ],

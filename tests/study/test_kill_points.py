@@ -22,7 +22,13 @@ from torchsar.study.commands import run, sweep, trade
 from torchsar.study.output.folder import STATE, opened
 
 COMMANDS = ("run", "sweep", "trade", "requires")
-SMALL = ["world.lines=48", "world.samples=64", "world.scene.field.count=2", "radar.pulse.duration_s=3e-7", "world.beam.dwell_s=0.05"]
+SMALL = [
+    "world.lines=48",
+    "world.samples=64",
+    "world.scene.field.count=2",
+    "radar.pulse.duration_s=3e-7",
+    "world.beam.dwell_s=0.05",
+]
 # what changes the disk; "open" counts when it may write
 EVENTS = {"os.rename", "os.mkdir", "os.rmdir", "os.remove", "os.truncate", "shutil.rmtree"}
 RESULT = {"run": "metrics.json", "sweep": "summary.json", "trade": "trade.json", "requires": "requires.json"}
@@ -55,7 +61,11 @@ def start(home: Path, command: str, out: Path, seed: int, moment: int | None, sa
         run.draw_all = sweep.draw_sweep = trade.draw_all = lambda *_, **__: []
         if moment is not None:
             die_at(moment)
-        more = ["--resume", "sweep.trials=2", "sweep.grid.world.noise.snr_db=[10.0, 20.0]"] if command == "sweep" else [f"seed={seed}"]
+        more = (
+            ["--resume", "sweep.trials=2", "sweep.grid.world.noise.snr_db=[10.0, 20.0]"]
+            if command == "sweep"
+            else [f"seed={seed}"]
+        )
         status = main([command, "tiny.yaml", *SMALL, "trade.repeats=1", "trade.trials=1", *more, "--out", str(out)])
     finally:
         os._exit(status)
@@ -74,7 +84,14 @@ class Home:
         (path / "elsewhere.txt").write_text("a file that a link points to")
         self.mine = {path / "elsewhere.txt"}
         for out in self.outs:
-            for name in ("notes.txt", "out.old", f"{STATE}.tmp/new", "report.html.bak", "project/config.yaml", "locked"):
+            for name in (
+                "notes.txt",
+                "out.old",
+                f"{STATE}.tmp/new",
+                "report.html.bak",
+                "project/config.yaml",
+                "locked",
+            ):
                 (out / name).parent.mkdir(parents=True, exist_ok=True)
                 (out / name).write_text(f"my own {name}")
                 self.mine.add(out / name)

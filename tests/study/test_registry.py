@@ -58,9 +58,7 @@ def test_signatures_become_keys_and_values_become_what_they_ask_for() -> None:
     keys = catalogue.sections["sample"].keys
     assert set(keys) == {"count", "level", "table", "pair"}
     assert [name for name, key in keys.items() if key.per_trial] == ["level"]
-    entry = catalogue.check(
-        {"stage": "sample", "level": 2.5, "table": [1.0, 2.0], "pair": [3, 4]}, "here", "file"
-    )
+    entry = catalogue.check({"stage": "sample", "level": 2.5, "table": [1.0, 2.0], "pair": [3, 4]}, "here", "file")
     made = catalogue.make(entry, "here", "file", radar="the radar")
     assert made.radar == "the radar" and made.count == 3 and made.level == 2.5 and made.pair == (3, 4)
     assert made.table.dtype == torch.float64 and made.table.tolist() == [1.0, 2.0]

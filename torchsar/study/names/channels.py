@@ -50,6 +50,11 @@ def migration_correct(
 ) -> CorrectMigration:
     """Range migration corrected by deramp, keystone and reramp, by a shift of each pulse, or not at
     all.
+
+    Args:
+        kind: "keystone", "static_bulk", or "none" for no correction.
+        whole_swath: Whether the correction follows the range over the swath.
+        range_m: Closest range of data without a range axis; None for the radar's.
     """
     kinds = {"keystone": Keystone(whole_swath), "static_bulk": StaticBulk(whole_swath), "none": NoMigration()}
     return CorrectMigration(radar, kinds[kind], range_m)
@@ -65,6 +70,13 @@ def rebuild_bands(
 ) -> Reconstruct:
     """Channels to the full Doppler band of the velocities given; mmse expects power in a flat band
     of band_hz, or by the pattern of the elements (null).
+
+    Args:
+        bands: Doppler bands of one PRF that are separated.
+        method: "least_squares", or "mmse" where an inverse may be singular.
+        band_hz: Doppler band in which mmse expects power; None for the pattern.
+        snr_db: Signal-to-noise ratio that mmse expects, in dB.
+        range_m: Closest range of data without a range axis; None for the radar's.
     """
     return Reconstruct(radar, _rebuild(bands, method, band_hz, snr_db), range_m)
 
@@ -74,6 +86,11 @@ def channel_balance(
 ) -> EstimateBalance:
     """Phase, gain and delay of channels from clutter at rest in a flat band of band_hz, or seen
     through the pattern of the elements (null).
+
+    Args:
+        band_hz: Flat Doppler band of the clutter; None for the pattern of the elements.
+        bands: Doppler bands of one PRF in the clutter.
+        delays: Whether delays are estimated as well.
     """
     return EstimateBalance(radar, _prior(band_hz), bands, delays)
 
@@ -82,6 +99,10 @@ def interferometry(radar: BistaticRadar, dwell_s: float | None = None, range_m: 
     """Along-track interferometry, u_a as given.
 
     dwell_s: how long targets are seen, null for the pattern of the elements.
+
+    Args:
+        dwell_s: How long targets are seen, in s; None for the pattern of the elements.
+        range_m: Closest range of data without a range axis; None for the radar's.
     """
     return Interferometry(radar, _aperture(dwell_s), range_m)
 
@@ -89,7 +110,13 @@ def interferometry(radar: BistaticRadar, dwell_s: float | None = None, range_m: 
 def along_track_autofocus(
     radar: BistaticRadar, dwell_s: float | None = None, half_m_s: float = 20.0, range_m: float | None = None
 ) -> AlongTrackAutofocus:
-    """u_a by the power of the deramped tone within +-half_m_s."""
+    """u_a by the power of the deramped tone within +-half_m_s.
+
+    Args:
+        dwell_s: How long targets are seen, in s; None for the pattern of the elements.
+        half_m_s: Half of the interval in which u_a is sought, in m/s.
+        range_m: Closest range of data without a range axis; None for the radar's.
+    """
     return AlongTrackAutofocus(radar, _aperture(dwell_s), range_m, half_m_s)
 
 
@@ -99,7 +126,13 @@ def likelihood_velocity(
     unknowns: tuple[Unknown, ...] = ("u_r_m_s", "u_a_m_s", "y0_m"),
     range_m: float | None = None,
 ) -> LikelihoodVelocity:
-    """Maximum likelihood of the unknowns near the values given, by Gauss-Newton steps."""
+    """Maximum likelihood of the unknowns near the values given, by Gauss-Newton steps.
+
+    Args:
+        dwell_s: How long targets are seen, in s; None for the pattern of the elements.
+        unknowns: What is estimated; the rest is held.
+        range_m: Closest range of data without a range axis; None for the radar's.
+    """
     return LikelihoodVelocity(radar, _aperture(dwell_s), range_m, unknowns)
 
 
@@ -111,6 +144,11 @@ def gradient_velocity(
 ) -> GradientVelocity:
     """Maximum likelihood of the unknowns near the values given, by a descent on autograd's
     gradients.
+
+    Args:
+        dwell_s: How long targets are seen, in s; None for the pattern of the elements.
+        unknowns: What is estimated; the rest is held.
+        range_m: Closest range of data without a range axis; None for the radar's.
     """
     return GradientVelocity(radar, _aperture(dwell_s), range_m, unknowns)
 
@@ -124,8 +162,15 @@ def moving_point_velocity(
     u_a_m_s: float | None = None,
     range_m: float | None = None,
 ) -> MigratingLines:
-    """The recommended estimator of velocity and place, without prior knowledge but of how far to search (u_r
-    null: three pulse rates wide). u_a_m_s: where it is known.
+    """The recommended estimator of velocity and position; only how far to search is known.
+
+    Args:
+        dwell_s: How long targets are seen, in s; None for the pattern of the elements.
+        u_r_reach_m_s: How far u_r is sought in m/s; None for three pulse rates.
+        u_a_reach_m_s: How far u_a is sought in m/s.
+        y0_reach_m: How far the position is sought in metres.
+        u_a_m_s: u_a in m/s where it is known.
+        range_m: Closest range of data without a range axis; None for the radar's.
     """
     reach = 1.5 * radar.ambiguous_velocity_m_s if u_r_reach_m_s is None else u_r_reach_m_s
     return MigratingLines(
@@ -147,6 +192,14 @@ def intensity_ratio(
 
     search_m_s: least and largest velocity, null for all that is unambiguous; mmse serves where an
     inverse is singular.
+
+    Args:
+        bandwidth_hz: Doppler bandwidth of the target in Hz.
+        bands: Doppler bands of one PRF that are separated.
+        method: "least_squares", or "mmse" where an inverse may be singular.
+        search_m_s: Least and largest velocity; None for all that is unambiguous.
+        step_m_s: Step of the search in m/s.
+        range_m: Closest range of data without a range axis; None for the radar's.
     """
     rebuild = _rebuild(bands, method)
     return SignalIntensityRatio(radar, bandwidth_hz, rebuild, search_m_s, step_m_s, range_m)
@@ -164,6 +217,15 @@ def alternate_velocity(
 ) -> MigratingLines:
     """u_r by the signal intensity ratio and u_a by autofocus in turn, as the paper does (Remote
     Sens. 2020, 12, 1703, section 4.3); mmse where an inverse may be singular.
+
+    Args:
+        bandwidth_hz: Doppler bandwidth of the target in Hz.
+        dwell_s: How long targets are seen, in s; None for the pattern of the elements.
+        bands: Doppler bands of one PRF that are separated.
+        method: "least_squares", or "mmse" where an inverse may be singular.
+        rounds: How often both are estimated.
+        step_m_s: Step of the search for u_r in m/s.
+        half_m_s: Half of the interval in which u_a is sought, in m/s.
     """
     ratio, autofocus = (
         intensity_ratio(radar, bandwidth_hz, bands, method, step_m_s=step_m_s),
@@ -204,8 +266,8 @@ def movers_image(
     u_a_reach_m_s: float = 20.0,
     suppressed_m_s: Sequence[float] = Detector().suppressed_m_s,
 ) -> MoversImage:
-    """The flow of Remote Sens. 2020, 12, 1703, Fig. 13: the image of every frame with moving targets
-    at their positions, and what they are.
+    """The flow of Remote Sens. 2020, 12, 1703, Fig. 13: the image of every frame with moving
+    targets at their positions, and what they are.
     """
     extraction = Extraction(half_along_m, half_range_m, integration_s, segment_s)
     detector = Detector(threshold_db, most=most, suppressed_m_s=suppressed_m_s)

@@ -79,19 +79,34 @@ def rotation_and_phase(
 
 
 def jitter_lagrange(points: int = 4, offset_samples: list[float] | None = None) -> CorrectJitter:
-    """Jitter correction by Lagrange interpolation through this many points."""
+    """Jitter correction by Lagrange interpolation through this many points.
+
+    Args:
+        points: Number of points of the interpolation.
+        offset_samples: Offsets of one period in samples, where they are known.
+    """
     return CorrectJitter(_tensor(offset_samples), Lagrange(points))
 
 
 def jitter_band_limited(
     points: int = 8, band: float = 0.95, offset_samples: list[float] | None = None
 ) -> CorrectJitter:
-    """Jitter correction by the best local weights for a signal of this band."""
+    """Jitter correction by the best local weights for a signal of this band.
+
+    Args:
+        points: Number of points of the interpolation.
+        band: Occupied share of the sampling rate.
+        offset_samples: Offsets of one period in samples, where they are known.
+    """
     return CorrectJitter(_tensor(offset_samples), BandLimited(points, band))
 
 
 def jitter_exact(offset_samples: list[float] | None = None) -> CorrectJitter:
-    """Jitter correction by exact periodic non-uniform reconstruction."""
+    """Jitter correction by exact periodic non-uniform reconstruction.
+
+    Args:
+        offset_samples: Offsets of one period in samples, where they are known.
+    """
     return CorrectJitter(_tensor(offset_samples), Exact())
 
 
@@ -112,6 +127,14 @@ def channel_response(
 
     The phase is taken without its constant and linear parts: these are a phase and a shift of the
     whole scene, which nothing can tell from the scene's own.
+
+    Args:
+        quadratic_rad: Quadratic phase at the band edge in radians.
+        cubic_rad: Cubic phase at the band edge in radians.
+        ripple_rad: Amplitude of the phase ripple in radians.
+        ripple_cycles: Cycles of the ripples over the band.
+        slope_db: Gain difference of the band edges in dB.
+        amplitude_ripple_db: Amplitude of the gain ripple in dB.
     """
 
     def curve(u: Tensor) -> Tensor:
@@ -163,17 +186,30 @@ def estimate_response(radar: StripmapRadar, method: Literal["sharpest", "points"
 def vibration(name: str, unit: Literal["mm", "um"]) -> Sinusoid:
     """Sinusoidal vibration by its published name amplitude_frequency_phase (1_100_90), the
     amplitude in `unit`.
+
+    Args:
+        name: Amplitude, frequency in Hz and phase in degrees, such as 1_100_90.
+        unit: Unit of the amplitude.
     """
     return Sinusoid.named(name, unit=unit)
 
 
 def drift(velocity_m_s: Tensor | float = 0.0, acceleration_m_s2: Tensor | float = 0.0) -> Polynomial:
-    """Constant velocity and acceleration along the line of sight, d = v t + a t^2 / 2."""
+    """Constant velocity and acceleration along the line of sight, d = v t + a t^2 / 2.
+
+    Args:
+        velocity_m_s: Velocity in m/s, receding positive.
+        acceleration_m_s2: Acceleration in m/s^2.
+    """
     return Polynomial((velocity_m_s, acceleration_m_s2 / 2))
 
 
 def measured_track(file: str) -> MeasuredTrack:
-    """A displacement (m) over time (s) from a file of two columns, text, .csv, .npy or .npz."""
+    """A displacement (m) over time (s) from a file of two columns, text, .csv, .npy or .npz.
+
+    Args:
+        file: Path of the file.
+    """
     return MeasuredTrack.from_file(file)
 
 
@@ -243,6 +279,16 @@ def clock_errors(
 ) -> SynchronisationError:
     """Clocks that drift apart: polynomials c0, c1, ... over seconds, sinusoids and a random walk
     from pulse to pulse; recorded beside a direct path that shows them.
+
+    Args:
+        phase_rad: Polynomial of the phase in rad, rad/s, ...
+        phase_sinusoid_rad: Amplitude of a sinusoidal phase in radians.
+        phase_walk_rad: Standard deviation of the steps of a random walk in radians.
+        delay_s: Polynomial of the delay in s, s/s, ...
+        delay_sinusoid_s: Amplitude of a sinusoidal delay in seconds.
+        sinusoid_hz: Frequency of the sinusoids in Hz.
+        direct_snr_db: Signal-to-noise ratio of the direct path in dB; None for none.
+        direct_samples: Samples of the direct path.
     """
     phase = [
         PolynomialDrift(phase_rad or [0.0]),

@@ -1,7 +1,7 @@
 """Numbers of radar and world that no system can use: most often a unit that was mistaken.
 
-Each number with a unit has a range that goes to the ends of what instruments and scenes can be. Inside
-these ranges, numbers must fit one another: relations of them are products of powers.
+Each number with a unit has a range that goes to the ends of what instruments and scenes can be.
+Inside these ranges, numbers must fit one another: relations of them are products of powers.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class Relation:
     factor: float = 1.0
 
 
-# The limits are a hundred times wider than what gives good images; impaired and tiny scenes are usable.
+# limits a hundred times wider than what gives good images: impaired and tiny scenes are usable
 _CARRIER, _PRF, _RANGE = "radar.carrier_hz", "radar.prf_hz", "radar.reference_range_m"
 _RELATIONS = (
     *(Relation("the share of time that a pulse takes", {pulse: 1, _PRF: 1}, high=1.0)

@@ -196,9 +196,8 @@ class Catalogue:
         if name == AUTO:
             return entry
         if not isinstance(name, str) or name not in self.entries:
-            raise ConfigError(
-                f"{file}: {where}.{self.key} names an unknown {self.what} {name!r}{did_you_mean(str(name), self.entries)}"
-            )
+            hint = did_you_mean(str(name), self.entries)
+            raise ConfigError(f"{file}: {where}.{self.key} names an unknown {self.what} {name!r}{hint}")
         return {self.key: name, **self.sections[name].check(rest, where, file)}
 
     def make(self, entry: Mapping[str, Any], where: str, file: str, given: Given = _NOTHING, **context: Any) -> Any:
