@@ -1,120 +1,62 @@
-"""Configs of targets that turn unevenly: run, sweep, requires and trade; limits and fidelity rows
-by their formulas.
+"""Targets with non-uniform rotation: what is theirs alone in the frame of all systems; limits and
+neglected phases by their formulas.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-import yaml
-from torchsar.study.config import load
-from torchsar.study.rotation.judge import cut_through
-from torchsar.study.rotation.requires import heed_limits
-from torchsar.study.rotation.trials import RotationTrials, run_batch
 
-from torchsar.cli import main
+from tests.study.scenes import FOUND_ROTATION, ISAL_ROTATION, bench_of, loaded_as, world
 from torchsar.core import Axis, Draws, Signal
 from torchsar.focus.rotation_requirements import least_order, rotation_limits, rotation_requirements
+from torchsar.metrics.rotation import cross_range_cut
 from torchsar.radar import LIGHT_M_S, InverseRadar
+from torchsar.study.commands.sweep import SweepTrial
 from torchsar.study.montecarlo import sweep
-from torchsar.study.settings.errors import ConfigError
-from torchsar.study.systems import system_of
 
-TRUE = {"omega_rad_s": 0.02, "warp_k": [10.0, 1000.0]}
-TAKEN_OUT = {
-    "range": {"stage": "range_phase", "uses": dict.fromkeys(("omega_rad_s", "warp_k", "yc_m"), "rotation")},
-    "image": {"stage": "matched_fourier", "uses": {"warp_k": "rotation"}},
-}
-KNOWN = {"range": {"stage": "range_phase", **TRUE}, "image": {"stage": "matched_fourier", "warp_k": TRUE["warp_k"]}}
 BOX = {"low": [0.018, 9.0, 900.0], "high": [0.022, 11.0, 1100.0]}
-TINY: dict = {
-    "system": "isal_rotation",
-    "title": "tiny satellite",
-    "seed": 3,
-    "radar": {"wavelength_m": 1.55e-6, "bandwidth_hz": 624.567621e6, "prf_hz": 50e3, "reference_range_m": 100e3},
-    "world": {
-        "pulses": 1000,
-        "samples": 32,
-        "trials": 2,
-        "scene": {"satellite": {"kind": "satellite", "count": 60, "half_width_m": 0.6}},
-        "rotation": {"omega_rad_s": 0.02, "k": [10.0, 1000.0]},
-        "noise": {"snr_db": 20.0},
-    },
-    "processor": {
-        "ideal": {"input": "clean", "stages": KNOWN},
-        "none": {"stages": {"image": {"stage": "matched_fourier"}}},
-        "coarse": {"stages": {"rotation": {"stage": "rotation_coarse"}, "image": TAKEN_OUT["image"]}},
-        "genetic": {
-            "stages": {"rotation": {"stage": "rotation_genetic", **BOX, "population": 6, "generations": 3}, **TAKEN_OUT}
-        },
-        "recommended": {"stages": {"rotation": {"stage": "rotation"}, **TAKEN_OUT}},
-    },
-    "metrics": {"reference": "ideal", "published": {"omega_error_percent": {"centred": {"genetic": 1.0}}}},
-    "trade": {
-        "taps": [4, 6],
-        "kernel_oversamplings": [2.0],
-        "scatterers": [5],
-        "rounds": [1],
-        "population": 6,
-        "generations": 2,
-        "precisions": ["complex64"],
-    },
-}
-FEW = {name: TINY["processor"][name] for name in ("ideal", "recommended")}
 
 
-def write(folder: Path, **changes: object) -> str:
-    tree = {key: value for key, value in {**TINY, **changes}.items() if value is not None}
-    path = folder / "turning.yaml"
-    path.write_text(yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
-    return str(path)
+def outcomes_of(folder: Path, *overrides: str, trials: int = 2, **changes: object):
+    bench = bench_of(folder, "isal_rotation", *overrides, **changes)
+    return bench, bench.batch(Draws(bench.config.seed, "run", range(trials)), detail=True).outcomes
 
 
-def run(config: str, out: Path, *overrides: str) -> dict:
-    assert main(["run", config, *overrides, "--out", str(out)]) == 0
-    return json.loads((out / "metrics.json").read_text(encoding="utf-8"))
-
-
-def test_a_run_compares_methods_over_cases_and_scenes(tmp_path: Path) -> None:
-    config = write(tmp_path, cases={"centred": {"seed": 3}, "off centre": {"world.centre_deviation_m": 1.5}})
-    metrics = run(config, tmp_path / "out")
-    methods = metrics["methods"]
-    best, none, coarse = (methods[name]["cases"]["centred"] for name in ("recommended", "none", "coarse"))
+def test_rotations_are_found_and_images_reach_the_ideal(tmp_path: Path) -> None:
+    genetic = {"rotation": {"stage": "rotation_genetic", **BOX, "population": 6, "generations": 3}, **FOUND_ROTATION}
+    processor = {**ISAL_ROTATION["processor"], "genetic": {"stages": genetic}}
+    _, outcomes = outcomes_of(tmp_path, processor=processor)
+    found = {n: {k: float(v.double().mean()) for k, v in o.metrics.items()} for n, o in outcomes.items()}
+    best, none, coarse = (found[name] for name in ("recommended", "none", "coarse"))
     assert abs(best["omega_error_percent"]) < 5 and abs(best["k1_error_percent"]) < 0.5 and best["ok"] == 1.0
     assert abs(best["entropy_above_ideal_nats"]) < 0.05 < none["entropy_above_ideal_nats"]
     assert abs(best["cross_range_scale_error_percent"] + best["omega_error_percent"]) < 0.5
-    assert abs(methods["recommended"]["cases"]["off centre"]["yc_error_m"]) < 0.2
-    assert (
-        "omega_error_percent" not in coarse and "yc_error_m" not in coarse and abs(coarse["k1_error_percent"]) < 15
-    )  # it says nothing of the rate
-    assert methods["genetic"]["metrics"]["evaluations"] > 6 and "yc_error_m" not in methods["genetic"]["metrics"]
-    told = methods["recommended"]["estimates"]["off centre/yc_m"]
-    assert len(told["value"]) == len(told["std"]) == len(told["ok"]) == 2 and np.allclose(told["value"], 1.5, atol=0.3)
-    assert set(methods["recommended"]["estimates"]) >= {
-        f"centred/{name}" for name in ("omega_rad_s", "k1_per_s", "k2_per_s2", "yc_m")
-    }
-    assert metrics["truth"]["centred/k2_per_s2"] == [1000.0, 1000.0]
-    assert "centred, published" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert len(list((tmp_path / "out" / "figures").glob("*.png"))) == 9
-    again = load(str(tmp_path / "out" / "config.yaml"))  # what was resolved can be run again
-    system_of(again).check(again)
+    # it says nothing of the rate
+    assert "omega_error_percent" not in coarse and "yc_error_m" not in coarse and abs(coarse["k1_error_percent"]) < 15
+    assert found["genetic"]["evaluations"] > 6 and "yc_error_m" not in found["genetic"]
+
+
+def test_a_range_centre_deviation_is_found(tmp_path: Path) -> None:
+    processor = {"recommended": ISAL_ROTATION["processor"]["recommended"]}
+    bench, outcomes = outcomes_of(tmp_path, "world.centre_deviation_m=1.5", processor=processor, metrics=None)
+    assert float(outcomes["recommended"].metrics["yc_error_m"].abs().max()) < 0.3
+    table = bench.system.found(bench, outcomes["recommended"], bench.trials(Draws(3, "run", range(2))))
+    assert {f"rotation.{key}" for key in ("omega_rad_s", "k1_per_s", "k2_per_s2", "yc_m")} <= set(table)
+    assert np.allclose(table["rotation.yc_m"].value, 1.5, atol=0.3)
 
 
 def test_scene_and_noise_have_seeds_of_their_own(tmp_path: Path) -> None:
-    config = write(
-        tmp_path, processor={"recommended": {"stages": {"image": {"stage": "matched_fourier"}}}}, metrics=None
-    )
+    processor = {"recommended": {"stages": {"image": {"stage": "matched_fourier"}}}}
 
     def drawn(*overrides: str) -> tuple[torch.Tensor, torch.Tensor]:
-        loaded = load(config, overrides)
-        truth = run_batch(RotationTrials(loaded).bench({}), Draws(loaded.config.seed, "run", range(2))).truth
-        assert truth.clean is not None
-        return truth.values["range_m"], truth.clean.signal.data
+        bench = bench_of(tmp_path, "isal_rotation", *overrides, processor=processor, metrics=None)
+        trials = bench.trials(Draws(bench.config.seed, "run", range(2)))
+        return trials.truth["range_m"], trials.clean.signal.data
 
     free, one, other = drawn(), drawn("world.scene_seed=5"), drawn("world.scene_seed=5", "seed=9")
     # scenes follow the seed and differ from trial to trial
@@ -128,21 +70,9 @@ def test_scene_and_noise_have_seeds_of_their_own(tmp_path: Path) -> None:
 
 def test_trials_of_a_sweep_do_not_depend_on_their_batch_and_stay_above_the_bound(tmp_path: Path) -> None:
     processor = {"recommended": {"stages": {"rotation": {"stage": "rotation"}}}}
-    trial = RotationTrials(
-        load(
-            write(
-                tmp_path,
-                processor=processor,
-                metrics=None,
-                precision="complex128",
-                sweep={"world.noise.snr_db": [0.0, 20.0]},
-            )
-        )
-    )
-    records = [
-        sweep(trial, {"world.noise.snr_db": [0.0, 20.0]}, batched=["world.noise.snr_db"], trials=4, seed=3, chunk=chunk)
-        for chunk in (1, 8)
-    ]
+    changes = {"processor": processor, "metrics": None, "precision": "complex128"}
+    trial, key = SweepTrial(loaded_as(tmp_path, "isal_rotation", **changes)), "world.noise.snr_db"
+    records = [sweep(trial, {key: [0.0, 20.0]}, batched=[key], trials=4, seed=3, chunk=chunk) for chunk in (1, 8)]
     for name, values in records[0].metrics.items():
         if name != "seconds":
             np.testing.assert_allclose(values, records[1].metrics[name], atol=1e-5, rtol=1e-4, err_msg=name)
@@ -156,156 +86,45 @@ def test_trials_of_a_sweep_do_not_depend_on_their_batch_and_stay_above_the_bound
         assert (predicted > 0.5 * bound).all() and (predicted[0] < 3 * bound[0]).all(), name
 
 
-def test_a_sweep_by_command(tmp_path: Path) -> None:
-    grid = {
-        "world.rotation.k": {"even": [0.0, 0.0], "uneven": [10.0, 1000.0]},
-        "trials": 1,
-        "success": {"omega_error_percent": 10.0},
-    }
-    config = write(tmp_path, sweep=grid, processor=FEW)
-    assert main(["sweep", config, "--out", str(tmp_path / "sweep")]) == 0
-    points = json.loads((tmp_path / "sweep" / "summary.json").read_text(encoding="utf-8"))["points"]
-    by = {(p["metric"], p["parameters"]["world.rotation.k"]): p for p in points if p["algorithm"] == "recommended"}
-    assert (
-        by["k1_error_percent", "uneven"]["n"] == by["k1_error_per_s", "even"]["n"] == 1
-    )  # of a true 0 there is no percentage
-    assert by["k1_error_percent", "even"]["n"] == 0 and abs(by["k1_error_per_s", "even"]["mean"]) < 0.5
-
-
-def test_requires_names_order_and_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["requires", write(tmp_path), "--out", str(tmp_path / "needs")]) == 0
-    assert "the simplest model that this scene allows: order 3, phase_only" in capsys.readouterr().out
-    needs = json.loads((tmp_path / "needs" / "requires.json").read_text(encoding="utf-8"))["turning"]
-    assert needs["order"] == 3 and all(row["verdict"] == "ok" for row in needs["limits"])
-    assert main(["requires", write(tmp_path), "world.rotation.k=[0.0, 0.0]"]) == 0
-    assert "order 1, phase_only" in capsys.readouterr().out
-
-
-def test_trade_sets_orders_kernels_estimators_and_precisions_side_by_side(tmp_path: Path) -> None:
-    assert main(["trade", write(tmp_path), "--out", str(tmp_path / "trade")]) == 0
-    tables = json.loads((tmp_path / "trade" / "trade.json").read_text(encoding="utf-8"))
-    entropies = [row["entropy_nats"] for row in tables["order"]]
-    assert entropies[0] > entropies[1] > entropies[2] == entropies[3] and entropies[7] == entropies[6] < entropies[2]
-    rows = {row["name"]: row for table in ("gridding", "estimators", "precision") for row in tables[table]}
-    assert rows["the sum itself"]["entropy_error_nats"] == 0.0
-    assert (
-        rows["6 taps, grid x2, complex64"]["image_error_db"]
-        < rows["4 taps, grid x2, complex64"]["image_error_db"]
-        < -60
-    )
-    assert rows["recommended"]["k1_error_percent"] < rows["coarse"]["k1_error_percent"]
-    assert rows["coarse"]["omega_error_percent"] is None and rows["recommended, complex64"]["k1_error_percent"] < 0.5
-    assert len(list((tmp_path / "trade" / "figures").glob("*.png"))) == 4
-
-
-def _method(**stages: dict) -> dict:
-    return {
-        "processor": {"ideal": TINY["processor"]["ideal"], "recommended": {"stages": KNOWN}, "odd": {"stages": stages}}
-    }
-
-
-def _world(**changes: object) -> dict:
-    return {"world": {**TINY["world"], **changes}, "processor": FEW}
-
-
-def _points(x: list[float], y: list[float]) -> dict:
-    return {"scene": {"points": {"kind": "points", "azimuth_m": x, "range_m": y}}}
-
-
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"radar": {**TINY["radar"], "carrier_hz": 1.9e14}}, "give one of wavelength_m and carrier_hz"),
-        (
-            {"radar": {key: value for key, value in TINY["radar"].items() if key != "wavelength_m"}},
-            "give one of wavelength_m and carrier_hz",
-        ),
-        (_world(rotation={"omega_rad_s": 0.0}), "key 'world.rotation.omega_rad_s' has the value 0.0"),
-        (_world(rotation={"omega_rad_s": 0.02, "k1": 10.0}), "key 'world.rotation.k1' is not known"),
-        (_world(rotation={"omega_rad_s": 0.02, "k": [-100.0, 2000.0]}), "two times share an angle"),
-        (_world(rotation_rad_s=0.02), "world.rotation_rad_s"),
-        (
-            _world(scene={"satellite": {"kind": "satellite", "count": 60, "half_width_m": 1.0}}),
-            "Doppler over half the pulse rate is 1.445",
-        ),
-        (
-            _world(**_points([0.05, 0.1, 0.2, 0.3], [0.0, 0.0, 0.0, 0.0])),
-            "range term, pi lambda sigma_y / ra^2 is 0 rad, and must be at least 1 rad: the rate",
-        ),
-        (_world(**_points([0.1, 0.2], [1.0, 2.0])), "scatterers above the noise is 2, and must be at least 3"),
-        ({"beyond_limits": ["recomended"]}, "beyond_limits names the method 'recomended'"),
-        (
-            _method(rotation={"stage": "rotation"}),
-            "processor.odd, whose last stage gives the axes ('pulse', 'range'), not an image",
-        ),
-        (_method(image={"stage": "matched_fourier", "uses": {"warp_k": "rotation"}}), "rotation"),
-        (
-            _method(
-                rotation={"stage": "rotation_genetic", "low": [0.018, 9.0], "high": [0.022, 11.0]},
-                image={"stage": "matched_fourier"},
-            ),
-            "needs the 3 values omega_rad_s, k1_per_s, k2_per_s2",
-        ),
-        ({"metrics": {"reference": "none"}}, "name a method with 'input: clean'"),
-        (
-            {
-                **_world(**_points([-0.3, 0.1, 0.2], [1.0, -1.0, 2.0])),
-                "metrics": {"reference": "ideal", "search_m": 1e-6},
-            },
-            "widen metrics.search_m",
-        ),
-    ],
-)
-def test_mistakes_are_named(tmp_path: Path, changes: dict, said: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run", write(tmp_path, **changes), "--out", str(tmp_path / "out")]) == 2
-    assert said in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_method_may_be_shown_beyond_its_limits(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    world = _world(**_points([0.05, 0.1, 0.2, 0.3], [0.0, 0.0, 0.0, 0.0]))
-    with pytest.raises(ConfigError, match=r"processor\.recommended: range term"):
-        heed_limits(load(write(tmp_path, **world)), "")
-    heed_limits(load(write(tmp_path, **world, beyond_limits=["recommended"])), "odd")
-    assert "cases.odd: range term" in caplog.text
-
-
-def test_recordings_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    np.savez(tmp_path / "record.npz", profiles=np.zeros((4, 4), np.complex64))
-    for command in ("run", "requires", "trade"):
-        assert (
-            main([command, write(tmp_path), f"data.file={tmp_path / 'record.npz'}", "--out", str(tmp_path / "other")])
-            == 2
-        )
-        assert "leave data.file out" in capsys.readouterr().err
-
-
-def test_listing_knows_the_experiments(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["list"]) == 0
-    said = capsys.readouterr().out
-    assert all(
-        name in said
-        for name in (
-            "isal_rotation_points",
-            "isal_satellite",
-            "isal_corner_cubes",
-            "isal_rotation_snr",
-            "rotation_and_phase",
-            "satellite",
-        )
-    )
+def test_of_a_true_zero_there_is_no_percentage(tmp_path: Path) -> None:
+    """Cases of one sweep: a constant rate has an error of k1 in 1/s, any other one in percent."""
+    processor = {"recommended": {"stages": {"rotation": {"stage": "rotation"}}}}
+    laws = {"constant": [0.0, 0.0], "changing": [10.0, 1000.0]}
+    rows = {}
+    for name, law in laws.items():
+        turning = world("isal_rotation", rotation={"omega_rad_s": 0.02, "k": law})
+        bench = bench_of(tmp_path, "isal_rotation", world=turning, processor=processor, metrics=None)
+        rows[name] = bench.batch(Draws(3, "zero", [0])).outcomes["recommended"].metrics
+    assert torch.isnan(rows["constant"].get("k1_error_percent", torch.tensor(torch.nan))).all()
+    assert abs(float(rows["constant"]["k1_error_per_s"])) < 0.5
+    assert torch.isnan(rows["changing"].get("k1_error_per_s", torch.tensor(torch.nan))).all()
+    assert abs(float(rows["changing"]["k1_error_percent"])) < 1
 
 
 def test_a_cut_measures_a_sinc() -> None:
     along, across = Axis("cross range", 400, -200 * 0.4, 0.4, "m"), Axis("range", 3, -1.0, 1.0, "m")
     x, width = along.values() - 7.3, 0.8  # half a cell a line, between lines
     line = torch.sinc(x / width) * torch.polar(torch.ones_like(x), math.pi * 0.5 * (x / 0.4))
-    figures = cut_through(
-        Signal(torch.stack([0 * line, 3 * line, 0 * line], -1), (along, across)), 7.2, 0.2, 20.0, 0.25
-    ).figures
+    image = Signal(torch.stack([0 * line, 3 * line, 0 * line], -1)[None], (along, across))
+    at, unit = (torch.tensor([value], dtype=torch.float64) for value in (7.2, 1.0))
+    cut = cross_range_cut(image, at, torch.tensor([0.2], dtype=torch.float64), unit, 20.0, 0.25)
+    assert cut is not None
+    figures = {name: float(value) for name, value in cut.figures.items()}
     assert figures["peak"] == pytest.approx(3.0, rel=2e-3)
     assert figures["irw_azimuth_m"] == pytest.approx(0.886 * width, rel=5e-3)
     assert figures["pslr_azimuth_db"] == pytest.approx(-13.26, abs=0.05)
+
+
+def test_a_point_beyond_the_search_is_named(tmp_path: Path) -> None:
+    few = {"points": {"kind": "points", "azimuth_m": [-0.3, 0.1, 0.2], "range_m": [1.0, -1.0, 2.0]}}
+    processor = {name: ISAL_ROTATION["processor"][name] for name in ("ideal", "none")}
+    processor["recommended"] = processor["none"]
+    metrics = {"reference": "ideal", "search_m": 1e-6}
+    _, outcomes = outcomes_of(
+        tmp_path, world=world("isal_rotation", scene=few), processor=processor, metrics=metrics, trials=1
+    )
+    judged = outcomes["recommended"].judged
+    assert set(judged.outside) | set(judged.targets) == {"points.0", "points.1", "points.2"} and judged.outside
 
 
 RADAR = InverseRadar(LIGHT_M_S / 1.55e-6, 624.567621e6, 500e3)

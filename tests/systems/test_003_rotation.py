@@ -6,29 +6,26 @@ cubes, estimates against the bound.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 
 import pytest
-import torch
-from torchsar.study.config import Loaded, load
-from torchsar.study.rotation.trials import Batch, RotationTrials, error_bounds, run_batch, target_figures
+from torch import Tensor
 
 from torchsar.core import Draws
-
-
-def kept(loaded: Loaded, methods: Sequence[str]) -> Loaded:
-    processor = {name: loaded.config.processor[name] for name in methods}
-    return replace(loaded, config=loaded.config.model_copy(update={"processor": processor}))
+from torchsar.study.table import load
+from torchsar.study.trials.batch import Batch
+from torchsar.study.trials.bench import Bench
 
 
 def batch(
-    config: str, methods: Sequence[str], overrides: Sequence[str] = (), trials: int = 1, cuts: bool = False
-) -> tuple[Loaded, Batch]:
-    loaded = kept(load(config, overrides), methods)
-    bench = RotationTrials(loaded).bench({})
-    with torch.no_grad():
-        return loaded, run_batch(bench, Draws(loaded.config.seed, "run", range(trials)), cuts=cuts)
+    config: str, methods: Sequence[str], overrides: Sequence[str] = (), trials: int = 1, detail: bool = False
+) -> tuple[Bench, Batch]:
+    bench = Bench(load(config, overrides))
+    return bench, bench.batch(Draws(bench.config.seed, "run", range(trials)), methods=methods, detail=detail)
+
+
+def metrics_of(made: Batch) -> dict[str, Mapping[str, Tensor]]:
+    return {name: outcome.metrics for name, outcome in made.outcomes.items()}
 
 
 # peak (dB), width (mm; None where a smear has none) and PSLR (dB) at -12, 0 and 12 m; brief 003,
@@ -42,8 +39,8 @@ POINTS = {
 
 
 def test_three_points_reach_the_figures_of_figs_2_and_3() -> None:
-    _, made = batch("isal_rotation_points", ["ideal", "none", *POINTS], cuts=True)
-    figures = target_figures(made, "ideal")
+    _, made = batch("isal_rotation_points", ["ideal", "none", *POINTS], detail=True)
+    figures, metrics = {n: o.judged.targets for n, o in made.outcomes.items()}, metrics_of(made)
     for method, targets in POINTS.items():
         for target, (peak, width, pslr) in targets.items():
             found = figures[method][target]
@@ -53,10 +50,10 @@ def test_three_points_reach_the_figures_of_figs_2_and_3() -> None:
     for target in ("points.0", "points.2"):
         assert float(figures["none"][target]["peak_db"]) == pytest.approx(-29.7, abs=0.3)
     assert float(figures["none"]["points.1"]["peak_db"]) == pytest.approx(-4.1, abs=0.3)
-    fitted = made.metrics["second_order_azimuth"]["k1_error_percent"]
+    fitted = metrics["second_order_azimuth"]["k1_error_percent"]
     # a second-order fit is k1 + k2 T / 2 = 20, not k1
     assert float(fitted) == pytest.approx(100, abs=5)
-    assert abs(float(made.metrics["recommended"]["k1_error_percent"])) < 0.01
+    assert abs(float(metrics["recommended"]["k1_error_percent"])) < 0.01
 
 
 def test_entropy_falls_with_the_order_and_uniform_autofocus_fails() -> None:
@@ -73,24 +70,24 @@ def test_entropy_falls_with_the_order_and_uniform_autofocus_fails() -> None:
         "recommended",
     ]
     _, made = batch("isal_satellite", methods)
-    entropy = {name: float(row["entropy_nats"]) for name, row in made.metrics.items()}
+    entropy = {name: float(row["entropy_nats"]) for name, row in metrics_of(made).items()}
     order = [entropy[name] for name in ("none", "second_order_azimuth", "third_order_azimuth", "third_order_2d")]
     assert order == sorted(order, reverse=True) and order[0] - order[3] > 3 and order[1] - order[3] > 2
     assert min(entropy["pga"], entropy["uniform_autofocus"]) > order[3] + 3
     assert abs(entropy["recommended"] - order[3]) < 0.01 and abs(entropy["phase_fit"] - order[3]) < 0.02
-    best = {key: float(value) for key, value in made.metrics["recommended"].items()}
+    best = {key: float(value) for key, value in metrics_of(made)["recommended"].items()}
     assert (
         abs(best["omega_error_percent"]) < 1
         and max(abs(best["k1_error_percent"]), abs(best["k2_error_percent"])) < 0.02
         and abs(best["yc_error_m"]) < 0.05
     )
-    assert bool(best["ok"]) and not bool(made.metrics["pga"]["ok"])
+    assert bool(best["ok"]) and not bool(metrics_of(made)["pga"]["ok"])
 
 
 def test_corner_cubes_need_both_estimators_in_turn() -> None:
     methods = ["ideal", "none", "autofocus", "autofocus_second_order", "autofocus_third_order", "recommended"]
     _, made = batch("isal_corner_cubes", methods, trials=2)
-    above = {name: row["entropy_above_ideal_nats"] for name, row in made.metrics.items() if name != "ideal"}
+    above = {name: row["entropy_above_ideal_nats"] for name, row in metrics_of(made).items() if name != "ideal"}
     assert bool(
         (above["none"] > above["autofocus"]).all() and (above["autofocus"] > above["autofocus_second_order"]).all()
     )
@@ -99,25 +96,24 @@ def test_corner_cubes_need_both_estimators_in_turn() -> None:
         and (above["autofocus_third_order"] > above["recommended"] + 1).all()
     )
     assert float(above["recommended"].abs().max()) < 0.1
-    assert float(made.metrics["recommended"]["omega_error_percent"].abs().max()) < 3
+    assert float(metrics_of(made)["recommended"]["omega_error_percent"].abs().max()) < 3
 
 
 def test_recommended_errors_stay_near_the_bound_on_new_scenes() -> None:
-    loaded, made = batch("isal_rotation_snr", ["recommended"], ["seed=77", "world.noise.snr_db=5.0"], trials=6)
-    table = RotationTrials(loaded).bench({}).table
-    bounds = error_bounds(table, made.truth, free_centre=True)
+    bench, made = batch("isal_rotation_snr", ["recommended"], ["seed=77", "world.noise.snr_db=5.0"], trials=6)
+    bounds = bench.system.bounds(bench, made)
     for name in ("omega_error_percent", "k1_error_percent", "k2_error_percent", "yc_error_m"):
         rms, least = (
-            float(x.square().mean().sqrt()) for x in (made.metrics["recommended"][name], bounds[name]["Cramer-Rao"])
+            float(x.square().mean().sqrt()) for x in (metrics_of(made)["recommended"][name], bounds[name]["Cramer-Rao"])
         )
         assert rms < 3 * least, (name, rms, least)
-    assert bool(made.metrics["recommended"]["ok"].all())
+    assert bool(metrics_of(made)["recommended"]["ok"].all())
 
 
 def test_ignored_centre_deviation_spoils_the_rate() -> None:
     _, made = batch("isal_rotation_yc", ["ignored", "recommended"], ["world.centre_deviation_m=-3.0"], trials=2)
-    assert float(made.metrics["ignored"]["omega_error_percent"].abs().max()) > 10
+    assert float(metrics_of(made)["ignored"]["omega_error_percent"].abs().max()) > 10
     assert bool(
-        (made.metrics["recommended"]["omega_error_percent"].abs() < 3).all()
-        and (made.metrics["recommended"]["yc_error_m"].abs() < 0.05).all()
+        (metrics_of(made)["recommended"]["omega_error_percent"].abs() < 3).all()
+        and (metrics_of(made)["recommended"]["yc_error_m"].abs() < 0.05).all()
     )

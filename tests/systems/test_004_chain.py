@@ -8,8 +8,9 @@ import json
 from pathlib import Path
 
 import pytest
-from torchsar.study.config import load
-from torchsar.study.stripmap.run import run
+
+from torchsar.study.commands.run import run
+from torchsar.study.table import load
 
 
 def metrics(out: Path) -> dict:
