@@ -156,9 +156,7 @@ class Points(World):
         noisy, truth = simulate_bistatic(radar, world, *size, rows, kind=self.kind, dtype=dtype, device=device)
         assert truth.clean is not None
         if self.sea is not None:
-            noisy = replace(
-                noisy, signal=noisy.signal.with_data(noisy.signal.data + own._sea(rows, snr, truth, noisy))
-            )
+            noisy = replace(noisy, signal=noisy.signal.with_data(noisy.signal.data + own._sea(rows, snr, truth, noisy)))
         values = {name: value[..., 0] for name, value in truth.values.items() if name in TRUTHS}
         named = {
             f"{target}.{name}": x.reshape(count, -1)[:, i]

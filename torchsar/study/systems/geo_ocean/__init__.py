@@ -29,9 +29,6 @@ from torchsar.study.trials.batch import IMAGE, Batch, Found, Judged, Outcome, Re
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.system import Choice, Column, System
 
-# the largest tensors of a frame over its raw data: images of twice the lines, and segments of ships
-_PEAK = 40.0
-
 
 @dataclass(frozen=True)
 class Judging:
@@ -68,7 +65,7 @@ class GeoOcean(System):
     Judging = Judging
     ending = "movers_image or stationary_image"
     truths = TRUTHS
-    peak = _PEAK
+    peak = 12.0
     tolerance = {"image_error_db": -20.0, "position_error_m": 10.0, "sea_error_db": -10.0}
     exact = {"transmit_range_remove.order": {"order": None}, "stationary_image.form": {"form": "stolt"}}
     definitions = {
