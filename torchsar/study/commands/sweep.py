@@ -169,7 +169,8 @@ def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
     loaded.system.check_sweep(loaded, given)
     grid = make_grid(given, [key for key in given if trial.may_differ(key)], f"{file}: sweep")
     for parameter in grid.parameters:
-        for value in parameter.values:
+        # values that share batches are finite numbers, and the config takes all of them or none
+        for value in parameter.values[:1] if parameter.batched else parameter.values:
             loaded.changed({parameter.name: value})
     for case in grid.cases():
         there = {stage for chain in trial.bench(case.fixed).chains.values() for stage in chain.stages}

@@ -30,9 +30,6 @@ from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Choice
 from torchsar.study.trials.system import Column, System
 
-# the largest tensors of a frame over its raw data: images of twice the lines, and segments of ships
-_PEAK = 40.0
-
 
 @dataclass(frozen=True)
 class Judging:
@@ -69,7 +66,7 @@ class GeoOcean(System):
     Judging = Judging
     ending = "movers_image or stationary_image"
     truths = TRUTHS
-    peak = _PEAK
+    peak = 12.0
     tolerance = {"image_error_db": -20.0, "position_error_m": 10.0, "sea_error_db": -10.0}
     exact = {"stationary_image.form": {"form": "stolt"}}
     definitions = {
