@@ -495,7 +495,7 @@ def _curves(
         )
     for i, (name, position) in enumerate((marks or {}).items()):
         axes.axvline(position, color=COLOURS[(len(series) + i) % len(COLOURS)], linestyle="--", linewidth=1, label=name)
-    axes.set(xlabel=xlabel, ylabel=ylabel, title=_wrapped(title, width))
+    axes.set(xlabel=xlabel, ylabel=textwrap.fill(ylabel, round(7 * width)), title=_wrapped(title, width))
     if ylim is not None:
         axes.set_ylim(*ylim)
     _legend_below(figure, axes)

@@ -1,4 +1,4 @@
-"""Reports of runs: numbers with prefixes, pictures to scale that show every target, wrapping panels."""
+"""Reports of runs: numbers with prefixes, pictures to scale, panels that wrap."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from torchsar.cli import main
 from torchsar.core import Axis, Signal
 from torchsar.metrics.cuts import about_peak, finer, impulse_cuts
 from torchsar.metrics.image import rolled_to
+from torchsar.metrics.impulse import impulse_response
 from torchsar.study.output.numbers import name_and_unit, number, quantity, scale_of
 from torchsar.study.output.pictures import draw_all
 from torchsar.study.output.report import run_fields
@@ -111,7 +112,8 @@ def test_text_has_nine_pixels_on_a_page_of_420() -> None:
     figures = [plot.image(signal), *plot.images({"a": signal, "b": signal}), *plot.panels([curve] * 3)]
     figures += [*plot.error_curves([part], "x", "y"), *plot.error_curves([part] * 4, "x", "y")]
     for figure in figures:
-        sizes = [text.get_fontsize() for text in figure.findobj(lambda o: hasattr(o, "get_fontsize")) if text.get_text()]
+        texts = figure.findobj(lambda one: hasattr(one, "get_fontsize"))
+        sizes = [text.get_fontsize() for text in texts if text.get_text()]
         assert min(sizes) / 72 * 386 / figure.get_figwidth() >= 9.0
 
 
@@ -133,7 +135,8 @@ def test_empty_panels_are_left_out_and_the_others_share_a_scale() -> None:
 
 
 def test_curves_of_like_size_share_a_panel() -> None:
-    curves = {name: (None, torch.tensor([0.0, size, math.nan])) for name, size in (("a", 1.0), ("b", 500.0), ("c", 3.0))}
+    sizes = {"a": 1.0, "b": 500.0, "c": 3.0}
+    curves = {name: (None, torch.tensor([0.0, size, math.nan])) for name, size in sizes.items()}
     assert [list(group) for group in plot.alike(curves)] == [["c", "a"], ["b"]]
     assert [len(group) for group in plot.alike(curves, largest=1)] == [1, 1, 1]
 
@@ -173,12 +176,14 @@ def test_cuts_show_ten_side_lobes_of_oversampled_responses() -> None:
     width = 2.4  # metres between nulls along azimuth: 24 samples
     along = torch.sinc((axes[0].values() - 51.2) / width)
     across = torch.sinc((axes[1].values() - 32.0) / 0.6)
-    cuts = impulse_cuts(Signal((along[:, None] * across).to(torch.complex128), axes), (51.2, 32.0))
+    response = Signal((along[:, None] * across).to(torch.complex128), axes)
+    cuts, measured = impulse_cuts(response, (51.2, 32.0)), impulse_response(response, (51.2, 32.0))
     for axis, spacing in (("azimuth", width), ("range", 0.6)):
         offset, line = cuts[axis]
         assert float(offset.min()) < -10.5 * spacing and float(offset.max()) > 10.5 * spacing
     offset, line = cuts["azimuth"]
-    assert (line.abs() - torch.sinc(offset / width).abs()).abs().max() < 0.02
+    from_centre = float(measured["position_azimuth_m"]) - 51.2 + offset
+    assert (line.abs() - torch.sinc(from_centre / width).abs()).abs().max() < 0.01
 
 
 def test_interpolated_parts_agree_with_the_samples() -> None:
@@ -254,6 +259,7 @@ def test_the_curve_of_the_velocity_search_has_its_minimum_at_the_estimate(
     assert main(["run", str(result / "config.yaml"), "--out", str(tmp_path / "again")]) == 0
     (series, _, _, _, marks) = next(args for args in drawn if args[1].startswith("effective velocity"))
     velocity, entropy = series["entropy"]
-    fine = np.abs(velocity - marks["estimate"]) <= 1.6 * np.diff(velocity).max()
-    assert fine.sum() >= 40
-    assert abs(velocity[entropy.argmin()] - marks["estimate"]) <= np.diff(velocity[fine]).max()
+    steps = np.diff(velocity)
+    fine = 1.01 * np.median(steps)
+    assert (steps <= fine).sum() >= 40 and steps.max() > 3 * fine
+    assert abs(velocity[entropy.argmin()] - marks["estimate"]) <= fine
