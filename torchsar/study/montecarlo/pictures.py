@@ -20,6 +20,7 @@ from torchsar.study.output.pictures import Drawn, Picture, draw_all
 # more panels in one figure are too small to read
 PANELS = 6
 
+
 def label_text(label: float | str) -> str:
     """A value of a parameter as results show it."""
     return label if isinstance(label, str) else f"{label:g}"
