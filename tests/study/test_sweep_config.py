@@ -116,12 +116,12 @@ def test_keys_of_any_kind_make_cases(load_tree) -> None:
 
 
 def test_the_log_says_what_is_batched(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    config = write_tiny(tmp_path, sweep={"world.noise.snr_db": [0.0], "world.beam.dwell_s": [0.1, 0.2], "trials": 1})
+    config = write_tiny(
+        tmp_path, sweep={"world.noise.snr_db": [0.0], "precision": ["complex64", "complex128"], "trials": 1}
+    )
     with caplog.at_level(logging.INFO, "torchsar"):
         assert main(["sweep", str(config), "--out", str(tmp_path / "result")]) == 0
-    assert (
-        "values that share batches: world.noise.snr_db (1); cases of their own: world.beam.dwell_s (2)" in caplog.text
-    )
+    assert "values that share batches: world.noise.snr_db (1); cases of their own: precision (2)" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -164,7 +164,7 @@ def test_an_interrupted_sweep_says_how_to_go_on_and_does(tmp_path: Path) -> None
             [*command, "--resume"], stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=mind_interrupts
         )
         assert running.stderr is not None
-        while "chunk" not in (line := running.stderr.readline()) and line:
+        while "trials/s" not in (line := running.stderr.readline()) and line:
             pass
         running.send_signal(stop)
         _, said = running.communicate(timeout=60)
@@ -232,7 +232,7 @@ def test_ctrl_c_with_workers_is_one_sentence(tmp_path: Path) -> None:
         command, stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=mind_interrupts, start_new_session=True
     )
     assert running.stderr is not None
-    while "chunk" not in (line := running.stderr.readline()) and line:
+    while "trials/s" not in (line := running.stderr.readline()) and line:
         pass
     time.sleep(1)
     os.killpg(running.pid, signal.SIGINT)  # as a terminal does, to all of them
