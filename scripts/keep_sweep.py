@@ -1,5 +1,5 @@
 """Keep what a finished sweep claims: RMSE, intervals, bounds and shares of its errors (and of
-metrics named besides), as a small file that tests check.
+metrics named besides), and the first trials of one point, as a small file that tests check.
 
 python scripts/keep_sweep.py out/stripmap_doppler docs/sweeps/stripmap_doppler.json python
 scripts/keep_sweep.py out/isal_snr docs/sweeps/isal_snr.json residual_phase_rms_rad
@@ -13,6 +13,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from torchsar.study import Record, read_sweep
+
 KEPT = ("algorithm", "parameters", "metric", "n", "median", "rmse", "interval", "ok_share", "success_share")
 
 
@@ -23,11 +27,26 @@ def rounded(x: Any) -> Any:
     return float(f"{x:.5g}") if isinstance(x, float) else x
 
 
+def sample(record: Record, wanted: set[str], point: int, trials: int) -> dict[str, Any]:
+    """The first trials of one point of the grid, by method and metric."""
+    at = np.unravel_index(range(record.done[..., 0].size)[point], record.done.shape[:-1])
+    values: dict[str, dict[str, list[float]]] = {}
+    for number, name in enumerate(record.algorithms):
+        for metric in sorted(wanted):
+            found = record.metrics[metric][(number, *at, slice(0, trials))]
+            if np.isfinite(found).all():
+                values.setdefault(name, {})[metric] = [float(f"{x:.7g}") for x in found]
+    parameters = {name: labels[i] for (name, labels), i in zip(record.labels.items(), at, strict=True)}
+    return {"parameters": parameters, "trials": list(range(trials)), "values": values}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("file", type=Path)
     parser.add_argument("metrics", nargs="*")
+    parser.add_argument("--point", type=int, default=-1, help="the point whose first trials are kept, by number")
+    parser.add_argument("--trials", type=int, default=2, help="how many of its trials")
     options = parser.parse_args()
     summary = json.loads((options.folder / "summary.json").read_text(encoding="utf-8"))
     session = summary["about"]["sessions"][-1]
@@ -44,6 +63,7 @@ def main() -> None:
             "versions": session["versions"],
             "trials": summary["trials"],
         },
+        "sample": sample(read_sweep(options.folder), wanted, options.point, options.trials),
         "points": [
             {key: rounded(point[key]) for key in KEPT if key in point}
             for point in summary["points"]

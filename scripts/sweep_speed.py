@@ -18,14 +18,13 @@ from contextlib import nullcontext
 from dataclasses import replace
 
 import torch
-from torchsar.study.config import load
-from torchsar.study.stripmap.trials import StripmapTrials
-from torchsar.study.sweeping import sweep_grid
 
-from torchsar.study.montecarlo.chunks import rows_by_bytes
+from torchsar.study.commands.sweep import SweepTrial, sweep_grid
 from torchsar.study.montecarlo.engines import Engine, InProcess, engine
 from torchsar.study.montecarlo.grid import Grid
 from torchsar.study.montecarlo.loop import Plan, run_plan
+from torchsar.study.montecarlo.work import rows_by_bytes
+from torchsar.study.table import load
 
 
 def first_point(grid: Grid) -> Grid:
@@ -33,7 +32,7 @@ def first_point(grid: Grid) -> Grid:
     return Grid(tuple(replace(p, labels=p.labels[:1], values=p.values[:1]) for p in grid.parameters))
 
 
-def rate(plan: Plan, trial: StripmapTrials, chosen: Engine) -> float:
+def rate(plan: Plan, trial: SweepTrial, chosen: Engine) -> float:
     """Trials a second of one run."""
     began = time.perf_counter()
     run_plan(plan, trial, None, nullcontext(chosen))
@@ -49,8 +48,8 @@ def main() -> None:
     options = parser.parse_intermixed_args()
     torch.set_num_threads(1)
     loaded = load(options.config, options.overrides)
-    grid = first_point(sweep_grid(loaded))
-    trial = StripmapTrials(loaded)
+    trial = SweepTrial(loaded)
+    grid = first_point(sweep_grid(loaded, trial))
     automatic = rows_by_bytes(trial.bytes_per_trial(grid.cases()[0].fixed), "cpu")
     chunks = {"one by one": 1, "one batch": options.trials, "automatic": automatic, "automatic, 2 workers": automatic}
     rates: dict[str, list[float]] = {name: [] for name in chunks}

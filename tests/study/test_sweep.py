@@ -344,27 +344,14 @@ def test_memory_stays_flat_over_ten_thousand_trials(tmp_path: Path) -> None:
 
 
 def test_the_machinery_costs_less_than_five_percent(tmp_path: Path) -> None:
-    x = torch.randn(64, 1024, dtype=torch.complex64)
+    """Of chunks of 50 ms: less than 2.5 ms of processor time a chunk, the store included."""
 
     def trial(parameters, draws):
-        began = time.perf_counter()
-        while time.perf_counter() - began < 0.05:
-            torch.fft.fft(x)
         return {f"metric{i}_m": torch.zeros(len(draws.trials)) for i in range(3)}
 
-    def bare() -> float:
-        began = time.perf_counter()
-        for _ in range(100):
-            trial({"a": 1.0}, Draws(1, trials=range(8)))
-        return time.perf_counter() - began
-
-    shares = []
-    for attempt in range(3):  # others use this machine too
-        record = sweep(trial, {"a": [1.0, 2.0]}, trials=400, chunk=8, out=tmp_path / f"s{attempt}")
-        shares.append(record.about["sessions"][0]["seconds"] / bare() - 1)
-        if shares[-1] < 0.05:
-            return
-    pytest.fail(f"overheads {shares}")
+    began = time.process_time()
+    sweep(trial, {"a": [1.0, 2.0]}, trials=400, chunk=8, out=tmp_path / "s")
+    assert (time.process_time() - began) / 100 < 2.5e-3
 
 
 def test_trials_that_came_out_otherwise_are_named(reference: Record) -> None:

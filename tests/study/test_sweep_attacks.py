@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torchsar.study.config import load
 
 from tests.study.tiny import write_tiny
 from torchsar.cli import main
@@ -23,9 +22,10 @@ from torchsar.study.montecarlo import Stop, read_sweep, sweep
 from torchsar.study.montecarlo.engines import _refuse_unsendable, engine, refuse_unguarded
 from torchsar.study.montecarlo.grid import address, check_name, make_grid
 from torchsar.study.montecarlo.store import Store
-from torchsar.study.montecarlo.summary import summary_tree
+from torchsar.study.montecarlo.summary import summary_of
 from torchsar.study.montecarlo.work import Work
 from torchsar.study.settings.errors import ConfigError
+from torchsar.study.table import load
 
 
 def level(rows: int) -> torch.Tensor:
@@ -153,7 +153,7 @@ def test_halves_of_a_batch_may_give_other_metrics_but_not_other_algorithms() -> 
     record = run(function=halved(lambda t: {"x": {"m": level(1), **({"late": level(1)} if t == 2 else {})}}), chunk=4)
     np.testing.assert_array_equal(np.isfinite(record.metrics["late"][0, 0]), [False, False, True, False])
     assert record.ok.all()
-    with pytest.raises(ConfigError, match="x and then of y"):
+    with pytest.raises(ConfigError, match="the algorithm 'y', those before it of x"):
         run(function=halved(lambda t: {"xy"[t > 1]: {"m": level(1)}}), chunk=4)
 
 
@@ -232,16 +232,16 @@ FAULTS = {
     "bound": (remove("error_m_bound_x"), "'error_m_bound_x' is missing"),
     "marks": (remove("done"), "'done' is missing"),
     "root": (remove("zarr.json"), "holds no results of a sweep"),
-    "empty": (lambda root: (root / "done" / "zarr.json").write_text(""), "is damaged"),
+    "empty": (lambda root: (root / "done" / "zarr.json").write_text(""), "is broken"),
     "cut": (
         lambda root: [file.write_bytes(b"x") for file in (root / "error_m" / "c").rglob("*") if file.is_file()],
-        "is damaged",
+        "is broken",
     ),
 }
 
 
 @pytest.mark.parametrize("fault, said", FAULTS.values(), ids=FAULTS)
-def test_a_damaged_store_is_not_taken_for_results(fault: Callable[[Path], Any], said: str, tmp_path: Path) -> None:
+def test_a_broken_store_is_not_taken_for_results(fault: Callable[[Path], Any], said: str, tmp_path: Path) -> None:
     run(tmp_path / "s")
     fault(tmp_path / "s" / "results.zarr")
     for options in ({"resume": True}, {}):
@@ -307,7 +307,7 @@ def test_an_algorithm_without_the_metric_neither_succeeds_nor_fails() -> None:
     record.about = {**record.about, "title": "t"}
     points = {
         point["algorithm"]: point
-        for point in summary_tree(record, {"error_m": 0.5}, {})["points"]
+        for point in summary_of(record, {"error_m": 0.5}).tree(record.about, {})["points"]
         if point["metric"] == "error_m"
     }
     assert points["with"]["success_share"] == 0.75 and np.isnan(points["without"]["success_share"])
@@ -370,7 +370,7 @@ def test_settings_of_a_config_are_checked(
 def test_a_part_of_a_section_is_set_after_the_section(tmp_path: Path) -> None:
     loaded = load(str(write_tiny(tmp_path)))
     changed = loaded.changed({"world.beam.dwell_s": 0.1, "world.beam": {"kind": "dwell", "dwell_s": 0.3}})
-    assert changed.config.world is not None and changed.config.world.beam["dwell_s"] == 0.1
+    assert changed.config.world["beam"]["dwell_s"] == 0.1
 
 
 def test_a_method_may_not_take_the_place_of_the_bounds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -401,7 +401,7 @@ def test_a_report_that_fails_leaves_the_results(
     config = write_tiny(tmp_path, sweep={"world.noise.snr_db": [20.0], "trials": 1})
     arguments = ["sweep", str(config), "--out", str(tmp_path / "s"), "--resume"]
     with monkeypatch.context() as patch:
-        patch.setattr("torchsar.study.sweeping.draw_sweep", fail)
+        patch.setattr("torchsar.study.commands.sweep.draw_sweep", fail)
         assert main(arguments) in (2, 130)
     assert said in capsys.readouterr().err and read_sweep(tmp_path / "s").done.all()
     assert main(arguments) == 0 and (tmp_path / "s" / "report.html").exists()

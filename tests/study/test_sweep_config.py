@@ -4,34 +4,42 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
-from torchsar.study.config import load
-from torchsar.study.stripmap.trials import StripmapTrials, error_name
-from torchsar.study.sweeping import sweep_grid
+import yaml
 
 from tests.study.tiny import TINY, write_tiny
 from torchsar.cli import main
+from torchsar.study.commands.sweep import SweepTrial, sweep_grid
 from torchsar.study.montecarlo import Record, differences, read_sweep
 from torchsar.study.montecarlo.engines import InProcess
 from torchsar.study.montecarlo.loop import Plan, run_plan
 from torchsar.study.settings.errors import ConfigError
+from torchsar.study.settings.sections import Loaded
+from torchsar.study.systems.stripmap.judge import error_name
+from torchsar.study.table import load
 
 SWEEP = {"world.noise.snr_db": [0.0, 20.0], "world.doppler_hz": [-20.0, 30.0], "trials": 6}
 SMALL = ["sweep.world.noise.snr_db=[-10.0, 10.0]", "sweep.world.squint_deg=[0.25]"]
 
 
-def record_of(loaded, chunk: int | None, trials: int) -> Record:
-    from contextlib import nullcontext
+def record_of(loaded: Loaded, chunk: int | None, trials: int) -> Record:
+    trial = SweepTrial(loaded)
+    plan = Plan(sweep_grid(loaded, trial), trials, loaded.config.seed, chunk)
+    return run_plan(plan, trial, None, nullcontext(InProcess()))
 
-    return run_plan(
-        Plan(sweep_grid(loaded), trials, loaded.config.seed, chunk),
-        StripmapTrials(loaded),
-        None,
-        nullcontext(InProcess()),
-    )
+
+@pytest.fixture
+def load_tree(tmp_path: Path) -> Callable[[dict], Loaded]:
+    def from_file(tree: dict) -> Loaded:
+        (tmp_path / "tree.yaml").write_text(yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
+        return load(str(tmp_path / "tree.yaml"))
+
+    return from_file
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +90,7 @@ def test_images_of_chosen_trials_are_kept(out: Path) -> None:
     )
 
 
-def test_a_batched_key_gives_what_a_config_of_that_value_gives() -> None:
+def test_a_batched_key_gives_what_a_config_of_that_value_gives(load_tree) -> None:
     tiny = load_tree({**TINY, "sweep": SWEEP})
     swept = record_of(tiny, 5, 3)
     alone = record_of(
@@ -93,7 +101,7 @@ def test_a_batched_key_gives_what_a_config_of_that_value_gives() -> None:
     )
 
 
-def test_keys_of_any_kind_make_cases() -> None:
+def test_keys_of_any_kind_make_cases(load_tree) -> None:
     found = record_of(
         load_tree({**TINY, "sweep": {"world.beam.dwell_s": [0.1, 0.2], "precision": ["complex64", "complex128"]}}),
         None,
@@ -107,21 +115,13 @@ def test_keys_of_any_kind_make_cases() -> None:
     assert (np.abs(entropy[:, 0] - entropy[:, 1]) > 0.01).any()
 
 
-def load_tree(tree: dict):
-    from torchsar.study.config import Loaded
-    from torchsar.study.stripmap.sections import StripmapConfig
-
-    return Loaded(StripmapConfig.model_validate(tree), "tiny.yaml", "tiny")
-
-
 def test_the_log_says_what_is_batched(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    config = write_tiny(tmp_path, sweep={"world.noise.snr_db": [0.0], "world.beam.dwell_s": [0.1, 0.2], "trials": 1})
+    config = write_tiny(
+        tmp_path, sweep={"world.noise.snr_db": [0.0], "precision": ["complex64", "complex128"], "trials": 1}
+    )
     with caplog.at_level(logging.INFO, "torchsar"):
         assert main(["sweep", str(config), "--out", str(tmp_path / "result")]) == 0
-    assert (
-        "per-trial tensors, which share batches: world.noise.snr_db (1); cases of their own: world.beam.dwell_s (2)"
-        in caplog.text
-    )
+    assert "values that share batches: world.noise.snr_db (1); cases of their own: precision (2)" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -155,22 +155,16 @@ def test_mistakes_are_one_sentence(sweep: dict, said: str, tmp_path: Path, capsy
     assert not (tmp_path / "result" / "report.html").exists()
 
 
-def test_a_recording_cannot_be_swept(tmp_path: Path) -> None:
+def test_a_recording_cannot_be_swept(load_tree, tmp_path: Path) -> None:
     loaded = load_tree({**TINY, "sweep": SWEEP})
+    assert sweep_grid(loaded, SweepTrial(loaded)).shape == (2, 2)
+    rest = {key: value for key, value in TINY.items() if key not in ("world", "radar")}
+    recorded = load_tree({**rest, "data": {"file": str(tmp_path)}, "sweep": SWEEP})
     with pytest.raises(ConfigError, match="a sweep simulates its trials"):
-        sweep_grid(
-            load_tree(
-                {
-                    **{k: v for k, v in TINY.items() if k not in ("world", "radar")},
-                    "data": {"file": str(tmp_path)},
-                    "sweep": SWEEP,
-                }
-            )
-        )
-    assert sweep_grid(loaded).shape == (2, 2)
+        sweep_grid(recorded, SweepTrial(recorded))
 
 
-def test_squint_is_the_doppler_of_the_true_velocity() -> None:
+def test_squint_is_the_doppler_of_the_true_velocity(load_tree) -> None:
     tree = {**TINY, "world": {**TINY["world"], "squint_deg": 0.6, "velocity_m_s": 121.0}, "sweep": {"trials": 1}}
     found = record_of(load_tree(tree), 1, 1)
     expected = 2 * 121.0 * np.sin(np.deg2rad(0.6)) / (299792458.0 / 3.2e9)
@@ -219,6 +213,6 @@ def test_the_point_estimator_of_the_stripmap_sweep_stands_on_its_bound() -> None
     record = record_of(loaded, None, 30)
     row = record.algorithms.index("point")
     rmse = np.sqrt((record.metrics["doppler_error_hz"][row, 0, 0] ** 2).mean(-1))
-    bound = record.bounds["doppler_error_hz"]["Cramer-Rao bound of a point of known place"][0, 0, :, 0]
+    bound = record.bounds["doppler_error_hz"]["Cramer-Rao bound of a point of known position"][0, 0, :, 0]
     assert ((0.7 * bound < rmse) & (rmse < 1.45 * bound)).all()
     assert (rmse < record.bounds["doppler_error_hz"]["1/(T sqrt q), Tsvetkov 2017"][0, 0, :, 0]).all()

@@ -164,7 +164,7 @@ def test_an_interrupted_sweep_says_how_to_go_on_and_does(tmp_path: Path) -> None
             [*command, "--resume"], stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=mind_interrupts
         )
         assert running.stderr is not None
-        while "chunk" not in (line := running.stderr.readline()) and line:
+        while "trials/s" not in (line := running.stderr.readline()) and line:
             pass
         running.send_signal(stop)
         _, said = running.communicate(timeout=60)
@@ -213,7 +213,7 @@ def test_a_running_scheduler_serves_and_a_failing_trial_is_named(alone: Record) 
         n_workers=1, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=40
     ) as cluster:
         bitwise(toy.run(cluster=cluster.scheduler_address, chunk=7), alone)
-        with pytest.raises(ConfigError, match="failed in trials 0 to 1 of law=flat: KeyError: 'nothing'"):
+        with pytest.raises(ConfigError, match="failed in trials 0 to 1 of law=flat: KeyError: nothing"):
             toy.run(trial=failing, cluster=cluster.scheduler_address, chunk=2, trials=2)
 
 
@@ -232,7 +232,7 @@ def test_ctrl_c_with_workers_is_one_sentence(tmp_path: Path) -> None:
         command, stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=mind_interrupts, start_new_session=True
     )
     assert running.stderr is not None
-    while "chunk" not in (line := running.stderr.readline()) and line:
+    while "trials/s" not in (line := running.stderr.readline()) and line:
         pass
     time.sleep(1)
     os.killpg(running.pid, signal.SIGINT)  # as a terminal does, to all of them

@@ -12,7 +12,7 @@ import pytest
 RECORDED = json.loads(
     (Path(__file__).resolve().parents[2] / "docs" / "sweeps" / "stripmap_doppler.json").read_text(encoding="utf-8")
 )
-BOUND, CURVE = "Cramer-Rao bound of a point of known place", "1/(T sqrt q), Tsvetkov 2017"
+BOUND, CURVE = "Cramer-Rao bound of a point of known position", "1/(T sqrt q), Tsvetkov 2017"
 SNRS, SQUINTS = (-20.0, -10.0, 0.0, 10.0, 20.0), (0.15, 0.25, 0.35)
 
 

@@ -117,11 +117,10 @@ def sweep(
     settings, trial = loaded.config.sweep, SweepTrial(loaded, device)
     grid = sweep_grid(loaded, trial)
     stop = None if settings.stop is None else Stop(**settings.stop.model_dump())
-    needs = [("success", name) for name in settings.success] + [("show", name) for name in settings.show]
-    needs += [] if settings.stop is None else [("stop.metric", settings.stop.metric)]
-    asked = tuple((f"{loaded.file}: sweep.{key}", metric) for key, metric in needs)
+    named = {"success": settings.success, "show": settings.show, "stop.metric": [stop.metric] if stop else []}
+    needs = tuple((f"{loaded.file}: sweep.{key}", metric) for key, metrics in named.items() for metric in metrics)
     save = frozenset(settings.save.trials)
-    plan = Plan(grid, settings.trials, loaded.config.seed, settings.chunk, stop, save, device, asked)
+    plan = Plan(grid, settings.trials, loaded.config.seed, settings.chunk, stop, save, device, needs)
     plan.refuse_missing(trial)
     config_text = loaded.text()
     about = {"title": loaded.config.title, "config": config_text, "dtype": loaded.config.precision}
@@ -210,10 +209,10 @@ def report(record: Record, loaded: Loaded, out: Path, config_text: str, command:
 
 
 def _announce(grid: Grid, trials: int) -> None:
-    kinds = {True: [], False: []}
-    for p in grid.parameters:
-        kinds[p.batched].append(f"{p.name} ({len(p.labels)})")
-    together, apart = (", ".join(kinds[batched]) or "none" for batched in (True, False))
+    together, apart = (
+        ", ".join(f"{p.name} ({len(p.labels)})" for p in grid.parameters if p.batched is batched) or "none"
+        for batched in (True, False)
+    )
     log.info(
         "%d points of %d trials; values that share batches: %s; cases of their own: %s",
         len(grid.points()),

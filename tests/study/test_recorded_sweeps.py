@@ -1,0 +1,41 @@
+"""Recorded sweeps in docs/sweeps: the same addresses give the same numbers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchsar.core import Draws
+from torchsar.study.commands.sweep import SweepTrial
+from torchsar.study.montecarlo.grid import address
+from torchsar.study.table import load
+
+ROOT = Path(__file__).resolve().parents[2]
+RECORDS = sorted((ROOT / "docs" / "sweeps").glob("*.json"))
+
+
+@pytest.mark.filterwarnings("ignore:at a pulse rate")
+@pytest.mark.parametrize("file", RECORDS, ids=lambda file: file.stem)
+def test_trials_of_a_record_come_out_again(file: Path) -> None:
+    """One point of each; figures are of single precision, hence a per cent of the largest trial."""
+    sample = json.loads(file.read_text(encoding="utf-8"))["sample"]
+    loaded = load(str(ROOT / "configs" / "sweeps" / f"{file.stem}.yaml"))
+    trial, trials = SweepTrial(loaded), sample["trials"]
+    grid = loaded.config.sweep.grid
+    values = {
+        key: grid[key][label] if isinstance(grid[key], dict) else next(v for v in grid[key] if v == label)
+        for key, label in sample["parameters"].items()
+    }
+    given = {
+        key: torch.full((len(trials),), value, dtype=torch.float64) if trial.may_differ(key) else value
+        for key, value in values.items()
+    }
+    found = trial(given, Draws(loaded.config.seed, (address(values),) * len(trials), trials))
+    for method, metrics in sample["values"].items():
+        for metric, recorded in metrics.items():
+            expected = torch.tensor(recorded, dtype=torch.float64)
+            error = (found[method][metric].double() - expected).abs().max()
+            assert error <= 0.01 * expected.abs().max(), (method, metric, found[method][metric], recorded)
