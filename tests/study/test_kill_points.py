@@ -56,8 +56,7 @@ def start(home: Path, command: str, out: Path, seed: int, moment: int | None, sa
     status = 99
     try:
         os.chdir(home)
-        output = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-        os.dup2(output, 1), os.dup2(output, 2)
+        sys.stdout = sys.stderr = said.open("w", buffering=1, encoding="utf-8")
         run.draw_all = sweep.draw_sweep = trade.draw_all = lambda *_, **__: []
         if moment is not None:
             die_at(moment)

@@ -69,13 +69,13 @@ _RANGES: Sequence[tuple[str, float, float, str]] = (
     ("*_m", 0.0, 1e9, "distances as far as beyond the Moon"),
     ("sal.world.record.*_s", 0.0, 1e-1, "the sweeps of tunable lasers"),
     ("*.integration_s", 1e-6, 1e5, "apertures from a laser's to an orbit's"),
-    ("*_s", 0.0, 1e5, "records of at most a day"),
     ("*_rad_s", 0.0, 1e3, "turning targets"),
     ("*_rad", 0.0, 1e4, "phases of at most a thousand turns"),
     ("*_deg", 0.0, 720.0, "angles of at most two turns"),
     ("*_db", 0.0, 400.0, "levels that single precision can hold"),
     ("*.motion.*_hz", 0.0, 1e7, "vibrations and turbulent air"),
     ("*_hz_s", 0.0, 1e18, "sweeps of the fastest lasers"),
+    ("*_s", 0.0, 1e5, "records of at most a day"),
     ("*_hz", 0.0, 1e13, "modulations, which are far slower than light"),
 )
 
