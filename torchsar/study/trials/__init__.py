@@ -1,1 +1,1 @@
-"""What experiments are made of: a system, its bench, a batch of trials and an outcome per method."""
+"""What experiments are made of: a system, its bench, batches of trials, outcomes of methods."""

@@ -1,4 +1,4 @@
-"""Choices that a config leaves open: the cheapest alternative whose predicted loss is acceptable."""
+"""Choices that a config leaves open: the cheapest with an acceptable predicted loss."""
 
 from __future__ import annotations
 

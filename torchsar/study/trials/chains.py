@@ -11,7 +11,7 @@ from torchsar.core import Chain, use
 from torchsar.study.settings.errors import ConfigError, did_you_mean, one_line
 from torchsar.study.settings.sections import Loaded, Method
 
-# a chain names what it must be given from outside `given.NAME`; a config, the true values `truth.NAME`
+# a chain calls what it must be given `given.NAME`; a config calls true values `truth.NAME`
 _TRUTH, _GIVEN = "truth.", "given."
 
 
@@ -80,12 +80,13 @@ def _sources(uses: Mapping[str, str], method: Method, loaded: Loaded, where: str
         name = source.removeprefix(_TRUTH)
         if true and not method.oracle:
             raise ConfigError(
-                f"{loaded.file}: {where}.uses.{key}: {source} is known to an oracle only; give the method 'oracle: true' "
-                "if it is to show what could be had at best"
+                f"{loaded.file}: {where}.uses.{key}: {source} is known to an oracle only; give the method 'oracle: "
+                "true' if it is to show what could be had at best"
             )
         if true and name not in loaded.system.truths:
             raise ConfigError(
-                f"{loaded.file}: {where}.uses.{key}: {name!r} is no true value{did_you_mean(name, loaded.system.truths)}"
+                f"{loaded.file}: {where}.uses.{key}: {name!r} is no true "
+                f"value{did_you_mean(name, loaded.system.truths)}"
             )
         found[key] = f"{_GIVEN}{name}" if true else source
     return found

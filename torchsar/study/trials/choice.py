@@ -35,7 +35,7 @@ class Measured:
     Args:
         run: Does the work of one alternative, which is timed; the yardstick is run as well.
         loss: Loss by metric of a result of `run`, against the yardstick.
-        share: Share of the whole work that `run` does of an alternative; its times are divided by it.
+        share: Share of the whole work that `run` does of an alternative, which divides its times.
     """
 
     run: Callable[[Alternative], Any]

@@ -87,33 +87,36 @@ class Geo(System):
         "migration_correct.kind": {"kind": "keystone"},
     }
     definitions = {
-        "snr": "power of the target over noise variance in one range-compressed sample of one channel, dB (snr_db). Raw, "
-        "before compression, it is 10 log10(B tau_p) less (raw_scnr_db): 27 dB at 50 MHz and 10 us. Sample of azimuth-only "
-        "data: of the compressed peak line. scr_db: power of the target over that of the sea in such a sample",
-        "targets": "every target is recorded and processed alone, with noise of its own; figures of a method are means over "
-        "its targets",
-        "velocities": "u_r: closing slant-range speed towards the receiver's closest point; u_a: along track, positive with "
-        "the receiver; y0: position along track at t = 0, the middle pulse",
+        "snr": "power of the target over noise variance in one range-compressed sample of one channel, dB (snr_db). "
+        "Raw, before compression, it is 10 log10(B tau_p) less (raw_scnr_db): 27 dB at 50 MHz and 10 us. Sample of "
+        "azimuth-only data: of the compressed peak line. scr_db: power of the target over that of the sea in such a "
+        "sample",
+        "targets": "every target is recorded and processed alone, with noise of its own; figures of a method are "
+        "means over its targets",
+        "velocities": "u_r: closing slant-range speed towards the receiver's closest point; u_a: along track, "
+        "positive with the receiver; y0: position along track at t = 0, the middle pulse",
         "responses": "irw, pslr, islr, mfta and noise-free positions are measured on the image of the CLEAN echo (same "
-        "impairment, no noise, no sea), rebuilt and focused with every value held that the method estimated from the NOISY "
-        "one: image noise would hide false targets below about -60 dB",
-        "irw_azimuth_m": "3 dB width on the axis x = (V_R - u_a) t of the true target; theory 0.886 v / B, B the processed "
-        "Doppler band within the target's",
+        "impairment, no noise, no sea), rebuilt and focused with every value held that the method estimated from the "
+        "NOISY one: image noise would hide false targets below about -60 dB",
+        "irw_azimuth_m": "3 dB width on the axis x = (V_R - u_a) t of the true target; theory 0.886 v / B, B the "
+        "processed Doppler band within the target's",
         "pslr_azimuth_db": "largest side lobe over the peak; theory, a sinc: -13.26 dB",
-        "islr_azimuth_db": "energy of 20 side lobes to either side over that of the main lobe; theory, a sinc: -9.92 dB",
-        "mfta_db": "largest replica in the zones of +-1..metrics.orders pulse rates from the peak over the peak, as far as "
-        "the image reaches",
+        "islr_azimuth_db": "energy of 20 side lobes to either side over that of the main lobe; theory, a sinc: -9.92 "
+        "dB",
+        "mfta_db": "largest replica in the zones of +-1..metrics.orders pulse rates from the peak over the peak, as "
+        "far as the image reaches",
         "u_r_error_m_s": "estimated minus true u_r; u_a_error_m_s, y0_error_m alike. Only of methods that estimate it",
         "predicted": "u_r_std_m_s, u_a_std_m_s, y0_std_m: standard deviations that the method itself predicts",
-        "position_error_m": "position along track at t = 0 from the measured peak after location correction by the method's "
-        "own velocities, minus the truth",
+        "position_error_m": "position along track at t = 0 from the measured peak after location correction by the "
+        "method's own velocities, minus the truth",
         "range": "irw_range_m, pslr_range_db, islr_range_db on the axis c tau / 2, on which the width of a sinc is "
         "0.886 c / (2 B); range_error_m: of the receive path at t = 0",
-        "condition_number": "of the band matrix at the velocities used; not given for mmse, which inverts no such matrix",
+        "condition_number": "of the band matrix at the velocities used; not given for mmse, which inverts no such "
+        "matrix",
         "noise_gain_db": "noise of a rebuilt bin against ideal uniform sampling by as many channels, mean over bins",
         "theory": "a target that is rebuilt and focused without error",
-        "bounds": "Cramer-Rao for known noise or clutter, complex amplitude and y0 unknown; u_a unknown too, or known, as "
-        "named",
+        "bounds": "Cramer-Rao for known noise or clutter, complex amplitude and y0 unknown; u_a unknown too, or "
+        "known, as named",
         "published": "figures of Remote Sens. 2020, 12, 1703; its SCNR is read as raw",
     }
     target_columns = {
@@ -140,11 +143,11 @@ class Geo(System):
         return len(world.targets) * radar.channels * world.pulses * (world.samples or 1)
 
     def check_sweep(self, loaded: Loaded, grid: Mapping[str, Any]) -> None:
-        targets = list(loaded.config.world["targets"])
+        targets = list((loaded.config.world or {})["targets"])
         if len(targets) > 1:
             raise ConfigError(
-                f"{loaded.file}: world.targets: a sweep follows one target, and there are {', '.join(targets)}; keep one of "
-                "them"
+                f"{loaded.file}: world.targets: a sweep follows one target, and there are {', '.join(targets)}; keep "
+                "one of them"
             )
 
     def simulate(self, bench: Bench, world: Points, draws: Draws) -> Trials:
@@ -221,11 +224,9 @@ class Geo(System):
         if focused is None:
             return {}
         lit = None if own.integration_s is None else float(torch.as_tensor(own.integration_s).reshape(-1)[0])
-        rows = {
-            target: [float(truth[f"{target}.{key}"][0]) for key in ("u_r_m_s", "u_a_m_s")] for target in world.targets
-        }
-        known = (lit, focused.processed_hz, world.samples is not None)
-        return {target: ideal_responses(result.bench.radar, *row, *known) for target, row in rows.items()}
+        radar, known = result.bench.radar, (lit, focused.processed_hz, world.samples is not None)
+        speeds = {t: [float(truth[f"{t}.{key}"][0]) for key in ("u_r_m_s", "u_a_m_s")] for t in world.targets}
+        return {target: ideal_responses(radar, u_r, u_a, *known) for target, (u_r, u_a) in speeds.items()}
 
     def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
         return figures.pictures(results, self.target_columns)
@@ -238,8 +239,8 @@ class Geo(System):
         levels = metrics["definitions"]
         text = "Echoes are free of noise."
         if "snr_db" in levels:
-            text = f"A target stands {levels['snr_db']:.4g} dB above the noise in a range-compressed sample of one channel, "
-            text += f"{levels['raw_scnr_db']:.4g} dB before compression."
+            text = f"A target stands {levels['snr_db']:.4g} dB above the noise in a range-compressed sample of one "
+            text += f"channel, {levels['raw_scnr_db']:.4g} dB before compression."
         yield "Signal to noise", text
 
     def extra_definitions(self, bench: Bench) -> Mapping[str, Any]:

@@ -73,37 +73,38 @@ class GeoOcean(System):
     tolerance = {"image_error_db": -20.0, "position_error_m": 10.0, "sea_error_db": -10.0}
     exact = {"transmit_range_remove.order": {"order": None}, "stationary_image.form": {"form": "stolt"}}
     definitions = {
-        "snr": "the sea has unit mean power in a range-compressed sample of one channel; scr_db: mean power of a sample of a "
-        "ship's lines over it; cnr_db: sea over noise",
-        "velocities": "u_r: closing slant-range speed; u_a: along track, positive with the receiver; y0: position along track "
-        "at t = 0, the middle pulse; range: closest one of the track at rest",
+        "snr": "the sea has unit mean power in a range-compressed sample of one channel; scr_db: mean power of a "
+        "sample of a ship's lines over it; cnr_db: sea over noise",
+        "velocities": "u_r: closing slant-range speed; u_a: along track, positive with the receiver; y0: position "
+        "along track at t = 0, the middle pulse; range: closest one of the track at rest",
         "matching": "a target that was found belongs to the nearest ship in the image of everything at rest, within "
-        "metrics.match_m; found: share of ships with one. A ship that is not found counts as at rest where that image shows "
-        "it: its errors are minus its velocities and its displacement, ok is False. false_targets: targets that belong to no "
-        "ship",
+        "metrics.match_m; found: share of ships with one. A ship that is not found counts as at rest where that "
+        "image shows it: its errors are minus its velocities and its displacement, ok is False. false_targets: "
+        "targets that belong to no ship",
         "u_r_error_m_s": "estimated minus true u_r; u_a_error_m_s alike. Figures of a method are means over its ships",
-        "position_error_m": "distance, along track and range together, of the position given to a ship from the intensity "
-        "centroid of the ship's own echo, without sea and noise, imaged in the same way by its true velocities: its "
-        "scatterers have random phases and interfere, and no image shows the centroid of their powers. along_error_m, "
-        "range_error_m: its parts, signed",
+        "position_error_m": "distance, along track and range together, of the position given to a ship from the "
+        "intensity centroid of the ship's own echo, without sea and noise, imaged in the same way by its true "
+        "velocities: its scatterers have random phases and interfere, and no image shows the centroid of their "
+        "powers. along_error_m, range_error_m: its parts, signed",
         "scatterers_error_m": "the same distance from the centroid of the scatterers' powers",
-        "image_position_m": "intensity centroid along x = V_R t, near the predicted position, of the image of the ship's own "
-        "echo as if it were at rest; displacement_m: that minus the true y0; displacement_vt_m: what the motion predicts on "
-        "the axis x = (V_R - u_a) t, which the source prints",
-        "replica_distance_m": "distance on x = V_R t of the stronger first replica from the image itself, centroids of the "
-        "same image; replica_distance_vt_m: PRF lambda R0 / (V_R - u_a), on the axis of the source. A blurred ship that "
-        "reaches beyond the rebuilt band loses one end to its replica: measured centroids then lie nearer than predicted",
-        "replica_db": "mean power of the final image within 100 m along track and 40 m in range of the strongest replica one "
-        "or two pulse rates away, over the sea's in the same lines; the sea itself has 0 dB, spread by its texture by about "
-        "1 dB. replica_before_db: of the image of everything at rest; replica_left_db: of the difference from the image of "
-        "what does not move",
-        "sea_error_db": "power of the difference of the image without movers from the image of what does not move, over the "
-        "power of the latter, within 400 m along track and 30 m in range of where the image at rest showed the ship; "
-        "sea_error_before_db: the same without removal. Of ships that move",
-        "hole_db": "power of the image without movers within 60 m and 12 m of where the image at rest showed the ship, over "
-        "that of the sea there: 0 dB is untouched",
-        "contrast_db": "mean power of the final image within 60 m and 12 m of the true position over the sea's in the same "
-        "lines",
+        "image_position_m": "intensity centroid along x = V_R t, near the predicted position, of the image of the "
+        "ship's own echo as if it were at rest; displacement_m: that minus the true y0; displacement_vt_m: what the "
+        "motion predicts on the axis x = (V_R - u_a) t, which the source prints",
+        "replica_distance_m": "distance on x = V_R t of the stronger first replica from the image itself, centroids "
+        "of the same image; replica_distance_vt_m: PRF lambda R0 / (V_R - u_a), on the axis of the source. A blurred "
+        "ship that reaches beyond the rebuilt band loses one end to its replica: measured centroids then lie nearer "
+        "than predicted",
+        "replica_db": "mean power of the final image within 100 m along track and 40 m in range of the strongest "
+        "replica one or two pulse rates away, over the sea's in the same lines; the sea itself has 0 dB, spread by "
+        "its texture by about 1 dB. replica_before_db: of the image of everything at rest; replica_left_db: of the "
+        "difference from the image of what does not move",
+        "sea_error_db": "power of the difference of the image without movers from the image of what does not move, "
+        "over the power of the latter, within 400 m along track and 30 m in range of where the image at rest showed "
+        "the ship; sea_error_before_db: the same without removal. Of ships that move",
+        "hole_db": "power of the image without movers within 60 m and 12 m of where the image at rest showed the "
+        "ship, over that of the sea there: 0 dB is untouched",
+        "contrast_db": "mean power of the final image within 60 m and 12 m of the true position over the sea's in "
+        "the same lines",
         "condition_number": "of the band matrix that rebuilds what is at rest (absent for mmse, which inverts no such "
         "matrix); noise_gain_db: noise of a rebuilt bin against ideal uniform sampling",
         "published": "figures of Remote Sens. 2020, 12, 1703, Fig. 18, whose azimuth is x = (V_R - u_a) t",
@@ -154,8 +155,8 @@ class GeoOcean(System):
             for stage in before:
                 if chain.uses[stage] or getattr(chain.stages[stage], "provides", ()):
                     raise ConfigError(
-                        f"{bench.file}: processor.{name}.stages.{stage}: stages before {last!r} may neither estimate nor use "
-                        "values; leave it out"
+                        f"{bench.file}: processor.{name}.stages.{stage}: stages before {last!r} may neither estimate "
+                        "nor use values; leave it out"
                     )
 
     def simulate(self, bench: Bench, world: Ocean, draws: Draws) -> Trials:
@@ -216,8 +217,9 @@ class GeoOcean(System):
         return images
 
     def notes(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        text = "Errors of positions count from what the image of the ship's own echo would show: its scatterers interfere, and "
-        yield "Positions", f"{text}no image shows the centre of their powers."
+        text = "Errors of positions count from what the image of the ship's own echo would show: its scatterers "
+        text += "interfere, and no image shows the centre of their powers."
+        yield "Positions", text
 
 
 def at_rest(chain: Chain) -> StationaryImage:
@@ -236,18 +238,19 @@ def _scenes(bench: Bench, trace: Trace) -> list[MadeScene]:
     """What a method made of every trial."""
     data, axes = trace.signal.data.reshape(-1, *trace.signal.data.shape[-2:]), trace.signal.axes
     if not trace.estimates:
-        return [MadeScene(*(Signal(image, axes),) * 3) for image in data]
+        shown = [Signal(image, axes) for image in data]
+        return [MadeScene(image, image, image) for image in shown]
     (estimate,) = trace.estimates.values()
     info = {name: x.reshape(len(data), *x.shape[len(trace.signal.trials) :]) for name, x in estimate.info.items()}
-    values = [estimate.value[key].reshape(len(data), -1) for key in TRUTHS]
+    u_r, u_a, y0, far = [estimate.value[key].reshape(len(data), -1) for key in TRUTHS]
     std, ok = estimate.std["u_r_m_s"].reshape(len(data), -1), estimate.ok.reshape(len(data), -1)
     scenes = []
     for i, image in enumerate(data):
         there = (info["level"][i] > 0).nonzero()[:, 0].tolist()
-        motions = [PointMotion(*(x[i, j] for x in values), bench.radar.speed_m_s) for j in there]
+        motions = [PointMotion(u_r[i, j], u_a[i, j], y0[i, j], far[i, j], bench.radar.speed_m_s) for j in there]
         targets = [FoundTarget(m, float(std[i, j]), bool(ok[i, j])) for m, j in zip(motions, there, strict=True)]
-        images = (info["conventional"][i], info["rest"][i], image)
-        scenes.append(MadeScene(*(Signal(x, axes) for x in images), targets))
+        before, rest, fused = (Signal(x, axes) for x in (info["conventional"][i], info["rest"][i], image))
+        scenes.append(MadeScene(before, rest, fused, targets))
     return scenes
 
 

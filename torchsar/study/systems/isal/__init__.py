@@ -1,4 +1,4 @@
-"""System 002: inverse synthetic aperture ladar, phase errors from pulse to pulse (Ruan et al. 2013)."""
+"""System 002: inverse synthetic aperture ladar, phase errors of pulses (Ruan et al. 2013)."""
 
 from __future__ import annotations
 
@@ -50,19 +50,19 @@ class Isal(System):
     definitions = {
         "snr": "mean power of all range-compressed samples over noise variance, dB",
         "entropy": "-sum p ln p, p = |I|^2 / sum |I|^2 over the whole image, nats",
-        "entropy_above_ideal_nats": "entropy less that of the error-free image of the same scene and noise; it depends on "
-        "the position of the image between cells by some 0.03",
+        "entropy_above_ideal_nats": "entropy less that of the error-free image of the same scene and noise; it "
+        "depends on the position of the image between cells by some 0.03",
         "contrast": "standard deviation over mean of the intensity |I|^2",
-        "residual_phase_rms_rad": "rms over pulses of the phases that all corrections together removed, minus the truth, "
-        "constant and linear term removed on the circle; lost pulses do not count",
+        "residual_phase_rms_rad": "rms over pulses of the phases that all corrections together removed, minus the "
+        "truth, constant and linear term removed on the circle; lost pulses do not count",
         "residual_phase_std_rad": "the standard deviation that the method itself predicts for it",
         "strehl": "|mean exp(j residual)|^2 over pulses; success is 0.8 and more, about 0.47 rad rms",
-        "entropy_above_clean_nats": "entropy less that which the same method reaches on the recording without the injected "
-        "phases",
-        "agreement_rad": "rms of (estimate - injected phase) less the estimate on the recording without injected phases: 0 "
-        "for a method that errors cannot influence",
-        "published": "figures of Ruan et al. 2013, Table 1, less the entropy of 7.2 nats that the paper implies for the "
-        "error-free image",
+        "entropy_above_clean_nats": "entropy less that which the same method reaches on the recording without the "
+        "injected phases",
+        "agreement_rad": "rms of (estimate - injected phase) less the estimate on the recording without injected "
+        "phases: 0 for a method that errors cannot influence",
+        "published": "figures of Ruan et al. 2013, Table 1, less the entropy of 7.2 nats that the paper implies for "
+        "the error-free image",
     }
     columns = {
         "entropy_above_ideal_nats": Column("entropy above the ideal image", "nats", drawn="mean"),
@@ -81,7 +81,7 @@ class Isal(System):
         return read_inverse(path, dtype)
 
     def context(self, recording: Recording) -> dict[str, Any]:
-        known = {name: recording.aux[name] for name in _GEOMETRY if name in recording.aux}
+        known: dict[str, Any] = {name: recording.aux[name] for name in _GEOMETRY if name in recording.aux}
         return {"geometry": geometry_of(**known) if known else None}
 
     def samples(self, world: Target, radar: InverseRadar) -> int:
@@ -117,8 +117,8 @@ class Isal(System):
     def choices(self, bench: Bench) -> Sequence[Choice]:
         if bench.recording is not None:
             raise ConfigError(
-                f"{bench.file}: alternatives are compared with true phases, which a recording does not tell; take a config "
-                "that simulates"
+                f"{bench.file}: alternatives are compared with true phases, which a recording does not tell; take a "
+                "config that simulates"
             )
         efforts = [Alternative(f"autofocus, search {s}, polish {p}", {"search": s, "polish": p}) for s, p in _EFFORTS]
         return [

@@ -28,7 +28,7 @@ from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Choice
 from torchsar.study.trials.system import Column, System
 
-# an image of a wrong rotation is one with so much less entropy than the right one, and k1 so far off
+# an image of a wrong rotation has so much less entropy than the right one, and k1 is so far off
 _TRAP_NATS, _TRAP_PERCENT = 0.005, 1.0
 # limits that concern only methods which estimate something
 _OF_ESTIMATORS = {"scatterers above the noise": "warp_k", "range term, pi lambda sigma_y / ra^2": "omega_rad_s"}
@@ -78,33 +78,34 @@ class IsalRotation(System):
         "matched_fourier.transform": {"transform": {"kind": "explicit_sum"}},
     }
     definitions = {
-        "snr": "mean power of all range-compressed samples over noise variance, dB; the same before and after a unitary "
-        "transform along range",
-        "rotation": "theta = omega (t + k1 t^2 / 2! + k2 t^3 / 3! + ...), t = 0 at the first pulse: k1, k2 are the TRUE "
-        "derivatives of the rate over the rate at the first pulse",
-        "mirror": "only omega^2 shows in the data: omega is given positive, and an image may be mirrored in cross range",
+        "snr": "mean power of all range-compressed samples over noise variance, dB; the same before and after a "
+        "unitary transform along range",
+        "rotation": "theta = omega (t + k1 t^2 / 2! + k2 t^3 / 3! + ...), t = 0 at the first pulse: k1, k2 are the "
+        "TRUE derivatives of the rate over the rate at the first pulse",
+        "mirror": "only omega^2 shows in the data: omega is given positive, and an image may be mirrored in cross "
+        "range",
         "omega_error_percent": "estimated minus true rate at the first pulse, % of the truth",
-        "k1_error_percent": "estimated minus true k1, % of the truth (k1_error_per_s, 1/s, where the truth is 0); k2 and so "
-        "on alike",
-        "yc_error_m": "estimated minus true range centre deviation: a scatterer at range y of the window turns at y + yc "
-        "from the centre",
-        "cross_range_scale_error_percent": "lengths in an image scaled by the method's own mean rate, less the true ones, %; "
-        "of methods without a rate that of radar.rotation_rad_s",
-        "predicted": "omega_std_percent, k1_std_percent, yc_std_m, ...: standard deviations that the method itself predicts, "
-        "% of its estimate",
-        "entropy_nats": "-sum p ln p, p = |I|^2 / sum |I|^2 over the whole image, nats; it grows with the lines of an image, "
-        "ln 2 nats from oversampling 1 to 2",
+        "k1_error_percent": "estimated minus true k1, % of the truth (k1_error_per_s, 1/s, where the truth is 0); k2 "
+        "and so on alike",
+        "yc_error_m": "estimated minus true range centre deviation: a scatterer at range y of the window turns at y "
+        "+ yc from the centre",
+        "cross_range_scale_error_percent": "lengths in an image scaled by the method's own mean rate, less the true "
+        "ones, %; of methods without a rate that of radar.rotation_rad_s",
+        "predicted": "omega_std_percent, k1_std_percent, yc_std_m, ...: standard deviations that the method itself "
+        "predicts, % of its estimate",
+        "entropy_nats": "-sum p ln p, p = |I|^2 / sum |I|^2 over the whole image, nats; it grows with the lines of "
+        "an image, ln 2 nats from oversampling 1 to 2",
         "entropy_above_ideal_nats": "entropy less that of the metrics.reference image of the same scene and noise",
         "contrast": "standard deviation over mean of the intensity |I|^2",
-        "targets": "cut along cross range through the range cell of a point target, metres by the method's own rate, by the "
-        "true mean rate where it finds none",
+        "targets": "cut along cross range through the range cell of a point target, metres by the method's own rate, "
+        "by the true mean rate where it finds none",
         "peak_db": "interpolated peak of the cut within metrics.search_m of the true position, relative to that of the "
         "reference",
         "irw_azimuth_m": "width between the first crossings of -3 dB beside the peak of the cut",
         "pslr_azimuth_db": "strongest response beyond the first minima beside the peak, over the peak",
         "evaluations": "evaluations of the objective that a search reports",
-        "bounds": "Cramer-Rao, noise known, complex amplitudes and cross ranges of resolved scatterers unknown; overlapping "
-        "neighbours raise it",
+        "bounds": "Cramer-Rao, noise known, complex amplitudes and cross ranges of resolved scatterers unknown; "
+        "overlapping neighbours raise it",
         "published": "figures of Remote Sens. 2025, 17, 3447",
     }
     columns = {
@@ -147,7 +148,7 @@ class IsalRotation(System):
         found = FoundRotation.by(chain, trace.estimates)
         metrics = found.errors(truth, duration_s, bench.radar.rotation_rad_s)
         seen = [e.info["evaluations"].double() for e in trace.estimates.values() if "evaluations" in e.info]
-        metrics |= {"evaluations": sum(x.expand(count) for x in seen)} if seen else {}  # pyright: ignore
+        metrics |= {"evaluations": torch.stack([x.expand(count) for x in seen]).sum(0)} if seen else {}
         rate = _scale_rate(found, truth, duration_s, bench.radar.rotation_rad_s, count)
         if trace.signal.names != IMAGE:
             return Judged(_expanded(metrics, count), view=View(rate, {}))

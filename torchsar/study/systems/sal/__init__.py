@@ -78,14 +78,15 @@ class Sal(System):
     definitions = {
         "snr": "per sample before any compression, of a scatterer of amplitude 1 against the variance of the complex "
         "noise, dB",
-        "velocity_rmse_m_s": "rms over periods with a lit scatterer (within 10 dB of the strongest) of the estimated minus "
-        "the true radial velocity of the motion at the turning points, receding positive",
+        "velocity_rmse_m_s": "rms over periods with a lit scatterer (within 10 dB of the strongest) of the estimated "
+        "minus the true radial velocity of the motion at the turning points, receding positive",
         "range_error": "estimated minus true motion at the middles of the up sweeps: integral of the velocity that was "
-        "compensated plus lambda / (4 pi) times the phases that were removed from pulses, known modulo a turn and unwrapped "
-        "along pulses against the truth",
-        "range_error_max_m": "largest distance of the range error from its value at the first lit pulse, over lit pulses",
-        "range_error_detrended_rms_m": "rms over lit pulses of the range error without constant and slope, which only turn "
-        "and shift the image",
+        "compensated plus lambda / (4 pi) times the phases that were removed from pulses, known modulo a turn and "
+        "unwrapped along pulses against the truth",
+        "range_error_max_m": "largest distance of the range error from its value at the first lit pulse, over lit "
+        "pulses",
+        "range_error_detrended_rms_m": "rms over lit pulses of the range error without constant and slope, which "
+        "only turn and shift the image",
         "residual_phase_rms_rad": "4 pi / lambda times range_error_detrended_rms_m",
         "entropy_nats": "-sum p ln p, p = |I|^2 / sum |I|^2 over the whole image, nats",
         "entropy_above_ideal_nats": "entropy less that of the same scene and noise without motion",
@@ -93,10 +94,10 @@ class Sal(System):
         "irw": "-3 dB width of the impulse response, m",
         "pslr": "strongest side lobe over the main lobe, dB",
         "islr": "energy of the side lobes over that of the main lobe (null to null), dB",
-        "position": "responses are sought about the true position, shifted by what is left of the motion: its mean velocity "
-        "v shifts azimuth by v R / V and range by 2 v / (lambda K) beat hertz",
-        "published": "figures of Remote Sens. 2024, 16, 793; its entropies depend on the size of the image and the noise, "
-        "only their order compares",
+        "position": "responses are sought about the true position, shifted by what is left of the motion: its mean "
+        "velocity v shifts azimuth by v R / V and range by 2 v / (lambda K) beat hertz",
+        "published": "figures of Remote Sens. 2024, 16, 793; its entropies depend on the size of the image and the "
+        "noise, only their order compares",
     }
     columns = {
         "residual_phase_rms_rad": Column("residual phase, rms without constant and slope", "rad", drawn="mean"),
@@ -162,8 +163,8 @@ class Sal(System):
                 before.append(stage)
         if world.record is None and bench.radar.detection == "real":
             log.warning(
-                "warning: %s: radar.detection is 'real', but separated sweeps are complex; give world.record for what a real "
-                "detector records",
+                "warning: %s: radar.detection is 'real', but separated sweeps are complex; give world.record for "
+                "what a real detector records",
                 file,
             )
 

@@ -116,8 +116,8 @@ class Stripmap(System):
     def check_sweep(self, loaded: Loaded, grid: Mapping[str, Any]) -> None:
         if "world.doppler_hz" in grid and "world.squint_deg" in grid:
             raise ConfigError(
-                f"{loaded.file}: sweep: world.doppler_hz and world.squint_deg both say where the beam looks; sweep one of "
-                "them"
+                f"{loaded.file}: sweep: world.doppler_hz and world.squint_deg both say where the beam looks; sweep "
+                "one of them"
             )
 
     def bounds(self, bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
