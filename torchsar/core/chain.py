@@ -231,7 +231,8 @@ class Chain(nn.Module):
             KeyError: If a stage or a given value has an unknown name.
         """
         part, values = self._part(trace, start, None, given)
-        log = _Log(*({k: x for k, x in of.items() if k not in part} for of in (trace.inputs, trace.outputs)))
+        before = [name for name in trace.inputs if name not in part]
+        log = _Log({name: trace.inputs[name] for name in before}, {name: trace.outputs[name] for name in before})
         self._run(part, trace.inputs[start], values, set(given or {}), log)
         return Trace(log.inputs, log.outputs, log.estimates, values, log.seconds, log.bytes)
 

@@ -1,4 +1,4 @@
-"""What a system brings: the sections of its configs, its world, its judge and what it may choose."""
+"""What a system brings: sections of its configs, its world, its judge and its choices."""
 
 from __future__ import annotations
 
@@ -169,10 +169,10 @@ class System(ABC):
         """What stages take from a recording besides its radar."""
         return {}
 
-    def check(self, bench: Bench) -> None:
+    def check(self, bench: Bench) -> None:  # noqa: B027  most systems need none
         """Refuse what the constructors cannot see. Raises ConfigError."""
 
-    def check_sweep(self, loaded: Loaded, grid: Mapping[str, Any]) -> None:
+    def check_sweep(self, loaded: Loaded, grid: Mapping[str, Any]) -> None:  # noqa: B027  as above
         """Refuse a grid that contradicts itself. Raises ConfigError."""
 
     def compare(self, bench: Bench, outcome: Outcome, ideal: Outcome | None) -> Judged:

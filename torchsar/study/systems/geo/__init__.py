@@ -143,7 +143,7 @@ class Geo(System):
         return len(world.targets) * radar.channels * world.pulses * (world.samples or 1)
 
     def check_sweep(self, loaded: Loaded, grid: Mapping[str, Any]) -> None:
-        targets = list(loaded.config.world["targets"])
+        targets = list((loaded.config.world or {})["targets"])
         if len(targets) > 1:
             raise ConfigError(
                 f"{loaded.file}: world.targets: a sweep follows one target, and there are {', '.join(targets)}; "
@@ -230,11 +230,9 @@ class Geo(System):
         if focused is None:
             return {}
         lit = None if own.integration_s is None else float(torch.as_tensor(own.integration_s).reshape(-1)[0])
-        rows = {
-            target: [float(truth[f"{target}.{key}"][0]) for key in ("u_r_m_s", "u_a_m_s")] for target in world.targets
-        }
-        known = (lit, focused.processed_hz, world.samples is not None)
-        return {target: ideal_responses(result.bench.radar, *row, *known) for target, row in rows.items()}
+        radar, known = result.bench.radar, (lit, focused.processed_hz, world.samples is not None)
+        speeds = {t: [float(truth[f"{t}.{key}"][0]) for key in ("u_r_m_s", "u_a_m_s")] for t in world.targets}
+        return {target: ideal_responses(radar, u_r, u_a, *known) for target, (u_r, u_a) in speeds.items()}
 
     def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
         return figures.pictures(results, self.target_columns)

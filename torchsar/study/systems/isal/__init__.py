@@ -83,7 +83,7 @@ class Isal(System):
         return read_inverse(path, dtype)
 
     def context(self, recording: Recording) -> dict[str, Any]:
-        known = {name: recording.aux[name] for name in _GEOMETRY if name in recording.aux}
+        known: dict[str, Any] = {name: recording.aux[name] for name in _GEOMETRY if name in recording.aux}
         return {"geometry": geometry_of(**known) if known else None}
 
     def samples(self, world: Target, radar: InverseRadar) -> int:

@@ -149,7 +149,7 @@ class IsalRotation(System):
         found = FoundRotation.by(chain, trace.estimates)
         metrics = found.errors(truth, duration_s, bench.radar.rotation_rad_s)
         seen = [e.info["evaluations"].double() for e in trace.estimates.values() if "evaluations" in e.info]
-        metrics |= {"evaluations": sum(x.expand(count) for x in seen)} if seen else {}  # pyright: ignore
+        metrics |= {"evaluations": torch.stack([x.expand(count) for x in seen]).sum(0)} if seen else {}
         rate = _scale_rate(found, truth, duration_s, bench.radar.rotation_rad_s, count)
         if trace.signal.names != IMAGE:
             return Judged(_expanded(metrics, count), view=View(rate, {}))

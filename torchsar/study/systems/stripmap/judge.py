@@ -160,11 +160,11 @@ def error_name(name: str) -> str:
 def compare(bench: Bench, outcome: Outcome, ideal: Outcome | None) -> Judged:
     """The figures of a method with those against the reference, and over its targets."""
     judged = over_targets(bench, outcome.judged, None if ideal is None else ideal.judged)
-    pair = [None if one is None else one.signal for one in (outcome, ideal)]
-    if pair[0] is pair[1] or not all(signal is not None and signal.names == IMAGE for signal in pair):
+    one, other = outcome.signal, None if ideal is None else ideal.signal
+    if one is None or other is None or one is other or not one.names == other.names == IMAGE:
         return judged
-    part = window(pair[0], bench.radar, bench.judging.margin)
-    pair = [signal.crop(**part).to(torch.complex128) for signal in pair]  # sums over millions of pixels
+    part = window(one, bench.radar, bench.judging.margin)
+    pair = [image.crop(**part).to(torch.complex128) for image in (one, other)]  # sums over millions of pixels
     count = len(judged.metrics["seconds"])
     found = {"image_error_db": error_db(*pair), "image_correlation": correlation(*pair)}
     return replace(judged, metrics={**judged.metrics, **{name: value.expand(count) for name, value in found.items()}})
