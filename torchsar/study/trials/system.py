@@ -169,10 +169,10 @@ class System(ABC):
         """What stages take from a recording besides its radar."""
         return {}
 
-    def check(self, bench: Bench) -> None:  # noqa: B027  most systems need none
+    def check(self, bench: Bench) -> None:
         """Refuse what the constructors cannot see. Raises ConfigError."""
 
-    def check_sweep(self, loaded: Loaded, grid: Mapping[str, Any]) -> None:  # noqa: B027  as above
+    def check_sweep(self, loaded: Loaded, grid: Mapping[str, Any]) -> None:
         """Refuse a grid that contradicts itself. Raises ConfigError."""
 
     def compare(self, bench: Bench, outcome: Outcome, ideal: Outcome | None) -> Judged:
