@@ -59,8 +59,8 @@ class Level:
         given = [one.name for one in fields(self) if getattr(self, one.name) is not None]
         if len(given) > 1:
             raise ValueError(
-                f"world.noise: {given[0]} and {given[1]} both say how strong a target is; give one of snr_db, raw_scnr_db "
-                "and scr_db, and leave the others null"
+                f"world.noise: {given[0]} and {given[1]} both say how strong a target is; give one of snr_db, "
+                "raw_scnr_db and scr_db, and leave the others null"
             )
 
 
@@ -126,8 +126,8 @@ class Points(World):
         beyond = any(bool((torch.as_tensor(target.range_m) != 0).any()) for target in self.targets.values())
         if self.samples is None and (self.kind == "full" or beyond):
             raise ValueError(
-                "world.samples: azimuth-only data (null) know one range, the reference_range_m of the radar; give samples, "
-                "or leave range_m and kind: full out"
+                "world.samples: azimuth-only data (null) know one range, the reference_range_m of the radar; "
+                "give samples, or leave range_m and kind: full out"
             )
 
     @property
