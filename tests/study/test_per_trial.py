@@ -241,14 +241,16 @@ SAME = {**dict.fromkeys(CONFIGS, 1e-5), "isal_rotation": 5e-4}
 
 
 def loaded(
-    system: str, folder: Path, world: Mapping[str, Any] | None = None, cheap: bool = False, **sweep: Any
+    system: str, folder: Path, world: Mapping[str, Any] | None = None, cheap: bool = False, sweep: Tree | None = None
 ) -> Loaded:
     """The tiny config of a system, with changes of its world and a sweep."""
     radar, own, stages, image = CONFIGS[system]
     processor = {"recommended": {"stages": image if cheap else stages}}
     tree = {"system": system, "title": "tiny", "seed": 3, "radar": radar, "world": {**own, **(world or {})}}
     path = folder / "tiny.yaml"
-    path.write_text(yaml.safe_dump({**tree, "processor": processor, "sweep": sweep}, sort_keys=False), encoding="utf-8")
+    path.write_text(
+        yaml.safe_dump({**tree, "processor": processor, "sweep": sweep or {}}, sort_keys=False), encoding="utf-8"
+    )
     return load(path)
 
 
@@ -279,7 +281,7 @@ def test_trials_of_different_velocities_share_batches_and_give_the_numbers_of_ca
     system: str, tmp_path: Path
 ) -> None:
     key, values = VELOCITIES[system][0], spread(system, 5)
-    config = loaded(system, tmp_path, **{key: values})
+    config = loaded(system, tmp_path, sweep={key: values})
     trial, record = swept(config, 1)
     assert any(len(set(batch[key].tolist())) > 1 for batch in trial.batches)
     grid = sweep_grid(config, trial)
@@ -318,7 +320,7 @@ def test_every_number_of_the_world_that_may_differ_gives_the_data_of_cases(syste
         together = bench.trials(draws, {key: torch.tensor(pair, dtype=torch.float64)}).recording.signal.data
         for i in range(2):
             case = Bench(config.changed({f"world.{key}": pair[i]}))
-            alone = case.trials(Draws(3, (draws.case[i],), [i])).recording.signal.data
+            alone = case.trials(Draws(3, ("ab"[i],), [i])).recording.signal.data
             rows = together.flatten().chunk(2)[i]  # the targets of a trial follow each other
             torch.testing.assert_close(rows, alone.flatten(), rtol=0, atol=1e-5 * float(alone.abs().max()), msg=key)
 
@@ -337,8 +339,8 @@ def test_a_gate_that_gives_a_sea_its_cells_makes_cases(tmp_path: Path) -> None:
 def test_a_sweep_over_velocities_costs_what_trials_of_one_velocity_cost(system: str, tmp_path: Path) -> None:
     count = 6 if system == "geo_ocean" else 64
     key, values = VELOCITIES[system][0], spread(system, count)
-    many = loaded(system, tmp_path, cheap=True, **{key: values})
-    one = loaded(system, tmp_path, cheap=True, **{key: values[:1]})
+    many = loaded(system, tmp_path, cheap=True, sweep={key: values})
+    one = loaded(system, tmp_path, cheap=True, sweep={key: values[:1]})
 
     def seconds(config: Loaded, trials: int) -> float:
         began = time.process_time()

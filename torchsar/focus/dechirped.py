@@ -98,6 +98,9 @@ def _pulse_s(radar: InverseRadar) -> float:
 class CompressDechirped(Stage):
     """Stage that compresses dechirped pulses (pulse, fast_time) in range, see `compress_dechirped`.
 
+    Data that are range-compressed already (pulse, range) pass unchanged, so that one chain serves
+    echoes of either kind.
+
     For pulses of 100 us and 150 GHz the velocity must be known to 5 m/s (quadratic phase of pi /
     4), see `inverse_requirements`.
 
@@ -112,6 +115,7 @@ class CompressDechirped(Stage):
     """
 
     works_on = ("pulse", "fast_time")
+    also_on = (("pulse", "range"),)
 
     velocity_m_s: Tensor | None
 
@@ -130,12 +134,14 @@ class CompressDechirped(Stage):
         """Compress a signal with axes (pulse, fast_time).
 
         Args:
-            signal: Dechirped recording.
+            signal: Dechirped recording, or range-compressed data, which are returned as they are.
             velocity_m_s: Range rate within pulses in m/s; None for that of the stage.
 
         Raises:
             ValueError: If the fast-time samples do not span the pulse about its middle.
         """
+        if signal.names == self.also_on[0]:
+            return signal
         pulse, fast = signal.axes
         self._check_sampling(fast)
         lines = compress_dechirped(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -230,7 +230,7 @@ class Together:
         parts: Scenes by name; each draws its own random numbers, addressed by its name.
     """
 
-    parts: dict[str, Scene]
+    parts: Mapping[str, Scene]
 
     def scatterers(self, draws: Draws) -> Scatterers:
         """Draw the scatterers of all parts, in their order.

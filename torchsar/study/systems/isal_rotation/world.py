@@ -48,8 +48,8 @@ class Rotating(Target):
             raise ValueError("world.rotation_rad_s is the rate of a uniform rotation; give world.rotation alone")
         if not bool((torch.as_tensor(self.rotation.omega_rad_s) > 0).all()):
             raise ValueError(
-                f"world.rotation.omega_rad_s must be positive, got {self.rotation.omega_rad_s}; only its square "
-                "shows in data"
+                f"world.rotation.omega_rad_s must be positive, got {self.rotation.omega_rad_s}; "
+                "only its square shows in data"
             )
 
     def of(self, radar: InverseRadar) -> TurntableWorld:
