@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from tests.echo.test_turntable import DOUBLE, QUICK, ladar, unit
-from torchsar.core import Chain, Draws, Signal, use
+from torchsar.core import Axis, Chain, Draws, Signal, use
 from torchsar.echo import dechirped_echo, simulate_turntable, turntable_echo
 from torchsar.focus import (
     AzimuthTransform,
@@ -153,6 +153,11 @@ def test_stages_make_a_chain_and_take_the_velocity() -> None:
     assert image.names == ("azimuth", "range") and image.axes[1] == ladar().raw_axes(40, 64)[1]
 
 
+def test_compressed_data_pass_unchanged() -> None:
+    signal = Signal(torch.ones(4, 64, dtype=DOUBLE), ladar().raw_axes(4, 64))
+    assert CompressDechirped(ladar())(signal) is signal
+
+
 @pytest.mark.parametrize(
     "stage", [CompressDechirped(QUICK), AzimuthTransform(QUICK, "hann", 2)], ids=["compress", "azimuth"]
 )
@@ -198,7 +203,7 @@ def test_invalid_arguments_raise() -> None:
     ):
         CompressDechirped(ladar(pulse_s=200e-6))(recording.signal)
     with pytest.raises(ValueError, match=r"CompressDechirped works on the axes \('pulse', 'fast_time'\)"):
-        CompressDechirped(ladar())(Signal(recording.signal.data, ladar().raw_axes(4, 64)))
+        CompressDechirped(ladar())(Signal(recording.signal.data, (Axis("pulse", 4, 0.0, 1.0, "s"), Axis("channel", 64, 0.0, 1.0, ""))))
     with pytest.raises(ValueError, match=r"radar.pulse_s is not set"):
         CompressDechirped(ladar(pulse_s=None))
     with pytest.raises(ValueError, match=r"azimuth window 'hamming' is unknown; choose one of \('none', 'hann'\)"):
