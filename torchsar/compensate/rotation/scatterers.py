@@ -185,7 +185,7 @@ def fit_scatterers(
             fit = replace(fit, scatterers=fit.scatterers.joined(new, fit.settled).apart(), noise=noise)
         if iteration == rounds or bool(fit.settled.all()):
             break
-        residual, step = _Step.of(data, sampling, fit, present, unknowns)
+        residual, step = _Step.of(data, sampling, fit, present, unknowns, count)
     return fit
 
 
@@ -256,7 +256,8 @@ def _phasors(left: Tensor, right: Tensor, dtype: torch.dtype) -> Tensor:
 def _blocks(data: Tensor, scatterers: int) -> Iterator[tuple[slice, slice]]:
     """Trials and pulses of blocks whose phasors fit into the cache.
 
-    How pulses are divided does not depend on the number of trials, so that sums round equally.
+    How pulses are divided does not depend on the number of trials, nor on how many scatterers the
+    other trials of a batch have, so that sums round equally.
     """
     trials, pulses, line = data.shape[0], data.shape[1], data.element_size() * max(1, scatterers)
     height = min(pulses, max(16, _BLOCK_BYTES // line))
@@ -285,10 +286,12 @@ class _Step:
     gram: Tensor
 
     @staticmethod
-    def of(data: Tensor, sampling: Sampling, fit: Fit, present: Tensor, unknowns: _Unknowns) -> tuple[Tensor, _Step]:
+    def of(
+        data: Tensor, sampling: Sampling, fit: Fit, present: Tensor, unknowns: _Unknowns, count: int
+    ) -> tuple[Tensor, _Step]:
         """The residual of the data and the step from it, in one pass over blocks of pulses.
 
-        The echoes of a block stay in the cache.
+        The echoes of a block of up to `count` scatterers stay in the cache.
         """
         motion, found = fit.motion, fit.scatterers
         warped = Warped.of(motion.k, sampling.times(data.device), sampling.duration_s)
@@ -307,7 +310,7 @@ class _Step:
         residual = torch.empty_like(data)
         moments = data.real.new_zeros(data.shape[0], bases.shape[1], 2 * found.cell.shape[-1])
         shift = data.new_zeros(envelope.shape)
-        for some, part in _blocks(data, found.cell.shape[-1]):
+        for some, part in _blocks(data, count):
             turned_back = _phasors(back_turns[some, part], right[some], data.dtype)
             rest = (data[some, part] - (turned_back @ weighted[some]).conj()) * present[some, part, None]
             residual[some, part] = rest
