@@ -212,7 +212,7 @@ def step_of(data: Tensor, present: Tensor) -> tuple[Tensor, _Step]:
         none,
         torch.zeros(1, dtype=F64),
     )
-    return _Step.of(data, SMALL, fit, present, _Unknowns(2, True))
+    return _Step.of(data, SMALL, fit, present, _Unknowns(2, True), 8)
 
 
 @pytest.mark.parametrize("gaps", [False, True])
@@ -273,7 +273,7 @@ def test_steps_explain_all_energy_of_noise_free_data() -> None:
             none,
             torch.zeros(1, dtype=F64),
         )
-        residual, step = _Step.of(data, SMALL, fit, present, _Unknowns(2, True))
+        residual, step = _Step.of(data, SMALL, fit, present, _Unknowns(2, True), 8)
         left.append(float(residual.abs().square().sum() / data.abs().square().sum()))
         _, found, _, covariance = step.taken()
         assert (covariance.diagonal(dim1=1, dim2=2) > 0).all()
