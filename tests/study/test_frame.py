@@ -284,3 +284,11 @@ def test_methods_cannot_take_the_names_of_groups_of_results(system: str, tmp_pat
     for name in ("truth", "estimate"):
         with pytest.raises(ConfigError, match=f"processor.{name}: this name is taken by a group of the results"):
             loaded_as(tmp_path, system, processor={**processor, name: processor["recommended"]})
+
+
+def test_a_point_outside_the_image_of_a_strip_is_counted_and_named(tmp_path: Path) -> None:
+    """Squint moves the second point beyond the last line; other systems have such tests too."""
+    bench = bench_of(tmp_path, "stripmap", "world.doppler_hz=12.0")
+    judged = batch_of(bench, [0], methods=["recommended"], detail=True).outcomes["recommended"].judged
+    assert list(judged.outside) == ["points.1"] and set(judged.targets) == {"points.0"}
+    assert float(judged.metrics["targets_found"]) == 1
