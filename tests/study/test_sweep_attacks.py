@@ -320,9 +320,9 @@ def test_an_algorithm_without_the_metric_neither_succeeds_nor_fails() -> None:
 def test_what_cannot_be_sent_is_a_sentence() -> None:
     pytest.importorskip("cloudpickle")
     lock = threading.Lock()
-    _refuse_unsendable(Work(lambda p, d: {}, (), {}, (), 1))
+    _refuse_unsendable(Work(lambda p, d: {}, make_grid({}), 1))
     with pytest.raises(ConfigError, match="cannot be sent to other processes .*lock"):
-        _refuse_unsendable(Work(lambda p, d: {"m": lock}, (), {}, (), 1))
+        _refuse_unsendable(Work(lambda p, d: {"m": lock}, make_grid({}), 1))
 
 
 def test_a_script_without_its_guard_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -159,7 +159,8 @@ def test_a_recording_cannot_be_swept(load_tree, tmp_path: Path) -> None:
     loaded = load_tree({**TINY, "sweep": SWEEP})
     assert sweep_grid(loaded, SweepTrial(loaded)).shape == (2, 2)
     rest = {key: value for key, value in TINY.items() if key not in ("world", "radar")}
-    recorded = load_tree({**rest, "data": {"file": str(tmp_path)}, "sweep": SWEEP})
+    (tmp_path / "raw.npz").touch()
+    recorded = load_tree({**rest, "data": {"file": str(tmp_path / "raw.npz")}, "sweep": SWEEP})
     with pytest.raises(ConfigError, match="a sweep simulates its trials"):
         sweep_grid(recorded, SweepTrial(recorded))
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import logging
 import signal
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from torch import Tensor
@@ -31,6 +31,8 @@ from torchsar.study.trials.bench import Bench
 log = logging.getLogger("torchsar")
 # what only says how much is computed or shown does not belong to the identity of results
 _NOT_IDENTITY = ("sweep", "trade", "title", "seed", "cases", "beyond_limits")
+# results that the same trial does not give again
+_NOT_RESULTS = ("seconds",)
 _FIXED = ("sweep", "seed", "data", "title", "trade", "system", "cases")
 
 
@@ -71,7 +73,10 @@ class SweepTrial:
         bench = self.bench({key: value for key, value in parameters.items() if not isinstance(value, Tensor)})
         save = bench.config.sweep.save
         batch = bench.batch(draws, given, keep=bench.chains if save.trials else ())
-        found: dict[str, Any] = {name: outcome.metrics for name, outcome in batch.outcomes.items()}
+        found: dict[str, Any] = {
+            name: {metric: x for metric, x in outcome.metrics.items() if metric not in _NOT_RESULTS}
+            for name, outcome in batch.outcomes.items()
+        }
         saved = {name: _saved(o, save.taps) for name, o in batch.outcomes.items()} if save.trials else {}
         return {**found, BOUNDS: bench.system.bounds(bench, batch), SAVED: saved}
 
@@ -164,12 +169,17 @@ def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
             f"{file}: processor.{taken}: in a sweep this name is taken by a part of the results; choose another"
         )
     for key in given:
-        _refuse_fixed(key, loaded)
+        if key.split(".")[0] in _FIXED or key == "world.trials":
+            raise ConfigError(f"{file}: sweep: the key {key!r} cannot be swept")
+        if "." not in key and key not in Config.model_fields:
+            raise ConfigError(
+                f"{file}: sweep.{key} is neither a setting of the sweep nor a key of the "
+                f"config{did_you_mean(key, (*Sweep.model_fields, *Config.model_fields))}"
+            )
     loaded.system.check_sweep(loaded, given)
     grid = make_grid(given, [key for key in given if trial.may_differ(key)], f"{file}: sweep")
     for parameter in grid.parameters:
-        # values that share batches are finite numbers, and the config takes all of them or none
-        for value in parameter.values[:1] if parameter.batched else parameter.values:
+        for value in parameter.values:
             loaded.changed({parameter.name: value})
     for case in grid.cases():
         there = {stage for chain in trial.bench(case.fixed).chains.values() for stage in chain.stages}
@@ -181,20 +191,10 @@ def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
     return grid
 
 
-def _refuse_fixed(key: str, loaded: Loaded) -> None:
-    if key.split(".")[0] in _FIXED or key == "world.trials":
-        raise ConfigError(f"{loaded.file}: sweep: the key {key!r} cannot be swept")
-    if "." not in key and key not in Config.model_fields:
-        raise ConfigError(
-            f"{loaded.file}: sweep.{key} is neither a setting of the sweep nor a key of the "
-            f"config{did_you_mean(key, (*Sweep.model_fields, *Config.model_fields))}"
-        )
-
-
 def identity(loaded: Loaded) -> dict[str, Any]:
     """What results depend on besides the grid: seed and resolved config."""
-    tree = loaded.config.model_dump()
-    return {"seed": loaded.config.seed, "config": {k: v for k, v in tree.items() if k not in _NOT_IDENTITY}}
+    kept = {key: value for key, value in loaded.config.model_dump().items() if key not in _NOT_IDENTITY}
+    return {"seed": loaded.config.seed, "config": kept}
 
 
 def report(record: Record, loaded: Loaded, out: Path, config_text: str, command: str) -> None:
@@ -226,15 +226,10 @@ def _announce(grid: Grid, trials: int) -> None:
 def _terminated_like_interrupted() -> Iterator[None]:
     """A batch system ends jobs with SIGTERM: record what there is, as after Ctrl-C."""
 
-    def stop(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    try:
-        earlier = signal.signal(signal.SIGTERM, stop)
-    except ValueError:  # not in the main thread
-        yield
-        return
+    main = threading.current_thread() is threading.main_thread()
+    earlier = signal.signal(signal.SIGTERM, signal.default_int_handler) if main else None
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, earlier)
+        if main:
+            signal.signal(signal.SIGTERM, earlier)

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 import torch
@@ -100,25 +101,25 @@ class Distributed:
         self.client.register_plugin(_plugin(work, self.threads, self.own), name=_PLUGIN)
         source, waiting, done = iter(tasks), {}, as_completed()
 
-        def submit(task: Task | None) -> None:
-            if task is not None:
-                future = self.client.submit(_compute, *task, pure=False)
-                waiting[future] = task[0]
-                done.add(future)
+        def submit(task: Task) -> None:
+            future = self.client.submit(_compute, *task, pure=False)
+            waiting[future] = task[0]
+            done.add(future)
 
         try:
-            for _ in range(_QUEUE * max(1, self.workers)):
-                submit(next(source, None))
+            for task in islice(source, _QUEUE * max(1, self.workers)):
+                submit(task)
             for future in done:
                 chunk = waiting.pop(future)
                 try:
                     computed = future.result()
                 except KilledWorker:
-                    for half in _after_deaths(chunk):
-                        submit((half, len(half)))
-                    continue
-                yield chunk, computed
-                submit(next(source, None))
+                    following = [(half, len(half)) for half in _after_deaths(chunk)]
+                else:
+                    yield chunk, computed
+                    following = islice(source, 1)
+                for task in following:
+                    submit(task)
         finally:
             self.client.cancel(list(waiting), force=True)
 

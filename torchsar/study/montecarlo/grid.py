@@ -65,10 +65,6 @@ class Grid:
         return tuple(len(p.labels) for p in self.parameters)
 
     @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(p.name for p in self.parameters)
-
-    @property
     def labels(self) -> dict[str, tuple[float | str, ...]]:
         return {p.name: p.labels for p in self.parameters}
 

@@ -20,15 +20,13 @@ from torchsar.study.montecarlo.engines import Engine, Task, engine, refuse_ungua
 from torchsar.study.montecarlo.grid import Grid, make_grid
 from torchsar.study.montecarlo.record import OK, Record
 from torchsar.study.montecarlo.store import Store, cut_off, empty, read_sweep
-from torchsar.study.montecarlo.work import Chunk, Computed, Outcome, Trial, Work, cut, probed_bytes, rows_by_bytes
+from torchsar.study.montecarlo.work import Chunk, Computed, Trial, Work, cut, probed_bytes, rows_by_bytes
 from torchsar.study.output.folder import ResultFolder, opened
 from torchsar.study.output.progress import Count, Ticker
 from torchsar.study.output.report import installed_version
 from torchsar.study.settings.errors import ConfigError, did_you_mean
 
 log = logging.getLogger("torchsar")
-# chunks that wait to be written together at most: what they hold must stay small beside a chunk
-_WAITING = 256
 # trials after which points are looked at first; fewer say too little of an interval
 FIRST_LOOK = 50
 SWEEP_FILES = ("config.yaml", "summary.json", "figures", "report.html")
@@ -76,11 +74,8 @@ class Stop:
 
 def looks(trials: int, stop: Stop | None) -> list[int]:
     """Numbers of trials after which points are looked at; the last is the limit."""
-    levels, level = [], FIRST_LOOK
-    while stop is not None and level < trials:
-        levels.append(level)
-        level *= 2
-    return [*levels, trials]
+    levels = [FIRST_LOOK << i for i in range(trials.bit_length()) if stop is not None]
+    return [*(level for level in levels if level < trials), trials]
 
 
 @dataclass(frozen=True)
@@ -128,9 +123,7 @@ class Plan:
 
     def work(self, trial: Trial) -> Work:
         """What processes need in order to compute its chunks."""
-        batched = {p.name: p.values for p in self.grid.parameters if p.batched}
-        cases = tuple(self.grid.cases())
-        return Work(trial, cases, batched, self.grid.names, self.seed, self.device, self.save)
+        return Work(trial, self.grid, self.seed, self.device, self.save)
 
     def refuse_missing(self, trial: Trial) -> None:
         """Refuse metrics that are asked for and that the first trial, computed here, does not give.
@@ -260,10 +253,10 @@ def run_plan(plan: Plan, trial: Trial, store: Store | None, engine: AbstractCont
         with engine as chosen:
             run.all_levels(chosen)
     except KeyboardInterrupt:
-        run.settle()
+        run.flush()
         raise Interrupted(f"{int(record.done.sum())} trials are recorded") from None
     finally:
-        run.settle()
+        run.flush()
     return record
 
 
@@ -276,7 +269,6 @@ class _Run:
         self.active = [set(range(len(case.points))) for case in work.cases]
         self.fits: dict[int, int] = {}
         self.rows: dict[int, int] = {}
-        self.waiting: list[Outcome] = []
         self.warned: set[str] = set()
 
     def all_levels(self, engine: Engine) -> None:
@@ -294,7 +286,7 @@ class _Run:
                         self._enter(chunk, computed)
                         count.advance(len(chunk))
                         log.debug("%s", count.say())
-                    self.settle()
+                    self.flush()
                     # batches never reach across a level that all points got to, so that an
                     # extended sweep runs the same ones however often it is resumed
                     self._about(finished=sorted({*self.record.about.get("finished", []), last}))
@@ -302,7 +294,7 @@ class _Run:
                         count.total -= (self.plan.trials - last) * self._drop_settled(last)
         finally:
             rows = {str(case): n for case, n in self.rows.items()}
-            session = {**session, "seconds": count.seconds, "trials": count.new, "chunk_rows": rows}
+            session |= {"seconds": count.seconds, "trials": count.new, "chunk_rows": rows}
             self._about(seed=self.plan.seed, sessions=[*self.record.about.get("sessions", []), session])
 
     def _tasks(self, first: int, last: int) -> Iterator[Task]:
@@ -321,50 +313,46 @@ class _Run:
                     yield Chunk(number, points, trials), self.fits.get(number)
 
     def _enter(self, chunk: Chunk, computed: Computed) -> None:
-        """Take in a chunk; it waits with others until writing them together is cheap."""
+        """Enter a chunk into the record and the store, which writes when that is cheap.
+
+        The store is informed first: an interrupt in between may then leave rows that are announced
+        and not done, never the reverse.
+        """
         for text in computed.warnings:
             if text not in self.warned:
                 log.warning("warning: %s", text)
-        self.warned.update(computed.warnings)
+                self.warned.add(text)
         fits = computed.fits
         if fits is not None and fits < self.fits.get(chunk.case, len(chunk)):
             log.warning("warning: %d trials at once do not fit into memory; going on with %d", len(chunk), fits)
             self.fits[chunk.case] = fits
-        self.waiting += computed.parts
-        if len(self.waiting) >= _WAITING or (self.store is not None and self.store.due):
-            self.settle()
-
-    def settle(self) -> None:
-        """Enter what waits into the record and the store.
-
-        The store is informed first: a second Ctrl-C in between may then leave rows that are
-        announced and not done, never the reverse.
-        """
-        while self.waiting:
-            part = self.waiting.pop(0)
-            chunk, known = part.chunk, self.work.cases[part.chunk.case].points
-            points = [self.points[chunk.case][p] for p in chunk.points]
+        known = self.work.cases[chunk.case].points
+        for part in computed.parts:
+            points, trials = [self.points[chunk.case][p] for p in part.chunk.points], part.chunk.trials
             if self.store is not None:
-                self.store.entered(points, chunk.trials)
+                self.store.entered(points, trials)
                 for row, arrays in part.saved.items():
-                    self.store.save(self.plan.grid.labels_at(known[chunk.points[row]]), chunk.trials[row], arrays)
-            self.record.add(points, chunk.trials, part.values, part.bounds)
+                    labels = self.plan.grid.labels_at(known[part.chunk.points[row]])
+                    self.store.save(labels, trials[row], arrays)
+            self.record.add(points, trials, part.values, part.bounds)
+        if self.store is not None and self.store.due:
+            self.store.flush()
+
+    def flush(self) -> None:
+        """Write what the store has not written."""
         if self.store is not None:
             self.store.flush()
 
     def _drop_settled(self, trials: int) -> int:
-        """End the points that have seen enough; returns how many."""
-        assert self.plan.stop is not None
-        dropped = 0
+        """End the points whose first `trials` trials say enough; returns how many."""
+        stop, before = self.plan.stop, sum(map(len, self.active))
         for points, active in zip(self.points, self.active):
-            ended = {p for p in active if self.plan.stop.reached(self.record, points[p], trials, self.plan.seed)}
+            ended = {p for p in active if stop and stop.reached(self.record, points[p], trials, self.plan.seed)}
             active -= ended
-            dropped += len(ended)
-        return dropped
+        return before - sum(map(len, self.active))
 
     def _session(self, engine: Engine) -> dict[str, Any]:
         device = torch.device(self.plan.device)
-        versions = {"torchsar-lab": installed_version(), "torch": torch.__version__, "numpy": np.__version__}
         return {
             "began": datetime.now(UTC).isoformat(timespec="seconds"),
             "device": self.plan.device,
@@ -372,7 +360,12 @@ class _Run:
             "workers": engine.workers,
             "threads": engine.threads,
             "machine": platform.machine(),
-            "versions": {**versions, "python": platform.python_version()},
+            "versions": {
+                "torchsar-lab": installed_version(),
+                "torch": torch.__version__,
+                "numpy": np.__version__,
+                "python": platform.python_version(),
+            },
         }
 
     def _about(self, **attributes: Any) -> None:
