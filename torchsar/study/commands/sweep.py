@@ -29,7 +29,7 @@ from torchsar.study.trials.batch import Outcome
 from torchsar.study.trials.bench import Bench
 
 log = logging.getLogger("torchsar")
-# what only says how much is computed or shown does not belong to the identity of results
+# keys that change only how much is computed or shown are not part of the identity of results
 _NOT_IDENTITY = ("sweep", "trade", "title", "seed", "cases", "beyond_limits")
 # results that the same trial does not give again
 _NOT_RESULTS = ("seconds",)
@@ -49,7 +49,7 @@ class SweepTrial:
         self._benches: dict[str, Bench] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """What travels to other processes; benches are built where they are used."""
+        """The state for other processes, without benches: each process builds its own."""
         return {"loaded": self.loaded, "device": self.device, "_benches": {}}
 
     def may_differ(self, key: str) -> bool:
@@ -105,18 +105,18 @@ def sweep(
         loaded: The config.
         out: The folder: results.zarr grows there while the sweep runs and is never replaced;
             config.yaml, summary.json, figures/ and report.html appear at the end.
-        resume: Whether a sweep that is there is gone on with.
+        resume: Whether to continue a sweep that is in the folder.
         workers: Processes of this machine; None computes in this one.
         cluster: Address of a running dask scheduler instead.
         threads: Threads of torch in each process.
         device: Where batches are computed.
-        command: What the report says it was made with.
+        command: The command, for the report.
 
     Returns:
         The path of the report.
 
     Raises:
-        ConfigError: For what the user can put right.
+        ConfigError: If the config is invalid, a trial fails, or the folder cannot be written.
         Interrupted: After Ctrl-C, with a sentence that says how to go on.
     """
     settings, trial = loaded.config.sweep, SweepTrial(loaded, device)
@@ -140,12 +140,12 @@ def sweep(
                 report(record.select(grid.labels), loaded, new, config_text, command)
     except Interrupted as stopped:
         raise Interrupted(f"{stopped} in {out}; go on with --resume") from None
-    except KeyboardInterrupt:  # a second Ctrl-C, or one while the report was made
-        raise Interrupted(f"what is marked done is in {out}; go on with --resume") from None
+    except KeyboardInterrupt:  # a second Ctrl-C, or one during the report
+        raise Interrupted(f"finished trials are recorded in {out}; go on with --resume") from None
     except OSError as error:
         raise ConfigError(
-            f"{out}: the report cannot be written ({error.strerror or error}); the trials are recorded, make it with "
-            "--resume"
+            f"{out}: the report cannot be written ({error.strerror or error}); the trials are recorded; make the "
+            "report with --resume"
         ) from error
     return out / "report.html"
 
@@ -154,7 +154,7 @@ def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
     """The grid of a config's sweep; every key and value is checked and every case built.
 
     Raises:
-        ConfigError: If the sweep cannot be run as it is written.
+        ConfigError: If the sweep is invalid.
     """
     given, file = loaded.config.sweep.grid, loaded.file
     if loaded.config.data.file is not None:
@@ -192,7 +192,7 @@ def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
 
 
 def identity(loaded: Loaded) -> dict[str, Any]:
-    """What results depend on besides the grid: seed and resolved config."""
+    """What the results depend on besides the grid: seed and resolved config."""
     kept = {key: value for key, value in loaded.config.model_dump().items() if key not in _NOT_IDENTITY}
     return {"seed": loaded.config.seed, "config": kept}
 
@@ -224,7 +224,7 @@ def _announce(grid: Grid, trials: int) -> None:
 
 @contextmanager
 def _terminated_like_interrupted() -> Iterator[None]:
-    """A batch system ends jobs with SIGTERM: record what there is, as after Ctrl-C."""
+    """Handle SIGTERM, by which batch systems end jobs, as Ctrl-C: finished trials are recorded."""
 
     main = threading.current_thread() is threading.main_thread()
     earlier = signal.signal(signal.SIGTERM, signal.default_int_handler) if main else None

@@ -1,4 +1,4 @@
-"""The sweep itself: points and trials in, a record out; it knows no physics."""
+"""The sweep itself: computes the trials of every point of a grid with any trial function."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from torchsar.study.output.report import installed_version
 from torchsar.study.settings.errors import ConfigError, did_you_mean
 
 log = logging.getLogger("torchsar")
-# trials after which points are looked at first; fewer say too little of an interval
+# trials after which points are checked first; intervals of fewer trials are too uncertain
 FIRST_LOOK = 50
 SWEEP_FILES = ("config.yaml", "summary.json", "figures", "report.html")
 
@@ -40,11 +40,11 @@ class Interrupted(KeyboardInterrupt):
 class Stop:
     """Ends a point when half of the 95 % interval of a statistic is small against the statistic.
 
-    Points are looked at after 50, 100, 200, 400, ... trials in the order of their numbers, and
-    never in between; every algorithm that has the metric must agree. An rmse that rare outliers
-    make up is settled before they come: with one error in a hundred 100 times as large and
-    relative = 0.19, four points of ten end at 50 trials without one. Below a threshold SNR take
-    the median, or a smaller relative (0.1 takes 100 trials or more).
+    Points are checked after 50, 100, 200, 400, ... trials in the order of their numbers, and
+    never in between; every algorithm that has the metric must meet the criterion. An rmse that is
+    dominated by rare outliers may meet it before the first outlier: with one error in a hundred
+    100 times as large and relative = 0.19, four points of ten end at 50 trials without one. Below
+    a threshold SNR take the median, or a smaller relative (0.1 takes 100 trials or more).
 
     Args:
         metric: The metric.
@@ -66,31 +66,31 @@ class Stop:
             raise ConfigError(f"stop.relative must lie between 0 and 1, got {self.relative!r}")
 
     def reached(self, record: Record, point: tuple[int, ...], trials: int, seed: int) -> bool:
-        """Whether the first `trials` trials of a point say enough."""
+        """Whether the first `trials` trials of a point meet the criterion."""
         values = record.metrics[self.metric][(slice(None), *point, slice(0, trials))]
         values = values[np.isfinite(values).any(-1)]
         return bool(len(values)) and bool((half_width_ratio(values, self.statistic, seed) < self.relative).all())
 
 
 def looks(trials: int, stop: Stop | None) -> list[int]:
-    """Numbers of trials after which points are looked at; the last is the limit."""
+    """Numbers of trials after which points are checked; the last is the limit."""
     levels = [FIRST_LOOK << i for i in range(trials.bit_length()) if stop is not None]
     return [*(level for level in levels if level < trials), trials]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a sweep is to compute.
+    """The work of a sweep.
 
     Args:
         grid: The points.
         trials: Trials of each point.
         seed: Of all random numbers.
         chunk: Rows of a batch, None to choose by bytes.
-        stop: When a point has seen enough trials.
+        stop: Criterion that ends points early.
         save: Trials whose arrays are kept.
         device: Where batches are computed.
-        needs: Metrics that are asked for, each with the key that asks for it.
+        needs: Metrics that the trial must give, each with the key that names it.
 
     Raises:
         ConfigError: If a number or the device is impossible.
@@ -122,14 +122,14 @@ class Plan:
             raise ConfigError(f"sweep: the device {self.device!r} cannot be used here: {text}") from None
 
     def work(self, trial: Trial) -> Work:
-        """What processes need in order to compute its chunks."""
+        """What a process needs to compute its chunks."""
         return Work(trial, self.grid, self.seed, self.device, self.save)
 
     def refuse_missing(self, trial: Trial) -> None:
-        """Refuse metrics that are asked for and that the first trial, computed here, does not give.
+        """Refuse needed metrics that the first trial, computed here, does not give.
 
         Raises:
-            ConfigError: With the first such metric.
+            ConfigError: If there is one; it names the first.
         """
         parts = self.work(trial).compute(Chunk(0, (0,), (0,))).parts if self.needs else []
         given = {metric for part in parts for metrics in part.values.values() for metric in metrics if metric != OK}
@@ -163,16 +163,16 @@ def sweep(
     Args:
         trial: Gets the parameters of a batch by name, and `Draws` whose trials are the rows of that
             batch. Returns {metric: (rows,) tensor}, or {algorithm: {metric: tensor}} to compare
-            algorithms on the same noise; `ok` (bool) is an algorithm's own verdict. Two further
-            keys: "bounds" {metric: {name: (rows,) tensor}}, and "saved" {algorithm: {name:
+            algorithms on the same noise; `ok` (bool) says whether the estimate is reliable. Two
+            further keys: "bounds" {metric: {name: (rows,) tensor}}, and "saved" {algorithm: {name:
             (rows, ...) tensor}}, kept for the trials in `save`.
-        grid: {name: values}, or {name: {label: value}} for values that are no numbers or words.
+        grid: {name: values}, or {name: {label: value}} if they are neither numbers nor words.
         trials: Trials of each point; more of them on a finished sweep extend it.
         seed: Of all random numbers.
         batched: Names whose values come as one float64 tensor (rows,); any other value comes as it
             is, one case after the other.
         out: Folder for results.zarr; None keeps the results in memory only.
-        resume: Whether a sweep that is there is gone on with.
+        resume: Whether to continue a sweep that is in the folder.
         chunk: Rows of a batch; None to choose by bytes.
         workers: Processes of this machine; None computes in this one.
         cluster: Address of a running dask scheduler instead.
@@ -180,13 +180,13 @@ def sweep(
         stop: Ends points early.
         save: Trials whose arrays are kept.
         device: Where batches are computed.
-        config: Whatever else the results depend on; resuming with another one is refused.
+        config: All else that the results depend on; a sweep is resumed only with the same one.
 
     Returns:
         The labelled results.
 
     Raises:
-        ConfigError: For bad input.
+        ConfigError: If an argument is invalid, or the trial function fails.
         Interrupted: After Ctrl-C.
     """
     if workers is not None:
@@ -195,7 +195,7 @@ def sweep(
         ("trial", callable(trial), "be a function of (parameters, draws)", trial),
         ("stop", stop is None or isinstance(stop, Stop), "be a Stop, such as Stop('error_m', 0.05)", stop),
         ("save", isinstance(save, Iterable), "list the numbers of trials", save),
-        ("config", isinstance(config or {}, Mapping), "be a mapping of whatever else results depend on", config),
+        ("config", isinstance(config or {}, Mapping), "be a mapping of what else results depend on", config),
     ):
         if not good:
             raise ConfigError(f"sweep: {name} must {expected}, got {given!r}")
@@ -261,7 +261,7 @@ def run_plan(plan: Plan, trial: Trial, store: Store | None, engine: AbstractCont
 
 
 class _Run:
-    """The state of one session: which points go on, how many rows fit, what is recorded."""
+    """The state of one session: active points, rows that fit into memory, and the record."""
 
     def __init__(self, plan: Plan, work: Work, record: Record, store: Store | None) -> None:
         self.plan, self.work, self.record, self.store = plan, work, record, store
@@ -272,7 +272,7 @@ class _Run:
         self.warned: set[str] = set()
 
     def all_levels(self, engine: Engine) -> None:
-        """Compute all trials, with looks at the points that may end early in between."""
+        """Compute all trials level by level; points may end early after each level."""
         stops = looks(self.plan.trials, self.plan.stop)
         known = (n for n in self.record.about.get("finished", []) if n < self.plan.trials)
         levels = sorted({*stops, *known})
@@ -344,7 +344,7 @@ class _Run:
             self.store.flush()
 
     def _drop_settled(self, trials: int) -> int:
-        """End the points whose first `trials` trials say enough; returns how many."""
+        """End the points that meet the criterion after `trials` trials; returns how many."""
         stop, before = self.plan.stop, sum(map(len, self.active))
         for points, active in zip(self.points, self.active):
             ended = {p for p in active if stop and stop.reached(self.record, points[p], trials, self.plan.seed)}

@@ -33,7 +33,7 @@ def _value_text(name: str, label: float | str) -> str:
 
 @dataclass(frozen=True)
 class Quantity:
-    """What is drawn of a metric.
+    """A figure of a metric that is drawn.
 
     Args:
         metric: Its name.
@@ -66,7 +66,7 @@ class Panel:
     """One position along the parameters that are not axes of a figure.
 
     Args:
-        title: What the position is.
+        title: The values of these parameters.
         index: Index by parameter.
     """
 
@@ -78,7 +78,7 @@ class SweepPictures:
     """Draws the figures of a sweep.
 
     Args:
-        summary: What is drawn.
+        summary: The figures of the sweep.
     """
 
     def __init__(self, summary: Summary) -> None:
@@ -111,7 +111,7 @@ class SweepPictures:
         return array[(slice(None),) * lead + index]
 
     def all(self, wanted: Sequence[str]) -> Drawn:
-        """Of each metric its curves, its success and its heat maps; last the verdicts."""
+        """Curves, success and heat maps of each metric; last the shares of trusted trials."""
         for metric in wanted:
             fields, (name, unit) = self.figures[metric], name_and_unit(metric)
             quantity = main_quantity(metric, bool(self.bounds.get(metric)))
@@ -147,7 +147,7 @@ class SweepPictures:
         return self.figures[quantity.metric][quantity.field]
 
     def part(self, quantity: Quantity, panel: Panel, over: str) -> dict[str, Any]:
-        """Every algorithm along one parameter, or side by side where there is none."""
+        """Every algorithm along one parameter, or side by side if there is none."""
         fields = self.figures[quantity.metric]
         y, interval = (self.cut(fields[name], panel, over) for name in (quantity.field, quantity.interval))
         bounds = self.bounds.get(quantity.metric, {}) if quantity.log else {}
@@ -161,7 +161,7 @@ class SweepPictures:
         return {"title": panel.title, "x": x, "series": series, "bounds": bounds}
 
     def has_positive(self, quantity: Quantity) -> bool:
-        """Whether there is something to draw on a logarithmic axis, and one is wanted."""
+        """Whether the axis is logarithmic and some value can be shown on it."""
         return quantity.log and bool((self.values(quantity) > 0).any())
 
     def is_log(self, over: str) -> bool:
@@ -201,10 +201,10 @@ class SweepPictures:
         return ", ".join(_value_text(name, self.labels[name][i]) for name, i in index.items())
 
     def caption(self, quantity: Quantity) -> str:
-        """What a reader should see, the interval's level and the number of trials."""
+        """What the picture shows, with the level of the interval and the number of trials."""
         trials = self.trials(quantity.metric)
         if quantity.is_share:
-            more = "; within: the error keeps to the limit" if quantity.field == "success_share" else ", right or wrong"
+            more = ", right or wrong" if quantity.field == "ok_share" else "; within: the error is at most the limit"
             return (
                 f"Share of {trials}, with exact {LEVEL:.0%} intervals. "
                 f"Trusted: the algorithm itself calls its estimate reliable (ok){more}."
@@ -216,12 +216,12 @@ class SweepPictures:
                 self.has_positive(quantity) and (self.values(quantity) == 0).any()
             ),
             "Dark lines are bounds: a curve that lies on one cannot be improved without bias, and where it departs "
-            "from it the algorithm has its threshold.": quantity.log and self.bounds.get(quantity.metric),
+            "from it is the threshold of the algorithm.": quantity.log and self.bounds.get(quantity.metric),
         }
         return " ".join(text for text, applies in sentences.items() if applies)
 
     def trials(self, metric: str) -> str:
-        """How many trials points have."""
+        """The number of trials of a point, or its range."""
         done = self.figures[metric]["trials"]
         few, many = int(done.min()), int(done.max())
         return f"{many} trials a point" if few == many else f"{few} to {many} trials a point"
@@ -282,7 +282,7 @@ def draw_sweep(summary: Summary, folder: Path, show: Sequence[str] = ()) -> list
     """The pictures of a sweep as PNG files in a new folder, in the order of reading.
 
     Args:
-        summary: What is drawn.
+        summary: The figures of the sweep.
         folder: Where to write.
         show: The metrics to draw, in this order; by default the errors, and where nothing is called
             an error everything that was measured.

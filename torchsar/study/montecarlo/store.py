@@ -1,9 +1,9 @@
 """The store of a sweep: labelled arrays in zarr version 3, and markers of what is done, written
 last.
 
-One process writes, and every file of a zarr store is replaced whole, so a sweep that is killed at
-any moment leaves arrays that may hold more than is marked done, never less; what is not marked is
-ignored and computed again.
+One process writes, and every file of a zarr store is replaced whole. A sweep that is killed at any
+moment therefore leaves arrays that may hold more than is marked done, never less; trials that are
+not marked are ignored and computed again.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Store:
 
     Args:
         root: The group.
-        record: What it holds.
+        record: Its content.
     """
 
     def __init__(self, root: zarr.Group, record: Record) -> None:
@@ -70,7 +70,7 @@ class Store:
 
     @classmethod
     def resume(cls, path: Path, grid: Grid, trials: int, identity: Mapping[str, Any]) -> Store:
-        """The store that is there, with room for new labels and trials.
+        """The existing store, enlarged for new labels and trials.
 
         Raises:
             ConfigError: If it belongs to another config.
@@ -97,7 +97,7 @@ class Store:
         return self
 
     def note(self, **about: Any) -> None:
-        """Set root attributes: what the run was."""
+        """Set root attributes that describe the run."""
         with _writing(self.path):
             self.root.update_attributes(json.loads(json.dumps(about, default=str)))
 
@@ -160,8 +160,8 @@ class Store:
         array[window] = data[window]
 
     def _array(self, name: str, data: np.ndarray, dims: tuple[str, ...], about: dict[str, Any]) -> zarr.Array:
-        """The array of that name, made or grown as needed, and remembered: looking it up costs as
-        much as writing it.
+        """The array of that name, made or enlarged as needed; cached, since looking it up takes as
+        long as writing it.
         """
         if name not in self._arrays:
             leading = tuple(max(1, min(n, 64)) for n in data.shape[:-1])
@@ -221,7 +221,7 @@ def read_sweep(path: Path | str) -> Record:
 
 
 def cut_off(path: Path) -> bool:
-    """Whether a sweep of ours was killed while it made this store, before anything was in it."""
+    """Whether a sweep was killed while it made this store, before the store held anything."""
     made = {p.name for p in path.iterdir() if not p.name.endswith(".partial")} if path.is_dir() else {""}
     root = path / "zarr.json"
     if not made <= {root.name, _DONE}:
@@ -236,30 +236,30 @@ def _opened(path: Path, mode: Any) -> zarr.Group:
         raise ConfigError(f"{path} holds no results of a sweep; choose another folder") from None
     if root.attrs.get("format") != FORMAT or not {"labels", "identity"} <= set(root.attrs):
         raise ConfigError(
-            f"{path} was not left by a sweep of this version of torchsar; remove it or choose another folder"
+            f"{path} was not written by a sweep of this version of torchsar; remove it or choose another folder"
         )
     return root
 
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """What the system says of a file that cannot be written, as one sentence."""
+    """Turn an error of the file system into one sentence."""
     try:
         yield
     except OSError as error:
         raise ConfigError(
-            f"{path} cannot be written ({error.strerror or error}); what is marked done there is "
-            "safe, go on with --resume once it can be"
+            f"{path} cannot be written ({error.strerror or error}); trials that are marked done are "
+            "safe; go on with --resume once the folder can be written"
         ) from error
 
 
 def _loaded(root: zarr.Group, path: Path) -> Record:
-    """Everything on disk, without what is not marked done.
+    """The trials on disk that are marked done.
 
     Raises:
         ConfigError: If files are missing or broken.
     """
-    advice = "restore it, or begin anew in another folder"
+    advice = "restore it, or start again in another folder"
     try:
         missing = [name for name in (_DONE, *_attributes(root).get("arrays", [])) if name not in root]
         if not missing:
@@ -349,7 +349,7 @@ def _short(value: Any) -> str:
 
 
 def _values(grid: Grid) -> dict[str, dict[str, str]]:
-    """By parameter and label, what the value is."""
+    """The text of every value by parameter and label."""
     return {p.name: {str(label): canonical(value) for label, value in zip(p.labels, p.values)} for p in grid.parameters}
 
 

@@ -26,7 +26,7 @@ log = logging.getLogger("torchsar")
 Trial = Callable[[Mapping[str, Any], Draws], Mapping[str, Any]]
 Numbers = dict[str, dict[str, list[float]]]
 BOUNDS, SAVED = "bounds", "saved"
-# larger batches leave the cache of a CPU and cost more per trial, as measured
+# larger batches do not fit the cache of a CPU and take more time per trial, as measured
 CACHE_BYTES = 12 << 20
 # of the free memory of a GPU, and tensors of the largest kind that chains hold at a time
 _GPU_SHARE, _LIVE_TENSORS = 0.5, 12
@@ -59,7 +59,7 @@ class Chunk:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one batch gave.
+    """Results of one batch.
 
     Args:
         chunk: Its rows.
@@ -76,11 +76,11 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Computed:
-    """What a chunk gave.
+    """Results of a chunk.
 
     Args:
-        parts: The batches that it was run in.
-        fits: The largest batch that fits into memory, None where nothing was too large.
+        parts: Results of the batches that it was run in.
+        fits: The largest batch that fits into memory, None if no batch was too large.
         warnings: What the trials logged as warnings.
     """
 
@@ -91,7 +91,7 @@ class Computed:
 
 @dataclass(frozen=True)
 class Work:
-    """All that a process needs in order to compute chunks."""
+    """All that a process needs to compute chunks."""
 
     trial: Trial
     grid: Grid
@@ -104,7 +104,7 @@ class Work:
         return tuple(self.grid.cases())
 
     def compute(self, chunk: Chunk, fits: int | None = None) -> Computed:
-        """Run a chunk in batches of at most `fits` rows; where memory ends, in halves from then on.
+        """Run a chunk in batches of at most `fits` rows; one that does not fit into memory is halved.
 
         Raises:
             ConfigError: If the trial function fails.
@@ -212,7 +212,7 @@ def _nested(tree: Any) -> bool:
 
 
 def _array(value: Any, row: int, rows: int, what: str) -> np.ndarray:
-    """One trial's part of what is to be kept."""
+    """One trial of an array that is kept."""
     if not hasattr(value, "__len__") or len(value) != rows:
         raise ValueError(
             f"{what} must hold one array for each of the {rows} trials, got "
@@ -225,7 +225,7 @@ def _array(value: Any, row: int, rows: int, what: str) -> np.ndarray:
 
 
 def _numbers(tree: Mapping[str, Mapping[str, Any]], rows: int, before: str = "") -> Numbers:
-    """Plain numbers for each row: lists, since that is the cheapest way out of torch."""
+    """Plain numbers for each row: lists, the fastest conversion from torch."""
     return {
         outer: {inner: _rows(value, rows, f"{before}{outer}.{inner}") for inner, value in named.items()}
         for outer, named in tree.items()
@@ -246,14 +246,14 @@ def _rows(value: Any, rows: int, what: str) -> list[float]:
 
 
 def _out_of_memory(error: Exception) -> bool:
-    """CUDA has a class for it, the CPU allocator of torch only a text."""
+    """CUDA raises a class of its own, the CPU allocator of torch only a text."""
     return isinstance(error, (MemoryError, torch.OutOfMemoryError)) or (
         isinstance(error, RuntimeError) and "allocate memory" in str(error)
     )
 
 
 class _Largest(TorchDispatchMode):
-    """Remembers the bytes of the largest tensor that any operation gives."""
+    """Records the bytes of the largest tensor that any operation returns."""
 
     bytes = 0
 
@@ -268,7 +268,7 @@ class _Largest(TorchDispatchMode):
 def probed_bytes(work: Work, case: int) -> int:
     """Bytes of the largest tensor of one trial, found by running it once.
 
-    A trial function with a method `bytes_per_trial(fixed)` saves that run.
+    A trial function with a method `bytes_per_trial(fixed)` is asked instead.
     """
     known = getattr(work.trial, "bytes_per_trial", None)
     if known is not None:
@@ -295,7 +295,7 @@ def rows_by_bytes(bytes_per_trial: int, device: str) -> int:
 def cut(case: int, whole: Case, active: set[int], first: int, last: int, rows: int) -> Iterator[Chunk]:
     """Chunks of at most `rows` rows: trials first..last-1 of the active points, point by point.
 
-    The cuts depend on these arguments alone, never on what has already been done, so that a resumed
+    The cuts depend on these arguments alone, not on the trials already done, so that a resumed
     sweep runs the same batches.
     """
     order = [(p, t) for p in range(len(whole.points)) if p in active for t in range(first, last)]
