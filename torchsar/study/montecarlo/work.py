@@ -104,7 +104,7 @@ class Work:
         return tuple(self.grid.cases())
 
     def compute(self, chunk: Chunk, fits: int | None = None) -> Computed:
-        """Run a chunk in batches of at most `fits` rows; one that does not fit into memory is halved.
+        """Run a chunk in batches of at most `fits` rows; one too large for the memory is halved.
 
         Raises:
             ConfigError: If the trial function fails.
