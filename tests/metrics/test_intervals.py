@@ -42,12 +42,13 @@ def test_figures_are_those_of_the_finite_trials(errors: np.ndarray) -> None:
             assert low < found[name][index] < high
 
 
-@pytest.mark.parametrize("name", FIELDS)
-def test_a_point_does_not_depend_on_its_neighbours(errors: np.ndarray, name: str) -> None:
-    together = trial_statistics(errors, seed=1)[name]
-    alone = np.stack([[trial_statistics(errors[i, j], seed=1)[name] for j in range(3)] for i in range(2)])
-    np.testing.assert_allclose(together, alone, rtol=1e-12)
-    assert not name.endswith("e_interval") or np.abs(together - trial_statistics(errors, seed=2)[name]).max() > 0
+def test_a_point_does_not_depend_on_its_neighbours(errors: np.ndarray) -> None:
+    together, other = (trial_statistics(errors, seed) for seed in (1, 2))
+    alone = [[trial_statistics(errors[i, j], seed=1) for j in range(3)] for i in range(2)]
+    for name in FIELDS:
+        values = np.stack([[found[name] for found in row] for row in alone])
+        np.testing.assert_allclose(together[name], values, rtol=1e-12, err_msg=name)
+        assert not name.endswith("e_interval") or np.abs(together[name] - other[name]).max() > 0
 
 
 def test_order_of_magnitude_and_sign_follow() -> None:
@@ -72,7 +73,7 @@ def test_median_interval_uses_the_tabulated_ranks(n: int, ranks: tuple[int, int]
     np.testing.assert_array_equal(interval, (NAN, NAN) if ranks is None else ranks)
 
 
-@pytest.mark.parametrize("n", [50, 120, 400])
+@pytest.mark.parametrize("n", [50, 200])
 def test_intervals_of_gaussian_errors_cover_what_they_promise(n: int) -> None:
     found = trial_statistics(np.random.default_rng(n).standard_normal((2000, n)), seed=5)
     for name, true in (("rmse", 1.0), ("mean", 0.0), ("median", 0.0)):
@@ -82,20 +83,21 @@ def test_intervals_of_gaussian_errors_cover_what_they_promise(n: int) -> None:
 
 
 def test_a_row_with_gaps_covers_as_its_finite_part_does() -> None:
-    values = np.full((2000, 600), NAN)
-    values[:, :150] = np.random.default_rng(6).standard_normal((2000, 150))
+    values = np.full((1000, 600), NAN)
+    values[:, :150] = np.random.default_rng(6).standard_normal((1000, 150))
     low, high = trial_statistics(values, seed=5)["rmse_interval"].T
     assert 0.90 < ((low <= 1) & (high >= 1)).mean() < 0.97
 
 
 def test_memory_stays_bounded_for_many_trials() -> None:
-    values = np.random.default_rng(7).standard_normal((20, 100_000))
+    # all resamples at once would take 400 MB
+    values = np.random.default_rng(7).standard_normal((4, 50_000))
     tracemalloc.start()
     low, high = trial_statistics(values, seed=0)["rmse_interval"].T
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 64e6
-    np.testing.assert_allclose((high - low) / 2, 1.96 / np.sqrt(2 * 100_000), rtol=0.15)
+    np.testing.assert_allclose((high - low) / 2, 1.96 / np.sqrt(2 * 50_000), rtol=0.15)
 
 
 @pytest.mark.parametrize(

@@ -320,12 +320,12 @@ def test_an_algorithm_without_the_metric_neither_succeeds_nor_fails() -> None:
 def test_what_cannot_be_sent_is_a_sentence() -> None:
     pytest.importorskip("cloudpickle")
     lock = threading.Lock()
-    _refuse_unsendable(Work(lambda p, d: {}, (), {}, (), 1))
+    _refuse_unsendable(Work(lambda p, d: {}, make_grid({}), 1))
     with pytest.raises(ConfigError, match="cannot be sent to other processes .*lock"):
-        _refuse_unsendable(Work(lambda p, d: {"m": lock}, (), {}, (), 1))
+        _refuse_unsendable(Work(lambda p, d: {"m": lock}, make_grid({}), 1))
 
 
-def test_a_script_without_its_guard_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_script_without_its_guard_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     import multiprocessing
 
     refuse_unguarded()
@@ -373,7 +373,7 @@ def test_a_part_of_a_section_is_set_after_the_section(tmp_path: Path) -> None:
     assert changed.config.world["beam"]["dwell_s"] == 0.1
 
 
-def test_a_method_may_not_take_the_place_of_the_bounds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_method_may_not_have_the_name_of_the_bounds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from tests.study.tiny import TINY
 
     config = write_tiny(

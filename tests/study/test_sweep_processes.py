@@ -23,6 +23,11 @@ from torchsar.study.montecarlo.engines import engine
 from torchsar.study.settings.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[2]
+# the command line with a progress line every 0.2 s
+QUICK = (
+    "import sys; from torchsar.cli import main; from torchsar.study.output import progress; "
+    "progress._PIPED_S = 0.2; sys.exit(main(sys.argv[1:]))"
+)
 needs_dask = pytest.mark.skipif(
     pytest.importorskip("importlib.util").find_spec("distributed") is None,
     reason="dask.distributed (extra cluster) is not installed",
@@ -158,7 +163,7 @@ def test_an_interrupted_sweep_says_how_to_go_on_and_does(tmp_path: Path) -> None
         write_tiny(tmp_path, sweep={"world.noise.snr_db": [0.0, 10.0], "trials": 4000, "chunk": 4}),
         tmp_path / "result",
     )
-    command = [sys.executable, "-m", "torchsar.cli", "sweep", str(config), "--out", str(out)]
+    command = [sys.executable, "-c", QUICK, "sweep", str(config), "--out", str(out)]
     for stop in (signal.SIGINT, signal.SIGTERM):
         running = subprocess.Popen(
             [*command, "--resume"], stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=mind_interrupts
@@ -227,7 +232,7 @@ def test_ctrl_c_with_workers_is_one_sentence(tmp_path: Path) -> None:
         write_tiny(tmp_path, sweep={"world.noise.snr_db": [0.0, 10.0], "trials": 4000, "chunk": 4}),
         tmp_path / "result",
     )
-    command = [sys.executable, "-m", "torchsar.cli", "sweep", str(config), "--workers", "2", "--out", str(out)]
+    command = [sys.executable, "-c", QUICK, "sweep", str(config), "--workers", "2", "--out", str(out)]
     running = subprocess.Popen(
         command, stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=mind_interrupts, start_new_session=True
     )

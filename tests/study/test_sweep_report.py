@@ -132,7 +132,7 @@ def test_points_hold_the_statistics_of_their_trials(record: Record, summary: dic
     assert {bound["rms"] for bound in summary["bounds"]} == {2.0}
 
 
-def test_disowning_failures_changes_no_error(record: Record, summary: dict[str, Any]) -> None:
+def test_marking_failures_as_unreliable_changes_no_error(record: Record, summary: dict[str, Any]) -> None:
     modest = Record(
         record.algorithms,
         record.labels,
@@ -188,7 +188,7 @@ THREE_PARAMETERS = [
 SWEEPS = {
     "one number": ({"snr_db": (0.0, 10.0)}, ["error.*rmse_over_snr", "success_share_over_snr"]),
     "words alone": (WORDS, ["rmse_over_scene"]),
-    "one place": ({}, ["rmse", "success_share", "ok_share"]),
+    "one point": ({}, ["rmse", "success_share", "ok_share"]),
     "two pages": (
         {"gain": (0.1, 1.0, 1000.0), "scene": tuple("abcdefg")},
         ["01_.*rmse_over_gain", "02_.*rmse_over_gain"],
@@ -301,7 +301,7 @@ def read(page: str) -> Reader:
     return reader
 
 
-def test_report_asks_for_nothing_from_outside(page: str) -> None:
+def test_the_report_loads_no_external_resources(page: str) -> None:
     addresses = read(page).addresses
     assert all(address.startswith(("data:", "#")) for address in addresses)
     assert sum(address.startswith("data:image/png;base64,") for address in addresses) == page.count("<figure>") >= 8

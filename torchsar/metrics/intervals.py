@@ -12,7 +12,7 @@ import numpy as np
 
 from torchsar.core.draws import generator_at
 
-# what reports of experiments use by default
+# the usual level of intervals in reports
 LEVEL = 0.95
 # the ends of 95 % intervals are then the 25th values from either end
 RESAMPLES = 1000
@@ -26,11 +26,11 @@ def trial_statistics(values: np.ndarray, seed: int, level: float = LEVEL) -> dic
 
     Values that are not finite are left out. Intervals of mean and rmse are percentiles of a
     bootstrap, which is too narrow for few trials: of Gaussian errors, at 95 %, it contains the
-    rmse in 81 % of cases for n = 10, 92 % for 50, 95 % for 200. It does not foresee rare outliers
-    that few trials have not met: it contains the rmse of log-normal errors in 69 % (n = 50) and
+    rmse in 81 % of cases for n = 10, 92 % for 50, 95 % for 200. It cannot include rare outliers
+    that do not occur in few trials: it contains the rmse of log-normal errors in 69 % (n = 50) and
     80 % (200), with one error in a hundred 100 times as large in 28 % and 62 %, while the median
     keeps 95 % or more and the mean 89 % or more. The bootstrap draws from (seed, number of trials)
-    alone: the interval of a point is the same, to rounding, whatever stands beside it.
+    alone: the interval of a point is the same, to rounding, whatever other points there are.
 
     Args:
         values: Shape (..., trial), float64.
@@ -56,7 +56,7 @@ def trial_statistics(values: np.ndarray, seed: int, level: float = LEVEL) -> dic
 def half_width_ratio(values: np.ndarray, statistic: str, seed: int, level: float = LEVEL) -> np.ndarray:
     """Half the width of a statistic's interval over its magnitude.
 
-    It tells how much more trials may still change the statistic.
+    It bounds how much further trials may still change the statistic.
 
     Args:
         values: Shape (..., trial).

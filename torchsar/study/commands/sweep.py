@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import logging
 import signal
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from torch import Tensor
@@ -29,8 +29,10 @@ from torchsar.study.trials.batch import Outcome
 from torchsar.study.trials.bench import Bench
 
 log = logging.getLogger("torchsar")
-# what only says how much is computed or shown does not belong to the identity of results
+# keys that change only how much is computed or shown are not part of the identity of results
 _NOT_IDENTITY = ("sweep", "trade", "title", "seed", "cases", "beyond_limits")
+# results that the same trial does not give again
+_NOT_RESULTS = ("seconds",)
 _FIXED = ("sweep", "seed", "data", "title", "trade", "system", "cases")
 
 
@@ -47,7 +49,7 @@ class SweepTrial:
         self._benches: dict[str, Bench] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """What travels to other processes; benches are built where they are used."""
+        """The state for other processes, without benches: each process builds its own."""
         return {"loaded": self.loaded, "device": self.device, "_benches": {}}
 
     def may_differ(self, key: str) -> bool:
@@ -71,7 +73,10 @@ class SweepTrial:
         bench = self.bench({key: value for key, value in parameters.items() if not isinstance(value, Tensor)})
         save = bench.config.sweep.save
         batch = bench.batch(draws, given, keep=bench.chains if save.trials else ())
-        found: dict[str, Any] = {name: outcome.metrics for name, outcome in batch.outcomes.items()}
+        found: dict[str, Any] = {
+            name: {metric: x for metric, x in outcome.metrics.items() if metric not in _NOT_RESULTS}
+            for name, outcome in batch.outcomes.items()
+        }
         saved = {name: _saved(o, save.taps) for name, o in batch.outcomes.items()} if save.trials else {}
         return {**found, BOUNDS: bench.system.bounds(bench, batch), SAVED: saved}
 
@@ -100,18 +105,18 @@ def sweep(
         loaded: The config.
         out: The folder: results.zarr grows there while the sweep runs and is never replaced;
             config.yaml, summary.json, figures/ and report.html appear at the end.
-        resume: Whether a sweep that is there is gone on with.
+        resume: Whether to continue a sweep that is in the folder.
         workers: Processes of this machine; None computes in this one.
         cluster: Address of a running dask scheduler instead.
         threads: Threads of torch in each process.
         device: Where batches are computed.
-        command: What the report says it was made with.
+        command: The command, for the report.
 
     Returns:
         The path of the report.
 
     Raises:
-        ConfigError: For what the user can put right.
+        ConfigError: If the config is invalid, a trial fails, or the folder cannot be written.
         Interrupted: After Ctrl-C, with a sentence that says how to go on.
     """
     settings, trial = loaded.config.sweep, SweepTrial(loaded, device)
@@ -135,12 +140,12 @@ def sweep(
                 report(record.select(grid.labels), loaded, new, config_text, command)
     except Interrupted as stopped:
         raise Interrupted(f"{stopped} in {out}; go on with --resume") from None
-    except KeyboardInterrupt:  # a second Ctrl-C, or one while the report was made
-        raise Interrupted(f"what is marked done is in {out}; go on with --resume") from None
+    except KeyboardInterrupt:  # a second Ctrl-C, or one during the report
+        raise Interrupted(f"finished trials are recorded in {out}; go on with --resume") from None
     except OSError as error:
         raise ConfigError(
-            f"{out}: the report cannot be written ({error.strerror or error}); the trials are recorded, make it with "
-            "--resume"
+            f"{out}: the report cannot be written ({error.strerror or error}); the trials are recorded; make the "
+            "report with --resume"
         ) from error
     return out / "report.html"
 
@@ -149,7 +154,7 @@ def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
     """The grid of a config's sweep; every key and value is checked and every case built.
 
     Raises:
-        ConfigError: If the sweep cannot be run as it is written.
+        ConfigError: If the sweep is invalid.
     """
     given, file = loaded.config.sweep.grid, loaded.file
     if loaded.config.data.file is not None:
@@ -164,12 +169,17 @@ def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
             f"{file}: processor.{taken}: in a sweep this name is taken by a part of the results; choose another"
         )
     for key in given:
-        _refuse_fixed(key, loaded)
+        if key.split(".")[0] in _FIXED or key == "world.trials":
+            raise ConfigError(f"{file}: sweep: the key {key!r} cannot be swept")
+        if "." not in key and key not in Config.model_fields:
+            raise ConfigError(
+                f"{file}: sweep.{key} is neither a setting of the sweep nor a key of the "
+                f"config{did_you_mean(key, (*Sweep.model_fields, *Config.model_fields))}"
+            )
     loaded.system.check_sweep(loaded, given)
     grid = make_grid(given, [key for key in given if trial.may_differ(key)], f"{file}: sweep")
     for parameter in grid.parameters:
-        # values that share batches are finite numbers, and the config takes all of them or none
-        for value in parameter.values[:1] if parameter.batched else parameter.values:
+        for value in parameter.values:
             loaded.changed({parameter.name: value})
     for case in grid.cases():
         there = {stage for chain in trial.bench(case.fixed).chains.values() for stage in chain.stages}
@@ -181,20 +191,10 @@ def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
     return grid
 
 
-def _refuse_fixed(key: str, loaded: Loaded) -> None:
-    if key.split(".")[0] in _FIXED or key == "world.trials":
-        raise ConfigError(f"{loaded.file}: sweep: the key {key!r} cannot be swept")
-    if "." not in key and key not in Config.model_fields:
-        raise ConfigError(
-            f"{loaded.file}: sweep.{key} is neither a setting of the sweep nor a key of the "
-            f"config{did_you_mean(key, (*Sweep.model_fields, *Config.model_fields))}"
-        )
-
-
 def identity(loaded: Loaded) -> dict[str, Any]:
-    """What results depend on besides the grid: seed and resolved config."""
-    tree = loaded.config.model_dump()
-    return {"seed": loaded.config.seed, "config": {k: v for k, v in tree.items() if k not in _NOT_IDENTITY}}
+    """What the results depend on besides the grid: seed and resolved config."""
+    kept = {key: value for key, value in loaded.config.model_dump().items() if key not in _NOT_IDENTITY}
+    return {"seed": loaded.config.seed, "config": kept}
 
 
 def report(record: Record, loaded: Loaded, out: Path, config_text: str, command: str) -> None:
@@ -224,17 +224,12 @@ def _announce(grid: Grid, trials: int) -> None:
 
 @contextmanager
 def _terminated_like_interrupted() -> Iterator[None]:
-    """A batch system ends jobs with SIGTERM: record what there is, as after Ctrl-C."""
+    """Handle SIGTERM, by which batch systems end jobs, as Ctrl-C: finished trials are recorded."""
 
-    def stop(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    try:
-        earlier = signal.signal(signal.SIGTERM, stop)
-    except ValueError:  # not in the main thread
-        yield
-        return
+    main = threading.current_thread() is threading.main_thread()
+    earlier = signal.signal(signal.SIGTERM, signal.default_int_handler) if main else None
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, earlier)
+        if main:
+            signal.signal(signal.SIGTERM, earlier)

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 import torch
@@ -18,10 +19,10 @@ from torchsar.study.settings.errors import ConfigError, one_line
 
 log = logging.getLogger("torchsar")
 Task = tuple[Chunk, int | None]
-_QUEUE = 4  # chunks sent ahead per worker, so that none waits for the next one
-_DEATHS = 10  # workers lost with a chunk before the chunk itself is taken for the cause
+_QUEUE = 4  # chunks submitted ahead per worker, so that no worker is idle
+_DEATHS = 10  # workers that may die with a chunk before the chunk is taken as the cause
 _UNGUARDED = (
-    "a script that starts workers is read again by each of them; put its call of "
+    "a script that starts workers is imported again by each of them; put its call of "
     "sweep(...) below the line: if __name__ == '__main__':"
 )
 
@@ -43,7 +44,7 @@ class InProcess:
 
 
 def _compute(chunk: Chunk, fits: int | None) -> Computed:
-    """Runs in a worker, with the work that its plugin holds."""
+    """Runs in a worker, with the work that its plugin carries."""
     from distributed import get_worker
 
     carrier: Any = get_worker().plugins[_PLUGIN]
@@ -54,10 +55,10 @@ _PLUGIN = "torchsar-work"
 
 
 def _plugin(work: Work, threads: int, own: bool) -> Any:
-    """Gives every worker, a restarted one too, the work, its torch threads, and the GPU of its
-    number.
+    """A plugin that sends the work, the number of torch threads and the index of the GPU to every
+    worker, restarted ones included.
 
-    own: workers that this program started leave Ctrl-C, which reaches all of them, to it.
+    own: workers that this program started ignore Ctrl-C, which the program itself handles.
     """
     from distributed import WorkerPlugin
 
@@ -67,7 +68,7 @@ def _plugin(work: Work, threads: int, own: bool) -> Any:
         def setup(self, worker: Any) -> None:
             logging.getLogger("distributed.worker").setLevel(
                 logging.CRITICAL
-            )  # a failed trial reaches the user once, as its own sentence
+            )  # a failed trial is reported once, as one sentence
             torch.set_num_threads(threads)
             if own and threading.current_thread() is threading.main_thread():
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -77,7 +78,7 @@ def _plugin(work: Work, threads: int, own: bool) -> Any:
 
 
 def _on_own_gpu(work: Work, worker: Any) -> Work:
-    """The GPU whose number is the worker's, where there are several and none was named."""
+    """The work on the GPU with the number of the worker, if there are several GPUs."""
     count = torch.cuda.device_count() if work.device == "cuda" else 0
     return replace(work, device=f"cuda:{int(worker) % count}") if count > 1 and str(worker).isdecimal() else work
 
@@ -100,25 +101,25 @@ class Distributed:
         self.client.register_plugin(_plugin(work, self.threads, self.own), name=_PLUGIN)
         source, waiting, done = iter(tasks), {}, as_completed()
 
-        def submit(task: Task | None) -> None:
-            if task is not None:
-                future = self.client.submit(_compute, *task, pure=False)
-                waiting[future] = task[0]
-                done.add(future)
+        def submit(task: Task) -> None:
+            future = self.client.submit(_compute, *task, pure=False)
+            waiting[future] = task[0]
+            done.add(future)
 
         try:
-            for _ in range(_QUEUE * max(1, self.workers)):
-                submit(next(source, None))
+            for task in islice(source, _QUEUE * max(1, self.workers)):
+                submit(task)
             for future in done:
                 chunk = waiting.pop(future)
                 try:
                     computed = future.result()
                 except KilledWorker:
-                    for half in _after_deaths(chunk):
-                        submit((half, len(half)))
-                    continue
-                yield chunk, computed
-                submit(next(source, None))
+                    following = [(half, len(half)) for half in _after_deaths(chunk)]
+                else:
+                    yield chunk, computed
+                    following = islice(source, 1)
+                for task in following:
+                    submit(task)
         finally:
             self.client.cancel(list(waiting), force=True)
 
@@ -127,12 +128,12 @@ Engine = InProcess | Distributed
 
 
 def _refuse_unsendable(work: Work) -> None:
-    """Asked before dask does, which would print the whole way down to what cannot be sent."""
+    """Refuse a trial that cannot be pickled, in one sentence; dask would print a long traceback."""
     import cloudpickle
 
     try:
         cloudpickle.dumps(work)
-    except Exception as error:  # objects raise what they like when they are pickled
+    except Exception as error:  # pickling may raise any exception
         raise ConfigError(
             "the trial function and its grid cannot be sent to other processes "
             f"({one_line(error)}); make such objects inside the function"
@@ -140,27 +141,27 @@ def _refuse_unsendable(work: Work) -> None:
 
 
 def refuse_unguarded() -> None:
-    """A worker process that is just starting reads the user's script again; workers of its own are
-    the mark of a script without the usual guard.
+    """Refuse to start workers from a process that is itself a starting worker.
 
-    SystemExit ends it with a sentence and without a traceback; the process that started it then
-    says that its workers did not come.
+    Such a process imports the user's script again; it starts workers only if the script lacks the
+    usual guard. SystemExit ends it with one sentence and without a traceback; the parent process
+    then reports that its workers did not start.
     """
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         raise SystemExit(_UNGUARDED)
 
 
 def _after_deaths(chunk: Chunk) -> Iterator[Chunk]:
-    """Halves of a chunk whose workers died one after the other: the system kills a process that
-    takes too much memory, without an error.
+    """Halves of a chunk whose workers died one after the other: the operating system kills a
+    process that takes too much memory, without an error.
     """
     if len(chunk) == 1:
         raise ConfigError(
-            f"every worker that ran trial {chunk.trials[0]} died, most likely for want of memory; "
+            f"every worker that ran trial {chunk.trials[0]} died, most likely because memory ran out; "
             "use fewer workers, or make the scene smaller"
         )
     log.warning(
-        "warning: the workers that ran %d trials at once died, most likely for want of memory; trying halves",
+        "warning: the workers that ran %d trials at once died, most likely because memory ran out; trying halves",
         len(chunk),
     )
     yield from chunk.pieces(-(-len(chunk) // 2))
@@ -205,8 +206,8 @@ def engine(workers: int | None = None, cluster: str | None = None, threads: int 
 def _local(distributed: Any, workers: int, threads: int) -> Iterator[Engine]:
     from dask import config
 
-    # dask lets malloc hand memory back at once, which doubled the time of chains: every operation
-    # faulted its pages in anew
+    # by default dask makes malloc return memory at once, which doubled the time of chains: every
+    # operation had to map its pages again
     environment = {
         **dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads),
         **dict.fromkeys(("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_"), 256 << 20),

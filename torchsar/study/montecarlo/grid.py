@@ -17,7 +17,7 @@ from torchsar.study.settings.errors import ConfigError
 
 # names of dims and parts of results
 RESERVED = ("algorithm", "trial", "method", "ok", "done", "saved")
-_LONGEST = 200  # bytes: file systems end at 255, and bounds and figures add words
+_LONGEST = 200  # bytes: file systems allow 255, and names of bounds and figures are longer
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class Parameter:
     Args:
         name: Its name.
         labels: Numbers or words that name the values in results.
-        values: What the trial is given.
-        batched: Whether the values reach the trial as one tensor with an entry per row, so that one
-            batch may hold several of them; else each value is a case of its own.
+        values: The values that are passed to the trial.
+        batched: Whether the trial gets the values as one tensor with an entry per row, so that one
+            batch may hold several of them; otherwise each value is a case of its own.
     """
 
     name: str
@@ -65,15 +65,11 @@ class Grid:
         return tuple(len(p.labels) for p in self.parameters)
 
     @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(p.name for p in self.parameters)
-
-    @property
     def labels(self) -> dict[str, tuple[float | str, ...]]:
         return {p.name: p.labels for p in self.parameters}
 
     def points(self) -> list[Point]:
-        """Every point; its address, made of names and values alone, stays in larger grids."""
+        """Every point; its address depends on its names and values alone."""
         return [
             Point(index, address({p.name: p.values[i] for p, i in zip(self.parameters, index)}))
             for index in itertools.product(*map(range, self.shape))
@@ -90,7 +86,7 @@ class Grid:
         ]
 
     def labels_at(self, point: Point) -> dict[str, float | str]:
-        """What a point is called, by parameter."""
+        """The labels of a point by parameter."""
         return {p.name: p.labels[i] for p, i in zip(self.parameters, point.index)}
 
 
@@ -125,13 +121,13 @@ def make_grid(
     """A grid from the values of every parameter.
 
     Args:
-        values: {name: values}, or {name: {label: value}} for values that are no numbers or words.
-        batched: Names whose values reach the trial as tensors with an entry per row.
-        where: What errors name.
+        values: {name: values}, or {name: {label: value}} if they are neither numbers nor words.
+        batched: Names whose values the trial gets as tensors with an entry per row.
+        where: Beginning of error messages.
 
     Raises:
         ConfigError: If a parameter has no values, a value is given twice, a name is reserved, or a
-            batched parameter is no number.
+            batched parameter is not a number.
     """
     if not isinstance(values, Mapping):
         raise ConfigError(f"{where} must be a mapping of names to lists of values, got {values!r}")
@@ -140,7 +136,7 @@ def make_grid(
     unknown = next((name for name in batched if name not in values), None)
     if unknown is not None:
         known = ", ".join(values) or "it has none"
-        raise ConfigError(f"{where}: batched names {unknown!r}, which is no parameter of the grid ({known})")
+        raise ConfigError(f"{where}: batched names {unknown!r}, which is not a parameter of the grid ({known})")
     return Grid(tuple(_parameter(name, given, name in batched, f"{where}: {name}") for name, given in values.items()))
 
 
@@ -150,11 +146,11 @@ def check_name(name: Any, taken: Sequence[str], where: str, kind: str) -> None:
     Args:
         name: The name.
         taken: Names that are in use.
-        where: What the error names.
-        kind: What is to bear the name.
+        where: Beginning of the error message.
+        kind: What is named: a parameter, a metric or a bound.
 
     Raises:
-        ConfigError: If the name is taken, no word, or too long.
+        ConfigError: If the name is taken, not a word, or too long.
     """
     why = ""
     if name in taken:
@@ -188,7 +184,7 @@ def _parameter(name: str, given: Any, batched: bool, where: str) -> Parameter:
         (not values, "has no values; give at least one"),
         (
             nameless is not None,
-            f"holds {nameless!r}, whose text is another in every process, and random numbers follow it; give numbers, "
+            f"holds {nameless!r}, whose text differs between processes, and random numbers depend on it; give numbers, "
             "words, lists, mappings or dataclasses",
         ),
         (twice is not None, f"holds {twice} twice; give each value once"),

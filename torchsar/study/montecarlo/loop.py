@@ -1,4 +1,4 @@
-"""The sweep itself: points and trials in, a record out; it knows no physics."""
+"""The sweep itself: computes the trials of every point of a grid with any trial function."""
 
 from __future__ import annotations
 
@@ -20,16 +20,14 @@ from torchsar.study.montecarlo.engines import Engine, Task, engine, refuse_ungua
 from torchsar.study.montecarlo.grid import Grid, make_grid
 from torchsar.study.montecarlo.record import OK, Record
 from torchsar.study.montecarlo.store import Store, cut_off, empty, read_sweep
-from torchsar.study.montecarlo.work import Chunk, Computed, Outcome, Trial, Work, cut, probed_bytes, rows_by_bytes
+from torchsar.study.montecarlo.work import Chunk, Computed, Trial, Work, cut, probed_bytes, rows_by_bytes
 from torchsar.study.output.folder import ResultFolder, opened
 from torchsar.study.output.progress import Count, Ticker
 from torchsar.study.output.report import installed_version
 from torchsar.study.settings.errors import ConfigError, did_you_mean
 
 log = logging.getLogger("torchsar")
-# chunks that wait to be written together at most: what they hold must stay small beside a chunk
-_WAITING = 256
-# trials after which points are looked at first; fewer say too little of an interval
+# trials after which points are checked first; intervals of fewer trials are too uncertain
 FIRST_LOOK = 50
 SWEEP_FILES = ("config.yaml", "summary.json", "figures", "report.html")
 
@@ -42,11 +40,11 @@ class Interrupted(KeyboardInterrupt):
 class Stop:
     """Ends a point when half of the 95 % interval of a statistic is small against the statistic.
 
-    Points are looked at after 50, 100, 200, 400, ... trials in the order of their numbers, and
-    never in between; every algorithm that has the metric must agree. An rmse that rare outliers
-    make up is settled before they come: with one error in a hundred 100 times as large and
-    relative = 0.19, four points of ten end at 50 trials without one. Below a threshold SNR take
-    the median, or a smaller relative (0.1 takes 100 trials or more).
+    Points are checked after 50, 100, 200, 400, ... trials in the order of their numbers, and
+    never in between; every algorithm that has the metric must meet the criterion. An rmse that is
+    dominated by rare outliers may meet it before the first outlier: with one error in a hundred
+    100 times as large and relative = 0.19, four points of ten end at 50 trials without one. Below
+    a threshold SNR take the median, or a smaller relative (0.1 takes 100 trials or more).
 
     Args:
         metric: The metric.
@@ -68,34 +66,31 @@ class Stop:
             raise ConfigError(f"stop.relative must lie between 0 and 1, got {self.relative!r}")
 
     def reached(self, record: Record, point: tuple[int, ...], trials: int, seed: int) -> bool:
-        """Whether the first `trials` trials of a point say enough."""
+        """Whether the first `trials` trials of a point meet the criterion."""
         values = record.metrics[self.metric][(slice(None), *point, slice(0, trials))]
         values = values[np.isfinite(values).any(-1)]
         return bool(len(values)) and bool((half_width_ratio(values, self.statistic, seed) < self.relative).all())
 
 
 def looks(trials: int, stop: Stop | None) -> list[int]:
-    """Numbers of trials after which points are looked at; the last is the limit."""
-    levels, level = [], FIRST_LOOK
-    while stop is not None and level < trials:
-        levels.append(level)
-        level *= 2
-    return [*levels, trials]
+    """Numbers of trials after which points are checked; the last is the limit."""
+    levels = [FIRST_LOOK << i for i in range(trials.bit_length()) if stop is not None]
+    return [*(level for level in levels if level < trials), trials]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a sweep is to compute.
+    """The work of a sweep.
 
     Args:
         grid: The points.
         trials: Trials of each point.
         seed: Of all random numbers.
         chunk: Rows of a batch, None to choose by bytes.
-        stop: When a point has seen enough trials.
+        stop: Criterion that ends points early.
         save: Trials whose arrays are kept.
         device: Where batches are computed.
-        needs: Metrics that are asked for, each with the key that asks for it.
+        needs: Metrics that the trial must give, each with the key that names it.
 
     Raises:
         ConfigError: If a number or the device is impossible.
@@ -127,16 +122,14 @@ class Plan:
             raise ConfigError(f"sweep: the device {self.device!r} cannot be used here: {text}") from None
 
     def work(self, trial: Trial) -> Work:
-        """What processes need in order to compute its chunks."""
-        batched = {p.name: p.values for p in self.grid.parameters if p.batched}
-        cases = tuple(self.grid.cases())
-        return Work(trial, cases, batched, self.grid.names, self.seed, self.device, self.save)
+        """What a process needs to compute its chunks."""
+        return Work(trial, self.grid, self.seed, self.device, self.save)
 
     def refuse_missing(self, trial: Trial) -> None:
-        """Refuse metrics that are asked for and that the first trial, computed here, does not give.
+        """Refuse needed metrics that the first trial, computed here, does not give.
 
         Raises:
-            ConfigError: With the first such metric.
+            ConfigError: If there is one; it names the first.
         """
         parts = self.work(trial).compute(Chunk(0, (0,), (0,))).parts if self.needs else []
         given = {metric for part in parts for metrics in part.values.values() for metric in metrics if metric != OK}
@@ -170,16 +163,16 @@ def sweep(
     Args:
         trial: Gets the parameters of a batch by name, and `Draws` whose trials are the rows of that
             batch. Returns {metric: (rows,) tensor}, or {algorithm: {metric: tensor}} to compare
-            algorithms on the same noise; `ok` (bool) is an algorithm's own verdict. Two further
-            keys: "bounds" {metric: {name: (rows,) tensor}}, and "saved" {algorithm: {name:
+            algorithms on the same noise; `ok` (bool) says whether the estimate is reliable. Two
+            further keys: "bounds" {metric: {name: (rows,) tensor}}, and "saved" {algorithm: {name:
             (rows, ...) tensor}}, kept for the trials in `save`.
-        grid: {name: values}, or {name: {label: value}} for values that are no numbers or words.
+        grid: {name: values}, or {name: {label: value}} if they are neither numbers nor words.
         trials: Trials of each point; more of them on a finished sweep extend it.
         seed: Of all random numbers.
         batched: Names whose values come as one float64 tensor (rows,); any other value comes as it
             is, one case after the other.
         out: Folder for results.zarr; None keeps the results in memory only.
-        resume: Whether a sweep that is there is gone on with.
+        resume: Whether to continue a sweep that is in the folder.
         chunk: Rows of a batch; None to choose by bytes.
         workers: Processes of this machine; None computes in this one.
         cluster: Address of a running dask scheduler instead.
@@ -187,13 +180,13 @@ def sweep(
         stop: Ends points early.
         save: Trials whose arrays are kept.
         device: Where batches are computed.
-        config: Whatever else the results depend on; resuming with another one is refused.
+        config: All else that the results depend on; a sweep is resumed only with the same one.
 
     Returns:
         The labelled results.
 
     Raises:
-        ConfigError: For bad input.
+        ConfigError: If an argument is invalid, or the trial function fails.
         Interrupted: After Ctrl-C.
     """
     if workers is not None:
@@ -202,7 +195,7 @@ def sweep(
         ("trial", callable(trial), "be a function of (parameters, draws)", trial),
         ("stop", stop is None or isinstance(stop, Stop), "be a Stop, such as Stop('error_m', 0.05)", stop),
         ("save", isinstance(save, Iterable), "list the numbers of trials", save),
-        ("config", isinstance(config or {}, Mapping), "be a mapping of whatever else results depend on", config),
+        ("config", isinstance(config or {}, Mapping), "be a mapping of what else results depend on", config),
     ):
         if not good:
             raise ConfigError(f"sweep: {name} must {expected}, got {given!r}")
@@ -260,15 +253,15 @@ def run_plan(plan: Plan, trial: Trial, store: Store | None, engine: AbstractCont
         with engine as chosen:
             run.all_levels(chosen)
     except KeyboardInterrupt:
-        run.settle()
+        run.flush()
         raise Interrupted(f"{int(record.done.sum())} trials are recorded") from None
     finally:
-        run.settle()
+        run.flush()
     return record
 
 
 class _Run:
-    """The state of one session: which points go on, how many rows fit, what is recorded."""
+    """The state of one session: active points, rows that fit into memory, and the record."""
 
     def __init__(self, plan: Plan, work: Work, record: Record, store: Store | None) -> None:
         self.plan, self.work, self.record, self.store = plan, work, record, store
@@ -276,11 +269,10 @@ class _Run:
         self.active = [set(range(len(case.points))) for case in work.cases]
         self.fits: dict[int, int] = {}
         self.rows: dict[int, int] = {}
-        self.waiting: list[Outcome] = []
         self.warned: set[str] = set()
 
     def all_levels(self, engine: Engine) -> None:
-        """Compute all trials, with looks at the points that may end early in between."""
+        """Compute all trials level by level; points may end early after each level."""
         stops = looks(self.plan.trials, self.plan.stop)
         known = (n for n in self.record.about.get("finished", []) if n < self.plan.trials)
         levels = sorted({*stops, *known})
@@ -294,7 +286,7 @@ class _Run:
                         self._enter(chunk, computed)
                         count.advance(len(chunk))
                         log.debug("%s", count.say())
-                    self.settle()
+                    self.flush()
                     # batches never reach across a level that all points got to, so that an
                     # extended sweep runs the same ones however often it is resumed
                     self._about(finished=sorted({*self.record.about.get("finished", []), last}))
@@ -302,7 +294,7 @@ class _Run:
                         count.total -= (self.plan.trials - last) * self._drop_settled(last)
         finally:
             rows = {str(case): n for case, n in self.rows.items()}
-            session = {**session, "seconds": count.seconds, "trials": count.new, "chunk_rows": rows}
+            session |= {"seconds": count.seconds, "trials": count.new, "chunk_rows": rows}
             self._about(seed=self.plan.seed, sessions=[*self.record.about.get("sessions", []), session])
 
     def _tasks(self, first: int, last: int) -> Iterator[Task]:
@@ -321,50 +313,46 @@ class _Run:
                     yield Chunk(number, points, trials), self.fits.get(number)
 
     def _enter(self, chunk: Chunk, computed: Computed) -> None:
-        """Take in a chunk; it waits with others until writing them together is cheap."""
+        """Enter a chunk into the record and the store, which writes when that is cheap.
+
+        The store is informed first: an interrupt in between may then leave rows that are announced
+        and not done, never the reverse.
+        """
         for text in computed.warnings:
             if text not in self.warned:
                 log.warning("warning: %s", text)
-        self.warned.update(computed.warnings)
+                self.warned.add(text)
         fits = computed.fits
         if fits is not None and fits < self.fits.get(chunk.case, len(chunk)):
             log.warning("warning: %d trials at once do not fit into memory; going on with %d", len(chunk), fits)
             self.fits[chunk.case] = fits
-        self.waiting += computed.parts
-        if len(self.waiting) >= _WAITING or (self.store is not None and self.store.due):
-            self.settle()
-
-    def settle(self) -> None:
-        """Enter what waits into the record and the store.
-
-        The store is informed first: a second Ctrl-C in between may then leave rows that are
-        announced and not done, never the reverse.
-        """
-        while self.waiting:
-            part = self.waiting.pop(0)
-            chunk, known = part.chunk, self.work.cases[part.chunk.case].points
-            points = [self.points[chunk.case][p] for p in chunk.points]
+        known = self.work.cases[chunk.case].points
+        for part in computed.parts:
+            points, trials = [self.points[chunk.case][p] for p in part.chunk.points], part.chunk.trials
             if self.store is not None:
-                self.store.entered(points, chunk.trials)
+                self.store.entered(points, trials)
                 for row, arrays in part.saved.items():
-                    self.store.save(self.plan.grid.labels_at(known[chunk.points[row]]), chunk.trials[row], arrays)
-            self.record.add(points, chunk.trials, part.values, part.bounds)
+                    labels = self.plan.grid.labels_at(known[part.chunk.points[row]])
+                    self.store.save(labels, trials[row], arrays)
+            self.record.add(points, trials, part.values, part.bounds)
+        if self.store is not None and self.store.due:
+            self.store.flush()
+
+    def flush(self) -> None:
+        """Write what the store has not written."""
         if self.store is not None:
             self.store.flush()
 
     def _drop_settled(self, trials: int) -> int:
-        """End the points that have seen enough; returns how many."""
-        assert self.plan.stop is not None
-        dropped = 0
+        """End the points that meet the criterion after `trials` trials; returns how many."""
+        stop, before = self.plan.stop, sum(map(len, self.active))
         for points, active in zip(self.points, self.active):
-            ended = {p for p in active if self.plan.stop.reached(self.record, points[p], trials, self.plan.seed)}
+            ended = {p for p in active if stop and stop.reached(self.record, points[p], trials, self.plan.seed)}
             active -= ended
-            dropped += len(ended)
-        return dropped
+        return before - sum(map(len, self.active))
 
     def _session(self, engine: Engine) -> dict[str, Any]:
         device = torch.device(self.plan.device)
-        versions = {"torchsar-lab": installed_version(), "torch": torch.__version__, "numpy": np.__version__}
         return {
             "began": datetime.now(UTC).isoformat(timespec="seconds"),
             "device": self.plan.device,
@@ -372,7 +360,12 @@ class _Run:
             "workers": engine.workers,
             "threads": engine.threads,
             "machine": platform.machine(),
-            "versions": {**versions, "python": platform.python_version()},
+            "versions": {
+                "torchsar-lab": installed_version(),
+                "torch": torch.__version__,
+                "numpy": np.__version__,
+                "python": platform.python_version(),
+            },
         }
 
     def _about(self, **attributes: Any) -> None:

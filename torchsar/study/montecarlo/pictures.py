@@ -33,29 +33,32 @@ def _value_text(name: str, label: float | str) -> str:
 
 @dataclass(frozen=True)
 class Quantity:
-    """What is drawn of a metric.
+    """A figure of a metric that is drawn.
 
     Args:
         metric: Its name.
         field: The field of its figures.
         interval: The field of the interval.
-        words: What stands before the name of the metric; for a share, all that is said.
+        title: What is drawn, for titles.
+        label: The same with the unit, for axes.
         log: Whether its axis is logarithmic.
     """
 
     metric: str
     field: str
     interval: str
-    words: str
+    title: str
+    label: str
     log: bool = False
 
     @property
     def is_share(self) -> bool:
         return self.field.endswith("share")
 
-    def named(self, name: str) -> str:
-        """Its words with the name of its metric."""
-        return self.words if self.is_share else self.words + name
+
+def share(metric: str, name: str, title: str) -> Quantity:
+    """A share of trials, whose title needs no unit."""
+    return Quantity(metric, f"{name}_share", f"{name}_interval", title, title)
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,7 @@ class Panel:
     """One position along the parameters that are not axes of a figure.
 
     Args:
-        title: What the position is.
+        title: The values of these parameters.
         index: Index by parameter.
     """
 
@@ -75,7 +78,7 @@ class SweepPictures:
     """Draws the figures of a sweep.
 
     Args:
-        summary: What is drawn.
+        summary: The figures of the sweep.
     """
 
     def __init__(self, summary: Summary) -> None:
@@ -108,19 +111,19 @@ class SweepPictures:
         return array[(slice(None),) * lead + index]
 
     def all(self, wanted: Sequence[str]) -> Drawn:
-        """Of each metric its curves, its success and its heat maps; last the verdicts."""
+        """Curves, success and heat maps of each metric; last the shares of trusted trials."""
         for metric in wanted:
             fields, (name, unit) = self.figures[metric], name_and_unit(metric)
             quantity = main_quantity(metric, bool(self.bounds.get(metric)))
             yield from self.curves(quantity)
             if "success_share" in fields:
                 within = f"{np.nanmax(fields['success_limit']):g} {unit}".rstrip()
-                words = f"share of trials trusted and within {within}: {name}"
-                yield from self.curves(Quantity(metric, "success_share", "success_interval", words))
+                title = f"share of trials trusted and within {within}: {name}"
+                yield from self.curves(share(metric, "success", title))
             for x, y in itertools.combinations(self.numeric, 2):
                 yield from self.heat_maps(quantity, x, y)
-        for metric in itertools.islice(self.figures, 1):
-            yield from self.curves(Quantity(metric, "ok_share", "ok_interval", "share of trusted trials"))
+        if self.figures:
+            yield from self.curves(share(next(iter(self.figures)), "ok", "share of trusted trials"))
 
     def curves(self, quantity: Quantity) -> Drawn:
         """Over every parameter with two numbers or more; without any, over words."""
@@ -134,33 +137,31 @@ class SweepPictures:
             along = over and f" over {name_and_unit(over)[0]}"
             for page, some in _paged(panels, PANELS):
                 parts = [self.part(quantity, panel, over) for panel in some]
-                label, x = quantity.named(axis_label(quantity.metric)), over and axis_label(over)
-                figure = plot.error_curves(parts, x, label, self.is_log(over), self.has_positive(quantity), ylim)
-                title = quantity.named(name_and_unit(quantity.metric)[0]) + along + page
+                x, logs = over and axis_label(over), (self.is_log(over), self.has_positive(quantity))
+                figure = plot.error_curves(parts, x, quantity.label, *logs, ylim)
                 end = over and f"_over_{over.rpartition('.')[2]}"
-                yield name + end, title, self.caption(quantity) + note, figure
+                yield name + end, quantity.title + along + page, self.caption(quantity) + note, figure
 
     def values(self, quantity: Quantity) -> np.ndarray:
         """What is drawn, (algorithm, *parameters)."""
         return self.figures[quantity.metric][quantity.field]
 
     def part(self, quantity: Quantity, panel: Panel, over: str) -> dict[str, Any]:
-        """Every algorithm along one parameter, or side by side where there is none."""
+        """Every algorithm along one parameter, or side by side if there is none."""
         fields = self.figures[quantity.metric]
         y, interval = (self.cut(fields[name], panel, over) for name in (quantity.field, quantity.interval))
         bounds = self.bounds.get(quantity.metric, {}) if quantity.log else {}
         bounds = {name: self.cut(rms, panel, over, lead=0) for name, rms in bounds.items()}
         if not over:
-            series = {quantity.named(name_and_unit(quantity.metric)[0]): (y, interval)}
+            series = {quantity.title: (y, interval)}
             bounds = {name: np.full(len(y), rms) for name, rms in bounds.items()}
             return {"title": "", "x": self.algorithms, "series": series, "bounds": bounds}
-        x = self.sorted_labels(over)
+        x = self.sorted_labels(over) if over in self.worded else np.asarray(self.sorted_labels(over), dtype=float)
         series = {name: (y[i], interval[i]) for i, name in enumerate(self.algorithms)}
-        x = x if over in self.worded else np.asarray(x, dtype=float)
         return {"title": panel.title, "x": x, "series": series, "bounds": bounds}
 
     def has_positive(self, quantity: Quantity) -> bool:
-        """Whether there is something to draw on a logarithmic axis, and one is wanted."""
+        """Whether the axis is logarithmic and some value can be shown on it."""
         return quantity.log and bool((self.values(quantity) > 0).any())
 
     def is_log(self, over: str) -> bool:
@@ -200,29 +201,27 @@ class SweepPictures:
         return ", ".join(_value_text(name, self.labels[name][i]) for name, i in index.items())
 
     def caption(self, quantity: Quantity) -> str:
-        """What a reader should see, the interval's level and the number of trials."""
+        """What the picture shows, with the level of the interval and the number of trials."""
         trials = self.trials(quantity.metric)
         if quantity.is_share:
-            meaning = (
-                "Trusted: the algorithm itself calls its estimate reliable (ok); within: the error keeps to the limit."
-                if quantity.field == "success_share"
-                else "Trusted: the algorithm itself calls its estimate reliable (ok), right or wrong."
+            more = ", right or wrong" if quantity.field == "ok_share" else "; within: the error is at most the limit"
+            return (
+                f"Share of {trials}, with exact {LEVEL:.0%} intervals. "
+                f"Trusted: the algorithm itself calls its estimate reliable (ok){more}."
             )
-            return f"Share of {trials}, with exact {LEVEL:.0%} intervals. {meaning}"
-        title = quantity.named(name_and_unit(quantity.metric)[0])
-        text = f"{title[:1].upper() + title[1:]} over {trials}, reliable or not, with {LEVEL:.0%} intervals."
-        text += "" if quantity.field == "median" else " Lower is better."
-        if self.has_positive(quantity) and (self.values(quantity) == 0).any():
-            text += " Zeros cannot be shown on the logarithmic axis."
-        if quantity.log and self.bounds.get(quantity.metric):
-            text += (
-                " Dark lines are bounds: a curve that lies on one cannot be improved without bias, and where it "
-                "departs from it the algorithm has its threshold."
-            )
-        return text
+        sentences = {
+            f"{_capital(quantity.title)} over {trials}, reliable or not, with {LEVEL:.0%} intervals.": True,
+            "Lower is better.": quantity.field != "median",
+            "Zeros cannot be shown on the logarithmic axis.": (
+                self.has_positive(quantity) and (self.values(quantity) == 0).any()
+            ),
+            "Dark lines are bounds: a curve that lies on one cannot be improved without bias, and where it departs "
+            "from it is the threshold of the algorithm.": quantity.log and self.bounds.get(quantity.metric),
+        }
+        return " ".join(text for text, applies in sentences.items() if applies)
 
     def trials(self, metric: str) -> str:
-        """How many trials points have."""
+        """The number of trials of a point, or its range."""
         done = self.figures[metric]["trials"]
         few, many = int(done.min()), int(done.max())
         return f"{many} trials a point" if few == many else f"{few} to {many} trials a point"
@@ -234,17 +233,16 @@ class SweepPictures:
         if not known.size:
             return
         panels, note = self.panels_beside({x, y})
-        title = quantity.named(name_and_unit(quantity.metric)[0])
         caption = (
-            f"{title[:1].upper() + title[1:]} over {self.trials(quantity.metric)}, all panels on one"
+            f"{_capital(quantity.title)} over {self.trials(quantity.metric)}, all panels on one"
             f"{' logarithmic' if log else ''} colour scale, dark for small.{note}"
         )
-        label, scale = quantity.named(axis_label(quantity.metric)), (float(known.min()), float(known.max()))
+        scale = (float(known.min()), float(known.max()))
         name = f"{quantity.metric}_map_{x.rpartition('.')[2]}_{y.rpartition('.')[2]}"
         for page, some in _paged(panels, max(1, PANELS // len(self.algorithms))):
             parts = [self.map_part(values[i], p, x, y, name) for p in some for i, name in enumerate(self.algorithms)]
-            figure = plot.heat_map(parts, axis_label(x), axis_label(y), label, log, scale)
-            yield name, f"{title} over {name_and_unit(x)[0]} and {name_and_unit(y)[0]}{page}", caption, figure
+            figure = plot.heat_map(parts, axis_label(x), axis_label(y), quantity.label, log, scale)
+            yield name, f"{quantity.title} over {name_and_unit(x)[0]} and {name_and_unit(y)[0]}{page}", caption, figure
 
     def map_part(self, values: np.ndarray, panel: Panel, x: str, y: str, algorithm: str) -> dict[str, Any]:
         """One panel of a heat map; values: (*parameters)."""
@@ -263,9 +261,14 @@ def main_quantity(metric: str, bounded: bool = False) -> Quantity:
         metric: Its name; errors that are ratios in dB are no errors about zero.
         bounded: Whether it has bounds, which make a logarithmic axis useful by themselves.
     """
+    name, label = name_and_unit(metric)[0], axis_label(metric)
     if "error" in metric and not metric.endswith("_db"):
-        return Quantity(metric, "rmse", "interval", "RMSE of ", log=True)
-    return Quantity(metric, "median", "median_interval", "median of ", log=bounded)
+        return Quantity(metric, "rmse", "interval", f"RMSE of {name}", f"RMSE of {label}", log=True)
+    return Quantity(metric, "median", "median_interval", f"median of {name}", f"median of {label}", log=bounded)
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _paged(panels: Sequence[Panel], size: int) -> Iterator[tuple[str, Sequence[Panel]]]:
@@ -279,11 +282,10 @@ def draw_sweep(summary: Summary, folder: Path, show: Sequence[str] = ()) -> list
     """The pictures of a sweep as PNG files in a new folder, in the order of reading.
 
     Args:
-        summary: What is drawn.
+        summary: The figures of the sweep.
         folder: Where to write.
         show: The metrics to draw, in this order; by default the errors, and where nothing is called
             an error everything that was measured.
     """
     wanted = show or [metric for metric in summary.figures if "error" in metric] or list(summary.figures)
-
     return draw_all([lambda: SweepPictures(summary).all(wanted)], folder)

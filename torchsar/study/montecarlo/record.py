@@ -24,10 +24,10 @@ class Record:
         labels: Values of every parameter, numbers or words, in the order of the dims.
         done: Which trials have run, bool (*parameters, trial); points that ended early have fewer
             than others.
-        ok: What the algorithm itself says of each trial, bool (algorithm, *parameters, trial).
+        ok: Whether each estimate is reliable, bool (algorithm, *parameters, trial).
         metrics: By name, float64 of the same shape as `ok`.
         bounds: By metric and name of the bound, float64 (*parameters, trial).
-        about: What the run was: title, resolved config, hash, seed, versions, device, timings.
+        about: Title, resolved config, hash, seed, versions, device and timings of the run.
     """
 
     algorithms: tuple[str, ...]
@@ -114,7 +114,7 @@ class Record:
         return found
 
     def grown(self, labels: Labels, trials: int) -> Record:
-        """The same results where there is room for more: labels begin with those of this record."""
+        """The same results in larger arrays: labels begin with those of this record."""
         return self._mapped(lambda x: _enlarged(x, (*map(len, labels.values()), trials)), labels)
 
     def select(self, labels: Labels) -> Record:
@@ -168,7 +168,7 @@ def _enlarged(x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Difference:
-    """One trial of one algorithm that two records give differently."""
+    """One trial of one algorithm that differs between two records."""
 
     metric: str
     algorithm: str
@@ -183,7 +183,7 @@ def differences(a: Record, b: Record, tolerance: float) -> list[Difference]:
     Two runs in batches of other sizes or with other threads differ by rounding alone, except in
     trials in which a choice (a peak, a candidate, an end of iterations) depends on less than that;
     those are found here. Errors are compared on the scale of the largest error of their metric and
-    point: each is a small difference of two large numbers.
+    point, since an error is a small difference of two large numbers.
 
     Args:
         a: The one record.

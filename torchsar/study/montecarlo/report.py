@@ -14,7 +14,7 @@ from torchsar.study.output.pictures import Picture
 from torchsar.study.output.progress import clock
 from torchsar.study.output.report import write_page
 
-# parts of `about` that stand elsewhere in the report, or are too long for it
+# parts of `about` that are shown elsewhere in the report, or are too long for it
 _NOT_SHOWN = ("title", "config", "identity", "sessions", "chunk_rows")
 
 
@@ -29,7 +29,7 @@ def write_sweep_report(
         pictures: In the order of reading.
         figures: The folder that holds them.
         config_text: The resolved config.
-        command: What the report says it was made with.
+        command: The command that made it.
     """
     tables = [*metric_tables(tree), *bound_tables(tree)]
     fields = {"facts": facts(tree), "tables": tables, "origin": list(origin(tree["about"]))}

@@ -1,9 +1,9 @@
 """The store of a sweep: labelled arrays in zarr version 3, and markers of what is done, written
 last.
 
-One process writes, and every file of a zarr store is replaced whole, so a sweep that is killed at
-any moment leaves arrays that may hold more than is marked done, never less; what is not marked is
-ignored and computed again.
+One process writes, and every file of a zarr store is replaced whole. A sweep that is killed at any
+moment therefore leaves arrays that may hold more than is marked done, never less; trials that are
+not marked are ignored and computed again.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,8 @@ FORMAT = 1
 _CHUNK_NUMBERS = 1 << 16
 # writing takes half a percent of the time at most
 _SHARE_FOR_WRITING = 0.005
+# trials whose arrays wait to be written at most, since they fill the memory meanwhile
+_WAITING = 64
 _DONE, _SAVED = "done", "saved"
 
 
@@ -41,15 +43,14 @@ class Store:
 
     Args:
         root: The group.
-        record: What it holds.
+        record: Its content.
     """
 
     def __init__(self, root: zarr.Group, record: Record) -> None:
         self.root, self.record = root, record
         self.path = Path(str(root.store_path).removeprefix("file://"))
         self._marks = _attributes(root[_DONE])
-        self._dirty: set[tuple[int, ...]] = set()
-        self._window: tuple[int, int] | None = None
+        self._dirty: set[tuple[tuple[int, ...], int]] = set()
         self._arrays: dict[str, zarr.Array] = {}
         self._pending: list[tuple[str, dict[str, Any], dict[str, np.ndarray]]] = []
         self._last, self._cost = time.perf_counter(), 0.0
@@ -69,7 +70,7 @@ class Store:
 
     @classmethod
     def resume(cls, path: Path, grid: Grid, trials: int, identity: Mapping[str, Any]) -> Store:
-        """The store that is there, with room for new labels and trials.
+        """The existing store, enlarged for new labels and trials.
 
         Raises:
             ConfigError: If it belongs to another config.
@@ -87,73 +88,66 @@ class Store:
         about = {"format": FORMAT, "identity": _plain(identity), "hash": address(identity), "values": values}
         self.root.update_attributes(about)
         self.record.about = _about(self.root)
-        self._describe()
-        for name, labels in (*self.record.labels.items(), ("trial", range(self.record.trials))):
-            self._put(name, np.array(labels))
+        labels = {name: list(known) for name, known in self.record.labels.items()}
+        self.root.update_attributes({"labels": labels, "trials": self.record.trials})
+        for name, values in (*labels.items(), ("trial", range(self.record.trials))):
+            self._put(name, np.array(values))
         for name, variable in self.record.variables().items() if self.record.algorithms else ():
             self._array(name, *variable)
         return self
 
-    def _describe(self) -> None:
-        labels = {name: list(values) for name, values in self.record.labels.items()}
-        algorithms = list(self.record.algorithms)
-        self.root.update_attributes({"labels": labels, "trials": self.record.trials, "algorithms": algorithms})
-
     def note(self, **about: Any) -> None:
-        """Set root attributes: what the run was."""
+        """Set root attributes that describe the run."""
         with _writing(self.path):
             self.root.update_attributes(json.loads(json.dumps(about, default=str)))
 
     @property
     def due(self) -> bool:
-        """Whether writing costs less than half a percent of the time since the last writing."""
-        return time.perf_counter() - self._last > self._cost / _SHARE_FOR_WRITING
+        """Whether writing costs less than half a percent of the time since the last writing, or
+        too many arrays wait for it.
+        """
+        waited = time.perf_counter() - self._last
+        return waited > self._cost / _SHARE_FOR_WRITING or len(self._pending) >= _WAITING
 
-    def entered(self, points: Iterable[tuple[int, ...]], trials: Sequence[int]) -> None:
+    def entered(self, points: Iterable[tuple[int, ...]], trials: Iterable[int]) -> None:
         """Rows have entered the record, to be written by the next `flush`.
 
         Args:
             points: Index of the point of each row.
             trials: Trial number of each row.
         """
-        self._dirty.update(points)
-        first, last = self._window or (trials[0], 0)
-        self._window = min(first, *trials), max(last, max(trials) + 1)
+        self._dirty.update(zip(points, trials))
 
     def save(self, labels: Mapping[str, float | str], trial: int, arrays: Mapping[str, np.ndarray]) -> None:
         """Keep arrays of one trial, to be written before it is marked done."""
         self._pending.append((f"{address(labels)}/{trial}", {"parameters": dict(labels), "trial": trial}, dict(arrays)))
 
     def flush(self) -> None:
-        """Write what has entered the record, then mark it done, in one file."""
-        if self._window is not None:
-            with _writing(self.path):
-                self._flush(*self._window)
+        """Write what has entered the record, then mark it done, in one file.
 
-    def _flush(self, first: int, last: int) -> None:
-        """The trials first..last-1.
-
-        The list of arrays comes after them and before the marks: whoever reads knows what must be
-        there.
+        The names of algorithms and arrays are written after the arrays and before the marks, so
+        that a reader finds every array that is named.
         """
-        began = time.perf_counter()
-        if list(self.record.algorithms) != self.root.attrs.get("algorithms"):
-            self._describe()
-            self._put("algorithm", np.array(self.record.algorithms))
-        variables = self.record.variables()
-        for name, variable in variables.items():
-            self._write(name, variable, first, last)
-        if list(variables) != self.root.attrs.get("arrays"):
-            self.root.update_attributes({"arrays": list(variables)})
-        for path, about, arrays in self._pending:
-            group = self.root.require_group(f"{_SAVED}/{path}")
-            group.attrs.put(about)
-            for name, data in arrays.items():
-                group.create_array(name, data=data, overwrite=True)
-        self._marks.update({",".join(map(str, point)): _spans(self.record.done[point]) for point in self._dirty})
-        self.root[_DONE].update_attributes(self._marks)
-        self._dirty, self._window, self._pending = set(), None, []
-        self._last = time.perf_counter()
+        if not self._dirty:
+            return
+        began, trials = time.perf_counter(), [trial for _, trial in self._dirty]
+        with _writing(self.path):
+            variables = self.record.variables()
+            for name, variable in variables.items():
+                self._write(name, variable, min(trials), max(trials) + 1)
+            names = {"algorithms": list(self.record.algorithms), "arrays": list(variables)}
+            if any(self.root.attrs.get(key) != value for key, value in names.items()):
+                self._put("algorithm", np.array(self.record.algorithms))
+                self.root.update_attributes(names)
+            for path, about, arrays in self._pending:
+                group = self.root.require_group(f"{_SAVED}/{path}")
+                group.attrs.put(about)
+                for name, data in arrays.items():
+                    group.create_array(name, data=data, overwrite=True)
+            points = {point for point, _ in self._dirty}
+            self._marks.update({",".join(map(str, point)): _spans(self.record.done[point]) for point in points})
+            self.root[_DONE].update_attributes(self._marks)
+        self._dirty, self._pending, self._last = set(), [], time.perf_counter()
         self._cost = self._last - began
 
     def _write(self, name: str, variable: tuple[np.ndarray, Any, Any], first: int, last: int) -> None:
@@ -166,15 +160,21 @@ class Store:
         array[window] = data[window]
 
     def _array(self, name: str, data: np.ndarray, dims: tuple[str, ...], about: dict[str, Any]) -> zarr.Array:
-        """The array of that name, made or grown as needed, and remembered: looking it up costs as
-        much as writing it.
+        """The array of that name, made or enlarged as needed; cached, since looking it up takes as
+        long as writing it.
         """
         if name not in self._arrays:
             leading = tuple(max(1, min(n, 64)) for n in data.shape[:-1])
             chunk = max(1, min(data.shape[-1], 1024, _CHUNK_NUMBERS // max(1, int(np.prod(leading)))))
-            made: dict[str, Any] = {"shape": data.shape, "dtype": data.dtype, "chunks": (*leading, chunk)}
-            made["fill_value"] = False if data.dtype == bool else np.nan
-            made |= {"dimension_names": dims, "attributes": about, "compressors": None}
+            made: dict[str, Any] = {
+                "shape": data.shape,
+                "dtype": data.dtype,
+                "chunks": (*leading, chunk),
+                "fill_value": False if data.dtype == bool else np.nan,
+                "dimension_names": dims,
+                "attributes": about,
+                "compressors": None,
+            }
             known: Any = self.root.get(name)
             self._arrays[name] = self.root.create_array(name, **made) if known is None else known
         if self._arrays[name].shape != data.shape:
@@ -221,7 +221,7 @@ def read_sweep(path: Path | str) -> Record:
 
 
 def cut_off(path: Path) -> bool:
-    """Whether a sweep of ours was killed while it made this store, before anything was in it."""
+    """Whether a sweep was killed while it made this store, before the store held anything."""
     made = {p.name for p in path.iterdir() if not p.name.endswith(".partial")} if path.is_dir() else {""}
     root = path / "zarr.json"
     if not made <= {root.name, _DONE}:
@@ -236,30 +236,30 @@ def _opened(path: Path, mode: Any) -> zarr.Group:
         raise ConfigError(f"{path} holds no results of a sweep; choose another folder") from None
     if root.attrs.get("format") != FORMAT or not {"labels", "identity"} <= set(root.attrs):
         raise ConfigError(
-            f"{path} was not left by a sweep of this version of torchsar; remove it or choose another folder"
+            f"{path} was not written by a sweep of this version of torchsar; remove it or choose another folder"
         )
     return root
 
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """What the system says of a file that cannot be written, as one sentence."""
+    """Turn an error of the file system into one sentence."""
     try:
         yield
     except OSError as error:
         raise ConfigError(
-            f"{path} cannot be written ({error.strerror or error}); what is marked done there is "
-            "safe, go on with --resume once it can be"
+            f"{path} cannot be written ({error.strerror or error}); trials that are marked done are "
+            "safe; go on with --resume once the folder can be written"
         ) from error
 
 
 def _loaded(root: zarr.Group, path: Path) -> Record:
-    """Everything on disk, without what is not marked done.
+    """The trials on disk that are marked done.
 
     Raises:
         ConfigError: If files are missing or broken.
     """
-    advice = "restore it, or begin anew in another folder"
+    advice = "restore it, or start again in another folder"
     try:
         missing = [name for name in (_DONE, *_attributes(root).get("arrays", [])) if name not in root]
         if not missing:
@@ -275,23 +275,20 @@ def _read(root: zarr.Group) -> Record:
     for index, spans in _attributes(root[_DONE]).items():
         for first, last in spans:
             record.done[(*map(int, filter(None, index.split(","))), slice(first, last))] = True
-    record.algorithms = tuple(held["algorithms"])
+    record.algorithms = tuple(held.get("algorithms", ()))
     record.ok = np.zeros((len(record.algorithms), *record.done.shape), bool)
-    with warnings.catch_warnings():
-        # a process that was killed while it wrote leaves half a file beside the old one
-        warnings.filterwarnings("ignore", message="Object at")
-        arrays = dict(root.arrays())
-    # a folder lists its files in any order
-    rank = {name: i for i, name in enumerate(held.get("arrays", []))}
-    for name, array in sorted(arrays.items(), key=lambda pair: rank.get(pair[0], -1)):
+    for name in held.get("arrays", ()):
+        array: Any = root[name]
         about = _attributes(array)
-        if about.get("kind") == OK:
-            _restore(record.ok, array, record.done)
-        elif about.get("kind") == "metric":
-            _restore(record.metrics.setdefault(name, record.blank()), array, record.done)
-        elif about.get("kind") == "bound":
-            named = record.bounds.setdefault(about["bound_of"], {})
-            _restore(named.setdefault(about["bound"], record.blank(False)), array, record.done)
+        if about["kind"] == OK:
+            target = record.ok
+        elif about["kind"] == "metric":
+            target = record.metrics.setdefault(name, record.blank())
+        else:
+            target = record.bounds.setdefault(about["bound_of"], {}).setdefault(about["bound"], record.blank(False))
+        # the array is smaller where the sweep was killed while its arrays grew
+        part = tuple(map(slice, array.shape))
+        target[part] = np.where(record.done[part[-record.done.ndim :]], np.asarray(array[...]), target[part])
     record.about = _about(root)
     return record
 
@@ -303,14 +300,6 @@ def _attributes(node: Any) -> dict[str, Any]:
 def _about(root: zarr.Group) -> dict[str, Any]:
     own = ("labels", "values", "trials", "algorithms", "arrays", "format")
     return {key: value for key, value in _attributes(root).items() if key not in own}
-
-
-def _restore(target: np.ndarray, array: zarr.Array, done: np.ndarray) -> None:
-    """Put an array of the same or a smaller shape where it belongs; a sweep may have been killed
-    while its arrays grew.
-    """
-    part = tuple(map(slice, array.shape))
-    target[part] = np.where(done[part[-done.ndim :]], np.asarray(array[...]), target[part])
 
 
 def _spans(done: np.ndarray) -> list[list[int]]:
@@ -360,7 +349,7 @@ def _short(value: Any) -> str:
 
 
 def _values(grid: Grid) -> dict[str, dict[str, str]]:
-    """By parameter and label, what the value is."""
+    """The text of every value by parameter and label."""
     return {p.name: {str(label): canonical(value) for label, value in zip(p.labels, p.values)} for p in grid.parameters}
 
 

@@ -15,8 +15,8 @@ from torchsar.study.montecarlo.record import Labels, Record
 
 _DEFINITIONS = {
     "statistics": (
-        "over all trials with a finite value, whether the algorithm calls them reliable (ok) or not, so that calling "
-        "failures unreliable makes nothing look better; n counts them"
+        "over all trials with a finite value, reliable (ok) or not, so that marking failures as unreliable improves no "
+        "figure; n counts them"
     ),
     "rmse": "root mean square of the metric about zero, which is the RMSE of a metric that is an error",
     "interval": (
@@ -28,15 +28,15 @@ _DEFINITIONS = {
         f"{LEVEL:.0%}; none for fewer than six trials"
     ),
     "ok_share": (
-        "share of the trials done that the algorithm itself calls reliable, with its exact "
+        "share of the trials done that the algorithm itself marks as reliable (trusted), with its exact "
         f"{LEVEL:.0%} interval (Clopper-Pearson)"
     ),
 }
 _SUCCESS = (
-    "share of the trials done that the algorithm calls reliable, with the metric within success_limit of zero, none "
-    f"where it never gives the metric, with its exact {LEVEL:.0%} interval (Clopper-Pearson)"
+    "share of the trials done that the algorithm marks as reliable (trusted), with the metric within success_limit of "
+    f"zero; none where it never gives the metric; with its exact {LEVEL:.0%} interval (Clopper-Pearson)"
 )
-_BOUND = "root mean square over the trials done of the bound of each trial, beside which an rmse stands"
+_BOUND = "root mean square over the trials done of the bound of each trial, for comparison with an rmse"
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Summary:
         """The content of summary.json; what is unknown is NaN (null in the file).
 
         Args:
-            about: What the run was, with its title.
+            about: Title and description of the run.
             definitions: Added to those made here.
         """
         points = [

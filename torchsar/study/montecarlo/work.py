@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -17,7 +18,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from torchsar.core import Draws
-from torchsar.study.montecarlo.grid import Case
+from torchsar.study.montecarlo.grid import Case, Grid
 from torchsar.study.montecarlo.record import OK
 from torchsar.study.settings.errors import ConfigError, one_line
 
@@ -25,7 +26,7 @@ log = logging.getLogger("torchsar")
 Trial = Callable[[Mapping[str, Any], Draws], Mapping[str, Any]]
 Numbers = dict[str, dict[str, list[float]]]
 BOUNDS, SAVED = "bounds", "saved"
-# larger batches leave the cache of a CPU and cost more per trial, as measured
+# larger batches do not fit the cache of a CPU and take more time per trial, as measured
 CACHE_BYTES = 12 << 20
 # of the free memory of a GPU, and tensors of the largest kind that chains hold at a time
 _GPU_SHARE, _LIVE_TENSORS = 0.5, 12
@@ -58,7 +59,7 @@ class Chunk:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one batch gave.
+    """Results of one batch.
 
     Args:
         chunk: Its rows.
@@ -75,11 +76,11 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Computed:
-    """What a chunk gave.
+    """Results of a chunk.
 
     Args:
-        parts: The batches that it was run in.
-        fits: The largest batch that fits into memory, None where nothing was too large.
+        parts: Results of the batches that it was run in.
+        fits: The largest batch that fits into memory, None if no batch was too large.
         warnings: What the trials logged as warnings.
     """
 
@@ -90,18 +91,20 @@ class Computed:
 
 @dataclass(frozen=True)
 class Work:
-    """All that a process needs in order to compute chunks."""
+    """All that a process needs to compute chunks."""
 
     trial: Trial
-    cases: tuple[Case, ...]
-    batched: Mapping[str, tuple[float, ...]]
-    names: tuple[str, ...]
+    grid: Grid
     seed: int
     device: str = "cpu"
     save: frozenset[int] = frozenset()
 
+    @cached_property
+    def cases(self) -> tuple[Case, ...]:
+        return tuple(self.grid.cases())
+
     def compute(self, chunk: Chunk, fits: int | None = None) -> Computed:
-        """Run a chunk in batches of at most `fits` rows; where memory ends, in halves from then on.
+        """Run a chunk in batches of at most `fits` rows; one too large for the memory is halved.
 
         Raises:
             ConfigError: If the trial function fails.
@@ -113,52 +116,40 @@ class Work:
                 if found is not None and len(piece) > found:
                     waiting = [*piece.pieces(found), *waiting]
                     continue
-                outcome = self._attempt(piece)
-                if outcome is None:
+                try:
+                    parts.append(self._once(piece))
+                except Exception as error:
+                    self._refuse_unless_halving_helps(piece, error)
                     found, waiting = -(-len(piece) // 2), [piece, *waiting]
-                else:
-                    parts.append(outcome)
         return Computed(parts, found if found != fits else None, tuple(dict.fromkeys(said)))
 
-    def _attempt(self, chunk: Chunk) -> Outcome | None:
-        """The outcome of a batch, None where it does not fit into memory."""
-        try:
-            return self._once(chunk)
-        except Exception as error:
-            if not _out_of_memory(error):
-                text = f"{type(error).__name__}: {one_line(error) or 'no message'}"
-                raise ConfigError(f"{self._where(chunk)}: {text}") from error
-        if len(chunk) == 1:
-            raise ConfigError(
-                f"{self._where(chunk)}: a single trial does not fit into the memory of {self.device}; "
-                "make the scene smaller"
-            )
-        if self.device != "cpu":
-            torch.cuda.empty_cache()
-        return None
-
-    def _where(self, chunk: Chunk) -> str:
+    def _refuse_unless_halving_helps(self, chunk: Chunk, error: Exception) -> None:
+        """Raise a ConfigError unless a batch of several trials did not fit into memory."""
         points = ", ".join(f"{k}={v}" for k, v in self.cases[chunk.case].fixed.items())
         of = f" of {points}" if points else ""
-        return f"the trial function failed in trials {min(chunk.trials)} to {max(chunk.trials)}{of}"
+        where = f"the trial function failed in trials {min(chunk.trials)} to {max(chunk.trials)}{of}"
+        if not _out_of_memory(error):
+            raise ConfigError(f"{where}: {type(error).__name__}: {one_line(error) or 'no message'}") from error
+        if len(chunk) == 1:
+            raise ConfigError(
+                f"{where}: a single trial does not fit into the memory of {self.device}; make the scene smaller"
+            ) from error
+        if self.device != "cpu":
+            torch.cuda.empty_cache()
 
     def parameters(self, chunk: Chunk) -> dict[str, Any]:
-        """What the trial is given: fixed values as they are, batched ones as (rows,) float64."""
-        case = self.cases[chunk.case]
-        given: dict[str, Any] = dict(case.fixed)
-        for name, values in self.batched.items():
-            dim = self.names.index(name)
-            rows = [values[case.points[p].index[dim]] for p in chunk.points]
-            given[name] = torch.tensor(rows, dtype=torch.float64, device=self.device)
-        return {name: given[name] for name in self.names}
-
-    def draws(self, chunk: Chunk) -> Draws:
-        """Random numbers of every row at its own address."""
-        points = self.cases[chunk.case].points
-        return Draws(self.seed, tuple(points[p].address for p in chunk.points), list(chunk.trials))
+        """Parameters of the trial: fixed values as they are, batched ones as (rows,) float64."""
+        given, indices = dict[str, Any](), [self.cases[chunk.case].points[p].index for p in chunk.points]
+        for dim, parameter in enumerate(self.grid.parameters):
+            rows = [parameter.values[index[dim]] for index in indices]
+            given[parameter.name] = (
+                torch.tensor(rows, dtype=torch.float64, device=self.device) if parameter.batched else rows[0]
+            )
+        return given
 
     def _once(self, chunk: Chunk) -> Outcome:
-        given, n = self.trial(self.parameters(chunk), self.draws(chunk)), len(chunk)
+        addresses = tuple(self.cases[chunk.case].points[p].address for p in chunk.points)
+        given = self.trial(self.parameters(chunk), Draws(self.seed, addresses, list(chunk.trials)))
         if not isinstance(given, Mapping):
             raise ValueError(
                 "a trial function returns {metric: tensor} or {algorithm: {metric: tensor}}, "
@@ -167,19 +158,23 @@ class Work:
         found = dict(given)
         bounds, saved = found.pop(BOUNDS, {}), found.pop(SAVED, {})
         nested = {name: value for name, value in found.items() if isinstance(value, Mapping)}
-        if nested and len(nested) != len(found):
-            raise ValueError(
-                "a trial function returns tensors by metric, or a mapping of metrics by algorithm, "
-                f"not both; got {list(found)}"
-            )
-        if not (any(nested.values()) if nested else found):
-            raise ValueError("a trial function gives at least one metric, and this one gave none")
-        for name, tree in ((BOUNDS, bounds), (SAVED, saved)):
-            if not isinstance(tree, Mapping) or not all(isinstance(named, Mapping) for named in tree.values()):
-                form = "{metric: {name: tensor}}" if name == BOUNDS else "{algorithm: {name: tensor}}"
-                raise ValueError(f"{name!r} must be a mapping of mappings, {form}")
+        for wrong, text in (
+            (
+                nested and len(nested) != len(found),
+                "a trial function returns tensors by metric, or a mapping of metrics by algorithm, not both; got "
+                f"{list(found)}",
+            ),
+            (
+                not (any(nested.values()) if nested else found),
+                "a trial function gives at least one metric, and this one gave none",
+            ),
+            (not _nested(bounds), f"{BOUNDS!r} must be a mapping of mappings, {{metric: {{name: tensor}}}}"),
+            (not _nested(saved), f"{SAVED!r} must be a mapping of mappings, {{algorithm: {{name: tensor}}}}"),
+        ):
+            if wrong:
+                raise ValueError(text)
         kept = {f"{algorithm}.{name}": value for algorithm, named in saved.items() for name, value in named.items()}
-        rows = [row for row, trial in enumerate(chunk.trials) if trial in self.save]
+        n, rows = len(chunk), [row for row, trial in enumerate(chunk.trials) if trial in self.save]
         return Outcome(
             chunk,
             _numbers(nested or {_name(self.trial): found}, n),
@@ -212,8 +207,12 @@ def _name(trial: Trial) -> str:
     return name if name.isidentifier() else "trial"
 
 
+def _nested(tree: Any) -> bool:
+    return isinstance(tree, Mapping) and all(isinstance(named, Mapping) for named in tree.values())
+
+
 def _array(value: Any, row: int, rows: int, what: str) -> np.ndarray:
-    """One trial's part of what is to be kept."""
+    """One trial of an array that is kept."""
     if not hasattr(value, "__len__") or len(value) != rows:
         raise ValueError(
             f"{what} must hold one array for each of the {rows} trials, got "
@@ -226,7 +225,7 @@ def _array(value: Any, row: int, rows: int, what: str) -> np.ndarray:
 
 
 def _numbers(tree: Mapping[str, Mapping[str, Any]], rows: int, before: str = "") -> Numbers:
-    """Plain numbers for each row: lists, since that is the cheapest way out of torch."""
+    """Plain numbers for each row: lists, the fastest conversion from torch."""
     return {
         outer: {inner: _rows(value, rows, f"{before}{outer}.{inner}") for inner, value in named.items()}
         for outer, named in tree.items()
@@ -247,14 +246,14 @@ def _rows(value: Any, rows: int, what: str) -> list[float]:
 
 
 def _out_of_memory(error: Exception) -> bool:
-    """CUDA has a class for it, the CPU allocator of torch only a text."""
+    """CUDA raises a class of its own, the CPU allocator of torch only a text."""
     return isinstance(error, (MemoryError, torch.OutOfMemoryError)) or (
         isinstance(error, RuntimeError) and "allocate memory" in str(error)
     )
 
 
 class _Largest(TorchDispatchMode):
-    """Remembers the bytes of the largest tensor that any operation gives."""
+    """Records the bytes of the largest tensor that any operation returns."""
 
     bytes = 0
 
@@ -269,7 +268,7 @@ class _Largest(TorchDispatchMode):
 def probed_bytes(work: Work, case: int) -> int:
     """Bytes of the largest tensor of one trial, found by running it once.
 
-    A trial function with a method `bytes_per_trial(fixed)` saves that run.
+    A trial function with a method `bytes_per_trial(fixed)` is asked instead.
     """
     known = getattr(work.trial, "bytes_per_trial", None)
     if known is not None:
@@ -296,7 +295,7 @@ def rows_by_bytes(bytes_per_trial: int, device: str) -> int:
 def cut(case: int, whole: Case, active: set[int], first: int, last: int, rows: int) -> Iterator[Chunk]:
     """Chunks of at most `rows` rows: trials first..last-1 of the active points, point by point.
 
-    The cuts depend on these arguments alone, never on what has already been done, so that a resumed
+    The cuts depend on these arguments alone, not on the trials already done, so that a resumed
     sweep runs the same batches.
     """
     order = [(p, t) for p in range(len(whole.points)) if p in active for t in range(first, last)]

@@ -54,6 +54,8 @@ class Strip(World):
             )
         if self.doppler_hz is not None and self.squint_deg is not None:
             raise ValueError("doppler_hz and squint_deg both say where the beam looks; give one of them")
+        if self.velocity_m_s is not None and bool((torch.as_tensor(self.velocity_m_s) <= 0).any()):
+            raise ValueError(f"velocity_m_s must be positive, got {self.velocity_m_s}")
         if self.squint_deg is not None and bool((torch.as_tensor(self.squint_deg).abs() >= 90).any()):
             raise ValueError(f"squint_deg must lie between -90 and 90 degrees, got {self.squint_deg}")
 
