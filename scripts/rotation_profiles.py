@@ -1,4 +1,5 @@
-"""Three points of an unevenly turning target: figures 1 to 3 of Remote Sens. 2025, 17, 3447.
+"""Three points of a target with non-uniform rotation: figures 1 to 3 of Remote Sens. 2025, 17,
+3447.
 
     python scripts/rotation_profiles.py [--out rotation_profiles] [--snr-db 20] [--small]
 
