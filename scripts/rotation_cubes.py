@@ -144,9 +144,8 @@ def scaled(image: Signal, rotation: Mapping[str, Tensor]) -> Signal:
 
 def close(image: Signal) -> Signal:
     """The middle of an image, which holds the cubes, over the peak."""
-    axis = image.axis("azimuth")
-    first, last = (round(float(axis.index_of(edge))) for edge in (-0.09, 0.09))
-    return image.with_data(image.data / image.data.abs().max()).crop(azimuth=(max(first, 0), min(last, axis.n)))
+    over_peak = image.with_data(image.data / image.data.abs().max())
+    return plot.within(over_peak, {"azimuth": (-0.09, 0.09), "range": (-0.15, 0.15)})
 
 
 def table(found: Results, truth: Truth) -> None:

@@ -8,6 +8,7 @@ writes either into one file.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
@@ -578,7 +579,7 @@ def error_curves(
         draw = _draw_dots if any(isinstance(x, str) for x in part["x"]) else _draw_bands
         draw(axes, part["x"], part["series"], part["bounds"], log_y)
         axes.set_yscale("log" if log_y else "linear")
-        axes.set(xlabel=xlabel, ylabel=textwrap.fill(ylabel, 34), title=_wrapped(part["title"], width))
+        axes.set(xlabel=xlabel, ylabel=textwrap.fill(ylabel, round(7 * width)), title=_wrapped(part["title"], width))
         figures.append(figure)
     ends = [figure.axes[0].get_ylim() for figure in figures]
     common = ylim or (min((low for low, _ in ends), default=0.0), max((high for _, high in ends), default=1.0))
@@ -660,9 +661,11 @@ def _label_words(axes: Axes, words: Sequence[str]) -> None:
     """Write words below an axis: in lines where they fit, else slanted below a higher figure."""
     figure = axes.get_figure()
     assert isinstance(figure, Figure)
-    fitting = int(_WORDS_FIT * figure.get_figwidth() / len(words)) - 2
-    if max(len(piece) for word in words for piece in word.split()) <= fitting:
-        axes.set_xticks(np.arange(len(words)), [textwrap.fill(word, fitting) for word in words])
+    fitting = int(_WORDS_FIT * figure.get_figwidth() / len(words))
+    filled = [textwrap.fill(word, fitting, break_long_words=False) for word in words]
+    longest = [max(map(len, text.splitlines()), default=0) + 1 for text in filled]
+    if all(one + other <= 2 * fitting for one, other in itertools.pairwise(longest)):
+        axes.set_xticks(np.arange(len(words)), filled)
         return
     figure.set_figheight(figure.get_figheight() + _SLANTED * max(map(len, words)))
     axes.set_xticks(np.arange(len(words)), words, rotation=40, ha="right")

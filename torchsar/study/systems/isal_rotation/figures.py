@@ -61,11 +61,11 @@ def _images(case: str, result: Result) -> Drawn:
     margin = next(iter(images.values())).axes[1].step
     shown = _parts(images, (-reach, reach), plot.span(along, margin))
     caption = (
-        f"The first trial, in dB: 0.1 % of the samples of '{next(iter(shown))}' exceed 0 dB, the same level for all "
-        "methods. Cross range is scaled by the rotation rate that the method itself estimates, or by the true mean "
-        "rate if it estimates none. The sign of cross range cannot be determined from the data."
+        "The first trial; 0 dB is the peak of the first image. Cross range is scaled by the rotation rate that the "
+        "method itself estimates, or by the true mean rate if it estimates none. The sign of cross range cannot be "
+        "determined from the data."
     )
-    figure = plot.images(shown, dynamic_range_db=35.0)
+    figure = plot.images(shown, dynamic_range_db=40.0, percentile=100)
     yield f"images_{word_of(case)}", titled("Images by every method", case), caption, figure
 
 
@@ -83,7 +83,7 @@ def _end(case: str, result: Result) -> Drawn:
         "The outermost part of the target. An error of the rotation rate moves the scatterers along cross range; "
         "errors of k1 and k2 blur them. 0 dB is the peak of the first image."
     )
-    figure = plot.images(shown, dynamic_range_db=35.0, percentile=100)
+    figure = plot.images(shown, dynamic_range_db=40.0, percentile=100)
     yield f"end_{word_of(case)}", titled("One end of the target, enlarged", case), caption, figure
 
 

@@ -199,13 +199,13 @@ def _targets(
     names = [] if bench.recording is not None else list(bench.world().named_points)
     if not names:
         return {}, []
-    at = positions(chain, used, bench, trials)
-    inside = torch.stack([(x >= a.start) & (x <= a.stop) for x, a in zip(at, image.axes)]).all(0).all(0)
+    expected = positions(chain, used, bench, trials)
+    inside = torch.stack([(x >= a.start) & (x <= a.stop) for x, a in zip(expected, image.axes)]).all(0).all(0)
     kept = [name for name, within in zip(names, inside.tolist()) if within]
     outside = [name for name in names if name not in kept]
     if not kept:
         return {}, outside
-    at = tuple(x[:, inside] if image.trials else x[0, inside] for x in at)
+    at = tuple(x[:, inside] if image.trials else x[0, inside] for x in expected)
     figures = impulse_response(image, (at[0], at[1]), sidelobe_nulls=bench.judging.sidelobe_nulls)
     figures = {key: value.reshape(trials.count, -1) for key, value in figures.items()}
     table = {key: figures[key] for key in _FIGURES}
