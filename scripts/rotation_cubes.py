@@ -1,12 +1,12 @@
-"""Five corner cubes on a turntable, through air that shakes the phase: figures 18 to 20 and Table 6
-of Remote Sens. 2025, 17, 3447.
+"""Five corner cubes on a turntable, seen through turbulent air: figures 18 to 20 and Table 6 of
+Remote Sens. 2025, 17, 3447.
 
     python scripts/rotation_cubes.py [--out rotation_cubes] [--seed 1] [--small]
 
-A simulated stand-in for a recording that is not public: 10 degrees a second with a changing rate, a
-random walk of phase of 0.15 rad a pulse, 10 dB. A phase that is free in every pulse and the
-rotation are found in turn; what each leaves in the data misleads the other, so that one pass is not
-enough.
+A simulation in place of a recording that is not public: 10 degrees per second with a changing
+rate, a random walk of phase of 0.15 rad per pulse, an SNR of 10 dB. A phase per pulse and the
+rotation are estimated in turn. The error of each estimate biases the other one, so that one pass is
+not enough.
 """
 
 from __future__ import annotations
@@ -144,9 +144,8 @@ def scaled(image: Signal, rotation: Mapping[str, Tensor]) -> Signal:
 
 def close(image: Signal) -> Signal:
     """The middle of an image, which holds the cubes, over the peak."""
-    axis = image.axis("azimuth")
-    first, last = (round(float(axis.index_of(edge))) for edge in (-0.09, 0.09))
-    return image.with_data(image.data / image.data.abs().max()).crop(azimuth=(max(first, 0), min(last, axis.n)))
+    over_peak = image.with_data(image.data / image.data.abs().max())
+    return plot.within(over_peak, {"azimuth": (-0.09, 0.09), "range": (-0.15, 0.15)})
 
 
 def table(found: Results, truth: Truth) -> None:

@@ -1,4 +1,5 @@
-"""Three points of an unevenly turning target: figures 1 to 3 of Remote Sens. 2025, 17, 3447.
+"""Three points of a target with non-uniform rotation: figures 1 to 3 of Remote Sens. 2025, 17,
+3447.
 
     python scripts/rotation_profiles.py [--out rotation_profiles] [--snr-db 20] [--small]
 
@@ -146,7 +147,7 @@ def table(profiles: Mapping[str, Profile]) -> None:
 
 
 def draw_profiles(profiles: Mapping[str, Profile], names: Sequence[str], reach_m: Sequence[float], path: Path) -> None:
-    """Profiles of the three points, beside each other, each within its reach."""
+    """Profiles of the three points, 0 dB for an ideal point, each within its reach."""
     parts = []
     for centre, reach in zip(PLACES_M, reach_m, strict=True):
         near = {NAMES[name]: profiles[name].near(centre, reach) for name in names}
@@ -155,7 +156,7 @@ def draw_profiles(profiles: Mapping[str, Profile], names: Sequence[str], reach_m
             {
                 "series": series,
                 "xlabel": "cross range (m)",
-                "ylabel": "amplitude (dB of an ideal point)",
+                "ylabel": "level (dB)",
                 "title": f"x = {centre:g} m",
                 "ylim": (-50.0, 3.0),
             }

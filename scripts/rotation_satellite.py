@@ -1,5 +1,5 @@
-"""A satellite that turns unevenly: figures 4 to 9 of Remote Sens. 2025, 17, 3447, with a procedural
-satellite instead of the one that is not published.
+"""A satellite with non-uniform rotation: figures 4 to 9 of Remote Sens. 2025, 17, 3447, with a
+procedural satellite in place of the one that is not published.
 
     python scripts/rotation_satellite.py [--out rotation_satellite] [--target full] [--seed 1]
     [--snr-db 20] [--small]
@@ -131,7 +131,7 @@ def draw_images(shown: Mapping[str, Signal], half_width_m: float, out: Path) -> 
         for edges in (WHOLE, REGIONS["A, tip of a panel"])
         for name in FIGURES
     ]
-    titles = [*FIGURES, *("tip of a panel" + " " * i for i in range(len(FIGURES)))]
+    titles = [*FIGURES, *(f"{name}: tip of a panel" for name in FIGURES)]
     plot.save(
         plot.images(
             {title: over_peak(image) for title, image in zip(titles, compared, strict=True)},
@@ -139,7 +139,6 @@ def draw_images(shown: Mapping[str, Signal], half_width_m: float, out: Path) -> 
             percentile=100,
         ),
         out / "methods.png",
-        columns=len(FIGURES),
     )
     best = cropped(shown["order 3, two-dimensional"], *WHOLE, half_width_m)
     plot.save(plot.image(best, 40, "scaled to metres", percentile=100), out / "figure_09.png")

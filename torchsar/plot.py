@@ -8,6 +8,7 @@ writes either into one file.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
@@ -47,6 +48,8 @@ _ELONGATED = 4.0
 _BLOCKS_PER_INCH = 90
 # letters that fit in an inch: of titles, and of words side by side below an axis, found by trial
 _LETTERS, _WORDS_FIT = 11.0, 12.0
+# inches of height that a letter of a slanted word needs
+_SLANTED = 0.05
 # points of a scene that are drawn small
 _MANY = 20
 # cells of a heat map, and those of a row, whose numbers fit into a panel
@@ -61,6 +64,7 @@ _STYLE: Any = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
+    "axes.axisbelow": True,
     "grid.color": "#e4e7eb",
     "grid.linewidth": 0.6,
     "xtick.color": INK,
@@ -263,13 +267,14 @@ def _show(signal: Signal, width: float, dynamic_range_db: float, title: str, top
         title=_wrapped(title, width),
     )
     axes.grid(False)
-    figure.colorbar(shown, ax=axes, label=label, fraction=0.05, pad=0.02)
+    # as high as the image, whatever its shape
+    figure.colorbar(shown, ax=axes, label=label, fraction=0.05, pad=0.02, aspect=20 * max(1.0, ratio or 1.0))
     return figure
 
 
 def _below(percentile: float) -> str:
     """Label of a colour scale."""
-    return "dB below the peak" if percentile == 100 else f"dB below percentile {percentile:g}"
+    return "dB relative to the peak" if percentile == 100 else f"dB relative to percentile {percentile:g}"
 
 
 @_styled
@@ -445,6 +450,8 @@ def places(
 ) -> Figure:
     """Draw the points of a scene by their positions.
 
+    With one scale on both axes, an axis with little extent or none shows a part of the other's.
+
     Args:
         x: Horizontal positions, shape (n,).
         y: Vertical positions, shape (n,).
@@ -455,10 +462,15 @@ def places(
         aspect: "equal" for one scale on both axes, "auto" otherwise.
     """
     ratio = float(np.ptp(y)) / max(float(np.ptp(x)), 1e-300) if aspect == "equal" else 0.8
+    ratio = min(max(ratio, 1 / _ELONGATED), _ELONGATED)
     height = min(max((_ALONE - 0.9) * ratio, 1.2), _HIGHEST) + _BELOW
     figure, axes = _figure(_ALONE, height, aspect == "equal")
     largest = 14 if len(x) > _MANY else 40
     axes.scatter(x, y, s=largest * size / max(float(size.max()), 1e-300), color=COLOURS[0], linewidths=0)
+    if aspect == "equal":
+        middle = np.array([[x.min() + x.max(), y.min() + y.max()]]) / 2
+        reach = 0.5 * max(float(np.ptp(x)), float(np.ptp(y))) / _ELONGATED
+        axes.update_datalim(np.concatenate([middle - reach, middle + reach]))
     axes.margins(0.08)
     axes.set(xlabel=xlabel, ylabel=ylabel, title=title, aspect=aspect)
     return figure
@@ -567,7 +579,7 @@ def error_curves(
         draw = _draw_dots if any(isinstance(x, str) for x in part["x"]) else _draw_bands
         draw(axes, part["x"], part["series"], part["bounds"], log_y)
         axes.set_yscale("log" if log_y else "linear")
-        axes.set(xlabel=xlabel, ylabel=textwrap.fill(ylabel, 34), title=_wrapped(part["title"], width))
+        axes.set(xlabel=xlabel, ylabel=textwrap.fill(ylabel, round(7 * width)), title=_wrapped(part["title"], width))
         figures.append(figure)
     ends = [figure.axes[0].get_ylim() for figure in figures]
     common = ylim or (min((low for low, _ in ends), default=0.0), max((high for _, high in ends), default=1.0))
@@ -640,17 +652,23 @@ def _draw_dots(
             linewidth=1.1,
             label=name,
         )
-    axes.set_xticks(
-        np.arange(len(x)),
-        x,
-        **(
-            {"rotation": 40, "ha": "right"}
-            if sum(len(word) + 2 for word in x) > _WORDS_FIT * axes.get_figure().get_figwidth()  # pyright: ignore
-            else {}
-        ),
-    )
+    _label_words(axes, x)
     axes.set_xlim(-0.6, len(x) - 0.4)
     axes.grid(False, axis="x")
+
+
+def _label_words(axes: Axes, words: Sequence[str]) -> None:
+    """Write words below an axis: in lines where they fit, else slanted below a higher figure."""
+    figure = axes.get_figure()
+    assert isinstance(figure, Figure)
+    fitting = int(_WORDS_FIT * figure.get_figwidth() / len(words))
+    filled = [textwrap.fill(word, fitting, break_long_words=False) for word in words]
+    longest = [max(map(len, text.splitlines()), default=0) + 1 for text in filled]
+    if all(one + other <= 2 * fitting for one, other in itertools.pairwise(longest)):
+        axes.set_xticks(np.arange(len(words)), filled)
+        return
+    figure.set_figheight(figure.get_figheight() + _SLANTED * max(map(len, words)))
+    axes.set_xticks(np.arange(len(words)), words, rotation=40, ha="right")
 
 
 def _scale_axes(axes: Axes, x: np.ndarray, log_x: bool, log_y: bool, ylim: tuple[float, float]) -> None:

@@ -20,7 +20,7 @@ from torchsar.core import Axis, Signal
 from torchsar.metrics.cuts import about_peak, finer, impulse_cuts
 from torchsar.metrics.image import rolled_to
 from torchsar.metrics.impulse import impulse_response
-from torchsar.study.output.numbers import name_and_unit, number, quantity, scale_of
+from torchsar.study.output.numbers import number, quantity, scale_of
 from torchsar.study.output.pictures import draw_all
 from torchsar.study.output.report import run_fields
 from torchsar.study.trials.system import Column
@@ -206,7 +206,7 @@ def test_an_image_is_rolled_to_where_another_one_lies() -> None:
     data = torch.zeros(64, 8, dtype=torch.complex64)
     data[10:14] = torch.randn(4, 8, dtype=torch.complex64, generator=generator)
     reference = reference.with_data(data)
-    moved = rolled_to(reference.with_data(data.roll(57, 0)), reference)
+    moved = rolled_to(reference.with_data(data.roll((57, 3), (0, 1))), reference)
     torch.testing.assert_close(moved.data, data)
 
 

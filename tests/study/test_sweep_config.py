@@ -139,7 +139,7 @@ def test_the_log_says_what_is_batched(tmp_path: Path, caplog: pytest.LogCaptureF
         ({"trials": 0}, "sweep.trials"),
         ({"seed": [1, 2]}, "cannot be swept"),
         ({"data.file": ["x"]}, "cannot be swept"),
-        ({"world.doppler_hz": [1.0], "world.squint_deg": [1.0]}, "both say where the beam looks"),
+        ({"world.doppler_hz": [1.0], "world.squint_deg": [1.0]}, "both give the direction of the beam"),
         ({"trials": 2, "success": {"dopler_hz": 1.0}}, "did you mean 'doppler"),
         ({"trials": 2, "show": ["entropy"]}, "did you mean 'entropy_nats'"),
         ({"trials": 2, "save": {"trials": [0], "taps": ["fokus"]}}, "did you mean 'focus'"),

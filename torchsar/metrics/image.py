@@ -231,9 +231,10 @@ def error_after_gain_db(images: Tensor, references: Tensor) -> Tensor:
 
 
 def rolled_to(image: Signal, reference: Signal) -> Signal:
-    """Shift an image along azimuth to where another one of the same scene lies.
+    """Shift an image along both axes to where another one of the same scene lies.
 
-    A slope of the phase over pulses shifts an image in a circle and changes nothing else.
+    A slope of the phase over pulses shifts an image in a circle along azimuth, and range profiles
+    can be aligned only up to a common shift in range.
 
     Args:
         image: Image (azimuth, range).
@@ -242,12 +243,14 @@ def rolled_to(image: Signal, reference: Signal) -> Signal:
     Returns:
         The image, rolled by whole samples until the circular centres of the energies agree.
     """
-    shift = round((_circular_centre(reference) - _circular_centre(image)) * image.axes[0].n)
-    return image.with_data(image.data.roll(shift, 0))
+    shifts = [
+        round((_circular_centre(reference, dim) - _circular_centre(image, dim)) * image.axes[dim].n) for dim in (0, 1)
+    ]
+    return image.with_data(image.data.roll(shifts, (0, 1)))
 
 
-def _circular_centre(image: Signal) -> float:
-    """Circular centre of the energy along azimuth, in parts of the image's height."""
-    n, power = image.axes[0].n, image.data.abs().double().square().sum(-1)
+def _circular_centre(image: Signal, dim: int) -> float:
+    """Circular centre of the energy along one axis, in parts of the image's extent."""
+    n, power = image.axes[dim].n, image.data.abs().double().square().sum(1 - dim)
     turns = torch.arange(n, dtype=torch.float64, device=power.device) / n
     return float(torch.angle(torch.polar(power, 2 * torch.pi * turns).sum())) / (2 * torch.pi)

@@ -62,7 +62,7 @@ def comparisons(results: Mapping[str, Any], columns: Mapping[str, Any], without:
             case: {n: m[key] for n, m in r.metrics.items() if key in m and n != without} for case, r in results.items()
         }
         names = list(dict.fromkeys(name for row in rows.values() for name in row))
-        if not column.drawn or not names:
+        if not column.drawn or sum(map(len, rows.values())) < 2:
             continue
 
         def mean(values: Any, rms: bool = column.drawn == "rms") -> float:

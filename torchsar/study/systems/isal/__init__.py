@@ -1,6 +1,4 @@
-"""Inverse synthetic aperture ladar, phase errors from pulse to pulse
-(Ruan et al. 2013).
-"""
+"""Inverse synthetic aperture ladar with a phase error in every pulse (Ruan et al. 2013)."""
 
 from __future__ import annotations
 
@@ -33,15 +31,15 @@ from torchsar.study.trials.choice import Alternative, Choice, Measured
 from torchsar.study.trials.system import Column, System
 
 _GEOMETRY = ("frequency_hz", "angle_rad", "position_m", "reference_m")
-# iterations of `autofocus`: its own 120 and 20, and what less gives
+# iterations of `autofocus` that are compared: its defaults, 120 and 20, and fewer
 _EFFORTS = ((0, 5), (10, 5), (30, 10), (120, 10), (120, 20))
 
 
 class Isal(System):
-    """Phase errors of a turning target."""
+    """A rotating target with a phase error in every pulse."""
 
     name = "isal"
-    about = "a turning target with a phase error in every pulse, simulated or recorded range profiles"
+    about = "a rotating target with a phase error in every pulse, simulated or recorded range profiles"
     Radar = staticmethod(with_wavelength(InverseRadar))
     World = Target
     impairments = TARGET_IMPAIRMENTS
@@ -52,18 +50,18 @@ class Isal(System):
     definitions = {
         "snr": "mean power of all range-compressed samples over noise variance, dB",
         "entropy": "-sum p ln p, p = |I|^2 / sum |I|^2 over the whole image, nats",
-        "entropy_above_ideal_nats": "entropy less that of the error-free image of the same scene and noise; it "
-        "depends on the position of the image between cells by some 0.03",
+        "entropy_above_ideal_nats": "entropy minus that of the error-free image of the same scene and noise; it "
+        "varies by about 0.03 with the position of the image relative to the grid",
         "contrast": "standard deviation over mean of the intensity |I|^2",
-        "residual_phase_rms_rad": "rms over pulses of the phases that all corrections together removed, minus "
-        "the truth, constant and linear term removed on the circle; lost pulses do not count",
-        "residual_phase_std_rad": "the standard deviation that the method itself predicts for it",
-        "strehl": "|mean exp(j residual)|^2 over pulses; success is 0.8 and more, about 0.47 rad rms",
-        "entropy_above_clean_nats": "entropy less that which the same method reaches on the recording without "
-        "the injected phases",
-        "agreement_rad": "rms of (estimate - injected phase) less the estimate on the recording without "
-        "injected phases: 0 for a method that errors cannot influence",
-        "published": "figures of Ruan et al. 2013, Table 1, less the entropy of 7.2 nats that the paper implies "
+        "residual_phase_rms_rad": "rms over the received pulses of the phase that all corrections remove minus "
+        "the true phase, without its constant and linear terms",
+        "residual_phase_std_rad": "standard deviation of the residual phase as predicted by the method",
+        "strehl": "|mean exp(j residual)|^2 over pulses; 0.8 or more, about 0.47 rad rms, is a success",
+        "entropy_above_clean_nats": "entropy minus that of the same method on the recording without the "
+        "injected phases",
+        "agreement_rad": "rms of (estimate - injected phase) minus the estimate on the recording without "
+        "injected phases; 0 for a method that removes any phase error alike",
+        "published": "values of Ruan et al. 2013, Table 1, minus the entropy of 7.2 nats that the paper implies "
         "for the error-free image",
     }
     columns = {
@@ -101,8 +99,8 @@ class Isal(System):
     def requirements(self, bench: Bench) -> Sequence[Requirement]:
         if bench.recording is not None:
             raise ConfigError(
-                f"{bench.file}: requires predicts what a simulation needs; of a recording neither the extents of the "
-                "target nor its motion are known"
+                f"{bench.file}: 'requires' needs the extent and the motion of the target, which are not known for a "
+                "recording; take a config that simulates"
             )
         radar, world = bench.radar, bench.world()
         across, along = world.edge(Draws(bench.config.seed))
@@ -119,7 +117,7 @@ class Isal(System):
     def choices(self, bench: Bench) -> Sequence[Choice]:
         if bench.recording is not None:
             raise ConfigError(
-                f"{bench.file}: alternatives are compared with true phases, which a recording does not tell; "
+                f"{bench.file}: 'trade' needs the true phases, which are not known for a recording; "
                 "take a config that simulates"
             )
         efforts = [Alternative(f"autofocus, search {s}, polish {p}", {"search": s, "polish": p}) for s, p in _EFFORTS]
@@ -137,7 +135,7 @@ class Isal(System):
 
 
 def _efforts(bench: Bench) -> Measured:
-    """`autofocus` with fewer iterations, on trials at the level of phases."""
+    """`autofocus` with fewer iterations, on trials with the echo model `phase_only`."""
     world, draws = bench.world(), Draws(bench.config.seed, "trade", range(bench.config.trade.trials))
     trials = replace(world, fidelity=PhaseOnly()).trials_of(bench.radar, draws, bench.dtype, bench.device)
     data, truth, present = trials.recording.signal.data, whole_phase(trials), received(trials)

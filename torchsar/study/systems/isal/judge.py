@@ -1,4 +1,4 @@
-"""Figures of one method on turning targets: phases against the truth, images, bounds."""
+"""Metrics of one method on rotating targets: residual phases, images, bounds."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from torchsar.scene import PhaseOnly
 from torchsar.study.trials.batch import IMAGE, Batch, Judged, Trials
 from torchsar.study.trials.bench import Bench
 
-# the bound with unknown amplitudes inverts a matrix of this size: a second on one core
+# the bound of unknown amplitudes inverts a matrix of at most this size, within a second on one core
 _MOST_SCATTERERS, _MOST_PULSES = 1200, 800
 
 
 def judge(bench: Bench, name: str, trace: Trace, trials: Trials) -> Judged:
-    """Residual phases of a method, and its image; the view is the phase that it removes."""
+    """Metrics of the residual phase and of the image; the view is the phase that is removed."""
     chain, clean = bench.chains[name], bench.config.processor[name].input == "clean"
     true, present = whole_phase(trials), received(trials)
     truth = torch.zeros_like(true) if clean else true
@@ -38,8 +38,10 @@ def judge(bench: Bench, name: str, trace: Trace, trials: Trials) -> Judged:
 
 
 def bounds(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
-    """Of the residual phase: with a known scene, and with unknown amplitudes; the latter's ratio
-    to the former comes from one scene of the case, scenes differ by a percent.
+    """Bounds of the residual phase for a known scene and for unknown amplitudes.
+
+    The ratio of the second to the first is computed for one scene of the case; it differs by about
+    one percent between scenes.
     """
     std, data = batch.trials.truth["noise_std"], batch.trials.clean.signal.data
     if not bool((std > 0).all()):
@@ -52,7 +54,7 @@ def bounds(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
 
 
 def whole_phase(trials: Trials) -> Tensor:
-    """The phase error of every pulse with those of impairments, (trial, pulse)."""
+    """Phase error of every pulse in rad, including that of impairments, (trial, pulse)."""
     phases = [value for name, value in trials.truth.items() if name == "phase_rad" or name.endswith(".phase_rad")]
     pulses = trials.recording.signal.data.shape[:-1]
     whole = torch.zeros(pulses, dtype=torch.float64, device=trials.recording.signal.data.device)
@@ -60,16 +62,16 @@ def whole_phase(trials: Trials) -> Tensor:
 
 
 def received(trials: Trials) -> Tensor | None:
-    """Pulses that no impairment lost, bool (trial, pulse); None where all were received."""
+    """Pulses that were received, bool (trial, pulse); None if no impairment loses any."""
     lost = [value for name, value in trials.truth.items() if name.endswith(".present")]
     return torch.stack(lost).all(0).reshape(-1, lost[0].shape[-1]) if lost else None
 
 
 def estimated_phase(chain: Chain, trace: Trace, like: Tensor) -> Tensor:
-    """Phase that a chain removes from each pulse, shaped as `like`: the sum over its correctors.
+    """Phase in rad that a chain removes from each pulse, shaped as `like`: the sum over correctors.
 
-    Of a chain without a corrector the last estimate of a phase, which it would remove; zero where
-    there is none. A phase that only starts another estimator does not count.
+    For a chain without a corrector it is the last estimate of a phase, and zero if there is none. A
+    phase that only initialises another estimator is left out.
     """
     taken = [
         trace.values[uses["phase_rad"]]
@@ -81,8 +83,8 @@ def estimated_phase(chain: Chain, trace: Trace, like: Tensor) -> Tensor:
 
 
 def _bound_ratio(bench: Bench) -> float | None:
-    """Bound of unknown amplitudes over that of a known scene, from the scene of an address of its
-    own; None where it would take too long.
+    """Ratio of the bound of unknown amplitudes to that of a known scene, computed for one scene;
+    None if it would take too long.
     """
     size, world, radar = bench.world(), bench.world().of(bench.radar), bench.radar
     scene = world.scene.scatterers(Draws(bench.config.seed, "bound"))

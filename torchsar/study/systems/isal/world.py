@@ -1,4 +1,4 @@
-"""The world of a turning target: section `world`, and its simulation."""
+"""The world of a rotating target: section `world`, and its simulation."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from torchsar.study.trials.system import Noise, World
 
 @dataclass(frozen=True, kw_only=True)
 class Target(World):
-    """What is true about a target that turns while it moves along the line of sight.
+    """Section `world`: the simulated target and its true parameters.
 
     Args:
-        pulses: Pulses of the record.
-        samples: Range cells of each.
-        scene: Scenes by name, which turn together.
-        motion: Motions along the line of sight by name; they add up.
-        start_phase: Random phases of the pulses by name; they add up.
-        fidelity: How finely the echo is modelled.
-        rotation_rad_s: True rotation rate; None for what the radar takes it to be.
-        noise: Mean power of all range-compressed samples over noise variance.
-        impairments: What happens to the recording, in order.
+        pulses: Number of pulses of the record.
+        samples: Number of range cells of each pulse.
+        scene: Parts of the target by name, which rotate together.
+        motion: Motions along the line of sight by name, which add up.
+        start_phase: Random phase errors of the pulses by name, which add up.
+        fidelity: Model of the echo.
+        rotation_rad_s: True rotation rate in rad/s; None for the rate that the radar assumes.
+        noise: Receiver noise; the SNR is the mean over all range-compressed samples.
+        impairments: Impairments of the recording by name, in the order of their effect.
     """
 
     pulses: int
@@ -56,26 +56,26 @@ class Target(World):
             raise ValueError(f"a target needs a scene, pulses and samples, got {self.pulses} x {self.samples}")
 
     def of(self, radar: InverseRadar) -> TurntableWorld:
-        """The world as the echo simulation takes it."""
+        """The parameters of the echo simulation."""
         scene, noise = Together(self.scene), self.noise.snr_db
         return TurntableWorld(scene, self.rotation_rad_s, self.motion, self.start_phase, noise, self.fidelity)
 
     def trials_of(self, radar: InverseRadar, draws: Draws, dtype: torch.dtype, device: str = "cpu") -> Trials:
-        """Recordings with and without errors of phase and motion, and the truth."""
+        """Recordings with and without phase errors and motion, and the truth."""
         world, size = self.of(radar), (self.pulses, self.samples)
         recording, truth = simulate_turntable(radar, world, *size, draws, self.impairments, dtype, device)
         assert truth.clean is not None
         return Trials(recording, truth.clean, truth.values, len(draws.trials or (0,)), world)
 
     def edge(self, draws: Draws) -> tuple[float, float]:
-        """Cross range and range (m) of a scatterer at the corner of the target."""
+        """Largest cross range and largest range (m) of the scatterers."""
         scene = Together(self.scene).scatterers(draws)
         return tuple(float(x.abs().max()) for x in (scene.azimuth_m, scene.range_m))  # pyright: ignore[reportReturnType]
 
 
 def echo_choices(bench: Bench) -> list[Choice]:
-    """Phases of range-compressed pulses alone, or dechirped pulses with all motion inside them,
-    which need the length of a pulse.
+    """The echo model: phases of range-compressed pulses alone, or dechirped pulses with the motion
+    within each pulse, which needs the length of a pulse.
     """
     world, radar = bench.world(), bench.radar
     if radar.pulse_s is None:
@@ -99,7 +99,7 @@ def echo_choices(bench: Bench) -> list[Choice]:
         point = replace(
             world, scene={"edge": Points([edge[0]], [edge[1]])}, noise=Noise(), start_phase=(), impairments={}
         )
-        # the velocity that compression takes out is that of the receiver's track
+        # compression removes the velocity of the track that the receiver follows
         compress = CompressDechirped(
             radar, velocity_m_s=sum(m.coefficients_m[0] for m in own.track) if own.track else None
         )

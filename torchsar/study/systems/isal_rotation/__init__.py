@@ -28,10 +28,9 @@ from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Choice
 from torchsar.study.trials.system import Column, System
 
-# a wrong rotation is one whose image has so much less entropy than the right one, with k1 so
-# far off
+# reports warn of an image with so much less entropy than the ideal one at so large an error of k1
 _TRAP_NATS, _TRAP_PERCENT = 0.005, 1.0
-# limits that concern only methods which estimate something
+# limits that concern only methods which estimate the value
 _OF_ESTIMATORS = {"scatterers above the noise": "warp_k", "range term, pi lambda sigma_y / ra^2": "omega_rad_s"}
 
 
@@ -40,11 +39,11 @@ class Judging:
     """How results are judged.
 
     Args:
-        reference: The method whose image of the same scene is the ideal one.
-        search_m: How far along cross range from its position the response of a point target is
-            sought.
-        published: Figure -> case -> method -> what the source published.
-        published_targets: Figure -> target -> method -> the same of point targets.
+        reference: Name of the method whose image of the same scene is the ideal one.
+        search_m: Largest distance in metres along cross range between the response of a point
+            target and its true position.
+        published: Values of the source, by metric, case and method.
+        published_targets: Values of the source for point targets, by metric, target and method.
     """
 
     reference: str | None = None
@@ -54,17 +53,17 @@ class Judging:
 
 
 class View(NamedTuple):
-    """What pictures need of a method: mean rates (trial,) by which images are scaled, and cuts."""
+    """Mean rotation rates (trial,) that scale the images of a method, and its cuts by target."""
 
     rate: Tensor
     cuts: Mapping[str, CrossRangeCut]
 
 
 class IsalRotation(System):
-    """Rotation of a target, estimated from its echoes."""
+    """A target with non-uniform rotation, which is estimated from its echoes."""
 
     name = "isal_rotation"
-    about = "a target whose rotation changes its rate during the record"
+    about = "a target whose rotation rate changes during the record"
     Radar = staticmethod(with_wavelength(InverseRadar))
     World = Rotating
     Judging = Judging
@@ -82,35 +81,35 @@ class IsalRotation(System):
         "snr": "mean power of all range-compressed samples over noise variance, dB; the same before and after a "
         "unitary transform along range",
         "rotation": "theta = omega (t + k1 t^2 / 2! + k2 t^3 / 3! + ...), t = 0 at the first pulse: k1, k2 are "
-        "the TRUE derivatives of the rate over the rate at the first pulse",
-        "mirror": "only omega^2 shows in the data: omega is given positive, and an image may be mirrored in "
-        "cross range",
+        "the true derivatives of the rate over the rate at the first pulse",
+        "mirror": "the data depend on omega^2 alone: omega is given as positive, and an image may be mirrored "
+        "in cross range",
         "omega_error_percent": "estimated minus true rate at the first pulse, % of the truth",
-        "k1_error_percent": "estimated minus true k1, % of the truth (k1_error_per_s, 1/s, where the truth is "
-        "0); k2 and so on alike",
-        "yc_error_m": "estimated minus true range centre deviation: a scatterer at range y of the window turns "
-        "at y + yc from the centre",
-        "cross_range_scale_error_percent": "lengths in an image scaled by the method's own mean rate, less the "
-        "true ones, %; of methods without a rate that of radar.rotation_rad_s",
-        "predicted": "omega_std_percent, k1_std_percent, yc_std_m, ...: standard deviations that the method "
-        "itself predicts, % of its estimate",
-        "entropy_nats": "-sum p ln p, p = |I|^2 / sum |I|^2 over the whole image, nats; it grows with the lines "
-        "of an image, ln 2 nats from oversampling 1 to 2",
-        "entropy_above_ideal_nats": "entropy less that of the metrics.reference image of the same scene and noise",
+        "k1_error_percent": "estimated minus true k1, % of the truth, or in 1/s (k1_error_per_s) if the truth is 0; "
+        "likewise for k2 and higher orders",
+        "yc_error_m": "estimated minus true range centre deviation yc: a scatterer at range y of the window "
+        "rotates at range y + yc from the centre of rotation",
+        "cross_range_scale_error_percent": "error of lengths in an image that is scaled by the mean rate that the "
+        "method estimates, %; by radar.rotation_rad_s if it estimates none",
+        "predicted": "omega_std_percent, k1_std_percent, yc_std_m, ...: standard deviations as predicted by the "
+        "method, % of its estimate",
+        "entropy_nats": "-sum p ln p, p = |I|^2 / sum |I|^2 over the whole image, nats; it grows with the number of "
+        "image lines, by ln 2 from oversampling 1 to 2",
+        "entropy_above_ideal_nats": "entropy minus that of the metrics.reference image of the same scene and noise",
         "contrast": "standard deviation over mean of the intensity |I|^2",
-        "targets": "cut along cross range through the range cell of a point target, metres by the method's own "
-        "rate, by the true mean rate where it finds none",
+        "targets": "cut along cross range through the range cell of a point target, scaled by the rate "
+        "that the method estimates, or by the true mean rate if it estimates none",
         "peak_db": "interpolated peak of the cut within metrics.search_m of the true position, relative to that of the "
         "reference",
         "irw_azimuth_m": "width between the first crossings of -3 dB beside the peak of the cut",
         "pslr_azimuth_db": "strongest response beyond the first minima beside the peak, over the peak",
-        "evaluations": "evaluations of the objective that a search reports",
-        "bounds": "Cramer-Rao, noise known, complex amplitudes and cross ranges of resolved scatterers unknown; "
-        "overlapping neighbours raise it",
-        "published": "figures of Remote Sens. 2025, 17, 3447",
+        "evaluations": "number of evaluations of the objective by a search",
+        "bounds": "Cramer-Rao bounds for known noise, and unknown complex amplitudes and cross ranges of "
+        "resolved scatterers; overlapping scatterers raise them",
+        "published": "values of Remote Sens. 2025, 17, 3447",
     }
     columns = {
-        "omega_error_percent": Column("error of the rate", "%", drawn="rms"),
+        "omega_error_percent": Column("error of the rotation rate", "%", drawn="rms"),
         "k1_error_percent": Column("error of k1", "%", drawn="rms"),
         "k2_error_percent": Column("error of k2", "%", drawn="rms"),
         "entropy_nats": Column("entropy", "nats", drawn="mean"),
@@ -122,7 +121,7 @@ class IsalRotation(System):
         "k2_error_per_s2": Column("error of k2, whose true value is 0", "1/s^2", drawn="rms"),
         "k3_error_per_s3": Column("error of k3, whose true value is 0", "1/s^3"),
         "yc_error_m": Column("error of the range centre deviation", "m"),
-        "omega_std_percent": Column("predicted error of the rate", "%"),
+        "omega_std_percent": Column("predicted error of the rotation rate", "%"),
         "k1_std_percent": Column("predicted error of k1", "%"),
         "k2_std_percent": Column("predicted error of k2", "%"),
         "yc_std_m": Column("predicted error of the range centre deviation", "m"),
@@ -211,7 +210,7 @@ class IsalRotation(System):
         return figures.pictures(results, self.columns)
 
     def notes(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        """Where an image of a wrong rotation has less entropy than the right one."""
+        """Cases in which a wrong rotation gives an image of less entropy than the true one."""
         methods, reference = metrics["methods"], metrics["definitions"]["reference"]
         for case in methods[reference]["cases"] if reference else ():
             rows = {name: method["cases"][case] for name, method in methods.items()}
@@ -222,8 +221,8 @@ class IsalRotation(System):
                 and abs(row.get("k1_error_percent", 0.0)) > _TRAP_PERCENT
             ]
             if trapped:
-                text = "Wrong rotations give less entropy here than the right one, on the grid of its image: "
-                yield f"Entropy trap, case {case}", f"{text}{', '.join(trapped)}. A finer grid takes this away."
+                text = "On the grid of these images, wrong rotations give less entropy than the true one: "
+                yield f"Misleading entropy, case {case}", f"{text}{', '.join(trapped)}. A finer grid prevents this."
 
     def extra_definitions(self, bench: Bench) -> Mapping[str, Any]:
         return {"reference": bench.judging.reference, "search_m": bench.judging.search_m}
@@ -236,8 +235,8 @@ def _expanded(metrics: Mapping[str, Tensor], count: int) -> dict[str, Tensor]:
 def _scale_rate(
     found: FoundRotation, truth: Mapping[str, Tensor], duration_s: float, assumed: float | None, count: int
 ) -> Tensor:
-    """Mean rate by which images are drawn in metres: the method's own, that of the radar, else the
-    true one.
+    """Mean rate (trial,) that scales images to metres: the estimated one, else the assumed one of
+    the radar, else the true one.
     """
     other = truth["rotation_rad_s"] if not assumed else torch.full_like(truth["rotation_rad_s"], assumed)
     own = found.rate(duration_s)
@@ -249,7 +248,7 @@ def _provides(chain: Any, value: str) -> bool:
 
 
 def _looks_for_centre(bench: Bench) -> bool:
-    """Whether any estimator of the config looks for the range centre deviation."""
+    """Whether any estimator of the config estimates the range centre deviation."""
     stages = (stage for chain in bench.chains.values() for stage in chain.stages.values())
     return any(getattr(s, "yc_m", 0.0) is None and "yc_m" in getattr(s, "provides", ()) for s in stages)
 

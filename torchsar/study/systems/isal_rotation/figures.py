@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from torchsar import plot
@@ -18,14 +18,18 @@ from torchsar.study.systems.isal.figures import target
 from torchsar.study.systems.isal_rotation.world import first_values
 from torchsar.study.trials.batch import Result
 
-# scatterers stand this much inside the picture; the end that is enlarged, in parts of the target
-_MARGIN, _END_HALF, _END_REACH = 1.15, 0.08, 0.02
-# targets of fewer scatterers show as points, whose cuts say more than an enlarged picture
+# half the cross range of a picture over that of the target, for many scatterers and for a few
+# points, beside which their responses are shown; the part of the half width that is enlarged
+_MARGIN, _MARGIN_OF_POINTS, _END = 1.15, 1.5, 0.2
+# targets of fewer scatterers are points, of which cuts show more than an enlarged picture
 _MANY = 20
+# half the extent of a cut in widths of the response, and the largest number of methods in a panel
+# beside the ideal one
+_WIDTHS, _BESIDE = 25, 4
 
 
 def pictures(results: Mapping[str, Result], columns: Mapping[str, Any]) -> Iterator[Callable[[], Drawn]]:
-    """Makers of all pictures."""
+    """Functions that draw the pictures, in the order of the report."""
     yield partial(target, next(iter(results.values())))
     yield partial(comparisons, results, columns)
     for case, result in results.items():
@@ -39,7 +43,7 @@ def _scatterers(result: Result) -> list[Tensor]:
 
 
 def _in_metres(result: Result) -> dict[str, Signal]:
-    """Images of the first trial with cross range in metres, by each method's own rate."""
+    """Images of the first trial with cross range in metres, scaled by each method's own rate."""
     found = {}
     for name, image in first_named(result.images).items():
         azimuth, range_ = image.axes
@@ -53,39 +57,43 @@ def _in_metres(result: Result) -> dict[str, Signal]:
 def _images(case: str, result: Result) -> Drawn:
     along, across, _ = _scatterers(result)
     images = _in_metres(result)
-    reach, cell = _MARGIN * float(across.abs().max()), next(iter(images.values())).axes[1].step
-    spans = {"cross range": (-reach, reach), "range": (float(along.min()) - 2 * cell, float(along.max()) + 2 * cell)}
-    shown = {name: plot.within(image, spans) for name, image in images.items()}
+    reach = (_MARGIN if len(across) >= _MANY else _MARGIN_OF_POINTS) * float(across.abs().max())
+    margin = next(iter(images.values())).axes[1].step
+    shown = _parts(images, (-reach, reach), plot.span(along, margin))
     caption = (
-        "The first trial, all on one scale, that of the first, in dB. Cross range by each method's own rate, by the "
-        "true mean rate where it finds none; it may be mirrored."
+        "The first trial; 0 dB is the peak of the first image. Cross range is scaled by the rotation rate that the "
+        "method itself estimates, or by the true mean rate if it estimates none. The sign of cross range cannot be "
+        "determined from the data."
     )
-    figure = plot.images(shown, dynamic_range_db=35.0)
+    figure = plot.images(shown, dynamic_range_db=40.0, percentile=100)
     yield f"images_{word_of(case)}", titled("Images by every method", case), caption, figure
 
 
 def _end(case: str, result: Result) -> Drawn:
-    """What lies about the outermost scatterer, as in Figs 5 to 9 of the source."""
-    along, across, amplitude = _scatterers(result)
+    """Draw the end of the target with the outermost scatterer, as in Figs 5 to 9 of the source."""
+    along, across, _ = _scatterers(result)
     if len(across) < _MANY:
         return
-    reach = float(across.abs().max())
-    tip = int(torch.where(across.abs() >= (1 - _END_REACH) * reach, amplitude.abs(), 0).argmax())
-    x, y, half = float(across[tip]), float(along[tip]), _END_HALF * reach
+    reach, side = float(across.abs().max()), across[across.abs().argmax()].sign()
+    near = side * across >= (1 - _END) * reach
     images = _in_metres(result)
-    beside = max(4 * next(iter(images.values())).axes[1].step, _END_HALF * float(along.abs().max()))
-    spans = {"cross range": (x - half, x + half), "range": (y - beside, y + beside)}
-    shown = {name: plot.within(image, spans) for name, image in images.items()}
+    margin = next(iter(images.values())).axes[1].step
+    shown = _parts(images, plot.span(across[near], 0.1 * _END * reach), plot.span(along[near], margin))
     caption = (
-        f"About the scatterer at {x:.2f} m of cross range and {y:.2f} m of range. An error of the rate moves it, one "
-        "of k1 and k2 smears it."
+        "The outermost part of the target. An error of the rotation rate moves the scatterers along cross range; "
+        "errors of k1 and k2 blur them. 0 dB is the peak of the first image."
     )
-    figure = plot.images(shown, dynamic_range_db=35.0, percentile=100)
+    figure = plot.images(shown, dynamic_range_db=40.0, percentile=100)
     yield f"end_{word_of(case)}", titled("One end of the target, enlarged", case), caption, figure
 
 
+def _parts(images: Mapping[str, Signal], across: tuple[float, float], along: tuple[float, float]) -> dict[str, Signal]:
+    """The part of every image between two cross ranges and two ranges, in metres."""
+    return {name: plot.within(image, {"cross range": across, "range": along}) for name, image in images.items()}
+
+
 def _slices(case: str, result: Result) -> Drawn:
-    """Cuts through the point targets, four methods a panel beside the ideal one."""
+    """Draw cuts through the point targets."""
     views = {name: result.first_of(name).judged.view for name in first_named(result.images)}
     targets = dict.fromkeys(target for view in views.values() for target in view.cuts)
     parts = [
@@ -93,24 +101,24 @@ def _slices(case: str, result: Result) -> Drawn:
     ]
     if parts:
         caption = (
-            "Cuts through the range cell of each point target, offsets from the true position; 0 dB is the peak of the "
-            "first method."
+            "Cuts along cross range through each point target. The ideal response is in every panel; the other methods "
+            "are spread over several panels if there are many. 0 dB is the peak of the ideal response."
         )
         yield f"slices_{word_of(case)}", titled("Responses of point targets", case), caption, plot.panels(parts)
 
 
 def _panels(target: str, cuts: Mapping[str, CrossRangeCut]) -> list[dict[str, Any]]:
+    """Panels of one target, each with the first method and an equal share of the others."""
     first, *others = cuts
     top, width = (float(cuts[first].figures[key][0]) for key in ("peak", "irw_azimuth_m"))
+    count = math.ceil(len(others) / _BESIDE) or 1
     parts = []
-    for begin in range(0, max(1, len(others)), 4):
+    for number in range(count):
         series = {}
-        for name in [first, *others[begin : begin + 4]]:
+        for name in [first, *others[number::count]]:
             offset, inside = cuts[name].offset_m[0], cuts[name].inside[0]
-            kept = inside & (offset.abs() <= 25 * width)
-            series[name] = (plot.array(offset[kept]), plot.decibel(cuts[name].line[0][kept], top))
-        xlabel = "cross range from the true position (m)"
-        parts.append(
-            {"series": series, "xlabel": xlabel, "ylabel": "level (dB)", "title": target, "ylim": (-50.0, 3.0)}
-        )
+            kept = inside & (offset.abs() <= _WIDTHS * width)
+            series[name] = (1e3 * plot.array(offset[kept]), plot.decibel(cuts[name].line[0][kept], top))
+        labels = {"xlabel": "cross range from the true position (mm)", "ylabel": "level (dB)", "title": target}
+        parts.append({"series": series, **labels, "ylim": (-50.0, 3.0)})
     return parts

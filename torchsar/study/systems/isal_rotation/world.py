@@ -17,7 +17,7 @@ from torchsar.study.systems.isal.world import Target
 
 @dataclass(frozen=True)
 class OneScene:
-    """The scene that a seed draws, the same in every trial."""
+    """A random scene with a seed of its own, the same in every trial."""
 
     scene: Scene
     seed: int
@@ -28,14 +28,14 @@ class OneScene:
 
 @dataclass(frozen=True, kw_only=True)
 class Rotating(Target):
-    """What is true about a target with non-uniform rotation.
+    """Section `world`: the simulated target and its true parameters.
 
     Args:
-        rotation: Rate at the first pulse, and its derivatives over the rate.
-        centre_deviation_m: How much farther from the centre of rotation scatterers are than the
-            range axis says, yc.
-        scene_seed: None for scenes that differ from trial to trial; the seed of one scene for all
-            trials, which then differ in noise alone.
+        rotation: Rotation rate at the first pulse and its relative derivatives.
+        centre_deviation_m: Range in metres from the centre of rotation to the zero of the range
+            axis, yc.
+        scene_seed: Seed of one scene for all trials, which then differ in noise alone; None for
+            another scene in every trial.
     """
 
     rotation: PolynomialRotation
@@ -48,8 +48,8 @@ class Rotating(Target):
             raise ValueError("world.rotation_rad_s is the rate of a uniform rotation; give world.rotation alone")
         if not bool((torch.as_tensor(self.rotation.omega_rad_s) > 0).all()):
             raise ValueError(
-                f"world.rotation.omega_rad_s must be positive, got {self.rotation.omega_rad_s}; "
-                "only its square shows in data"
+                f"world.rotation.omega_rad_s must be positive, got {self.rotation.omega_rad_s}; the data "
+                "depend on its square alone"
             )
 
     def of(self, radar: InverseRadar) -> TurntableWorld:
@@ -61,9 +61,7 @@ class Rotating(Target):
 
     @property
     def named_points(self) -> dict[str, int]:
-        """Names `part.number` of explicit points, whose response is worth measuring, and their
-        indices among all scatterers.
-        """
+        """Names of the point targets, `part.number`, and their indices among all scatterers."""
         names: dict[str, int] = {}
         first = 0
         for part, one in self.scene.items():
@@ -73,7 +71,7 @@ class Rotating(Target):
         return names
 
     def noise_std(self, amplitude: Tensor) -> float:
-        """Of a sample, from the mean power of scatterers spread over the range cells."""
+        """Noise of a sample, from the mean power of the scatterers over the range cells."""
         snr_db = self.noise.snr_db
         if snr_db is None:
             return 0.0

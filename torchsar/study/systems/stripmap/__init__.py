@@ -41,26 +41,26 @@ class Stripmap(System):
     reads = "raw stripmap"
     ending = "a focusing stage"
     truths = ("doppler_hz", "velocity_m_s")
-    # runs of this system have always drawn at the address of unbatched draws
+    # the address of draws without a batch, so that the results of earlier versions are reproduced
     address = 0
     peak = 2.0
     tolerance = {"image_error_db": -20.0, "echo_error_db": -20.0, "data_error_db": -20.0}
     exact = {"stage": {"stage": "omega_k_stolt"}, "world.path": {"kind": "hyperbola"}}
     definitions = {
-        "snr": "mean signal power per lit raw sample over noise variance, dB",
+        "snr": "mean signal power over noise variance, of the raw samples that contain signal, dB",
         "entropy": "-sum p ln p, p = |I|^2 / sum |I|^2 over the window, nats",
         "contrast": "standard deviation over mean of the intensity |I|^2 over the window",
-        "irw": "-3 dB width of the impulse response, m; medians over the targets that were found",
-        "pslr": "strongest side lobe over the main lobe, dB",
+        "irw": "-3 dB width of the impulse response, m; the median over the targets that were found",
+        "pslr": "peak of the strongest side lobe over that of the main lobe, dB",
         "islr": "energy of the side lobes over that of the main lobe (null to null), dB",
         "position_error": "measured minus true position of the peak, m",
         "peak_db": "interpolated peak relative to the same target in the reference method, dB",
         "image_error_db": "10 lg of |I - I0|^2 / |I0|^2 over the window, I0 from the reference method, dB",
         "image_correlation": "|<I, I0>| / (|I| |I0|) of the complex images over the window",
-        "doppler_centroid_hz": "absolute Doppler of the beam centre, positive when closing",
-        "doppler_baseband_hz": "the centroid modulo the PRF, within half of it of zero",
+        "doppler_centroid_hz": "absolute Doppler frequency of the beam centre, positive when the range decreases",
+        "doppler_baseband_hz": "the Doppler centroid modulo the PRF, between -PRF/2 and PRF/2",
         "squint_deg": "asin(wavelength * doppler / (2 * velocity)), positive when the beam looks ahead",
-        "published": "figures of the source, or the theory of a rectangular band",
+        "published": "values of the source, or those of the theory of a rectangular spectrum",
     }
     columns = {
         "targets_found": Column("targets found"),
@@ -116,12 +116,12 @@ class Stripmap(System):
     def check_sweep(self, loaded: Loaded, grid: Mapping[str, Any]) -> None:
         if "world.doppler_hz" in grid and "world.squint_deg" in grid:
             raise ConfigError(
-                f"{loaded.file}: sweep: world.doppler_hz and world.squint_deg both say where the beam looks; "
+                f"{loaded.file}: sweep: world.doppler_hz and world.squint_deg both give the direction of the beam; "
                 "sweep one of them"
             )
 
     def bounds(self, bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
-        """Of scenes made of points alone: clutter has no energy of its own that one could name."""
+        """Bounds for scenes of points alone: the energy of other scenes is not known in advance."""
         truth, world, radar = batch.trials.truth, batch.trials.own, bench.radar
         std = truth["noise_std"]
         if (
@@ -147,7 +147,7 @@ class Stripmap(System):
         return choices(bench, {row.effect: row for row in self.requirements(bench)})
 
     def position_of(self, result: Result, target: str) -> tuple[float, float]:
-        """Azimuth and range (m) at which the recommended method should show a target."""
+        """Expected azimuth and range (m) of a target in the image of the recommended method."""
         trials, view = result.first.trials, result.first_of("recommended").judged.view
         azimuth, range_ = judge.positions(result.bench.chains["recommended"], view, result.bench, trials)
         index = list(result.bench.world().named_points).index(target)

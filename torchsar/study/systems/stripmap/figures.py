@@ -23,15 +23,16 @@ from torchsar.study.settings.cases import titled, word_of
 from torchsar.study.systems.stripmap.judge import focus_name, window
 from torchsar.study.trials.batch import IMAGE, Result, image_of
 
-# the curve of the velocity search about the estimate: half its extent in steps of the grid, and its
-# points, of which the middle one is the estimate
+# the part of the velocity curve that is drawn finely: half its extent in steps of the grid, and its
+# number of points, of which the middle one is the estimate
 _NEAR_STEPS, _NEAR_POINTS = 1.5, 41
+# methods whose cuts differ enough to be distinguished in one picture
 _CUT_METHODS = ("clean", "none", "baseline", "recommended")
 
 
 @dataclass(frozen=True)
 class Strip:
-    """What the pictures of one case are drawn from: its first trial."""
+    """The first trial of one case, from which its pictures are drawn."""
 
     case: str
     result: Result
@@ -46,26 +47,26 @@ class Strip:
 
     @property
     def scale(self) -> dict[str, Any]:
-        """Scenes of known points are shown below their peak; of others the brightest thousandth
-        saturates.
+        """Levels of images: 0 dB is the peak where all targets are known points, and else the level
+        that 0.1 % of the samples exceed.
         """
         known = bool(self.result.targets)
         return {"percentile": 100.0 if known else 99.9, "dynamic_range_db": 60.0 if known else 50.0}
 
     def images(self) -> dict[str, Signal]:
-        """Judged parts of the images of all methods but reruns."""
+        """Images of all methods but reruns, in the window that the metrics use."""
         methods, margin = self.result.bench.config.processor, self.result.bench.judging.margin
         images = {name: image for name, image in self.result.images.items() if methods[name].rerun is None}
         return {name: image.crop(**window(image, self.radar, margin)) for name, image in images.items()}
 
     def step(self, name: str, output: bool) -> Signal:
-        """What went into a stage of the recommended chain, or came out of it."""
+        """Input or output of a stage of the recommended chain."""
         trace = self.result.first_of("recommended").trace
         assert trace is not None
         return image_of((trace.outputs if output else trace.inputs)[name])
 
     def strongest(self) -> tuple[str, float, float]:
-        """Name, azimuth and range (m) of the strongest target, else of the brightest point."""
+        """Name, azimuth and range (m) of the strongest target; without targets, of the peak."""
         targets = self.result.first_of("recommended").judged.targets
         image = self.images()["recommended"]
         if targets:
@@ -78,7 +79,7 @@ class Strip:
 
 
 def pictures(results: Mapping[str, Result], columns: Mapping[str, Any]) -> Iterator[Callable[[], Drawn]]:
-    """Makers of all pictures."""
+    """Functions that draw the pictures, in the order of the report."""
     makers = (_images, _cuts, _squint, _doppler_spectrum, _increments, _corrections, _contaminated_line)
     for case, result in results.items():
         for make in (*makers, _response, _image_corrections, _velocity):
@@ -88,7 +89,7 @@ def pictures(results: Mapping[str, Result], columns: Mapping[str, Any]) -> Itera
 
 
 def _of_case(make: Callable[[Strip], Drawn], strip: Strip) -> Drawn:
-    """Pictures with the name of their case."""
+    """Draw pictures, with the case in their names and titles."""
     word = "" if strip.case == "all" else f"_{word_of(strip.case)}"
     for name, title, caption, figure in make(strip):
         yield f"{name}{word}", titled(title, strip.case), caption, figure
@@ -97,13 +98,13 @@ def _of_case(make: Callable[[Strip], Drawn], strip: Strip) -> Drawn:
 def _images(strip: Strip) -> Drawn:
     shown = strip.images()
     caption = (
-        "The image of the recommended method over the judged window: range to the right, azimuth upward, in metres; "
-        "amplitude in dB."
+        "The image of the recommended method in the window that the metrics use, in dB. The two axes have one scale "
+        "unless the window is too elongated for that."
     )
     title = strip.result.bench.config.processor["recommended"].title or "recommended"
     yield "image", "Focused image", caption, plot.image(shown["recommended"], title=title, **strip.scale)
     if len(shown) > 1:
-        caption = f"All images on one scale, that of '{next(iter(shown))}'."
+        caption = f"The same window of every image; 0 dB is one level for all, taken from '{next(iter(shown))}'."
         yield "methods", "The same scene by every method", caption, plot.images(shown, **strip.scale)
 
 
@@ -121,12 +122,12 @@ def _cuts(strip: Strip) -> Drawn:
         }
         for axis in IMAGE
     ]
-    caption = f"Cuts through {label}, band-limited interpolation by 16; 0 dB is each curve's own peak."
+    caption = f"Cuts through {label}, interpolated by a factor of 16. 0 dB is the peak of each curve."
     yield "cuts", "Impulse-response cuts", caption, plot.panels(parts)
 
 
 def _squint(strip: Strip) -> Drawn:
-    """The recommended image beside the rerun that ignores the Doppler centroid."""
+    """Draw the recommended image beside the rerun that ignores the Doppler centroid."""
     margin = strip.result.bench.judging.margin
     for name, method in strip.result.bench.config.processor.items():
         if method.rerun is not None and any(key.endswith("doppler_hz") for key in method.rerun.given):
@@ -134,14 +135,14 @@ def _squint(strip: Strip) -> Drawn:
             shown = {"squint taken into account": strip.images()["recommended"]}
             shown[method.title or name] = wrong.crop(**window(wrong, strip.radar, margin))
             caption = (
-                "First: focused about the estimated Doppler centroid. Second: the same data focused as if the beam "
-                "looked straight to the side: displaced, smeared, with ghosts."
+                "First: focused at the estimated Doppler centroid. Second: the same data focused as if the beam "
+                "pointed exactly sideways. Targets are then displaced and blurred, and false targets appear."
             )
             yield "squint", "With and without the squint", caption, plot.images(shown, **strip.scale)
 
 
 def _baseband(strip: Strip) -> tuple[float, float] | None:
-    """Doppler centroid that the recommended image is focused with: absolute, and in one PRF."""
+    """Doppler centroid of the recommended image in Hz: absolute, and within one PRF."""
     centroid = strip.result.first_of("recommended").judged.view.doppler_hz
     if centroid is None:
         return None
@@ -162,8 +163,8 @@ def _doppler_spectrum(strip: Strip) -> Drawn:
     turns = round((centroid[0] - centroid[1]) / strip.radar.prf_hz)
     title = f"centroid {centroid[0]:.1f} Hz = {centroid[1]:.1f} Hz {'-' if turns < 0 else '+'} {abs(turns)} PRF"
     caption = (
-        "Azimuth power spectrum of the data that are focused, averaged over range. The dashed line is the Doppler "
-        "centroid inside one PRF; the ambiguity is found from range migration."
+        "Azimuth power spectrum of the data before focusing, averaged over range. The dashed line is the Doppler "
+        "centroid within one PRF. The number of whole PRFs is estimated from range migration."
     )
     series, marks = {"mean over range": (plot.array(frequency), level)}, {"centroid": centroid[1]}
     figure = plot.curves(series, "baseband Doppler (Hz)", "power (dB)", title, marks)
@@ -179,15 +180,16 @@ def _increments(strip: Strip) -> Drawn:
         series["estimate"] = (plot.array(time_s), np.full(len(doppler), centroid[1]))
         doppler -= prf * np.round((doppler - centroid[1]) / prf)
     caption = (
-        "Mean phase increment between adjacent lines, in Hz (PRF times increment over 2 pi), for blocks of lines along "
-        "the strip. The scene makes it fluctuate; the estimate averages it."
+        "Mean phase increment between adjacent lines, as a frequency (PRF times increment over 2 pi), for blocks of "
+        "lines along the strip. It varies with the targets that the beam illuminates; the estimate is one value for "
+        "all lines."
     )
-    figure = plot.curves(series, "slow time (s)", "increment (Hz)")
+    figure = plot.curves(series, "slow time (s)", "phase increment (Hz)")
     yield "phase_increments", "Phase increments along the strip", caption, figure
 
 
 def _changed(strip: Strip, names: tuple[str, ...], groups: tuple[str, ...]) -> Iterator[tuple[str, Signal, Signal]]:
-    """Stages of the recommended chain that changed signals of these axes, with input and output."""
+    """Name, input and output of each stage of the recommended chain that changed its signal."""
     for name, entry in strip.stages.items():
         before, after = strip.step(name, False), strip.step(name, True)
         same = before.data.shape == after.data.shape and torch.equal(before.data, after.data)
@@ -206,13 +208,13 @@ def _corrections(strip: Strip) -> Drawn:
         parts = [
             {"series": dict(zip(("before", "after"), drawn)), "xlabel": xlabel, "ylabel": ylabel, "title": title}
             for drawn, xlabel, ylabel, title in (
-                (lines, "line", "power (dB over the median line)", "power of the lines"),
+                (lines, "line", "power (dB)", "power of the lines"),
                 (bands, "range frequency (MHz)", "power (dB)", "mean range spectrum"),
             )
         ]
         caption = (
-            f"Stage '{name}' ({strip.stages[name]['stage']}). First: power of every line. Second: range spectrum "
-            "averaged over the lines."
+            f"Stage '{name}' ({strip.stages[name]['stage']}). First: power of every line relative to the median line "
+            "before the correction. Second: range spectrum, averaged over the lines."
         )
         yield f"correction_{name}", f"Correction: {name}", caption, plot.panels(parts)
 
@@ -222,7 +224,7 @@ def _frequency_mhz(strip: Strip, n: int) -> np.ndarray:
 
 
 def _contaminated_line(strip: Strip) -> Drawn:
-    """The range spectrum of the line that an interference correction changed most."""
+    """Draw the range spectrum of the line that an interference correction changed most."""
     for name, before, after in _changed(strip, ("pulse", "range"), ("repair", "own")):
         if "interference" not in f"{strip.stages[name]['stage']} {name}":
             continue
@@ -237,33 +239,33 @@ def _contaminated_line(strip: Strip) -> Drawn:
             for label, s in (("before", before), ("after", after))
         }
         caption = (
-            f"Range spectrum of line {line}, the one from which most was removed ({int((removed > 0).sum())} of "
-            f"{len(removed)} lines were changed)."
+            f"Range spectrum of line {line}, from which the most power was removed. "
+            f"{int((removed > 0).sum())} of {len(removed)} lines were changed."
         )
         figure = plot.curves(series, "range frequency (MHz)", "level (dB)", f"line {line}")
         yield "contaminated_line", "Spectrum of a contaminated line", caption, figure
 
 
 def _response(strip: Strip) -> Drawn:
-    """Estimated response of the channel over range frequency, beside the truth if it is known."""
+    """Draw the estimated response of the channel, with the true one where it is known."""
     band_mhz = plot.array(band_grid()) * strip.radar.pulse.bandwidth_hz / 2e6
     truth, parts = strip.result.first.trials.truth, []
     for estimate in strip.result.first_of("recommended").estimates.values():
-        for key, label in (("phase_rad", "phase (rad)"), ("amplitude", "amplitude (1)")):
+        for key, title, label in (("phase_rad", "phase", "phase (rad)"), ("amplitude", "amplitude", "amplitude")):
             value = estimate.value.get(key)
             if value is None or value.shape[-1:] != band_mhz.shape:
                 continue
             true = [v for name, v in truth.items() if name.endswith(f".{key}") and v.shape[-1:] == band_mhz.shape]
             curves = {"estimate": value, **({"truth": true[0]} if true else {})}
             series = {n: (band_mhz, plot.array(v.reshape(-1, v.shape[-1])[0])) for n, v in curves.items()}
-            parts.append({"series": series, "xlabel": "range frequency (MHz)", "ylabel": label, "title": label})
+            parts.append({"series": series, "xlabel": "range frequency (MHz)", "ylabel": label, "title": title})
     if parts:
-        caption = "Phase and amplitude over the band of the pulse, as found from bright points of the image."
-        yield "response", "Response of the whole channel", caption, plot.panels(parts)
+        caption = "Phase and amplitude over the band of the pulse, estimated from bright points of the image."
+        yield "response", "Frequency response of the channel", caption, plot.panels(parts)
 
 
 def _image_corrections(strip: Strip) -> Drawn:
-    """Range cut through the strongest target before and after a correction of the image."""
+    """Draw a range cut through the strongest target before and after corrections of the image."""
     for name, before, after in _changed(strip, IMAGE, ("repair",)):
         label, *at = strip.strongest()
         cuts = {when: impulse_cuts(x, (at[0], at[1]))["range"] for when, x in (("before", before), ("after", after))}
@@ -274,7 +276,7 @@ def _image_corrections(strip: Strip) -> Drawn:
 
 
 def _velocity(strip: Strip) -> Drawn:
-    """Entropy over velocity, finely about the estimate."""
+    """Draw the entropy that the velocity search minimises, finely about the estimate."""
     bench, first = strip.result.bench, strip.result.first_of("recommended")
     chain = bench.chains["recommended"]
     for name, stage in chain.stages.items():
@@ -289,7 +291,7 @@ def _velocity(strip: Strip) -> Drawn:
         series, marks = {"entropy": (plot.array(velocity), plot.array(entropy))}, {"estimate": float(value)}
         figure = plot.curves(series, "effective velocity (m/s)", "entropy (nats)", f"{float(value):.2f} m/s", marks)
         caption = (
-            "Entropy of a small group of range lines over effective velocity: on the grid of the search, and finer "
-            "about the estimate, which is the dashed line."
+            "Entropy of the image of a group of range cells over the velocity that it is focused with. The search "
+            "minimises this curve; the dashed line is the minimum that it found."
         )
         yield f"{name}_entropy", "Effective velocity by minimum entropy", caption, figure

@@ -1,4 +1,4 @@
-"""Figures of one method on strips: estimates against the truth, images, responses of points."""
+"""Metrics of one method on strips: errors of estimates, images, responses of point targets."""
 
 from __future__ import annotations
 
@@ -21,14 +21,21 @@ from torchsar.study.trials.bench import Bench
 
 log = logging.getLogger("torchsar")
 _UNIT = re.compile(r"_(hz|m_s|m|s|rad|deg|db)$")
-# a window of fewer lines or samples says nothing of an image
+# metrics of a window of fewer lines or samples would depend on a few targets
 _LEAST = 32
 _FIGURES = ("irw_azimuth_m", "irw_range_m", "pslr_azimuth_db", "pslr_range_db", "islr_azimuth_db", "islr_range_db")
 
 
 @dataclass(frozen=True)
 class Margin:
-    """Lines and samples at the edges of the image that the metrics leave out."""
+    """Edges of the image that the metrics leave out.
+
+    Args:
+        first_lines: Lines at the start of the record.
+        last_lines: Lines at its end.
+        first_samples: Range samples at the near edge.
+        last_samples: Range samples at the far edge.
+    """
 
     first_lines: int = 0
     last_lines: int = 0
@@ -41,12 +48,15 @@ class Judging:
     """How images are judged.
 
     Args:
-        margin: None leaves out lines without a full aperture and samples without a full pulse.
-        reference: The method that image errors and peaks are relative to.
-        sidelobe_nulls: Extent of the side lobes in null spacings.
-        found_within_m: How far from its position a target counts as found.
-        found_above_db: How far below the reference's its peak may lie.
-        published: Figure -> case -> method -> what the source published.
+        margin: Edges of the image that the metrics leave out; None for lines without a full
+            aperture and samples without a full pulse.
+        reference: Name of the method with which images and peaks are compared.
+        sidelobe_nulls: Extent of the side lobes that are measured, in spacings of the nulls.
+        found_within_m: Largest distance in metres between the peak and the true position of a
+            target that counts as found.
+        found_above_db: Lowest peak of a target that counts as found, in dB relative to the
+            reference.
+        published: Values of the source, by metric, case and method.
     """
 
     margin: Margin | None = None
@@ -58,8 +68,8 @@ class Judging:
 
 
 def window(image: Signal, radar: StripmapRadar, margin: Margin | None) -> dict[str, tuple[int, int]]:
-    """Lines and samples that are judged: those with a full pulse and a full aperture, or what the
-    margin leaves. An axis of which fewer than 32 would be left is judged whole.
+    """Lines and samples that the metrics use: those with a full pulse and a full aperture, or what
+    the margin leaves. An axis of which fewer than 32 would be left is used as a whole.
     """
     lines, samples = (axis.n for axis in image.axes)
     if margin is None:
@@ -70,14 +80,14 @@ def window(image: Signal, radar: StripmapRadar, margin: Margin | None) -> dict[s
     kept = {axis: (first, n - last) for axis, (n, first, last) in spans.items()}
     for axis, (first, last) in kept.items():
         if last - first < _LEAST:
-            log.debug("a margin leaves %d of the image along %s: that axis is judged whole", last - first, axis)
+            log.debug("a margin leaves %d of the image along %s: the whole axis is used", last - first, axis)
             kept[axis] = (0, spans[axis][0])
     return kept
 
 
 @dataclass(frozen=True)
 class Used:
-    """What the focusing stage of a chain worked with, (trial,) each, and the view of a method."""
+    """Parameters that the focusing stage of a chain used, of shape (trial,) each."""
 
     doppler_hz: Tensor | None
     velocity_m_s: Tensor
@@ -112,18 +122,18 @@ class Used:
 
 
 def focus_name(chain: Chain) -> str:
-    """The stage that makes the image: the last one with a Doppler of its own, else the last."""
+    """Name of the stage that forms the image: the last one with a Doppler frame, else the last."""
     focusing = [name for name, stage in chain.stages.items() if hasattr(focuser_of(stage), "frame_hz")]
     return focusing[-1] if focusing else list(chain.stages)[-1]
 
 
 def focuser_of(stage: nn.Module) -> nn.Module:
-    """The stage itself, or the focuser that it wraps."""
+    """The focusing stage that a stage wraps, or else the stage itself."""
     return getattr(stage, "focuser", stage)
 
 
 def judge(bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
-    """Figures of one method; detail: those of point targets as well."""
+    """Metrics of one method, with those of point targets if `detail` is true."""
     chain, n = bench.chains[name], trials.count
     metrics = estimation_metrics(trace, trials, bench.radar.prf_hz)
     if trace.signal.names != IMAGE:
@@ -138,7 +148,7 @@ def judge(bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -
 
 
 def estimation_metrics(trace: Trace, trials: Trials, prf_hz: float) -> dict[str, Tensor]:
-    """Scalar estimates by name and their errors; a name that two stages give is the later one's."""
+    """Scalar estimates by name, and their errors; of two stages with one name the later counts."""
     n, truth = trials.count, trials.truth
     found = {key: v for estimate in trace.estimates.values() for key, v in estimate.value.items()}
     values = {key: v.double().expand(n) for key, v in found.items() if v.shape == trace.signal.trials}
@@ -158,7 +168,7 @@ def error_name(name: str) -> str:
 
 
 def compare(bench: Bench, outcome: Outcome, ideal: Outcome | None) -> Judged:
-    """The figures of a method with those against the reference, and over its targets."""
+    """Metrics of a method together with those relative to the reference and over its targets."""
     judged = over_targets(bench, outcome.judged, None if ideal is None else ideal.judged)
     one, other = outcome.signal, None if ideal is None else ideal.signal
     if one is None or other is None or one is other or not one.names == other.names == IMAGE:
@@ -171,7 +181,7 @@ def compare(bench: Bench, outcome: Outcome, ideal: Outcome | None) -> Judged:
 
 
 def positions(chain: Chain, used: Used, bench: Bench, trials: Trials) -> tuple[Tensor, Tensor]:
-    """Azimuth and range (m), (trial, target), where a method should show the point targets."""
+    """Expected azimuth and range (m), (trial, target), of the point targets in an image."""
     index = torch.tensor(list(bench.world().named_points.values()))
     zero, closest, velocity = (trials.truth[key] for key in ("zero_doppler_s", "closest_range_m", "velocity_m_s"))
     zero, closest = (x[..., index].expand(trials.count, -1) for x in (zero, closest))
@@ -185,29 +195,29 @@ def positions(chain: Chain, used: Used, bench: Bench, trials: Trials) -> tuple[T
 def _targets(
     bench: Bench, chain: Chain, image: Signal, used: Used, trials: Trials
 ) -> tuple[dict[str, dict[str, Tensor]], list[str]]:
-    """Figures of every point target inside the image, and the names of those outside."""
+    """Metrics of every point target inside the image, and the names of those outside."""
     names = [] if bench.recording is not None else list(bench.world().named_points)
     if not names:
         return {}, []
-    places = positions(chain, used, bench, trials)
-    inside = torch.stack([(x >= a.start) & (x <= a.stop) for x, a in zip(places, image.axes)]).all(0).all(0)
+    expected = positions(chain, used, bench, trials)
+    inside = torch.stack([(x >= a.start) & (x <= a.stop) for x, a in zip(expected, image.axes)]).all(0).all(0)
     kept = [name for name, within in zip(names, inside.tolist()) if within]
     outside = [name for name in names if name not in kept]
     if not kept:
         return {}, outside
-    at = tuple(x[:, inside] if image.trials else x[0, inside] for x in places)
+    at = tuple(x[:, inside] if image.trials else x[0, inside] for x in expected)
     figures = impulse_response(image, (at[0], at[1]), sidelobe_nulls=bench.judging.sidelobe_nulls)
     figures = {key: value.reshape(trials.count, -1) for key, value in figures.items()}
     table = {key: figures[key] for key in _FIGURES}
-    for axis, x in zip(("azimuth", "range"), places):
+    for axis, x in zip(("azimuth", "range"), expected):
         table[f"position_error_{axis}_m"] = figures[f"position_{axis}_m"] - x[:, inside]
     table["peak_db"] = 20 * torch.log10(figures["peak"].abs().clamp_min(1e-300))
     return {name: {key: value[:, i] for key, value in table.items()} for i, name in enumerate(kept)}, outside
 
 
 def over_targets(bench: Bench, judged: Judged, ideal: Judged | None) -> Judged:
-    """The figures of a method with peaks relative to the reference's, which of the targets were
-    found, and medians over those.
+    """Metrics of a method with peaks relative to the reference, the number of targets found, and
+    medians over these.
     """
     settings, targets = bench.judging, {}
     for name, row in judged.targets.items():

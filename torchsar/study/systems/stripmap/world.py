@@ -20,19 +20,19 @@ from torchsar.study.trials.system import Noise, World
 
 @dataclass(frozen=True, kw_only=True)
 class Strip(World):
-    """What is true about a strip.
+    """Section `world`: the simulated strip and its true parameters.
 
     Args:
-        lines: Pulses of the record.
-        samples: Range samples of each.
-        scene: Scenes by name, seen together.
-        beam: What lights them.
-        path: How finely the range follows the straight path.
-        velocity_m_s: True effective velocity; None for the radar's nominal one.
-        doppler_hz: True Doppler of the beam centre; None for the nominal pointing.
-        squint_deg: Squint of the beam centre, in place of doppler_hz.
-        noise: Mean signal power per lit raw sample over noise variance.
-        impairments: What happens to the recording, in order.
+        lines: Number of pulses of the record.
+        samples: Number of range samples of each pulse.
+        scene: Scenes by name, whose echoes add up.
+        beam: Illumination of the scene by the antenna.
+        path: Model of the range to a target over time.
+        velocity_m_s: True effective velocity in m/s; None for the nominal one of the radar.
+        doppler_hz: True Doppler centroid in Hz; None for the nominal pointing of the radar.
+        squint_deg: True squint of the beam in degrees, as an alternative to doppler_hz.
+        noise: Receiver noise; the SNR is that of raw samples that contain signal.
+        impairments: Impairments of the recording by name, in the order of their effect.
     """
 
     lines: int
@@ -53,7 +53,7 @@ class Strip(World):
                 f"a strip needs a scene and at least 2 lines of 2 samples, got {self.lines} x {self.samples}"
             )
         if self.doppler_hz is not None and self.squint_deg is not None:
-            raise ValueError("doppler_hz and squint_deg both say where the beam looks; give one of them")
+            raise ValueError("doppler_hz and squint_deg both give the direction of the beam; give one of them")
         if self.velocity_m_s is not None and bool((torch.as_tensor(self.velocity_m_s) <= 0).any()):
             raise ValueError(f"velocity_m_s must be positive, got {self.velocity_m_s}")
         if self.squint_deg is not None and bool((torch.as_tensor(self.squint_deg).abs() >= 90).any()):
@@ -68,7 +68,7 @@ class Strip(World):
         return 2 * velocity * torch.sin(squint) / radar.wavelength_m
 
     def of(self, radar: StripmapRadar) -> StripmapWorld:
-        """The world as the echo simulation takes it."""
+        """The parameters of the echo simulation."""
         doppler, scene = self.doppler(radar), Together(self.scene)
         return StripmapWorld(scene, self.beam, self.path, self.velocity_m_s, doppler, self.noise.snr_db)
 
