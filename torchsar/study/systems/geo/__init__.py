@@ -151,7 +151,7 @@ class Geo(System):
             )
 
     def may_differ(self, path: str, world: Mapping[str, Any]) -> bool:
-        """A gate that illuminates a sea sets the number of its cells, and must not vary in a case."""
+        """A gate that illuminates a sea sets the number of its cells, and may not vary in a case."""
         lights_sea = "gate." if world["sea_gate"] is None else "sea_gate."
         shapes = world["sea"] is not None and path.startswith(lights_sea)
         return not shapes and super().may_differ(path, world)

@@ -88,8 +88,8 @@ def _methods(case: str, result: Result) -> Drawn:
     parts = [_marked(result, name, made.fused, False) for name, made in _made(result).items()]
     if parts:
         caption = (
-            "The final image of every method. The inverse of three bands raises the level of the sea; setting the "
-            "extent of moving ships to zero leaves holes in it."
+            "The final image of every method. The inverse of three bands amplifies false targets; setting the extent "
+            "of moving ships to zero leaves holes in the sea."
         )
         figures = plot.overlays(parts, _UP_DB - _DOWN_DB)
         yield f"methods_{word_of(case)}", titled("Final images", case), caption, figures

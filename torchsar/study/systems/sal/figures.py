@@ -21,8 +21,8 @@ from torchsar.study.trials.batch import Result, image_of
 # margins about the scatterers: samples in azimuth, cells in range, and a part of the extent of the
 # scene
 _SAMPLES, _CELLS, _PART = 24, 6, 0.1
-# dynamic range of images and of profiles; side lobes of responses without a window lie above both
-_IMAGE_DB, _PROFILE_DB = 30.0, 40.0
+# dynamic range of images and profiles, so that images out of focus are visible beside sharp ones
+_RANGE_DB = 40.0
 # levels of cuts through responses
 _CUT_DB = (-40.0, 2.0)
 Lines = Mapping[str, tuple[Axis, Tensor]]
@@ -54,9 +54,9 @@ def _courses(result: Result) -> dict[str, Course]:
 def _target(result: Result) -> Drawn:
     along, range_, amplitude = (plot.array(x) for x in _scatterers(result))
     caption = (
-        "Scatterers of the first trial; the area of a point is proportional to its power. The axes differ in scale."
+        "Scatterers of the first trial; the area of a point is proportional to its amplitude. The axes differ in scale."
     )
-    figure = plot.places(range_, along, np.abs(amplitude) ** 2, "range (m)", "azimuth (m)", aspect="auto")
+    figure = plot.places(range_, along, np.abs(amplitude), "range (m)", "azimuth (m)", aspect="auto")
     yield "target", "Target", caption, figure
 
 
@@ -93,12 +93,12 @@ def _profiles(case: str, result: Result) -> Drawn:
             "methods whose profiles look alike the first is shown. A radial velocity v shifts the beat frequency by "
             "2 v / lambda, and thus the range."
         )
-        figure = plot.images(shown, dynamic_range_db=_PROFILE_DB, percentile=100)
+        figure = plot.images(shown, dynamic_range_db=_RANGE_DB, percentile=100)
         yield f"profiles_{word_of(case)}", titled("Range profiles over slow time", case), caption, figure
 
 
 def _look_alike(one: Tensor, other: Tensor) -> bool:
-    limit = 10 ** (-_PROFILE_DB / 20) * float(one.abs().max())
+    limit = 10 ** (-_RANGE_DB / 20) * float(one.abs().max())
     return one.shape == other.shape and float((one.abs() - other.abs()).abs().max()) < limit
 
 
@@ -112,13 +112,13 @@ def _images(case: str, result: Result) -> Drawn:
     cut = {name: _about_scene(image, result) for name, image in finer.items()}
     peaks = {name: float(image.data.abs().max()) for name, image in cut.items()}
     levels = plot.decibel(np.array([*peaks.values()]), next(iter(peaks.values()), None))
-    shown = {f"{name}, peak {level:.0f} dB": cut[name] for name, level in zip(cut, levels, strict=True)}
+    shown = {f"{name}, peak {round(float(level))} dB": cut[name] for name, level in zip(cut, levels, strict=True)}
     caption = (
         "Images of the first trial, interpolated to a quarter of the range step, in dB relative to the peak of the "
         "first image. The titles give the peak of each image: out of focus it is low, and the image is dark. A "
         "constant slope of the range error shifts an image along azimuth without loss of focus."
     )
-    figure = plot.images(shown, dynamic_range_db=_IMAGE_DB, percentile=100)
+    figure = plot.images(shown, dynamic_range_db=_RANGE_DB, percentile=100)
     yield f"images_{word_of(case)}", titled("Images by every method", case), caption, figure
 
 
@@ -137,13 +137,13 @@ def _motion(case: str, result: Result) -> Drawn:
     errors = {n: (c.pulse, 1e3 * _lit_only(c, c.velocity_error_m_s)) for n, c in estimating.items()}
     parts += _by_size("estimated minus true velocity", "mm/s", errors)
     left = {name: (c.pulse, 1e6 * _lit_only(c, c.detrended_m)) for name, c in courses.items()}
-    parts += _by_size("remaining range error", "µm", left)
+    parts += _by_size("remaining range error", "um", left)
     quarter = 1e6 * result.bench.radar.wavelength_m / 4
     caption = (
         "First trial: the radial velocity, true and by the two least accurate methods; errors of the estimated "
         "velocity; range errors after compensation. Methods with errors of similar size share a panel. Periods in "
         "which no scatterer is illuminated are left out, and so are constant and slope of range errors, which affect "
-        f"only the phase and the position of an image. A quarter of the wavelength is {quarter:.2g} µm."
+        f"only the phase and the position of an image. A quarter of the wavelength is {quarter:.2g} um."
     )
     yield f"motion_{word_of(case)}", titled("Radial motion and its errors", case), caption, plot.panels(parts)
 
