@@ -151,7 +151,7 @@ class Geo(System):
             )
 
     def may_differ(self, path: str, world: Mapping[str, Any]) -> bool:
-        """A gate that illuminates a sea sets the number of its cells, and may not vary in a case."""
+        """A gate that illuminates a sea sets the number of its cells, and cannot vary."""
         lights_sea = "gate." if world["sea_gate"] is None else "sea_gate."
         shapes = world["sea"] is not None and path.startswith(lights_sea)
         return not shapes and super().may_differ(path, world)
@@ -247,8 +247,8 @@ class Geo(System):
         if "snr_db" in levels:
             text = (
                 f"A target is {levels['snr_db']:.4g} dB above the noise in a range-compressed sample of one channel, "
+                f"{levels['raw_scnr_db']:.4g} dB before compression."
             )
-            text += f"{levels['raw_scnr_db']:.4g} dB before compression."
         yield "Signal to noise", text
 
     def extra_definitions(self, bench: Bench) -> Mapping[str, Any]:

@@ -155,7 +155,7 @@ class GeoOcean(System):
                     )
 
     def may_differ(self, path: str, world: Mapping[str, Any]) -> bool:
-        """The gate sets the number of cells of the sea, and must not vary in a case."""
+        """The gate sets the number of cells of the sea, and cannot vary."""
         return not path.startswith("gate.") and super().may_differ(path, world)
 
     def simulate(self, bench: Bench, world: Ocean, draws: Draws) -> Trials:
@@ -216,9 +216,11 @@ class GeoOcean(System):
         return images
 
     def notes(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        text = "Errors of positions are relative to the position in the image of the ship's own echo. The scatterers "
-        text += "of a ship interfere, so that no image shows the centroid of their powers."
-        yield "Positions", text
+        yield (
+            "Positions",
+            "Errors of positions are relative to the position in the image of the ship's own echo. The scatterers of a "
+            "ship interfere, so that no image shows the centroid of their powers.",
+        )
 
 
 def at_rest(chain: Chain) -> StationaryImage:

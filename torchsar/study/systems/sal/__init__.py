@@ -183,8 +183,14 @@ class Sal(System):
             t: tuple(truth[k][..., i].expand(trace.signal.trials) for k in ("azimuth_m", "range_m"))
             for t, i in named.items()
         }
-        nulls = settings.sidelobe_nulls
-        targets = target_responses(trace.signal, at, course, bench.radar, nulls, settings.search_m)  # pyright: ignore
+        targets = target_responses(
+            trace.signal,
+            at,  # pyright: ignore[reportArgumentType]
+            course,
+            bench.radar,
+            settings.sidelobe_nulls,
+            settings.search_m,
+        )
         shown = targets.get(settings.target or "", {})
         metrics |= {key: value for key, value in shown.items() if key.startswith(("irw", "pslr", "islr"))}
         return _expanded(metrics, targets, [t for t in named if t not in targets], course, trials.count)
@@ -235,14 +241,13 @@ class Sal(System):
             if wrong:
                 text = (
                     f"Some defocused images have less entropy than the ideal one ({ideal['entropy_nats']:.2f} nats): "
+                    f"{', '.join(wrong)}. Compare methods by the residual phase, not by entropy alone."
                 )
-                text += f"{', '.join(wrong)}. Compare methods by the residual phase, not by entropy alone."
                 yield f"Misleading entropy, case {case}", text
 
     def extra_definitions(self, bench: Bench) -> Mapping[str, Any]:
-        judging = bench.judging
-        shown = {"reference": judging.reference, "target": judging.target}
-        return {"islr_extent_nulls": judging.sidelobe_nulls, **shown}
+        named = {"islr_extent_nulls": "sidelobe_nulls", "reference": "reference", "target": "target"}
+        return {shown: getattr(bench.judging, name) for shown, name in named.items()}
 
 
 def _expanded(

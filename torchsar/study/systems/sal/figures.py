@@ -47,8 +47,8 @@ def _scatterers(result: Result) -> tuple[Tensor, Tensor, Tensor]:
 
 def _courses(result: Result) -> dict[str, Course]:
     """Estimated and remaining motion of every method in the first trial."""
-    views = {name: outcome.judged.view for name, outcome in result.first.outcomes.items() if not outcome.failed}
-    return {name: view.first() for name, view in views.items()}
+    outcomes = result.first.outcomes
+    return {name: outcome.judged.view.first() for name, outcome in outcomes.items() if not outcome.failed}
 
 
 def _target(result: Result) -> Drawn:
@@ -74,9 +74,15 @@ def _about_scene(signal: Signal, result: Result) -> Signal:
     radar, velocity = result.bench.radar, result.first.trials.truth["velocity_m_s"]
     shift = velocity[:1].cpu() * radar.carrier_hz / radar.chirp_rate_hz_s
     shifted = torch.cat([range_m + shift.min().clamp(max=0.0), range_m + shift.max().clamp(min=0.0)])
-    along = _SAMPLES * signal.axes[0].step + _PART * float(azimuth.max() - azimuth.min())
-    across = _CELLS * radar.range_step_m + _PART * float(range_m.max() - range_m.min())
-    return plot.within(signal, {"azimuth": plot.span(azimuth, along), "range": plot.span(shifted, across)})
+    return plot.within(
+        signal,
+        {
+            "azimuth": plot.span(
+                azimuth, _SAMPLES * signal.axes[0].step + _PART * float(azimuth.max() - azimuth.min())
+            ),
+            "range": plot.span(shifted, _CELLS * radar.range_step_m + _PART * float(range_m.max() - range_m.min())),
+        },
+    )
 
 
 def _profiles(case: str, result: Result) -> Drawn:
@@ -99,7 +105,7 @@ def _profiles(case: str, result: Result) -> Drawn:
 
 def _look_alike(one: Tensor, other: Tensor) -> bool:
     limit = 10 ** (-_RANGE_DB / 20) * float(one.abs().max())
-    return one.shape == other.shape and float((one.abs() - other.abs()).abs().max()) < limit
+    return one.shape == other.shape and torch.allclose(one.abs(), other.abs(), rtol=0.0, atol=limit)
 
 
 def _in_milliseconds(signal: Signal) -> Signal:
@@ -110,9 +116,8 @@ def _in_milliseconds(signal: Signal) -> Signal:
 def _images(case: str, result: Result) -> Drawn:
     finer = {name: finer_in_range(finer_in_range(image)) for name, image in first_named(result.images).items()}
     cut = {name: _about_scene(image, result) for name, image in finer.items()}
-    peaks = {name: float(image.data.abs().max()) for name, image in cut.items()}
-    levels = plot.decibel(np.array([*peaks.values()]), next(iter(peaks.values()), None))
-    shown = {f"{name}, peak {round(float(level))} dB": cut[name] for name, level in zip(cut, levels, strict=True)}
+    top = float(next(iter(cut.values())).data.abs().max())
+    shown = {f"{n}, peak {round(float(plot.decibel(s.data.abs().max(), top)))} dB": s for n, s in cut.items()}
     caption = (
         "Images of the first trial, interpolated to a quarter of the range step, in dB relative to the peak of the "
         "first image. The titles give the peak of each image: out of focus it is low, and the image is dark. A "
@@ -129,28 +134,23 @@ def _motion(case: str, result: Result) -> Drawn:
     if not estimating:
         return
     pulse, true = next(iter(estimating.values())).pulse, result.first.trials.truth["velocity_m_s"]
-    order = sorted(estimating, key=lambda name: -float(_rms(estimating[name])))
+    errors = {n: (c.pulse, 1e3 * _lit_only(c, c.velocity_error_m_s)) for n, c in estimating.items()}
+    order = sorted(errors, key=lambda name: -float(errors[name][1].square().nanmean()))
     worst = {n: (estimating[n].pulse, _lit_only(estimating[n], estimating[n].velocity_m_s)) for n in order[:2]}
     parts = [
         _panel("radial velocity", "m/s", {"true": (pulse, true.reshape(-1, true.shape[-1])[0][: pulse.n]), **worst})
     ]
-    errors = {n: (c.pulse, 1e3 * _lit_only(c, c.velocity_error_m_s)) for n, c in estimating.items()}
     parts += _by_size("estimated minus true velocity", "mm/s", errors)
     left = {name: (c.pulse, 1e6 * _lit_only(c, c.detrended_m)) for name, c in courses.items()}
     parts += _by_size("remaining range error", "um", left)
-    quarter = 1e6 * result.bench.radar.wavelength_m / 4
     caption = (
         "First trial: the radial velocity, true and by the two least accurate methods; errors of the estimated "
         "velocity; range errors after compensation. Methods with errors of similar size share a panel. Periods in "
         "which no scatterer is illuminated are left out, and so are constant and slope of range errors, which affect "
-        f"only the phase and the position of an image. A quarter of the wavelength is {quarter:.2g} um."
+        "only the phase and the position of an image. A quarter of the wavelength is "
+        f"{1e6 * result.bench.radar.wavelength_m / 4:.2g} um."
     )
     yield f"motion_{word_of(case)}", titled("Radial motion and its errors", case), caption, plot.panels(parts)
-
-
-def _rms(course: Course) -> Tensor:
-    assert course.velocity_error_m_s is not None
-    return course.rms(course.velocity_error_m_s)
 
 
 def _lit_only(course: Course, x: Tensor | None) -> Tensor:
