@@ -77,10 +77,8 @@ def _about_scene(signal: Signal, result: Result) -> Signal:
     return plot.within(
         signal,
         {
-            "azimuth": plot.span(
-                azimuth, _SAMPLES * signal.axes[0].step + _PART * float(azimuth.max() - azimuth.min())
-            ),
-            "range": plot.span(shifted, _CELLS * radar.range_step_m + _PART * float(range_m.max() - range_m.min())),
+            "azimuth": plot.span(azimuth, _SAMPLES * signal.axes[0].step + _PART * float(np.ptp(azimuth.numpy()))),
+            "range": plot.span(shifted, _CELLS * radar.range_step_m + _PART * float(np.ptp(range_m.numpy()))),
         },
     )
 
