@@ -1,13 +1,16 @@
-"""The report in a real browser: nothing in the console, nothing asked for outside, every picture
-drawn.
+"""The report in a real browser: nothing in the console, no external resources, every picture drawn,
+and a layout that fits wide and narrow pages.
 """
 
 from __future__ import annotations
 
+import html
+import json
 import re
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,12 +20,23 @@ from torchsar.cli import main
 BROWSER = next(
     (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None
 )
+# in the report: what it loads, elements that reach over its edge outside of boxes that scroll, and
+# the largest number of panels of a picture that stand side by side
 PROBE = """<script>addEventListener("load", () => {
   const images = [...document.images], broken = images.filter(i => !i.complete || i.naturalWidth < 100).length;
   const outside = performance.getEntriesByType("resource").map(e => e.name).filter(n => !n.startsWith("data:"));
-  const wide = document.documentElement.scrollWidth > innerWidth;
-  document.body.dataset.probe = JSON.stringify({images: images.length, broken, outside, title: document.title, wide});
+  const free = [...document.body.querySelectorAll("*")].filter(e => !e.parentElement.closest(".scroll, pre"));
+  const wide = free.filter(e => e.getBoundingClientRect().right > innerWidth + 0.5).map(e => e.outerHTML.slice(0, 80));
+  if (document.documentElement.scrollWidth > innerWidth) wide.push("page");
+  const rows = [...document.querySelectorAll(".panels")].flatMap(p => {
+    const tops = [...p.children].map(i => i.offsetTop);
+    return tops.map(top => tops.filter(other => other === top).length);
+  });
+  parent.postMessage(JSON.stringify({images: images.length, broken, outside, wide, columns: Math.max(...rows)}), "*");
 });</script>"""
+# a narrow window is not narrow in every browser, but a frame is
+FRAME = """<!doctype html><script>addEventListener("message", e => document.body.dataset.probe = e.data);</script>
+<body><iframe width="{width}" height="900" src="{page}"></iframe></body>"""
 
 
 def browse(page: Path, profile: Path, *options: str) -> subprocess.CompletedProcess[str]:
@@ -68,12 +82,27 @@ def test_console_messages_would_be_seen(report: Path, tmp_path: Path) -> None:
     assert any("CONSOLE" in line and "here" in line for line in done.stderr.splitlines())
 
 
-def test_every_picture_is_drawn_and_nothing_comes_from_outside(report: Path, tmp_path: Path) -> None:
-    probed = tmp_path / "probed.html"
-    probed.write_text(report.read_text().replace("</body>", PROBE + "</body>"))
-    dom = browse(probed, tmp_path / "profile", "--window-size=1200,900", "--dump-dom").stdout
+def probe(page: str, width: int, folder: Path) -> dict[str, Any]:
+    """What a page reports that is shown in a frame of a width in pixels."""
+    (folder / "probed.html").write_text(page.replace("</body>", PROBE + "</body>"))
+    (folder / "frame.html").write_text(FRAME.format(width=width, page="probed.html"))
+    dom = browse(folder / "frame.html", folder / "profile", "--window-size=1300,1000", "--dump-dom").stdout
     found = re.search(r'data-probe="([^"]*)"', dom)
     assert found, dom[:500]
-    probe = found.group(1).replace("&quot;", '"')
-    assert '"broken":0' in probe and '"outside":[]' in probe and '"wide":false' in probe
-    assert int(re.search(r'"images":(\d+)', probe).group(1)) == len(list((report.parent / "figures").iterdir()))  # type: ignore[union-attr]
+    return json.loads(html.unescape(found.group(1)))
+
+
+@pytest.mark.parametrize(("width", "columns"), [(1200, 2), (420, 1)])
+def test_pictures_are_drawn_and_panels_wrap_on_a_narrow_page(
+    report: Path, tmp_path: Path, width: int, columns: int
+) -> None:
+    found = probe(report.read_text(), width, tmp_path)
+    assert found["broken"] == 0 and found["outside"] == []
+    assert found["images"] == len(list((report.parent / "figures").iterdir()))
+    assert found["wide"] == []
+    assert found["columns"] == columns
+
+
+def test_a_page_that_is_too_wide_would_be_seen(report: Path, tmp_path: Path) -> None:
+    wide = report.read_text().replace("</main>", '<div style="width: 500px">wide</div></main>')
+    assert any("500px" in element for element in probe(wide, 420, tmp_path)["wide"])

@@ -1,4 +1,4 @@
-"""Azimuth-multichannel SAR with a far transmitter, moving points one at a time
+"""Azimuth-multichannel SAR with a far transmitter, and moving points one at a time
 (Remote Sens. 2020, 12, 1703).
 """
 
@@ -38,18 +38,18 @@ from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Choice
 from torchsar.study.trials.system import Column, System
 
-# Doppler bands that hold clutter seen through a pattern
+# Doppler bands that contain clutter illuminated through an antenna pattern
 _CLUTTER_BANDS = 5
 _IMAGES = (("azimuth",), ("azimuth", "range"))
 
 
 @dataclass(frozen=True)
 class Judging:
-    """How results are judged.
+    """Settings of the metrics.
 
     Args:
-        orders: How many pulse rates away replicas are sought.
-        published_targets: Figure -> target -> method -> what the source published.
+        orders: Largest distance of a replica, in pulse rates, up to which it is measured.
+        published_targets: Published values by figure, target and method.
     """
 
     orders: int = 3
@@ -61,7 +61,7 @@ class Judging:
 
 
 class View(NamedTuple):
-    """What pictures need of a method: its clean images, rebuilt spectra, and how they were made."""
+    """What pictures need of a method: images and spectra without noise, and their geometry."""
 
     image: Signal | None
     spectrum: Signal | None
@@ -69,10 +69,10 @@ class View(NamedTuple):
 
 
 class Geo(System):
-    """Moving points before several channels."""
+    """Moving points, recorded by several channels."""
 
     name = "geo"
-    about = "moving points before several channels along track, a far transmitter"
+    about = "moving points, recorded by several channels along track from a far transmitter"
     Radar = staticmethod(bistatic_radar)
     World = Points
     Judging = Judging
@@ -89,15 +89,15 @@ class Geo(System):
     definitions = {
         "snr": "power of the target over noise variance in one range-compressed sample of one channel, dB "
         "(snr_db). Raw, before compression, it is 10 log10(B tau_p) less (raw_scnr_db): 27 dB at 50 MHz and 10 "
-        "us. Sample of azimuth-only data: of the compressed peak line. scr_db: power of the target over that of "
-        "the sea in such a sample",
-        "targets": "every target is recorded and processed alone, with noise of its own; figures of a method "
+        "us. A sample of azimuth-only data is one of the compressed peak line. scr_db: power of the target over that "
+        "of the sea in such a sample",
+        "targets": "every target is recorded and processed alone, with noise of its own; metrics of a method "
         "are means over its targets",
         "velocities": "u_r: closing slant-range speed towards the receiver's closest point; u_a: along track, "
         "positive with the receiver; y0: position along track at t = 0, the middle pulse",
         "responses": "irw, pslr, islr, mfta and noise-free positions are measured on the image of the CLEAN echo (same "
-        "impairment, no noise, no sea), rebuilt and focused with every value held that the method estimated "
-        "from the NOISY one: image noise would hide false targets below about -60 dB",
+        "impairment, no noise, no sea), rebuilt and focused with the values that the method estimated "
+        "from the NOISY one, because image noise would hide false targets below about -60 dB",
         "irw_azimuth_m": "3 dB width on the axis x = (V_R - u_a) t of the true target; theory 0.886 v / B, B "
         "the processed Doppler band within the target's",
         "pslr_azimuth_db": "largest side lobe over the peak; theory, a sinc: -13.26 dB",
@@ -105,8 +105,8 @@ class Geo(System):
         "-9.92 dB",
         "mfta_db": "largest replica in the zones of +-1..metrics.orders pulse rates from the peak over the "
         "peak, as far as the image reaches",
-        "u_r_error_m_s": "estimated minus true u_r; u_a_error_m_s, y0_error_m alike. Only of methods that estimate it",
-        "predicted": "u_r_std_m_s, u_a_std_m_s, y0_std_m: standard deviations that the method itself predicts",
+        "u_r_error_m_s": "estimated minus true u_r, of methods that estimate it; u_a_error_m_s and y0_error_m likewise",
+        "predicted": "u_r_std_m_s, u_a_std_m_s, y0_std_m: standard deviations that the estimator predicts",
         "position_error_m": "position along track at t = 0 from the measured peak after location correction by "
         "the method's own velocities, minus the truth",
         "range": "irw_range_m, pslr_range_db, islr_range_db on the axis c tau / 2, on which the width of a sinc is "
@@ -117,10 +117,10 @@ class Geo(System):
         "theory": "a target that is rebuilt and focused without error",
         "bounds": "Cramer-Rao for known noise or clutter, complex amplitude and y0 unknown; u_a unknown too, or "
         "known, as named",
-        "published": "figures of Remote Sens. 2020, 12, 1703; its SCNR is read as raw",
+        "published": "values of Remote Sens. 2020, 12, 1703; its SCNR is taken as that before range compression",
     }
     target_columns = {
-        "irw_azimuth_m": Column("width in azimuth along the track that the target sees", "m"),
+        "irw_azimuth_m": Column("width in azimuth, axis (V_R - u_a) t", "m"),
         "pslr_azimuth_db": Column("PSLR in azimuth", "dB"),
         "islr_azimuth_db": Column("ISLR in azimuth", "dB"),
         "mfta_db": Column("largest false target (MFTA)", "dB", drawn="mean"),
@@ -151,7 +151,7 @@ class Geo(System):
             )
 
     def may_differ(self, path: str, world: Mapping[str, Any]) -> bool:
-        """A gate decides how many cells of a sea it lights, and thus makes cases."""
+        """A gate that illuminates a sea sets the number of its cells, and cannot vary."""
         lights_sea = "gate." if world["sea_gate"] is None else "sea_gate."
         shapes = world["sea"] is not None and path.startswith(lights_sea)
         return not shapes and super().may_differ(path, world)
@@ -194,7 +194,7 @@ class Geo(System):
         return table
 
     def bounds(self, bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
-        """Lower bounds of the errors for the unknowns that any method has; none without noise."""
+        """Lower bounds of the errors, for the unknowns of the methods; none without noise."""
         truth, world, radar = batch.trials.truth, bench.world(), bench.radar
         metrics = [outcome.metrics for outcome in batch.outcomes.values()]
         kinds: dict[str, tuple[str, ...]] = {}
@@ -224,7 +224,7 @@ class Geo(System):
         return choices.choices(bench)
 
     def theory(self, result: Result) -> Mapping[str, Mapping[str, float]]:
-        """Of the recommended method, where it makes an image."""
+        """Ideal responses of the recommended method, if it makes an image."""
         focused, truth = result.first_of("recommended").judged.view.focused, result.first.trials.truth
         own, world = result.first.trials.own, result.bench.world()
         if focused is None:
@@ -243,14 +243,16 @@ class Geo(System):
 
     def notes(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         levels = metrics["definitions"]
-        text = "Echoes are free of noise."
+        text = "Echoes are without noise."
         if "snr_db" in levels:
-            text = f"A target stands {levels['snr_db']:.4g} dB above the noise in a range-compressed sample of one "
-            text += f"channel, {levels['raw_scnr_db']:.4g} dB before compression."
+            text = (
+                f"A target is {levels['snr_db']:.4g} dB above the noise in a range-compressed sample of one channel, "
+                f"{levels['raw_scnr_db']:.4g} dB before compression."
+            )
         yield "Signal to noise", text
 
     def extra_definitions(self, bench: Bench) -> Mapping[str, Any]:
-        """SNR both ways, and the range to the transmitter, as numbers."""
+        """SNR before and after compression, and coefficients of the range to the transmitter."""
         snr, gain = bench.world().snr_db(bench.radar), compression_gain_db(bench.radar)
         transmit = {f"transmit_range_k{i}": k for i, k in enumerate(bench.radar.transmit_range, 1)}
         levels = (
@@ -260,7 +262,7 @@ class Geo(System):
 
 
 def _held(chain: Chain, trace: Trace) -> dict[str, Tensor]:
-    """Everything that a chain was given or has estimated."""
+    """Values that a chain was given or has estimated."""
     estimates = {f"{stage}.{key}": v for stage, e in trace.estimates.items() for key, v in e.value.items()}
     sources = {source for uses in chain.uses.values() for source in uses.values() if source.startswith("given.")}
     return {**estimates, **{source: trace.values[source] for source in sources}}

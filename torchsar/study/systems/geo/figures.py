@@ -1,4 +1,4 @@
-"""The pictures of a run of moving points: profiles, main lobes, images and spectra."""
+"""The pictures of a run of moving points: azimuth profiles, main lobes, contours and spectra."""
 
 from __future__ import annotations
 
@@ -20,22 +20,23 @@ from torchsar.study.output.pictures import Drawn, comparisons
 from torchsar.study.settings.cases import key_of, titled, word_of
 from torchsar.study.trials.batch import Result
 
-# what is shown of profiles: metres about the peak, and the lowest levels
+# half extent of main lobes (m), and lowest levels of profiles and of spectra
 _NEAR_M, _LOW_DB, _SPECTRUM_DB = 12.0, -90.0, -70.0
-# half extents of contour plots in azimuth and range, and their samples
+# half extents of contour plots in azimuth and range (m), and their samples
 _ALONG_M, _ACROSS_M, _SAMPLES = 6.0, 20.0, 161
+# samples of drawn main lobes per sample of an image
 _FINER = 8
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One target by one method in the first trial.
+    """One target, processed by one method, in the first trial.
 
     Args:
         image: Its image without noise.
         profile: Cut along azimuth through the peak.
-        along_m: Positions of the cut on x = (V_R - u_a) t of the target.
-        spectrum: Rebuilt spectrum over Doppler from its centre.
+        along_m: Positions of the cut on the axis x = (V_R - u_a) t of the target in metres.
+        spectrum: Rebuilt spectrum over Doppler frequency from its centre.
     """
 
     image: Signal
@@ -48,7 +49,7 @@ Shots = dict[str, dict[str, Shot]]
 
 
 def shots(result: Result) -> Shots:
-    """Every target by every method that makes images."""
+    """Every target, by every method that makes images."""
     targets, truth, radar = list(result.bench.world().targets), result.first.trials.truth, result.bench.radar
     found: Shots = {}
     for name, outcome in result.first.outcomes.items():
@@ -90,14 +91,14 @@ def by_target(results: Mapping[str, Result]) -> dict[str, Any]:
 
 
 def _pair(result: Result) -> Shots:
-    """The conventional method beside the recommended one, or what there is of them."""
+    """The conventional and the recommended method, or the first two where they are missing."""
     found = shots(result)
     chosen = [name for name in ("conventional", "recommended") if name in found] or list(found)[:2]
     return {name: found[name] for name in chosen}
 
 
 def _panels(found: Shots, curve: Callable[[Shot], tuple[Any, Any]], xlabel: str, low: float) -> list[dict[str, Any]]:
-    """A panel for each target, a curve of levels in dB for each method."""
+    """Panels, one for each target, with a curve of levels in dB for each method."""
     return [
         {
             "title": target,
@@ -114,10 +115,13 @@ def _profiles(case: str, result: Result) -> Drawn:
     def curve(shot: Shot) -> tuple[Any, Any]:
         return plot.array(shot.along_m), np.maximum(plot.decibel(shot.profile), _LOW_DB)
 
+    radar = result.bench.radar
+    replica_m = radar.prf_hz * radar.wavelength_m * radar.reference_range_m / radar.speed_m_s
     caption = (
-        "Azimuth profiles through the peak of images without noise, each in dB of its own peak. False targets lie "
-        "about 720 m a pulse rate from it at the parameters of the source; the humps near 1330 m of a target cut "
-        "by a gate are tails of its band, beyond the rebuilt one, folded back from the ends of the gate."
+        "Azimuth profiles through the peak of images without noise, in dB relative to their own peaks. False targets "
+        f"lie at multiples of about {replica_m:.0f} m from the peak, one for each pulse rate; V_R is the speed of the "
+        "receiver. Weak maxima between them, of targets with limited illumination, are ends of the Doppler band that "
+        "lie outside of the rebuilt band."
     )
     figures = plot.panels(_panels(_pair(result), curve, "x = (V_R - u_a) t (m)", _LOW_DB))
     yield f"profiles_{word_of(case)}", titled("False targets", case), caption, figures
@@ -131,12 +135,12 @@ def _main_lobes(case: str, result: Result) -> Drawn:
         return offset[near], plot.decibel(fine)[near]
 
     figures = plot.panels(_panels(shots(result), curve, "x from the peak (m)", -40.0))
-    caption = "The same profiles about their peaks, by every method."
+    caption = "The same profiles about their peaks, for every method."
     yield f"main_lobes_{word_of(case)}", titled("Main lobes", case), caption, figures
 
 
 def _contours(case: str, result: Result) -> Drawn:
-    """About the peaks of two-dimensional images."""
+    """Two-dimensional images about their peaks, if there are any."""
     found = _pair(result)
     images = {
         f"{target}, {name}": of[target].image for target in next(iter(found.values()), {}) for name, of in found.items()
@@ -144,8 +148,8 @@ def _contours(case: str, result: Result) -> Drawn:
     cut = {title: _about_peak(image) for title, image in images.items() if "range" in image.names}
     if cut:
         caption = (
-            "About the peak of images without noise, range on the axis c tau / 2; interpolated. Conventional images of "
-            "fast targets are defocused and lie elsewhere."
+            "Interpolated images without noise about their peaks, range on the axis c tau / 2. Conventional images of "
+            "moving targets are defocused and displaced."
         )
         yield f"contours_{word_of(case)}", titled("Contours", case), caption, plot.contours(cut)
 
@@ -162,5 +166,7 @@ def _spectra(case: str, result: Result) -> Drawn:
         return plot.array(shot.spectrum.axes[0].values()), np.maximum(plot.decibel(shot.spectrum.data), _SPECTRUM_DB)
 
     figures = plot.panels(_panels(_pair(result), curve, "Doppler from the centre (Hz)", _SPECTRUM_DB))
-    caption = "Rebuilt Doppler spectra of echoes without noise. Energy out of its band makes false targets."
+    caption = (
+        "Rebuilt Doppler spectra of echoes without noise. Energy outside of the band of a target makes false ones."
+    )
     yield f"spectra_{word_of(case)}", titled("Rebuilt spectra", case), caption, figures

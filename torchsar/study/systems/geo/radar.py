@@ -25,7 +25,25 @@ def bistatic_radar(
 ) -> BistaticRadar:
     """Make a `BistaticRadar` from the keys of a config.
 
-    The range to the transmitter follows from transmit_range, k1, k2, ..., or from an orbit.
+    Args:
+        carrier_hz: Carrier frequency in Hz.
+        bandwidth_hz: Bandwidth of the transmitted up-chirp in Hz.
+        pulse_s: Length of the transmitted pulse in seconds.
+        sampling_hz: Complex sampling rate in Hz, at least the bandwidth.
+        prf_hz: Pulse repetition frequency of the transmitter in Hz.
+        speed_m_s: Speed of the receiver along its straight, level track in m/s.
+        reference_range_m: Closest slant range from the receiver to the scene centre in metres.
+        height_m: Height of the receiver in metres.
+        channel_m: Positions of the channels along the track in metres.
+        element_m: Length of the aperture of each channel along the track in metres.
+        transmit_range: Coefficients k1, k2, ... (m/s, m/s^2, ...) of the change of the range to the
+            transmitter, k1 t + k2 t^2 + ...
+        orbit: Orbit of the transmitter, from which these coefficients follow; null if they are
+            given, or zero.
+        wave_speed_m_s: Propagation speed in m/s.
+
+    Raises:
+        ValueError: If both transmit_range and orbit are given, or the radar is not possible.
     """
     if orbit is not None and transmit_range:
         raise ValueError("radar: give one of transmit_range and orbit, and leave the other out")

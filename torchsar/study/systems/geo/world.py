@@ -20,7 +20,7 @@ from torchsar.study.names.registry import GATES, MULTICHANNEL_IMPAIRMENTS, RECEI
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.system import World
 
-# true values that processors may be given, and that metrics.json names of each target
+# true values that processors may use, and that metrics.json contains for each target
 TRUTHS = ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
 
 
@@ -29,10 +29,10 @@ class Target:
     """A point of amplitude 1 in uniform motion.
 
     Args:
-        u_r_m_s: Slant-range speed, closing positive.
-        u_a_m_s: Along-track speed, positive in the direction of the receiver.
-        azimuth_m: Along-track position at t = 0.
-        range_m: Closest range beyond the reference range.
+        u_r_m_s: Speed along the slant range in m/s, closing positive.
+        u_a_m_s: Speed along the track in m/s, positive in the direction of the receiver.
+        azimuth_m: Position along the track in metres at t = 0, the middle pulse.
+        range_m: Closest range in metres beyond the reference range.
     """
 
     u_r_m_s: Tensor | float = 0.0
@@ -43,12 +43,12 @@ class Target:
 
 @dataclass(frozen=True)
 class Level:
-    """Receiver noise; at most one level is given, in dB.
+    """Level of a target over noise or sea; at most one is given, in dB.
 
     Args:
-        snr_db: Target over noise in a sample of one channel after range compression.
-        raw_scnr_db: The same before it, 10 log10(B tau_p) less.
-        scr_db: Target over sea in a sample after range compression.
+        snr_db: Power of a target over noise in a sample of one channel after range compression.
+        raw_scnr_db: The same before range compression, which adds 10 log10(B tau_p).
+        scr_db: Power of a target over that of the sea in a sample after range compression.
     """
 
     snr_db: Tensor | float | None = None
@@ -65,7 +65,7 @@ class Level:
 
 
 class Own(NamedTuple):
-    """What the judge needs: the impaired echo of the targets alone, their SNR (row,) in dB, and the
+    """What metrics need: the impaired echo of the targets alone, their SNR (row,) in dB, and the
     world with the numbers of each row.
     """
 
@@ -81,22 +81,23 @@ class Own(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Points(World):
-    """What is true about moving points. Every target is recorded alone, with noise and sea of its
-    own, which follow its name.
+    """True motion of points, sea and noise. Every target is recorded alone, with random numbers
+    of its own, which depend on its name.
 
     Args:
-        pulses: Pulses of the record.
-        samples: Range lines; None for the peak line alone, azimuth only.
-        kind: Range-compressed data, or full chirps, which need samples of two pulses more.
-        targets: Targets by name.
-        gate: What lights the targets.
-        sea: Surface at rest; None for none.
-        sea_gate: What lights the sea; None for the gate of the targets.
-        receive: Model of the range to the receiver.
-        transmit_range: True k1, k2, ... of the range to the transmitter; None for those of the
-            ephemeris of the radar.
-        noise: Level of the noise.
-        impairments: What happens to the recording, in order.
+        pulses: Number of pulses of the record.
+        samples: Number of range samples; null for azimuth alone, the range line of the target.
+        kind: compressed for range-compressed data, or full for chirps, which need more samples
+            by two pulse lengths.
+        targets: Point targets by name.
+        gate: Illumination of the targets over slow time.
+        sea: Clutter of a sea at rest; null for none.
+        sea_gate: Illumination of the sea; null for the gate of the targets.
+        receive: Model of the range from a target to the receiver.
+        transmit_range: True k1, k2, ... of the range to the transmitter; null for the values of
+            the radar.
+        noise: Level of the targets over noise or sea.
+        impairments: Impairments of the recording by name, applied in this order.
     """
 
     pulses: int
@@ -145,7 +146,9 @@ class Points(World):
         return noise.snr_db
 
     def trials_of(self, radar: BistaticRadar, draws: Draws, dtype: torch.dtype, device: str = "cpu") -> Trials:
-        """Rows (trial, target), flattened: with noise and sea, and without, and the truth."""
+        """Simulate rows (trial, target), flattened, with and without noise and sea, and the true
+        values.
+        """
         rows, count = _row_draws(draws, self.targets), len(draws.trials or (0,))
         own: Points = repeated(self, len(self.targets))  # each row has the numbers of its trial
         level = own.snr_db(radar)
@@ -193,13 +196,13 @@ class Points(World):
 
 
 def compression_gain_db(radar: BistaticRadar) -> float:
-    """10 log10(B tau_p): what range compression adds to a raw SNR."""
+    """Gain of range compression in SNR, 10 log10(B tau_p), in dB."""
     return 10 * math.log10(radar.pulse.bandwidth_hz * radar.pulse.duration_s)
 
 
 def _row_draws(draws: Draws, names: Mapping[str, Target]) -> Draws:
-    """One address for each trial and target, trials outermost; a target keeps its draws whatever
-    others there are.
+    """One address for each trial and target, trials outermost; the random numbers of a target do
+    not depend on other targets.
     """
     trials = list(draws.trials if draws.trials is not None else [0])
     cases = draws.case if isinstance(draws.case, tuple) else (draws.case,) * len(trials)

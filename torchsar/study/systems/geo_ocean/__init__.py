@@ -1,5 +1,5 @@
-"""Moving ships on a sea before several channels
-(Remote Sens. 2020, 12, 1703, Figs 13 and 18).
+"""Moving ships on a sea, recorded by several channels (Remote Sens. 2020, 12, 1703, Figs 13
+and 18).
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from torchsar.study.trials.system import Column, System
 
 @dataclass(frozen=True)
 class Judging:
-    """How results are judged.
+    """Settings of the metrics.
 
     Args:
-        match_m: How far, along track and in range, a target that was found may appear from where a
-            ship appears.
-        published_targets: Figure -> ship -> method -> what the source published.
+        match_m: Largest distance in metres, along track and in range, of a detected target from the
+            position at which the image of everything at rest shows a ship.
+        published_targets: Published values by figure, ship and method.
     """
 
     match_m: Sequence[float] = (150.0, 40.0)
@@ -50,7 +50,7 @@ class Judging:
 
 
 class View(NamedTuple):
-    """What pictures need of a method: its images, and targets by ship, of every trial."""
+    """What pictures need of a method: images of every trial, and detected targets by ship."""
 
     made: Sequence[MadeScene]
     found: Sequence[Mapping[str, FoundTarget | None]]
@@ -60,7 +60,7 @@ class GeoOcean(System):
     """Ships on a sea."""
 
     name = "geo_ocean"
-    about = "moving ships on a sea before several channels along track, whole scenes"
+    about = "whole scenes of moving ships on a sea, recorded by several channels along track"
     Radar = staticmethod(bistatic_radar)
     World = Ocean
     Judging = Judging
@@ -74,21 +74,21 @@ class GeoOcean(System):
         "a sample of a ship's lines over it; cnr_db: sea over noise",
         "velocities": "u_r: closing slant-range speed; u_a: along track, positive with the receiver; y0: "
         "position along track at t = 0, the middle pulse; range: closest one of the track at rest",
-        "matching": "a target that was found belongs to the nearest ship in the image of everything at rest, within "
-        "metrics.match_m; found: share of ships with one. A ship that is not found counts as at rest where that "
-        "image shows it: its errors are minus its velocities and its displacement, ok is False. false_targets: "
-        "targets that belong to no ship",
-        "u_r_error_m_s": "estimated minus true u_r; u_a_error_m_s alike. Figures of a method are means over its ships",
+        "matching": "a detected target belongs to the nearest ship in the image of everything at rest, within "
+        "metrics.match_m; found: share of ships with one. A ship that is not found counts as at rest at its position "
+        "in that image: its errors are minus its velocities and its displacement, and ok is False. false_targets: "
+        "detected targets that belong to no ship",
+        "u_r_error_m_s": "estimated minus true u_r; u_a_error_m_s likewise. Metrics of a method are means over ships",
         "position_error_m": "distance, along track and range together, of the position given to a ship from the "
         "intensity centroid of the ship's own echo, without sea and noise, imaged in the same way by its true "
-        "velocities: its scatterers have random phases and interfere, and no image shows the centroid of their "
+        "velocities. Its scatterers have random phases and interfere, so that no image shows the centroid of their "
         "powers. along_error_m, range_error_m: its parts, signed",
         "scatterers_error_m": "the same distance from the centroid of the scatterers' powers",
         "image_position_m": "intensity centroid along x = V_R t, near the predicted position, of the image of "
         "the ship's own echo as if it were at rest; displacement_m: that minus the true y0; displacement_vt_m: "
         "what the motion predicts on the axis x = (V_R - u_a) t, which the source prints",
         "replica_distance_m": "distance on x = V_R t of the stronger first replica from the image itself, "
-        "centroids of the same image; replica_distance_vt_m: PRF lambda R0 / (V_R - u_a), on the axis of the "
+        "both centroids of the same image; replica_distance_vt_m: PRF lambda R0 / (V_R - u_a), on the axis of the "
         "source. A blurred ship that reaches beyond the rebuilt band loses one end to its replica: measured "
         "centroids then lie nearer than predicted",
         "replica_db": "mean power of the final image within 100 m along track and 40 m in range of the "
@@ -104,37 +104,35 @@ class GeoOcean(System):
         "in the same lines",
         "condition_number": "of the band matrix that rebuilds what is at rest (absent for mmse, which inverts no such "
         "matrix); noise_gain_db: noise of a rebuilt bin against ideal uniform sampling",
-        "published": "figures of Remote Sens. 2020, 12, 1703, Fig. 18, whose azimuth is x = (V_R - u_a) t",
+        "published": "values of Remote Sens. 2020, 12, 1703, Fig. 18, whose azimuth is x = (V_R - u_a) t",
     }
     target_columns = {
         "u_r_error_m_s": Column("error of the slant-range velocity", "m/s", drawn="rms"),
         "u_a_error_m_s": Column("error of the along-track velocity", "m/s", drawn="rms"),
         "position_error_m": Column("error of the position", "m", drawn="rms"),
-        "along_error_m": Column("of it along track", "m"),
-        "range_error_m": Column("of it in range", "m"),
-        "scatterers_error_m": Column("error of the position against the scatterers' powers", "m"),
-        "displacement_vt_m": Column(
-            "displacement in the image of everything at rest, predicted, axis (V_R - u_a) t", "m"
-        ),
-        "replica_distance_vt_m": Column("distance of the false target, predicted, same axis", "m"),
-        "displacement_m": Column("displacement, measured, axis V_R t", "m"),
+        "along_error_m": Column("error of the position, along track", "m"),
+        "range_error_m": Column("error of the position, in range", "m"),
+        "scatterers_error_m": Column("error of the position from the centroid of powers", "m"),
+        "displacement_vt_m": Column("displacement if imaged at rest, predicted, axis (V_R - u_a) t", "m"),
+        "replica_distance_vt_m": Column("distance of the false target, predicted, axis (V_R - u_a) t", "m"),
+        "displacement_m": Column("displacement if imaged at rest, measured, axis V_R t", "m"),
         "replica_distance_m": Column("distance of the false target, measured, axis V_R t", "m"),
         "replica_before_db": Column("false target over the sea, image of everything at rest", "dB"),
         "replica_db": Column("false target over the sea, final image", "dB", drawn="mean"),
-        "replica_left_db": Column("remainder of the false target over the sea", "dB"),
-        "sea_error_db": Column("error of the sea about a ship that was removed", "dB", drawn="mean"),
-        "sea_error_before_db": Column("the same before it was removed", "dB"),
-        "hole_db": Column("sea where the ship was shown against the true sea", "dB"),
-        "contrast_db": Column("ship over the sea at its true position, final image", "dB", drawn="mean"),
+        "replica_left_db": Column("remaining false target over the sea", "dB"),
+        "sea_error_db": Column("error of the sea near a removed ship", "dB", drawn="mean"),
+        "sea_error_before_db": Column("error of the sea near a ship before removal", "dB"),
+        "hole_db": Column("sea at a removed ship, relative to the true sea", "dB"),
+        "contrast_db": Column("ship over the sea at its true position", "dB", drawn="mean"),
         "u_r_std_m_s": Column("predicted error of the slant-range velocity", "m/s"),
         "found": Column("share of ships found"),
     }
     columns = {
         **target_columns,
-        "false_targets": Column("targets that belong to no ship"),
+        "false_targets": Column("detected targets that belong to no ship"),
         "condition_number": Column("condition number of the reconstruction of what is at rest"),
-        "noise_gain_db": Column("noise gain of that reconstruction", "dB"),
-        "ok": Column("share of trials with every ship found and called reliable"),
+        "noise_gain_db": Column("noise gain of the reconstruction of what is at rest", "dB"),
+        "ok": Column("share of trials in which every ship is found and reliable"),
         "seconds": Column("time of a trial", "s"),
     }
 
@@ -157,7 +155,7 @@ class GeoOcean(System):
                     )
 
     def may_differ(self, path: str, world: Mapping[str, Any]) -> bool:
-        """The gate decides how many cells of the sea it lights, and thus makes cases."""
+        """The gate sets the number of cells of the sea, and cannot vary."""
         return not path.startswith("gate.") and super().may_differ(path, world)
 
     def simulate(self, bench: Bench, world: Ocean, draws: Draws) -> Trials:
@@ -185,7 +183,7 @@ class GeoOcean(System):
         return Judged(whole, ships, view=View(made, views))
 
     def found(self, bench: Bench, outcome: Outcome, trials: Trials) -> dict[str, Found]:
-        """Motions of the targets that belong to ships; NaN where a ship was not found."""
+        """Estimated motions of the ships; NaN where a ship was not found."""
         if outcome.failed or outcome.judged.view.made[0].targets is None:
             return {}
         rows = outcome.judged.view.found
@@ -218,31 +216,33 @@ class GeoOcean(System):
         return images
 
     def notes(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        text = "Errors of positions are measured from the position that the image of the ship's own echo shows. Its "
-        text += "scatterers interfere, so that no image shows the centre of their powers."
-        yield "Positions", text
+        yield (
+            "Positions",
+            "Errors of positions are relative to the position in the image of the ship's own echo. The scatterers of a "
+            "ship interfere, so that no image shows the centroid of their powers.",
+        )
 
 
 def at_rest(chain: Chain) -> StationaryImage:
-    """How a chain images what is at rest."""
+    """The stage of a chain that images what is at rest."""
     last: Any = list(chain.stages.values())[-1]
     return last.flow.image if isinstance(last, MoversImage) else last
 
 
 def _extraction(bench: Bench) -> Extraction:
-    """Of the recommended method, which also images the ships' own echoes."""
+    """Extraction of the recommended method, which also images the echoes of single ships."""
     last: Any = list(bench.chains["recommended"].stages.values())[-1]
     return last.flow.extraction if isinstance(last, MoversImage) else Extraction()
 
 
 def _stacked(rows: Sequence[Mapping[str, float]]) -> dict[str, Tensor]:
-    """Figures of several trials by name; NaN where a trial lacks one."""
+    """Metrics of several trials by name; NaN where a trial does not have one."""
     names = dict.fromkeys(name for row in rows for name in row)
     return {n: torch.tensor([row.get(n, math.nan) for row in rows], dtype=torch.float64) for n in names}
 
 
 def _conditioning(radar: BistaticRadar, stage: StationaryImage) -> dict[str, Tensor]:
-    """Of the reconstruction of what is at rest."""
+    """Condition number and noise gain of the reconstruction of what is at rest."""
     motion = PointMotion.of(radar, torch.zeros((), dtype=torch.float64))
     gain = {"noise_gain_db": noise_gain_db(radar, motion, stage.rebuild)}
     if not isinstance(stage.rebuild, LeastSquares):

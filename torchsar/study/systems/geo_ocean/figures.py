@@ -1,4 +1,4 @@
-"""The pictures of a run of ships on a sea: whole scenes by every method, the flow, ships."""
+"""The pictures of a run of ships on a sea: steps of the processing, final images, and ships."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torchsar.study.trials.batch import Result
 
 # half extents in azimuth and range (m) of pictures of ships, and of the boxes about them
 _SHIP_M, _BOX_M = (150.0, 60.0), (120.0, 60.0)
-# levels over the sea (dB) that are shown of scenes, and their largest number of blocks to a side
+# highest and lowest level of drawn scenes over the sea (dB), and their largest number of blocks
 _UP_DB, _DOWN_DB, _BLOCKS = 25.0, -10.0, 300
 
 
@@ -32,7 +32,7 @@ def pictures(results: Mapping[str, Result], columns: Mapping[str, Any]) -> Itera
 
 
 def _made(result: Result) -> dict[str, MadeScene]:
-    """The first scene by every method."""
+    """Images of the first trial by every method."""
     return {n: outcome.judged.view.made[0] for n, outcome in result.first.outcomes.items() if not outcome.failed}
 
 
@@ -45,7 +45,7 @@ def _true(shown: ShownShip) -> ImagePosition:
 
 
 def _over_sea(image: Signal) -> Signal:
-    """Root mean square over blocks, over that of the median block, limited to what is shown."""
+    """Root mean square of blocks relative to the median block, limited to the drawn levels."""
     view = plot.quicklook(image, _BLOCKS)
     level = view.data.abs().to(torch.float64)
     level = level / level.median().clamp_min(1e-300)
@@ -53,13 +53,13 @@ def _over_sea(image: Signal) -> Signal:
 
 
 def _boxes(positions: Sequence[ImagePosition]) -> tuple[np.ndarray, np.ndarray]:
-    """Outlines of windows about positions as one broken line."""
+    """Outlines about positions as one broken line."""
     return plot.boxes([(p.range_m, p.azimuth_m) for p in positions], _BOX_M[1], _BOX_M[0])
 
 
 def _marked(result: Result, title: str, image: Signal, apparent: bool) -> dict[str, Any]:
-    """An image with outlines about true positions, and about where an image of everything at rest
-    shows ships and their replicas.
+    """An image with outlines about the true positions of ships, and about their positions and
+    replicas in an image of everything at rest.
     """
     ships = list(_shown(result).values())
     lines = {"true position": _boxes([_true(one) for one in ships])}
@@ -76,20 +76,20 @@ def _flow(case: str, result: Result) -> Drawn:
         steps = {"everything at rest": made.conventional, "without moving ships": made.rest, "fused": made.fused}
         parts = [_marked(result, title, image, title != "fused") for title, image in steps.items()]
         caption = (
-            "Azimuth (m, up) over range (m), root mean square over blocks, 35 dB. First: everything focused as if at "
-            "rest; closing ships appear beside their positions, with false targets. Second: the echo of what moves is "
-            "subtracted. Third: every moving ship is at its position."
+            "Root mean square of blocks; the scale ends 10 dB below the sea. First: everything is focused "
+            "as if at rest; ships with a radial velocity are displaced and have false targets. Second: the echoes of "
+            "moving ships are subtracted. Third: every moving ship is focused and inserted at its position."
         )
         figures = plot.overlays(parts, _UP_DB - _DOWN_DB)
-        yield f"flow_{word_of(case)}", titled("The recommended flow", case), caption, figures
+        yield f"flow_{word_of(case)}", titled("Steps of the recommended method", case), caption, figures
 
 
 def _methods(case: str, result: Result) -> Drawn:
     parts = [_marked(result, name, made.fused, False) for name, made in _made(result).items()]
     if parts:
         caption = (
-            "The final image of every method. The inverse of three bands raises the level of the whole scene; zeroing "
-            "leaves holes in the sea."
+            "The final image of every method. The inverse of three bands amplifies false targets; setting the extent "
+            "of moving ships to zero leaves holes in the sea."
         )
         figures = plot.overlays(parts, _UP_DB - _DOWN_DB)
         yield f"methods_{word_of(case)}", titled("Final images", case), caption, figures
@@ -105,7 +105,7 @@ def _ships(case: str, result: Result) -> Drawn:
             parts.append({"title": f"{name}, {method}", "signal": plot.within(made[method].fused, spans), "lines": {}})
     if parts:
         caption = (
-            "Each ship where the image of everything at rest shows it (conventional) and at its position "
-            "(recommended), in dB of its own peak."
+            "Each ship at its position in the image of everything at rest (conventional) and at its true position "
+            "(recommended), in dB relative to its own peak."
         )
         yield f"ships_{word_of(case)}", titled("Ships", case), caption, plot.overlays(parts)

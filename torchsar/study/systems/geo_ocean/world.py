@@ -21,7 +21,7 @@ from torchsar.study.names.registry import GATES, SEAS
 from torchsar.study.trials.batch import Trials
 from torchsar.study.trials.system import World
 
-# true values of the ships that processors may be given
+# true values of the ships that processors may use
 TRUTHS = ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")
 
 
@@ -30,15 +30,15 @@ class Vessel:
     """A ship of random scatterers.
 
     Args:
-        u_r_m_s: Slant-range speed, closing positive.
-        u_a_m_s: Along-track speed, positive in the direction of the receiver.
-        azimuth_m: Along-track position of its middle at t = 0.
-        range_m: Closest range of its middle beyond the reference range.
-        scr_db: Mean power of a sample of one of its lines over that of the sea.
-        length_m: Length along track.
-        range_cells: Lines that it covers.
-        count: Scatterers.
-        cell_m: Distance of its lines.
+        u_r_m_s: Speed along the slant range in m/s, closing positive.
+        u_a_m_s: Speed along the track in m/s, positive in the direction of the receiver.
+        azimuth_m: Position of its middle along the track in metres at t = 0, the middle pulse.
+        range_m: Closest range of its middle in metres beyond the reference range.
+        scr_db: Mean power of a sample of one of its range lines over that of the sea in dB.
+        length_m: Length along the track in metres.
+        range_cells: Number of range lines that it covers.
+        count: Number of its scatterers.
+        cell_m: Distance between its range lines in metres.
     """
 
     u_r_m_s: Tensor | float = 0.0
@@ -55,20 +55,20 @@ class Vessel:
         self.points()
 
     def points(self) -> ShipOfPoints:
-        """The ship as the echo simulation takes it."""
+        """The same ship in the form of the echo simulation."""
         motion = (self.u_r_m_s, self.u_a_m_s, self.azimuth_m, self.range_m)
         return ShipOfPoints(*motion, self.length_m, self.range_cells, self.count, self.cell_m, self.scr_db)
 
 
 @dataclass
 class Frame:
-    """One trial: what ships look like, and the recording without those that move.
+    """One trial: reference images of the ships, and the recording without those that move.
 
     Args:
-        ships: By name.
-        still: What is recorded without ships that move (channel, pulse, range), without the
-            transmit range.
-        images: Images of it, by reconstruction and form, as they are needed.
+        ships: Ships by name.
+        still: Recording without ships that move, shape (channel, pulse, range), with the range to
+            the transmitter removed.
+        images: Images of it by reconstruction and form, added when they are first needed.
     """
 
     ships: Mapping[str, ShownShip]
@@ -76,7 +76,7 @@ class Frame:
     images: dict[tuple[Rebuild, str], Signal] = field(default_factory=dict)
 
     def still_image(self, stage: StationaryImage) -> Signal:
-        """The image of what does not move, rebuilt as a method rebuilds."""
+        """Image of what does not move, by the reconstruction of a method."""
         kind = (stage.rebuild, stage.form)
         if kind not in self.images:
             self.images[kind] = stage(self.still)
@@ -85,14 +85,14 @@ class Frame:
 
 @dataclass(frozen=True, kw_only=True)
 class Ocean(World):
-    """What is true about ships on a sea, all in one scene. The unit is the mean power of the sea.
+    """True ships on a sea, all in one scene. Powers are relative to the mean power of the sea.
 
     Args:
-        pulses: Pulses of the record.
-        samples: Range lines.
+        pulses: Number of pulses of the record.
+        samples: Number of range lines.
         targets: Ships by name.
-        gate: What lights ships and sea.
-        sea: The sea; its cnr_db is its power over the noise.
+        gate: Illumination of ships and sea over slow time.
+        sea: Clutter of the sea; its cnr_db is its power over the noise in dB.
     """
 
     pulses: int
@@ -109,14 +109,14 @@ class Ocean(World):
     def trials_of(
         self, radar: BistaticRadar, draws: Draws, extraction: Extraction, dtype: torch.dtype, device: str = "cpu"
     ) -> Trials:
-        """Recordings of the whole scene, and the truth of every ship.
+        """Simulate recordings of the whole scene, and the true values of every ship.
 
         Args:
             radar: The instrument.
-            draws: Noise and sea follow seed and trial, and each ship its name.
+            draws: Random numbers; those of a ship depend on its name.
             extraction: Extent of a ship in the data, for images of its own echo.
             dtype: Complex type of the recording.
-            device: Where it is computed.
+            device: Device of the computation.
         """
         trials = list(draws.trials if draws.trials is not None else [0])
         cases = draws.case if isinstance(draws.case, tuple) else (draws.case,) * len(trials)

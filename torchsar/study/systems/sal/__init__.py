@@ -1,5 +1,5 @@
-"""Synthetic aperture ladar with a symmetric triangular sweep, radial motion estimated
-from every period (Remote Sens. 2024, 16, 793).
+"""Synthetic aperture ladar with a symmetric triangular sweep, whose radial motion is estimated from
+every period (Remote Sens. 2024, 16, 793).
 """
 
 from __future__ import annotations
@@ -39,22 +39,22 @@ from torchsar.study.trials.choice import Choice
 from torchsar.study.trials.system import Column, System
 
 log = logging.getLogger("torchsar")
-# stages that work on deramped profiles, and cannot tell whether they are
+# stages that work on deramped profiles, but cannot check whether their input is deramped
 _OF_DERAMPED = ("azimuth_matched_filter", "phase_polish")
-# a wrong image is one that leaves more than this, and has less entropy by more than this
-_TRAPPED_RAD, _TRAPPED_NATS = 1.0, 0.02
+# the report names images whose residual phase exceeds this, and whose entropy is lower by this
+_WRONG_RAD, _LOWER_NATS = 1.0, 0.02
 
 
 @dataclass(frozen=True)
 class Judging:
-    """How results are judged.
+    """Settings of the metrics.
 
     Args:
-        reference: The method whose image of the same scene is the ideal one.
-        target: The point target whose response is shown.
-        sidelobe_nulls: Extent of the side lobes in null spacings.
-        search_m: How far from its predicted position a response is sought.
-        published: Figure -> case -> method -> what the source published.
+        reference: Method whose image of the same scene is the ideal one; null for none.
+        target: Point target whose impulse response is measured and drawn; null for none.
+        sidelobe_nulls: Extent of the side lobes of a response in null spacings.
+        search_m: Largest distance in metres of a response from its predicted position.
+        published: Published values by figure, case and method.
     """
 
     reference: str | None = None
@@ -89,15 +89,15 @@ class Sal(System):
         "which only turn and shift the image",
         "residual_phase_rms_rad": "4 pi / lambda times range_error_detrended_rms_m",
         "entropy_nats": "-sum p ln p, p = |I|^2 / sum |I|^2 over the whole image, nats",
-        "entropy_above_ideal_nats": "entropy less that of the same scene and noise without motion",
+        "entropy_above_ideal_nats": "entropy minus that of the same scene and noise without motion",
         "contrast": "standard deviation over mean of the AMPLITUDE |I|",
         "irw": "-3 dB width of the impulse response, m",
         "pslr": "strongest side lobe over the main lobe, dB",
         "islr": "energy of the side lobes over that of the main lobe (null to null), dB",
-        "position": "responses are sought about the true position, shifted by what is left of the motion: its "
+        "position": "responses are sought near the true position, shifted by the remaining motion: its "
         "mean velocity v shifts azimuth by v R / V and range by 2 v / (lambda K) beat hertz",
-        "published": "figures of Remote Sens. 2024, 16, 793; its entropies depend on the size of the image and "
-        "the noise, only their order compares",
+        "published": "values of Remote Sens. 2024, 16, 793; entropies depend on the size of the image and on the "
+        "noise, so that only their order can be compared",
     }
     columns = {
         "residual_phase_rms_rad": Column("residual phase, rms without constant and slope", "rad", drawn="mean"),
@@ -137,7 +137,7 @@ class Sal(System):
         return world.periods * per_period
 
     def bytes_per_trial(self, bench: Bench) -> int:
-        """Noise in double precision, or spectra that are upsampled over the whole band."""
+        """Memory of noise in double precision, or of spectra upsampled over the whole band."""
         world, radar = bench.world(), bench.radar
         stages = [stage for chain in bench.chains.values() for stage in chain.stages.values()]
         wide = [s.upsampling for s in stages if isinstance(s, SpectrumCorrelation) and s.window_m is None]
@@ -183,14 +183,20 @@ class Sal(System):
             t: tuple(truth[k][..., i].expand(trace.signal.trials) for k in ("azimuth_m", "range_m"))
             for t, i in named.items()
         }
-        nulls = settings.sidelobe_nulls
-        targets = target_responses(trace.signal, at, course, bench.radar, nulls, settings.search_m)  # pyright: ignore
+        targets = target_responses(
+            trace.signal,
+            at,  # pyright: ignore[reportArgumentType]
+            course,
+            bench.radar,
+            settings.sidelobe_nulls,
+            settings.search_m,
+        )
         shown = targets.get(settings.target or "", {})
         metrics |= {key: value for key, value in shown.items() if key.startswith(("irw", "pslr", "islr"))}
         return _expanded(metrics, targets, [t for t in named if t not in targets], course, trials.count)
 
     def bounds(self, bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
-        """Of scenes of one point, whose energy every estimator can use."""
+        """Lower bounds for scenes of one point, whose energy every estimator can use."""
         truth, radar, std = batch.trials.truth, bench.radar, batch.trials.truth["noise_std"]
         points = all(isinstance(scene, Points) for scene in bench.world().scene.values())
         if truth["range_m"].shape[-1] != 1 or not points or not bool((std > 0).all()):
@@ -222,31 +228,32 @@ class Sal(System):
         return figures.pictures(results, self.columns)
 
     def notes(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        """Where a wrong image has less entropy than the right one."""
+        """Images with much residual phase, but less entropy than the ideal one."""
         methods, reference = metrics["methods"], metrics["definitions"]["reference"]
         for case, ideal in (methods[reference]["cases"] if reference else {}).items():
             rows = {name: method["cases"][case] for name, method in methods.items() if name != reference}
-            least = ideal.get("entropy_nats", 0.0) - _TRAPPED_NATS
-            trapped = [
-                f"{name} {row['entropy_nats']:.2f} nats with {row['residual_phase_rms_rad']:.3g} rad left"
+            least = ideal.get("entropy_nats", 0.0) - _LOWER_NATS
+            wrong = [
+                f"{name} {row['entropy_nats']:.2f} nats with {row['residual_phase_rms_rad']:.3g} rad of residual phase"
                 for name, row in rows.items()
-                if row.get("entropy_nats", least) < least and row["residual_phase_rms_rad"] > _TRAPPED_RAD
+                if row.get("entropy_nats", least) < least and row["residual_phase_rms_rad"] > _WRONG_RAD
             ]
-            if trapped:
-                text = f"Wrong images have less entropy here than the right one ({ideal['entropy_nats']:.2f} nats): "
-                text += f"{', '.join(trapped)}. Judge by what is left of the motion, by entropy second."
-                yield f"Entropy trap, case {case}", text
+            if wrong:
+                text = (
+                    f"Some defocused images have less entropy than the ideal one ({ideal['entropy_nats']:.2f} nats): "
+                    f"{', '.join(wrong)}. Compare methods by the residual phase, not by entropy alone."
+                )
+                yield f"Misleading entropy, case {case}", text
 
     def extra_definitions(self, bench: Bench) -> Mapping[str, Any]:
-        judging = bench.judging
-        shown = {"reference": judging.reference, "target": judging.target}
-        return {"islr_extent_nulls": judging.sidelobe_nulls, **shown}
+        named = {"islr_extent_nulls": "sidelobe_nulls", "reference": "reference", "target": "target"}
+        return {shown: getattr(bench.judging, name) for shown, name in named.items()}
 
 
 def _expanded(
     metrics: Mapping[str, Tensor], targets: Mapping[str, Any], outside: Sequence[str], course: Course, count: int
 ) -> Judged:
-    """Figures with one entry a trial, also where trials share their value."""
+    """Metrics with one entry per trial, also where trials share their value."""
     rows = {name: {key: value.expand(count) for key, value in of.items()} for name, of in targets.items()}
     return Judged({key: value.expand(count) for key, value in metrics.items()}, rows, outside, course)
 

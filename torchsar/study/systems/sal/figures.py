@@ -1,4 +1,4 @@
-"""The pictures of a run of a ladar: range profiles, images, the motion and what is left of it."""
+"""The pictures of a run of a ladar: range profiles, images, motion, and impulse responses."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ from torchsar.study.output.pictures import Drawn, comparisons, first_named
 from torchsar.study.settings.cases import titled, word_of
 from torchsar.study.trials.batch import Result, image_of
 
-# about the scatterers pictures show so many samples in azimuth and cells in range, and this part of
-# the extent of the scene
+# margins about the scatterers: samples in azimuth, cells in range, and a part of the extent of the
+# scene
 _SAMPLES, _CELLS, _PART = 24, 6, 0.1
-# level below which images show nothing: side lobes of responses without a window lie above it
-_LOW_DB = 30.0
+# dynamic range of images and profiles, so that images out of focus are visible beside sharp ones
+_RANGE_DB = 40.0
+# levels of cuts through responses
+_CUT_DB = (-40.0, 2.0)
 Lines = Mapping[str, tuple[Axis, Tensor]]
 
 
@@ -36,7 +38,7 @@ def pictures(results: Mapping[str, Result], columns: Mapping[str, Any]) -> Itera
 
 
 def _scatterers(result: Result) -> tuple[Tensor, Tensor, Tensor]:
-    """Azimuth, relative range (m) and amplitude in the first trial."""
+    """Azimuth (m), relative range (m) and amplitude of the scatterers in the first trial."""
     truth = result.first.trials.truth
     values = (truth[name] for name in ("azimuth_m", "range_m", "amplitude"))
     azimuth, range_m, amplitude = (x.reshape(-1, x.shape[-1])[0].cpu() for x in values)
@@ -44,21 +46,23 @@ def _scatterers(result: Result) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _courses(result: Result) -> dict[str, Course]:
-    """What methods found of the motion in the first trial."""
-    views = {name: outcome.judged.view for name, outcome in result.first.outcomes.items() if not outcome.failed}
-    return {name: view.first() for name, view in views.items()}
+    """Estimated and remaining motion of every method in the first trial."""
+    outcomes = result.first.outcomes
+    return {name: outcome.judged.view.first() for name, outcome in outcomes.items() if not outcome.failed}
 
 
 def _target(result: Result) -> Drawn:
     along, range_, amplitude = (plot.array(x) for x in _scatterers(result))
-    caption = "Scatterers of the first scene, ranges relative to the reference; the area of a point is its power."
-    figure = plot.places(range_, along, np.abs(amplitude) ** 2, "relative range (m)", "azimuth (m)")
+    caption = (
+        "Scatterers of the first trial; the area of a point is proportional to its amplitude. The axes differ in scale."
+    )
+    figure = plot.places(range_, along, np.abs(amplitude), "range (m)", "azimuth (m)", aspect="auto")
     yield "target", "Target", caption, figure
 
 
 def _about_scene(signal: Signal, result: Result) -> Signal:
-    """The part of an image or of profiles about the scatterers, and where residual motion shifts
-    them: in range by its velocity, in azimuth by its slope, if the image is in focus.
+    """The part of an image or of profiles about the scatterers. It includes shifts by residual
+    motion: in range by its velocity, in azimuth by its slope, if the image is in focus.
     """
     azimuth, range_m, _ = _scatterers(result)
     focused = [
@@ -70,9 +74,13 @@ def _about_scene(signal: Signal, result: Result) -> Signal:
     radar, velocity = result.bench.radar, result.first.trials.truth["velocity_m_s"]
     shift = velocity[:1].cpu() * radar.carrier_hz / radar.chirp_rate_hz_s
     shifted = torch.cat([range_m + shift.min().clamp(max=0.0), range_m + shift.max().clamp(min=0.0)])
-    along = _SAMPLES * signal.axes[0].step + _PART * float(azimuth.max() - azimuth.min())
-    across = _CELLS * radar.range_step_m + _PART * float(range_m.max() - range_m.min())
-    return plot.within(signal, {"azimuth": plot.span(azimuth, along), "range": plot.span(shifted, across)})
+    return plot.within(
+        signal,
+        {
+            "azimuth": plot.span(azimuth, _SAMPLES * signal.axes[0].step + _PART * float(np.ptp(azimuth.numpy()))),
+            "range": plot.span(shifted, _CELLS * radar.range_step_m + _PART * float(np.ptp(range_m.numpy()))),
+        },
+    )
 
 
 def _profiles(case: str, result: Result) -> Drawn:
@@ -80,17 +88,22 @@ def _profiles(case: str, result: Result) -> Drawn:
     for name, outcome in result.first.outcomes.items():
         outputs = {} if outcome.trace is None else outcome.trace.outputs
         signal = next((image_of(s) for s in outputs.values() if s.names == ("pulse", "range")), None)
-        known = [s for s in found.values() if signal is not None and s.data.shape == signal.data.shape]
-        if signal is not None and not any(torch.equal(s.data, signal.data) for s in known):
+        if signal is not None and not any(_look_alike(s.data, signal.data) for s in found.values()):
             found[name] = signal
     shown = {name: _in_milliseconds(_about_scene(s, result)) for name, s in first_named(found).items()}
     if shown:
         caption = (
-            "Range profiles of the up sweeps of the first trial, of methods that differ before any correction of pulse "
-            "phases, in dB of the peak of the first panel. Motion shifts the beat frequency by 2 v / lambda."
+            "Range profiles of the up sweeps of the first trial, in dB relative to the peak of the first panel. Of "
+            "methods whose profiles look alike the first is shown. A radial velocity v shifts the beat frequency by "
+            "2 v / lambda, and thus the range."
         )
-        figure = plot.images(shown, dynamic_range_db=40.0, percentile=100)
+        figure = plot.images(shown, dynamic_range_db=_RANGE_DB, percentile=100)
         yield f"profiles_{word_of(case)}", titled("Range profiles over slow time", case), caption, figure
+
+
+def _look_alike(one: Tensor, other: Tensor) -> bool:
+    limit = 10 ** (-_RANGE_DB / 20) * float(one.abs().max())
+    return one.shape == other.shape and torch.allclose(one.abs(), other.abs(), rtol=0.0, atol=limit)
 
 
 def _in_milliseconds(signal: Signal) -> Signal:
@@ -100,43 +113,42 @@ def _in_milliseconds(signal: Signal) -> Signal:
 
 def _images(case: str, result: Result) -> Drawn:
     finer = {name: finer_in_range(finer_in_range(image)) for name, image in first_named(result.images).items()}
-    shown = {name: _about_scene(image, result) for name, image in finer.items()}
+    cut = {name: _about_scene(image, result) for name, image in finer.items()}
+    top = float(next(iter(cut.values())).data.abs().max())
+    shown = {f"{n}, peak {round(float(plot.decibel(s.data.abs().max(), top)))} dB": s for n, s in cut.items()}
     caption = (
-        "The first trial on a quarter of the range step; all images on one scale, that of the first, in dB. A slope of "
-        "the range error shifts an image along azimuth, which is no error of focus."
+        "Images of the first trial, interpolated to a quarter of the range step, in dB relative to the peak of the "
+        "first image. The titles give the peak of each image: out of focus it is low, and the image is dark. A "
+        "constant slope of the range error shifts an image along azimuth without loss of focus."
     )
-    figure = plot.images(shown, dynamic_range_db=_LOW_DB, percentile=100)
+    figure = plot.images(shown, dynamic_range_db=_RANGE_DB, percentile=100)
     yield f"images_{word_of(case)}", titled("Images by every method", case), caption, figure
 
 
 def _motion(case: str, result: Result) -> Drawn:
-    """Velocity, its error, and the range error that is left; methods of like size together."""
+    """Velocity, its error, and the remaining range error; errors of similar size share a panel."""
     courses = {name: course for name, course in _courses(result).items() if name != "ideal"}
     estimating = {name: course for name, course in courses.items() if course.velocity_m_s is not None}
     if not estimating:
         return
     pulse, true = next(iter(estimating.values())).pulse, result.first.trials.truth["velocity_m_s"]
-    order = sorted(estimating, key=lambda name: -float(_rms(estimating[name])))
+    errors = {n: (c.pulse, 1e3 * _lit_only(c, c.velocity_error_m_s)) for n, c in estimating.items()}
+    order = sorted(errors, key=lambda name: -float(errors[name][1].square().nanmean()))
     worst = {n: (estimating[n].pulse, _lit_only(estimating[n], estimating[n].velocity_m_s)) for n in order[:2]}
     parts = [
         _panel("radial velocity", "m/s", {"true": (pulse, true.reshape(-1, true.shape[-1])[0][: pulse.n]), **worst})
     ]
-    errors = {n: (c.pulse, 1e3 * _lit_only(c, c.velocity_error_m_s)) for n, c in estimating.items()}
     parts += _by_size("estimated minus true velocity", "mm/s", errors)
     left = {name: (c.pulse, 1e6 * _lit_only(c, c.detrended_m)) for name, c in courses.items()}
-    parts += _by_size("range error left", "um", left)
-    quarter = 1e6 * result.bench.radar.wavelength_m / 4
+    parts += _by_size("remaining range error", "um", left)
     caption = (
-        "Estimates of the first trial against the truth, methods of like error together; periods without a lit "
-        "scatterer are left out. Range errors without constant and slope, which only turn and shift the image. A "
-        f"quarter of the wavelength is {quarter:.2g} um."
+        "First trial: the radial velocity, true and by the two least accurate methods; errors of the estimated "
+        "velocity; range errors after compensation. Methods with errors of similar size share a panel. Periods in "
+        "which no scatterer is illuminated are left out, and so are constant and slope of range errors, which affect "
+        "only the phase and the position of an image. A quarter of the wavelength is "
+        f"{1e6 * result.bench.radar.wavelength_m / 4:.2g} um."
     )
-    yield f"motion_{word_of(case)}", titled("Motion and what is left of it", case), caption, plot.panels(parts)
-
-
-def _rms(course: Course) -> Tensor:
-    assert course.velocity_error_m_s is not None
-    return course.rms(course.velocity_error_m_s)
+    yield f"motion_{word_of(case)}", titled("Radial motion and its errors", case), caption, plot.panels(parts)
 
 
 def _lit_only(course: Course, x: Tensor | None) -> Tensor:
@@ -155,13 +167,13 @@ def _panel(title: str, unit: str, lines: Lines) -> dict[str, object]:
 
 
 def _by_size(title: str, unit: str, lines: Lines) -> list[dict[str, object]]:
-    """Panels of methods whose largest values are alike, the smallest first."""
+    """Panels of methods whose largest values are of similar size, the smallest first."""
     groups = plot.alike(lines)
     return [_panel(title if len(group) > 1 else f"{title}: {next(iter(group))}", unit, group) for group in groups]
 
 
 def _slices(case: str, result: Result) -> Drawn:
-    """Cuts through the response of metrics.target, four methods a panel beside the ideal."""
+    """Cuts through the response of metrics.target, four methods in a panel beside the ideal one."""
     target, images = result.bench.judging.target, result.images
     figures = {n: o.judged.targets[target] for n, o in result.first.outcomes.items() if target in o.judged.targets}
     at = {n: [float(f[f"position_{axis}_m"][0]) for axis in ("azimuth", "range")] for n, f in figures.items()}
@@ -171,12 +183,25 @@ def _slices(case: str, result: Result) -> Drawn:
     for first in range(0, len(others), 4):
         names = [*(["ideal"] if "ideal" in cuts else []), *others[first : first + 4]]
         for axis in ("azimuth", "range"):
-            series = {n: (plot.array(cuts[n][axis][0]), plot.decibel(plot.array(cuts[n][axis][1]))) for n in names}
-            shown = {"xlabel": f"{axis} from the peak (m)", "ylabel": "level (dB)", "title": axis, "ylim": (-40.0, 2.0)}
+            reach = float(cuts[names[0]][axis][0].abs().max())
+            series = {n: _within(reach, *cuts[n][axis]) for n in names}
+            shown = {
+                "xlabel": f"{axis} from the response (m)",
+                "ylabel": "level (dB)",
+                "title": axis,
+                "ylim": (-40.0, 2.0),
+            }
             parts.append({"series": series, **shown})
     if parts:
         caption = (
-            "Slices through the strongest response near the predicted one, over ten side lobes to either side; 0 dB is "
-            "each curve's own peak. Methods by what they leave of the motion, the best first."
+            "Azimuth and range cuts through the strongest response near the predicted position, with ten side lobes on "
+            "either side, in dB relative to the peak of each curve. Methods are sorted by the remaining motion, the "
+            "best first; where much of it remains there is no distinct response."
         )
         yield f"slices_{word_of(case)}", titled(f"Response of {target}", case), caption, plot.panels(parts)
+
+
+def _within(reach: float, offset_m: Tensor, response: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """The part of a cut that other cuts of the panel have, in dB."""
+    near = offset_m.abs() <= reach
+    return plot.array(offset_m[near]), plot.decibel(response[near])

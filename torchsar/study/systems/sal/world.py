@@ -43,9 +43,10 @@ class Record:
     """A continuous record instead of separated sweeps.
 
     Args:
-        trigger_s: Where in a block an up sweep starts.
-        block_s: Length of a block; None for one period where every period is kept, else two.
-        trigger_known: Whether the recording says where the sweeps start.
+        trigger_s: Time from the start of a block to the start of an up sweep in seconds.
+        block_s: Length of a block in seconds; null for one period where every period is kept, else
+            two.
+        trigger_known: Whether the recording contains the time of the trigger.
     """
 
     trigger_s: Tensor | float = 0.0
@@ -55,20 +56,20 @@ class Record:
 
 @dataclass(frozen=True, kw_only=True)
 class Ground(World):
-    """What is true about a scene, what moves its line of sight, the air, the laser and the noise.
+    """True scene, motion of the line of sight, atmosphere, laser and noise.
 
     Args:
-        periods: Periods of the sweep.
-        scene: Scenes by name, seen together.
-        motion: Motions of the line of sight by name; they add up.
-        log_amplitude: Scintillation; None for none.
-        fidelity: How finely the range is followed inside sweeps.
-        gate_m: Least and largest relative range that is recorded; None for all.
-        sweep_error: Phase error of the laser's sweeps; None for none.
-        calibration: Internal fibre that shows it; None for none.
-        record: None for sweeps that an ideal splitter hands over.
-        noise: Per sample before any compression, of a scatterer of amplitude 1.
-        impairments: What happens to the recording, in order.
+        periods: Number of recorded periods of the sweep.
+        scene: Scenes by name; their echoes add up.
+        motion: Radial motions of the line of sight by name; they add up.
+        log_amplitude: Scintillation of the atmosphere; null for none.
+        fidelity: Model of how the range changes inside a sweep.
+        gate_m: Least and largest relative range in metres that is recorded; null for all ranges.
+        sweep_error: Phase error of the laser's sweeps; null for none.
+        calibration: Internal fibre by which the sweep error can be measured; null for none.
+        record: Continuous record of the detector; null for sweeps that are separated ideally.
+        noise: Receiver noise per sample before any compression, against a scatterer of amplitude 1.
+        impairments: Impairments of the recording by name, applied in this order.
     """
 
     periods: int
@@ -95,14 +96,14 @@ class Ground(World):
         self.of()
 
     def of(self) -> LadarWorld:
-        """The world as the echo simulation takes it."""
+        """The same world in the form of the echo simulation."""
         gate = None if self.gate_m is None else tuple(self.gate_m)
         scene, snr_db = Together(self.scene), self.noise.snr_db
         effects = (self.log_amplitude, snr_db, self.fidelity, gate, self.sweep_error, self.calibration)
         return LadarWorld(scene, self.motion, *effects)  # pyright: ignore[reportArgumentType]
 
     def trials_of(self, radar: TriangularLadar, draws: Draws, dtype: torch.dtype, device: str = "cpu") -> Trials:
-        """Recordings with and without motion, and the truth."""
+        """Simulate recordings with and without motion, and the true values."""
         world, made = self.of(), (self.impairments, dtype, device)
         if self.record is None:
             recording, truth = simulate_ladar(radar, world, self.periods, draws, *made)
@@ -114,8 +115,8 @@ class Ground(World):
 
     @property
     def named_points(self) -> dict[str, int]:
-        """Names `part.number` of targets whose response is worth measuring, points and
-        retro-reflectors, and their indices among all scatterers.
+        """Names `part.number` of point targets and retro-reflectors, whose responses are measured,
+        and their indices among all scatterers.
         """
         names: dict[str, int] = {}
         first = 0
