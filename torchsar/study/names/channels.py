@@ -264,7 +264,8 @@ def stationary_image(
         band_hz: Doppler band of the flat spectrum that "mmse" assumes, in Hz; None for the spectrum
             by the pattern of the elements.
         snr_db: Signal-to-noise ratio that "mmse" assumes, in dB.
-        form: "stolt" for the exact image formation, "bulk" for the cheaper one.
+        form: "stolt", exact at every range, or "bulk", with the migration of mid-swath for all
+            ranges.
     """
     return StationaryImage(radar, _rebuild(bands, method, band_hz, snr_db), form)
 
@@ -294,15 +295,16 @@ def movers_image(
         band_hz: Doppler band of the flat spectrum that "mmse" assumes, in Hz; None for the spectrum
             by the pattern of the elements.
         snr_db: Signal-to-noise ratio that "mmse" assumes, in dB.
-        removal: Whether the echo of a target is subtracted or set to zero in the clutter.
-        integration_s: Time over which a target is focused in s.
-        segment_s: Length of a segment of this time in s.
+        removal: "subtract" removes the echo fitted to a target, "zero" all data in its area.
+        integration_s: Time for which a scatterer is illuminated in s.
+        segment_s: Length of the segments of slow time in s.
         half_along_m: Half width of a target along track in m.
         half_range_m: Half width of a target in range in m.
-        threshold_db: Detection threshold above the clutter in dB.
+        threshold_db: Least mean intensity of a target over the median of the image in dB.
         most: Largest number of targets.
         u_a_reach_m_s: Half width of the search in u_a in m/s.
-        suppressed_m_s: Velocities u_r at which clutter is suppressed, in m/s.
+        suppressed_m_s: Slant-range speeds in m/s of the images with suppressed sea, in which weaker
+            targets are detected; empty to omit these.
 
     Reference:
         Remote Sens. 2020, 12, 1703, Fig. 13.
