@@ -58,8 +58,8 @@ def migration_correct(
     whole_swath: bool = True,
     range_m: float | None = None,
 ) -> CorrectMigration:
-    """Correction of the range migration by deramp, keystone and reramp, by a shift of each pulse, or
-    no correction.
+    """Correction of range migration by deramp, keystone and reramp, by a shift of each pulse, or no
+    correction.
 
     Args:
         kind: "keystone", "static_bulk", or "none" for no correction.

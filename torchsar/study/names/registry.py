@@ -59,7 +59,9 @@ SWEEP_FIDELITIES = Catalogue(
     },
 )
 LOG_AMPLITUDES = Catalogue("log-amplitude", "kind", {"scintillation": scene.LogAmplitude})
-SWEEP_ERRORS = Catalogue("sweep error", "kind", {"polynomial": echo.PolynomialSweepError, "sinusoid": echo.SinusoidSweepError})
+SWEEP_ERRORS = Catalogue(
+    "sweep error", "kind", {"polynomial": echo.PolynomialSweepError, "sinusoid": echo.SinusoidSweepError}
+)
 CALIBRATIONS = Catalogue("calibration", "kind", {"fibre": scene.CalibrationFibre})
 GATES = Catalogue("gate", "kind", {"band_limited": scene.BandLimited, "pattern": scene.Pattern})
 SEAS = Catalogue("sea", "kind", {"k_sea": factories.k_sea, "image": factories.image_sea})
