@@ -200,7 +200,7 @@ class Bench:
     def _run(
         self, name: str, method: Method, trials: Trials, earlier: Mapping[str, Outcome]
     ) -> tuple[Trace, Mapping[str, Estimate], Mapping[str, float]]:
-        """The trace of a method, its estimates, and its times. Estimates of an earlier method by the
+        """The trace of a method, its estimates and its times. Estimates of earlier methods by the
         same stages from the same data are reused.
         """
         chain, recording = self.chains[name], trials.clean if method.input == "clean" else trials.recording
