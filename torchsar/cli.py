@@ -19,13 +19,13 @@ EXIT_BAD_INPUT = 2  # the status of argparse for a command line that it rejects
 _COMMANDS = {
     "run": "run an experiment and write its images, figures and report",
     "sweep": "run the Monte Carlo sweep of a config: many trials of every point of its grid",
-    "requires": "show what the scene of a config requires of its models and methods",
-    "trade": "measure speed against loss of the alternatives, beside an exact yardstick",
+    "requires": "show the requirements of the scene of a config on models and methods",
+    "trade": "measure the speed and the loss of the alternatives, relative to an exact yardstick",
 }
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line.
+    """Return the parser of the command line.
 
     Returns:
         Parser of all commands.
@@ -54,7 +54,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _folder(command: str, config: str) -> Path:
-    """The default result folder: each command has its own."""
+    """The default result folder, which is different for each command."""
     return Path("out") / (config if command == "run" else f"{config}_{command}")
 
 
@@ -68,10 +68,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command.
 
     Args:
-        arguments: Words after the name of the program; those of this process by default.
+        arguments: Arguments after the name of the program; those of this process by default.
 
     Returns:
-        0, or 2 after one sentence on stderr for bad input, or 130 if interrupted.
+        0; 2 after an error message on stderr about invalid input; 130 if interrupted.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     options = _parse(given)
@@ -81,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"torchsar-lab {version('torchsar-lab')}")
         return 0
     try:
-        if options.command != "list":  # before torch is imported, which takes seconds
+        if options.command != "list":  # before the import of torch, which takes seconds
             print(f"torchsar: {options.command} {options.config}", file=sys.stderr, flush=True)
         with _log_to_stderr(), warnings.catch_warnings():
             warnings.showwarning = _show_warning
@@ -98,7 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parse(given: Sequence[str]) -> argparse.Namespace:
-    """Overrides may stand before and after options; argparse refuses anything else left over."""
+    """Parse the arguments; overrides may precede and follow options."""
     top = parser()
     options, rest = top.parse_known_args(given)
     if rest and (not hasattr(options, "overrides") or any(word.startswith("-") for word in rest)):
@@ -113,7 +113,7 @@ def _parse(given: Sequence[str]) -> argparse.Namespace:
 def _dispatch(options: argparse.Namespace, command: str) -> int:
     from torchsar.study.settings.text import experiments, find_config
 
-    if options.command == "list":  # its first part and a name that is not known come before torch, too
+    if options.command == "list":  # the experiments, or an unknown name, before the import of torch
         print(experiments(), flush=True)
     else:
         find_config(options.config)
@@ -150,7 +150,7 @@ def _dispatch(options: argparse.Namespace, command: str) -> int:
 
 
 def _refuse_device(name: str, torch: Any) -> None:
-    """Refuse a device on which nothing can be computed: an empty tensor would do on any."""
+    """Raise ConfigError if a device cannot compute; allocation alone succeeds on any device."""
     try:
         torch.zeros(1, dtype=torch.complex128, device=name).abs().item()
     except (RuntimeError, AssertionError, TypeError, ImportError) as error:
@@ -165,10 +165,10 @@ def _fail(sentence: str) -> int:
 
 @contextmanager
 def _log_to_stderr() -> Iterator[None]:
-    """The log of the program as lines on stderr, the same warning only once."""
+    """Write the log of the program to stderr, each warning only once."""
     level = os.environ.get("TORCHSAR_LOG", "INFO").upper()
     if level not in logging.getLevelNamesMapping():
-        raise ConfigError(f"TORCHSAR_LOG={level} is no level of the log; choose DEBUG, INFO, WARNING or ERROR")
+        raise ConfigError(f"TORCHSAR_LOG={level} is no log level; choose DEBUG, INFO, WARNING or ERROR")
     log, handler, shown = logging.getLogger("torchsar"), logging.StreamHandler(), set[str]()
 
     def is_new(record: logging.LogRecord) -> bool:
@@ -188,7 +188,7 @@ def _log_to_stderr() -> Iterator[None]:
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    """A Python warning as one line of the log, without the position in the code."""
+    """Write a Python warning as one line of the log, without its position in the code."""
     logging.getLogger("torchsar").warning("warning: %s", " ".join(str(message).split()))
 
 

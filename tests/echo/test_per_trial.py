@@ -46,6 +46,7 @@ from torchsar.echo import (
     ladar_echo,
     sea_echo,
     simulate,
+    smooth_response,
     simulate_bistatic,
     simulate_ladar,
     simulate_ladar_record,
@@ -641,7 +642,7 @@ CLOCKS = {
 }
 FACTORIES = (
     Case(
-        factories.channel_response,  # pyright: ignore[reportArgumentType]
+        smooth_response,  # pyright: ignore[reportArgumentType]
         {"ripple_rad": 0.3},
         {**RESPONSE, "ripple_cycles": (1.0, 2.5, 4.0), "amplitude_ripple_db": (0.0, 1.0, 2.0)},
         (impairment,),

@@ -157,7 +157,7 @@ def test_truth_takes_the_road_of_oracles_alone(system: str, tmp_path: Path) -> N
         stage = list(processor["recommended"]["stages"].values())[-1]
         stage["uses"] = {**stage.get("uses", {}), name: f"truth.{name}"}
         processor["recommended"].pop("oracle", None)
-        with pytest.raises(ConfigError, match=f"truth.{name} is known to an oracle only"):
+        with pytest.raises(ConfigError, match=f"truth.{name} is a true value"):
             bench_of(tmp_path, system, processor=processor)
         processor["recommended"]["oracle"] = True
         stage["uses"][name] = "truth.colour"

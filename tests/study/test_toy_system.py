@@ -88,7 +88,7 @@ def _check_run(config: str, out: Path) -> None:
     best, coarse = (tree["methods"][name]["metrics"] for name in ("recommended", "coarse"))
     assert abs(best["frequency_error_hz"]) < 0.1 < abs(coarse["frequency_error_hz"]) and best["ok"] == 1.0
     assert len(tree["methods"]["recommended"]["estimates"]["line.frequency_hz"]["value"]) == 3
-    assert "padding 16 was taken" in tree["chosen"][0] and tree["truth"]["frequency_hz"] == [10.3] * 3
+    assert "padding 16 was chosen" in tree["chosen"][0] and tree["truth"]["frequency_hz"] == [10.3] * 3
     assert "error of the frequency" in (out / "report.html").read_text(encoding="utf-8")
     assert list((out / "figures").glob("*.png"))
 

@@ -15,7 +15,7 @@ from torchsar.echo.ladar_record import ladar_record, simulate_ladar_record
 from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedLines
 from torchsar.echo.pairs import SimulatedPairs
 from torchsar.echo.pulse_phase import PhaseSinusoid, PhaseWalk, WhitePhase
-from torchsar.echo.response import ChannelResponse
+from torchsar.echo.response import ChannelResponse, smooth_response
 from torchsar.echo.sea import sea_echo
 from torchsar.echo.stripmap import Impairment, apply_impairments, simulate, stripmap_echo, target_energy
 from torchsar.echo.sweep_error import PolynomialSweepError, SinusoidSweepError, calibration_channel
@@ -58,6 +58,7 @@ __all__ = [
     "simulate_ladar",
     "simulate_ladar_record",
     "simulate_turntable",
+    "smooth_response",
     "stripmap_echo",
     "target_energy",
     "turntable_echo",

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Recording
+from torchsar.core import Draws, Recording, per_trial
 
 Curve = Callable[[Tensor], Tensor]
+# points of the true response: as many as the estimators of `torchsar.repair` return
+_POINTS = 1025
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,7 @@ class ChannelResponse:
         phase, amplitude = self.curves(u.clamp(-1, 1))
         response = torch.polar(amplitude, phase).to(data.dtype)
         impaired = torch.fft.ifft(torch.fft.fft(data) * response[..., None, :])
-        phase, amplitude = self.curves(torch.linspace(-1, 1, 1025, dtype=torch.float64, device=data.device))
+        phase, amplitude = self.curves(_band(data.device))
         return replace(recording, signal=recording.signal.with_data(impaired)), {
             "phase_rad": phase,
             "amplitude": amplitude,
@@ -71,3 +74,54 @@ class ChannelResponse:
             )
         phase, amplitude = torch.broadcast_tensors(phase, amplitude)
         return phase, amplitude
+
+
+def smooth_response(
+    quadratic_rad: Tensor | float = 0.0,
+    cubic_rad: Tensor | float = 0.0,
+    ripple_rad: Tensor | float = 0.0,
+    ripple_cycles: Tensor | float = 3.0,
+    slope_db: Tensor | float = 0.0,
+    amplitude_ripple_db: Tensor | float = 0.0,
+) -> ChannelResponse:
+    """Impairment: phase quadratic u^2 + cubic u^3 + ripple sin(pi cycles u), and gain slope u / 2 +
+    ripple cos(pi cycles u) in dB, u = -1..1 over the band.
+
+    The constant and linear parts of the phase are removed: they are a phase and a shift of the
+    whole scene, which no processor can distinguish from those of the scene itself. Every parameter
+    is a number or a tensor (trial,).
+
+    Args:
+        quadratic_rad: Quadratic phase at the band edge in radians.
+        cubic_rad: Cubic phase at the band edge in radians.
+        ripple_rad: Amplitude of the phase ripple in radians.
+        ripple_cycles: Cycles of the ripples over the band.
+        slope_db: Gain difference of the band edges in dB.
+        amplitude_ripple_db: Amplitude of the gain ripple in dB.
+
+    Returns:
+        The impairment.
+    """
+
+    def curve(u: Tensor) -> Tensor:
+        quadratic, cubic, ripple, cycles = (
+            per_trial(v, 1, u) for v in (quadratic_rad, cubic_rad, ripple_rad, ripple_cycles)
+        )
+        return quadratic * u.square() + cubic * u**3 + ripple * torch.sin(math.pi * cycles * u)
+
+    def phase(u: Tensor) -> Tensor:
+        grid = _band(u.device)
+        whole = curve(grid)
+        slope = (whole * grid).sum(-1, keepdim=True) / grid.square().sum()
+        return curve(u) - whole.mean(-1, keepdim=True) - u * slope
+
+    def amplitude(u: Tensor) -> Tensor:
+        slope, ripple, cycles = (per_trial(v, 1, u) for v in (slope_db, amplitude_ripple_db, ripple_cycles))
+        return 10 ** ((slope * u / 2 + ripple * torch.cos(math.pi * cycles * u)) / 20)
+
+    return ChannelResponse(phase, amplitude)
+
+
+def _band(device: torch.device) -> Tensor:
+    """Normalised frequencies -1..1 over the band, shape (_POINTS,)."""
+    return torch.linspace(-1, 1, _POINTS, dtype=torch.float64, device=device)

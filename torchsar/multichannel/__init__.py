@@ -34,7 +34,7 @@ from torchsar.multichannel.response import (
     doppler_offsets,
     noise_gain_db,
 )
-from torchsar.multichannel.scene_image import Detector, ImageMovers, SceneImage
+from torchsar.multichannel.scene_image import Detector, ImageMovers, MoversImage, SceneImage
 from torchsar.multichannel.stationary import StationaryImage, stationary_image
 from torchsar.multichannel.synchronise import EstimateSynchronisation, RemoveSynchronisation
 from torchsar.multichannel.transmit import AzimuthScaling, RemoveTransmitRange, remove_transmit_range, scale_azimuth
@@ -59,6 +59,7 @@ from torchsar.multichannel.velocity import (
     moving_point_velocity,
     sample_whitening,
 )
+from torchsar.multichannel.velocity.migrating import MigratingLines
 
 __all__ = [
     "AlongTrackAutofocus",
@@ -86,7 +87,9 @@ __all__ = [
     "Keystone",
     "LeastSquares",
     "LikelihoodVelocity",
+    "MigratingLines",
     "MinimumMeanSquare",
+    "MoversImage",
     "MovingPointVelocity",
     "MultichannelUse",
     "NoMigration",

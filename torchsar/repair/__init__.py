@@ -36,7 +36,12 @@ from torchsar.repair.jitter_blind import BlindJitter, estimate_jitter_blind
 from torchsar.repair.jitter_pilot import PilotJitter, estimate_jitter_pilot
 from torchsar.repair.lines import LineIntegrity, line_integrity, place_lines
 from torchsar.repair.response import CorrectResponse, correct_response, estimate_amplitude_response
-from torchsar.repair.response_phase import EstimateResponse, estimate_response_points, estimate_response_sharpest
+from torchsar.repair.response_phase import (
+    EstimateFlatResponse,
+    EstimateResponse,
+    estimate_response_points,
+    estimate_response_sharpest,
+)
 from torchsar.repair.sparse import sparse_fill
 from torchsar.repair.triangle import (
     BlankTurningPoints,
@@ -60,6 +65,7 @@ __all__ = [
     "CorrectJitter",
     "CorrectResponse",
     "DropInterference",
+    "EstimateFlatResponse",
     "EstimateImbalance",
     "EstimateResponse",
     "Exact",

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -392,6 +393,9 @@ def estimate_response_points(
     return _phase_estimate(total @ basis, std, image.shape[:-2])
 
 
+_METHODS = {"sharpest": estimate_response_sharpest, "points": estimate_response_points}
+
+
 class EstimateResponse(Stage):
     """Estimator of the channel's phase and amplitude response from a focused image.
 
@@ -400,8 +404,9 @@ class EstimateResponse(Stage):
 
     Args:
         radar: Radar; gives bandwidth, sampling rate and length of the pulse.
-        method: `estimate_response_sharpest` (default), `estimate_response_points`, or any function
-            of (image, band, valid=columns) that returns such an Estimate.
+        method: "sharpest" for `estimate_response_sharpest` (default), "points" for
+            `estimate_response_points`, or any function of (image, band, valid=columns) that returns
+            such an Estimate.
         expected_power: Range power spectrum of a clean image of this kind (`band_power(clean)`),
             FFT order, shape (n,); None: the amplitude is one.
     """
@@ -414,11 +419,12 @@ class EstimateResponse(Stage):
     def __init__(
         self,
         radar: StripmapRadar,
-        method: Callable[..., Estimate] = estimate_response_sharpest,
+        method: Literal["sharpest", "points"] | Callable[..., Estimate] = "sharpest",
         expected_power: Tensor | None = None,
     ) -> None:
         super().__init__()
-        self.radar, self.method = radar, method
+        self.radar = radar
+        self.method = _METHODS[method] if isinstance(method, str) else method
         self.register_buffer("expected_power", expected_power)
 
     def forward(self, signal: Signal) -> Estimate:
@@ -439,3 +445,32 @@ class EstimateResponse(Stage):
         return Estimate(
             {**estimate.value, "amplitude": amplitude}, estimate.quality, estimate.ok, estimate.std, estimate.info
         )
+
+
+class EstimateFlatResponse(EstimateResponse):
+    """Estimator of the response from images that were compressed with the `flat` reference.
+
+    Such an image, if clean, has the same power at all frequencies of the pulse band; the amplitude
+    is therefore estimated as well.
+
+    Args:
+        radar: Radar; gives bandwidth, sampling rate and length of the pulse.
+        method: "sharpest", "points" or a function; see `EstimateResponse`.
+    """
+
+    def __init__(
+        self, radar: StripmapRadar, method: Literal["sharpest", "points"] | Callable[..., Estimate] = "sharpest"
+    ) -> None:
+        super().__init__(radar, method)
+
+    def forward(self, signal: Signal) -> Estimate:
+        """Estimate the response.
+
+        Args:
+            signal: Image, shape (..., azimuth, range).
+
+        Returns:
+            As `EstimateResponse`, with the amplitude relative to a flat spectrum.
+        """
+        flat = torch.ones(signal.data.shape[-1], dtype=torch.float64, device=signal.data.device)
+        return EstimateResponse(self.radar, self.method, flat)(signal)

@@ -314,11 +314,11 @@ class MeasuredTrack:
         return float(self.time_s[-1] - self.time_s[0]) / (len(self.time_s) - 1)
 
     @classmethod
-    def from_file(cls, path: str | Path) -> MeasuredTrack:
+    def from_file(cls, file: str | Path) -> MeasuredTrack:
         """Read a track of times in seconds and displacements in metres.
 
         Args:
-            path: Text or .csv file of two columns (separated by commas or blanks, a line of names
+            file: Text or .csv file of two columns (separated by commas or blanks, a line of names
                 is allowed), .npy file of shape (n, 2), or .npz file with `time_s` (n,) and
                 `displacement_m` (..., n).
 
@@ -329,7 +329,7 @@ class MeasuredTrack:
             ValueError: If the file does not exist or holds anything else; the message names the
                 file.
         """
-        path = Path(path)
+        path = Path(file)
         if not path.is_file():
             raise ValueError(
                 f"{path}: no such file; a measured track is a text, .csv, .npy or .npz file of times "

@@ -11,7 +11,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -70,7 +70,7 @@ class Sinusoid:
         refuse_unless_finite("phase_deg of a vibration", self.phase_deg)
 
     @classmethod
-    def named(cls, name: str, *, unit: str) -> Sinusoid:
+    def named(cls, name: str, *, unit: Literal["mm", "um"]) -> Sinusoid:
         """Return the vibration of a published name amplitude_frequency_phase, such as `1_0.1_90`.
 
         Args:

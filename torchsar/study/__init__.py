@@ -1,7 +1,7 @@
-"""Experiments from a config: run, sweep, judge, store and report. Needs the extra `study`.
+"""Experiments that are defined by configs. This package needs the extra `study`.
 
-From a script: `torchsar.study.sweep(trial, grid, ...)` runs any function over a grid of parameters
-(torchsar.study.montecarlo).
+The function `torchsar.study.sweep(trial, grid, ...)` runs any function of Python over a grid of
+parameters, without a config; see `torchsar.study.montecarlo`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ __all__ = ["Difference", "Interrupted", "Record", "Stop", "differences", "read_s
 
 
 def __getattr__(name: str) -> Any:
-    """The names above on first use: zarr and the rest take a second to import."""
+    """Import `montecarlo` on first use, because zarr and other packages take a second."""
     if name in __all__:
         from torchsar.study import montecarlo
 

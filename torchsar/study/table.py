@@ -1,6 +1,6 @@
-"""The systems by name, and the way from a file to a checked config.
+"""The systems by name, and the reading of config files.
 
-This is the only module that knows every system.
+This is the only module that names the systems.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from torchsar.study.settings.sections import Loaded, Sweep, checked
 from torchsar.study.settings.text import find_config, override, read_tree
 from torchsar.study.trials.system import System
 
-# name of a system -> module that holds its class `SYSTEM`; further ones join by the entry point
-# group `torchsar.systems` (name = "package.module")
-SYSTEMS = {name: f"torchsar.study.systems.{name}" for name in ("stripmap", "isal", "isal_rotation", "sal")}
-SYSTEMS |= {name: f"torchsar.study.systems.{name}" for name in ("geo", "geo_ocean")}
+# modules with the class `SYSTEM` of each system, by name; other packages add systems by the entry
+# point group `torchsar.systems` (name = "package.module")
+_NAMES = ("stripmap", "isal", "isal_rotation", "sal", "geo", "geo_ocean")
+SYSTEMS = {name: f"torchsar.study.systems.{name}" for name in _NAMES}
 
 
 class _Systems(Mapping[str, System]):
-    """Systems by name; a system is imported when it is asked for."""
+    """Systems by name; a system is imported on first use."""
 
     def __init__(self) -> None:
         self._made: dict[str, System] = {}
@@ -54,10 +54,11 @@ def load(name: str | Path, overrides: Sequence[str] = ()) -> Loaded:
         overrides: key=value with dotted keys and YAML values.
 
     Returns:
-        The checked config, every default filled in.
+        The checked config with all defaults.
 
     Raises:
-        ConfigError: In one sentence that names file, key, value and what is accepted.
+        ConfigError: If the config is invalid; the message has file, key, value and the accepted
+            values.
     """
     path = find_config(str(name))
     settings = [field for field in Sweep.model_fields if field != "grid"]

@@ -14,6 +14,7 @@ from torchsar.compensate.pulse_phase.stages import (
     PgaSca,
     Sca,
     SharpestPhase,
+    TargetAutofocus,
     correct_pulse_phase,
 )
 
@@ -29,6 +30,7 @@ __all__ = [
     "Sca",
     "SharpestPhase",
     "Shrinking",
+    "TargetAutofocus",
     "autofocus",
     "correct_pulse_phase",
     "entropy_fixed_point",

@@ -18,6 +18,8 @@ from torchsar.compensate.pulse_phase.pairs import sca
 from torchsar.compensate.pulse_phase.recommended import autofocus
 from torchsar.compensate.pulse_phase.sharpen import entropy_fixed_point
 from torchsar.core import Estimate, Signal, Stage, real_dtype, refuse_non_finite
+from torchsar.focus import TargetImage
+from torchsar.radar import FarField, InverseRadar, Spotlight
 
 
 def correct_pulse_phase(data: Tensor, phase_rad: Tensor) -> Tensor:
@@ -227,6 +229,39 @@ class Autofocus(Stage):
             The estimate of `autofocus`.
         """
         return autofocus(signal.data, start=start, search=self.search, polish=self.polish, imaging=self.imaging)
+
+
+class TargetAutofocus(Autofocus):
+    """Phase per pulse that sharpens the image of a target; see `autofocus`.
+
+    The image is the polar-format image of `TargetImage` if the recording has a geometry, and the
+    Fourier transform along pulses otherwise.
+
+    Args:
+        radar: Radar of the recording.
+        geometry: Geometry of the recording; None if it is not known.
+        search: Largest number of iterations of the entropy fixed point, approximately.
+        polish: Largest number of iterations against the Wiener estimate.
+    """
+
+    def __init__(
+        self, radar: InverseRadar, geometry: FarField | Spotlight | None = None, search: int = 120, polish: int = 20
+    ) -> None:
+        super().__init__(search, polish)
+        self.target = None if geometry is None else TargetImage(radar, geometry)
+
+    def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
+        """Estimate `phase_rad` of a signal of axes (pulse, range).
+
+        Args:
+            signal: Range-compressed pulses, shape (..., pulse, range), complex.
+            start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
+
+        Returns:
+            The estimate of `autofocus`.
+        """
+        imaging = None if self.target is None else self.target.operator(signal.data)
+        return autofocus(signal.data, start=start, search=self.search, polish=self.polish, imaging=imaging)
 
 
 class SharpestPhase(Stage):

@@ -13,12 +13,12 @@ from torchsar.study.names.registry import GROUPS, WORLD, group_of, stages
 from torchsar.study.settings.signature import Catalogue, Section
 from torchsar.study.trials.system import System
 
-# a key in a docstring's list of arguments: its name at four columns, further lines at more
+# an argument in a docstring: its name is indented by four columns, further lines by more
 _ARGUMENT = re.compile(r"^ {4}((?:\w+, )*\w+): (.*(?:\n {5,}.*)*)", re.MULTILINE)
 
 
 def listing(systems: Mapping[str, System]) -> str:
-    """The list as text, after the packaged configs."""
+    """Return the list of systems, stages, parts of worlds and data files as text."""
     lines = ["", "SYSTEMS (the key `system` of a config; a number marked * may differ from trial to trial)"]
     for name, system in systems.items():
         lines.append(f"  {name:<26}{system.about}")
@@ -47,21 +47,21 @@ def _entries(catalogue: Catalogue, names: Any) -> list[str]:
 
 
 def _keys(section: Section, above: str = "") -> list[str]:
-    """A line for each key: its default, and what its constructor says of it; `NAME` is for names
-    that a config gives.
+    """A line for each key, with its default and its description by the docstring of its target;
+    `NAME` denotes names that a config chooses.
     """
-    said, lines = _arguments(section.target), []
+    described, lines = _arguments(section.target), []
     for name, key in section.keys.items():
         shown = f"{above}{name}{'*' if key.per_trial else ''}"
         shown += "" if key.default is ... else f"={_short(key.default)}"
-        lines.append(f"      {shown:<30} {said.get(name, '')}".rstrip())
+        lines.append(f"      {shown:<30} {described.get(name, '')}".rstrip())
         if isinstance(key.inner, Section):
             lines += _keys(key.inner, f"{above}{name}.{'NAME.' if key.many else ''}")
     return lines
 
 
 def _arguments(target: Callable[..., Any]) -> dict[str, str]:
-    """The first sentence on each argument in a docstring, those of base classes among them."""
+    """The first sentence about each argument in the docstrings of a class and its bases."""
     found: dict[str, str] = {}
     docs = [getattr(one, "__doc__", None) or "" for one in reversed(getattr(target, "__mro__", (target,)))]
     for names, text in (match for doc in docs for match in _ARGUMENT.findall(inspect.cleandoc(doc))):

@@ -1,4 +1,4 @@
-"""`torchsar requires`: what a scene requires of its models and methods, before anything runs."""
+"""`torchsar requires`: requirements of a scene on models and methods, without processing it."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ FILES = ("config.yaml", "requires.json", "requires.txt")
 
 
 def requires(loaded: Loaded, out: Path, device: str = "cpu") -> str:
-    """Limits, neglected phases and recommended choices of every case, as text.
+    """Write limits, neglected phases and recommended choices of every case into a folder.
 
     Args:
         loaded: The config.
-        out: The folder for config.yaml, requires.json and requires.txt.
-        device: Where a recording is processed, whose Doppler and velocity are estimated first.
+        out: The folder of config.yaml, requires.json and requires.txt.
+        device: Device on which the Doppler centroid and the velocity of a recording are estimated.
 
     Returns:
         The text of requires.txt.
 
     Raises:
-        ConfigError: If the config is invalid, or the system predicts nothing for a recording.
+        ConfigError: If the config is invalid, or the system cannot predict losses of a recording.
     """
     with fresh_result(out, "requires", FILES) as folder:
         benches = {name: Bench(case, device) for name, case in cases_of(loaded).items()}
@@ -48,7 +48,7 @@ def requires(loaded: Loaded, out: Path, device: str = "cpu") -> str:
 
 
 def needs(bench: Bench) -> dict[str, Any]:
-    """What one case requires, as it stands in requires.json."""
+    """Return the requirements of one case, as in requires.json."""
     tolerance = tolerance_of(bench.loaded)
     try:
         with warnings.catch_warnings(record=True) as caught:
@@ -90,12 +90,15 @@ def _choice(choice: Choice, tolerance: Mapping[str, float]) -> dict[str, Any]:
 
 
 def refuse_beyond_limits(bench: Bench, case: str) -> None:
-    """Refuse a case beyond a limit that stops a method; warn of the other limits.
+    """Check the limits of the methods of a case, and log a warning for each limit that is exceeded.
 
-    A method that the config names in beyond_limits is shown beyond its limits on purpose.
+    Args:
+        bench: Bench of the case.
+        case: Name of the case.
 
     Raises:
-        ConfigError: With the limit, what it comes to and what helps.
+        ConfigError: If a limit excludes a method that the config does not name in beyond_limits;
+            the message has the limit, its value and a remedy.
     """
     where = "" if case == ALL else f"cases.{case}: "
     try:
@@ -129,7 +132,7 @@ def _text(name: str, tree: Mapping[str, Any]) -> str:
 
 
 def aligned(rows: Sequence[Sequence[str]], right: Collection[int] = ()) -> list[str]:
-    """Lines of a table; the columns of the given numbers are aligned to the right."""
+    """Return the lines of a table; the columns with the numbers in `right` are aligned right."""
     wide = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [[x.rjust(w) if i in right else x.ljust(w) for i, (x, w) in enumerate(zip(row, wide))] for row in rows]
     return ["  ".join(line).rstrip() for line in lines]

@@ -1,4 +1,4 @@
-"""`torchsar run`: every method on every case, from config to report."""
+"""`torchsar run`: every method on every case, with its report."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from torchsar.study.trials.system import per_trial_first
 
 log = logging.getLogger("torchsar")
 FILES = ("config.yaml", "metrics.json", "arrays.zarr", "figures", "report.html")
-# batches of runs are as large as this in their largest tensor: large enough to cost no calls, small
-# beside the memory of any machine that holds one trial
+# largest tensor of a batch in bytes: large enough for efficient calls, and small relative to the
+# memory of a machine that can process one trial
 _BATCH_BYTES = 256 << 20
-# longer estimates than this stand in metrics.json by their mean; arrays.zarr holds all of them
+# metrics.json has only the mean of estimates with more numbers than this; arrays.zarr has all
 _LISTED = 16
 
 
@@ -38,16 +38,17 @@ def run(loaded: Loaded, out: Path, command: str = "torchsar run", device: str = 
 
     Args:
         loaded: The config.
-        out: The folder; config.yaml, metrics.json, arrays.zarr, figures/ and report.html appear
-            there whole or not at all.
-        command: What the report says it was made with.
-        device: Where the trials are computed.
+        out: The result folder. It gets config.yaml, metrics.json, arrays.zarr, figures/ and
+            report.html, all of them or none.
+        command: Command line that the report shows.
+        device: Device on which the trials are computed.
 
     Returns:
         The path of the report.
 
     Raises:
-        ConfigError: For whatever the user can put right, limits that the scene exceeds included.
+        ConfigError: If the config is invalid, the simulation or a stage rejects it, or the scene
+            exceeds the limits of a method.
     """
     began = time.perf_counter()
     with fresh_result(out, "run", FILES) as folder:
@@ -87,7 +88,7 @@ def _step(method: str, stage: str) -> str:
 
 
 def _chunks(bench: Bench) -> list[range]:
-    """The trials of a case in batches."""
+    """Numbers of the trials of each batch of a case."""
     count = 1 if bench.recording is not None else bench.world().trials
     height = max(1, min(count, _BATCH_BYTES // max(1, bench.bytes_per_trial)))
     return [range(first, min(first + height, count)) for first in range(0, count, height)]
@@ -99,7 +100,7 @@ def _steps(bench: Bench) -> list[str]:
 
 
 def _case(bench: Bench, name: str) -> Result:
-    """All trials of one case, a batch at a time."""
+    """Run all trials of one case in batches."""
     began, system = time.perf_counter(), bench.system
     first: Batch | None = None
     metrics: dict[str, list[Mapping[str, Tensor]]] = {}
@@ -121,34 +122,34 @@ def _case(bench: Bench, name: str) -> Result:
     of_targets = {method: {t: joined_metrics(parts) for t, parts in of.items()} for method, of in targets.items()}
     found = {method: joined_found(parts) for method, parts in estimates.items()}
     result = Result(bench, first, whole, of_targets, found, joined_metrics(truth))
-    _warn_of_doubt(name, result)
+    _warn_if_unreliable(name, result)
     log.info("%s: %.1f s", bench.loaded.name if name == ALL else name, time.perf_counter() - began)
     return result
 
 
-def _warn_of_doubt(case: str, result: Result) -> None:
-    """Name the estimators of the recommended method that are unreliable in some trials."""
-    doubted = {
+def _warn_if_unreliable(case: str, result: Result) -> None:
+    """Warn of unreliable estimates of the recommended method."""
+    unreliable = {
         n: int((~e.ok.bool()).sum()) for n, e in result.first_of("recommended").estimates.items() if not e.ok.all()
     }
     verdicts = result.metrics["recommended"].get(OK)
     if verdicts is not None and not bool((verdicts > 0).all()):
         count, where = int((verdicts == 0).sum()), "" if case == ALL else f"{case}: "
-        stages = f" ({', '.join(doubted)})" if doubted else ""
+        stages = f" ({', '.join(unreliable)})" if unreliable else ""
         log.warning(
             "warning: %srecommended: estimates unreliable in %d of %d trials%s", where, count, len(verdicts), stages
         )
 
 
 def _scalars(batch: Batch) -> dict[str, Tensor]:
-    """True values that are one number a trial."""
+    """True values with one number per trial."""
     n = batch.trials.count
     values = {name: per_trial_first(torch.as_tensor(value), n) for name, value in batch.trials.truth.items()}
     return {name: x.reshape(n).cpu() for name, x in values.items() if x.numel() == n and not x.is_complex()}
 
 
 def _first_truth(result: Result) -> dict[str, Tensor]:
-    """All that is true of the first trial."""
+    """All true values of the first trial."""
     n = result.first.trials.count
     return {name: per_trial_first(torch.as_tensor(v), n)[0] for name, v in result.first.trials.truth.items()}
 
@@ -163,18 +164,23 @@ def _first_estimates(results: Mapping[str, Result]) -> dict[str, dict[str, Tenso
 
 
 def metrics_tree(loaded: Loaded, results: Mapping[str, Result]) -> dict[str, Any]:
-    """The content of metrics.json: `metrics` of a method are those of the first case."""
+    """Return the content of metrics.json.
+
+    Args:
+        loaded: The config.
+        results: Results by case; `metrics` of a method are those of the first case.
+    """
     first = next(iter(results.values()))
     methods = {name: _method_tree(method.title, name, results) for name, method in loaded.config.processor.items()}
     truth = {key_of(c, name): _listed(value) for c, result in results.items() for name, value in result.truth.items()}
     shown = {
-        "metrics": f"methods.NAME.metrics are means over trials of the first case, {next(iter(results))!r}; every case is "
-        "in methods.NAME.cases, with standard deviations over trials as _sd",
-        "estimates": f"of more than {_LISTED} numbers a trial the mean and the rms standard deviation; all are in arrays.zarr",
-        "ok": "whether all estimators of the method call their estimates reliable; a share over trials",
-        "seconds": "wall time of the chain of the method per trial; estimates that methods share count in each",
-        "targets_outside": "named targets that lie outside the image of the method, or are never in the beam; "
-        "of a case their number",
+        "metrics": "methods.NAME.metrics are means over trials of the first case, "
+        f"{next(iter(results))!r}; methods.NAME.cases has all cases, with standard deviations over trials as _sd",
+        "estimates": f"an estimate of more than {_LISTED} numbers per trial is given by its mean and its rms standard "
+        "deviation; arrays.zarr has all numbers",
+        "ok": "whether all estimates of the method are reliable; its mean is the share of such trials",
+        "seconds": "wall time of the chain of the method per trial; shared estimates count in every method",
+        "targets_outside": "named targets outside the image, or never in the beam; a case has their number",
     }
     return {
         "methods": methods,
@@ -213,7 +219,7 @@ def _method_tree(title: str, name: str, results: Mapping[str, Result]) -> dict[s
 
 
 def _entry(found: Found) -> dict[str, Any]:
-    """Value, standard deviation and verdict of an estimate: lists over trials, or one entry."""
+    """Value, standard deviation and `ok` of an estimate: lists over trials, or one entry."""
     value, std = found.value, found.std
     if value[0].numel() > _LISTED:
         value = value.double().flatten(1).mean(1)

@@ -1,4 +1,4 @@
-"""Stages of `torchsar.multichannel` from plain keys."""
+"""Factories for the stages of `torchsar.multichannel` from plain keys."""
 
 from __future__ import annotations
 
@@ -6,23 +6,31 @@ from collections.abc import Sequence
 from typing import Literal
 
 from torchsar.core import Alternate, Turn
-from torchsar.multichannel.balance import EstimateBalance
-from torchsar.multichannel.body import Extraction
-from torchsar.multichannel.migration import CorrectMigration, Keystone, NoMigration, StaticBulk
-from torchsar.multichannel.reconstruct import Reconstruct
-from torchsar.multichannel.response import ElementPattern, FlatBand, LeastSquares, MinimumMeanSquare, Prior, Rebuild
-from torchsar.multichannel.scene_image import Detector, MoversImage, Removal
-from torchsar.multichannel.stationary import StationaryImage
-from torchsar.multichannel.velocity.aperture import Aperture, Dwell, ElementBeam
-from torchsar.multichannel.velocity.bank import Search
-from torchsar.multichannel.velocity.migrating import MigratingLines
-from torchsar.multichannel.velocity.sir import SignalIntensityRatio
-from torchsar.multichannel.velocity.stages import (
+from torchsar.multichannel import (
     AlongTrackAutofocus,
+    CorrectMigration,
+    Detector,
+    Dwell,
+    ElementBeam,
+    ElementPattern,
+    EstimateBalance,
+    Extraction,
+    FlatBand,
     GradientVelocity,
     Interferometry,
+    Keystone,
+    LeastSquares,
     LikelihoodVelocity,
+    MigratingLines,
+    MinimumMeanSquare,
+    MoversImage,
     MovingPointVelocity,
+    NoMigration,
+    Reconstruct,
+    Search,
+    SignalIntensityRatio,
+    StaticBulk,
+    StationaryImage,
 )
 from torchsar.radar import BistaticRadar
 
@@ -30,15 +38,17 @@ Unknown = Literal["u_r_m_s", "u_a_m_s", "y0_m"]
 Method = Literal["least_squares", "mmse"]
 
 
-def _aperture(dwell_s: float | None) -> Aperture:
+def _aperture(dwell_s: float | None) -> Dwell | ElementBeam:
     return ElementBeam() if dwell_s is None else Dwell(dwell_s)
 
 
-def _prior(band_hz: float | None) -> Prior:
+def _prior(band_hz: float | None) -> FlatBand | ElementPattern:
     return ElementPattern() if band_hz is None else FlatBand(band_hz)
 
 
-def _rebuild(bands: int, method: Method, band_hz: float | None = None, snr_db: float = 40.0) -> Rebuild:
+def _rebuild(
+    bands: int, method: Method, band_hz: float | None = None, snr_db: float = 40.0
+) -> LeastSquares | MinimumMeanSquare:
     return LeastSquares(bands) if method == "least_squares" else MinimumMeanSquare(bands, snr_db, _prior(band_hz))
 
 
@@ -48,13 +58,13 @@ def migration_correct(
     whole_swath: bool = True,
     range_m: float | None = None,
 ) -> CorrectMigration:
-    """Range migration corrected by deramp, keystone and reramp, by a shift of each pulse, or not at
-    all.
+    """Correction of range migration by deramp, keystone and reramp, by a shift of each pulse, or no
+    correction.
 
     Args:
         kind: "keystone", "static_bulk", or "none" for no correction.
-        whole_swath: Whether the correction follows the range over the swath.
-        range_m: Closest range of data without a range axis; None for the radar's.
+        whole_swath: Whether the correction varies with the range over the swath.
+        range_m: Closest range of data without a range axis in m; None for that of the radar.
     """
     kinds = {"keystone": Keystone(whole_swath), "static_bulk": StaticBulk(whole_swath), "none": NoMigration()}
     return CorrectMigration(radar, kinds[kind], range_m)
@@ -68,15 +78,15 @@ def rebuild_bands(
     snr_db: float = 40.0,
     range_m: float | None = None,
 ) -> Reconstruct:
-    """Channels to the full Doppler band of the velocities given; mmse expects power in a flat band
-    of band_hz, or by the pattern of the elements (null).
+    """Reconstruction of the full Doppler band from the channels, for the velocities given.
 
     Args:
-        bands: Doppler bands of one PRF that are separated.
-        method: "least_squares", or "mmse" where an inverse may be singular.
-        band_hz: Doppler band in which mmse expects power; None for the pattern.
-        snr_db: Signal-to-noise ratio that mmse expects, in dB.
-        range_m: Closest range of data without a range axis; None for the radar's.
+        bands: Number of Doppler bands, each as wide as the PRF, that are separated.
+        method: "least_squares", or "mmse" if the matrix of the channels may be singular.
+        band_hz: Doppler band of the flat spectrum that "mmse" assumes, in Hz; None for the spectrum
+            by the pattern of the elements.
+        snr_db: Signal-to-noise ratio that "mmse" assumes, in dB.
+        range_m: Closest range of data without a range axis in m; None for that of the radar.
     """
     return Reconstruct(radar, _rebuild(bands, method, band_hz, snr_db), range_m)
 
@@ -84,25 +94,24 @@ def rebuild_bands(
 def channel_balance(
     radar: BistaticRadar, band_hz: float | None = None, bands: int = 5, delays: bool = True
 ) -> EstimateBalance:
-    """Phase, gain and delay of channels from clutter at rest in a flat band of band_hz, or seen
-    through the pattern of the elements (null).
+    """Estimator of phase, gain and delay of the channels from clutter at rest.
 
     Args:
-        band_hz: Flat Doppler band of the clutter; None for the pattern of the elements.
-        bands: Doppler bands of one PRF in the clutter.
+        band_hz: Doppler band of the flat spectrum of the clutter in Hz; None for the spectrum by
+            the pattern of the elements.
+        bands: Number of Doppler bands of the clutter, each as wide as the PRF.
         delays: Whether delays are estimated as well.
     """
     return EstimateBalance(radar, _prior(band_hz), bands, delays)
 
 
 def interferometry(radar: BistaticRadar, dwell_s: float | None = None, range_m: float | None = None) -> Interferometry:
-    """Along-track interferometry, u_a as given.
-
-    dwell_s: how long targets are seen, null for the pattern of the elements.
+    """Estimator of u_r by along-track interferometry, for the u_a given.
 
     Args:
-        dwell_s: How long targets are seen, in s; None for the pattern of the elements.
-        range_m: Closest range of data without a range axis; None for the radar's.
+        dwell_s: Time during which the beam illuminates a target, in s; None for the time within the
+            pattern of the elements.
+        range_m: Closest range of data without a range axis in m; None for that of the radar.
     """
     return Interferometry(radar, _aperture(dwell_s), range_m)
 
@@ -110,12 +119,13 @@ def interferometry(radar: BistaticRadar, dwell_s: float | None = None, range_m: 
 def along_track_autofocus(
     radar: BistaticRadar, dwell_s: float | None = None, half_m_s: float = 20.0, range_m: float | None = None
 ) -> AlongTrackAutofocus:
-    """u_a by the power of the deramped tone within +-half_m_s.
+    """Estimator of u_a by the power of the deramped tone.
 
     Args:
-        dwell_s: How long targets are seen, in s; None for the pattern of the elements.
-        half_m_s: Half of the interval in which u_a is sought, in m/s.
-        range_m: Closest range of data without a range axis; None for the radar's.
+        dwell_s: Time during which the beam illuminates a target, in s; None for the time within the
+            pattern of the elements.
+        half_m_s: Half width of the search interval of u_a in m/s.
+        range_m: Closest range of data without a range axis in m; None for that of the radar.
     """
     return AlongTrackAutofocus(radar, _aperture(dwell_s), range_m, half_m_s)
 
@@ -126,12 +136,13 @@ def likelihood_velocity(
     unknowns: tuple[Unknown, ...] = ("u_r_m_s", "u_a_m_s", "y0_m"),
     range_m: float | None = None,
 ) -> LikelihoodVelocity:
-    """Maximum likelihood of the unknowns near the values given, by Gauss-Newton steps.
+    """Maximum-likelihood estimator of the unknowns near the values given, by Gauss-Newton steps.
 
     Args:
-        dwell_s: How long targets are seen, in s; None for the pattern of the elements.
-        unknowns: What is estimated; the rest is held.
-        range_m: Closest range of data without a range axis; None for the radar's.
+        dwell_s: Time during which the beam illuminates a target, in s; None for the time within the
+            pattern of the elements.
+        unknowns: Quantities that are estimated; the others keep the values given.
+        range_m: Closest range of data without a range axis in m; None for that of the radar.
     """
     return LikelihoodVelocity(radar, _aperture(dwell_s), range_m, unknowns)
 
@@ -142,13 +153,13 @@ def gradient_velocity(
     unknowns: tuple[Unknown, ...] = ("u_r_m_s", "u_a_m_s", "y0_m"),
     range_m: float | None = None,
 ) -> GradientVelocity:
-    """Maximum likelihood of the unknowns near the values given, by a descent on autograd's
-    gradients.
+    """Maximum-likelihood estimator of the unknowns near the values given, by gradient descent.
 
     Args:
-        dwell_s: How long targets are seen, in s; None for the pattern of the elements.
-        unknowns: What is estimated; the rest is held.
-        range_m: Closest range of data without a range axis; None for the radar's.
+        dwell_s: Time during which the beam illuminates a target, in s; None for the time within the
+            pattern of the elements.
+        unknowns: Quantities that are estimated; the others keep the values given.
+        range_m: Closest range of data without a range axis in m; None for that of the radar.
     """
     return GradientVelocity(radar, _aperture(dwell_s), range_m, unknowns)
 
@@ -162,15 +173,17 @@ def moving_point_velocity(
     u_a_m_s: float | None = None,
     range_m: float | None = None,
 ) -> MigratingLines:
-    """The recommended estimator of velocity and position; only how far to search is known.
+    """The recommended estimator of velocity and position. It needs no initial values, only the
+    limits of the search.
 
     Args:
-        dwell_s: How long targets are seen, in s; None for the pattern of the elements.
-        u_r_reach_m_s: How far u_r is sought in m/s; None for three pulse rates.
-        u_a_reach_m_s: How far u_a is sought in m/s.
-        y0_reach_m: How far the position is sought in metres.
-        u_a_m_s: u_a in m/s where it is known.
-        range_m: Closest range of data without a range axis; None for the radar's.
+        dwell_s: Time during which the beam illuminates a target, in s; None for the time within the
+            pattern of the elements.
+        u_r_reach_m_s: Half width of the search in u_r in m/s; None for 1.5 ambiguous velocities.
+        u_a_reach_m_s: Half width of the search in u_a in m/s.
+        y0_reach_m: Half width of the search in the position in m.
+        u_a_m_s: u_a in m/s if it is known a priori.
+        range_m: Closest range of data without a range axis in m; None for that of the radar.
     """
     reach = 1.5 * radar.ambiguous_velocity_m_s if u_r_reach_m_s is None else u_r_reach_m_s
     return MigratingLines(
@@ -188,18 +201,16 @@ def intensity_ratio(
     step_m_s: float = 0.5,
     range_m: float | None = None,
 ) -> SignalIntensityRatio:
-    """u_r by the signal intensity ratio of the paper.
-
-    search_m_s: least and largest velocity, null for all that is unambiguous; mmse serves where an
-    inverse is singular.
+    """Estimator of u_r by the signal intensity ratio.
 
     Args:
         bandwidth_hz: Doppler bandwidth of the target in Hz.
-        bands: Doppler bands of one PRF that are separated.
-        method: "least_squares", or "mmse" where an inverse may be singular.
-        search_m_s: Least and largest velocity; None for all that is unambiguous.
+        bands: Number of Doppler bands, each as wide as the PRF, that are separated.
+        method: "least_squares", or "mmse" if the matrix of the channels may be singular.
+        search_m_s: Least and largest velocity of the search in m/s; None for all that are
+            unambiguous.
         step_m_s: Step of the search in m/s.
-        range_m: Closest range of data without a range axis; None for the radar's.
+        range_m: Closest range of data without a range axis in m; None for that of the radar.
     """
     rebuild = _rebuild(bands, method)
     return SignalIntensityRatio(radar, bandwidth_hz, rebuild, search_m_s, step_m_s, range_m)
@@ -215,22 +226,23 @@ def alternate_velocity(
     step_m_s: float = 0.5,
     half_m_s: float = 20.0,
 ) -> MigratingLines:
-    """u_r by the signal intensity ratio and u_a by autofocus in turn, as the paper does (Remote
-    Sens. 2020, 12, 1703, section 4.3); mmse where an inverse may be singular.
+    """Alternate estimation of u_r by the signal intensity ratio and of u_a by autofocus.
 
     Args:
         bandwidth_hz: Doppler bandwidth of the target in Hz.
-        dwell_s: How long targets are seen, in s; None for the pattern of the elements.
-        bands: Doppler bands of one PRF that are separated.
-        method: "least_squares", or "mmse" where an inverse may be singular.
-        rounds: How often both are estimated.
+        dwell_s: Time during which the beam illuminates a target, in s; None for the time within the
+            pattern of the elements.
+        bands: Number of Doppler bands, each as wide as the PRF, that are separated.
+        method: "least_squares", or "mmse" if the matrix of the channels may be singular.
+        rounds: Number of times that both are estimated.
         step_m_s: Step of the search for u_r in m/s.
-        half_m_s: Half of the interval in which u_a is sought, in m/s.
+        half_m_s: Half width of the search interval of u_a in m/s.
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, section 4.3.
     """
-    ratio, autofocus = (
-        intensity_ratio(radar, bandwidth_hz, bands, method, step_m_s=step_m_s),
-        along_track_autofocus(radar, dwell_s, half_m_s),
-    )
+    ratio = intensity_ratio(radar, bandwidth_hz, bands, method, step_m_s=step_m_s)
+    autofocus = along_track_autofocus(radar, dwell_s, half_m_s)
     made = Alternate(rounds, u_r=Turn(ratio), u_a=Turn(autofocus))
     made.works_on, made.also_on = autofocus.works_on, autofocus.also_on
     return MigratingLines(radar, made, one_line=True)
@@ -244,8 +256,16 @@ def stationary_image(
     snr_db: float = 40.0,
     form: Literal["stolt", "bulk"] = "stolt",
 ) -> StationaryImage:
-    """The image of everything as if at rest; mmse expects power in a flat band of band_hz, or by
-    the pattern of the elements (null).
+    """The image of a scene at rest; moving targets are defocused in it.
+
+    Args:
+        bands: Number of Doppler bands, each as wide as the PRF, that are separated.
+        method: "least_squares", or "mmse" if the matrix of the channels may be singular.
+        band_hz: Doppler band of the flat spectrum that "mmse" assumes, in Hz; None for the spectrum
+            by the pattern of the elements.
+        snr_db: Signal-to-noise ratio that "mmse" assumes, in dB.
+        form: "stolt", exact at every range, or "bulk", with the migration of mid-swath for all
+            ranges.
     """
     return StationaryImage(radar, _rebuild(bands, method, band_hz, snr_db), form)
 
@@ -256,7 +276,7 @@ def movers_image(
     method: Method = "least_squares",
     band_hz: float | None = None,
     snr_db: float = 40.0,
-    removal: Removal = "subtract",
+    removal: Literal["subtract", "zero"] = "subtract",
     integration_s: float = 4.5,
     segment_s: float = 0.6,
     half_along_m: float = 120.0,
@@ -266,8 +286,28 @@ def movers_image(
     u_a_reach_m_s: float = 20.0,
     suppressed_m_s: Sequence[float] = Detector().suppressed_m_s,
 ) -> MoversImage:
-    """The flow of Remote Sens. 2020, 12, 1703, Fig. 13: the image of every frame with moving
-    targets at their positions, and what they are.
+    """The image of every frame with the moving targets focused at their true positions, and the
+    estimates of these targets.
+
+    Args:
+        bands: Number of Doppler bands, each as wide as the PRF, that are separated.
+        method: "least_squares", or "mmse" if the matrix of the channels may be singular.
+        band_hz: Doppler band of the flat spectrum that "mmse" assumes, in Hz; None for the spectrum
+            by the pattern of the elements.
+        snr_db: Signal-to-noise ratio that "mmse" assumes, in dB.
+        removal: "subtract" removes the echo fitted to a target, "zero" all data in its area.
+        integration_s: Time for which a scatterer is illuminated in s.
+        segment_s: Length of the segments of slow time in s.
+        half_along_m: Half width of a target along track in m.
+        half_range_m: Half width of a target in range in m.
+        threshold_db: Least mean intensity of a target over the median of the image in dB.
+        most: Largest number of targets.
+        u_a_reach_m_s: Half width of the search in u_a in m/s.
+        suppressed_m_s: Slant-range speeds in m/s of the images with suppressed sea, in which weaker
+            targets are detected; empty to omit these.
+
+    Reference:
+        Remote Sens. 2020, 12, 1703, Fig. 13.
     """
     extraction = Extraction(half_along_m, half_range_m, integration_s, segment_s)
     detector = Detector(threshold_db, most=most, suppressed_m_s=suppressed_m_s)

@@ -1,30 +1,24 @@
-"""Stages and impairments whose constructors take other objects or functions, from plain keys."""
+"""Stages, scenes and impairments whose constructors take objects or functions, from plain keys."""
 
 from __future__ import annotations
 
 import inspect
-import math
 import typing
 from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import Any, Literal
 
-import torch
 from torch import Tensor
 
-from torchsar.compensate.pulse_phase.stages import Autofocus, CorrectPulsePhase
-from torchsar.compensate.rotation import RotationAutofocus, UnevenRotation
-from torchsar.compensate.velocity import EffectiveVelocity
-from torchsar.core import Alternate, Estimate, Signal, Stage, Turn, per_trial
-from torchsar.echo.channel_errors import PolynomialDrift, SinusoidDrift, SynchronisationError, WalkDrift
-from torchsar.echo.response import ChannelResponse
-from torchsar.focus import OmegaK, PaddedLines, TargetImage
+from torchsar.compensate import EffectiveVelocity, RotationAutofocus, UnevenRotation
+from torchsar.compensate.pulse_phase import CorrectPulsePhase
+from torchsar.core import Alternate, Turn
+from torchsar.echo import PolynomialDrift, SinusoidDrift, SynchronisationError, WalkDrift
+from torchsar.focus import OmegaK, PaddedLines
 from torchsar.optim.scalar import gradient_minimum, parabola_minimum
-from torchsar.radar import LIGHT_M_S, FarField, InverseRadar, Spotlight, StripmapRadar
-from torchsar.repair.jitter import BandLimited, CorrectJitter, Exact, Lagrange
-from torchsar.repair.response import band_grid
-from torchsar.repair.response_phase import EstimateResponse, estimate_response_points, estimate_response_sharpest
-from torchsar.scene import Dechirped, ImageReflectivity, KSea, MeasuredTrack, Polynomial, Sinusoid
+from torchsar.radar import LIGHT_M_S, InverseRadar, StripmapRadar
+from torchsar.repair import BandLimited, CorrectJitter, Lagrange
+from torchsar.scene import Dechirped, ImageReflectivity, KSea, Polynomial
 
 _REFINE = {"gradient": gradient_minimum, "parabola": parabola_minimum}
 
@@ -37,8 +31,14 @@ def effective_velocity(
     refine: Literal["gradient", "parabola"] = "gradient",
     tolerance_m_s: float = 0.01,
 ) -> EffectiveVelocity:
-    """Minimum-entropy velocity of range lines that are compressed with `reference` (None:
-    compressed already).
+    """Velocity of minimum image entropy.
+
+    Args:
+        reference: Reference of the range compression; None if the lines are already compressed.
+        reach_m_s: Largest error of the nominal velocity in m/s.
+        lines: Number of range cells that are used, at least 16.
+        refine: Method that refines the minimum.
+        tolerance_m_s: Tolerance of the refinement in m/s.
     """
     return EffectiveVelocity(OmegaK(radar, reference), reach_m_s, lines, _REFINE[refine], tolerance_m_s)
 
@@ -50,8 +50,14 @@ def omega_k_padded(
     doppler_hz: float | None = None,
     lines: int | None = None,
 ) -> PaddedLines:
-    """omega_k with empty lines behind the record, one aperture by default, so that cut apertures do
-    not wrap round.
+    """Omega-K focusing with empty lines appended to the record, so that apertures that are cut off
+    at its end do not appear at its beginning.
+
+    Args:
+        reference: Reference of the range compression; None if the lines are already compressed.
+        velocity_m_s: Velocity in m/s; None for that of the radar.
+        doppler_hz: Doppler centroid in Hz; None for that of the radar.
+        lines: Number of empty lines; None for one aperture.
     """
     return PaddedLines(OmegaK(radar, reference, velocity_m_s, doppler_hz), lines)
 
@@ -65,11 +71,17 @@ def rotation_and_phase(
     search: int = 60,
     polish: int = 20,
 ) -> Alternate:
-    """A phase per pulse and the rotation in turn (`RotationAutofocus`, `UnevenRotation`), each on
-    the recorded data without what the other has found.
+    """A phase per pulse and the rotation, estimated alternately by `RotationAutofocus` and
+    `UnevenRotation`, each from the recorded data after correction of the other.
 
-    yc_m is held: a phase that is free in every pulse takes all of the range centre deviation with
-    it.
+    Args:
+        order: Order of the warp of slow time by the rotation.
+        yc_m: Deviation of the range centre in metres. It is held fixed, because an independent
+            phase of every pulse absorbs its whole effect.
+        rounds: Number of times that both are estimated.
+        scatterers: Largest number of scatterers that are used.
+        search: Largest number of iterations of the entropy fixed point.
+        polish: Largest number of iterations against the Wiener estimate.
     """
     return Alternate(
         rounds,
@@ -78,120 +90,25 @@ def rotation_and_phase(
     )
 
 
-def jitter_lagrange(points: int = 4, offset_samples: list[float] | None = None) -> CorrectJitter:
-    """Jitter correction by Lagrange interpolation through this many points.
+def jitter_lagrange(points: int = 4, offset_samples: Tensor | None = None) -> CorrectJitter:
+    """Jitter correction by Lagrange interpolation.
 
     Args:
         points: Number of points of the interpolation.
-        offset_samples: Offsets of one period in samples, where they are known.
+        offset_samples: Offsets of one period in samples, if they are known.
     """
-    return CorrectJitter(_tensor(offset_samples), Lagrange(points))
+    return CorrectJitter(offset_samples, Lagrange(points))
 
 
-def jitter_band_limited(
-    points: int = 8, band: float = 0.95, offset_samples: list[float] | None = None
-) -> CorrectJitter:
-    """Jitter correction by the best local weights for a signal of this band.
+def jitter_band_limited(points: int = 8, band: float = 0.95, offset_samples: Tensor | None = None) -> CorrectJitter:
+    """Jitter correction by the local weights of least error for a band-limited signal.
 
     Args:
         points: Number of points of the interpolation.
-        band: Occupied share of the sampling rate.
-        offset_samples: Offsets of one period in samples, where they are known.
+        band: Bandwidth of the signal over the sampling rate.
+        offset_samples: Offsets of one period in samples, if they are known.
     """
-    return CorrectJitter(_tensor(offset_samples), BandLimited(points, band))
-
-
-def jitter_exact(offset_samples: list[float] | None = None) -> CorrectJitter:
-    """Jitter correction by exact periodic non-uniform reconstruction.
-
-    Args:
-        offset_samples: Offsets of one period in samples, where they are known.
-    """
-    return CorrectJitter(_tensor(offset_samples), Exact())
-
-
-def _tensor(values: list[float] | None) -> Tensor | None:
-    return None if values is None else torch.tensor(values, dtype=torch.float64)
-
-
-def channel_response(
-    quadratic_rad: Tensor | float = 0.0,
-    cubic_rad: Tensor | float = 0.0,
-    ripple_rad: Tensor | float = 0.0,
-    ripple_cycles: Tensor | float = 3.0,
-    slope_db: Tensor | float = 0.0,
-    amplitude_ripple_db: Tensor | float = 0.0,
-) -> ChannelResponse:
-    """Impairment: phase quadratic u^2 + cubic u^3 + ripple sin(pi cycles u), and gain slope u / 2 +
-    ripple cos(pi cycles u) in dB, u = -1..1 over the band.
-
-    The phase is taken without its constant and linear parts: these are a phase and a shift of the
-    whole scene, which nothing can tell from the scene's own.
-
-    Args:
-        quadratic_rad: Quadratic phase at the band edge in radians.
-        cubic_rad: Cubic phase at the band edge in radians.
-        ripple_rad: Amplitude of the phase ripple in radians.
-        ripple_cycles: Cycles of the ripples over the band.
-        slope_db: Gain difference of the band edges in dB.
-        amplitude_ripple_db: Amplitude of the gain ripple in dB.
-    """
-
-    def curve(u: Tensor) -> Tensor:
-        quadratic, cubic, ripple, cycles = (
-            per_trial(v, 1, u) for v in (quadratic_rad, cubic_rad, ripple_rad, ripple_cycles)
-        )
-        return quadratic * u.square() + cubic * u**3 + ripple * torch.sin(math.pi * cycles * u)
-
-    def phase(u: Tensor) -> Tensor:
-        grid = band_grid(u.device)
-        whole = curve(grid)
-        slope = (whole * grid).sum(-1, keepdim=True) / grid.square().sum()
-        return curve(u) - whole.mean(-1, keepdim=True) - u * slope
-
-    def amplitude(u: Tensor) -> Tensor:
-        slope, ripple, cycles = (per_trial(v, 1, u) for v in (slope_db, amplitude_ripple_db, ripple_cycles))
-        return 10 ** ((slope * u / 2 + ripple * torch.cos(math.pi * cycles * u)) / 20)
-
-    return ChannelResponse(phase, amplitude)
-
-
-_RESPONSE = {"sharpest": estimate_response_sharpest, "points": estimate_response_points}
-
-
-class FlatBandResponse(Stage):
-    """EstimateResponse for images made with the `flat` reference: a clean one fills the pulse band
-    evenly, so the amplitude is found as well.
-    """
-
-    works_on = EstimateResponse.works_on
-    provides = EstimateResponse.provides
-
-    def __init__(self, radar: StripmapRadar, method: Literal["sharpest", "points"] = "sharpest") -> None:
-        super().__init__()
-        self.radar, self.method = radar, _RESPONSE[method]
-
-    def forward(self, signal: Signal) -> Estimate:
-        even = torch.ones(signal.data.shape[-1], dtype=torch.float64, device=signal.data.device)
-        return EstimateResponse(self.radar, self.method, even)(signal)
-
-
-def estimate_response(radar: StripmapRadar, method: Literal["sharpest", "points"] = "sharpest") -> EstimateResponse:
-    """Phase response of the channel from bright places of the focused image; the amplitude is left
-    alone.
-    """
-    return EstimateResponse(radar, _RESPONSE[method])
-
-
-def vibration(name: str, unit: Literal["mm", "um"]) -> Sinusoid:
-    """Sinusoidal vibration by its published name amplitude_frequency_phase (1_100_90), the
-    amplitude in `unit`.
-
-    Args:
-        name: Amplitude, frequency in Hz and phase in degrees, such as 1_100_90.
-        unit: Unit of the amplitude.
-    """
-    return Sinusoid.named(name, unit=unit)
+    return CorrectJitter(offset_samples, BandLimited(points, band))
 
 
 def drift(velocity_m_s: Tensor | float = 0.0, acceleration_m_s2: Tensor | float = 0.0) -> Polynomial:
@@ -204,36 +121,14 @@ def drift(velocity_m_s: Tensor | float = 0.0, acceleration_m_s2: Tensor | float 
     return Polynomial((velocity_m_s, acceleration_m_s2 / 2))
 
 
-def measured_track(file: str) -> MeasuredTrack:
-    """A displacement (m) over time (s) from a file of two columns, text, .csv, .npy or .npz.
+def dechirped(track_m: Sequence[Tensor | float] | None = None) -> Dechirped:
+    """Dechirped pulses with the range evaluated at every sample.
 
     Args:
-        file: Path of the file.
-    """
-    return MeasuredTrack.from_file(file)
-
-
-def dechirped(track_m: Sequence[Tensor | float] | None = None) -> Dechirped:
-    """Dechirped pulses with the motion inside them; track_m: velocity, half the acceleration, ...
-
-    that the range window follows.
+        track_m: Polynomial that the range window follows: velocity in m/s, half the acceleration in
+            m/s^2, and so on; None for a fixed range window.
     """
     return Dechirped((Polynomial(track_m),) if track_m else ())
-
-
-class AutofocusOfImage(Autofocus):
-    """`autofocus`, through polar format where the recording tells where the antenna was."""
-
-    def __init__(
-        self, radar: InverseRadar, geometry: FarField | Spotlight | None = None, search: int = 120, polish: int = 20
-    ) -> None:
-        super().__init__(search, polish)
-        self.target = None if geometry is None else TargetImage(radar, geometry)
-
-    def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
-        if self.target is not None:
-            self.imaging = self.target.operator(signal.data)
-        return super().forward(signal, start)
 
 
 def k_sea(
@@ -243,7 +138,15 @@ def k_sea(
     margin_s: float | None = None,
     lobes: int = 1,
 ) -> KSea:
-    """K-distributed sea, cnr_db over the noise in a range-compressed sample."""
+    """K-distributed sea clutter.
+
+    Args:
+        cnr_db: Clutter-to-noise ratio of a range-compressed sample in dB.
+        shape: Shape of the gamma distribution; small for spiky seas.
+        cell_m: Along-track and range side of the cells of constant texture in metres.
+        margin_s: Time by which the surface extends beyond the record in s; None for the whole beam.
+        lobes: Number of nulls to either side up to which the antenna pattern is used.
+    """
     return KSea(power_db=cnr_db, shape=shape, cell_m=cell_m, margin_s=margin_s, lobes=lobes)
 
 
@@ -256,8 +159,16 @@ def image_sea(
     margin_s: float | None = None,
     lobes: int = 1,
 ) -> ImageReflectivity:
-    """A surface whose mean intensity is the image in a .npy or .npz file (array `key`), cnr_db over
-    the noise in a range-compressed sample.
+    """Surface whose mean intensity is the image in a .npy or .npz file.
+
+    Args:
+        file: Path of the file.
+        azimuth_extent_m: Along-track extent of the image in metres.
+        range_extent_m: Range extent of the image in metres.
+        cnr_db: Clutter-to-noise ratio of a range-compressed sample in dB.
+        key: Name of the array in an .npz file of several arrays.
+        margin_s: Time by which the surface extends beyond the record in s; None for the whole beam.
+        lobes: Number of nulls to either side up to which the antenna pattern is used.
     """
     try:
         return ImageReflectivity.from_file(
@@ -277,8 +188,8 @@ def clock_errors(
     direct_snr_db: Tensor | float | None = 40.0,
     direct_samples: int = 64,
 ) -> SynchronisationError:
-    """Clocks that drift apart: polynomials c0, c1, ... over seconds, sinusoids and a random walk
-    from pulse to pulse; recorded beside a direct path that shows them.
+    """Phase and delay errors of clocks that drift apart: polynomials of slow time, sinusoids and a
+    random walk from pulse to pulse. A direct path that shows them is recorded as well.
 
     Args:
         phase_rad: Polynomial of the phase in rad, rad/s, ...
@@ -287,8 +198,8 @@ def clock_errors(
         delay_s: Polynomial of the delay in s, s/s, ...
         delay_sinusoid_s: Amplitude of a sinusoidal delay in seconds.
         sinusoid_hz: Frequency of the sinusoids in Hz.
-        direct_snr_db: Signal-to-noise ratio of the direct path in dB; None for none.
-        direct_samples: Samples of the direct path.
+        direct_snr_db: Signal-to-noise ratio of the direct path in dB; None for no noise.
+        direct_samples: Number of samples of the direct path.
     """
     phase = [
         PolynomialDrift(phase_rad or [0.0]),
@@ -296,13 +207,21 @@ def clock_errors(
         WalkDrift(phase_walk_rad),
     ]
     delay = [PolynomialDrift(delay_s or [0.0]), SinusoidDrift(delay_sinusoid_s, sinusoid_hz)]
-    # delays need range cells; phases always draw from the same addresses
+    # azimuth-only data have no range cells and admit no delay; the phase terms keep their random
+    # number addresses either way
     delayed = bool(delay_s) or isinstance(delay_sinusoid_s, Tensor) or bool(delay_sinusoid_s)
     return SynchronisationError(phase, delay if delayed else [], direct_snr_db, direct_samples)
 
 
 def with_wavelength(radar: type) -> Callable[..., Any]:
-    """The constructor of a radar, which takes wavelength_m in place of carrier_hz as well."""
+    """The constructor of a radar with `wavelength_m` as an alternative to `carrier_hz`.
+
+    Args:
+        radar: Class of the radar, with the parameter `carrier_hz`.
+
+    Returns:
+        A function with the signature of the class and the parameter `wavelength_m`.
+    """
 
     @wraps(radar, updated=())
     def made(carrier_hz: float | None = None, wavelength_m: float | None = None, **keys: Any) -> Any:

@@ -11,103 +11,7 @@ from functools import cache
 from importlib.metadata import entry_points
 from typing import Any
 
-from torchsar.compensate.ambiguity import DopplerCentroid
-from torchsar.compensate.doppler import EnergyCentre, PhaseIncrement, RangeDependentCentroid
-from torchsar.compensate.envelope import AlignEnvelopes, ShiftRange
-from torchsar.compensate.point import PointDoppler
-from torchsar.compensate.pulse_phase.stages import CorrectPulsePhase, EntropyFixedPoint, Pga, PgaSca, Sca, SharpestPhase
-from torchsar.compensate.radial import (
-    CompensateMotion,
-    EqualisePulses,
-    MirrorProduct,
-    MlPeak,
-    PhasePolish,
-    PulseGain,
-    RadialMotion,
-    SegmentedInterference,
-    SpectrumCorrelation,
-)
-from torchsar.compensate.rotation import (
-    ChirpletClean,
-    CoarseRotation,
-    PhaseFitRotation,
-    RotationAutofocus,
-    RotationDescent,
-    RotationEvolution,
-    RotationGenetic,
-    RotationNewton,
-    RotationSearch,
-    UnevenRotation,
-)
-from torchsar.echo.channel_errors import ChannelErrors
-from torchsar.echo.channels import ChannelImbalance
-from torchsar.echo.interference import Quantiser, Tone, WideInterferer
-from torchsar.echo.jitter import PeriodicJitter
-from torchsar.echo.lines import CorruptedNumbers, LostGaps, LostLines, RepeatedLines
-from torchsar.echo.pulse_phase import PhaseSinusoid, PhaseWalk, WhitePhase
-from torchsar.echo.sweep_error import PolynomialSweepError, SinusoidSweepError
-from torchsar.echo.turntable import LostPulses
-from torchsar.focus import (
-    AzimuthTransform,
-    Backproject,
-    ClosestRange,
-    CompressDechirped,
-    OmegaK,
-    OmegaKStolt,
-    RangeCompress,
-    RangeDoppler,
-    TargetImage,
-)
-from torchsar.focus.matched_fourier import MatchedFourier, RangePhase
-from torchsar.focus.triangular import AzimuthMatchedFilter, CompressSweeps, DerampAzimuth
-from torchsar.multichannel.azimuth import FocusAzimuth
-from torchsar.multichannel.balance import CorrectBalance
-from torchsar.multichannel.compress import CompressChannels
-from torchsar.multichannel.synchronise import EstimateSynchronisation, RemoveSynchronisation
-from torchsar.multichannel.transmit import AzimuthScaling, RemoveTransmitRange
-from torchsar.multichannel.velocity.walk import WalkAmbiguity
-from torchsar.repair.channels import CorrectImbalance, EstimateImbalance
-from torchsar.repair.fill import BandLimitedFill, LinearFill, SparseFill, ZeroFill
-from torchsar.repair.interference import DropInterference, NotchInterference, SubtractInterference
-from torchsar.repair.jitter_blind import BlindJitter
-from torchsar.repair.jitter_pilot import PilotJitter
-from torchsar.repair.lines import LineIntegrity
-from torchsar.repair.response import CorrectResponse
-from torchsar.repair.triangle import BlankTurningPoints, CircularShift, SplitSweeps
-from torchsar.repair.triangle_calibrate import CalibrateSweeps
-from torchsar.scene import (
-    Aircraft,
-    AlwaysLit,
-    Antenna,
-    BandLimited,
-    CalibrationFibre,
-    Dwell,
-    EverySample,
-    ExactRange,
-    Hyperbola,
-    LetterE,
-    LinearInSweep,
-    LogAmplitude,
-    OnePerPeriod,
-    OnePerSweep,
-    Parabola,
-    PathFluctuation,
-    Pattern,
-    PhaseOnly,
-    Points,
-    Polynomial,
-    QuadraticInSweep,
-    RandomPoints,
-    RetroAndBrokenLine,
-    Satellite,
-    Sinusoid,
-    Speckle,
-    SpreadRows,
-    StartPhase,
-    TaylorRange,
-    UniformStartPhase,
-    VibrationSpectrum,
-)
+from torchsar import compensate, echo, focus, multichannel, repair, scene
 from torchsar.study.names import channels, factories
 from torchsar.study.settings.signature import Catalogue
 
@@ -115,20 +19,20 @@ SCENES = Catalogue(
     "scene",
     "kind",
     {
-        "points": Points,
-        "random_points": RandomPoints,
-        "speckle": Speckle,
-        "aircraft": Aircraft,
-        "satellite": Satellite,
-        "spread_rows": SpreadRows,
-        "letter_e": LetterE,
-        "retro_and_broken_line": RetroAndBrokenLine,
+        "points": scene.Points,
+        "random_points": scene.RandomPoints,
+        "speckle": scene.Speckle,
+        "aircraft": scene.Aircraft,
+        "satellite": scene.Satellite,
+        "spread_rows": scene.SpreadRows,
+        "letter_e": scene.LetterE,
+        "retro_and_broken_line": scene.RetroAndBrokenLine,
     },
 )
-BEAMS = Catalogue("beam", "kind", {"always_lit": AlwaysLit, "dwell": Dwell, "antenna": Antenna})
-PATHS = Catalogue("path", "kind", {"hyperbola": Hyperbola, "parabola": Parabola})
+BEAMS = Catalogue("beam", "kind", {"always_lit": scene.AlwaysLit, "dwell": scene.Dwell, "antenna": scene.Antenna})
+PATHS = Catalogue("path", "kind", {"hyperbola": scene.Hyperbola, "parabola": scene.Parabola})
 MOTIONS = Catalogue(
-    "motion", "kind", {"vibration": factories.vibration, "sinusoid": Sinusoid, "polynomial": Polynomial}
+    "motion", "kind", {"vibration": scene.Sinusoid.named, "sinusoid": scene.Sinusoid, "polynomial": scene.Polynomial}
 )
 RADIAL_MOTIONS = Catalogue(
     "motion of the line of sight",
@@ -136,53 +40,55 @@ RADIAL_MOTIONS = Catalogue(
     {
         **MOTIONS.entries,
         "drift": factories.drift,
-        "path_fluctuation": PathFluctuation,
-        "vibration_spectrum": VibrationSpectrum,
-        "measured_track": factories.measured_track,
+        "path_fluctuation": scene.PathFluctuation,
+        "vibration_spectrum": scene.VibrationSpectrum,
+        "measured_track": scene.MeasuredTrack.from_file,
     },
 )
-START_PHASES = Catalogue("start phase", "kind", {"normal": StartPhase, "uniform": UniformStartPhase})
-FIDELITIES = Catalogue("fidelity", "kind", {"phase_only": PhaseOnly, "dechirped": factories.dechirped})
+START_PHASES = Catalogue("start phase", "kind", {"normal": scene.StartPhase, "uniform": scene.UniformStartPhase})
+FIDELITIES = Catalogue("fidelity", "kind", {"phase_only": scene.PhaseOnly, "dechirped": factories.dechirped})
 SWEEP_FIDELITIES = Catalogue(
     "fidelity of a sweep",
     "kind",
     {
-        "linear_in_sweep": LinearInSweep,
-        "quadratic_in_sweep": QuadraticInSweep,
-        "every_sample": EverySample,
-        "one_per_sweep": OnePerSweep,
-        "one_per_period": OnePerPeriod,
+        "linear_in_sweep": scene.LinearInSweep,
+        "quadratic_in_sweep": scene.QuadraticInSweep,
+        "every_sample": scene.EverySample,
+        "one_per_sweep": scene.OnePerSweep,
+        "one_per_period": scene.OnePerPeriod,
     },
 )
-LOG_AMPLITUDES = Catalogue("log-amplitude", "kind", {"scintillation": LogAmplitude})
-SWEEP_ERRORS = Catalogue("sweep error", "kind", {"polynomial": PolynomialSweepError, "sinusoid": SinusoidSweepError})
-CALIBRATIONS = Catalogue("calibration", "kind", {"fibre": CalibrationFibre})
-GATES = Catalogue("gate", "kind", {"band_limited": BandLimited, "pattern": Pattern})
+LOG_AMPLITUDES = Catalogue("log-amplitude", "kind", {"scintillation": scene.LogAmplitude})
+SWEEP_ERRORS = Catalogue(
+    "sweep error", "kind", {"polynomial": echo.PolynomialSweepError, "sinusoid": echo.SinusoidSweepError}
+)
+CALIBRATIONS = Catalogue("calibration", "kind", {"fibre": scene.CalibrationFibre})
+GATES = Catalogue("gate", "kind", {"band_limited": scene.BandLimited, "pattern": scene.Pattern})
 SEAS = Catalogue("sea", "kind", {"k_sea": factories.k_sea, "image": factories.image_sea})
-RECEIVE_RANGES = Catalogue("receive range", "kind", {"exact": ExactRange, "taylor": TaylorRange})
+RECEIVE_RANGES = Catalogue("receive range", "kind", {"exact": scene.ExactRange, "taylor": scene.TaylorRange})
 MULTICHANNEL_IMPAIRMENTS = Catalogue(
     "impairment of a multichannel recording",
     "kind",
-    {"channel_errors": ChannelErrors, "clock_errors": factories.clock_errors},
+    {"channel_errors": echo.ChannelErrors, "clock_errors": factories.clock_errors},
 )
 IMPAIRMENTS = Catalogue(
     "impairment",
     "kind",
     {
-        "channel_imbalance": ChannelImbalance,
-        "channel_response": factories.channel_response,
-        "tone": Tone,
-        "wide_interferer": WideInterferer,
-        "quantiser": Quantiser,
-        "periodic_jitter": PeriodicJitter,
-        "lost_lines": LostLines,
-        "lost_gaps": LostGaps,
-        "repeated_lines": RepeatedLines,
-        "corrupted_numbers": CorruptedNumbers,
-        "lost_pulses": LostPulses,
-        "white_phase": WhitePhase,
-        "phase_walk": PhaseWalk,
-        "phase_sinusoid": PhaseSinusoid,
+        "channel_imbalance": echo.ChannelImbalance,
+        "channel_response": echo.smooth_response,
+        "tone": echo.Tone,
+        "wide_interferer": echo.WideInterferer,
+        "quantiser": echo.Quantiser,
+        "periodic_jitter": echo.PeriodicJitter,
+        "lost_lines": echo.LostLines,
+        "lost_gaps": echo.LostGaps,
+        "repeated_lines": echo.RepeatedLines,
+        "corrupted_numbers": echo.CorruptedNumbers,
+        "lost_pulses": echo.LostPulses,
+        "white_phase": echo.WhitePhase,
+        "phase_walk": echo.PhaseWalk,
+        "phase_sinusoid": echo.PhaseSinusoid,
     },
 )
 
@@ -220,71 +126,71 @@ WORLD = {
 }
 
 REPAIR: dict[str, Callable[..., Any]] = {
-    "line_integrity": LineIntegrity,
-    "zero_fill": ZeroFill,
-    "linear_fill": LinearFill,
-    "band_limited_fill": BandLimitedFill,
-    "sparse_fill": SparseFill,
-    "interference_subtract": SubtractInterference,
-    "interference_notch": NotchInterference,
-    "interference_drop": DropInterference,
-    "jitter_pilot": PilotJitter,
-    "jitter_blind": BlindJitter,
+    "line_integrity": repair.LineIntegrity,
+    "zero_fill": repair.ZeroFill,
+    "linear_fill": repair.LinearFill,
+    "band_limited_fill": repair.BandLimitedFill,
+    "sparse_fill": repair.SparseFill,
+    "interference_subtract": repair.SubtractInterference,
+    "interference_notch": repair.NotchInterference,
+    "interference_drop": repair.DropInterference,
+    "jitter_pilot": repair.PilotJitter,
+    "jitter_blind": repair.BlindJitter,
     "jitter_lagrange": factories.jitter_lagrange,
     "jitter_band_limited": factories.jitter_band_limited,
-    "jitter_exact": factories.jitter_exact,
-    "imbalance": EstimateImbalance,
-    "imbalance_correct": CorrectImbalance,
-    "response": factories.estimate_response,
-    "response_flat_band": factories.FlatBandResponse,
-    "response_correct": CorrectResponse,
-    "split_sweeps": SplitSweeps,
-    "circular_shift": CircularShift,
-    "blank_turning_points": BlankTurningPoints,
-    "calibrate_sweeps": CalibrateSweeps,
+    "jitter_exact": repair.CorrectJitter,
+    "imbalance": repair.EstimateImbalance,
+    "imbalance_correct": repair.CorrectImbalance,
+    "response": repair.EstimateResponse,
+    "response_flat_band": repair.EstimateFlatResponse,
+    "response_correct": repair.CorrectResponse,
+    "split_sweeps": repair.SplitSweeps,
+    "circular_shift": repair.CircularShift,
+    "blank_turning_points": repair.BlankTurningPoints,
+    "calibrate_sweeps": repair.CalibrateSweeps,
     "channel_balance": channels.channel_balance,
-    "channel_balance_correct": CorrectBalance,
-    "synchronisation": EstimateSynchronisation,
-    "synchronisation_remove": RemoveSynchronisation,
+    "channel_balance_correct": multichannel.CorrectBalance,
+    "synchronisation": multichannel.EstimateSynchronisation,
+    "synchronisation_remove": multichannel.RemoveSynchronisation,
 }
 COMPENSATE: dict[str, Callable[..., Any]] = {
-    "phase_increment": PhaseIncrement,
-    "energy_centre": EnergyCentre,
-    "range_dependent_centroid": RangeDependentCentroid,
-    "doppler_centroid": DopplerCentroid,
-    "point_doppler": PointDoppler,
+    "phase_increment": compensate.PhaseIncrement,
+    "energy_centre": compensate.EnergyCentre,
+    "range_dependent_centroid": compensate.RangeDependentCentroid,
+    "doppler_centroid": compensate.DopplerCentroid,
+    "point_doppler": compensate.PointDoppler,
     "effective_velocity": factories.effective_velocity,
-    "align_envelopes": AlignEnvelopes,
-    "shift_range": ShiftRange,
-    "sca": Sca,
-    "pga": Pga,
-    "pga_sca": PgaSca,
-    "entropy_fixed_point": EntropyFixedPoint,
-    "sharpest_phase": SharpestPhase,
-    "autofocus": factories.AutofocusOfImage,
-    "pulse_phase_correct": CorrectPulsePhase,
-    "segmented_interference": SegmentedInterference,
-    "mirror_product": MirrorProduct,
-    "radial_motion": RadialMotion,
-    "ml_peak": MlPeak,
-    "spectrum_correlation": SpectrumCorrelation,
-    "compensate_motion": CompensateMotion,
-    "phase_polish": PhasePolish,
-    "pulse_gain": PulseGain,
-    "equalise_pulses": EqualisePulses,
-    "rotation": UnevenRotation,
-    "rotation_coarse": CoarseRotation,
-    "rotation_phase_fit": PhaseFitRotation,
-    "rotation_search": RotationSearch,
-    "rotation_genetic": RotationGenetic,
-    "rotation_evolution": RotationEvolution,
-    "rotation_newton": RotationNewton,
-    "rotation_descent": RotationDescent,
-    "rotation_autofocus": RotationAutofocus,
+    "align_envelopes": compensate.AlignEnvelopes,
+    "shift_range": compensate.ShiftRange,
+    "sca": compensate.Sca,
+    "pga": compensate.Pga,
+    "pga_sca": compensate.PgaSca,
+    "entropy_fixed_point": compensate.EntropyFixedPoint,
+    "sharpest_phase": compensate.SharpestPhase,
+    "autofocus": compensate.TargetAutofocus,
+    "pulse_phase_correct": compensate.CorrectPulsePhase,
+    "segmented_interference": compensate.SegmentedInterference,
+    "mirror_product": compensate.MirrorProduct,
+    "radial_motion": compensate.RadialMotion,
+    "ml_peak": compensate.MlPeak,
+    "spectrum_correlation": compensate.SpectrumCorrelation,
+    "compensate_motion": compensate.CompensateMotion,
+    "phase_polish": compensate.PhasePolish,
+    "pulse_gain": compensate.PulseGain,
+    "equalise_pulses": compensate.EqualisePulses,
+    "rotation": compensate.UnevenRotation,
+    "rotation_coarse": compensate.CoarseRotation,
+    "rotation_phase_fit": compensate.PhaseFitRotation,
+    "rotation_search": compensate.RotationSearch,
+    "rotation_genetic": compensate.RotationGenetic,
+    "rotation_evolution": compensate.RotationEvolution,
+    "rotation_newton": compensate.RotationNewton,
+    "rotation_descent": compensate.RotationDescent,
+    "rotation_autofocus": compensate.RotationAutofocus,
     "rotation_and_phase": factories.rotation_and_phase,
-    "transmit_range_remove": RemoveTransmitRange,
-    "azimuth_scaling": AzimuthScaling,
-    "walk_ambiguity": WalkAmbiguity,
+    "transmit_range_remove": multichannel.RemoveTransmitRange,
+    "azimuth_scaling": multichannel.AzimuthScaling,
+    "walk_ambiguity": multichannel.WalkAmbiguity,
     "migration_correct": channels.migration_correct,
     "moving_point_velocity": channels.moving_point_velocity,
     "interferometry": channels.interferometry,
@@ -295,27 +201,27 @@ COMPENSATE: dict[str, Callable[..., Any]] = {
     "alternate_velocity": channels.alternate_velocity,
 }
 FOCUS: dict[str, Callable[..., Any]] = {
-    "range_compress": RangeCompress,
-    "omega_k": OmegaK,
+    "range_compress": focus.RangeCompress,
+    "omega_k": focus.OmegaK,
     "omega_k_padded": factories.omega_k_padded,
-    "omega_k_stolt": OmegaKStolt,
-    "range_doppler": RangeDoppler,
-    "backproject": Backproject,
-    "closest_range": ClosestRange,
-    "compress_dechirped": CompressDechirped,
-    "azimuth_transform": AzimuthTransform,
-    "target_image": TargetImage,
-    "compress_sweeps": CompressSweeps,
-    "deramp_azimuth": DerampAzimuth,
-    "azimuth_matched_filter": AzimuthMatchedFilter,
-    "range_phase": RangePhase,
-    "matched_fourier": MatchedFourier,
-    "chirplet_clean": ChirpletClean,
-    "compress_channels": CompressChannels,
+    "omega_k_stolt": focus.OmegaKStolt,
+    "range_doppler": focus.RangeDoppler,
+    "backproject": focus.Backproject,
+    "closest_range": focus.ClosestRange,
+    "compress_dechirped": focus.CompressDechirped,
+    "azimuth_transform": focus.AzimuthTransform,
+    "target_image": focus.TargetImage,
+    "compress_sweeps": focus.CompressSweeps,
+    "deramp_azimuth": focus.DerampAzimuth,
+    "azimuth_matched_filter": focus.AzimuthMatchedFilter,
+    "range_phase": focus.RangePhase,
+    "matched_fourier": focus.MatchedFourier,
+    "chirplet_clean": compensate.ChirpletClean,
+    "compress_channels": multichannel.CompressChannels,
     "rebuild_bands": channels.rebuild_bands,
     "stationary_image": channels.stationary_image,
     "movers_image": channels.movers_image,
-    "focus_target": FocusAzimuth,
+    "focus_target": multichannel.FocusAzimuth,
 }
 # keys of stages that choose a form, and that may be left to choose
 _AUTOMATIC = (
@@ -338,7 +244,7 @@ def stages() -> Catalogue:
                 f"the entry point {point.value!r} takes the stage name {point.name!r}, which is in use; rename it"
             )
         entries[point.name] = point.load()
-    return Catalogue("stage", "stage", entries, given=("radar", "geometry"), automatic=_AUTOMATIC)
+    return Catalogue("stage", "stage", entries, given=("radar", "geometry", "expected_power"), automatic=_AUTOMATIC)
 
 
 def group_of(name: str) -> str:

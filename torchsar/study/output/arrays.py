@@ -1,4 +1,4 @@
-"""Numbers and arrays of a result as files."""
+"""Files of the numbers and arrays of a result."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchsar.core import Signal
 
 
 def write_json(path: Path, tree: Mapping[str, Any]) -> None:
-    """Numbers that are not finite become null, so that every reader accepts the file."""
+    """Write a JSON file. Numbers that are not finite become null, as the format requires."""
     path.write_text(json.dumps(_finite(tree), indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
@@ -33,8 +33,14 @@ def _finite(x: Any) -> Any:
 def write_arrays(
     path: Path, images: Mapping[str, Signal], truth: Mapping[str, Tensor], estimates: Mapping[str, Mapping[str, Tensor]]
 ) -> None:
-    """arrays.zarr (version 3): one group per method with `image` and its axes; `truth`;
+    """Write a zarr store of version 3: `METHOD/image` with its axes, `truth/NAME`, and
     `estimate/METHOD/STAGE.VALUE`.
+
+    Args:
+        path: Folder of the store.
+        images: Images by path of their group.
+        truth: True values by name.
+        estimates: Estimates by method and name.
     """
     root = zarr.open_group(str(path), mode="w", zarr_format=3)
     for name, signal in images.items():

@@ -1,9 +1,9 @@
-"""Result folders: one result each, beside whatever else a user keeps in them.
+"""Result folders, each with one result and possibly other files of the user.
 
-A result folder holds a directory `.torchsar` of this program: a lock, the manifest of the files
-that the program wrote, and, while a command runs, what it is writing. Only files of the manifest
-that are still as they were written are ever replaced or removed. A result is written beside its
-place and moved there at the end; a journal lets the next command finish a move that was cut off.
+A result folder has a directory `.torchsar` with a lock, the manifest of the files that the program
+wrote, and, while a command runs, its incomplete result. The program replaces and removes only files
+of the manifest that were not changed since. A complete result is moved to its final path; if the
+move is interrupted, the next command completes it according to a journal.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,24 +24,24 @@ from torchsar.study.settings.errors import ConfigError
 
 try:
     import fcntl
-except ImportError:  # absent on some systems, which then do not guard against two writers at once
+except ImportError:  # not available on every operating system; there is then no lock
     fcntl = None
 
 log = logging.getLogger("torchsar")
 STATE = ".torchsar"
-# larger files are known by their size alone: reading gigabytes again would take as long as a run
+# larger files are compared by their size alone: reading gigabytes would take as long as a run
 _HASHED_BYTES = 1 << 22
-# these tell a reader that a result is whole: they leave first and arrive last
+# files whose presence means that a result is complete: they are removed first and moved last
 _LAST = ("report.html", "metrics.json", "summary.json", "trade.json", "requires.json")
 
 
 @dataclass(frozen=True)
 class ResultFolder:
-    """An open result folder, which this process alone writes into; made by `opened`.
+    """A result folder that is locked for this process; see `opened`.
 
     Args:
         path: The folder.
-        kind: The command that it belongs to: run, sweep, trade or requires.
+        kind: The command of its result: run, sweep, trade or requires.
     """
 
     path: Path
@@ -49,14 +49,14 @@ class ResultFolder:
 
     @contextmanager
     def staged(self) -> Iterator[Path]:
-        """An empty folder to write a result into.
+        """Provide an empty folder for a new result.
 
-        Its content replaces the earlier result when the block ends well, and is dropped when it
-        does not.
+        Its content replaces the earlier result at the end of the block, and is removed if the block
+        raises an error.
 
         Raises:
-            ConfigError: If a file of the user has come to stand where one of the result belongs;
-                the result is then kept in a new folder, which the sentence names.
+            ConfigError: If a file of the user has the path of a file of the result; the result is
+                then kept in a new folder, which the message names.
         """
         new = self.path / STATE / "new"
         new.mkdir()
@@ -68,21 +68,21 @@ class ResultFolder:
 
     @property
     def claimed(self) -> bool:
-        """Whether the folder is known to hold a result of this kind, finished or not."""
+        """Whether the folder is reserved for, or holds, a result of this kind."""
         return _manifest(self.path)["kind"] == self.kind
 
     def claim(self) -> None:
-        """Note what kind of result the folder holds before the result is there."""
+        """Reserve the folder for a result of this kind."""
         _write_whole(self.path / STATE / "manifest.json", {**_manifest(self.path), "kind": self.kind})
 
     def refuse_conflicts(self, names: Sequence[str]) -> None:
-        """Refuse the folder if files of the user bear the names of a result.
+        """Check that no file of the user has the name of a file of the result.
 
         Args:
-            names: Files and folders directly below the result folder.
+            names: Files and folders of the result, directly below the result folder.
 
         Raises:
-            ConfigError: With the first such file.
+            ConfigError: If there is such a file, or the result of another command.
         """
         held = _manifest(self.path)
         if held["kind"] not in (None, self.kind):
@@ -98,7 +98,7 @@ class ResultFolder:
                 )
 
     def _publish(self, new: Path) -> None:
-        """Decide on the new result by writing the journal, then carry the decision out."""
+        """Write the journal of the new result, and then execute it."""
         files = {path.relative_to(new).as_posix(): _print_of(path) for path in _files_below(new)}
         try:
             self.refuse_conflicts(sorted({name.split("/")[0] for name in files}))
@@ -114,19 +114,19 @@ class ResultFolder:
 
 @contextmanager
 def opened(out: Path, kind: str, names: Sequence[str] = ()) -> Iterator[ResultFolder]:
-    """The result folder at `out`, made if need be, for this process alone.
+    """Lock a result folder for this process, and make it if it does not exist.
 
-    A move that an earlier command could not finish is finished first. Where nothing is written,
-    nothing is left.
+    An interrupted move of an earlier command is completed first. If nothing is written, folders
+    that were made are removed again.
 
     Args:
         out: The folder.
-        kind: run, sweep, trade or requires: a folder holds results of one kind.
-        names: What the result will consist of: files and folders directly below `out`.
+        kind: Command of the result: run, sweep, trade or requires.
+        names: Files and folders of the result, directly below `out`.
 
     Raises:
-        ConfigError: If the folder cannot be written, another command is writing there, it holds
-            the result of another command, or files of the user bear one of the names.
+        ConfigError: If the folder cannot be written, another command is writing to it, it has the
+            result of another command, or a file of the user has one of the names.
     """
     made = [folder for folder in (out, *out.parents) if not os.path.exists(folder)]
     with _locked(out):
@@ -141,13 +141,13 @@ def opened(out: Path, kind: str, names: Sequence[str] = ()) -> Iterator[ResultFo
 
 @contextmanager
 def fresh_result(out: Path, kind: str, names: Sequence[str]) -> Iterator[Path]:
-    """A folder to write a whole result into; see `opened` and `ResultFolder.staged`."""
+    """Provide an empty folder for a new result; see `opened` and `ResultFolder.staged`."""
     with opened(out, kind, names) as folder, folder.staged() as new:
         yield new
 
 
 def _locked(out: Path) -> Any:
-    """The open lock file of a result folder. The lock ends with the process, however that ends."""
+    """The locked file of a result folder; the operating system releases it with the process."""
     state = out / STATE
     while True:
         try:
@@ -175,7 +175,7 @@ def _locked(out: Path) -> Any:
 
 
 def _finish(out: Path) -> None:
-    """Carry out what the journal says as far as it is still to be done; drop what was cut off."""
+    """Execute the remaining steps of the journal, and remove incomplete results."""
     state = out / STATE
     journal = _read(state / "journal.json")
     if journal is not None:
@@ -187,7 +187,7 @@ def _finish(out: Path) -> None:
         _remove_empty(out, journal["old"])
         for name in sorted(files, key=_rank):
             if (state / "new" / name).is_file() and not _move(state / "new" / name, out / name):
-                log.warning("warning: %s: %s is not torchsar's and stays; the new one was dropped", out, name)
+                log.warning("warning: %s: %s is a file of the user and was kept; the new one was removed", out, name)
         _write_whole(state / "manifest.json", journal["new"])
         (state / "journal.json").unlink()
     for name in ("new", "old"):
@@ -199,7 +199,7 @@ def _rank(name: str) -> tuple[int, str]:
 
 
 def _move(source: Path, target: Path) -> bool:
-    """Move a file to where nothing is; False where something is."""
+    """Move a file to a free path; return False if the path is not free."""
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         if target.exists() or target.is_symlink():
@@ -211,25 +211,27 @@ def _move(source: Path, target: Path) -> bool:
 
 
 def _remove_empty(out: Path, files: Mapping[str, Any]) -> None:
-    """Remove the folders of a replaced result in which nothing is left."""
-    folders = {folder for name in files for folder in (out / name).parents if out in folder.parents}
+    """Remove the empty folders of a replaced result."""
+    _remove_if_empty({folder for name in files for folder in (out / name).parents if out in folder.parents})
+
+
+def _tidy(out: Path, made: Sequence[Path]) -> None:
+    """Remove a state directory with only the lock, and then those of `made` that are empty."""
+    state = out / STATE
+    if {path.name for path in state.iterdir()} <= {"lock"}:
+        shutil.rmtree(state, ignore_errors=True)
+        _remove_if_empty(made)
+
+
+def _remove_if_empty(folders: Collection[Path]) -> None:
+    """Remove those folders that are empty, the innermost ones first."""
     for folder in sorted(folders, key=lambda path: -len(path.parts)):
         if folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()
 
 
-def _tidy(out: Path, made: Sequence[Path]) -> None:
-    """Remove a state that holds nothing but the lock, and the folders that were made for it."""
-    state = out / STATE
-    if {path.name for path in state.iterdir()} <= {"lock"}:
-        shutil.rmtree(state, ignore_errors=True)
-        for folder in made:
-            if folder.is_dir() and not any(folder.iterdir()):
-                folder.rmdir()
-
-
 def _files_below(path: Path) -> list[Path]:
-    """The file itself, or all files below a folder; links count as files, wherever they point."""
+    """The file itself, or all files below a folder; a symbolic link counts as a file."""
     if path.is_symlink() or path.is_file():
         return [path]
     return sorted(p for p in path.rglob("*") if p.is_symlink() or not p.is_dir())
@@ -259,7 +261,7 @@ def _read(path: Path) -> dict[str, Any] | None:
 
 
 def _write_whole(path: Path, tree: Mapping[str, Any]) -> None:
-    """Write a JSON file that appears whole or not at all."""
+    """Write a JSON file atomically."""
     part = path.with_name(path.name + ".part")
     part.write_text(json.dumps(tree), encoding="utf-8")
     part.replace(path)

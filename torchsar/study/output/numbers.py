@@ -1,4 +1,4 @@
-"""Numbers for reading: units with prefixes, and as many digits as mean something."""
+"""Formatting of numbers: units with prefixes, and significant digits."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from typing import Any
 
 MISSING = "–"
-# units that take a prefix; those of levels, shares and angles in degrees take none
+# units that have prefixes, unlike those of levels, ratios and angles in degrees
 _PREFIXED = ("m", "s", "Hz", "rad", "B")
 _PREFIXES = {-12: "p", -9: "n", -6: "u", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
 
 
 def scale_of(values: Sequence[float | None], unit: str) -> tuple[float, str]:
-    """Factor and unit in which most of some values lie between 1 and 1000."""
+    """Return the factor and the unit for which the median of the values is between 1 and 1000."""
     there = sorted(abs(v) for v in values if v is not None and math.isfinite(v) and v)
     if not there or unit.split("/")[0].split("^")[0] not in _PREFIXED or "^" in unit.split("/")[0]:
         return 1.0, unit
@@ -22,13 +22,16 @@ def scale_of(values: Sequence[float | None], unit: str) -> tuple[float, str]:
 
 
 def number(value: Any, sd: Any = None, factor: float = 1.0) -> str:
-    """A number for reading; text passes, and what is missing is a dash.
+    """Return a number as text.
 
     Args:
-        value: A number, text, a verdict, or a list of these.
-        sd: Its standard deviation, whose two leading digits both are rounded to; without one the
+        value: A number, a text, a truth value, None, or a list of these.
+        sd: Standard deviation. Both numbers are rounded to its two leading digits; without it the
             number has four digits.
-        factor: What numbers are multiplied by.
+        factor: Factor of all numbers.
+
+    Returns:
+        The text; a dash for None and for numbers that are not finite.
     """
     if isinstance(value, (list, tuple)):
         sds = sd if isinstance(sd, (list, tuple)) else [sd] * len(value)
@@ -52,7 +55,7 @@ def number(value: Any, sd: Any = None, factor: float = 1.0) -> str:
 
 
 def quantity(value: Any, unit: str, sd: Any = None) -> str:
-    """A number, or a list of them, with its unit in the prefix that suits it: 17.58 um/s."""
+    """Return a number, or a list of numbers, with the unit and a suitable prefix: 17.58 um/s."""
     factor, unit = scale_of([*_numbers(value), *_numbers(sd)], unit)
     text = number(value, sd, factor)
     return f"{text} {unit}".strip() if any(map(math.isfinite, _numbers(value))) else text

@@ -1,4 +1,4 @@
-"""Figures of a run as files, in the order of reading, and those that systems have in common."""
+"""Figures of a run as files, and the figures that are common to all systems."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ import torch
 from torchsar import plot
 from torchsar.core import Signal
 
-# comparisons of values that span more than this factor have a logarithmic axis
+# ratio of the largest and the least value above which a comparison has a logarithmic axis
 _DECADES = 100.0
 Drawn = Iterator[tuple[str, str, str, Any]]
 
 
 @dataclass(frozen=True)
 class Picture:
-    """Figure files that are shown beside each other, and what a reader should see in them."""
+    """Figure files that are shown side by side, with their title and caption."""
 
     files: tuple[str, ...]
     title: str
@@ -29,12 +29,15 @@ class Picture:
 
 
 def draw_all(makers: Iterable[Callable[[], Drawn]], folder: Path) -> list[Picture]:
-    """Every picture that the makers have the material for, as PNG files in a folder.
+    """Draw pictures and write them as PNG files.
 
     Args:
-        makers: Each yields (name, title, caption, figure), or nothing; a list of figures is one
-            picture of several panels.
-        folder: Where to write; made if need be.
+        makers: Functions that yield pictures as (name, title, caption, figure); a list of figures
+            is one picture with several panels, an empty list none.
+        folder: Folder of the files; it is made if it does not exist.
+
+    Returns:
+        The pictures in their order.
     """
     folder.mkdir(parents=True, exist_ok=True)
     pictures: list[Picture] = []
@@ -50,12 +53,12 @@ def draw_all(makers: Iterable[Callable[[], Drawn]], folder: Path) -> list[Pictur
 
 
 def comparisons(results: Mapping[str, Any], columns: Mapping[str, Any], without: str = "ideal") -> Drawn:
-    """Figures of all methods over cases, or over methods where there is one case.
+    """Yield a picture of each metric over the cases, or over the methods if there is one case.
 
     Args:
-        results: By case, with `metrics` by method and name.
-        columns: The figures; those with `drawn` are drawn.
-        without: A method that is left out, being what the others are compared with.
+        results: Results by case, with `metrics` by method and name.
+        columns: Presentation of the metrics; those with `drawn` are drawn.
+        without: The reference method, which is not drawn.
     """
     for key, column in columns.items():
         rows = {
@@ -77,13 +80,13 @@ def comparisons(results: Mapping[str, Any], columns: Mapping[str, Any], without:
         known = np.concatenate([y[np.isfinite(y)] for y in series.values()])
         log = len(known) > 0 and known.min() > 0 and (column.drawn == "rms" or known.max() > _DECADES * known.min())
         label = f"{column.label} ({column.unit})" if column.unit else column.label
-        said = "Root mean square" if column.drawn == "rms" else "Mean"
+        statistic = "Root mean square" if column.drawn == "rms" else "Mean"
         part = {"title": "", "x": x, "series": drawn, "bounds": {}}
         figures = plot.error_curves([part], "", label, log_y=log)
-        yield key, column.label, f"{said} over trials of the {label}, by method.", figures
+        yield key, column.label, f"{statistic} over trials of the {label}, by method.", figures
 
 
 def first_named(images: Mapping[str, Signal], name: str = "ideal") -> dict[str, Signal]:
-    """Images with that of one method in front, where there is one."""
+    """Return the images with that of one method first, if there is one."""
     front = {name: images[name]} if name in images else {}
     return {**front, **images}

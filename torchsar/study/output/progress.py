@@ -1,4 +1,4 @@
-"""How far long work is: a line that is rewritten on a terminal, lines of the log elsewhere."""
+"""Progress messages: one line that is rewritten on a terminal, or lines of the log."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 log = logging.getLogger("torchsar")
-# a reader of a log must never wait longer than 10 s for a sign of life
+# seconds between messages: a log gets at least one message in 10 s
 _PIPED_S, _TERMINAL_S = 8.0, 0.5
 
 
 class Ticker:
-    """Says at regular intervals, from a thread of its own, how far the work is.
+    """Shows progress messages at regular intervals from a thread.
 
     Args:
-        say: Gives the sentence of the moment; an empty one is not shown.
+        message: Function that returns the present message; an empty one is not shown.
     """
 
-    def __init__(self, say: Callable[[], str]) -> None:
-        self._say, self._ended = say, threading.Event()
+    def __init__(self, message: Callable[[], str]) -> None:
+        self._message, self._ended = message, threading.Event()
         self._terminal = sys.stderr.isatty()
         self._thread = threading.Thread(target=self._tick, daemon=True)
 
@@ -32,7 +32,7 @@ class Ticker:
 
     def _tick(self) -> None:
         while not self._ended.wait(_TERMINAL_S if self._terminal else _PIPED_S):
-            text = self._say()
+            text = self._message()
             if text and self._terminal:
                 sys.stderr.write(f"\r\x1b[K{text}")
                 sys.stderr.flush()
@@ -47,10 +47,10 @@ class Ticker:
 
 
 class Steps:
-    """Steps of known names that are taken in order; tells the time left from those taken before.
+    """Progress of a known sequence of steps; the remaining time follows from earlier steps.
 
     Args:
-        names: Name of every step that is to come. A name may come several times.
+        names: Names of all steps in order. Several steps may have the same name.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
@@ -58,7 +58,7 @@ class Steps:
         self._began, self._spent = self._since, dict[str, float]()
 
     def begin(self, name: str) -> None:
-        """A step begins, and the one before it is over; steps in between were not needed."""
+        """Note that a step begins; steps between the last one and this one were not needed."""
         now = time.perf_counter()
         if self._at >= 0:
             self._spent[self._names[self._at]] = now - self._since
@@ -68,7 +68,7 @@ class Steps:
 
     @property
     def left_s(self) -> float | None:
-        """Seconds to come, None while nothing is known."""
+        """Remaining time in s; None before the end of the first step."""
         coming = self._names[max(self._at, 0) :]
         if not self._spent or not coming:
             return None
@@ -77,7 +77,7 @@ class Steps:
         return max(0.0, whole - (time.perf_counter() - self._since))
 
     def say(self) -> str:
-        """What is being done, for how long, and the time left."""
+        """Return the present step, its time, and the remaining time."""
         if self._at < 0:
             return ""
         now, left = time.perf_counter(), self.left_s
@@ -87,12 +87,12 @@ class Steps:
 
 
 class Count:
-    """Counts what is done of many equal things, such as trials; tells the time left from the pace.
+    """Progress of many equal items such as trials; the remaining time follows from their rate.
 
     Args:
-        unit: What is counted.
-        total: How many there are.
-        done: How many of them were done before.
+        unit: Name of the items.
+        total: Number of all items.
+        done: Number of items that were done earlier.
     """
 
     def __init__(self, unit: str, total: int, done: int = 0) -> None:
@@ -100,22 +100,22 @@ class Count:
         self._began = self._since = time.perf_counter()
 
     def advance(self, count: int) -> None:
-        """So many more are done."""
+        """Note that further items are done."""
         self.done, self._since = self.done + count, time.perf_counter()
 
     @property
     def new(self) -> int:
-        """How many were done since the beginning of this count."""
+        """Number of items since the start of this count."""
         return self.done - self._first
 
     @property
     def seconds(self) -> float:
-        """Since the beginning of this count."""
+        """Time since the start of this count in s."""
         return time.perf_counter() - self._began
 
     def say(self) -> str:
-        """How many are done, and the time left."""
-        then, spent = "the time left is known after the first batch", self._since - self._began
+        """Return the number of items that are done, and the remaining time."""
+        then, spent = "the remaining time is known after the first batch", self._since - self._began
         if self.new:
             left = (self.total - self.done) * spent / self.new - (time.perf_counter() - self._since)
             then = f"{self.new / max(spent, 1e-9):.3g} {self.unit}/s, about {clock(max(left, 0.0))} left"
@@ -123,7 +123,7 @@ class Count:
 
 
 def clock(seconds: float) -> str:
-    """Minutes and seconds, with hours where there are any."""
+    """Return a time as minutes and seconds, with hours if there are any."""
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"

@@ -1,4 +1,4 @@
-"""Reports: one HTML file each, with its pictures inside."""
+"""Reports: HTML files that contain their pictures."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from torchsar.plot import name_and_unit
 from torchsar.study.output.numbers import MISSING, number, quantity, scale_of
 from torchsar.study.output.pictures import Picture
 
-# tiles above the tables show at most so many figures: two rows of four on a wide screen
+# largest number of metrics shown above the tables: two rows of four on a wide screen
 _TILES = 8
 
 
 class Column(Protocol):
-    """How a figure is shown."""
+    """Presentation of a metric."""
 
     @property
     def label(self) -> str: ...
@@ -34,7 +34,7 @@ Shown = Mapping[str, Column]
 
 
 def installed_version() -> str:
-    """The version of this distribution."""
+    """Return the version of the installed distribution."""
     try:
         return version("torchsar-lab")
     except PackageNotFoundError:
@@ -45,11 +45,11 @@ def write_page(path: Path, template: str, pictures: Sequence[Picture], figures: 
     """Write one HTML file that is self-contained: it loads no external resources.
 
     Args:
-        path: Where to write it.
-        template: A file of `templates` that extends base.html.j2.
-        pictures: Pictures in the order of reading.
-        figures: The folder that holds them.
-        fields: What the template shows; the base shows `title`, `command`, `definitions` and
+        path: Path of the file.
+        template: Template in the folder `templates` that extends base.html.j2.
+        pictures: Pictures in their order.
+        figures: Folder of the files of the pictures.
+        fields: Values of the template; the base needs `title`, `command`, `definitions` and
             `config`.
     """
     environment = jinja2.Environment(
@@ -74,7 +74,13 @@ def _embedded(path: Path) -> str:
 
 
 def run_fields(metrics: Mapping[str, Any], columns: Shown, target_columns: Shown) -> dict[str, Any]:
-    """What the template of a run shows, from the content of metrics.json."""
+    """Return the values of the template of a run.
+
+    Args:
+        metrics: Content of metrics.json.
+        columns: Presentation of the metrics.
+        target_columns: Presentation of the metrics of targets.
+    """
     methods = metrics["methods"]
     best, cases = methods["recommended"], list(methods["recommended"]["cases"])
     shown = {key: column for key, column in columns.items() if best["metrics"].get(key) is not None}
@@ -109,7 +115,7 @@ def _row(name: str, cells: list[str], soft: bool = False) -> dict[str, Any]:
 
 
 def _sd(row: Mapping[str, Any], key: str) -> float | None:
-    """Standard deviation over trials; times have none, which would be that of the machine."""
+    """Standard deviation over trials; not of times, which depend on the load of the machine."""
     return None if key == "seconds" else row.get(f"{key}_sd")
 
 
@@ -118,13 +124,13 @@ def _cell(row: Mapping[str, Any], key: str, factor: float) -> str:
 
 
 def _tables(rows: Mapping[str, Any], columns: Shown, published: Mapping[str, Any], first: str) -> list[dict[str, Any]]:
-    """A table for each figure: a row for each case or target, a column for each method.
+    """A table for each metric, with a row for each case or target and a column for each method.
 
     Args:
-        rows: Method -> case or target -> figure -> number.
-        columns: The figures.
-        published: Figure -> case or target -> method -> what the source published.
-        first: What a row stands for.
+        rows: Numbers by method, case or target, and metric.
+        columns: Presentation of the metrics.
+        published: Published values by metric, case or target, and method.
+        first: Heading of the first column.
     """
     tables = []
     for key, column in columns.items():
@@ -142,7 +148,7 @@ def _tables(rows: Mapping[str, Any], columns: Shown, published: Mapping[str, Any
 
 
 def _one_table(rows: Mapping[str, Any], columns: Shown, published: Mapping[str, Any], case: str) -> dict[str, Any]:
-    """One table for one case: a row for each figure, a column for each method."""
+    """One table for one case, with a row for each metric and a column for each method."""
     names, body = list(rows), []
     for key, column in columns.items():
         values = [rows[name][case].get(key) for name in names]

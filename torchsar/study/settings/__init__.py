@@ -1,1 +1,1 @@
-"""Configs: YAML, sections read from constructors, cases, and errors in one sentence."""
+"""Configs: YAML files, sections derived from constructors, cases, and error messages."""

@@ -1,4 +1,4 @@
-"""What the user did wrong, in one sentence."""
+"""Errors in configs, command lines and input files."""
 
 from __future__ import annotations
 
@@ -7,13 +7,22 @@ from collections.abc import Iterable
 
 
 class ConfigError(ValueError):
-    """A mistake in a config, a command line or an input file; its text is one sentence that names
-    the offender.
+    """An error in a config, a command line or an input file; its text is one sentence that names
+    the key or the file.
     """
 
 
 def did_you_mean(word: str, accepted: Iterable[str]) -> str:
-    """'; did you mean ...?' where something close is accepted, then the list of what is."""
+    """Return a hint for an unknown word.
+
+    Args:
+        word: The word that is not accepted.
+        accepted: The words that are.
+
+    Returns:
+        "; did you mean ...?" with the most similar accepted word, if there is one, and the list of
+        accepted words.
+    """
     names = sorted(accepted)
     near = difflib.get_close_matches(word, names, n=1, cutoff=0.6)
     hint = f"; did you mean {near[0]!r}?" if near else ""
@@ -21,6 +30,6 @@ def did_you_mean(word: str, accepted: Iterable[str]) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """The text of an error without line ends; a KeyError without its quotes."""
+    """Return the text of an error in one line, for a KeyError without its quotes."""
     text = error.args[0] if isinstance(error, KeyError) and error.args else error
     return " ".join(str(text).split())

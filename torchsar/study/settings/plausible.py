@@ -1,7 +1,7 @@
-"""Numbers of radar and world that no system can use: most often a unit that was mistaken.
+"""Checks of the numbers of radar and world, which find most mistakes of units.
 
-Each number with a unit has a range that goes to the ends of what instruments and scenes can be.
-Inside these ranges, numbers must fit one another: relations of them are products of powers.
+Each number with a unit has a wide range of plausible magnitudes. Relations between numbers, which
+are products of powers, have limits as well.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 from torchsar.radar import LIGHT_M_S
 from torchsar.study.settings.errors import ConfigError
 
-# endings of keys and their units, the longer ending first where one ends another
+# units by the suffix of a key; a suffix that ends with another one comes first
 _UNITS = {
     "_hz_s": "Hz/s",
     "_m_s2": "m/s^2",
@@ -29,7 +29,8 @@ _UNITS = {
     "_s": "s",
 }
 _PREFIXES = {1e3: "k", 1e-3: "m", 1e6: "M", 1e-6: "u", 1e9: "G", 1e-9: "n", 1e12: "T", 1e-12: "p"}
-# SYSTEM.KEY, least and largest magnitude besides zero, and why; the first pattern that fits counts
+# pattern of SYSTEM.KEY, least and largest magnitude of numbers other than zero, and the reason; the
+# first pattern that matches is used
 _RANGES: Sequence[tuple[str, float, float, str]] = (
     ("*.radar.wave_speed_m_s", 1e8, 3.1e8, "the speed of light in glass, air or space"),
     ("sal.radar.carrier_hz", 1e12, 1e16, "light from the far infrared to the ultraviolet"),
@@ -82,14 +83,14 @@ _RANGES: Sequence[tuple[str, float, float, str]] = (
 
 @dataclass(frozen=True)
 class Relation:
-    """A product of powers of numbers that has to lie within limits.
+    """Limits of a product of powers of numbers.
 
     Args:
-        what: What the product is.
-        powers: Powers by dotted key; `world.scene` stands for the farthest coordinate of the scene.
-        low: Least product.
-        high: Largest product.
-        factor: Number before the product.
+        what: Meaning of the product.
+        powers: Powers by dotted key; `world.scene` denotes the largest coordinate of the scene.
+        low: Least value of the product.
+        high: Largest value of the product.
+        factor: Constant factor of the product.
     """
 
     what: str
@@ -99,7 +100,7 @@ class Relation:
     factor: float = 1.0
 
 
-# limits a hundred times wider than what gives good images: impaired and tiny scenes are usable
+# the limits are a hundred times wider than those of good images, to admit impaired and tiny scenes
 _CARRIER, _PRF, _RANGE = "radar.carrier_hz", "radar.prf_hz", "radar.reference_range_m"
 _RELATIONS = (
     *(Relation("the share of time that a pulse takes", {pulse: 1, _PRF: 1}, high=1.0)
@@ -136,43 +137,39 @@ _RELATIONS = (
 
 
 def refuse_implausible(system: str, radar: Any, world: Any, file: str) -> None:
-    """Refuse numbers that are in no usable range, or that cannot go together.
+    """Check that all numbers and their relations are within their limits.
 
     Args:
         system: Name of the system.
-        radar: The section radar, defaults filled in; None for recorded data.
+        radar: The section radar with all defaults; None for recorded data.
         world: The section world.
         file: Name of the config, for messages.
 
     Raises:
-        ConfigError: With the unit, the accepted range and what may have been meant.
+        ConfigError: With the unit, the accepted range and, if there is one, a likely correction.
     """
     numbers: dict[str, float] = {}
     for key, value in _numbers({"radar": radar, "world": world}, ""):
         numbers[key] = max(value, numbers.get(key, 0.0), key=abs)
         row = next((row for row in _RANGES if fnmatch(f"{system}.{key}", row[0])), None)
         if row is not None and value and not row[1] <= abs(value) <= row[2]:
-            raise ConfigError(
-                f"{file}: {key} is {_outside(key, value, *row[1:3])} ({row[3]}){_meant(key, value, *row[1:3])}"
-            )
+            raise ConfigError(f"{file}: {key} is {_out_of_range(key, value, *row[1:])}")
     span = [key for key in numbers if key.startswith("world.scene.") and key.endswith("_m")]
     farthest = max(span, key=lambda key: abs(numbers[key]), default="")
     for relation in _RELATIONS:
-        _refuse_relation(
-            relation, {farthest if k == "world.scene" else k: p for k, p in relation.powers.items()}, numbers, file
-        )
+        powers = {farthest if key == "world.scene" else key: power for key, power in relation.powers.items()}
+        _check_relation(relation, powers, numbers, file)
 
 
-def _refuse_relation(relation: Relation, powers: Mapping[str, int], numbers: Mapping[str, float], file: str) -> None:
+def _check_relation(relation: Relation, powers: Mapping[str, int], numbers: Mapping[str, float], file: str) -> None:
+    """Raise ConfigError if a relation between numbers of the config is outside its limits."""
     factor, length = relation.factor, "radar.wavelength_m"
     if _CARRIER in powers and length in numbers:
         factor *= LIGHT_M_S ** powers[_CARRIER]
         powers = {length if key == _CARRIER else key: p if key != _CARRIER else -p for key, p in powers.items()}
     values = {key: abs(numbers.get(key, 0.0)) for key in powers}
-    if not all(values.values()):
-        return
-    product = factor * math.prod(values[key] ** power for key, power in powers.items())
-    if relation.low <= product <= relation.high:
+    product = factor * math.prod(values[key] ** power for key, power in powers.items() if values[key])
+    if not all(values.values()) or relation.low <= product <= relation.high:
         return
     edge = relation.low if product < relation.low else relation.high
     limit = f"{'at least' if edge == relation.low else 'at most'} {edge:g}"
@@ -187,7 +184,7 @@ def _refuse_relation(relation: Relation, powers: Mapping[str, int], numbers: Map
 
 
 def _numbers(tree: Any, path: str) -> Iterator[tuple[str, float]]:
-    """Every number of a tree with its dotted key; entries of a list share that of the list."""
+    """Every number of a tree with its dotted key; entries of a list have the key of the list."""
     if isinstance(tree, Mapping):
         for key, value in tree.items():
             yield from _numbers(value, f"{path}.{key}".lstrip("."))
@@ -202,16 +199,11 @@ def _unit(key: str) -> str:
     return next((f" {unit}" for ending, unit in _UNITS.items() if key.endswith(ending)), "")
 
 
-def _outside(key: str, value: float, low: float, high: float) -> str:
+def _out_of_range(key: str, value: float, low: float, high: float, reason: str) -> str:
+    """The value, its range, and the number with a prefix of its unit if that is in range."""
     unit = _unit(key)
     accepted = f"{low:g}{unit} to {high:g}{unit}" if low else f"at most {high:g}{unit}"
-    return f"{value:g}{unit}, and should be {accepted}"
-
-
-def _meant(key: str, value: float, low: float, high: float) -> str:
-    """The same number with another prefix of its unit, if that would be in range."""
-    fitting = (scale for scale in _PREFIXES if max(low, high * 1e-12) <= abs(value) * scale <= high)
-    scale = next(fitting, None)
-    if scale is None or key.endswith(("_deg", "_db")):
-        return ""
-    return f"; did you mean {value:g} {_PREFIXES[scale]}{_unit(key).strip()}, which is {value * scale:g}?"
+    scales = () if key.endswith(("_deg", "_db")) else _PREFIXES
+    near = next((scale for scale in scales if max(low, high * 1e-12) <= abs(value) * scale <= high), None)
+    hint = f"; did you mean {value:g} {_PREFIXES[near]}{unit.strip()}, which is {value * near:g}?" if near else ""
+    return f"{value:g}{unit}, and should be {accepted} ({reason}){hint}"

@@ -1,35 +1,40 @@
-"""A checked config: the sections that every system has, and those of the system."""
+"""Config sections: those that are the same for every system, and the checks of a whole config."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
 from torchsar.study.settings.errors import ConfigError, did_you_mean
 from torchsar.study.settings.plausible import refuse_implausible
 from torchsar.study.settings.sentences import Strict, sentence
-from torchsar.study.settings.signature import Catalogue, Section
 from torchsar.study.settings.text import dump
 
-# how true values were named before they had a name of their own
+# prefix of the true values in configs of earlier versions
 _OLD_TRUTH = "aux.true_"
-# names that group results, and therefore cannot be those of methods
+# names of groups in the results, which methods and cases cannot have
 RESERVED = ("truth", "estimate")
 
 
 class Data(Strict):
-    """Recorded data instead of a simulated world; impairments are put into the recording."""
+    """Recorded data instead of a simulated world; `impairments` are added to the recording."""
 
     file: str | None = None
     impairments: dict[str, Any] = {}
 
 
 class Rerun(Strict):
-    """A part of another method's chain, run again on what entered it, with values held fixed."""
+    """A repetition of the last stages of another method with given values.
+
+    Fields:
+        method: The other method.
+        start: The first stage that is run again, on the same input as before.
+        given: Values that replace estimates of that method, by `stage.value`.
+    """
 
     method: str
     start: str
@@ -37,15 +42,15 @@ class Rerun(Strict):
 
 
 class Method(Strict):
-    """One chain.
+    """One processing chain.
 
     Fields:
-        title: For the report.
-        input: What the chain gets: the impaired recording or the clean one.
-        oracle: Whether its stages may use true values, `truth.NAME`: it shows what could be had at
-            best.
+        title: Title in the report.
+        input: Input of the chain: the impaired recording or the clean one.
+        oracle: Whether the stages may use true values, `truth.NAME`. Such a method shows the best
+            possible result.
         stages: Stages by name.
-        rerun: Instead of stages, a part of another method's chain.
+        rerun: A part of the chain of another method, instead of stages.
     """
 
     title: str = ""
@@ -64,12 +69,12 @@ class Method(Strict):
 
 
 class Trade(Strict):
-    """How `torchsar trade` and `torchsar requires` decide, and how often alternatives are timed.
+    """Settings of the comparison of alternatives by `torchsar trade` and `torchsar requires`.
 
     Fields:
-        tolerance: Largest loss that is acceptable, by metric; those of the system by default.
-        trials: Trials on which estimators are compared.
-        repeats: Timings of each alternative, interleaved with those of the others.
+        tolerance: Largest acceptable loss by metric; by default those of the system.
+        trials: Number of trials on which estimators are compared.
+        repeats: Number of timings of each alternative, interleaved with those of the others.
     """
 
     tolerance: dict[str, float] = {}
@@ -78,7 +83,7 @@ class Trade(Strict):
 
 
 class EarlyStop(Strict):
-    """Ends a point once half of the 95 % interval of a statistic is below `relative` times it."""
+    """A point ends when half of the 95 % interval of a statistic is below `relative` times it."""
 
     metric: str
     relative: float = Field(gt=0, lt=1)
@@ -86,21 +91,22 @@ class EarlyStop(Strict):
 
 
 class Save(Strict):
-    """Trials whose images, and the outputs of the named stages, are kept in the store."""
+    """Trials whose images and outputs of the stages in `taps` are kept in the store."""
 
     trials: list[int] = []
     taps: list[str] = []
 
 
 class Sweep(Strict):
-    """A Monte Carlo sweep. Keys that are not settings are keys of the config with their values.
+    """A Monte Carlo sweep. Keys other than those below are axes of the grid.
 
     Fields:
-        grid: Dotted key -> list of values, or mapping of labels to values.
-        trials: Trials of each point, or their limit where points end early.
-        chunk: Trials of a batch, chosen by memory where it is not given.
-        success: Metric -> largest magnitude with which a trial counts as a success.
-        show: Metrics to draw, by default all errors.
+        grid: Values of each axis, a list or a mapping of labels to values, by dotted key.
+        trials: Number of trials of each point, or the largest number if points may end early.
+        chunk: Number of trials of a batch; None to choose it by the memory.
+        stop: Condition under which a point ends early.
+        success: Largest magnitude of a metric for a trial to count as a success, by metric.
+        show: Metrics that are drawn; by default all errors.
         save: Trials whose images are kept.
     """
 
@@ -123,11 +129,11 @@ class Sweep(Strict):
 
 
 class Config(Strict):
-    """A whole experiment. The system gives `radar`, `world` and `metrics` their keys.
+    """A whole experiment. The system defines the keys of `radar`, `world` and `metrics`.
 
     Fields:
-        cases: Name -> dotted keys with the values that make the case.
-        beyond_limits: Methods that the config shows beyond their limits on purpose.
+        cases: Values by dotted key that each case changes, by name of the case.
+        beyond_limits: Methods that are deliberately used beyond their limits.
     """
 
     system: str = "stripmap"
@@ -152,42 +158,24 @@ class Config(Strict):
             raise ValueError("processor.recommended needs stages of its own")
         taken = next((name for name in RESERVED if name in self.processor), None)
         if taken is not None:
-            raise ValueError(f"processor.{taken}: this name is taken by a group of the results; choose another")
-        for key, names in (
-            ("beyond_limits", self.beyond_limits),
-            ("metrics.reference", [self.metrics.get("reference")]),
-        ):
-            unknown = next((name for name in names if name is not None and name not in self.processor), None)
-            if unknown is not None:
-                raise ValueError(f"{key} names the method {unknown!r}; there is {', '.join(self.processor)}")
+            raise ValueError(f"processor.{taken}: a group of the results has this name; choose another one")
+        reference = self.metrics.get("reference")
+        named = [*(("beyond_limits", name) for name in self.beyond_limits), ("metrics.reference", reference)]
+        for key, name in named:
+            if name is not None and name not in self.processor:
+                raise ValueError(f"{key} names the method {name!r}; there is {', '.join(self.processor)}")
         return self
-
-
-class Sections(Protocol):
-    """What a system says of the keys of its sections."""
-
-    @property
-    def sections(self) -> Mapping[str, Section]: ...
-
-    @property
-    def stages(self) -> Catalogue: ...
-
-    @property
-    def recording_impairments(self) -> Catalogue: ...
-
-    @property
-    def reads(self) -> str: ...
 
 
 @dataclass(frozen=True)
 class Loaded:
-    """A checked config: what its file and the command line say, every default filled in.
+    """A checked config with all defaults.
 
     Args:
-        config: The sections; `radar`, `world`, `metrics` and stages are mappings of complete keys.
-        system: The system that it belongs to.
+        config: The sections; `radar`, `world`, `metrics` and stages are mappings with all keys.
+        system: Its system, with the keys of these sections and of the stages.
         file: Name of the file with the overrides, for messages.
-        name: Name of the file without its ending.
+        name: Name of the file without its suffix.
     """
 
     config: Config
@@ -196,14 +184,14 @@ class Loaded:
     name: str
 
     def changed(self, values: Mapping[str, Any], where: str = "sweep") -> Loaded:
-        """The same config with other values at dotted keys.
+        """Return the config with other values at dotted keys.
 
         Args:
-            values: Values by dotted key; numbers in a path count the entries of a list.
-            where: Where the values stand, for messages.
+            values: Values by dotted key; a number in a key is an index of a list.
+            where: Section that holds the values, for messages.
 
         Raises:
-            ConfigError: If a key leads nowhere, a value is not accepted, or the system changes.
+            ConfigError: If a key does not exist, a value is not accepted, or the system changes.
         """
         tree = self.config.model_dump()
         for key, value in sorted(values.items(), key=lambda item: item[0].count(".")):  # sections before their parts
@@ -213,12 +201,12 @@ class Loaded:
         return replace(self, config=checked(tree, self.system, f"{self.file}: {where}"))
 
     def text(self) -> str:
-        """The resolved config as YAML."""
+        """Return the config with all defaults as YAML."""
         return dump(self.config.model_dump())
 
 
 def _placed(tree: Any, path: list[str], value: Any, what: str) -> Any:
-    """The tree with one value changed; all but the last part of the path must be there."""
+    """The tree with one value changed; all parts of the path but the last must exist."""
     head, rest = path[0], path[1:]
     if isinstance(tree, list) and head.isdecimal() and int(head) < len(tree):
         index = int(head)
@@ -230,8 +218,16 @@ def _placed(tree: Any, path: list[str], value: Any, what: str) -> Any:
     return {**tree, head: _placed(tree[head], rest, value, what) if rest else value}
 
 
-def checked(tree: Any, system: Sections, file: str) -> Config:
-    """The config in a tree, its sections completed.
+def checked(tree: Any, system: Any, file: str) -> Config:
+    """Check a config and fill in all defaults.
+
+    Args:
+        tree: Content of the config.
+        system: Its system.
+        file: Name of the file, for messages.
+
+    Returns:
+        The complete config.
 
     Raises:
         ConfigError: In one sentence that names file, key, value and what is accepted.
@@ -245,14 +241,14 @@ def checked(tree: Any, system: Sections, file: str) -> Config:
     made = {n: None if tree is None else system.sections[n].check(tree, n, file) for n, tree in sections.items()}
     refuse_implausible(config.system, made["radar"], made["world"], file)
     found = config.data.impairments
-    kept = {n: system.recording_impairments.check(entry, f"data.impairments.{n}", file) for n, entry in found.items()}
+    kept = {n: system.impairments.check(entry, f"data.impairments.{n}", file) for n, entry in found.items()}
     methods = {name: _method(method, f"processor.{name}", system, file) for name, method in config.processor.items()}
-    check_reruns(methods, file)
+    _check_reruns(methods, file)
     data = config.data.model_copy(update={"impairments": kept})
     return config.model_copy(update={**made, "data": data, "processor": methods})
 
 
-def _method(method: Method, where: str, system: Sections, file: str) -> Method:
+def _method(method: Method, where: str, system: Any, file: str) -> Method:
     """The method with all keys of its stages."""
     stages = {}
     for name, entry in (method.stages or {}).items():
@@ -268,8 +264,8 @@ def _method(method: Method, where: str, system: Sections, file: str) -> Method:
     return method.model_copy(update={"stages": stages or None})
 
 
-def _check_source(config: Config, system: Sections, file: str) -> None:
-    """A config has a file of recorded data, or both radar and world."""
+def _check_source(config: Config, system: Any, file: str) -> None:
+    """Raise ConfigError unless the config has a recording, or both radar and world."""
     recorded = config.data.file
     if recorded is None:
         missing = [name for name in ("radar", "world") if getattr(config, name) is None]
@@ -278,18 +274,14 @@ def _check_source(config: Config, system: Sections, file: str) -> None:
         if missing:
             raise ConfigError(f"{file}: section {missing[0]!r} is missing; a simulation needs 'radar' and 'world'")
     elif not system.reads:
-        raise ConfigError(f"{file}: data.file: system {config.system} simulates and reads no recordings; leave it out")
+        raise ConfigError(f"{file}: data.file: system {config.system} reads no recordings; omit this key")
     elif not Path(recorded).is_file():
         what = "is no file" if Path(recorded).exists() else "does not exist"
         raise ConfigError(f"{file}: data.file: {recorded!r} {what}; give the path of a {system.reads} .npz file")
 
 
-def check_reruns(methods: Mapping[str, Method], file: str) -> None:
-    """Reruns name an earlier method with stages, and a stage of it.
-
-    Raises:
-        ConfigError: If one does not.
-    """
+def _check_reruns(methods: Mapping[str, Method], file: str) -> None:
+    """Raise ConfigError unless every rerun names a stage of an earlier method with stages."""
     earlier: dict[str, Method] = {}
     for name, method in methods.items():
         if method.rerun is not None:

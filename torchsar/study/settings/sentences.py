@@ -1,4 +1,4 @@
-"""One sentence from what the validation of a config finds wrong."""
+"""Error messages of one sentence from the validation errors of pydantic."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from torchsar.study.settings.errors import did_you_mean
 
-# keys and values that were renamed: a config that still has the old one is given the new one
+# keys and values that were renamed; the message about an old one gives the new one
 RENAMED = {
     "damages": "impairments",
     "told": "trigger_known",
@@ -24,24 +24,27 @@ RENAMED = {
 
 
 class Strict(BaseModel):
-    """Base of all sections: unknown keys, wrong types and infinities are refused."""
+    """Base of all sections; it rejects unknown keys, wrong types and infinities."""
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
 
 
-# the error that says most comes first: an unknown key, a missing one, a wrong value; where a number
-# or a list of them is accepted, what is wrong with the number says more
+# order in which errors are reported: an unknown key, a missing key, a wrong value. If a number or a
+# list is accepted, the error of the number is more informative than that of the list.
 _RANK = {"extra_forbidden": 0, "missing": 1, "list_type": 3}
 
 
 def sentence(error: ValidationError, model: type[BaseModel], file: str, where: str = "") -> str:
-    """One sentence from the most telling error of a validation.
+    """Return one sentence about the most informative of the errors of a validation.
 
     Args:
-        error: What pydantic raised.
+        error: Error of pydantic.
         model: The model that was validated.
         file: Name of the config.
         where: Dotted path of the section that the model describes.
+
+    Returns:
+        The sentence, with file, key and value.
     """
     worst = min(error.errors(), key=lambda e: _RANK.get(e["type"], 2))
     path = [str(part) for part in worst["loc"]]
@@ -59,7 +62,7 @@ def sentence(error: ValidationError, model: type[BaseModel], file: str, where: s
         text = "should be a mapping of keys" + (", and not an empty one" if kind == "too_short" else "")
     if isinstance(given, str) and given in RENAMED:
         text = f"should be {RENAMED[given]!r}, as it is now called"
-    if not key:  # what a whole config contradicts, not one key of it
+    if not key:  # an error of the whole config, not of one key
         return f"{file}: {text}"
     shown = repr(given)
     if not text.startswith("should"):
@@ -68,13 +71,12 @@ def sentence(error: ValidationError, model: type[BaseModel], file: str, where: s
 
 
 def _descend(model: type[BaseModel], path: list[str]) -> tuple[list[str], type[BaseModel] | None]:
-    """The real keys of a pydantic location (union tags dropped), and the section in which the last
-    of them was looked up.
-    """
+    """The keys in a pydantic location, without tags of unions, and the section of the last key."""
     names: list[str] = []
     section, hint = None, model
     for part in path:
-        hint = _without_none(hint)
+        members = members_of(hint)
+        hint = members[0] if len(members) == 1 else hint
         if inspect.isclass(hint) and issubclass(hint, BaseModel):
             names.append(part)
             section, hint = hint, hint.model_fields[part].annotation if part in hint.model_fields else None
@@ -84,8 +86,8 @@ def _descend(model: type[BaseModel], path: list[str]) -> tuple[list[str], type[B
     return names, section
 
 
-def _without_none(hint: Any) -> Any:
-    """X for X | None; unions of several types stay, since their members are scalars here."""
-    union = typing.get_origin(hint) in (typing.Union, types.UnionType)
-    arms = [arm for arm in typing.get_args(hint) if arm is not type(None)] if union else []
-    return arms[0] if len(arms) == 1 else hint
+def members_of(hint: Any) -> list[Any]:
+    """Return the members of a union without None, or the type itself if it is no union."""
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return [member for member in typing.get_args(hint) if member is not type(None)]
+    return [hint]

@@ -1,4 +1,4 @@
-"""Config sections that are constructors: keys, types, defaults and errors come from signatures."""
+"""Config sections from constructors: keys, types and defaults are those of their signatures."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from pydantic import BaseModel, ValidationError, create_model
 from torch import Tensor
 
 from torchsar.study.settings.errors import ConfigError, did_you_mean, one_line
-from torchsar.study.settings.sentences import Strict, sentence
+from torchsar.study.settings.sentences import Strict, members_of, sentence
 
 _SCALARS = (float, int, str, bool, type(None))
-_YAML = (float, int, str, bool, type(None), tuple, list)
-# where it stands for a name, the cheapest choice that the scene allows is taken
+_YAML = (*_SCALARS, tuple, list)
+# value of a key that is replaced by the cheapest acceptable choice
 AUTO = "auto"
 Given = Mapping[str, Tensor]
 _NOTHING: Given = {}
@@ -34,12 +34,11 @@ class Key:
     Args:
         type: Type of the value in YAML.
         default: The default in YAML's terms; `...` where the key is required.
-        inner: What describes the value: a section, or a catalogue to choose from; None for plain
-            values.
-        many: "mapping" or "sequence" where the value is a mapping of names to such things, after
-            what the constructor takes.
-        per_trial: Whether the constructor takes a tensor with one entry per trial for a number.
-        as_tensor: Whether the constructor takes a tensor for a list of numbers.
+        inner: The section or the catalogue that describes the value; None for plain values.
+        many: "mapping" or "sequence" if the value is a mapping of names to such sections, according
+            to the type of the parameter; empty otherwise.
+        per_trial: Whether the constructor accepts a tensor with one entry per trial for a number.
+        as_tensor: Whether the constructor accepts a tensor for a list of numbers.
     """
 
     type: Any
@@ -55,8 +54,8 @@ class Section:
 
     Args:
         target: A class or factory function.
-        given: Parameters that do not come from the config.
-        automatic: Keys that may be left to choose, `auto`.
+        given: Parameters that are not keys of the config.
+        automatic: Keys that may have the value `auto`.
     """
 
     def __init__(self, target: Callable[..., Any], given: Sequence[str] = (), automatic: Sequence[str] = ()) -> None:
@@ -64,7 +63,7 @@ class Section:
 
     @cached_property
     def keys(self) -> dict[str, Key]:
-        """The keys by name. Raises TypeError for a required parameter that YAML cannot hold."""
+        """Keys by name. Raises TypeError for a required parameter that YAML cannot represent."""
         fields = dataclasses.is_dataclass(self.target) or not inspect.isclass(self.target)
         hints = typing.get_type_hints(self.target if fields else self.target.__init__, include_extras=True)
         found = {}
@@ -87,10 +86,18 @@ class Section:
         return create_model(getattr(self.target, "__name__", "section"), __base__=Strict, **fields)
 
     def check(self, tree: Any, where: str, file: str) -> dict[str, Any]:
-        """The complete keys of a section, defaults filled in.
+        """Check a section and fill in all defaults.
+
+        Args:
+            tree: Content of the section.
+            where: Dotted path of the section, for messages.
+            file: Name of the config, for messages.
+
+        Returns:
+            Values of all keys.
 
         Raises:
-            ConfigError: Naming file, key, value and what is accepted.
+            ConfigError: With file, key, value and the accepted values.
         """
         open_keys = [key for key in self.automatic if isinstance(tree, dict) and tree.get(key) == AUTO]
         fixed = {key: value for key, value in tree.items() if key not in open_keys} if open_keys else tree
@@ -99,27 +106,27 @@ class Section:
         except ValidationError as error:
             raise ConfigError(sentence(error, self.model, file, where)) from None
         for name, key in self.keys.items():
-            place, value = f"{where}.{name}" if where else name, values[name]
+            path, value = f"{where}.{name}" if where else name, values[name]
             if key.inner is None or value is None or name in open_keys:
                 continue
             if key.many:
-                values[name] = {part: key.inner.check(v, f"{place}.{part}", file) for part, v in value.items()}
+                values[name] = {part: key.inner.check(v, f"{path}.{part}", file) for part, v in value.items()}
             else:
-                values[name] = key.inner.check(value, place, file)
+                values[name] = key.inner.check(value, path, file)
         return values
 
     def make(self, values: Mapping[str, Any], where: str, file: str, given: Given = _NOTHING, **context: Any) -> Any:
-        """The object that checked keys describe.
+        """Build the object of a section.
 
         Args:
-            values: The keys, as `check` returns them.
+            values: Values of all keys, as `check` returns them.
             where: Dotted path of the section, for messages.
             file: Name of the config, for messages.
             given: Tensors with one entry per trial, by dotted key below this section.
-            context: Values of parameters that do not come from the config.
+            context: Values of parameters that are not keys of the config.
 
         Raises:
-            ConfigError: With what the constructor says.
+            ConfigError: If the constructor raises an error.
         """
         made = {name: self._made(name, values[name], where, file, below(given, name)) for name in self.keys}
         accepted = inspect.signature(self.target).parameters
@@ -140,7 +147,7 @@ class Section:
         return parts if key.many == "mapping" else list(parts.values())
 
     def takes_tensor(self, path: Sequence[str], values: Mapping[str, Any]) -> bool:
-        """Whether the number at a path below this section may differ between trials."""
+        """Return whether the number at a path below this section may differ between trials."""
         key = self.keys.get(path[0])
         if key is None or (values.get(path[0]) is None and len(path) > 1):
             return False
@@ -156,14 +163,14 @@ class Section:
 
 
 class Catalogue:
-    """Names to constructors, one of which a config chooses.
+    """Constructors by name, one of which a config names.
 
     Args:
-        what: What an entry is, for messages.
-        key: The key that names the choice.
-        entries: Names to classes or factories.
-        given: Parameters that do not come from the config.
-        automatic: Keys, `ENTRY.key`, that may be left to choose, `auto`.
+        what: Kind of the entries, for messages.
+        key: The key of a config that holds the name.
+        entries: Classes or factories by name.
+        given: Parameters that are not keys of the config.
+        automatic: Keys that may have the value `auto`, as `ENTRY.key`.
     """
 
     def __init__(
@@ -181,10 +188,18 @@ class Catalogue:
         }
 
     def check(self, entry: Any, where: str, file: str) -> dict[str, Any]:
-        """An entry {key: name, ...} with all keys of that name filled in.
+        """Check an entry {key: name, ...} and fill in all defaults.
+
+        Args:
+            entry: The entry, or the name alone.
+            where: Dotted path of the entry, for messages.
+            file: Name of the config, for messages.
+
+        Returns:
+            The complete entry.
 
         Raises:
-            ConfigError: Naming file, key and what is accepted.
+            ConfigError: With file, key, value and the accepted values.
         """
         if isinstance(entry, str):
             entry = {self.key: entry}
@@ -201,30 +216,30 @@ class Catalogue:
         return {self.key: name, **self.sections[name].check(rest, where, file)}
 
     def make(self, entry: Mapping[str, Any], where: str, file: str, given: Given = _NOTHING, **context: Any) -> Any:
-        """The object that a checked entry describes; see `Section.make`."""
+        """Build the object of a checked entry; see `Section.make`."""
         rest = {key: value for key, value in entry.items() if key != self.key}
         return self.sections[entry[self.key]].make(rest, where, file, given, **context)
 
     def takes_tensor(self, path: Sequence[str], entry: Mapping[str, Any]) -> bool:
-        """Whether the number at a path below an entry may differ between trials."""
+        """Return whether the number at a path below an entry may differ between trials."""
         return entry[self.key] in self.sections and self.sections[entry[self.key]].takes_tensor(path, entry)
 
     def describe(self, value: Any) -> dict[str, Any] | None:
-        """The entry that stands for a frozen object, None where no entry makes such objects."""
+        """Return the entry that describes an object, None if no entry has its class."""
         name = next((name for name, target in self.entries.items() if target is type(value)), None)
         return None if name is None else {self.key: name, **_described(value)}
 
 
 def below(given: Given, name: str) -> dict[str, Tensor]:
-    """The part of dotted keys that lies below a name."""
+    """Return the values whose dotted keys begin with a name, without this name."""
     return {key.partition(".")[2]: value for key, value in given.items() if key.startswith(f"{name}.")}
 
 
 def _key(hint: Any, default: Any) -> Key | None:
-    """The key for a type, None where YAML cannot hold it."""
-    arms, plain = _arms(hint), _plain(hint)
+    """The key for a type, None if YAML cannot represent it."""
+    arms, plain = members_of(hint), _plain(hint)
     if plain is not None:
-        scalars = {item for arm in arms for item in (_arms(typing.get_args(arm)[0]) if _is_list(arm) else [arm])}
+        scalars = {item for arm in arms for item in (members_of(typing.get_args(arm)[0]) if _is_list(arm) else [arm])}
         as_tensor = Tensor in arms and not any(map(_is_list, arms))
         value = list(default) if isinstance(default, tuple) else default
         return Key(plain, value, per_trial={float, Tensor} <= scalars, as_tensor=as_tensor)
@@ -241,7 +256,7 @@ def _key(hint: Any, default: Any) -> Key | None:
 
 
 def _inner(hint: Any) -> tuple[Section | Catalogue | None, str]:
-    """What describes a value of a type, and whether it is one of many."""
+    """The section or catalogue of a type, and whether the type is a collection of these."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Annotated:
         return next(((extra, "") for extra in args[1:] if isinstance(extra, Catalogue)), (None, ""))
@@ -261,27 +276,17 @@ def _described_default(default: Any, inner: Section | Catalogue, many: str) -> A
 
 
 def _described(value: Any) -> dict[str, Any]:
-    """The fields of a frozen object in YAML's terms."""
+    """The fields of a dataclass object that YAML can represent."""
     found = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     return {name: list(x) if isinstance(x, tuple) else x for name, x in found.items() if isinstance(x, _YAML)}
 
 
 def _default(target: Callable[..., Any], parameter: inspect.Parameter) -> Any:
-    """The default of a parameter, also where a dataclass makes it; `...` where it is required."""
-    if parameter.default is parameter.empty:
-        return ...
-    if dataclasses.is_dataclass(target):
-        field = next((f for f in dataclasses.fields(target) if f.name == parameter.name), None)
-        if field is not None and field.default_factory is not dataclasses.MISSING:
-            return field.default_factory()
-    return parameter.default
-
-
-def _arms(hint: Any) -> list[Any]:
-    """The members of a union without None, else the type itself."""
-    if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        return [arm for arm in typing.get_args(hint) if arm is not type(None)]
-    return [hint]
+    """The default of a parameter, also if a field factory makes it; `...` if it is required."""
+    field = getattr(target, "__dataclass_fields__", {}).get(parameter.name)
+    if field is not None and field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return ... if parameter.default is parameter.empty else parameter.default
 
 
 def _is_list(hint: Any) -> bool:
@@ -289,7 +294,7 @@ def _is_list(hint: Any) -> bool:
 
 
 def _plain(hint: Any) -> Any | None:
-    """The part of a type that YAML can hold as it is, None where there is nothing.
+    """The part of a type that YAML can represent, None if there is none.
 
     Tensors become numbers or lists of numbers.
     """
@@ -312,7 +317,7 @@ def _plain(hint: Any) -> Any | None:
 
 
 def _converted(value: Any, key: Key, given: Given) -> Any:
-    """A list as a tuple, with tensors where trials differ; the value itself otherwise."""
+    """The value for the constructor: a list becomes a tensor or a tuple, with values per trial."""
     if isinstance(value, list):
         value = [given.get(str(i), item) for i, item in enumerate(value)]
         return torch.tensor(value, dtype=torch.float64) if key.as_tensor else tuple(value)

@@ -1,4 +1,4 @@
-"""YAML in and out, and overrides from the command line."""
+"""Reading and writing of YAML, search for config files, and overrides from the command line."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 
 import yaml
 
-from torchsar.study.settings.errors import ConfigError, did_you_mean
+from torchsar.study.settings.errors import ConfigError, did_you_mean, one_line
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe YAML that reads 1e-6 as a number (YAML 1.2), only true/false as booleans, and refuses a
-    key given twice.
+    """Loader of safe YAML. It reads 1e-6 as a number (YAML 1.2) and only true and false as
+    booleans, and it rejects duplicate keys.
     """
 
 
@@ -49,7 +49,7 @@ _Loader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping
 
 
 class _Dumper(yaml.SafeDumper):
-    """Mappings in their own order, lists of numbers on one line."""
+    """Dumper that keeps the order of mappings and writes lists of scalars on one line."""
 
 
 _Dumper.add_representer(
@@ -62,43 +62,46 @@ _Dumper.add_representer(tuple, lambda dumper, items: dumper.represent_list(list(
 
 
 def parse(text: str, what: str) -> Any:
-    """A YAML document. Raises ConfigError naming `what` and the line."""
+    """Return the content of a YAML document.
+
+    Args:
+        text: The document.
+        what: Name of its source, for messages.
+
+    Raises:
+        ConfigError: If it is no YAML; the message has the source and the line.
+    """
     try:
         return yaml.load(text, Loader=_Loader)  # a SafeLoader
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
-        place = f", line {mark.line + 1}" if mark else ""
-        raise ConfigError(f"{what}{place}: not readable as YAML: {error.problem}") from None
+        line = f", line {mark.line + 1}" if mark else ""
+        raise ConfigError(f"{what}{line}: not readable as YAML: {error.problem}") from None
     except (yaml.YAMLError, ValueError) as error:
-        raise ConfigError(f"{what}: not readable as YAML: {' '.join(str(error).split())}") from None
+        raise ConfigError(f"{what}: not readable as YAML: {one_line(error)}") from None
 
 
 def dump(tree: Mapping[str, Any]) -> str:
-    """The YAML text of a tree of plain values."""
+    """Return a tree of plain values as YAML."""
     return yaml.dump(tree, Dumper=_Dumper, sort_keys=False, width=160, allow_unicode=True)
 
 
-def config_folders() -> list[Path]:
-    """Where configs are found by name: inside an installed package, or beside the package in a
-    checkout.
+def packaged_configs() -> dict[str, Path]:
+    """Return the files of the configs that are part of torchsar, by name.
+
+    They are in the folder `configs` of an installed package, or beside the package in a checkout;
+    configs of sweeps are in its subfolder `sweeps`.
     """
     package = Path(__file__).resolve().parents[2]
-    return [folder for folder in (package / "configs", package.parent / "configs") if folder.is_dir()]
-
-
-def packaged_configs() -> dict[str, Path]:
-    """Names of the configs that come with torchsar, and their files; those of sweeps lie in a
-    folder of their own.
-    """
     return {
         path.stem: path
-        for folder in reversed(config_folders())
+        for folder in (package.parent / "configs", package / "configs")
         for path in (*sorted(folder.glob("*.yaml")), *sorted(folder.glob("sweeps/*.yaml")))
     }
 
 
 def experiments() -> str:
-    """The packaged configs with their titles, for `torchsar list`."""
+    """Return the packaged configs with their titles, for `torchsar list`."""
     lines = ["EXPERIMENTS (torchsar run NAME; those marked [sweep] are for torchsar sweep NAME)"]
     for name, path in packaged_configs().items():
         tree = read_tree(path)
@@ -107,8 +110,14 @@ def experiments() -> str:
 
 
 def find_config(name: str) -> Path:
-    """A file by its path, else a packaged config by its name, 'stripmap_damaged' or
-    'configs/stripmap_damaged.yaml'.
+    """Return the file of a config.
+
+    Args:
+        name: Path of a file, or the name of a packaged config such as "stripmap_damaged" or
+            "configs/stripmap_damaged.yaml".
+
+    Raises:
+        ConfigError: If there is no such file.
     """
     path = Path(name)
     if path.is_file():
@@ -128,7 +137,7 @@ def find_config(name: str) -> Path:
 
 
 def read_tree(path: Path) -> dict[str, Any]:
-    """The mapping in a config file."""
+    """Return the mapping in a config file. Raises ConfigError if the file holds no mapping."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -142,11 +151,17 @@ def read_tree(path: Path) -> dict[str, Any]:
 def override(
     tree: dict[str, Any], assignments: Sequence[str], literal: tuple[str, str, Sequence[str]] = ("", "", ())
 ) -> dict[str, Any]:
-    """The tree with key=value assignments applied, the keys as dotted paths and the values as YAML.
+    """Return a tree with overrides applied.
 
-    literal: a section whose keys are dotted themselves, the mapping in it that may hold them too,
-    and those of its keys that are not dotted: `sweep.world.noise.snr_db=[0, 10]` and
-    `sweep.grid.world.noise.snr_db=[0, 10]` set the key "world.noise.snr_db".
+    Args:
+        tree: The tree.
+        assignments: Overrides key=value, with dotted keys and YAML values.
+        literal: A section whose keys contain dots themselves, the mapping in it with such keys, and
+            the keys of the section without dots. `sweep.world.noise.snr_db=[0, 10]` and
+            `sweep.grid.world.noise.snr_db=[0, 10]` both set the key "world.noise.snr_db".
+
+    Raises:
+        ConfigError: If an assignment is no override, or its key is below a plain value.
     """
     for assignment in assignments:
         key, equals, value = assignment.partition("=")
@@ -167,8 +182,8 @@ def _assigned(tree: Any, path: list[str], value: Any, key: str) -> dict[str, Any
         tree = {}
     if not isinstance(tree, dict):
         raise ConfigError(
-            f"command line: {key} cannot be set, because the part before {'.'.join(path)!r} holds "
-            f"the value {tree!r}, not a section"
+            f"command line: {key} cannot be set, because the part before {'.'.join(path)!r} has the value "
+            f"{tree!r} and is not a section"
         )
     head, rest = path[0], path[1:]
     return {**tree, head: _assigned(tree.get(head), rest, value, key) if rest else value}

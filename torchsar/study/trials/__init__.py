@@ -1,1 +1,1 @@
-"""Experiments: a system, its bench, a batch of trials, and an outcome per method."""
+"""Experiments: a system, its bench, batches of trials, and the outcome of every method."""

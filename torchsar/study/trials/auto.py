@@ -1,4 +1,4 @@
-"""Choices that a config leaves open: the cheapest alternative of acceptable predicted loss."""
+"""Keys with the value `auto`: the cheapest alternative with an acceptable predicted loss."""
 
 from __future__ import annotations
 
@@ -12,27 +12,29 @@ from torchsar.study.trials.choice import Alternative, Choice
 
 
 def tolerance_of(loaded: Loaded) -> dict[str, float]:
-    """Largest acceptable loss by metric: the system's own, and what the config says."""
+    """Return the largest acceptable loss by metric, from the system and the config."""
     unknown = next((name for name in loaded.config.trade.tolerance if name not in loaded.system.tolerance), None)
     if unknown is not None:
         known = ", ".join(loaded.system.tolerance)
-        raise ConfigError(f"{loaded.file}: trade.tolerance names {unknown!r}, which is no loss here; there is {known}")
+        raise ConfigError(
+            f"{loaded.file}: trade.tolerance names {unknown!r}, which is no loss of this system; there is {known}"
+        )
     return {**loaded.system.tolerance, **loaded.config.trade.tolerance}
 
 
 def within(loss: Mapping[str, float] | None, tolerance: Mapping[str, float]) -> bool:
-    """Whether every loss is known and acceptable; one that is not a number is not."""
+    """Return whether every loss is known and acceptable; NaN is not."""
     return loss is not None and all(value <= tolerance[name] for name, value in loss.items() if name in tolerance)
 
 
 def cheapest(choice: Choice, tolerance: Mapping[str, float]) -> Alternative:
-    """The first alternative whose predicted loss is acceptable, else the exact one."""
+    """Return the first alternative with an acceptable predicted loss, or else the exact one."""
     kept = [one for one in choice.alternatives if one.loss is not None and within(one.loss, tolerance)]
     return kept[0] if kept else choice.alternatives[-1]
 
 
 def choices_of(bench: Any) -> Sequence[Choice]:
-    """The decisions of a config. Raises ConfigError where nothing can be predicted for it."""
+    """Return the choices of a config. Raises ConfigError if their losses cannot be predicted."""
     try:
         return bench.system.choices(bench)
     except ConfigError:
@@ -42,43 +44,48 @@ def choices_of(bench: Any) -> Sequence[Choice]:
 
 
 def resolved(loaded: Loaded, bench_of: Callable[[Loaded], Any]) -> tuple[Loaded, tuple[str, ...]]:
-    """The config with every `auto` settled, and what was taken and why, in sentences.
+    """Replace every `auto` of a config by an alternative.
 
     Args:
         loaded: The config.
-        bench_of: Builds the bench of a config without `auto`.
+        bench_of: Function that builds the bench of a config without `auto`.
+
+    Returns:
+        The config without `auto`, and a sentence about each replacement with its reason.
 
     Raises:
-        ConfigError: If `auto` stands where the system has nothing to choose.
+        ConfigError: If the system has no alternatives for a key with the value `auto`.
     """
-    places = list(_places(loaded.config))
-    if not places:
+    found = list(_automatic(loaded.config))
+    if not found:
         return loaded, ()
     exact = loaded.system.exact
-    unknown = next((path for at, path, _ in places if at not in exact), None)
+    unknown = next((path for at, path, _ in found if at not in exact), None)
     if unknown is not None:
         raise ConfigError(
-            f"{loaded.file}: {unknown} is 'auto', and this system chooses nothing there; it does at "
+            f"{loaded.file}: {unknown} is 'auto', but this system accepts 'auto' only for "
             f"{', '.join(exact) or 'no key'}"
         )
-    bench = bench_of(loaded.changed({path: {**entry, **exact[at]} for at, path, entry in places}, "auto"))
+    bench = bench_of(loaded.changed({path: {**entry, **exact[at]} for at, path, entry in found}, "auto"))
     choices = {choice.at: choice for choice in choices_of(bench)}
-    fixed = next((path for at, path, _ in places if at not in choices), None)
+    fixed = next((path for at, path, _ in found if at not in choices), None)
     if fixed is not None:
-        raise ConfigError(f"{loaded.file}: {fixed} is 'auto', and nothing is to choose there in this config; name it")
-    tolerance, changes, said = tolerance_of(loaded), {}, []
-    for at, path, entry in places:
+        raise ConfigError(f"{loaded.file}: {fixed} is 'auto', but this config has no alternatives for it; give a name")
+    tolerance, changes, reasons = tolerance_of(loaded), {}, []
+    for at, path, entry in found:
         taken = cheapest(choices[at], tolerance)
         changes[path] = {**entry, **taken.keys}
         why = ", ".join(
             f"{name} {value:.3g} (at most {tolerance[name]:g})" for name, value in (taken.loss or {}).items()
         )
-        said.append(f"{path}: {taken.name} was taken, the cheapest with an acceptable predicted loss: {why or 'exact'}")
-    return loaded.changed(changes, "auto"), tuple(said)
+        reasons.append(
+            f"{path}: {taken.name} was chosen, the cheapest with an acceptable predicted loss: {why or 'exact'}"
+        )
+    return loaded.changed(changes, "auto"), tuple(reasons)
 
 
-def _places(config: Config) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    """What each `auto` is about, the dotted path of the mapping that holds it, and the mapping."""
+def _automatic(config: Config) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    """Every `auto`: the key of its choice (`Choice.at`), the path of its mapping, the mapping."""
     for key, value in (config.world or {}).items():
         if isinstance(value, Mapping) and value.get("kind") == AUTO:
             yield f"world.{key}", f"world.{key}", value

@@ -1,4 +1,4 @@
-"""One batch of trials: what was simulated or recorded, and the outcome of every method."""
+"""Batches of trials: recordings with their true values, and the outcome of every method."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ Metrics = Mapping[str, Tensor]
 
 @dataclass(frozen=True)
 class Trials:
-    """What the trials of one batch hold.
+    """Recordings and true values of the trials of one batch.
 
     Args:
-        recording: What methods get.
-        clean: What methods of `input: clean` get: no impairments, and no errors of motion or phase.
-        truth: True values by name, (trial, ...); methods that are oracles may use them.
+        recording: Input of the methods.
+        clean: Input of methods with `input: clean`, without impairments and errors of motion and
+            phase.
+        truth: True values by name, (trial, ...); only oracles may use them.
         count: Number of trials.
-        own: What only the judge of the system needs besides.
+        own: Further data for the judge of the system.
     """
 
     recording: Recording
@@ -38,13 +39,13 @@ class Trials:
 
 @dataclass(frozen=True)
 class Judged:
-    """What a system says of one method in one batch.
+    """Metrics of one method in one batch.
 
     Args:
-        metrics: Figures by name, (trial,) each.
-        targets: The same of each named target.
-        outside: Named targets that lie outside the image or the record.
-        view: What the pictures of the system need besides.
+        metrics: Metrics by name, (trial,) each.
+        targets: Metrics of each named target.
+        outside: Named targets outside the image or the record.
+        view: Further data for the pictures of the system.
     """
 
     metrics: Metrics
@@ -55,16 +56,16 @@ class Judged:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one method gave in one batch.
+    """Result of one method in one batch.
 
     Args:
-        judged: Its figures.
-        estimates: What its estimators found, by stage.
-        signal: Its last signal; None where it failed.
-        seconds: Wall time of its stages.
-        trace: Every intermediate, where something later needs it.
-        reusable: Stages that estimated something and left the signal alone.
-        failed: Why it failed; empty where it did not.
+        judged: Its metrics.
+        estimates: Its estimates by stage.
+        signal: Its last signal; None if it failed.
+        seconds: Wall time of its stages in s.
+        trace: All intermediate signals; None if nothing needs them.
+        reusable: Stages that return an estimate and leave the signal unchanged.
+        failed: The reason of its failure; empty if it did not fail.
     """
 
     judged: Judged
@@ -93,11 +94,11 @@ class Result:
     """All trials of one case, and the first batch of them for pictures and arrays.
 
     Args:
-        bench: What the case was run on.
+        bench: The bench of the case.
         first: The first batch.
-        metrics: By method and name, (trial,).
-        targets: By method, target and name, (trial,).
-        estimates: By method and name: values, standard deviations and verdicts, (trial, ...).
+        metrics: Metrics by method and name, (trial,).
+        targets: Metrics by method, target and name, (trial,).
+        estimates: Estimates by method and name.
         truth: True values by name, (trial, ...).
     """
 
@@ -110,7 +111,7 @@ class Result:
 
     @property
     def images(self) -> dict[str, Signal]:
-        """The image of every method in the first trial."""
+        """Images of the first trial, by method."""
         signals = {name: outcome.signal for name, outcome in self.first.outcomes.items()}
         return {name: image_of(signal) for name, signal in signals.items() if signal is not None}
 
@@ -128,7 +129,7 @@ class Found:
 
 
 def joined_metrics(parts: Sequence[Metrics]) -> dict[str, Tensor]:
-    """Figures of several batches one after the other; NaN where a batch lacks one."""
+    """Concatenate the metrics of several batches, with NaN for a metric that a batch lacks."""
     counts = [max((len(value) for value in part.values()), default=0) for part in parts]
     names = dict.fromkeys(name for part in parts for name in part)
 
@@ -139,7 +140,7 @@ def joined_metrics(parts: Sequence[Metrics]) -> dict[str, Tensor]:
 
 
 def joined_found(parts: Sequence[Mapping[str, Found]]) -> dict[str, Found]:
-    """Estimates of several batches one after the other; those that every batch has."""
+    """Concatenate those estimates of several batches that every batch has."""
 
     def whole(values: list[Tensor | None]) -> Tensor | None:
         there = [value for value in values if value is not None]
@@ -151,7 +152,7 @@ def joined_found(parts: Sequence[Mapping[str, Found]]) -> dict[str, Found]:
 
 
 def summary(metrics: Metrics) -> dict[str, float]:
-    """Mean over the trials that have a figure, with `<name>_sd` where there are several."""
+    """Return the mean over the trials with a finite metric, and `<name>_sd` of several trials."""
     row: dict[str, float] = {}
     for name, value in metrics.items():
         x = value.to(torch.float64)
@@ -163,32 +164,32 @@ def summary(metrics: Metrics) -> dict[str, float]:
 
 
 def verdict(estimates: Mapping[str, Estimate], count: int) -> dict[str, Tensor]:
-    """`ok`, (trial,) bool: whether all estimates of a method are reliable; nothing without any."""
+    """Return `ok`, (trial,) bool, whether all estimates are reliable; empty without estimates."""
     found = [_rows(estimate.ok, count).flatten(1).all(1) for estimate in estimates.values()]
     return {OK: torch.stack(found).all(0)} if found else {}
 
 
 def _rows(x: Tensor, count: int) -> Tensor:
-    """A tensor with trials first, one that is the same in all trials repeated."""
+    """A tensor as one row per trial; a value common to all trials is repeated."""
     return (
         x.reshape(count, -1) if x.numel() and x.numel() % count == 0 and x.ndim else x.reshape(1, -1).expand(count, -1)
     )
 
 
 def image_of(signal: Signal, trial: int = 0) -> Signal:
-    """A signal of one trial."""
+    """Return the signal of one trial."""
     if not signal.trials:
         return signal
     return signal.with_data(signal.data.reshape(-1, *signal.data.shape[len(signal.trials) :])[trial])
 
 
 def fault_of_image(signal: Signal, images: Sequence[tuple[str, ...]], ending: str) -> str:
-    """What is wrong with a last signal as an image; empty where nothing is."""
+    """Return the reason why the last signal of a chain is no image, empty if it is one."""
     if signal.names not in images:
         return (
             f"whose last stage gives the axes {signal.names}, not an image {IMAGE}; end its chain with {ending} (a "
-            "sweep needs none)"
+            "sweep does not need an image)"
         )
     odd = [axis.name for axis in signal.axes if not math.isfinite(axis.step * axis.n)]
-    said = "; check the carrier, the pulse rate and the rotation of the radar"
-    return f"whose image has cells of infinite size along {odd[0]}{said}" if odd else ""
+    hint = "; check the carrier, the pulse rate and the rotation of the radar"
+    return f"whose image has cells of infinite size along {odd[0]}{hint}" if odd else ""

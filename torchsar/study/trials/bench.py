@@ -1,4 +1,4 @@
-"""The bench: radar, world and chains of one case, built once, and batches of trials on it."""
+"""The bench of a case: its radar, world and chains, and the processing of batches of trials."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from torchsar.study.trials.chains import build_chains, true_names, unknown_attri
 
 log = logging.getLogger("torchsar")
 Announce = Callable[[str, str], Any]
-# what a stage that cannot work on its data raises; a RuntimeError is what torch itself refuses
+# errors of stages that cannot process their data; torch itself raises RuntimeError
 _FAILURES = (ValueError, TypeError, KeyError, RuntimeError)
 
 
@@ -32,15 +32,15 @@ class Bench:
     """Radar, world and chains of one case, on one device.
 
     Args:
-        loaded: The config of the case; `auto` in it is settled here.
-        device: Where its trials are computed.
-        announce: Called with a method and a stage whenever a stage begins.
+        loaded: The config of the case. Every `auto` in it is replaced.
+        device: Device on which trials are computed.
+        announce: Function that is called with the method and the stage when a stage begins.
 
     Attributes:
-        chosen: What `auto` was settled to, in sentences.
+        chosen: A sentence about each `auto` that was replaced.
 
     Raises:
-        ConfigError: If anything that the config names cannot be built.
+        ConfigError: If a part of the config cannot be built.
     """
 
     def __init__(self, loaded: Loaded, device: str = "cpu", announce: Announce = lambda *_: None) -> None:
@@ -66,7 +66,7 @@ class Bench:
         self.system.check(self)
 
     def memo(self, name: str, make: Callable[[], Any]) -> Any:
-        """Something that is made once for this bench."""
+        """Return an object that is made once for this bench and kept by name."""
         if name not in self._memo:
             self._memo[name] = make()
         return self._memo[name]
@@ -83,28 +83,28 @@ class Bench:
             raise ConfigError(f"{self.file}: data.file: {text}") from None
 
     def _refuse_oversize(self) -> None:
-        """Raw data larger than the memory of the machine are a slip of the pen."""
+        """Raise ConfigError if the raw data of a trial exceed the memory of the machine."""
         try:
             memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-        except (AttributeError, ValueError, OSError):  # not known on every system
+        except (AttributeError, ValueError, OSError):  # not available on every operating system
             return
         size = 8 * self.system.samples(self._still, self.radar)
         if size > memory:
             raise ConfigError(
                 f"{self.file}: world: the raw data of a trial take {size / 1e9:.3g} GB, and this machine has "
-                f"{memory / 1e9:.3g} GB; give the world fewer pulses or samples"
+                f"{memory / 1e9:.3g} GB; reduce the number of pulses or samples of the world"
             )
 
     def _refuse_reference(self) -> None:
         reference = getattr(self.judging, "reference", None)
         if reference is not None and self.config.processor[reference].input != "clean":
             raise ConfigError(
-                f"{self.file}: metrics.reference names {reference!r}, whose image is not the ideal one; name a method "
+                f"{self.file}: metrics.reference names {reference!r}, which processes impaired data; name a method "
                 "with 'input: clean'"
             )
 
     def world(self, given: Mapping[str, Tensor] | None = None) -> Any:
-        """The world of the config.
+        """Return the world of the config.
 
         Args:
             given: Tensors (trial,) that replace numbers, by dotted key below `world`.
@@ -119,7 +119,12 @@ class Bench:
         return self.system.bytes_per_trial(self)
 
     def trials(self, draws: Draws, given: Mapping[str, Tensor] | None = None) -> Trials:
-        """The trials of the draws, simulated, or recorded with the impairments of the config."""
+        """Return simulated trials, or the recording with the impairments of the config.
+
+        Args:
+            draws: Random numbers of the trials.
+            given: Tensors (trial,) that replace numbers of the world, by dotted key below `world`.
+        """
         if self.recording is None:
             return self.system.simulate(self, self.world(given), draws)
         impaired, truth = apply_impairments(self.recording, self.impairments, replace(draws, trials=None))
@@ -134,18 +139,21 @@ class Bench:
         detail: bool = False,
         methods: Collection[str] = (),
     ) -> Batch:
-        """Simulate a batch of trials, and run and judge every method on it.
+        """Simulate a batch of trials, run every method on it, and compute its metrics.
 
         Args:
-            draws: Random numbers, whose trials are those of the batch.
-            given: Tensors (trial,) in place of numbers of the world, by dotted key below `world`.
+            draws: Random numbers of the trials of the batch.
+            given: Tensors (trial,) that replace numbers of the world, by dotted key below `world`.
             keep: Methods whose traces are kept.
-            detail: Whether figures of single targets are wanted as well, and a method whose chain
-                does not end with an image is refused: for runs.
-            methods: The methods to run; none named means all.
+            detail: Whether metrics of single targets are computed as well, and a method whose chain
+                does not end with an image is an error, as for `torchsar run`.
+            methods: Methods that are run; all if empty.
+
+        Returns:
+            The trials and the outcomes.
 
         Raises:
-            ConfigError: If the world, the recommended method or every method fails.
+            ConfigError: If the simulation or the recommended method fails.
         """
         self.announce("", "recording" if self.recording is not None else "simulation")
         with self._named("world"):
@@ -192,14 +200,14 @@ class Bench:
     def _run(
         self, name: str, method: Method, trials: Trials, earlier: Mapping[str, Outcome]
     ) -> tuple[Trace, Mapping[str, Estimate], Mapping[str, float]]:
-        """The trace of a method with its estimates and times; those that an earlier method has made
-        already, with the same stages on the same data, are taken over.
+        """The trace of a method, its estimates and its times. Estimates of earlier methods by the
+        same stages from the same data are reused.
         """
         chain, recording = self.chains[name], trials.clean if method.input == "clean" else trials.recording
         if method.rerun is not None:
             source = earlier[method.rerun.method].trace
             if source is None:
-                raise ValueError(f"the method {method.rerun.method!r}, part of which is run again, failed")
+                raise ValueError(f"the method {method.rerun.method!r}, part of which this method repeats, failed")
             given = {k: torch.tensor(v, dtype=torch.float64, device=self.device) for k, v in method.rerun.given.items()}
             began = time.perf_counter()
             again = chain.retrace(source, method.rerun.start, given)
@@ -213,7 +221,7 @@ class Bench:
         return trace, {**shared.estimates, **trace.estimates}, {**trace.seconds, **spent}
 
     def _shared(self, method: Method, earlier: Mapping[str, Outcome]) -> Outcome:
-        """Estimates of the earlier method whose chain begins with the most of the same stages."""
+        """Reusable estimates of the earlier method with the most initial stages in common."""
         best, found = [], Outcome(Judged({}))
         for name, outcome in earlier.items():
             other = self.config.processor[name]
@@ -227,7 +235,7 @@ class Bench:
         return replace(found, estimates=kept)
 
     def _compared(self, outcomes: Mapping[str, Outcome]) -> dict[str, Outcome]:
-        """The outcomes with figures against the reference."""
+        """The outcomes with the metrics relative to the reference."""
         reference = getattr(self.judging, "reference", None)
         ideal = outcomes.get(reference or "")
         ideal = None if ideal is None or ideal.failed else ideal
@@ -238,7 +246,7 @@ class Bench:
 
     @contextmanager
     def _named(self, what: str) -> Iterator[None]:
-        """What the simulation refuses, as a sentence about the config."""
+        """Turn an error of the simulation into a ConfigError."""
         try:
             yield
         except ConfigError:
@@ -248,7 +256,7 @@ class Bench:
 
     @contextmanager
     def _announced(self, chain: Chain, method: str) -> Iterator[None]:
-        """Announce each stage as it begins."""
+        """Announce each stage when it begins."""
         hooks = [
             stage.register_forward_pre_hook(lambda *_, name=name: self.announce(method, name))
             for name, stage in chain.stages.items()

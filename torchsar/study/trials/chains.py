@@ -1,4 +1,4 @@
-"""From a checked config to chains of stages."""
+"""Chains of stages from a checked config."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ from torchsar.core import Chain, use
 from torchsar.study.settings.errors import ConfigError, did_you_mean, one_line
 from torchsar.study.settings.sections import Loaded, Method
 
-# a chain calls values that it is given from outside `given.NAME`; a config calls the true values
-# `truth.NAME`
+# prefix of true values in a config, and prefix of input values in a chain
 _TRUTH, _GIVEN = "truth.", "given."
 
 
 def build_chains(loaded: Loaded, **context: Any) -> dict[str, Chain]:
-    """The chain of every method; a rerun has that of the method whose part it runs.
+    """Build the chain of every method.
 
     Args:
         loaded: The config.
-        context: What constructors of stages take from the recording, such as `radar`.
+        context: Parameters of constructors that are not keys of the config, such as `radar`.
+
+    Returns:
+        Chains by method; a rerun has the chain of the method that it repeats.
 
     Raises:
         ConfigError: If a key, a connection or a held value is not accepted.
@@ -43,12 +45,12 @@ def build_chains(loaded: Loaded, **context: Any) -> dict[str, Chain]:
 
 
 def provides(stage: nn.Module) -> Collection[str]:
-    """Names of the values that a stage estimates."""
+    """Return the names of the values that a stage estimates."""
     return getattr(stage, "provides", ())
 
 
 def true_names(chain: Chain) -> set[str]:
-    """Names of the true values that a chain uses."""
+    """Return the names of the true values that a chain uses."""
     sources = {source for uses in chain.uses.values() for source in uses.values()}
     return {source.removeprefix(_GIVEN) for source in sources if source.startswith(_GIVEN)}
 
@@ -56,17 +58,17 @@ def true_names(chain: Chain) -> set[str]:
 def _chain(loaded: Loaded, method: Method, where: str, context: Mapping[str, Any]) -> Chain:
     built = {}
     for name, entry in (method.stages or {}).items():
-        place = f"{where}.stages.{name}"
+        path = f"{where}.stages.{name}"
         if not name.isidentifier():
             raise ConfigError(
-                f"{loaded.file}: {place}: a stage name is a word of letters, digits and '_', not starting with a digit"
+                f"{loaded.file}: {path}: a stage name has only letters, digits and '_', and does not begin with a digit"
             )
         rest = {key: value for key, value in entry.items() if key != "uses"}
         try:
-            stage = loaded.system.stages.make(rest, place, loaded.file, **context)
+            stage = loaded.system.stages.make(rest, path, loaded.file, **context)
         except AttributeError as error:
-            raise ConfigError(f"{loaded.file}: {place}: {unknown_attribute(error, context)}") from None
-        built[name] = use(stage, **_sources(entry.get("uses", {}), method, loaded, place))
+            raise ConfigError(f"{loaded.file}: {path}: {unknown_attribute(error, context)}") from None
+        built[name] = use(stage, **_sources(entry.get("uses", {}), method, loaded, path))
     try:
         return Chain(**built)
     except (ValueError, TypeError) as error:
@@ -74,15 +76,14 @@ def _chain(loaded: Loaded, method: Method, where: str, context: Mapping[str, Any
 
 
 def _sources(uses: Mapping[str, str], method: Method, loaded: Loaded, where: str) -> dict[str, str]:
-    """Where a stage takes its values from; true values only in a method that is an oracle."""
+    """The sources of the values of a stage; only an oracle may use true values."""
     found = {}
     for key, source in uses.items():
-        true = source.startswith(_TRUTH)
-        name = source.removeprefix(_TRUTH)
+        true, name = source.startswith(_TRUTH), source.removeprefix(_TRUTH)
         if true and not method.oracle:
             raise ConfigError(
-                f"{loaded.file}: {where}.uses.{key}: {source} is known to an oracle only; give the method "
-                "'oracle: true' if it is to show what could be had at best"
+                f"{loaded.file}: {where}.uses.{key}: {source} is a true value; set 'oracle: true' for the method if it "
+                "shall show the best possible result"
             )
         if true and name not in loaded.system.truths:
             raise ConfigError(
@@ -94,12 +95,18 @@ def _sources(uses: Mapping[str, str], method: Method, loaded: Loaded, where: str
 
 
 def unknown_attribute(error: AttributeError, context: Mapping[str, Any]) -> str:
-    """The sentence for a stage that asks its radar for what only another system's radar has.
+    """Return the message about a stage that needs an attribute which the radar does not have.
 
-    Any other AttributeError is a fault of the program and is raised again.
+    Args:
+        error: The error of the stage. Any other AttributeError is a fault of the program and is
+            raised again.
+        context: Parameters of the constructor of the stage, with `radar`.
+
+    Returns:
+        The message.
     """
     if error.obj is not context.get("radar") or error.obj is None:
         raise error
     return (
-        f"this stage needs radar.{error.name}, which a radar of this system does not have; it belongs to another system"
+        f"this stage needs radar.{error.name}, which a radar of this system does not have; use a stage of this system"
     )

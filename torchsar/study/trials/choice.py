@@ -1,4 +1,4 @@
-"""What a config may leave open: decisions, their alternatives and how these are compared."""
+"""Choices of a config, their alternatives, and the comparison of these."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Alternative:
-    """One way to do what a choice is about.
+    """One alternative of a choice.
 
     Args:
-        name: For tables.
-        keys: What stands in the config for it, in the mapping that the choice is made in.
-        loss: Predicted loss by metric; None where nothing is predicted.
-        neglects: What it leaves out.
-        effect: The row of the requirements about the same, which is then judged by this loss.
+        name: Name in tables.
+        keys: Keys and values that select it in the mapping of the choice.
+        loss: Predicted loss by metric; None if there is no prediction.
+        neglects: The effects that it neglects.
+        effect: Name of the requirement about the same effect, whose verdict then follows from this
+            loss.
     """
 
     name: str
@@ -26,18 +27,20 @@ class Alternative:
     effect: str = ""
 
 
-# levels below this are differences of rounding at most
+# lower levels are differences by rounding in double precision
 EXACT_DB = -280.0
 
 
 @dataclass(frozen=True)
 class Measured:
-    """How the alternatives of a choice are compared.
+    """Measurement of the time and the loss of alternatives.
 
     Args:
-        run: Does the work of one alternative, which is timed; the yardstick is run as well.
-        loss: Loss by metric of a result of `run`, against the yardstick.
-        share: Share of the whole work that `run` does of an alternative; times are divided by it.
+        run: Function of an alternative that computes its result, and whose time is measured.
+        loss: Function of an alternative and its result that returns the loss by metric, relative to
+            the yardstick.
+        share: Function of an alternative that returns the share of its work that `run` does; times
+            are divided by it.
     """
 
     run: Callable[[Alternative], Any]
@@ -47,15 +50,15 @@ class Measured:
 
 @dataclass(frozen=True)
 class Choice:
-    """A decision that a config takes, with its alternatives from the cheapest to the best one.
+    """A choice that a config makes, with its alternatives from the cheapest to the exact one.
 
     Args:
-        name: For tables.
-        at: Where `auto` may be written: a dotted key of the world such as `world.fidelity`, or
-            `stage`, or `STAGE.key` for a key of stages of that name.
-        alternatives: The cheapest first, the best one last.
-        measured: Prepares their comparison, which may take long.
-        yardstick: What they are compared with, where that is none of them.
+        name: Name in tables.
+        at: The key that may have the value `auto`: a dotted key of the world such as
+            `world.fidelity`, `stage`, or `STAGE.key` for a key of all stages of that name.
+        alternatives: The alternatives, the cheapest first and the exact one last.
+        measured: Function that prepares their measurement, which may take long.
+        yardstick: The reference of the measurement, if it is none of the alternatives.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""What a system brings: sections of its configs, its world, its judge and its choices."""
+"""Base of the systems: config sections, world, metrics, limits, choices and pictures of each."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ class Noise:
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """Base of the section `world` of every system: what is true and no processor may see.
+    """Base of the section `world` of every system: the true scene, which no processor may use.
 
     Args:
-        trials: Trials of each case of a run; a sweep has its own number.
+        trials: Number of trials of each case of a run; a sweep has its own number.
     """
 
     trials: int = 1
@@ -51,11 +51,11 @@ class World:
 
 @dataclass(frozen=True)
 class Judging:
-    """Section `metrics` of the systems that need no more: how results are judged.
+    """The section `metrics` of systems without further settings of their metrics.
 
     Args:
-        reference: The method whose image of the same scene is the ideal one.
-        published: Figure -> case -> method -> what the source published.
+        reference: The method with the ideal image of the same scene.
+        published: Published values by metric, case and method.
     """
 
     reference: str | None = None
@@ -64,13 +64,14 @@ class Judging:
 
 @dataclass(frozen=True)
 class Column:
-    """A figure as reports and pictures show it.
+    """Presentation of a metric in reports and pictures.
 
     Args:
-        label: What it is.
-        unit: Its unit, for tables and axes; SI units get prefixes where they stand alone.
-        digits: Digits after the point.
-        drawn: How methods are compared in a picture: "" not at all, "mean" or "rms" over trials.
+        label: Its name in words.
+        unit: Its unit for tables and axes; SI units are shown with prefixes.
+        digits: Number of digits after the decimal point.
+        drawn: Statistic over trials in the picture that compares methods: "mean", "rms", or "" for
+            no picture.
     """
 
     label: str
@@ -80,24 +81,24 @@ class Column:
 
 
 class System(ABC):
-    """Base of the systems: what is physics. Commands, batches, stores and reports exist once.
+    """Base of the systems, which contain the physics; all other code is common to them.
 
     Class attributes:
-        name: The value of the key `system`.
+        name: Value of the key `system`.
         about: One line for `torchsar list`.
         Radar, World, Judging: Constructors of the sections radar, world and metrics.
-        impairments: What may be put into a recording by data.impairments.
-        reads: What data.file holds; empty where no recordings are read.
-        ending: Stages that end a chain with an image; empty where a run needs none.
+        impairments: Impairments that data.impairments may add to a recording.
+        reads: Content of data.file; empty if the system reads no recordings.
+        ending: Stages that end a chain with an image; empty if a run needs no images.
         truths: Names of true values that oracles may use.
-        definitions: Of figures, by name, for metrics.json and reports.
-        columns: Figures that reports show, by metric.
-        target_columns: Those of named targets.
-        tolerance: Largest acceptable loss by metric, by default.
-        exact: Where `auto` may be written (see `Choice.at`), with the keys of the exact choice.
-        images: Axes of signals that count as images.
-        address: The address of the random numbers of runs.
-        peak: The largest tensor of a trial over its raw data, as measured.
+        definitions: Definitions of metrics, by name, for metrics.json and reports.
+        columns: Metrics in reports.
+        target_columns: Metrics of named targets in reports.
+        tolerance: Default of the largest acceptable loss, by metric.
+        exact: Keys of the exact alternative, by the key that may be `auto` (see `Choice.at`).
+        images: Axes of signals that are images.
+        address: Address of the random numbers of runs.
+        peak: Measured ratio of the largest tensor of a trial and its raw data.
     """
 
     name: ClassVar[str]
@@ -119,7 +120,7 @@ class System(ABC):
     peak: ClassVar[float] = 8.0
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Other processes make the system anew from its class, which is all that there is of it."""
+        """A system has no state: other processes build it from its class."""
         return type(self), ()
 
     @cached_property
@@ -130,53 +131,50 @@ class System(ABC):
     def stages(self) -> Catalogue:
         return stages()
 
-    @property
-    def recording_impairments(self) -> Catalogue:
-        return self.impairments
-
-    # physics, by every system
+    # physics of every system
 
     @abstractmethod
     def simulate(self, bench: Bench, world: Any, draws: Draws) -> Trials:
-        """Simulate the trials of the draws; numbers of the world may differ from trial to trial."""
+        """Simulate the trials of the draws; numbers of the world may differ between trials."""
 
     @abstractmethod
     def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
-        """Compare what a method found with the truth; detail: of single targets as well."""
+        """Compute the metrics of a method; with `detail` those of single targets as well."""
 
     @abstractmethod
     def samples(self, world: Any, radar: Any) -> int:
-        """Samples of the raw data of one trial."""
+        """Return the number of samples of the raw data of one trial."""
 
     def may_differ(self, path: str, world: Mapping[str, Any]) -> bool:
-        """Whether a number of the world, by dotted key, may differ between the trials of a batch.
+        """Return whether a number of the world, by dotted key, may differ between trials.
 
-        By default its constructor decides; one that gives arrays their shape may not.
+        By default this is so if the constructor accepts a tensor. A number that determines the
+        shape of arrays may not.
         """
         return self.sections["world"].takes_tensor(path.split("."), world)
 
     def bytes_per_trial(self, bench: Bench) -> int:
-        """Bytes of the largest tensor that a trial needs."""
+        """Return the size of the largest tensor of a trial in bytes."""
         return int(self.peak * self.samples(bench.world(), bench.radar) * bench.dtype.itemsize)
 
-    # physics, where a system has it
+    # optional physics
 
     def read(self, path: str, dtype: torch.dtype) -> Recording:
-        """The recording in a file. Raises ValueError or OSError."""
+        """Return the recording in a file. Raises ValueError or OSError."""
         raise NotImplementedError(f"system {self.name} reads no recordings")
 
     def context(self, recording: Recording) -> dict[str, Any]:
-        """What stages take from a recording besides its radar."""
+        """Return parameters of stages from a recording, in addition to its radar."""
         return {}
 
     def check(self, bench: Bench) -> None:
-        """Refuse what the constructors cannot see. Raises ConfigError."""
+        """Check what no constructor checks. Raises ConfigError."""
 
     def check_sweep(self, loaded: Loaded, grid: Mapping[str, Any]) -> None:
-        """Refuse a grid that contradicts itself. Raises ConfigError."""
+        """Check that the axes of a grid are consistent. Raises ConfigError."""
 
     def compare(self, bench: Bench, outcome: Outcome, ideal: Outcome | None) -> Judged:
-        """The figures of a method with those against the method that metrics.reference names."""
+        """Return the metrics of a method, with those relative to the method metrics.reference."""
         judged, key = outcome.judged, "entropy_nats"
         if ideal is None or ideal is outcome or key not in judged.metrics or key not in ideal.metrics:
             return judged
@@ -184,11 +182,11 @@ class System(ABC):
         return replace(judged, metrics={**judged.metrics, "entropy_above_ideal_nats": above})
 
     def bounds(self, bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
-        """Lower bounds of errors: metric -> name of the bound -> (trial,)."""
+        """Return lower bounds of errors, (trial,), by metric and name of the bound."""
         return {}
 
     def found(self, bench: Bench, outcome: Outcome, trials: Trials) -> dict[str, Found]:
-        """What the estimators of a method found, by `stage.value`."""
+        """Return the estimates of a method by `stage.value`."""
         n, table = trials.count, {}
         for stage, estimate in outcome.estimates.items():
             ok = estimate.ok.expand(n) if estimate.ok.numel() in (1, n) else None
@@ -199,39 +197,39 @@ class System(ABC):
         return table
 
     def limits(self, bench: Bench) -> Mapping[Limit, Sequence[str]]:
-        """Limits of methods in this scene, each with the methods that it concerns."""
+        """Return the limits of methods in this scene, with the methods that each concerns."""
         return {}
 
     def requirements(self, bench: Bench) -> Sequence[Requirement]:
-        """What each simplification neglects in this scene."""
+        """Return the effects that each simplification neglects in this scene."""
         return ()
 
     def choices(self, bench: Bench) -> Sequence[Choice]:
-        """Decisions that the config takes, the most important one first."""
+        """Return the choices of the config, the most important one first."""
         return ()
 
     def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
-        """Makers of the pictures of a run, in the order of reading; results by case."""
+        """Yield functions that draw the pictures of a run, in order, from the results by case."""
         yield partial(comparisons, results, self.columns)
 
     def pictured(self, result: Result) -> dict[str, Signal]:
-        """The images of a case that are kept, those of the first trial, by path."""
+        """Return the images of the first trial of a case that are stored, by path."""
         return result.images
 
     def theory(self, result: Result) -> Mapping[str, Mapping[str, float]]:
-        """Figures of named targets without any error, by target."""
+        """Return the theoretical metrics of named targets without errors, by target."""
         return {}
 
     def notes(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        """(title, text) of what a reader of the report should know."""
+        """Yield notes for the report, as (title, text)."""
         yield from ()
 
     def extra_definitions(self, bench: Bench) -> Mapping[str, Any]:
-        """Definitions that depend on the config."""
+        """Return definitions that depend on the config."""
         return {}
 
 
 def per_trial_first(x: Tensor, count: int) -> Tensor:
-    """A tensor with a leading dim of trials, made where there is none."""
+    """Return a tensor with trials as the first dim; a value without this dim is repeated."""
     x = x.detach()
     return x if x.ndim and x.shape[0] == count else x[None].expand(count, *x.shape)
