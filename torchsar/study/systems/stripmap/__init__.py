@@ -10,7 +10,9 @@ from torch import Tensor
 
 from torchsar.core import Draws, Recording, Trace, Truth
 from torchsar.echo import target_energy
+from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Requirement
+from torchsar.focus.strip_limits import strip_limits
 from torchsar.io import read_stripmap
 from torchsar.metrics.bounds import reference_doppler_std_hz, tone_frequency_bound_hz, velocity_bound_m_s
 from torchsar.radar import StripmapRadar
@@ -139,6 +141,13 @@ class Stripmap(System):
         velocity = velocity_bound_m_s(q, seconds, truth["velocity_m_s"].to(q), radar.wavelength_m, range_m)
         bounds = {"doppler_error_hz": doppler, "doppler_baseband_error_hz": doppler}
         return {**bounds, "velocity_error_m_s": {"Cramer-Rao bound": velocity}}
+
+    def limits(self, bench: Bench) -> Mapping[Limit, Sequence[str]]:
+        """Of simulated data: the aperture of recorded ones is what the beam has made it."""
+        if bench.recording is not None:
+            return {}
+        found = strip_limits(bench.radar, bench.world().samples, *Probe.of(bench).motion)
+        return {limit: list(bench.chains) for limit in found}
 
     def requirements(self, bench: Bench) -> Sequence[Requirement]:
         return Probe.of(bench).rows()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -98,7 +99,9 @@ class Probe:
 
     def rows(self) -> tuple[Requirement, ...]:
         """What each simplification neglects for this size, Doppler and velocity."""
-        return requirements(self.radar, self.radar.raw_axes(*self.size), *self.motion)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # an aliased aperture is one of the limits
+            return requirements(self.radar, self.radar.raw_axes(*self.size), *self.motion)
 
 
 def _first(x: Tensor | float) -> float:
