@@ -217,7 +217,10 @@ def test_doubtful_recordings_are_named_in_a_warning(
 
 def test_aliasing_is_named_with_both_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     logging.getLogger("torchsar").handlers.clear()
-    config, expected = str(write_tiny(tmp_path)), "Doppler band of a 0.2 s aperture is 14.67 Hz, and must be below 10 Hz"
+    config, expected = (
+        str(write_tiny(tmp_path)),
+        "Doppler band of a 0.2 s aperture is 14.67 Hz, and must be below 10 Hz",
+    )
     assert main(["run", config, "radar.prf_hz=10.0", "--out", str(tmp_path / "run")]) == 0
     assert f"warning: {expected}" in capsys.readouterr().err
     assert main(["requires", config, "radar.prf_hz=10.0", "--out", str(tmp_path / "requires")]) == 0

@@ -35,6 +35,8 @@ FILES = ("config.yaml", "trade.json", "trade.txt", "figures")
 _FAILURES = (ValueError, TypeError, KeyError, RuntimeError, ArithmeticError)
 # work is repeated for so long (s) that its time is known to a percent or so
 _LEAST_S = 0.1
+# losses below this (dB), those of rounding in double precision, are drawn at it
+_DRAWN_DB = -150.0
 Row = dict[str, Any]
 
 
@@ -108,7 +110,7 @@ def compared(choice: Choice, bench: Bench, tolerance: Mapping[str, float]) -> li
 
 @dataclass
 class _Tried:
-    """What was measured of one alternative; `failed` names an error or a loss that is not finite."""
+    """What was measured of one alternative; `failed` is an error, or a loss that is not finite."""
 
     one: Alternative
     measured: Measured
@@ -179,7 +181,7 @@ def _draw(name: str, rows: Sequence[Row], tolerance: Mapping[str, float], path: 
     metric = next((metric for row in rows for metric in row["loss"] if metric in tolerance), None)
     kept = [row for row in rows if not row["failed"] and metric in row["loss"]]
     if metric is not None and kept:
-        loss = [row["loss"][metric] for row in kept]
+        loss = [max(row["loss"][metric], _DRAWN_DB) for row in kept]
         figure = plot.trade(
             [r["name"] for r in kept], [r["cpu_s"] for r in kept], loss, metric, name, tolerance[metric]
         )

@@ -212,9 +212,7 @@ def _image(
 
 
 def _compared(exact: Signal, work: Callable[[Alternative], Signal], share: float = 1.0) -> Measured:
-    return Measured(
-        work, lambda one, image: {"image_error_db": worst_image_error_db(image, exact)}, lambda one: share
-    )
+    return Measured(work, lambda one, image: {"image_error_db": worst_image_error_db(image, exact)}, lambda one: share)
 
 
 def _orders(bench: Bench) -> Measured:
