@@ -23,7 +23,7 @@ from torchsar.study.output.pictures import Drawn
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.sections import Loaded
 from torchsar.study.systems.stripmap import figures, judge
-from torchsar.study.systems.stripmap.choices import Probe, choices
+from torchsar.study.systems.stripmap.choices import choices, probe_of
 from torchsar.study.systems.stripmap.world import Strip
 from torchsar.study.trials.batch import Batch, Judged, Outcome, Result, Trials
 from torchsar.study.trials.bench import Bench
@@ -146,11 +146,11 @@ class Stripmap(System):
         """Of simulated data: the aperture of recorded ones is what the beam has made it."""
         if bench.recording is not None:
             return {}
-        found = strip_limits(bench.radar, bench.world().samples, *Probe.of(bench).motion)
+        found = strip_limits(bench.radar, bench.world().samples, *probe_of(bench).motion)
         return {limit: list(bench.chains) for limit in found}
 
     def requirements(self, bench: Bench) -> Sequence[Requirement]:
-        return Probe.of(bench).rows()
+        return probe_of(bench).rows()
 
     def choices(self, bench: Bench) -> Sequence[Choice]:
         return choices(bench, {row.effect: row for row in self.requirements(bench)})
