@@ -215,10 +215,17 @@ def test_doubtful_recordings_are_named_in_a_warning(
     assert len(said) == 1 and all(part in said[0] for part in expected)
 
 
-def test_aliasing_is_named_with_both_figures(tmp_path: Path) -> None:
-    out = tmp_path / "result"
-    assert main(["requires", str(write_tiny(tmp_path)), "radar.prf_hz=10.0", "--out", str(out)]) == 0
-    assert "PRF 10 Hz is below the Doppler band 14.66" in (out / "requires.json").read_text()
+def test_aliasing_is_named_with_both_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    logging.getLogger("torchsar").handlers.clear()
+    config, expected = (
+        str(write_tiny(tmp_path)),
+        "Doppler band of a 0.2 s aperture is 14.67 Hz, and must be below 10 Hz",
+    )
+    assert main(["run", config, "radar.prf_hz=10.0", "--out", str(tmp_path / "run")]) == 0
+    assert f"warning: {expected}" in capsys.readouterr().err
+    assert main(["requires", config, "radar.prf_hz=10.0", "--out", str(tmp_path / "requires")]) == 0
+    (row,) = json.loads((tmp_path / "requires" / "requires.json").read_text())["all"]["limits"]
+    assert (row["verdict"], row["limit"]) == ("warn", 10.0) and row["value"] == pytest.approx(14.67, abs=0.01)
 
 
 def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:

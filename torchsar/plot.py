@@ -40,6 +40,8 @@ MARKERS, DASHES = "osD^vPX", ("--", ":", "-.")
 # widths in inches of a figure alone and of one panel among several: text of 9 points has at least 9
 # pixels where a page of 420 pixels leaves 386 of them
 _ALONE, _PANEL = 5.2, 3.9
+# directions from a point in which its number may stand
+_AROUND = ((1, 0.6), (-1, 0.6), (1, -0.6), (-1, -0.6), (0, 1.1), (0, -1.1), (1.2, 0), (-1.2, 0))
 # inches beside and below images for labels and the colour scale, and the largest height of an image
 _BESIDE, _BELOW, _HIGHEST = 1.55, 0.85, 4.6
 # pictures to scale become illegible when they are more elongated than this
@@ -523,7 +525,9 @@ def trade(
     title: str,
     tolerance: float | None = None,
 ) -> Figure:
-    """Draw loss over computing time: a labelled point for each alternative and the Pareto front.
+    """Draw loss over computing time: a numbered point for each alternative, and the Pareto front.
+
+    Points on the front are filled; a step line joins them. Below the axes stand the names.
 
     Args:
         names: Names of the alternatives.
@@ -536,15 +540,56 @@ def trade(
     figure, axes = _figure(_ALONE, 3.6)
     points = sorted(zip(seconds, loss, strict=True))
     front = [(s, e) for i, (s, e) in enumerate(points) if all(e < other for _, other in points[:i])]
-    axes.step([s for s, _ in front], [e for _, e in front], where="post", color=FAINT, linewidth=1, zorder=0)
-    if tolerance is not None:
-        axes.axhline(tolerance, color=FAINT, linestyle="--", linewidth=1, zorder=0)
-    for i, (name, s, e) in enumerate(zip(names, seconds, loss, strict=True)):
-        axes.plot([s], [e], "o", color=COLOURS[i % len(COLOURS)], markersize=7)
-        axes.annotate(name, (s, e), textcoords="offset points", xytext=(7, 4 if i % 2 else -10), fontsize=8, color=INK)
     axes.set(xscale="log", xlabel="time (s)", ylabel=ylabel, title=title)
-    axes.margins(0.18)
+    for i, (name, s, e) in enumerate(zip(names, seconds, loss, strict=True), 1):
+        colour = COLOURS[(i - 1) % len(COLOURS)]
+        filled = colour if (s, e) in front else "white"
+        axes.plot([s], [e], "o", color=colour, markerfacecolor=filled, markersize=7, label=f"{i}  {name}")
+    axes.margins(0.12)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    low, high = (math.log10(x) for x in axes.get_xlim())
+    axes.step(
+        [s for s, _ in front] + [10**high], [e for _, e in front] + [front[-1][1]], where="post", color=INK, zorder=0
+    )
+    if tolerance is not None:
+        axes.axhline(tolerance, color=SECOND, linestyle="--", zorder=0, label="tolerance")
+    bottom, top = axes.get_ylim()
+    _number_points(
+        axes, [((math.log10(s) - low) / (high - low), (e - bottom) / (top - bottom)) for s, e in zip(seconds, loss)]
+    )
+    axes.set(xlim=(10**low, 10**high), ylim=(bottom, top))
+    _legend_below(figure, axes)
     return figure
+
+
+def _number_points(axes: Axes, points: Sequence[tuple[float, float]]) -> None:
+    """Write the number of every point beside it, clear of other points and numbers.
+
+    Args:
+        axes: Axes of a figure of one panel.
+        points: Positions in shares of the axes.
+    """
+    size = np.array([72 * 0.8 * _ALONE, 72 * 0.75 * 3.6])  # of the panel in points of 1/72 inch, roughly
+    at = [np.array(point) * size for point in points]
+    taken = list(at)
+    for i, point in enumerate(at, 1):
+        beside = [np.array([9.0 * ring * x, 9.0 * ring * y]) for ring in (1, 2, 3, 4) for x, y in _AROUND]
+        # the free position that is nearest; the last one where none is
+        offset = next((o for o in beside if all(np.hypot(*(point + o - t)) > 8.5 for t in taken)), beside[-1])
+        taken.append(point + offset)
+        axes.annotate(
+            str(i),
+            points[i - 1],
+            xycoords="axes fraction",
+            textcoords="offset points",
+            xytext=tuple(offset),
+            fontsize=8,
+            color=INK,
+            ha="center",
+            va="center",
+        )
 
 
 @_styled

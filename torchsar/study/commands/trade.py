@@ -8,6 +8,7 @@ import platform
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,8 @@ FILES = ("config.yaml", "trade.json", "trade.txt", "figures")
 _FAILURES = (ValueError, TypeError, KeyError, RuntimeError, ArithmeticError)
 # work is repeated for so long (s) that its time is known to a percent or so
 _LEAST_S = 0.1
+# losses below this (dB), those of rounding in double precision, are drawn at it
+_DRAWN_DB = -150.0
 Row = dict[str, Any]
 
 
@@ -82,8 +85,7 @@ def trade(loaded: Loaded, out: Path, device: str = "cpu") -> str:
 def compared(choice: Choice, bench: Bench, tolerance: Mapping[str, float]) -> list[Row]:
     """The alternatives of one choice, timed and judged, the cheapest acceptable one marked."""
     repeats = bench.config.trade.repeats
-    first = [] if choice.yardstick is None else [choice.yardstick]
-    order = [*first, *reversed(choice.alternatives)]  # the best first: what the others are compared with
+    order = [*choice.alternatives, *([] if choice.yardstick is None else [choice.yardstick])]
     names = [f"{choice.name}: {one.name}" for one in order]
     progress = Steps([f"{choice.name}: preparation", *names * repeats])
     with Ticker(progress.say):
@@ -93,42 +95,58 @@ def compared(choice: Choice, bench: Bench, tolerance: Mapping[str, float]) -> li
             measured = choice.measured()
         except _FAILURES as error:
             raise ConfigError(f"{bench.file}: {one_line(error)}") from error
-        timings: dict[str, list[tuple[float, float]]] = {one.name: [] for one in order}
-        rows: dict[str, Row] = {}
-        for turn in range(repeats):
-            for one, name in zip(order, names, strict=True):
-                if turn == 0 or not rows[one.name]["failed"]:
+        found = [_Tried(one, measured) for one in order]
+        for _ in range(repeats):
+            for tried, name in zip(found, names, strict=True):
+                if not tried.failed:
                     progress.begin(name)
-                    rows[one.name] = _timed(one, measured, timings[one.name])
-                    if turn == 0:
-                        log.info("%s", _line(rows[one.name]))
-    for name, times in timings.items():
-        if times:
-            cpu, wall = (statistics.median(part) for part in zip(*times, strict=True))
-            rows[name].update(cpu_s=cpu, wall_s=wall)
-    found = [rows[one.name] for one in (*first, *choice.alternatives)]
-    for row in found:
-        row["within_tolerance"] = not row["failed"] and within(row["loss"], tolerance)
-    kept = [row for row in found if row["within_tolerance"]]
-    for row in found:
+                    tried.again()
+    rows = [tried.row(tolerance) for tried in found]
+    kept = [row for row in rows if row["within_tolerance"]]
+    for row in rows:
         row["recommended"] = bool(kept) and row is min(kept, key=lambda r: r["cpu_s"])
-    return found
+    return rows
 
 
-def _timed(one: Alternative, measured: Measured, times: list[tuple[float, float]]) -> Row:
-    """One repeat of an alternative; the row names a failure or a loss that is not finite."""
-    row: Row = {"name": one.name, "neglects": one.neglects, "cpu_s": None, "wall_s": None, "peak_bytes": None}
-    row |= {"loss": {}, "predicted": one.loss, "failed": ""}
-    try:
-        with PeakMemory() as peak:
-            spent, result = _spent(lambda: measured.run(one), _LEAST_S if times else 0.0)
-        times.append((spent[0] / measured.share(one), spent[1] / measured.share(one)))
-        loss = {name: float(value) for name, value in measured.loss(one, result).items()}
-    except _FAILURES as error:
-        times.clear()
-        return {**row, "failed": one_line(error)}
-    wrong = [name for name, value in loss.items() if math.isnan(value) or value == math.inf]
-    return {**row, "peak_bytes": peak.bytes, "loss": loss, "failed": f"{wrong[0]} is not finite" if wrong else ""}
+@dataclass
+class _Tried:
+    """What was measured of one alternative; `failed` is an error, or a loss that is not finite."""
+
+    one: Alternative
+    measured: Measured
+    times: list[tuple[float, float]] = field(default_factory=list)
+    peaks: list[int] = field(default_factory=list)
+    loss: dict[str, float] = field(default_factory=dict)
+    failed: str = ""
+
+    def again(self) -> None:
+        """One more repeat; the first one measures the loss as well."""
+        try:
+            with PeakMemory() as peak:
+                spent, result = _spent(lambda: self.measured.run(self.one), _LEAST_S if self.times else 0.0)
+            if not self.times:
+                self.loss = {name: float(value) for name, value in self.measured.loss(self.one, result).items()}
+        except _FAILURES as error:
+            self.failed = one_line(error)
+        else:
+            share = self.measured.share(self.one)
+            self.times.append((spent[0] / share, spent[1] / share))
+            self.peaks += [] if peak.bytes is None else [peak.bytes]
+            wrong = next((name for name, x in self.loss.items() if math.isnan(x) or x == math.inf), None)
+            self.failed = "" if wrong is None else f"{wrong} is not finite"
+        if len(self.times) < 2:
+            log.info("%s", self._line())
+
+    def row(self, tolerance: Mapping[str, float]) -> Row:
+        """The alternative as it stands in trade.json."""
+        cpu, wall = (statistics.median(part) for part in zip(*self.times)) if self.times else (None, None)
+        row = {"name": self.one.name, "neglects": self.one.neglects, "cpu_s": cpu, "wall_s": wall}
+        row |= {"peak_bytes": max(self.peaks, default=None), "loss": self.loss, "predicted": self.one.loss}
+        return {**row, "failed": self.failed, "within_tolerance": not self.failed and within(self.loss, tolerance)}
+
+    def _line(self) -> str:
+        losses = ", ".join(f"{name} {_loss(value)}" for name, value in self.loss.items())
+        return f"{self.one.name}: " + (f"failed: {self.failed}" if self.failed else losses)
 
 
 def _spent(work: Callable[[], Any], least_s: float) -> tuple[tuple[float, float], Any]:
@@ -139,12 +157,6 @@ def _spent(work: Callable[[], Any], least_s: float) -> tuple[tuple[float, float]
         spent = (time.process_time() - began[0], time.perf_counter() - began[1])
         if spent[0] >= least_s:
             return (spent[0] / runs, spent[1] / runs), result
-
-
-def _line(row: Row) -> str:
-    if row["failed"]:
-        return f"{row['name']}: failed: {row['failed']}"
-    return f"{row['name']}: " + ", ".join(f"{name} {_loss(value)}" for name, value in row["loss"].items())
 
 
 def _loss(value: float) -> str:
@@ -169,7 +181,7 @@ def _draw(name: str, rows: Sequence[Row], tolerance: Mapping[str, float], path: 
     metric = next((metric for row in rows for metric in row["loss"] if metric in tolerance), None)
     kept = [row for row in rows if not row["failed"] and metric in row["loss"]]
     if metric is not None and kept:
-        loss = [row["loss"][metric] for row in kept]
+        loss = [max(row["loss"][metric], _DRAWN_DB) for row in kept]
         figure = plot.trade(
             [r["name"] for r in kept], [r["cpu_s"] for r in kept], loss, metric, name, tolerance[metric]
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -57,8 +58,9 @@ _ESTIMATORS: dict[type, Estimator] = {
 }
 # integration time (s) of the source, for targets that are seen through a pattern
 _PATTERN_S = 4.5
-# range lines on which two-dimensional chains are compared; they hold the migration of any aperture
-_LINES = 128
+# range lines on which two-dimensional chains are compared, which hold the migration of any
+# aperture, and integration times that their pulses last
+_LINES, _APERTURES = 128, 1.5
 # corrections of range migration, and the rows of the requirements that are about their losses
 _MIGRATIONS = {
     "none": (NoMigration(), "no range migration correction"),
@@ -197,18 +199,20 @@ def _alone(bench: Bench, dtype: torch.dtype | None = None, fastest: bool = False
     return replace(world, **changes).trials_of(bench.radar, draws, dtype or bench.dtype)
 
 
-def _image(bench: Bench, trials: Trials, rebuild: Any = None, **settings: Any) -> tuple[Signal, FocusedPoint]:
-    """Images of the targets with their true velocities."""
+def _image(
+    bench: Bench, trials: Trials, band_hz: float | None = None, rebuild: Any = None, **settings: Any
+) -> tuple[Signal, FocusedPoint]:
+    """Images of the targets with their true velocities, of the band that the config focuses."""
     best = LeastSquares(min(2, bench.radar.channels))
-    chain = known_motion_chain(bench.radar, rebuild or best, _bandwidth_hz(bench), **settings)
+    chain = known_motion_chain(bench.radar, rebuild or best, band_hz or _bandwidth_hz(bench), **settings)
     trace = chain.trace(trials.clean, {f"given.{name}": trials.truth[name] for name in TRUTHS})
     focused = FocusedPoint.of(chain, trace, bench.radar)
     assert focused is not None
     return trace.signal, focused
 
 
-def _compared(exact: Signal, work: Callable[[Alternative], Signal]) -> Measured:
-    return Measured(work, lambda one, image: {"image_error_db": worst_image_error_db(image, exact)})
+def _compared(exact: Signal, work: Callable[[Alternative], Signal], share: float = 1.0) -> Measured:
+    return Measured(work, lambda one, image: {"image_error_db": worst_image_error_db(image, exact)}, lambda one: share)
 
 
 def _orders(bench: Bench) -> Measured:
@@ -216,21 +220,38 @@ def _orders(bench: Bench) -> Measured:
     return _compared(_image(bench, trials)[0], lambda one: _image(bench, trials, order=one.keys["order"])[0])
 
 
+def _cropped(bench: Bench) -> dict[str, Any]:
+    """The part of the record in which targets are lit for the band that is focused: replicas of
+    other bands migrate in their own way.
+    """
+    world = bench.world()
+    lit = _PATTERN_S if world.integration_s is None else float(world.integration_s)
+    late = max(map(abs, _span(world, "azimuth_m"))) / bench.radar.speed_m_s
+    pulses = math.ceil((_APERTURES * lit + 2 * late) * bench.radar.prf_hz)
+    return {"gate": BandLimited(lit), "pulses": min(world.pulses, pulses)}
+
+
 def _migrated(bench: Bench) -> Measured:
     """Against the response along azimuth times that along range, which migration leaves alone.
 
-    Targets are lit for the band that is focused: replicas of other bands migrate in their own way.
+    Only the band is focused that is lit at every range frequency: exact imaging, as the keystone
+    transform, stretches the ends of the spectrum along azimuth in proportion to the frequency.
     """
-    lit = bench.world().integration_s
-    size = {"gate": BandLimited(_PATTERN_S if lit is None else lit)}
+    size, radar = _cropped(bench), bench.radar
+    slowest = radar.speed_m_s - _span(bench.world(), "u_a_m_s")[1]
+    lit_hz = slowest**2 * size["gate"].duration_s / (radar.wavelength_m * radar.reference_range_m)
+    inside = 1 - 2 * radar.pulse.bandwidth_hz / radar.carrier_hz
+    band = inside * min(lit_hz, _bandwidth_hz(bench) or math.inf)
     trials = _alone(bench, samples=max(_LINES, bench.world().samples or 0), **size)
-    line, lines = _image(bench, _alone(bench, torch.complex128, **size))[0], trials.clean.signal.axes[2]
+    line, lines = _image(bench, _alone(bench, torch.complex128, **size), band)[0], trials.clean.signal.axes[2]
     beyond = lines.values() - trials.truth["range_m"][:, None]
-    across = torch.sinc(beyond / (bench.radar.wave_speed_m_s / bench.radar.pulse.bandwidth_hz))
+    across = torch.sinc(beyond / (radar.wave_speed_m_s / radar.pulse.bandwidth_hz))
     exact = Signal(line.data[..., None] * across[:, None], (*line.axes, lines))
     follow = _follows(bench)
     return _compared(
-        exact, lambda one: _image(bench, trials, migration=_MIGRATIONS[one.keys["kind"]][0], follow=follow)[0]
+        exact,
+        lambda one: _image(bench, trials, band, migration=_MIGRATIONS[one.keys["kind"]][0], follow=follow)[0],
+        size["pulses"] / bench.world().pulses,
     )
 
 
@@ -264,11 +285,13 @@ def _received(bench: Bench) -> Measured:
 
 
 def _dimensions(bench: Bench) -> Measured:
-    """The same targets by azimuth-only data, range-compressed lines and full chirps."""
+    """The fastest target by azimuth-only data, range-compressed lines and full chirps."""
     # echoes begin at the middle of the axis
     longer = _LINES + 2 * bench.radar.pulse.n_samples(bench.radar.sampling_hz)
     sizes = ({}, {"samples": _LINES}, {"samples": longer, "kind": "full"})
-    trials = {name: _alone(bench, fastest=True, **size) for name, size in zip(_DIMENSIONS, sizes, strict=True)}
+    crop = _cropped(bench)
+    share = crop["pulses"] / bench.world().pulses / len(bench.world().targets)
+    trials = {name: _alone(bench, fastest=True, **crop, **size) for name, size in zip(_DIMENSIONS, sizes, strict=True)}
 
     def run(one: Alternative) -> Signal:
         kind = one.keys["dimensions"]
@@ -284,4 +307,4 @@ def _dimensions(bench: Bench) -> Measured:
     def loss(one: Alternative, image: Signal) -> dict[str, float]:
         return {"width_change_percent": float((100 * (width(image) / exact - 1)).abs().max())}
 
-    return Measured(run, loss)
+    return Measured(run, loss, lambda one: share)

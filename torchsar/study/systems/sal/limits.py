@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, get_args
 
@@ -18,9 +18,9 @@ from torchsar.echo import range_model_error_db
 from torchsar.focus.ladar_requirements import Limit, ladar_limits, ladar_requirements
 from torchsar.focus.requirements import Requirement
 from torchsar.metrics import error_after_gain_db
-from torchsar.metrics.radial_motion import leading, lit_periods
-from torchsar.scene import Extremes, Motion, Points, drawn_motion
-from torchsar.scene.ladar import refuse_unseen_ranges
+from torchsar.metrics.moved_scene import Moved
+from torchsar.metrics.radial_motion import lit_periods
+from torchsar.scene import drawn_motion
 from torchsar.study.names.registry import SWEEP_FIDELITIES
 from torchsar.study.systems.sal.world import Ground
 from torchsar.study.trials.bench import Bench
@@ -48,53 +48,11 @@ _MODELS = (
 )
 
 
-@dataclass(frozen=True)
-class Moved:
-    """What the first trial of a run shows.
-
-    Args:
-        azimuth_m, range_m: Positions of scatterers that lead estimators, (target,).
-        peak: Largest amplitude.
-        motion: The drawn motions.
-        extremes: Bounds of ranges and motion.
-    """
-
-    azimuth_m: Tensor
-    range_m: Tensor
-    peak: float
-    motion: Sequence[Motion]
-    extremes: Extremes
-
-    @property
-    def farthest(self) -> Points:
-        """The leading scatterer farthest from the middle of the scene."""
-        far = int((self.range_m.abs() + self.azimuth_m.abs()).argmax())
-        return Points([float(self.azimuth_m[far])], [float(self.range_m[far])])
-
-
 def moved(bench: Bench) -> Moved:
-    """From the first trial of a run.
-
-    Raises:
-        ValueError: If no scatterer can be seen, or one lies where no sweep can show it.
-    """
+    """What the first trial of a run shows. Raises ValueError if nothing can be seen."""
     world, radar, draws = bench.world(), bench.radar, Draws(bench.config.seed, "run", [0])
-    scene = world.of().scene.scatterers(draws)
-    azimuth, ranges, level = (
-        v.reshape(-1, v.shape[-1])[0] for v in (scene.azimuth_m, scene.range_m, scene.amplitude.abs())
-    )
-    low, high = world.gate_m or (-math.inf, math.inf)
-    inside = (level > 0) & (ranges >= low) & (ranges <= high)
-    leads = leading(torch.where(inside, level, 0))
-    if not bool(leads.any()):
-        raise ValueError(
-            "world: no scatterer of the scene has an amplitude above 0 within the gate; give it one, or widen gate_m"
-        )
-    reach = float(ranges[inside].min()), float(ranges[inside].max())
-    refuse_unseen_ranges(radar, *reach)
     motion = drawn_motion(world.motion, draws, world.periods * radar.pulse_step_s)
-    extremes = Extremes.of(radar, motion, world.periods, reach, float(azimuth.abs().max()))
-    return Moved(azimuth[leads], ranges[leads], float(level[leads].max()), motion, extremes)
+    return Moved.of(radar, world.of().scene.scatterers(draws), motion, world.periods, world.gate_m)
 
 
 def limits(bench: Bench, seen: Moved) -> dict[Limit, list[str]]:

@@ -10,7 +10,9 @@ from torch import Tensor
 
 from torchsar.core import Draws, Recording, Trace, Truth
 from torchsar.echo import target_energy
+from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Requirement
+from torchsar.focus.strip_limits import strip_limits
 from torchsar.io import read_stripmap
 from torchsar.metrics.bounds import reference_doppler_std_hz, tone_frequency_bound_hz, velocity_bound_m_s
 from torchsar.radar import StripmapRadar
@@ -21,7 +23,7 @@ from torchsar.study.output.pictures import Drawn
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.settings.sections import Loaded
 from torchsar.study.systems.stripmap import figures, judge
-from torchsar.study.systems.stripmap.choices import Probe, choices
+from torchsar.study.systems.stripmap.choices import choices, probe_of
 from torchsar.study.systems.stripmap.world import Strip
 from torchsar.study.trials.batch import Batch, Judged, Outcome, Result, Trials
 from torchsar.study.trials.bench import Bench
@@ -140,8 +142,15 @@ class Stripmap(System):
         bounds = {"doppler_error_hz": doppler, "doppler_baseband_error_hz": doppler}
         return {**bounds, "velocity_error_m_s": {"Cramer-Rao bound": velocity}}
 
+    def limits(self, bench: Bench) -> Mapping[Limit, Sequence[str]]:
+        """Of simulated data: the aperture of recorded ones is what the beam has made it."""
+        if bench.recording is not None:
+            return {}
+        found = strip_limits(bench.radar, bench.world().samples, *probe_of(bench).motion)
+        return {limit: list(bench.chains) for limit in found}
+
     def requirements(self, bench: Bench) -> Sequence[Requirement]:
-        return Probe.of(bench).rows()
+        return probe_of(bench).rows()
 
     def choices(self, bench: Bench) -> Sequence[Choice]:
         return choices(bench, {row.effect: row for row in self.requirements(bench)})

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Recording, Signal, Truth
-from torchsar.echo import simulate
+from torchsar.core import Draws, Signal
 from torchsar.echo.jitter import sample_unevenly
-from torchsar.focus.patches import HALF, PointPatches
-from torchsar.focus.requirements import Requirement, full_swath_m, requirements
+from torchsar.focus.requirements import Requirement
 from torchsar.metrics import error_after_gain_db, error_db
-from torchsar.radar import StripmapRadar
+from torchsar.metrics.strip_probe import StripProbe
 from torchsar.repair.jitter import BandLimited, Exact, Lagrange
 from torchsar.scene import Dwell, Hyperbola, Parabola, Points, StripmapWorld
 from torchsar.study.names.registry import FOCUS
@@ -28,81 +26,21 @@ _OFFSETS, _LINES = (0.0, 0.18, -0.12, 0.07), 1024
 FORMS = {"range_doppler": "range-Doppler", "omega_k": "bulk + refocus (omega_k)", "omega_k_stolt": ""}
 
 
-@dataclass(frozen=True)
-class Probe:
-    """Point targets at both edges and in the middle of the swath, without noise or impairments.
-
-    Args:
-        radar: The instrument.
-        world: The points, seen with the true Doppler and velocity.
-        size: Lines and samples.
-        edges_m: Ranges of the points from the middle of the fully compressed part of a line.
+def probe_of(bench: Bench) -> StripProbe:
+    """Points seen with Doppler and velocity of the world, or of a recording as the recommended
+    method estimates them.
     """
-
-    radar: StripmapRadar
-    world: StripmapWorld
-    size: tuple[int, int]
-    edges_m: tuple[float, ...] = (0.0,)
-
-    @staticmethod
-    def of(bench: Bench) -> Probe:
-        """With Doppler and velocity of the world, or of a recording as the recommended method
-        estimates them.
-        """
-        radar = bench.radar
-        if bench.recording is None:
-            world = bench.world()
-            size, seen = (world.lines, world.samples), world.of(radar)
-        else:
-            used = bench.batch(Draws(0), methods=("recommended",)).outcomes["recommended"].judged.view
-            size = tuple(axis.n for axis in bench.recording.signal.axes)
-            doppler, velocity = float(used.doppler_hz or 0.0), float(used.velocity_m_s)
-            dwell = radar.integration_s or 0.75 * radar.aperture_s(radar.near_range_m)
-            seen = StripmapWorld(Points([0.0], [0.0]), Dwell(dwell), Hyperbola(), velocity, doppler)
-        probe = Probe(radar, replace(seen, snr_db=None), size)
-        margin = (HALF + 1) * radar.range_step_m
-        near, far = full_swath_m(radar, radar.raw_axes(*size), *probe.motion, probe.dwell_s)
-        middle = radar.near_range_m + max(0, size[1] - radar.pulse_samples) / 2 * radar.range_step_m
-        edges = (min(0.0, near - middle + margin), 0.0, max(0.0, far - middle - margin))
-        return replace(probe, world=replace(probe.world, scene=Points([0.0] * 3, [*edges])), edges_m=edges)
-
-    @property
-    def dwell_s(self) -> float:
-        """Time for which targets are lit."""
-        radar = self.radar
-        known = getattr(self.world.beam, "dwell_s", None) or radar.integration_s
-        return float(known or radar.aperture_s(radar.near_range_m))
-
-    @property
-    def motion(self) -> tuple[float, float]:
-        """Doppler of the beam centre (Hz) and velocity (m/s), of the first trial."""
-        world, radar = self.world, self.radar
-        doppler = (radar.pointing_doppler_hz or 0.0) if world.doppler_hz is None else world.doppler_hz
-        velocity = radar.velocity_m_s if world.velocity_m_s is None else world.velocity_m_s
-        return _first(doppler), _first(velocity)
-
-    def recorded(self, dtype: torch.dtype, **changes: Any) -> tuple[Recording, Truth]:
-        return simulate(self.radar, replace(self.world, **changes), *self.size, Draws(0), dtype=dtype)
-
-    def seen(self) -> tuple[Signal, PointPatches, tuple[Tensor, Tensor]]:
-        """Raw data in double precision, the patches about the points, Doppler and velocity."""
-        recording, truth = self.recorded(torch.complex128)
-        of = truth.values
-        known = (of["doppler_hz"], of["velocity_m_s"])
-        at = (of["zero_doppler_s"], of["closest_range_m"])
-        return recording.signal, PointPatches.about(self.radar, self.size, *at, *known), known
-
-    def focused(self, form: str, signal: Signal, known: tuple[Tensor, Tensor]) -> Tensor:
-        """The image by a form, with given Doppler and velocity."""
-        return FOCUS[form](self.radar, "matched", velocity_m_s=known[1], doppler_hz=known[0])(signal).data
-
-    def rows(self) -> tuple[Requirement, ...]:
-        """What each simplification neglects for this size, Doppler and velocity."""
-        return requirements(self.radar, self.radar.raw_axes(*self.size), *self.motion)
-
-
-def _first(x: Tensor | float) -> float:
-    return float(torch.as_tensor(x).reshape(-1)[0])
+    radar = bench.radar
+    if bench.recording is None:
+        world = bench.world()
+        size, seen = (world.lines, world.samples), world.of(radar)
+    else:
+        used = bench.batch(Draws(0), methods=("recommended",)).outcomes["recommended"].judged.view
+        size = tuple(axis.n for axis in bench.recording.signal.axes)
+        doppler, velocity = float(used.doppler_hz or 0.0), float(used.velocity_m_s)
+        dwell = radar.integration_s or 0.75 * radar.aperture_s(radar.near_range_m)
+        seen = StripmapWorld(Points([0.0], [0.0]), Dwell(dwell), Hyperbola(), velocity, doppler)
+    return StripProbe(radar, replace(seen, snr_db=None), size).between_edges()
 
 
 def choices(bench: Bench, rows: Mapping[str, Requirement]) -> list[Choice]:
@@ -120,7 +58,7 @@ def choices(bench: Bench, rows: Mapping[str, Requirement]) -> list[Choice]:
         Choice("precision", "precision", precisions, partial(_precisions, bench)),
     ]
     if bench.recording is None:
-        probe = Probe.of(bench)
+        probe = probe_of(bench)
         lost = Parabola().neglected_db(bench.radar, *probe.motion, bench.radar.near_range_m, probe.dwell_s)
         histories = [
             Alternative("parabola", {"kind": "parabola"}, {"echo_error_db": lost}, "higher orders"),
@@ -138,14 +76,19 @@ def _neglects(rows: Mapping[str, Requirement], row: str) -> str:
     return rows[row].neglects if row else ""
 
 
+def _focused(bench: Bench, form: str, signal: Signal, known: tuple[Tensor, Tensor]) -> Tensor:
+    """The image by a form, with given Doppler and velocity."""
+    return FOCUS[form](bench.radar, "matched", velocity_m_s=known[1], doppler_hz=known[0])(signal).data
+
+
 def _forms(bench: Bench) -> Measured:
     """Whole images by each form against backprojection of patches about the points."""
-    probe = Probe.of(bench)
+    probe = probe_of(bench)
     raw, patches, known = probe.seen()
     signal, exact = raw.to(bench.dtype), patches.exact(raw, *known)
 
     def run(one: Alternative) -> Tensor:
-        return probe.focused(one.keys["stage"], signal, known) if one.keys else patches.exact(raw, *known)
+        return _focused(bench, one.keys["stage"], signal, known) if one.keys else patches.exact(raw, *known)
 
     def loss(one: Alternative, image: Tensor) -> dict[str, float]:
         made = patches.cut(image) if one.keys else image
@@ -156,22 +99,22 @@ def _forms(bench: Bench) -> Measured:
 
 def _precisions(bench: Bench) -> Measured:
     """The recommended form in single precision against double precision."""
-    probe = Probe.of(bench)
+    probe = probe_of(bench)
     raw, patches, known = probe.seen()
     names = [entry["stage"] for entry in (bench.config.processor["recommended"].stages or {}).values()]
     form = next((name for name in names if name in FORMS), "omega_k")
     signals = {name: raw.to(getattr(torch, name)) for name in ("complex64", "complex128")}
-    exact = patches.cut(probe.focused(form, raw, known))
+    exact = patches.cut(_focused(bench, form, raw, known))
 
     def loss(one: Alternative, image: Tensor) -> dict[str, float]:
         return {"image_error_db": float(error_after_gain_db(patches.cut(image), exact).max())}
 
-    return Measured(lambda one: probe.focused(form, signals[one.keys["precision"]], known), loss)
+    return Measured(lambda one: _focused(bench, form, signals[one.keys["precision"]], known), loss)
 
 
 def _histories(bench: Bench) -> Measured:
     """Echoes by each range history, point by point."""
-    probe, paths = Probe.of(bench), {"parabola": Parabola(), "hyperbola": Hyperbola()}
+    probe, paths = probe_of(bench), {"parabola": Parabola(), "hyperbola": Hyperbola()}
     alone = [replace(probe, world=replace(probe.world, scene=Points([0.0], [r]))) for r in probe.edges_m]
 
     def echoes(path: str) -> list[Tensor]:
@@ -198,7 +141,7 @@ _CORRECTORS: dict[str, Any] = {
 
 def _jitter(bench: Bench) -> Measured:
     """Correctors of a known periodic jitter on the first lines of raw data."""
-    raw = Probe.of(bench).recorded(bench.dtype)[0].signal.data
+    raw = probe_of(bench).recorded(bench.dtype)[0].signal.data
     lit = raw.abs().square().sum(-1).argmax()
     raw = raw[max(0, int(lit) - _LINES // 2) :][:_LINES]
     offsets = torch.tensor(_OFFSETS, dtype=torch.float64)
