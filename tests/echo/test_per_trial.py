@@ -46,11 +46,11 @@ from torchsar.echo import (
     ladar_echo,
     sea_echo,
     simulate,
-    smooth_response,
     simulate_bistatic,
     simulate_ladar,
     simulate_ladar_record,
     simulate_turntable,
+    smooth_response,
 )
 from torchsar.radar import InverseRadar, Orbit, seen_point
 from torchsar.scene import (

@@ -203,7 +203,8 @@ def test_invalid_arguments_raise() -> None:
     ):
         CompressDechirped(ladar(pulse_s=200e-6))(recording.signal)
     with pytest.raises(ValueError, match=r"CompressDechirped works on the axes \('pulse', 'fast_time'\)"):
-        CompressDechirped(ladar())(Signal(recording.signal.data, (Axis("pulse", 4, 0.0, 1.0, "s"), Axis("channel", 64, 0.0, 1.0, ""))))
+        axes = (Axis("pulse", 4, 0.0, 1.0, "s"), Axis("channel", 64, 0.0, 1.0, ""))
+        CompressDechirped(ladar())(Signal(recording.signal.data, axes))
     with pytest.raises(ValueError, match=r"radar.pulse_s is not set"):
         CompressDechirped(ladar(pulse_s=None))
     with pytest.raises(ValueError, match=r"azimuth window 'hamming' is unknown; choose one of \('none', 'hann'\)"):

@@ -179,7 +179,8 @@ def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
     loaded.system.check_sweep(loaded, given)
     grid = make_grid(given, [key for key in given if trial.may_differ(key)], f"{file}: sweep")
     for parameter in grid.parameters:
-        for value in parameter.values:
+        ends = {*parameter.values[:1], min(parameter.values), max(parameter.values)} if parameter.batched else ()
+        for value in ends or parameter.values:  # numbers between two accepted ones are accepted
             loaded.changed({parameter.name: value})
     for case in grid.cases():
         there = {stage for chain in trial.bench(case.fixed).chains.values() for stage in chain.stages}

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from torchsar.metrics import half_width_ratio
+from torchsar.metrics.intervals import half_width_ratio
 from torchsar.study.montecarlo.engines import Engine, Task, engine, refuse_unguarded
 from torchsar.study.montecarlo.grid import Grid, make_grid
 from torchsar.study.montecarlo.record import OK, Record

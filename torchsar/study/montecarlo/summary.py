@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from torchsar.metrics import finite_rms, share_interval, trial_statistics
-from torchsar.metrics.intervals import LEVEL, RESAMPLES
+from torchsar.metrics.intervals import LEVEL, RESAMPLES, finite_rms, share_interval, trial_statistics
 from torchsar.study.montecarlo.record import Labels, Record
 
 _DEFINITIONS = {
