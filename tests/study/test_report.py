@@ -60,8 +60,8 @@ def test_a_row_has_one_prefix() -> None:
 
 
 def test_estimates_have_the_unit_of_their_name() -> None:
-    assert name_and_unit("motion.velocity_m_s") == ("velocity", "m/s")
-    assert name_and_unit("world.noise.snr_db") == ("SNR", "dB") and name_and_unit("ok") == ("ok", "")
+    assert plot.name_and_unit("motion.velocity_m_s") == ("velocity", "m/s")
+    assert plot.name_and_unit("world.noise.snr_db") == ("SNR", "dB") and plot.name_and_unit("ok") == ("ok", "")
 
 
 def test_tiles_and_tables_show_uncertainties_of_trials() -> None:
