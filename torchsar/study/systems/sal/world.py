@@ -98,7 +98,7 @@ class Ground(World):
     def of(self) -> LadarWorld:
         """The same world in the form of the echo simulation."""
         gate = None if self.gate_m is None else tuple(self.gate_m)
-        scene, snr_db = Together(self.scene), self.noise.snr_db
+        scene, snr_db = Together(dict(self.scene)), self.noise.snr_db
         effects = (self.log_amplitude, snr_db, self.fidelity, gate, self.sweep_error, self.calibration)
         return LadarWorld(scene, self.motion, *effects)  # pyright: ignore[reportArgumentType]
 
