@@ -151,6 +151,9 @@ def span(positions: Tensor, margin: float) -> tuple[float, float]:
     Args:
         positions: Positions on an axis, any shape.
         margin: Distance in the unit of the axis.
+
+    Returns:
+        First and last position, with the margin.
     """
     return float(positions.min()) - margin, float(positions.max()) + margin
 
@@ -182,6 +185,9 @@ def boxes(centres: Sequence[tuple[float, float]], half_x: float, half_y: float) 
         centres: Positions (x, y).
         half_x: Half width of the rectangles.
         half_y: Half height of the rectangles.
+
+    Returns:
+        Coordinates x and y of the line, with NaN between the rectangles.
     """
     x, y = half_x * np.array([-1, 1, 1, -1, -1, np.nan]), half_y * np.array([-1, -1, 1, 1, -1, np.nan])
     at = np.asarray(centres, dtype=float).reshape(-1, 2)
@@ -292,6 +298,9 @@ def image(signal: Signal, dynamic_range_db: float = 50.0, title: str = "", perce
         dynamic_range_db: Lowest level, in dB below 0 dB.
         title: Title of the figure.
         percentile: Percentile of the amplitude that is 0 dB.
+
+    Returns:
+        The figure.
     """
     top = level(signal, percentile, _ALONE)
     return _show(signal, _ALONE, dynamic_range_db, title, top, _below(percentile))
@@ -311,6 +320,9 @@ def images(
         dynamic_range_db: Lowest level, in dB below 0 dB.
         percentile: Percentile of the amplitude that is 0 dB.
         reference: Title of the image whose percentile counts; by default the first.
+
+    Returns:
+        The figures, one for each signal.
     """
     width = _width(len(signals))
     top = level(signals[reference or next(iter(signals))], percentile, width)
@@ -324,6 +336,9 @@ def contours(signals: Mapping[str, Signal], levels_db: Sequence[float] = (-30, -
     Args:
         signals: Signals with two axes, by title; the first trial of each is drawn, a figure each.
         levels_db: Levels of the lines, in dB relative to the peak of each image, rising.
+
+    Returns:
+        The figures, one for each signal.
     """
     figures, width = [], _width(len(signals))
     for title, signal in signals.items():
@@ -385,6 +400,9 @@ def overlays(parts: Sequence[Mapping[str, Any]], dynamic_range_db: float = 40.0)
             from names to (x, y), and may have `ylim`. A panel without `signal` has the arguments
             of `curves`.
         dynamic_range_db: Lowest level, in dB below the peak.
+
+    Returns:
+        The figures, one for each part.
     """
     figures, width = [], _width(len(parts))
     for part in parts:
@@ -436,6 +454,9 @@ def curves(
         title: Title of the panel.
         marks: Positions of vertical lines by name, in the unit of x.
         ylim: Limits of the vertical axis.
+
+    Returns:
+        The figure.
     """
     return _curves(_ALONE, series, xlabel, ylabel, title, marks, ylim)
 
@@ -462,6 +483,9 @@ def places(
         ylabel: Label of the vertical axis, with unit.
         title: Title of the figure.
         aspect: "equal" for one scale on both axes, "auto" otherwise.
+
+    Returns:
+        The figure.
     """
     ratio = float(np.ptp(y)) / max(float(np.ptp(x)), 1e-300) if aspect == "equal" else 0.8
     ratio = min(max(ratio, 1 / _ELONGATED), _ELONGATED)
@@ -484,6 +508,9 @@ def panels(parts: Sequence[Mapping[str, Any]]) -> list[Figure]:
 
     Args:
         parts: Panels, a figure each, with the arguments of `curves`.
+
+    Returns:
+        The figures, one for each part.
     """
     return [_curves(_width(len(parts)), **part) for part in parts]
 
@@ -536,6 +563,9 @@ def trade(
         ylabel: Label of the vertical axis, with unit.
         title: Title of the figure.
         tolerance: Largest acceptable loss, drawn as a dashed line.
+
+    Returns:
+        The figure.
     """
     figure, axes = _figure(_ALONE, 3.6)
     points = sorted(zip(seconds, loss, strict=True))
@@ -616,6 +646,9 @@ def error_curves(
         log_x: Whether the horizontal axes are logarithmic.
         log_y: Whether the vertical axes are logarithmic.
         ylim: Limits of the vertical axes.
+
+    Returns:
+        The figures, one for each part that has values.
     """
     filled = [part for part in parts if any(np.isfinite(_drawable(y, log_y)).any() for y, _ in part["series"].values())]
     figures, width = [], _width(len(filled))
@@ -768,6 +801,9 @@ def heat_map(
         label: Label of the colour scale, with unit.
         log: Whether the colour scale is logarithmic.
         limits: Ends of the colour scale; by default those of the values.
+
+    Returns:
+        The figures, one for each part that has values.
     """
     shown = [(part, _drawable(part["z"], log)) for part in parts]
     shown = [(part, z) for part, z in shown if np.isfinite(z).any()]
@@ -848,6 +884,9 @@ def array(x: Tensor) -> np.ndarray:
 
     Args:
         x: Tensor, any shape.
+
+    Returns:
+        Array of the same shape and type.
     """
     return torch.as_tensor(x).detach().cpu().resolve_conj().numpy()
 
@@ -866,12 +905,35 @@ _UNITS = {
     "_s": "s",
 }
 # words of names that are not written in small letters
-_WRITTEN = ["Doppler", "SNR", "PRF", "RMS", "IRW", "PSLR", "ISLR", "RCS", "SIR", "CNR", "SCR", "SCNR", "MFTA", "ADC"]
+_WRITTEN = [
+    "Doppler",
+    "SNR",
+    "PRF",
+    "RMS",
+    "RMSE",
+    "IRW",
+    "PSLR",
+    "ISLR",
+    "RCS",
+    "SIR",
+    "CNR",
+    "SCR",
+    "SCNR",
+    "MFTA",
+    "ADC",
+]
 _ACRONYMS = {word.lower(): word for word in _WRITTEN}
 
 
 def name_and_unit(name: str) -> tuple[str, str]:
-    """What the last part of a name says, and its unit: 'world.noise.snr_db' -> ('SNR', 'dB')."""
+    """Split the last part of a dotted name into words and unit.
+
+    Args:
+        name: Name with its unit, such as 'world.noise.snr_db'.
+
+    Returns:
+        Words and unit, such as ('SNR', 'dB').
+    """
     last = name.rpartition(".")[2]
     suffix = next((suffix for suffix in _UNITS if last.endswith(suffix) and last != suffix), "")
     words = last.removesuffix(suffix).strip("_").split("_")
@@ -879,6 +941,13 @@ def name_and_unit(name: str) -> tuple[str, str]:
 
 
 def axis_label(name: str) -> str:
-    """'doppler_error_hz' -> 'Doppler error (Hz)'."""
+    """Make the label of an axis from a name.
+
+    Args:
+        name: Name with its unit, such as 'doppler_error_hz'.
+
+    Returns:
+        Label such as 'Doppler error (Hz)'.
+    """
     words, unit = name_and_unit(name)
     return f"{words} ({unit})" if unit else words

@@ -292,9 +292,7 @@ def test_trials_of_different_velocities_share_batches_and_give_the_numbers_of_ca
             if name not in ("seconds", "ok"):
                 found = record.metrics[name].reshape(len(values))
                 scale = np.abs(found).max()
-                np.testing.assert_allclose(
-                    found[index], float(value[0]), rtol=0, atol=SAME * scale, err_msg=name
-                )
+                np.testing.assert_allclose(found[index], float(value[0]), rtol=0, atol=SAME * scale, err_msg=name)
 
 
 def numbers(tree: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, float]]:

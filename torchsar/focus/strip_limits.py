@@ -14,6 +14,9 @@ def strip_limits(radar: StripmapRadar, samples: int, doppler_hz: float, velocity
         samples: Range samples of a line; the aperture is that of the middle one.
         doppler_hz: Absolute Doppler centroid in Hz.
         velocity_m_s: Effective velocity in m/s.
+
+    Returns:
+        The limit of the Doppler band, or nothing.
     """
     if radar.integration_s is None:
         return ()

@@ -238,6 +238,9 @@ def worst_image_error_db(image: Signal, exact: Signal) -> float:
     Args:
         image: Images of one point a row, (row, azimuth) or (row, azimuth, range).
         exact: Reference images of the same size.
+
+    Returns:
+        Largest relative error over the rows in dB.
     """
     two = [x.data.to(torch.complex128).reshape(len(x.data), -1, x.data.shape[-1]) for x in (image, exact)]
     two = [x if "range" in image.names else x.mT for x in two]

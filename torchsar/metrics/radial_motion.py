@@ -13,10 +13,9 @@ from torchsar.compensate.radial import integrated_range
 from torchsar.core import Axis, Chain, Signal, Trace, unit_phasor
 from torchsar.metrics.impulse import impulse_response
 from torchsar.radar import TriangularLadar, sweep_middles
+from torchsar.radar.ladar import leading
 
 SWEEPS = ("ramp", "pulse", "fast_time")
-# scatterers more than 10 dB below the strongest do not lead an estimator
-_LEADING = 10 ** (-10 / 20)
 
 
 @dataclass(frozen=True)
@@ -105,18 +104,6 @@ class Course:
         mean = torch.where(self.lit, x, 0).sum(-1) / self._count
         slope = torch.where(self.lit, x * k, 0).sum(-1) / torch.where(self.lit, k.square(), 0).sum(-1).clamp_min(1)
         return mean, slope, k
-
-
-def leading(level: Tensor) -> Tensor:
-    """Scatterers within 10 dB of the strongest.
-
-    Args:
-        level: Amplitudes, (..., target).
-
-    Returns:
-        bool (..., target).
-    """
-    return (level >= _LEADING * level.amax(-1, keepdim=True)) & (level > 0)
 
 
 def lit_periods(radar: TriangularLadar, pulse: Axis, azimuth_m: Tensor, range_m: Tensor) -> Tensor:

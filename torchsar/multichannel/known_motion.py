@@ -34,6 +34,9 @@ def known_motion_chain(
         order: Orders of the transmit range that are removed; None for all.
         full: Whether the data are chirps that must be compressed first.
         follow: Whether the migration is corrected with the known motion.
+
+    Returns:
+        The chain.
     """
     known = {name: f"given.{name}" for name in ("u_r_m_s", "u_a_m_s", "y0_m")}
     stages: dict[str, nn.Module] = {"compress": CompressChannels(radar, "flat")} if full else {}

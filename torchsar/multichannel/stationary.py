@@ -221,6 +221,9 @@ def swath_limit(
         positions_m: Along-track position and range from the middle of each ship in metres.
         range_m: Half extent in range that is extracted about a ship in metres.
         integration_s: Integration time in seconds.
+
+    Returns:
+        The limit, with the value of this scene.
     """
     curve = (integration_s * radar.speed_m_s) ** 2 / (8 * radar.reference_range_m)
     walks = [

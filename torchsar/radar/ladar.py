@@ -202,3 +202,19 @@ def sweep_middles(radar: TriangularLadar, pulse: Axis, device: torch.device | st
     """
     start = pulse.values(device)
     return torch.stack([start + 0.25 * radar.period_s, start + 0.75 * radar.period_s])
+
+
+# scatterers more than 10 dB below the strongest do not lead an estimator
+_LEADING = 10 ** (-10 / 20)
+
+
+def leading(level: Tensor) -> Tensor:
+    """Scatterers within 10 dB of the strongest.
+
+    Args:
+        level: Amplitudes, (..., target).
+
+    Returns:
+        bool (..., target).
+    """
+    return (level >= _LEADING * level.amax(-1, keepdim=True)) & (level > 0)

@@ -35,14 +35,25 @@ def descent_near_truth(data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, **know
         omega_rad_s: True rate at the first pulse in rad/s, shape (...,).
         warp_k: True coefficients of the warp, shape (..., coefficient).
         known: wavelength_m, prf_hz, range_m, yc_m and order, as `uneven_rotation` takes them.
+
+    Returns:
+        The estimate of `descend_rotation`.
     """
     objective = _entropy(data, "shape", **known)  # pyright: ignore[reportArgumentType]
     return descend_rotation(objective, objective.start(0.95 * omega_rad_s, 0.95 * warp_k, None))
 
 
 def genetic_near_truth(data: Tensor, omega_rad_s: Tensor, warp_k: Tensor, **known: object) -> Estimate:
-    """Search within 10 % of the true rotation by 10 individuals in 4 generations; the arguments of
-    `descent_near_truth`.
+    """Search within 10 % of the true rotation by 10 individuals in 4 generations.
+
+    Args:
+        data: Range-compressed pulses, shape (..., pulse, range).
+        omega_rad_s: True rate at the first pulse in rad/s, shape (...,).
+        warp_k: True coefficients of the warp, shape (..., coefficient).
+        known: wavelength_m, prf_hz, range_m, yc_m and order, as `uneven_rotation` takes them.
+
+    Returns:
+        The estimate of `genetic_rotation`.
     """
     objective = _entropy(data, "raw", **known)  # pyright: ignore[reportArgumentType]
     centre = torch.cat([omega_rad_s[..., None], warp_k], -1)

@@ -23,6 +23,7 @@ from torchsar.study.montecarlo.grid import Grid, address, canonical
 from torchsar.study.montecarlo.record import OK, Labels, Record
 from torchsar.study.settings.errors import ConfigError, one_line
 
+# number of the layout of the store; another one is refused on resume
 FORMAT = 1
 # numbers in a zarr chunk at most: half a megabyte, which is written whole for every change
 _CHUNK_NUMBERS = 1 << 16

@@ -18,9 +18,9 @@ from torchsar.echo import range_model_error_db
 from torchsar.focus.ladar_requirements import Limit, ladar_limits, ladar_requirements
 from torchsar.focus.requirements import Requirement
 from torchsar.metrics import error_after_gain_db
-from torchsar.metrics.moved_scene import Moved
 from torchsar.metrics.radial_motion import lit_periods
 from torchsar.scene import drawn_motion
+from torchsar.scene.moved_scene import Moved
 from torchsar.study.names.registry import SWEEP_FIDELITIES
 from torchsar.study.systems.sal.world import Ground
 from torchsar.study.trials.bench import Bench

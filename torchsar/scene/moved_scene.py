@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsar.metrics.radial_motion import leading
 from torchsar.radar import TriangularLadar
-from torchsar.scene import Extremes, Motion, Points, Scatterers
-from torchsar.scene.ladar import refuse_unseen_ranges
+from torchsar.radar.ladar import leading
+from torchsar.scene.ladar import Extremes, refuse_unseen_ranges
+from torchsar.scene.targets import Points, Scatterers
+from torchsar.scene.vibration import Motion
 
 
 @dataclass(frozen=True)
