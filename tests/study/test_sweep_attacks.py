@@ -52,7 +52,7 @@ def run(out: Path | None = None, function: Any = trial, **options: Any):
         ({"a": np.float64(3)}, "must be a list of values"),
         ({"a": [10**400]}, "names nothing"),
         ({"a": {float("nan"): 3}}, "holds the value nan"),
-        ({"a": {"x": object()}}, "another in every process"),
+        ({"a": {"x": object()}}, "differs between processes"),
         ({"done": [1]}, "cannot be called 'done'"),
         ({"ok": [1]}, "cannot be called 'ok'"),
         ({"a/b": [1]}, "without '/'"),

@@ -205,11 +205,11 @@ def test_chunks_change_the_stripmap_chain_only_by_rounding(precision: str, toler
 def test_the_point_estimator_of_the_stripmap_sweep_stands_on_its_bound(load_tree) -> None:
     tree = yaml.safe_load(load("stripmap_doppler", SMALL).text())
     point = {"target": {"kind": "points", "azimuth_m": [0.0], "range_m": [0.0], "random_phase": True}}
-    tree["processor"] = {"point": tree["processor"]["point"]}
+    tree["processor"] = {"recommended": tree["processor"]["point"]}
     tree["sweep"] = {"world.scene": {"point": point}, "world.squint_deg": [0.25], "world.noise.snr_db": [-10.0, 10.0]}
     loaded = load_tree(tree)
     record = record_of(loaded, None, 30)
-    row = record.algorithms.index("point")
+    row = record.algorithms.index("recommended")
     rmse = np.sqrt((record.metrics["doppler_error_hz"][row, 0, 0] ** 2).mean(-1))
     bound = record.bounds["doppler_error_hz"]["Cramer-Rao bound of a point of known position"][0, 0, :, 0]
     assert ((0.7 * bound < rmse) & (rmse < 1.45 * bound)).all()

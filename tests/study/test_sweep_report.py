@@ -301,10 +301,11 @@ def read(page: str) -> Reader:
     return reader
 
 
-def test_the_report_loads_no_external_resources(page: str) -> None:
-    addresses = read(page).addresses
+def test_the_report_loads_no_external_resources(page: str, drawn: tuple[Path, list[Picture]]) -> None:
+    addresses, panels = read(page).addresses, [file for picture in drawn[1] for file in picture.files]
     assert all(address.startswith(("data:", "#")) for address in addresses)
-    assert sum(address.startswith("data:image/png;base64,") for address in addresses) == page.count("<figure>") >= 8
+    assert sum(address.startswith("data:image/png;base64,") for address in addresses) == len(panels)
+    assert page.count("<figure>") == len(drawn[1]) >= 8
     assert not re.search(r"https?://|@import|url\(|<script", page)
     assert {address[1:] for address in addresses if address.startswith("#")} <= set(re.findall(r'id="(\w+)"', page))
 
