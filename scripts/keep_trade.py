@@ -3,7 +3,7 @@ and the README quotes.
 
 python scripts/keep_trade.py [docs/trade] [--systems sal geo] [--table]
 
-`--table` prints the recommended alternatives of the kept files as a table, without measuring again.
+`--table` prints the first choice of every kept file as a table, without measuring again.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from torchsar.study.commands.trade import trade
+from torchsar.study.output.numbers import MISSING
 from torchsar.study.table import load
+from torchsar.study.trials.choice import EXACT_DB
 
 # the config of each system that shows its alternatives
 CONFIGS = {
@@ -76,17 +78,16 @@ def written(tree: dict[str, Any]) -> str:
 
 
 def table(folder: Path) -> Iterator[str]:
-    """A markdown table: the recommended alternative of each choice beside the best one."""
-    yield "| system | choice | recommended | CPU time | loss | best | CPU time |"
-    yield "|---|---|---|---|---|---|---|"
+    """A markdown table: the alternatives of the first choice of each system."""
+    yield "| system | choice | alternative | CPU (ms) | loss | recommended |"
+    yield "|---|---|---|---|---|---|"
     for system in CONFIGS:
         tree = json.loads((folder / f"{system}.json").read_text(encoding="utf-8"))
-        for choice, rows in {tree["choice"]: tree["alternatives"], **tree["others"]}.items():
-            one, best = next((row for row in rows if row["recommended"]), None), rows[-1]
-            if one is not None:
-                loss = ", ".join(f"{name} {value:.3g}" for name, value in one["loss"].items())
-                times = [f"{1e3 * row['cpu_s']:.3g} ms" for row in (one, best)]
-                yield f"| `{system}` | {choice} | {one['name']} | {times[0]} | {loss} | {best['name']} | {times[1]} |"
+        for i, row in enumerate(tree["alternatives"]):
+            loss = ", ".join(f"{'exact' if x <= EXACT_DB else f'{x:.3g}'} ({name})" for name, x in row["loss"].items())
+            time_ms = MISSING if row["cpu_s"] is None else f"{1e3 * row['cpu_s']:.3g}"
+            about = f"| `{system}` | {tree['choice']}" if i == 0 else "| | "
+            yield f"{about} | {row['name']} | {time_ms} | {loss or 'failed'} | {'yes' if row['recommended'] else ''} |"
 
 
 def main() -> None:

@@ -576,10 +576,12 @@ def trade(
         filled = colour if (s, e) in front else "white"
         axes.plot([s], [e], "o", color=colour, markerfacecolor=filled, markersize=7, label=f"{i}  {name}")
     axes.margins(0.12)
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    low, high = (math.log10(x) for x in (points[0][0], points[-1][0]))
+    margin = max(0.12 * (high - low), 0.3)  # decades; at least so much that ticks of 1, 2, 5 show
+    low, high = low - margin, high + margin
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high - low < 3 else (1,)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
-    low, high = (math.log10(x) for x in axes.get_xlim())
     axes.step(
         [s for s, _ in front] + [10**high], [e for _, e in front] + [front[-1][1]], where="post", color=INK, zorder=0
     )

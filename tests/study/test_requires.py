@@ -59,16 +59,16 @@ def load_system(name: str) -> Any:
 
 @pytest.mark.parametrize("place", PLACES, ids=lambda place: "-".join(place))
 def test_auto_takes_what_the_tolerance_dictates(place: tuple[str, str]) -> None:
-    """The tolerance lies just above and just below the loss of every alternative."""
+    """The tolerance lies just above and just below the loss of the cheapest alternatives."""
     config, path, changes = PLACES[place]
     choice = next(one for one in choices_of(Bench(load(config, changes))) if one.at == place[1])
     predicted = [one for one in choice.alternatives if one.loss is not None]
     assert any(one.loss for one in predicted) and not predicted[-1].loss
-    for one in [one for one in predicted if one.loss][:3]:
+    for one in [one for one in predicted if one.loss][:2]:
         ((metric, loss),) = one.loss.items()  # pyright: ignore[reportOptionalMemberAccess]
         for tolerance in (loss + 0.01, loss - 0.01):
-            told = f"trade.tolerance.{metric}={tolerance!r}"
-            bench = Bench(load(config, [*changes, f"{path}=auto", told]))
+            limit = f"trade.tolerance.{metric}={tolerance!r}"
+            bench = Bench(load(config, [*changes, f"{path}=auto", limit]))
             taken = next(x for x in predicted if not x.loss or x.loss[metric] <= tolerance)
             entry = at(bench.config, path)
             assert {key: entry[key] for key in taken.keys} == dict(taken.keys)
@@ -86,7 +86,7 @@ def test_auto_is_refused_where_nothing_is_to_choose() -> None:
 @pytest.mark.parametrize("system", list(ACCURACY.FAMILIES))
 def test_predictions_agree_with_measurements(system: str) -> None:
     """On other scenes than the recorded ones: right advice, except close to the tolerance."""
-    rows = ACCURACY.assessed(system, 3, first=100)["comparisons"]
+    rows = ACCURACY.assessed(system, 2, first=100)["comparisons"]
     assert rows
     for row in rows:
         near = abs(row["measured"] - row["tolerance"]) < (0.1 if row["metric"] == "peak_loss_db" else 5.0)

@@ -15,6 +15,7 @@ from tests.scripting import script
 from tests.study.tiny import write_tiny
 from torchsar.cli import main
 from torchsar.study.commands.trade import compared, trade
+from torchsar.study.settings.cases import cases_of
 from torchsar.study.settings.errors import ConfigError
 from torchsar.study.table import load
 from torchsar.study.trials.auto import choices_of, tolerance_of
@@ -106,7 +107,7 @@ def test_the_kept_losses_are_reproduced() -> None:
         tree = json.loads((ROOT / "docs" / "trade" / f"{system}.json").read_text(encoding="utf-8"))
         kept = {tree["choice"]: tree["alternatives"], **tree["others"]}[name]
         loaded = load(tree["config"], ["trade.trials=1", "world.trials=1"])
-        bench = Bench(loaded)
+        bench = Bench(next(iter(cases_of(loaded).values())))
         choice = next(choice for choice in choices_of(bench) if choice.name == name)
         assert choice.measured is not None
         measured = choice.measured()

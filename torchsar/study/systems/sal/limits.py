@@ -103,7 +103,9 @@ def choices(bench: Bench, seen: Moved) -> list[Choice]:
         "radial motion": radial_motion,
     }
     found = [Alternative(name, {"estimator": work}) for name, work in estimators.items()]
-    models = [_model(bench, seen, *entry) for entry in _MODELS]
+    # a continuous record knows no single range of a sweep
+    possible = [entry for entry in _MODELS if bench.world().record is None or not entry[0].startswith("one_per")]
+    models = [_model(bench, seen, *entry) for entry in possible]
     return [
         Choice("echo model", "world.fidelity", models, partial(_echoes, bench, seen)),
         Choice("estimator of the velocity", "estimator", found, partial(_estimates, bench)),
