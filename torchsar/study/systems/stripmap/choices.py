@@ -14,10 +14,10 @@ from torchsar.core import Draws, Signal
 from torchsar.echo.jitter import sample_unevenly
 from torchsar.focus.requirements import Requirement
 from torchsar.metrics import error_after_gain_db, error_db
-from torchsar.metrics.strip_probe import StripProbe
 from torchsar.repair.jitter import BandLimited, Exact, Lagrange
 from torchsar.scene import Dwell, Hyperbola, Parabola, Points, StripmapWorld
 from torchsar.study.names.registry import FOCUS
+from torchsar.study.systems.stripmap.probe import StripProbe
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured
 
