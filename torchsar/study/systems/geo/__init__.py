@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -12,8 +12,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Chain, Draws, Signal, Trace, per_trial
-from torchsar.focus.ladar_requirements import Limit
-from torchsar.focus.requirements import Requirement
 from torchsar.metrics import bistatic_bounds
 from torchsar.metrics.moving_point import (
     UNKNOWNS,
@@ -35,7 +33,6 @@ from torchsar.study.systems.geo.radar import bistatic_radar
 from torchsar.study.systems.geo.world import TRUTHS, Points, compression_gain_db
 from torchsar.study.trials.batch import Batch, Found, Judged, Outcome, Result, Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Choice
 from torchsar.study.trials.system import Column, System
 
 # Doppler bands that contain clutter illuminated through an antenna pattern
@@ -214,14 +211,11 @@ class Geo(System):
                 found.setdefault(error_name(key), {})[title] = value.expand(truth["u_r_m_s"].shape)
         return {key: named for key, named in found.items() if any(key in of for of in metrics)}
 
-    def limits(self, bench: Bench) -> Mapping[Limit, Sequence[str]]:
-        return choices.limits(bench)
+    limits = staticmethod(choices.limits)
 
-    def requirements(self, bench: Bench) -> Sequence[Requirement]:
-        return choices.requirements(bench)
+    requirements = staticmethod(choices.requirements)
 
-    def choices(self, bench: Bench) -> Sequence[Choice]:
-        return choices.choices(bench)
+    choices = staticmethod(choices.choices)
 
     def theory(self, result: Result) -> Mapping[str, Mapping[str, float]]:
         """Ideal responses of the recommended method, if it makes an image."""

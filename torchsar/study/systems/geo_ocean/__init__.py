@@ -13,8 +13,6 @@ import torch
 from torch import Tensor
 
 from torchsar.core import Chain, Draws, Signal, Trace
-from torchsar.focus.ladar_requirements import Limit
-from torchsar.focus.requirements import Requirement
 from torchsar.metrics.ship_scene import FoundTarget, MadeScene, made_scenes, matched, ship_metrics
 from torchsar.multichannel import Extraction, PointMotion, StationaryImage
 from torchsar.multichannel.response import LeastSquares, condition_number, noise_gain_db
@@ -27,7 +25,6 @@ from torchsar.study.systems.geo_ocean import choices, figures
 from torchsar.study.systems.geo_ocean.world import TRUTHS, Ocean
 from torchsar.study.trials.batch import Found, Judged, Outcome, Result, Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Choice
 from torchsar.study.trials.system import Column, System
 
 
@@ -195,14 +192,11 @@ class GeoOcean(System):
                 table[f"{ship}.{key}"] = Found(torch.tensor(values, dtype=torch.float64), None, ok)
         return table
 
-    def limits(self, bench: Bench) -> Mapping[Limit, Sequence[str]]:
-        return choices.limits(bench)
+    limits = staticmethod(choices.limits)
 
-    def requirements(self, bench: Bench) -> Sequence[Requirement]:
-        return choices.requirements(bench)
+    requirements = staticmethod(choices.requirements)
 
-    def choices(self, bench: Bench) -> Sequence[Choice]:
-        return choices.choices(bench)
+    choices = staticmethod(choices.choices)
 
     def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
         return figures.pictures(results, self.target_columns)

@@ -25,7 +25,7 @@ from torchsar.study.settings.errors import ConfigError
 from torchsar.study.systems.isal import figures, judge
 from torchsar.study.systems.isal.judge import received, whole_phase
 from torchsar.study.systems.isal.world import Target, echo_choices
-from torchsar.study.trials.batch import Batch, Judged, Result, Trials
+from torchsar.study.trials.batch import Judged, Result, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Alternative, Choice, Measured
 from torchsar.study.trials.system import Column, System
@@ -90,11 +90,10 @@ class Isal(System):
     def simulate(self, bench: Bench, world: Target, draws: Draws) -> Trials:
         return world.trials_of(bench.radar, draws, bench.dtype, bench.device)
 
+    bounds = staticmethod(judge.bounds)
+
     def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
         return judge.judge(bench, name, trace, trials)
-
-    def bounds(self, bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
-        return judge.bounds(bench, batch)
 
     def requirements(self, bench: Bench) -> Sequence[Requirement]:
         if bench.recording is not None:

@@ -14,7 +14,6 @@ from torch import Tensor
 from torchsar.core import Draws, Trace
 from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.matched_fourier import MatchedFourier
-from torchsar.focus.requirements import Requirement
 from torchsar.metrics import contrast, entropy, rotation_bounds
 from torchsar.metrics.rotation import CrossRangeCut, FoundRotation, cross_range_cut, k_scales, true_k
 from torchsar.radar import InverseRadar
@@ -25,7 +24,6 @@ from torchsar.study.systems.isal_rotation import choices, figures
 from torchsar.study.systems.isal_rotation.world import Rotating
 from torchsar.study.trials.batch import IMAGE, Batch, Judged, Outcome, Result, Trials
 from torchsar.study.trials.bench import Bench
-from torchsar.study.trials.choice import Choice
 from torchsar.study.trials.system import Column, System
 
 # reports warn of an image with so much less entropy than the ideal one at so large an error of k1
@@ -200,11 +198,9 @@ class IsalRotation(System):
             found[limit] = [n for n, chain in bench.chains.items() if estimated is None or _provides(chain, estimated)]
         return found
 
-    def requirements(self, bench: Bench) -> Sequence[Requirement]:
-        return choices.requirements(bench)
+    requirements = staticmethod(choices.requirements)
 
-    def choices(self, bench: Bench) -> Sequence[Choice]:
-        return choices.choices(bench)
+    choices = staticmethod(choices.choices)
 
     def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
         return figures.pictures(results, self.columns)

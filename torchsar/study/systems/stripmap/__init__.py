@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsar.core import Draws, Recording, Trace, Truth
+from torchsar.core import Draws, Recording, Truth
 from torchsar.echo import target_energy
 from torchsar.focus.ladar_requirements import Limit
 from torchsar.focus.requirements import Requirement
@@ -25,7 +25,7 @@ from torchsar.study.settings.sections import Loaded
 from torchsar.study.systems.stripmap import figures, judge
 from torchsar.study.systems.stripmap.choices import choices, probe_of
 from torchsar.study.systems.stripmap.world import Strip
-from torchsar.study.trials.batch import Batch, Judged, Outcome, Result, Trials
+from torchsar.study.trials.batch import Batch, Result, Trials
 from torchsar.study.trials.bench import Bench
 from torchsar.study.trials.choice import Choice
 from torchsar.study.trials.system import Column, System
@@ -109,11 +109,8 @@ class Stripmap(System):
     def simulate(self, bench: Bench, world: Strip, draws: Draws) -> Trials:
         return world.trials_of(bench.radar, draws, bench.dtype, bench.device)
 
-    def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
-        return judge.judge(bench, name, trace, trials, detail)
-
-    def compare(self, bench: Bench, outcome: Outcome, ideal: Outcome | None) -> Judged:
-        return judge.compare(bench, outcome, ideal)
+    compare = staticmethod(judge.compare)
+    judge = staticmethod(judge.judge)
 
     def check_sweep(self, loaded: Loaded, grid: Mapping[str, Any]) -> None:
         if "world.doppler_hz" in grid and "world.squint_deg" in grid:
