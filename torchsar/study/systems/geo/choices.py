@@ -91,7 +91,9 @@ def use_of(chain: Chain, bench: Bench) -> MultichannelUse:
     rebuilds = [s for s in stages if isinstance(s, Reconstruct)]
     # without a reconstruction the intensity ratio tells bands apart
     rebuilds = rebuilds or [s for s in stages if isinstance(s, SignalIntensityRatio)]
-    estimators = tuple(dict.fromkeys(_ESTIMATORS[type(stage)] for stage in stages if type(stage) in _ESTIMATORS))
+    estimators: tuple[Estimator, ...] = tuple(
+        dict.fromkeys(_ESTIMATORS[type(stage)] for stage in stages if type(stage) in _ESTIMATORS)
+    )
     migrations = [stage.migration for stage in stages if isinstance(stage, CorrectMigration)]
     snr, lit = world.snr_db(bench.radar), world.integration_s
     return MultichannelUse(
@@ -156,7 +158,9 @@ def choices(bench: Bench) -> list[Choice]:
         )
         for n in (2, 4)
     ]
-    rebuilds = {f"least squares, {n} band{'s' * (n > 1)}": LeastSquares(n) for n in range(1, radar.channels + 1)}
+    rebuilds: dict[str, Any] = {
+        f"least squares, {n} band{'s' * (n > 1)}": LeastSquares(n) for n in range(1, radar.channels + 1)
+    }
     rebuilds["least mean square, pattern, 5 bands"] = MinimumMeanSquare(5)
     if band is not None:
         rebuilds["least mean square, flat band, 5 bands"] = MinimumMeanSquare(5, prior=FlatBand(band))
@@ -288,7 +292,7 @@ def _dimensions(bench: Bench) -> Measured:
     """The fastest target by azimuth-only data, range-compressed lines and full chirps."""
     # echoes begin at the middle of the axis
     longer = _LINES + 2 * bench.radar.pulse.n_samples(bench.radar.sampling_hz)
-    sizes = ({}, {"samples": _LINES}, {"samples": longer, "kind": "full"})
+    sizes: tuple[dict[str, Any], ...] = ({}, {"samples": _LINES}, {"samples": longer, "kind": "full"})
     crop = _cropped(bench)
     share = crop["pulses"] / bench.world().pulses / len(bench.world().targets)
     trials = {name: _alone(bench, fastest=True, **crop, **size) for name, size in zip(_DIMENSIONS, sizes, strict=True)}

@@ -99,7 +99,8 @@ def probe_of(bench: Bench) -> StripProbe:
         size, seen = (world.lines, world.samples), world.of(radar)
     else:
         used = bench.batch(Draws(0), methods=("recommended",)).outcomes["recommended"].judged.view
-        size = tuple(axis.n for axis in bench.recording.signal.axes)
+        pulse, sample = bench.recording.signal.axes
+        size = (pulse.n, sample.n)
         doppler, velocity = float(used.doppler_hz or 0.0), float(used.velocity_m_s)
         dwell = radar.integration_s or 0.75 * radar.aperture_s(radar.near_range_m)
         seen = StripmapWorld(Points([0.0], [0.0]), Dwell(dwell), Hyperbola(), velocity, doppler)
