@@ -190,7 +190,8 @@ def made_scenes(trace: Trace, speed_m_s: float) -> list[MadeScene]:
     """
     data, axes = trace.signal.data.reshape(-1, *trace.signal.data.shape[-2:]), trace.signal.axes
     if not trace.estimates:
-        return [MadeScene(*(Signal(image, axes),) * 3) for image in data]
+        images = [Signal(image, axes) for image in data]
+        return [MadeScene(image, image, image) for image in images]
     (estimate,) = trace.estimates.values()
     info = {name: x.reshape(len(data), *x.shape[len(trace.signal.trials) :]) for name, x in estimate.info.items()}
     values = [estimate.value[key].reshape(len(data), -1) for key in ("u_r_m_s", "u_a_m_s", "y0_m", "range_m")]
@@ -198,10 +199,10 @@ def made_scenes(trace: Trace, speed_m_s: float) -> list[MadeScene]:
     scenes = []
     for i, image in enumerate(data):
         there = (info["level"][i] > 0).nonzero()[:, 0].tolist()
-        motions = [PointMotion(*(x[i, j] for x in values), speed_m_s) for j in there]
+        motions = [PointMotion(*[x[i, j] for x in values], speed_m_s) for j in there]  # pyright: ignore[reportCallIssue]
         targets = [FoundTarget(m, float(std[i, j]), bool(ok[i, j])) for m, j in zip(motions, there, strict=True)]
-        images = (info["conventional"][i], info["rest"][i], image)
-        scenes.append(MadeScene(*(Signal(x, axes) for x in images), targets))
+        conventional, rest = Signal(info["conventional"][i], axes), Signal(info["rest"][i], axes)
+        scenes.append(MadeScene(conventional, rest, Signal(image, axes), targets))
     return scenes
 
 

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchsar.compensate.rotation.entropy_search import descend_rotation, genetic_rotation
 from torchsar.compensate.rotation.image_entropy import EntropyObjective, ImageEntropy
+from torchsar.compensate.rotation.unknowns import Variables
 from torchsar.core import Draws, Estimate
 
 # a genetic search that is short enough to compare: population, generations, part of the truth to
@@ -16,7 +17,7 @@ _POPULATION, _GENERATIONS, _PART = 10, 4, 0.1
 
 def _entropy(
     data: Tensor,
-    variables: str,
+    variables: Variables,
     wavelength_m: float,
     prf_hz: float,
     range_m: Tensor,

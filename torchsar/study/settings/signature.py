@@ -64,8 +64,8 @@ class Section:
     @cached_property
     def keys(self) -> dict[str, Key]:
         """Keys by name. Raises TypeError for a required parameter that YAML cannot represent."""
-        fields = dataclasses.is_dataclass(self.target) or not inspect.isclass(self.target)
-        hints = typing.get_type_hints(self.target if fields else self.target.__init__, include_extras=True)
+        initialised = inspect.isclass(self.target) and not hasattr(self.target, "__dataclass_fields__")
+        hints = typing.get_type_hints(self.target.__init__ if initialised else self.target, include_extras=True)
         found = {}
         for parameter in inspect.signature(self.target).parameters.values():
             if parameter.name in self.given or parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
@@ -106,7 +106,7 @@ class Section:
         except ValidationError as error:
             raise ConfigError(sentence(error, self.model, file, where)) from None
         for name, key in self.keys.items():
-            path, value = f"{where}.{name}" if where else name, values[name]
+            path, value = f"{where}.{name}" if where else name, typing.cast(Any, values[name])
             if key.inner is None or value is None or name in open_keys:
                 continue
             if key.many:
@@ -243,7 +243,7 @@ def _key(hint: Any, default: Any) -> Key | None:
         as_tensor = Tensor in arms and not any(map(_is_list, arms))
         value = list(default) if isinstance(default, tuple) else default
         return Key(plain, value, per_trial={float, Tensor} <= scalars, as_tensor=as_tensor)
-    classes = [arm for arm in arms if dataclasses.is_dataclass(arm)]
+    classes: list[Any] = [arm for arm in arms if dataclasses.is_dataclass(arm)]
     if len(classes) > 1:
         inner, many = Catalogue("choice", "kind", {_snake(c.__name__): c for c in classes}), ""
     else:
@@ -264,7 +264,7 @@ def _inner(hint: Any) -> tuple[Section | Catalogue | None, str]:
         return _inner(args[1])[0], "mapping"
     if origin in (Sequence, list):
         return _inner(args[0])[0], "sequence"
-    return (Section(hint), "") if dataclasses.is_dataclass(hint) else (None, "")
+    return (Section(hint), "") if hasattr(hint, "__dataclass_fields__") else (None, "")
 
 
 def _described_default(default: Any, inner: Section | Catalogue, many: str) -> Any:

@@ -211,11 +211,11 @@ class Geo(System):
                 found.setdefault(error_name(key), {})[title] = value.expand(truth["u_r_m_s"].shape)
         return {key: named for key, named in found.items() if any(key in of for of in metrics)}
 
-    limits = staticmethod(choices.limits)
+    limits = staticmethod(choices.limits)  # pyright: ignore[reportAssignmentType]
 
-    requirements = staticmethod(choices.requirements)
+    requirements = staticmethod(choices.requirements)  # pyright: ignore[reportAssignmentType]
 
-    choices = staticmethod(choices.choices)
+    choices = staticmethod(choices.choices)  # pyright: ignore[reportAssignmentType]
 
     def theory(self, result: Result) -> Mapping[str, Mapping[str, float]]:
         """Ideal responses of the recommended method, if it makes an image."""

@@ -192,11 +192,11 @@ class GeoOcean(System):
                 table[f"{ship}.{key}"] = Found(torch.tensor(values, dtype=torch.float64), None, ok)
         return table
 
-    limits = staticmethod(choices.limits)
+    limits = staticmethod(choices.limits)  # pyright: ignore[reportAssignmentType]
 
-    requirements = staticmethod(choices.requirements)
+    requirements = staticmethod(choices.requirements)  # pyright: ignore[reportAssignmentType]
 
-    choices = staticmethod(choices.choices)
+    choices = staticmethod(choices.choices)  # pyright: ignore[reportAssignmentType]
 
     def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
         return figures.pictures(results, self.target_columns)

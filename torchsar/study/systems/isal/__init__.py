@@ -90,7 +90,7 @@ class Isal(System):
     def simulate(self, bench: Bench, world: Target, draws: Draws) -> Trials:
         return world.trials_of(bench.radar, draws, bench.dtype, bench.device)
 
-    bounds = staticmethod(judge.bounds)
+    bounds = staticmethod(judge.bounds)  # pyright: ignore[reportAssignmentType]
 
     def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
         return judge.judge(bench, name, trace, trials)

@@ -101,7 +101,8 @@ def echo_choices(bench: Bench) -> list[Choice]:
         )
         # compression removes the velocity of the track that the receiver follows
         compress = CompressDechirped(
-            radar, velocity_m_s=sum(m.coefficients_m[0] for m in own.track) if own.track else None
+            radar,
+            velocity_m_s=sum(m.coefficients_m[0] for m in own.track) if own.track else None,  # pyright: ignore
         )
 
         def made(name: str, of: Any, dtype: torch.dtype) -> Tensor:

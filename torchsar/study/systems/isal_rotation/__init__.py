@@ -198,9 +198,9 @@ class IsalRotation(System):
             found[limit] = [n for n, chain in bench.chains.items() if estimated is None or _provides(chain, estimated)]
         return found
 
-    requirements = staticmethod(choices.requirements)
+    requirements = staticmethod(choices.requirements)  # pyright: ignore[reportAssignmentType]
 
-    choices = staticmethod(choices.choices)
+    choices = staticmethod(choices.choices)  # pyright: ignore[reportAssignmentType]
 
     def pictures(self, results: Mapping[str, Result]) -> Iterator[Callable[[], Drawn]]:
         return figures.pictures(results, self.columns)

@@ -109,8 +109,8 @@ class Stripmap(System):
     def simulate(self, bench: Bench, world: Strip, draws: Draws) -> Trials:
         return world.trials_of(bench.radar, draws, bench.dtype, bench.device)
 
-    compare = staticmethod(judge.compare)
-    judge = staticmethod(judge.judge)
+    compare = staticmethod(judge.compare)  # pyright: ignore[reportAssignmentType]
+    judge = staticmethod(judge.judge)  # pyright: ignore[reportAssignmentType]
 
     def check_sweep(self, loaded: Loaded, grid: Mapping[str, Any]) -> None:
         if "world.doppler_hz" in grid and "world.squint_deg" in grid:
