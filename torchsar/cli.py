@@ -71,7 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Arguments after the name of the program; those of this process by default.
 
     Returns:
-        0; 2 after an error message on stderr about invalid input; 130 if interrupted.
+        0; 1 if stdout was closed; 2 after an error message on stderr about invalid input; 130 if
+        interrupted.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     options = _parse(given)
@@ -92,6 +93,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(f"{error.name or error} is not installed; install the extra: pip install 'torchsar-lab[study]'")
     except ConfigError as error:
         return _fail(str(error))
+    except BrokenPipeError:  # the reader of stdout, such as `head`, has ended
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except KeyboardInterrupt as stopped:
         print(f"torchsar: interrupted, {stopped if stopped.args else 'nothing was written'}", file=sys.stderr)
         return 130

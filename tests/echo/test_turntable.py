@@ -248,7 +248,7 @@ def test_the_window_follows_the_track() -> None:
         ValueError,
         match=(
             r"the target reaches from .* of a range window of -0.0324775 to 0.0314782 m; .* let "
-            r"the reference follow it"
+            r"the window follow it by the track of Dechirped"
         ),
     ):
         simulate_turntable(ladar(), TurntableWorld(SMALL, motion=motion, fidelity=Dechirped()), 20, 64, Draws(1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import random
@@ -105,6 +106,12 @@ def test_files_that_come_while_a_command_works_are_kept_and_so_is_the_result(out
     assert (out / "figures" / "my.png").read_text() == "mine"
 
 
+def test_a_full_disk_is_one_sentence_and_the_earlier_result_stays(out: Path) -> None:
+    with pytest.raises(ConfigError, match=r"cannot be written \(No space left"), fresh_result(out, "run", NAMES):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert result(out) == whole("first", 3)
+
+
 def test_a_folder_belongs_to_one_kind_of_command(out: Path) -> None:
     with pytest.raises(ConfigError, match="result of another command, run"), opened(out, "trade"):
         pytest.fail("must not begin")
@@ -115,6 +122,7 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
     "a file": (lambda tmp: touched(tmp / "file"), "cannot be written"),
     "below a file": (lambda tmp: touched(tmp / "file") / "below", "cannot be written"),
     "a state of somebody else": (lambda tmp: touched(tmp / "mine" / STATE / "x").parents[1], "was not made by"),
+    "where no folder can be made": (lambda tmp: Path("/proc/torchsar"), "cannot be written"),
     "no name": (lambda tmp: tmp / "a\0b", "cannot be written"),
     "a long name": (lambda tmp: tmp / ("x" * 400), "cannot be written"),
 }

@@ -356,6 +356,7 @@ def test_workers_that_do_not_start_are_a_sentence(monkeypatch: pytest.MonkeyPatc
         ({"show": ["ok"]}, "sweep.show names 'ok', which no trial gives"),
         ({"success": {"entropy_nats": -1.0}}, "greater than or equal to 0"),
         ({"save": {"trials": [2]}}, "a point has the trials 0 to 1"),
+        ({"world.beam.dwell_s": [0.2, -0.1, 0.3]}, "got -0.1"),
         ({"trials": 10**13}, "do not fit into memory"),
     ],
 )

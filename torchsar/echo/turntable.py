@@ -742,6 +742,6 @@ def _refuse_outside(scatterers: Scatterers, off_m: Tensor, radar: InverseRadar, 
     if not (low <= nearest and farthest <= high):
         raise ValueError(
             f"the target reaches from {nearest:.6g} to {farthest:.6g} m of a range window of "
-            f"{low:.6g} to {high:.6g} m; choose a smaller target or more range samples, or let the reference "
-            "follow it: Dechirped(track=...)"
+            f"{low:.6g} to {high:.6g} m; choose a smaller target or more range samples, or let the window "
+            "follow it by the track of Dechirped (in a config, track_m of the fidelity dechirped)"
         )

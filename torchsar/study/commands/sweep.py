@@ -180,8 +180,8 @@ def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
     grid = make_grid(given, [key for key in given if trial.may_differ(key)], f"{file}: sweep")
     for parameter in grid.parameters:
         ends = {*parameter.values[:1], min(parameter.values), max(parameter.values)} if parameter.batched else ()
-        for value in ends or parameter.values:  # numbers between two accepted ones are accepted
-            loaded.changed({parameter.name: value})
+        for value in ends:  # numbers between two accepted ones are accepted
+            Bench(loaded.changed({parameter.name: value}), trial.device)
     for case in grid.cases():
         there = {stage for chain in trial.bench(case.fixed).chains.values() for stage in chain.stages}
         for tap in loaded.config.sweep.save.taps:

@@ -129,7 +129,10 @@ class Work:
         of = f" of {points}" if points else ""
         where = f"the trial function failed in trials {min(chunk.trials)} to {max(chunk.trials)}{of}"
         if not _out_of_memory(error):
-            raise ConfigError(f"{where}: {type(error).__name__}: {one_line(error) or 'no message'}") from error
+            raise ConfigError(
+                f"{where}: {'' if isinstance(error, ConfigError) else type(error).__name__ + ': '}"
+                f"{one_line(error) or 'no message'}"
+            ) from error
         if len(chunk) == 1:
             raise ConfigError(
                 f"{where}: a single trial does not fit into the memory of {self.device}; make the scene smaller"

@@ -142,22 +142,28 @@ def opened(out: Path, kind: str, names: Sequence[str] = ()) -> Iterator[ResultFo
 @contextmanager
 def fresh_result(out: Path, kind: str, names: Sequence[str]) -> Iterator[Path]:
     """Provide an empty folder for a new result; see `opened` and `ResultFolder.staged`."""
-    with opened(out, kind, names) as folder, folder.staged() as new:
-        yield new
+    try:
+        with opened(out, kind, names) as folder, folder.staged() as new:
+            yield new
+    except OSError as error:
+        raise ConfigError(
+            f"--out {out}: the result cannot be written ({error.strerror or error}); make room, or choose another "
+            "folder"
+        ) from error
 
 
 def _locked(out: Path) -> Any:
     """The locked file of a result folder; the operating system releases it with the process."""
     state = out / STATE
-    while True:
+    for attempts_left in reversed(range(10_000)):
         try:
             state.mkdir(parents=True, exist_ok=True)
             if any(state.iterdir()) and not (state / "lock").is_file():
                 raise ConfigError(f"--out {out}: {state} was not made by torchsar; move it, or choose another folder")
             file = (state / "lock").open("a")
-        except FileNotFoundError:  # another command has just removed the empty folder
-            continue
         except (OSError, ValueError) as error:
+            if isinstance(error, FileNotFoundError) and attempts_left:
+                continue  # another command may just have removed the empty folder
             raise ConfigError(f"--out {str(out)!r} cannot be written: {error}; choose another folder") from None
         try:
             if fcntl is not None:

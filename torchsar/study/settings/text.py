@@ -130,7 +130,7 @@ def find_config(name: str) -> Path:
     ):
         return packaged[path.stem]
     if path.is_dir():
-        raise ConfigError(f"{name} is a folder, not a config file")
+        raise ConfigError(f"{name!r} is a folder, not a config file")
     raise ConfigError(
         f"there is no config file {name!r} and no packaged config of that name{did_you_mean(path.stem, packaged)}"
     )
