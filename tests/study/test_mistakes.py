@@ -196,7 +196,7 @@ MISTAKES = [
             },
             "metrics": None,
         },
-        "works on profiles deramped once, here 0 times",
+        "needs profiles that are deramped once, but 0 stages deramp_azimuth",
     ),
     (
         "sal",

@@ -53,7 +53,7 @@ class Box:
         Args:
             low: Least values, shape (..., n).
             high: Greatest values, shape (..., n).
-            who: Name of the search, for messages.
+            who: Name of the search, used in error messages.
 
         Raises:
             TypeError: If a bound is not a real floating tensor.
@@ -73,7 +73,7 @@ class Box:
         low, high = torch.broadcast_tensors(low.detach(), high.detach())
         if not bool((torch.isfinite(low) & torch.isfinite(high) & (low <= high)).all()):
             raise ValueError(
-                f"{who}: the box must be finite with low <= high in every unknown, got low "
+                f"{who}: the search bounds must be finite with low <= high in every unknown, got low "
                 f"{low.flatten()[:8].tolist()} and high {high.flatten()[:8].tolist()}"
             )
         return Box(low, high)
@@ -127,7 +127,7 @@ class Dice:
         count, trials = None if self.draws.trials is None else len(self.draws.trials), math.prod(self.box.trials)
         if count is not None and count != trials:
             raise ValueError(
-                f"draws for {count} trials do not fit a box of {trials}; give Draws(seed, "
+                f"draws for {count} trials do not fit search bounds for {trials} trials; give Draws(seed, "
                 f"trials=range({trials})), or Draws(seed) for the same numbers in every trial"
             )
 
@@ -161,7 +161,7 @@ def costs_of(objective: Population, x: Tensor, who: str) -> Tensor:
     Args:
         objective: Maps candidates (*trials, candidate, n) to costs (*trials, candidate).
         x: Candidates, shape (*trials, candidate, n).
-        who: Name of the search, for messages.
+        who: Name of the search, used in error messages.
 
     Returns:
         Costs, shape (*trials, candidate).
@@ -222,14 +222,14 @@ def best(x: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def check_counts(who: str, least: dict[str, tuple[float, float]]) -> None:
-    """Check that settings are not below their least values.
+    """Check that settings are not below their minimum values.
 
     Args:
-        who: Name of the search, for messages.
-        least: (value, least value) by parameter name.
+        who: Name of the search, used in error messages.
+        least: (value, minimum value) by parameter name.
 
     Raises:
-        ValueError: If a value is below its least value.
+        ValueError: If a value is below its minimum value.
     """
     for name, (value, bound) in least.items():
         if not value >= bound:

@@ -247,7 +247,7 @@ class SignalIntensityRatio(Stage):
         return self._checked_for_ambiguity(found, lines, u_a_m_s, y0_m)
 
     def _checked_for_ambiguity(self, found: Estimate, lines: Tensor, u_a_m_s: Number, y0_m: Number) -> Estimate:
-        """Check the estimate for a velocity off by whole PRFs on the strongest range line."""
+        """Check for a velocity wrong by a multiple of lambda * PRF, on the strongest range line."""
         motion = self._motion(lines, found["u_r_m_s"], u_a_m_s, y0_m)
         line = take(lines.movedim(-1, -3), lines.detach().abs().square().sum((-3, -2)).argmax(-1), -3)
         dwell_s = self.bandwidth_hz * self.radar.wavelength_m * self.radar.reference_range_m / self.radar.speed_m_s**2

@@ -222,7 +222,7 @@ def read_sweep(path: Path | str) -> Record:
 
 
 def cut_off(path: Path) -> bool:
-    """Whether a sweep was killed while it made this store, before the store held anything."""
+    """Return whether a sweep was killed while creating this store, which then holds no results."""
     made = {p.name for p in path.iterdir() if not p.name.endswith(".partial")} if path.is_dir() else {""}
     root = path / "zarr.json"
     if not made <= {root.name, _DONE}:

@@ -115,7 +115,10 @@ class Points(World):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.pulses < 1 or not self.targets or (self.samples is not None and self.samples < 1):
-            raise ValueError(f"world needs targets, pulses and samples, got {self.pulses} and {self.samples}")
+            raise ValueError(
+                "world needs at least one target and one pulse, and samples of 1 or more or None, got "
+                f"{len(self.targets)} targets, {self.pulses} pulses and {self.samples} samples"
+            )
         if self.noise.scr_db is not None and self.sea is None:
             raise ValueError("world.noise.scr_db is the level of targets over a sea; give world.sea, or snr_db instead")
         if self.sea is not None and all(getattr(self.noise, one.name) is None for one in fields(Level)):
