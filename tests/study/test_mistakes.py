@@ -178,7 +178,7 @@ MISTAKES = [
     ),
     ("sal", alone({"stage": "azimuth_transform"}), "processor.recommended"),
     ("sal", alone({"stage": "target_image"}), "processor.recommended"),
-    ("sal", {"world": world("sal", noise={"snr_db": 4000.0})}, "noise.snr_db is 4000.0, beyond what numbers hold"),
+    ("sal", {"world": world("sal", noise={"snr_db": 4000.0})}, "noise.snr_db is 4000.0, outside the numerical range"),
     (
         "sal",
         {"world": world("sal", motion={"drift": {"kind": "drift", "velocity_m_s": float("nan")}})},
@@ -218,10 +218,10 @@ MISTAKES = [
     ("geo", {"radar": radar("geo", channel_m=[])}, "channel_m"),
     ("geo", {"radar": radar("geo", prf_hz=0.0)}, "prf_hz"),
     ("geo", {"radar": radar("geo", reference_range_m=2000.0)}, "height_m must lie in 0..reference_range_m"),
-    ("geo", {"world": world("geo", noise={"snr_db": 0.0, "raw_scnr_db": 0.0})}, "both say how strong a target is"),
-    ("geo", {"world": world("geo", noise={"scr_db": 0.0})}, "noise.scr_db is the level of targets over a sea"),
-    ("geo", {"world": world("geo", sea={"kind": "k_sea"}, noise={})}, "the level of a sea counts from the noise"),
-    ("geo", {"world": world("geo", targets={"p": {"range_m": 10.0}})}, "azimuth-only data (null) know one range"),
+    ("geo", {"world": world("geo", noise={"snr_db": 0.0, "raw_scnr_db": 0.0})}, "both set the level of the targets"),
+    ("geo", {"world": world("geo", noise={"scr_db": 0.0})}, "noise.scr_db is a signal-to-clutter ratio"),
+    ("geo", {"world": world("geo", sea={"kind": "k_sea"}, noise={})}, "the level of the sea is relative to the noise"),
+    ("geo", {"world": world("geo", targets={"p": {"range_m": 10.0}})}, "azimuth-only data (null) have a single range"),
     ("geo", {"world": world("geo", targets={"p": {"u_a_m_s": 300.0}})}, "speed past the fastest target is 0 m/s"),
     ("geo", {"world": world("geo", pulses=600)}, "record is 3.333 s, and must be at least 4.5 s"),
     (

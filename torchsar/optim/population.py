@@ -1,4 +1,4 @@
-"""Parts shared by the searches without gradients: result, box, random numbers and costs."""
+"""Parts shared by the searches without gradients: result, bounds, random numbers and costs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Searched:
 
 @dataclass(frozen=True)
 class Box:
-    """Least and greatest values of the unknowns per trial; equal values fix an unknown.
+    """Lower and upper bounds of the unknowns per trial; equal values fix an unknown.
 
     Args:
         low: Least values, shape (*trials, n), float32 or float64.
@@ -48,7 +48,7 @@ class Box:
 
     @staticmethod
     def of(low: Tensor, high: Tensor, who: str) -> Box:
-        """Build a box from bounds that broadcast against each other.
+        """Build the bounds from tensors that broadcast against each other.
 
         Args:
             low: Least values, shape (..., n).
@@ -84,7 +84,7 @@ class Box:
         return self.low.shape[:-1]
 
     def at(self, part: Tensor) -> Tensor:
-        """Map coordinates in 0..1 of the box to points.
+        """Map relative coordinates, 0 at `low` and 1 at `high`, to points.
 
         Args:
             part: Coordinates, shape (*trials, candidate, n).
@@ -95,7 +95,7 @@ class Box:
         return self.low[..., None, :] + part * (self.high - self.low)[..., None, :]
 
     def kept(self, x: Tensor) -> Tensor:
-        """Move candidates that lie outside the box onto its edge.
+        """Set unknowns beyond a bound to the bound.
 
         Args:
             x: Candidates, shape (*trials, candidate, n).
@@ -108,16 +108,16 @@ class Box:
 
 @dataclass(frozen=True)
 class Dice:
-    """Random numbers for all trials of a box.
+    """Random numbers for all trials of a search.
 
     Each trial has its own numbers where the draws have trials; otherwise all trials share the same.
 
     Args:
         draws: Source of the random numbers.
-        box: Box whose trials the numbers are for.
+        box: Bounds whose trials the numbers are for.
 
     Raises:
-        ValueError: If the draws have another number of trials than the box.
+        ValueError: If the draws have another number of trials than the bounds.
     """
 
     draws: Draws
@@ -150,7 +150,7 @@ class Dice:
         return self._of_trials(self.draws.normal(purpose, shape), shape)
 
     def _of_trials(self, x: Tensor, shape: Sequence[int]) -> Tensor:
-        """Numbers in the dtype and shape of the box."""
+        """Numbers in the dtype and shape of the bounds."""
         x = x.to(dtype=self.box.low.dtype, device=self.box.low.device)
         return x.expand(*self.box.trials, *shape) if self.draws.trials is None else x.reshape(*self.box.trials, *shape)
 

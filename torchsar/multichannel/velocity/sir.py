@@ -168,8 +168,8 @@ class SignalIntensityRatio(Stage):
         least_quality: Least quality of a reliable estimate.
 
     Raises:
-        ValueError: If the search holds fewer than two steps, the reconstructed band does not exceed
-            `bandwidth_hz`, or there are too few channels for the bands.
+        ValueError: If the search interval is shorter than two steps, the reconstructed band does not
+            exceed `bandwidth_hz`, or there are too few channels for the bands.
 
     Reference:
         Remote Sens. 2020, 12, 1703, Eqs. (37)-(39).
@@ -220,9 +220,9 @@ class SignalIntensityRatio(Stage):
         Returns:
             `u_r_m_s` of shape (...,), closing positive, with a jackknife standard deviation. The
             quality is 1 - median / largest Gamma over the grid. `info` holds `log_ratio` over the
-            grid and `pulse_rates`. `ok` is False for zero data (whose value is the middle of the
-            search), a maximum at an end of the search, a quality below `least_quality`, or a
-            velocity off by whole PRFs.
+            grid and `pulse_rates`. `ok` is False if the data are zero (the value is then
+            the middle of the search interval), the maximum lies at an end of the interval, the
+            quality is below `least_quality`, or the velocity is wrong by a multiple of lambda PRF.
 
         Raises:
             ValueError: If the reconstruction is singular.
@@ -258,7 +258,7 @@ class SignalIntensityRatio(Stage):
         return PointMotion.of(self.radar, lines, u_r_m_s, u_a_m_s, y0_m, self.range_m)
 
     def _estimate(self, fine: Tensor, coarse: Tensor, costs: Tensor, lines: Tensor, std: Tensor) -> Estimate:
-        """Form the estimate and judge it."""
+        """Return the estimate with its quality and `ok`."""
         low, high = self.search_m_s
         has_data = lines.detach().abs().amax((-3, -2, -1)) > 0
         value = torch.where(has_data, fine.clamp(low, high), (low + high) / 2)
