@@ -113,7 +113,7 @@ MISTAKES = [
     ("isal_rotation", {"radar": radar("isal_rotation", wavelength_m=None)}, "give one of carrier_hz and wavelength_m"),
     ("isal_rotation", rotating(rotation={"omega_rad_s": 0.0}), "world.rotation"),
     ("isal_rotation", rotating(rotation={"omega_rad_s": 0.02, "k1": 10.0}), "key 'world.rotation.k1' is not known"),
-    ("isal_rotation", rotating(rotation={"omega_rad_s": 0.02, "k": [-100.0, 2000.0]}), "two times share an angle"),
+    ("isal_rotation", rotating(rotation={"omega_rad_s": 0.02, "k": [-100.0, 2000.0]}), "two times have the same angle"),
     ("isal_rotation", rotating(rotation_rad_s=0.02), "world.rotation_rad_s"),
     (
         "isal_rotation",

@@ -1,4 +1,4 @@
-"""Processing chains: stages run in order, pass named values on, and can be rerun from any stage."""
+"""Processing chains: stages run in order, pass on named values, and can be rerun from any stage."""
 
 from __future__ import annotations
 

@@ -168,8 +168,8 @@ class SignalIntensityRatio(Stage):
         least_quality: Least quality of a reliable estimate.
 
     Raises:
-        ValueError: If the search interval is shorter than two steps, the reconstructed band does not
-            exceed `bandwidth_hz`, or there are too few channels for the bands.
+        ValueError: If the search interval is shorter than two steps, the reconstructed band does
+            not exceed `bandwidth_hz`, or there are too few channels for the bands.
 
     Reference:
         Remote Sens. 2020, 12, 1703, Eqs. (37)-(39).

@@ -121,7 +121,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Found:
-    """Estimates of one quantity: value, predicted standard deviation (trial, ...), `ok` (trial,)."""
+    """Estimates of a quantity: value and predicted standard deviation (trial, ...), `ok` (trial,)."""
 
     value: Tensor
     std: Tensor | None
