@@ -1,7 +1,7 @@
 """Extended moving targets ("bodies"): one velocity for all scatterers, image, and echo to subtract.
 
 Range lines around the body are shifted by its range history and deramped channel by channel. Each
-scatterer then is one tone in all channels, whatever the aliasing: the frequency F gives its
+scatterer then is one tone in all channels, even if aliased: the frequency F gives its
 along-track position y = y0 + F lambda R0 / v, and position and velocity give its phases across the
 channels. In short segments of slow time the sea at the frequency of a tone comes from as few look
 angles as there are Doppler bands; range lines beside the body give its covariance. The slant-range

@@ -149,20 +149,20 @@ def refuse_full_band(radar: BistaticRadar, rebuild: Rebuild, bandwidth_hz: float
 class SignalIntensityRatio(Stage):
     """Estimator of u_r that maximises the intensity ratio Gamma, per trial.
 
-    A grid over the search is followed by parabolas about its best point. Prefer `Interferometry` or
-    `MovingPointVelocity`: the ratio needs about 15 dB more SNR (its threshold lies at 0 to +7 dB
-    per sample), below its threshold it is biased by more than the standard deviation indicates, and
-    with stationary clutter beside the target its maximum lies at u_r = 0. Without noise it errs by
-    up to 0.06 m/s, since echoes beyond the reconstructed bands alias into them. The record must
-    contain the whole dwell of the target.
+    A grid search is refined by parabolic interpolation about its best point. Prefer
+    `Interferometry` or `MovingPointVelocity`: the ratio needs about 15 dB more SNR (its threshold
+    lies at 0 to +7 dB per sample), below its threshold it is biased by more than the standard
+    deviation indicates, and with stationary clutter beside the target its maximum lies at u_r = 0.
+    Without noise it errs by up to 0.06 m/s, since echoes beyond the reconstructed bands alias into
+    them. The record must contain the whole dwell of the target.
 
     Args:
         radar: Instrument.
         bandwidth_hz: Processed Doppler bandwidth V^2 T / (lambda R0) in Hz.
         rebuild: Reconstruction method, `LeastSquares(3)` by default, since two bands leave little
             outside the processed band.
-        search_m_s: Least and largest velocity in m/s, None for the unambiguous interval +-lambda
-            PRF / 2.
+        search_m_s: Least and largest velocity of the search in m/s, None for the unambiguous
+            interval +-lambda PRF / 2.
         step_m_s: Step of the grid in m/s.
         range_m: Closest range in metres, None for the reference range of the radar.
         least_quality: Least quality of a reliable estimate.
