@@ -232,7 +232,7 @@ class ImageMovers(Stage):
         return remaining, bodies
 
     def _inside_frame(self, detection: Detection, signal: Signal) -> bool:
-        """Test if a target stays in the swath at any velocity and passes broadside in the record."""
+        """Test if a target stays in the swath at any velocity and is broadside in the record."""
         axis, pulse = signal.axis("range"), signal.axis("pulse")
         abeam_s = detection.azimuth_m / self.radar.speed_m_s
         walk = self.extraction.range_m + self.radar.ambiguous_velocity_m_s / 2 * (

@@ -266,8 +266,8 @@ def _loaded(root: zarr.Group, path: Path) -> Record:
         if not missing:
             return _read(root)
     except (KeyError, ValueError, IndexError, TypeError, OSError) as error:
-        raise ConfigError(f"{path} is broken ({type(error).__name__}: {one_line(error)}); {advice}") from error
-    raise ConfigError(f"{path} is broken: {missing[0]!r} is missing; {advice}")
+        raise ConfigError(f"{path} is damaged ({type(error).__name__}: {one_line(error)}); {advice}") from error
+    raise ConfigError(f"{path} is damaged: {missing[0]!r} is missing; {advice}")
 
 
 def _read(root: zarr.Group) -> Record:
