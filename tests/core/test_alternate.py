@@ -149,7 +149,7 @@ class Holding(Mean):
 
 
 def test_invalid_alternations_raise() -> None:
-    with pytest.raises(ValueError, match=r"two turns or more and one round or more, got \['mean'\] and rounds=3"):
+    with pytest.raises(ValueError, match=r"at least two estimators and one round, got \['mean'\] and rounds=3"):
         Alternate(mean=Turn(Mean()))
     with pytest.raises(ValueError, match="rounds=0"):
         both(0)

@@ -70,6 +70,7 @@ from torchsar.scene import (
     KSea,
     LadarWorld,
     LetterE,
+    LitPoints,
     LogAmplitude,
     MeasuredTrack,
     Movers,
@@ -676,6 +677,7 @@ FACTORIES = (
 # parameters annotated with Tensor that have no case, and plain numbers, each with the reason
 NOT_PER_TRIAL = {
     (MeasuredTrack, "time_s"): "times of measurement, which all trials share",
+    (LitPoints, "processed_hz"): "Doppler band of a receiver, which all trials share",
     (Aircraft, "spacing_m"): "decides how many scatterers there are",
     (Aircraft, "length_m"): "decides how many scatterers there are",
     (Aircraft, "width_m"): "decides how many scatterers there are",

@@ -509,7 +509,7 @@ REFUSED = {
         lambda: dechirped_echo(
             Points([4e3], [0.0]).scatterers(Draws(0)), InverseRadar(10e9, 5e9, 50.0, 4e-4, 1e-2), 4, 16, 4e-4
         ),
-        "the rotation curves phases by .* rad within a pulse, and the dechirped model holds to 0.6 rad",
+        "quadratic phase of .* rad within a pulse, and the dechirped model is valid up to 0.6 rad",
     ),
     "snr": (
         lambda: TurntableWorld(SMALL, snr_db=math.nan),

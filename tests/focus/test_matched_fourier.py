@@ -429,7 +429,7 @@ def test_invalid_arguments_raise():
     signal = Signal(noise(2, N, 3), RADAR.raw_axes(N, 3))
     backwards = torch.tensor([[-100.0, 2000.0], [0.0, 0.0]], dtype=torch.float64)
     for stage in (MatchedFourier(RADAR), RangePhase(RADAR, 0.02)):
-        with pytest.raises(ValueError, match="1 of 2 trials: two times share an angle"):
+        with pytest.raises(ValueError, match="1 of 2 trials: two times have the same angle"):
             stage(signal, warp_k=backwards)
         with pytest.raises(ValueError, match="warp_k is"):
             stage(signal, warp_k=K[:1].expand(3, 2))

@@ -119,7 +119,7 @@ def test_a_motion_that_leaves_the_record_ends_the_search() -> None:
 def test_invalid_arguments_are_rejected() -> None:
     data, _ = noisy_point()
     frame = Frame.of(RADAR, data)
-    with pytest.raises(ValueError, match="12 beside it for the covariance of the sea, got 0 lines"):
+    with pytest.raises(ValueError, match="12 beside it for the covariance of the sea, got 0 cells"):
         chip_about(data.data, frame, motion_of(r0=9000.0), EXTRACTION)
     with pytest.raises(ValueError, match="segment_s of an extraction must be positive"):
         Extraction(segment_s=0.0)

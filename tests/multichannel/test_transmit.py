@@ -62,7 +62,7 @@ def test_coefficients_per_trial_with_gradients():
     together = remove_transmit_range(data, time, (1.0, k2), 0.24)
     torch.testing.assert_close(together[1], remove_transmit_range(data[1], time, (1.0, 0.02), 0.24))
     assert torch.autograd.gradcheck(lambda d, k: remove_transmit_range(d, time, (1.0, k), 0.24), (data, k2))
-    with pytest.raises(ValueError, match="one time per pulse \\(6\\)"):
+    with pytest.raises(ValueError, match="for each of the 6 pulses"):
         remove_transmit_range(data, time[:5], K, 0.24)
 
 

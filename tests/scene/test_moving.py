@@ -158,7 +158,7 @@ def test_points_may_differ_between_trials_and_be_complex():
         (lambda: PolynomialTransmit([1.0], 2), "0..1"),
         (lambda: OrbitTransmit(None, (1.0, 2.0)), "three coordinates"),  # pyright: ignore[reportArgumentType]
         (lambda: BistaticWorld(None, Pattern()), "empty"),
-        (lambda: movers_of(Fleet({})), "holds no scene"),
+        (lambda: movers_of(Fleet({})), "at least one scene"),
     ],
 )
 def test_impossible_scenes_are_refused(build, message):

@@ -260,14 +260,14 @@ CASE_MISTAKES = [
     ({"empty": {}}, "cases.empty changes nothing"),
     ({"odd": {"world.nose.snr_db": 3.0}}, "leads nowhere at 'nose'"),
     ({"odd": {"world.noise.snr_db": "loud"}}, "cases.odd: key 'world.noise.snr_db'"),
-    ({"odd": {"metrics.reference": "sca"}}, "cases.odd: the key 'metrics.reference' holds for all cases"),
-    ({"odd": {"world.trials": 2}}, "the key 'world.trials' holds for all cases"),
-    ({"odd": {"data.file": __file__}}, "is not used by a simulation"),
-    ({"odd": {"processor.more": {"stages": {"image": IMAGE}}}}, "cases.odd changes which methods there are"),
-    ({"../": {"seed": 2}}, "a case cannot be called '../'"),
-    ({"all": {"seed": 2}}, "a case cannot be called 'all'"),
-    ({"truth": {"seed": 2}}, "a case cannot be called 'truth'"),
-    ({"a b": {"seed": 2}, "a_b": {"seed": 3}}, "would share their figures"),
+    ({"odd": {"metrics.reference": "sca"}}, "cases.odd: the key 'metrics.reference' is common to all cases"),
+    ({"odd": {"world.trials": 2}}, "the key 'world.trials' is common to all cases"),
+    ({"odd": {"data.file": __file__}}, "a simulation does not use the key 'data.file'"),
+    ({"odd": {"processor.more": {"stages": {"image": IMAGE}}}}, "cases.odd adds or removes a method"),
+    ({"../": {"seed": 2}}, "'../' is not a valid name of a case"),
+    ({"all": {"seed": 2}}, "'all' is not a valid name of a case"),
+    ({"truth": {"seed": 2}}, "'truth' is not a valid name of a case"),
+    ({"a b": {"seed": 2}, "a_b": {"seed": 3}}, "would have the same names"),
 ]
 
 
@@ -282,7 +282,7 @@ def test_cases_that_would_mislead_are_refused(tmp_path: Path, cases: dict, said:
 def test_methods_cannot_take_the_names_of_groups_of_results(system: str, tmp_path: Path) -> None:
     processor = SCENES[system]["processor"]
     for name in ("truth", "estimate"):
-        with pytest.raises(ConfigError, match=f"processor.{name}: this name is taken by a group of the results"):
+        with pytest.raises(ConfigError, match=f"processor.{name}: a group of the results has this name"):
             loaded_as(tmp_path, system, processor={**processor, name: processor["recommended"]})
 
 

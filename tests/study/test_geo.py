@@ -181,7 +181,7 @@ def test_a_sweep_follows_one_target(tmp_path: Path) -> None:
         sweep_grid(loaded, SweepTrial(loaded))
     both = {**grid, "world.noise.snr_db": [0.0]}
     loaded = loaded_as(tmp_path, "geo", sweep=both, world=world("geo", targets=ALONE, noise={}))
-    with pytest.raises(ConfigError, match="both say how strong a target is"):
+    with pytest.raises(ConfigError, match="both set the level of the targets"):
         trial = SweepTrial(loaded)
         sweep_grid(loaded, trial)
         trial({key: torch.zeros(1, dtype=torch.float64) for key in both}, Draws(1, "run", [0]))

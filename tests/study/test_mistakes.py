@@ -107,13 +107,13 @@ MISTAKES = [
         {"world": world("isal", impairments={"lost": {"kind": "lost_lines", "count": 3}})},
         "did you mean 'lost_pulses'",
     ),
-    ("isal", {"radar": radar("isal", carrier_hz=1e-300)}, "check the carrier"),
+    ("isal", {"radar": radar("isal", carrier_hz=1e-300)}, "waves short enough to show the shape of a target"),
     # isal_rotation
     ("isal_rotation", {"radar": radar("isal_rotation", carrier_hz=1.9e14)}, "give one of carrier_hz and wavelength_m"),
     ("isal_rotation", {"radar": radar("isal_rotation", wavelength_m=None)}, "give one of carrier_hz and wavelength_m"),
     ("isal_rotation", rotating(rotation={"omega_rad_s": 0.0}), "world.rotation"),
     ("isal_rotation", rotating(rotation={"omega_rad_s": 0.02, "k1": 10.0}), "key 'world.rotation.k1' is not known"),
-    ("isal_rotation", rotating(rotation={"omega_rad_s": 0.02, "k": [-100.0, 2000.0]}), "two times share an angle"),
+    ("isal_rotation", rotating(rotation={"omega_rad_s": 0.02, "k": [-100.0, 2000.0]}), "two times have the same angle"),
     ("isal_rotation", rotating(rotation_rad_s=0.02), "world.rotation_rad_s"),
     (
         "isal_rotation",
@@ -178,13 +178,13 @@ MISTAKES = [
     ),
     ("sal", alone({"stage": "azimuth_transform"}), "processor.recommended"),
     ("sal", alone({"stage": "target_image"}), "processor.recommended"),
-    ("sal", {"world": world("sal", noise={"snr_db": 4000.0})}, "noise.snr_db is 4000.0, beyond what numbers hold"),
+    ("sal", {"world": world("sal", noise={"snr_db": 4000.0})}, "world.noise.snr_db is 4000 dB"),
     (
         "sal",
         {"world": world("sal", motion={"drift": {"kind": "drift", "velocity_m_s": float("nan")}})},
         "it should be a finite number",
     ),
-    ("sal", {"world": world("sal", **points([0.0], [-4000.0]))}, "lies behind the ladar"),
+    ("sal", {"world": world("sal", **points([0.0], [-4000.0]))}, "the Doppler band of the scene over the period rate"),
     ("sal", {"world": world("sal", **points([0.0], [100.0]))}, "beats of relative ranges beyond"),
     (
         "sal",
@@ -196,7 +196,7 @@ MISTAKES = [
             },
             "metrics": None,
         },
-        "works on profiles deramped once, here 0 times",
+        "needs profiles that are deramped once, but 0 stages deramp_azimuth",
     ),
     (
         "sal",
@@ -218,10 +218,10 @@ MISTAKES = [
     ("geo", {"radar": radar("geo", channel_m=[])}, "channel_m"),
     ("geo", {"radar": radar("geo", prf_hz=0.0)}, "prf_hz"),
     ("geo", {"radar": radar("geo", reference_range_m=2000.0)}, "height_m must lie in 0..reference_range_m"),
-    ("geo", {"world": world("geo", noise={"snr_db": 0.0, "raw_scnr_db": 0.0})}, "both say how strong a target is"),
-    ("geo", {"world": world("geo", noise={"scr_db": 0.0})}, "noise.scr_db is the level of targets over a sea"),
-    ("geo", {"world": world("geo", sea={"kind": "k_sea"}, noise={})}, "the level of a sea counts from the noise"),
-    ("geo", {"world": world("geo", targets={"p": {"range_m": 10.0}})}, "azimuth-only data (null) know one range"),
+    ("geo", {"world": world("geo", noise={"snr_db": 0.0, "raw_scnr_db": 0.0})}, "both set the level of the targets"),
+    ("geo", {"world": world("geo", noise={"scr_db": 0.0})}, "noise.scr_db is a signal-to-clutter ratio"),
+    ("geo", {"world": world("geo", sea={"kind": "k_sea"}, noise={})}, "the level of the sea is relative to the noise"),
+    ("geo", {"world": world("geo", targets={"p": {"range_m": 10.0}})}, "azimuth-only data (null) have a single range"),
     ("geo", {"world": world("geo", targets={"p": {"u_a_m_s": 300.0}})}, "speed past the fastest target is 0 m/s"),
     ("geo", {"world": world("geo", pulses=600)}, "record is 3.333 s, and must be at least 4.5 s"),
     (
@@ -347,7 +347,7 @@ def test_systems_without_recordings_refuse_them(
     np.savez(tmp_path / "record.npz", profiles=np.zeros((4, 4), np.complex64))
     given = [write(tmp_path, system), f"data.file={tmp_path / 'record.npz'}", "--out", str(tmp_path / "out")]
     assert main([command, *given]) == 2
-    assert "simulates and reads no recordings; leave it out" in capsys.readouterr().err
+    assert "reads no recordings; omit" in capsys.readouterr().err
 
 
 def test_an_unknown_system_is_named(tmp_path: Path) -> None:

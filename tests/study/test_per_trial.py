@@ -159,7 +159,7 @@ CONFIGS: dict[str, tuple[Tree, Tree, Tree, Tree]] = {
             "noise": {"snr_db": 20.0},
         },
         {**REMOVED, "velocity": VELOCITY},
-        {**REMOVED, "rebuild": {"stage": "rebuild_bands", "bands": 2}},
+        {**REMOVED, "velocity": {"stage": "interferometry"}},
     ),
     "geo_ocean": (
         GEO_RADAR,

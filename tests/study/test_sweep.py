@@ -161,7 +161,7 @@ def test_a_long_chunk_reports_progress_while_it_runs(
     with caplog.at_level(logging.INFO, "torchsar"):
         toy.run(trial=slow, grid={"snr_db": [0.0], "law": ["flat"]}, trials=3, chunk=3)
     lines = [text for text in caplog.messages if text.startswith("0 of 3 trials after")]
-    assert len(lines) >= 2 and all("the time left is known after the first batch" in text for text in lines)
+    assert len(lines) >= 2 and all("the remaining time is known after the first batch" in text for text in lines)
 
 
 def test_a_warning_is_printed_once_a_sweep(caplog: pytest.LogCaptureFixture) -> None:

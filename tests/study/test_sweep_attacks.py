@@ -232,10 +232,10 @@ FAULTS = {
     "bound": (remove("error_m_bound_x"), "'error_m_bound_x' is missing"),
     "marks": (remove("done"), "'done' is missing"),
     "root": (remove("zarr.json"), "holds no results of a sweep"),
-    "empty": (lambda root: (root / "done" / "zarr.json").write_text(""), "is broken"),
+    "empty": (lambda root: (root / "done" / "zarr.json").write_text(""), "is damaged"),
     "cut": (
         lambda root: [file.write_bytes(b"x") for file in (root / "error_m" / "c").rglob("*") if file.is_file()],
-        "is broken",
+        "is damaged",
     ),
 }
 

@@ -65,7 +65,7 @@ def test_every_command_works_on_it(
 
     monkeypatch.setattr(toy_system.ToneSystem, "simulate", seen)
     assert main(["list"]) == 0
-    assert "a tone in noise" in (said := capsys.readouterr().out) and "stage strongest_line: padding=8" in said
+    assert "a tone in noise" in (said := capsys.readouterr().out) and "strongest_line" in said and "padding=8" in said
     _check_run(config, tmp_path / "run")
     batches.clear()
     _check_sweep(config, tmp_path / "sweep")

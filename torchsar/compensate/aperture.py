@@ -3,7 +3,7 @@
 The ends of a record cut the apertures of the targets near them. In a strip with a few bright points
 this pulls the centroid by a considerable part of the beam's band. In an image each target lies at
 the time when the beam centre crosses it, so lines of complete apertures can be separated from the
-others. The azimuth spectrum of these lines alone is that of the beam, whatever the scene.
+others. The azimuth spectrum of these lines alone is that of the beam for any scene.
 """
 
 from __future__ import annotations

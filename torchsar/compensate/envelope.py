@@ -175,9 +175,9 @@ def align_envelopes(
         degree is None and tones
     ):
         raise ValueError(
-            f"align_envelopes: degree is {degree!r} (0 or more; None without tones), tones "
-            f"{tones!r} (0 or more), passes {passes!r} and blocks {blocks!r} (1 or more); whole "
-            "numbers"
+            "align_envelopes needs whole numbers: degree and tones must be 0 or more, passes and blocks 1 "
+            "or more; degree may be None only if tones is 0; "
+            f"got degree {degree!r}, tones {tones!r}, passes {passes!r} and blocks {blocks!r}"
         )
 
     def find(pulses: Envelopes) -> Course:

@@ -54,7 +54,9 @@ class Envelopes:
 
     @staticmethod
     def of(lines: Tensor) -> Envelopes:
-        """Compute the envelopes of pulses: |s|^2 on half cells, over its mean in each pulse.
+        """Compute the power envelope |s|^2 of each pulse, divided by its mean over the pulse.
+
+        The envelope has two samples per range cell, because |s|^2 has twice the bandwidth of s.
 
         Args:
             lines: Pulses, shape (trial, pulse, range), complex.

@@ -15,7 +15,7 @@ from torchsar.core.stage import Stage
 
 @dataclass(frozen=True)
 class Turn:
-    """One estimator of an alternation, with the stage that corrects the data with its values.
+    """One estimator of `Alternate`, with the stage that corrects the data with its values.
 
     Args:
         estimator: Stage that returns an Estimate.
@@ -52,7 +52,7 @@ class Alternate(Stage):
         super().__init__()
         if len(turns) < 2 or rounds < 1:
             raise ValueError(
-                f"an alternation needs two turns or more and one round or more, got {list(turns)} and rounds={rounds}"
+                f"Alternate needs at least two estimators and one round, got {list(turns)} and rounds={rounds}"
             )
         self.rounds = rounds
         self.estimators = nn.ModuleDict({name: turn.estimator for name, turn in turns.items()})

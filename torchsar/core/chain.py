@@ -1,4 +1,4 @@
-"""Chains of stages that run in order, exchange named values and can be rerun in part."""
+"""Processing chains: stages run in order, pass on named values, and can be rerun from any stage."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ def _factorials(k: Tensor) -> Tensor:
 def least_rate(k: Tensor, duration_s: float, points: int = 513) -> Tensor:
     """Return the lowest relative rotation rate during the observation.
 
-    At zero or below, two times share one angle, and no image can be formed.
+    At zero or below, two times have the same angle, and no image can be formed.
 
     Args:
         k: Relative derivatives of the rotation rate, shape (..., order - 1).

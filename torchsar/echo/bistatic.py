@@ -279,8 +279,8 @@ def _movers(
             else f"target {outside[0]} (counted from 0) lies {float(off.max()):g} m"
         )
         raise ValueError(
-            f"{far} from the middle of a range axis of {width:g} m; range_m counts from the "
-            "reference range, or record longer lines (n_range)"
+            f"{far} from the middle of a range axis of {width:g} m; range_m is relative to the "
+            "reference range; correct it, or record longer range lines (n_range)"
         )
     return movers
 

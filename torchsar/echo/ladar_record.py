@@ -176,18 +176,20 @@ class BlockPaths:
         motion: Sequence[Motion],
         without: Sequence[Effect],
     ) -> BlockPaths:
-        """Form the ranges of all blocks.
+        """Compute the range history of every scatterer in each block of the record.
+
+        A block is one recorded modulation period; `BlockPaths` holds its range history.
 
         Args:
             scatterers: Scatterers, shape (..., target).
             radar: Ladar.
-            start_s: Starts of the blocks in seconds, shape (pulse,), float64.
-            n_sample: Number of samples of a block.
+            start_s: Start times of the blocks in seconds, shape (pulse,), float64.
+            n_sample: Number of samples in a block.
             motion: Motions along the line of sight.
-            without: Omitted effects.
+            without: Names of physical effects that are left out of the model.
 
         Returns:
-            Ranges of all blocks.
+            Range histories of all blocks.
         """
         length = n_sample / radar.sample_rate_hz
         flight = "flight" not in without

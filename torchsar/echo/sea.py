@@ -187,7 +187,7 @@ class _Lines:
         return self.step_m * (self.first + torch.arange(self.cells, dtype=torch.float64, device=device))
 
     def band(self, device: torch.device | str | None) -> tuple[Tensor, Tensor]:
-        """Range frequencies within the band and the share of each bin inside, (frequency,) each."""
+        """Return the range frequencies in the band and the fraction of each bin in it."""
         f = torch.fft.fftfreq(self.length, 1 / self.sampling_hz, dtype=torch.float64, device=device)
         share = ((self.band_hz / 2 - f.abs()) * self.length / self.sampling_hz + 0.5).clamp(0, 1)
         return f[share > 0], share[share > 0]

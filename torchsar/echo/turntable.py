@@ -382,8 +382,8 @@ def _series_terms(phase_rad: Tensor) -> int:
         if worst ** (order + 1) / math.factorial(order + 1) < _SERIES_ERROR:
             return order
     raise ValueError(
-        f"the rotation curves phases by {worst:.3g} rad within a pulse, and the dechirped model holds to "
-        "0.6 rad; shorten the pulse"
+        f"the rotation causes a quadratic phase of {worst:.3g} rad within a pulse, and the dechirped model is "
+        "valid up to 0.6 rad; shorten the pulse"
     )
 
 

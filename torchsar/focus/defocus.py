@@ -94,7 +94,7 @@ class InvertibleOmegaK:
         return torch.fft.ifft2(torch.fft.fft(spectra * self._residual().conj()) * self.bulk.conj())
 
     def focus(self, lines: Tensor) -> Tensor:
-        """Form the image that `omega_k` forms with the same arguments.
+        """Focus raw lines with the stored filters; the image equals that of `omega_k`.
 
         Args:
             lines: Raw lines, shape (..., pulse, range), complex.

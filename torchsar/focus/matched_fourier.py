@@ -233,8 +233,8 @@ class RangePhase(Stage):
         yc_m: Range centre deviation in metres; None for 0.
 
     Raises:
-        ValueError: On use, if no rotation rate is known or the warp does not rise over the
-            aperture.
+        ValueError: On use, if no rotation rate is known or the rotation angle does not increase
+            throughout the aperture.
     """
 
     omega_rad_s: Tensor | None
@@ -270,7 +270,8 @@ class RangePhase(Stage):
             yc_m: Range centre deviation in metres; None for that of the stage.
 
         Raises:
-            ValueError: If no rotation rate is known or the warp does not rise over the aperture.
+            ValueError: If no rotation rate is known or the rotation angle does not increase
+                throughout the aperture.
         """
         pulse, range_ = signal.axes
         omega, yc = self.omega_rad_s if omega_rad_s is None else omega_rad_s, self.yc_m if yc_m is None else yc_m
@@ -313,9 +314,9 @@ class MatchedFourier(Stage):
 
     Raises:
         ValueError: If `oversampling` is not positive, `lines` is below 1, or `weight` is not known.
-            On use: if the warp does not rise over the aperture, if lines in metres lack a rotation
-            rate, or if their Doppler exceeds the whole pulse rate. Warns from 0.95 of half the
-            pulse rate on.
+            On use: if the rotation angle does not increase throughout the aperture, if lines in
+            metres lack a rotation rate, or if their Doppler exceeds the whole pulse rate. Warns
+            from 0.95 of half the pulse rate on.
     """
 
     omega_rad_s: Tensor | None
@@ -414,8 +415,8 @@ def _hold_given(stage: Stage, **values: Tensor | float | None) -> None:
 
 
 def _warp_of(signal: Signal, k: Tensor | None) -> Tensor:
-    """k on the device of the signal, empty where there is none; raises ValueError where it does not
-    fit or does not rise over the aperture.
+    """k on the device of the signal, empty where there is none; raises ValueError where its
+    shape does not fit or the rotation angle does not increase throughout the aperture.
     """
     if k is None:
         return torch.zeros(0, dtype=torch.float64, device=signal.data.device)
@@ -432,8 +433,8 @@ def _warp_of(signal: Signal, k: Tensor | None) -> Tensor:
         return k
     if bad:
         raise ValueError(
-            f"the warp does not rise over the aperture in {bad} of {least.numel()} trials: two "
-            "times share an angle, and no image can be formed; check warp_k"
+            f"the rotation angle does not increase throughout the aperture in {bad} of {least.numel()} trials: "
+            "two times have the same angle, and no image can be formed; check warp_k"
         )
     return k
 

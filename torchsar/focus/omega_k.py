@@ -354,15 +354,18 @@ def refocus_turns_per_sample(at: FrameGeometry) -> Tensor:
 
 
 def refocus(rows: Tensor, turns_per_sample: Tensor, centre: int) -> Tensor:
-    """Apply the azimuth phase of each range line relative to line `centre`.
+    """Apply the azimuth compression that the bulk filter leaves out away from its reference range.
+
+    The bulk filter focuses at one reference range. At every other range, a phase remains that is
+    linear in the distance from the reference range and depends on the Doppler frequency.
 
     Args:
-        rows: Azimuth spectra, shape (..., d, n), complex.
-        turns_per_sample: Turns per range sample, shape (..., d).
-        centre: Range line of the bulk filter.
+        rows: Azimuth spectra after the bulk filter, shape (..., Doppler, range), complex.
+        turns_per_sample: Remaining phase per range sample in cycles, shape (..., Doppler).
+        centre: Index of the range sample at the reference range of the bulk filter.
 
     Returns:
-        Azimuth spectra, same shape.
+        Focused azimuth spectra, same shape.
     """
     return rows * linear_phasor(turns_per_sample, -centre, rows.shape[-1], rows.dtype)
 

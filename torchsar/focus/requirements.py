@@ -78,7 +78,7 @@ class Aperture:
     """Samples of the part of the wavenumber plane that a target occupies.
 
     Args:
-        at: Geometry at the sampled Doppler rows.
+        at: Geometry at the sampled Doppler frequencies.
         frequency_hz: Samples of the range band in Hz.
         integration_s: Integration time in seconds.
         doppler_band_hz: Doppler bandwidth in Hz.
@@ -99,18 +99,18 @@ class Aperture:
         integration_s: float | None,
         samples: int = 65,
     ) -> Aperture:
-        """Sample the Doppler rows and the range band of a target.
+        """Sample the Doppler band and the range band of a target.
 
-        Warns where the PRF is below the Doppler band of the aperture.
+        Warns if the PRF is below the Doppler bandwidth of the aperture.
 
         Args:
             radar: Radar of the recording.
             range_m: Slant range of the target in metres.
             doppler_hz: Absolute Doppler centroid in Hz.
             velocity_m_s: Effective velocity in m/s.
-            frame_hz: Frame Doppler in Hz.
-            integration_s: Integration time in seconds; None for the time that the target stays
-                inside one PRF.
+            frame_hz: Doppler frequency of the axes of the image in Hz, see `omega_k`.
+            integration_s: Integration time in seconds; None for the time in which the Doppler of
+                the target changes by one PRF.
             samples: Number of samples per axis.
         """
         cos2 = 1 - float(radar.sin_squint(doppler_hz, velocity_m_s)) ** 2
@@ -136,7 +136,7 @@ class Aperture:
 
     @property
     def slope(self) -> Tensor:
-        """dG / df at the carrier minus one, the relative migration of a row, shape (d, 1)."""
+        """dG / df at the carrier minus one, the relative range migration, shape (d, 1)."""
         step = 1e-3 * self.at.radar.carrier_hz
         ends = self.at.mapped(torch.tensor([-step, step], dtype=torch.float64))
         return (ends[:, 1:] - ends[:, :1]) / (2 * step) - 1

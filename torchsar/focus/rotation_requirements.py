@@ -91,7 +91,7 @@ def rotation_limits(
             1e-6,
             "",
             "refuse",
-            "two times share an angle, and no image can be formed",
+            "two times have the same angle, and no image can be formed",
             "record fewer pulses",
             at_least=True,
         ),

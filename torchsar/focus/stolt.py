@@ -21,12 +21,12 @@ from torchsar.radar import StripmapRadar
 
 
 class StoltMap:
-    """Residual Stolt mapping after the bulk filter.
+    """Stolt interpolation of the range spectrum after the bulk filter.
 
-    It corrects the change of migration and of range focus over the swath. After bulk filter and
-    refocusing only f(G(0) + h) - h of the mapping remains, a fraction of a frequency bin in most
-    scenes. The spectrum is evaluated there by a non-uniform FFT with separate points in every
-    Doppler row, so that large residuals are handled as well.
+    It corrects the change of range migration and of range focus over the swath. The bulk filter and
+    `refocus` already perform most of the Stolt mapping; the remaining frequency shift is a fraction
+    of a frequency bin in most scenes. A non-uniform FFT evaluates the spectrum at the shifted
+    frequencies of every Doppler row, so that larger shifts are also handled.
 
     Args:
         basis: Basis over the range band.

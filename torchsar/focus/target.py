@@ -91,7 +91,8 @@ class TargetImage(Stage):
         )  # change of range per pulse and metre of cross range
         if not turn:
             raise ValueError(
-                "the line of sight does not rotate, so that there is no cross range to image; record over an angle"
+                "the line of sight does not rotate, so that there is no cross-range resolution; "
+                "record data over a range of aspect angles"
             )
         across = self.radar.wavelength_m / (2 * turn)
         along = self.radar.range_step_m * n_range / float(waves.direction.norm(dim=-1).mean())

@@ -115,7 +115,7 @@ def azimuth_turns(
     It is 2 (sqrt(R^2 + (V t)^2) - R) / lambda with R = reference + relative range.
 
     Args:
-        pulse: Slow time of the samples, zero abeam.
+        pulse: Slow time of the samples, zero at broadside.
         range_: Relative range.
         radar: Radar of the recording.
         device: Device of the result.
@@ -157,7 +157,7 @@ def deramp_azimuth(data: Tensor, radar: TriangularLadar, pulse: Axis, range_: Ax
     Args:
         data: Range profiles, shape (..., pulse, range), complex.
         radar: Radar of the recording.
-        pulse: Slow time of the samples (middles of the sweeps), zero abeam.
+        pulse: Slow time of the samples (middles of the sweeps), zero at broadside.
         range_: Relative range.
 
     Returns:

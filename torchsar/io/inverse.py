@@ -99,7 +99,9 @@ def _samples(value: np.ndarray, key: str, path: Path) -> Tensor:
     """Sample array as a complex tensor."""
     if not np.iscomplexobj(value) or value.ndim != 2 or min(value.shape) < 2:
         rows = "range" if key == "profiles" else "frequency"
-        raise ValueError(f"{path}: {key} must be complex ({rows}, pulse) with two or more of each, got {_shown(value)}")
+        raise ValueError(
+            f"{path}: {key} must be a complex array ({rows}, pulse) of at least 2 x 2 samples, got {_shown(value)}"
+        )
     return torch.from_numpy(np.ascontiguousarray(value))
 
 

@@ -28,9 +28,10 @@ def _velocity_m_s(c: float, snr: Value, samples_per_sweep: Value, wavelength_m: 
 
 
 def velocity_free_offset_bound_m_s(snr: Value, samples_per_sweep: Value, wavelength_m: Value, sweep_s: Value) -> Tensor:
-    """Compute the velocity bound of one period with unknown phases of both sweeps, c = 3.
+    """Compute the velocity bound of one period with unknown phases of both sweeps.
 
-    An estimate from the spectral peaks of the full sweeps reaches it.
+    The factor c of the module docstring is 3. An estimate from the spectral peaks of the full
+    sweeps reaches the bound.
 
     Args:
         snr: Signal-to-noise ratio per sample.
@@ -45,9 +46,10 @@ def velocity_free_offset_bound_m_s(snr: Value, samples_per_sweep: Value, wavelen
 
 
 def velocity_segmented_bound_m_s(snr: Value, samples_per_sweep: Value, wavelength_m: Value, sweep_s: Value) -> Tensor:
-    """Compute the least error of the velocity from the phases of half sweeps, c = 4.
+    """Compute the velocity bound of estimates from the phases of half sweeps.
 
-    This is the bound of segmented interference, 1.25 dB above `velocity_free_offset_bound_m_s`.
+    The factor c of the module docstring is 4. This is the bound of segmented interference; it
+    is 1.25 dB above `velocity_free_offset_bound_m_s`.
 
     Args:
         snr: Signal-to-noise ratio per sample.
@@ -67,9 +69,10 @@ def velocity_segmented_bound_m_s(snr: Value, samples_per_sweep: Value, wavelengt
 def velocity_known_offset_bound_m_s(
     snr: Value, samples_per_sweep: Value, wavelength_m: Value, sweep_s: Value
 ) -> Tensor:
-    """Compute the velocity bound with equal phases at the turning point, c = 0.75.
+    """Compute the velocity bound if the phases of both sweeps agree at the turning point.
 
-    Up-sweep and down-sweep have equal phases there if the trigger is exact. The bound is 7.3 dB
+    The up-sweep and the down-sweep have equal phases there if the trigger is exact. The factor c of
+    the module docstring is then 0.75. The bound is 7.3 dB
     below `velocity_segmented_bound_m_s`.
 
     Args:

@@ -228,8 +228,8 @@ def _sweeps_axis(trace: Trace) -> Axis:
     found = [signal for signal in (*trace.inputs.values(), *trace.outputs.values()) if signal.names == SWEEPS]
     if not found:
         raise ValueError(
-            f"the method never has separated sweeps {SWEEPS}; begin its chain with split_sweeps if "
-            "the world has a record"
+            f"no signal in the chain has separated sweeps {SWEEPS}; if the data are a continuous record, "
+            "begin the chain with split_sweeps"
         )
     return found[-1].axis("pulse")
 

@@ -1,4 +1,4 @@
-"""Cramer-Rao bounds of the non-uniform rotation that all scatterers of a target share."""
+"""Cramer-Rao bounds of the parameters of the non-uniform rotation of a rigid target."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ class ImagePosition:
 
     @staticmethod
     def of(motion: PointMotion) -> ImagePosition:
-        """Where the image of everything at rest shows a motion."""
+        """Position of a target of this motion in the image focused for a stationary scene."""
         return ImagePosition(motion.speed_m_s * float(motion.image_s), float(motion.closest_m))
 
     def window(self, image: Signal, reach_m: tuple[float, float]) -> tuple[Tensor, Tensor]:
@@ -93,7 +93,7 @@ class ShownShip:
     Args:
         ship: The ship.
         centre: Motion of the intensity centroid of its own image, by its true velocities.
-        image: Position in the image of everything at rest.
+        image: Position in the image focused for a stationary scene.
         replica: Position of the strongest replica, one or two pulse rates away.
         away_m: Distance of the first replica, measured on x = V_R t, and predicted on
             x = (V_R - u_a) t.
@@ -209,15 +209,16 @@ def made_scenes(trace: Trace, speed_m_s: float) -> list[MadeScene]:
 def matched(
     targets: Sequence[FoundTarget], ships: Mapping[str, ShownShip], match_m: tuple[float, float]
 ) -> dict[str, FoundTarget | None]:
-    """Assign targets to ships by where the image of everything at rest shows both.
+    """Assign detected targets to ships by position in the image focused for a stationary scene.
 
     Args:
-        targets: Reliable targets.
-        ships: The ships.
-        match_m: Largest distances in azimuth and range.
+        targets: Reliable detected targets.
+        ships: The ships of the scene.
+        match_m: Largest distances in azimuth and range in metres.
 
     Returns:
-        By ship the nearest target in units of match_m, each target once; None where there is none.
+        The nearest target of each ship, by name, with distances relative to match_m; None if no
+        target is near enough. No target is assigned twice.
     """
     pairs = []
     for name, shown in ships.items():
@@ -238,7 +239,8 @@ def matched(
 def ship_metrics(shown: ShownShip, found: FoundTarget | None, made: MadeScene, still: Signal) -> dict[str, float]:
     """Figures of one ship.
 
-    A ship that is not found counts as at rest where the image of everything at rest shows it.
+    A ship that is not found counts as stationary, at its position in the image focused for a
+    stationary scene.
 
     Args:
         shown: The truth.

@@ -1,7 +1,7 @@
 """Extended moving targets ("bodies"): one velocity for all scatterers, image, and echo to subtract.
 
 Range lines around the body are shifted by its range history and deramped channel by channel. Each
-scatterer then is one tone in all channels, whatever the aliasing: the frequency F gives its
+scatterer then is one tone in all channels, even if aliased: the frequency F gives its
 along-track position y = y0 + F lambda R0 / v, and position and velocity give its phases across the
 channels. In short segments of slow time the sea at the frequency of a tone comes from as few look
 angles as there are Doppler bands; range lines beside the body give its covariance. The slant-range
@@ -300,31 +300,31 @@ class Body:
 
 
 def chip_about(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extraction) -> Chip:
-    """Extract the range lines around a body of a given motion.
+    """Extract the range cells of a body with a given motion, deramped and in segments of slow time.
 
     Args:
         data: Range-compressed channels without the transmit range, shape (channel, pulse, range),
-            complex, including lines beside the body.
+            complex, including range cells outside the body.
         frame: Geometry of the data.
         motion: Motion of the body.
         extraction: Extent of the body.
 
     Returns:
-        The lines in segments, with the covariance of the sea.
+        Short-time spectra of the range cells, with the covariance of the sea.
 
     Raises:
-        ValueError: If the body lies outside the range lines, or fewer than 12 lines lie beside it.
+        ValueError: If the data have no range cell of the body, or fewer than 12 outside it.
     """
     off = (frame.range_m - motion.range_m).abs()
     body, beside = off <= extraction.range_m, off > extraction.range_m + _GUARD_CELLS * frame.radar.range_step_m
     if not bool(body.any()) or int(beside.sum()) < _LEAST_LINES:
         counts = (
-            f"{int(body.sum())} lines within {extraction.range_m:g} m of "
+            f"{int(body.sum())} cells within {extraction.range_m:g} m of "
             f"{float(motion.range_m):.0f} m and {int(beside.sum())} beside them"
         )
         raise ValueError(
-            f"a body needs range lines about it and {_LEAST_LINES} beside it for the covariance of the sea, "
-            f"got {counts}; give more range lines or a smaller extraction"
+            f"a body needs range cells of its own and {_LEAST_LINES} beside it for the covariance of the sea, "
+            f"got {counts}; give more range cells or a smaller extraction"
         )
     lit = (
         frame.time_s - motion.y0_m / motion.along_m_s

@@ -84,7 +84,9 @@ def detect(
         ValueError: If the image has trials.
     """
     if image.trials:
-        raise ValueError(f"detect works on one image at a time, got trials {tuple(image.trials)}; call it for each")
+        raise ValueError(
+            f"detect works on one image at a time, got trials {tuple(image.trials)}; call it for each image separately"
+        )
     level, (rows, columns) = contrast(image, extent_m)
     left, found = level.clone(), []
     while len(found) < most and float(left.max()) >= 10 ** (threshold_db / 10):

@@ -358,7 +358,7 @@ class CorrectMigration(Stage):
     def forward(
         self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0, ambiguity: Number = 0
     ) -> Signal:
-        """Correct the migration with a reference per trial, by default at rest and abeam at t = 0.
+        """Correct the migration with a reference per trial, by default at rest, broadside at t = 0.
 
         Args:
             signal: Channels with the axes (channel, pulse, range) or (channel, pulse).

@@ -370,7 +370,7 @@ def _estimator_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Li
             1,
             "",
             "warn",
-            "the ratio has its maximum at u_r = 0, whatever the motion of the target",
+            "the ratio has its maximum at u_r = 0 for any motion of the target",
             "whiten, or suppress the clutter first",
         )
     if use.snr_db is None:
@@ -531,7 +531,7 @@ def _corner_speeds(use: MultichannelUse) -> tuple[Tensor, Tensor]:
 
 
 def _parabola_left_m(radar: BistaticRadar, use: MultichannelUse) -> Tensor:
-    """Return the error (corner, time) in metres of a parabolic receive range, for a point abeam."""
+    """Return the error (corner, time) in m of a parabolic receive range, for a broadside point."""
     time, (u_r, u_a) = _aperture_times(use), _corner_speeds(use)
     exact = receive_range(time, u_r, u_a, 0.0, radar.reference_range_m, radar.speed_m_s, 0.0)
     parabola = -u_r * time + (radar.speed_m_s - u_a).square() * time.square() / (2 * radar.reference_range_m)

@@ -118,7 +118,7 @@ def shared_response(
 
 
 def doppler_centre_hz(radar: BistaticRadar, motion: PointMotion, left_k1_m_s: float = 0.0) -> Tensor:
-    """Return the Doppler centre (u_r - k1) / lambda of a point abeam.
+    """Return the Doppler centre (u_r - k1) / lambda of a point at broadside.
 
     Args:
         radar: Instrument.

@@ -162,7 +162,8 @@ class ImageMovers(Stage):
         """
         if signal.trials:
             raise ValueError(
-                f"ImageMovers works on one frame at a time, got trials {tuple(signal.trials)}; call it for each"
+                f"ImageMovers works on one frame at a time, got trials {tuple(signal.trials)}; "
+                "call it for each trial separately"
             )
         conventional = self.image(signal)
         axis = signal.axis("range")
@@ -219,7 +220,7 @@ class ImageMovers(Stage):
         if len(known) > self.detector.most:
             raise ValueError(
                 f"{len(known)} motions are known, but the detector allows at most {self.detector.most} "
-                "targets; raise its `most`"
+                "targets; increase the setting `most` of the detector"
             )
         bodies = []
         for motion in known:
@@ -231,7 +232,7 @@ class ImageMovers(Stage):
         return remaining, bodies
 
     def _inside_frame(self, detection: Detection, signal: Signal) -> bool:
-        """Test whether a target stays in the swath at any velocity and is abeam in the record."""
+        """Test if a target stays in the swath at any velocity and is broadside in the record."""
         axis, pulse = signal.axis("range"), signal.axis("pulse")
         abeam_s = detection.azimuth_m / self.radar.speed_m_s
         walk = self.extraction.range_m + self.radar.ambiguous_velocity_m_s / 2 * (

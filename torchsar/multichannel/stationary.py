@@ -37,7 +37,7 @@ def two_way_radar(radar: BistaticRadar, bands: int, near_range_m: float) -> Stri
         near_range_m: Range of the first sample in metres.
 
     Returns:
-        A radar that looks abeam with waves of twice the speed.
+        A radar that looks broadside with waves of twice the speed.
     """
     return StripmapRadar(
         carrier_hz=radar.carrier_hz,
@@ -194,7 +194,7 @@ def bulk_error_db(radar: BistaticRadar, bands: int, half_swath_m: float, integra
     Args:
         radar: Receiver.
         bands: Doppler bands that are reconstructed.
-        half_swath_m: Half of the swath in metres.
+        half_swath_m: Half width of the swath in metres.
         integration_s: Integration time in seconds.
 
     Returns:
@@ -213,17 +213,18 @@ def swath_limit(
     range_m: float,
     integration_s: float,
 ) -> Limit:
-    """Limit of the swath within which moving ships are found whatever their velocity.
+    """Return the least half swath in which moving ships of any unambiguous velocity are found.
 
     Args:
         radar: Receiver.
-        half_swath_m: Half of the swath in metres.
-        positions_m: Along-track position and range from the middle of each ship in metres.
-        range_m: Half extent in range that is extracted about a ship in metres.
+        half_swath_m: Half width of the swath in metres.
+        positions_m: Along-track position of each ship, and its range from the middle of the swath,
+            in metres.
+        range_m: Half extent in range of the data extracted about a ship in metres.
         integration_s: Integration time in seconds.
 
     Returns:
-        The limit, with the value of this scene.
+        Half width of this scene and its least value.
     """
     curve = (integration_s * radar.speed_m_s) ** 2 / (8 * radar.reference_range_m)
     walks = [

@@ -63,8 +63,8 @@ def remove_transmit_range(
     pulses = data.shape[-2] if with_range else data.shape[-1]
     if time_s.shape[-1:] != (pulses,):
         raise ValueError(
-            f"remove_transmit_range needs one time per pulse ({pulses}), got shape "
-            f"{tuple(time_s.shape)}; check with_range={with_range}, which chooses the pulse axis"
+            f"remove_transmit_range needs time_s with one value for each of the {pulses} pulses, but its "
+            f"shape is {tuple(time_s.shape)}; check with_range={with_range}, which determines the pulse axis"
         )
     phasor = transmit_phasor([per_trial(k, 1, data) for k in coefficients], time_s, wavelength_m, data.dtype)
     return data * _over_range(phasor[..., None, :], with_range)
@@ -78,8 +78,8 @@ def scale_azimuth(
     Data of channel m are multiplied by exp(j pi (q2 t'^2 + q3 t'^3 + q4 t'^4)) with t' = t - dx_m /
     v_e and q_i = 2 k_i / lambda. The term k1 t remains; it centres the Doppler at (u_r - k1) /
     lambda and belongs to the channel response, Eq. (34): use `reconstruct(..., left_k1_m_s=k1)`.
-    The phase 2 k2 t dx_m / v_e is neglected, 0.006 rad at the ends of 4.5 s. Differentiable. Prefer
-    `remove_transmit_range`, which is exact.
+    The phase 2 k2 t dx_m / v_e is neglected; it reaches 0.006 rad at the ends of an aperture of
+    4.5 s. The function is differentiable. `remove_transmit_range` is exact and should be preferred.
 
     Args:
         data: Channels as in `remove_transmit_range`.

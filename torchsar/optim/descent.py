@@ -534,8 +534,8 @@ def _derived(objective: Objective, x: Tensor) -> tuple[Tensor, Tensor]:
         (gradient,) = torch.autograd.grad(cost.sum(), x, allow_unused=True) if cost.requires_grad else (None,)
         if gradient is None:
             raise ValueError(
-                "the objective returned costs that autograd cannot follow back to x; leave out "
-                "detach and no_grad, or return (cost, gradient) with with_gradient=True"
+                "the objective returned costs that autograd cannot differentiate with respect to x; "
+                "leave out detach and no_grad, or return (cost, gradient) with with_gradient=True"
             )
     return cost.detach(), gradient
 

@@ -26,13 +26,13 @@ def differential_evolution(
     weight: float = 0.7,
     crossover: float = 0.9,
 ) -> Searched:
-    """Search a box for the least cost by differential evolution.
+    """Minimise a cost within bounds by differential evolution.
 
     In each generation every candidate competes with base + weight * (one - other), where base, one
     and other are three further candidates; each unknown is taken from this challenger with the
-    probability `crossover`, and at least one is. The better of the two is kept. Challengers outside
-    the box are moved onto its edge. A trial takes population * (generations + 1) evaluations, 888
-    by default.
+    probability `crossover`, and at least one is. The better of the two is kept. Unknowns of a
+    challenger beyond a bound are set to the bound. A trial takes population * (generations + 1)
+    evaluations, 888 by default.
 
     Args:
         objective: Maps candidates (..., population, n) to costs (..., population) for all trials;
@@ -41,7 +41,7 @@ def differential_evolution(
         high: Greatest values of the unknowns, shape (..., n).
         population: Number of candidates, at least 4.
         generations: Number of generations.
-        draws: Random numbers; with as many trials as the box, or without trials for the same
+        draws: Random numbers; with as many trials as the bounds, or without trials for the same
             numbers in every trial. Results do not depend on how trials are batched.
         strategy: "rand1bin" draws the base at random, "best1bin" takes the best candidate.
         weight: Factor on the difference, above 0 and at most 2.
@@ -53,7 +53,7 @@ def differential_evolution(
 
     Raises:
         TypeError: If a bound is not a real floating tensor.
-        ValueError: If the box, a setting or the shape of the costs is not valid.
+        ValueError: If the bounds, a setting or the shape of the costs is not valid.
 
     Reference:
         Storn and Price 1997, DE/rand/1/bin and DE/best/1/bin.
@@ -86,7 +86,7 @@ class _Rule:
     crossover: float
 
     def first(self) -> Tensor:
-        """First population, uniform in the box."""
+        """First population, uniform within the bounds."""
         box = self.dice.box
         return box.at(self.dice.uniform("evolution first", (self.population, box.low.shape[-1])))
 

@@ -35,11 +35,12 @@ def genetic(
     spread: float = 0.1,
     cooling: float = 0.9,
 ) -> Searched:
-    """Search a box for the least cost by selection, blend crossover, Gaussian mutation and elitism.
+    """Minimise a cost within bounds by a genetic algorithm.
 
-    The first population is uniform in the box. In each generation the `elites` best candidates
-    survive and population - elites children are made and evaluated; children outside the box are
-    moved onto its edge. A trial takes population + generations * (population - elites) evaluations,
+    It uses selection, blend crossover, Gaussian mutation and elitism. The first population is
+    uniform within the bounds. In each generation the `elites` best candidates survive and
+    population - elites children are made and evaluated; unknowns of a child beyond a bound are set
+    to the bound. A trial takes population + generations * (population - elites) evaluations,
     870 by default.
 
     Args:
@@ -49,7 +50,7 @@ def genetic(
         high: Greatest values of the unknowns, shape (..., n).
         population: Number of candidates.
         generations: Number of generations.
-        draws: Random numbers; with as many trials as the box, or without trials for the same
+        draws: Random numbers; with as many trials as the bounds, or without trials for the same
             numbers in every trial. Results do not depend on how trials are batched.
         elites: Number of best candidates that survive a generation.
         selection: "tournament" takes the best of `entrants` candidates drawn with replacement;
@@ -61,7 +62,7 @@ def genetic(
         blend: A blend is uniform on the line through both parents, extended by this fraction of
             their distance beyond either.
         mutation: Probability per unknown of a Gaussian step.
-        spread: Standard deviation of that step, relative to the side of the box.
+        spread: Standard deviation of that step, relative to high - low.
         cooling: Factor on `spread` per generation.
 
     Returns:
@@ -69,7 +70,7 @@ def genetic(
 
     Raises:
         TypeError: If a bound is not a real floating tensor.
-        ValueError: If the box, a setting or the shape of the costs is not valid.
+        ValueError: If the bounds, a setting or the shape of the costs is not valid.
 
     Reference:
         Remote Sens. 2025, 17, 3447, section 3.3, which gives neither rates nor operators; those
@@ -119,7 +120,7 @@ class _Breed:
     cooling: float
 
     def first(self) -> Tensor:
-        """First population, uniform in the box."""
+        """First population, uniform within the bounds."""
         box = self.dice.box
         return box.at(self.dice.uniform("genetic first", (self.population, box.low.shape[-1])))
 

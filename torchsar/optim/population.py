@@ -1,4 +1,4 @@
-"""Parts shared by the searches without gradients: result, box, random numbers and costs."""
+"""Parts shared by the searches without gradients: result, bounds, random numbers and costs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Searched:
 
 @dataclass(frozen=True)
 class Box:
-    """Least and greatest values of the unknowns per trial; equal values fix an unknown.
+    """Lower and upper bounds of the unknowns per trial; equal values fix an unknown.
 
     Args:
         low: Least values, shape (*trials, n), float32 or float64.
@@ -48,12 +48,12 @@ class Box:
 
     @staticmethod
     def of(low: Tensor, high: Tensor, who: str) -> Box:
-        """Build a box from bounds that broadcast against each other.
+        """Build the bounds from tensors that broadcast against each other.
 
         Args:
             low: Least values, shape (..., n).
             high: Greatest values, shape (..., n).
-            who: Name of the search, for messages.
+            who: Name of the search, used in error messages.
 
         Raises:
             TypeError: If a bound is not a real floating tensor.
@@ -73,7 +73,7 @@ class Box:
         low, high = torch.broadcast_tensors(low.detach(), high.detach())
         if not bool((torch.isfinite(low) & torch.isfinite(high) & (low <= high)).all()):
             raise ValueError(
-                f"{who}: the box must be finite with low <= high in every unknown, got low "
+                f"{who}: the search bounds must be finite with low <= high in every unknown, got low "
                 f"{low.flatten()[:8].tolist()} and high {high.flatten()[:8].tolist()}"
             )
         return Box(low, high)
@@ -84,7 +84,7 @@ class Box:
         return self.low.shape[:-1]
 
     def at(self, part: Tensor) -> Tensor:
-        """Map coordinates in 0..1 of the box to points.
+        """Map relative coordinates, 0 at `low` and 1 at `high`, to points.
 
         Args:
             part: Coordinates, shape (*trials, candidate, n).
@@ -95,7 +95,7 @@ class Box:
         return self.low[..., None, :] + part * (self.high - self.low)[..., None, :]
 
     def kept(self, x: Tensor) -> Tensor:
-        """Move candidates that lie outside the box onto its edge.
+        """Set unknowns beyond a bound to the bound.
 
         Args:
             x: Candidates, shape (*trials, candidate, n).
@@ -108,16 +108,16 @@ class Box:
 
 @dataclass(frozen=True)
 class Dice:
-    """Random numbers for all trials of a box.
+    """Random numbers for all trials of a search.
 
     Each trial has its own numbers where the draws have trials; otherwise all trials share the same.
 
     Args:
         draws: Source of the random numbers.
-        box: Box whose trials the numbers are for.
+        box: Bounds whose trials the numbers are for.
 
     Raises:
-        ValueError: If the draws have another number of trials than the box.
+        ValueError: If the draws have another number of trials than the bounds.
     """
 
     draws: Draws
@@ -127,7 +127,7 @@ class Dice:
         count, trials = None if self.draws.trials is None else len(self.draws.trials), math.prod(self.box.trials)
         if count is not None and count != trials:
             raise ValueError(
-                f"draws for {count} trials do not fit a box of {trials}; give Draws(seed, "
+                f"draws for {count} trials do not fit search bounds for {trials} trials; give Draws(seed, "
                 f"trials=range({trials})), or Draws(seed) for the same numbers in every trial"
             )
 
@@ -150,7 +150,7 @@ class Dice:
         return self._of_trials(self.draws.normal(purpose, shape), shape)
 
     def _of_trials(self, x: Tensor, shape: Sequence[int]) -> Tensor:
-        """Numbers in the dtype and shape of the box."""
+        """Numbers in the dtype and shape of the bounds."""
         x = x.to(dtype=self.box.low.dtype, device=self.box.low.device)
         return x.expand(*self.box.trials, *shape) if self.draws.trials is None else x.reshape(*self.box.trials, *shape)
 
@@ -161,7 +161,7 @@ def costs_of(objective: Population, x: Tensor, who: str) -> Tensor:
     Args:
         objective: Maps candidates (*trials, candidate, n) to costs (*trials, candidate).
         x: Candidates, shape (*trials, candidate, n).
-        who: Name of the search, for messages.
+        who: Name of the search, used in error messages.
 
     Returns:
         Costs, shape (*trials, candidate).
@@ -222,14 +222,14 @@ def best(x: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def check_counts(who: str, least: dict[str, tuple[float, float]]) -> None:
-    """Check that settings are not below their least values.
+    """Check that settings are not below their minimum values.
 
     Args:
-        who: Name of the search, for messages.
-        least: (value, least value) by parameter name.
+        who: Name of the search, used in error messages.
+        least: (value, minimum value) by parameter name.
 
     Raises:
-        ValueError: If a value is below its least value.
+        ValueError: If a value is below its minimum value.
     """
     for name, (value, bound) in least.items():
         if not value >= bound:

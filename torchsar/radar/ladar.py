@@ -158,7 +158,8 @@ class TriangularLadar:
         Args:
             n_period: Number of recorded periods.
             start_s: Start of the first period in seconds. By default the turning point of period
-                n_period // 2 lies at slow time zero, where a scatterer at azimuth zero is abeam.
+                n_period // 2 lies at slow time zero, where a scatterer at azimuth zero is at
+                broadside.
 
         Returns:
             Ramp (0 up, 1 down), start of each period in seconds, and fast time in seconds.

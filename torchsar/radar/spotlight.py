@@ -247,7 +247,10 @@ class Spotlight:
         )
 
     def neglected_range_m(self, x: Tensor, y: Tensor) -> Tensor:
-        """Return the exact range minus that of plane waves: rho^2 / (2 range) and smaller terms.
+        """Return the range error of the plane-wave approximation, at most about rho^2 / (2 range).
+
+        The error is the exact range minus the range under the plane-wave approximation; rho is the
+        distance of the point from the scene centre.
 
         Args:
             x: First coordinate of ground points in metres, shape (point,).

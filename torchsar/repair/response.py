@@ -175,8 +175,8 @@ def estimate_amplitude_response(power: Tensor, expected: Tensor, band: float, or
     wanted = _binned(expected.to(torch.float64), band, bins)
     if not bool((wanted > 0).all()):
         raise ValueError(
-            "the expected spectrum has bins without power inside the band; give a spectrum of "
-            "the same band and at least four bins per order"
+            "the expected spectrum has bins without power inside the band; give a spectrum "
+            "of the same band with at least 4 * order samples"
         )
     ratio = _binned(power.to(torch.float64), band, bins) / wanted
     level = ratio.mean(-1, keepdim=True)

@@ -101,9 +101,7 @@ def refuse_no_record(record: Tensor, what: str) -> None:
             f"{getattr(record, 'dtype', type(record).__name__)}; convert the samples first"
         )
     if record.ndim < 2 or not record.numel():
-        raise ValueError(
-            f"{what} works on a record (..., pulse, time) with samples in it, got shape {tuple(record.shape)}"
-        )
+        raise ValueError(f"{what} works on a non-empty record (..., pulse, time), got shape {tuple(record.shape)}")
 
 
 def _trigger_of(trigger_s: Trigger, record: Tensor) -> Tensor:

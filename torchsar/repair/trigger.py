@@ -94,7 +94,7 @@ def refuse_no_samples(record: Tensor) -> None:
         )
     if record.ndim < 2 or not record.numel():
         raise ValueError(
-            f"find_trigger works on a record (..., pulse, time) with samples in it, got shape {tuple(record.shape)}"
+            f"find_trigger works on a non-empty record (..., pulse, time), got shape {tuple(record.shape)}"
         )
     refuse_non_finite(record, "find_trigger")
 

@@ -228,14 +228,15 @@ class Fidelity(Protocol):
         ...
 
     def neglected_phase_rad(self, radar: TriangularLadar, extremes: Extremes) -> dict[str, float]:
-        """Predict the largest neglected phases.
+        """Predict the largest phases that the range model neglects.
 
         Args:
             radar: Ladar.
             extremes: Largest ranges and motions of the scene.
 
         Returns:
-            Phase in radians by name.
+            Phase in radians by name of the effect: `level` for the approximation of the range
+            history, and the effects in `without`.
         """
         ...
 
@@ -315,15 +316,15 @@ class QuadraticInSweep(_Level):
         return history.chords(middle_s, history.radar.sweep_s / 2)
 
     def neglected_phase_rad(self, radar: TriangularLadar, extremes: Extremes) -> dict[str, float]:
-        """Predict the largest neglected phases.
+        """Predict the largest phases that the range model neglects.
 
         Args:
             radar: Ladar.
             extremes: Largest ranges and motions of the scene.
 
         Returns:
-            Phase in radians by name. `level` is that of the jerk j, j u (u^2 - (T/2)^2) / 6 in
-            range, and of the acceleration across the band.
+            Phase in radians by name of the effect. `level` is due to the jerk j, whose range error
+            is j u (u^2 - (T/2)^2) / 6, and to the acceleration over the band.
         """
         t = radar.sweep_s
         jerk = 4 * math.pi / radar.wavelength_m * extremes.jerk_m_s3 * (t / 2) ** 3 / 6 * 2 / math.sqrt(27)
@@ -359,15 +360,15 @@ class LinearInSweep(_Level):
         return (*history.chords(middle_s, history.radar.sweep_s / 2)[:2], None)
 
     def neglected_phase_rad(self, radar: TriangularLadar, extremes: Extremes) -> dict[str, float]:
-        """Predict the largest neglected phases.
+        """Predict the largest phases that the range model neglects.
 
         Args:
             radar: Ladar.
             extremes: Largest ranges and motions of the scene.
 
         Returns:
-            Phase in radians by name. `level` is that at the ends of a sweep,
-            4 pi / lambda a T^2 / 8 + pi K v T^2 / c.
+            Phase in radians by name of the effect. `level` is the phase at the ends of a sweep due
+            to acceleration a and velocity v, 4 pi / lambda a T^2 / 8 + pi K v T^2 / c.
         """
         t = radar.sweep_s
         bend = 4 * math.pi / radar.wavelength_m * extremes.acceleration_m_s2 * t**2 / 8
@@ -403,15 +404,15 @@ class OnePerSweep(_Level):
         return middle, torch.zeros_like(middle), None
 
     def neglected_phase_rad(self, radar: TriangularLadar, extremes: Extremes) -> dict[str, float]:
-        """Predict the largest neglected phases.
+        """Predict the largest phases that the range model neglects.
 
         Args:
             radar: Ladar.
             extremes: Largest ranges and motions of the scene.
 
         Returns:
-            Phase in radians by name. `level` is that of the velocity at the ends of a sweep, at the
-            upper end of the band.
+            Phase in radians by name of the effect. `level` is due to the velocity, at the ends of a
+            sweep and the upper edge of the band.
         """
         upper = radar.carrier_hz + radar.bandwidth_hz / 2
         return {
@@ -447,14 +448,15 @@ class OnePerPeriod(_Level):
         return middle, torch.zeros_like(middle), None
 
     def neglected_phase_rad(self, radar: TriangularLadar, extremes: Extremes) -> dict[str, float]:
-        """Predict the largest neglected phases.
+        """Predict the largest phases that the range model neglects.
 
         Args:
             radar: Ladar.
             extremes: Largest ranges and motions of the scene.
 
         Returns:
-            Phase in radians by name. `level` is that of the velocity at the ends of the period.
+            Phase in radians by name of the effect. `level` is due to the velocity, at the ends of
+            the period and the upper edge of the band.
         """
         upper = radar.carrier_hz + radar.bandwidth_hz / 2
         return {

@@ -458,7 +458,7 @@ class Fleet:
         """
         parts = [scene.movers(radar, draws.part(name)) for name, scene in self.parts.items()]
         if not parts:
-            raise ValueError("a fleet holds no scene; give it at least one, or no scene at all")
+            raise ValueError("a fleet needs at least one scene; add a scene to `parts`, or leave the fleet out")
         names = ("u_r_m_s", "u_a_m_s", "y0_m", "range_m", "amplitude")
         bends = None if all(p.bend is None for p in parts) else [p.bend or Bend.none(p.u_r_m_s) for p in parts]
         bend = (

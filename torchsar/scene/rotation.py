@@ -138,7 +138,7 @@ class PolynomialRotation:
     def refuse_turning_back(self, duration_s: float) -> None:
         """Raise ValueError if the rate falls to zero within the record in any trial.
 
-        Two times would then share an angle, and no image could be formed.
+        Two times would then have the same angle, and no image could be formed.
 
         Args:
             duration_s: Length of the record in seconds.
@@ -150,7 +150,6 @@ class PolynomialRotation:
         if not least > 0:
             raise ValueError(
                 f"the rotation rate falls to {least:.3g} of its first value within the "
-                f"{duration_s:.6g} s of the record, so that two times share an angle and no image "
-                "forms; "
-                "choose other k, or record fewer pulses"
+                f"{duration_s:.6g} s of the record, so that two times have the same "
+                "angle and no image can be formed; choose other k, or record fewer pulses"
             )

@@ -77,12 +77,12 @@ class PhaseOnly:
     def neglected_db(
         self, radar: InverseRadar, world: TurntableWorld, n_pulse: int, cross_range_m: float, range_m: float
     ) -> float:
-        """Relative error of the echo of one scatterer: mean |exp(j phi) - 1|^2 in dB, phi being the
-        phase by which its dechirped echo differs from this model after compression, which removes
-        the residual video phase.
+        """Return the relative error of this model for one scatterer, mean |exp(j phi) - 1|^2 in dB.
 
-        Evaluated on a grid of pulses and of times inside them; a constant velocity that the
-        receiver's track follows is left out, see `Dechirped`.
+        phi is the phase difference between the dechirped echo and this model, without the residual
+        video phase, which compression removes. The mean is over a grid of pulses and of times
+        within the pulse. The Doppler phase within the pulse due to the mean velocity of the
+        reference range (`track` of `Dechirped`) is not counted.
         """
         pulse = torch.linspace(0, n_pulse - 1, min(n_pulse, _GRID), dtype=torch.float64)[:, None]
         inside = torch.linspace(-0.5, 0.5, _GRID, dtype=torch.float64) * _pulse_s(radar)

@@ -84,7 +84,7 @@ def sharpest_phase(
         `phase_rad` of shape (..., pulse), to be removed, detached, with its standard deviation.
         `ok` is False unless the image is 1.5 times sharper than noise can be made, more than one
         range cell contributes to the sharpness, and the predicted Strehl ratio exceeds 0.8. The
-        sharpness is measured by entropy whatever the objective. Pulses without samples keep the
+        sharpness is measured by entropy for every objective. Pulses without samples keep the
         phase of the start, or that of the basis. info["iterations"] is the number of steps.
 
     Raises:

@@ -153,7 +153,7 @@ def _summed(halves: tuple[Tensor, ...], searched: Tensor, coarse: Tensor) -> tup
     """Phase (..., 1, pulse) between the halves from products summed over bins, and weights of one.
 
     Up and down spectra are multiplied and summed before the halves are combined: each sum is then
-    the power spectrum of the scene times one phasor, whatever the scene, after the Doppler shift
+    the power spectrum of the scene times one phasor, for any scene, after the Doppler shift
     `coarse` (bins) is removed. Otherwise a dense scene would determine where in its half the phase
     is read. The removed phase is added again.
     """

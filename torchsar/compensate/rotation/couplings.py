@@ -1,4 +1,4 @@
-"""Overlap of the echoes of neighbouring scatterers: couplings of a joint least-squares step."""
+"""Inner products of the echoes of neighbouring scatterers, for joint least-squares estimation."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from torchsar.radar import BistaticRadar
 
 
 class Aperture(Protocol):
-    """Expected amplitude of a point over slow time, about the time at which it is abeam."""
+    """Expected amplitude of a point over slow time, about the time at which it is at broadside."""
 
     def weight(self, radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
         """Return the expected amplitude.
@@ -31,7 +31,7 @@ class Aperture(Protocol):
 
 @dataclass(frozen=True)
 class Dwell:
-    """Equal amplitude for a duration about the time abeam, zero outside.
+    """Constant amplitude for a duration centred on the time at broadside, zero outside.
 
     The edges depend on the position of the point, but estimators do not use them to find that
     position.
@@ -73,5 +73,5 @@ class ElementBeam:
 
 
 def _abeam_s(motion: PointMotion) -> Tensor:
-    """Return the time at which a point is abeam in seconds."""
+    """Return the time in seconds at which a point is at broadside."""
     return (motion.y0_m / motion.along_m_s).detach()

@@ -149,27 +149,27 @@ def refuse_full_band(radar: BistaticRadar, rebuild: Rebuild, bandwidth_hz: float
 class SignalIntensityRatio(Stage):
     """Estimator of u_r that maximises the intensity ratio Gamma, per trial.
 
-    A grid over the search is followed by parabolas about its best point. Prefer `Interferometry` or
-    `MovingPointVelocity`: the ratio needs about 15 dB more SNR (its threshold lies at 0 to +7 dB
-    per sample), below its threshold it is biased by more than the standard deviation indicates, and
-    with stationary clutter beside the target its maximum lies at u_r = 0. Without noise it errs by
-    up to 0.06 m/s, since echoes beyond the reconstructed bands alias into them. The record must
-    contain the whole dwell of the target.
+    A grid search is refined by parabolic interpolation about its best point. Prefer
+    `Interferometry` or `MovingPointVelocity`: the ratio needs about 15 dB more SNR (its threshold
+    lies at 0 to +7 dB per sample), below its threshold it is biased by more than the standard
+    deviation indicates, and with stationary clutter beside the target its maximum lies at u_r = 0.
+    Without noise it errs by up to 0.06 m/s, since echoes beyond the reconstructed bands alias into
+    them. The record must contain the whole dwell of the target.
 
     Args:
         radar: Instrument.
         bandwidth_hz: Processed Doppler bandwidth V^2 T / (lambda R0) in Hz.
         rebuild: Reconstruction method, `LeastSquares(3)` by default, since two bands leave little
             outside the processed band.
-        search_m_s: Least and largest velocity in m/s, None for the unambiguous interval +-lambda
-            PRF / 2.
+        search_m_s: Least and largest velocity of the search in m/s, None for the unambiguous
+            interval +-lambda PRF / 2.
         step_m_s: Step of the grid in m/s.
         range_m: Closest range in metres, None for the reference range of the radar.
         least_quality: Least quality of a reliable estimate.
 
     Raises:
-        ValueError: If the search holds fewer than two steps, the reconstructed band does not exceed
-            `bandwidth_hz`, or there are too few channels for the bands.
+        ValueError: If the search interval is shorter than two steps, the reconstructed band does
+            not exceed `bandwidth_hz`, or there are too few channels for the bands.
 
     Reference:
         Remote Sens. 2020, 12, 1703, Eqs. (37)-(39).
@@ -220,9 +220,9 @@ class SignalIntensityRatio(Stage):
         Returns:
             `u_r_m_s` of shape (...,), closing positive, with a jackknife standard deviation. The
             quality is 1 - median / largest Gamma over the grid. `info` holds `log_ratio` over the
-            grid and `pulse_rates`. `ok` is False for zero data (whose value is the middle of the
-            search), a maximum at an end of the search, a quality below `least_quality`, or a
-            velocity off by whole PRFs.
+            grid and `pulse_rates`. `ok` is False if the data are zero (the value is then
+            the middle of the search interval), the maximum lies at an end of the interval, the
+            quality is below `least_quality`, or the velocity is wrong by a multiple of lambda PRF.
 
         Raises:
             ValueError: If the reconstruction is singular.
@@ -247,7 +247,7 @@ class SignalIntensityRatio(Stage):
         return self._checked_for_ambiguity(found, lines, u_a_m_s, y0_m)
 
     def _checked_for_ambiguity(self, found: Estimate, lines: Tensor, u_a_m_s: Number, y0_m: Number) -> Estimate:
-        """Check the estimate for a velocity off by whole PRFs on the strongest range line."""
+        """Check for a velocity wrong by a multiple of lambda * PRF, on the strongest range line."""
         motion = self._motion(lines, found["u_r_m_s"], u_a_m_s, y0_m)
         line = take(lines.movedim(-1, -3), lines.detach().abs().square().sum((-3, -2)).argmax(-1), -3)
         dwell_s = self.bandwidth_hz * self.radar.wavelength_m * self.radar.reference_range_m / self.radar.speed_m_s**2
@@ -258,7 +258,7 @@ class SignalIntensityRatio(Stage):
         return PointMotion.of(self.radar, lines, u_r_m_s, u_a_m_s, y0_m, self.range_m)
 
     def _estimate(self, fine: Tensor, coarse: Tensor, costs: Tensor, lines: Tensor, std: Tensor) -> Estimate:
-        """Form the estimate and judge it."""
+        """Return the estimate with its quality and `ok`."""
         low, high = self.search_m_s
         has_data = lines.detach().abs().amax((-3, -2, -1)) > 0
         value = torch.where(has_data, fine.clamp(low, high), (low + high) / 2)

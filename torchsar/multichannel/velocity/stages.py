@@ -82,14 +82,14 @@ class _Velocity(Stage):
 
 
 class Interferometry(_Velocity):
-    """Along-track interferometry as a stage, with u_a as given; see `interferometry`.
+    """Stage that estimates u_r by along-track interferometry for a given u_a; see `interferometry`.
 
     Args:
         radar: Instrument.
         aperture: Expected amplitude over slow time.
         range_m: Closest range in metres, None for that of the line or the reference range.
-        check_ambiguity: Whether to check for a velocity off by whole PRFs (about 10 ms per trial):
-            a warning is then given and `ok` is False.
+        check_ambiguity: Whether to check for a velocity wrong by a multiple of lambda * PRF, in
+            about 10 ms per trial. If one is found, a warning is given and `ok` is False.
     """
 
     def __init__(

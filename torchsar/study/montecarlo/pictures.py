@@ -1,4 +1,4 @@
-"""The pictures of a sweep, drawn from its summary alone."""
+"""Figures of a sweep, drawn from its summary alone."""
 
 from __future__ import annotations
 

@@ -222,7 +222,7 @@ def read_sweep(path: Path | str) -> Record:
 
 
 def cut_off(path: Path) -> bool:
-    """Whether a sweep was killed while it made this store, before the store held anything."""
+    """Return whether a sweep was killed while creating this store, which then holds no results."""
     made = {p.name for p in path.iterdir() if not p.name.endswith(".partial")} if path.is_dir() else {""}
     root = path / "zarr.json"
     if not made <= {root.name, _DONE}:
@@ -266,8 +266,8 @@ def _loaded(root: zarr.Group, path: Path) -> Record:
         if not missing:
             return _read(root)
     except (KeyError, ValueError, IndexError, TypeError, OSError) as error:
-        raise ConfigError(f"{path} is broken ({type(error).__name__}: {one_line(error)}); {advice}") from error
-    raise ConfigError(f"{path} is broken: {missing[0]!r} is missing; {advice}")
+        raise ConfigError(f"{path} is damaged ({type(error).__name__}: {one_line(error)}); {advice}") from error
+    raise ConfigError(f"{path} is damaged: {missing[0]!r} is missing; {advice}")
 
 
 def _read(root: zarr.Group) -> Record:

@@ -40,13 +40,14 @@ _BOUND = "root mean square over the trials done of the bound of each trial, for 
 
 @dataclass(frozen=True)
 class Summary:
-    """The figures of a sweep.
+    """Statistics of the metrics of a sweep, and their bounds.
 
     Args:
         algorithms: Names, along the first dim of figures.
         labels: Values of every parameter, in the order of the dims.
-        figures: By metric and field, (algorithm, *parameters), intervals (..., 2).
-        bounds: Root mean square by metric and name of the bound, (*parameters).
+        figures: Arrays of shape (algorithm, *parameters) for each metric and statistic; confidence
+            intervals have one more dimension of 2.
+        bounds: Root-mean-square value of each bound of each metric, shape (*parameters).
     """
 
     algorithms: tuple[str, ...]

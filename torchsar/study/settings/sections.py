@@ -83,7 +83,11 @@ class Trade(Strict):
 
 
 class EarlyStop(Strict):
-    """A point ends when half of the 95 % interval of a statistic is below `relative` times it."""
+    """Condition that ends the trials of a grid point before their largest number is reached.
+
+    It holds if half the width of the 95 % confidence interval of a statistic of a metric is below
+    `relative` times the statistic.
+    """
 
     metric: str
     relative: float = Field(gt=0, lt=1)
@@ -102,9 +106,9 @@ class Sweep(Strict):
 
     Fields:
         grid: Values of each axis, a list or a mapping of labels to values, by dotted key.
-        trials: Number of trials of each point, or the largest number if points may end early.
+        trials: Number of trials of each point, or the largest number if `stop` is given.
         chunk: Number of trials of a batch; None to choose it by the memory.
-        stop: Condition under which a point ends early.
+        stop: Condition that ends the trials of a point early; see `EarlyStop`.
         success: Largest magnitude of a metric for a trial to count as a success, by metric.
         show: Metrics that are drawn; by default all errors.
         save: Trials whose images are kept.

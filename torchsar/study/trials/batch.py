@@ -121,7 +121,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Found:
-    """An estimate by name: value and predicted standard deviation (trial, ...), `ok` (trial,)."""
+    """Estimates of a quantity: value, standard deviation (trial, ...) and `ok` (trial,)."""
 
     value: Tensor
     std: Tensor | None

@@ -1,4 +1,4 @@
-"""The pictures of a run of moving points: azimuth profiles, main lobes, contours and spectra."""
+"""Figures of moving point targets: azimuth profiles, main lobes, contours and spectra."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class Level:
         given = [one.name for one in fields(self) if getattr(self, one.name) is not None]
         if len(given) > 1:
             raise ValueError(
-                f"world.noise: {given[0]} and {given[1]} both say how strong a target is; give one of snr_db, "
+                f"world.noise: {given[0]} and {given[1]} both set the level of the targets; give one of snr_db, "
                 "raw_scnr_db and scr_db, and leave the others null"
             )
 
@@ -115,20 +115,23 @@ class Points(World):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.pulses < 1 or not self.targets or (self.samples is not None and self.samples < 1):
-            raise ValueError(f"world needs targets, pulses and samples, got {self.pulses} and {self.samples}")
+            raise ValueError(
+                "world needs at least one target and one pulse, and samples of 1 or more or None, got "
+                f"{len(self.targets)} targets, {self.pulses} pulses and {self.samples} samples"
+            )
         if self.noise.scr_db is not None and self.sea is None:
-            raise ValueError("world.noise.scr_db is the level of targets over a sea; give world.sea, or snr_db instead")
+            raise ValueError("world.noise.scr_db is a signal-to-clutter ratio; give world.sea, or use snr_db")
         if self.sea is not None and all(getattr(self.noise, one.name) is None for one in fields(Level)):
             raise ValueError(
-                "world.noise: the level of a sea counts from the noise; give snr_db, raw_scnr_db or scr_db"
+                "world.noise: the level of the sea is relative to the noise; give snr_db, raw_scnr_db or scr_db"
             )
         if self.sea is not None and self.kind == "full":
-            raise ValueError("world.sea is added to range-compressed echoes; take kind: compressed")
+            raise ValueError("world.sea is added to range-compressed echoes; set kind: compressed")
         beyond = any(bool((torch.as_tensor(target.range_m) != 0).any()) for target in self.targets.values())
         if self.samples is None and (self.kind == "full" or beyond):
             raise ValueError(
-                "world.samples: azimuth-only data (null) know one range, the reference_range_m of the radar; "
-                "give samples, or leave range_m and kind: full out"
+                "world.samples: azimuth-only data (null) have a single range, the reference_range_m of the radar; "
+                "give samples, or omit range_m and kind: full"
             )
 
     @property

@@ -34,7 +34,7 @@ class Judging:
 
     Args:
         match_m: Largest distance in metres, along track and in range, of a detected target from the
-            position at which the image of everything at rest shows a ship.
+            position at which the image focused for a stationary scene shows a ship.
         published_targets: Published values by figure, ship and method.
     """
 
@@ -71,7 +71,7 @@ class GeoOcean(System):
         "a sample of a ship's lines over it; cnr_db: sea over noise",
         "velocities": "u_r: closing slant-range speed; u_a: along track, positive with the receiver; y0: "
         "position along track at t = 0, the middle pulse; range: closest one of the track at rest",
-        "matching": "a detected target belongs to the nearest ship in the image of everything at rest, within "
+        "matching": "a detected target belongs to the nearest ship in the image focused for a stationary scene, within "
         "metrics.match_m; found: share of ships with one. A ship that is not found counts as at rest at its position "
         "in that image: its errors are minus its velocities and its displacement, and ok is False. false_targets: "
         "detected targets that belong to no ship",
@@ -90,7 +90,7 @@ class GeoOcean(System):
         "centroids then lie nearer than predicted",
         "replica_db": "mean power of the final image within 100 m along track and 40 m in range of the "
         "strongest replica one or two pulse rates away, over the sea's in the same lines; the sea itself has 0 "
-        "dB, spread by its texture by about 1 dB. replica_before_db: of the image of everything at rest; "
+        "dB, spread by its texture by about 1 dB. replica_before_db: of the image focused for a stationary scene; "
         "replica_left_db: of the difference from the image of what does not move",
         "sea_error_db": "power of the difference of the image without movers from the image of what does not "
         "move, over the power of the latter, within 400 m along track and 30 m in range of where the image at "
@@ -114,7 +114,7 @@ class GeoOcean(System):
         "replica_distance_vt_m": Column("distance of the false target, predicted, axis (V_R - u_a) t", "m"),
         "displacement_m": Column("displacement if imaged at rest, measured, axis V_R t", "m"),
         "replica_distance_m": Column("distance of the false target, measured, axis V_R t", "m"),
-        "replica_before_db": Column("false target over the sea, image of everything at rest", "dB"),
+        "replica_before_db": Column("false target over the sea, image focused for a stationary scene", "dB"),
         "replica_db": Column("false target over the sea, final image", "dB", drawn="mean"),
         "replica_left_db": Column("remaining false target over the sea", "dB"),
         "sea_error_db": Column("error of the sea near a removed ship", "dB", drawn="mean"),

@@ -95,7 +95,7 @@ def _use_of(bench: Bench, name: str) -> MultichannelUse:
 
 
 def _swath_limits(bench: Bench, name: str) -> list[Limit]:
-    """Moving ships are sought only where they lie in the swath whatever their velocity."""
+    """Moving ships are sought only where they lie in the swath at any velocity."""
     last, world = _last(bench, name), bench.world()
     if not isinstance(last, MoversImage):
         return []

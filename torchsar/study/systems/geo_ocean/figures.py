@@ -1,4 +1,4 @@
-"""The pictures of a run of ships on a sea: steps of the processing, final images, and ships."""
+"""Figures of the ocean simulation: steps of the processing, final images, and ships."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _boxes(positions: Sequence[ImagePosition]) -> tuple[np.ndarray, np.ndarray]:
 
 def _marked(result: Result, title: str, image: Signal, apparent: bool) -> dict[str, Any]:
     """An image with outlines about the true positions of ships, and about their positions and
-    replicas in an image of everything at rest.
+    replicas in an image focused for a stationary scene.
     """
     ships = list(_shown(result).values())
     lines = {"true position": _boxes([_true(one) for one in ships])}
@@ -105,7 +105,7 @@ def _ships(case: str, result: Result) -> Drawn:
             parts.append({"title": f"{name}, {method}", "signal": plot.within(made[method].fused, spans), "lines": {}})
     if parts:
         caption = (
-            "Each ship at its position in the image of everything at rest (conventional) and at its true position "
-            "(recommended), in dB relative to its own peak."
+            "Each ship at its position in the image focused for a stationary scene (conventional) and at its "
+            "true position (recommended), in dB relative to its own peak."
         )
         yield f"ships_{word_of(case)}", titled("Ships", case), caption, plot.overlays(parts)

@@ -104,7 +104,10 @@ class Ocean(World):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.pulses < 1 or self.samples < 1 or not self.targets:
-            raise ValueError(f"world needs targets, pulses and samples, got {self.pulses} and {self.samples}")
+            raise ValueError(
+                "world needs at least one target, one pulse and one sample, got "
+                f"{len(self.targets)} targets, {self.pulses} pulses and {self.samples} samples"
+            )
 
     def trials_of(
         self, radar: BistaticRadar, draws: Draws, extraction: Extraction, dtype: torch.dtype, device: str = "cpu"

@@ -99,7 +99,7 @@ class Isal(System):
         if bench.recording is not None:
             raise ConfigError(
                 f"{bench.file}: 'requires' needs the extent and the motion of the target, which are not known for a "
-                "recording; take a config that simulates"
+                "recording; use a config that simulates the echoes"
             )
         radar, world = bench.radar, bench.world()
         across, along = world.edge(Draws(bench.config.seed))
@@ -117,7 +117,7 @@ class Isal(System):
         if bench.recording is not None:
             raise ConfigError(
                 f"{bench.file}: 'trade' needs the true phases, which are not known for a recording; "
-                "take a config that simulates"
+                "use a config that simulates the echoes"
             )
         efforts = [Alternative(f"autofocus, search {s}, polish {p}", {"search": s, "polish": p}) for s, p in _EFFORTS]
         return [

@@ -1,4 +1,4 @@
-"""The pictures of a run of turning targets: images of every case, and residual phases."""
+"""Figures of the simulation of rotating targets: images of every case, and residual phases."""
 
 from __future__ import annotations
 

@@ -53,7 +53,10 @@ class Target(World):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.pulses < 1 or self.samples < 1 or not self.scene:
-            raise ValueError(f"a target needs a scene, pulses and samples, got {self.pulses} x {self.samples}")
+            raise ValueError(
+                "world needs a scene and at least one pulse and one sample, got "
+                f"{self.pulses} pulses and {self.samples} samples"
+            )
 
     def of(self, radar: InverseRadar) -> TurntableWorld:
         """The parameters of the echo simulation."""

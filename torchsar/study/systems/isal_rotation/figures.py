@@ -1,4 +1,4 @@
-"""The pictures of a run of a rotating target: images in metres, one end, cuts through points."""
+"""Figures of one rotating target: images in metres, detail of one end, cuts through points."""
 
 from __future__ import annotations
 

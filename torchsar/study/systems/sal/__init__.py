@@ -157,8 +157,8 @@ class Sal(System):
                 stage, times = entry["stage"], before.count("deramp_azimuth")
                 if stage in _OF_DERAMPED and times != 1 and not any(group_of(other) == "own" for other in before):
                     raise ConfigError(
-                        f"{file}: processor.{name}.stages.{key}: {stage} works on profiles deramped once, here {times} "
-                        "times; put one deramp_azimuth between compress_sweeps and it"
+                        f"{file}: processor.{name}.stages.{key}: {stage} needs profiles that are deramped once, but "
+                        f"{times} stages deramp_azimuth precede it; put one of them between compress_sweeps and {stage}"
                     )
                 before.append(stage)
         if world.record is None and bench.radar.detection == "real":

@@ -1,4 +1,4 @@
-"""The pictures of a run of a ladar: range profiles, images, motion, and impulse responses."""
+"""Figures of the ladar simulation: range profiles, images, motion, and impulse responses."""
 
 from __future__ import annotations
 

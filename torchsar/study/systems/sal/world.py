@@ -88,10 +88,10 @@ class Ground(World):
         super().__post_init__()
         snr_db = self.noise.snr_db
         if self.periods < 1 or not self.scene:
-            raise ValueError(f"a ladar needs a scene and at least one period, got {self.periods}")
+            raise ValueError(f"world needs a scene and at least one period, got {self.periods} periods")
         if snr_db is not None and bool((torch.as_tensor(snr_db).abs() > 300).any()):
             raise ValueError(
-                f"noise.snr_db is {snr_db}, beyond what numbers hold; give -300 to 300 dB, or null for none"
+                f"noise.snr_db is {snr_db}, outside the numerical range; give -300 to 300 dB, or null for no noise"
             )
         self.of()
 

@@ -1,4 +1,4 @@
-"""The pictures of a run of a strip."""
+"""Figures of the stripmap simulation."""
 
 from __future__ import annotations
 
