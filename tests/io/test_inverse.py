@@ -127,9 +127,9 @@ def test_geometry_and_radar_of_a_spotlight(tmp_path):
         (spotlight(y_m=None, r0_m=None), r"lacks \['y_m', 'r0_m'\]"),
         (
             profiles(profiles=np.ones((6, 4))),
-            r"profiles must be complex \(range, pulse\) .* got float64 of shape \(6, 4\)",
+            r"profiles must be a complex array \(range, pulse\) .* got float64 of shape \(6, 4\)",
         ),
-        (spotlight(fp=np.ones((16, 5, 1), complex)), r"fp must be complex \(frequency, pulse\)"),
+        (spotlight(fp=np.ones((16, 5, 1), complex)), r"fp must be a complex array \(frequency, pulse\)"),
         (profiles(prf_hz=0.0), "prf_hz must be one positive number, got 0.0"),
         (profiles(range_step_m="fine"), "range_step_m must be one positive number, got 'fine'"),
         (profiles(range_step_m=0.75), "range_step_m 0.75 holds a bandwidth of .* less than bandwidth_hz 4e"),

@@ -158,7 +158,8 @@ def _evaluated(objective: Objective, x: Tensor) -> _Point:
         check_cost(cost, x)
         if not cost.requires_grad:
             raise ValueError(
-                "the objective returned costs that autograd cannot follow back to x; leave out detach and no_grad"
+                "the objective returned costs that autograd cannot differentiate with respect to x; leave "
+                "out detach and no_grad"
             )
         (gradient,) = torch.autograd.grad(cost.sum(), x, create_graph=True)
         hessian = torch.stack([_row(part, x) for part in gradient.unbind(-1)], -2)
