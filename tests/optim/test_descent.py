@@ -359,7 +359,9 @@ MISTAKES = [
         id="one cost for all",
     ),
     pytest.param(torch.zeros(3, 2), lambda x: 1.0, {}, ValueError, "returned float", id="a number"),
-    pytest.param(torch.zeros(3, 2), lambda x: x.detach().sum(-1), {}, ValueError, "autograd cannot differentiate", id="detached"),
+    pytest.param(
+        torch.zeros(3, 2), lambda x: x.detach().sum(-1), {}, ValueError, "autograd cannot differ", id="detached"
+    ),
     pytest.param(torch.zeros(3, 2), rosenbrock, {"with_gradient": True}, TypeError, "cost, gradient", id="no pair"),
     pytest.param(
         torch.zeros(3, 2),
