@@ -118,7 +118,7 @@ def draw(traces: Mapping[str, Trace], scene: LetterE, out: Path) -> None:
     """Figure 10: the scene; figures 11 and 12: range profiles and images."""
     points = scene.scatterers(Draws(0))
     plot.save(
-        plot.places(
+        plot.scatterers(
             plot.array(points.range_m),
             plot.array(points.azimuth_m),
             plot.array(points.amplitude.abs()),

@@ -212,7 +212,7 @@ def main(arguments: list[str] | None = None) -> None:
     table(found, truth)
     x, y, level = (plot.array(truth.values[name]) for name in ("cross_range_m", "range_m", "amplitude"))
     plot.save(
-        plot.places(y, x, abs(level), "range (m)", "cross range (m)", "corner cubes"), options.out / "figure_18.png"
+        plot.scatterers(y, x, abs(level), "range (m)", "cross range (m)", "corner cubes"), options.out / "figure_18.png"
     )
     names = {
         "a: uniform autofocus": "uniform autofocus",

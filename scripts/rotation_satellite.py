@@ -109,7 +109,7 @@ def cropped(image: Signal, azimuth: tuple[float, float], range_m: tuple[float, f
 def draw_target(truth: Truth, path: Path) -> None:
     """Figure 4: the scatterers."""
     x, y, a = (plot.array(truth.values[name]) for name in ("cross_range_m", "range_m", "amplitude"))
-    plot.save(plot.places(y, x, abs(a), "range (m)", "cross range (m)", f"{len(x)} scatterers"), path)
+    plot.save(plot.scatterers(y, x, abs(a), "range (m)", "cross range (m)", f"{len(x)} scatterers"), path)
 
 
 def over_peak(image: Signal) -> Signal:

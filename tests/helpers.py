@@ -22,7 +22,7 @@ from torchsar.scene import (
 )
 
 
-def mind_interrupts() -> None:
+def enable_interrupts() -> None:
     """For the child of a Popen: tests that were started in the background ignore Ctrl-C, and their
     children would, too.
     """

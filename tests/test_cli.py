@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.helpers import mind_interrupts
+from tests.helpers import enable_interrupts
 from tests.study.tiny import write_tiny
 from torchsar.cli import main
 
@@ -241,7 +241,7 @@ def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
         "--out",
         str(tmp_path / "result"),
     ]
-    running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=mind_interrupts)
+    running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=enable_interrupts)
     assert running.stderr is not None and "torchsar: run" in running.stderr.readline()
     running.send_signal(signal.SIGINT)
     _, said = running.communicate(timeout=60)

@@ -462,7 +462,7 @@ def curves(
 
 
 @_styled
-def places(
+def scatterers(
     x: np.ndarray,
     y: np.ndarray,
     size: np.ndarray,

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.helpers import mind_interrupts
+from tests.helpers import enable_interrupts
 from tests.study import toy
 from tests.study.tiny import write_tiny
 from torchsar.study.montecarlo import Record, engines, read_sweep
@@ -166,7 +166,7 @@ def test_an_interrupted_sweep_says_how_to_go_on_and_does(tmp_path: Path) -> None
     command = [sys.executable, "-c", QUICK, "sweep", str(config), "--out", str(out)]
     for stop in (signal.SIGINT, signal.SIGTERM):
         running = subprocess.Popen(
-            [*command, "--resume"], stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=mind_interrupts
+            [*command, "--resume"], stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=enable_interrupts
         )
         assert running.stderr is not None
         while "trials/s" not in (line := running.stderr.readline()) and line:
@@ -234,7 +234,7 @@ def test_ctrl_c_with_workers_is_one_sentence(tmp_path: Path) -> None:
     )
     command = [sys.executable, "-c", QUICK, "sweep", str(config), "--workers", "2", "--out", str(out)]
     running = subprocess.Popen(
-        command, stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=mind_interrupts, start_new_session=True
+        command, stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=enable_interrupts, start_new_session=True
     )
     assert running.stderr is not None
     while "trials/s" not in (line := running.stderr.readline()) and line:

@@ -26,7 +26,7 @@ def target(result: Result) -> Drawn:
         names = ("range_m", "cross_range_m", "amplitude")
         along, across, amplitude = (plot.array(truth[n].reshape(-1, truth[n].shape[-1])[0]) for n in names)
         caption = "Positions of the scatterers in the first trial. The area of a dot is proportional to the power."
-        figure = plot.places(along, across, np.abs(amplitude) ** 2, "range (m)", "cross range (m)")
+        figure = plot.scatterers(along, across, np.abs(amplitude) ** 2, "range (m)", "cross range (m)")
         yield "target", "Target", caption, figure
 
 

@@ -56,7 +56,7 @@ def _target(result: Result) -> Drawn:
     caption = (
         "Scatterers of the first trial; the area of a point is proportional to its amplitude. The axes differ in scale."
     )
-    figure = plot.places(range_, along, np.abs(amplitude), "range (m)", "azimuth (m)", aspect="auto")
+    figure = plot.scatterers(range_, along, np.abs(amplitude), "range (m)", "azimuth (m)", aspect="auto")
     yield "target", "Target", caption, figure
 
 
