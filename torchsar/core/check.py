@@ -32,5 +32,5 @@ def refuse_non_finite(x: Tensor, what: str) -> None:
         first = tuple(int(i) for i in bad.nonzero()[0])
         raise ValueError(
             f"{what}: {count} of {x.numel()} samples are NaN or Inf, the first at index {first}; "
-            "mark such lines as missing or correct the code that reads the data"
+            "set missing samples to zero, or correct the code that reads the data"
         )
