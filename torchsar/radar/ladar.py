@@ -121,10 +121,10 @@ class TriangularLadar:
 
     @property
     def ambiguous_velocity_m_s(self) -> float:
-        """Radial velocity lambda / (2 T) in m/s that adds one cycle of phase in a sweep of length T.
+        """Radial velocity lambda / (2 T) in m/s that shifts the phase by one cycle per sweep.
 
-        The segmented interference of the paper compares the phases of the halves of the sweeps, and
-        therefore measures the radial velocity modulo this interval.
+        T is the length of a sweep. The segmented interference of the paper compares the phases of
+        the halves of the sweeps, and therefore measures the radial velocity modulo this interval.
 
         Reference:
             Remote Sens. 2024, 16, 793, Eq. (17).
