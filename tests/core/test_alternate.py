@@ -149,19 +149,20 @@ class Holding(Mean):
 
 
 def test_invalid_alternations_raise() -> None:
-    with pytest.raises(ValueError, match=r"at least two turns and one round, got \['mean'\] and rounds=3"):
+    with pytest.raises(ValueError, match=r"at least two estimators and one round, got \['mean'\] and rounds=3"):
         Alternate(mean=Turn(Mean()))
     with pytest.raises(ValueError, match="rounds=0"):
         both(0)
     with pytest.raises(
         ValueError,
-        match=r"the turn 'dependent' needs the values \['slope'\] in the first round, "
-        "but the turns before it provide nothing",
+        match=r"the estimator 'dependent' needs the values \['slope'\] in the first round, "
+        "but the estimators before it provide nothing",
     ):
         Alternate(dependent=Turn(Dependent()), slope=Turn(Slope()))
     with pytest.raises(
         ValueError,
-        match=r"the corrector of the turn 'slope' needs the values \['mean'\], which the estimator of this turn does",
+        match=r"the corrector of the estimator 'slope' needs the values \['mean'\], "
+        "which this estimator does not provide",
     ):
         Alternate(slope=Turn(Slope(), WithoutMean()), mean=Turn(Mean()))
     assert Alternate(slope=Turn(Slope()), dependent=Turn(Dependent())).provides == ("slope", "copy")

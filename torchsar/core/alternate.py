@@ -53,7 +53,9 @@ class Alternate(Stage):
     def __init__(self, rounds: int = 3, **turns: Turn) -> None:
         super().__init__()
         if len(turns) < 2 or rounds < 1:
-            raise ValueError(f"Alternate needs at least two turns and one round, got {list(turns)} and rounds={rounds}")
+            raise ValueError(
+                f"Alternate needs at least two estimators and one round, got {list(turns)} and rounds={rounds}"
+            )
         self.rounds = rounds
         self.estimators = nn.ModuleDict({name: turn.estimator for name, turn in turns.items()})
         self.correctors = nn.ModuleDict(
@@ -71,9 +73,9 @@ class Alternate(Stage):
             missing = [p.name for p in _parameters(estimator) if p.default is p.empty and p.name not in available]
             if missing:
                 raise ValueError(
-                    f"Alternate: the estimator of the turn {name!r} needs the values {missing} in the first round, "
-                    f"but the turns before it provide {sorted(available) or 'nothing'}; change the order of the turns, "
-                    "or give the parameter a default"
+                    f"Alternate: the estimator {name!r} needs the values {missing} in the first round, but the "
+                    f"estimators before it provide {sorted(available) or 'nothing'}; change the order of the "
+                    "estimators, or give these parameters of its `forward` a default"
                 )
             available |= set(getattr(estimator, "provides", ()))
         for name, corrector in self.correctors.items():
@@ -82,8 +84,8 @@ class Alternate(Stage):
             )
             if missing:
                 raise ValueError(
-                    f"Alternate: the corrector of the turn {name!r} needs the values {sorted(missing)}, which the "
-                    "estimator of this turn does not provide"
+                    f"Alternate: the corrector of the estimator {name!r} needs the values {sorted(missing)}, which "
+                    "this estimator does not provide"
                 )
 
     def forward(self, signal: Signal) -> Estimate:

@@ -15,9 +15,9 @@ _DUAL_NAME = {"pulse": "doppler", "range": "range_frequency"}
 class Axis:
     """Uniform sampling grid of one dimension: sample i lies at `start + i * step`.
 
-    Axes of raw data are `pulse` (slow time in s) and `range` (slant range in m), those of an image
-    `azimuth` and `range` (both in m). A frequency axis made by `dual` keeps the origin of the axis
-    that it came from, so that the inverse transform restores it.
+    Raw data have the axes `pulse` (slow time in s) and `range` (slant range in m), images the axes
+    `azimuth` and `range` (both in m). A frequency axis made by `dual` keeps the `start` of the axis
+    from which it was made, so that the inverse transform restores that axis.
 
     Args:
         name: Name of the axis.
@@ -25,8 +25,8 @@ class Axis:
         start: Coordinate of the first sample, in `unit`.
         step: Distance between samples, in `unit`, positive.
         unit: Unit of the coordinates, such as "s", "m" or "Hz".
-        dual_start: Of a frequency axis, the `start` of the axis that it came from; None for any
-            other.
+        dual_start: For a frequency axis made by `dual`, the `start` of the axis from which it was
+            made; None for all other axes.
 
     Raises:
         ValueError: If there is no sample, or the step is not positive.

@@ -255,7 +255,9 @@ class Chain(nn.Module):
                 raise KeyError(f"the chain has no stage {name!r}; its stages are {names}")
         unknown = set(given or {}) - set(trace.values)
         if unknown:
-            raise KeyError(f"`given` names {sorted(unknown)}, but the trace holds the values {sorted(trace.values)}")
+            raise KeyError(
+                f"`given` has unknown names {sorted(unknown)}; the trace has the values {sorted(trace.values)}"
+            )
         part = names[names.index(start) : names.index(stop) + 1 if stop else None]
         return part, {**trace.values, **(given or {})}
 
@@ -267,7 +269,7 @@ class Chain(nn.Module):
         available |= {source for names in self.uses.values() for source in names.values()}
         unknown = set(given or {}) - available
         if unknown:
-            raise KeyError(f"`given` names {sorted(unknown)}, but the chain has the values {sorted(available)}")
+            raise KeyError(f"`given` has unknown names {sorted(unknown)}; the chain has the values {sorted(available)}")
 
     def _run(
         self, names: list[str], signal: Signal, values: dict[str, Tensor], held: set[str], log: _Log | None

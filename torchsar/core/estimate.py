@@ -39,8 +39,8 @@ class Estimate:
     def __post_init__(self) -> None:
         if self.ok.dtype != torch.bool or self.ok.shape != self.quality.shape:
             raise ValueError(
-                f"an estimate needs a bool `ok` shaped like `quality`, got {self.ok.dtype} "
-                f"{tuple(self.ok.shape)} and {tuple(self.quality.shape)}"
+                f"an Estimate needs a bool tensor `ok` of the shape of `quality`, got `ok` of {self.ok.dtype} with "
+                f"shape {tuple(self.ok.shape)} and `quality` with shape {tuple(self.quality.shape)}"
             )
 
     def __getitem__(self, name: str) -> Tensor:

@@ -33,8 +33,8 @@ def real_dtype(dtype: torch.dtype) -> torch.dtype:
 def cis(angle_rad: Tensor) -> Tensor:
     """Compute exp(1j * angle) in the precision of the angle.
 
-    Takes a third of the time of torch.polar. Use `unit_phasor` for phases of more than a few turns.
-    Differentiable.
+    It takes a third of the time of torch.polar. Use `unit_phasor` for phases of more than a few
+    turns. Differentiable.
 
     Args:
         angle_rad: Angle in radians, any shape, float32 or float64.

@@ -78,7 +78,7 @@ def _load(path: Path) -> dict[str, np.ndarray]:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except (ValueError, OSError) as error:
-        raise ValueError(f"{path} is not a numpy archive (.npz) without pickled objects ({error})") from None
+        raise ValueError(f"{path} must be a numpy archive (.npz) without pickled objects: {error}") from None
 
 
 def _kind(arrays: dict[str, np.ndarray], path: Path) -> str:
@@ -117,7 +117,7 @@ def _profiles_radar(
     sampled = LIGHT_M_S / (2 * step)
     if bandwidth > 1.01 * sampled:
         raise ValueError(
-            f"{path}: range_step_m must be at most c / (2 B) for the bandwidth B of bandwidth_hz {bandwidth:g}, "
+            f"{path}: range_step_m must be at most c / (2 B) for the bandwidth_hz B = {bandwidth:g}, "
             f"got {step:g} m, which samples only {sampled:g} Hz"
         )
     carrier = _number(arrays, "f0_hz", path) if "f0_hz" in arrays else UNSTATED_CARRIER_HZ

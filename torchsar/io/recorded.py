@@ -53,7 +53,7 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Rec
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
     except (ValueError, OSError) as error:
-        raise ValueError(f"{path} is not a numpy archive (.npz) without pickled objects ({error})") from None
+        raise ValueError(f"{path} must be a numpy archive (.npz) without pickled objects: {error}") from None
     missing = [key for key in _REQUIRED if key not in arrays]
     if missing:
         raise ValueError(

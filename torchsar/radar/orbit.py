@@ -209,9 +209,9 @@ def seen_point(
     inside = EARTH_RADIUS_M**2 - (height * torch.sin(tilt)).square()
     if not bool((inside.detach() > 0).all()):
         raise ValueError(
-            f"a line of sight {off_nadir_deg} degrees off nadir misses the Earth from a satellite "
-            f"{float(height.detach().max()) / 1e3:g} km from its centre; stay below "
-            f"{_horizon_deg(height):.4g} degrees"
+            f"a line of sight {off_nadir_deg} degrees off nadir misses the Earth; stay below "
+            f"{_horizon_deg(height):.4g} degrees for a satellite {float(height.detach().max()) / 1e3:g} km from the "
+            "centre of the Earth"
         )
     return position_m + (height * torch.cos(tilt) - torch.sqrt(inside)) * look
 

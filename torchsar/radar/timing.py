@@ -148,8 +148,8 @@ def _check_arguments(
     if not bool((prf_hz > 0).all()) or float(prf_hz.max()) * 2 * (pulse_s + guard_s) >= 1:
         raise ValueError(
             f"pulses of {pulse_s:g} s with guards of {guard_s:g} s leave nothing of the pulse period for reception at "
-            f"prf_hz of {float(prf_hz.min()):g}..{float(prf_hz.max()):g} Hz; lower the rates (above 0) or "
-            "shorten the pulse"
+            f"prf_hz of {float(prf_hz.min()):g}..{float(prf_hz.max()):g} Hz; choose lower rates above 0 or a "
+            "shorter pulse"
         )
     horizon = EARTH_RADIUS_M * math.acos(EARTH_RADIUS_M / (EARTH_RADIUS_M + height_m))
     if ground_m.numel() < 2 or not (float(ground_m.min()) >= 0 and float(ground_m.max()) <= horizon):
