@@ -116,7 +116,7 @@ def decibel(x: Tensor | np.ndarray, reference: float | None = None) -> np.ndarra
         reference: Amplitude of 0 dB; by default the largest one.
 
     Returns:
-        Levels in dB, same shape, limited to -300 dB.
+        Levels in dB, same shape; lower levels than -300 dB are set to -300 dB.
     """
     amplitude = np.abs(x.detach().cpu().numpy() if isinstance(x, Tensor) else x)
     top = reference if reference is not None else float(amplitude.max(initial=0.0))
@@ -562,9 +562,9 @@ def trade(
 ) -> Figure:
     """Draw the loss of accuracy of alternative methods over their computing time.
 
-    Each alternative is a numbered point, with its name in the legend below the axes. Points whose
-    loss no faster alternative reaches form the Pareto front; they are filled and joined by a step
-    line.
+    Each alternative is a numbered point, with its name in the legend below the axes. Points
+    for which no faster alternative has an equal or smaller loss form the Pareto front; they are
+    filled and joined by a step line.
 
     Args:
         names: Names of the alternatives.

@@ -30,12 +30,13 @@ class Turn:
 class Alternate(Stage):
     """Joint estimate of several effects, by running one estimator for each of them in turn.
 
-    One round runs all estimators in the order given. Each receives the original signal after the
-    correctors of all other turns, every corrector with the latest values of its own estimator.
-    Correction always starts from the original signal, so that errors of an early round do not
-    remain in the data. An estimator also receives, as arguments, the latest values (its own
-    included) whose names are parameters of its `forward`. A value that no turn has estimated yet is
-    not passed, so that the default of the parameter applies.
+    Each estimator has a turn, which may also have a corrector. One round runs all estimators in the
+    order given. An estimator receives the original signal, corrected by the correctors of all other
+    turns, each with the latest values of its own estimator. Correction always starts from the
+    original signal, so that errors of an early round do not remain in the data. An estimator also
+    receives, as arguments, the latest values (its own included) whose names are parameters of its
+    `forward`. A value that no turn has estimated yet is not passed, so that the default of the
+    parameter applies.
 
         Alternate(rounds=3, phase=Turn(autofocus, corrector), rotation=Turn(estimator))
 

@@ -160,7 +160,7 @@ class Chain(nn.Module):
             available |= {f"{name}.{key}" for key in getattr(stage, "provides", ())}
 
     def forward(self, x: Recording | Signal, given: Mapping[str, Tensor] | None = None) -> Signal:
-        """Run all stages.
+        """Run all stages of the chain on a recording or a signal.
 
         Args:
             x: Recording, whose side data are available as "aux.NAME", or a Signal.
@@ -207,7 +207,7 @@ class Chain(nn.Module):
     def rerun(
         self, trace: Trace, start: str, stop: str | None = None, given: Mapping[str, Tensor] | None = None
     ) -> Signal:
-        """Repeat some stages of the chain, beginning with the signal before them in a trace.
+        """Repeat consecutive stages on the signal that a trace holds before the first of them.
 
         Args:
             trace: Result of an earlier call of the method `trace`.

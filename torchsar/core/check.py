@@ -9,8 +9,8 @@ from torch import Tensor
 def refuse_non_finite(x: Tensor, what: str) -> None:
     """Raise ValueError if samples are NaN or infinite.
 
-    Valid data take the time of one sum over the samples. The check has no effect inside torch.vmap,
-    where values cannot be read.
+    For valid data the check takes the time of one sum over the samples. It has no effect inside
+    torch.vmap, where values cannot be read.
 
     Args:
         x: Samples of any shape, real or complex.

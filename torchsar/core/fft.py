@@ -28,7 +28,9 @@ def centred_fft(x: Tensor, dim: int = -1) -> Tensor:
 
 
 def centred_ifft(x: Tensor, dim: int = -1) -> Tensor:
-    """Compute the inverse of `centred_fft`.
+    """Compute the inverse Fourier transform of a spectrum whose phases refer to the middle sample.
+
+    x[i] = (1 / n) sum_f X(f) exp(2j pi f (i - n // 2)), the inverse of `centred_fft`.
 
     Args:
         x: Spectrum, any shape, frequencies rising, complex.
@@ -131,10 +133,10 @@ def block_bytes_of(device: torch.device) -> int:
 def over_blocks(work: Callable[[Any], None], parts: Iterable[Any], like: Tensor) -> None:
     """Call a function for every part of an array, in as many threads as torch uses.
 
-    Each thread processes its own parts with single-threaded operations. It therefore does not wait
-    for the slowest thread after every operation, which on a busy machine takes several times as
-    long as the work itself. Parts are processed one after another if there are fewer than two for
-    each thread, on an accelerator, and inside torch.func transforms. Not differentiable.
+    Each thread processes its own parts with single-threaded operations, and therefore does not wait
+    for the slowest thread after every operation. On a busy machine such waiting takes several times
+    as long as the work itself. Parts are processed one after another if there are fewer than two
+    for each thread, on an accelerator, and inside torch.func transforms. Not differentiable.
 
     Args:
         work: Function of one part, which writes its result into the array.

@@ -132,7 +132,7 @@ def linear_phasor(turns_per_step: Tensor, start: float, n: int, dtype: torch.dty
 
 
 def outer_phasor(fine: Tensor, coarse: Tensor, n: int) -> Tensor:
-    """Multiply the two tables of `phasor_tables` to the phasors of a linear phase.
+    """Multiply the two tables of `phasor_tables` into the phasors of a linear phase.
 
     Args:
         fine: Phasors of the first m elements, shape (..., m), complex.

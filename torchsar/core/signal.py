@@ -109,7 +109,7 @@ class Signal:
         return Signal(data, tuple(axes.get(axis.name, axis) for axis in self.axes))
 
     def crop(self, **bounds: tuple[int, int]) -> Signal:
-        """Return a part of the samples along some axes: `signal.crop(range=(0, 1480))`.
+        """Return a part of the samples along some axes, such as `signal.crop(range=(0, 1480))`.
 
         Args:
             **bounds: Pairs (first, last) by the name of the axis; samples first to last - 1 are

@@ -22,8 +22,7 @@ class UniformSpline:
 
     The result is that of scipy.interpolate.CubicSpline with default settings. Two values give a
     straight line, three a parabola. Outside the grid the polynomials of the first and last interval
-    continue.
-    Differentiable in the values and in the times of evaluation.
+    continue. Differentiable in the values and in the times of evaluation.
 
     Args:
         values: Values at the knots, shape (..., n) with n >= 2, float64; leading dimensions are

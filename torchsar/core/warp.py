@@ -104,8 +104,8 @@ def _factorials(k: Tensor) -> Tensor:
 def least_rate(k: Tensor, duration_s: float, points: int = 513) -> Tensor:
     """Return the lowest rotation rate during the observation relative to that at the first pulse.
 
-    Where it is zero or negative, the target turns back and has the same angle at two times, so that
-    no image can be formed.
+    Where it is zero or negative, the target stops or turns back, so that different times have the
+    same angle and no image can be formed.
 
     Args:
         k: Derivatives k1, k2, ... of the rotation rate at the first pulse divided by that rate, in

@@ -1,6 +1,7 @@
 """Gradient descent of a smooth cost per trial: L-BFGS and Adam.
 
-All trials are evaluated together; each has its own line search, its own history and its own end.
+All trials are evaluated together, but each has its own line search and history, and ends
+independently of the others.
 """
 
 from __future__ import annotations

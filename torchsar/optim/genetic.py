@@ -127,7 +127,16 @@ class _Breed:
         return box.at(self.dice.uniform("genetic first", (self.population, box.low.shape[-1])))
 
     def children(self, generation: int, x: Tensor, cost: Tensor) -> Tensor:
-        """Children (..., brood, n) of the ranked candidates x (..., population, n)."""
+        """Make the children of one generation by selection, crossover and mutation.
+
+        Args:
+            generation: Number of the generation, from 0 on.
+            x: Candidates in rising order of their costs, shape (..., population, n).
+            cost: Costs of the candidates, shape (..., population).
+
+        Returns:
+            Children within the bounds, shape (..., brood, n).
+        """
         at = f"genetic {generation}"
         box, n = self.dice.box, x.shape[-1]
         one, other = (pick(x, self._parents(f"{at} parent {i}", cost)) for i in range(2))

@@ -152,7 +152,7 @@ class FarField:
         return self.direction.shape[0]
 
     def range_m(self, pulses: slice, x: Tensor, y: Tensor) -> Tensor:
-        """Return the range of ground points in given pulses, relative to zero of the profiles.
+        """Return the range of ground points in given pulses, from range zero of the profiles on.
 
         Args:
             pulses: Slice of the pulses.
@@ -229,7 +229,7 @@ class Spotlight:
         return self.position_m.shape[0]
 
     def range_m(self, pulses: slice, x: Tensor, y: Tensor) -> Tensor:
-        """Return the range of ground points in given pulses, relative to zero of the profiles.
+        """Return the range of ground points in given pulses, from range zero of the profiles on.
 
         Args:
             pulses: Slice of the pulses.
@@ -314,12 +314,12 @@ def plane_wave_loss(
 ) -> PlaneWaveLoss:
     """Bound the displacement and defocus of a ground point by the plane-wave approximation.
 
-    With the elevation el and the azimuth a of the point from the line of sight, the neglected range
-    is d(a) = (rho^2 - (rho cos(el) cos(a))^2) / (2 R). Its mean over the aperture shifts the point
-    in range, and its slope shifts it in cross range. What no shift explains is d'' + d, with the
-    second derivative d'' in a; it is at most rho^2 (1 + cos(el)^2) / (2 R), and its phase at the
-    ends of the aperture is `defocus_rad`. The bounds hold for apertures below about 1 rad, and
-    leave out terms of order rho^3 / R^2.
+    With the elevation el of the line of sight and the azimuth a of the point relative to it, the
+    neglected range is d(a) = (rho^2 - (rho cos(el) cos(a))^2) / (2 R). Its mean over the aperture
+    shifts the point in range, and its slope shifts it in cross range. What no shift explains is
+    d'' + d, with the second derivative d'' in a; it is at most rho^2 (1 + cos(el)^2) / (2 R), and
+    its phase at the ends of the aperture is `defocus_rad`. The bounds hold for apertures below
+    about 1 rad, and leave out terms of order rho^3 / R^2.
 
     Args:
         radius_m: Distance rho of the point from the scene centre in metres.
