@@ -152,7 +152,9 @@ class FarField:
         return self.direction.shape[0]
 
     def range_m(self, pulses: slice, x: Tensor, y: Tensor) -> Tensor:
-        """Return the range of ground points in given pulses, from range zero of the profiles on.
+        """Return the range of ground points in given pulses.
+
+        Range is counted from range zero of the range profiles.
 
         Args:
             pulses: Slice of the pulses.
@@ -229,7 +231,9 @@ class Spotlight:
         return self.position_m.shape[0]
 
     def range_m(self, pulses: slice, x: Tensor, y: Tensor) -> Tensor:
-        """Return the range of ground points in given pulses, from range zero of the profiles on.
+        """Return the range of ground points in given pulses.
+
+        Range is counted from range zero of the range profiles.
 
         Args:
             pulses: Slice of the pulses.
