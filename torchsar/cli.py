@@ -1,4 +1,4 @@
-"""The command `torchsar`."""
+"""Command line of the program `torchsar`."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ _COMMANDS = {
     "run": "run an experiment and write its images, figures and report",
     "sweep": "run the Monte Carlo sweep of a config: many trials of every point of its grid",
     "requires": "show the requirements of the scene of a config on models and methods",
-    "trade": "measure the speed and the loss of the alternatives, relative to an exact yardstick",
+    "trade": "measure the time and the loss of alternative methods, relative to an exact reference",
 }
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line.
+    """Return the argument parser of the program `torchsar`.
 
     Returns:
-        Parser of all commands.
+        Parser of all commands and their options.
     """
     top = argparse.ArgumentParser(prog="torchsar", description="Synthetic aperture radar experiments from a config.")
     top.add_argument("--version", action="store_true", help="print the version and end")
@@ -65,14 +65,14 @@ def _positive(text: str) -> int:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command.
+    """Run one command of the program `torchsar`.
 
     Args:
-        arguments: Arguments after the name of the program; those of this process by default.
+        arguments: Command line after the name of the program; by default that of this process.
 
     Returns:
-        0; 1 if stdout was closed; 2 after an error message on stderr about invalid input; 130 if
-        interrupted.
+        Exit status: 0 after success, 1 if stdout was closed, 2 if the input is invalid (a message
+        on stderr says why), 130 if the user interrupted the command.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     options = _parse(given)
@@ -159,7 +159,7 @@ def _refuse_device(name: str, torch: Any) -> None:
         torch.zeros(1, dtype=torch.complex128, device=name).abs().item()
     except (RuntimeError, AssertionError, TypeError, ImportError) as error:
         reason = str(error).splitlines()[0].rstrip(".")
-        raise ConfigError(f"--device {name} cannot be used here: {reason}; leave it out to use the processor") from None
+        raise ConfigError(f"--device {name} cannot be used here: {reason}; leave it out to use the CPU") from None
 
 
 def _fail(sentence: str) -> int:
@@ -172,7 +172,9 @@ def _log_to_stderr() -> Iterator[None]:
     """Write the log of the program to stderr, each warning only once."""
     level = os.environ.get("TORCHSAR_LOG", "INFO").upper()
     if level not in logging.getLevelNamesMapping():
-        raise ConfigError(f"TORCHSAR_LOG={level} is no log level; choose DEBUG, INFO, WARNING or ERROR")
+        raise ConfigError(
+            f"the environment variable TORCHSAR_LOG={level} is no log level; choose DEBUG, INFO, WARNING or ERROR"
+        )
     log, handler, shown = logging.getLogger("torchsar"), logging.StreamHandler(), set[str]()
 
     def is_new(record: logging.LogRecord) -> bool:

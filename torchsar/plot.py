@@ -1,8 +1,8 @@
-"""Figures of images, curves and sweeps; the only module that imports the plotting library.
+"""Figures of images, curves and parameter sweeps; the only module that imports matplotlib.
 
-Each function that draws takes signals or arrays and returns a matplotlib Figure, or a list of them,
-one for each panel, so that a page can set the panels side by side or below each other. `save`
-writes either into one file.
+Each function that draws takes signals or arrays and returns a matplotlib Figure, or a list of
+Figures, one for each panel, so that a page can set the panels side by side or below each other.
+`save` writes a Figure or such a list into one file.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def decibel(x: Tensor | np.ndarray, reference: float | None = None) -> np.ndarra
         reference: Amplitude of 0 dB; by default the largest one.
 
     Returns:
-        Levels in dB, same shape, limited to -300 dB.
+        Levels in dB, same shape; lower levels than -300 dB are set to -300 dB.
     """
     amplitude = np.abs(x.detach().cpu().numpy() if isinstance(x, Tensor) else x)
     top = reference if reference is not None else float(amplitude.max(initial=0.0))
@@ -146,14 +146,14 @@ def quicklook(signal: Signal, largest: int = 900) -> Signal:
 
 
 def span(positions: Tensor, margin: float) -> tuple[float, float]:
-    """From the first to the last of some positions, with a margin on both sides.
+    """Return the interval from the lowest to the highest position, with a margin on both sides.
 
     Args:
         positions: Positions on an axis, any shape.
         margin: Distance in the unit of the axis.
 
     Returns:
-        First and last position, with the margin.
+        Lowest position minus the margin, and highest position plus the margin.
     """
     return float(positions.min()) - margin, float(positions.max()) + margin
 
@@ -179,15 +179,17 @@ def within(signal: Signal, spans: Mapping[str, tuple[float, float]]) -> Signal:
 
 
 def boxes(centres: Sequence[tuple[float, float]], half_x: float, half_y: float) -> tuple[np.ndarray, np.ndarray]:
-    """Outline rectangles about positions as one broken line, for `overlays`.
+    """Return the outlines of equal rectangles about some positions as one line with gaps.
+
+    The function `overlays` draws such a line over an image.
 
     Args:
-        centres: Positions (x, y).
-        half_x: Half width of the rectangles.
-        half_y: Half height of the rectangles.
+        centres: Positions (x, y) of the centres of the rectangles.
+        half_x: Half width of the rectangles in the unit of x.
+        half_y: Half height of the rectangles in the unit of y.
 
     Returns:
-        Coordinates x and y of the line, with NaN between the rectangles.
+        Coordinates x and y of the line, with NaN after each rectangle.
     """
     x, y = half_x * np.array([-1, 1, 1, -1, -1, np.nan]), half_y * np.array([-1, -1, 1, 1, -1, np.nan])
     at = np.asarray(centres, dtype=float).reshape(-1, 2)
@@ -195,14 +197,17 @@ def boxes(centres: Sequence[tuple[float, float]], half_x: float, half_y: float) 
 
 
 def alike(curves: Mapping[str, tuple[Any, Tensor]], largest: int = 4) -> list[dict[str, tuple[Any, Tensor]]]:
-    """Group curves whose largest values are within a decade, so that each panel shows its curves.
+    """Group curves by magnitude, so that all curves of a group can be seen in one panel.
+
+    The largest absolute values of the curves of a group differ by less than a factor of 10.
 
     Args:
         curves: Curves (x, y) by name; y, shape (n,), may have NaN.
         largest: Largest number of curves in a group.
 
     Returns:
-        Groups of curves, the smallest first; in each the largest curve first.
+        Groups of curves, those of the smallest values first; within a group the curve of the
+        largest values is first.
     """
     size = {name: float(torch.nan_to_num(y).abs().max()) for name, (_, y) in curves.items()}
     groups: list[list[str]] = []
@@ -237,11 +242,11 @@ def _to_scale(signal: Signal) -> float | None:
 
 
 def level(signal: Signal, percentile: float = 100.0, width: float = _PANEL) -> float:
-    """Compute the amplitude that is 0 dB in pictures of a signal.
+    """Compute the amplitude that pictures of a signal show as 0 dB.
 
     Args:
         signal: Signal with two axes; the first trial counts.
-        percentile: Percentile of the amplitude.
+        percentile: Percentile of the amplitude, 0 to 100, that is 0 dB; 100 is the peak.
         width: Width of the figure in inches, on which the averaging in blocks depends.
 
     Returns:
@@ -289,15 +294,15 @@ def _below(percentile: float) -> str:
 def image(signal: Signal, dynamic_range_db: float = 50.0, title: str = "", percentile: float = 99.9) -> Figure:
     """Draw an image or raw data in dB, range horizontal, azimuth or slow time vertical.
 
-    Both axes have one scale where both are in metres and the image is not too elongated. 0 dB is a
-    high percentile of the amplitude, so that a few bright ships do not darken the land; 100, the
-    peak, suits scenes of points. The first trial of a batch is drawn.
+    Both axes have one scale where they have the same unit and the image is not too elongated. 0 dB
+    is a high percentile of the amplitude, so that a few bright ships do not darken the land; the
+    percentile 100, the peak, suits scenes of points. The first trial of a batch is drawn.
 
     Args:
         signal: Signal with two axes, shape (..., azimuth, range).
-        dynamic_range_db: Lowest level, in dB below 0 dB.
+        dynamic_range_db: Range of levels shown in dB; everything lower is black.
         title: Title of the figure.
-        percentile: Percentile of the amplitude that is 0 dB.
+        percentile: Percentile of the amplitude, 0 to 100, that is 0 dB.
 
     Returns:
         The figure.
@@ -313,13 +318,13 @@ def images(
     percentile: float = 99.9,
     reference: str | None = None,
 ) -> list[Figure]:
-    """Draw several images on one scale of levels, a figure each.
+    """Draw several images with the same 0 dB amplitude, each into a figure of its own.
 
     Args:
         signals: Signals with two axes, by title; the first trial of each is drawn.
-        dynamic_range_db: Lowest level, in dB below 0 dB.
-        percentile: Percentile of the amplitude that is 0 dB.
-        reference: Title of the image whose percentile counts; by default the first.
+        dynamic_range_db: Range of levels shown in dB; everything lower is black.
+        percentile: Percentile of the amplitude, 0 to 100, that is 0 dB.
+        reference: Title of the image whose percentile is 0 dB; by default the first image.
 
     Returns:
         The figures, one for each signal.
@@ -334,7 +339,8 @@ def contours(signals: Mapping[str, Signal], levels_db: Sequence[float] = (-30, -
     """Draw lines of equal amplitude of several images, range horizontal, azimuth vertical.
 
     Args:
-        signals: Signals with two axes, by title; the first trial of each is drawn, a figure each.
+        signals: Signals with two axes, by title; the first trial of each is drawn into a figure of
+            its own.
         levels_db: Levels of the lines, in dB relative to the peak of each image, rising.
 
     Returns:
@@ -393,13 +399,14 @@ def short_time_spectrum(samples: Tensor, rate_hz: float, width: int = 64, hop: i
 
 @_styled
 def overlays(parts: Sequence[Mapping[str, Any]], dynamic_range_db: float = 40.0) -> list[Figure]:
-    """Draw images, each in dB of its own peak, with dashed lines over them.
+    """Draw images, each in dB relative to its own peak, with dashed lines over them.
 
     Args:
-        parts: Panels, a figure each. Each has `title`, `signal` with two axes, `lines`, a mapping
-            from names to (x, y), and may have `ylim`. A panel without `signal` has the arguments
-            of `curves`.
-        dynamic_range_db: Lowest level, in dB below the peak.
+        parts: One mapping for each figure, with the keys `title`, `signal` (with two axes), `lines`
+            (a mapping from names to pairs of coordinates (x, y)) and optionally `ylim`, the limits
+            of the vertical axis. A mapping without `signal` has the arguments of `curves` and draws
+            curves alone.
+        dynamic_range_db: Range of levels shown in dB below the peak; everything lower is black.
 
     Returns:
         The figures, one for each part.
@@ -471,9 +478,10 @@ def scatterers(
     title: str = "",
     aspect: Literal["equal", "auto"] = "equal",
 ) -> Figure:
-    """Draw the points of a scene by their positions.
+    """Draw the point scatterers of a scene at their positions.
 
-    With one scale on both axes, an axis with little extent or none shows a part of the other's.
+    With one scale on both axes, an axis along which the points hardly differ still shows at least a
+    quarter of the extent of the other axis.
 
     Args:
         x: Horizontal positions, shape (n,).
@@ -504,10 +512,10 @@ def scatterers(
 
 @_styled
 def panels(parts: Sequence[Mapping[str, Any]]) -> list[Figure]:
-    """Draw several panels of curves.
+    """Draw several panels of curves, each into a figure of its own.
 
     Args:
-        parts: Panels, a figure each, with the arguments of `curves`.
+        parts: One mapping for each panel, with the arguments of `curves`.
 
     Returns:
         The figures, one for each part.
@@ -552,14 +560,16 @@ def trade(
     title: str,
     tolerance: float | None = None,
 ) -> Figure:
-    """Draw loss over computing time: a numbered point for each alternative, and the Pareto front.
+    """Draw the loss of accuracy of alternative methods over their computing time.
 
-    Points on the front are filled; a step line joins them. Below the axes stand the names.
+    Each alternative is a numbered point, with its name in the legend below the axes. Points
+    for which no faster alternative has an equal or smaller loss form the Pareto front; they are
+    filled and joined by a step line.
 
     Args:
         names: Names of the alternatives.
-        seconds: Computing time of each, in seconds.
-        loss: Loss of each, in the unit of `ylabel`; less is better.
+        seconds: Computing time of each alternative, in seconds.
+        loss: Loss of each alternative, in the unit of `ylabel`; less is better.
         ylabel: Label of the vertical axis, with unit.
         title: Title of the figure.
         tolerance: Largest acceptable loss, drawn as a dashed line.
@@ -633,16 +643,17 @@ def error_curves(
     log_y: bool = False,
     ylim: tuple[float, float] | None = None,
 ) -> list[Figure]:
-    """Draw errors of algorithms with their intervals over one parameter.
+    """Draw the errors of algorithms, with their confidence intervals, over one parameter.
 
-    Numbers give lines with bands, words dots with bars; all panels have one vertical scale. Values
-    that are not finite, or not positive on a logarithmic axis, are left out, and so are panels
-    without any value.
+    If the values of the parameter are numbers, lines with bands are drawn; if they are words, dots
+    with bars. All panels have the same vertical scale. Values that are not finite, or not positive
+    on a logarithmic axis, are left out, and so are panels without any value.
 
     Args:
-        parts: Panels, a figure each. Each has `title`; `x`, numbers (n,) or words; `series`, a
-            mapping from names to values (n,) and intervals (n, 2); and `bounds`, a mapping from
-            names to values (n,), drawn dark and dashed.
+        parts: One mapping for each panel, with the keys `title`; `x`, the n values of the
+            parameter, numbers or words; `series`, a mapping from names to pairs of errors (n,) and
+            intervals (n, 2); and `bounds`, a mapping from names to values (n,), such as lower
+            bounds, drawn dark and dashed.
         xlabel: Label of the horizontal axes, with unit.
         ylabel: Label of the vertical axes, with unit.
         log_x: Whether the horizontal axes are logarithmic.
@@ -791,18 +802,19 @@ def heat_map(
     log: bool = False,
     limits: tuple[float, float] | None = None,
 ) -> list[Figure]:
-    """Draw coloured cells over two parameters, all panels on one colour scale.
+    """Draw values over two parameters as coloured cells, all panels on one colour scale.
 
-    Panels of few cells show their numbers. Values that are not finite, or not positive on a
-    logarithmic scale, stay white; panels without any value are left out.
+    In a panel of few cells, each cell also shows its value as a number. Values that are not finite,
+    or not positive on a logarithmic scale, stay white; panels without any value are left out.
 
     Args:
-        parts: Panels, a figure each. Each has `title`, `x` (n,), `y` (m,) and `z` (m, n).
+        parts: One mapping for each panel, with the keys `title`, `x` (n,) and `y` (m,), the values
+            of the two parameters, and `z` (m, n), the values that are drawn.
         xlabel: Label of the horizontal axes, with unit.
         ylabel: Label of the vertical axes, with unit.
         label: Label of the colour scale, with unit.
         log: Whether the colour scale is logarithmic.
-        limits: Ends of the colour scale; by default those of the values.
+        limits: Lowest and highest value of the colour scale; by default those of the values drawn.
 
     Returns:
         The figures, one for each part that has values.
@@ -849,10 +861,10 @@ def _label_cells(axes: Axes, part: Mapping[str, Any], z: np.ndarray, norm: Norma
 
 
 def save(figure: Figure | Sequence[Figure], path: Any, dpi: int = 120, columns: int = 2) -> None:
-    """Write a figure to a file, or several as one picture.
+    """Write one figure, or several figures as one picture, to a file.
 
     Args:
-        figure: Figure to write, or panels that are set side by side, row by row.
+        figure: Figure to write, or several, which are set side by side, row by row.
         path: Path of the file; its suffix gives the format.
         dpi: Resolution in dots per inch.
         columns: Number of panels in a row.

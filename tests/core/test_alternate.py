@@ -155,11 +155,14 @@ def test_invalid_alternations_raise() -> None:
         both(0)
     with pytest.raises(
         ValueError,
-        match=r"the turn 'dependent' needs \['slope'\] in the first round, but the turns before it provide nothing",
+        match=r"the estimator 'dependent' needs the values \['slope'\] in the first round, "
+        "but the estimators before it provide nothing",
     ):
         Alternate(dependent=Turn(Dependent()), slope=Turn(Slope()))
     with pytest.raises(
-        ValueError, match=r"the corrector of the turn 'slope' needs \['mean'\], which its estimator does not provide"
+        ValueError,
+        match=r"the corrector of the estimator 'slope' needs the values \['mean'\], "
+        "which this estimator does not provide",
     ):
         Alternate(slope=Turn(Slope(), WithoutMean()), mean=Turn(Mean()))
     assert Alternate(slope=Turn(Slope()), dependent=Turn(Dependent())).provides == ("slope", "copy")

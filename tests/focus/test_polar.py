@@ -124,7 +124,7 @@ def test_dtypes_are_kept_and_never_mixed():
         TypeError, match=r"built for torch.complex64, got torch.complex128; build it with dtype=torch.complex128"
     ):
         single.image(x)
-    with pytest.raises(TypeError, match="expected complex64 or complex128, got torch.float64"):
+    with pytest.raises(TypeError, match="must be complex64 or complex128, got torch.float64"):
         double.image(x.real)
     with pytest.raises(ValueError, match=r"do not end in the \(pulse, frequency\) = \(11, 14\)"):
         double.image(x[:, :5])

@@ -246,7 +246,7 @@ def test_stage_in_a_chain_takes_recorded_side_data():
 
 def test_invalid_arguments_raise():
     geometry, x = spotlight(), profiles()
-    with pytest.raises(ValueError, match=r"need frequency_hz and either angle_rad or position_m .* got none of them"):
+    with pytest.raises(ValueError, match=r"needs frequency_hz and either angle_rad or position_m .* got none of them"):
         SpotlightBackprojection(8.0, 2.0)(Signal(x, InverseRadar(9.3e9, 96e6, 1.0).raw_axes(9, 12)))
     with pytest.raises(ValueError, match=r"got \['frequency_hz', 'angle_rad', 'position_m'\]"):
         geometry_of(FREQUENCY, torch.zeros(9), geometry.position_m)

@@ -65,8 +65,8 @@ def test_candidates_stay_in_the_box() -> None:
     [
         ({"population": 3}, "population is 3"),
         ({"strategy": "rand2"}, "'rand1bin' or 'best1bin'"),
-        ({"weight": 0.0}, "weight is 0"),
-        ({"crossover": -0.1}, "a probability of crossover in 0..1"),
+        ({"weight": 0.0}, "weight must be above 0 .* got weight=0"),
+        ({"crossover": -0.1}, "crossover must be a probability in 0..1"),
     ],
 )
 def test_invalid_settings_raise(options: dict, message: str) -> None:

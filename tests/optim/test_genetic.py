@@ -101,10 +101,10 @@ def test_float32_is_kept() -> None:
     ("options", "message"),
     [
         ({"population": 1}, "population is 1"),
-        ({"elites": 30}, "leave no children"),
+        ({"elites": 30}, "elites must be fewer than population=30"),
         ({"elites": 0}, "elites is 0"),
         ({"selection": "rank"}, "'tournament' or 'roulette'"),
-        ({"crossover": 1.5}, "choose probabilities in 0..1"),
+        ({"crossover": 1.5}, "must be probabilities in 0..1"),
         ({"draws": Draws(1, trials=range(5))}, "draws for 5 trials"),
     ],
 )
@@ -123,5 +123,5 @@ def test_invalid_boxes_and_objectives_raise() -> None:
         genetic(sphere, low.long(), high, draws=Draws(1))
     with pytest.raises(ValueError, match="same number of unknowns"):
         genetic(sphere, low, high[..., :2], draws=Draws(1))
-    with pytest.raises(ValueError, match="one real cost each"):
+    with pytest.raises(ValueError, match="one real cost for each candidate"):
         genetic(lambda x: x, low, high, draws=Draws(1))

@@ -1,4 +1,4 @@
-"""Alternation between estimators, each on data corrected with the results of the others."""
+"""Alternation between estimators; each works on data corrected with the results of the others."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchsar.core.stage import Stage
 
 @dataclass(frozen=True)
 class Turn:
-    """One estimator of `Alternate`, with the stage that corrects the data with its values.
+    """One estimator of `Alternate`, with the stage that corrects the data by its estimated values.
 
     Args:
         estimator: Stage that returns an Estimate.
@@ -30,17 +30,20 @@ class Turn:
 class Alternate(Stage):
     """Joint estimate of several effects, by running one estimator for each of them in turn.
 
-    One round runs all estimators in the order given. Each receives the original signal after the
-    correctors of all other turns, every corrector with the latest values of its own estimator.
-    Correction always starts from the original signal, so that errors of an early round do not
-    remain in the data. An estimator also receives those of the latest values, its own among them,
-    that are parameters of its `forward`; a value that no turn has estimated yet is left out.
+    Each estimator has a turn, which may also have a corrector. One round runs all estimators in the
+    order given. An estimator receives the original signal, corrected by the correctors of all other
+    turns, each with the latest values of its own estimator. Correction always starts from the
+    original signal, so that errors of an early round do not remain in the data. An estimator also
+    receives, as arguments, the latest values (its own included) whose names are parameters of its
+    `forward`. A value that no turn has estimated yet is not passed, so that the default of the
+    parameter applies.
 
         Alternate(rounds=3, phase=Turn(autofocus, corrector), rotation=Turn(estimator))
 
     Args:
         rounds: Number of rounds, at least one.
-        **turns: Two or more turns by name, in the order in which they run.
+        **turns: Two or more objects `Turn` (estimator and corrector) by name, in the order in which
+            they run.
 
     Raises:
         ValueError: If there are fewer than two turns or less than one round, if an estimator needs
@@ -71,8 +74,9 @@ class Alternate(Stage):
             missing = [p.name for p in _parameters(estimator) if p.default is p.empty and p.name not in available]
             if missing:
                 raise ValueError(
-                    f"the turn {name!r} needs {missing} in the first round, but the turns before it provide "
-                    f"{sorted(available) or 'nothing'}; change the order of the turns, or give the parameter a default"
+                    f"Alternate: the estimator {name!r} needs the values {missing} in the first round, but the "
+                    f"estimators before it provide {sorted(available) or 'nothing'}; change the order of the "
+                    "estimators, or give these parameters of its `forward` a default"
                 )
             available |= set(getattr(estimator, "provides", ()))
         for name, corrector in self.correctors.items():
@@ -81,19 +85,21 @@ class Alternate(Stage):
             )
             if missing:
                 raise ValueError(
-                    f"the corrector of the turn {name!r} needs {sorted(missing)}, which its estimator does not provide"
+                    f"Alternate: the corrector of the estimator {name!r} needs the values {sorted(missing)}, which "
+                    "this estimator does not provide"
                 )
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate the values of all turns.
+        """Run all rounds of the alternating estimators and merge their last estimates into one.
 
         Args:
             signal: Signal on the axes that the estimators and correctors work on.
 
         Returns:
-            Values and standard deviations of all turns; of a name that several turns provide, those
-            of the last. `quality` is the lowest of the turns. `ok` is False where any of the turns
-            is unreliable. Keys of `info` begin with the name of the turn.
+            Estimate with the values and standard deviations of all estimators; where several
+            provide the same name, the last of them counts. Per trial, `quality` is the lowest of
+            the qualities, and `ok` is False where any of the estimators is unreliable. Keys of
+            `info` are "TURN.KEY", with the name of the turn in front.
         """
         found: dict[str, Estimate] = {}
         for _ in range(self.rounds):

@@ -15,9 +15,9 @@ _DUAL_NAME = {"pulse": "doppler", "range": "range_frequency"}
 class Axis:
     """Uniform sampling grid of one dimension: sample i lies at `start + i * step`.
 
-    Axes of raw data are `pulse` (slow time in s) and `range` (slant range in m), those of an image
-    `azimuth` and `range` (both in m). A frequency axis made by `dual` keeps the origin of the axis
-    that it came from, so that the inverse transform restores it.
+    Raw data have the axes `pulse` (slow time in s) and `range` (slant range in m), images the axes
+    `azimuth` and `range` (both in m). A frequency axis made by `dual` keeps the `start` of the axis
+    from which it was made, so that the inverse transform restores that axis.
 
     Args:
         name: Name of the axis.
@@ -25,8 +25,8 @@ class Axis:
         start: Coordinate of the first sample, in `unit`.
         step: Distance between samples, in `unit`, positive.
         unit: Unit of the coordinates, such as "s", "m" or "Hz".
-        dual_start: Of a frequency axis, the `start` of the axis that it came from; None for any
-            other.
+        dual_start: For a frequency axis made by `dual`, the `start` of the axis from which it was
+            made; None for all other axes.
 
     Raises:
         ValueError: If there is no sample, or the step is not positive.
@@ -64,8 +64,8 @@ class Axis:
     def offsets(self, device: torch.device | str | None = None) -> Tensor:
         """Return the coordinates of all samples relative to the first one.
 
-        Form phases from these differences rather than from `values`: a large `start` costs
-        precision.
+        Compute phases from these differences rather than from `values`, which lose precision where
+        `start` is large.
 
         Args:
             device: Device of the result.
@@ -87,28 +87,31 @@ class Axis:
         return (torch.as_tensor(value, dtype=torch.float64) - self.start) / self.step
 
     def part(self, first: int, last: int) -> Axis:
-        """Return the axis of the samples `first` to `last - 1`; indices outside 0..n extend it.
+        """Return the axis of the samples with the indices `first` to `last - 1`.
+
+        An index below 0 or above the number of samples extends the axis on that side.
 
         Args:
-            first: Index of the first sample that is kept.
-            last: Index after the last sample that is kept.
+            first: Index of the first sample of the result.
+            last: Index after the last sample of the result.
         """
         return replace(self, n=last - first, start=self.start + first * self.step)
 
     def resampled(self, factor: int) -> Axis:
-        """Return the axis after band-limited interpolation.
+        """Return the axis of the samples after band-limited interpolation by a whole factor.
 
         Args:
-            factor: Number of new samples for each old one.
+            factor: Number of new samples for each old one, at least 1.
         """
         return replace(self, n=self.n * factor, step=self.step / factor)
 
     def dual(self) -> Axis:
-        """Return the frequency axis of a centred transform, or the original of a frequency axis.
+        """Return the axis after a centred Fourier transform along this axis.
 
         Returns:
-            Frequencies in cycles per unit (Hz for s, 1/m for m), rising, with zero at sample n //
-            2. The dual of `pulse` is `doppler`, that of `range` is `range_frequency`.
+            Frequency axis in cycles per unit (Hz for s, 1/m for m), rising, with zero at sample
+            n // 2; `pulse` becomes `doppler` and `range` becomes `range_frequency`. For a frequency
+            axis made by `dual`, the original axis.
         """
         step = 1.0 / (self.n * self.step)
         if self.dual_start is not None:

@@ -15,7 +15,7 @@ from torchsar.core.signal import Recording, Signal
 
 
 class Use(nn.Module):
-    """Stage together with the sources of the values that it takes; made by `use`.
+    """Stage together with the sources of its keyword values; made by the function `use`.
 
     Args:
         stage: Stage whose `forward` takes the values.
@@ -51,7 +51,7 @@ def use(stage: nn.Module, **names: str) -> Use:
         if not isinstance(source, str):
             raise TypeError(
                 f"{parameter}={source!r}: `use` connects values by name, such as "
-                f"{parameter}='doppler'; a constant belongs to the constructor of the stage"
+                f"{parameter}='doppler'; pass a constant to the constructor of the stage instead"
             )
     return Use(
         stage, {parameter: source if "." in source else f"{source}.{parameter}" for parameter, source in names.items()}
@@ -65,7 +65,7 @@ class Trace:
     Args:
         inputs: Signal before each stage.
         outputs: Signal after each stage.
-        estimates: Estimate of each stage that returned one.
+        estimates: Estimates of the stages that returned an Estimate.
         values: Estimated and given values under "STAGE.VALUE", side data under "aux.NAME".
         seconds: Wall time of each stage, in seconds.
         bytes: Size of the samples after each stage, in bytes.
@@ -98,11 +98,12 @@ class _Log:
 class Chain(nn.Module):
     """Sequence of stages that run in order and pass estimates to later stages as named values.
 
-    `chain(x)` returns the signal after the last stage, `chain.trace(x)` every intermediate result.
-    `chain.rerun(trace, start, given={"velocity.velocity_m_s": v})` repeats the stages from `start`
-    on with some values replaced. It is differentiable and always begins with the signal of the
-    trace, so it can serve as the objective of a minimum-entropy search. A stage that returns only
-    an Estimate leaves the signal unchanged. Connections made by `use` are checked at construction.
+    `chain(x)` returns the signal after the last stage, and `chain.trace(x)` a Trace of all
+    intermediate results. `chain.rerun(trace, start, given={"velocity.velocity_m_s": v})` repeats
+    the stages from `start` on with some values replaced. A rerun always begins with the signal that
+    the trace holds before `start`, and it is differentiable, so that it can serve as the objective
+    of a minimum-entropy search. A stage that returns only an Estimate leaves the signal unchanged.
+    Connections made by `use` are checked when the chain is built.
 
     Args:
         **stages: Stages by name, in the order in which they run; `use` connects their parameters.
@@ -136,8 +137,8 @@ class Chain(nn.Module):
             for parameter, source in self.uses[name].items():
                 if parameter not in accepted:
                     raise ValueError(
-                        f"stage {name!r} ({type(stage).__name__}) has no value {parameter!r} to connect; it "
-                        f"accepts {accepted or 'none'}"
+                        f"stage {name!r} ({type(stage).__name__}) has no value {parameter!r} to connect; its "
+                        f"`forward` accepts {accepted or 'none'}"
                     )
                 if not source.startswith(("aux.", "given.")) and source not in available:
                     raise ValueError(
@@ -159,19 +160,21 @@ class Chain(nn.Module):
             available |= {f"{name}.{key}" for key in getattr(stage, "provides", ())}
 
     def forward(self, x: Recording | Signal, given: Mapping[str, Tensor] | None = None) -> Signal:
-        """Run all stages.
+        """Run all stages of the chain on a recording or a signal.
 
         Args:
             x: Recording, whose side data are available as "aux.NAME", or a Signal.
-            given: Values by name ("STAGE.VALUE" or "aux.NAME") that replace those estimated or
-                recorded. A stage does not run at all, even if it would change the signal, where
-                `given` holds every value that it provides.
+            given: Values by name. "STAGE.VALUE" and "aux.NAME" replace estimated and recorded
+                values; "given.NAME" sets a value that a stage takes from the caller. A stage for
+                which `given` holds every value that it provides does not run at all, even if it
+                would change the signal.
 
         Returns:
             Signal after the last stage.
 
         Raises:
-            KeyError: If a given value has an unknown name, or a connected value is missing.
+            KeyError: If a given value has an unknown name, or a value that a stage is connected to
+                is missing.
             TypeError: If x is neither a Recording nor a Signal, or a stage returns anything else
                 than a Signal, an Estimate or a pair of both.
         """
@@ -180,15 +183,20 @@ class Chain(nn.Module):
         return self._run(list(self.stages), signal, {**aux, **(given or {})}, set(given or {}), None)
 
     def trace(self, x: Recording | Signal, given: Mapping[str, Tensor] | None = None) -> Trace:
-        """Run all stages and return every intermediate result, with times and sizes.
+        """Run all stages of the chain and return every intermediate result, with times and sizes.
 
         Args:
-            x: As in `forward`.
-            given: As in `forward`.
+            x: Recording, whose side data are available as "aux.NAME", or a Signal.
+            given: Values by name that replace those estimated or recorded, as in `forward`.
+
+        Returns:
+            Trace with the signals, estimates, values, wall times and sizes of all stages.
 
         Raises:
-            KeyError: As in `forward`.
-            TypeError: As in `forward`.
+            KeyError: If a given value has an unknown name, or a value that a stage is connected to
+                is missing.
+            TypeError: If x is neither a Recording nor a Signal, or a stage returns anything else
+                than a Signal, an Estimate or a pair of both.
         """
         signal, aux = _split(x)
         self._refuse_unknown(given, aux)
@@ -199,10 +207,10 @@ class Chain(nn.Module):
     def rerun(
         self, trace: Trace, start: str, stop: str | None = None, given: Mapping[str, Tensor] | None = None
     ) -> Signal:
-        """Repeat some stages on the signal that entered the first of them in a trace.
+        """Repeat consecutive stages on the signal that a trace holds before the first of them.
 
         Args:
-            trace: Result of `trace`.
+            trace: Result of an earlier call of the method `trace`.
             start: Name of the first stage to repeat.
             stop: Name of the last stage to repeat; by default the last one of the chain.
             given: Values by name that replace those of the trace.
@@ -217,15 +225,16 @@ class Chain(nn.Module):
         return self._run(part, trace.inputs[start], values, set(given or {}), None)
 
     def retrace(self, trace: Trace, start: str, given: Mapping[str, Tensor] | None = None) -> Trace:
-        """Repeat the stages from one of them to the end and return every intermediate result.
+        """Repeat the last stages of the chain and return a new trace with their results.
 
         Args:
-            trace: Result of `trace`.
+            trace: Result of an earlier call of the method `trace`.
             start: Name of the first stage to repeat.
             given: Values by name that replace those of the trace.
 
         Returns:
-            Signals before `start` as in `trace`, and all results of the repeated stages.
+            Trace with all results of the repeated stages. Of the stages before `start` it holds
+            the signals and values of `trace`, but neither estimates nor times nor sizes.
 
         Raises:
             KeyError: If a stage or a given value has an unknown name.
@@ -243,10 +252,12 @@ class Chain(nn.Module):
         names = list(self.stages)
         for name in (start, stop or start):
             if name not in names:
-                raise KeyError(f"the chain has the stages {names}, not {name!r}")
+                raise KeyError(f"the chain has no stage {name!r}; its stages are {names}")
         unknown = set(given or {}) - set(trace.values)
         if unknown:
-            raise KeyError(f"given {sorted(unknown)}, but the trace holds the values {sorted(trace.values)}")
+            raise KeyError(
+                f"`given` has unknown names {sorted(unknown)}; the trace has the values {sorted(trace.values)}"
+            )
         part = names[names.index(start) : names.index(stop) + 1 if stop else None]
         return part, {**trace.values, **(given or {})}
 
@@ -258,7 +269,7 @@ class Chain(nn.Module):
         available |= {source for names in self.uses.values() for source in names.values()}
         unknown = set(given or {}) - available
         if unknown:
-            raise KeyError(f"given {sorted(unknown)}, but the chain has the values {sorted(available)}")
+            raise KeyError(f"`given` has unknown names {sorted(unknown)}; the chain has the values {sorted(available)}")
 
     def _run(
         self, names: list[str], signal: Signal, values: dict[str, Tensor], held: set[str], log: _Log | None
@@ -283,7 +294,8 @@ class Chain(nn.Module):
         for parameter, source in self.uses[name].items():
             if source not in values:
                 raise KeyError(
-                    f"stage {name!r} needs {source!r} for {parameter!r}, but the values are {sorted(values)}"
+                    f"stage {name!r} needs the value {source!r} for its parameter {parameter!r}, but the only values "
+                    f"of this run are {sorted(values)}"
                 )
             arguments[parameter] = values[source]
         result = stage(signal, **arguments)

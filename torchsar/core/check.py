@@ -9,7 +9,8 @@ from torch import Tensor
 def refuse_non_finite(x: Tensor, what: str) -> None:
     """Raise ValueError if samples are NaN or infinite.
 
-    Costs one sum over valid data. Has no effect inside torch.vmap, where values cannot be read.
+    For valid data the check takes the time of one sum over the samples. It has no effect inside
+    torch.vmap, where values cannot be read.
 
     Args:
         x: Samples of any shape, real or complex.
@@ -31,5 +32,5 @@ def refuse_non_finite(x: Tensor, what: str) -> None:
         first = tuple(int(i) for i in bad.nonzero()[0])
         raise ValueError(
             f"{what}: {count} of {x.numel()} samples are NaN or Inf, the first at index {first}; "
-            "mark such lines as missing or correct the reader"
+            "set missing samples to zero, or correct the code that reads the data"
         )

@@ -12,10 +12,10 @@ from torch import Tensor
 
 
 def generator_at(*address: str | int) -> np.random.Generator:
-    """Return the random generator of an address.
+    """Return a random generator that is fixed by an address of texts and whole numbers.
 
     The address is hashed (BLAKE2b) to the key of a counter-based generator (Philox), so that equal
-    addresses give equal numbers and different addresses independent ones.
+    addresses give equal numbers, and different addresses give independent numbers.
 
     Args:
         *address: Text and whole numbers, such as seed, purpose, case and trial.
@@ -39,14 +39,14 @@ class Draws:
 
     Args:
         seed: Seed of the whole study.
-        case: Text or number of a point in parameter space, such as a hash of its parameters, so
-            that a point keeps its numbers when a grid grows. A tuple has one case per trial, for a
-            batch that holds several points.
+        case: Text or number that identifies a point in parameter space, such as a hash of its
+            parameters, so that the point keeps its random numbers when further points are added to
+            a sweep. A tuple has one case per trial, for a batch that holds several points.
         trials: Indices of the trials of this chunk, which become the leading dimension. None draws
             a single trial without that dimension, with the numbers of trial 0.
 
     Raises:
-        ValueError: If a tuple of cases and the trials differ in number.
+        ValueError: If the case is a tuple whose length is not the number of trials.
     """
 
     seed: int
@@ -56,24 +56,24 @@ class Draws:
     def __post_init__(self) -> None:
         if isinstance(self.case, tuple) and (self.trials is None or len(self.case) != len(self.trials)):
             raise ValueError(
-                f"draws for {len(self.case)} cases need as many trials, got "
-                f"{None if self.trials is None else len(self.trials)}; name one case for all of them "
-                "or one for each"
+                f"Draws with a tuple of {len(self.case)} cases need as many trials, got "
+                f"{None if self.trials is None else len(self.trials)}; give one case for all trials, "
+                "or a tuple with one case per trial"
             )
 
     def for_trials(self, trials: Sequence[int]) -> Draws:
-        """Return the same source for other trials.
+        """Return a source of random numbers with this seed and case, but for other trials.
 
         Args:
             trials: Indices of the trials.
 
         Raises:
-            ValueError: If there is a tuple of cases and it differs from the trials in number.
+            ValueError: If the case is a tuple whose length is not the number of trials.
         """
         return replace(self, trials=trials)
 
     def part(self, name: str) -> Draws:
-        """Return an independent source for a named part of a scene.
+        """Return an independent source of random numbers for a named part of a scene.
 
         Two parts of one kind, such as two areas of speckle, draw the same numbers unless their
         sources have different names.
@@ -109,14 +109,14 @@ class Draws:
         """Draw standard normal numbers.
 
         Args:
-            purpose: Name of the quantity, part of the address.
-            shape: Shape of one trial.
+            purpose: Name of the quantity; different names give independent numbers.
+            shape: Shape of the numbers of one trial.
             dtype: Real or complex dtype of the result.
             device: Device of the result.
 
         Returns:
-            Numbers of shape (trial, *shape) with mean zero and unit variance; for a complex dtype
-            circular, with unit mean square magnitude.
+            Numbers of shape (trial, *shape) with mean zero and unit variance. For a complex dtype
+            they are circular Gaussian, with a mean square magnitude of one.
         """
         if dtype.is_complex:
             parts = self._stack(
@@ -139,8 +139,8 @@ class Draws:
         """Draw numbers that are uniform between two limits.
 
         Args:
-            purpose: Name of the quantity, part of the address.
-            shape: Shape of one trial.
+            purpose: Name of the quantity; different names give independent numbers.
+            shape: Shape of the numbers of one trial.
             low: Lower limit.
             high: Upper limit.
             dtype: Dtype of the result.
@@ -157,7 +157,7 @@ class Draws:
         """Draw k of the whole numbers 0 to n - 1 without repetition.
 
         Args:
-            purpose: Name of the quantity, part of the address.
+            purpose: Name of the quantity; different names give independent numbers.
             n: Number of whole numbers to choose from.
             k: Number of whole numbers to choose.
             device: Device of the result.
@@ -170,16 +170,16 @@ class Draws:
     def permutation(self, purpose: str, n: int | Sequence[int], device: torch.device | str | None = None) -> Tensor:
         """Draw the whole numbers 0 to n - 1 in random order.
 
-        `subset` is the first k of them at the same address, sorted.
+        For the same purpose, `subset` returns the first k of these numbers, sorted.
 
         Args:
-            purpose: Name of the quantity, part of the address.
-            n: Number of whole numbers, one for all trials or one for each.
+            purpose: Name of the quantity; different names give independent numbers.
+            n: Number of whole numbers: an int for all trials, or a sequence with one int per trial.
             device: Device of the result.
 
         Returns:
-            Numbers of shape (trial, largest n), int64; a shorter row ends in the numbers from its
-            own n on, in rising order.
+            Numbers of shape (trial, largest n), int64. The row of a trial with a smaller n is
+            filled up with the whole numbers from that n on, in rising order.
         """
         generators = self._generators(purpose)
         counts = [n] * len(generators) if isinstance(n, int) else list(n)

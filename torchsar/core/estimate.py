@@ -19,11 +19,12 @@ class Estimate:
     Args:
         value: Estimated values by name. Names end in the unit, such as `doppler_hz` of shape (...,)
             or `phase_rad` of shape (..., pulse). Finite even where `ok` is False.
-        quality: Shape (...,), from 0 (unusable) to 1; each estimator defines its measure.
+        quality: Quality from 0 (unusable) to 1, shape (...,); each estimator defines how it is
+            measured.
         ok: Bool, shape (...,); False where the estimate is unreliable.
-        std: Predicted standard deviations, with the names, shapes and units of the values; present
-            only where theory gives one.
-        info: Further tensors for reports.
+        std: Predicted standard deviations, with the names, shapes and units of the values; only for
+            those values whose standard deviation theory predicts.
+        info: Further tensors by name, for reports.
 
     Raises:
         ValueError: If `ok` is not a bool tensor with the shape of `quality`.
@@ -38,8 +39,8 @@ class Estimate:
     def __post_init__(self) -> None:
         if self.ok.dtype != torch.bool or self.ok.shape != self.quality.shape:
             raise ValueError(
-                f"an estimate needs a bool `ok` shaped like `quality`, got {self.ok.dtype} "
-                f"{tuple(self.ok.shape)} and {tuple(self.quality.shape)}"
+                f"an Estimate needs a bool tensor `ok` of the shape of `quality`, got `ok` of {self.ok.dtype} with "
+                f"shape {tuple(self.ok.shape)} and `quality` with shape {tuple(self.quality.shape)}"
             )
 
     def __getitem__(self, name: str) -> Tensor:
@@ -72,7 +73,7 @@ class Estimate:
 
 
 def settle(value: Tensor, fallback: Tensor | float) -> tuple[Tensor, Tensor]:
-    """Replace values that are not finite.
+    """Replace values that are not finite by a fallback.
 
     Args:
         value: Values of any shape, float.

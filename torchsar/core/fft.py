@@ -28,7 +28,9 @@ def centred_fft(x: Tensor, dim: int = -1) -> Tensor:
 
 
 def centred_ifft(x: Tensor, dim: int = -1) -> Tensor:
-    """Compute the inverse of `centred_fft`.
+    """Compute the inverse Fourier transform of a spectrum whose phases refer to the middle sample.
+
+    x[i] = (1 / n) sum_f X(f) exp(2j pi f (i - n // 2)), the inverse of `centred_fft`.
 
     Args:
         x: Spectrum, any shape, frequencies rising, complex.
@@ -41,10 +43,10 @@ def centred_ifft(x: Tensor, dim: int = -1) -> Tensor:
 
 
 def fft_lines(x: Tensor, inverse: bool = False, n: int | None = None) -> Tensor:
-    """Compute the FFT along dim -2 with rounding that does not depend on the number of trials.
+    """Compute the FFT along dim -2, bit for bit the same for any number of trials.
 
-    torch.fft.fft along dim -2 treats a single matrix and a batch differently, so that the last bits
-    of its results differ. Differentiable.
+    torch.fft.fft along dim -2 treats a single matrix and a batch differently, so that its results
+    for the two differ in the last bits. Differentiable.
 
     Args:
         x: Samples, shape (..., line, range), complex.
@@ -100,7 +102,7 @@ def to_frequency(signal: Signal, name: str) -> Signal:
 
 
 def from_frequency(signal: Signal, name: str) -> Signal:
-    """Compute the inverse of `to_frequency`, which restores the original axis.
+    """Transform a frequency axis back to the original axis; the inverse of `to_frequency`.
 
     Args:
         signal: Signal with a frequency axis made by `to_frequency`.
@@ -122,7 +124,8 @@ def block_bytes_of(device: torch.device) -> int:
         device: Device of the array.
 
     Returns:
-        Bytes: 1 MiB on a CPU, which stays in the cache of a core, 256 MiB on an accelerator.
+        Size in bytes: 1 MiB on a CPU, which stays in the cache of a core, or 256 MiB on an
+        accelerator.
     """
     return 1 << 20 if device.type == "cpu" else 1 << 28
 
@@ -130,15 +133,15 @@ def block_bytes_of(device: torch.device) -> int:
 def over_blocks(work: Callable[[Any], None], parts: Iterable[Any], like: Tensor) -> None:
     """Call a function for every part of an array, in as many threads as torch uses.
 
-    Each thread processes its own parts with single-threaded operations, so that none waits for the
-    slowest thread after every operation; on a busy machine that costs several times the work
-    itself. Parts are processed one after another if there are fewer than two for each thread, on an
-    accelerator, and inside torch.func transforms. Not differentiable.
+    Each thread processes its own parts with single-threaded operations, and therefore does not wait
+    for the slowest thread after every operation. On a busy machine such waiting takes several times
+    as long as the work itself. Parts are processed one after another if there are fewer than two
+    for each thread, on an accelerator, and inside torch.func transforms. Not differentiable.
 
     Args:
         work: Function of one part, which writes its result into the array.
         parts: Parts of the array, in any form that `work` accepts.
-        like: The array; decides whether threads can be used.
+        like: The array, whose device and storage decide whether threads can be used.
     """
     parts, threads = list(parts), torch.get_num_threads()
     if threads == 1 or len(parts) < 2 * threads or like.device.type != "cpu" or not _has_storage(like):
@@ -175,16 +178,16 @@ def transform_in_blocks(
 ) -> Tensor:
     """Compute an FFT along dim -1 or -2 in blocks that stay in the cache.
 
-    Along dim -2 a few columns at a time are gathered, transformed and written back: two to four
-    times as fast as one call for the large array, and without a second array if `out` is
+    Along dim -2 a few columns at a time are gathered, transformed and written back. This is two to
+    four times as fast as one call for the large array, and needs no second array if `out` is
     contiguous. Not differentiable.
 
     Args:
         x: Samples, shape (..., line, range), complex.
-        dim: -1 or -2.
+        dim: Dimension to transform, -1 or -2.
         inverse: Whether to compute the inverse transform.
-        out: Array for the result, of the shape of x; by default x itself.
-        block_bytes: Size of a block; by default that of `block_bytes_of`.
+        out: Array for the result, of the shape of x; by default x itself, which is overwritten.
+        block_bytes: Size of a block in bytes; by default the result of `block_bytes_of`.
 
     Returns:
         `out`, in FFT order.
@@ -210,8 +213,8 @@ def transform_in_blocks(
 def spectrum_in_blocks(x: Tensor) -> Tensor:
     """Compute the two-dimensional FFT in blocks that stay in the cache.
 
-    Trials that fit the cache are transformed whole, larger ones along one dimension after the
-    other. Not differentiable.
+    A trial that fits the cache is transformed by one two-dimensional FFT, a larger one along the
+    range first and then along the pulses, in blocks. Not differentiable.
 
     Args:
         x: Samples, shape (..., pulse, range), complex.

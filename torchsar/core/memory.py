@@ -1,4 +1,4 @@
-"""Peak memory of a piece of work."""
+"""Measurement of the peak memory of a block of code."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ import torch
 
 
 class PeakMemory:
-    """Context that measures the memory which the work inside it adds at most.
+    """Context manager that measures the peak memory added by the code inside its `with` block.
 
-    It is that of the accelerator where one is in use, else that of the process.
+    It measures the memory of the CUDA device if CUDA is in use, else that of the process.
 
     Attributes:
-        bytes: Peak in bytes; None before the end, and on systems that do not report it.
+        bytes: Peak minus the memory in use at the beginning, in bytes. None until the block ends,
+            and on systems that do not report memory.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Phases: reduction to one turn in float64, and fast unit phasors."""
+"""Phases and unit phasors: removal of whole turns in float64, and fast complex exponentials."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ def real_dtype(dtype: torch.dtype) -> torch.dtype:
         TypeError: For any other dtype.
     """
     if dtype not in _REAL:
-        raise TypeError(f"expected complex64 or complex128, got {dtype}; convert the samples first")
+        raise TypeError(f"the dtype must be complex64 or complex128, got {dtype}; convert the samples first")
     return _REAL[dtype]
 
 
 def cis(angle_rad: Tensor) -> Tensor:
     """Compute exp(1j * angle) in the precision of the angle.
 
-    Takes a third of the time of torch.polar. Use `unit_phasor` for phases of more than a few turns.
-    Differentiable.
+    It takes a third of the time of torch.polar. Use `unit_phasor` for phases of more than a few
+    turns. Differentiable.
 
     Args:
         angle_rad: Angle in radians, any shape, float32 or float64.
@@ -56,7 +56,7 @@ def cis(angle_rad: Tensor) -> Tensor:
 def reduced_turns(turns: Tensor) -> Tensor:
     """Remove whole turns from a phase.
 
-    Differentiable: the removed part counts as a constant.
+    Differentiable: the number of removed turns counts as a constant.
 
     Args:
         turns: Phase in turns, any shape, float64.
@@ -70,8 +70,8 @@ def reduced_turns(turns: Tensor) -> Tensor:
     """
     if turns.dtype != torch.float64:
         raise TypeError(
-            f"phase needs float64 turns, got {turns.dtype}: a range of 700 km is 1e7 turns at S "
-            "band and 1e12 in the near infrared; form the phase in float64"
+            f"the phase must be in float64 turns, got {turns.dtype}; compute it in float64, since a range of "
+            "700 km is 1e7 turns at S band and 1e12 turns in the near infrared"
         )
     _check_resolution(turns)
     return turns - torch.round(turns.detach())
@@ -80,8 +80,8 @@ def reduced_turns(turns: Tensor) -> Tensor:
 def unit_phasor(turns: Tensor, dtype: torch.dtype) -> Tensor:
     """Compute exp(2j * pi * turns); whole turns are removed while the phase is still float64.
 
-    The phase convention is exp(-2j pi f tau): the echo of delay tau at carrier frequency f is
-    `unit_phasor(-f * tau, dtype)`. Differentiable.
+    The phase of an echo in this package is -2 pi f tau, so that an echo of delay tau at the carrier
+    frequency f is `unit_phasor(-f * tau, dtype)`. Differentiable.
 
     Args:
         turns: Phase in turns, any shape, float64.
@@ -107,16 +107,16 @@ def _check_resolution(turns: Tensor) -> None:
         return
     if not worst <= MAX_TURNS:
         raise ValueError(
-            f"phase of {worst:.3g} turns exceeds {MAX_TURNS:.0e}, where float64 holds only 1e-4 "
-            "turn; form range - reference range as a difference first"
+            f"the phase must be at most {MAX_TURNS:.0e} turns, beyond which float64 resolves only 1e-4 turn, "
+            f"got {worst:.3g} turns; subtract the reference range from the range before computing the phase"
         )
 
 
 def linear_phasor(turns_per_step: Tensor, start: float, n: int, dtype: torch.dtype) -> Tensor:
-    """Compute exp(2j pi s (start + i)) for i = 0..n - 1, with s in turns.
+    """Compute the phasors exp(2j pi s (start + i)) for i = 0..n - 1 of a linear phase.
 
-    Multiplies two short tables: as exact as `unit_phasor` of every element, at a tenth of its cost.
-    Differentiable.
+    They are products of the elements of two short tables, which is as exact as `unit_phasor` of
+    every element and takes a tenth of the time. Differentiable.
 
     Args:
         turns_per_step: Phase step s in turns, shape (...,), float64.
@@ -132,11 +132,11 @@ def linear_phasor(turns_per_step: Tensor, start: float, n: int, dtype: torch.dty
 
 
 def outer_phasor(fine: Tensor, coarse: Tensor, n: int) -> Tensor:
-    """Multiply the tables of `phasor_tables`.
+    """Multiply the two tables of `phasor_tables` into the phasors of a linear phase.
 
     Args:
-        fine: Shape (..., m), complex.
-        coarse: Shape (..., ceil(n / m)), complex.
+        fine: Phasors of the first m elements, shape (..., m), complex.
+        coarse: Phasors of every m-th element, shape (..., ceil(n / m)), complex.
         n: Number of elements.
 
     Returns:
@@ -146,16 +146,18 @@ def outer_phasor(fine: Tensor, coarse: Tensor, n: int) -> Tensor:
 
 
 def phasor_tables(turns_per_step: Tensor, start: float, n: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Return the two factors of `linear_phasor`, for use where the full product is not needed.
+    """Return two short tables whose products are the phasors exp(2j pi s (start + i)), i < n.
+
+    `linear_phasor` multiplies them; the tables serve where the full product is not needed.
 
     Args:
-        turns_per_step: As in `linear_phasor`.
-        start: As in `linear_phasor`.
-        n: As in `linear_phasor`.
-        dtype: As in `linear_phasor`.
+        turns_per_step: Phase step s in turns, shape (...,), float64.
+        start: Offset of the first element in steps.
+        n: Number of elements.
+        dtype: complex64 or complex128.
 
     Returns:
-        `fine` of shape (..., m) and `coarse` of shape (..., ceil(n / m)), complex; element i of the
+        `fine` of shape (..., m) and `coarse` of shape (..., ceil(n / m)), complex. Element i of the
         phasor is fine[i % m] * coarse[i // m], with m a power of two near sqrt(n).
     """
     m = max(1, 2 ** round(math.log2(max(n, 1)) / 2))

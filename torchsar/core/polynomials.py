@@ -9,7 +9,7 @@ from torch import Tensor
 def legendre(u: Tensor, order: int) -> Tensor:
     """Evaluate the Legendre polynomials of degree 0 to `order`.
 
-    Their mean squares over -1..1 are 1 / (2 degree + 1). Differentiable.
+    The mean square of the polynomial of degree d over -1..1 is 1 / (2 d + 1). Differentiable.
 
     Args:
         u: Positions in -1..1, any shape, float.

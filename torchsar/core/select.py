@@ -7,15 +7,16 @@ from torch import Tensor
 
 
 def per_trial(value: Tensor | float, trailing: int, like: Tensor) -> Tensor:
-    """Return a number or one value per trial in a form that broadcasts against data.
+    """Append dimensions of length one to values per trial, so that they broadcast against data.
 
     Args:
         value: Number, or one value per trial, shape (...,).
-        trailing: Number of trailing dimensions of the data.
-        like: Tensor that gives the device.
+        trailing: Number of dimensions of the data after the trial dimensions.
+        like: Tensor on whose device the result is placed.
 
     Returns:
-        Float64, shape (..., 1, ..., 1) with `trailing` dimensions of length one at the end.
+        The values in float64, shape (..., 1, ..., 1) with `trailing` dimensions of length one at
+        the end.
     """
     value = torch.as_tensor(value, dtype=torch.float64, device=like.device)
     return value[(...,) + (None,) * trailing]
@@ -42,8 +43,8 @@ def best_of(costs: Tensor, candidates: Tensor) -> tuple[Tensor, Tensor]:
     """Choose the candidate of lowest cost in each trial.
 
     Args:
-        costs: Shape (candidate, ...).
-        candidates: Shape (candidate, ...).
+        costs: Cost of each candidate, shape (candidate, ...).
+        candidates: Values of the candidates, shape (candidate, ...).
 
     Returns:
         The best candidate, shape (...,), and the difference between the second-lowest and the

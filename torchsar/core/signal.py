@@ -47,8 +47,8 @@ class Signal:
         if trailing != expected:
             named = ", ".join(f"{axis.name}={axis.n}" for axis in self.axes)
             raise ValueError(
-                f"data of shape {tuple(self.data.shape)} does not end in the axes ({named}); "
-                "transpose or crop it so that range is last"
+                f"the data of a Signal must end in dimensions of the lengths of its axes ({named}), got "
+                f"shape {tuple(self.data.shape)}; transpose or crop the data, with range last"
             )
 
     @property
@@ -62,7 +62,7 @@ class Signal:
         return tuple(axis.name for axis in self.axes)
 
     def axis(self, name: str) -> Axis:
-        """Return the axis of a name.
+        """Return the axis that has a given name.
 
         Raises:
             KeyError: If the signal has no axis of that name.
@@ -101,7 +101,7 @@ class Signal:
             **axes: New axes, by the names of those that they replace.
 
         Raises:
-            KeyError: If the signal has no axis of such a name.
+            KeyError: If the signal has no axis of one of these names.
             ValueError: If the trailing dimensions do not have the lengths of the new axes.
         """
         for name in axes:
@@ -109,15 +109,15 @@ class Signal:
         return Signal(data, tuple(axes.get(axis.name, axis) for axis in self.axes))
 
     def crop(self, **bounds: tuple[int, int]) -> Signal:
-        """Return a part of the samples along some axes: `signal.crop(range=(0, 1480))`.
+        """Return a part of the samples along some axes, such as `signal.crop(range=(0, 1480))`.
 
         Args:
             **bounds: Pairs (first, last) by the name of the axis; samples first to last - 1 are
                 kept.
 
         Raises:
-            KeyError: If the signal has no axis of such a name.
-            ValueError: If a pair is empty or exceeds its axis.
+            KeyError: If the signal has no axis of one of these names.
+            ValueError: Unless 0 <= first < last <= number of samples of the axis.
         """
         signal = self
         for name, (first, last) in bounds.items():
@@ -142,7 +142,8 @@ class Recording:
 
     Args:
         signal: Raw samples on true axes.
-        radar: Frozen description of the instrument: carrier, waveform, nominal path.
+        radar: Description of the instrument (carrier, waveform, nominal path), such as a
+            StripmapRadar.
         aux: Side data by name, such as `line_number` or `agc_db`, both of shape (..., pulse).
     """
 
@@ -163,7 +164,7 @@ class Recording:
     ) -> Recording:
         """Make a recording from a user's own raw data matrix and side data.
 
-        Lines that hold only zeros raise a warning.
+        Range lines that hold only zeros cause a UserWarning.
 
         Args:
             data: Complex samples (..., line, sample), range last, as an array or a tensor.
@@ -171,14 +172,17 @@ class Recording:
             dtype: complex64 or complex128; the samples are converted to it.
             start_s: Slow time of the first line, in seconds.
             what: Name of the data for messages.
-            **aux: Side data by name. `agc_db` (..., line) is the attenuation of the receiver in dB:
-                each line is multiplied by 10**(agc_db / 20) here. `line_number` (..., line) has one
-                number per line.
+            **aux: Side data by name. `agc_db` (..., line) is the attenuation of the receiver in dB,
+                which is compensated here: each line is multiplied by 10**(agc_db / 20).
+                `line_number` (..., line) has one number per line.
+
+        Returns:
+            Recording with the axes that `radar.raw_axes` gives, and the side data in `aux`.
 
         Raises:
             ValueError: If `dtype` or the samples are not complex, there are no samples, a sample is
-                not finite, side data are no numbers or do not fit the lines, or `agc_db` exceeds
-                200 dB.
+                not finite, side data are not numbers, `agc_db` or `line_number` does not have one
+                entry per line, or `agc_db` exceeds +-200 dB.
         """
         if not dtype.is_complex:
             raise ValueError(f"{what}: dtype must be complex64 or complex128, got {dtype}")
@@ -199,16 +203,16 @@ class Recording:
             level = side["agc_db"].to(torch.float64)
             if not bool((level.abs() <= AGC_LIMIT_DB).all()):
                 raise ValueError(
-                    f"{what}: agc_db must be finite and within +-{AGC_LIMIT_DB:g} dB, got "
+                    f"{what}: agc_db must be finite and within +-{AGC_LIMIT_DB:g} dB, got values from "
                     f"{float(level.min()):g} to {float(level.max()):g}"
                 )
             x = x * (10 ** (level / 20)).to(x.real.dtype)[..., None]
         return cls(Signal(x, radar.raw_axes(x.shape[-2], x.shape[-1], start_s)), radar, side)
 
     def to(self, *args: Any, **kwargs: Any) -> Recording:
-        """Return the recording with samples and side data moved; arguments as for Tensor.to.
+        """Return the recording on another device or in another dtype; arguments as for Tensor.to.
 
-        Only the samples change their dtype.
+        Side data move to the device too, but keep their dtype.
         """
         signal = self.signal.to(*args, **kwargs)
         return replace(
@@ -258,7 +262,8 @@ class Truth:
 
     Args:
         values: True values by name; tensors begin with the trial dimensions.
-        clean: Recording without the impairments, or None if there is none.
+        clean: Recording of the same scene without the simulated impairments, or None where the
+            simulation made no such recording.
     """
 
     values: Mapping[str, Tensor]

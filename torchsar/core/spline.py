@@ -20,9 +20,9 @@ _REACH = 32
 class UniformSpline:
     """Cubic spline through values at `start + i * step`, with not-a-knot conditions at both ends.
 
-    It equals scipy.interpolate.CubicSpline with default settings. Two values give a straight line,
-    three a parabola. Outside the grid the polynomials of the first and last interval continue.
-    Differentiable in the values and in the times of evaluation.
+    The result is that of scipy.interpolate.CubicSpline with default settings. Two values give a
+    straight line, three a parabola. Outside the grid the polynomials of the first and last interval
+    continue. Differentiable in the values and in the times of evaluation.
 
     Args:
         values: Values at the knots, shape (..., n) with n >= 2, float64; leading dimensions are
@@ -55,7 +55,7 @@ class UniformSpline:
             )
 
     def at(self, t: Tensor) -> Tensor:
-        """Evaluate the spline.
+        """Evaluate the spline at given times.
 
         Args:
             t: Times, any shape, float64, the same for all trials.
@@ -66,7 +66,7 @@ class UniformSpline:
         return self._polynomial(self._unit, t)
 
     def slope(self, t: Tensor) -> Tensor:
-        """Evaluate the derivative of the spline.
+        """Evaluate the derivative of the spline at given times.
 
         Args:
             t: Times, any shape, float64, the same for all trials.
@@ -78,10 +78,10 @@ class UniformSpline:
         return self._polynomial([c0[1], 2 * c0[2], 3 * c0[3]], t) / self.step
 
     def integral(self, t: Tensor) -> Tensor:
-        """Evaluate the integral of the spline from `start` on.
+        """Evaluate the integral of the spline from its first knot to given times.
 
         Args:
-            t: Times, any shape, float64, the same for all trials.
+            t: Upper limits of the integral, any shape, float64, the same for all trials.
 
         Returns:
             Integral in units of the values times the unit of time, shape (..., *t.shape).
@@ -92,11 +92,11 @@ class UniformSpline:
         return self._polynomial([before, c[0], c[1] / 2, c[2] / 3, c[3] / 4], t) * self.step
 
     def pieces(self) -> Tensor:
-        """Return the polynomial coefficients of every interval.
+        """Return the polynomial coefficients of the spline in every interval between its n knots.
 
         Returns:
-            Coefficients of rising powers of the time since the first knot of the interval, shape
-            (..., n - 1, 4).
+            Coefficients of the powers 0 to 3 of the time since the first knot of the interval,
+            shape (..., n - 1, 4).
         """
         return torch.stack([c / self.step**power for power, c in enumerate(self._unit)], -1)
 
@@ -121,11 +121,12 @@ class UniformSpline:
 def second_differences(values: Tensor) -> Tensor:
     """Return the second derivatives at the knots of a not-a-knot spline with unit step.
 
-    The second derivatives M solve M[i-1] + 4 M[i] + M[i+1] = 6 (y[i-1] - 2 y[i] + y[i+1]) inside.
-    Not-a-knot makes M linear through the first three knots, so that M[1] is the second difference
-    of y there; likewise at the other end. Between them all equations are solved at once, by
-    convolution with the response of the infinite grid, z^|k| / (2 sqrt 3) with z = sqrt 3 - 2, and
-    two decaying terms that satisfy the conditions at the ends.
+    At the inner knots the second derivatives M of the spline through the values y solve M[i-1] +
+    4 M[i] + M[i+1] = 6 (y[i-1] - 2 y[i] + y[i+1]). The not-a-knot condition makes M linear over the
+    first three knots, so that M[1] is the second difference of y there, and likewise over the last
+    three. The equations between these two knots are solved all at once: by convolution with the
+    response of the infinite grid, z^|k| / (2 sqrt 3) at a distance of k knots with z = sqrt 3 - 2,
+    plus two decaying terms that satisfy the conditions at the ends.
 
     Args:
         values: Values y at the knots, shape (..., n) with n >= 2, float64.

@@ -15,9 +15,9 @@ class Stage(nn.Module):
     """Base class of a processing stage, which checks axes and samples before `forward` runs.
 
     `stage(signal, **values)` returns a Signal, an Estimate (the signal is then unchanged), or a
-    pair of both. Keyword parameters of `forward` are values that a Chain can connect. Constants are
-    buffers, tunable values are nn.Parameters (see `hold`). A subclass sets the following class
-    attributes:
+    pair of both. A Chain can connect keyword parameters of `forward` to values that earlier stages
+    estimate. A subclass holds its constants as buffers and its tunable values as nn.Parameters (see
+    `hold`), and sets the following class attributes:
 
     - `works_on`: names of the trailing axes that it needs.
     - `also_on`: further tuples of axes that it accepts.
@@ -51,12 +51,12 @@ class Stage(nn.Module):
         return super().__call__(signal, *args, **values)
 
     def hold(self, name: str, value: Tensor | float) -> None:
-        """Register a value of the stage: an nn.Parameter as tunable, anything else as a constant.
+        """Register a value of the stage as its attribute, tunable or constant.
 
         Args:
             name: Name of the attribute.
-            value: nn.Parameter, which is kept as it is, or a number or tensor, which becomes a
-                float64 buffer.
+            value: nn.Parameter, which stays tunable, or a number or tensor, which becomes a
+                constant float64 buffer.
         """
         if isinstance(value, nn.Parameter):
             self.register_parameter(name, value)

@@ -1,11 +1,11 @@
 """Warped slow time of a target with non-uniform rotation.
 
-The angle of the target is the rotation rate at the first pulse times warp(t), where t is the time
-since the first pulse and warp(t) = t + k1 t^2 / 2! + k2 t^3 / 3! + ... The relative derivatives k1
-= acceleration / rate (1/s), k2 = jerk / rate (1/s^2), ... are derivatives of the rate at the first
-pulse divided by that rate. They are not the coefficients of a polynomial, which are k1 / 2, k2 / 6,
-... (see `coefficients_of`). They stand in a tensor `k` of shape (..., order - 1); an empty tensor
-means uniform rotation.
+The rotation angle of the target is the rotation rate at the first pulse times warp(t), where t is
+the time since the first pulse and warp(t) = t + k1 t^2 / 2! + k2 t^3 / 3! + ... is the warped time.
+The relative derivatives k1 = acceleration / rate (1/s), k2 = jerk / rate (1/s^2), ... are the
+derivatives of the rotation rate at the first pulse, divided by that rate. The coefficients of the
+polynomial are k1 / 2, k2 / 6, ... (see `coefficients_of`). A tensor `k` of shape (..., order - 1)
+holds k1, k2, ...; an empty tensor means uniform rotation.
 
 Reference:
     Remote Sens. 2025, 17, 3447, Eqs. (1)-(3).
@@ -22,13 +22,15 @@ from torch import Tensor
 
 
 def warp(time_s: Tensor, k: Tensor) -> Tensor:
-    """Compute the warped time.
+    """Compute the warped time t + k1 t^2 / 2! + k2 t^3 / 3! + ... of a rotating target.
 
+    The rotation angle is the rotation rate at the first pulse times the warped time.
     Differentiable.
 
     Args:
-        time_s: Time since the first pulse in seconds, shape (m,) or (..., m).
-        k: Relative derivatives of the rotation rate in 1/s, 1/s^2, ..., shape (..., order - 1).
+        time_s: Time t since the first pulse in seconds, shape (m,) or (..., m).
+        k: Derivatives k1, k2, ... of the rotation rate at the first pulse divided by that rate, in
+            1/s, 1/s^2, ..., shape (..., order - 1).
 
     Returns:
         Warped time in seconds, shape (..., m).
@@ -37,16 +39,17 @@ def warp(time_s: Tensor, k: Tensor) -> Tensor:
 
 
 def warp_rate(time_s: Tensor, k: Tensor) -> Tensor:
-    """Compute the derivative of the warp: the rotation rate relative to that at the first pulse.
+    """Compute the rotation rate of a target relative to its rate at the first pulse.
 
-    Differentiable.
+    It is the derivative 1 + k1 t + k2 t^2 / 2! + ... of the warped time. Differentiable.
 
     Args:
-        time_s: Time since the first pulse in seconds, shape (m,) or (..., m).
-        k: Relative derivatives of the rotation rate in 1/s, 1/s^2, ..., shape (..., order - 1).
+        time_s: Time t since the first pulse in seconds, shape (m,) or (..., m).
+        k: Derivatives k1, k2, ... of the rotation rate at the first pulse divided by that rate, in
+            1/s, 1/s^2, ..., shape (..., order - 1).
 
     Returns:
-        Relative rotation rate, shape (..., m).
+        Ratio of rotation rates, without unit, shape (..., m).
     """
     return _horner(time_s, k, 1)
 
@@ -65,25 +68,30 @@ def _horner(time_s: Tensor, k: Tensor, first: int) -> Tensor:
 
 
 def coefficients_of(k: Tensor) -> Tensor:
-    """Convert relative derivatives to the polynomial coefficients of the warp.
+    """Convert relative derivatives of a rotation rate to the coefficients of the warped time.
 
     Args:
-        k: Relative derivatives k_i, shape (..., order - 1).
+        k: Derivatives k1, k2, ... of the rotation rate at the first pulse divided by that rate, in
+            1/s, 1/s^2, ..., shape (..., order - 1).
 
     Returns:
-        Coefficients k_i / (i + 1)! of t^2, t^3, ..., same shape.
+        Coefficients k_i / (i + 1)! of t^2, t^3, ... in the warped time, same shape and units.
     """
     return k / _factorials(k)
 
 
 def k_of_coefficients(coefficients: Tensor) -> Tensor:
-    """Compute the inverse of `coefficients_of`.
+    """Convert coefficients of the warped time to relative derivatives of the rotation rate.
+
+    This is the inverse of `coefficients_of`.
 
     Args:
-        coefficients: Coefficients of t^2, t^3, ... of the warp, shape (..., order - 1).
+        coefficients: Coefficients of t^2, t^3, ... in the warped time, in 1/s, 1/s^2, ..., shape
+            (..., order - 1).
 
     Returns:
-        Relative derivatives k_i, same shape.
+        Derivatives k1, k2, ... of the rotation rate at the first pulse divided by that rate, same
+        shape and units.
     """
     return coefficients * _factorials(coefficients)
 
@@ -94,34 +102,37 @@ def _factorials(k: Tensor) -> Tensor:
 
 
 def least_rate(k: Tensor, duration_s: float, points: int = 513) -> Tensor:
-    """Return the lowest relative rotation rate during the observation.
+    """Return the lowest rotation rate during the observation relative to that at the first pulse.
 
-    At zero or below, two times have the same angle, and no image can be formed.
+    Where it is zero or negative, the target stops or turns back, so that different times have the
+    same angle and no image can be formed.
 
     Args:
-        k: Relative derivatives of the rotation rate, shape (..., order - 1).
+        k: Derivatives k1, k2, ... of the rotation rate at the first pulse divided by that rate, in
+            1/s, 1/s^2, ..., shape (..., order - 1).
         duration_s: Duration of the observation in seconds.
         points: Number of times at which the rate is evaluated.
 
     Returns:
-        Lowest rate relative to that at the first pulse, shape (...,).
+        Lowest ratio of the rotation rate to that at the first pulse, shape (...,).
     """
     return warp_rate(torch.linspace(0, duration_s, points, dtype=torch.float64, device=k.device), k).amin(-1)
 
 
 def shape_of(k: Tensor, duration_s: float) -> Tensor:
-    """Convert relative derivatives to the Legendre coefficients of the warp.
+    """Convert relative derivatives of a rotation rate to Legendre coefficients of the warped time.
 
-    The warp is c1 (s + q2 P2(s) + q3 P3(s) + ...) + constant, with s = 2 t / duration - 1. The
-    coefficients q are much better conditioned than k, whose estimation errors are strongly
-    correlated.
+    The warped time is c1 (s + q2 P2(s) + q3 P3(s) + ...) + constant, with the Legendre polynomials
+    P2, P3, ... and s = 2 t / duration - 1. The coefficients q are better suited to a search than
+    the relative derivatives k, whose estimation errors are strongly correlated.
 
     Args:
-        k: Relative derivatives of the rotation rate, shape (..., order - 1).
+        k: Derivatives k1, k2, ... of the rotation rate at the first pulse divided by that rate, in
+            1/s, 1/s^2, ..., shape (..., order - 1).
         duration_s: Duration of the observation in seconds.
 
     Returns:
-        Legendre coefficients q2, q3, ... relative to c1, same shape.
+        Legendre coefficients q2, q3, ..., without unit, same shape.
     """
     base, slopes = _legendre_of(k, duration_s)
     c = base + (k[..., None] * slopes).sum(-2)
@@ -129,16 +140,19 @@ def shape_of(k: Tensor, duration_s: float) -> Tensor:
 
 
 def k_of_shape(shape: Tensor, duration_s: float) -> Tensor:
-    """Compute the inverse of `shape_of`.
+    """Convert Legendre coefficients of the warped time to relative derivatives of the rate.
 
-    The warp must rise at the first pulse: 1 + sum_j q_j P_j'(-1) > 0.
+    This is the inverse of `shape_of`. The warped time c1 (s + q2 P2(s) + q3 P3(s) + ...), with the
+    Legendre polynomials P_j and s = 2 t / duration - 1, must rise at the first pulse, that is
+    1 + sum_j q_j P_j'(-1) > 0.
 
     Args:
-        shape: Legendre coefficients q2, q3, ..., shape (..., order - 1).
+        shape: Legendre coefficients q2, q3, ..., without unit, shape (..., order - 1).
         duration_s: Duration of the observation in seconds.
 
     Returns:
-        Relative derivatives k_i, same shape.
+        Derivatives k1, k2, ... of the rotation rate at the first pulse divided by that rate, in
+        1/s, 1/s^2, ..., same shape.
     """
     order = shape.shape[-1] + 1
     half = duration_s / 2
@@ -185,16 +199,19 @@ def _on(like: Tensor, values: np.ndarray) -> Tensor:
 
 
 def cut_warp(k: Tensor, order: int, duration_s: float) -> Tensor:
-    """The warp of an order that lies nearest to another one in least squares over the record: its
-    first Legendre terms, or itself where it has no more.
+    """Approximate a warped time by one of lower order, in least squares over the observation.
+
+    The warped time is t + k1 t^2 / 2! + k2 t^3 / 3! + ...; the approximation keeps its first
+    Legendre terms and is scaled to a rate of one at the first pulse.
 
     Args:
-        k: Coefficients k1, k2, ... of a warp, shape (..., coefficient).
-        order: Order of the nearest warp, 1 or more.
-        duration_s: Length of the record in seconds.
+        k: Relative derivatives k1, k2, ... of the rotation rate in 1/s, 1/s^2, ..., shape (..., m).
+        order: Highest power of time in the approximation, 1 or more.
+        duration_s: Duration of the observation in seconds.
 
     Returns:
-        Coefficients, shape (..., order - 1) at most.
+        Relative derivatives of the approximation, shape (..., order - 1); `k` itself where it has
+        fewer than `order` entries.
     """
     if order > k.shape[-1]:
         return k

@@ -1,4 +1,4 @@
-"""Readers of recorded data."""
+"""Readers of recorded radar data in `.npz` files."""
 
 from torchsar.io.inverse import read_inverse
 from torchsar.io.recorded import read_stripmap

@@ -28,15 +28,19 @@ UNSTATED_CARRIER_HZ = 5.52e9
 def read_inverse(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording:
     """Read range profiles, a turntable sweep or a spotlight phase history from a numpy archive.
 
-    The archive has no pickles and holds one of three sample arrays. Target in flight: `profiles`,
-    complex (range, pulse), range increasing away from the radar, with the numbers `range_step_m`,
-    `bandwidth_hz`, `prf_hz` and optionally `f0_hz` (by default 5.52e9; it only scales cross range).
-    Turntable: `sig`, complex (frequency, pulse), of phase -4 pi f (x cos a + y sin a) / c, with
-    `freq_hz` (frequency,) rising in equal steps and `angle_deg` (pulse,). Spotlight: `fp`, complex
-    (frequency, pulse), of phase -4 pi f (|antenna - p| - r0) / c, with `freq_hz`, the antenna
-    position `x_m`, `y_m`, `z_m` (pulse,) relative to the scene centre, and the reference range
-    `r0_m` (pulse,). Turntable and spotlight data may have `prf_hz`, by default 1, so that slow time
-    counts pulses. Other keys are ignored.
+    The archive (.npz, without pickled objects) holds exactly one of three complex sample arrays,
+    each with further keys:
+    - Target in flight: range profiles `profiles` (range, pulse), with range increasing away from
+      the radar. Numbers: `range_step_m`, `bandwidth_hz`, `prf_hz`, and optionally the carrier
+      `f0_hz`, which only scales cross range (by default 5.52e9).
+    - Turntable: `sig` (frequency, pulse), in which the point (x, y) has the phase -4 pi f (x cos a
+      + y sin a) / c. Arrays: the frequencies f in `freq_hz` (frequency,), rising in equal steps,
+      and the rotation angles a in `angle_deg` (pulse,).
+    - Spotlight: `fp` (frequency, pulse), in which the point p has the phase -4 pi f (|antenna - p|
+      - r0) / c. Arrays: `freq_hz` (frequency,) as above, the antenna position `x_m`, `y_m`, `z_m`
+      (pulse,) relative to the scene centre, and the reference range r0 in `r0_m` (pulse,).
+    Turntable and spotlight data may have `prf_hz`; by default it is 1, so that slow time counts
+    pulses. Other keys are ignored.
 
     Args:
         path: Path of the archive.
@@ -74,7 +78,7 @@ def _load(path: Path) -> dict[str, np.ndarray]:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except (ValueError, OSError) as error:
-        raise ValueError(f"{path} is not a numpy archive without pickles ({error})") from None
+        raise ValueError(f"{path} must be a numpy archive (.npz) without pickled objects: {error}") from None
 
 
 def _kind(arrays: dict[str, np.ndarray], path: Path) -> str:
@@ -83,14 +87,14 @@ def _kind(arrays: dict[str, np.ndarray], path: Path) -> str:
     if len(found) != 1:
         choices = "; ".join(f"{kind} with {', '.join(keys)}" for kind, keys in _SCHEMAS.items())
         raise ValueError(
-            f"{path} holds {found or 'none'} of the sample arrays; an archive of this sort holds "
-            f"exactly one: {choices} (this one: {sorted(arrays)})"
+            f"{path} must hold exactly one of the sample arrays ({choices}), got {found or 'none'} among "
+            f"the keys {sorted(arrays)}"
         )
     missing = [key for key in _SCHEMAS[found[0]] if key not in arrays]
     if missing:
         raise ValueError(
-            f"{path} lacks {missing}; beside {found[0]!r} there must be "
-            f"{list(_SCHEMAS[found[0]])} (this one: {sorted(arrays)})"
+            f"{path} lacks the keys {missing}; an archive with {found[0]!r} must also hold "
+            f"{list(_SCHEMAS[found[0]])}, got the keys {sorted(arrays)}"
         )
     return found[0]
 
@@ -113,8 +117,8 @@ def _profiles_radar(
     sampled = LIGHT_M_S / (2 * step)
     if bandwidth > 1.01 * sampled:
         raise ValueError(
-            f"{path}: range_step_m {step:g} holds a bandwidth of {sampled:g} Hz, less than "
-            f"bandwidth_hz {bandwidth:g}; the step must be c / (2 B) or finer"
+            f"{path}: range_step_m must be at most c / (2 B) for the bandwidth_hz B = {bandwidth:g}, "
+            f"got {step:g} m, which samples only {sampled:g} Hz"
         )
     carrier = _number(arrays, "f0_hz", path) if "f0_hz" in arrays else UNSTATED_CARRIER_HZ
     return InverseRadar(carrier, sampled, _number(arrays, "prf_hz", path)), {}

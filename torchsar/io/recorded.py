@@ -23,14 +23,16 @@ _AUX = ("agc_db", "line_number", "pilot")
 def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Recording:
     """Read a raw stripmap recording from a numpy archive.
 
-    The archive has no pickles and holds the samples `iq`, integer or float (line, sample, 2) or
-    complex (line, sample), and the numbers `fs_hz`, `prf_hz`, `f0_hz`, `chirp_rate_hz_s` (negative
-    for a down-chirp), `pulse_s`, `slant_range_cell1_m` (slant range of cell 1, at the leading edge
-    of the echo) and `v_eff_m_s` (nominal effective velocity). Optional are `first_cell` (index of
-    the first sample, counted from 1, by default 1), `c_m_s` (speed of light), `agc_db` (line,)
-    (attenuation of the receiver in dB, compensated here), `line_number` (line,) and `pilot`
-    (sample,), a recorded pilot tone. Other keys are ignored, a Doppler ambiguity among them, which
-    the processor estimates.
+    The archive (.npz, without pickled objects) must hold these keys:
+    - `iq`: samples, complex (line, sample), or integer or float (line, sample, 2) with I and Q.
+    - `fs_hz`, `prf_hz`, `f0_hz`: sampling rate, pulse repetition frequency and carrier in Hz.
+    - `chirp_rate_hz_s`, `pulse_s`: chirp rate, negative for a down-chirp, and pulse length.
+    - `slant_range_cell1_m`: slant range of a target whose echo begins at range cell 1.
+    - `v_eff_m_s`: nominal effective velocity.
+    It may hold `first_cell` (range cell of the first sample, counted from 1, by default 1), `c_m_s`
+    (speed of light), `agc_db` (line,) (attenuation of the receiver in dB, which is compensated
+    here), `line_number` (line,) and `pilot` (sample,), a recorded pilot tone. Other keys are
+    ignored, including the Doppler ambiguity number, which is estimated from the data.
 
     Args:
         path: Path of the archive.
@@ -51,11 +53,12 @@ def read_stripmap(path: str | Path, dtype: torch.dtype = torch.complex64) -> Rec
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
     except (ValueError, OSError) as error:
-        raise ValueError(f"{path} is not a numpy archive without pickles ({error})") from None
+        raise ValueError(f"{path} must be a numpy archive (.npz) without pickled objects: {error}") from None
     missing = [key for key in _REQUIRED if key not in arrays]
     if missing:
         raise ValueError(
-            f"{path} lacks {missing}; a raw stripmap archive holds {list(_REQUIRED)} (this one: {sorted(arrays)})"
+            f"{path} lacks the keys {missing}; a raw stripmap archive must hold {list(_REQUIRED)}, "
+            f"got the keys {sorted(arrays)}"
         )
     number = {key: _number(arrays, key, path) for key in _REQUIRED[1:]}
     c = _number(arrays, "c_m_s", path) if "c_m_s" in arrays else LIGHT_M_S
@@ -115,5 +118,6 @@ def _complex(iq: np.ndarray, path: Path) -> np.ndarray:
     if iq.ndim == 3 and iq.shape[-1] == 2 and iq.dtype.kind in "iuf":
         return iq[..., 0].astype(np.float32) + 1j * iq[..., 1].astype(np.float32)
     raise ValueError(
-        f"{path}: iq must be complex (line, sample) or (line, sample, 2), got {iq.dtype} of shape {iq.shape}"
+        f"{path}: iq must be complex (line, sample) or (line, sample, 2) with real I and Q, got {iq.dtype} of "
+        f"shape {iq.shape}"
     )

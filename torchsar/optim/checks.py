@@ -1,4 +1,4 @@
-"""Checks of arguments and of objectives that the gradient methods share, and their norm."""
+"""Checks of arguments and objectives, and a norm, shared by the gradient methods."""
 
 from __future__ import annotations
 
@@ -9,23 +9,24 @@ from torch import Tensor
 
 
 def check_start(start: Tensor) -> None:
-    """Check that a start of the unknowns is a real tensor of shape (..., n).
+    """Check that the first point of a search is a real tensor of shape (..., n) for n unknowns.
 
     Args:
         start: First point of the search.
 
     Raises:
-        TypeError: If it is neither float32 nor float64.
-        ValueError: If it has no unknowns in its last dim.
+        TypeError: If `start` is neither float32 nor float64.
+        ValueError: If `start` has no dimension, or its last dimension, the unknowns, is empty.
     """
     if start.dtype not in (torch.float32, torch.float64):
         raise TypeError(
-            f"start is {start.dtype}; a descent needs float32 or float64, give complex unknowns "
+            f"start must be a tensor of float32 or float64, got {start.dtype}; give complex unknowns "
             "as their real and imaginary parts"
         )
     if start.ndim == 0 or start.shape[-1] == 0:
         raise ValueError(
-            f"start has shape {tuple(start.shape)}; give the unknowns in its last dim, (..., n) with n of at least 1"
+            "start must have the shape (..., n), with n >= 1 unknowns in the last dimension, got "
+            f"shape {tuple(start.shape)}"
         )
 
 
@@ -37,7 +38,7 @@ def check_limits(method: str, **limits: float) -> None:
         **limits: Values by the names of their parameters.
 
     Raises:
-        ValueError: If one is not positive.
+        ValueError: If a value is not positive.
     """
     for name, value in limits.items():
         if not value > 0:
@@ -53,12 +54,12 @@ def check_tolerances(method: str, gradient_tolerance: float, value_tolerance: fl
         value_tolerance: Relative tolerance of the cost.
 
     Raises:
-        ValueError: If one is negative or not a number.
+        ValueError: If a tolerance is negative or not a number.
     """
     if not (gradient_tolerance >= 0 and value_tolerance >= 0):
         raise ValueError(
-            f"{method}: gradient_tolerance is {gradient_tolerance} and value_tolerance "
-            f"{value_tolerance}; choose relative tolerances of at least 0, such as 1e-6"
+            f"{method}: gradient_tolerance and value_tolerance must be relative tolerances of at least 0, "
+            f"such as 1e-6, got {gradient_tolerance} and {value_tolerance}"
         )
 
 
@@ -92,7 +93,7 @@ def described(value: Any) -> str:
 
 
 def norm(x: Tensor) -> Tensor:
-    """Compute the Euclidean norm over the unknowns.
+    """Compute the Euclidean norm of each trial over its unknowns.
 
     Args:
         x: Values, shape (..., n).

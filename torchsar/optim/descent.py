@@ -1,6 +1,7 @@
 """Gradient descent of a smooth cost per trial: L-BFGS and Adam.
 
-All trials are evaluated together; each has its own line search, its own history and its own end.
+All trials are evaluated together, but each has its own line search and history, and ends
+independently of the others.
 """
 
 from __future__ import annotations
@@ -31,14 +32,14 @@ class Descent:
     Args:
         x: Best point, shape (..., n). Where `ok` is False it is the best finite point, or the
             start.
-        cost: Cost at `x`, shape (...,), in the dtype of the objective. A start whose cost or
-            gradient is not finite keeps them as they were returned.
+        cost: Cost at `x`, shape (...,), in the dtype of the objective. Where the cost or gradient
+            at the start is not finite, the trial ends there and has the cost of the start.
         gradient_norm: Euclidean norm of the gradient at `x`, shape (...,).
         steps: Steps taken, shape (...,), int64.
         evaluations: Calls of the objective in which the trial took part, shape (...,), int64.
         converged: True where a tolerance was met, shape (...,), bool.
         ok: False where the start, or a point at which the search ended, had a cost or gradient that
-            was not finite, shape (...,), bool. `newton` adds conditions of its own.
+            was not finite, shape (...,), bool. `newton` documents further conditions.
     """
 
     x: Tensor
@@ -65,10 +66,10 @@ def lbfgs(
     """Minimise a smooth cost per trial by limited-memory BFGS with a strong Wolfe line search.
 
     Every call of the objective evaluates all trials, each at the current point of its own search,
-    so that no result depends on the other trials. A finished trial is evaluated at its result, but
-    neither changes nor counts. Apart from `value_tolerance` the search is invariant to the scale
-    and the offset of the cost. The result is detached. Trials are leading dims; do not use inside
-    vmap.
+    so that no result depends on the other trials. A finished trial is still evaluated, at its
+    result, but its point and its counts no longer change. Apart from `value_tolerance` the search
+    is invariant to the scale and the offset of the cost. The result carries no gradient. All
+    leading dimensions are trials; torch.func.vmap is not supported.
 
     Args:
         objective: Maps points (..., n) to real costs (...,), each cost from its own row alone.
@@ -80,12 +81,15 @@ def lbfgs(
         gradient_tolerance: A trial has converged when its gradient norm is at most this fraction of
             that at the start.
         value_tolerance: A trial has converged when a step lowers the cost by at most this fraction
-            of the cost. Values below four units of rounding are raised to them, except 0.
-        first_step: Length of the first trial step, in the units of x.
-        search: Largest number of evaluations of one line search. A search that finds no lower point
-            drops the history once and then ends the trial. A step to a cost or gradient that is not
-            finite counts as too long; `ok` is False for a trial whose search ends there.
-        with_gradient: The objective returns costs (...,) and gradients (..., n) itself.
+            of the cost. A positive value below four times the machine epsilon of the dtype is
+            raised to that; 0 remains 0.
+        first_step: Length of the first step that is tested, in the units of x.
+        search: Largest number of evaluations of one line search. After a search that finds no lower
+            point, the history is dropped and the search repeated along the steepest descent; if
+            that fails too, the trial ends. A step to a cost or gradient that is not finite counts
+            as too long; `ok` is False for a trial whose search ends there.
+        with_gradient: Whether the objective itself returns the pair of costs (...,) and gradients
+            (..., n).
 
     Returns:
         Best point per trial, with cost, counts, `converged` and `ok`.
@@ -125,13 +129,14 @@ def adam(
     patience: int = 50,
     with_gradient: bool = False,
 ) -> Descent:
-    """Minimise a cost per trial by Adam at a constant rate and return the best point visited.
+    """Minimise a cost per trial by Adam at a constant rate, and return the best point visited.
 
-    Suits costs that are rough on the scale of a step, or noisy; on a smooth cost `lbfgs` reaches a
-    lower cost in fewer evaluations. One evaluation per step.
+    Adam suits costs that are noisy, or rough on the scale of a step; on a smooth cost `lbfgs`
+    reaches a lower cost in fewer evaluations. Each step evaluates the objective once.
 
     Args:
-        objective: As in `lbfgs`.
+        objective: Maps points (..., n) to real costs (...,), each cost from its own row alone.
+            Gradients come from autograd, also under no_grad.
         start: First point, shape (..., n), float32 or float64.
         steps: Largest number of steps of a trial.
         rate: Length of the first step in each coordinate, in the units of x.
@@ -140,17 +145,20 @@ def adam(
             that at the start.
         value_tolerance: A trial has converged when its best cost fell by at most this fraction of
             itself during `patience` steps.
-        patience: Number of steps without gain after which a trial has converged; longer than an
-            overshoot.
-        with_gradient: As in `lbfgs`.
+        patience: Number of steps without such a fall of the best cost after which a trial has
+            converged; choose it longer than the oscillations about a minimum.
+        with_gradient: Whether the objective itself returns the pair of costs (...,) and gradients
+            (..., n).
 
     Returns:
         Best point per trial, with cost, counts, `converged` and `ok`. `ok` is False where the start
         or a later point had a cost or gradient that was not finite; the trial ends there.
 
     Raises:
-        TypeError: As in `lbfgs`.
-        ValueError: As in `lbfgs`, or if `betas` do not lie in 0 <= beta < 1.
+        TypeError: If the start is not float32 or float64, or `with_gradient` is set and the
+            objective does not return a pair.
+        ValueError: If the objective returns another shape or costs without a gradient, if a limit
+            is not positive or a tolerance negative, or if `betas` do not lie in 0 <= beta < 1.
 
     Reference:
         Kingma and Ba 2015, algorithm 1, with epsilon relative to the first gradient.
@@ -159,7 +167,7 @@ def adam(
     check_limits("adam", steps=steps, patience=patience, rate=rate)
     check_tolerances("adam", gradient_tolerance, value_tolerance)
     if not all(0 <= beta < 1 for beta in betas):
-        raise ValueError(f"adam: betas are {betas}; choose both in 0 <= beta < 1, for instance (0.9, 0.999)")
+        raise ValueError(f"adam: both betas must satisfy 0 <= beta < 1, such as (0.9, 0.999), got {betas}")
     with torch.no_grad():
         scaled = _Scaled(objective, start, with_gradient)
         walk = _first_walk(scaled, gradient_tolerance)
@@ -545,15 +553,15 @@ def _given(objective: Objective, x: Tensor) -> tuple[Tensor, Tensor]:
     answer = objective(x)
     if not (isinstance(answer, tuple) and len(answer) == 2):
         raise TypeError(
-            "with_gradient=True needs an objective that returns (cost, gradient), this one "
-            f"returned {type(answer).__name__}; return the pair or leave with_gradient out"
+            "with_gradient=True needs an objective that returns the pair (cost, gradient), got "
+            f"{type(answer).__name__}; return the pair or leave with_gradient out"
         )
     cost, gradient = answer
     check_cost(cost, x)
     if not isinstance(gradient, Tensor) or gradient.shape != x.shape:
         raise ValueError(
-            f"the objective returned {described(gradient)} as gradient at x of shape "
-            f"{tuple(x.shape)}; return the same shape as x"
+            f"the objective returned {described(gradient)} as gradient for x of shape "
+            f"{tuple(x.shape)}; return a gradient of the same shape as x"
         )
     return cost.detach(), gradient.detach().to(x.dtype)
 

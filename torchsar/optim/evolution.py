@@ -28,11 +28,11 @@ def differential_evolution(
 ) -> Searched:
     """Minimise a cost within bounds by differential evolution.
 
-    In each generation every candidate competes with base + weight * (one - other), where base, one
-    and other are three further candidates; each unknown is taken from this challenger with the
-    probability `crossover`, and at least one is. The better of the two is kept. Unknowns of a
-    challenger beyond a bound are set to the bound. A trial takes population * (generations + 1)
-    evaluations, 888 by default.
+    In each generation every candidate competes with a challenger, and the better of the two is
+    kept. The challenger takes each unknown from base + weight * (one - other) with the probability
+    `crossover`, at least one of them, and the rest from the candidate; base, one and other are
+    three further candidates. An unknown beyond a bound is set to that bound. A trial takes
+    population * (generations + 1) evaluations, 888 by default.
 
     Args:
         objective: Maps candidates (..., population, n) to costs (..., population) for all trials;
@@ -44,8 +44,8 @@ def differential_evolution(
         draws: Random numbers; with as many trials as the bounds, or without trials for the same
             numbers in every trial. Results do not depend on how trials are batched.
         strategy: "rand1bin" draws the base at random, "best1bin" takes the best candidate.
-        weight: Factor on the difference, above 0 and at most 2.
-        crossover: Probability that an unknown comes from the challenger.
+        weight: Factor on the difference of two candidates, above 0 and at most 2.
+        crossover: Probability that an unknown of the challenger is not that of the candidate.
 
     Returns:
         Best point per trial. `history` is the least cost of each generation, shape (...,
@@ -116,6 +116,6 @@ def _check(population: int, generations: int, strategy: str, weight: float, cros
         raise ValueError(f"differential_evolution: strategy {strategy!r} is not known; choose 'rand1bin' or 'best1bin'")
     if not (0 < weight <= 2 and 0 <= crossover <= 1):
         raise ValueError(
-            f"differential_evolution: weight is {weight} and crossover {crossover}; choose a weight above 0 and at "
-            "most 2, and a probability of crossover in 0..1"
+            "differential_evolution: weight must be above 0 and at most 2, and crossover must be a probability in "
+            f"0..1, got weight={weight} and crossover={crossover}"
         )

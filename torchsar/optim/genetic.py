@@ -37,11 +37,11 @@ def genetic(
 ) -> Searched:
     """Minimise a cost within bounds by a genetic algorithm.
 
-    It uses selection, blend crossover, Gaussian mutation and elitism. The first population is
-    uniform within the bounds. In each generation the `elites` best candidates survive and
-    population - elites children are made and evaluated; unknowns of a child beyond a bound are set
-    to the bound. A trial takes population + generations * (population - elites) evaluations,
-    870 by default.
+    It uses selection, blend crossover, Gaussian mutation and elitism. The candidates of the first
+    population are drawn uniformly within the bounds. In each generation the `elites` best
+    candidates survive, and population - elites children are made and evaluated. An unknown of a
+    child beyond a bound is set to that bound. A trial takes population + generations *
+    (population - elites) evaluations, 870 by default.
 
     Args:
         objective: Maps candidates (..., population, n) to costs (..., population) for all trials;
@@ -57,13 +57,14 @@ def genetic(
             "roulette" draws with a probability proportional to how far the cost of a candidate lies
             below the worst finite cost.
         entrants: Number of candidates of a tournament.
-        crossover: Probability that a child is a blend of both parents; otherwise it copies the
-            first.
-        blend: A blend is uniform on the line through both parents, extended by this fraction of
-            their distance beyond either.
+        crossover: Probability that a child is a blend of its two parents; otherwise it is a copy of
+            the first parent.
+        blend: In a blend each unknown is drawn uniformly between the values of the two parents, an
+            interval extended on both sides by this fraction of its length.
         mutation: Probability per unknown of a Gaussian step.
         spread: Standard deviation of that step, relative to high - low.
-        cooling: Factor on `spread` per generation.
+        cooling: Factor by which the spread changes from one generation to the next, above 0 and at
+            most 1.
 
     Returns:
         Best point per trial. `history` is the least cost so far, shape (..., generations + 1).
@@ -73,8 +74,9 @@ def genetic(
         ValueError: If the bounds, a setting or the shape of the costs is not valid.
 
     Reference:
-        Remote Sens. 2025, 17, 3447, section 3.3, which gives neither rates nor operators; those
-        here follow Goldberg 1989, and Eshelman and Schaffer 1993 (BLX-alpha).
+        Remote Sens. 2025, 17, 3447, section 3.3, which specifies neither the probabilities nor the
+        operators; those used here follow Goldberg 1989, and Eshelman and Schaffer 1993
+        (BLX-alpha).
     """
     box = Box.of(low, high, "genetic")
     _check(population, generations, elites, selection, entrants, crossover, blend, mutation, spread, cooling)
@@ -125,7 +127,16 @@ class _Breed:
         return box.at(self.dice.uniform("genetic first", (self.population, box.low.shape[-1])))
 
     def children(self, generation: int, x: Tensor, cost: Tensor) -> Tensor:
-        """Children (..., brood, n) of the ranked candidates x (..., population, n)."""
+        """Make the children of one generation by selection, crossover and mutation.
+
+        Args:
+            generation: Number of the generation, from 0 on.
+            x: Candidates in rising order of their costs, shape (..., population, n).
+            cost: Costs of the candidates, shape (..., population).
+
+        Returns:
+            Children within the bounds, shape (..., brood, n).
+        """
         at = f"genetic {generation}"
         box, n = self.dice.box, x.shape[-1]
         one, other = (pick(x, self._parents(f"{at} parent {i}", cost)) for i in range(2))
@@ -182,11 +193,13 @@ def _check(
         },
     )
     if not elites < population:
-        raise ValueError(f"genetic: {elites} elites leave no children in a population of {population}; choose fewer")
+        raise ValueError(
+            f"genetic: elites must be fewer than population={population}, so that children are made, got {elites}"
+        )
     if selection not in ("tournament", "roulette"):
         raise ValueError(f"genetic: selection {selection!r} is not known; choose 'tournament' or 'roulette'")
     if not (0 <= crossover <= 1 and 0 <= mutation <= 1 and 0 < cooling <= 1):
         raise ValueError(
-            f"genetic: crossover is {crossover}, mutation {mutation} and cooling {cooling}; choose probabilities "
-            "in 0..1 for the first two and a factor above 0 and at most 1 for cooling"
+            "genetic: crossover and mutation must be probabilities in 0..1, and cooling a factor above 0 and at "
+            f"most 1, got crossover={crossover}, mutation={mutation} and cooling={cooling}"
         )

@@ -1,4 +1,4 @@
-"""Search over the full grid: every combination of given values, the best per trial."""
+"""Search over a full grid: the cost of every combination of given values of the unknowns."""
 
 from __future__ import annotations
 
@@ -19,19 +19,21 @@ def grid_search(
     limit: int = 100_000,
     block: int = 1024,
 ) -> Searched:
-    """Evaluate the cost at all combinations of given values and return the best per trial.
+    """Evaluate a cost at all combinations of given values and return the best point per trial.
 
     Args:
         objective: Maps candidates (*trials, candidate, n) to costs (*trials, candidate); NaN counts
             as +inf.
-        axes: Values of each unknown, real floating, shape (m_i,) for all trials or (*trials, m_i).
-        trials: Shape of the trials, needed where no axis has it.
+        axes: One float tensor per unknown with the values to test, shape (m_i,) for the same values
+            in all trials, or (*trials, m_i).
+        trials: Shape of the trials; needed where no axis has trial dimensions.
         limit: Largest number of grid points accepted.
-        block: Candidates per call of the objective.
+        block: Number of candidates in one call of the objective.
 
     Returns:
-        Best point per trial; of equal costs the first counts, with the last unknown varying
-        fastest. `history` holds all costs, shape (*trials, m_1, m_2, ...).
+        Best point per trial. Of several points of equal cost it is the first in the order of the
+        grid, in which the last unknown varies fastest. `history` holds all costs, shape (*trials,
+        m_1, m_2, ...).
 
     Raises:
         TypeError: If an axis is not a real floating tensor.
@@ -44,7 +46,7 @@ def grid_search(
     if total > limit:
         raise ValueError(
             f"grid_search: {' x '.join(map(str, sizes))} values are {total} evaluations per "
-            f"trial, above the limit of {limit}; use fewer values, or raise the limit"
+            f"trial, above the limit of {limit}; use fewer values, or raise `limit`"
         )
     check_counts("grid_search", {"block": (block, 1)})
     axes = [axis.expand(*shape, axis.shape[-1]) for axis in axes]
@@ -87,6 +89,7 @@ def _checked(axes: Sequence[Tensor]) -> list[Tensor]:
             )
         if axis.ndim == 0 or not axis.shape[-1] or not bool(torch.isfinite(axis).all()):
             raise ValueError(
-                f"grid_search: axis {i} needs finite values in its last dim, got shape {tuple(axis.shape)}"
+                f"grid_search: axis {i} needs finite values, at least one, along its last dimension, got shape "
+                f"{tuple(axis.shape)} or values that are not finite"
             )
     return [axis.detach() for axis in axes]

@@ -28,31 +28,34 @@ def newton(
 ) -> Descent:
     """Minimise a smooth cost of few unknowns per trial by Newton's method.
 
-    With `damped` the Hessian is shifted (Levenberg) until its least eigenvalue, if negative, has
-    changed sign, and is at least 1e-6 of the largest. The step is halved until the cost falls
-    (Armijo). Without `damped` the step is x - H^-1 gradient, which also climbs to maxima and
-    saddles and diverges where H is near singular: the behaviour that Remote Sens. 2025, 17, 3447
-    reports for its "Gauss-Newton". (An entropy is not a sum of squares, so a Gauss-Newton method in
-    the strict sense does not exist for it.) The result is detached; do not use inside vmap.
+    With `damped` a multiple of the identity is added to the Hessian H (Levenberg), so that a
+    negative least eigenvalue changes its sign, and the least eigenvalue is at least 1e-6 of the
+    largest magnitude. The step is then halved until the cost falls (Armijo). Without `damped` the
+    step is -H^-1 gradient, which can also lead to maxima and saddles, and diverges where H is near
+    singular. Remote Sens. 2025, 17, 3447 reports this behaviour for its "Gauss-Newton" method. (An
+    entropy is not a sum of squares, so that no Gauss-Newton method in the strict sense exists for
+    it.) The result carries no gradient; torch.func.vmap is not supported.
 
     Args:
         objective: Maps points (..., n) to real costs (...,), each cost from its own row alone,
             twice differentiable by autograd.
         start: First point, shape (..., n), float32 or float64.
-        damped: Shift the Hessian and search along the step.
+        damped: Whether to add a multiple of the identity to the Hessian and to search along the
+            step.
         steps: Largest number of steps of a trial.
         search: Largest number of halvings of a step. A trial whose search finds no lower cost ends.
         gradient_tolerance: A trial has converged when its gradient norm is at most this fraction of
             that at the start.
         value_tolerance: A trial has converged when a step changed the cost by at most this fraction
-            of the cost, or by four units of rounding.
+            of the cost, or by at most four times the machine epsilon of the dtype.
 
     Returns:
         Last point per trial, finite where the start is: a trial that would step to a cost or
-        derivative that is not finite stops before it. `evaluations` counts calls of the objective;
-        one that also gives the Hessian counts once and takes n + 1 backward passes. `ok` is False
-        where the trial met values that were not finite, ended above its start or where the Hessian
-        is not positive definite, or, without `damped`, has not converged.
+        derivative that is not finite stops before that step. `evaluations` counts calls of the
+        objective; a call that also gives the Hessian counts once and takes n + 1 backward passes.
+        `ok` is False where the trial met values that were not finite, where it ended at a cost
+        above that of its start or at a point without a positive definite Hessian, and, without
+        `damped`, where it has not converged.
 
     Raises:
         TypeError: If the start is not float32 or float64.

@@ -23,7 +23,7 @@ class Searched:
         x: Best point, shape (..., n). Where `ok` is False it is the first candidate.
         cost: Cost at `x`, shape (...,); +inf where `ok` is False.
         evaluations: Candidates whose cost was computed, shape (...,), int64.
-        history: Costs during the search; each search documents its shape.
+        history: Costs during the search; the function that searches documents its shape.
         ok: False where no candidate had a finite cost, shape (...,), bool.
     """
 
@@ -55,6 +55,9 @@ class Box:
             high: Greatest values, shape (..., n).
             who: Name of the search, used in error messages.
 
+        Returns:
+            Bounds of equal shape (*trials, n).
+
         Raises:
             TypeError: If a bound is not a real floating tensor.
             ValueError: If shapes do not fit, a bound is not finite, or low > high.
@@ -80,7 +83,7 @@ class Box:
 
     @property
     def trials(self) -> torch.Size:
-        """Shape of the trials."""
+        """Shape of the trial dimensions of the bounds."""
         return self.low.shape[:-1]
 
     def at(self, part: Tensor) -> Tensor:
@@ -95,26 +98,25 @@ class Box:
         return self.low[..., None, :] + part * (self.high - self.low)[..., None, :]
 
     def kept(self, x: Tensor) -> Tensor:
-        """Set unknowns beyond a bound to the bound.
+        """Limit candidates to the bounds: set each unknown beyond a bound to that bound.
 
         Args:
             x: Candidates, shape (*trials, candidate, n).
 
         Returns:
-            Candidates, same shape.
+            Limited candidates, same shape.
         """
         return torch.minimum(torch.maximum(x, self.low[..., None, :]), self.high[..., None, :])
 
 
 @dataclass(frozen=True)
 class Dice:
-    """Random numbers for all trials of a search.
-
-    Each trial has its own numbers where the draws have trials; otherwise all trials share the same.
+    """Source of random numbers for all trials of a search, in the dtype of its bounds.
 
     Args:
-        draws: Source of the random numbers.
-        box: Bounds whose trials the numbers are for.
+        draws: Source of the random numbers. If it has trials, each trial of the search gets its own
+            numbers; otherwise all trials get the same numbers.
+        box: Bounds of the search, which give the trials, dtype and device.
 
     Raises:
         ValueError: If the draws have another number of trials than the bounds.
@@ -132,20 +134,26 @@ class Dice:
             )
 
     def uniform(self, purpose: str, shape: Sequence[int]) -> Tensor:
-        """Draw uniform numbers in 0..1, shape (*trials, *shape).
+        """Draw uniform random numbers in 0..1 for all trials.
 
         Args:
-            purpose: Address of the numbers within a trial.
-            shape: Shape for one trial.
+            purpose: Name of the numbers; different names give independent numbers.
+            shape: Shape of the numbers of one trial.
+
+        Returns:
+            Numbers of shape (*trials, *shape).
         """
         return self._of_trials(self.draws.uniform(purpose, shape), shape)
 
     def normal(self, purpose: str, shape: Sequence[int]) -> Tensor:
-        """Draw standard normal numbers, shape (*trials, *shape).
+        """Draw standard normal random numbers for all trials.
 
         Args:
-            purpose: Address of the numbers within a trial.
-            shape: Shape for one trial.
+            purpose: Name of the numbers; different names give independent numbers.
+            shape: Shape of the numbers of one trial.
+
+        Returns:
+            Numbers of shape (*trials, *shape).
         """
         return self._of_trials(self.draws.normal(purpose, shape), shape)
 
@@ -156,7 +164,7 @@ class Dice:
 
 
 def costs_of(objective: Population, x: Tensor, who: str) -> Tensor:
-    """Evaluate the objective without gradients; NaN counts as +inf.
+    """Evaluate the objective for all candidates, without gradients; a cost of NaN becomes +inf.
 
     Args:
         objective: Maps candidates (*trials, candidate, n) to costs (*trials, candidate).
@@ -175,7 +183,7 @@ def costs_of(objective: Population, x: Tensor, who: str) -> Tensor:
         got = f"{cost.dtype} of shape {tuple(cost.shape)}" if isinstance(cost, Tensor) else type(cost).__name__
         raise ValueError(
             f"{who}: the objective returned {got} for candidates of shape {tuple(x.shape)}; "
-            f"return one real cost each, shape {tuple(x.shape[:-1])}"
+            f"return one real cost for each candidate, shape {tuple(x.shape[:-1])}"
         )
     return torch.where(torch.isnan(cost), torch.inf, cost)
 
@@ -188,7 +196,7 @@ def ranked(x: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:
         cost: Their costs, shape (*trials, candidate).
 
     Returns:
-        Candidates and costs in that order.
+        Candidates and their costs, of the same shapes, in rising order of the cost.
     """
     order = torch.argsort(cost, dim=-1, stable=True)
     return pick(x, order), cost.gather(-1, order)
@@ -208,7 +216,7 @@ def pick(x: Tensor, index: Tensor) -> Tensor:
 
 
 def best(x: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the best candidate and its cost.
+    """Return the candidate of lowest cost in each trial, and its cost.
 
     Args:
         x: Candidates, shape (*trials, candidate, n).
@@ -222,11 +230,11 @@ def best(x: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def check_counts(who: str, least: dict[str, tuple[float, float]]) -> None:
-    """Check that settings are not below their minimum values.
+    """Check that the settings of a search reach their minimum values.
 
     Args:
         who: Name of the search, used in error messages.
-        least: (value, minimum value) by parameter name.
+        least: Pairs (value, minimum value) by the name of the parameter.
 
     Raises:
         ValueError: If a value is below its minimum value.

@@ -14,7 +14,7 @@ Cost = Callable[[Tensor], Tensor]
 
 
 def grid_minimum(cost: Cost, centre: Tensor, reach: float, count: int) -> tuple[Tensor, Tensor]:
-    """Return the best of equally spaced points of centre +- reach per trial.
+    """Return, per trial, the point of lowest cost among equally spaced points in centre +- reach.
 
     Args:
         cost: Maps points (...,) to costs (...,).
@@ -39,20 +39,23 @@ def grid_minimum(cost: Cost, centre: Tensor, reach: float, count: int) -> tuple[
 def parabola_minimum(
     cost: Cost, start: Tensor, step: float, tolerance: float, rounds: int = 12
 ) -> tuple[Tensor, Tensor]:
-    """Minimise a cost by successive parabolas about the best point so far.
+    """Minimise a cost of one unknown per trial by successive parabolas, without gradients.
 
-    The step shrinks to a quarter when the vertex lies inside it. The result stays within start +- 2
-    steps. Needs no gradient and takes two to three evaluations per round.
+    Each round fits a parabola to the current point and to two points at the half width on either
+    side, and moves to its vertex, by at most the half width. The half width shrinks to a quarter
+    when the vertex lies inside. The result stays within start +- 2 step. A round takes three
+    evaluations.
 
     Args:
         cost: Maps points (...,) to costs (...,).
         start: First point, shape (...,).
-        step: First half width of the parabola.
-        tolerance: A trial stops when its half width is below it.
+        step: First half width of the parabola, in the unit of the unknown.
+        tolerance: A trial stops when its half width is at most this.
         rounds: Largest number of rounds.
 
     Returns:
-        The minimum and the second derivative there, each of shape (...,).
+        The position of the minimum, and the second derivative of the cost there (0 where no
+        parabola had a minimum), each of shape (...,).
     """
     with torch.no_grad():
         x, half, best = start, torch.full_like(start, step), cost(start)
@@ -79,20 +82,21 @@ def parabola_minimum(
 def gradient_minimum(
     cost: Cost, start: Tensor, step: float, tolerance: float, rounds: int = 12
 ) -> tuple[Tensor, Tensor]:
-    """Minimise a differentiable cost by secants on its derivative inside a bracket.
+    """Minimise a differentiable cost of one unknown per trial by the secant method on its slope.
 
-    The first bracket is start +- step. Where the slopes at its ends do not bracket a minimum, the
-    trial moves downhill by at most one more step.
+    The first bracket is start +- step. Where the slopes at the ends show that the minimum lies
+    outside, the bracket is extended downhill, by at most one more step.
 
     Args:
         cost: Maps points (...,) to costs (...,), differentiable by autograd.
         start: First point, shape (...,).
-        step: Half width of the first bracket.
-        tolerance: A trial stops when its bracket or move is below it.
+        step: Half width of the first bracket, in the unit of the unknown.
+        tolerance: A trial stops when it moves by at most this in one round.
         rounds: Largest number of rounds.
 
     Returns:
-        The minimum and the second derivative from the last two slopes, each of shape (...,).
+        The position of the minimum, and the second derivative of the cost from the last two slopes,
+        at least 0, each of shape (...,).
     """
     left, right = start - step, start + step
     slope_left, slope_right = _slope(cost, left), _slope(cost, right)

@@ -1,4 +1,4 @@
-"""Bistatic radar with a multichannel airborne receiver and a far transmitter, and its ranges."""
+"""Bistatic radar with a far transmitter and a multichannel airborne receiver; range histories."""
 
 from __future__ import annotations
 
@@ -16,11 +16,13 @@ from torchsar.radar.waveform import LinearFM
 
 @dataclass(frozen=True)
 class BistaticRadar:
-    """Far transmitter with a low pulse rate and airborne receiver with channels along track.
+    """Bistatic radar: a far transmitter with a low pulse rate, and an airborne receiver.
 
-    The phase of an echo is -2 pi / lambda (R_T + R_m), one way each. A range axis holds the receive
-    path R_m = c tau - R_T in steps of c / sampling_hz; on the axis c tau / 2, on which resolutions
-    are quoted, all lengths are half of these. Slow time is zero at pulse n // 2.
+    The receiver has several channels along its track. The phase of an echo is -2 pi (R_T + R_m) /
+    lambda, with the one-way ranges R_T from the transmitter to the target and R_m from the target
+    to the channel m. The range axis holds R_m = c tau - R_T, where tau is the delay of the echo, in
+    steps of c / sampling_hz. Lengths on it are twice those on the axis c tau / 2, on which
+    resolutions are usually quoted. Slow time is zero at pulse n // 2.
 
     Args:
         carrier_hz: Carrier frequency in Hz.
@@ -79,7 +81,8 @@ class BistaticRadar:
         object.__setattr__(self, "transmit_range", tuple(self.transmit_range))
         if not self.channel_m or not all(math.isfinite(x) for x in self.channel_m):
             raise ValueError(
-                f"radar.channel_m needs the along-track position of at least one channel (m), got {self.channel_m}"
+                "radar.channel_m must hold the finite along-track position (m) of at least one channel, "
+                f"got {self.channel_m}"
             )
         if len(set(self.channel_m)) != len(self.channel_m):
             raise ValueError(
@@ -107,7 +110,7 @@ class BistaticRadar:
     def ambiguous_velocity_m_s(self) -> float:
         """Slant-range velocity lambda PRF in m/s that shifts the Doppler frequency by one PRF.
 
-        The channels measure the slant-range velocity modulo this interval, however many they are.
+        Any number of channels measures the slant-range velocity only modulo this interval.
         """
         return self.wavelength_m * self.prf_hz
 
@@ -151,15 +154,23 @@ class BistaticRadar:
             device: Device of the result.
 
         Returns:
-            Weights in FFT order, float64 (n,). A bin at the edge of the band has the fraction that
-            lies inside.
+            Weights in FFT order, float64 (n,): equal inside the band and zero outside. The weight
+            of a bin at the edge is reduced to the fraction of the bin that lies inside.
         """
         bins = self.range_frequency_hz(n, device).abs() * n / self.sampling_hz
         inside = (self.pulse.bandwidth_hz * n / self.sampling_hz / 2 - bins + 0.5).clamp(0, 1)
         return inside * (n / inside.sum())
 
     def transmit_range_m(self, time_s: Tensor) -> Tensor:
-        """Return R_T(t) - R_T(0) in metres by the ephemeris, float64, shape of time_s."""
+        """Return the change of the transmit range since slow time zero, from `transmit_range`.
+
+        Args:
+            time_s: Slow times t in seconds, any shape.
+
+        Returns:
+            Range of the scene from the transmitter at t minus that at zero, k1 t + k2 t^2 + ..., in
+            metres, float64, same shape.
+        """
         return polynomial_range(self.transmit_range, time_s)
 
 
@@ -172,7 +183,7 @@ def polynomial_range(coefficients: Sequence[float | Tensor], time_s: Tensor) -> 
         time_s: Times in seconds.
 
     Returns:
-        Range in metres, float64.
+        Range k1 t + k2 t^2 + ... in metres, float64.
     """
     total = torch.zeros_like(time_s, dtype=torch.float64)
     for k in reversed(coefficients):
@@ -189,17 +200,19 @@ def receive_range(
     speed_m_s: float,
     channel_m: Tensor | float,
 ) -> Tensor:
-    """Return the range history R_m(t) - R0 of a point in uniform motion, exact.
+    """Return the exact range history R_m(t) - R0 from a receive channel to a moving point.
 
-    R_m(t) = sqrt((R0 - u_r t)^2 + (v t - y0 - dx_m)^2) with v = V_R - u_a. The result is formed as
-    a difference, so that it keeps its precision. All arguments broadcast.
+    The point moves uniformly, and the receiver along a straight track: R_m(t) = sqrt((R0 - u_r t)^2
+    + (v t - y0 - dx_m)^2) with v = V_R - u_a. The difference R_m(t) - R0 is computed without
+    subtracting large numbers, so that it keeps its precision. All arguments broadcast.
 
     Args:
         time_s: Slow time t in seconds.
         u_r_m_s: Slant-range speed u_r in m/s, closing positive.
         u_a_m_s: Along-track speed u_a in m/s, positive in the direction of the receiver.
-        y0_m: Along-track position y0 at t = 0 in metres.
-        range_m: Closest range R0 of the track to the point at rest in metres.
+        y0_m: Along-track position y0 of the point at t = 0 in metres.
+        range_m: Range R0 in metres from the track to the position of the point at t = 0, across the
+            track.
         speed_m_s: Speed V_R of the receiver in m/s.
         channel_m: Along-track position dx_m of the channel in metres.
 

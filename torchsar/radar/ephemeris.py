@@ -1,4 +1,4 @@
-"""The orbit of a transmitter in the numbers of a config, and the range that follows from it."""
+"""Orbit of a transmitter as given in a config, and the range polynomial that follows from it."""
 
 from __future__ import annotations
 
@@ -12,23 +12,26 @@ from torchsar.radar.orbit import Orbit, range_coefficients, seen_point
 
 @dataclass(frozen=True)
 class Ephemeris:
-    """Orbit of a transmitter over a rotating spherical Earth, and the point that it looks at.
+    """Orbit of a transmitter over a rotating spherical Earth, and its line of sight to the scene.
 
     Args:
-        height_m: Height above the Earth, at perigee and apogee alike where eccentricity is 0.
-        eccentricity: Eccentricity of the orbit.
-        inclination_deg: Inclination.
-        raan_deg: Right ascension of the ascending node.
-        argument_of_perigee_deg: Argument of perigee.
-        mean_anomaly_deg: Mean anomaly at time zero.
-        off_nadir_deg: Angle of the line of sight from the nadir.
-        squint_deg: Angle of the line of sight ahead of the plane across the track.
-        side: Side of the track that it looks to.
-        time_s: Slow time zero after the mean anomaly given.
-        order: Number of coefficients k1, k2, ... of the range to the transmitter.
+        height_m: Semi-major axis minus the radius of the Earth, in metres; the height of the orbit
+            where the eccentricity is 0.
+        eccentricity: Eccentricity of the orbit, 0 to 0.9.
+        inclination_deg: Inclination in degrees.
+        raan_deg: Right ascension of the ascending node in degrees.
+        argument_of_perigee_deg: Argument of perigee in degrees.
+        mean_anomaly_deg: Mean anomaly at the epoch of the orbit, in degrees.
+        off_nadir_deg: Angle between the line of sight and the nadir in degrees.
+        squint_deg: Rotation of the line of sight about the nadir in degrees; 0 is across the track,
+            90 is ahead.
+        side: Side of the track to which the transmitter looks.
+        time_s: Time in seconds from the epoch of the orbit to slow time zero.
+        order: Number of coefficients k1, k2, ... of the range polynomial from the transmitter to
+            the scene, 1 to 6.
 
     Raises:
-        ValueError: If the height is not positive, or eccentricity or order are out of their range.
+        ValueError: If the height is not positive, or the eccentricity or the order is out of range.
     """
 
     height_m: float = 36_500e3
@@ -47,14 +50,15 @@ class Ephemeris:
         if not self.height_m > 0 or not 0 <= self.eccentricity <= 0.9 or not 1 <= self.order <= 6:
             raise ValueError(
                 "an orbit needs a positive height_m, eccentricity of 0 to 0.9 and order of 1 to 6, got "
-                f"{self.height_m}, {self.eccentricity} and {self.order}"
+                f"height_m={self.height_m}, eccentricity={self.eccentricity} and order={self.order}"
             )
 
     def transmit_coefficients(self) -> tuple[float, ...]:
-        """Compute k1, k2, ... of the range from the satellite to the point that it looks at.
+        """Compute the coefficients of the range from the satellite to the point that it looks at.
 
         Returns:
-            Coefficients of the polynomial in slow time, k_i in m/s^i.
+            Coefficients k1, k2, ... in m/s, m/s^2, ... of the change of range k1 t + k2 t^2 + ...
+            with the slow time t.
         """
         names = ("eccentricity", "inclination_deg", "raan_deg", "argument_of_perigee_deg", "mean_anomaly_deg")
         orbit = Orbit.at_height(self.height_m, **{name: getattr(self, name) for name in names})

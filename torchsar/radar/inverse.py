@@ -67,18 +67,23 @@ class InverseRadar:
             ValueError: If `pulse_s` is None.
         """
         if self.pulse_s is None:
-            raise ValueError("radar.pulse_s is not set; give the length of the dechirped pulse")
+            raise ValueError("radar.pulse_s is not set; give the length of the dechirped pulse in seconds")
         return self.bandwidth_hz / self.pulse_s
 
     def cross_range_step_m(self, n_pulse: int) -> float:
-        """Return the cross-range cell lambda / (2 omega T) in metres, with T = n_pulse / prf.
+        """Return the cross-range cell lambda / (2 omega T) of an image, in metres.
+
+        Args:
+            n_pulse: Number of pulses, which last T = n_pulse / PRF; the target rotates with omega,
+                `rotation_rad_s`.
 
         Raises:
             ValueError: If `rotation_rad_s` is None.
         """
         if self.rotation_rad_s is None:
             raise ValueError(
-                "radar.rotation_rad_s is not set; give it for an axis in metres, else images have a Doppler axis"
+                "radar.rotation_rad_s is not set; give the rotation rate of the target in rad/s, without which "
+                "cross range has no scale in metres"
             )
         return self.wavelength_m * self.prf_hz / (2 * self.rotation_rad_s * n_pulse)
 

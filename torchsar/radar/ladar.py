@@ -33,11 +33,12 @@ class TriangularLadar:
         reference_range_m: Delay of the local oscillator as a range in metres; ranges of scatterers
             are relative to it.
         beam_rad: Illuminated azimuth angle in radians, None where the beam covers the whole scene.
-        keep_every: One period is recorded of every `keep_every` periods.
-        detection: "complex" samples, or one "real" channel.
-        dechirp_sign: "lo_conj_echo" as printed in the paper: the phase is +2 pi fc dtau, and a
-            scatterer beyond the reference range has a positive beat frequency in the up sweep.
-            "echo_conj_lo" is its conjugate.
+        keep_every: Of every `keep_every` periods, one is recorded.
+        detection: "complex" for complex samples, "real" for those of a one-channel detector.
+        dechirp_sign: Sign of the dechirped phase. "lo_conj_echo" is the local oscillator times the
+            conjugate echo, as in the paper: the phase is +2 pi carrier_hz times the delay relative
+            to the local oscillator, and a scatterer beyond the reference range has a positive beat
+            frequency in the up sweep. "echo_conj_lo" is the conjugate.
         wave_speed_m_s: Propagation speed in m/s.
 
     Raises:
@@ -68,14 +69,15 @@ class TriangularLadar:
             raise ValueError(f"radar.speed_m_s must be a number of 0 or more, got {self.speed_m_s}")
         if self.beam_rad is not None and not 0 < self.beam_rad < math.pi:
             raise ValueError(
-                "radar.beam_rad must lie in 0..pi, or be None where the beam covers the whole scene, "
+                "radar.beam_rad must lie in 0..pi rad, or be None where the beam covers the whole scene, "
                 f"got {self.beam_rad}"
             )
         if not (isinstance(self.keep_every, int) and self.keep_every >= 1):
             raise ValueError(f"radar.keep_every must be a whole number of 1 or more, got {self.keep_every}")
         if not self.bandwidth_hz < 2 * self.carrier_hz:
             raise ValueError(
-                f"radar.bandwidth_hz of {self.bandwidth_hz:g} Hz does not fit about a carrier of {self.carrier_hz:g} Hz"
+                f"radar.bandwidth_hz must be less than twice the carrier of {self.carrier_hz:g} Hz, "
+                f"got {self.bandwidth_hz:g} Hz"
             )
         for name, kinds in (("detection", get_args(Detection)), ("dechirp_sign", get_args(DechirpSign))):
             if getattr(self, name) not in kinds:
@@ -83,8 +85,8 @@ class TriangularLadar:
         samples = self.sweep_s * self.sample_rate_hz
         if round(samples) < 16 or abs(samples - round(samples)) > 1e-6 * samples:
             raise ValueError(
-                f"a sweep of {self.sweep_s:g} s holds {samples:g} samples at {self.sample_rate_hz:g} "
-                "Hz; choose a sample rate that makes it a whole number of 16 or more"
+                "radar.sample_rate_hz must give a whole number of samples, 16 or more, in a sweep of "
+                f"{self.sweep_s:g} s, got {samples:g} samples at {self.sample_rate_hz:g} Hz"
             )
 
     @property
@@ -99,7 +101,7 @@ class TriangularLadar:
 
     @property
     def chirp_rate_hz_s(self) -> float:
-        """Chirp rate K = 2 B / period in Hz/s."""
+        """Chirp rate 2 B / period in Hz/s, with the bandwidth B of one sweep."""
         return self.bandwidth_hz / self.sweep_s
 
     @property
@@ -109,7 +111,7 @@ class TriangularLadar:
 
     @property
     def range_step_m(self) -> float:
-        """Range cell c / (2 B) in metres, which is one bin 1 / sweep_s of the beat frequency."""
+        """Range cell c / (2 B) in metres, the range of one bin (1 / sweep_s) of beat frequency."""
         return self.wave_speed_m_s / (2 * self.bandwidth_hz)
 
     @property
@@ -119,9 +121,10 @@ class TriangularLadar:
 
     @property
     def ambiguous_velocity_m_s(self) -> float:
-        """Velocity interval lambda / (2 sweep_s) in m/s of one cycle of the interference phase.
+        """Radial velocity lambda / (2 T) in m/s that shifts the phase by one cycle per sweep.
 
-        The segmented interference measures the radial velocity modulo this interval.
+        T is the length of a sweep. The segmented interference of the paper compares the phases of
+        the halves of the sweeps, and therefore measures the radial velocity modulo this interval.
 
         Reference:
             Remote Sens. 2024, 16, 793, Eq. (17).
@@ -129,15 +132,19 @@ class TriangularLadar:
         return self.wavelength_m / (2 * self.sweep_s)
 
     def beat_hz(self, relative_range_m: float) -> float:
-        """Return the beat frequency of a scatterer at rest in the up sweep, K 2 RD / c, in Hz.
+        """Return the beat frequency 2 K R / c of a scatterer at rest in the up sweep, in Hz.
+
+        K is the chirp rate; the sign is that of the dechirp sign "lo_conj_echo".
 
         Args:
-            relative_range_m: Range RD of the scatterer relative to the reference range in metres.
+            relative_range_m: Range R of the scatterer relative to the reference range in metres.
         """
         return self.chirp_rate_hz_s * 2 * relative_range_m / self.wave_speed_m_s
 
     def doppler_hz(self, velocity_m_s: float) -> float:
-        """Return the shift of the beat frequency by a radial velocity, 2 v / lambda, in Hz.
+        """Return the shift 2 v / lambda of the beat frequency by a radial velocity, in Hz.
+
+        The sign is that of the dechirp sign "lo_conj_echo", in the up sweep and the down sweep.
 
         Args:
             velocity_m_s: Radial velocity v in m/s, receding positive.
@@ -145,9 +152,10 @@ class TriangularLadar:
         return 2 * velocity_m_s / self.wavelength_m
 
     def fast_time_axis(self) -> Axis:
-        """Return the time from the middle of a sweep, u_n = (n - (N - 1) / 2) / fs, in seconds.
+        """Return the axis of the time from the middle of a sweep, in seconds.
 
-        The samples are symmetric about zero, so that a sweep can be reversed in time.
+        Sample n of N lies at (n - (N - 1) / 2) / sample_rate_hz. The samples are symmetric about
+        zero, so that a sweep can be reversed in time.
         """
         n, step = self.sweep_samples, 1 / self.sample_rate_hz
         return Axis("fast_time", n, -(n - 1) / 2 * step, step, "s")
@@ -174,8 +182,8 @@ class TriangularLadar:
     def record_axes(self, n_period: int, n_sample: int, start_s: float | None = None) -> tuple[Axis, Axis]:
         """Return the axes (pulse, time) of a continuous record in blocks, one per recorded period.
 
-        The first sample lies half a sampling interval after the start of its block. Samples of
-        separated sweeps are then samples of the record where the triangle starts with the block.
+        The first sample lies half a sampling interval after the start of its block. Where the
+        triangle starts with the block, the samples of separated sweeps are samples of the record.
 
         Args:
             n_period: Number of recorded periods.
@@ -195,7 +203,7 @@ def sweep_middles(radar: TriangularLadar, pulse: Axis, device: torch.device | st
 
     Args:
         radar: Instrument.
-        pulse: Axis of the starts of the periods in seconds.
+        pulse: Axis with the start of each period in seconds.
         device: Device of the result.
 
     Returns:
@@ -210,12 +218,12 @@ _LEADING = 10 ** (-10 / 20)
 
 
 def leading(level: Tensor) -> Tensor:
-    """Scatterers within 10 dB of the strongest.
+    """Mark the scatterers whose amplitude is within 10 dB of the strongest and above zero.
 
     Args:
-        level: Amplitudes, (..., target).
+        level: Amplitudes, shape (..., target).
 
     Returns:
-        bool (..., target).
+        True for these scatterers, bool, shape (..., target).
     """
     return (level >= _LEADING * level.amax(-1, keepdim=True)) & (level > 0)

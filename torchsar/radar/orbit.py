@@ -62,16 +62,19 @@ class Orbit:
 
     @staticmethod
     def at_height(height_m: float, **elements: Tensor | float) -> Orbit:
-        """Return the orbit whose semi-major axis is height_m above the radius of the Earth.
+        """Return the orbit whose semi-major axis is the radius of the Earth plus a height.
 
         Args:
             height_m: Height in metres.
-            elements: Other elements of the orbit by name.
+            **elements: Other elements of the orbit by name, such as `inclination_deg`.
         """
         return Orbit(EARTH_RADIUS_M + height_m, **elements)
 
     def state(self, time_s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return position and velocity at given times; differentiable in the elements and in time.
+        """Return the position and velocity of the satellite at given times.
+
+        Both are in the Earth-centred inertial frame, and differentiable in the elements of the
+        orbit and in time.
 
         Args:
             time_s: Times in seconds, float64 (time,).
@@ -108,7 +111,7 @@ def _radians(degrees: Tensor | float, like: Tensor) -> Tensor:
 def eccentric_anomaly(mean_rad: Tensor, eccentricity: Tensor) -> Tensor:
     """Solve Kepler's equation E - e sin E = M by Newton's method.
 
-    Only the last step is differentiated; at the solution its gradient is that of E itself.
+    Autograd differentiates only the last Newton step, whose gradient at the solution is that of E.
 
     Args:
         mean_rad: Mean anomaly M in radians.
@@ -178,8 +181,9 @@ def seen_point(
 ) -> Tensor:
     """Return the point of the spherical Earth on the line of sight of a satellite.
 
-    The squint rotates the line of sight about the nadir: 0 degrees is across the path relative to
-    the rotating Earth (where k1 = 0 on a circular orbit), 90 degrees is ahead along that path.
+    The squint rotates the line of sight about the nadir: 0 degrees is across the path of the
+    satellite relative to the rotating Earth (on a circular orbit the range rate is then zero), 90
+    degrees is ahead along that path.
 
     Args:
         position_m: Position of the satellite in the inertial frame in metres, shape (..., 3).
@@ -205,9 +209,9 @@ def seen_point(
     inside = EARTH_RADIUS_M**2 - (height * torch.sin(tilt)).square()
     if not bool((inside.detach() > 0).all()):
         raise ValueError(
-            f"a line of sight {off_nadir_deg} degrees off nadir misses the Earth from "
-            f"{float(height.detach().max()) / 1e3:g} km; stay below {_horizon_deg(height):.4g} "
-            "degrees"
+            f"a line of sight {off_nadir_deg} degrees off nadir misses the Earth; stay below "
+            f"{_horizon_deg(height):.4g} degrees for a satellite {float(height.detach().max()) / 1e3:g} km from the "
+            "centre of the Earth"
         )
     return position_m + (height * torch.cos(tilt) - torch.sqrt(inside)) * look
 
@@ -227,7 +231,7 @@ def power_series(series: Sequence[Tensor], power: float) -> list[Tensor]:
         power: Exponent.
 
     Returns:
-        As many coefficients of the power.
+        Taylor coefficients of s(t)^power, as many as in `series`.
     """
     out = [series[0] ** power]
     for n in range(1, len(series)):
@@ -248,15 +252,15 @@ def _dot_series(series: Sequence[Tensor]) -> list[Tensor]:
 
 
 def orbit_series(position_m: Tensor, velocity_m_s: Tensor, order: int) -> list[Tensor]:
-    """Return the Taylor coefficients of a two-body orbit up to t^order.
+    """Return the Taylor coefficients of the position on a two-body orbit, up to t^order.
 
     Args:
-        position_m: Position in metres, shape (..., 3).
-        velocity_m_s: Velocity in m/s, shape (..., 3).
+        position_m: Position at t = 0 in the inertial frame in metres, shape (..., 3).
+        velocity_m_s: Velocity at t = 0 in m/s, shape (..., 3).
         order: Highest power of time.
 
     Returns:
-        order + 1 coefficients, shape (..., 3) each.
+        order + 1 coefficients in m, m/s, m/s^2, ..., shape (..., 3) each.
     """
     series = [position_m, velocity_m_s]
     for n in range(order - 1):
@@ -270,11 +274,11 @@ def earth_series(point_m: Tensor, order: int) -> list[Tensor]:
     """Return the Taylor coefficients up to t^order of the path of a point fixed to the Earth.
 
     Args:
-        point_m: Position in the inertial frame in metres, shape (..., 3).
+        point_m: Position at t = 0 in the inertial frame in metres, shape (..., 3).
         order: Highest power of time.
 
     Returns:
-        order + 1 coefficients, shape (..., 3) each.
+        order + 1 coefficients in m, m/s, m/s^2, ..., shape (..., 3) each.
     """
     series = [point_m]
     for n in range(order):
@@ -283,12 +287,14 @@ def earth_series(point_m: Tensor, order: int) -> list[Tensor]:
 
 
 def range_coefficients(orbit: Orbit, point_m: Tensor, time_s: Tensor, order: int = 4) -> Tensor:
-    """Return the Taylor coefficients k1, k2, ... of the transmit range R_T(t) about given times.
+    """Return the Taylor coefficients k1, k2, ... of the transmit range about given times.
 
-    R_T(t) = R_1T + k1 t + k2 t^2 + ..., exact and differentiable. With dr, dv, da the differences
-    of position, velocity and acceleration, k1 = dr.dv / R and k2 = (dv.dv / R + dr.da / R - k1^2 /
-    R) / 2. The printed Eqs. (10), (11) have another sign and other factors. Higher orders follow by
-    series arithmetic from the equations of motion.
+    The transmit range R is that from the transmitter to the scene point. At the time t after a time
+    of expansion it is R + k1 t + k2 t^2 + ...; the coefficients are exact and differentiable. With
+    dr, dv, da the differences of position, velocity and acceleration between transmitter and point,
+    k1 = dr.dv / R and k2 = (dv.dv / R + dr.da / R - k1^2 / R) / 2. Eqs. (10) and (11) as printed in
+    the paper have another sign and other factors. Higher orders follow by series arithmetic from
+    the equations of motion.
 
     Args:
         orbit: Orbit of the transmitter.
@@ -309,9 +315,9 @@ def range_coefficients(orbit: Orbit, point_m: Tensor, time_s: Tensor, order: int
 
 
 def orbit_range(orbit: Orbit, point_m: Tensor, epoch_s: Tensor | float, time_s: Tensor) -> Tensor:
-    """Return the change of the transmit range R_T(epoch + t) - R_T(epoch), exact.
+    """Return the exact change since an epoch of the range from the transmitter to a scene point.
 
-    The result is formed as a difference, so that it keeps its precision.
+    The change is computed without subtracting two large ranges, so that it keeps its precision.
 
     Args:
         orbit: Orbit of the transmitter.
@@ -320,7 +326,7 @@ def orbit_range(orbit: Orbit, point_m: Tensor, epoch_s: Tensor | float, time_s: 
         time_s: Times t after the epoch in seconds, float64 (time,).
 
     Returns:
-        Change of range in metres, float64 (..., time).
+        Range at epoch + t minus range at the epoch, in metres, float64 (..., time).
     """
     epoch = torch.as_tensor(epoch_s, dtype=torch.float64, device=time_s.device)[..., None]
     start = orbit.state(epoch)[0] - point_m[..., None, :]

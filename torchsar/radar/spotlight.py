@@ -1,8 +1,8 @@
 """Geometry of spotlight and turntable recordings, and the error of the plane-wave approximation.
 
-Ground points have coordinates x, y, z in metres about the scene centre. A scatterer at range r
-behind that centre (r grows away from the radar) has the phase -4 pi f r / c at the frequency f.
-Range profiles are the centred unitary transform of such samples.
+Ground points have coordinates x, y, z in metres about the scene centre. A scatterer at the range r
+relative to that centre (r grows away from the radar) has the phase -4 pi f r / c at the frequency
+f. Range profiles are the centred, unitary inverse Fourier transform of such samples.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _STEP_TOLERANCE = 0.01
 
 
 def range_profiles(samples: Tensor) -> Tensor:
-    """Transform frequency samples to range profiles (unitary).
+    """Transform frequency samples to range profiles by a unitary inverse Fourier transform.
 
     Args:
         samples: Frequency samples, shape (..., n), complex.
@@ -77,16 +77,17 @@ def frequency_step_hz(frequency_hz: Tensor) -> float:
 
 @dataclass(frozen=True, eq=False)
 class FarField:
-    """Plane-wave geometry: the range of a ground point is direction . (x, y) + offset.
+    """Plane-wave geometry: the range of a ground point (x, y) is direction . (x, y) + offset.
 
-    The curvature of the wavefront is neglected; `plane_wave_loss` bounds the error and
+    The curvature of the wavefront is neglected; `plane_wave_loss` bounds the resulting error, and
     `Spotlight.neglected_range_m` gives it exactly.
 
     Args:
         frequency_hz: Frequencies in Hz, float64 (n,), rising in equal steps.
-        direction: Change of range per metre along x and y, float64 (pulse, 2): the ground part of
-            the unit vector that points away from the radar.
-        offset_m: Range of the scene centre in metres, float64 (pulse,).
+        direction: Change of range per metre along x and y, float64 (pulse, 2): the x and y
+            components of the unit vector that points away from the radar.
+        offset_m: Range of the scene centre relative to range zero of the profiles in metres,
+            float64 (pulse,).
         wave_speed_m_s: Propagation speed in m/s.
 
     Raises:
@@ -102,13 +103,13 @@ class FarField:
         frequency_step_hz(self.frequency_hz)
         if self.direction.ndim != 2 or self.direction.shape[-1] != 2 or self.offset_m.shape != self.direction.shape[:1]:
             raise ValueError(
-                "direction must be (pulse, 2) and offset_m (pulse,), got "
+                "direction must have the shape (pulse, 2) and offset_m the shape (pulse,), got "
                 f"{tuple(self.direction.shape)} and {tuple(self.offset_m.shape)}"
             )
 
     @classmethod
     def turntable(cls, frequency_hz: Tensor, angle_rad: Tensor, wave_speed_m_s: float = LIGHT_M_S) -> FarField:
-        """Return the geometry of a rotating target, range x cos a + y sin a.
+        """Return the plane-wave geometry of a rotating target, with range x cos a + y sin a.
 
         Args:
             frequency_hz: Frequencies in Hz, float64 (n,).
@@ -127,13 +128,17 @@ class FarField:
         )
 
     def turned(self, angle_rad: float) -> FarField:
-        """Return the same waves in coordinates with the x axis turned by angle_rad towards y."""
+        """Return the same geometry in ground coordinates that are turned about the scene centre.
+
+        Args:
+            angle_rad: Angle in radians by which the new x axis is turned towards the old y axis.
+        """
         cos, sin = math.cos(angle_rad), math.sin(angle_rad)
         turn = torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64, device=self.direction.device)
         return replace(self, direction=self.direction @ turn)
 
     def to(self, device: torch.device | str) -> FarField:
-        """Return the same waves on another device."""
+        """Return the same plane-wave geometry with its tensors on another device."""
         return replace(
             self,
             frequency_hz=self.frequency_hz.to(device),
@@ -149,10 +154,12 @@ class FarField:
     def range_m(self, pulses: slice, x: Tensor, y: Tensor) -> Tensor:
         """Return the range of ground points in given pulses.
 
+        Range is counted from range zero of the range profiles.
+
         Args:
-            pulses: Pulses.
-            x: First coordinate in metres, shape (point,).
-            y: Second coordinate in metres, shape (point,).
+            pulses: Slice of the pulses.
+            x: Coordinate x of the points in metres, shape (point,).
+            y: Coordinate y of the points in metres, shape (point,).
 
         Returns:
             Range in metres, float64 (pulse, point).
@@ -163,14 +170,15 @@ class FarField:
 
 @dataclass(frozen=True, eq=False)
 class Spotlight:
-    """Antenna positions about the scene centre and the reference ranges of the profiles.
+    """Spotlight geometry: antenna positions about the scene centre, and reference ranges.
 
-    The range of a point p is |position - p| - reference.
+    In a range profile the point p lies at the range |position - p| - reference.
 
     Args:
         frequency_hz: Frequencies in Hz, float64 (n,), rising in equal steps.
         position_m: Antenna positions in metres, float64 (pulse, 3).
-        reference_m: Ranges in metres to which the profiles refer, float64 (pulse,).
+        reference_m: Range from the antenna in metres that is range zero of each profile, float64
+            (pulse,).
         height_m: Coordinate z of the ground points in metres.
         wave_speed_m_s: Propagation speed in m/s.
 
@@ -192,12 +200,16 @@ class Spotlight:
             or self.reference_m.shape != self.position_m.shape[:1]
         ):
             raise ValueError(
-                "position_m must be (pulse, 3) and reference_m (pulse,), got "
+                "position_m must have the shape (pulse, 3) and reference_m the shape (pulse,), got "
                 f"{tuple(self.position_m.shape)} and {tuple(self.reference_m.shape)}"
             )
 
     def turned(self, angle_rad: float) -> Spotlight:
-        """Return the same antennas in coordinates with the x axis turned by angle_rad towards y."""
+        """Return the same geometry in ground coordinates that are turned about the scene centre.
+
+        Args:
+            angle_rad: Angle in radians by which the new x axis is turned towards the old y axis.
+        """
         cos, sin = math.cos(angle_rad), math.sin(angle_rad)
         turn = torch.tensor(
             [[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]], dtype=torch.float64, device=self.position_m.device
@@ -205,7 +217,7 @@ class Spotlight:
         return replace(self, position_m=self.position_m @ turn)
 
     def to(self, device: torch.device | str) -> Spotlight:
-        """Return the same antennas on another device."""
+        """Return the same spotlight geometry with its tensors on another device."""
         return replace(
             self,
             frequency_hz=self.frequency_hz.to(device),
@@ -221,10 +233,12 @@ class Spotlight:
     def range_m(self, pulses: slice, x: Tensor, y: Tensor) -> Tensor:
         """Return the range of ground points in given pulses.
 
+        Range is counted from range zero of the range profiles.
+
         Args:
-            pulses: Pulses.
-            x: First coordinate in metres, shape (point,).
-            y: Second coordinate in metres, shape (point,).
+            pulses: Slice of the pulses.
+            x: Coordinate x of the points in metres, shape (point,).
+            y: Coordinate y of the points in metres, shape (point,).
 
         Returns:
             Range in metres, float64 (pulse, point).
@@ -236,9 +250,9 @@ class Spotlight:
         return torch.sqrt(square) - self.reference_m[pulses, None]
 
     def far_field(self) -> FarField:
-        """Return the plane waves that match this geometry at the scene centre.
+        """Return the plane-wave approximation of this geometry about the scene centre.
 
-        Range and its first derivatives agree at the centre of the ground plane.
+        The range and its first derivatives are exact at x = y = 0 on the ground plane.
         """
         down = self.position_m.new_tensor([0.0, 0.0, self.height_m]) - self.position_m
         distance = torch.linalg.vector_norm(down, dim=-1)
@@ -247,14 +261,14 @@ class Spotlight:
         )
 
     def neglected_range_m(self, x: Tensor, y: Tensor) -> Tensor:
-        """Return the range error of the plane-wave approximation, at most about rho^2 / (2 range).
+        """Return the range that the plane-wave approximation neglects at ground points.
 
-        The error is the exact range minus the range under the plane-wave approximation; rho is the
-        distance of the point from the scene centre.
+        It is the exact range minus that of the approximation, at most about rho^2 / (2 R) for a
+        point at the distance rho from the scene centre and the antenna at the distance R.
 
         Args:
-            x: First coordinate of ground points in metres, shape (point,).
-            y: Second coordinate in metres, shape (point,).
+            x: Coordinate x of the points in metres, shape (point,).
+            y: Coordinate y of the points in metres, shape (point,).
 
         Returns:
             Neglected range in metres, shape (pulse, point).
@@ -265,13 +279,14 @@ class Spotlight:
     def apparent(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Return the positions at which the plane-wave approximation shows ground points.
 
-        They are the least-squares fit of the exact ranges over all pulses. Sampling a polar-format
-        image at these positions puts it on the true ground; the residual of the fit is the
-        remaining defocus. The azimuth angle must change over the aperture.
+        The plane-wave ranges of these positions fit the exact ranges of the points in least squares
+        over all pulses; the residual of the fit defocuses the points. A polar-format image that is
+        sampled at these positions has no distortion. The azimuth angle must change over the
+        aperture.
 
         Args:
-            x: First coordinate of ground points in metres, shape (point,).
-            y: Second coordinate in metres, shape (point,).
+            x: True coordinate x of the points in metres, shape (point,).
+            y: True coordinate y of the points in metres, shape (point,).
 
         Returns:
             Apparent coordinates x and y in metres, shape (point,) each.
@@ -283,13 +298,14 @@ class Spotlight:
 
 @dataclass(frozen=True)
 class PlaneWaveLoss:
-    """Displacement and defocus that plane waves cause at the edge of an image.
+    """Displacement and defocus of a point that the plane-wave approximation causes.
 
     Args:
-        total_rad: Phase of the neglected range in radians; all of it but `defocus_rad` only
-            displaces the point.
-        displacement_m: Largest displacement on the ground in metres, in either direction.
-        defocus_rad: Phase at the ends of the aperture that no displacement explains, in radians.
+        total_rad: Phase in radians of the range that the approximation neglects. All of it except
+            `defocus_rad` only displaces the point.
+        displacement_m: Largest displacement on the ground in metres, in range or in cross range.
+        defocus_rad: Phase error at the ends of the aperture, in radians, that remains after the
+            displacement.
     """
 
     total_rad: float
@@ -300,13 +316,14 @@ class PlaneWaveLoss:
 def plane_wave_loss(
     radius_m: float, range_m: float, aperture_rad: float, wavelength_m: float, elevation_rad: float = 0.0
 ) -> PlaneWaveLoss:
-    """Bound the displacement and the defocus that plane waves cause at a ground point.
+    """Bound the displacement and defocus of a ground point by the plane-wave approximation.
 
-    The neglected range is d = (rho^2 - (u . p)^2) / (2 R) with u . p = rho cos(el) cos(azimuth from
-    the line of sight). Its mean shifts range and its slope over the aperture shifts cross range. A
-    shifted point does not explain d'' + d, which is at most rho^2 (1 + cos(el)^2) / (2 R); its
-    phase at the ends of the aperture is `defocus_rad`. Use it for apertures below about 1 rad;
-    terms of order rho^3 / R^2 are left out.
+    With the elevation el of the line of sight and the azimuth a of the point relative to it, the
+    neglected range is d(a) = (rho^2 - (rho cos(el) cos(a))^2) / (2 R). Its mean over the aperture
+    shifts the point in range, and its slope shifts it in cross range. What no shift explains is
+    d'' + d, with the second derivative d'' in a; it is at most rho^2 (1 + cos(el)^2) / (2 R), and
+    its phase at the ends of the aperture is `defocus_rad`. The bounds hold for apertures below
+    about 1 rad, and leave out terms of order rho^3 / R^2.
 
     Args:
         radius_m: Distance rho of the point from the scene centre in metres.
@@ -316,7 +333,7 @@ def plane_wave_loss(
         elevation_rad: Elevation of the line of sight in radians.
 
     Returns:
-        Upper bounds.
+        Upper bounds of the phase, displacement and defocus.
 
     Raises:
         ValueError: If an argument is out of range.
@@ -327,9 +344,9 @@ def plane_wave_loss(
         and wavelength_m > 0
         and abs(elevation_rad) < math.pi / 2
     ):
-        got = f"{radius_m}, {range_m}, {aperture_rad}, {wavelength_m}, {elevation_rad}"
+        got = f"{radius_m=}, {range_m=}, {aperture_rad=}, {wavelength_m=}, {elevation_rad=}"
         raise ValueError(
-            "need 0 <= radius_m < range_m, 0 <= aperture_rad <= 2 pi, wavelength_m > 0 and "
+            "plane_wave_loss needs 0 <= radius_m < range_m, 0 <= aperture_rad <= 2 pi, wavelength_m > 0 and "
             f"|elevation_rad| < pi / 2, got {got}"
         )
     per_metre = 4 * math.pi / wavelength_m
@@ -346,20 +363,18 @@ def geometry_of(
     reference_m: Tensor | None = None,
     height_m: float = 0.0,
 ) -> FarField | Spotlight:
-    """Build the geometry from recorded side data.
-
-    Angles give a turntable, antenna positions give a spotlight geometry.
+    """Build the imaging geometry from the frequencies and angles or positions of a recording.
 
     Args:
         frequency_hz: Frequencies in Hz, float64 (n,).
         angle_rad: Rotation angles in radians, float64 (pulse,), or None.
         position_m: Antenna positions in metres, float64 (pulse, 3), or None.
-        reference_m: Ranges of the profiles in metres, float64 (pulse,), by default the distance of
-            the antenna from the scene centre.
+        reference_m: Range from the antenna in metres that is range zero of each profile, float64
+            (pulse,); by default the distance of the antenna from the scene centre.
         height_m: Coordinate z of the ground points in metres.
 
     Returns:
-        Turntable geometry for angles, spotlight geometry for antenna positions.
+        FarField of a turntable if angles are given, Spotlight if antenna positions are given.
 
     Raises:
         ValueError: If the frequencies are missing, or not exactly one of angles and positions is
@@ -373,8 +388,8 @@ def geometry_of(
             if v is not None
         ]
         raise ValueError(
-            "need frequency_hz and either angle_rad or position_m (connect them with `use`, such "
-            f"as angle_rad='aux.angle_rad'), got {given or 'none of them'}"
+            "the imaging geometry needs frequency_hz and either angle_rad or position_m (connect them with "
+            f"`use`, such as angle_rad='aux.angle_rad'), got {given or 'none of them'}"
         )
     if angle_rad is not None:
         return FarField.turntable(frequency_hz, angle_rad)
@@ -389,5 +404,5 @@ def _float64(value: Tensor | None, name: str, ndim: int) -> Tensor:
     """Return the value if it is a float64 tensor with ndim dimensions, else raise TypeError."""
     if not isinstance(value, Tensor) or value.dtype != torch.float64 or value.ndim != ndim:
         got = f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
-        raise TypeError(f"{name} must be a float64 tensor with {ndim} dims, shared by all trials, got {got}")
+        raise TypeError(f"{name} must be a float64 tensor with {ndim} dims, the same for all trials, got {got}")
     return value

@@ -18,7 +18,7 @@ LIGHT_M_S = 299_792_458.0  # speed of light in vacuum, by definition of the metr
 class StripmapRadar:
     """Stripmap radar on a straight path, described in the slant plane.
 
-    The effective velocity also fixes the azimuth scale of images, x = velocity * slow time.
+    The nominal effective velocity also gives images their azimuth axis, x = velocity * slow time.
 
     Args:
         carrier_hz: Carrier frequency in Hz.
@@ -26,7 +26,7 @@ class StripmapRadar:
         sampling_hz: Complex sampling rate in Hz, at least the bandwidth of the pulse.
         prf_hz: Pulse repetition frequency in Hz.
         velocity_m_s: Nominal effective velocity in m/s.
-        near_range_m: Slant range of sample 0 in metres, counted from the leading edge of the echo.
+        near_range_m: Slant range in metres of a target whose echo begins at sample 0.
         pointing_doppler_hz: Nominal Doppler of the beam centre in Hz, to which image coordinates
             refer. None where it has yet to be estimated.
         integration_s: Nominal coherent integration time (beam dwell) in seconds. None where the
@@ -160,17 +160,24 @@ class StripmapRadar:
         return 2 * velocity.square() / (self.wavelength_m * torch.as_tensor(range_m, dtype=torch.float64))
 
     def aperture_s(self, range_m: float) -> float:
-        """Return the duration of one synthetic aperture at a range, in seconds.
+        """Return the duration of one synthetic aperture, in seconds.
 
         This is the nominal integration time or, where that is None, the time in which the Doppler
-        of a point sweeps one PRF.
+        frequency of a target sweeps one PRF.
+
+        Args:
+            range_m: Closest range of the target in metres.
         """
         return (
             self.prf_hz / float(self.azimuth_rate_hz_s(range_m)) if self.integration_s is None else self.integration_s
         )
 
     def aperture_lines(self, range_m: float) -> int:
-        """Return the number of pulses of one synthetic aperture at a range, rounded up."""
+        """Return the number of pulses of one synthetic aperture, rounded up.
+
+        Args:
+            range_m: Closest range of the target in metres.
+        """
         return math.ceil(self.aperture_s(range_m) * self.prf_hz)
 
     def image_position(
@@ -182,9 +189,10 @@ class StripmapRadar:
     ) -> tuple[Tensor, Tensor]:
         """Return the position of a target in an image that refers to a given Doppler frequency.
 
-        The line of sight of frame Doppler f crosses the target at slant range R = r / cos(squint)
-        and slow time t = t0 - lambda f R / (2 v^2). The image shows the target at (nominal velocity
-        * t, R). With f = 0 these are the zero-Doppler coordinates. All arguments broadcast.
+        The target has the Doppler frequency f at the slant range R = r / cos(squint) and the slow
+        time t = t0 - lambda f R / (2 v^2). The image shows it at the azimuth t times the nominal
+        velocity and at the slant range R. With f = 0 these are the zero-Doppler coordinates. All
+        arguments broadcast.
 
         Args:
             zero_doppler_s: Slow time t0 of closest approach in seconds.

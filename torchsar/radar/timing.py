@@ -14,14 +14,14 @@ from torchsar.radar.stripmap import LIGHT_M_S
 
 @dataclass(frozen=True)
 class TimingDiagram:
-    """Swath positions at which an echo meets a transmitted pulse or the nadir echo.
+    """Ground positions whose echo overlaps a transmitted pulse or the nadir echo, for each PRF.
 
     Args:
         prf_hz: Pulse repetition frequencies in Hz, shape (prf,).
         ground_m: Ground distance from the sub-satellite point in metres, evenly spaced, shape
             (ground,).
-        transmit: True where the echo meets a transmitted pulse, bool (prf, ground).
-        nadir: True where the echo meets the nadir echo, bool (prf, ground).
+        transmit: True where the echo overlaps a transmitted pulse, bool (prf, ground).
+        nadir: True where the echo overlaps the nadir echo, bool (prf, ground).
 
     Reference:
         Remote Sens. 2020, 12, 1703, Fig. 2.
@@ -34,17 +34,18 @@ class TimingDiagram:
 
     @property
     def clear(self) -> Tensor:
-        """Whether the echo of a ground position is received completely, bool (prf, ground)."""
+        """True where the echo overlaps neither a pulse nor the nadir echo, bool (prf, ground)."""
         return ~(self.transmit | self.nadir)
 
     def swath_fits(self, width_m: float) -> Tensor:
-        """Test whether a swath of a given width is clear from each starting position to its end.
+        """Test for each ground position whether a swath that starts there is received completely.
 
         Args:
             width_m: Width of the swath on the ground in metres.
 
         Returns:
-            Bool (prf, ground), False where the swath extends beyond the end of `ground_m`.
+            True where all echoes of the swath are received completely, bool (prf, ground); False
+            where the swath extends beyond the end of `ground_m`.
         """
         cells = math.ceil(width_m / float(self.ground_m[1] - self.ground_m[0])) + 1
         lost = torch.nn.functional.pad((~self.clear).to(torch.int64).cumsum(-1), (1, 0))
@@ -59,9 +60,10 @@ def timing_diagram(
 ) -> TimingDiagram:
     """Compute the timing diagram of a satellite that receives its own echoes.
 
-    The Earth is spherical. The echo of a ground position lasts pulse_s from its two-way delay
-    onward. It must stay guard_s away from the transmitted pulses at k / PRF, and from the nadir
-    echo, which lasts pulse_s + nadir_s from 2 height / c + k / PRF onward.
+    The Earth is spherical. The echo of a ground position begins at its two-way delay and lasts
+    pulse_s. It must stay guard_s away from the transmitted pulses, which begin at k / PRF for whole
+    numbers k, and from the nadir echoes, which begin at 2 height / c + k / PRF and last pulse_s +
+    nadir_s.
 
     Args:
         height_m: Height of the satellite in metres.
@@ -69,11 +71,11 @@ def timing_diagram(
         ground_m: Ground distance from the sub-satellite point in metres, float64 (ground,), evenly
             spaced and rising.
         pulse_s: Length of the pulse in seconds.
-        guard_s: Guard time in seconds.
-        nadir_s: Additional length of the nadir echo in seconds.
+        guard_s: Guard time before and after each pulse and nadir echo in seconds.
+        nadir_s: Length in seconds by which the nadir echo is longer than the pulse.
 
     Returns:
-        The diagram over pulse rates and ground positions.
+        The diagram over pulse repetition frequencies and ground positions.
 
     Raises:
         ValueError: If the height, the pulse or a guard time is out of range, a position lies beyond
@@ -112,7 +114,7 @@ def ground_slant_m(height_m: float, ground_m: Tensor) -> Tensor:
 
 
 def off_nadir_ground_m(height_m: float, off_nadir_deg: float) -> float:
-    """Return the ground distance of the position seen at an off-nadir angle, in metres.
+    """Return the ground distance from the nadir point to the point seen at an off-nadir angle.
 
     Args:
         height_m: Height of the satellite in metres.
@@ -127,7 +129,7 @@ def off_nadir_ground_m(height_m: float, off_nadir_deg: float) -> float:
     sine = (1 + height_m / EARTH_RADIUS_M) * math.sin(math.radians(off_nadir_deg))
     if not 0 <= sine < 1:
         raise ValueError(
-            f"a line of sight {off_nadir_deg} degrees off nadir misses the Earth from "
+            f"a line of sight {off_nadir_deg} degrees off nadir misses the Earth from a height of "
             f"{height_m / 1e3:g} km; give "
             f"0..{math.degrees(math.asin(1 / (1 + height_m / EARTH_RADIUS_M))):.4g} degrees"
         )
@@ -140,18 +142,18 @@ def _check_arguments(
     """Raise ValueError for arguments of `timing_diagram` that are out of range."""
     if not (height_m > 0 and pulse_s > 0 and guard_s >= 0 and nadir_s >= 0):
         raise ValueError(
-            "a timing diagram needs a height and a pulse above 0 and guards of 0 s or more, got "
+            "a timing diagram needs height_m and pulse_s above 0, and guard_s and nadir_s of 0 s or more, got "
             f"height_m={height_m}, pulse_s={pulse_s}, guard_s={guard_s}, nadir_s={nadir_s}"
         )
     if not bool((prf_hz > 0).all()) or float(prf_hz.max()) * 2 * (pulse_s + guard_s) >= 1:
         raise ValueError(
-            f"pulses of {pulse_s:g} s leave nothing of the period for reception at pulse rates of "
-            f"{float(prf_hz.min()):g}..{float(prf_hz.max()):g} Hz; lower the rates or shorten the "
-            "pulse"
+            f"pulses of {pulse_s:g} s with guards of {guard_s:g} s leave nothing of the pulse period for reception at "
+            f"prf_hz of {float(prf_hz.min()):g}..{float(prf_hz.max()):g} Hz; choose lower rates above 0 or a "
+            "shorter pulse"
         )
     horizon = EARTH_RADIUS_M * math.acos(EARTH_RADIUS_M / (EARTH_RADIUS_M + height_m))
     if ground_m.numel() < 2 or not (float(ground_m.min()) >= 0 and float(ground_m.max()) <= horizon):
         raise ValueError(
-            f"ground_m needs at least two positions within 0..{horizon:.6g} m, the horizon, got "
+            f"ground_m needs at least two positions from 0 m to the horizon at {horizon:.6g} m, got "
             f"{ground_m.numel()} from {float(ground_m.min()):g} to {float(ground_m.max()):g} m"
         )

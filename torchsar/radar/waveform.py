@@ -1,4 +1,4 @@
-"""Transmitted pulses."""
+"""Waveforms of transmitted pulses."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class LinearFM:
 
     def __post_init__(self) -> None:
         if not (self.bandwidth_hz > 0 and self.duration_s > 0 and self.direction in (-1, 1)):
-            raise ValueError(f"a pulse needs bandwidth > 0, duration > 0 and direction +1 or -1, got {self}")
+            raise ValueError(f"a pulse needs bandwidth_hz > 0, duration_s > 0 and direction +1 or -1, got {self}")
 
     @property
     def rate_hz_s(self) -> float:
@@ -47,7 +47,7 @@ class LinearFM:
     def samples(
         self, sampling_hz: float, dtype: torch.dtype = torch.complex128, device: torch.device | str | None = None
     ) -> Tensor:
-        """Sample the pulse from its leading edge.
+        """Return the samples of the pulse, from its leading edge on.
 
         Args:
             sampling_hz: Complex sampling rate in Hz.
@@ -73,11 +73,11 @@ class LinearFM:
             The spectrum in FFT order, shape (n,), complex128.
 
         Raises:
-            ValueError: If a line of n samples is shorter than the pulse.
+            ValueError: If a range line of n samples is shorter than the pulse.
         """
         if n < self.n_samples(sampling_hz):
             raise ValueError(
-                f"a line of {n} samples does not hold the pulse of {self.n_samples(sampling_hz)}; "
+                f"a line of {n} samples does not hold the pulse of {self.n_samples(sampling_hz)} samples; "
                 "record longer lines or shorten the pulse"
             )
         return torch.fft.fft(self.samples(sampling_hz, device=device), n)
