@@ -120,8 +120,8 @@ class LostLines:
         fraction: Fraction of all lines, at least 0 and below 1; None if a count is given.
 
     Raises:
-        ValueError: If both or none is given, or one is out of range; when applied, if no line would
-            be left or the trials of draws and recording differ.
+        ValueError: If both count and fraction are given or neither is, or one is out of range; when
+            applied, if no line would be left or the trials of draws and recording differ.
     """
 
     count: int | None = None

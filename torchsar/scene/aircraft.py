@@ -65,10 +65,9 @@ class Aircraft:
 
     The fuselage lies along cross range; ranges count from the middle of the window. The publication
     gives no coordinates of its target; this model reproduces the pattern of the published image
-    entropies. Each trial
-    draws circular Gaussian amplitudes (Rayleigh magnitude, uniform phase, unit mean power) and
-    displaces every scatterer by up to half a spacing in both directions, so that no scatterer lies
-    on a grid.
+    entropies. Each trial draws circular Gaussian amplitudes (Rayleigh magnitude, uniform phase,
+    unit mean power) and displaces every scatterer by up to half a spacing in both directions, so
+    that no scatterer lies on a grid.
 
     Args:
         spacing_m: Distance of scatterers along the outline in metres, fixed for all trials, since

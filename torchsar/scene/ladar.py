@@ -129,7 +129,7 @@ class RangeHistory:
     At slow time t the range of a scatterer is
     sqrt((Rref + RD)^2 + (V t - x)^2) - Rref + d(t - start_s), with the reference range Rref, the
     relative range RD and the azimuth x of the scatterer, the speed V of the ladar and the
-    displacement d by the motions. It is formed without loss of digits by the subtraction. With
+    displacement d by the motions. The difference is formed without loss of digits. With
     "flight" omitted it is the range at the time t of reception; otherwise it is the range at the
     time of reflection, R(t - R / c), in which the delay Rref / c is exact and the rest of R / c is
     accounted for to first order. With "hyperbola" omitted a parabola replaces the square root.
@@ -212,8 +212,8 @@ def refuse_unseen_ranges(radar: TriangularLadar, near_m: float, far_m: float) ->
     reach = radar.sample_rate_hz / 2 / radar.beat_hz(1.0)
     if max(-near_m, far_m) >= reach:
         raise ValueError(
-            f"world: relative ranges of scatterers must lie within +-{reach:.4g} m, since beat frequencies beyond "
-            f"alias, got {near_m:g} to {far_m:g} m; bring the reference range nearer to them, or sample faster"
+            f"world: relative ranges of scatterers must lie within +-{reach:.4g} m, since larger ranges have beat "
+            f"frequencies that alias, got {near_m:g} to {far_m:g} m; bring the reference range nearer, or sample faster"
         )
 
 
@@ -590,5 +590,5 @@ def _refuse_effects(without: Sequence[str]) -> None:
     """Raise ValueError for an unknown effect."""
     if isinstance(without, str) or not set(without) <= set(get_args(Effect)):
         raise ValueError(
-            f"without must be a tuple of effects to leave out, of {', '.join(get_args(Effect))}, got {without!r}"
+            f"without must be a tuple of the effects to leave out ({', '.join(get_args(Effect))}), got {without!r}"
         )

@@ -126,8 +126,7 @@ class PolynomialRotation:
         return self.omega(time_s)[..., None] * (k[..., :1] + warp_rate(time_s, k[..., 1:]) - 1)
 
     def mean_rate(self, duration_s: float, like: Tensor) -> Tensor:
-        """Return the mean rotation rate, which scales cross range in an image that is not
-        compensated.
+        """Return the mean rotation rate, which scales cross range in an uncompensated image.
 
         Args:
             duration_s: Length of the record in seconds.
