@@ -305,7 +305,10 @@ def test_channels_pass_through_vmap():
     [
         ({"scene": MovingPoints([0.0], [300.0], [0.0], [0.0])}, "as fast as the receiver"),
         ({"scene": MovingPoints([0.0], [0.0], [0.0], [-5000.0])}, "positive range"),
-        ({"scene": MovingPoints([0.0], [0.0], [0.0], [5000.0])}, "relative to the reference range"),
+        (
+            {"scene": MovingPoints([0.0], [0.0], [0.0], [5000.0])},
+            "counts from the reference range, must lie within 1.5",
+        ),
         ({"scene": MovingPoints([], [], [], [])}, "holds no target"),
         ({"n_pulse": 0}, "whole numbers"),
         ({"n_range": 100, "kind": "full"}, "120 samples of the pulse"),

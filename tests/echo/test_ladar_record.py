@@ -232,7 +232,10 @@ def test_gradients(detection) -> None:
 
 def test_error_messages() -> None:
     world = LadarWorld(Points([0.0], [1.5]))
-    with pytest.raises(ValueError, match="must hold a sweep of 8e-06 s and not overlap, being 1.6e-05 s apart"):
+    with pytest.raises(
+        ValueError,
+        match="block_s must be at least the 8e-06 s of a sweep and at most the 1.6e-05 s from one block to the next",
+    ):
         simulate_ladar_record(table1(), world, 4, Draws(0), block_s=3.2e-5)
     with pytest.raises(ValueError, match="got OnePerSweep; use simulate_ladar"):
         simulate_ladar_record(table1(), LadarWorld(Points([0.0], [1.5]), fidelity=OnePerSweep()), 4, Draws(0))
@@ -240,7 +243,7 @@ def test_error_messages() -> None:
         simulate_ladar_record(
             table1(detection="real"), LadarWorld(Points([0.0], [0.1]), (Polynomial([2.0]),)), 4, Draws(0)
         )
-    with pytest.raises(ValueError, match="beyond half the sampling rate"):
+    with pytest.raises(ValueError, match="must be below half the sampling rate"):
         simulate_ladar_record(table4(), LadarWorld(Points([0.0], [40.0])), 4, Draws(0))
 
 

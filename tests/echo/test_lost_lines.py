@@ -78,11 +78,11 @@ def test_impairments_depend_on_their_address_only() -> None:
     "build, message",
     [
         (lambda: LostLines(), "a count or a fraction"),
-        (lambda: LostLines(fraction=1.5), "fraction in 0..1"),
+        (lambda: LostLines(fraction=1.5), "fraction of lost lines must be at least 0 and below 1"),
         (lambda: LostGaps(2, 0), "length >= 1"),
         (lambda: LostLines(count=N)(recording(None), Draws(0)), "leave nothing of a recording of 200 lines"),
         (lambda: LostGaps(30, 8)(recording(None), Draws(0)), "do not fit a recording of 200 lines"),
-        (lambda: LostLines(count=3)(recording(None), Draws(0, trials=range(2))), "draw one unbatched trial"),
+        (lambda: LostLines(count=3)(recording(None), Draws(0, trials=range(2))), "use draws without trials"),
     ],
 )
 def test_invalid_parameters_are_refused(build, message: str) -> None:

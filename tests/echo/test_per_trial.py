@@ -847,7 +847,7 @@ def test_truths_of_many_trigger_times_are_those_of_each() -> None:
 def test_without_trials_of_the_draws_the_parameters_are_the_trials() -> None:
     world = StripmapWorld(RandomPoints(4, 9.0, double(10.0, 20.0)), velocity_m_s=double(119.0, 121.0))
     assert stripmap(world, Draws(1))["data"].shape == (2, 20, 40)
-    with pytest.raises(ValueError, match="parameters per trial must have one length"):
+    with pytest.raises(ValueError, match="parameters per trial must all have the same number of trials"):
         stripmap(StripmapWorld(RandomPoints(4, 9.0, double(1.0, 2.0)), snr_db=double(1.0, 2.0, 3.0)), Draws(1))
 
 

@@ -244,8 +244,13 @@ def test_gradients_reach_power_and_image():
 @pytest.mark.parametrize(
     "n_range, gate, error, sentence",
     [
-        (2100, Pattern(), ValueError, "a frame of 2100 samples about 5000 m begins at a range of -"),
-        (None, BandLimited(30.0), ValueError, "a gate of 30 s at 5000 m ends at a look angle of sine 0.9, beyond 0.8"),
+        (2100, Pattern(), ValueError, "got 2100 samples about the reference range of 5000 m, which begin at -"),
+        (
+            None,
+            BandLimited(30.0),
+            ValueError,
+            "at or below 0.8, got 30 s, which reaches a sine of 0.9 at the reference range of 5000 m",
+        ),
         (None, "pattern", TypeError, "gate of a sea must be BandLimited"),
     ],
 )

@@ -306,7 +306,7 @@ REFUSED = {
     ),
     "both": (
         lambda: TurntableWorld(CUBES, 0.02, rotation=ROTATION),
-        "the world turns by rotation_rad_s=0.02 and by a polynomial rotation; give one of them",
+        "rotation_rad_s=0.02 and a polynomial rotation are both given for the world; give one of them",
     ),
     "type": (lambda: TurntableWorld(CUBES, rotation=0.02), "rotation must be a PolynomialRotation or None, got 0.02"),  # pyright: ignore[reportArgumentType]
     "yc": (lambda: TurntableWorld(CUBES, centre_deviation_m=math.inf), "centre_deviation_m must be a finite number"),
@@ -330,7 +330,7 @@ REFUSED = {
         lambda: dechirped_echo(
             CUBES.scatterers(Draws(0)), ladar(20, pulse_s=9e-4), 20, 32, PolynomialRotation(1e-4, (0.0, 0.0, 1e9))
         ),
-        "the target turns by .* rad in half a pulse, of which the dechirped model drops .* rad",
+        "the target turns by .* rad in half a pulse, for which the dechirped model neglects a phase of .* rad",
     ),
 }
 

@@ -145,7 +145,7 @@ def test_unsuitable_measured_tracks_are_refused(tmp_path: Path) -> None:
             MeasuredTrack.from_file(tmp_path / name)
     track = MeasuredTrack(torch.arange(4, dtype=torch.float64), torch.zeros(2, 4, dtype=torch.float64))
     assert track.displacement_m(torch.zeros(3, 5, dtype=torch.float64)).shape == (2, 3, 5)
-    with pytest.raises(ValueError, match="reaches from -1 to 4 s, asked for 2 to 9 s"):
+    with pytest.raises(ValueError, match="must lie within -1 to 4 s, one step beyond its ends, got 2 to 9 s"):
         track.displacement_m(torch.tensor([2.0, 9.0], dtype=torch.float64))
 
 
@@ -155,12 +155,18 @@ def test_unsuitable_measured_tracks_are_refused(tmp_path: Path) -> None:
         (lambda: LadarWorld(Points([0.0], [0.0]), gate_m=(2.0, 1.0)), "gate_m must be"),
         (lambda: LadarWorld(Points([0.0], [0.0]), snr_db=math.nan), "snr_db must be a finite number"),
         (lambda: LadarWorld(Points([0.0], [0.0]), log_amplitude=LogAmplitude(-0.1)), "rms of a log-amplitude"),
-        (lambda: LinearInSweep(("curvature",)), "effects that may be left out are residual_video, hyperbola, flight"),  # type: ignore[arg-type]
-        (lambda: LinearInSweep("flight"), "give a tuple of them"),  # type: ignore[arg-type]
+        (
+            lambda: LinearInSweep(("curvature",)),  # type: ignore[arg-type]
+            r"without must be a tuple of the effects to leave out \(residual_video, hyperbola, flight\)",
+        ),
+        (lambda: LinearInSweep("flight"), "must be a tuple of the effects"),  # type: ignore[arg-type]
         (lambda: CalibrationFibre(0.0), "longer than 0 s"),
         (lambda: PathFluctuation(1e-6, 100.0, 10.0), "0 < lowest_hz <= highest_hz"),
         (lambda: VibrationSpectrum(1e-6, 1.0, 10.0, count=0), "count of sinusoids"),
-        (lambda: PathFluctuation(1e-6, highest_hz=1.0).drawn(Draws(0), 0.1), "has no band; give lowest_hz"),
+        (
+            lambda: PathFluctuation(1e-6, highest_hz=1.0).drawn(Draws(0), 0.1),
+            "must not be below lowest_hz, got .*; give lowest_hz",
+        ),
         (lambda: RetroAndBrokenLine(range_m=math.inf), "range_m of a retro-reflector"),
     ],
 )

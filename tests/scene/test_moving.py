@@ -152,7 +152,7 @@ def test_points_may_differ_between_trials_and_be_complex():
         (lambda: MovingPoints([1.0], [0.0, 1.0], [0.0], [0.0]), "one speed, position"),
         (lambda: MovingPoints([math.nan], [0.0], [0.0], [0.0]), "u_r_m_s of moving points must be a finite"),
         (lambda: Ship(0.0, 0.0, count=3, range_cells=4), "a scatterer for each"),
-        (lambda: GroundMovers([1.0], [0.0], [0.0], [1.0], towards_transmitter=(1.0, 1.0)), "longer than 1"),
+        (lambda: GroundMovers([1.0], [0.0], [0.0], [1.0], towards_transmitter=(1.0, 1.0)), "of a length of at most 1"),
         (lambda: TaylorRange(3), "2, 4, 6"),
         (lambda: BandLimited(0.0), "positive number"),
         (lambda: PolynomialTransmit([1.0], 2), "0..1"),

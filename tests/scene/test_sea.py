@@ -117,7 +117,7 @@ def test_images_come_from_files(tmp_path):
             "two.npz",
             None,
             ValueError,
-            r"two.npz holds the arrays \['sea', 'complex'\]; name the one to use, got key=None",
+            r"two.npz holds the arrays \['sea', 'complex'\]; give the name of one of them as key, got key=None",
         ),
         ("two.npz", "land", ValueError, "got key='land'"),
         ("none.npy", None, FileNotFoundError, "none.npy does not exist"),
@@ -149,10 +149,10 @@ def test_impossible_seas_are_refused(changes, sentence):
 @pytest.mark.parametrize(
     "image, extent, sentence",
     [
-        ([[1.0, -1.0]], 10.0, "an image of a surface holds intensities"),
-        ([[1.0, math.nan]], 10.0, "an image of a surface holds intensities"),
-        ([[0.0, 0.0]], 10.0, "an image of a surface holds intensities"),
-        ([1.0, 2.0], 10.0, r"needs the dims \(azimuth, range\), got an array of shape \(2,\)"),
+        ([[1.0, -1.0]], 10.0, "intensity of a surface must be finite and not negative"),
+        ([[1.0, math.nan]], 10.0, "intensity of a surface must be finite and not negative"),
+        ([[0.0, 0.0]], 10.0, "intensity of a surface must be finite and not negative"),
+        ([1.0, 2.0], 10.0, r"an array of shape \(..., azimuth, range\), got shape \(2,\)"),
         ([[1.0]], 0.0, "azimuth_extent_m of an image must be a positive number of metres, got 0.0"),
     ],
 )
@@ -162,5 +162,5 @@ def test_impossible_images_are_refused(image, extent, sentence):
 
 
 def test_an_invalid_shape_of_gamma_numbers_is_refused():
-    with pytest.raises(ValueError, match="gamma numbers are made for shapes of 0.1 to 1000, got 0"):
+    with pytest.raises(ValueError, match="shape of a gamma distribution must lie in 0.1..1000, got 0"):
         gamma_from_normal(torch.zeros(1, dtype=torch.float64), 0.0)

@@ -159,7 +159,7 @@ def test_unknown_config_names_what_there_is() -> None:
         (["radar.pulse.duration_s=4e-6"], ["world", "a line of 128 samples does not hold the pulse of 200"]),
         (
             ["world.impairments={x: {kind: periodic_jitter, offset_samples: []}}"],
-            ["world.impairments.x", "at least one offset"],
+            ["world.impairments.x", "at least one entry of offset_samples"],
         ),
         (["processor.recommended.stages.keys.stage=omega_k"], ["processor.recommended", "cannot be called 'keys'"]),
         (

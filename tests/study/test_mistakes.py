@@ -185,7 +185,7 @@ MISTAKES = [
         "it should be a finite number",
     ),
     ("sal", {"world": world("sal", **points([0.0], [-4000.0]))}, "the Doppler band of the scene over the period rate"),
-    ("sal", {"world": world("sal", **points([0.0], [100.0]))}, "beats of relative ranges beyond"),
+    ("sal", {"world": world("sal", **points([0.0], [100.0]))}, "beat frequencies that alias"),
     (
         "sal",
         {

@@ -1,8 +1,8 @@
 """Simulation: from radar and world to recording and truth, with noise and receiver impairments.
 
 An impairment is called with a recording and random draws; it returns the impaired recording and the
-true values of the impairment. It works on recorded data as well. Parameters may differ between
-trials as in `torchsar.scene`.
+true values of the impairment. It works on recorded data as well. A parameter annotated
+`Tensor | float` is a number, equal in all trials, or a tensor with one value per trial.
 """
 
 from torchsar.echo.bistatic import bistatic_echo, simulate_bistatic

@@ -38,23 +38,27 @@ def bistatic_echo(
 ) -> Tensor:
     """Return the echo of moving points without noise.
 
-    The phase is -2 pi / lambda (R_T(t) - R_T(0) + R_m(t) - reference_range_m), one way for each
-    range. The receive window follows the ephemeris: the envelope lies at R_m plus the difference of
-    the true range to the transmitter and radar.transmit_range. Ranges are constant during a pulse.
-    Echoes partly outside the range axis are cut and never wrap (compressed: below -35 dB).
-    Differentiable in speeds, positions and amplitudes.
+    R_T(t) is the range from the transmitter to the scene and R_m(t) the range from a target to the
+    receiver at slow time t. The phase of the echo is
+    -2 pi / lambda (R_T(t) - R_T(0) + R_m(t) - radar.reference_range_m), one way for each range. The
+    receive window follows the ephemeris of the transmitter: the envelope lies at R_m plus the
+    difference between the true R_T(t) - R_T(0) and that of radar.transmit_range. Ranges are
+    constant during a pulse. Echoes partly outside the range axis are cut and do not wrap; for the
+    kind "compressed" what wraps lies below -35 dB. Differentiable in speeds, positions and
+    amplitudes.
 
     Args:
         movers: Targets, shape (..., target).
         radar: Receiver.
         n_pulse: Number of pulses.
-        n_range: Number of range samples, None for the peak lines alone.
+        n_range: Number of range samples; None for one sample per pulse, in which every target
+            contributes the peak of its range response.
         gate: Receive gain.
         receive: Model of the range to the receiver.
-        transmit: True range to the transmitter, None for that of the ephemeris.
-        kind: "compressed" for a rectangular band of the width of the pulse, with the peak 1 for
-            amplitude 1. "full" for the sampled pulse itself, whose leading edge lies at R_m;
-            `focus.RangeCompress` gives its compressed echo.
+        transmit: True range to the transmitter, None for that of radar.transmit_range.
+        kind: "compressed" for the range response of a rectangular band as wide as that of the
+            pulse, with the peak 1 for a target of amplitude 1. "full" for the sampled pulse itself,
+            whose leading edge lies at R_m; `focus.RangeCompress` compresses it.
         dtype: Complex dtype of the result.
 
     Returns:
@@ -181,25 +185,28 @@ def simulate_bistatic(
         n_range: Number of range samples, None for azimuth-only data, in which every target lies on
             the one recorded line.
         draws: Random draws.
-        kind: See `bistatic_echo`; azimuth-only data are compressed.
+        kind: "compressed" for range-compressed echoes, "full" for echoes of the uncompressed pulse.
+            Azimuth-only data are always compressed.
         impairments: Impairments by name, applied in order.
         dtype: Complex dtype of the recording.
         device: Device of the recording.
 
     Returns:
         The recording, shape (..., channel, pulse, range) or (..., channel, pulse), and the truth.
-        The truth holds, per target, shape (..., target): `u_r_m_s`, `u_a_m_s`, `y0_m` (also as
+        The truth holds, per target, shape (..., target): the closing slant-range speed `u_r_m_s`,
+        the along-track speed `u_a_m_s`, the along-track position `y0_m` at slow time zero (also as
         `azimuth_m`), the closest range `range_m`, `amplitude`, and the closing speed towards the
-        transmitter `u_t_m_s` where there is one. It further holds `transmit_range_m`, the true
-        R_T(t) - R_T(0), shape (..., pulse); `noise_std`, the standard deviation of the noise of a
-        sample of this kind, shape (...,); and the values of each impairment under
-        "<impairment>.<name>". `clean` is the recording without noise and impairments.
+        transmitter `u_t_m_s` where the scene gives it. It further holds `transmit_range_m`, the
+        true change R_T(t) - R_T(0) of the range to the transmitter, shape (..., pulse);
+        `noise_std`, the standard deviation of the noise of a recorded sample, shape (...,); and the
+        values of each impairment under "<impairment>.<name>". `clean` is the recording without
+        noise and impairments.
 
     Raises:
-        TypeError: If an argument is of another kind.
+        TypeError: If radar, world or draws has the wrong type.
         ValueError: If a target is as fast as the receiver or far outside the range axis, there are
-            no pulses, lines do not hold the pulse, or a parameter per trial has another length than
-            the trials.
+            no pulses, range lines are shorter than the pulse, or a parameter per trial has another
+            length than the trials.
     """
     _refuse_impossible(radar, world, n_pulse, n_range, kind, draws)
     movers = _movers(radar, world, n_range, draws, device)
@@ -274,13 +281,13 @@ def _movers(
     outside = (off > 1.5 * width).nonzero()[:, 0].tolist()
     if n_range is not None and outside:
         far = (
-            f"targets {outside} (counted from 0) lie {float(off.max()):g} m"
+            f"targets {outside} (counted from 0) with up to {float(off.max()):g} m"
             if len(outside) > 1
-            else f"target {outside[0]} (counted from 0) lies {float(off.max()):g} m"
+            else f"target {outside[0]} (counted from 0) with {float(off.max()):g} m"
         )
         raise ValueError(
-            f"{far} from the middle of a range axis of {width:g} m; range_m is relative to the "
-            "reference range; correct it, or record longer range lines (n_range)"
+            f"range_m of a target, which counts from the reference range, must lie within 1.5 times the length of "
+            f"the range axis of {width:g} m, got {far}; correct it, or record longer range lines (n_range)"
         )
     return movers
 
@@ -314,8 +321,8 @@ def _refuse_impossible(
         n_range is None or (isinstance(n_range, int) and n_range >= 1)
     ):
         raise ValueError(
-            "a recording needs whole numbers of pulses and range samples, at least one each, got "
-            f"n_pulse={n_pulse} and n_range={n_range} (None for azimuth-only data)"
+            "n_pulse and n_range must be whole numbers of 1 or more (n_range None for azimuth-only data), got "
+            f"n_pulse={n_pulse} and n_range={n_range}"
         )
     if kind not in get_args(Kind):
         raise ValueError(f"kind must be one of {', '.join(get_args(Kind))}, got {kind!r}")
@@ -323,8 +330,8 @@ def _refuse_impossible(
     samples = radar.pulse.n_samples(radar.sampling_hz)
     if kind == "full" and (n_range is None or n_range < samples):
         raise ValueError(
-            f"full echoes need lines of at least the {samples} samples of the pulse, got "
-            f"n_range={n_range}; record longer lines, shorten the pulse, or take kind='compressed'"
+            f"n_range must be at least the {samples} samples of the pulse for kind='full', got "
+            f"{n_range}; record longer lines, shorten the pulse, or take kind='compressed'"
         )
 
 

@@ -59,8 +59,8 @@ class ChannelErrors:
         delay_s: Delays in seconds, later positive.
 
     Raises:
-        ValueError: If a number is not finite; when applied, if the numbers do not fit the channels,
-            or delays meet azimuth-only data.
+        ValueError: If a number is not finite; when applied, if a parameter has not one entry per
+            channel, or delays are given for azimuth-only data.
     """
 
     phase_rad: PerChannel | None = None
@@ -104,24 +104,26 @@ class Drift(Protocol):
     """Error of a clock as a function of slow time."""
 
     def values(self, time_s: Tensor, draws: Draws) -> Tensor:
-        """Return the error.
+        """Return the clock error at each pulse.
 
         Args:
             time_s: Slow time in seconds, zero at the middle pulse, shape (pulse,), float64.
             draws: Random draws.
 
         Returns:
-            Error in radians or seconds, shape (..., pulse), float64.
+            Clock error, in radians for a phase and in seconds for a delay, shape (..., pulse),
+            float64.
         """
         ...
 
 
 @dataclass(frozen=True)
 class PolynomialDrift:
-    """Polynomial drift, c0 + c1 t + c2 t^2 + ...
+    """Polynomial drift of a clock, c0 + c1 t + c2 t^2 + ..., with the slow time t in seconds.
 
     Args:
-        coefficients: c0, c1, ... per power of a second; each a number or one value per trial.
+        coefficients: c0, c1, ... in rad, rad/s, ... for a phase and in s, s/s, ... for a delay;
+            each a number or one value per trial.
 
     Raises:
         ValueError: If a coefficient is not finite.
@@ -133,14 +135,14 @@ class PolynomialDrift:
         refuse_unless_finite("coefficients of a drift", self.coefficients)
 
     def values(self, time_s: Tensor, draws: Draws) -> Tensor:
-        """Return the drift.
+        """Return the polynomial drift at each pulse.
 
         Args:
             time_s: Slow time in seconds, shape (pulse,), float64.
             draws: Random draws, which are not used.
 
         Returns:
-            Drift, shape (..., pulse), float64.
+            Drift in radians or seconds, as the coefficients, shape (..., pulse), float64.
         """
         total = torch.zeros_like(time_s)
         for c in reversed(self.coefficients):
@@ -150,10 +152,10 @@ class PolynomialDrift:
 
 @dataclass(frozen=True)
 class SinusoidDrift:
-    """Sinusoidal drift, amplitude sin(2 pi frequency t + start).
+    """Sinusoidal drift of a clock, amplitude sin(2 pi frequency_hz t + start_rad) at slow time t.
 
     Args:
-        amplitude: Amplitude in radians or seconds.
+        amplitude: Amplitude, in radians for a phase and in seconds for a delay.
         frequency_hz: Frequency in hertz.
         start_rad: Phase at slow time zero in radians, None for a random phase in each trial.
 
@@ -170,14 +172,14 @@ class SinusoidDrift:
             refuse_unless_finite(f"{name} of a drift", getattr(self, name))
 
     def values(self, time_s: Tensor, draws: Draws) -> Tensor:
-        """Return the drift.
+        """Return the sinusoidal drift at each pulse.
 
         Args:
             time_s: Slow time in seconds, shape (pulse,), float64.
             draws: Random draws of the start phase.
 
         Returns:
-            Drift, shape (..., pulse), float64.
+            Drift in radians or seconds, as the amplitude, shape (..., pulse), float64.
         """
         start = (
             2 * math.pi * draws.uniform("echo.drift.sinusoid")
@@ -190,10 +192,10 @@ class SinusoidDrift:
 
 @dataclass(frozen=True)
 class WalkDrift:
-    """Random walk with normal steps from pulse to pulse, zero at the middle pulse.
+    """Random walk of a clock with normal steps from pulse to pulse, zero at the middle pulse.
 
     Args:
-        step: Standard deviation of a step in radians or seconds.
+        step: Standard deviation of a step, in radians for a phase and in seconds for a delay.
 
     Raises:
         ValueError: If the standard deviation is negative or not finite.
@@ -205,14 +207,14 @@ class WalkDrift:
         refuse_unless_finite("step of a drift", self.step, 0.0)
 
     def values(self, time_s: Tensor, draws: Draws) -> Tensor:
-        """Draw the walk.
+        """Draw the random walk of the clock.
 
         Args:
             time_s: Slow time in seconds, shape (pulse,), float64.
             draws: Random draws.
 
         Returns:
-            Drift, shape (..., pulse), float64.
+            Drift in radians or seconds, as the step, shape (..., pulse), float64.
         """
         unit = draws.normal("echo.drift.walk", (time_s.numel(),))
         walk = (with_dims(self.step, 1, unit) * unit).cumsum(-1)
@@ -221,14 +223,14 @@ class WalkDrift:
 
 @dataclass(frozen=True)
 class SynchronisationError:
-    """Impairment: phase and delay of every pulse by clocks that drift apart, and a direct path.
+    """Impairment: phase and delay of every pulse due to clocks that drift apart.
 
-    Both errors are common to all channels: data become exp(j phase) times data that are delayed
-    without a change of their carrier phases. The recording gets aux `direct_path`, the direct
-    signal of the transmitter in each pulse after range compression, shape (..., pulse,
-    direct_samples). Its known range is removed; it has a rectangular band and the peak exp(j phase)
-    at sample direct_samples // 2 + delay_s sampling_hz. The truth holds `phase_rad` and `delay_s`,
-    shape (..., pulse) each, float64.
+    Both errors are common to all channels. The data are delayed without a change of their carrier
+    phases and then multiplied by exp(j phase). The recording gets aux `direct_path`, a record of
+    the direct signal of the transmitter in each pulse after range compression, shape (..., pulse,
+    direct_samples). The direct signal has a rectangular band, and its known range is removed, so
+    that its peak exp(j phase) lies at sample direct_samples // 2 + delay_s * sampling_hz. The truth
+    holds `phase_rad` and `delay_s`, shape (..., pulse) each, float64.
 
     Args:
         phase_rad: Drifts whose sum is the phase in radians.
@@ -239,8 +241,9 @@ class SynchronisationError:
 
     Raises:
         TypeError: If a single drift is given instead of a list.
-        ValueError: If the ratio is not finite or the samples are too few; when applied, if delays
-            meet azimuth-only data or exceed a quarter of the direct path.
+        ValueError: If direct_snr_db is not finite or direct_samples is below 8; when applied, if
+            delays are given for azimuth-only data or exceed a quarter of the samples of the direct
+            path.
     """
 
     phase_rad: Sequence[Drift] = ()
@@ -252,7 +255,7 @@ class SynchronisationError:
         if hasattr(self.phase_rad, "values") or hasattr(self.delay_s, "values"):
             raise TypeError(
                 f"phase_rad and delay_s must be lists of drifts, got {self.phase_rad!r} and {self.delay_s!r}; "
-                "put a single one in brackets"
+                "put a single drift in brackets"
             )
         refuse_unless_finite("direct_snr_db", self.direct_snr_db)
         if not self.direct_samples >= 8:

@@ -1,8 +1,8 @@
 """Interference in the receiver: tones, wideband interferers, and the converter that digitises them.
 
-The level of an interferer is its power over the mean power per sample of the recording that it is
-added to, averaged over the contaminated lines: echo and noise for the first interferer, in addition
-the earlier interferers for a second one.
+The level of an interferer is the ratio of its power to the mean power per sample of the lines that
+it is added to. Those lines hold echo and noise for the first interferer; for a later one they also
+hold the interferers that were added before.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from torchsar.scene.trials import positive, refuse_other_trials, refuse_unless, 
 
 @dataclass(frozen=True)
 class Tone:
-    """Impairment: a tone on a share of the lines.
+    """Impairment: a tone that is added to randomly chosen lines.
 
-    The truth holds `contaminated`, shape (..., pulse), bool, and `frequency_hz` at the middle of
-    each line, shape (..., pulse).
+    The truth holds `contaminated`, shape (..., pulse), bool, true for the lines with the tone, and
+    `frequency_hz` at the middle of each line, shape (..., pulse).
 
     Args:
-        over_signal_db: Power of the tone over the mean power per sample of the contaminated lines
-            in decibels.
+        over_signal_db: Ratio in decibels of the power of the tone to the mean power per sample that
+            the contaminated lines have without it.
         frequency_hz: Baseband frequency at the first line in hertz.
         drift_hz: Linear change of the frequency from the first to the last line in hertz.
-        wander_hz: Amplitude of one slow sinusoidal period of the frequency over the record in
-            hertz.
+        wander_hz: Amplitude in hertz of a sinusoidal change of the frequency with one period over
+            the record.
         rate_hz_s: Linear change of the frequency within a line in hertz per second.
-        share: Share of the lines, chosen at random, above 0 and at most 1.
-        coherent: Whether one oscillator runs through the whole recording, so that the phase follows
-            from slow and fast time; otherwise each line has a random phase.
+        share: Fraction of all lines that get the tone, above 0 and at most 1.
+        coherent: Whether one oscillator runs through the whole recording, so that the phase
+            continues from line to line; otherwise each line has a random phase.
 
     Raises:
         ValueError: If a number is not finite or the share is out of range.
@@ -89,18 +89,19 @@ class Tone:
 
 @dataclass(frozen=True)
 class WideInterferer:
-    """Impairment: band-limited noise on a share of the lines, independent from line to line.
+    """Impairment: band-limited noise on randomly chosen lines, independent from line to line.
 
-    The noise is stationary: a line is a section of a longer process, not a period of a circular
-    one. The truth holds `contaminated`, shape (..., pulse), bool, and `bandwidth_hz`, shape (...,).
+    The noise is stationary: the noise of a line is cut out of a longer process and does not join at
+    the ends of the line. The truth holds `contaminated`, shape (..., pulse), bool, true for the
+    lines with this noise, and `bandwidth_hz`, shape (...,).
 
     Args:
-        over_signal_db: Power of the noise over the mean power per sample of the contaminated lines
-            in decibels.
+        over_signal_db: Ratio in decibels of the power of the noise to the mean power per sample
+            that the contaminated lines have without it.
         frequency_hz: Centre frequency in hertz.
-        bandwidth_hz: Bandwidth in hertz, fixed for all trials, since it decides how many numbers
-            are drawn.
-        share: Share of the lines, chosen at random, above 0 and at most 1.
+        bandwidth_hz: Bandwidth in hertz, fixed for all trials, since it decides how many random
+            numbers are drawn.
+        share: Fraction of all lines that get the noise, above 0 and at most 1.
 
     Raises:
         ValueError: If a number is not finite, the bandwidth is not positive or the share is out of
@@ -148,14 +149,14 @@ class Quantiser:
     """Impairment: an I/Q converter behind an automatic gain control, without dither.
 
     The output levels are the odd numbers from -(2^bits - 1) to 2^bits - 1; larger samples are
-    clipped. The gain of a trial brings the rms value of one component to rms_levels and is undone
-    after the conversion. The truth holds `gain` and the share of samples at the outermost levels,
-    `extreme_share`, shape (...,) each.
+    clipped. In each trial the gain brings the rms value of one component, I or Q, to rms_levels,
+    and is undone after the conversion. The truth holds `gain` and `extreme_share`, the fraction of
+    samples at the two outermost levels, shape (...,) each.
 
     Args:
         bits: Number of bits, 1 to 16, fixed for all trials.
-        rms_levels: Rms value of one component in units of half a level step; RADARSAT-1 records 4
-            bits at 6.6 to 7.4.
+        rms_levels: Rms value of one component, I or Q, at the converter, in units of half the
+            distance of neighbouring levels; RADARSAT-1 records 4 bits at 6.6 to 7.4.
 
     Raises:
         ValueError: If the number of bits or the rms value is out of range.
@@ -191,7 +192,7 @@ class Quantiser:
 
 def _check_share(share: Tensor | float) -> None:
     """Raise ValueError for a share of lines that is out of range."""
-    refuse_unless("share of contaminated lines must be in 0..1 and above 0", share, lambda x: (x > 0) & (x <= 1))
+    refuse_unless("share of contaminated lines must be above 0 and at most 1", share, lambda x: (x > 0) & (x <= 1))
 
 
 def _chosen_lines(draws: Draws, share: Tensor | float, data: Tensor) -> Tensor:

@@ -13,14 +13,14 @@ from torchsar.scene.trials import refuse_other_trials, refuse_unless_finite, sta
 
 
 def sample_unevenly(x: Tensor, offset_samples: Tensor) -> Tensor:
-    """Sample periodic band-limited lines at the instants n + e[n mod M].
+    """Take sample n of every line at the instant n + e[n mod M], with the M offsets e.
 
     Args:
         x: Lines, shape (..., pulse, range), complex, taken as band-limited and periodic.
         offset_samples: Offsets e in samples, shape (M,) or (..., M).
 
     Returns:
-        Samples of the shape of x.
+        Unevenly sampled lines of the shape of x.
     """
     n, m = x.shape[-1], offset_samples.shape[-1]
     spectrum = torch.fft.fft(x)
@@ -34,12 +34,12 @@ def sample_unevenly(x: Tensor, offset_samples: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class PeriodicJitter:
-    """Impairment: sample n of every line is taken at the instant n + e[n mod M].
+    """Impairment: sample n of every line is taken at the instant n + e[n mod M], with M offsets e.
 
     A pilot tone through the same converter is recorded as aux `pilot`, shape (..., pilot_samples),
-    with a random phase. A pilot shows only differences of the offsets: choose offsets of mean zero
-    (or e_0 = 0, with an estimator of that origin) where positions in images are compared. The truth
-    holds `offset_samples`, shape (..., M), and `pilot_cycles`.
+    with a random phase. A pilot tone shows only the differences between offsets. Where positions in
+    images are compared, choose offsets of mean zero, or e_0 = 0 if the estimator sets its first
+    offset to zero. The truth holds `offset_samples`, shape (..., M), and `pilot_cycles`.
 
     Args:
         offset_samples: Offsets e_0 to e_{M-1} in samples: numbers or values per trial, or one
@@ -62,8 +62,8 @@ class PeriodicJitter:
     def __post_init__(self) -> None:
         if not len(self.offset_samples) or self.pilot_samples < 0:
             raise ValueError(
-                "jitter needs at least one offset and pilot_samples of 0 or more, got offsets "
-                f"{self.offset_samples} and {self.pilot_samples} samples"
+                "jitter needs at least one entry of offset_samples and a value of pilot_samples of 0 or more, "
+                f"got offset_samples={self.offset_samples} and pilot_samples={self.pilot_samples}"
             )
         refuse_unless_finite("pilot_cycles", self.pilot_cycles)
         refuse_unless_finite("pilot_snr_db", self.pilot_snr_db)
@@ -88,10 +88,10 @@ class PeriodicJitter:
         }
 
     def pilot(self, offsets: Tensor, draws: Draws, like: Tensor) -> Tensor:
-        """Return the recorded pilot tone.
+        """Return the pilot tone as sampled with the jitter.
 
         Args:
-            offsets: Offsets in samples, shape (..., M), float64.
+            offsets: Offsets of the M sampling instants in samples, shape (..., M), float64.
             draws: Random draws.
             like: Tensor that gives dtype and device.
 

@@ -44,11 +44,13 @@ def ladar_echo(
 ) -> Tensor:
     """Return dechirped sweeps without noise.
 
-    The phase of a scatterer at the relative range RD(t) is fc dtau +- (K u dtau - K dtau^2 / 2) in
-    cycles, with dtau = 2 RD / c and the upper sign in the up-sweep, in the convention
-    LO * conj(echo); it is conjugated for "echo_conj_lo". A scatterer is illuminated while |V t - x|
-    at the middle of the sweep is at most half the width of the beam. Differentiable in positions,
-    amplitudes and motions.
+    The phase of a scatterer in cycles is fc dtau +- (K u dtau - K dtau^2 / 2), with the carrier fc,
+    the chirp rate K, the time u from the middle of the sweep and the upper sign in the up-sweep.
+    The delay is dtau = 2 RD / c, where RD is the range relative to the reference range. This holds
+    for radar.dechirp_sign "lo_conj_echo"; for "echo_conj_lo" the samples are conjugated. A
+    scatterer at azimuth x is illuminated in a sweep if |V t - x| is at most half the width of the
+    beam at the slow time t of the middle of the sweep, with the speed V of the ladar.
+    Differentiable in positions, amplitudes and motions.
 
     Args:
         scatterers: Scatterers, shape (..., target).
@@ -56,8 +58,8 @@ def ladar_echo(
         n_period: Number of periods.
         motion: Motions along the line of sight, random ones already drawn.
         fidelity: Model of the range within a sweep.
-        sweep_error: Phase error of the laser. Models below `EverySample` neglect its change by the
-            motion.
+        sweep_error: Phase error of the laser. All models of the range but `EverySample` compute it
+            as for scatterers at rest.
         dtype: Complex dtype of the result.
 
     Returns:
@@ -92,14 +94,15 @@ def range_model_error_db(
 ) -> float:
     """Predict the relative error that a range model makes in the echo of one scatterer.
 
-    It is 1 - |mean exp(j phi)|^2 in dB, where phi is the phase by which the model differs from the
-    range at every sample with all effects: one complex gain of the whole echo counts as no error.
-    The phase is evaluated on a part of the periods and of the samples of a sweep.
+    The error is 1 - |mean exp(j phi)|^2 in dB, where phi is the phase difference between the model
+    and the exact echo, in which the range is evaluated at every sample with all effects. A complex
+    gain that is common to the whole echo counts as no error. The phase is evaluated in some of the
+    periods and at some of the samples of a sweep.
 
     Args:
         scatterers: One scatterer without trial dimensions, shape (1,).
         radar: Ladar.
-        n_period: Number of kept periods.
+        n_period: Number of recorded periods.
         motion: Motions along the line of sight.
         fidelity: Model of the range within a sweep.
 
@@ -122,14 +125,16 @@ def range_model_error_db(
         turns = turns if lines.curve is None else turns + lines.curve[..., None] * u.square()
     lit = lit_by(scatterers, radar, middle_s).expand(turns.shape).to(torch.float64)
     if not bool(lit.any()):
-        raise ValueError("the beam never illuminates the scatterer whose echo is compared; widen the beam or move it")
+        raise ValueError(
+            "the beam never illuminates the scatterer whose echo is compared; widen the beam or move the scatterer"
+        )
     error = unit_phasor(turns - _sample_turns(exact, None, time_s, u)[..., 0], torch.complex128)
     mean = (lit * error).sum().abs() / lit.sum()
     return 10 * math.log10(max(1 - float(mean) ** 2, 1e-30))
 
 
 def lit_by(s: Scatterers, radar: TriangularLadar, time_s: Tensor) -> Tensor:
-    """Return whether the beam illuminates each scatterer.
+    """Return whether the beam illuminates each scatterer at each time.
 
     Args:
         s: Scatterers, shape (..., target).
@@ -152,7 +157,7 @@ def refuse_beats(beat_hz: Tensor, shines: Tensor, radar: TriangularLadar) -> Non
 
     Args:
         beat_hz: Beat frequencies in hertz, shape (..., target).
-        shines: Scatterers that contribute, broadcastable, bool.
+        shines: Whether a scatterer contributes to the echo, broadcastable to beat_hz, bool.
         radar: Ladar.
 
     Raises:
@@ -164,16 +169,16 @@ def refuse_beats(beat_hz: Tensor, shines: Tensor, radar: TriangularLadar) -> Non
         return
     if not worst < radar.sample_rate_hz / 2:
         raise ValueError(
-            f"a scatterer beats at {worst / 1e6:.6g} MHz, beyond half the sampling rate of "
-            f"{radar.sample_rate_hz / 1e6:g} MHz; move it nearer to the reference range "
+            f"the beat frequency of a scatterer must be below half the sampling rate, {radar.sample_rate_hz / 2e6:g} "
+            f"MHz, got {worst / 1e6:.6g} MHz; move it nearer to the reference range "
             f"(1 m is {radar.beat_hz(1.0) / 1e6:.3g} MHz), move it more slowly (1 m/s is "
-            f"{radar.doppler_hz(1.0) / 1e6:.3g} MHz), sample faster, or gate it out (gate_m)"
+            f"{radar.doppler_hz(1.0) / 1e6:.3g} MHz), sample faster, or exclude it by gate_m"
         )
 
 
 @dataclass(frozen=True)
 class SweepLines:
-    """Phase of each scatterer in each sweep as a polynomial of the fast time.
+    """Phase of each scatterer in each sweep as a polynomial of the time from the sweep middle.
 
     Args:
         start: Phase at the middle of the sweep in cycles, shape (*trials, 2, pulse, target),
@@ -189,7 +194,7 @@ class SweepLines:
 
     @staticmethod
     def of(history: RangeHistory, fidelity: Fidelity, middle_s: Tensor) -> SweepLines:
-        """Form the polynomials of a range history.
+        """Form the phase polynomials of a range history.
 
         Args:
             history: Range of the scatterers.
@@ -318,8 +323,8 @@ def simulate_ladar(
 ) -> tuple[Recording, Truth]:
     """Simulate separated sweeps of a ladar, batched over the trials of the draws.
 
-    Samples are complex whatever radar.detection is, as an ideal splitter would give them; use
-    `simulate_ladar_record` for what the receiver records.
+    Samples are complex whatever radar.detection is, as if an ideal stage had cut the record of the
+    receiver into sweeps; `simulate_ladar_record` simulates that record itself.
 
     Args:
         radar: Ladar.
@@ -333,17 +338,19 @@ def simulate_ladar(
     Returns:
         The recording, shape (..., 2, pulse, fast_time), and the truth. With a calibration fibre the
         recording has aux `calibration`, shape (..., 2, pulse or 1, fast_time), and
-        `calibration_delay_s`. The truth holds at the turning points t_k + period / 2, shape (...,
-        pulse): `velocity_m_s` of the motion alone in m/s, receding positive; `range_error_m`, the
-        displacement in metres, and `range_error_up_m`, `range_error_down_m` at the middles of the
-        sweeps; `log_amplitude` if it is modelled (with the flight time, all at the time of
-        reflection R / c earlier). It further holds `azimuth_m`, `range_m` and `amplitude` of the
-        scatterers, shape (..., target); `noise_std`, the standard deviation of the noise of a
-        sample, shape (...,); and the values of each impairment under "<impairment>.<name>". `clean`
-        is the recording without motion and impairments, with the same noise and scintillation.
+        `calibration_delay_s`. The truth holds at the turning points, half a period after the start
+        of each recorded period, shape (..., pulse): `velocity_m_s` of the motion alone in m/s,
+        receding positive; `range_error_m`, the displacement in metres; and `log_amplitude` if it is
+        modelled. `range_error_up_m` and `range_error_down_m` are the displacement at the middles of
+        the up-sweeps and down-sweeps. Where the flight time is modelled, all these are the values
+        at the times of reflection, R / c earlier. It further holds `azimuth_m`, `range_m` and
+        `amplitude` of the scatterers, shape (..., target); `noise_std`, the standard deviation of
+        the noise of a sample, shape (...,); and the values of each impairment under
+        "<impairment>.<name>". `clean` is the recording without motion and impairments, with the
+        same noise and scintillation.
 
     Raises:
-        TypeError: If an argument is of another kind.
+        TypeError: If radar, world or draws has the wrong type.
         ValueError: If a beat frequency exceeds half the sampling rate, the scene or the gate is
             empty, there is no period, or a parameter per trial has another length than the trials.
     """

@@ -24,12 +24,12 @@ _NODES = 16
 
 @dataclass(frozen=True)
 class LadarCourse:
-    """What is drawn for a simulation: scatterers within the gate, motions and scintillation.
+    """Scatterers, motions and scintillation of a simulation, with all random parts drawn.
 
     Args:
-        scatterers: Scatterers, zero outside the gate, shape (..., target).
-        motion: Motions, random ones drawn.
-        chi: Log-amplitude, None for none.
+        scatterers: Scatterers, with amplitude zero outside the range gate, shape (..., target).
+        motion: Motions along the line of sight, random ones already drawn.
+        chi: Log-amplitude of the scintillation, None for no scintillation.
         start_s: Start of the first recorded period in seconds.
     """
 
@@ -42,7 +42,7 @@ class LadarCourse:
     def of(
         radar: TriangularLadar, world: LadarWorld, n_period: int, draws: Draws, device: torch.device | str | None
     ) -> LadarCourse:
-        """Draw everything random of a simulation.
+        """Draw the scatterers, motions and scintillation of a simulation.
 
         Args:
             radar: Ladar.
@@ -55,7 +55,7 @@ class LadarCourse:
             Scatterers, motions and scintillation.
 
         Raises:
-            TypeError: If an argument is of another kind.
+            TypeError: If radar, world or draws has the wrong type.
             ValueError: If there is no period, no scatterer within the gate, or a parameter per
                 trial has another length than the trials.
         """
@@ -65,7 +65,7 @@ class LadarCourse:
                 f"{type(radar).__name__}, {type(world).__name__} and {type(draws).__name__}"
             )
         if not (isinstance(n_period, int) and n_period >= 1):
-            raise ValueError(f"a recording needs at least one period, a whole number of them, got n_period={n_period}")
+            raise ValueError(f"n_period must be a whole number of 1 or more periods, got {n_period}")
         refuse_other_trials(world, draws)
         drawn = world.scene.scatterers(draws)
         s = Scatterers(*(v.to(device) for v in (drawn.azimuth_m, drawn.range_m, drawn.amplitude)))
@@ -75,7 +75,7 @@ class LadarCourse:
         return LadarCourse(_gated(s, world.gate_m), drawn_motion(world.motion, draws, span_s), chi, axis.start)
 
     def moved_m(self, time_s: Tensor) -> Tensor:
-        """Return the displacement.
+        """Return the displacement of the whole scene along the line of sight.
 
         Args:
             time_s: Slow time in seconds, any shape, float64.
@@ -86,7 +86,7 @@ class LadarCourse:
         return displacement_m(self.motion, time_s - self.start_s)
 
     def log_amplitude(self, time_s: Tensor) -> Tensor:
-        """Return the log-amplitude chi, zero if it is not modelled.
+        """Return the log-amplitude chi of the scintillation, zero if none is modelled.
 
         Args:
             time_s: Slow time in seconds, any shape, float64.
@@ -116,16 +116,23 @@ class LadarCourse:
     def truths(
         self, radar: TriangularLadar, world: LadarWorld, middle_s: Tensor, later_s: Tensor | None = None
     ) -> dict[str, Tensor]:
-        """Return the true values of a recording, with the flight time at the time of reflection.
+        """Return the true values of a recording.
+
+        Where the flight time is modelled they are the values at the times of reflection, R / c
+        before reception.
 
         Args:
             radar: Ladar.
             world: World.
             middle_s: Slow times of the sweep middles in seconds, shape (2, pulse).
-            later_s: Delay of all sweeps in seconds, a number or shape (...,).
+            later_s: Time in seconds by which all sweeps come later than middle_s, a number or shape
+                (...,); None for zero.
 
         Returns:
-            Tensors by name; see `simulate_ladar`.
+            Tensors by name: the velocity `velocity_m_s` and the displacement `range_error_m` at the
+            turning points, `range_error_up_m` and `range_error_down_m` at the middles of the
+            sweeps, `azimuth_m`, `range_m` and `amplitude` of the scatterers, `noise_std`, and
+            `log_amplitude` if it is modelled.
         """
         then = (
             middle_s
@@ -200,8 +207,8 @@ def _gated(s: Scatterers, gate_m: tuple[Tensor | float, Tensor | float] | None) 
     if bool(empty.any()):
         low, high = (float(bound.expand(empty.shape)[empty][0]) for bound in (low, high))
         raise ValueError(
-            f"no scatterer lies within the gate of {low:g} to {high:g} m; they lie "
-            f"from {float(s.range_m.min()):g} to {float(s.range_m.max()):g} m: widen gate_m"
+            f"no scatterer lies within the gate of {low:g} to {high:g} m, but the scatterers lie "
+            f"from {float(s.range_m.min()):g} to {float(s.range_m.max()):g} m; widen gate_m"
         )
     return replace(s, amplitude=s.amplitude * inside)
 
@@ -225,7 +232,8 @@ def calibration_aux(
         device: Device of the channel.
 
     Returns:
-        `calibration` and `calibration_delay_s`, or nothing without a fibre.
+        Tensors `calibration` and `calibration_delay_s` by name; an empty dictionary for a world
+        without a fibre.
     """
     if world.calibration is None:
         return {}

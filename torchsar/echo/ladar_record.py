@@ -49,12 +49,14 @@ def ladar_record(
 ) -> Tensor:
     """Return blocks of a continuous record without noise.
 
-    The phase of a scatterer in cycles is fc dtau + psi(t') - psi(t' - dtau), where psi is the phase
-    of the triangle and t' the time since the arrival of a reference. In block k triangles start at
-    t_k + trigger_s, and one period before and after. Within a sweep this is
-    +-(K u dtau - K dtau^2 / 2); an echo that was sent before the last turning point, by a time o,
-    differs by +-K o^2. Within a block the range of each scatterer follows a parabola, the motion a
-    spline with 64 knots per period, and the log-amplitude a straight line. Differentiable.
+    The phase of a scatterer in cycles is fc dtau + psi(t') - psi(t' - dtau), with the carrier fc,
+    the delay dtau relative to the reference range, the phase psi of the triangular frequency sweep
+    and the time t' within the triangle. In each block a triangle starts trigger_s after the start
+    of the block, and others one period before and after. At the time u from the middle of a sweep
+    of the rate K, psi(t') - psi(t' - dtau) is +-(K u dtau - K dtau^2 / 2); where the echo was sent
+    a time o before the last turning point, +-K o^2 is added. Within a block the range of each
+    scatterer follows a parabola, the motion a spline with 64 knots per period, and the
+    log-amplitude a straight line. Differentiable.
 
     Args:
         scatterers: Scatterers, shape (..., target).
@@ -64,12 +66,12 @@ def ladar_record(
         motion: Motions along the line of sight, random ones already drawn.
         trigger_s: Time from the start of a block to the start of an up-sweep in seconds, a number
             or one value per trial.
-        without: Omitted effects.
+        without: Physical effects that are left out: "residual_video", "hyperbola" or "flight".
         sweep_error: Phase error of the laser.
         log_amplitude: Function of slow times (*times) that returns the log-amplitude, shape
             (*trials, *times); None for none.
-        dtype: Complex dtype of the result, or of which it has the real dtype if radar.detection is
-            "real".
+        dtype: Complex dtype of the result; if radar.detection is "real", the result has the
+            corresponding real dtype.
 
     Returns:
         Record, shape (*trials, pulse, time).
@@ -144,13 +146,14 @@ class BlockPaths:
     """Ranges of scatterers in blocks of a record.
 
     Args:
-        start_m: Relative range at the start of the block in metres, shape (..., pulse, target),
-            float64.
-        speed: First derivative there in m/s, same shape.
-        bend: Half the second derivative in m/s^2, same shape.
-        knots: Displacement by the motion at knots in metres, shape (..., pulse, knot).
-        shrink: 1 - v / c where the flight time is modelled, otherwise 1, shape (..., pulse,
-            target).
+        start_m: Range relative to the reference range, without motion, at the start of the block in
+            metres, shape (..., pulse, target), float64.
+        speed: First derivative of that range at the start of the block in m/s, same shape.
+        bend: Half the second derivative of that range in m/s^2, same shape.
+        knots: Displacement by the motion at the knots of a spline in metres, shape (..., pulse,
+            knot).
+        shrink: Factor of the range, 1 - v / c at the radial velocity v where the flight time is
+            modelled, otherwise 1, shape (..., pulse, target).
         lit: Whether the scatterer is illuminated, shape (..., pulse, target), bool.
         step_s: Distance of the knots in seconds.
         offsets_s: Times of the samples from the start of the block in seconds, shape (n,).
@@ -218,14 +221,14 @@ class BlockPaths:
         )
 
     def part(self, first: int, last: int) -> BlockPaths:
-        """Return some of the blocks.
+        """Return the range histories of consecutive blocks.
 
         Args:
             first: First block.
             last: Block after the last one.
 
         Returns:
-            The blocks first to last - 1.
+            Range histories of the blocks first to last - 1.
         """
         return replace(
             self,
@@ -236,7 +239,7 @@ class BlockPaths:
         )
 
     def motion_m(self) -> Tensor:
-        """Return the displacement by the motion at the samples.
+        """Return the displacement by the motion at all samples of all blocks.
 
         Returns:
             Displacement in metres, shape (..., pulse, n).
@@ -244,14 +247,15 @@ class BlockPaths:
         return UniformSpline(self.knots, 0.0, self.step_s).at(self.offsets_s)
 
     def delay_s(self, target: int, motion_m: Tensor) -> Tensor:
-        """Return the delay of one scatterer at the samples.
+        """Return the delay of one scatterer at all samples, relative to the reference range.
 
         Args:
             target: Index of the scatterer.
             motion_m: Displacement at the samples in metres, shape (..., pulse, n).
 
         Returns:
-            2 RD / c in seconds, shape (..., pulse, n).
+            Delay in seconds, twice the relative range over the speed of light, shape (..., pulse,
+            n).
         """
         start_m, speed, bend, shrink = (
             v[..., target, None] for v in (self.start_m, self.speed, self.bend, self.shrink)
@@ -313,9 +317,9 @@ def _refuse_folding(beat_hz: Tensor, contributing: Tensor) -> None:
     )
     if low <= 0 <= high:
         raise ValueError(
-            f"beats of {low / 1e6:.6g} to {high / 1e6:.6g} MHz fold at zero in real samples; move the "
-            "reference range off the scene until the beat of the range exceeds that of the velocity, "
-            '2 v / lambda, or detect complex samples (detection "complex")'
+            f"beat frequencies of {low / 1e6:.6g} to {high / 1e6:.6g} MHz fold at zero in real samples; move the "
+            "reference range so far off the scene that the beat frequency by range exceeds the Doppler frequency, "
+            '2 v / lambda, or record complex samples (detection "complex")'
         )
 
 
@@ -349,31 +353,32 @@ def simulate_ladar_record(
             grid of separated sweeps.
         trigger_known: Whether the recording holds the trigger times, as aux `trigger_s`.
         impairments: Impairments by name, applied in order.
-        dtype: Complex dtype of the recording, or of which it has the real dtype.
+        dtype: Complex dtype of the recording; real samples have the corresponding real dtype.
         device: Device of the recording.
 
     Returns:
         The recording, shape (..., pulse, time), and the truth. With a calibration fibre the
         recording has aux `calibration`, shape (..., 2, pulse or 1, fast_time), and
-        `calibration_delay_s`. The truth holds at the turning points t_k + trigger_s + period / 2,
-        shape (..., pulse): `velocity_m_s` of the motion alone in m/s, receding positive;
-        `range_error_m`, the displacement in metres, and `range_error_up_m`, `range_error_down_m` at
-        the middles of the sweeps; `log_amplitude` if it is modelled; all are exact for up to 16
-        different trigger times, and interpolated for more. It further holds `azimuth_m`, `range_m`
+        `calibration_delay_s`. The truth holds at the turning points, trigger_s plus half a period
+        after the start of each block, shape (..., pulse): `velocity_m_s` of the motion alone in
+        m/s, receding positive; `range_error_m`, the displacement in metres; and `log_amplitude` if
+        it is modelled. `range_error_up_m` and `range_error_down_m` are the displacement at the
+        middles of the up-sweeps and down-sweeps. All these are exact for up to 16 different trigger
+        times, and interpolated for more. It further holds `azimuth_m`, `range_m`
         and `amplitude` of the scatterers, shape (..., target); `noise_std`, shape (...,);
         `trigger_s`; and the values of each impairment under "<impairment>.<name>". `clean` is the
         recording without motion and impairments, with the same noise and scintillation.
 
     Raises:
-        TypeError: If an argument is of another kind.
+        TypeError: If radar, world or draws has the wrong type.
         ValueError: If a beat frequency exceeds half the sampling rate or folds at zero, blocks
             overlap or hold no sweep, the fidelity does not apply to a record, the scene or the gate
             is empty, or a parameter per trial has another length than the trials.
     """
     if not isinstance(world.fidelity, EverySample | LinearInSweep | QuadraticInSweep):
         raise ValueError(
-            "a continuous record needs EverySample, LinearInSweep or QuadraticInSweep, got "
-            f"{type(world.fidelity).__name__}; use simulate_ladar for such studies"
+            "fidelity of a continuous record must be EverySample, LinearInSweep or QuadraticInSweep, got "
+            f"{type(world.fidelity).__name__}; use simulate_ladar for this fidelity"
         )
     course = LadarCourse.of(radar, world, n_period, draws, device)
     axes = radar.record_axes(n_period, _block_samples(radar, block_s))
@@ -426,8 +431,8 @@ def _block_samples(radar: TriangularLadar, block_s: float | None) -> int:
     length = (radar.period_s if radar.keep_every == 1 else 2 * radar.period_s) if block_s is None else block_s
     if not radar.sweep_s <= length <= radar.pulse_step_s * (1 + 1e-9):
         raise ValueError(
-            f"blocks of {length:g} s must hold a sweep of {radar.sweep_s:g} s and not overlap, "
-            f"being {radar.pulse_step_s:g} s apart; choose block_s between"
+            f"block_s must be at least the {radar.sweep_s:g} s of a sweep and at most the {radar.pulse_step_s:g} s "
+            f"from one block to the next, got {length:g} s"
         )
     return round(length * radar.sample_rate_hz)
 

@@ -59,8 +59,8 @@ def _order(draws: Draws, purpose: str, n: Tensor, number: Tensor) -> Tensor:
         return order.expand(*number.shape[:-1], -1)
     except RuntimeError:
         raise ValueError(
-            f"draws for {tuple(order.shape[:-1])} trials do not fit a recording of "
-            f"{tuple(number.shape[:-1])} trials; draw one unbatched trial for a single recording"
+            f"draws must have the trials of the recording, of shape {tuple(number.shape[:-1])}, got trials of shape "
+            f"{tuple(order.shape[:-1])}; use draws without trials for a single recording"
         ) from None
 
 
@@ -70,14 +70,16 @@ def _at(index: Tensor, n: int) -> Tensor:
 
 
 def take_lines(recording: Recording, source: Tensor) -> Recording:
-    """Return the recording whose line i is line source[i] of another one.
+    """Return a recording whose line i is line source[i] of the given recording.
 
     Args:
         recording: Recording of lines, shape (*trials, pulse, range).
-        source: Index of each line, -1 for a zero line of number -1, shape (*trials, pulse), int64.
+        source: Index of the line to take, or -1 for a line of zeros with the line number -1, shape
+            (*trials, pulse), int64.
 
     Returns:
-        Recording of the same shape; side data with one entry per line are rearranged as well.
+        Recording of the shape of the given one; side data with one entry per line are rearranged as
+        well.
     """
     data, n = recording.signal.data, recording.signal.data.shape[-2]
     present, index = source >= 0, source.clamp_min(0)
@@ -109,16 +111,17 @@ def _drop(recording: Recording, lost: Tensor) -> tuple[Recording, dict[str, Tens
 class LostLines:
     """Impairment: single lines lost at random positions.
 
-    The truth holds `lost`, shape (..., pulse), bool, on the grid of line number minus first number,
-    and `lost_number`, shape (..., count), padded with -1 where trials lose fewer lines.
+    The truth holds `lost`, shape (..., pulse), bool, indexed by the line number minus the number of
+    the first line, and the numbers of the lost lines `lost_number`, shape (..., count), padded with
+    -1 where trials lose fewer lines.
 
     Args:
         count: Number of lost lines, fixed for all trials; None if a fraction is given.
         fraction: Fraction of all lines, at least 0 and below 1; None if a count is given.
 
     Raises:
-        ValueError: If both or none is given, or one is out of range; when applied, if no line would
-            be left or the trials of draws and recording differ.
+        ValueError: If both count and fraction are given or neither is, or one is out of range; when
+            applied, if no line would be left or the trials of draws and recording differ.
     """
 
     count: int | None = None
@@ -126,12 +129,14 @@ class LostLines:
 
     def __post_init__(self) -> None:
         if (self.count is None) == (self.fraction is None):
-            raise ValueError(f"lost lines need a count or a fraction, got count={self.count}, fraction={self.fraction}")
-        expected = "lost lines need a count >= 0 or a fraction in 0..1"
+            raise ValueError(
+                f"lost lines need a count or a fraction, and not both, got count={self.count}, fraction={self.fraction}"
+            )
         if self.count is not None and self.count < 0:
-            raise ValueError(f"{expected}, got count={self.count}")
+            raise ValueError(f"count of lost lines must be 0 or more, got {self.count}")
         if self.fraction is not None:
-            refuse_unless(expected, self.fraction, lambda x: (x >= 0) & (x < 1))
+            sentence = "fraction of lost lines must be at least 0 and below 1"
+            refuse_unless(sentence, self.fraction, lambda x: (x >= 0) & (x < 1))
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         refuse_other_trials(self, draws, recording)
@@ -150,9 +155,10 @@ class LostLines:
 
 @dataclass(frozen=True)
 class LostGaps:
-    """Impairment: gaps of consecutive lost lines, apart from one another.
+    """Impairment: gaps of consecutive lost lines, with at least one received line between gaps.
 
-    The truth is that of `LostLines`.
+    The truth holds `lost`, shape (..., pulse), bool, indexed by the line number minus the number of
+    the first line, and the numbers of the lost lines `lost_number`, shape (..., count * length).
 
     Args:
         count: Number of gaps, fixed for all trials.
@@ -192,8 +198,9 @@ class LostGaps:
 class RepeatedLines:
     """Impairment: lines that appear twice in succession, with the same number and samples.
 
-    The last lines of a full matrix are dropped. The truth holds `repeated`, shape (..., pulse),
-    bool, the second copies in the impaired matrix.
+    The recording keeps its number of lines: as many lines (or padding) at its end are dropped as
+    lines are repeated. The truth holds `repeated`, shape (..., pulse), bool, true for the second
+    copy of each repeated line in the impaired recording.
 
     Args:
         count: Number of repeated lines, fixed for all trials.
@@ -231,12 +238,13 @@ class RepeatedLines:
 class CorruptedNumbers:
     """Impairment: line numbers that are overwritten, while the samples are unchanged.
 
-    The truth holds `corrupted`, bool, and `true_number`, shape (..., pulse) each, in the order of
-    the matrix.
+    The truth holds, for each line of the recording, `corrupted`, bool, and `true_number`, shape
+    (..., pulse) each.
 
     Args:
         count: Number of corrupted line numbers, fixed for all trials.
-        bits: None for any number 0 to 65535; otherwise one of this many low bits is flipped.
+        bits: None to overwrite with random numbers of 0 to 65535; otherwise one randomly chosen bit
+            among this many lowest bits of the number is flipped.
 
     Raises:
         ValueError: If a number is out of range; when applied, if the count exceeds the lines or the

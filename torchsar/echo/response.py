@@ -20,10 +20,10 @@ _POINTS = 1025
 class ChannelResponse:
     """Impairment: every range spectrum is multiplied by amplitude(u) exp(j phase(u)).
 
-    u is the range frequency over half the pulse bandwidth. The functions are evaluated within -1..1
-    only; outside the band their values at its edges hold. Constant and linear parts of the phase
-    are applied as well, although no processor can distinguish them from a phase and a shift of the
-    scene. The truth holds `phase_rad` and `amplitude` at 1025 points of -1..1.
+    u is the range frequency divided by half the pulse bandwidth. The functions are evaluated within
+    -1..1 only; outside the band their values at its edges are used. Constant and linear parts of
+    the phase are applied as well, although no processor can distinguish them from a phase and a
+    shift of the scene. The truth holds `phase_rad` and `amplitude` at 1025 points of -1..1.
 
     Args:
         phase_rad: Function of u, shape (n,), float64, that returns the phase in radians, shape (n,)
@@ -54,10 +54,11 @@ class ChannelResponse:
         }
 
     def curves(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Return phase and amplitude.
+        """Return phase and amplitude of the response.
 
         Args:
-            u: Normalised frequency within -1..1, shape (n,), float64.
+            u: Range frequency divided by half the pulse bandwidth, within -1..1, shape (n,),
+                float64.
 
         Returns:
             Phase in radians and amplitude, shape (n,) or (..., n) each.
@@ -69,8 +70,9 @@ class ChannelResponse:
         amplitude = torch.ones_like(u) if self.amplitude is None else self.amplitude(u)
         if not bool((amplitude > 0).all()):
             raise ValueError(
-                "the amplitude response must be positive over the whole band; a band that is cut off "
-                "belongs to the pulse"
+                "amplitude of a channel response must be positive over the whole band, got "
+                f"{float(amplitude.detach().min()):.4g}; to cut off a part of the band, reduce the bandwidth of the "
+                "pulse"
             )
         phase, amplitude = torch.broadcast_tensors(phase, amplitude)
         return phase, amplitude
@@ -84,12 +86,14 @@ def smooth_response(
     slope_db: Tensor | float = 0.0,
     amplitude_ripple_db: Tensor | float = 0.0,
 ) -> ChannelResponse:
-    """Impairment: phase quadratic u^2 + cubic u^3 + ripple sin(pi cycles u), and gain slope u / 2 +
-    ripple cos(pi cycles u) in dB, u = -1..1 over the band.
+    """Build a channel response whose phase and gain vary smoothly over the band.
 
-    The constant and linear parts of the phase are removed: they are a phase and a shift of the
-    whole scene, which no processor can distinguish from those of the scene itself. Every parameter
-    is a number or a tensor (trial,).
+    With the range frequency u = -1..1 over the band, the phase in radians is
+    quadratic_rad u^2 + cubic_rad u^3 + ripple_rad sin(pi ripple_cycles u), and the gain in dB is
+    slope_db u / 2 + amplitude_ripple_db cos(pi ripple_cycles u). The constant and the linear part
+    of this phase are removed: they are a phase and a shift of the whole scene, which no processor
+    can distinguish from those of the scene itself. Every parameter is a number or a tensor of shape
+    (trial,).
 
     Args:
         quadratic_rad: Quadratic phase at the band edge in radians.
@@ -100,7 +104,7 @@ def smooth_response(
         amplitude_ripple_db: Amplitude of the gain ripple in dB.
 
     Returns:
-        The impairment.
+        The impairment that multiplies every range spectrum by this response.
     """
 
     def curve(u: Tensor) -> Tensor:

@@ -6,10 +6,10 @@ frequency f_r, f the Doppler frequency, V the speed of the receiver)
 
     exp(-j 2 pi [ f y / V + sqrt(F^2 - (c f / V)^2) R0 / c ]),    sin(look) = -c f / (F V).
 
-This is the phase from which omega-K focusing starts. The channel at dx receives what the reference
-channel received dx / V earlier, which is the exact factor exp(-j 2 pi f dx / V). One sum over range
-per bin of the full Doppler band therefore serves all channels; they differ only in their folding to
-the pulse rate.
+This is the phase from which omega-K focusing starts. The channel with the along-track offset dx
+receives at the time t what the reference channel received at t - dx / V, which is the exact factor
+exp(-j 2 pi f dx / V). One sum over range per bin of the full Doppler band therefore serves all
+channels: for each channel it is multiplied by that factor and then folded to the PRF.
 
 Reference:
     Remote Sens. 2020, 12, 1703, Eqs. (1), (4), with zero target velocity.
@@ -53,13 +53,14 @@ def sea_echo(
 ) -> Tensor:
     """Return the range-compressed echo of a sea without noise.
 
-    The phase is -2 pi / lambda (R_m - reference range), and the range response is that of the
-    rectangular band of the pulse; the transmit range and a pulse of another shape are applied by
-    the caller. A cell keeps its amplitude while it is illuminated. Amplitudes fall with
-    1 / sqrt(R0) over range, as the number of cells in the beam grows, so that the mean power is
-    10^(power_db / 10) in every sample, for every gate and frame. The stationary phase is the only
-    approximation; it blurs the edges of a band-limited gate by their Fresnel ripple. Differentiable
-    in power_db and in images.
+    The phase of a cell is -2 pi / lambda (R_m - reference range), with the range R_m from the cell
+    to the receiver, and the range response is that of the rectangular band of the pulse. The
+    caller applies the transmit range and, where needed, a pulse of another shape. A cell keeps its
+    amplitude while it is illuminated. The amplitude falls with the closest range R0 as
+    1 / sqrt(R0), since the number of cells in the beam grows with R0: the mean power is
+    10^(power_db / 10) in every sample, for every gate and frame. The principle of stationary phase
+    is the only approximation; it blurs the edges of a band-limited gate by Fresnel ripple. The echo
+    is differentiable in power_db and, for a sea made from an image, in the image.
 
     Args:
         sea: Surface.
@@ -68,8 +69,8 @@ def sea_echo(
         n_range: Number of range samples, None for one line at the reference range.
         gate: `BandLimited` of duration T illuminates the Doppler band |f| < V^2 T / (2 lambda R0)
             of the reference range at every range, as a beam of fixed width does. `Pattern` weights
-            with sinc(element sin(look) / lambda) up to sea.lobes nulls. Both need one value for all
-            trials.
+            with sinc(element_m sin(look) / lambda) up to null number sea.lobes to either side.
+            duration_s and element_m must each be one number for all trials.
         draws: Random draws.
         dtype: Complex dtype of the result.
         device: Device of the result.
@@ -79,8 +80,8 @@ def sea_echo(
         pulse) without n_range.
 
     Raises:
-        TypeError: If the gate or the dtype is of another kind.
-        ValueError: If the frame begins behind the receiver, the gate is wider than a look angle of
+        TypeError: If the gate is neither `BandLimited` nor `Pattern`, or the dtype is not complex.
+        ValueError: If the frame begins behind the receiver, the gate reaches a look angle above
             53 degrees or differs between trials, or power_db has another length than the trials.
     """
     real_dtype(dtype)
@@ -119,8 +120,9 @@ class _Light:
             edge = radar.speed_m_s * duration_s / (2 * radar.reference_range_m)
             if edge > _STEEPEST:
                 raise ValueError(
-                    f"a gate of {duration_s:g} s at {radar.reference_range_m:g} m ends at a look "
-                    f"angle of sine {edge:.3g}, beyond {_STEEPEST}; shorten it, or use Pattern()"
+                    f"duration_s of the gate of a sea must keep the sine of the look angle at or below {_STEEPEST}, "
+                    f"got {duration_s:g} s, which reaches a sine of {edge:.3g} at the reference range of "
+                    f"{radar.reference_range_m:g} m; shorten it, or use Pattern()"
                 )
             return _Light(torch.ones_like, edge, edge)
         if isinstance(gate, Pattern):
@@ -164,8 +166,9 @@ class _Lines:
         near = middle - (n_range // 2) * step
         if near <= 0:
             raise ValueError(
-                f"a frame of {n_range} samples about {middle:g} m begins at a range of {near:g} m; "
-                f"record at most {2 * int(middle / step)} samples"
+                f"n_range must be so small that the frame begins at a positive range, got {n_range} samples about "
+                f"the reference range of {middle:g} m, which begin at {near:g} m; record at most "
+                f"{2 * int(middle / step)} samples"
             )
         far, cos = near + (n_range - 1) * step, math.sqrt(1 - last_sin**2)
         before = min(math.ceil(near * (1 - cos) / step) + _SKIRT, math.ceil(near / step) - 1)

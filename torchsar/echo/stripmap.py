@@ -56,10 +56,10 @@ def path_geometry(
     doppler_hz: Tensor | float,
     velocity_m_s: Tensor | float,
 ) -> Placed:
-    """Convert positions in the recorded frame to the geometry of the path.
+    """Convert positions of scatterers in the recorded frame to crossing times and closest ranges.
 
-    The middle of the frame is the middle pulse and the middle of the fully compressed part of a
-    line.
+    Positions are zero at the middle of the frame, which is the middle pulse and the middle of the
+    fully compressed part of a range line.
 
     Args:
         scatterers: Scatterers, shape (..., target).
@@ -70,7 +70,7 @@ def path_geometry(
         velocity_m_s: Effective velocity in m/s, a number or one value per trial.
 
     Returns:
-        The scatterers, shape (..., target).
+        The scatterers in the geometry of the straight path, shape (..., target).
     """
     doppler, velocity = (per_trial(v, 1, scatterers.azimuth_m) for v in (doppler_hz, velocity_m_s))
     middle_m = radar.near_range_m + max(0, n_range - radar.pulse_samples) / 2 * radar.range_step_m
@@ -255,7 +255,7 @@ def _target_blocks(placed: Placed, height: int, n_fft: int) -> Iterator[slice]:
 def target_energy(truth: Truth, world: StripmapWorld, radar: StripmapRadar, n_pulse: int) -> Tensor:
     """Return the energy of the raw echo of each target over all lines of the record.
 
-    Over the noise variance (`noise_std` squared) it is the peak signal-to-noise ratio after
+    Divided by the noise variance (`noise_std` squared) it is the peak signal-to-noise ratio after
     two-dimensional compression.
 
     Args:
@@ -367,13 +367,13 @@ def _refuse_impossible(scatterers: Scatterers, radar: StripmapRadar, n_range: in
     if not bool((sin_squint.abs() < 1).all()):
         worst = float(sin_squint.abs().max())
         raise ValueError(
-            f"the Doppler frequency of the beam requires a squint beyond 90 degrees (sine {worst:.4g}); its "
-            "magnitude must be below 2 * velocity / wavelength"
+            "the Doppler frequency of the beam centre must have a magnitude below 2 * velocity / wavelength, "
+            f"got one that requires a squint beyond 90 degrees (sine {worst:.4g})"
         )
     if radar.pulse_samples > n_range:
         raise ValueError(
-            f"a line of {n_range} samples does not hold the pulse of {radar.pulse_samples}; "
-            "record longer lines or shorten the pulse"
+            f"a line of {n_range} samples does not hold the pulse of {radar.pulse_samples} samples; "
+            "record longer lines (n_range) or shorten the pulse"
         )
 
 
@@ -382,12 +382,12 @@ def apply_impairments(
 ) -> tuple[Recording, dict[str, Tensor]]:
     """Apply impairments to a recording, simulated or recorded.
 
-    The recording gets aux `line_number` if it has none.
+    A recording without aux `line_number` gets line numbers 0, 1, ... in the order of its pulses.
 
     Args:
         recording: Recording.
         impairments: Impairments by name, applied in order.
-        draws: Random draws; each impairment draws from an address of its own, its name.
+        draws: Random draws; each impairment draws its own random numbers, addressed by its name.
 
     Returns:
         The impaired recording, and the true values under "<impairment>.<name>".

@@ -34,24 +34,25 @@ class PolynomialSweepError:
     down_hz: Sequence[Tensor | float]
 
     def __post_init__(self) -> None:
-        sentence = "a polynomial sweep error needs finite coefficients for up and down"
         if not len(self.up_hz) or not len(self.down_hz):
             raise ValueError(
-                f"{sentence}, got {self.up_hz} and {self.down_hz}; leave the effect out where there is none"
+                "up_hz and down_hz of a polynomial sweep error must each have at least one coefficient, "
+                f"got {self.up_hz} and {self.down_hz}; leave the sweep error out where there is none"
             )
         for c in (*self.up_hz, *self.down_hz):
-            refuse_unless(sentence, c, finite)
+            refuse_unless("coefficients of a polynomial sweep error must be finite", c, finite)
 
     def turns(self, time_s: Tensor, ramp: int, dims: int | None = None) -> Tensor:
-        """Return the phase error.
+        """Return the phase error of the laser at times within a sweep.
 
         Args:
             time_s: Time u from the middle of the sweep in seconds, float64.
             ramp: 0 for the up-sweep, 1 for the down-sweep.
-            dims: Number of last dimensions of time_s that are no trials, all by default.
+            dims: Number of trailing dimensions of time_s that index times; dimensions before them
+                are trials. None if all dimensions index times.
 
         Returns:
-            Phase error in cycles; the trials of the parameters lead.
+            Phase error in cycles, shape (*trials, *times).
         """
         behind = time_s.ndim if dims is None else dims
         total = torch.zeros_like(time_s)
@@ -64,8 +65,8 @@ class PolynomialSweepError:
 class SinusoidSweepError:
     """Frequency error of the sweep as a sinusoid, A sin(2 pi F u + phase).
 
-    u is the time from the middle of the sweep. The phase error is the antiderivative of the
-    frequency error, zero at the middle of each sweep.
+    u is the time from the middle of the sweep in seconds. The phase error is the antiderivative of
+    the frequency error, zero at the middle of each sweep.
 
     Args:
         amplitude_hz: Amplitude A in hertz.
@@ -88,15 +89,16 @@ class SinusoidSweepError:
         refuse_unless("frequency_hz of a sinusoidal sweep error must be above 0 Hz", self.frequency_hz, positive)
 
     def turns(self, time_s: Tensor, ramp: int, dims: int | None = None) -> Tensor:
-        """Return the phase error.
+        """Return the phase error of the laser at times within a sweep.
 
         Args:
             time_s: Time u from the middle of the sweep in seconds, float64.
             ramp: 0 for the up-sweep, 1 for the down-sweep.
-            dims: Number of last dimensions of time_s that are no trials, all by default.
+            dims: Number of trailing dimensions of time_s that index times; dimensions before them
+                are trials. None if all dimensions index times.
 
         Returns:
-            Phase error in cycles; the trials of the parameters lead.
+            Phase error in cycles, shape (*trials, *times).
         """
         behind = time_s.ndim if dims is None else dims
         phase = either(self.phase_down_deg if ramp else self.phase_up_deg, math.radians, torch.deg2rad)
@@ -108,16 +110,19 @@ class SinusoidSweepError:
 
 
 def wound_turns(error: SweepError, radar: TriangularLadar, position_s: Tensor) -> Tensor:
-    """Return the phase error as a continuous function over sweeps and periods.
+    """Return the phase error of the laser, continued without jumps from sweep to sweep.
+
+    The phase error is zero at the start of the triangle. Each sweep starts with the phase error at
+    which the sweep before it ends, and the same up-sweep and down-sweep repeat in every period.
 
     Args:
-        error: Phase error of the sweeps.
+        error: Phase error of one up-sweep and one down-sweep.
         radar: Ladar.
-        position_s: Time since the start of a triangle in seconds, shape (n,) or (..., pulse, n),
-            float64.
+        position_s: Time since the start of a triangle in seconds, negative before it, shape (n,) or
+            (..., pulse, n), float64.
 
     Returns:
-        Phase error in cycles, of the shape of position_s behind the trials of the parameters.
+        Phase error in cycles, shape (*trials, n) or (*trials, pulse, n).
     """
     half = torch.as_tensor(radar.sweep_s / 2, dtype=torch.float64, device=position_s.device)
     ends = [(error.turns(-half, ramp, 2), error.turns(half, ramp, 2)) for ramp in (0, 1)]
@@ -138,15 +143,16 @@ def calibration_channel(
     dtype: torch.dtype,
     device: torch.device | str | None = None,
 ) -> Tensor:
-    """Return the recording of the internal fibre in the sweeps, of amplitude 1.
+    """Return the beat signal of the internal calibration fibre in every sweep, with amplitude 1.
 
-    The phase in the up-sweep is fc tc + K u tc - K tc^2 / 2 + e(u) - e(u - tc) in cycles; the
-    down-sweep has -K and its own error e. It is conjugated if the dechirp sign of the radar is
-    "echo_conj_lo".
+    At the time u from the middle of an up-sweep the phase in cycles is
+    fc tc + K u tc - K tc^2 / 2 + e(u) - e(u - tc), with the carrier fc, the chirp rate K, the delay
+    tc of the fibre and the phase error e of the laser. In a down-sweep -K stands for K, and e is
+    the error of the down-sweep. The signal is conjugated if radar.dechirp_sign is "echo_conj_lo".
 
     Args:
         radar: Ladar.
-        fibre: Calibration fibre with the delay tc.
+        fibre: Calibration fibre.
         error: Phase error of the laser, None for none.
         n_period: Number of periods.
         draws: Random draws of the noise.

@@ -73,10 +73,11 @@ class PulseTurn:
 
     @staticmethod
     def of(rotation: Rotation, radar: InverseRadar, n_pulse: int, like: Tensor) -> PulseTurn:
-        """Evaluate a rotation.
+        """Return angle, rate and acceleration of a rotation at the middle of each pulse.
 
         Args:
-            rotation: See `rotation_angle`.
+            rotation: Rate in rad/s of a uniform rotation, with the angle zero at pulse
+                n_pulse // 2; or a PolynomialRotation, with the angle zero at the first pulse.
             radar: Radar.
             n_pulse: Number of pulses.
             like: Tensor that gives the device.
@@ -111,14 +112,18 @@ def turntable_echo(
     dtype: torch.dtype = torch.complex64,
     centre_deviation_m: Tensor | float = 0.0,
 ) -> Tensor:
-    """Return range-compressed pulses with fixed envelopes, without noise.
+    """Return range-compressed pulses of a rotating target without range migration and noise.
 
-    s[k, n] = sum_m a_m h(n - y_m / dr)
-    exp(-4j pi / lambda (x_m sin theta_k + (y_m + yc) (cos theta_k - 1))), with cross range x and
-    range y. h is the response of a rectangular band of n_range frequencies, with unit peak and
-    periodic in the window. The phase of a_m is that of the echo at theta = 0. For each range
-    frequency the sum over scatterers is a matrix product of phasors. Differentiable in positions,
-    amplitudes, rate, k and yc.
+    In pulse i and at sample n from the middle of the range window,
+
+        s[i, n] = sum_m a_m h(n - y_m / dr)
+            exp(-4j pi / lambda (x_m sin theta_i + (y_m + yc) (cos theta_i - 1))),
+
+    with the cross range x_m, range y_m and amplitude a_m of scatterer m, the range step dr and the
+    rotation angle theta_i. h is the response of a rectangular band of n_range frequencies, with
+    unit peak and periodic in the window. The phase of a_m is that of the echo at theta = 0. For
+    each range frequency the sum over scatterers is a matrix product of phasors. Differentiable in
+    positions, amplitudes, yc and the parameters of the rotation.
 
     Args:
         scatterers: Scatterers, shape (..., target).
@@ -129,8 +134,8 @@ def turntable_echo(
             trial, with the angle zero at pulse n_pulse // 2; or a PolynomialRotation, with the
             angle zero at the first pulse.
         dtype: Complex dtype of the result.
-        centre_deviation_m: Distance yc of the centre of rotation in metres, a number or one value
-            per trial.
+        centre_deviation_m: Distance yc in metres, a number or one value per trial: the centre of
+            rotation lies at the range -yc from the middle of the range window.
 
     Returns:
         Pulses, shape (*trials, pulse, range).
@@ -162,12 +167,14 @@ def turntable_echo(
 
 @dataclass(frozen=True)
 class PulseRange:
-    """Range of the whole target relative to the reference during pulses.
+    """Range of the whole target during each pulse, relative to the reference of the receiver.
+
+    Within a pulse the range is a straight line in fast time plus a deviation from that line.
 
     Args:
         middle_m: Range at the middle of each pulse in metres, shape (*trials, pulse), float64.
-        speed_m_s: Slope of the range in m/s, same shape.
-        bend_m: Residual of the straight line in metres, shape (*trials, pulse, fast_time).
+        speed_m_s: Slope of the straight line in m/s, receding positive, same shape.
+        bend_m: Deviation from the straight line in metres, shape (*trials, pulse, fast_time).
     """
 
     middle_m: Tensor
@@ -178,17 +185,18 @@ class PulseRange:
     def of(
         motion: Sequence[Motion], track: Sequence[Motion], pulse_s: Tensor, fast_s: Tensor, half_s: float
     ) -> PulseRange:
-        """Evaluate the motion during pulses.
+        """Compute the range of the target during each pulse.
 
         Args:
-            motion: Motions along the line of sight.
-            track: Motions that the reference follows from pulse to pulse.
+            motion: Motions of the target along the line of sight.
+            track: Motions that the reference of the receiver follows from pulse to pulse.
             pulse_s: Times of the pulse middles in seconds, shape (pulse,), float64.
             fast_s: Fast time from the middle of a pulse in seconds, shape (fast_time,), float64.
             half_s: Half the pulse length in seconds.
 
         Returns:
-            Motion relative to the track at the pulse middles.
+            Motion minus track at the middle of each pulse, and the slope of the motion within the
+            pulse with the deviation from that slope.
         """
         start, middle, end = (displacement_m(motion, pulse_s + shift) for shift in (-half_s, 0.0, half_s))
         speed = (end - start) / (2 * half_s)
@@ -209,18 +217,22 @@ def dechirped_echo(
 ) -> Tensor:
     """Return dechirped pulses with the range evaluated at every sample, without noise.
 
-    The phase of a scatterer is -2 pi (f0 dtau + gamma t' dtau - gamma dtau^2 / 2) at the time t'
-    from the middle of the pulse, with dtau = 2 (x sin theta + y cos theta + d) / c, where d is the
-    motion minus the track at the middle of the pulse. The constant f0 2 y / c is omitted, so that
-    amplitudes have the same meaning as in `turntable_echo`. With a centre of rotation at -yc the
-    first two terms of dtau become x sin theta + (y + yc) cos theta - yc. A changing rotation rate
-    is followed within a pulse by its value and slope at the middle.
+    At the time t' from the middle of a pulse the phase of a scatterer is
+    -2 pi (f0 dtau + gamma t' dtau - gamma dtau^2 / 2), with the carrier f0, the chirp rate gamma
+    and the delay dtau relative to the reference of the receiver. For a scatterer at the cross range
+    x and range y and the rotation angle theta, dtau = 2 (x sin theta + y cos theta + d) / c, where
+    d is the motion minus the value of the track at the middle of the pulse. With a centre of
+    rotation at the range -yc the first two terms are x sin theta + (y + yc) cos theta - yc. The
+    constant phase of the carrier at the range y is omitted: the phase of an amplitude is that of
+    the echo at theta = 0. Within a pulse the rotation rate changes linearly, with its value and
+    slope at the middle.
 
     Within a pulse the phases of scatterers are linear in t' except for about 1e-4 rad. The linear
-    parts are a matrix product of short tables, the rest a power series. The result is exact to
-    1e-6 rad, and to 1e-10 rad for the ladar of Ruan et al. 2013. The receiver is ideal: a beat
-    frequency outside the window, such as that of the coupling v f0 / gamma, wraps, and
-    `focus.compress_dechirped` unwraps it. Differentiable in positions, amplitudes, omega, k and yc.
+    parts are summed by a matrix product of short tables, the rest by a power series. The result is
+    exact to 1e-6 rad, and to 1e-10 rad for the ladar of Ruan et al. 2013. The receiver is ideal: a
+    beat frequency outside the range window wraps, for example where a radial speed v shifts the
+    echo by v f0 / gamma in range; `focus.compress_dechirped` unwraps it. Differentiable in
+    positions, amplitudes, yc and the parameters of the rotation.
 
     Args:
         scatterers: Scatterers, shape (..., target).
@@ -230,19 +242,19 @@ def dechirped_echo(
         rotation_rad_s: Rotation rate in rad/s of a uniform rotation, a number or one value per
             trial, with the angle zero at pulse n_pulse // 2; or a PolynomialRotation, with the
             angle zero at the first pulse.
-        motion: Motions along the line of sight.
-        track: Motions that the reference follows from pulse to pulse.
+        motion: Motions of the target along the line of sight.
+        track: Motions that the reference of the receiver follows from pulse to pulse.
         dtype: Complex dtype of the result.
-        centre_deviation_m: Distance yc of the centre of rotation in metres, a number or one value
-            per trial.
+        centre_deviation_m: Distance yc in metres, a number or one value per trial: the centre of
+            rotation lies at the range -yc from the middle of the range window.
 
     Returns:
         Pulses, shape (*trials, pulse, fast_time).
 
     Raises:
-        ValueError: If rotation or motion within a pulse would cost more than 1e-6 rad, the pulse
-            length is not known, or the rate of a PolynomialRotation falls to zero within the
-            record.
+        ValueError: If the phase that the model neglects of rotation or motion within a pulse
+            exceeds 1e-6 rad, the pulse length is not known, or the rate of a PolynomialRotation
+            falls to zero within the record.
     """
     x, y, amplitude = _rows_of(scatterers)
     lever = y + per_trial(centre_deviation_m, 1, y)
@@ -267,15 +279,17 @@ def dechirped_echo(
 
 @dataclass(frozen=True)
 class ScattererLines:
-    """Phase of every scatterer in every pulse beyond the phase that all share.
+    """Phase of every scatterer in every dechirped pulse, without the part common to all of them.
 
-    The phase is start + slope t' + curve t'^2 + bend * (residual range of the motion).
+    At the time t' from the middle of the pulse the phase in cycles is
+    start + slope t' + curve t'^2 + bend r(t'), where r is the deviation of the motion of the whole
+    target from a straight line within the pulse.
 
     Args:
         start: Phase at the middle of the pulse in cycles, shape (*trials, pulse, target), float64.
         slope: Frequency in hertz, same shape.
         curve: Quadratic coefficient in cycles per square second, same shape.
-        bend: Cycles per metre of the residual range, same shape.
+        bend: Cycles per metre of the deviation r, same shape.
     """
 
     start: Tensor
@@ -287,9 +301,16 @@ class ScattererLines:
     def of(
         radar: InverseRadar, x: Tensor, y: Tensor, lever: Tensor, turn: PulseTurn, path: PulseRange
     ) -> ScattererLines:
-        """Form the phases for a rotation of second order within the pulse.
+        """Form the phases from the range of each scatterer to second order in fast time.
 
-        The range is along + across (rate t' + acceleration t'^2 / 2) - towards (rate t')^2 / 2.
+        At the time t' from the middle of a pulse, where the rotation angle is theta, the range by
+        the rotation is
+
+            r + (x cos theta - y' sin theta) (rate t' + acceleration t'^2 / 2)
+              - (x sin theta + y' cos theta) (rate t')^2 / 2,
+
+        with its value r at the middle of the pulse, the cross range x and the range y' from the
+        centre of rotation.
 
         Args:
             radar: Radar.
@@ -361,7 +382,7 @@ def _needs_bend(turns_per_m: Tensor, bend_m: Tensor) -> bool:
     if not worst**2 / 2 <= _DROPPED_RAD:
         raise ValueError(
             f"the motion departs by {float(bend_m.detach().abs().max()):.3g} m from a straight line within a "
-            "pulse, which exceeds the dechirped model; shorten the pulse or slow the motion"
+            "pulse, more than the dechirped model can represent; shorten the pulse or slow the motion"
         )
     return worst > _SERIES_ERROR
 
@@ -389,12 +410,12 @@ def _series_terms(phase_rad: Tensor) -> int:
 
 @dataclass(frozen=True)
 class TurnInPulse:
-    """Largest rotation of the target in half a pulse, by order.
+    """Largest angles by which the target turns in half a pulse, split by their order in time.
 
     Args:
-        by_rate: Angle by the rate in radians.
-        by_acceleration: Angle by the acceleration in radians.
-        beyond: Angle by all higher orders in radians.
+        by_rate: Angle due to the rotation rate in radians.
+        by_acceleration: Angle due to the angular acceleration in radians.
+        beyond: Angle due to all higher orders in radians.
     """
 
     by_rate: float
@@ -403,16 +424,16 @@ class TurnInPulse:
 
     @staticmethod
     def worst(turn: PulseTurn, rotation: Rotation, radar: InverseRadar, half_s: float) -> TurnInPulse:
-        """Return the largest angles of all pulses and trials.
+        """Return the largest angles by which the target turns in half a pulse.
 
         Args:
-            turn: Rotation of each pulse.
-            rotation: See `rotation_angle`.
+            turn: Angle, rate and acceleration at the middle of each pulse.
+            rotation: Rate in rad/s of a uniform rotation, or a PolynomialRotation.
             radar: Radar.
             half_s: Half the pulse length in seconds.
 
         Returns:
-            The largest angles.
+            The largest angles of all pulses and trials.
         """
         by_rate, by_acceleration = (
             float(turn.rate_rad_s.detach().abs().max()) * half_s,
@@ -445,8 +466,8 @@ def _refuse_fast_turns(radar: InverseRadar, radius_m: float, turn: TurnInPulse, 
     )
     if not dropped <= _DROPPED_RAD:
         raise ValueError(
-            f"the target turns by {whole:.3g} rad in half a pulse, of which the dechirped model "
-            f"drops {dropped:.3g} rad of phase; shorten the pulse or slow the rotation"
+            f"the target turns by {whole:.3g} rad in half a pulse, for which the dechirped model neglects a phase of "
+            f"{dropped:.3g} rad, more than {_DROPPED_RAD:g} rad; shorten the pulse or slow the rotation"
         )
 
 
@@ -470,7 +491,7 @@ def fast_time_axis(radar: InverseRadar, n_fast: int) -> Axis:
 def _pulse_s(radar: InverseRadar) -> float:
     """Pulse length in seconds."""
     if radar.pulse_s is None:
-        raise ValueError("radar.pulse_s is not set; a dechirped pulse needs its length")
+        raise ValueError("radar.pulse_s is not set; give the pulse length (s), which dechirped pulses need")
     return radar.pulse_s
 
 
@@ -490,16 +511,17 @@ def _pulse_blocks(n_pulse: int, per_pulse: int) -> Iterator[slice]:
 class LostPulses:
     """Impairment: whole pulses at random positions that were not received; their samples are zero.
 
-    Unlike with `LostLines` other pulses keep their positions, since pulses are counted by the
-    trigger. The truth holds `present`, shape (..., pulse), bool.
+    The other pulses keep their positions, since pulses are counted by the trigger; with `LostLines`
+    they would move up. The truth holds `present`, shape (..., pulse), bool, true for the pulses
+    that were received.
 
     Args:
         count: Number of lost pulses, fixed for all trials; None if a fraction is given.
         fraction: Fraction of all pulses, at least 0 and below 1; None if a count is given.
 
     Raises:
-        ValueError: If both or none is given, or one is out of range; when applied, if no pulse
-            would be left or the trials of draws and recording differ.
+        ValueError: If both count and fraction are given or neither is, or one is out of range; when
+            applied, if no pulse would be left or the trials of draws and recording differ.
     """
 
     count: int | None = None
@@ -508,13 +530,14 @@ class LostPulses:
     def __post_init__(self) -> None:
         if (self.count is None) == (self.fraction is None):
             raise ValueError(
-                f"lost pulses need a count or a fraction, got count={self.count}, fraction={self.fraction}"
+                "lost pulses need a count or a fraction, and not both, got "
+                f"count={self.count}, fraction={self.fraction}"
             )
-        expected = "lost pulses need a count >= 0 or a fraction in 0..1"
         if self.count is not None and self.count < 0:
-            raise ValueError(f"{expected}, got count={self.count}")
+            raise ValueError(f"count of lost pulses must be 0 or more, got {self.count}")
         if self.fraction is not None:
-            refuse_unless(expected, self.fraction, lambda x: (x >= 0) & (x < 1))
+            sentence = "fraction of lost pulses must be at least 0 and below 1"
+            refuse_unless(sentence, self.fraction, lambda x: (x >= 0) & (x < 1))
 
     def __call__(self, recording: Recording, draws: Draws) -> tuple[Recording, dict[str, Tensor]]:
         refuse_other_trials(self, draws, recording)
@@ -526,8 +549,8 @@ class LostPulses:
         order = draws.permutation("echo.pulses.lost", n, data.device)
         if order.shape[:-1] not in ((), data.shape[:-2]):
             raise ValueError(
-                f"draws for {tuple(order.shape[:-1])} trials do not fit a recording of "
-                f"{tuple(data.shape[:-2])} trials; draw one unbatched trial for a single recording"
+                f"draws must have the trials of the recording, of shape {tuple(data.shape[:-2])}, got trials of shape "
+                f"{tuple(order.shape[:-1])}; use draws without trials for a single recording"
             )
         kept = (torch.arange(n, device=data.device) >= count[..., None]).expand(data.shape[:-1])
         present = torch.zeros_like(kept).scatter(-1, order.expand(kept.shape), kept)
@@ -546,10 +569,11 @@ def simulate_turntable(
 ) -> tuple[Recording, Truth]:
     """Simulate a recording of a rotating target, batched over the trials of the draws.
 
-    With `PhaseOnly` the unimpaired recording is clean * exp(j psi) EXACTLY, noise included:
-    circular Gaussian noise keeps its distribution under a phase, and tests of equivariance are
-    exact. With `Dechirped` the noise does not take part in the phases. Noise follows world.snr_db,
-    which is the same before and after range compression.
+    With world.fidelity `PhaseOnly` the recording before impairments is EXACTLY the clean recording,
+    noise included, with each pulse multiplied by exp(j psi), where psi is the phase error of the
+    pulse: circular Gaussian noise keeps its distribution under a phase, and tests of equivariance
+    are exact. With `Dechirped` the noise is added to the echo after its phase errors. The
+    signal-to-noise ratio world.snr_db is the same before and after range compression.
 
     Args:
         radar: Radar.
@@ -741,7 +765,7 @@ def _refuse_outside(scatterers: Scatterers, off_m: Tensor, radar: InverseRadar, 
     low, high = (-(n_range // 2) - 0.5) * radar.range_step_m, (n_range - n_range // 2 - 0.5) * radar.range_step_m
     if not (low <= nearest and farthest <= high):
         raise ValueError(
-            f"the target reaches from {nearest:.6g} to {farthest:.6g} m of a range window of "
-            f"{low:.6g} to {high:.6g} m; choose a smaller target or more range samples, or let the window "
-            "follow it by the track of Dechirped (in a config, track_m of the fidelity dechirped)"
+            f"the target must stay within the range window of {low:.6g} to {high:.6g} m, but reaches from "
+            f"{nearest:.6g} to {farthest:.6g} m; choose a smaller target or more range samples, or let the window "
+            "follow the target by the track of Dechirped (in a config, track_m of the fidelity dechirped)"
         )

@@ -64,10 +64,10 @@ class Aircraft:
     """Outline of an aircraft with swept wings, tail plane and fin, about 600 scatterers.
 
     The fuselage lies along cross range; ranges count from the middle of the window. The publication
-    gives no coordinates of its target; this one reproduces the pattern of its entropies. Each trial
-    draws circular Gaussian amplitudes (Rayleigh magnitude, uniform phase, unit mean power) and
-    displaces every scatterer by up to half a spacing in both directions, so that no scatterer lies
-    on a grid.
+    gives no coordinates of its target; this model reproduces the pattern of the published image
+    entropies. Each trial draws circular Gaussian amplitudes (Rayleigh magnitude, uniform phase,
+    unit mean power) and displaces every scatterer by up to half a spacing in both directions, so
+    that no scatterer lies on a grid.
 
     Args:
         spacing_m: Distance of scatterers along the outline in metres, fixed for all trials, since
@@ -139,7 +139,7 @@ class SpreadRows:
     Args:
         rows: Number of occupied range cells.
         per_row: Number of scatterers in each of them.
-        width: Share of the unambiguous cross-range extent that the positions fill, 0 to 1.
+        width: Fraction of the unambiguous cross-range extent that the positions fill, 0 to 1.
         extent_m: Unambiguous cross-range extent in metres, lambda PRF / (2 omega).
         range_step_m: Length of a range cell in metres.
         range_cells: Number of range cells of the window.
@@ -161,7 +161,7 @@ class SpreadRows:
                 f"spread rows need 1 to range_cells={self.range_cells} rows with at least one "
                 f"scatterer each, got rows={self.rows}, per_row={self.per_row}"
             )
-        refuse_unless("spread rows need a width in 0..1", self.width, lambda x: (x >= 0) & (x <= 1))
+        refuse_unless("width of spread rows must be in 0..1", self.width, lambda x: (x >= 0) & (x <= 1))
         for name in ("extent_m", "range_step_m"):
             refuse_unless(f"{name} of spread rows must be a positive number of metres", getattr(self, name), positive)
 

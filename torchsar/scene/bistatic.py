@@ -37,8 +37,9 @@ class Gate(Protocol):
 class BandLimited:
     """Gate that passes each target for a limited time, equal in all channels.
 
-    The interval is centred on the time y0 / v of the closest along-track position, so that the
-    Doppler band of the target is limited.
+    The interval is centred on the time y0 / v of the closest approach along track, so that the
+    Doppler band of the target is limited. y0 is the along-track position of the target at slow time
+    zero and v the along-track speed of the receiver relative to the target.
 
     Args:
         duration_s: Length of the interval in seconds. A sea needs one value for all trials.
@@ -53,7 +54,10 @@ class BandLimited:
         refuse_unless("duration_s of a band-limited gate must be a positive number", self.duration_s, positive)
 
     def weight(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
-        """Return one where |t - y0 / v| < duration_s / 2, and zero elsewhere.
+        """Return the gain, one where |t - y0 / v| < duration_s / 2 and zero elsewhere.
+
+        t is the slow time, y0 the along-track position of the target at t = 0, and v the
+        along-track speed of the receiver relative to the target.
 
         Args:
             movers: Targets.
@@ -72,8 +76,10 @@ class BandLimited:
 class Pattern:
     """One-way pattern of a uniformly illuminated antenna element over the whole record.
 
-    The gain is sin(pi q) / (pi q) with q = element_m sin(look) / wavelength and
-    sin(look) = (v t - y0 - dx_m) / R_m, where dx_m is the position of channel m.
+    The amplitude gain is sin(pi q) / (pi q) with q = element_m sin(look) / wavelength and
+    sin(look) = (v t - y0 - dx_m) / R_m. Here t is the slow time, v the along-track speed of the
+    receiver relative to the target, y0 the along-track position of the target at t = 0, dx_m the
+    along-track position of channel m and R_m its range to the target.
 
     Args:
         element_m: Length of the element in metres, None for that of the radar. A sea needs one
@@ -111,13 +117,13 @@ class TransmitRange(Protocol):
     """True range from the transmitter to the scene as a function of time."""
 
     def range_m(self, time_s: Tensor) -> Tensor:
-        """Return the change of the range since slow time zero.
+        """Return the change of the range to the transmitter since slow time zero.
 
         Args:
             time_s: Slow time in seconds, any shape, float64.
 
         Returns:
-            R_T(t) - R_T(0) in metres, shape (*trials, *times), float64.
+            Change R_T(t) - R_T(0) of the range R_T in metres, shape (*trials, *times), float64.
         """
         ...
 
@@ -147,23 +153,24 @@ class PolynomialTransmit:
             )
 
     def range_m(self, time_s: Tensor) -> Tensor:
-        """Return the change of the range since slow time zero.
+        """Return the change of the range to the transmitter since slow time zero.
 
         Args:
             time_s: Slow time in seconds, any shape, float64.
 
         Returns:
-            R_T(t) - R_T(0) in metres, shape (*trials, *times), float64.
+            Change R_T(t) - R_T(0) of the range R_T in metres, shape (*trials, *times), float64.
         """
         kept = [with_dims(k, time_s.ndim, time_s) for k in self.coefficients[: self.order]]
         return polynomial_range(kept, time_s)
 
     def neglected_phase_rad(self, radar: BistaticRadar, duration_s: float) -> float:
-        """Return the largest phase of the terms beyond the order.
+        """Return the largest phase of the polynomial terms beyond the chosen order.
 
         Args:
             radar: Receiver.
-            duration_s: Length in seconds of the interval about slow time zero.
+            duration_s: Length in seconds of the interval, centred on slow time zero, in which the
+                phase is considered.
 
         Returns:
             Phase in radians, the largest of all trials.
@@ -194,18 +201,20 @@ class OrbitTransmit:
 
     def __post_init__(self) -> None:
         if len(self.point_m) != 3:
-            raise ValueError(f"point_m needs three coordinates in the inertial frame (m), got {len(self.point_m)}")
+            raise ValueError(
+                f"point_m must be three coordinates (m) in the inertial frame, got {len(self.point_m)} of them"
+            )
         refuse_unless_finite("point_m of a transmit range", self.point_m)
         refuse_unless_finite("epoch_s of a transmit range", self.epoch_s)
 
     def range_m(self, time_s: Tensor) -> Tensor:
-        """Return the change of the range since slow time zero.
+        """Return the change of the range to the transmitter since slow time zero.
 
         Args:
             time_s: Slow time in seconds, shape (pulse,), float64.
 
         Returns:
-            R_T(t) - R_T(0) in metres, shape (..., pulse), float64.
+            Change R_T(t) - R_T(0) of the range R_T in metres, shape (..., pulse), float64.
         """
         return orbit_range(self.orbit, stacked(self.point_m, time_s.device), self.epoch_s, time_s)
 
@@ -219,13 +228,14 @@ class BistaticWorld:
         gate: Receive gain, `BandLimited` or `Pattern`.
         sea: Stationary surface such as `KSea`, None for none.
         snr_db: Power of a target of amplitude 1 over the noise variance in decibels, in one sample
-            of one channel after range compression at the peak line of the target (before
-            compression it is lower by 10 log10(B tau_p)); None for no noise.
+            of one channel after range compression at the peak of the target. Before compression it
+            is lower by 10 log10(B tau_p), with the bandwidth B and the duration tau_p of the pulse.
+            None for no noise.
         receive: Model of the range to the receiver, `ExactRange` or `TaylorRange`.
-        transmit: True range to the transmitter, None for that of the ephemeris.
+        transmit: True range to the transmitter, None for that of radar.transmit_range.
 
     Raises:
-        TypeError: If the scene, the gate or the range model is of another kind.
+        TypeError: If the scene, the gate or the range model has the wrong type.
         ValueError: If there is neither a scene nor a sea, or snr_db is not finite.
     """
 

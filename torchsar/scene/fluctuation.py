@@ -36,7 +36,7 @@ class RandomMotion(Protocol):
             span_s: Length of the recording in seconds.
 
         Returns:
-            A motion with the trials of the draws.
+            The drawn motion, with one course for each trial of the draws.
         """
         ...
 
@@ -46,11 +46,12 @@ def drawn_motion(motion: Sequence[Motion | RandomMotion], draws: Draws, span_s: 
 
     Args:
         motion: Fixed and random motions.
-        draws: Random draws; each motion uses an address of its own, its position in the list.
+        draws: Random draws; each motion draws its own random numbers, addressed by its position in
+            the list.
         span_s: Length of the recording in seconds.
 
     Returns:
-        Motions in the same order.
+        Fixed motions and drawn ones, in the order of the list.
     """
     return [
         part.drawn(draws.part(f"motion.{position}"), span_s) if isinstance(part, RandomMotion) else part
@@ -63,8 +64,8 @@ class Tones:
     """Sum of sinusoids, sum_i cosine_i cos(2 pi f_i t) + sine_i sin(2 pi f_i t).
 
     Args:
-        frequency_hz: Frequencies in hertz, shape (tone,) or (..., tone), float64. Frequencies
-            shared by all trials need one table of phases only.
+        frequency_hz: Frequencies in hertz, shape (tone,) if shared by all trials, which takes less
+            time, or (..., tone), float64.
         cosine: Cosine amplitudes, shape (..., tone), float64; in metres for a motion.
         sine: Sine amplitudes, shape (..., tone), float64.
     """
@@ -80,7 +81,7 @@ class Tones:
             time_s: Times in seconds, any shape, shared by all trials, float64.
 
         Returns:
-            Shape (*trials, *times), float64.
+            Sum in the unit of the amplitudes, shape (*trials, *times), float64.
         """
         times = max(1, _TIMES_AT_ONCE // self.frequency_hz.shape[:-1].numel())
         parts = [self._block(block) for block in time_s.flatten().split(times)]
@@ -248,7 +249,7 @@ def random_tones(
 
     Args:
         draws: Random draws of the phases.
-        rms: Root of the mean square of the sum.
+        rms: Root mean square of the sum, in the unit of its amplitudes.
         lowest_hz: Lower end of the band in hertz.
         highest_hz: Upper end of the band in hertz.
         slope: Exponent of the frequency in the power spectral density.
@@ -304,8 +305,8 @@ class MeasuredTrack:
         off = float((time - time[0] - step * torch.arange(len(time), dtype=torch.float64)).abs().max())
         if not (step > 0 and off <= _UNEVEN * step):
             raise ValueError(
-                f"times of a measured track must rise evenly, got a mean step of {step:g} s and "
-                f"a departure of {off:.3g} s; resample the track first"
+                f"times of a measured track must rise evenly, got a mean step of {step:g} s and times up to "
+                f"{off:.3g} s away from even spacing; resample the track first"
             )
 
     @property
@@ -357,9 +358,8 @@ class MeasuredTrack:
         asked = time_s.detach()
         if asked.numel() and not (float(asked.min()) >= first and float(asked.max()) <= last):
             raise ValueError(
-                f"the measured track reaches from {first:g} to {last:g} s, asked for "
-                f"{float(asked.min()):g} to {float(asked.max()):g} s; record fewer periods or "
-                "measure a longer track"
+                f"times of a measured track must lie within {first:g} to {last:g} s, one step beyond its ends, got "
+                f"{float(asked.min()):g} to {float(asked.max()):g} s; record fewer periods or measure a longer track"
             )
         return UniformSpline(self.displacement.to(time_s.device), float(self.time_s[0]), self.step_s).at(time_s)
 
@@ -405,8 +405,9 @@ def _refuse_empty_band(lowest_hz: Tensor | float, highest_hz: Tensor | float) ->
     empty = ~(lowest <= highest)
     if bool(empty.any()):
         raise ValueError(
-            f"a random motion from {float(lowest[empty][0]):g} Hz (by default one cycle in the recording) to "
-            f"{float(highest[empty][0]):g} Hz has no band; give lowest_hz or a larger highest_hz"
+            f"highest_hz of a random motion must not be below lowest_hz, got {float(highest[empty][0]):g} Hz below "
+            f"{float(lowest[empty][0]):g} Hz (by default one cycle in the recording); give lowest_hz or a larger "
+            "highest_hz"
         )
 
 
@@ -422,4 +423,4 @@ def _refuse_band(
     if lowest_hz is not None and highest_hz is not None:
         refuse_unless(expected, lowest_hz, lambda x: x <= highest_hz, f"highest_hz is {highest_hz}")
     if not (isinstance(count, int) and count >= 1):
-        raise ValueError(f"a random motion needs a count of sinusoids of 1 or more, got {count}")
+        raise ValueError(f"count of sinusoids of a random motion must be a whole number of 1 or more, got {count}")

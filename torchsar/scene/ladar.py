@@ -32,13 +32,14 @@ class Extremes:
 
     Args:
         range_m: Smallest and largest relative range in metres.
-        across_m: Largest magnitude of the along-track offset V t - x in metres.
+        across_m: Largest along-track distance of the ladar from a scatterer in metres.
         velocity_m_s: Largest magnitude of the radial velocity in metres per second.
         velocity_change_m_s: Largest change of the radial velocity over the recording in metres per
             second.
-        acceleration_m_s2: Largest magnitude of the radial acceleration.
-        jerk_m_s3: Largest magnitude of its derivative.
-        displacement_m: Extent of the displacement along the line of sight in metres.
+        acceleration_m_s2: Largest magnitude of the radial acceleration in m/s^2.
+        jerk_m_s3: Largest magnitude of the derivative of the radial acceleration in m/s^3.
+        displacement_m: Difference of largest and smallest displacement along the line of sight in
+            metres.
     """
 
     range_m: tuple[float, float] = (0.0, 0.0)
@@ -57,14 +58,17 @@ class Extremes:
         range_m: tuple[float, float],
         azimuth_m: float,
     ) -> Extremes:
-        """Determine the extremes of a motion by differences of its displacement.
+        """Determine the extremes of a scene, those of the motion by differences of displacements.
 
         Args:
             radar: Ladar.
-            motion: Motions along the line of sight; the first trial counts.
-            n_period: Number of kept periods.
+            motion: Motions along the line of sight; only the first trial is used.
+            n_period: Number of recorded periods.
             range_m: Smallest and largest relative range in metres.
             azimuth_m: Largest magnitude of the azimuth of the scatterers in metres.
+
+        Returns:
+            The extremes.
         """
         span_s = n_period * radar.pulse_step_s
         n = min(max(8, n_period * radar.keep_every * _TIMES_A_PERIOD), _MOST_TIMES)
@@ -86,21 +90,24 @@ class Extremes:
 
 
 def omitted_phase_rad(without: Sequence[Effect], radar: TriangularLadar, extremes: Extremes) -> dict[str, float]:
-    """Predict the phase of each omitted effect.
+    """Predict the phase error that the omission of each physical effect causes.
 
-    The residual video phase is pi K (dtau1^2 - dtau2^2) between the nearest and the farthest
-    scatterer, with opposite signs in up-sweeps and down-sweeps. A parabola instead of the hyperbola
-    costs pi X^4 / (2 lambda R^3). The flight time shifts the epoch by R / c, which matters by
-    4 pi / lambda times the change of the velocity times R / c; a constant velocity gives a constant
-    phase only.
+    Without the residual video phase the error is pi K (dtau1^2 - dtau2^2), with the chirp rate K
+    and the delays dtau1 and dtau2, relative to the reference range, of the scatterers with the
+    largest and the smallest magnitude of relative range; its sign is opposite in up-sweeps and
+    down-sweeps. A parabola instead of the hyperbola gives pi X^4 / (2 lambda R^3), with the largest
+    along-track distance X between ladar and scatterer and the smallest range R. Without the flight
+    time, ranges are taken at a time that is wrong by R / c: the error is 4 pi / lambda dv R / c,
+    with the change dv of the radial velocity over the recording. A constant velocity would give
+    only a constant phase.
 
     Args:
-        without: Omitted effects.
+        without: Omitted effects, of "residual_video", "hyperbola" and "flight".
         radar: Ladar.
         extremes: Largest ranges and motions of the scene.
 
     Returns:
-        Phase in radians by effect.
+        Phase error in radians by name of the effect.
     """
     near, far = sorted(abs(r) for r in extremes.range_m)
     least = 0.0 if extremes.range_m[0] * extremes.range_m[1] < 0 else near
@@ -119,17 +126,21 @@ def omitted_phase_rad(without: Sequence[Effect], radar: TriangularLadar, extreme
 class RangeHistory:
     """Range of scatterers relative to the reference range as a function of slow time.
 
-    The range is sqrt((Rref + RD)^2 + (V t - x)^2) - Rref + d(t - start_s), formed as a difference.
-    With "flight" omitted it is the range at the time of reception, otherwise that at the time of
-    reflection, R(t - R / c): the delay Rref / c is exact, and a step of first order accounts for
-    the rest. With "hyperbola" omitted the square root is a parabola.
+    At slow time t the range of a scatterer is
+    sqrt((Rref + RD)^2 + (V t - x)^2) - Rref + d(t - start_s), with the reference range Rref, the
+    relative range RD and the azimuth x of the scatterer, the speed V of the ladar and the
+    displacement d by the motions. The difference is formed without loss of digits. With
+    "flight" omitted it is the range at the time t of reception; otherwise it is the range at the
+    time of reflection, R(t - R / c), in which the delay Rref / c is exact and the rest of R / c is
+    accounted for to first order. With "hyperbola" omitted a parabola replaces the square root.
 
     Args:
         scatterers: Scatterers, shape (..., target).
         radar: Ladar.
         motion: Motions along the line of sight.
-        start_s: Slow time at which the time of the motions starts in seconds, fixed for all trials.
-        without: Omitted effects.
+        start_s: Slow time in seconds at which the time of the motions is zero, fixed for all
+            trials.
+        without: Omitted effects, of "residual_video", "hyperbola" and "flight".
     """
 
     scatterers: Scatterers
@@ -183,7 +194,7 @@ Lines = tuple[Tensor, Tensor, Tensor | None]
 
 
 def refuse_unseen_ranges(radar: TriangularLadar, near_m: float, far_m: float) -> None:
-    """Refuse scatterers that no sweep can show, even at rest.
+    """Raise ValueError for scatterers that no sweep can show, even at rest.
 
     Args:
         radar: Ladar.
@@ -201,8 +212,8 @@ def refuse_unseen_ranges(radar: TriangularLadar, near_m: float, far_m: float) ->
     reach = radar.sample_rate_hz / 2 / radar.beat_hz(1.0)
     if max(-near_m, far_m) >= reach:
         raise ValueError(
-            f"world: scatterers lie from {near_m:g} to {far_m:g} m, and beats of relative ranges beyond {reach:.4g} m "
-            "alias; bring the reference range nearer, or sample faster"
+            f"world: relative ranges of scatterers must lie within +-{reach:.4g} m, since larger ranges have beat "
+            f"frequencies that alias, got {near_m:g} to {far_m:g} m; bring the reference range nearer, or sample faster"
         )
 
 
@@ -211,7 +222,7 @@ class Fidelity(Protocol):
 
     @property
     def without(self) -> tuple[Effect, ...]:
-        """Return the omitted effects."""
+        """Names of the omitted effects, of "residual_video", "hyperbola" and "flight"."""
         ...
 
     def sweep_range_m(self, history: RangeHistory, middle_s: Tensor) -> Lines:
@@ -275,14 +286,14 @@ class EverySample(_Level):
         return (*history.chords(middle_s, history.radar.sweep_s / 2)[:2], None)
 
     def neglected_phase_rad(self, radar: TriangularLadar, extremes: Extremes) -> dict[str, float]:
-        """Predict the phases of the omitted effects.
+        """Predict the phase errors that the omitted effects cause.
 
         Args:
             radar: Ladar.
             extremes: Largest ranges and motions of the scene.
 
         Returns:
-            Phase in radians by effect.
+            Phase in radians by name of the effect.
         """
         return omitted_phase_rad(self.without, radar, extremes)
 
@@ -292,8 +303,8 @@ class QuadraticInSweep(_Level):
     """Linear phase of each scatterer in each sweep, with one curvature for all scatterers.
 
     The curvature accounts for the acceleration and for the change of the Doppler shift across the
-    band. For many scatterers the model costs little more than `LinearInSweep`. It neglects the jerk
-    and differences of the curvature between scatterers.
+    band. For many scatterers the model takes little longer than `LinearInSweep`. It neglects the
+    jerk and differences of the curvature between scatterers.
 
     Args:
         without: Effects that are omitted, a tuple of "residual_video", "hyperbola" and "flight".
@@ -323,8 +334,9 @@ class QuadraticInSweep(_Level):
             extremes: Largest ranges and motions of the scene.
 
         Returns:
-            Phase in radians by name of the effect. `level` is due to the jerk j, whose range error
-            is j u (u^2 - (T/2)^2) / 6, and to the acceleration over the band.
+            Phase in radians by name of the effect. `level` is due to the radial jerk j and to the
+            radial acceleration over the band. At the time u from the middle of a sweep of the
+            length T the jerk causes the range error j u (u^2 - (T/2)^2) / 6.
         """
         t = radar.sweep_s
         jerk = 4 * math.pi / radar.wavelength_m * extremes.jerk_m_s3 * (t / 2) ** 3 / 6 * 2 / math.sqrt(27)
@@ -368,7 +380,8 @@ class LinearInSweep(_Level):
 
         Returns:
             Phase in radians by name of the effect. `level` is the phase at the ends of a sweep due
-            to acceleration a and velocity v, 4 pi / lambda a T^2 / 8 + pi K v T^2 / c.
+            to the radial acceleration a and the radial velocity v,
+            4 pi / lambda a T^2 / 8 + pi K v T^2 / c, with the length T and the rate K of the sweep.
         """
         t = radar.sweep_s
         bend = 4 * math.pi / radar.wavelength_m * extremes.acceleration_m_s2 * t**2 / 8
@@ -474,10 +487,11 @@ class SweepError(Protocol):
         Args:
             time_s: Time u from the middle of a sweep in seconds, float64.
             ramp: 0 for the up-sweep, 1 for the down-sweep.
-            dims: Number of last dimensions of time_s that are no trials, all by default.
+            dims: Number of trailing dimensions of time_s that index times; dimensions before them
+                are trials. None if all dimensions index times.
 
         Returns:
-            Phase error in cycles, float64; the trials of the parameters lead.
+            Phase error in cycles, shape (*trials, *times), float64.
         """
         ...
 
@@ -531,7 +545,7 @@ class LadarWorld:
         calibration: Internal fibre, which records the sweep error.
 
     Raises:
-        TypeError: If the scene, the motion or the fidelity is of another kind.
+        TypeError: If the scene, the motion or the fidelity has the wrong type.
         ValueError: If snr_db is not finite or the gate is empty.
     """
 
@@ -561,18 +575,20 @@ class LadarWorld:
 
 def _refuse_gate(gate_m: tuple[Tensor | float, Tensor | float]) -> None:
     """Raise ValueError for a range gate that is empty in any trial."""
-    sentence = "gate_m must be (low, high) relative range in m with low < high"
     if not (isinstance(gate_m, tuple | list) and len(gate_m) == 2):
-        raise ValueError(f"{sentence}, got {gate_m}")
+        raise ValueError(f"gate_m must be a pair (low, high) of relative ranges (m), got {gate_m}")
     low, high = torch.broadcast_tensors(*(torch.as_tensor(v, dtype=torch.float64).detach() for v in gate_m))
     empty = ~(low < high)
     if bool(empty.any()):
-        raise ValueError(f"{sentence}, got ({float(low[empty][0]):g}, {float(high[empty][0]):g})")
+        raise ValueError(
+            "gate_m must be a pair (low, high) of relative ranges (m) with low < high, got "
+            f"({float(low[empty][0]):g}, {float(high[empty][0]):g})"
+        )
 
 
 def _refuse_effects(without: Sequence[str]) -> None:
     """Raise ValueError for an unknown effect."""
     if isinstance(without, str) or not set(without) <= set(get_args(Effect)):
         raise ValueError(
-            f"effects that may be left out are {', '.join(get_args(Effect))}, got {without!r}; give a tuple of them"
+            f"without must be a tuple of the effects to leave out ({', '.join(get_args(Effect))}), got {without!r}"
         )

@@ -26,8 +26,9 @@ class LetterE:
     Args:
         first_range_m: Relative range of the first point of the spine in metres.
         spine_azimuth_m: Azimuth of the spine in metres.
-        random_phase: Whether each trial draws phases. Equal phases are a trap for entropy: an image
-            whose rows collapse has a lower entropy than the correct one.
+        random_phase: Whether each trial draws phases; otherwise all phases are zero. Equal phases
+            mislead autofocus by minimum entropy: a wrong image, whose rows have collapsed, has a
+            lower entropy than the correct image.
 
     Raises:
         ValueError: If a position is not finite.
@@ -78,8 +79,8 @@ class RetroAndBrokenLine:
     Args:
         range_m: Relative range of the retro-reflector in metres.
         azimuth_m: Azimuth of the retro-reflector in metres.
-        retro_db: Level of the retro-reflector in decibels.
-        line_db: Level of each point of the line over that of the retro-reflector in decibels.
+        retro_db: Power of the retro-reflector relative to a scatterer of amplitude 1 in decibels.
+        line_db: Power of each point of the line relative to the retro-reflector in decibels.
         line_m: Distances of the first and the last point of the line behind the retro-reflector in
             metres.
         line_azimuth_m: Azimuth extent of the line, centred on the retro-reflector, in metres.
@@ -101,7 +102,7 @@ class RetroAndBrokenLine:
     def __post_init__(self) -> None:
         for name in ("range_m", "azimuth_m", "retro_db", "line_db", "line_azimuth_m"):
             refuse_unless_finite(f"{name} of a retro-reflector with a line", getattr(self, name))
-        sentence = "line_m must be the first and last distance of the line beyond the retro-reflector"
+        sentence = "line_m must be the distances (m) of the first and last point of the line behind the retro-reflector"
         if not isinstance(self.line_m, tuple | list) or len(self.line_m) != 2:
             raise ValueError(f"{sentence}, got {self.line_m}")
         for distance in self.line_m:

@@ -1,4 +1,4 @@
-"""Errors of the responses of moving points by simplified ranges, predicted without echoes."""
+"""Errors in the responses of moving points due to simplified ranges, predicted without echoes."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _PULSES, _BAND = 513, 17
 class LitPoints:
     """Moving points, one per row, with the times at which they are illuminated and processed.
 
-    Each error is that of the worst point: the mean of |exp(j phi) - 1|^2 in dB over the pulses,
-    weighted by the power of the gate, where phi is the neglected phase.
+    Every predicted error is that of the worst point: the mean of |exp(j phi) - 1|^2 over the
+    pulses, weighted by the power of the gate, in dB, where phi is the neglected phase.
 
     Args:
         movers: Points, shape (row, 1).
@@ -46,7 +46,7 @@ class LitPoints:
 
     @cached_property
     def weight(self) -> Tensor:
-        """Power of the illumination, zero outside the processed band, shape (row, time)."""
+        """Power gain of the gate, set to zero outside the processed band, shape (row, time)."""
         power = self.gate.weight(self.movers, self.time_s, self.radar)[..., 0].square().mean(-2)
         if self.processed_hz is None:
             return power
@@ -61,22 +61,31 @@ class LitPoints:
         return 10 * math.log10(max(float(error.max()), 1e-30))
 
     def transmit_order_db(self, order: int) -> float:
-        """Predict the error of a response when the transmit range is removed to a given order.
+        """Predict the error where the transmit range is compensated to a given order in slow time.
 
         Args:
-            order: Number of orders that are removed.
+            order: Number of coefficients of radar.transmit_range, k1 of t, k2 of t^2, ..., that are
+                compensated; the others are neglected.
+
+        Returns:
+            Mean of |exp(j phi) - 1|^2 over the pulses in dB for the worst point, with the neglected
+            phase phi.
         """
         left = self.radar.transmit_range[order:]
         metres = sum((k * self.time_s ** (order + i) for i, k in enumerate(left, 1)), torch.zeros_like(self.time_s))
         return self._worst_db(2 * math.pi / self.radar.wavelength_m * metres[None, :, None])
 
     def migration_db(self, bulk: bool, known: bool = False) -> float:
-        """Predict the error of a response by range migration that remains.
+        """Predict the error due to range migration that is not corrected.
 
         Args:
-            bulk: Whether the migration of one motion is corrected in all points; otherwise none is.
-            known: Whether that motion is the true one of each point; otherwise it is that of a
-                point at rest at y0 = 0.
+            bulk: Whether range migration is corrected; otherwise all of it remains.
+            known: Whether the correction of each point is that of its true motion; otherwise all
+                points are corrected as a point at rest at the along-track position 0.
+
+        Returns:
+            Mean of |exp(j phi) - 1|^2 over pulses and range frequencies in dB for the worst point,
+            where phi is the phase that the remaining migration causes across the band.
         """
         radar, frequency_hz = self.radar, torch.linspace(-0.5, 0.5, _BAND, dtype=torch.float64)
         left = ExactRange().range_m(self.movers, self.time_s, radar).mean(-3) - self.movers.range_m[..., None, :]
@@ -86,10 +95,14 @@ class LitPoints:
         return self._worst_db(2 * math.pi * radar.pulse.bandwidth_hz / radar.wave_speed_m_s * frequency_hz * left)
 
     def receive_model_db(self, model: ReceiveRange) -> float:
-        """Predict the error of the echo by a model of the range to the receiver.
+        """Predict the error of the echo due to a model of the range to the receiver.
 
         Args:
             model: Model of the range.
+
+        Returns:
+            Mean of |exp(j phi) - 1|^2 over the pulses in dB for the worst point, where phi is the
+            phase difference between the model and the exact range.
         """
         left = (one.range_m(self.movers, self.time_s, self.radar) for one in (model, ExactRange()))
         phase = 2 * math.pi / self.radar.wavelength_m * torch.sub(*left)[..., 0].mT

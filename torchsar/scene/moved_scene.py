@@ -1,4 +1,4 @@
-"""What a moving scene shows of a ladar: leading scatterers, and bounds of ranges and motion."""
+"""Strongest scatterers of a scene seen by a ladar, and bounds of its ranges and motion."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from torchsar.scene.vibration import Motion
 
 @dataclass(frozen=True)
 class Moved:
-    """What one trial shows.
+    """Strongest scatterers and bounds of ranges and motion, of one trial of a ladar scene.
 
     Args:
-        azimuth_m, range_m: Positions of scatterers that lead estimators, (target,).
+        azimuth_m, range_m: Positions in metres of the strongest scatterers, those within 10 dB of
+            the largest amplitude, shape (target,).
         peak: Largest amplitude.
-        motion: The drawn motions.
+        motion: Motions along the line of sight, random ones already drawn.
         extremes: Bounds of ranges and motion.
     """
 
@@ -35,7 +36,7 @@ class Moved:
 
     @property
     def farthest(self) -> Points:
-        """The leading scatterer farthest from the middle of the scene."""
+        """The scatterer farthest from the middle of the scene among the strongest ones."""
         far = int((self.range_m.abs() + self.azimuth_m.abs()).argmax())
         return Points([float(self.azimuth_m[far])], [float(self.range_m[far])])
 
@@ -47,14 +48,17 @@ class Moved:
         periods: int,
         gate_m: tuple[float, float] | None = None,
     ) -> Moved:
-        """Find them for the first trial of a scene.
+        """Find the strongest scatterers and the bounds of the first trial of a scene.
 
         Args:
             radar: Instrument.
             scene: Scatterers.
             motion: Drawn motions.
             periods: Number of sweep periods.
-            gate_m: Least and largest range that is seen; None for all.
+            gate_m: Least and largest relative range that is seen in metres; None for all.
+
+        Returns:
+            Strongest scatterers within the gate, motions and bounds.
 
         Raises:
             ValueError: If no scatterer can be seen, or one lies where no sweep can show it.
@@ -67,7 +71,7 @@ class Moved:
         leads = leading(torch.where(inside, level, 0))
         if not bool(leads.any()):
             raise ValueError(
-                "world: no scatterer of the scene has an amplitude above 0 within the gate; give it one, "
+                "world: no scatterer of the scene within the gate has an amplitude above 0; add such a scatterer, "
                 "or widen gate_m"
             )
         reach = float(ranges[inside].min()), float(ranges[inside].max())

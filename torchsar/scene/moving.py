@@ -21,17 +21,17 @@ Numbers = Sequence[Tensor | float] | Tensor
 class Bend:
     """Deviation of a real motion from uniform motion in the slant plane.
 
-    The range to the transmitter shrinks by s t + a t^2 / 2, and b2 t^2 + b3 t^3 + b4 t^4 is added
-    to (R0 - u_r t)^2 within the square of the range to the receiver.
+    By the slow time t the range to the transmitter shrinks by s t + a t^2 / 2. The squared range to
+    the receiver grows by b2 t^2 + b3 t^3 + b4 t^4 over that of uniform motion in the slant plane.
+    All tensors have the shape (..., target) and the dtype float64.
 
     Args:
-        transmit_m_s: Closing speed s towards the transmitter in m/s, shape (..., target), float64
-            as all others.
-        transmit_m_s2: Its derivative a in m/s^2.
+        transmit_m_s: Closing speed s towards the transmitter in m/s.
+        transmit_m_s2: Closing acceleration a towards the transmitter in m/s^2.
         along_m_s2: Along-track acceleration in m/s^2.
-        second: b2 in m^2/s^2.
-        third: b3 in m^2/s^3.
-        fourth: b4 in m^2/s^4.
+        second: Coefficient b2 in m^2/s^2.
+        third: Coefficient b3 in m^2/s^3.
+        fourth: Coefficient b4 in m^2/s^4.
     """
 
     transmit_m_s: Tensor
@@ -43,7 +43,7 @@ class Bend:
 
     @staticmethod
     def none(like: Tensor) -> Bend:
-        """Return zero deviation, for targets that are joined with others.
+        """Return a deviation of zero, for targets in uniform motion among others that deviate.
 
         Args:
             like: Tensor of shape (..., target).
@@ -54,31 +54,31 @@ class Bend:
         return Bend(**{f.name: torch.zeros_like(like) for f in fields(Bend)})
 
     def each(self, change: Callable[[Tensor], Tensor]) -> Bend:
-        """Apply a function to every entry.
+        """Apply a function to every tensor of the deviation.
 
         Args:
             change: Function of a tensor of shape (..., target).
 
         Returns:
-            Changed deviation.
+            Deviation that consists of the changed tensors.
         """
         return Bend(**{f.name: change(getattr(self, f.name)) for f in fields(Bend)})
 
     def square_m2(self, time_s: Tensor) -> Tensor:
-        """Return the term that is added to the squared range.
+        """Return the term that the deviation adds to the squared range to the receiver.
 
         Args:
-            time_s: Slow time in seconds, shape (pulse,), float64.
+            time_s: Slow time t in seconds, shape (pulse,), float64.
 
         Returns:
-            b2 t^2 + b3 t^3 + b4 t^4 in square metres, shape (..., 1, pulse, target).
+            second t^2 + third t^3 + fourth t^4 in square metres, shape (..., 1, pulse, target).
         """
         t = time_s[:, None]
         second, third, fourth = (b[..., None, None, :] for b in (self.second, self.third, self.fourth))
         return t.square() * (second + t * (third + t * fourth))
 
     def transmit_m(self, time_s: Tensor) -> Tensor:
-        """Return the change of the range to the transmitter by the motion.
+        """Return the change of the range to the transmitter due to the motion of the target.
 
         Args:
             time_s: Slow time in seconds, shape (pulse,), float64.
@@ -106,7 +106,7 @@ class Movers:
         bend: Deviation from uniform motion in the slant plane, None for none.
 
     Raises:
-        TypeError: If a dtype is another one.
+        TypeError: If speeds or positions are not float64, or amplitudes not complex.
         ValueError: If the tensors differ in the number of targets.
     """
 
@@ -127,17 +127,18 @@ class Movers:
         counts = [x.shape[-1] if x.ndim else 0 for x in (*real, self.amplitude)]
         if len(set(counts)) != 1:
             raise ValueError(
-                f"movers need as many speeds, positions and amplitudes as targets in the last dim, got {counts}"
+                "speeds, positions and amplitudes of movers must have the same number of targets (last dim), got "
+                f"{counts}"
             )
 
     def each(self, change: Callable[[Tensor], Tensor]) -> Movers:
-        """Apply a function to every entry, such as a change of the device.
+        """Apply a function to every tensor of the targets, such as a move to another device.
 
         Args:
             change: Function of a tensor of shape (..., target).
 
         Returns:
-            Changed targets.
+            Targets that consist of the changed tensors.
         """
         bend = None if self.bend is None else self.bend.each(change)
         return Movers(
@@ -156,13 +157,14 @@ class Movers:
         return radar.reference_range_m + self.range_m
 
     def position_m(self, time_s: Tensor) -> Tensor:
-        """Return the along-track position without the part u_a t.
+        """Return the along-track position without the displacement by the along-track speed.
 
         Args:
             time_s: Slow time in seconds, shape (pulse,), float64.
 
         Returns:
-            y0 and the displacement by an acceleration in metres, shape (..., 1, pulse, target).
+            Position at slow time zero plus the displacement by an along-track acceleration in
+            metres, shape (..., 1, pulse, target).
         """
         y0 = self.y0_m[..., None, None, :]
         return y0 if self.bend is None else y0 + self.bend.along_m_s2[..., None, None, :] * time_s[:, None].square() / 2
@@ -175,20 +177,23 @@ class Movers:
             radar: Receiver.
 
         Returns:
-            v t - y0 - dx_m in metres, shape (..., channel, pulse, target).
+            v t - y0 - dx_m in metres, shape (..., channel, pulse, target): v is the along-track
+            speed of the receiver relative to the target, y0 the along-track position of the target
+            (`position_m`) and dx_m that of channel m.
         """
         travelled = (radar.speed_m_s - self.u_a_m_s[..., None, None, :]) * time_s[:, None]
         return travelled - self.position_m(time_s) - radar.channels_at(time_s.device)[:, None, None]
 
     def excess_m(self, time_s: Tensor, radar: BistaticRadar) -> Tensor:
-        """Return the exact range to the receiver beyond the closest range.
+        """Return how much the exact range to the receiver exceeds the closest range.
 
         Args:
             time_s: Slow time in seconds, shape (pulse,), float64.
             radar: Receiver.
 
         Returns:
-            R_m(t) - R0 in metres, shape (..., channel, pulse, target).
+            R_m(t) - R0 in metres for the range R_m of channel m and the closest range R0, shape
+            (..., channel, pulse, target).
         """
         u_r, u_a, closest = (x[..., None, None, :] for x in (self.u_r_m_s, self.u_a_m_s, self.closest_m(radar)))
         channel = radar.channels_at(time_s.device)[:, None, None]
@@ -306,8 +311,8 @@ class Ship:
         range_cells: Number of range cells, fixed for all trials.
         count: Number of scatterers, fixed for all trials.
         cell_m: Distance of the range cells in metres.
-        level_db: Mean power of a sample of one of its range cells over that of a point of amplitude
-            1 in decibels.
+        level_db: Mean power of a sample in one range cell of the ship relative to that of a point
+            of amplitude 1 in decibels.
 
     Raises:
         ValueError: If a number is not finite, a length is negative, or there are fewer scatterers
@@ -361,11 +366,14 @@ class Ship:
 class GroundMovers:
     """Points that move on flat ground, followed exactly in three dimensions.
 
-    The ground lies radar.height_m below the track. The squared range
-    (g + w t + a t^2 / 2)^2 + h^2 + along^2 is that of uniform motion in the slant plane with
-    R0^2 = g^2 + h^2 and u_r = -g w / R0, plus a `Bend` with b2 = w^2 + g a - u_r^2, b3 = w a and
-    b4 = a^2 / 4. Each parameter is a list with one entry per target (numbers, or one value per
-    trial) or a tensor of shape (..., target). All values are those at slow time zero.
+    The ground lies the height h = radar.height_m below the track of the receiver. A point with the
+    ground range g, the outward speed w and the outward acceleration a has the squared range
+    (g + w t + a t^2 / 2)^2 + h^2 + y^2 to the receiver, with the along-track distance y. This is
+    the squared range of uniform motion in the slant plane, with the closest range R0,
+    R0^2 = g^2 + h^2, and the closing speed u_r = -g w / R0, plus b2 t^2 + b3 t^3 + b4 t^4 with
+    b2 = w^2 + g a - u_r^2, b3 = w a and b4 = a^2 / 4. Each parameter is a list with one entry per
+    target (numbers, or one value per trial) or a tensor of shape (..., target). All values are
+    those at slow time zero.
 
     Args:
         outward_m_s: Speeds across the track in m/s, positive away from it.
@@ -376,11 +384,12 @@ class GroundMovers:
         outward_m_s2: Constant accelerations across the track in m/s^2, zero by default.
         along_m_s2: Constant accelerations along track in m/s^2, zero by default.
         towards_transmitter: Outward and along-track component of the unit vector from the scene to
-            the transmitter; by default the motion does not change the range to the transmitter.
+            the transmitter; by default both are zero, and the motion does not change the range to
+            the transmitter.
 
     Raises:
-        ValueError: If a number is not finite, the lists differ in length, or the vector is longer
-            than one.
+        ValueError: If a number is not finite, the lists differ in length, or the vector of the two
+            components is longer than 1.
     """
 
     outward_m_s: Numbers
@@ -398,10 +407,10 @@ class GroundMovers:
                 refuse_unless_finite(f"{name} of ground movers", _numbers(getattr(self, name)))
         out, along = (torch.as_tensor(v, dtype=torch.float64) for v in self.towards_transmitter)
         refuse_unless(
-            "towards_transmitter holds two parts of a unit vector",
+            "towards_transmitter must be two components of a unit vector, of a length of at most 1",
             torch.hypot(*torch.broadcast_tensors(out, along)),
             lambda length: length <= 1,
-            "it must not be longer than 1",
+            "divide by the length of the three-dimensional vector",
         )
 
     def movers(self, radar: BistaticRadar, draws: Draws) -> Movers:
@@ -510,7 +519,7 @@ class ExactRange:
     """Exact range by the square root: the default, as fast as any series."""
 
     def range_m(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
-        """Return R_m(t) relative to the reference range.
+        """Return the exact range from each target to each channel, relative to the reference range.
 
         Args:
             movers: Targets.
@@ -538,14 +547,15 @@ class ExactRange:
 
 @dataclass(frozen=True)
 class TaylorRange:
-    """Series of the range, R0 (x / 2 - x^2 / 8 + ...) with x = R_m^2 / R0^2 - 1.
+    """Power series of the range to the receiver about the closest range.
 
-    The series is that of the whole range history and not of one about the middle of an aperture; it
-    converges for R_m < 1.4 R0. Order 2 is the parabola of the publication, with u_r^2 instead of
-    the misprinted u_a^2 in the last numerator of Eq. (3).
+    For the range R_m to channel m and the closest range R0 the series is
+    R_m - R0 = R0 (x / 2 - x^2 / 8 + ...) with x = R_m^2 / R0^2 - 1. The same series holds for the
+    whole range history, and it converges for R_m < 1.4 R0. Order 2 is the parabola of the
+    publication, with u_r^2 instead of the misprinted u_a^2 in the last numerator of Eq. (3).
 
     Args:
-        order: Twice the highest power of x: 2, 4, 6, ...
+        order: Twice the highest power of x that is kept: 2, 4, 6, ...
 
     Raises:
         ValueError: If the order is odd or below 2.
@@ -559,11 +569,11 @@ class TaylorRange:
     def __post_init__(self) -> None:
         if self.order < 2 or self.order % 2:
             raise ValueError(
-                f"order of a range series must be 2, 4, 6, ..., got {self.order}; each power of x counts as two"
+                f"order of a range series must be 2, 4, 6, ..., got {self.order}; give twice the number of terms"
             )
 
     def range_m(self, movers: Movers, time_s: Tensor, radar: BistaticRadar) -> Tensor:
-        """Return R_m(t) relative to the reference range by the series.
+        """Return the range from each target to each channel by the series.
 
         Args:
             movers: Targets.
@@ -571,7 +581,8 @@ class TaylorRange:
             radar: Receiver.
 
         Returns:
-            Range in metres, shape (..., channel, pulse, target), float64.
+            Range relative to the reference range in metres, shape (..., channel, pulse, target),
+            float64.
         """
         closest = movers.closest_m(radar)[..., None, None, :]
         excess = movers.excess_m(time_s, radar) / closest

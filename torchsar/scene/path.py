@@ -30,7 +30,7 @@ class Path(Protocol):
         ...
 
     def neglected_phase_rad(self, radar: StripmapRadar, range_m: float, since_s: float) -> float:
-        """Return the largest phase that the history neglects within an aperture.
+        """Return the largest phase that this range history neglects within an aperture.
 
         Args:
             radar: Radar.
@@ -66,10 +66,10 @@ class Hyperbola:
         return closest_m + x2 / (torch.sqrt(closest_m.square() + x2) + closest_m)
 
     def neglected_phase_rad(self, radar: StripmapRadar, range_m: float, since_s: float) -> float:
-        """Return the phase at the ends of the pulse by the part of the Doppler shift that varies.
+        """Return the phase at the ends of the pulse due to motion within the pulse.
 
-        The phase is pi f_d T, with the Doppler shift f_d at the end of the aperture and the length
-        T of the pulse.
+        The phase is pi f_d T, with the Doppler shift f_d at the end of the aperture relative to
+        that at closest approach, and the length T of the pulse.
 
         Args:
             radar: Radar.
@@ -87,7 +87,7 @@ class Hyperbola:
 class Parabola:
     """Second-order range history, r(t) = r0 + v^2 t^2 / (2 r0).
 
-    The history neglects the fourth order; see `neglected_phase_rad`.
+    This range history neglects the terms of the hyperbola from t^4 on; see `neglected_phase_rad`.
 
     Reference:
         Tsvetkov 2017, Eq. (2).
@@ -111,6 +111,9 @@ class Parabola:
     ) -> float:
         """Predict the relative error of the echo of a target, mean |exp(j phi) - 1|^2 in dB.
 
+        phi is the phase difference between the echoes by the parabola and by the exact hyperbola;
+        the mean is over the time for which the target is illuminated.
+
         Args:
             radar: Radar.
             doppler_hz: Doppler of the beam centre in Hz.
@@ -129,10 +132,10 @@ class Parabola:
         return 10 * math.log10(max(error, 1e-30))
 
     def neglected_phase_rad(self, radar: StripmapRadar, range_m: float, since_s: float) -> float:
-        """Return the phase of the difference to the hyperbola at the end of the aperture.
+        """Return the phase difference to the exact hyperbola at the end of the aperture.
 
-        It is about pi x^4 / (2 lambda r^3), where x is the along-track distance from closest
-        approach.
+        The phase is about pi x^4 / (2 lambda r^3), with the closest range r and the along-track
+        distance x of the end of the aperture from closest approach.
 
         Args:
             radar: Radar.
@@ -151,7 +154,7 @@ class Beam(Protocol):
     """Two-way illumination of a target."""
 
     def weight(self, since_s: Tensor, doppler_offset_hz: Tensor, velocity_m_s: Tensor) -> Tensor:
-        """Return the two-way gain.
+        """Return the two-way amplitude gain.
 
         Args:
             since_s: Slow time since the beam centre crossed the target in seconds, shape (...,
@@ -171,7 +174,7 @@ class AlwaysLit:
     """Beam that illuminates every target in every pulse."""
 
     def weight(self, since_s: Tensor, doppler_offset_hz: Tensor, velocity_m_s: Tensor) -> Tensor:
-        """Return one.
+        """Return the two-way amplitude gain, which is one for every pulse and target.
 
         Args:
             since_s: Slow time since the beam centre crossed the target in seconds, shape (...,
@@ -204,7 +207,7 @@ class Dwell:
         refuse_unless("dwell_s must be a positive number of seconds", self.dwell_s, lambda x: x > 0)
 
     def weight(self, since_s: Tensor, doppler_offset_hz: Tensor, velocity_m_s: Tensor) -> Tensor:
-        """Return one during the dwell time, and zero elsewhere.
+        """Return the two-way amplitude gain, one during the dwell time and zero elsewhere.
 
         Args:
             since_s: Slow time since the beam centre crossed the target in seconds, shape (...,
@@ -223,7 +226,8 @@ class Dwell:
 class Antenna:
     """Beam of a uniform aperture, side lobes included.
 
-    The two-way gain is sinc^2(length f / (2 v)) at the Doppler offset f.
+    The two-way amplitude gain is sinc^2(length_m f / (2 v)) at the Doppler frequency f relative to
+    the beam centre, with the velocity v and sinc(x) = sin(pi x) / (pi x).
 
     Args:
         length_m: Length of the aperture in metres.
@@ -238,7 +242,9 @@ class Antenna:
         refuse_unless("length_m must be a positive number of metres", self.length_m, lambda x: x > 0)
 
     def weight(self, since_s: Tensor, doppler_offset_hz: Tensor, velocity_m_s: Tensor) -> Tensor:
-        """Return the two-way gain.
+        """Return the two-way amplitude gain of the uniform aperture, sinc^2(length_m f / (2 v)).
+
+        f is the Doppler offset, v the velocity, and sinc(x) = sin(pi x) / (pi x).
 
         Args:
             since_s: Slow time since the beam centre crossed the target in seconds, shape (...,

@@ -70,13 +70,15 @@ class PolynomialRotation:
         return per_trial(self.omega_rad_s, 0, like)
 
     def warp_k(self, like: Tensor) -> Tensor:
-        """Return k1, k2, ... as one tensor.
+        """Return the parameters k1, k2, ... of the rotation as one tensor.
+
+        k_i is derivative i of the rotation rate at the first pulse, divided by that rate.
 
         Args:
             like: Tensor that gives the device.
 
         Returns:
-            Shape (*trials, order - 1), float64.
+            k1, k2, ... in 1/s, 1/s^2, ..., shape (*trials, order - 1), float64.
         """
         terms = [per_trial(value, 0, like) for value in self._terms()]
         return (
@@ -86,7 +88,7 @@ class PolynomialRotation:
         )
 
     def angle(self, time_s: Tensor) -> Tensor:
-        """Return the rotation angle; differentiable in omega and k.
+        """Return the rotation angle; differentiable in the parameters of the rotation.
 
         Args:
             time_s: Time since the first pulse in seconds, shape (pulse,), float64.
@@ -124,14 +126,14 @@ class PolynomialRotation:
         return self.omega(time_s)[..., None] * (k[..., :1] + warp_rate(time_s, k[..., 1:]) - 1)
 
     def mean_rate(self, duration_s: float, like: Tensor) -> Tensor:
-        """Return the mean rate, which scales an image without compensation.
+        """Return the mean rotation rate, which scales cross range in an uncompensated image.
 
         Args:
             duration_s: Length of the record in seconds.
             like: Tensor that gives the device.
 
         Returns:
-            Total angle over the duration in rad/s, shape (*trials,).
+            Total angle divided by the duration in rad/s, shape (*trials,).
         """
         return self.angle(torch.tensor([duration_s], dtype=torch.float64, device=like.device))[..., 0] / duration_s
 

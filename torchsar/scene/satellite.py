@@ -200,10 +200,10 @@ class Satellite:
         return {name: slice(first, last) for name, first, last in zip(_SHARES, [0, *ends], ends)}
 
     def corners(self) -> Tensor:
-        """Return which scatterers are corners.
+        """Return which scatterers are corners, which lie at the same positions in all trials.
 
         Returns:
-            Shape (target,), bool.
+            True for corners, shape (target,), bool.
         """
         found = torch.zeros(self.count, dtype=torch.bool)
         for name, members in self.parts().items():

@@ -27,7 +27,8 @@ _REACH, _NODES = 9.0, 4097
 class Sea(ABC):
     """Surface of independent circular Gaussian scatterers with a local mean intensity.
 
-    The scatterers are speckle, their mean intensity is the texture, in which kinds of sea differ.
+    The scatterers form speckle. Their local mean intensity is the texture, in which the kinds of
+    sea differ.
 
     Args:
         power_db: Mean power of one sample of azimuth-only or range-compressed data in decibels.
@@ -35,13 +36,13 @@ class Sea(ABC):
             mean over draws: a record with few texture cells may have more or less.
         margin_s: Time by which the surface extends beyond the record at both ends in seconds, fixed
             for all trials. None extends it as far as the gate illuminates, for an antenna pattern
-            down to half power; what is illuminated from further away is replaced by the surface at
-            the other end. With 0 the surface is periodic with the record: two to three times
-            faster, but its Doppler spectrum has no leakage, unlike that of a real record.
-        lobes: Number of nulls to either side up to which an antenna pattern illuminates the
-            surface, fixed for all trials. Beyond the first null lies 10 % of the power of a sinc,
-            beyond the second 5 %; a second one needs about twice the Doppler band, and longer
-            lines.
+            down to half power; the surface is periodic, so that beyond its end the antenna sees the
+            other end. With 0 the period is the length of the record: the simulation is two to three
+            times faster, but the Doppler spectrum has no leakage, unlike that of a real record.
+        lobes: Number of nulls of an antenna pattern, counted from its maximum to either side, up to
+            which it illuminates the surface, fixed for all trials. A sinc pattern has 10 % of its
+            power beyond the first null and 5 % beyond the second. With 2 the simulation needs about
+            twice the Doppler band of 1, and longer lines.
 
     Raises:
         ValueError: If the power is not finite, the margin is negative or the number of lobes is not
@@ -69,9 +70,9 @@ class Sea(ABC):
             draws: Random draws.
 
         Returns:
-            Mean intensity of shape (..., row, column), float64, unity on average; the row of each
-            azimuth, shape (a,) or (..., a), and the column of each range, shape (r,) or (..., r),
-            int64.
+            Table of mean intensities, shape (..., row, column), float64, unity on average; the row
+            of the table for each azimuth, shape (a,) or (..., a), int64; and the column for each
+            range, shape (r,) or (..., r), int64.
         """
 
     def reflectivity(
@@ -79,8 +80,8 @@ class Sea(ABC):
     ) -> Tensor:
         """Draw the complex amplitudes of the cells of a grid.
 
-        Amplitudes have unit mean square and are independent except for their texture. Another grid
-        has another surface.
+        Amplitudes have unit mean square and are independent except for their texture. A different
+        grid has a different surface, also at positions that both grids share.
 
         Args:
             azimuth_m: Along-track positions in metres, zero below the receiver at slow time zero,
@@ -126,13 +127,13 @@ class KSea(Sea):
             mean over draws: a record with few texture cells may have more or less.
         margin_s: Time by which the surface extends beyond the record at both ends in seconds, fixed
             for all trials. None extends it as far as the gate illuminates, for an antenna pattern
-            down to half power; what is illuminated from further away is replaced by the surface at
-            the other end. With 0 the surface is periodic with the record: two to three times
-            faster, but its Doppler spectrum has no leakage, unlike that of a real record.
-        lobes: Number of nulls to either side up to which an antenna pattern illuminates the
-            surface, fixed for all trials. Beyond the first null lies 10 % of the power of a sinc,
-            beyond the second 5 %; a second one needs about twice the Doppler band, and longer
-            lines.
+            down to half power; the surface is periodic, so that beyond its end the antenna sees the
+            other end. With 0 the period is the length of the record: the simulation is two to three
+            times faster, but the Doppler spectrum has no leakage, unlike that of a real record.
+        lobes: Number of nulls of an antenna pattern, counted from its maximum to either side, up to
+            which it illuminates the surface, fixed for all trials. A sinc pattern has 10 % of its
+            power beyond the first null and 5 % beyond the second. With 2 the simulation needs about
+            twice the Doppler band of 1, and longer lines.
 
     Raises:
         ValueError: If the shape or a side is out of range, or as for `Sea`.
@@ -157,7 +158,7 @@ class KSea(Sea):
             )
 
     def texture(self, azimuth_m: Tensor, range_m: Tensor, draws: Draws) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw the texture.
+        """Draw the texture, gamma-distributed mean intensities of rectangular cells.
 
         Args:
             azimuth_m: Along-track positions of a grid in metres, shape (a,), float64.
@@ -165,9 +166,9 @@ class KSea(Sea):
             draws: Random draws.
 
         Returns:
-            Mean intensity of shape (..., row, column), float64, unity on average; the row of each
-            azimuth, shape (a,) or (..., a), and the column of each range, shape (r,) or (..., r),
-            int64.
+            Table of mean intensities, shape (..., row, column), float64, unity on average; the row
+            of the table for each azimuth, shape (a,) or (..., a), int64; and the column for each
+            range, shape (r,) or (..., r), int64.
         """
         row, column = (
             _cells(positions, side) for positions, side in zip((azimuth_m, range_m), self.cell_m, strict=True)
@@ -197,13 +198,13 @@ class ImageReflectivity(Sea):
             mean over draws: a record with few texture cells may have more or less.
         margin_s: Time by which the surface extends beyond the record at both ends in seconds, fixed
             for all trials. None extends it as far as the gate illuminates, for an antenna pattern
-            down to half power; what is illuminated from further away is replaced by the surface at
-            the other end. With 0 the surface is periodic with the record: two to three times
-            faster, but its Doppler spectrum has no leakage, unlike that of a real record.
-        lobes: Number of nulls to either side up to which an antenna pattern illuminates the
-            surface, fixed for all trials. Beyond the first null lies 10 % of the power of a sinc,
-            beyond the second 5 %; a second one needs about twice the Doppler band, and longer
-            lines.
+            down to half power; the surface is periodic, so that beyond its end the antenna sees the
+            other end. With 0 the period is the length of the record: the simulation is two to three
+            times faster, but the Doppler spectrum has no leakage, unlike that of a real record.
+        lobes: Number of nulls of an antenna pattern, counted from its maximum to either side, up to
+            which it illuminates the surface, fixed for all trials. A sinc pattern has 10 % of its
+            power beyond the first null and 5 % beyond the second. With 2 the simulation needs about
+            twice the Doppler band of 1, and longer lines.
 
     Raises:
         ValueError: If the image has fewer than two dimensions, NaN or negative pixels or a mean of
@@ -222,12 +223,13 @@ class ImageReflectivity(Sea):
         image = (image.abs().square() if image.is_complex() else image).to(torch.float64)
         if image.ndim < 2 or not image.numel():
             raise ValueError(
-                f"an image of a surface needs the dims (azimuth, range), got an array of shape {tuple(image.shape)}"
+                "intensity of a surface must be an array of shape (..., azimuth, range), got shape "
+                f"{tuple(image.shape)}"
             )
         if not bool((torch.isfinite(image) & (image >= 0)).all() and (image.mean((-2, -1)) > 0).all()):
             raise ValueError(
-                "an image of a surface holds intensities: finite, not negative, and some above zero; "
-                "square an image of amplitudes first"
+                "intensity of a surface must be finite and not negative, with some pixels above 0, got values from "
+                f"{float(image.min()):g} to {float(image.max()):g}; square an image of amplitudes first"
             )
         object.__setattr__(self, "intensity", image)
 
@@ -266,9 +268,9 @@ class ImageReflectivity(Sea):
             draws: Random draws.
 
         Returns:
-            Mean intensity of shape (..., row, column), float64, unity on average; the row of each
-            azimuth, shape (a,) or (..., a), and the column of each range, shape (r,) or (..., r),
-            int64.
+            Table of mean intensities, shape (..., row, column), float64, unity on average; the row
+            of the table for each azimuth, shape (a,) or (..., a), int64; and the column for each
+            range, shape (r,) or (..., r), int64.
         """
         image = self.intensity.to(azimuth_m.device)
         row, column = (
@@ -279,15 +281,16 @@ class ImageReflectivity(Sea):
 
 
 def gamma_from_normal(x: Tensor, shape: Tensor | float) -> Tensor:
-    """Transform standard normal numbers into gamma numbers of unit mean, rank by rank.
+    """Transform standard normal numbers into gamma-distributed numbers of unit mean.
 
-    Correlated normal fields become correlated gamma fields. The relative error is below 1e-4;
-    numbers beyond 9 standard deviations are clamped.
+    Every number is replaced by the gamma number of the same cumulative probability, so that
+    correlated normal fields become correlated gamma fields. The relative error is below 1e-4;
+    normal numbers beyond 9 standard deviations are clamped.
 
     Args:
         x: Normal numbers of any shape, float64.
         shape: Shape of the gamma distribution, 0.1 to 1000: a number, or a tensor that broadcasts
-            with x, in which inf gives ones. Results are not differentiable in it.
+            with x, in which inf gives ones. The result is not differentiable in the shape.
 
     Returns:
         Gamma numbers of the shape of x, float64.
@@ -315,7 +318,7 @@ def gamma_from_normal(x: Tensor, shape: Tensor | float) -> Tensor:
 def _gamma_table(shape: float) -> Tensor:
     """Logarithm of the gamma number at equally spaced normal numbers, by bisection."""
     if not _SHAPES[0] <= shape <= _SHAPES[1]:
-        raise ValueError(f"gamma numbers are made for shapes of {_SHAPES[0]:g} to {_SHAPES[1]:g}, got {shape}")
+        raise ValueError(f"shape of a gamma distribution must lie in {_SHAPES[0]:g}..{_SHAPES[1]:g}, got {shape}")
     x = torch.linspace(-_REACH, _REACH, _NODES, dtype=torch.float64)
     # the smaller tail probability of each number is matched, which keeps its digits
     tail, order = torch.special.ndtr(-x.abs()), torch.full_like(x, shape)
@@ -362,4 +365,4 @@ def _image(path: Path, key: str | None) -> Tensor:
                 return torch.as_tensor(loaded[key])
     except (ValueError, OSError, TypeError) as error:
         raise ValueError(f"{path} is no numpy file of plain numbers ({error})") from None
-    raise ValueError(f"{path} holds the arrays {names}; name the one to use, got key={key!r}")
+    raise ValueError(f"{path} holds the arrays {names}; give the name of one of them as key, got key={key!r}")

@@ -28,7 +28,7 @@ class Scatterers:
         amplitude: Amplitude, shape (..., target), complex.
 
     Raises:
-        TypeError: If a dtype is another one.
+        TypeError: If positions are not float64 or amplitudes not complex.
         ValueError: If the tensors differ in the number of targets.
     """
 
@@ -123,7 +123,7 @@ class Points:
 
 @dataclass(frozen=True)
 class RandomPoints:
-    """Points at random positions in a rectangle, with random levels and phases.
+    """Points at random positions in a rectangle, with random powers and phases.
 
     Args:
         count: Number of scatterers, fixed for all trials.
@@ -131,7 +131,8 @@ class RandomPoints:
         range_extent_m: Range side of the rectangle in metres.
         azimuth_m: Azimuth of its middle in metres.
         range_m: Range of its middle in metres.
-        spread_db: Levels are uniform between -spread_db and 0 in decibels.
+        spread_db: Width of the distribution of powers, which are uniform between -spread_db and 0
+            in decibels relative to amplitude 1.
 
     Raises:
         ValueError: If there is no scatterer, an extent is negative or a number is not finite.
@@ -177,7 +178,8 @@ class Speckle:
         range_extent_m: Range side of the rectangle in metres.
         azimuth_m: Azimuth of its middle in metres.
         range_m: Range of its middle in metres.
-        level_db: Mean power of all scatterers together in decibels, within +-300 dB.
+        level_db: Mean power of all scatterers together in decibels relative to a scatterer of
+            amplitude 1, within +-300 dB.
 
     Raises:
         ValueError: If there is no scatterer, an extent is negative or a number is out of range.

@@ -177,14 +177,15 @@ def refuse_other_trials(thing: object, draws: Draws, recording: Recording | None
             )
     if not trials and len({shape[-1] for _, shape in shapes if shape and shape[-1] != 1}) > 1:
         found = ", ".join(f"{name} {tuple(shape)}" for name, shape in shapes if shape)
-        raise ValueError(f"parameters per trial must have one length, got the shapes {found}")
+        raise ValueError(f"parameters per trial must all have the same number of trials, got the shapes {found}")
 
 
 def repeated(thing: Any, times: int) -> Any:
     """Return an object whose parameters per trial hold each of their entries several times.
 
-    Parameters are found as in `refuse_other_trials`. They serve where each trial of a world is
-    simulated as several rows, such as one for each of its targets.
+    Use the result where each trial of a world is simulated as several rows of a batch, such as one
+    row for each of its targets. Parameters are found by their annotations in dataclasses, and in
+    the sequences, mappings and dataclasses that these hold.
 
     Args:
         thing: Dataclass with parameters, or a sequence or mapping of such.

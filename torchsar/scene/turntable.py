@@ -42,22 +42,23 @@ class PhaseOnly:
         rotation_rad_s: float | PolynomialRotation | None = None,
         centre_deviation_m: float = 0.0,
     ) -> float:
-        """Return a bound of the phase by which the dechirped echo of a scatterer differs.
+        """Return a bound of the phase difference between this model and the dechirped echo.
 
-        The bound is the sum of the phases of four effects: migration at the ends of the band
-        (pi x A / dr over the total angle A of a PolynomialRotation, half of that for a uniform
-        rotation, whose angle is zero at the middle pulse); the phase of the carrier that rotation
-        and residual speed accumulate in half a pulse; the same at the ends of the band; and the
-        residual video phase.
+        The bound is the sum of the phases of four effects: range migration at the ends of the band
+        (pi x A / dr for a scatterer at the cross range x and a range step dr, where A is the
+        largest rotation angle from the angle zero); the carrier phase that rotation and residual
+        speed accumulate in half a pulse; the same at the ends of the band; and the residual video
+        phase.
 
         Args:
             radar: Radar, with a pulse length.
             n_pulse: Number of pulses.
             cross_range_m: Cross range of the scatterer in metres.
             range_m: Range of the scatterer in metres.
-            speed_m_s: Speed along the line of sight that the tracking leaves in m/s.
+            speed_m_s: Residual speed along the line of sight, not removed by tracking, in m/s.
             rotation_rad_s: Rotation rate in rad/s or rotation, None for the rate of the radar.
-            centre_deviation_m: Distance yc of the centre of rotation in metres.
+            centre_deviation_m: Distance yc in metres: the centre of rotation lies at the range -yc
+                from the middle of the range window.
 
         Returns:
             Phase in radians, the largest of all pulses, samples and trials.
@@ -83,6 +84,16 @@ class PhaseOnly:
         video phase, which compression removes. The mean is over a grid of pulses and of times
         within the pulse. The Doppler phase within the pulse due to the mean velocity of the
         reference range (`track` of `Dechirped`) is not counted.
+
+        Args:
+            radar: Radar, with a pulse length.
+            world: World with the rotation and the motion; only its first trial is used.
+            n_pulse: Number of pulses.
+            cross_range_m: Cross range of the scatterer in metres.
+            range_m: Range of the scatterer in metres.
+
+        Returns:
+            Error in dB.
         """
         pulse = torch.linspace(0, n_pulse - 1, min(n_pulse, _GRID), dtype=torch.float64)[:, None]
         inside = torch.linspace(-0.5, 0.5, _GRID, dtype=torch.float64) * _pulse_s(radar)
@@ -116,14 +127,15 @@ class PhaseOnly:
 class Dechirped:
     """Dechirped pulses with the range evaluated at every sample.
 
-    Rotation, translation and vibration continue during the pulse. The phase is
-    -2 pi (f0 dtau + gamma t' dtau - gamma dtau^2 / 2), with the delay dtau relative to the
-    reference and the time t' from the middle of the pulse. The model neglects the curvature of the
-    wavefront, see `neglected_phase_rad`, and the motion during the time of flight.
+    Rotation, translation and vibration continue during the pulse. The phase of a scatterer is
+    -2 pi (f0 dtau + gamma t' dtau - gamma dtau^2 / 2), with the carrier f0, the chirp rate gamma,
+    the delay dtau relative to the reference of the receiver and the time t' from the middle of the
+    pulse. The model neglects the curvature of the wavefront, see `neglected_phase_rad`, and the
+    motion during the time of flight.
 
     Args:
-        track: Motions that the reference of the receiver follows from pulse to pulse. The echo is
-            relative to the reference, which the recording holds as aux `reference_m`.
+        track: Motions that the reference of the receiver follows from pulse to pulse. Delays are
+            relative to this reference, whose displacement the recording holds as aux `reference_m`.
     """
 
     track: Sequence[Motion] = ()
@@ -137,10 +149,11 @@ class Dechirped:
         rotation_rad_s: float | PolynomialRotation | None = None,
         centre_deviation_m: float = 0.0,
     ) -> float:
-        """Return the largest change of the carrier phase by the curvature of the wavefront.
+        """Return the largest change of the carrier phase due to the curvature of the wavefront.
 
-        The phase is 4 pi / lambda w^2 / (2 R) at the distance w across the line of sight. Both
-        senses of rotation are considered.
+        For a target at the range R, a scatterer at the distance w from the line of sight has the
+        phase 4 pi / lambda w^2 / (2 R), which changes as w changes with the rotation. Both senses
+        of rotation are considered.
 
         Args:
             radar: Radar, with the range of the target.
@@ -148,7 +161,8 @@ class Dechirped:
             cross_range_m: Cross range of the scatterer in metres.
             range_m: Range of the scatterer in metres.
             rotation_rad_s: Rotation rate in rad/s or rotation, None for the rate of the radar.
-            centre_deviation_m: Distance yc of the centre of rotation in metres.
+            centre_deviation_m: Distance yc in metres: the centre of rotation lies at the range -yc
+                from the middle of the range window.
 
         Returns:
             Phase in radians, the largest over the aperture and all trials.
@@ -158,7 +172,8 @@ class Dechirped:
         """
         if not radar.reference_range_m:
             raise ValueError(
-                "radar.reference_range_m is 0; the curvature of the wavefront depends on the target's range; set it"
+                "radar.reference_range_m is 0; set it to the range of the target (m), on which the curvature of the "
+                "wavefront depends"
             )
         theta, _ = _swing(radar, n_pulse, rotation_rad_s)
         lever = abs(range_m + centre_deviation_m)
@@ -194,7 +209,7 @@ class TurntableWorld:
             from the centre of rotation. Phases follow y + yc, while envelopes stay at y.
 
     Raises:
-        TypeError: If the fidelity or the rotation is of another kind.
+        TypeError: If the fidelity or the rotation has the wrong type.
         ValueError: If a number is not finite, or both kinds of rotation are given.
     """
 
@@ -219,8 +234,8 @@ class TurntableWorld:
             )
         if self.rotation is not None and self.rotation_rad_s is not None:
             raise ValueError(
-                f"the world turns by rotation_rad_s={self.rotation_rad_s} and by a polynomial "
-                "rotation; give one of them"
+                f"rotation_rad_s={self.rotation_rad_s} and a polynomial rotation are both given for the world; "
+                "give one of them"
             )
 
 
@@ -238,5 +253,5 @@ def _swing(radar: InverseRadar, n_pulse: int, rotation: float | PolynomialRotati
 def _pulse_s(radar: InverseRadar) -> float:
     """Pulse length in seconds."""
     if radar.pulse_s is None:
-        raise ValueError("radar.pulse_s is not set; phases within a pulse depend on its length; set it")
+        raise ValueError("radar.pulse_s is not set; give the pulse length (s), on which phases within a pulse depend")
     return radar.pulse_s

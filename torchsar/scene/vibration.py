@@ -45,8 +45,8 @@ class Motion(Protocol):
 class Sinusoid:
     """Sinusoidal vibration, d(t) = A sin(2 pi f t + phase).
 
-    The publication is reproduced by the SINE: with a cosine, its vibration 1_0.1_90 is nearly
-    linear in time and hardly defocuses.
+    The results of the publication are reproduced with this SINE. With a cosine its vibration
+    `1_0.1_90` (amplitude 1, 0.1 Hz, 90 degrees) would be nearly linear in time and hardly defocus.
 
     Args:
         amplitude_m: Amplitude A in metres.
@@ -92,7 +92,8 @@ class Sinusoid:
         found = _NAME.fullmatch(name) if isinstance(name, str) else None
         if found is None:
             raise ValueError(
-                f"vibration {name!r} is no name of the form amplitude_frequency_phase, such as '1_100_90' or '1_0.1_90'"
+                f"vibration {name!r} is no name of the form amplitude_frequency_phase (frequency in Hz, phase in "
+                "degrees), such as '1_100_90' or '1_0.1_90'"
             )
         amplitude, frequency, phase = (float(part) for part in found.groups())
         return cls(amplitude * _UNIT_M[unit], frequency, phase)
@@ -236,7 +237,8 @@ def start_phase_rad(effects: Sequence[PulsePhase], draws: Draws, n_pulse: int) -
     """Draw the sum of start phases.
 
     Args:
-        effects: Start phases; each draws from an address of its own, its position in the list.
+        effects: Start phases; each draws its own random numbers, addressed by its position in the
+            list.
         draws: Random draws.
         n_pulse: Number of pulses.
 
