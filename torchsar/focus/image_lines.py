@@ -51,7 +51,8 @@ def mean_rate(omega_rad_s: Tensor | float, k: Tensor, duration_s: float) -> Tens
 
     Args:
         omega_rad_s: Rotation rate at the first pulse in rad/s, shape (...,) or a number.
-        k: Coefficients of the warp, shape (..., order - 1).
+        k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s, 1/s^2,
+            ..., shape (..., order - 1).
         duration_s: Aperture time T in seconds.
 
     Returns:
@@ -72,7 +73,8 @@ def cross_range_of(
     Args:
         doppler_hz: Doppler frequencies in Hz, shape (f,) or a number.
         omega_rad_s: Rotation rate at the first pulse in rad/s, shape (...,) or a number.
-        k: Coefficients of the warp, shape (..., order - 1).
+        k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s, 1/s^2,
+            ..., shape (..., order - 1).
         wavelength_m: Carrier wavelength in metres.
         duration_s: Aperture time in seconds.
 
@@ -122,7 +124,8 @@ class DopplerLines:
         """Return the step between lines in Doppler cells 1 / T, a float64 scalar tensor.
 
         Args:
-            k: Coefficients of the warp, shape (..., order - 1), float64.
+            k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s,
+                1/s^2, ..., shape (..., order - 1), float64.
             duration_s: Aperture time T in seconds.
         """
         return torch.as_tensor(1 / self.oversampling, dtype=torch.float64, device=k.device)
@@ -168,7 +171,8 @@ class CrossRangeLines:
         """Return the step between lines in Doppler cells 1 / T, shape (...,), float64.
 
         Args:
-            k: Coefficients of the warp, shape (..., order - 1), float64.
+            k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s,
+                1/s^2, ..., shape (..., order - 1), float64.
             duration_s: Aperture time T in seconds.
         """
         return 2 * self.step_m / self.wavelength_m * duration_s * mean_rate(self.omega_rad_s, k, duration_s)

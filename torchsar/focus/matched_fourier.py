@@ -59,7 +59,8 @@ def range_phase(
         wavelength_m: Carrier wavelength in metres.
         prf_hz: Pulse rate in Hz.
         omega_rad_s: Rotation rate Om at the first pulse in rad/s, a number or shape (...,).
-        k: Coefficients of the warp, shape (..., order - 1).
+        k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s, 1/s^2,
+            ..., shape (..., order - 1).
         yc_m: Range centre deviation yc in metres, a number or shape (...,); y_n + yc is the
             distance from the rotation centre.
 
@@ -95,8 +96,9 @@ def matched_fourier(
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex.
-        warp_k: Coefficients of the warp, shape (..., order - 1), with an empty last dim for uniform
-            rotation. Leading dims broadcast with those of the data.
+        warp_k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s,
+            1/s^2, ..., shape (..., order - 1), with an empty last dim for uniform rotation. Leading
+            dims broadcast with those of the data.
         prf_hz: Pulse rate in Hz.
         lines: Image lines: `DopplerLines`, or `CrossRangeLines` for an axis in metres.
         transform: How the sum is formed: `Gridding`, `ExplicitSum`, `Resampling` or
@@ -133,7 +135,8 @@ class MatchedFourierOperator:
     prepared once, at construction.
 
     Args:
-        warp_k: Coefficients of the warp, shape (..., order - 1).
+        warp_k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s,
+            1/s^2, ..., shape (..., order - 1).
         n_pulse: Number of pulses of the data.
         prf_hz: Pulse rate in Hz.
         dtype: Complex type of the data.
@@ -229,7 +232,8 @@ class RangePhase(Stage):
     Args:
         radar: Radar of the recording.
         omega_rad_s: Rotation rate at the first pulse in rad/s; None for that of the radar.
-        warp_k: Coefficients of the warp, shape (..., order - 1); None for uniform rotation.
+        warp_k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s,
+            1/s^2, ..., shape (..., order - 1); None for uniform rotation.
         yc_m: Range centre deviation in metres; None for 0.
 
     Raises:
@@ -309,7 +313,8 @@ class MatchedFourier(Stage):
         transform: How the sum over pulses is formed, see `matched_fourier`.
         cross_range_m: Step in metres and number of lines of an azimuth axis in metres; replaces
             `oversampling` and `lines` and needs a rotation rate.
-        warp_k: Coefficients of the warp, shape (..., order - 1); None for uniform rotation.
+        warp_k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s,
+            1/s^2, ..., shape (..., order - 1); None for uniform rotation.
         omega_rad_s: Rotation rate at the first pulse in rad/s; None for that of the radar.
 
     Raises:

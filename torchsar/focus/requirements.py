@@ -28,9 +28,10 @@ class Requirement:
         range_cells: Neglected shift in range cells; nan where no shift is neglected.
         tolerance_rad: Tolerated phase in rad.
         remedy: Remedy where the simplification is not permissible.
-        error_db: Relative error in dB of the response of a point where the neglected phase is
-            largest, see `phase_error_db`; nan where it is not predicted.
-        tolerance_db: Tolerated relative error in dB.
+        error_db: Error in dB of the response of a point where the neglected phase is largest: its
+            relative error, see `phase_error_db`, or the loss of its peak; nan where neither is
+            predicted.
+        tolerance_db: Largest permissible `error_db` in dB.
     """
 
     effect: str
@@ -46,7 +47,7 @@ class Requirement:
     def ok(self) -> bool:
         """True where the simplification is permissible.
 
-        The relative error `error_db` decides where it is predicted, otherwise the neglected phase.
+        The error `error_db` of the response decides where it is predicted, otherwise the phase.
         """
         if math.isnan(self.error_db):
             return self.phase_rad <= self.tolerance_rad
