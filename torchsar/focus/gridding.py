@@ -64,7 +64,7 @@ def interpolate_rows(weights: Tensor, grid: Tensor, first: Tensor) -> Tensor:
 
 
 def correlate_rows(values: Tensor, grid: Tensor, first: Tensor, taps: int) -> Tensor:
-    """Multiply values with grid rows at each tap: sum values[m] * grid[first[m] + tap] over columns.
+    """Correlate values with grid rows: sum values[m] * grid[first[m] + tap] over the columns.
 
     It is the adjoint of `spread_rows` as a map of its weights.
 

@@ -60,7 +60,7 @@ class Limit:
 
     @property
     def sentence(self) -> str:
-        """One sentence with value and limit; where the limit is not met, consequence and remedy too."""
+        """One sentence with value and limit, and if it is not met, consequence and remedy."""
         relation = "at least" if self.at_least else "below"
         figures = (
             f"{self.name} is {f'{self.value:.4g} {self.unit}'.strip()}, and must be {relation} "

@@ -29,8 +29,8 @@ OVERSAMPLING = 2
 class Kernel:
     """Kaiser-Bessel interpolation kernel.
 
-    `Kernel.of(eps)` chooses the width for a relative error. For equal error, an oversampling of 1.25
-    needs about 1.6 times as many taps as one of 2, but an FFT of 5/8 the length.
+    `Kernel.of(eps)` chooses the width for a relative error. For equal error, an oversampling of
+    1.25 needs about 1.6 times as many taps as one of 2, but an FFT of 5/8 the length.
 
     Args:
         taps: Width in grid points, 2 to 16.

@@ -124,9 +124,9 @@ def band_weight(radar: StripmapRadar, offset_hz: Tensor, band_hz: float) -> Tens
 
 @dataclass(frozen=True)
 class FrameGeometry:
-    """Doppler, velocity and image frame of the rows of an azimuth spectrum, one row per Doppler bin.
+    """Doppler, velocity and image frame of the rows of an azimuth spectrum.
 
-    All values are float64.
+    There is one row per Doppler bin. All values are float64.
 
     Args:
         radar: Radar of the recording.

@@ -311,7 +311,7 @@ class PolarFormat(GroundImager):
         return kept[1]
 
     def form(self, profiles: Tensor, geometry: FarField | Spotlight, azimuth: Axis, range_: Axis) -> Tensor:
-        """Form the image by polar format.
+        """Form the image of range profiles by polar format.
 
         Args:
             profiles: Range profiles, shape (..., pulse, range), complex.

@@ -137,12 +137,12 @@ class Aperture:
 
     @property
     def carrier_row(self) -> Tensor:
-        """Omega-K mapping G - f0 of the carrier f0 in Hz per Doppler, see `wavenumber`, shape (d, 1)."""
+        """Omega-K mapping G - f0 at the carrier f0 in Hz, see `wavenumber`, shape (Doppler, 1)."""
         return self.at.mapped(torch.zeros(1, dtype=torch.float64))
 
     @property
     def slope(self) -> Tensor:
-        """Relative range migration at each Doppler, shape (d, 1).
+        """Relative range migration at each Doppler, shape (Doppler, 1).
 
         It is dG / df - 1 at the carrier, with the omega-K mapping G of `wavenumber`.
         """

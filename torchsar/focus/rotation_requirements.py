@@ -400,7 +400,9 @@ def _whole(k: Tensor, duration_s: float) -> Tensor:
 def _check(omega: float, k: Sequence[float], x: Tensor, lever: Tensor, amplitude: Tensor) -> None:
     """Raise ValueError for an invalid rotation or shapes that differ."""
     if not (math.isfinite(omega) and omega > 0) or not all(math.isfinite(one) for one in k):
-        raise ValueError(f"omega_rad_s must be positive (rad/s) and every k finite, got omega_rad_s={omega} and k={list(k)}")
+        raise ValueError(
+            f"omega_rad_s must be positive (rad/s) and every k finite, got omega_rad_s={omega} and k={list(k)}"
+        )
     if not x.shape == lever.shape == amplitude.shape or x.ndim != 1 or not len(x):
         raise ValueError(
             "cross_range_m, lever_m and amplitude must have the same shape (target,), got the shapes "

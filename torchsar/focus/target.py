@@ -64,8 +64,8 @@ class TargetImage(Stage):
             Map from range profiles to the image, with its adjoint, or None.
 
         Raises:
-            ValueError: If the size of the profiles is not that of the geometry, or the line of sight does not
-                rotate.
+            ValueError: If the size of the profiles is not that of the geometry, or the line of
+                sight does not rotate.
         """
         if self.waves is None:
             return None
@@ -115,8 +115,8 @@ class TargetImage(Stage):
             Image with axes (azimuth, range).
 
         Raises:
-            ValueError: If the size of the profiles is not that of the geometry, or the line of sight does not
-                rotate.
+            ValueError: If the size of the profiles is not that of the geometry, or the line of
+                sight does not rotate.
         """
         operator = self.operator(signal.data)
         return (

@@ -142,7 +142,9 @@ class Resampling:
 
     def __post_init__(self) -> None:
         if self.interpolation not in ("linear", "spline"):
-            raise ValueError(f"interpolation {self.interpolation!r} of the pulses is not known; choose 'linear' or 'spline'")
+            raise ValueError(
+                f"interpolation {self.interpolation!r} of the pulses is not known; choose 'linear' or 'spline'"
+            )
 
     def build(self, of: PulsesToLines) -> Sum:
         """Build the linear map from pulses to image lines, which also has its adjoint.
