@@ -414,8 +414,8 @@ class MatchedFourier(Stage):
             return DopplerLines(self.oversampling, self.lines)
         if omega_rad_s is None:
             raise ValueError(
-                "image lines in metres need omega_rad_s, got None; set radar.rotation_rad_s, give omega_rad_s, connect an "
-                "estimate of it, or leave out cross_range_m for a Doppler axis"
+                "image lines in metres need omega_rad_s, got None; set radar.rotation_rad_s, give omega_rad_s, "
+                "connect an estimate of it, or leave out cross_range_m for a Doppler axis"
             )
         lines = CrossRangeLines(*self.cross_range_m, omega_rad_s, self.radar.wavelength_m)
         _check_pulse_rate(lines, k, pulse)

@@ -95,7 +95,7 @@ def backproject_spotlight(
 
     Args:
         profiles: Range profiles, shape (..., pulse, range), complex, as from `read_inverse`; s_k(f)
-            is their Fourier transform.
+            are the frequency samples computed from them.
         geometry: `Spotlight` for exact ranges, `FarField` for plane waves.
         x_m: First ground coordinate of the pixels in metres, float64.
         y_m: Second ground coordinate of the pixels in metres, float64; broadcasts against `x_m`.
@@ -193,11 +193,12 @@ class GroundGrid:
         numbers = (self.extent_m, self.step_m, *self.centre_m, self.range_axis_rad)
         if not (all(map(math.isfinite, numbers)) and len(self.centre_m) == 2 and 0 < self.step_m <= self.extent_m):
             raise ValueError(
-                f"a ground grid needs 0 < step_m <= extent_m, a centre of two coordinates and finite numbers, got {self}"
+                "a ground grid needs 0 < step_m <= extent_m, a centre of two coordinates and finite numbers, "
+                f"got {self}"
             )
 
     def axes(self) -> tuple[Axis, Axis]:
-        """Return the axes ("azimuth", "range") of n samples in metres; the centre is sample n // 2."""
+        """Return the axes ("azimuth", "range") in metres; of n samples the centre is n // 2."""
         n = round(self.extent_m / self.step_m) + 1
         start_range, start_azimuth = (c - (n // 2) * self.step_m for c in self.centre_m)
         return Axis("azimuth", n, start_azimuth, self.step_m, "m"), Axis("range", n, start_range, self.step_m, "m")

@@ -57,7 +57,7 @@ class StripPlan:
 
     @property
     def blocks(self) -> list[tuple[slice, slice]]:
-        """Raw lines to read and image lines to keep for each block; the kept lines tile the strip."""
+        """Raw lines to read and image lines to keep for each block; kept lines tile the strip."""
         if self.height >= self.n_lines:
             return [(slice(0, self.n_lines), slice(0, self.n_lines))]
         step = self.height - (self.reach[1] - self.reach[0])
@@ -70,7 +70,7 @@ class StripPlan:
 
 
 def filter_tail(guard_lines: float) -> float:
-    """Compute the part of the energy of an azimuth filter that lies beyond its aperture and a guard.
+    """Compute the part of the energy of an azimuth filter beyond its aperture and a guard.
 
     The filter uses the whole PRF, and its phase jumps where the PRF band wraps. At g lines from the
     ends of the aperture, a jump that changes the filter by 2 gives a tail |h| = 1 / (pi g); over
