@@ -75,7 +75,7 @@ class Kernel:
                 return kernel
         raise ValueError(
             f"the relative error eps must be at least {kernels[-1].error:.1e} at an oversampling of {oversampling}, "
-            f"got eps={eps}; choose a finer grid, an oversampling up to 2"
+            f"got eps={eps}; choose a finer grid (oversampling up to 2)"
         )
 
     @property

@@ -220,7 +220,7 @@ def azimuth_matched_filter(
     if not radar.speed_m_s > 0:
         raise ValueError(
             f"radar.speed_m_s must be positive for an azimuth image, got {radar.speed_m_s}; a target that does not "
-            "move across the line of sight has none"
+            "move across the line of sight has no such image"
         )
     n = data.shape[-2]
     half = _half_aperture(radar, pulse, range_, beam_rad)
