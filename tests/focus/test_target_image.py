@@ -114,7 +114,7 @@ def test_autofocus_with_the_polar_image_handles_migration():
 
 
 def test_invalid_arguments_raise():
-    with pytest.raises(ValueError, match="step_cells must lie in 0..1"):
+    with pytest.raises(ValueError, match="step_cells must be above 0 and at most 1"):
         TargetImage(RADAR, step_cells=1.5)
     still = geometry_of(frequency_hz=FREQUENCY, angle_rad=torch.zeros(PULSES, dtype=torch.float64))
     with pytest.raises(ValueError, match="does not rotate"):

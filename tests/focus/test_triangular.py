@@ -138,7 +138,7 @@ def test_window_and_invalid_arguments() -> None:
     assert out.axis("range").start == pytest.approx(0.0, abs=1e-9) and out.axis("range").stop == pytest.approx(
         3.0, abs=0.04
     )
-    with pytest.raises(ValueError, match="does not lie in the relative ranges"):
+    with pytest.raises(ValueError, match="window_m must lie in the relative ranges"):
         CompressSweeps(MOVING, window_m=(0.0, 9.0))(sweeps)
     with pytest.raises(ValueError, match="ramp must be"):
         CompressSweeps(MOVING, "left")

@@ -16,10 +16,10 @@ from torchsar.radar import StripmapRadar
 
 
 class Aperture(Protocol):
-    """Weights of the pulses that form a pixel."""
+    """Choice of the pulses that contribute to a pixel, as a weight of each pulse."""
 
     def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
-        """Return the weight of each pulse, in the shape of the arguments.
+        """Return the weight of each pulse at each pixel, in the shape of the arguments.
 
         Args:
             since_s: Slow time since the beam centre crossed the pixel, in seconds.
@@ -30,10 +30,10 @@ class Aperture(Protocol):
 
 @dataclass(frozen=True)
 class EveryPulse:
-    """All recorded pulses."""
+    """Aperture of all recorded pulses."""
 
     def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
-        """Return weights of 1, in the shape of `since_s`.
+        """Return the weight 1 for each pulse, in the shape of `since_s`.
 
         Args:
             since_s: Slow time since the beam centre crossed the pixel, in seconds.
@@ -44,7 +44,7 @@ class EveryPulse:
 
 @dataclass(frozen=True)
 class Integration:
-    """The pulses within an integration time about the crossing of the beam centre.
+    """Aperture of the pulses within an integration time about the crossing of the beam centre.
 
     Args:
         integration_s: Integration time in seconds.
@@ -53,7 +53,7 @@ class Integration:
     integration_s: float
 
     def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
-        """Return 1 within the integration time and 0 elsewhere.
+        """Return the weight of each pulse: 1 within the integration time and 0 elsewhere.
 
         Args:
             since_s: Slow time since the beam centre crossed the pixel, in seconds.
@@ -64,9 +64,9 @@ class Integration:
 
 @dataclass(frozen=True)
 class DopplerBand:
-    """The pulses in which the Doppler of the pixel lies in a band about the centroid.
+    """Aperture of the pulses in which the Doppler of the pixel lies in a band about the centroid.
 
-    With the PRF as width these are the pulses that a Doppler processor uses.
+    With the PRF as width, these are the pulses that a focuser in the Doppler domain uses.
 
     Args:
         width_hz: Width of the band in Hz.
@@ -75,7 +75,7 @@ class DopplerBand:
     width_hz: float
 
     def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
-        """Return 1 within the band and 0 elsewhere.
+        """Return the weight of each pulse: 1 where the Doppler lies in the band and 0 elsewhere.
 
         Args:
             since_s: Slow time since the beam centre crossed the pixel, in seconds.
@@ -101,25 +101,28 @@ def backproject(
 ) -> Tensor:
     """Sum the compressed echo coherently over the pulses at the range of each pixel.
 
-    The range history is the exact hyperbola, formed as a difference to the range of the pixel at
-    crossing. The echo between samples comes from its range spectrum by a non-uniform FFT. A target
-    has the phase -4 pi R / lambda and the sum of its pulses as amplitude. Echoes outside the record
-    count as zero. Takes pulses x pixels x 50 operations: use it for patches. Differentiable in the
-    raw data, the velocity, the frame and the pixel positions.
+    The range history is the exact hyperbola, computed as difference from the range at which the
+    beam centre crosses the pixel. The echo between range samples is interpolated from its range
+    spectrum by a non-uniform FFT. A focused target at slant range R has the phase -4 pi R / lambda;
+    its amplitude is the sum over its pulses. Echoes outside the record count as zero. The sum takes
+    pulses x pixels x 50 operations: use it for patches. Differentiable in the raw data, the
+    velocity, the frame Doppler and the pixel positions.
 
     Args:
         raw: Raw or range-compressed data, shape (..., pulse, range), complex.
         radar: Radar of the recording.
-        azimuth_m: Azimuth of the pixels in metres, nominal velocity x slow time of crossing;
-            float64, broadcasts against `range_m`.
-        range_m: Slant range of the pixels at crossing in metres, in the frame Doppler; float64.
+        azimuth_m: Azimuth of the pixels in metres: nominal velocity x the slow time at which the
+            line of sight of `frame_hz` crosses the pixel; float64, broadcasts against `range_m`.
+        range_m: Slant range of the pixels at that crossing in metres; float64.
         doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,).
         velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
             radar.
-        frame_hz: Frame Doppler of the image coordinates in Hz; None for the nominal pointing of the
-            radar, or the centroid where there is none.
-        reference: Range reference spectrum, shape (range,); None for range-compressed data.
-        aperture: Pulses that form a pixel; None for all.
+        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates;
+            None for the nominal pointing of the radar, or the centroid where it has none.
+        reference: Spectrum of the range compression filter, shape (range,); None for
+            range-compressed data.
+        aperture: Pulses that contribute to a pixel, such as `Integration` or `DopplerBand`; None
+            for all.
         start_s: Slow time of the first pulse in seconds.
         eps: Relative error of the interpolation in range.
         block_bytes: Size of a working array in bytes.
@@ -129,8 +132,9 @@ def backproject(
         coordinates.
 
     Raises:
-        ValueError: If a value per trial has another shape than the trials, the velocity is not
-            positive, or a Doppler exceeds 2 velocity / wavelength.
+        ValueError: If the Doppler or the velocity is neither a number nor a tensor of the leading
+            dims of the data, the velocity is not positive, or a Doppler exceeds 2 velocity /
+            wavelength.
     """
     at = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz)
     x, r = torch.broadcast_tensors(
@@ -225,15 +229,17 @@ class Backproject(Focuser):
 
     Args:
         radar: Radar of the recording.
-        reference: Name of the range reference; None for range-compressed data.
+        reference: Filter that compresses the pulses in range: "matched", "flat" or "phase"; None
+            for range-compressed data.
         velocity_m_s: Effective velocity in m/s; None for that of the radar.
         doppler_hz: Absolute Doppler centroid in Hz; None for the nominal pointing of the radar.
-        frame_hz: Frame Doppler of the image in Hz; None for the nominal pointing, else the
-            centroid.
+        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates;
+            None for the nominal pointing of the radar, or the centroid where it has none.
         lines: First and last raw line of the patch; None for all.
         cells: First and last range cell of the patch; None for all.
         oversampling: Pixels per raw sample along either axis.
-        aperture: Pulses that form a pixel; None for all.
+        aperture: Pulses that contribute to a pixel, such as `Integration` or `DopplerBand`; None
+            for all.
         eps: Relative error of the interpolation in range.
 
     Raises:
@@ -259,12 +265,15 @@ class Backproject(Focuser):
         self.lines, self.cells, self.oversampling, self.aperture, self.eps = lines, cells, oversampling, aperture, eps
 
     def forward(self, signal: Signal, doppler_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Signal:
-        """Focus a signal with axes (pulse, range).
+        """Focus the patch of the stage from a signal with axes (pulse, range).
 
         Args:
             signal: Recording.
             doppler_hz: Doppler centroid in Hz; None for that of the stage.
             velocity_m_s: Effective velocity in m/s; None for that of the stage.
+
+        Returns:
+            Image of the patch with axes (azimuth, range).
         """
         azimuth, range_ = self.radar.image_axes(signal.axes)
         azimuth, range_ = (

@@ -1,7 +1,7 @@
 """Chirp-z transform onto any uniform grid of frequencies, and the keystone transform.
 
-Both evaluate exact sums, X_i = sum_j x_j exp(-2j pi (start + i step) (j - j0)), as one convolution
-with a chirp, not interpolations.
+Both compute the spectrum X_i = sum_j x_j exp(-2j pi (start + i step) (j - centre)) of samples x_j
+exactly, by one convolution with a chirp instead of interpolation.
 
 Reference:
     Bluestein 1970 (chirp-z); Perry, DiPietro and Fante 1999, IEEE Trans. AES 35(1) (keystone).
@@ -21,9 +21,9 @@ def chirp_z(
 ) -> Tensor:
     """Evaluate the spectrum of samples on a uniform grid of frequencies by Bluestein's convolution.
 
-    X_i = sum_j x_j exp(-2j pi (start + i step) (j - centre)), i = 0..n-1, exact to the precision of
-    the data, since the chirps are formed from float64 phases. Differentiable in `x`, `start` and
-    `step`.
+    The result X_i = sum_j x_j exp(-2j pi (start + i step) (j - centre)), i = 0..n-1, is exact to
+    the precision of the data, since the chirps are formed from float64 phases. Differentiable in
+    `x`, `start` and `step`.
 
     Args:
         x: Samples, shape (..., m) along `dim`, complex.
@@ -41,7 +41,7 @@ def chirp_z(
         ValueError: If `n` is below 1.
     """
     if n < 1:
-        raise ValueError(f"a chirp-z transform needs at least one frequency, got n={n}")
+        raise ValueError(f"n, the number of frequencies of a chirp-z transform, must be at least 1, got n={n}")
     if dim % x.ndim != x.ndim - 1:
         return chirp_z(x.movedim(dim, -1), start, step, n, -1, centre).movedim(-1, dim)
     m = x.shape[-1]
@@ -59,21 +59,24 @@ def chirp_z(
 
 
 def keystone(data: Tensor, frequency_hz: Tensor, carrier_hz: float, ambiguity: Tensor | int = 0) -> Tensor:
-    """Rescale slow time per range frequency, which removes the range walk of all targets at once.
+    """Rescale slow time per range frequency, which removes the linear range walk of all targets.
 
-    The result is s(t carrier / (carrier + f), f). A target that moves with v has the phase (carrier
-    + f) v t; afterwards carrier v t, and its range is constant. Slow time is zero at pulse `n //
-    2`, where the data do not change. The Doppler of the whole band, which grows with carrier + f,
-    must lie within half a pulse rate of `ambiguity` pulse rates. The signal is evaluated exactly as
-    periodic and band-limited through the pulses: where the scale exceeds one (f < 0), the outermost
-    pulses are taken from beyond the aperture and wrap around. Differentiable in the data.
+    Data s(t, f) over slow time t and range frequency f become s(t carrier / (carrier + f), f). The
+    phase of a target of constant velocity grows with (carrier + f) t before and with carrier t
+    afterwards, so that its range is constant. Slow time is zero at pulse `n // 2` of n, where the
+    data do not change.
+
+    At every f the true Doppler must lie within half a pulse rate of `ambiguity` pulse rates. Pulses
+    are resampled exactly as a periodic, band-limited signal. For f < 0, where the scale exceeds
+    one, the outermost pulses come from beyond the aperture and wrap around. Differentiable in the
+    data.
 
     Args:
         data: Pulses, shape (..., pulse, range frequency), complex.
         frequency_hz: Range frequencies f relative to the carrier in Hz, shape (range frequency,).
         carrier_hz: Carrier frequency in Hz.
         ambiguity: Number of pulse rates by which the true Doppler exceeds the sampled one, a number
-            or shape (...,). A wrong number leaves the walk of the missing pulse rates.
+            or shape (...,). An error of this number leaves the range walk that belongs to it.
 
     Returns:
         Pulses of the same shape.
@@ -88,13 +91,13 @@ def keystone(data: Tensor, frequency_hz: Tensor, carrier_hz: float, ambiguity: T
     n, frequency_hz = data.shape[-2], frequency_hz.to(device=data.device, dtype=torch.float64)
     if frequency_hz.shape != data.shape[-1:]:
         raise ValueError(
-            f"keystone needs one frequency per range frequency of the data {tuple(data.shape)}, "
-            f"got {tuple(frequency_hz.shape)}"
+            f"frequency_hz must hold one frequency per range frequency of the data, shape {tuple(data.shape[-1:])}, "
+            f"got shape {tuple(frequency_hz.shape)}"
         )
     if not (carrier_hz > 0 and bool((frequency_hz > -carrier_hz).all())):
         raise ValueError(
-            f"keystone needs frequencies above minus the carrier of {carrier_hz:g} Hz, got down "
-            f"to {float(frequency_hz.min()):g} Hz"
+            "frequency_hz, relative to a positive carrier_hz, must lie above minus the carrier, got down to "
+            f"{float(frequency_hz.min()):g} Hz with a carrier of {carrier_hz:g} Hz"
         )
     scale = carrier_hz / (carrier_hz + frequency_hz)
     # the sum over Doppler bins d, sample i at (i - n // 2) scale

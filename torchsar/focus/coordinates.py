@@ -1,4 +1,4 @@
-"""Range of closest approach as image coordinate, and zero padding of the record."""
+"""Conversion of slant range to range of closest approach, and focusing with zero-padded records."""
 
 from __future__ import annotations
 
@@ -22,13 +22,15 @@ def closest_range(
 ) -> Tensor:
     """Resample an image from slant range R to the range of closest approach, r = R cos(squint).
 
-    Band-limited interpolation; samples from beyond the record wrap around. A squint of 1.6 degrees
-    moves a target at 1000 km by 400 m. Differentiable.
+    The squint is that of the line of sight that defines the image coordinates. The interpolation is
+    band-limited; samples from beyond the record wrap around. A squint of 1.6 degrees moves a target
+    at 1000 km by 400 m. Differentiable.
 
     Args:
-        image: Focused image in the frame Doppler, shape (..., azimuth, range), complex.
+        image: Focused image, shape (..., azimuth, range), complex.
         radar: Radar of the recording.
-        frame_hz: Frame Doppler of the image in Hz, a number or shape (...,).
+        frame_hz: Doppler frequency of that line of sight in Hz, with which the image was focused, a
+            number or shape (...,).
         velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
             radar.
         eps: Relative error of the interpolation.
@@ -54,8 +56,9 @@ def closest_range(
 class ClosestRange(Stage):
     """Stage that converts the range axis of a focused image to the range of closest approach.
 
-    This is the zero-Doppler range; azimuth remains the crossing of the beam centre. The frame is
-    the nominal pointing of the radar, or the centroid `doppler_hz` where the radar has none.
+    The range of closest approach is that of a zero-Doppler image; azimuth remains the crossing of
+    the beam centre. The beam centre is given by the nominal pointing of the radar, or by the
+    centroid `doppler_hz` where the radar has none.
 
     Args:
         radar: Radar of the recording.
@@ -73,8 +76,11 @@ class ClosestRange(Stage):
 
         Args:
             signal: Focused image.
-            doppler_hz: Doppler centroid in Hz with which it was focused.
+            doppler_hz: Doppler centroid in Hz with which the image was focused.
             velocity_m_s: Effective velocity in m/s; None for that of the radar.
+
+        Returns:
+            Image on the same axes; range is that of closest approach.
 
         Raises:
             ValueError: If the radar has no nominal pointing and `doppler_hz` is absent.
@@ -84,22 +90,22 @@ class ClosestRange(Stage):
         frame = pointing if pointing is not None else doppler_hz
         if frame is None:
             raise ValueError(
-                "ClosestRange needs the doppler_hz that the image was focused with; connect it: "
+                "ClosestRange needs the doppler_hz that the image was focused with, got None; connect it: "
                 "use(ClosestRange(radar), doppler_hz='doppler')"
             )
         return signal.with_data(closest_range(signal.data, self.radar, frame, velocity_m_s, self.eps))
 
 
 class PaddedLines(Stage):
-    """Stage that focuses with zero lines after the record.
+    """Stage that appends zero lines to the record before focusing.
 
-    Apertures that the end of the record cuts off then do not wrap around. The image has the lines
-    of the record. Time and memory grow with the share of added lines.
+    Targets whose aperture is cut off by the end of the record then do not wrap around to its start.
+    The image has the lines of the record. Time and memory grow in proportion to the padded length.
 
     Args:
         focuser: Focusing stage.
-        lines: Number of added lines; None for one aperture, the time in which a target sweeps one
-            PRF, or the nominal dwell of the radar.
+        lines: Number of added lines; None for one aperture: the integration time of the radar, or
+            where it has none, the time in which the Doppler of a target sweeps one PRF.
 
     Raises:
         ValueError: If `lines` is negative.
@@ -108,7 +114,7 @@ class PaddedLines(Stage):
     def __init__(self, focuser: Focuser, lines: int | None = None) -> None:
         super().__init__()
         if lines is not None and lines < 0:
-            raise ValueError(f"PaddedLines needs 0 or more lines, got {lines}")
+            raise ValueError(f"lines of PaddedLines must be 0 or more, got {lines}")
         self.focuser, self.lines = focuser, lines
 
     def forward(self, signal: Signal, doppler_hz: Tensor | None = None, velocity_m_s: Tensor | None = None) -> Signal:
@@ -118,6 +124,9 @@ class PaddedLines(Stage):
             signal: Recording.
             doppler_hz: Doppler centroid in Hz; None for that of the focuser.
             velocity_m_s: Effective velocity in m/s; None for that of the focuser.
+
+        Returns:
+            Image with axes (azimuth, range) and as many lines as the recording.
         """
         n, radar = signal.axis("pulse").n, self.focuser.radar
         more = radar.aperture_lines(signal.axis("range").stop) if self.lines is None else self.lines

@@ -1,8 +1,9 @@
 """Range compression of dechirped pulses and azimuth transform of a rotating target.
 
-With the delay dtau relative to the reference and t' from the middle of the pulse, a dechirped pulse
-has the phase exp(-2j pi (f0 dtau + gamma t' dtau - gamma dtau^2 / 2)). Transforms over the pulses
-of a turntable use exp(+j), so that +x lies at positive coordinates of the image axis.
+A dechirped echo is exp(-2j pi (f0 dtau + gamma t' dtau - gamma dtau^2 / 2)), with the carrier f0,
+the chirp rate gamma, the delay dtau relative to the reference range and the time t' from the middle
+of the pulse. Azimuth transforms over the pulses use exp(+j), so that a positive cross range x lies
+at positive coordinates of the image axis.
 """
 
 from __future__ import annotations
@@ -24,18 +25,20 @@ def compress_dechirped(
 ) -> Tensor:
     """Compress dechirped pulses in range.
 
-    Fast time i lies at (i - n // 2) pulse_s / n from the middle of the pulse, range i at (i - n //
-    2) range_step_m from the reference. With a velocity the phase
-    2 pi (2 v / c) (f0 t' + gamma t'^2) is removed first: the shift v f0 / gamma, also where it
-    wraps around, and the blur by range walk within the pulse. Differentiable in samples and
-    velocity.
+    Of n samples, fast-time sample i lies (i - n // 2) pulse_s / n from the middle of the pulse, and
+    range sample i at (i - n // 2) range_step_m from the reference range. Where a velocity v is
+    given, the phase 2 pi (2 v / c) (f0 t' + gamma t'^2) that it causes within the pulse is removed
+    first, with the time t' from the middle of the pulse, the carrier f0 and the chirp rate gamma.
+    This corrects the range shift v f0 / gamma, also where it wraps around, and the blur by range
+    walk. Differentiable in samples and velocity.
 
     Args:
         raw: Dechirped pulses, shape (..., pulse, fast_time), complex.
         radar: Radar of the recording, with its pulse length.
         velocity_m_s: Range rate dR/dt within pulses in m/s, receding positive, a number or shape
             (...,); None for no correction.
-        residual_video: Remove the residual video phase pi gamma (2 r / c)^2 at each range r.
+        residual_video: Remove the residual video phase pi gamma (2 r / c)^2 at each range r
+            relative to the reference range.
 
     Returns:
         Range-compressed pulses, shape (..., pulse, range); an echo of unit amplitude has a unit
@@ -61,13 +64,15 @@ def compress_dechirped(
 def azimuth_transform(pulses: Tensor, window: str = "none", oversampling: int = 1) -> Tensor:
     """Form the image of phase-corrected pulses by a centred transform with exp(+j) over the pulses.
 
-    Line q is sum_k w_k s[k] exp(2j pi (q - n // 2) (k - pulse // 2) / n) / sqrt(n) with n =
-    oversampling * pulse, so that the energy of the pulses is preserved. Rounding does not depend on
-    the number of trials. Differentiable.
+    Of n = oversampling * pulse lines, line q is
+    sum_k w_k s[k] exp(2j pi (q - n // 2) (k - pulse // 2) / n) / sqrt(n) with the pulses s[k] and
+    the window w_k, so that without a window the energy of the pulses is preserved. Rounding errors
+    do not depend on the number of trials. Differentiable.
 
     Args:
         pulses: Range-compressed pulses, shape (..., pulse, range), complex.
-        window: "none" or "hann", of unit mean square, so that noise keeps its level.
+        window: "none" or "hann". The window has unit mean square, so that it does not change the
+            power of white noise.
         oversampling: Image lines per pulse, by zero padding.
 
     Returns:
@@ -91,7 +96,7 @@ def _hann(n: int, like: Tensor) -> Tensor:
 def _pulse_s(radar: InverseRadar) -> float:
     """Pulse length of the radar; raises ValueError where it is not set."""
     if radar.pulse_s is None:
-        raise ValueError("radar.pulse_s is not set; a dechirped pulse needs its length")
+        raise ValueError("radar.pulse_s is not set; give the length of the dechirped pulses in seconds")
     return radar.pulse_s
 
 
@@ -101,8 +106,8 @@ class CompressDechirped(Stage):
     Data that are range-compressed already (pulse, range) pass unchanged, so that one chain serves
     echoes of either kind.
 
-    For pulses of 100 us and 150 GHz the velocity must be known to 5 m/s (quadratic phase of pi /
-    4), see `inverse_requirements`.
+    For pulses of 100 us duration and 150 GHz bandwidth, the velocity must be known to 5 m/s, which
+    leaves a quadratic phase of pi / 4; see `inverse_requirements`.
 
     Args:
         radar: Radar of the recording, with its pulse length.
@@ -137,6 +142,9 @@ class CompressDechirped(Stage):
             signal: Dechirped recording, or range-compressed data, which are returned as they are.
             velocity_m_s: Range rate within pulses in m/s; None for that of the stage.
 
+        Returns:
+            Range-compressed signal with axes (pulse, range).
+
         Raises:
             ValueError: If the fast-time samples do not span the pulse about its middle.
         """
@@ -155,7 +163,7 @@ class CompressDechirped(Stage):
         if abs(fast.step - step) > 1e-9 * step or abs(fast.start + (fast.n // 2) * step) > 1e-6 * step:
             raise ValueError(
                 f"{fast.n} fast-time samples from {fast.start:.6g} s by {fast.step:.6g} s do not fill "
-                f"the pulse of {_pulse_s(self.radar):g} s about its middle; set radar.pulse_s"
+                f"the pulse of {_pulse_s(self.radar):g} s about its middle; set radar.pulse_s to the pulse length"
             )
 
 
@@ -182,10 +190,13 @@ class AzimuthTransform(Stage):
         self.radar, self.window, self.oversampling = radar, window, int(oversampling)
 
     def forward(self, signal: Signal) -> Signal:
-        """Transform a signal with axes (pulse, range).
+        """Form the image of a signal with axes (pulse, range) by a transform over the pulses.
 
         Args:
             signal: Range-compressed pulses.
+
+        Returns:
+            Image with axes (azimuth, range); azimuth in metres, or in Hz without a rotation rate.
         """
         pulse, range_ = signal.axes
         image = azimuth_transform(signal.data, self.window, self.oversampling)

@@ -1,8 +1,8 @@
-"""Bulk + refocus omega-K as an invertible operator between raw lines and image.
+"""Omega-K without Stolt interpolation as an invertible operator between raw lines and image.
 
-Every filter of `omega_k` except the range reference has unit modulus. With an all-pass reference
-the operator is unitary: its inverse is its adjoint, the conjugate filters in reverse order.
-Corrections that model the scene use this.
+Every filter of `omega_k` has unit modulus, except the filter of range compression. Where that also
+has unit modulus (all-pass), the operator is unitary: its inverse is its adjoint, which applies the
+conjugate filters in reverse order. Methods that compute the echoes of a modelled image use it.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from torchsar.radar import StripmapRadar
 
 
 def all_pass(reference: Tensor) -> Tensor:
-    """Return the phase of a range reference spectrum with unit modulus.
+    """Scale a range reference spectrum to unit modulus and keep its phase.
 
     Args:
-        reference: Range reference spectrum, shape (range,), complex.
+        reference: Spectrum of the range compression filter, shape (range,), complex.
 
     Returns:
         Spectrum of unit modulus, same shape; 1 where the reference is zero.
@@ -29,11 +29,12 @@ def all_pass(reference: Tensor) -> Tensor:
 
 
 class InvertibleOmegaK:
-    """Bulk + refocus omega-K with stored filters and its adjoint, for one geometry per trial.
+    """Omega-K without Stolt interpolation and its adjoint, with stored filters, for one geometry.
 
-    The adjoint is the exact inverse where |reference| = 1 or `reference` is None. The Doppler-range
-    domain between the two halves is accessible, for models of the azimuth spectrum. Stores one
-    complex number per sample. Makes the approximation of `omega_k`.
+    It makes the same approximation as `omega_k`. The adjoint maps an image to raw lines, and is the
+    exact inverse where |reference| = 1 or `reference` is None. `to_doppler` and `from_doppler` give
+    access to the focused azimuth spectra, in the domain (Doppler, range). The filters take one
+    complex number per sample. The geometry may differ between trials.
 
     Args:
         radar: Radar of the recording.
@@ -41,13 +42,15 @@ class InvertibleOmegaK:
         doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,).
         velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
             radar.
-        frame_hz: Frame Doppler of the image in Hz; None for the nominal pointing, else the
-            centroid.
-        reference: Range reference spectrum, shape (range,); None for range-compressed data.
+        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates;
+            None for the nominal pointing of the radar, or the centroid where it has none.
+        reference: Spectrum of the range compression filter, shape (range,); None for
+            range-compressed data.
 
     Raises:
-        ValueError: If a value per trial has another shape than the trials, the velocity is not
-            positive, or a Doppler exceeds 2 velocity / wavelength.
+        ValueError: If the Doppler or the velocity is neither a number nor a tensor of the leading
+            dims of the data, the velocity is not positive, or a Doppler exceeds 2 velocity /
+            wavelength.
     """
 
     def __init__(
@@ -83,7 +86,9 @@ class InvertibleOmegaK:
         return torch.fft.ifft(torch.fft.fft2(lines) * self.bulk) * self._residual()
 
     def from_doppler(self, spectra: Tensor) -> Tensor:
-        """Apply the adjoint of `to_doppler`, with an all-pass reference its inverse.
+        """Transform focused azimuth spectra into raw lines by the adjoint of `to_doppler`.
+
+        The adjoint is the inverse where the range reference has unit modulus or is None.
 
         Args:
             spectra: Azimuth spectra, shape (..., doppler, range), complex.
@@ -105,7 +110,9 @@ class InvertibleOmegaK:
         return torch.fft.ifft(self.to_doppler(lines), dim=-2)
 
     def defocus(self, image: Tensor) -> Tensor:
-        """Apply the adjoint of `focus`, with an all-pass reference its inverse.
+        """Transform an image into raw lines by the adjoint of `focus`.
+
+        The adjoint is the inverse where the range reference has unit modulus or is None.
 
         Args:
             image: Image, shape (..., azimuth, range), complex.
@@ -125,9 +132,9 @@ def defocus_omega_k(
     frame_hz: Tensor | float | None = None,
     reference: Tensor | None = None,
 ) -> Tensor:
-    """Compute the raw lines of an image: the adjoint of `omega_k`.
+    """Compute the raw lines of an image by the adjoint of `omega_k`.
 
-    Exact inverse for an all-pass reference or None.
+    It is the exact inverse where `reference` has unit modulus or is None.
 
     Args:
         image: Image, shape (..., azimuth, range), complex.
@@ -135,15 +142,18 @@ def defocus_omega_k(
         doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,).
         velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
             radar.
-        frame_hz: Frame Doppler of the image in Hz; None for the nominal pointing, else the
-            centroid.
-        reference: Range reference spectrum, shape (range,); None for range-compressed data.
+        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates;
+            None for the nominal pointing of the radar, or the centroid where it has none.
+        reference: Spectrum of the range compression filter, shape (range,); None for
+            range-compressed data.
 
     Returns:
         Raw lines, same shape.
 
     Raises:
-        ValueError: As in `InvertibleOmegaK`.
+        ValueError: If the Doppler or the velocity is neither a number nor a tensor of the leading
+            dims of the image, the velocity is not positive, or a Doppler exceeds 2 velocity /
+            wavelength.
     """
     operator = InvertibleOmegaK(
         radar, image, doppler_hz=doppler_hz, velocity_m_s=velocity_m_s, frame_hz=frame_hz, reference=reference

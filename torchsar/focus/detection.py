@@ -39,8 +39,8 @@ def multilook(image: Tensor, looks: tuple[int, int]) -> Tensor:
     azimuth, range_ = looks
     if not (1 <= azimuth <= image.shape[-2] and 1 <= range_ <= image.shape[-1]):
         raise ValueError(
-            f"looks of {looks} (azimuth, range) do not fit an image of {tuple(image.shape[-2:])}; "
-            "choose 1 up to its size"
+            f"looks (azimuth, range) must be at least 1 and at most the {tuple(image.shape[-2:])} samples of the "
+            f"image, got {looks}"
         )
     x = power(image)
     return avg_pool2d(x.reshape(-1, 1, *x.shape[-2:]), looks).reshape(
@@ -49,10 +49,10 @@ def multilook(image: Tensor, looks: tuple[int, int]) -> Tensor:
 
 
 def amplitude(image: Tensor, looks: tuple[int, int] = (1, 1)) -> Tensor:
-    """Compute the square root of the mean power over looks.
+    """Compute the amplitude of an image: the square root of the mean power of blocks of samples.
 
-    Scaled by the peak of each trial during the computation, so that no level overflows or
-    underflows.
+    Complex images are divided by their peak before squaring and multiplied by it afterwards, so
+    that very large or small values neither overflow nor underflow.
 
     Args:
         image: Image, shape (..., azimuth, range), complex, or real power.
@@ -88,15 +88,15 @@ def to_db(power_: Tensor, floor_db: float = -120.0, reference: Tensor | None = N
 
 
 def quicklook_looks(shape: tuple[int, ...], step_m: tuple[float, float], size: int) -> tuple[int, int]:
-    """Choose looks for a picture of limited size with cells as square as whole numbers allow.
+    """Choose how many samples to average for a picture of limited size with nearly square cells.
 
     Args:
         shape: Shape of the image, ending in (azimuth, range).
-        step_m: Sample spacing in azimuth and range in metres.
-        size: Largest number of samples per side.
+        step_m: Sample spacing of the image in azimuth and range in metres.
+        size: Largest number of samples per side of the picture.
 
     Returns:
-        Looks in azimuth and range.
+        Samples to average in azimuth and in range, the looks of `multilook`.
     """
     azimuth, range_ = shape[-2:]
     side = max(azimuth * step_m[0], range_ * step_m[1]) / size
@@ -113,7 +113,7 @@ class Detect(Stage):
     """Stage that computes the amplitude of a focused image, see `amplitude`.
 
     Args:
-        looks: Samples of a block in azimuth and range.
+        looks: Samples of a block in azimuth and range, over which the power is averaged.
     """
 
     works_on = ("azimuth", "range")
@@ -123,10 +123,13 @@ class Detect(Stage):
         self.looks = looks
 
     def forward(self, signal: Signal) -> Signal:
-        """Detect an image with axes (azimuth, range); the axes are those of the blocks.
+        """Compute the amplitude of an image with axes (azimuth, range).
 
         Args:
             signal: Focused image.
+
+        Returns:
+            Amplitude, real; the axes have one sample in the middle of each block.
 
         Raises:
             ValueError: If a block exceeds the image.
@@ -140,7 +143,7 @@ class QuickLook(Stage):
     """Stage that makes an amplitude picture of limited size with cells nearly square in metres.
 
     Args:
-        size: Largest number of samples per side.
+        size: Largest number of samples per side of the picture.
 
     Raises:
         ValueError: If `size` is below 1.
@@ -151,14 +154,17 @@ class QuickLook(Stage):
     def __init__(self, size: int = 1024) -> None:
         super().__init__()
         if size < 1:
-            raise ValueError(f"a quick-look needs a size of at least one sample, got {size}")
+            raise ValueError(f"size of a QuickLook must be at least 1 sample per side, got {size}")
         self.size = size
 
     def forward(self, signal: Signal) -> Signal:
-        """Make the picture of an image with axes (azimuth, range).
+        """Reduce an image with axes (azimuth, range) to an amplitude picture of limited size.
 
         Args:
             signal: Focused image.
+
+        Returns:
+            Amplitude, real, with the mean power of each block of samples.
         """
         azimuth, range_ = signal.axes
         return Detect(quicklook_looks(signal.data.shape, (azimuth.step, range_.step), self.size))(signal)

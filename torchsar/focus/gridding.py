@@ -1,11 +1,12 @@
-"""Non-uniform FFT along pulses with points that all range cells share.
+"""Non-uniform FFT along pulses, with the same points for all range cells.
 
-Range remains contiguous in memory, and only short tables depend on the points. Spreading,
-interpolation and the derivative of either in the tap weights are the three partial derivatives of
-one trilinear form, sum over m, tap and column of
-weights[m, tap] * values[m, column] * grid[first[m] + tap, column]. They are therefore each other's
-gradients to any order. Each is a bag of weighted rows (`embedding_bag`), which on a CPU core takes
-a tenth of the time of adding complex rows by index.
+A point is the frequency at which a pulse is evaluated. Spreading pulses onto a uniform grid,
+interpolating the grid at the points, and the derivative of both in the kernel weights are the three
+partial derivatives of one sum over point m, tap and column,
+weights[m, tap] * values[m, column] * grid[first[m] + tap, column]. Each operation is therefore the
+gradient of the others, to any order. Each is computed as a sum of weighted rows (`embedding_bag`),
+which on a CPU core takes a tenth of the time of adding complex rows by index. Range remains
+contiguous in memory.
 
 Reference:
     Fessler and Sutton 2003 (gridding); Barnett et al. 2019 (kernel, error against width and
@@ -47,7 +48,9 @@ def spread_rows(weights: Tensor, values: Tensor, first: Tensor, length: int) -> 
 
 
 def interpolate_rows(weights: Tensor, grid: Tensor, first: Tensor) -> Tensor:
-    """Apply the adjoint of `spread_rows` in the values: sum weights[m, tap] * grid[first[m] + tap].
+    """Interpolate grid rows at points: sum weights[m, tap] * grid[first[m] + tap] over the taps.
+
+    It is the adjoint of `spread_rows` as a map of its values.
 
     Args:
         weights: Tap weights, shape (b, m, tap), real.
@@ -61,7 +64,9 @@ def interpolate_rows(weights: Tensor, grid: Tensor, first: Tensor) -> Tensor:
 
 
 def correlate_rows(values: Tensor, grid: Tensor, first: Tensor, taps: int) -> Tensor:
-    """Apply the adjoint of `spread_rows` in the weights: sum values[m] * grid[first[m] + tap].
+    """Correlate values with grid rows: sum values[m] * grid[first[m] + tap] over the columns.
+
+    It is the adjoint of `spread_rows` as a map of its weights.
 
     Args:
         values: Rows of values, shape (b, m, column), real.
@@ -70,7 +75,7 @@ def correlate_rows(values: Tensor, grid: Tensor, first: Tensor, taps: int) -> Te
         taps: Number of taps.
 
     Returns:
-        Weights, shape (b, m, tap).
+        Sums for each point and tap, shape (b, m, tap).
     """
     return _Trilinear.apply("weights", taps, first, values, grid)
 
@@ -196,9 +201,10 @@ class PulsePoints:
 
 
 class PulseNufft:
-    """Sums of pulses at non-uniform points into uniform lines, and the adjoint.
+    """Non-uniform FFT that sums pulses into uniform image lines (type 1), and its adjoint (type 2).
 
-    Built for one dtype and device; the points are arguments of each transform.
+    Pulse m is summed with the phase 2 pi p[m] per line, where p[m] is its point. An object is built
+    for one dtype and device; the points are arguments of each transform.
 
     Args:
         lines: Number of lines; line `lines // 2` is frequency zero.
@@ -226,19 +232,22 @@ class PulseNufft:
         self._factor = torch.polar(scale / kernel.spectrum(line / self.length), -2 * math.pi * late * line).to(dtype)
 
     def points(self, cycles_per_line: Tensor) -> PulsePoints:
-        """Prepare points; differentiable.
+        """Compute grid rows and kernel weights of the points of pulses; differentiable.
 
         A trial with points that are not finite gives NaN and leaves the other trials unchanged.
 
         Args:
-            cycles_per_line: Points in cycles per line, shape (..., m), float64, any real numbers
-                (periodic in 1).
+            cycles_per_line: Phase step of each pulse from line to line in cycles, shape (..., m),
+                float64, any real numbers (periodic in 1).
+
+        Returns:
+            Points for `type1` and `type2`.
 
         Raises:
             TypeError: If the points are not float64.
         """
         if cycles_per_line.dtype != torch.float64:
-            raise TypeError(f"points of a non-uniform FFT must be float64 cycles, got {cycles_per_line.dtype}")
+            raise TypeError(f"points of a non-uniform FFT must be float64 cycles per line, got {cycles_per_line.dtype}")
         whole = torch.floor(cycles_per_line.detach())
         position = (cycles_per_line - whole) * self.length
         first = torch.nan_to_num(torch.round(position.detach()), 0.0, 0.0, 0.0)
@@ -255,9 +264,9 @@ class PulseNufft:
             return self.length + self.kernel.taps + 1
 
     def type1(self, y: Tensor, points: PulsePoints) -> Tensor:
-        """Compute sum_m y[m] exp(+2j pi p[m] (q - lines // 2)) for q = 0..lines - 1.
+        """Sum pulses into image lines q: sum_m y[m] exp(+2j pi p[m] (q - lines // 2)).
 
-        Differentiable in `y` and in the points.
+        The lines are q = 0..lines - 1. Differentiable in `y` and in the points.
 
         Args:
             y: Pulses, shape (..., m, range), complex.
@@ -275,7 +284,9 @@ class PulseNufft:
         return image.view(*trials, *image.shape[-2:])
 
     def type2(self, x: Tensor, points: PulsePoints) -> Tensor:
-        """Compute sum_q x[q] exp(-2j pi p[m] (q - lines // 2)), the adjoint of `type1`.
+        """Transform image lines into pulses m: sum_q x[q] exp(-2j pi p[m] (q - lines // 2)).
+
+        It is the adjoint of `type1`. Differentiable in `x` and in the points.
 
         Args:
             x: Lines, shape (..., lines, range), complex.

@@ -1,8 +1,8 @@
 """Azimuth lines of an image formed by the matched Fourier transform, in Doppler or in metres.
 
-Notation of the Reference: Om is the rotation rate at the first pulse, phi(t) the warp of
-`core.warp.warp`, T = pulses / PRF the aperture time. Image lines are counted in cells of 1 / T,
-the Doppler at the mean rotation rate Om phi(T) / T.
+The rotation angle of the target is Om phi(t), with the rotation rate Om at the first pulse and the
+warp phi(t) of `core.warp.warp`. T = pulses / PRF is the aperture time. The step between image lines
+is given in Doppler cells of 1 / T, where Doppler is that at the mean rotation rate Om phi(T) / T.
 
 Reference:
     Remote Sens. 2025, 17, 3447, Eqs. (9)-(10).
@@ -24,10 +24,11 @@ from torchsar.focus.warped_sums import whole_warp
 def lines_for(cells: float, oversampling: float = 2.0) -> int:
     """Return the number of image lines that cover the Doppler band of a target.
 
-    Use it where the target occupies less than the pulse rate.
+    Use it where the Doppler band of the target is narrower than the pulse rate.
 
     Args:
-        cells: Half width of the band in Doppler cells 1 / T; the lines cover -cells..cells.
+        cells: Half width of the band in Doppler cells, 1 / aperture time; the lines cover
+            -cells..cells.
         oversampling: Lines per Doppler cell.
 
     Returns:
@@ -38,21 +39,23 @@ def lines_for(cells: float, oversampling: float = 2.0) -> int:
     """
     if not (math.isfinite(cells) and cells > 0 and oversampling > 0):
         raise ValueError(
-            f"lines need a positive number of cells and a positive oversampling, got {cells} and {oversampling}"
+            f"image lines need a positive number of cells and a positive oversampling, got cells={cells} and "
+            f"oversampling={oversampling}"
         )
     return 2 * smooth_length(math.ceil(cells * oversampling) + 1)
 
 
 def mean_rate(omega_rad_s: Tensor | float, k: Tensor, duration_s: float) -> Tensor:
-    """Return the mean rotation rate over the aperture, Om phi(T) / T.
+    """Return the mean rotation rate over the aperture: the whole rotation angle over its duration.
 
-    This rate scales the Doppler axis of `matched_fourier`, and of an image formed without the warp,
-    to cross range.
+    This rate converts the Doppler axis of `matched_fourier`, and of an image formed without the
+    warp, to cross range.
 
     Args:
         omega_rad_s: Rotation rate at the first pulse in rad/s, shape (...,) or a number.
-        k: Coefficients of the warp, shape (..., order - 1).
-        duration_s: Aperture time T in seconds.
+        k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s, 1/s^2,
+            ..., shape (..., order - 1).
+        duration_s: Aperture time in seconds.
 
     Returns:
         Mean rotation rate in rad/s, shape (...,), float64.
@@ -64,15 +67,17 @@ def mean_rate(omega_rad_s: Tensor | float, k: Tensor, duration_s: float) -> Tens
 def cross_range_of(
     doppler_hz: Tensor | float, omega_rad_s: Tensor | float, k: Tensor, wavelength_m: float, duration_s: float
 ) -> Tensor:
-    """Convert Doppler frequencies of the image axis to cross range, wavelength f / (2 mean rate).
+    """Convert Doppler frequencies f of the image axis to cross range, wavelength f / (2 mean rate).
 
-    The relative error of the cross range is minus that of the rate. The data do not show the sign
-    of the rotation rate: the image may be mirrored in cross range.
+    The mean rate is the rotation rate averaged over the aperture. If it is 1 % too large, the cross
+    range is 1 % too small. The data do not show the sign of the rotation rate, so that the image
+    may be mirrored in cross range.
 
     Args:
         doppler_hz: Doppler frequencies in Hz, shape (f,) or a number.
         omega_rad_s: Rotation rate at the first pulse in rad/s, shape (...,) or a number.
-        k: Coefficients of the warp, shape (..., order - 1).
+        k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s, 1/s^2,
+            ..., shape (..., order - 1).
         wavelength_m: Carrier wavelength in metres.
         duration_s: Aperture time in seconds.
 
@@ -88,10 +93,10 @@ def cross_range_of(
 class DopplerLines:
     """Image lines at equal steps of Doppler.
 
-    Line `number // 2` is Doppler zero. Every trial has the same Doppler axis.
+    Doppler zero is line n // 2 of n lines. Every trial has the same Doppler axis.
 
     Args:
-        oversampling: Lines per Doppler cell 1 / T.
+        oversampling: Lines per Doppler cell, which is 1 / aperture time.
         lines: Number of lines about Doppler zero; None for the whole pulse rate,
             round(oversampling * pulses).
 
@@ -107,11 +112,12 @@ class DopplerLines:
             self.lines is not None and self.lines < 1
         ):
             raise ValueError(
-                f"oversampling must be positive and lines at least 1, got {self.oversampling} and {self.lines}"
+                f"oversampling must be positive and lines at least 1 or None, got oversampling={self.oversampling} "
+                f"and lines={self.lines}"
             )
 
     def number(self, n_pulse: int) -> int:
-        """Return the number of image lines.
+        """Return the number of image lines for a number of pulses.
 
         Args:
             n_pulse: Number of pulses.
@@ -119,10 +125,11 @@ class DopplerLines:
         return self.lines or round(self.oversampling * n_pulse)
 
     def cells_per_line(self, k: Tensor, duration_s: float) -> Tensor:
-        """Return the step between lines in Doppler cells 1 / T, a float64 scalar tensor.
+        """Return the step between image lines in Doppler cells of 1 / T, a float64 scalar tensor.
 
         Args:
-            k: Coefficients of the warp, shape (..., order - 1), float64.
+            k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s,
+                1/s^2, ..., shape (..., order - 1), float64.
             duration_s: Aperture time T in seconds.
         """
         return torch.as_tensor(1 / self.oversampling, dtype=torch.float64, device=k.device)
@@ -152,8 +159,8 @@ class CrossRangeLines:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.step_m) and self.step_m > 0 and self.count >= 1):
             raise ValueError(
-                "lines in metres need a positive step and at least one line, got a step of "
-                f"{self.step_m} m and {self.count} lines"
+                "image lines in metres need a positive step and at least one line, got "
+                f"step_m={self.step_m} and count={self.count}"
             )
 
     def number(self, n_pulse: int) -> int:
@@ -165,10 +172,13 @@ class CrossRangeLines:
         return self.count
 
     def cells_per_line(self, k: Tensor, duration_s: float) -> Tensor:
-        """Return the step between lines in Doppler cells 1 / T, shape (...,), float64.
+        """Return the step between image lines in Doppler cells of 1 / T, shape (...,), float64.
+
+        The step in metres is fixed, so that it depends on the mean rotation rate of each trial.
 
         Args:
-            k: Coefficients of the warp, shape (..., order - 1), float64.
+            k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s,
+                1/s^2, ..., shape (..., order - 1), float64.
             duration_s: Aperture time T in seconds.
         """
         return 2 * self.step_m / self.wavelength_m * duration_s * mean_rate(self.omega_rad_s, k, duration_s)

@@ -1,4 +1,4 @@
-"""Requirements of a rotating target on its processor: the phase that each simplification neglects.
+"""Phase that each simplification of inverse SAR processing neglects for a rotating target.
 
 All values follow from the radar and from bounds of the motion, before any simulation.
 
@@ -39,12 +39,13 @@ def inverse_requirements(
     rotation_rad_s: float | None = None,
     tolerance_rad: float = math.pi / 4,
 ) -> tuple[Requirement, ...]:
-    """List the phase and the range cells that each simplification neglects at worst.
+    """List the largest phase and range shift that each simplification neglects, with its tolerance.
 
-    The phase of a shift is that at the ends of the band, pi per range cell. Shifts that change over
-    the aperture may have 0.05 cell rms, migration 0.4 cell in all (up to 1 cell it costs up to 0.1
-    nat of entropy), phases between pulses pi, and all other rows `tolerance_rad`. Rows about motion
-    within a pulse need `radar.pulse_s` and are absent without it.
+    A range shift is also expressed as its phase at the ends of the band, pi per range cell. The
+    tolerances are 0.05 cell rms for shifts that change over the aperture, 0.4 cell for the whole
+    migration by rotation (between 0.4 and 1 cell it raises the entropy of the image by up to
+    0.1 nat), pi for phase steps between neighbouring samples, and `tolerance_rad` for all other
+    phases. Motion within a pulse is listed only where `radar.pulse_s` is set.
 
     Args:
         radar: Radar of the recording.
@@ -52,9 +53,10 @@ def inverse_requirements(
         n_range: Number of range samples.
         cross_range_extent_m: Extent of the target in cross range, in metres.
         range_extent_m: Extent of the target in range, in metres.
-        velocity_m_s: Radial velocity in m/s that neither the tracking window nor the compression
-            removes. The whole velocity gives the error of removing it nowhere.
-        acceleration_m_s2: Radial acceleration in m/s^2, likewise.
+        velocity_m_s: Radial velocity in m/s that remains after the range window has followed the
+            target and compression has removed the known part. The full velocity gives the error
+            without any such removal.
+        acceleration_m_s2: Radial acceleration in m/s^2 that remains in the same sense.
         vibrations: Amplitude in metres and frequency in Hz of each vibration; their effects add up.
         rotation_rad_s: Rotation rate in rad/s; None for that of the radar.
         tolerance_rad: Tolerated phase in rad.
@@ -63,8 +65,8 @@ def inverse_requirements(
         One row per simplification.
 
     Raises:
-        ValueError: If the rotation rate is not known, or an extent or motion is not a valid finite
-            number.
+        ValueError: If the rotation rate is not known, or an extent or motion is not finite, or an
+            extent or number of samples is not positive.
 
     Reference:
         Ruan et al. 2013, for the effects that it names.
@@ -72,8 +74,8 @@ def inverse_requirements(
     omega = radar.rotation_rad_s if rotation_rad_s is None else rotation_rad_s
     if omega is None:
         raise ValueError(
-            "neither radar.rotation_rad_s nor rotation_rad_s is set; the requirements of a "
-            "rotating target depend on its rotation"
+            "rotation_rad_s is not given and radar.rotation_rad_s is not set; give one of them, since "
+            "the requirements of a rotating target depend on its rotation"
         )
     _check_finite(
         {
@@ -104,7 +106,7 @@ def inverse_requirements(
 
 @dataclass(frozen=True)
 class TurningTarget:
-    """A rotating target with the radial motion that remains; all values are 0 or more.
+    """Rotating target with the radial motion that compensation leaves; all values are 0 or more.
 
     Args:
         radar: Radar of the recording.
@@ -127,10 +129,13 @@ class TurningTarget:
     vibrations: tuple[tuple[float, float], ...]
 
     def over_aperture(self, tolerance_rad: float) -> tuple[Requirement, ...]:
-        """List migration by rotation and by motion, and the nonlinear phase of rotation.
+        """List the errors over the aperture: range migration and the nonlinear phase of rotation.
 
         Args:
-            tolerance_rad: Tolerated phase in rad.
+            tolerance_rad: Tolerated nonlinear phase in rad.
+
+        Returns:
+            One row per simplification.
         """
         angle, cell = self.rate_rad_s * self.aperture_s, self.radar.range_step_m
         cells = self.cross_m * angle / cell
@@ -168,10 +173,15 @@ class TurningTarget:
         )
 
     def between_samples(self, n_range: int) -> tuple[Requirement, ...]:
-        """List phases between neighbouring pulses or range frequencies, which alias beyond pi.
+        """List the phase steps between neighbouring pulses or range frequencies.
+
+        Steps beyond pi alias.
 
         Args:
             n_range: Number of range samples.
+
+        Returns:
+            One row per simplification.
         """
         per_m, period_s = 4 * math.pi / self.radar.wavelength_m, 1 / self.radar.prf_hz
         swing = sum(2 * abs(a) * math.sin(math.pi * min(f * period_s, 0.5)) for a, f in self.vibrations)
@@ -209,6 +219,9 @@ class TurningTarget:
         Args:
             pulse_s: Pulse length in seconds.
             tolerance_rad: Tolerated phase in rad.
+
+        Returns:
+            One row per simplification.
         """
         chirp, half2 = self.radar.chirp_rate_hz_s, pulse_s**2 / 4
         coupling = self.radar.carrier_hz / chirp / self.radar.range_step_m  # cells per m/s

@@ -1,6 +1,8 @@
-"""Limits of the estimators of a triangular ladar, and requirements of its scene on the model.
+"""Limits of velocity estimators and errors of simplified echo models for a triangular ladar.
 
-Both follow from the radar and from bounds of the motion, before any simulation.
+`ladar_limits` lists where the estimators fail, `ladar_requirements` the phase that each
+simplification of the model neglects. Both follow from the radar and from bounds of the motion,
+before any simulation.
 """
 
 from __future__ import annotations
@@ -24,17 +26,17 @@ Verdict = Literal["ok", "warn", "refuse"]
 
 @dataclass(frozen=True)
 class Limit:
-    """One limit of a method, with the value that the scene has.
+    """One limit of a method, with the value of the limited quantity in a given scene.
 
     Args:
         name: Name of the quantity.
-        value: Value of the scene, in `unit`.
+        value: Value of the quantity in the scene, in `unit`.
         limit: Limit of the method, in `unit`.
         unit: Unit of both, empty for pure numbers.
-        beyond: Verdict where the limit is exceeded.
-        consequence: Consequence of exceeding the limit.
-        remedy: Remedy.
-        at_least: The value must be at least the limit; otherwise it must be below.
+        beyond: Verdict where the limit is not met, "warn" or "refuse".
+        consequence: Consequence where the limit is not met.
+        remedy: Remedy where the limit is not met.
+        at_least: True if the value must be at least the limit, False if it must be below.
     """
 
     name: str
@@ -58,7 +60,7 @@ class Limit:
 
     @property
     def sentence(self) -> str:
-        """One sentence with value and limit, and where exceeded with consequence and remedy."""
+        """One sentence with value and limit, and if it is not met, consequence and remedy."""
         relation = "at least" if self.at_least else "below"
         figures = (
             f"{self.name} is {f'{self.value:.4g} {self.unit}'.strip()}, and must be {relation} "
@@ -79,22 +81,23 @@ def ladar_limits(
     spacing_m: float | None = None,
     lit_share: float = 1.0,
 ) -> tuple[Limit, ...]:
-    """List the limits of the estimators for motion within given bounds.
+    """List the limits of the velocity estimators of a triangular ladar for motion within bounds.
 
-    Rows that need a figure not given (`snr_db`, `spacing_m`) are absent. The velocity bias by jerk
-    is jerk x period^2 / 27; a vibration of 10 um at 5 kHz gives 2 mm/s rms.
+    Limits that need `snr_db` or `spacing_m` are left out where these are None. One row compares the
+    velocity bias by jerk, which is jerk x period^2 / 27: a vibration of 10 um at 5 kHz gives 2 mm/s
+    rms.
 
     Args:
         radar: Radar of the recording.
-        n_period: Number of periods.
+        n_period: Number of recorded periods.
         ranges_m: Least and largest range of scatterers relative to the reference, in metres.
         speed_m_s: Largest absolute radial velocity in m/s.
         acceleration_m_s2: Largest absolute radial acceleration in m/s^2.
         jerk_m_s3: Largest absolute radial jerk in m/s^3.
         snr_db: Signal-to-noise ratio of a sample before compression in dB.
         azimuth_extent_m: Extent of the scatterers in azimuth, in metres.
-        spacing_m: Least distance in range of scatterers of one gate, in metres.
-        lit_share: Share of the periods in which a reference scatterer is illuminated.
+        spacing_m: Least distance in range between scatterers of the same range gate, in metres.
+        lit_share: Share of the periods, 0 to 1, in which a reference scatterer is illuminated.
 
     Returns:
         One row per limit.
@@ -118,7 +121,7 @@ def ladar_limits(
         }
     )
     if near > far:
-        raise ValueError(f"ranges_m must be (least, largest) relative range, got {ranges_m}")
+        raise ValueError(f"ranges_m must be (least, largest) relative range in metres, in this order, got {ranges_m}")
     rows = (
         *_band_limits(radar, near, far, speed_m_s),
         *_motion_limits(radar, acceleration_m_s2, jerk_m_s3, snr_db),
@@ -302,18 +305,20 @@ def ladar_requirements(
     displacement_m: float | None = None,
     tolerance_rad: float = PHASE_RAD,
 ) -> tuple[Requirement, ...]:
-    """List the phase that each simplification neglects at worst.
+    """List the largest phase that each simplification neglects for a triangular ladar.
 
-    The simplifications are those of the echo and of the compensation. Flight time and carrier are
-    assessed by their effect over the whole record.
+    The simplifications are those of the echo model, such as one range per sweep, and of the motion
+    compensation. Ignoring the flight time, and compensating the whole band with the phase of the
+    carrier, are assessed over the whole record.
 
     Args:
         radar: Radar of the recording.
-        n_period: Number of periods.
+        n_period: Number of recorded periods.
         ranges_m: Least and largest range of scatterers relative to the reference, in metres.
         speed_m_s: Largest absolute radial velocity in m/s.
         acceleration_m_s2: Largest absolute radial acceleration in m/s^2.
-        displacement_m: Change of range over the record in metres; None for speed times its length.
+        displacement_m: Change of range over the record in metres; None for speed times duration of
+            the record.
         tolerance_rad: Tolerated phase in rad.
 
     Returns:
@@ -401,8 +406,8 @@ def ladar_requirements(
 
 
 def _hyperbola_rad(radar: TriangularLadar, record_s: float) -> float:
-    """pi X^4 / (2 lambda R^3) at the ends of the aperture in the beam, or of the record where that
-    is shorter.
+    """Phase pi X^4 / (2 lambda R^3) at the azimuth X of the ends of the aperture in the beam, or of
+    the record where that is shorter.
     """
     reach = radar.speed_m_s * record_s / 2
     if radar.beam_rad is not None:

@@ -1,17 +1,19 @@
 """Matched Fourier transform: azimuth focusing of a target with non-uniform rotation.
 
-The transform is a Fourier transform over the warped time phi(t) = `core.warp.warp(t, k)`, with t =
-0 at the first pulse. Data (..., pulse, range) hold for each scatterer
+The rotation angle is Om phi(t), with the rotation rate Om at the first pulse (t = 0) and the warped
+time phi(t) of `core.warp.warp`. A scatterer at cross range x in range sample n contributes
 
-    exp(-j c4 x Om phi(t)) exp(+j (c4/2) (y_n + yc) Om^2 phi(t)^2),    c4 = 4 pi / wavelength.
+    exp(-j c4 x Om phi(t)) exp(+j (c4/2) (y_n + yc) Om^2 phi(t)^2),    c4 = 4 pi / wavelength,
 
-`range_phase` removes the second factor, `matched_fourier` focuses the first:
+where y_n + yc is its range from the rotation centre. `range_phase` removes the second factor,
+`matched_fourier` focuses the first by a Fourier transform over phi. From the pulses s(m, n) with
+weights w_m, line q of the image is
 
     I(q, n) = sum_m w_m s(m, n) exp(+2j pi c_q u_m) / sqrt(pulses),
 
-u = phi(t) / phi(T) in [0, 1), T = pulses / PRF, c_q = (q - lines // 2) / oversampling. The image
-axis is c / T, Doppler at the mean rotation rate; cross range is x = wavelength c / (2 Om phi(T)).
-The data show only Om^2: images may be mirrored in x.
+with u_m = phi(t_m) / phi(T) in [0, 1), T = pulses / PRF and c_q = (q - lines // 2) / oversampling.
+The image axis c_q / T is Doppler at the mean rotation rate; the cross range of line q is
+wavelength c_q / (2 Om phi(T)). The data show only Om^2, so that images may be mirrored in x.
 
 Reference:
     Remote Sens. 2025, 17, 3447, Eqs. (7)-(10), with the warp of `core.warp`; Greengard and Lee 2004
@@ -49,8 +51,9 @@ def range_phase(
 ) -> Tensor:
     """Remove the phase that the range of a scatterer adds during the rotation.
 
-    Multiplies by exp(-j (c4/2) (y_n + yc) Om^2 phi^2), c4 = 4 pi / wavelength; use it before
-    `matched_fourier`. Differentiable in all arguments except `range_m`.
+    Multiplies range sample n by exp(-2j pi (y_n + yc) (Om phi)^2 / wavelength), where Om phi(t) is
+    the rotation angle with the warp phi(t). Use it before `matched_fourier`. Differentiable in all
+    arguments except `range_m`.
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex.
@@ -59,7 +62,8 @@ def range_phase(
         wavelength_m: Carrier wavelength in metres.
         prf_hz: Pulse rate in Hz.
         omega_rad_s: Rotation rate Om at the first pulse in rad/s, a number or shape (...,).
-        k: Coefficients of the warp, shape (..., order - 1).
+        k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s, 1/s^2,
+            ..., shape (..., order - 1).
         yc_m: Range centre deviation yc in metres, a number or shape (...,); y_n + yc is the
             distance from the rotation centre.
 
@@ -88,21 +92,24 @@ def matched_fourier(
     transform: Transform = _GRIDDING,
     weight: str = "matched",
 ) -> Tensor:
-    """Form the image of pulses whose Doppler follows the warp.
+    """Form the image of a target with non-uniform rotation by a Fourier transform over its angle.
 
-    Differentiable twice in data, warp and rotation rate; `CompiledNufft` once. Remove the range
-    term with `range_phase` first where the target is deeper than the depth of focus.
+    The rotation angle follows the warp, up to a constant factor. Where the target is deeper in
+    range than the depth of focus, 2 (cross-range resolution)^2 / wavelength, first remove the phase
+    of the range with `range_phase`. Differentiable twice in data, warp and rotation rate, with
+    `CompiledNufft` once.
 
     Args:
         data: Range-compressed pulses, shape (..., pulse, range), complex.
-        warp_k: Coefficients of the warp, shape (..., order - 1), with an empty last dim for uniform
-            rotation. Leading dims broadcast with those of the data.
+        warp_k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s,
+            1/s^2, ..., shape (..., order - 1), with an empty last dim for uniform rotation. Leading
+            dims broadcast with those of the data.
         prf_hz: Pulse rate in Hz.
         lines: Image lines: `DopplerLines`, or `CrossRangeLines` for an axis in metres.
         transform: How the sum is formed: `Gridding`, `ExplicitSum`, `Resampling` or
             `CompiledNufft`.
-        weight: "matched" for equal weights, with the best signal-to-noise ratio; "warped" for
-            weights proportional to the rotation rate, as in the integral over the warp of Eq. (9).
+        weight: "matched" for equal weights of the pulses, with the best signal-to-noise ratio;
+            "warped" for weights proportional to the rotation rate, as in the integral of Eq. (9).
 
     Returns:
         Image, shape (..., line, range), of the dtype of the data. A scatterer with the amplitude a
@@ -129,11 +136,12 @@ def matched_fourier(
 class MatchedFourierOperator:
     """Linear map of `matched_fourier` for one warp per trial, with its exact adjoint.
 
-    `compensate.pulse_phase.Through` uses it as image formation. The points of the transform are
-    prepared once, at construction.
+    `compensate.pulse_phase.Through` uses it as image formation. The tables of the transform, which
+    depend on the warp only, are computed once, at construction.
 
     Args:
-        warp_k: Coefficients of the warp, shape (..., order - 1).
+        warp_k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s,
+            1/s^2, ..., shape (..., order - 1).
         n_pulse: Number of pulses of the data.
         prf_hz: Pulse rate in Hz.
         dtype: Complex type of the data.
@@ -167,7 +175,7 @@ class MatchedFourierOperator:
         self.transform: Sum = transform.build(PulsesToLines(k, n_pulse, prf_hz, u, step, self.lines, dtype))
 
     def image(self, pulses: Tensor) -> Tensor:
-        """Transform pulses into the image.
+        """Form the image of range-compressed pulses.
 
         Args:
             pulses: Pulses, shape (..., pulse, range), complex.
@@ -183,7 +191,7 @@ class MatchedFourierOperator:
         return self.transform.forward(pulses if self.weight is None else pulses * self.weight[..., None])
 
     def adjoint(self, image: Tensor) -> Tensor:
-        """Apply the adjoint to an image.
+        """Apply the adjoint of `image`, which maps an image to pulses.
 
         Args:
             image: Image, shape (..., line, range), complex.
@@ -204,33 +212,35 @@ class MatchedFourierOperator:
         """Raise where x is not of the dtype and size that the operator was built for."""
         if x.dtype != self.dtype:
             raise TypeError(
-                f"this matched Fourier transform was built for {self.dtype}, got {x.dtype}; build it "
+                f"this matched Fourier transform was built for {self.dtype}, got data of {x.dtype}; build it "
                 f"with dtype={x.dtype}"
             )
         if x.ndim < 2 or x.shape[-2] != n:
             raise ValueError(
-                f"a matched Fourier transform of {n} {what} got the shape {tuple(x.shape)}; its last "
-                f"dims are ({what}, range)"
+                f"data of this matched Fourier transform must have the last dims ({what}, range) with {n} {what}, "
+                f"got shape {tuple(x.shape)}"
             )
 
 
 def _check_weight(weight: str) -> None:
     """Raise ValueError for an unknown weighting of the pulses."""
     if weight not in ("matched", "warped"):
-        raise ValueError(f"weight {weight!r} is not known; choose 'matched' or 'warped'")
+        raise ValueError(f"weight {weight!r} of the pulses is not known; choose 'matched' or 'warped'")
 
 
 class RangePhase(Stage):
-    """Stage that removes the phase of the range during rotation, before `MatchedFourier`.
+    """Stage that removes the phase that the range of scatterers adds during the rotation.
 
-    Applies `range_phase` on the range axis of the signal. Connected values take precedence over
-    those given here.
+    Use it before `MatchedFourier`. It applies `range_phase` with the range axis of the signal.
+    Values that a chain connects take precedence over those given here.
 
     Args:
         radar: Radar of the recording.
         omega_rad_s: Rotation rate at the first pulse in rad/s; None for that of the radar.
-        warp_k: Coefficients of the warp, shape (..., order - 1); None for uniform rotation.
-        yc_m: Range centre deviation in metres; None for 0.
+        warp_k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s,
+            1/s^2, ..., shape (..., order - 1); None for uniform rotation.
+        yc_m: Range centre deviation in metres, added to the range axis to give the distance from
+            the rotation centre; None for 0.
 
     Raises:
         ValueError: On use, if no rotation rate is known or the rotation angle does not increase
@@ -261,13 +271,18 @@ class RangePhase(Stage):
         warp_k: Tensor | None = None,
         yc_m: Tensor | None = None,
     ) -> Signal:
-        """Correct a signal with axes (pulse, range).
+        """Remove the phase of the range from a signal with axes (pulse, range).
 
         Args:
             signal: Range-compressed pulses.
             omega_rad_s: Rotation rate at the first pulse in rad/s; None for that of the stage.
-            warp_k: Coefficients of the warp; None for those of the stage.
-            yc_m: Range centre deviation in metres; None for that of the stage.
+            warp_k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + ..., shape (..., order -
+                1); None for those of the stage.
+            yc_m: Range centre deviation in metres, added to the range axis to give the distance
+                from the rotation centre; None for that of the stage.
+
+        Returns:
+            Corrected signal on the same axes.
 
         Raises:
             ValueError: If no rotation rate is known or the rotation angle does not increase
@@ -277,8 +292,8 @@ class RangePhase(Stage):
         omega, yc = self.omega_rad_s if omega_rad_s is None else omega_rad_s, self.yc_m if yc_m is None else yc_m
         if omega is None:
             raise ValueError(
-                "range_phase needs a rotation rate: set radar.rotation_rad_s, give omega_rad_s, or "
-                "connect an estimate of it"
+                "RangePhase needs a rotation rate in rad/s, got none; set radar.rotation_rad_s, give omega_rad_s, "
+                "or connect an estimate of it"
             )
         k = _warp_of(signal, self.warp_k if warp_k is None else warp_k)
         return signal.with_data(
@@ -297,26 +312,27 @@ class RangePhase(Stage):
 class MatchedFourier(Stage):
     """Stage that forms the image (azimuth, range) of a target with non-uniform rotation.
 
-    Applies `matched_fourier`. The azimuth axis is Doppler at the mean rate in Hz, the same for all
-    trials, or cross range in metres where `cross_range_m` is given. Connected values of `warp_k`
-    and `omega_rad_s` take precedence over those given here.
+    It applies `matched_fourier`. The azimuth axis is Doppler in Hz at the mean rotation rate, the
+    same for all trials, or cross range in metres where `cross_range_m` is given. Values of `warp_k`
+    and `omega_rad_s` that a chain connects take precedence over those given here.
 
     Args:
         radar: Radar of the recording.
-        oversampling: Lines per Doppler cell.
-        lines: Number of lines about Doppler zero; None for the whole pulse rate.
+        oversampling: Image lines per Doppler cell, which is 1 / aperture time.
+        lines: Number of image lines about Doppler zero; None for the whole pulse rate.
         weight: "matched" or "warped", see `matched_fourier`.
         transform: How the sum over pulses is formed, see `matched_fourier`.
         cross_range_m: Step in metres and number of lines of an azimuth axis in metres; replaces
             `oversampling` and `lines` and needs a rotation rate.
-        warp_k: Coefficients of the warp, shape (..., order - 1); None for uniform rotation.
+        warp_k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s,
+            1/s^2, ..., shape (..., order - 1); None for uniform rotation.
         omega_rad_s: Rotation rate at the first pulse in rad/s; None for that of the radar.
 
     Raises:
         ValueError: If `oversampling` is not positive, `lines` is below 1, or `weight` is not known.
-            On use: if the rotation angle does not increase throughout the aperture, if lines in
-            metres lack a rotation rate, or if their Doppler exceeds the whole pulse rate. Warns
-            from 0.95 of half the pulse rate on.
+            On use: if the rotation angle does not increase throughout the aperture, if
+            `cross_range_m` is given without a rotation rate, or if the outermost line in metres has
+            a Doppler above the pulse rate. From 0.95 of half the pulse rate on, the stage warns.
     """
 
     omega_rad_s: Tensor | None
@@ -347,11 +363,16 @@ class MatchedFourier(Stage):
 
         Args:
             signal: Recording, axes (pulse, range).
-            warp_k: Coefficients of the warp; None for those of the stage.
+            warp_k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + ..., shape (..., order -
+                1); None for those of the stage.
             omega_rad_s: Rotation rate at the first pulse in rad/s; None for that of the stage.
 
+        Returns:
+            Map from pulses to the image, with its adjoint.
+
         Raises:
-            ValueError: As listed for the stage.
+            ValueError: If the rotation angle does not increase throughout the aperture, or lines in
+                metres lack a rotation rate or have a Doppler above the pulse rate.
         """
         pulse = signal.axis("pulse")
         k = _warp_of(signal, self.warp_k if warp_k is None else warp_k)
@@ -371,11 +392,16 @@ class MatchedFourier(Stage):
 
         Args:
             signal: Range-compressed pulses.
-            warp_k: Coefficients of the warp; None for those of the stage.
+            warp_k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + ..., shape (..., order -
+                1); None for those of the stage.
             omega_rad_s: Rotation rate at the first pulse in rad/s; None for that of the stage.
 
+        Returns:
+            Image with axes (azimuth, range).
+
         Raises:
-            ValueError: As listed for the stage.
+            ValueError: If the rotation angle does not increase throughout the aperture, or lines in
+                metres lack a rotation rate or have a Doppler above the pulse rate.
         """
         operator = self.operator(signal, warp_k, omega_rad_s)
         return Signal(
@@ -388,8 +414,8 @@ class MatchedFourier(Stage):
             return DopplerLines(self.oversampling, self.lines)
         if omega_rad_s is None:
             raise ValueError(
-                "lines in metres need omega_rad_s, got none; set radar.rotation_rad_s, give omega_rad_s, connect an "
-                "estimate of it, or leave out cross_range_m for a Doppler axis"
+                "image lines in metres need omega_rad_s, got None; set radar.rotation_rad_s, give omega_rad_s, "
+                "connect an estimate of it, or leave out cross_range_m for a Doppler axis"
             )
         lines = CrossRangeLines(*self.cross_range_m, omega_rad_s, self.radar.wavelength_m)
         _check_pulse_rate(lines, k, pulse)
@@ -422,8 +448,8 @@ def _warp_of(signal: Signal, k: Tensor | None) -> Tensor:
         return torch.zeros(0, dtype=torch.float64, device=signal.data.device)
     if k.ndim == 0 or not _broadcasts(k.shape[:-1], signal.trials):
         raise ValueError(
-            f"warp_k is (..., order - 1) with the trials {tuple(signal.trials)} of the data in "
-            f"front, or (order - 1,) for all of them, got the shape {tuple(k.shape)}"
+            f"warp_k must have the shape (order - 1,), or (..., order - 1) with leading dims that broadcast with the "
+            f"trials {tuple(signal.trials)} of the data, got the shape {tuple(k.shape)}"
         )
     k, pulse = k.to(device=signal.data.device, dtype=torch.float64), signal.axis("pulse")
     least = least_rate(k.detach(), pulse.n * pulse.step)
@@ -466,6 +492,6 @@ def _check_pulse_rate(lines: CrossRangeLines, k: Tensor, pulse: Axis) -> None:
         "the pulse rate"
     )
     if worst > 2:
-        raise ValueError(f"{reach}: every scatterer would show more than once; choose fewer lines")
+        raise ValueError(f"{reach}, so that every scatterer would show more than once; choose fewer lines")
     if worst > 0.95:
         warnings.warn(f"{reach}: scatterers there are aliased; choose fewer lines or a higher pulse rate", stacklevel=5)

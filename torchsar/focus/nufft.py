@@ -29,8 +29,8 @@ OVERSAMPLING = 2
 class Kernel:
     """Kaiser-Bessel interpolation kernel.
 
-    `Kernel.of(eps)` chooses the width. A grid of 1.25 needs about 1.6 times the taps of a grid of
-    2, and an FFT of 5/8 the length.
+    `Kernel.of(eps)` chooses the width for a relative error. For equal error, an oversampling of
+    1.25 needs about 1.6 times as many taps as one of 2, but an FFT of 5/8 the length.
 
     Args:
         taps: Width in grid points, 2 to 16.
@@ -45,10 +45,10 @@ class Kernel:
 
     def __post_init__(self) -> None:
         if not (isinstance(self.taps, int) and 2 <= self.taps <= 16):
-            raise ValueError(f"a gridding kernel has 2 to 16 taps, got {self.taps}")
+            raise ValueError(f"taps of a gridding kernel must be a whole number, 2 to 16 taps, got {self.taps}")
         if not 1.25 <= self.oversampling <= 2:
             raise ValueError(
-                f"the grid of a gridding kernel is 1.25 to 2 times as fine as the samples, got {self.oversampling}"
+                f"oversampling of a gridding kernel must be 1.25 to 2 times the samples, got {self.oversampling}"
             )
 
     @staticmethod
@@ -61,26 +61,29 @@ class Kernel:
             even: Choose an even width. Odd widths are the default, because with an even one the set
                 of taps changes at points on the grid, and gradients there would be one-sided.
 
+        Returns:
+            The kernel.
+
         Raises:
             ValueError: If `eps` lies outside its range, or 16 taps do not reach it.
         """
         if not 1e-13 <= eps <= 0.1:
-            raise ValueError(f"a non-uniform FFT reaches relative errors of 1e-13 to 0.1, got eps={eps}")
+            raise ValueError(f"the relative error eps of a non-uniform FFT must lie in 1e-13..0.1, got eps={eps}")
         kernels = [Kernel(taps, oversampling) for taps in range(2 if even else 3, 17, 1 if even else 2)]
         for kernel in kernels:
             if kernel.error <= eps:
                 return kernel
         raise ValueError(
-            f"a kernel on a grid of oversampling {oversampling} reaches a relative error of "
-            f"{kernels[-1].error:.1e}, got eps={eps}; choose a finer grid, up to 2"
+            f"the relative error eps must be at least {kernels[-1].error:.1e} at an oversampling of {oversampling}, "
+            f"got eps={eps}; choose a finer grid (oversampling up to 2)"
         )
 
     @property
     def error(self) -> float:
-        """Relative error.
+        """Upper estimate of the relative error of a transform with this kernel.
 
-        The theoretical decay, scaled so that errors measured against the direct sum are 1.2 to 5
-        times smaller.
+        It follows the theoretical decay with the number of taps. Errors measured against the direct
+        sum are 1.2 to 5 times smaller.
         """
         free = 1 - 1 / self.oversampling
         return max(8 * free * math.sqrt(self.taps) * math.exp(-math.pi * self.taps * math.sqrt(free)), 3e-14)
@@ -94,10 +97,11 @@ class Kernel:
         """Evaluate the kernel at the taps around points.
 
         Args:
-            offset: Point minus nearest centre tap, -0.5..0.5, real (...,).
+            offset: Distance of each point from the middle of its taps in grid steps, -0.5..0.5,
+                real, any shape.
 
         Returns:
-            Weights, shape (taps, ...).
+            Weight of each tap, shape (taps, *offset.shape).
         """
         coefficients = _polynomials(self).to(dtype=offset.dtype, device=offset.device)
         u = 2 * offset
@@ -108,10 +112,12 @@ class Kernel:
         return (coefficients @ stacked.flatten(1)).unflatten(-1, offset.shape)
 
     def spectrum(self, cycles: Tensor) -> Tensor:
-        """Evaluate the Fourier transform of the kernel, the factor that interpolation applies.
+        """Evaluate the Fourier transform of the kernel.
+
+        Interpolation with the kernel multiplies samples by this factor; divide by it to correct.
 
         Args:
-            cycles: Frequencies in cycles per grid step, float64.
+            cycles: Frequencies in cycles per grid step, float64, any shape.
 
         Returns:
             Spectrum, same shape, float64.
@@ -144,11 +150,11 @@ def _polynomials(kernel: Kernel) -> Tensor:
 
 @dataclass(frozen=True)
 class Points:
-    """Positions of non-uniform points on the grid.
+    """Grid indices and kernel weights of non-uniform points on a periodic grid.
 
     Args:
-        first: Index of the first tap, periodic, shape (..., m), int64.
-        weights: Tap weights, shape (taps, ..., m).
+        first: Grid index of the first tap of each point, shape (..., m), int64.
+        weights: Weight of each tap of each point, shape (taps, ..., m).
     """
 
     first: Tensor
@@ -156,16 +162,19 @@ class Points:
 
     @staticmethod
     def of(kernel: Kernel, start: Tensor, length: int, dtype: torch.dtype, shift: Tensor | None = None) -> Points:
-        """Prepare points at the positions start + shift.
+        """Compute grid indices and kernel weights of points at the positions start + shift.
 
         Args:
             kernel: Interpolation kernel.
-            start: Positions in grid steps, any numbers, periodic in `length`; float64, often one
-                row (m,) for all.
+            start: Positions in grid steps, any numbers, periodic in `length`; float64, shape (m,)
+                for all trials or (..., m).
             length: Length of the grid.
             dtype: Real type of the weights.
             shift: Further positions in grid steps, shape (..., m), small enough for the precision
                 of its own dtype.
+
+        Returns:
+            Points for `interpolate` and `spread`.
         """
         start = start - (kernel.taps - 1) / 2
         whole = torch.round(start.detach())
@@ -178,7 +187,7 @@ class Points:
 
 
 def interpolate(grid: Tensor, points: Points) -> Tensor:
-    """Sum weight * grid[first + tap] over the taps, periodic.
+    """Interpolate a periodic grid at points: sum weight * grid[first + tap] over their taps.
 
     Args:
         grid: Grid, shape (..., length), complex.
@@ -198,7 +207,9 @@ def interpolate(grid: Tensor, points: Points) -> Tensor:
 
 
 def spread(values: Tensor, points: Points, length: int) -> Tensor:
-    """Apply the adjoint of `interpolate`: add weight * value onto the grid.
+    """Spread values at points onto a periodic grid, the adjoint of `interpolate`.
+
+    Each value is multiplied by the weights of its taps and added to the grid there.
 
     Args:
         values: Values at the points, shape (..., m), complex.
@@ -226,9 +237,10 @@ def _flat_index(first: Tensor, width: int) -> Tensor:
 
 
 class Nufft:
-    """Transforms between uniform samples and points in cycles per sample.
+    """Non-uniform FFT between uniform samples and their spectrum at arbitrary frequencies.
 
-    Built for one length and accuracy; use it for many rows.
+    The frequencies are called points and given in cycles per sample. An object is built for one
+    length and accuracy and can be used for many rows.
 
     Args:
         n: Number of samples.
@@ -248,15 +260,19 @@ class Nufft:
         self.weight = (1 / self.kernel.spectrum(offset / self.length)).to(real_dtype(dtype))
 
     def points(self, cycles_per_sample: Tensor) -> Points:
-        """Prepare points, which can be used for several arrays.
+        """Compute grid indices and kernel weights of frequencies, for use in several transforms.
 
         Args:
-            cycles_per_sample: Points, shape (..., m), float64, any real numbers (periodic in 1).
+            cycles_per_sample: Frequencies in cycles per sample, shape (..., m), float64, any real
+                numbers (periodic in 1).
+
+        Returns:
+            Points for `type1` and `type2`.
         """
         return Points.of(self.kernel, cycles_per_sample * self.length, self.length, real_dtype(self.dtype))
 
     def grid(self, x: Tensor) -> Tensor:
-        """Compute the oversampled spectrum that `interpolate` takes.
+        """Compute the oversampled spectrum of samples, the grid that `interpolate` takes.
 
         Args:
             x: Samples, shape (..., n), complex.
@@ -270,11 +286,11 @@ class Nufft:
         return torch.fft.fft(torch.cat([x[..., half:], gap, x[..., :half]], -1))
 
     def type2(self, x: Tensor, points: Points) -> Tensor:
-        """Compute sum_j x_j exp(-2j pi p (j - n//2)).
+        """Evaluate the spectrum of samples at points p: sum_j x_j exp(-2j pi p (j - n//2)).
 
         Args:
             x: Samples, shape (..., n), complex.
-            points: Points p, shape (..., m).
+            points: Points p, shape (..., m), prepared by `points`.
 
         Returns:
             Spectrum at the points, shape (..., m).
@@ -282,14 +298,14 @@ class Nufft:
         return interpolate(self.grid(x), points)
 
     def type1(self, y: Tensor, points: Points) -> Tensor:
-        """Compute sum_k y_k exp(+2j pi p_k (j - n//2)), the adjoint of `type2`.
+        """Apply the adjoint of `type2`: x_j = sum_k y_k exp(+2j pi p_k (j - n//2)).
 
         Args:
-            y: Values at the points, shape (..., m), complex.
-            points: Points p, shape (..., m).
+            y: Values y_k at the points p_k, shape (..., m), complex.
+            points: Points p_k, shape (..., m), prepared by `points`.
 
         Returns:
-            Samples, shape (..., n).
+            Samples x_j, j = 0..n-1, shape (..., n).
         """
         x = torch.fft.ifft(spread(y, points, self.length), norm="forward")
         half = self.n // 2
@@ -299,7 +315,7 @@ class Nufft:
 def nufft_type2(x: Tensor, points: Tensor, eps: float = 1e-6) -> Tensor:
     """Evaluate the spectrum of uniform samples at any frequencies.
 
-    sum_j x_j exp(-2j pi p (j - n//2)). Differentiable in samples and points.
+    At the point p it is sum_j x_j exp(-2j pi p (j - n//2)). Differentiable in samples and points.
 
     Args:
         x: Samples, shape (..., n), complex.

@@ -1,15 +1,17 @@
-"""Wavenumber (omega-K) focusing of stripmap data in beam coordinates.
+"""Wavenumber (omega-K) focusing of stripmap data.
 
-A target at slant range R from the beam centre, crossed at slow time t, has the two-dimensional
-spectrum (stationary phase)
+The image shows a target at the slow time t and the slant range R at which a chosen line of sight
+crosses it. The line of sight is given by its Doppler frequency, the frame Doppler f_frame: usually
+that of the beam centre, or 0 Hz for the classical zero-Doppler image. At range frequency f,
+relative to the carrier f0, and Doppler frequency f_a the echo has the spectrum (stationary phase)
 
     exp(-j 2 pi [2 R G(f, X) / c + f_a t]),    X = c f_a / (2 v),
     G = cos(s) sqrt((f0 + f)^2 - X^2) + sin(s) X,
 
-with s the squint of the frame Doppler, sin(s) = lambda f_frame / (2 v). In wavenumber space G is a
-rotation by s, so that G = f0 + f with zero slope at the frame Doppler: images keep the range and
-azimuth axes of the raw matrix, and their spectra stay centred at any squint. A frame of 0 Hz gives
-the classical zero-Doppler image.
+where v is the effective velocity and s the squint of the line of sight, sin(s) = lambda f_frame /
+(2 v). The mapping to G rotates the plane of wave numbers by s: at the frame Doppler and the carrier
+G = f0, with the slope 1 over f and 0 over f_a. Images therefore keep the range and azimuth axes of
+the raw matrix, and their spectra stay centred at any squint.
 
 Reference:
     Tsvetkov 2017, focusing steps 1 to 6 after Eq. (2).
@@ -56,20 +58,24 @@ def wavenumber(
     velocity_m_s: Tensor | float,
     frame_hz: Tensor | float,
 ) -> Tensor:
-    """Map range frequencies to wavenumbers: G(f, f_a) - f0.
+    """Compute the omega-K mapping G - f0 of range frequency f and Doppler frequency f_a, in Hz.
 
-    Differences are formed before they can lose digits. Evanescent pairs (|X| > f0 + f) are clamped
-    to grazing incidence.
+        G = cos(s) sqrt((f0 + f)^2 - X^2) + sin(s) X,    X = c f_a / (2 v),
+
+    where f0 is the carrier frequency, v the velocity and s the squint of the line of sight that
+    defines the image coordinates. 2 G / c is the wave number along slant range. The difference
+    G - f0 is formed without loss of digits. Where |X| > f0 + f, the square root is set to 0.
 
     Args:
         radar: Radar of the recording.
-        frequency_hz: Baseband range frequencies in Hz, shape (f,).
-        doppler_hz: Doppler frequencies in Hz, shape (..., d).
-        velocity_m_s: Effective velocity in m/s, a number or shape (...,).
-        frame_hz: Frame Doppler in Hz, a number or shape (...,).
+        frequency_hz: Range frequencies f relative to the carrier in Hz, shape (f,).
+        doppler_hz: Doppler frequencies f_a in Hz, shape (..., d).
+        velocity_m_s: Effective velocity v in m/s, a number or shape (...,).
+        frame_hz: Doppler frequency of that line of sight in Hz, sin(s) = lambda frame_hz / (2 v), a
+            number or shape (...,).
 
     Returns:
-        Mapped frequencies in Hz, shape (..., d, f), float64.
+        G - f0 in Hz, shape (..., d, f), float64.
     """
     velocity, frame = (per_trial(value, 2, doppler_hz) for value in (velocity_m_s, frame_hz))
     f0, c = radar.carrier_hz, radar.wave_speed_m_s
@@ -89,13 +95,13 @@ BAND_EDGE = 0.1
 def band_weight(radar: StripmapRadar, offset_hz: Tensor, band_hz: float) -> Tensor:
     """Compute the weights of a processed Doppler band: 1 inside, 1/2 at +-band_hz / 2.
 
-    The edges are raised cosines of a tenth of the band. Warns where band and edges exceed the PRF,
-    so that azimuth spectra fold.
+    Each edge is a raised cosine whose width is a tenth of the band. Warns where the band with its
+    edges, 1.1 band_hz, exceeds the PRF, which then cuts the azimuth spectrum.
 
     Args:
         radar: Radar of the recording.
         offset_hz: Doppler relative to the centroid in Hz, any shape.
-        band_hz: Processed bandwidth in Hz.
+        band_hz: Processed Doppler bandwidth in Hz.
 
     Returns:
         Weights, same shape as `offset_hz`.
@@ -104,7 +110,7 @@ def band_weight(radar: StripmapRadar, offset_hz: Tensor, band_hz: float) -> Tens
         ValueError: If `band_hz` is not a positive number.
     """
     if not (math.isfinite(band_hz) and band_hz > 0):
-        raise ValueError(f"the processed Doppler band must be a positive number of Hz, got {band_hz}")
+        raise ValueError(f"band_hz, the processed Doppler band, must be a positive number of Hz, got {band_hz}")
     if band_hz * (1 + BAND_EDGE) > radar.prf_hz * (1 + 1e-9):
         warnings.warn(
             f"PRF {radar.prf_hz:g} Hz is below the processed band of {band_hz:g} Hz and its "
@@ -118,14 +124,18 @@ def band_weight(radar: StripmapRadar, offset_hz: Tensor, band_hz: float) -> Tens
 
 @dataclass(frozen=True)
 class FrameGeometry:
-    """Geometry of the rows of an azimuth spectrum; all values are float64.
+    """Doppler, velocity and image frame of the rows of an azimuth spectrum.
+
+    There is one row per Doppler bin. All values are float64.
 
     Args:
         radar: Radar of the recording.
-        doppler_hz: Absolute Doppler of the rows in Hz, shape (..., d).
+        doppler_hz: Absolute Doppler of each row in Hz, shape (..., d).
         velocity_m_s: Effective velocity in m/s, shape (...,).
-        frame_hz: Frame Doppler in Hz, shape (...,).
-        weight: Weights of a processed Doppler band, shape (..., d); None for the whole PRF.
+        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates,
+            shape (...,).
+        weight: Weight of each row inside a processed Doppler band, shape (..., d); None for the
+            whole PRF.
     """
 
     radar: StripmapRadar
@@ -144,7 +154,7 @@ class FrameGeometry:
         device: torch.device | None = None,
         band_hz: float | None = None,
     ) -> FrameGeometry:
-        """Build the geometry of all rows of raw data.
+        """Build the geometry of the azimuth spectrum of raw data, which has one row per pulse.
 
         Args:
             radar: Radar of the recording.
@@ -152,13 +162,19 @@ class FrameGeometry:
             doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,).
             velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
                 radar.
-            frame_hz: Frame Doppler in Hz; None for the nominal pointing, else the centroid.
+            frame_hz: Doppler frequency in Hz of the line of sight that defines the image
+                coordinates; None for the nominal pointing of the radar, or the centroid where it
+                has none.
             device: Device of the result; None for that of the data.
             band_hz: Processed Doppler bandwidth in Hz; None for the whole PRF.
 
+        Returns:
+            Geometry of all rows.
+
         Raises:
-            ValueError: If a value per trial has another shape than the trials, the velocity is not
-                positive, or a Doppler exceeds 2 velocity / wavelength.
+            ValueError: If the Doppler or the velocity is neither a number nor a tensor of the
+                leading dims of the data, the velocity is not positive, or a Doppler exceeds 2
+                velocity / wavelength.
         """
         device = raw.device if device is None else device
         centroid = torch.as_tensor(doppler_hz, dtype=torch.float64, device=device)
@@ -170,8 +186,8 @@ class FrameGeometry:
         for name, value in (("doppler_hz", centroid), ("velocity_m_s", velocity)):
             if value.ndim and value.shape != raw.shape[:-2]:
                 raise ValueError(
-                    f"{name} of shape {tuple(value.shape)} does not match the trial dims "
-                    f"{tuple(raw.shape[:-2])} of the data; give one number per trial"
+                    f"{name} must be one number, or one per trial in the shape "
+                    f"{tuple(raw.shape[:-2])} of the leading dims of the data, got shape {tuple(value.shape)}"
                 )
         _check_squint(radar, velocity, centroid, frame)
         doppler = radar.doppler_hz(raw.shape[-2], centroid, device)
@@ -184,7 +200,7 @@ class FrameGeometry:
         )
 
     def rows(self, part: slice) -> FrameGeometry:
-        """Select some of the rows.
+        """Return the geometry of some of the rows, which are Doppler bins.
 
         Args:
             part: Slice of the Doppler axis.
@@ -194,29 +210,29 @@ class FrameGeometry:
         )
 
     def weighted(self, lines: Tensor) -> Tensor:
-        """Multiply lines by the weight of their row, if there is one.
+        """Multiply each Doppler row by its weight in the processed band, if there is such a band.
 
         Args:
-            lines: Lines, shape (..., d, n), complex.
+            lines: Rows of an azimuth spectrum, shape (..., d, n), complex.
 
         Returns:
-            Lines, same shape.
+            Weighted rows, same shape.
         """
         return lines if self.weight is None else lines * self.weight.to(real_dtype(lines.dtype))[..., None]
 
     @property
     def requires_grad(self) -> bool:
-        """True where Doppler, velocity or frame require gradients."""
+        """True if Doppler, velocity or frame Doppler require gradients."""
         return any(value.requires_grad for value in (self.doppler_hz, self.velocity_m_s, self.frame_hz))
 
     def mapped(self, frequency_hz: Tensor) -> Tensor:
-        """Apply `wavenumber` to these rows.
+        """Compute the omega-K mapping G - f0 at the Doppler of each row, see `wavenumber`.
 
         Args:
-            frequency_hz: Baseband range frequencies in Hz, shape (f,).
+            frequency_hz: Range frequencies relative to the carrier f0 in Hz, shape (f,).
 
         Returns:
-            Mapped frequencies in Hz, shape (..., d, f).
+            G - f0 in Hz, shape (..., d, f).
         """
         return wavenumber(self.radar, frequency_hz, self.doppler_hz, self.velocity_m_s, self.frame_hz)
 
@@ -236,23 +252,24 @@ def _check_squint(radar: StripmapRadar, velocity_m_s: Tensor, *doppler_hz: Tenso
         raise ValueError(f"velocity_m_s must be positive and finite in every trial, got {slowest:g}")
     if not largest < 1:
         raise ValueError(
-            f"a Doppler needs a squint of sine {largest:.4g}; doppler_hz and frame_hz must "
-            "stay below 2 * velocity / wavelength in magnitude"
+            "doppler_hz and frame_hz must stay below 2 * velocity / wavelength in magnitude, got "
+            f"{largest:.4g} times this limit"
         )
 
 
 def residual_frequency(at: FrameGeometry, offset_hz: Tensor) -> Tensor:
-    """Compute the part of the wavenumber mapping that bulk filter and refocusing leave.
+    """Compute the frequency shift of Stolt mapping that remains after bulk filter and refocusing.
 
-    f(G(0) + h) - h for image frequencies h about G(0), where f(G), the inverse of `wavenumber`, is
-    the raw range frequency of an image frequency.
+    The range frequency h of the image belongs to the range frequency f of the raw data at which
+    G(f) = G(0) + h, with the mapping G of `wavenumber`. Bulk filter and refocusing act as if f were
+    h, so that the shift f - h remains.
 
     Args:
-        at: Geometry of the rows.
-        offset_hz: Image frequencies h in Hz, shape (h,).
+        at: Geometry of the Doppler rows.
+        offset_hz: Range frequencies h of the image in Hz, shape (h,).
 
     Returns:
-        Frequencies in Hz, shape (..., d, h), float64.
+        Shifts f - h in Hz, shape (..., d, h), float64.
     """
     velocity, frame = (per_trial(value, 2, at.doppler_hz) for value in (at.velocity_m_s, at.frame_hz))
     f0, c = at.radar.carrier_hz, at.radar.wave_speed_m_s
@@ -264,10 +281,11 @@ def residual_frequency(at: FrameGeometry, offset_hz: Tensor) -> Tensor:
 
 
 class FrequencyBasis:
-    """Chebyshev polynomials over the range band, which evaluate smooth phases per Doppler row.
+    """Chebyshev polynomials that interpolate smooth phases over the range band.
 
-    A phase then takes a few float64 numbers per row and one matrix product. The number of nodes
-    follows from the fractional bandwidth so that the polynomial errs below 1e-6 turn.
+    The phase of a Doppler row is computed in float64 at a few range frequencies, the nodes
+    (`nodes_hz`); one matrix product then evaluates it at all range frequencies. The number of nodes
+    follows from the ratio of sampling rate to carrier, so that the error stays below 1e-6 turn.
 
     Args:
         radar: Radar of the recording.
@@ -287,26 +305,27 @@ class FrequencyBasis:
         self._polynomials = torch.cos(torch.acos(u) * order[:, None])
 
     def evaluate(self, values_at_nodes: Tensor, dtype: torch.dtype) -> Tensor:
-        """Evaluate a smooth real function on the FFT grid from its values at the nodes.
+        """Interpolate a smooth real function of range frequency from the nodes to the FFT grid.
 
         Args:
-            values_at_nodes: Values, shape (..., row, node), float64.
+            values_at_nodes: Values at the frequencies `nodes_hz`, shape (..., row, node), float64.
             dtype: Real type of the result.
 
         Returns:
-            Values, shape (..., row, n).
+            Values at all range frequencies in FFT order, shape (..., row, n).
         """
         return (values_at_nodes @ self._to_coefficients).to(dtype) @ self._polynomials.to(dtype)
 
     def phasor(self, turns_at_nodes: Tensor, dtype: torch.dtype) -> Tensor:
-        """Evaluate exp(2j pi turns) on the FFT grid from the turns at the nodes.
+        """Interpolate a phase from the nodes to the FFT grid, and return exp(2j pi phase).
 
         Args:
-            turns_at_nodes: Phase in turns, shape (..., row, node), float64.
+            turns_at_nodes: Phase in turns at the frequencies `nodes_hz`, shape (..., row, node),
+                float64.
             dtype: Complex type of the result.
 
         Returns:
-            Phasors, shape (..., row, n).
+            Phasors at all range frequencies in FFT order, shape (..., row, n).
         """
         coefficients = turns_at_nodes @ self._to_coefficients
         constant = reduced_turns(coefficients[..., :1])
@@ -317,21 +336,23 @@ class FrequencyBasis:
 def bulk_filter(
     basis: FrequencyBasis, at: FrameGeometry, range_m: Tensor | float, reference: Tensor | None, dtype: torch.dtype
 ) -> Tensor:
-    """Compute the conjugate two-dimensional spectrum of a target at one range.
+    """Compute the filter that focuses targets at one slant range R.
 
-    The phase is 2 pi [(2 R / c) (G - f0 - f) + 1/8], 1/8 turn at the frame Doppler. A focused
-    target then has the phase -4 pi R / lambda of its echo at the crossing of the beam centre, as in
-    backprojection.
+    It is the conjugate of the two-dimensional spectrum of such a target, with the phase 2 pi
+    [(2 R / c) (G - f0 - f) + 1/8] over Doppler and range frequency f, where G - f0 is the mapping
+    of `wavenumber`. A focused target keeps the phase -4 pi R / lambda of its echo at slant range R,
+    as in backprojection.
 
     Args:
-        basis: Basis over the range band.
-        at: Geometry of the rows.
+        basis: Polynomials that interpolate phases over the range band.
+        at: Geometry of the Doppler rows.
         range_m: Slant range R in metres.
-        reference: Range reference spectrum to include, shape (n,); None for none.
+        reference: Spectrum of the range compression filter, shape (n,), included as a factor; None
+            for range-compressed data.
         dtype: Complex type of the result.
 
     Returns:
-        Filter, shape (..., d, n).
+        Filter, shape (..., d, n), for d Doppler rows and n range frequencies.
     """
     turns = (2 * range_m / at.radar.wave_speed_m_s) * (at.mapped(basis.nodes_hz) - basis.nodes_hz) + STATIONARY_TURNS
     h = basis.phasor(turns, dtype)
@@ -339,12 +360,13 @@ def bulk_filter(
 
 
 def refocus_turns_per_sample(at: FrameGeometry) -> Tensor:
-    """Compute the azimuth phase per range sample that the bulk filter leaves.
+    """Compute the azimuth phase that the bulk filter leaves per range sample.
 
-    It is (2 dr / c) (G(0, X) - f0).
+    The bulk filter is exact at its reference range. Every range step dr away from it leaves
+    (2 dr / c) (G - f0) turns, with the mapping G - f0 of `wavenumber` at the carrier frequency f0.
 
     Args:
-        at: Geometry of the rows.
+        at: Geometry of the Doppler rows.
 
     Returns:
         Turns per range sample, shape (..., d), float64.
@@ -380,11 +402,13 @@ def omega_k(
     reference: Tensor | None = None,
     band_hz: float | None = None,
 ) -> Tensor:
-    """Focus by bulk + refocus omega-K.
+    """Focus raw data by omega-K without Stolt interpolation: a bulk filter, then refocusing.
 
-    Neglects the change of migration over the swath, which `requirements` predicts; `omega_k_stolt`
-    does not. A focused target has the phase -4 pi R / lambda. Differentiable in the raw data, the
-    velocity and the frame; without gradients it works by blocks within one copy of the data.
+    The bulk filter is exact in the middle of the swath; refocusing corrects the azimuth phase at
+    all other ranges. The change of range migration over the swath is neglected: `requirements`
+    predicts the error, and `omega_k_stolt` avoids it. A focused target at slant range R has the
+    phase -4 pi R / lambda. Differentiable in the raw data, the velocity and the frame Doppler.
+    Where no gradients are needed, Doppler rows are processed in blocks inside one copy of the data.
 
     Args:
         raw: Raw or range-compressed data, shape (..., pulse, range), complex.
@@ -393,17 +417,19 @@ def omega_k(
             a number or shape (...,).
         velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
             radar.
-        frame_hz: Frame Doppler of the image coordinates in Hz; None for the nominal pointing, else
-            the centroid.
-        reference: Range reference spectrum, shape (range,); None for range-compressed data.
+        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates;
+            None for the nominal pointing of the radar, or the centroid where it has none.
+        reference: Spectrum of the range compression filter, shape (range,); None for
+            range-compressed data.
         band_hz: Processed Doppler bandwidth about the centroid in Hz; None for the whole PRF.
 
     Returns:
         Image, shape (..., azimuth, range), complex.
 
     Raises:
-        ValueError: If a value per trial has another shape than the trials, the velocity is not
-            positive, a Doppler exceeds 2 velocity / wavelength, or `band_hz` is not positive.
+        ValueError: If the Doppler or the velocity is neither a number nor a tensor of the leading
+            dims of the data, the velocity is not positive, a Doppler exceeds 2 velocity /
+            wavelength, or `band_hz` is not positive.
 
     Reference:
         Tsvetkov 2017, focusing steps 1 to 5 after Eq. (2).
@@ -453,21 +479,23 @@ def through_doppler(
 
 
 class Focuser(Stage):
-    """Base of the focusing stages.
+    """Base class of the stages that focus stripmap data, such as `OmegaK`.
 
-    The image axes (azimuth, range) are coordinates of the frame Doppler. Values of `velocity_m_s`
-    and `doppler_hz` that a chain connects take precedence over those given here. A subclass sets
-    `form`, the function that focuses.
+    The image shows a target where a chosen line of sight crosses it: azimuth follows from the slow
+    time of the crossing, range is the slant range there. `frame_hz` is the Doppler frequency of
+    that line of sight. Values of `velocity_m_s` and `doppler_hz` that a chain connects take
+    precedence over those given here. A subclass sets `form`, the function that focuses.
 
     Args:
         radar: Radar of the recording.
-        reference: Name of the range reference in REFERENCES, compressed in the same pass; None for
-            range-compressed data.
+        reference: Filter that compresses the pulses in range in the same pass: "matched", "flat" or
+            "phase", see `RangeCompress`; None for range-compressed data.
         velocity_m_s: Effective velocity in m/s: a number, a tensor per trial, or an nn.Parameter to
             optimise; None for that of the radar.
-        doppler_hz: Absolute Doppler centroid in Hz, likewise; None for the nominal pointing or 0.
-        frame_hz: Frame Doppler of the image in Hz; None for the nominal pointing, else the
-            centroid.
+        doppler_hz: Absolute Doppler centroid in Hz: a number, a tensor per trial, or an
+            nn.Parameter; None for the nominal pointing of the radar, or 0 where it has none.
+        frame_hz: Doppler frequency of that line of sight in Hz, 0 for a zero-Doppler image; None
+            for the nominal pointing of the radar, or the centroid where it has none.
         band_hz: Processed Doppler bandwidth in Hz; None for the whole PRF.
 
     Raises:
@@ -498,14 +526,14 @@ class Focuser(Stage):
         self.hold("doppler_hz", (radar.pointing_doppler_hz or 0.0) if doppler_hz is None else doppler_hz)
 
     def spectrum(self, n: int, device: torch.device | str | None = None) -> Tensor | None:
-        """Return the range reference spectrum, or None for range-compressed data.
+        """Return the spectrum of the range compression filter, or None for range-compressed data.
 
         Args:
-            n: Number of samples of a line.
+            n: Number of samples of a range line.
             device: Device of the result.
 
         Returns:
-            Spectrum, shape (n,), complex128.
+            Spectrum in FFT order, shape (n,), complex128, or None.
         """
         return (
             None
@@ -521,8 +549,12 @@ class Focuser(Stage):
             doppler_hz: Doppler centroid in Hz; None for that of the stage.
             velocity_m_s: Effective velocity in m/s; None for that of the stage.
 
+        Returns:
+            Image with axes (azimuth, range).
+
         Raises:
-            ValueError: As in the function that focuses.
+            ValueError: If the function that focuses refuses the Doppler, the velocity or the
+                processed band, see `omega_k`.
         """
         data = type(self).form(
             signal.data,
@@ -537,7 +569,10 @@ class Focuser(Stage):
 
 
 class OmegaK(Focuser):
-    """Stage that focuses by bulk + refocus omega-K, see `omega_k`; arguments as in `Focuser`."""
+    """Stage that focuses stripmap data by omega-K without Stolt interpolation, see `omega_k`.
+
+    Arguments as in `Focuser`.
+    """
 
     form = staticmethod(omega_k)
 
@@ -545,7 +580,7 @@ class OmegaK(Focuser):
 class StoredOmegaK(Stage):
     """Stage that focuses many recordings of one geometry with filters built once.
 
-    Stores one complex number per sample of the raw matrix.
+    The stored filters take one complex number per sample of the raw matrix.
 
     Args:
         stage: Stage whose radar, reference, velocity and Doppler are used.
@@ -581,18 +616,21 @@ class StoredOmegaK(Stage):
             self.register_buffer("coarse", coarse)
 
     def forward(self, signal: Signal) -> Signal:
-        """Focus a signal on the axes of the stage.
+        """Focus a recording whose axes and dtype are those that the filters were built for.
 
         Args:
-            signal: Recording.
+            signal: Recording with axes (pulse, range).
+
+        Returns:
+            Image with axes (azimuth, range).
 
         Raises:
             ValueError: If axes or dtype are not those that the filters were built for.
         """
         if signal.axes != self.axes or signal.data.dtype != self.filter.dtype:
             raise ValueError(
-                f"stored filters are for the axes {self.axes} in {self.filter.dtype}, got "
-                f"{signal.axes} in {signal.data.dtype}; build a new StoredOmegaK"
+                f"the signal must have the axes {self.axes} and the dtype {self.filter.dtype} that the filters of "
+                f"this StoredOmegaK were built for, got {signal.axes} and {signal.data.dtype}; build a new one"
             )
 
         def focus_rows(rows: Tensor, part: slice) -> Tensor:

@@ -1,4 +1,4 @@
-"""Parts of stripmap images about points, by any focuser and by exact backprojection."""
+"""Small patches of stripmap images about point targets, cut from any image or focused exactly."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ HALF = 16
 
 @dataclass(frozen=True)
 class SmoothBand:
-    """Weight of one PRF of Doppler with a raised-cosine roll-off over its outer eighths.
+    """Doppler band with raised-cosine edges over its outer eighths, as weight of the pulses.
 
-    A sharp end would put Fresnel ripple of its own on the reference image. Targets that are lit
-    within the inner three quarters of the PRF keep their full weight.
+    Sharp edges would add Fresnel ripple to an image that serves as reference. Pulses in the inner
+    three quarters of the band have the weight 1.
 
     Args:
         width_hz: Width of the band in Hz.
@@ -32,18 +32,23 @@ class SmoothBand:
     width_hz: float
 
     def weight(self, since_s: Tensor, doppler_offset_hz: Tensor) -> Tensor:
-        """Return the weight at offsets from the Doppler centroid in Hz, any shape."""
+        """Return the weight of each pulse at each pixel, in the shape of `doppler_offset_hz`.
+
+        Args:
+            since_s: Slow time since the beam centre crossed the pixel, in seconds; not used.
+            doppler_offset_hz: Doppler of the pixel relative to the centroid, in Hz.
+        """
         outer = ((doppler_offset_hz.abs() - 3 * self.width_hz / 8) / (self.width_hz / 8)).clamp(0, 1)
         return 0.5 * (1 + torch.cos(math.pi * outer))
 
 
 @dataclass(frozen=True)
 class PointPatches:
-    """Square patches of an image about points.
+    """Square patches of 32 x 32 samples of a stripmap image, each about a point target.
 
     Args:
         radar: Radar of the recording.
-        spots: Line and cell of each patch.
+        spots: Azimuth line and range cell of the middle of each patch.
     """
 
     radar: StripmapRadar
@@ -58,7 +63,7 @@ class PointPatches:
         doppler_hz: Tensor,
         velocity_m_s: Tensor,
     ) -> PointPatches:
-        """Find where images show points.
+        """Place a patch where a focused image shows each of some point targets.
 
         Args:
             radar: Radar of the recording.
@@ -67,6 +72,9 @@ class PointPatches:
             closest_range_m: Closest ranges in metres, shape (point,).
             doppler_hz: Doppler centroid in Hz.
             velocity_m_s: Effective velocity in m/s.
+
+        Returns:
+            The patches, one per point.
         """
         frame = doppler_hz if radar.pointing_doppler_hz is None else radar.pointing_doppler_hz
         at = radar.image_position(zero_doppler_s, closest_range_m, frame, velocity_m_s)
@@ -76,12 +84,19 @@ class PointPatches:
         return PointPatches(radar, spots)
 
     def cut(self, image: Tensor) -> Tensor:
-        """Cut the patches from an image (lines, samples); complex128, shape (patch, line, cell)."""
+        """Cut the patches from a focused image.
+
+        Args:
+            image: Image, shape (line, cell), complex.
+
+        Returns:
+            Patches, complex128, shape (patch, line, cell).
+        """
         parts = [image[i - HALF : i + HALF, j - HALF : j + HALF] for i, j in self.spots]
         return torch.stack(parts).to(torch.complex128)
 
     def exact(self, signal: Signal, doppler_hz: Tensor, velocity_m_s: Tensor) -> Tensor:
-        """Focus the patches by backprojection over one PRF of Doppler.
+        """Focus only the patches, by exact backprojection of raw data over one PRF of Doppler.
 
         Args:
             signal: Raw data.

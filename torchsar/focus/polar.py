@@ -1,11 +1,13 @@
-"""Polar format by gridding: an image of plane waves as one two-dimensional non-uniform FFT.
+"""Polar format by gridding: the image as one two-dimensional non-uniform FFT.
 
     image(x, y) = sum_k sum_f s_k(f) exp(+4j pi f / c (u_k . (x, y) + offset_k)),
 
-which is backprojection with `FarField` ranges. The samples lie on a polar raster of wave vectors 2
-f / c u_k. A Kaiser-Bessel kernel spreads them onto a twice oversampled rectangular grid, an FFT
-forms the image, and a division corrects the kernel. The positions on the grid are computed once, as
-a sparse matrix, which also gives the exact adjoint.
+where s_k(f) is the sample of pulse k at frequency f. The range of a ground point (x, y) in pulse k
+is that of a plane wave, the scalar product with the direction u_k plus offset_k (`FarField`). The
+sum is backprojection with these ranges. The samples lie on a polar raster of wave vectors
+2 f / c u_k. A Kaiser-Bessel kernel spreads them onto a twice oversampled rectangular grid, an FFT
+forms the image, and a division by the spectrum of the kernel corrects the spreading. The spreading
+is stored as a sparse matrix, whose transpose gives the exact adjoint.
 
 Reference:
     Fessler and Sutton 2003 (gridding); Carrara, Goodman and Majewski 1995, ch. 3 (polar format).
@@ -64,12 +66,15 @@ class SparsePair:
 
     @staticmethod
     def of_columns(row: Tensor, weight: Tensor, rows: int) -> SparsePair:
-        """Build the pair from the entries of each column.
+        """Build a sparse matrix and its transpose from the entries of each column of the matrix.
 
         Args:
             row: Row of each entry, shape (column, entry), int64.
             weight: Value of each entry, shape (column, entry), real.
-            rows: Number of rows.
+            rows: Number of rows of the matrix.
+
+        Returns:
+            The matrix and its transpose.
         """
         columns, entries = row.shape
         kind = torch.int32 if max(row.numel(), rows) < 2**31 else torch.int64
@@ -157,9 +162,10 @@ class _GridAxis:
 class PolarOperator:
     """Linear map from range profiles to an image by polar format, with its exact adjoint.
 
-    Built for one dtype and device (that of the geometry) and one geometry, shared by all trials.
-    Building takes under a second and 20 bytes x kernel taps^2 per sample (complex64). A unit point
-    gives the sum of the window weights. Differentiable in the profiles.
+    The operator is built for one geometry, which all trials share, for one dtype and for the device
+    of the geometry. Building takes under a second; the operator occupies 20 bytes x kernel taps^2
+    per sample (complex64). A point of unit amplitude has a peak of the sum of the window weights.
+    Differentiable in the profiles.
 
     Args:
         geometry: Plane waves. The range axis of the image is the first ground direction (x), the
@@ -167,7 +173,7 @@ class PolarOperator:
         azimuth: Azimuth axis of the image in metres.
         range_: Range axis of the image in metres.
         window: "none" or "hann", over pulses and over frequencies.
-        eps: Relative error against the direct sum.
+        eps: Relative error of the image against the direct sum.
         dtype: Complex type of the data.
 
     Raises:
@@ -205,7 +211,7 @@ class PolarOperator:
         )
 
     def image(self, profiles: Tensor) -> Tensor:
-        """Transform range profiles into the image.
+        """Form the polar-format image of range profiles.
 
         Args:
             profiles: Range profiles, shape (..., pulse, range), complex.
@@ -229,7 +235,7 @@ class PolarOperator:
         return self._x.crop(torch.fft.ifft(columns, norm="forward"), -1) * self._unkernel
 
     def adjoint(self, image: Tensor) -> Tensor:
-        """Apply the adjoint to an image.
+        """Apply the adjoint of `image`, which maps an image to range profiles.
 
         Args:
             image: Image, shape (..., azimuth, range), complex.
@@ -275,18 +281,24 @@ class PolarOperator:
 class PolarFormat(GroundImager):
     """Stage that images the ground plane by polar format; arguments as in `GroundImager`.
 
-    Neglects the curvature of the wavefront, see `plane_wave_loss`. The operator of the last
-    geometry is stored; `operator` gives it to autofocus loops.
+    The curvature of the wavefront is neglected; `plane_wave_loss` bounds the resulting error. The
+    operator of the last geometry is stored; `operator` returns it for use in autofocus loops.
     """
 
     _kept: tuple[list[Tensor], PolarOperator] | None = None
 
     def operator(self, profiles: Tensor, geometry: FarField | Spotlight) -> PolarOperator:
-        """Return the operator for a geometry in turned coordinates and the dtype of the profiles.
+        """Return the polar-format operator for a geometry and the dtype of the profiles.
+
+        A repeated call with the same geometry and dtype returns the stored operator.
 
         Args:
             profiles: Range profiles, shape (..., pulse, range), complex.
-            geometry: Geometry of the recording.
+            geometry: Geometry in ground coordinates with x along the range axis of the image, as
+                from `FarField.turned`.
+
+        Returns:
+            Map from range profiles to the image, with its adjoint.
         """
         waves = geometry.far_field() if isinstance(geometry, Spotlight) else geometry
         key = [waves.frequency_hz, waves.direction, waves.offset_m]
@@ -299,11 +311,11 @@ class PolarFormat(GroundImager):
         return kept[1]
 
     def form(self, profiles: Tensor, geometry: FarField | Spotlight, azimuth: Axis, range_: Axis) -> Tensor:
-        """Form the image by polar format.
+        """Form the image of range profiles by polar format.
 
         Args:
             profiles: Range profiles, shape (..., pulse, range), complex.
-            geometry: Geometry in the turned coordinates of the axes.
+            geometry: Geometry in ground coordinates with x along the range axis of the image.
             azimuth: Azimuth axis of the image.
             range_: Range axis of the image.
 

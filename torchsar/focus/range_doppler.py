@@ -14,14 +14,15 @@ from torchsar.radar import StripmapRadar
 def migration(at: FrameGeometry) -> Tensor:
     """Compute the relative range migration of each Doppler row.
 
-    cos(squint of the frame) / cos(squint of the row) - 1, formed as a difference. A target at slant
-    range R appears at R (1 + migration), the slope of the wavenumber mapping at the carrier.
+    It is cos(s_frame) / cos(s) - 1, where s is the squint at the Doppler of the row and s_frame
+    that of the line of sight that defines the image coordinates. In this row a target at slant
+    range R appears at range R (1 + migration).
 
     Args:
-        at: Geometry of the rows.
+        at: Geometry of the Doppler rows.
 
     Returns:
-        Relative migration, shape (..., d), float64.
+        Relative migration of each row, shape (..., d), float64.
     """
     velocity, frame = at.velocity_m_s[..., None], at.frame_hz[..., None]
     sin, sin_frame = (at.radar.wavelength_m * f / (2 * velocity) for f in (at.doppler_hz, frame))
@@ -40,12 +41,13 @@ def range_doppler(
     band_hz: float | None = None,
     eps: float = 2e-4,
 ) -> Tensor:
-    """Focus by the range-Doppler algorithm.
+    """Focus raw data by the range-Doppler algorithm.
 
-    Azimuth FFT, correction of migration by interpolation, hyperbolic azimuth phase per range,
-    inverse FFT. Exact over the whole swath in migration and azimuth phase. Neglects the coupling of
-    range and azimuth beyond the carrier (no secondary range compression), which broadens responses
-    for wide bands, long apertures and squinted beams; `requirements` predicts by how much.
+    The steps are an azimuth FFT, correction of range migration by interpolation, multiplication by
+    the hyperbolic azimuth phase of each range, and an inverse FFT. Migration and azimuth phase are
+    exact over the whole swath. There is no secondary range compression: the neglected coupling of
+    range and azimuth broadens responses for wide bands, long apertures and squinted beams;
+    `requirements` predicts its phase.
 
     Args:
         raw: Raw or range-compressed data, shape (..., pulse, range), complex.
@@ -53,9 +55,10 @@ def range_doppler(
         doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,).
         velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
             radar.
-        frame_hz: Frame Doppler of the image coordinates in Hz; None for the nominal pointing, else
-            the centroid.
-        reference: Range reference spectrum, shape (range,); None for range-compressed data.
+        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates;
+            None for the nominal pointing of the radar, or the centroid where it has none.
+        reference: Spectrum of the range compression filter, shape (range,); None for
+            range-compressed data.
         band_hz: Processed Doppler bandwidth about the centroid in Hz; None for the whole PRF.
         eps: Relative error of the interpolation.
 
@@ -63,7 +66,9 @@ def range_doppler(
         Image, shape (..., azimuth, range), complex, with coordinates and phases as in `omega_k`.
 
     Raises:
-        ValueError: As in `omega_k`.
+        ValueError: If the Doppler or the velocity is neither a number nor a tensor of the leading
+            dims of the data, the velocity is not positive, a Doppler exceeds 2 velocity /
+            wavelength, or `band_hz` is not positive.
     """
     geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz, band_hz=band_hz)
     n, centre, real = raw.shape[-1], raw.shape[-1] // 2, real_dtype(raw.dtype)

@@ -19,7 +19,8 @@ def matched_reference(pulse: LinearFM, n: int, sampling_hz: float, device: torch
         device: Device of the result.
 
     Returns:
-        Spectrum in FFT order, shape (n,), complex128; an echo of unit amplitude has a unit peak.
+        Spectrum in FFT order, shape (n,), complex128; a compressed echo of unit amplitude
+        has a peak of 1.
     """
     spectrum = pulse.spectrum(n, sampling_hz, device)
     return spectrum.conj() * (n / spectrum.abs().square().sum())
@@ -28,9 +29,10 @@ def matched_reference(pulse: LinearFM, n: int, sampling_hz: float, device: torch
 def flat_reference(pulse: LinearFM, n: int, sampling_hz: float, device: torch.device | str | None = None) -> Tensor:
     """Compute the inverse pulse spectrum inside the pulse bandwidth, zero outside.
 
-    The response is a pure sinc (PSLR -13.26 dB), while the matched one has the Fresnel ripple of a
-    short pulse; noise outside the band is removed. Costs 0.1 to 0.3 dB of signal-to-noise ratio at
-    usual time-bandwidth products.
+    The compressed pulse is a pure sinc (PSLR -13.26 dB), without the ripple that the Fresnel
+    spectrum of a short pulse causes after the matched filter. Noise outside the pulse bandwidth is
+    removed. The signal-to-noise ratio is 0.1 to 0.3 dB below that of the matched filter at usual
+    time-bandwidth products.
 
     Args:
         pulse: Transmitted pulse.
@@ -39,7 +41,8 @@ def flat_reference(pulse: LinearFM, n: int, sampling_hz: float, device: torch.de
         device: Device of the result.
 
     Returns:
-        Spectrum in FFT order, shape (n,), complex128; an echo of unit amplitude has a unit peak.
+        Spectrum in FFT order, shape (n,), complex128; a compressed echo of unit amplitude
+        has a peak of 1.
     """
     spectrum = pulse.spectrum(n, sampling_hz, device)
     frequency = torch.fft.fftfreq(n, 1 / sampling_hz, dtype=torch.float64, device=device)
@@ -51,8 +54,8 @@ def flat_reference(pulse: LinearFM, n: int, sampling_hz: float, device: torch.de
 def phase_reference(pulse: LinearFM, n: int, sampling_hz: float, device: torch.device | str | None = None) -> Tensor:
     """Compute the conjugate phase of the pulse spectrum, of constant modulus in the sampled band.
 
-    Uses the signal beyond the nominal band edges: a few percent sharper than the matched reference
-    where the noise allows it.
+    The filter also uses the part of the pulse spectrum beyond the nominal band edges. Where the
+    noise there is low, the response is a few percent narrower than that of the matched filter.
 
     Args:
         pulse: Transmitted pulse.
@@ -61,7 +64,8 @@ def phase_reference(pulse: LinearFM, n: int, sampling_hz: float, device: torch.d
         device: Device of the result.
 
     Returns:
-        Spectrum in FFT order, shape (n,), complex128; an echo of unit amplitude has a unit peak.
+        Spectrum in FFT order, shape (n,), complex128; a compressed echo of unit amplitude
+        has a peak of 1.
     """
     spectrum = pulse.spectrum(n, sampling_hz, device)
     size = spectrum.abs().clamp_min(torch.finfo(torch.float64).tiny)
@@ -73,7 +77,7 @@ REFERENCES = {"matched": matched_reference, "flat": flat_reference, "phase": pha
 
 
 def range_compress(raw: Tensor, reference: Tensor) -> Tensor:
-    """Convolve lines circularly with a range reference.
+    """Compress raw lines in range by circular convolution with a filter, given as its spectrum.
 
     Args:
         raw: Raw data, shape (..., pulse, range), complex.
@@ -93,10 +97,12 @@ class RangeCompress(Stage):
 
     Args:
         radar: Radar of the recording.
-        reference: "matched", "flat" or "phase".
+        reference: Spectrum of the filter: "matched" for the conjugate pulse spectrum, "flat" for
+            the inverse pulse spectrum inside the pulse bandwidth, "phase" for the conjugate phase
+            of the pulse spectrum.
 
     Raises:
-        ValueError: If `reference` is not known.
+        ValueError: If `reference` is none of these.
     """
 
     def __init__(self, radar: StripmapRadar, reference: str = "matched") -> None:
@@ -106,10 +112,10 @@ class RangeCompress(Stage):
         self.radar, self.reference = radar, reference
 
     def spectrum(self, n: int, device: torch.device | str | None = None) -> Tensor:
-        """Return the reference spectrum.
+        """Return the spectrum of the filter that compresses range lines of n samples.
 
         Args:
-            n: Number of samples of a line.
+            n: Number of samples of a range line.
             device: Device of the result.
 
         Returns:
@@ -118,10 +124,13 @@ class RangeCompress(Stage):
         return REFERENCES[self.reference](self.radar.pulse, n, self.radar.sampling_hz, device)
 
     def forward(self, signal: Signal) -> Signal:
-        """Compress a signal with axes (pulse, range).
+        """Compress a signal with axes (pulse, range) in range.
 
         Args:
             signal: Recording.
+
+        Returns:
+            Range-compressed signal on the axes of the recording.
         """
         real_dtype(signal.data.dtype)
         return signal.with_data(range_compress(signal.data, self.spectrum(signal.data.shape[-1], signal.data.device)))

@@ -1,4 +1,4 @@
-"""Requirements of a stripmap scene on its focuser: the phase that each simplification neglects.
+"""Phase that each simplification of a stripmap focuser neglects in a given scene.
 
 All values follow from the radar and the axes, before any simulation.
 """
@@ -24,13 +24,14 @@ class Requirement:
     Args:
         effect: Name of the simplification.
         neglects: Description of the neglected term.
-        phase_rad: Neglected phase in rad.
-        range_cells: The same in range cells; nan where it is not a shift.
+        phase_rad: Largest neglected phase in rad.
+        range_cells: Neglected shift in range cells; nan where no shift is neglected.
         tolerance_rad: Tolerated phase in rad.
         remedy: Remedy where the simplification is not permissible.
-        error_db: Loss in dB of the response of a point where the phase is largest: its relative
-            error, see `phase_error_db`, or the loss of its peak; nan where it is not predicted.
-        tolerance_db: Tolerated loss in dB.
+        error_db: Error in dB of the response of a point where the neglected phase is largest: its
+            relative error, see `phase_error_db`, or the loss of its peak; nan where neither is
+            predicted.
+        tolerance_db: Largest permissible `error_db` in dB.
     """
 
     effect: str
@@ -44,8 +45,9 @@ class Requirement:
 
     @property
     def ok(self) -> bool:
-        """True where the simplification is permissible: by its error where that is predicted, else
-        by its phase.
+        """True where the simplification is permissible.
+
+        The error `error_db` of the response decides where it is predicted, otherwise the phase.
         """
         if math.isnan(self.error_db):
             return self.phase_rad <= self.tolerance_rad
@@ -75,11 +77,11 @@ def phase_error_db(phase_rad: Tensor) -> float:
 
 @dataclass(frozen=True)
 class Aperture:
-    """Samples of the part of the wavenumber plane that a target occupies.
+    """Samples of the Doppler band and the range band that the spectrum of a target occupies.
 
     Args:
         at: Geometry at the sampled Doppler frequencies.
-        frequency_hz: Samples of the range band in Hz.
+        frequency_hz: Sampled range frequencies relative to the carrier in Hz, shape (f,).
         integration_s: Integration time in seconds.
         doppler_band_hz: Doppler bandwidth in Hz.
     """
@@ -108,10 +110,14 @@ class Aperture:
             range_m: Slant range of the target in metres.
             doppler_hz: Absolute Doppler centroid in Hz.
             velocity_m_s: Effective velocity in m/s.
-            frame_hz: Doppler frequency of the axes of the image in Hz, see `omega_k`.
+            frame_hz: Doppler frequency in Hz of the line of sight that defines the image
+                coordinates, see `omega_k`.
             integration_s: Integration time in seconds; None for the time in which the Doppler of
                 the target changes by one PRF.
             samples: Number of samples per axis.
+
+        Returns:
+            The sampled bands.
         """
         cos2 = 1 - float(radar.sin_squint(doppler_hz, velocity_m_s)) ** 2
         rate = float(radar.azimuth_rate_hz_s(range_m, velocity_m_s)) * cos2
@@ -131,24 +137,30 @@ class Aperture:
 
     @property
     def carrier_row(self) -> Tensor:
-        """G(0, X) - f0 in Hz, shape (d, 1)."""
+        """Omega-K mapping G - f0 at the carrier f0 in Hz, see `wavenumber`, shape (Doppler, 1)."""
         return self.at.mapped(torch.zeros(1, dtype=torch.float64))
 
     @property
     def slope(self) -> Tensor:
-        """dG / df at the carrier minus one, the relative range migration, shape (d, 1)."""
+        """Relative range migration at each Doppler, shape (Doppler, 1).
+
+        It is dG / df - 1 at the carrier, with the omega-K mapping G of `wavenumber`.
+        """
         step = 1e-3 * self.at.radar.carrier_hz
         ends = self.at.mapped(torch.tensor([-step, step], dtype=torch.float64))
         return (ends[:, 1:] - ends[:, :1]) / (2 * step) - 1
 
     def bulk_residual_rad(self, offset_m: float) -> Tensor:
-        """Compute the phase that bulk + refocus omega-K leaves, 2 pi (2 dr / c) (G(f) - G(0) - f).
+        """Compute the phase that omega-K without Stolt interpolation leaves away from centre range.
+
+        It is 2 pi (2 dr / c) (G(f) - G(0) - f) at range frequency f, with the mapping G of
+        `wavenumber` at each Doppler.
 
         Args:
             offset_m: Distance dr of the target from the centre range in metres.
 
         Returns:
-            Phase in rad, shape (d, f).
+            Phase in rad, shape (d, f), over Doppler and range frequency.
         """
         left = self.at.mapped(self.frequency_hz) - self.carrier_row - self.frequency_hz
         return 4 * math.pi * offset_m / self.at.radar.wave_speed_m_s * left
@@ -156,13 +168,14 @@ class Aperture:
     def coupling_rad(self, range_m: float) -> Tensor:
         """Compute the phase that the range-Doppler algorithm leaves.
 
-        It is the curvature of G over the range band, 2 pi (2 R / c) (G(f) - G(0) - G'(0) f).
+        It is 2 pi (2 R / c) (G(f) - G(0) - G'(0) f) at range frequency f, with the mapping G of
+        `wavenumber` at each Doppler and its slope G' over f: the terms beyond linear ones in f.
 
         Args:
             range_m: Slant range R of the target in metres.
 
         Returns:
-            Phase in rad, shape (d, f).
+            Phase in rad, shape (d, f), over Doppler and range frequency.
         """
         left = self.at.mapped(self.frequency_hz) - self.carrier_row - (1 + self.slope) * self.frequency_hz
         return 4 * math.pi * range_m / self.at.radar.wave_speed_m_s * left
@@ -179,22 +192,24 @@ def requirements(
     velocity_error_m_s: float = 1.0,
     tolerance_db: float = -20.0,
 ) -> tuple[Requirement, ...]:
-    """List the phase that each simplification neglects at worst in a stripmap scene.
+    """List the largest phase that each simplification of a focuser neglects in a stripmap scene.
 
-    A quarter of a range resolution cell of migration is pi/4 at the ends of the band, so that
-    counting in cells and in phase agrees. Warns where the PRF is below the Doppler band.
+    A shift by a quarter of a range resolution cell is a phase of pi/4 at the ends of the range
+    band, so that tolerances in cells and in phase agree. Warns where the PRF is below the Doppler
+    band of a target.
 
     Args:
         radar: Radar of the recording.
         axes: Axes of the raw matrix, (pulse, range).
         doppler_hz: Absolute Doppler centroid in Hz; None for the nominal pointing or 0.
         velocity_m_s: Effective velocity in m/s; None for that of the radar.
-        integration_s: Integration time of a target in seconds; None for that of the radar, else one
-            PRF of Doppler.
-        frame_hz: Frame Doppler in Hz; None for the nominal pointing, else the centroid, as in the
-            focusers.
+        integration_s: Integration time of a target in seconds; None for that of the radar, or where
+            it has none, the time in which the Doppler of a target sweeps one PRF.
+        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates;
+            None for the nominal pointing of the radar, or the centroid where it has none.
         tolerance_rad: Tolerated phase in rad.
-        velocity_error_m_s: Error of the effective velocity of one of the rows, in m/s.
+        velocity_error_m_s: Error of the effective velocity in m/s that the row "velocity wrong by"
+            assumes.
         tolerance_db: Tolerated relative error of a response, for rows that predict one.
 
     Returns:
@@ -286,7 +301,7 @@ def requirements(
 def full_swath_m(
     radar: StripmapRadar, axes: tuple[Axis, ...], doppler_hz: float, velocity_m_s: float, integration_s: float
 ) -> tuple[float, float]:
-    """Slant ranges at the beam centre whose echoes are recorded over the whole aperture.
+    """Compute the slant ranges whose echoes are recorded over the whole aperture.
 
     Args:
         radar: Radar of the recording.
@@ -296,7 +311,8 @@ def full_swath_m(
         integration_s: Integration time of a target in seconds.
 
     Returns:
-        Least and largest range in metres; the middle of the record twice where no range is.
+        Least and largest slant range at the crossing of the beam centre in metres. Where no range
+        is recorded over the whole aperture, both are the middle of the record.
     """
     start, stop = axes[-1].start, axes[-1].stop - radar.pulse_samples * axes[-1].step
     along = velocity_m_s * integration_s / 2
@@ -306,10 +322,10 @@ def full_swath_m(
 
 
 def recommended_form(rows: tuple[Requirement, ...]) -> str:
-    """Name the cheapest focuser that the table of `requirements` permits.
+    """Return the name of the fastest omega-K focuser that the simplifications permit.
 
     Args:
-        rows: Table of `requirements`.
+        rows: Simplifications and their errors, as returned by `requirements`.
 
     Returns:
         "omega_k" or "omega_k_stolt".

@@ -1,6 +1,6 @@
-"""Limits of estimating a non-uniform rotation, and requirements of the target on its processor.
+"""Limits of estimating a non-uniform rotation, and the phase that simplified processing neglects.
 
-Both follow from radar, rotation and scatterers, before any simulation.
+Both are computed from radar, rotation and scatterers of a target, before any simulation.
 """
 
 from __future__ import annotations
@@ -47,22 +47,22 @@ def rotation_limits(
     noise_std: float = 0.0,
     rate_bound: float | None = None,
 ) -> tuple[Limit, ...]:
-    """List the limits of estimating and imaging a target with non-uniform rotation.
+    """List the limits of estimating the rotation of a target and of forming its image.
 
-    The angle is omega_rad_s (t + k1 t^2 / 2! + ...).
+    The rotation angle is omega_rad_s (t + k1 t^2 / 2! + k2 t^3 / 3! + ...), with the time t since
+    the first pulse.
 
     Args:
         radar: Radar of the recording.
         n_pulse: Number of pulses.
         omega_rad_s: Rotation rate at the first pulse in rad/s.
-        k: Coefficients k1, k2, ... of the warp.
+        k: Coefficients k1, k2, ... of the rotation angle in 1/s, 1/s^2, ...
         cross_range_m: Cross range of the scatterers in metres, shape (target,).
-        lever_m: Range of the scatterers from the rotation centre (y + yc) in metres, shape
-            (target,).
-        amplitude: Amplitudes of range-compressed samples, shape (target,).
-        noise_std: Square root of the variance of the complex noise per sample.
-        rate_bound: Cramer-Rao bound of omega_rad_s in rad/s, see `metrics.rotation_bounds`; its row
-            is absent where this is None.
+        lever_m: Range of the scatterers from the rotation centre in metres, shape (target,).
+        amplitude: Amplitudes of the scatterers in range-compressed samples, shape (target,).
+        noise_std: Square root of the variance of the complex noise per range-compressed sample.
+        rate_bound: Cramer-Rao bound (standard deviation) of omega_rad_s in rad/s, see
+            `metrics.rotation_bounds`; None leaves out the limit of this bound.
 
     Returns:
         One row per limit.
@@ -208,18 +208,25 @@ def rotation_requirements(
     lever_m: float,
     tolerance_rad: float = math.pi / 4,
 ) -> tuple[Requirement, ...]:
-    """List the phase that each simplification neglects at worst for a rotating target.
+    """List the largest phase that each simplification neglects for a rotating target.
 
-    Orders of the warp neglect the Legendre terms that no lower order represents. Azimuth only
-    neglects the range term beyond a line in the warp, pi/4 at the depth of focus 2 ra^2 / lambda.
-    Fixed envelopes neglect migration, a phase at the ends of the band. Both are judged by the
-    relative error of the response, the range term by its phase.
+    The rotation angle is omega_rad_s phi(t), with the warp phi(t) = t + k1 t^2 / 2! + ... The
+    simplifications are:
+
+    - a warp cut to order 1, 2, 3 or 4, which neglects its Legendre terms of higher order. It is
+      permissible where the relative error of the response is small;
+    - azimuth only, which neglects the phase of the range y from the rotation centre,
+      2 pi y (omega_rad_s phi)^2 / wavelength, apart from a line in phi. It is permissible up to
+      `tolerance_rad`; pi/4 is reached at y = 2 (cross-range resolution)^2 / wavelength;
+    - fixed envelopes, which neglect migration through range cells, a phase at the ends of the range
+      band. It is permissible where the relative error of the response is small;
+    - small angles and ranges in float32, permissible up to `tolerance_rad`.
 
     Args:
         radar: Radar of the recording.
         n_pulse: Number of pulses.
         omega_rad_s: Rotation rate at the first pulse in rad/s.
-        k: Coefficients k1, k2, ... of the warp.
+        k: Coefficients k1, k2, ... of the warp in 1/s, 1/s^2, ...
         cross_range_m: Largest cross range of the scatterers in metres.
         lever_m: Largest range of the scatterers from the rotation centre in metres.
         tolerance_rad: Tolerated phase in rad.
@@ -288,10 +295,10 @@ def rotation_requirements(
 
 
 def peak_loss_db(phase_rad: Tensor) -> float:
-    """Compute the loss of the peak of a response, -20 log10 |mean exp(j phi)|, by a phase phi.
+    """Compute the loss of the peak of a response by a phase error phi, -20 log10 |mean exp(j phi)|.
 
     Args:
-        phase_rad: Phase in rad over the aperture, any shape.
+        phase_rad: Phase error phi in rad over the aperture, any shape.
 
     Returns:
         Loss in dB, 0 or more; a quadratic phase that reaches pi / 4 at the ends gives 0.24 dB.
@@ -300,18 +307,19 @@ def peak_loss_db(phase_rad: Tensor) -> float:
 
 
 def range_term_loss_db(warp_s: Tensor, omega_rad_s: float, lever_m: float, wavelength_m: float) -> float:
-    """Compute the loss of the peak of a scatterer by its range term, (c4/2) y omega^2 phi^2.
+    """Compute the loss of the peak of a scatterer by the phase of its range during rotation.
 
-    A line in the warp, which only shifts the peak, is no loss.
+    The phase is 2 pi y (omega phi)^2 / wavelength, with the range y from the rotation centre and
+    the rotation angle omega phi. Its part linear in phi only shifts the peak and is not counted.
 
     Args:
-        warp_s: Warp phi at the pulses in seconds, shape (pulse,).
-        omega_rad_s: Rotation rate at the first pulse in rad/s.
+        warp_s: Warp phi at the pulses in seconds, the rotation angle over omega, shape (pulse,).
+        omega_rad_s: Rotation rate omega at the first pulse in rad/s.
         lever_m: Range y of the scatterer from the rotation centre in metres.
         wavelength_m: Wavelength in metres.
 
     Returns:
-        Loss in dB.
+        Loss in dB, 0 or more.
     """
     phase = 2 * math.pi / wavelength_m * abs(lever_m) * (omega_rad_s * warp_s).square()
     scaled = warp_s / warp_s.abs().max().clamp_min(torch.finfo(torch.float64).tiny)
@@ -322,18 +330,21 @@ def range_term_loss_db(warp_s: Tensor, omega_rad_s: float, lever_m: float, wavel
 def order_loss_db(
     k: Tensor, order: int, duration_s: float, omega_rad_s: float, cross_range_m: float, wavelength_m: float
 ) -> float:
-    """Compute the loss of the peak of a scatterer by a warp that is cut to an order.
+    """Compute the loss of the peak of a scatterer by a rotation model of too low an order.
+
+    The rotation angle is omega_rad_s (t + k1 t^2 / 2! + ...). The model keeps its Legendre terms up
+    to an order; the phase of the other terms defocuses the scatterer.
 
     Args:
-        k: Coefficients k1, k2, ... of the warp, shape (coefficient,).
-        order: Order of the warp that is used, 1 to 4.
+        k: Coefficients k1, k2, ... in 1/s, 1/s^2, ..., shape (coefficient,).
+        order: Highest order in time that the model keeps, 1 to 4.
         duration_s: Length of the record in seconds.
         omega_rad_s: Rotation rate at the first pulse in rad/s.
         cross_range_m: Cross range of the scatterer in metres.
         wavelength_m: Wavelength in metres.
 
     Returns:
-        Loss in dB; 0 where the warp has no higher orders.
+        Loss in dB; 0 where the rotation has no higher orders.
     """
     across = 4 * math.pi / wavelength_m * cross_range_m * omega_rad_s
     return peak_loss_db(across * _legendre_left(k, duration_s)[order - 1])
@@ -349,13 +360,14 @@ _ORDER_NEGLECTS = {
 
 
 def least_order(rows: Sequence[Requirement]) -> int:
-    """Return the least order of the warp that a table of `rotation_requirements` permits.
+    """Return the least order in time of the rotation angle that focuses a target well enough.
 
     Args:
-        rows: Table of `rotation_requirements`.
+        rows: Simplifications and their errors, as returned by `rotation_requirements`.
 
     Returns:
-        The order; one more than the last of the table where none is permitted.
+        The least order whose row is permissible; one more than the highest listed order where none
+        is.
     """
     orders = [row for row in rows if row.effect.startswith("warp of order")]
     return next((i for i, row in enumerate(orders, start=1) if row.ok), len(orders) + 1)
@@ -388,7 +400,9 @@ def _whole(k: Tensor, duration_s: float) -> Tensor:
 def _check(omega: float, k: Sequence[float], x: Tensor, lever: Tensor, amplitude: Tensor) -> None:
     """Raise ValueError for an invalid rotation or shapes that differ."""
     if not (math.isfinite(omega) and omega > 0) or not all(math.isfinite(one) for one in k):
-        raise ValueError(f"a rotation needs a positive rate and finite k, got omega_rad_s={omega} and k={list(k)}")
+        raise ValueError(
+            f"omega_rad_s must be positive (rad/s) and every k finite, got omega_rad_s={omega} and k={list(k)}"
+        )
     if not x.shape == lever.shape == amplitude.shape or x.ndim != 1 or not len(x):
         raise ValueError(
             "cross_range_m, lever_m and amplitude must have the same shape (target,), got the shapes "

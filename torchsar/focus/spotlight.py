@@ -15,7 +15,7 @@ from torchsar.radar.spotlight import FarField, Spotlight, frequency_samples, fre
 
 
 def window_weights(name: str, n: int, device: torch.device | str | None = None) -> Tensor:
-    """Compute weights over an aperture or a band.
+    """Compute the weights of a window over the pulses of an aperture or the frequencies of a band.
 
     Args:
         name: "none" for ones, "hann" for a raised cosine whose zeros lie just outside.
@@ -36,14 +36,14 @@ def window_weights(name: str, n: int, device: torch.device | str | None = None) 
 
 
 def aperture_weights(window: str, geometry: FarField | Spotlight) -> Tensor:
-    """Compute the product of the windows over pulses and over frequencies.
+    """Compute the weight of each sample: the product of windows over pulses and over frequencies.
 
     Args:
-        window: "none" or "hann".
+        window: "none" or "hann", used in both directions.
         geometry: Geometry of the recording.
 
     Returns:
-        Weights, shape (pulse, range), float64.
+        Weights, shape (pulse, frequency), float64.
 
     Raises:
         ValueError: If the window is not known.
@@ -53,7 +53,7 @@ def aperture_weights(window: str, geometry: FarField | Spotlight) -> Tensor:
 
 
 def refuse_other_size(profiles: Tensor, geometry: FarField | Spotlight) -> None:
-    """Check that profiles are complex and of the size of the geometry.
+    """Raise an error unless range profiles are complex and have the size of the geometry.
 
     Args:
         profiles: Range profiles, shape (..., pulse, range).
@@ -82,21 +82,23 @@ def backproject_spotlight(
     eps: float = 1e-10,
     block_bytes: int = 1 << 23,
 ) -> Tensor:
-    """Sum the samples over pulses and frequencies at the range of each pixel.
+    """Form the image of ground points by exact backprojection of spotlight or turntable data.
 
-        image = sum_k sum_f s_k(f) exp(+4j pi f r_k / c),    r_k the range of the pixel in pulse k.
+        image = sum_k sum_f s_k(f) exp(+4j pi f r_k / c),
 
-    A point of unit amplitude gives the sum of the window weights (their number without a window)
-    with its own phase. Between range samples the profile comes from a non-uniform FFT. Profiles are
-    periodic in range: a scatterer c / (2 frequency step) farther appears at the same position.
-    Takes pulses x pixels x 40 operations. Differentiable in profiles, pixel and antenna positions.
+    where s_k(f) is the sample of pulse k at frequency f and r_k the range of the pixel in pulse k.
+    A point scatterer of unit amplitude has the sum of the window weights as peak (without a window
+    the number of samples) and keeps its phase. Range profiles are interpolated by a non-uniform
+    FFT. They are periodic in range: a scatterer c / (2 frequency step) farther appears at the same
+    position. The sum takes pulses x pixels x 40 operations. Differentiable in profiles, pixel and
+    antenna positions.
 
     Args:
-        profiles: Range profiles, shape (..., pulse, range), complex, as from `read_inverse`; s are
-            their frequency samples.
+        profiles: Range profiles, shape (..., pulse, range), complex, as from `read_inverse`; s_k(f)
+            are the frequency samples computed from them.
         geometry: `Spotlight` for exact ranges, `FarField` for plane waves.
-        x_m: Ground coordinate of the pixels in metres, float64.
-        y_m: Ground coordinate of the pixels in metres, float64; broadcasts against `x_m`.
+        x_m: First ground coordinate of the pixels in metres, float64.
+        y_m: Second ground coordinate of the pixels in metres, float64; broadcasts against `x_m`.
         window: "none" or "hann", over pulses and over frequencies.
         eps: Relative error of the interpolation in range.
         block_bytes: Size of a working array in bytes.
@@ -107,8 +109,8 @@ def backproject_spotlight(
 
     Raises:
         TypeError: If the profiles are not complex.
-        ValueError: If their size is not that of the geometry, there is no pixel, or the window is
-            not known.
+        ValueError: If the size of the profiles is not that of the geometry, there is no pixel, or
+            the window is not known.
     """
     refuse_other_size(profiles, geometry)
     x, y = torch.broadcast_tensors(
@@ -116,7 +118,7 @@ def backproject_spotlight(
     )
     shape, x, y = x.shape, x.reshape(-1), y.reshape(-1)
     if not x.numel():
-        raise ValueError(f"backprojection needs at least one pixel, got coordinates of shape {tuple(shape)}")
+        raise ValueError(f"backprojection needs at least one pixel, got x_m and y_m of the common shape {tuple(shape)}")
     samples = frequency_samples(profiles) * aperture_weights(window, geometry).to(real_dtype(profiles.dtype))
     between = _BetweenSamples(geometry, eps, samples)
     trials = max(1, math.prod(samples.shape[:-2]))
@@ -173,9 +175,10 @@ class GroundGrid:
     Args:
         extent_m: Side of the square in metres.
         step_m: Sample spacing in metres.
-        centre_m: Centre (x, y) in metres, in the turned coordinates.
-        range_axis_rad: Direction of the range axis of the image, from x towards y; the azimuth axis
-            is a quarter turn further. At 0 the range axis is x and the azimuth axis y.
+        centre_m: Position of the centre in metres along (range axis, azimuth axis) of the image.
+        range_axis_rad: Direction of the range axis of the image in rad, from ground coordinate x
+            towards y; the azimuth axis is a quarter turn further. At 0 the range axis is x and the
+            azimuth axis y.
 
     Raises:
         ValueError: If a number is not finite, or 0 < step_m <= extent_m does not hold.
@@ -190,18 +193,19 @@ class GroundGrid:
         numbers = (self.extent_m, self.step_m, *self.centre_m, self.range_axis_rad)
         if not (all(map(math.isfinite, numbers)) and len(self.centre_m) == 2 and 0 < self.step_m <= self.extent_m):
             raise ValueError(
-                f"a ground grid needs 0 < step_m <= extent_m, a centre (x, y) and a finite direction, got {self}"
+                "a ground grid needs 0 < step_m <= extent_m, a centre of two coordinates and finite numbers, "
+                f"got {self}"
             )
 
     def axes(self) -> tuple[Axis, Axis]:
-        """Return the axes ("azimuth", "range") in metres; the centre is sample n // 2."""
+        """Return the axes ("azimuth", "range") in metres; of n samples the centre is n // 2."""
         n = round(self.extent_m / self.step_m) + 1
         start_range, start_azimuth = (c - (n // 2) * self.step_m for c in self.centre_m)
         return Axis("azimuth", n, start_azimuth, self.step_m, "m"), Axis("range", n, start_range, self.step_m, "m")
 
 
 class GroundImager(Stage):
-    """Base of the stages that form an image of the ground plane from range profiles.
+    """Base class of the stages that form an image of the ground plane from range profiles.
 
     The image has the axes ("azimuth", "range"). One geometry is used for all trials. Where the
     geometry is not known in advance, connect recorded side data:
@@ -209,13 +213,13 @@ class GroundImager(Stage):
         use(PolarFormat(100.0, 0.25), frequency_hz="aux.frequency_hz",
             position_m="aux.position_m", reference_m="aux.reference_m")
 
-    or `frequency_hz` and `angle_rad` for a turntable.
+    For a turntable, connect `frequency_hz` and `angle_rad` instead.
 
     Args:
         extent_m: Side of the image in metres, see `GroundGrid`.
         step_m: Sample spacing in metres.
-        centre_m: Centre (x, y) in metres.
-        range_axis_rad: Direction of the range axis in rad.
+        centre_m: Position of the centre in metres along (range axis, azimuth axis).
+        range_axis_rad: Direction of the range axis in rad, from ground coordinate x towards y.
         height_m: Height z of the imaged plane in metres.
         window: "none" or "hann", over pulses and over frequencies.
         eps: Relative error of the interpolation.
@@ -244,11 +248,11 @@ class GroundImager(Stage):
         self.height_m, self.window, self.eps, self.geometry = height_m, window, eps, geometry
 
     def form(self, profiles: Tensor, geometry: FarField | Spotlight, azimuth: Axis, range_: Axis) -> Tensor:
-        """Form the image; subclasses implement it.
+        """Form the image of range profiles on given axes; subclasses implement this method.
 
         Args:
             profiles: Range profiles, shape (..., pulse, range), complex.
-            geometry: Geometry in the turned coordinates of the axes.
+            geometry: Geometry in ground coordinates with x along the range axis of the image.
             azimuth: Azimuth axis of the image.
             range_: Range axis of the image.
 
@@ -273,6 +277,9 @@ class GroundImager(Stage):
             angle_rad: Angle of each pulse of a turntable in rad, shape (pulse,).
             position_m: Antenna position of each pulse in metres, shape (pulse, 3).
             reference_m: Reference range of each pulse in metres, shape (pulse,).
+
+        Returns:
+            Image with axes (azimuth, range) in metres.
         """
         geometry = self.geometry
         if geometry is None or frequency_hz is not None:
@@ -289,11 +296,11 @@ class SpotlightBackprojection(GroundImager):
     """
 
     def form(self, profiles: Tensor, geometry: FarField | Spotlight, azimuth: Axis, range_: Axis) -> Tensor:
-        """Form the image by backprojection.
+        """Form the image of range profiles by exact backprojection.
 
         Args:
             profiles: Range profiles, shape (..., pulse, range), complex.
-            geometry: Geometry in the turned coordinates of the axes.
+            geometry: Geometry in ground coordinates with x along the range axis of the image.
             azimuth: Azimuth axis of the image.
             range_: Range axis of the image.
 

@@ -29,7 +29,7 @@ class StoltMap:
     frequencies of every Doppler row, so that larger shifts are also handled.
 
     Args:
-        basis: Basis over the range band.
+        basis: Polynomials that interpolate the shift over the range band.
         radar: Radar of the recording.
         n: Number of range samples.
         eps: Relative error of the interpolation.
@@ -73,9 +73,9 @@ def omega_k_stolt(
 ) -> Tensor:
     """Focus by omega-K with Stolt interpolation.
 
-    The image of a target is exact at every range; coordinates and phases are those of `omega_k`, to
-    which it tends for narrow swaths. Takes two to three times the time of `omega_k`. Differentiable
-    in the raw data, the velocity and the frame.
+    The image of a target is exact at every range. Coordinates and phases are those of `omega_k`,
+    and for narrow swaths both images agree. The computation takes two to three times as long as
+    `omega_k`. Differentiable in the raw data, the velocity and the frame Doppler.
 
     Args:
         raw: Raw or range-compressed data, shape (..., pulse, range), complex.
@@ -83,9 +83,10 @@ def omega_k_stolt(
         doppler_hz: Absolute Doppler centroid in Hz, a number or shape (...,).
         velocity_m_s: Effective velocity in m/s, a number or shape (...,); None for that of the
             radar.
-        frame_hz: Frame Doppler of the image coordinates in Hz; None for the nominal pointing, else
-            the centroid.
-        reference: Range reference spectrum, shape (range,); None for range-compressed data.
+        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates;
+            None for the nominal pointing of the radar, or the centroid where it has none.
+        reference: Spectrum of the range compression filter, shape (range,); None for
+            range-compressed data.
         band_hz: Processed Doppler bandwidth about the centroid in Hz; None for the whole PRF.
         eps: Relative error of the interpolation. The default keeps the image error below -80 dB;
             1e-12 suits complex128 references.
@@ -94,7 +95,9 @@ def omega_k_stolt(
         Image, shape (..., azimuth, range), complex.
 
     Raises:
-        ValueError: As in `omega_k`.
+        ValueError: If the Doppler or the velocity is neither a number nor a tensor of the leading
+            dims of the data, the velocity is not positive, a Doppler exceeds 2 velocity /
+            wavelength, or `band_hz` is not positive.
     """
     geometry = FrameGeometry.of(radar, raw, doppler_hz, velocity_m_s, frame_hz, band_hz=band_hz)
     n, centre = raw.shape[-1], raw.shape[-1] // 2

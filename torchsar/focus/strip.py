@@ -27,7 +27,7 @@ ARRAYS = 3
 
 
 class Lines(Protocol):
-    """Any source of complex lines that is sliced as source[..., first:last, :].
+    """Any source of complex raw lines that can be sliced as source[..., first:last, :].
 
     Examples are a tensor, a numpy array or memmap, and a zarr array.
     """
@@ -39,15 +39,15 @@ class Lines(Protocol):
 
 @dataclass(frozen=True)
 class StripPlan:
-    """Division of a strip into blocks.
+    """Division of a strip into overlapping blocks of raw lines that fit the memory.
 
     Image line k needs the raw lines k + reach[0] to k + reach[1].
 
     Args:
         n_lines: Number of lines of the strip.
         height: Raw lines read per block.
-        reach: First and last raw line relative to an image line.
-        bytes: Memory of the samples in bytes.
+        reach: First and last raw line that contribute to an image line, relative to it.
+        bytes: Memory of the samples of a block in bytes.
     """
 
     n_lines: int
@@ -57,7 +57,7 @@ class StripPlan:
 
     @property
     def blocks(self) -> list[tuple[slice, slice]]:
-        """Raw lines to read and image lines to keep of every block; the latter tile the strip."""
+        """Raw lines to read and image lines to keep for each block; kept lines tile the strip."""
         if self.height >= self.n_lines:
             return [(slice(0, self.n_lines), slice(0, self.n_lines))]
         step = self.height - (self.reach[1] - self.reach[0])
@@ -70,16 +70,17 @@ class StripPlan:
 
 
 def filter_tail(guard_lines: float) -> float:
-    """Compute the energy of a whole-PRF azimuth filter beyond a guard, relative to all of it.
+    """Compute the part of the energy of an azimuth filter beyond its aperture and a guard.
 
-    The phase of the filter jumps by any amount where the PRF band wraps; a jump that changes the
-    filter by 2 gives |h| = 1 / (pi g), and half of that energy is the average.
+    The filter uses the whole PRF, and its phase jumps where the PRF band wraps. At g lines from the
+    ends of the aperture, a jump that changes the filter by 2 gives a tail |h| = 1 / (pi g); over
+    all jumps the mean energy is half of that.
 
     Args:
         guard_lines: Distance g from the ends of the aperture in lines.
 
     Returns:
-        Relative energy.
+        Energy beyond the guard relative to the whole energy of the filter.
     """
     return 1 / (math.pi**2 * guard_lines)
 
@@ -95,21 +96,25 @@ def reach_lines(
 ) -> tuple[int, int]:
     """Compute the first and last raw line, relative to an image line, that contribute to it.
 
-    With a processed band the soft edges make the filter compact: the overlap is shortest, and the
-    tolerance holds for any data. Without one the aperture is that of the whole PRF, and the
-    tolerance holds for data that are 30 dB down at the ends of the PRF band (a beam narrower than
-    the PRF, little noise); data that fill the band agree to about -45 dB.
+    With a processed band (`band_hz`), its soft edges make the azimuth filter short: few lines
+    contribute, and the tolerance holds for any data. Without it the aperture is that of the whole
+    PRF. The tolerance then holds for data whose spectrum is 30 dB down at the ends of the PRF band
+    (a beam narrower than the PRF, little noise). For data that fill the band, the blocks agree with
+    one transform of the whole strip to about -45 dB.
 
     Args:
         radar: Radar of the recording.
         axes: Axes of the raw matrix, (pulse, range).
         doppler_hz: Lowest and highest absolute centroid of the strip in Hz.
-        frame_hz: Frame Doppler of the image coordinates in Hz; None for the centroid itself.
+        frame_hz: Doppler frequency in Hz of the line of sight that defines the image coordinates;
+            None for the centroid itself.
         band_hz: Processed Doppler bandwidth of the focuser in Hz; None for the whole PRF.
-        tolerance_db: Energy of the cut tails in dB.
+        tolerance_db: Energy of the tails of the filter that are cut off, relative to its whole
+            energy, in dB.
 
     Returns:
-        First and last raw line relative to the image line.
+        First and last contributing raw line relative to the image line; the first is negative where
+        earlier lines contribute.
     """
     far, near = axes[-1].stop, axes[-1].start
     cos2 = 1 - max(float(radar.sin_squint(f)) ** 2 for f in doppler_hz)
@@ -144,20 +149,22 @@ def _frame_shift_s(radar: StripmapRadar, doppler_hz: float, frame_hz: float, ran
 def plan_strip(shape: tuple[int, ...], reach: tuple[int, int], memory_bytes: int, itemsize: int = 8) -> StripPlan:
     """Divide a strip into blocks that fit a memory limit.
 
-    Three arrays of a block are in memory at once.
+    Three arrays of the size of a block are in memory at once: its raw lines, its image, and the
+    image of the previous block.
 
     Args:
         shape: Shape of the strip, (..., line, sample).
-        reach: First and last raw line relative to an image line, see `reach_lines`.
-        memory_bytes: Memory for samples in bytes.
+        reach: First and last raw line that contribute to an image line, relative to it, see
+            `reach_lines`.
+        memory_bytes: Memory for these arrays in bytes.
         itemsize: Bytes per sample.
 
     Returns:
         Plan of the blocks.
 
     Raises:
-        ValueError: If the overlap leaves no space for new lines; the message names the least
-            memory.
+        ValueError: If a block that fits the memory holds no more lines than blocks overlap; the
+            message names the least memory.
     """
     n_lines = shape[-2]
     line_bytes = ARRAYS * itemsize * math.prod(shape[:-2]) * shape[-1]
@@ -168,9 +175,9 @@ def plan_strip(shape: tuple[int, ...], reach: tuple[int, int], memory_bytes: int
     least = overlap + max(1, overlap // 8)
     if height < least:
         raise ValueError(
-            f"strip blocks of {height} lines ({memory_bytes / 1e9:.3g} GB) do not hold the "
-            f"overlap of {overlap} lines; allow at least {least * line_bytes / 1e9:.3g} GB, or a "
-            "narrower processed band"
+            f"memory_bytes must hold blocks of at least {least} lines, since blocks overlap by {overlap} lines, got "
+            f"{memory_bytes / 1e9:.3g} GB for {height} lines; allow at least {least * line_bytes / 1e9:.3g} GB, or "
+            "process a narrower Doppler band"
         )
     height = max((h for h in range(max(least, height // 2), height + 1) if smooth_length(h) == h), default=height)
     return StripPlan(n_lines, height, reach, height * line_bytes)
@@ -188,15 +195,15 @@ def focus_strip(
 ) -> Iterator[tuple[slice, Signal]]:
     """Focus a strip block by block.
 
-    Holds at most `plan.bytes` of samples if the caller keeps one block; the working memory of the
-    stage is additional (tens of megabytes).
+    At most `plan.bytes` of samples are in memory if the caller keeps one block at a time; the
+    working memory of the focusing stage (tens of megabytes) is additional.
 
     Args:
         source: Raw lines, shape (..., line, sample), read by blocks.
         focus: Focusing stage or chain that keeps the size of the matrix, called as focus(signal,
             **values(lines)).
         radar: Radar of the recording.
-        plan: Plan of the blocks.
+        plan: Division of the strip into blocks, from `plan_strip`.
         axes: Axes of the raw matrix; None for those of the radar.
         values: Values that change along the strip, such as {"doppler_hz": ..., "velocity_m_s":
             ...}, for the raw lines of a block. The radar should then have a nominal pointing, which
@@ -211,7 +218,7 @@ def focus_strip(
     """
     if source.shape[-2] != plan.n_lines:
         raise ValueError(
-            f"the plan is for {plan.n_lines} lines, the source has {source.shape[-2]}; make a plan "
+            f"source must have the {plan.n_lines} lines of the plan, got {source.shape[-2]} lines; make a plan "
             "with plan_strip(source.shape, ...)"
         )
     axes = radar.raw_axes(plan.n_lines, source.shape[-1]) if axes is None else axes
@@ -247,7 +254,7 @@ def write_strip(blocks: Iterator[tuple[slice, Signal]], target: Any) -> None:
     """Write the blocks of `focus_strip` into an array as they are produced.
 
     Args:
-        blocks: Image lines and their image.
+        blocks: Image lines of each block and their image, as yielded by `focus_strip`.
         target: Tensor, numpy array or memmap, or zarr array, written as target[..., lines, :].
     """
     for lines, image in blocks:

@@ -1,4 +1,4 @@
-"""Limits of a stripmap recording, which follow from the radar before any simulation."""
+"""Limit of the Doppler band of a stripmap recording, computed from the radar parameters."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from torchsar.radar import StripmapRadar
 
 
 def strip_limits(radar: StripmapRadar, samples: int, doppler_hz: float, velocity_m_s: float) -> tuple[Limit, ...]:
-    """List the limits of a recording; none where the radar has no integration time.
+    """Compare the Doppler band of the aperture of a stripmap radar with its PRF.
 
     Args:
-        radar: Instrument.
-        samples: Range samples of a line; the aperture is that of the middle one.
+        radar: Radar of the recording.
+        samples: Number of range samples of a line; the Doppler rate is that at the middle one.
         doppler_hz: Absolute Doppler centroid in Hz.
         velocity_m_s: Effective velocity in m/s.
 
     Returns:
-        The limit of the Doppler band, or nothing.
+        The limit of the Doppler band; an empty tuple where the radar has no integration time.
     """
     if radar.integration_s is None:
         return ()

@@ -15,9 +15,10 @@ from torchsar.radar import FarField, InverseRadar, Spotlight
 class TargetImage(Stage):
     """Stage that forms an image ("azimuth", "range") from range profiles ("pulse", "range").
 
-    Polar format where the geometry is known, otherwise a transform along pulses. The polar image
-    has its range axis along the mean line of sight, range increasing away from the radar; it covers
-    the whole unambiguous extent of cross range and all range cells, as `autofocus` requires.
+    Where the geometry is known, the image is formed by polar format, otherwise by a Fourier
+    transform along pulses (`AzimuthTransform`). The polar image has its range axis along the
+    mean line of sight, with range increasing away from the radar. It covers the whole unambiguous
+    extent of cross range and all range cells, as `autofocus` requires.
 
     Args:
         radar: Radar of the recording.
@@ -40,7 +41,7 @@ class TargetImage(Stage):
     ) -> None:
         super().__init__()
         if not 0 < step_cells <= 1:
-            raise ValueError(f"step_cells must lie in 0..1 resolution cells, got {step_cells}")
+            raise ValueError(f"step_cells must be above 0 and at most 1 resolution cell, got {step_cells}")
         self.radar, self.window, self.step_cells = radar, window, step_cells
         self.along = AzimuthTransform(radar, window, oversampling)
         self.waves = (
@@ -51,16 +52,20 @@ class TargetImage(Stage):
         self._operator: PolarOperator | None = None
 
     def operator(self, profiles: Tensor) -> PolarOperator | None:
-        """Return the polar operator for profiles, or None where images are transforms along pulses.
+        """Return the polar-format operator for profiles, or None where no geometry is known.
 
-        The operator is stored for further profiles of the same dtype and device.
+        Without a geometry, images are transforms along pulses. The operator is stored
+        for further profiles of the same dtype and device.
 
         Args:
             profiles: Range profiles, shape (..., pulse, range), complex.
 
+        Returns:
+            Map from range profiles to the image, with its adjoint, or None.
+
         Raises:
-            ValueError: If the size is not that of the geometry, or the line of sight does not
-                rotate.
+            ValueError: If the size of the profiles is not that of the geometry, or the line of
+                sight does not rotate.
         """
         if self.waves is None:
             return None
@@ -106,9 +111,12 @@ class TargetImage(Stage):
         Args:
             signal: Range profiles.
 
+        Returns:
+            Image with axes (azimuth, range).
+
         Raises:
-            ValueError: If the size is not that of the geometry, or the line of sight does not
-                rotate.
+            ValueError: If the size of the profiles is not that of the geometry, or the line of
+                sight does not rotate.
         """
         operator = self.operator(signal.data)
         return (

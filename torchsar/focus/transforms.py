@@ -1,6 +1,6 @@
-"""Choices of how the matched Fourier transform forms its sum over pulses.
+"""Ways in which the matched Fourier transform can compute its sum over pulses.
 
-Each choice is a frozen object with its accuracy settings and builds the corresponding sum of
+Each is a frozen object that holds its accuracy settings and builds the corresponding sum of
 `focus.warped_sums` for given pulses and image lines.
 
 Reference:
@@ -24,14 +24,17 @@ _EPS = 1e-6
 
 @dataclass(frozen=True)
 class PulsesToLines:
-    """Pulses and image lines of one matched Fourier transform.
+    """Pulses and image lines between which one matched Fourier transform maps.
 
     Args:
-        warp_k: Coefficients of the warp, shape (..., order - 1), float64.
+        warp_k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s,
+            1/s^2, ..., shape (..., order - 1), float64.
         n_pulse: Number of pulses.
         prf_hz: Pulse rate in Hz.
-        u: Warp at the pulses over the warp of the whole aperture, shape (..., pulse), float64.
-        cells_per_line: Step between image lines in Doppler cells, shape (...,), float64.
+        u: Rotation angle at each pulse over that of the whole aperture, shape (..., pulse),
+            float64.
+        cells_per_line: Step between image lines in Doppler cells, 1 / aperture time, shape (...,),
+            float64.
         lines: Number of image lines.
         dtype: Complex type of the data.
     """
@@ -46,28 +49,29 @@ class PulsesToLines:
 
     @property
     def points(self) -> Tensor:
-        """Cycles per line of each pulse, shape (..., pulse), float64."""
+        """Phase step of each pulse from line to line in cycles, shape (..., pulse), float64."""
         return self.u * self.cells_per_line[..., None]
 
     @property
     def scale(self) -> float:
-        """Factor on the sum, 1 / sqrt(pulses)."""
+        """Factor on the sum over pulses, 1 / sqrt(number of pulses)."""
         return 1 / math.sqrt(self.n_pulse)
 
 
 @dataclass(frozen=True)
 class Gridding:
-    """Non-uniform FFT by gridding with a Kaiser-Bessel kernel, the default.
+    """Sum over pulses by a non-uniform FFT with a Kaiser-Bessel gridding kernel, the default.
 
-    Give the width `taps` or the relative error `eps`, not both. For searches 4 taps suffice, with
-    an entropy error below 1.5e-4 nat; the default suits images in complex64.
+    Give the width `taps` or the relative error `eps`, not both. The default suits images in
+    complex64. For searches that compare the entropy of images, 4 taps suffice: their error of the
+    entropy is below 1.5e-4 nat.
 
     Args:
         taps: Width of the kernel in grid points, 2 to 16.
         eps: Relative error of the image, 1e-13 to 0.1; 1e-6 where neither is given. The narrowest
             kernel of an even width is chosen.
-        oversampling: Fineness of the grid, 1.25 to 2 times the pulses. None for 2 with `taps`; with
-            `eps` None for 1.5, the fastest, or 2 where 1.5 does not reach `eps`.
+        oversampling: Grid points per image line, 1.25 to 2. None chooses 2 where `taps` is given;
+            otherwise 1.5, the fastest, or 2 where 1.5 does not reach `eps`.
 
     Raises:
         ValueError: If both `taps` and `eps` are given, or one value lies outside its range.
@@ -79,12 +83,12 @@ class Gridding:
 
     def __post_init__(self) -> None:
         if self.taps is not None and self.eps is not None:
-            raise ValueError(f"give the kernel's taps or its eps, not both, got taps={self.taps} and eps={self.eps}")
+            raise ValueError(f"Gridding takes either taps or eps, not both, got taps={self.taps} and eps={self.eps}")
         _ = self.kernel
 
     @property
     def kernel(self) -> Kernel:
-        """Interpolation kernel of this choice."""
+        """Kaiser-Bessel kernel of the given width or relative error."""
         if self.taps is not None:
             return Kernel(self.taps, 2.0 if self.oversampling is None else self.oversampling)
         eps, oversampling = _EPS if self.eps is None else self.eps, self.oversampling
@@ -93,33 +97,39 @@ class Gridding:
         return Kernel.of(eps, oversampling, even=True)
 
     def build(self, of: PulsesToLines) -> Sum:
-        """Build the sum over pulses with its adjoint.
+        """Build the linear map from pulses to image lines, which also has its adjoint.
 
         Args:
-            of: Pulses and image lines.
+            of: Pulses and image lines of the transform.
+
+        Returns:
+            The map.
         """
         return Gridded(of.points, of.lines, self.kernel, of.dtype, of.scale)
 
 
 @dataclass(frozen=True)
 class ExplicitSum:
-    """Direct evaluation of the sum: exact and slow, the reference for the other choices."""
+    """Sum over pulses by direct evaluation: exact and slow, the reference for faster ways."""
 
     def build(self, of: PulsesToLines) -> Sum:
-        """Build the sum over pulses with its adjoint.
+        """Build the linear map from pulses to image lines, which also has its adjoint.
 
         Args:
-            of: Pulses and image lines.
+            of: Pulses and image lines of the transform.
+
+        Returns:
+            The map.
         """
         return Explicit(of.points, of.lines, of.dtype, of.scale)
 
 
 @dataclass(frozen=True)
 class Resampling:
-    """Interpolation of the pulses to equal steps of angle, followed by an FFT: a baseline.
+    """Sum over pulses by interpolation to equal steps of rotation angle, then an FFT: a baseline.
 
-    Loses accuracy towards the edge of the Doppler band: with targets up to 93 % of half the pulse
-    rate the relative image error is 0.20 (linear) and 0.077 (spline).
+    It loses accuracy towards the edge of the Doppler band: for targets whose Doppler reaches 93 %
+    of half the pulse rate, the relative error of the image is 0.20 (linear) and 0.077 (spline).
 
     Args:
         interpolation: "linear", or "spline" for the not-a-knot cubic spline.
@@ -132,22 +142,27 @@ class Resampling:
 
     def __post_init__(self) -> None:
         if self.interpolation not in ("linear", "spline"):
-            raise ValueError(f"interpolation {self.interpolation!r} is not known; choose 'linear' or 'spline'")
+            raise ValueError(
+                f"interpolation {self.interpolation!r} of the pulses is not known; choose 'linear' or 'spline'"
+            )
 
     def build(self, of: PulsesToLines) -> Sum:
-        """Build the sum over pulses with its adjoint.
+        """Build the linear map from pulses to image lines, which also has its adjoint.
 
         Args:
-            of: Pulses and image lines.
+            of: Pulses and image lines of the transform.
+
+        Returns:
+            The map.
         """
         return Resampled(of.warp_k, of.n_pulse, of.prf_hz, of.cells_per_line, of.lines, self.interpolation, of.scale)
 
 
 @dataclass(frozen=True)
 class CompiledNufft:
-    """Non-uniform FFT of the compiled library finufft, in float64 on the CPU.
+    """Sum over pulses by the compiled library finufft, in float64 on the CPU.
 
-    Gives first derivatives only. Needs the extra `nufft`: pip install 'torchsar-lab[nufft]'.
+    It gives first derivatives only. Needs the extra `nufft`: pip install 'torchsar-lab[nufft]'.
 
     Args:
         eps: Relative error of the image; None for that of the default `Gridding`.
@@ -156,10 +171,13 @@ class CompiledNufft:
     eps: float | None = None
 
     def build(self, of: PulsesToLines) -> Sum:
-        """Build the sum over pulses with its adjoint.
+        """Build the linear map from pulses to image lines, which also has its adjoint.
 
         Args:
-            of: Pulses and image lines.
+            of: Pulses and image lines of the transform.
+
+        Returns:
+            The map.
 
         Raises:
             ModuleNotFoundError: If finufft is not installed.

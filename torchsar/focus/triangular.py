@@ -1,6 +1,6 @@
-"""From dechirped triangular sweeps to a focused image.
+"""Image formation from dechirped triangular sweeps of a ladar.
 
-Range compression, azimuth deramp, azimuth matched filter.
+The steps are range compression, removal of the azimuth phase (deramp) and azimuth matched filter.
 
 Reference:
     Remote Sens. 2024, 16, 793.
@@ -25,7 +25,8 @@ _EPOCH = {"up": 0.25, "down": 0.75}
 def video_filter(frequency_hz: Tensor, radar: TriangularLadar, ramp: Ramp = "up") -> Tensor:
     """Compute the filter that removes the residual video phase.
 
-    exp(+j pi f^2 / K) for the up-sweep, its conjugate for the down-sweep.
+    It is exp(+j pi f^2 / K) over beat frequency f for the up-sweep, with the chirp rate K, and its
+    conjugate for the down-sweep.
 
     Args:
         frequency_hz: Beat frequencies f in Hz.
@@ -45,19 +46,21 @@ def video_filter(frequency_hz: Tensor, radar: TriangularLadar, ramp: Ramp = "up"
 def compress_sweeps(sweeps: Tensor, radar: TriangularLadar, ramp: Ramp = "up", video: bool = True) -> Tensor:
     """Compress the up-sweeps or the down-sweeps into range profiles.
 
-    The sweeps are in the dechirp sign of the radar. The profiles are in the sign of the Reference,
-    with the phase +4 pi RD / lambda for the relative range RD, and refer to the middle of the
-    sweep. A scatterer of amplitude a has the peak a. Remove the residual video phase after motion
-    compensation, not before. Differentiable.
+    A scatterer of amplitude a, RD metres beyond the reference range of the radar in the middle of
+    the sweep, has a peak of modulus a and phase +4 pi RD / lambda. This is the sign of the
+    Reference, for either dechirp sign of the radar. Compensate motion in the sweeps before the
+    residual video phase is removed. Differentiable.
 
     Args:
-        sweeps: Dechirped sweeps, shape (..., 2, pulse, N), up before down, complex.
+        sweeps: Dechirped sweeps with N samples each, shape (..., 2, pulse, N), up before down,
+            complex, in the sign `radar.dechirp_sign`.
         radar: Radar of the recording.
         ramp: "up" or "down".
-        video: Remove the residual video phase, -pi K dtau^2 of the up-sweep.
+        video: Remove the residual video phase, for the up-sweep -pi K dtau^2 with the chirp rate K
+            and the delay dtau of the scatterer relative to the reference range.
 
     Returns:
-        Range profiles, shape (..., pulse, N), relative range rising from -(N // 2) cells.
+        Range profiles, shape (..., pulse, N), with relative range rising from -(N // 2) cells.
 
     Raises:
         TypeError: If the sweeps are not complex.
@@ -92,7 +95,8 @@ def compress_sweeps(sweeps: Tensor, radar: TriangularLadar, ramp: Ramp = "up", v
 def profile_axes(pulse: Axis, radar: TriangularLadar, ramp: Ramp = "up") -> tuple[Axis, Axis]:
     """Return the axes of range profiles: slow time in seconds, relative range in metres.
 
-    Slow time refers to the middle of the sweeps.
+    Slow time refers to the middle of the sweeps; relative range is zero at the reference range of
+    the radar.
 
     Args:
         pulse: Pulse axis of the sweeps.
@@ -112,11 +116,12 @@ def azimuth_turns(
 ) -> Tensor:
     """Compute the azimuth phase in turns of a scatterer at azimuth zero.
 
-    It is 2 (sqrt(R^2 + (V t)^2) - R) / lambda with R = reference + relative range.
+    It is 2 (sqrt(R^2 + (V t)^2) - R) / lambda with slow time t, speed V and R = reference range +
+    relative range.
 
     Args:
         pulse: Slow time of the samples, zero at broadside.
-        range_: Relative range.
+        range_: Range relative to the reference range of the radar.
         radar: Radar of the recording.
         device: Device of the result.
 
@@ -124,13 +129,14 @@ def azimuth_turns(
         Phase in turns, shape (pulse, range), float64.
 
     Raises:
-        ValueError: If the range axis reaches the radar.
+        ValueError: If a range R of the axis is zero or negative.
     """
     across = (radar.speed_m_s * pulse.values(device))[:, None].square()
     r = radar.reference_range_m + range_.values(device)
     if bool((r <= 0).any()):
         raise ValueError(
-            f"the range axis reaches {float(r.min()):.4g} m from the ladar; crop it to ranges in front of the ladar"
+            "the range axis must lie at positive distances from the ladar, got "
+            f"{float(r.min()):.4g} m from the ladar; crop it to ranges in front of the ladar"
         )
     return 2 / radar.wavelength_m * across / (torch.sqrt(r.square() + across) + r)
 
@@ -149,16 +155,17 @@ def _check_profiles(data: Tensor, pulse: Axis, range_: Axis, what: str) -> None:
 
 
 def deramp_azimuth(data: Tensor, radar: TriangularLadar, pulse: Axis, range_: Axis) -> Tensor:
-    """Remove the azimuth phase of a scatterer at azimuth zero.
+    """Remove the azimuth phase of a scatterer at azimuth zero from range profiles.
 
-    A scatterer at azimuth x keeps a tone of -2 V x / (lambda R) Hz. Estimators of a phase per pulse
-    need deramped profiles. Differentiable.
+    The echo of a scatterer at azimuth x and range R is then a tone of -2 V x / (lambda R) Hz over
+    slow time, with the speed V. Estimators of one phase error per pulse need such deramped
+    profiles. Differentiable.
 
     Args:
         data: Range profiles, shape (..., pulse, range), complex.
         radar: Radar of the recording.
         pulse: Slow time of the samples (middles of the sweeps), zero at broadside.
-        range_: Relative range.
+        range_: Range relative to the reference range of the radar.
 
     Returns:
         Deramped profiles, same shape.
@@ -166,7 +173,7 @@ def deramp_azimuth(data: Tensor, radar: TriangularLadar, pulse: Axis, range_: Ax
     Raises:
         TypeError: If the data are not complex.
         ValueError: If the data are not finite or do not fit their axes, or the range axis reaches
-            the radar.
+            the radar or lies behind it.
     """
     _check_profiles(data, pulse, range_, "deramp_azimuth")
     return data * unit_phasor(-azimuth_turns(pulse, range_, radar, data.device), data.dtype)
@@ -182,22 +189,25 @@ def azimuth_matched_filter(
 ) -> Tensor:
     """Form the image of deramped profiles by the azimuth matched filter.
 
-    The image is the sum over the aperture of s(t) exp(-j 2 pi (V t - x)^2 / (lambda R)) at x = V t,
-    with the exact phases of every range cell and without wrap-around. A scatterer that is
-    illuminated over its whole aperture keeps its amplitude. Differentiable.
+    The image at azimuth x and range R is the weighted mean over the pulses of the aperture of
+    s(t) exp(-4j pi (sqrt(R^2 + (V t - x)^2) - R) / lambda), where s(t) are the profiles with their
+    azimuth phase restored, t is slow time and V the speed. The image is evaluated at the azimuths
+    x = V t of the pulses, without wrap-around. A scatterer that is illuminated over its whole
+    aperture keeps its amplitude. Differentiable.
 
     Args:
         data: Deramped profiles, shape (..., pulse, range), complex.
         radar: Radar of the recording.
-        pulse: Slow time of the samples.
-        range_: Relative range.
-        beam_rad: Azimuth angle of the aperture, which is beam_rad * R long about every x; None for
-            that of the radar, or the whole record where the radar has none.
-        weighting: Coefficient a of the weights 1 - a + a cos(2 pi y / L) over the aperture L, which
-            lower the first side lobes (0: -13.27 dB; 0.03: -13.9 dB and 1 % wider; 0.46: Hamming).
+        pulse: Slow time of the samples, zero at broadside.
+        range_: Range relative to the reference range of the radar.
+        beam_rad: Angle of the aperture in rad: it is beam_rad * R long about every x. None for the
+            beam of the radar, or the whole record where the radar has no beam.
+        weighting: Coefficient a of the weights 1 - a + a cos(2 pi y / L) at the distance y from the
+            middle of an aperture of length L. They lower the first side lobes (0: -13.27 dB; 0.03:
+            -13.9 dB and 1 % wider; 0.46: Hamming).
 
     Returns:
-        Image, shape (..., azimuth, range).
+        Image, shape (..., azimuth, range), complex.
 
     Raises:
         TypeError: If the data are not complex.
@@ -209,7 +219,8 @@ def azimuth_matched_filter(
         raise ValueError(f"weighting must lie in 0..0.5, got {weighting}")
     if not radar.speed_m_s > 0:
         raise ValueError(
-            "radar.speed_m_s is 0; a target that does not move across the line of sight has no azimuth image"
+            f"radar.speed_m_s must be positive for an azimuth image, got {radar.speed_m_s}; a target that does not "
+            "move across the line of sight has no such image"
         )
     n = data.shape[-2]
     half = _half_aperture(radar, pulse, range_, beam_rad)
@@ -261,7 +272,8 @@ class CompressSweeps(Stage):
         radar: Radar of the recording.
         ramp: "up" or "down".
         video: Remove the residual video phase.
-        window_m: Least and greatest relative range to keep in metres; None for all.
+        window_m: Least and greatest range to keep in metres, relative to the reference range of the
+            radar; None for all ranges.
 
     Raises:
         ValueError: If `ramp` is not known.
@@ -283,10 +295,13 @@ class CompressSweeps(Stage):
         self.ramp: Ramp = ramp
 
     def forward(self, signal: Signal) -> Signal:
-        """Compress a signal with axes (ramp, pulse, fast_time).
+        """Compress a signal with axes (ramp, pulse, fast_time) into range profiles.
 
         Args:
             signal: Dechirped sweeps.
+
+        Returns:
+            Range profiles of one ramp with axes (pulse, range).
 
         Raises:
             ValueError: If `window_m` does not lie in the relative ranges of the profiles.
@@ -302,8 +317,8 @@ class CompressSweeps(Stage):
         low, high = (round(float(axes[1].index_of(edge))) for edge in self.window_m)
         if not 0 <= low < high < axes[1].n:
             raise ValueError(
-                f"window_m {tuple(self.window_m)} does not lie in the relative ranges "
-                f"{axes[1].start:.4g}..{axes[1].stop:.4g} m"
+                f"window_m must lie in the relative ranges {axes[1].start:.4g}..{axes[1].stop:.4g} m of the profiles "
+                f"and hold more than one range cell, got {tuple(self.window_m)}"
             )
         return out.crop(range=(low, high + 1))
 
@@ -320,10 +335,13 @@ class DerampAzimuth(Stage):
         self.radar = radar
 
     def forward(self, signal: Signal) -> Signal:
-        """Deramp a signal with axes (pulse, range).
+        """Remove the azimuth phase of a scatterer at azimuth zero from range profiles.
 
         Args:
-            signal: Range profiles.
+            signal: Range profiles with axes (pulse, range).
+
+        Returns:
+            Deramped profiles on the same axes.
         """
         return signal.with_data(deramp_azimuth(signal.data, self.radar, *signal.axes))
 
@@ -342,10 +360,13 @@ class AzimuthMatchedFilter(Stage):
         self.radar, self.beam_rad, self.weighting = radar, beam_rad, weighting
 
     def forward(self, signal: Signal) -> Signal:
-        """Filter a signal with axes (pulse, range).
+        """Form the image of deramped profiles by the azimuth matched filter.
 
         Args:
-            signal: Deramped profiles.
+            signal: Deramped profiles with axes (pulse, range).
+
+        Returns:
+            Image with axes (azimuth, range) in metres.
         """
         pulse, range_ = signal.axes
         image = azimuth_matched_filter(signal.data, self.radar, pulse, range_, self.beam_rad, self.weighting)

@@ -1,7 +1,7 @@
-"""Sums of a matched Fourier transform over pulses, each with its exact adjoint.
+"""The sum over pulses of the matched Fourier transform, computed in four ways, and its adjoint.
 
-The sums are formed by gridding, directly, by resampling, or by a compiled library; the choices are
-in `focus.transforms`.
+The sum maps pulses to image lines. It is computed by gridding, directly, by resampling, or by a
+compiled library, as chosen by an object of `focus.transforms`.
 
 Reference:
     Remote Sens. 2025, 17, 3447, Eq. (9); Greengard and Lee 2004 (non-uniform FFT), see
@@ -26,7 +26,7 @@ from torchsar.focus.nufft import Kernel
 
 
 def slow_times(n_pulse: int, prf_hz: float, device: torch.device | str | None = None) -> Tensor:
-    """Return the time since the first pulse.
+    """Return the time of each pulse since the first pulse.
 
     Args:
         n_pulse: Number of pulses.
@@ -42,10 +42,12 @@ def slow_times(n_pulse: int, prf_hz: float, device: torch.device | str | None = 
 def normalised_warp(k: Tensor, n_pulse: int, prf_hz: float) -> tuple[Tensor, Tensor]:
     """Compute the normalised warp u = phi(t) / phi(T) and its rate du/d(t/T) at the pulses.
 
-    The rate is 1 for uniform rotation. Differentiable.
+    The warp phi(t) is the rotation angle over the rotation rate at the first pulse, T the aperture
+    time. The rate is 1 for uniform rotation. Differentiable.
 
     Args:
-        k: Coefficients of the warp, shape (..., order - 1).
+        k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s, 1/s^2,
+            ..., shape (..., order - 1).
         n_pulse: Number of pulses.
         prf_hz: Pulse rate in Hz.
 
@@ -59,10 +61,11 @@ def normalised_warp(k: Tensor, n_pulse: int, prf_hz: float) -> tuple[Tensor, Ten
 
 
 def whole_warp(k: Tensor, duration_s: float) -> Tensor:
-    """Compute the warp of the whole aperture, phi(T).
+    """Compute phi(T): the rotation angle of the whole aperture over the rate at the first pulse.
 
     Args:
-        k: Coefficients of the warp, shape (..., order - 1).
+        k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s, 1/s^2,
+            ..., shape (..., order - 1).
         duration_s: Aperture time T in seconds.
 
     Returns:
@@ -72,30 +75,37 @@ def whole_warp(k: Tensor, duration_s: float) -> Tensor:
 
 
 class Sum(Protocol):
-    """A linear map from pulses to image lines with its adjoint."""
+    """Linear map from pulses to image lines with its adjoint: the sum of a Fourier transform."""
 
     def forward(self, pulses: Tensor) -> Tensor:
-        """Transform pulses (..., pulse, range) into lines (..., line, range).
+        """Transform pulses into image lines.
 
         Args:
-            pulses: Pulses, complex.
+            pulses: Pulses, shape (..., pulse, range), complex.
+
+        Returns:
+            Image lines, shape (..., line, range).
         """
         ...
 
     def adjoint(self, image: Tensor) -> Tensor:
-        """Transform lines (..., line, range) into pulses (..., pulse, range).
+        """Transform image lines into pulses by the adjoint of `forward`.
 
         Args:
-            image: Image lines, complex.
+            image: Image lines, shape (..., line, range), complex.
+
+        Returns:
+            Pulses, shape (..., pulse, range).
         """
         ...
 
 
 class Gridded:
-    """The sum by gridding, see `focus.gridding`.
+    """Sum over pulses by a non-uniform FFT with gridding, see `focus.gridding`.
 
     Args:
-        points: Cycles per line of each pulse, shape (..., pulse), float64.
+        points: Phase step of each pulse from one image line to the next in cycles, shape (...,
+            pulse), float64.
         lines: Number of image lines.
         kernel: Interpolation kernel.
         dtype: Complex type of the data.
@@ -107,27 +117,34 @@ class Gridded:
         self.points = self.plan.points(points)
 
     def forward(self, pulses: Tensor) -> Tensor:
-        """Transform pulses (..., pulse, range) into lines (..., line, range).
+        """Transform pulses into image lines.
 
         Args:
-            pulses: Pulses, complex.
+            pulses: Pulses, shape (..., pulse, range), complex.
+
+        Returns:
+            Image lines, shape (..., line, range).
         """
         return self.plan.type1(pulses, self.points)
 
     def adjoint(self, image: Tensor) -> Tensor:
-        """Transform lines (..., line, range) into pulses (..., pulse, range).
+        """Transform image lines into pulses by the adjoint of `forward`.
 
         Args:
-            image: Image lines, complex.
+            image: Image lines, shape (..., line, range), complex.
+
+        Returns:
+            Pulses, shape (..., pulse, range).
         """
         return self.plan.type2(image, self.points)
 
 
 class Explicit:
-    """The direct sum, by blocks of lines.
+    """Sum over pulses by direct evaluation, in blocks of image lines.
 
     Args:
-        points: Cycles per line of each pulse, shape (..., pulse), float64.
+        points: Phase step of each pulse from one image line to the next in cycles, shape (...,
+            pulse), float64.
         lines: Number of image lines.
         dtype: Complex type of the data.
         scale: Factor on the sum.
@@ -146,34 +163,41 @@ class Explicit:
         return self.scale * linear_phasor(self.points, at - self.lines // 2, count, self.dtype)
 
     def forward(self, pulses: Tensor) -> Tensor:
-        """Transform pulses (..., pulse, range) into lines (..., line, range).
+        """Transform pulses into image lines.
 
         Args:
-            pulses: Pulses, complex.
+            pulses: Pulses, shape (..., pulse, range), complex.
+
+        Returns:
+            Image lines, shape (..., line, range).
         """
         return torch.cat([self._matrix(*block).mT @ pulses for block in self._blocks()], -2)
 
     def adjoint(self, image: Tensor) -> Tensor:
-        """Transform lines (..., line, range) into pulses (..., pulse, range).
+        """Transform image lines into pulses by the adjoint of `forward`.
 
         Args:
-            image: Image lines, complex.
+            image: Image lines, shape (..., line, range), complex.
+
+        Returns:
+            Pulses, shape (..., pulse, range).
         """
         parts = [self._matrix(at, count).conj() @ image[..., at : at + count, :] for at, count in self._blocks()]
         return torch.stack(parts).sum(0)
 
 
 class Resampled:
-    """The sum by interpolation of the pulses to equal steps of angle, followed by an FFT.
+    """Sum over pulses by interpolation to equal steps of rotation angle, followed by an FFT.
 
-    The transform over equal steps is an integral over du, so that pulses are divided by the rate of
-    the warp.
+    The FFT weights equal steps of angle equally, the sum over pulses equal steps of time. Pulses
+    are therefore divided by the relative rotation rate.
 
     Args:
-        k: Coefficients of the warp, shape (..., order - 1), float64.
+        k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s, 1/s^2,
+            ..., shape (..., order - 1), float64.
         n_pulse: Number of pulses.
         prf_hz: Pulse rate in Hz.
-        step: Step between image lines in Doppler cells, shape (...,), float64.
+        step: Step between image lines in Doppler cells, 1 / aperture time, shape (...,), float64.
         lines: Number of image lines.
         interpolation: "linear" or "spline".
         scale: Factor on the sum.
@@ -189,10 +213,13 @@ class Resampled:
         self.position, self.factor = time * prf_hz, scale / rate
 
     def forward(self, pulses: Tensor) -> Tensor:
-        """Transform pulses (..., pulse, range) into lines (..., line, range).
+        """Transform pulses into image lines.
 
         Args:
-            pulses: Pulses, complex.
+            pulses: Pulses, shape (..., pulse, range), complex.
+
+        Returns:
+            Image lines, shape (..., line, range).
         """
         even = self.interpolate(pulses, self.position) * self.factor.to(pulses.real.dtype)[..., None]
         length = round(self.n_pulse / float(self.step)) if self.step.ndim == 0 and not self.step.requires_grad else 0
@@ -203,10 +230,15 @@ class Resampled:
         return torch.cat([whole[..., length - half :], whole[..., : self.lines - half]], -1).mT
 
     def adjoint(self, image: Tensor) -> Tensor:
-        """Transform lines into pulses, by automatic differentiation of the linear map.
+        """Transform image lines into pulses by the adjoint of `forward`.
+
+        The adjoint is found by automatic differentiation of the linear map.
 
         Args:
             image: Image lines, shape (..., line, range), complex.
+
+        Returns:
+            Pulses, shape (..., pulse, range).
         """
         trials = torch.broadcast_shapes(image.shape[:-2], self.position.shape[:-1])
         with torch.enable_grad():
@@ -217,17 +249,20 @@ class Resampled:
 
 
 def times_of_even_angle(k: Tensor, n_pulse: int, prf_hz: float) -> Tensor:
-    """Compute the times at which the warp reaches equal steps of angle, j phi(T) / n_pulse.
+    """Compute the times at which the rotation angle has grown by equal steps.
 
-    Differentiable twice: the last two Newton steps carry gradients.
+    At time j the warp, which is the angle over the rate at the first pulse, is j / n_pulse of its
+    value over the whole aperture, j = 0..n_pulse - 1. Differentiable twice: the last two Newton
+    steps carry gradients.
 
     Args:
-        k: Coefficients of the warp, shape (..., order - 1), float64.
+        k: Coefficients k1, k2, ... of the warp t + k1 t^2 / 2! + k2 t^3 / 3! + ... in 1/s, 1/s^2,
+            ..., shape (..., order - 1), float64.
         n_pulse: Number of pulses.
         prf_hz: Pulse rate in Hz.
 
     Returns:
-        Times in seconds, shape (..., n_pulse), float64.
+        Times since the first pulse in seconds, shape (..., n_pulse), float64.
     """
     duration = n_pulse / prf_hz
     angle = torch.arange(n_pulse, dtype=torch.float64, device=k.device) / n_pulse * whole_warp(k, duration)
@@ -281,12 +316,13 @@ def _pulses_at(pulses: Tensor, index: Tensor) -> Tensor:
 
 
 class Compiled:
-    """The sum by the compiled library finufft, in float64 for all data.
+    """Sum over pulses by the compiled library finufft, in float64 for data of any precision.
 
-    In single precision its points lose a thousandth of a cell far from zero.
+    In single precision the library rounds points far from zero by a thousandth of a Doppler cell.
 
     Args:
-        points: Cycles per line of each pulse, shape (..., pulse), float64.
+        points: Phase step of each pulse from one image line to the next in cycles, shape (...,
+            pulse), float64.
         lines: Number of image lines.
         eps: Relative error.
         scale: Factor on the sum.
@@ -300,18 +336,24 @@ class Compiled:
         self.points, self.lines, self.eps, self.scale = points, lines, eps, scale
 
     def forward(self, pulses: Tensor) -> Tensor:
-        """Transform pulses (..., pulse, range) into lines (..., line, range).
+        """Transform pulses into image lines.
 
         Args:
-            pulses: Pulses, complex.
+            pulses: Pulses, shape (..., pulse, range), complex.
+
+        Returns:
+            Image lines, shape (..., line, range).
         """
         return _CompiledSum.apply(*self._together(pulses), self.lines, self.eps).to(pulses.dtype) * self.scale
 
     def adjoint(self, image: Tensor) -> Tensor:
-        """Transform lines (..., line, range) into pulses (..., pulse, range).
+        """Transform image lines into pulses by the adjoint of `forward`.
 
         Args:
-            image: Image lines, complex.
+            image: Image lines, shape (..., line, range), complex.
+
+        Returns:
+            Pulses, shape (..., pulse, range).
         """
         return _CompiledSum.apply(*self._together(image), 0, self.eps).to(image.dtype) * self.scale
 
