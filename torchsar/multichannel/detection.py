@@ -91,8 +91,8 @@ def detect(
     """
     if image.trials:
         raise ValueError(
-            f"detect works on one image at a time, got images with the trial "
-            f"dimensions {tuple(image.trials)}; call it for each image separately"
+            "detect works on one image at a time, got images with the trial dimensions "
+            f"{tuple(image.trials)}; call it for each image separately"
         )
     level, (rows, columns) = contrast(image, extent_m)
     left, found = level.clone(), []

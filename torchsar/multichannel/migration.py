@@ -202,7 +202,7 @@ class StaticBulk:
         return _profiles(spectrum, frame, reference, 0.0) if self.whole_swath else torch.fft.ifft(spectrum)
 
     def neglected_m(self, integration_s: float, motion: PointMotion, reference: PointMotion) -> Tensor:
-        """Return the walk and curvature that remain, relative to the reference, in metres, (...,)."""
+        """Return the walk and curvature in metres that remain besides the reference's, (...,)."""
         return (
             (_moved_m(integration_s, motion) - _moved_m(integration_s, _followed(motion, reference, self.whole_swath)))
             .abs()
@@ -239,7 +239,7 @@ class Keystone:
         return _profiles(spectrum, frame, reference, 1.0) if self.whole_swath else torch.fft.ifft(spectrum)
 
     def neglected_m(self, integration_s: float, motion: PointMotion, reference: PointMotion) -> Tensor:
-        """Return the curvature that remains, relative to the reference, in metres, (...,)."""
+        """Return the curvature in metres that remains besides the reference's, (...,)."""
         e = _moved_m(integration_s, motion) - _moved_m(integration_s, _followed(motion, reference, self.whole_swath))
         return e.mean(0).abs()
 
