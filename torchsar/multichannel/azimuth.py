@@ -2,7 +2,7 @@
 
 Reference:
     Remote Sens. 2020, 12, 1703, sections 4.1 and 4.3. The filter is the exact spectrum of the
-    hyperbolic range history, including an along-track offset y0.
+    hyperbolic range history, including an along-track position y0 of the point at slow time zero.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def focus_azimuth(
 
 
 class FocusAzimuth(Stage):
-    """Azimuth focusing of one target per trial with its velocities.
+    """Stage that focuses one target per trial in azimuth, with its velocities.
 
     The input is a spectrum (doppler[, range]) of `Reconstruct`, the output an image (azimuth[,
     range]). Azimuth is x = V_R t in metres, with the speed V_R of the receiver and slow time t. For
@@ -109,7 +109,7 @@ class FocusAzimuth(Stage):
         y0_m: Number = 0.0,
         range_m: Number | None = None,
     ) -> Signal:
-        """Focus one target per trial.
+        """Focus one target per trial in azimuth.
 
         Args:
             signal: Spectrum with the axes (doppler[, range]).

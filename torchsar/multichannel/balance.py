@@ -73,7 +73,7 @@ def correct_balance(
     for name, value in (("phase_rad", phase_rad), ("gain_db", gain_db), ("delay_s", delay_s)):
         if value is not None and value.shape[-1:] != (radar.channels,):
             raise ValueError(
-                f"correct_balance needs {name} (..., {radar.channels}), one value per channel, got "
+                f"correct_balance needs {name} of shape (..., {radar.channels}), one value per channel, got "
                 f"shape {tuple(value.shape)}"
             )
     factor = (unit_phasor(-phase_rad / (2 * math.pi), torch.complex128) * 10 ** (-gain_db / 20)).to(data.dtype)
@@ -221,24 +221,37 @@ class _Models:
 
     @staticmethod
     def of(radar: BistaticRadar, prior: Prior, bands: int, n_pulse: int, device: torch.device) -> _Models:
-        """Form the covariances from expected power and array response, FFT order."""
+        """Return the covariances for an expected clutter power, with Doppler bins in FFT order."""
         return _Models(clutter_covariance(radar, prior, n_pulse, bands, device))
 
     def noisy(self, snr_db: float) -> Tensor:
-        """Add white noise at an SNR in dB of the strongest expected power."""
+        """Return the covariances plus white noise.
+
+        The SNR in dB is the ratio of the strongest expected power of a band to the noise.
+        """
         return self.clutter + 10 ** (-snr_db / 10) * torch.eye(
             self.clutter.shape[-1], dtype=self.clutter.dtype, device=self.clutter.device
         )
 
     def solve(self, products: Tensor, snr_db: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return weights (..., channel), half the Hessian and the negative log-likelihood."""
+        """Fit the channel gains for a given SNR in dB by maximum likelihood.
+
+        Returns:
+            Complex weights that balance the channels (..., channel), half the Hessian and the value
+            of the negative log-likelihood.
+        """
         model = self.noisy(snr_db)
         matrix = (torch.linalg.inv(model) * products.mT).mean(-3)
         weights, hessian, cost = _solved(matrix, self._start(products))
         return weights, hessian, 2 * cost + torch.linalg.slogdet(model)[1].mean()
 
     def best(self, products: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return weights, half the Hessian and SNR of the highest likelihood, per trial."""
+        """Fit the channel gains and the SNR by maximum likelihood in each trial.
+
+        Returns:
+            Complex weights that balance the channels (..., channel), half the Hessian of the
+            negative log-likelihood and the SNR in dB.
+        """
         found = [self.solve(products, level) for level in _LEVELS_DB]
         weights, hessian, cost = (torch.stack(parts, -1) for parts in zip(*found))
         best = cost.argmin(-1)

@@ -651,7 +651,7 @@ def body_image(body: Body, position_m: Tensor, extraction: Extraction) -> Tensor
     """Return the complex image of a body at given along-track positions, with the sea suppressed.
 
     Args:
-        body: Body.
+        body: Body that was found in the data.
         position_m: Along-track positions at t = 0 in metres, float64 (position,).
         extraction: Extent of the body.
 

@@ -36,9 +36,9 @@ class CompressChannels(Stage):
         self.radar, self.reference = radar, reference
 
     def spectrum(self, n: int, device: torch.device | str | None = None) -> Tensor:
-        """Return the reference spectrum for range lines of n samples, complex128 (n,)."""
+        """Return the reference spectrum of compression for lines of n samples, complex128 (n,)."""
         return REFERENCES[self.reference](self.radar.pulse, n, self.radar.sampling_hz, device)
 
     def forward(self, signal: Signal) -> Signal:
-        """Return the range-compressed data on the same axes (channel, pulse, range)."""
+        """Compress full chirps with the axes (channel, pulse, range) in range, on the same axes."""
         return signal.with_data(range_compress(signal.data, self.spectrum(signal.data.shape[-1], signal.data.device)))

@@ -1,4 +1,4 @@
-"""The chain that focuses points of known velocity and position."""
+"""Chain of stages that focuses points of known velocity and position."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def known_motion_chain(
     full: bool = False,
     follow: bool = True,
 ) -> Chain:
-    """Build the chain from channels to the images of points, each of known motion.
+    """Build the chain of stages from channels to the images of points of known motion.
 
     When it is run, the chain needs the motion of each point by the names `given.u_r_m_s`,
     `given.u_a_m_s`, `given.y0_m` and `given.range_m`, each of shape (trial,): slant-range and

@@ -202,7 +202,7 @@ class StaticBulk:
         return _profiles(spectrum, frame, reference, 0.0) if self.whole_swath else torch.fft.ifft(spectrum)
 
     def neglected_m(self, integration_s: float, motion: PointMotion, reference: PointMotion) -> Tensor:
-        """Return the walk and curvature in metres that remain besides the reference's, (...,)."""
+        """Return the range migration of a point minus that of the reference in metres, (...,)."""
         return (
             (_moved_m(integration_s, motion) - _moved_m(integration_s, _followed(motion, reference, self.whole_swath)))
             .abs()
@@ -231,7 +231,10 @@ class Keystone:
     whole_swath: bool = True
 
     def apply(self, data: Tensor, frame: Frame, reference: PointMotion, ambiguity: Tensor) -> Tensor:
-        """Remove walk by deramp, keystone and reramp; arguments as in `Migration.apply`."""
+        """Correct range migration by deramp, keystone transform and reramp.
+
+        Arguments as in `Migration.apply`.
+        """
         path = frame.path_m(reference)
         deramp = unit_phasor(path / frame.radar.wavelength_m, data.dtype)[..., None]
         spectrum = torch.fft.fft(data * deramp) * _envelope_phasor(path, frame.radar, data)
@@ -239,7 +242,7 @@ class Keystone:
         return _profiles(spectrum, frame, reference, 1.0) if self.whole_swath else torch.fft.ifft(spectrum)
 
     def neglected_m(self, integration_s: float, motion: PointMotion, reference: PointMotion) -> Tensor:
-        """Return the curvature in metres that remains besides the reference's, (...,)."""
+        """Return the range curvature of a point minus that of the reference in metres, (...,)."""
         e = _moved_m(integration_s, motion) - _moved_m(integration_s, _followed(motion, reference, self.whole_swath))
         return e.mean(0).abs()
 

@@ -83,7 +83,7 @@ class PointMotion:
 
     @property
     def along_m_s(self) -> Tensor:
-        """Along-track speed v = V_R - u_a of the receiver relative to the point in m/s."""
+        """Along-track speed of the receiver minus that of the point, v = V_R - u_a, in m/s."""
         return self.speed_m_s - self.u_a_m_s
 
     @property

@@ -169,7 +169,7 @@ class ElementPattern:
     """
 
     def power(self, offset_hz: Tensor, radar: BistaticRadar, motion: PointMotion) -> Tensor:
-        """Return the power pattern over Doppler offsets in Hz, see `Prior.power`."""
+        """Return the antenna pattern over Doppler as a power ratio, see `Prior.power`."""
         return torch.sinc(radar.element_m * offset_hz / motion.along_m_s[(...,) + (None,) * offset_hz.ndim]).square()
 
 
@@ -254,7 +254,10 @@ class LeastSquares:
         _check_bands(self.bands)
 
     def weights(self, radar: BistaticRadar, motion: PointMotion, n_pulse: int) -> Tensor:
-        """Return the weights from channels to Doppler bands, complex128 (..., band, channel)."""
+        """Return the weights from channels to Doppler bands, complex128 (..., band, channel).
+
+        They are the same for all Doppler bins of a band.
+        """
         matrix = band_matrix(radar, motion, self.bands)
         normal = matrix.mH @ matrix
         floor = _TINY * self.bands * radar.channels
@@ -302,7 +305,10 @@ class MinimumMeanSquare:
             )
 
     def weights(self, radar: BistaticRadar, motion: PointMotion, n_pulse: int) -> Tensor:
-        """Return the weights from channels to bands, complex128 (..., n_pulse, band, channel)."""
+        """Return the weights from channels to Doppler bands for each Doppler bin of a band.
+
+        The shape is (..., n_pulse, band, channel), complex128.
+        """
         offset = doppler_offsets(n_pulse, self.bands, radar.prf_hz, motion.u_r_m_s.device).view(self.bands, n_pulse).T
         matrix = band_matrix(radar, motion, self.bands)[..., None, :, :]
         weighted = matrix * self.prior.power(offset, radar, motion)[..., None, :].to(matrix.dtype)
@@ -310,7 +316,7 @@ class MinimumMeanSquare:
         return torch.linalg.solve(weighted @ matrix.mH + noise, weighted).mH
 
     def refusal(self, channels: int) -> str | None:
-        """Return None: with a prior any number of bands can be separated."""
+        """Return None, since a prior lets any number of channels separate the bands."""
         return None
 
 

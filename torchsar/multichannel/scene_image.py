@@ -78,7 +78,7 @@ class Detector:
             )
 
     def found(self, image: Signal) -> list[Detection]:
-        """Return the detections in an image (azimuth, range), strongest first."""
+        """Return the targets that are detected in an image (azimuth, range), strongest first."""
         return detect(image, self.threshold_db, self.extent_m, self.apart_m, self.most)
 
 

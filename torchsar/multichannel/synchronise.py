@@ -130,7 +130,7 @@ def remove_synchronisation(
     for name, value in (("phase_rad", phase_rad), ("delay_s", delay_s)):
         if value is not None and value.shape[-1:] != (pulses,):
             raise ValueError(
-                f"remove_synchronisation needs {name} (..., {pulses}), one value per pulse, got shape "
+                f"remove_synchronisation needs {name} of shape (..., {pulses}), one value per pulse, got shape "
                 f"{tuple(value.shape)}"
             )
     turn = unit_phasor(-phase_rad.to(torch.float64) / (2 * math.pi), data.dtype)[..., None, :]

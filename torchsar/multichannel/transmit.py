@@ -203,7 +203,10 @@ class AzimuthScaling(Stage):
     def __init__(self, radar: BistaticRadar, order: int = 4) -> None:
         super().__init__()
         if not 2 <= order <= 4:
-            raise ValueError(f"azimuth scaling removes orders 2 to 4 of the transmit range (Eq. 31), got order={order}")
+            raise ValueError(
+                "order must be 2, 3 or 4, since azimuth scaling removes orders 2 to 4 of the transmit range (Eq. 31), "
+                f"got {order}"
+            )
         self.radar, self.order = radar, order
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0) -> Signal:

@@ -1,7 +1,8 @@
 """Along-track velocity of a moving point by the power of its deramped tone.
 
-This is azimuth autofocus with a known form of the phase history. It inverts no band matrix, so that
-it also works at speeds at which the channels sample the same positions.
+Data are deramped with the phase history of each candidate velocity; the right one leaves a tone of
+most power. This is azimuth autofocus with a known form of the phase history. The Doppler bands are
+not reconstructed, so that it also works at speeds at which the channels sample the same positions.
 
 Reference:
     Remote Sens. 2020, 12, 1703, section 4.2, which prescribes autofocus for this velocity
@@ -64,7 +65,7 @@ def along_track_velocity(
     """
     if not half_m_s > 0:
         raise ValueError(
-            f"half_m_s of a search along track must be positive, got {half_m_s}; omit the estimator where u_a is known"
+            f"half_m_s of a search along track must be positive, got {half_m_s}; omit the stage where u_a_m_s is known"
         )
     # raises ValueError for a search up to the speed of the receiver
     PointMotion.of(radar, data, 0.0, start.u_a_m_s + half_m_s)

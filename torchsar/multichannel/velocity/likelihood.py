@@ -1,7 +1,7 @@
 """Maximum likelihood of velocity and position of a moving point by Gauss-Newton steps.
 
-The complex amplitude is eliminated, and noise is white or clutter of known covariance. In white
-noise the estimate reaches the Cramer-Rao bound of `metrics.bistatic_bounds`.
+The complex amplitude is fitted for each motion in closed form. Noise is white or clutter of known
+covariance. In white noise the estimate reaches the Cramer-Rao bound of `metrics.bistatic_bounds`.
 """
 
 from __future__ import annotations
@@ -151,7 +151,10 @@ class PointLikelihood:
         samples.
 
         Args:
-            fit: Fit at a motion.
+            fit: Fit of the point for one motion.
+
+        Returns:
+            Power, shape (...,).
         """
         power = self.data.abs().square()
         illuminated = (

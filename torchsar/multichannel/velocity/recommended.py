@@ -111,14 +111,17 @@ class _Job:
     unknowns: tuple[str, ...]
 
     def found(self, whitening: Whitening | None) -> Found:
-        """Search the bank on the middle of the aperture, then fit there and on all of it."""
+        """Find the point by a grid search over velocities, followed by maximum likelihood.
+
+        The search uses the middle of the aperture, the last fit all of it.
+        """
         coarse = self.aperture if isinstance(self.aperture, Dwell) else Dwell(_COARSE_S)
         start, _ = bank_search(self.data, self.radar, coarse, self.search, self.u_a_m_s, self.range_m, whitening)
         near = maximum_likelihood(self.data, self.radar, start, coarse, self.unknowns, whitening)
         return maximum_likelihood(self.data, self.radar, near.motion, self.aperture, self.unknowns, whitening)
 
     def centred(self, found: Found, whitening: Whitening) -> Found:
-        """Repeat the fit with the aperture about the position found.
+        """Repeat the fit four times, with the expected amplitude about the last position found.
 
         In clutter a displaced expected amplitude biases the position; each round reduces this bias
         to a third.
@@ -130,7 +133,10 @@ class _Job:
         return found
 
     def refined(self, found: Found) -> _Refined:
-        """Repeat the fit twice in the covariance of its residual, where that is not white."""
+        """Repeat the fit up to two times with the covariance of its residual.
+
+        Trials whose residual is white noise keep their fit.
+        """
         whitening = sample_whitening(self.left(found), self.radar)
         for _ in range(_ROUNDS):
             if not bool(whitening.coloured.any()):

@@ -147,8 +147,8 @@ def refuse_full_band(radar: BistaticRadar, rebuild: Rebuild, bandwidth_hz: float
     if not 0 < bandwidth_hz < rebuild.bands * radar.prf_hz:
         band = f"{rebuild.bands} bands of {radar.prf_hz:g} Hz"
         raise ValueError(
-            "bandwidth_hz must be above 0 and below the rebuilt Doppler band, since the intensity ratio "
-            f"compares the spectrum inside and outside it, but {band} leave nothing outside "
+            "bandwidth_hz must be above 0 and below the width of the rebuilt bands, since the intensity ratio compares "
+            f"the spectrum inside bandwidth_hz with the rest, but {band} leave nothing outside "
             f"{bandwidth_hz:g} Hz; rebuild more bands, or integrate less"
         )
 

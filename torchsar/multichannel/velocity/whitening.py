@@ -46,7 +46,7 @@ class Whitening:
     coloured: Tensor
 
     def expanded(self, count: int) -> Whitening:
-        """Return this whitening, which has no trials, repeated for `count` trials."""
+        """Return this whitening of a single trial repeated for `count` trials."""
         return Whitening(
             self.factor.expand(count, *self.factor.shape), self.log_det.expand(count), self.coloured.expand(count)
         )
