@@ -106,7 +106,7 @@ def test_refusals():
         EstimateSynchronisation(RADAR)(signal, torch.zeros(7, 64, dtype=torch.complex128))
     with pytest.raises(ValueError, match="8 samples or more, got torch.float64"):
         estimate_synchronisation(torch.zeros(7, 64, dtype=torch.float64), RADAR)
-    with pytest.raises(ValueError, match=r"delay_s \(\.\.\., 8\)"):
+    with pytest.raises(ValueError, match=r"delay_s of shape \(\.\.\., 8\)"):
         remove_synchronisation(signal.data, RADAR, torch.zeros(8), torch.zeros(7))
 
 

@@ -366,9 +366,9 @@ def test_refusals():
     for name in ESTIMATORS:
         with pytest.raises(ValueError, match="slow time must be zero at pulse 400 of 800"):
             _small(name)(cropped)
-        with pytest.raises(ValueError, match="expects 2 channels .* got 3 and 900"):
+        with pytest.raises(ValueError, match="expects 2 channels .* got 3 channels and 900 pulses"):
             _small(name, published_radar(channel_m=(0.0, 0.8)))(signal)
-        with pytest.raises(ValueError, match="at least 4 pulses, got 3 and 2"):
+        with pytest.raises(ValueError, match="at least 4 pulses, got 3 channels and 2 pulses"):
             _small(name)(Signal(signal.data[..., :2], RADAR.axes(2)))
     for unknowns in (("u_r",), (), ("u_r_m_s", "u_r_m_s")):
         with pytest.raises(ValueError, match="unknowns must be names among"):

@@ -1,8 +1,8 @@
 """Azimuth-multichannel SAR: reconstruction and focusing, velocity estimation, and calibration.
 
-The receiver has several channels along track and a low pulse rate. Doppler spectra of stationary
-scenes and of moving targets are reconstructed from the channels, with the velocity of the target
-where it moves.
+The receiver has several channels along track and a low pulse rate. The full Doppler spectrum of a
+stationary scene is reconstructed from the channels with zero velocity, that of a moving target with
+the velocity of the target.
 """
 
 from torchsar.multichannel.azimuth import FocusAzimuth, azimuth_filter, focus_azimuth

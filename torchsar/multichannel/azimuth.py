@@ -2,7 +2,7 @@
 
 Reference:
     Remote Sens. 2020, 12, 1703, sections 4.1 and 4.3. The filter is the exact spectrum of the
-    hyperbolic range history, including an along-track offset y0.
+    hyperbolic range history, including an along-track position y0 of the point at slow time zero.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ def azimuth_filter(
     """Return the matched filter of a point with a given motion over Doppler.
 
     The filter exp(+j 2 pi / lambda (Rmin sqrt(1 - (lambda f / V)^2) - R_ref)) removes the curvature
-    of the phase of the spectrum. R_ref is the reference range of the radar, to which echo phases
-    refer. Differentiable in the motion.
+    of the phase of the spectrum. Here f is the absolute Doppler frequency, Rmin the least range
+    between the receiver and the point, V their relative speed, and R_ref the reference range of the
+    radar, to which echo phases refer. Differentiable in the motion.
 
     Args:
         offset_hz: Doppler relative to the centre in Hz, float64 (bin,).
@@ -33,8 +34,8 @@ def azimuth_filter(
         centre_hz: Doppler centre in Hz, shape (...,), by default that of the motion.
 
     Returns:
-        The filter, shape (..., bin), complex, zero at |f| >= V / lambda, where no point of this
-        speed has a spectrum.
+        The filter, shape (..., bin), complex, zero at |f| >= V / lambda, where a point of this
+        speed has no spectrum.
     """
     centre_hz = doppler_centre_hz(radar, motion) if centre_hz is None else centre_hz
     sine = radar.wavelength_m * (centre_hz[..., None] + offset_hz) / motion.square_m2_s2.sqrt()[..., None]
@@ -64,7 +65,7 @@ def focus_azimuth(
 
     Returns:
         Images over slow time, shape (..., bin), complex, with time zero at bin n // 2. A point
-        appears at `motion.image_s`.
+        appears at the slow time `motion.image_s` at which its Doppler is zero.
     """
     matched = azimuth_filter(offset_hz, radar, motion, spectrum.dtype)
     if bandwidth_hz is not None:
@@ -73,13 +74,14 @@ def focus_azimuth(
 
 
 class FocusAzimuth(Stage):
-    """Azimuth focusing of one target per trial with its velocities.
+    """Stage that focuses one target per trial in azimuth, with its velocities.
 
     The input is a spectrum (doppler[, range]) of `Reconstruct`, the output an image (azimuth[,
-    range]) with azimuth x = V_R t in metres. On the axis x = (V_R - u_a) t, which refers to the
-    track as seen by the target, all widths are scaled by (V_R - u_a) / V_R. All range lines are
-    focused for a single range, since a separate range for each line would curve the range side
-    lobes of the target. Use `StationaryImage` for a whole stationary scene.
+    range]). Azimuth is x = V_R t in metres, with the speed V_R of the receiver and slow time t. For
+    widths along the track as seen by a target of along-track speed u_a, multiply the widths on this
+    axis by (V_R - u_a) / V_R. All range lines are focused for a single range, since a separate
+    range for each line would curve the range side lobes of the target. Use `StationaryImage` for a
+    whole stationary scene.
 
     Args:
         radar: Instrument.
@@ -107,7 +109,7 @@ class FocusAzimuth(Stage):
         y0_m: Number = 0.0,
         range_m: Number | None = None,
     ) -> Signal:
-        """Focus one target per trial.
+        """Focus one target per trial in azimuth.
 
         Args:
             signal: Spectrum with the axes (doppler[, range]).
@@ -138,7 +140,9 @@ class FocusAzimuth(Stage):
 
 
 def image_axis(radar: BistaticRadar, doppler: Axis) -> Axis:
-    """Return the azimuth axis x = V_R t in metres of the image of a spectrum.
+    """Return the azimuth axis x = V_R t in metres of the image that a Doppler spectrum gives.
+
+    V_R is the speed of the receiver and t the slow time.
 
     Args:
         radar: Instrument.

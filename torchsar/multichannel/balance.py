@@ -2,9 +2,10 @@
 
 Stationary clutter is a Gaussian process whose covariance over the channels is known at every
 Doppler frequency up to these differences: each band has the response of the array and the power
-that the antenna pattern gives it. The differences are estimated by maximum likelihood. With more
-channels than bands with power this amounts to fitting the balanced data into the space of the bands
-(a noise-subspace method); otherwise the estimate relies on the power over Doppler.
+that the antenna pattern gives it. The differences are estimated by maximum likelihood. If the
+clutter fills fewer bands than there are channels, this amounts to fitting the balanced data into
+the subspace that the responses to these bands span (a noise-subspace method); otherwise the
+estimate relies on the expected power over Doppler.
 
 Reference:
     Remote Sens. 2020, 12, 1703, section 4.3, which requires the correction without a method; Weiss
@@ -50,8 +51,8 @@ def correct_balance(
 ) -> Tensor:
     """Remove phase, gain and delay differences between the channels.
 
-    Each channel is divided by 10^(gain_db / 20) exp(j phase) and advanced by its delay, which moves
-    envelopes only. Differentiable.
+    Each channel is divided by 10^(gain_db / 20) exp(j phase), and its envelope is advanced in range
+    time by its delay; the delay does not change the carrier phase. Differentiable.
 
     Args:
         data: Channels, shape (..., channel, pulse, range), or (..., channel, pulse) if `with_range`
@@ -72,13 +73,15 @@ def correct_balance(
     for name, value in (("phase_rad", phase_rad), ("gain_db", gain_db), ("delay_s", delay_s)):
         if value is not None and value.shape[-1:] != (radar.channels,):
             raise ValueError(
-                f"correct_balance needs {name} (..., {radar.channels}), one value per channel, got "
+                f"correct_balance needs {name} of shape (..., {radar.channels}), one value per channel, got "
                 f"shape {tuple(value.shape)}"
             )
     factor = (unit_phasor(-phase_rad / (2 * math.pi), torch.complex128) * 10 ** (-gain_db / 20)).to(data.dtype)
     if not with_range:
         if delay_s is not None and bool(delay_s.any()):
-            raise ValueError("data without a range axis cannot be shifted along it; leave delay_s out")
+            raise ValueError(
+                "delay_s must be None or zero for data without a range axis, along which delays act; leave delay_s out"
+            )
         return data * factor[..., None]
     balanced = data * factor[..., None, None]
     return balanced if delay_s is None else torch.fft.ifft(torch.fft.fft(balanced) * _advance(delay_s, radar, data))
@@ -103,11 +106,12 @@ def estimate_balance(
     """Estimate phase, gain and delay of each channel from stationary clutter.
 
     The noise level is estimated as well. Not differentiable. Where the clutter fills fewer bands
-    than there are channels, `FlatBand(bands * PRF)` suits any scene, since it only assumes that the
-    rest of the spectrum is empty, and is more accurate: 0.03 degree against 0.3 degree for 900
-    pulses by 256 cells. A phase that grows linearly along the array shifts all clutter in Doppler;
-    it is determined only by the edges of the band or the shape of the pattern. With a flat prior as
-    wide as the bands of as many channels it cannot be determined.
+    than there are channels, prefer the prior `FlatBand(bands * PRF)`: it suits any scene, since it
+    only assumes that the rest of the spectrum is empty, and the phases err by 0.03 degree instead
+    of 0.3 degree (900 pulses by 256 range cells). A phase that grows linearly along the array
+    shifts all clutter in Doppler; it is determined only by the edges of the band or the shape of
+    the pattern. It cannot be determined with a flat prior that fills as many bands as there are
+    channels.
 
     Args:
         data: Range-compressed channels without the transmit range, shape (..., channel, pulse,
@@ -116,15 +120,16 @@ def estimate_balance(
         prior: Expected power of the clutter over Doppler, `ElementPattern()` by default.
         bands: Number of Doppler bands that the clutter fills, each one PRF wide.
         delays: False to assume zero delays.
-        blocks: Number of parts of the range band in which a delay is approximated by a phase. A
-            delay of two samples changes the phase across one of 16 blocks by a tenth of a cycle.
+        blocks: Number of parts into which the range band is divided; within each part a delay is
+            approximated by a constant phase. A delay of two samples changes the phase across one of
+            16 blocks by a tenth of a cycle.
 
     Returns:
         `phase_rad`, `gain_db` and `delay_s`, float64 (..., channel), relative to the channel
         nearest to the reference point of the track, with standard deviations from the likelihood.
-        `info` holds `snr_db` (...,), the strongest expected power over noise. `ok` is False, and
-        the values are zero, where a channel has no power or a phase has a standard deviation above
-        0.1 rad.
+        `info` holds `snr_db` (...,), the ratio of the clutter power at the peak of the prior to the
+        noise power. `ok` is False, and the values are zero, where a channel has no power or a phase
+        has a standard deviation above 0.1 rad.
 
     Raises:
         ValueError: If the radar has one channel, the shape of the data does not match it, `bands`
@@ -156,19 +161,21 @@ def estimate_balance(
 def _check_data(data: Tensor, radar: BistaticRadar, blocks: int, bands: int) -> None:
     """Raise ValueError unless data, blocks and bands suit the radar."""
     if radar.channels < 2:
-        raise ValueError("balance compares at least two channels, but the radar has one")
+        raise ValueError(
+            "the balance between channels needs at least two positions in channel_m, but the radar has one"
+        )
     if data.ndim < 3 or data.shape[-3] != radar.channels:
         raise ValueError(
-            f"balance works on data (..., {radar.channels}, pulse, range), the channels of the radar's "
-            f"channel_m, got shape {tuple(data.shape)}"
+            f"the balance is estimated from data (..., {radar.channels}, pulse, range) with one channel for each "
+            f"position in the radar's channel_m, got shape {tuple(data.shape)}"
         )
     if bands < 1:
         raise ValueError(f"bands must be at least 1, the number of Doppler bands with clutter, got {bands}")
     inside = int(data.shape[-1] * radar.pulse.bandwidth_hz / radar.sampling_hz)
     if not 2 <= blocks <= inside:
         raise ValueError(
-            f"the band of {data.shape[-1]} range samples holds {inside} range frequencies: blocks "
-            f"must lie in 2..{inside}, got {blocks}"
+            f"blocks must be at least 2 and at most {inside}, the number of range frequencies of {data.shape[-1]} "
+            f"range samples within the bandwidth of the pulse, got {blocks}"
         )
 
 
@@ -214,24 +221,37 @@ class _Models:
 
     @staticmethod
     def of(radar: BistaticRadar, prior: Prior, bands: int, n_pulse: int, device: torch.device) -> _Models:
-        """Form the covariances from expected power and array response, FFT order."""
+        """Return the covariances for an expected clutter power, with Doppler bins in FFT order."""
         return _Models(clutter_covariance(radar, prior, n_pulse, bands, device))
 
     def noisy(self, snr_db: float) -> Tensor:
-        """Add white noise at an SNR in dB of the strongest expected power."""
+        """Return the covariances plus white noise.
+
+        The SNR in dB is the ratio of the strongest expected power of a band to the noise.
+        """
         return self.clutter + 10 ** (-snr_db / 10) * torch.eye(
             self.clutter.shape[-1], dtype=self.clutter.dtype, device=self.clutter.device
         )
 
     def solve(self, products: Tensor, snr_db: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return weights (..., channel), half the Hessian and the negative log-likelihood."""
+        """Fit the channel gains for a given SNR in dB by maximum likelihood.
+
+        Returns:
+            Complex weights that balance the channels (..., channel), half the Hessian and the value
+            of the negative log-likelihood.
+        """
         model = self.noisy(snr_db)
         matrix = (torch.linalg.inv(model) * products.mT).mean(-3)
         weights, hessian, cost = _solved(matrix, self._start(products))
         return weights, hessian, 2 * cost + torch.linalg.slogdet(model)[1].mean()
 
     def best(self, products: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return weights, half the Hessian and SNR of the highest likelihood, per trial."""
+        """Fit the channel gains and the SNR by maximum likelihood in each trial.
+
+        Returns:
+            Complex weights that balance the channels (..., channel), half the Hessian of the
+            negative log-likelihood and the SNR in dB.
+        """
         found = [self.solve(products, level) for level in _LEVELS_DB]
         weights, hessian, cost = (torch.stack(parts, -1) for parts in zip(*found))
         best = cost.argmin(-1)
@@ -343,14 +363,17 @@ def _standard_deviations(hessian: Tensor, reference: int, looks: float) -> tuple
 
 
 class EstimateBalance(Stage):
-    """`estimate_balance` as a stage whose values connect to `CorrectBalance`.
+    """Stage that estimates phase, gain and delay of each channel; see `estimate_balance`.
+
+    The values connect to `CorrectBalance`.
 
     Args:
         radar: Instrument.
         prior: Expected power of the clutter over Doppler, `ElementPattern()` by default.
         bands: Number of Doppler bands that the clutter fills, each one PRF wide.
         delays: False to assume zero delays.
-        blocks: Number of parts of the range band in which a delay is approximated by a phase.
+        blocks: Number of parts into which the range band is divided; within each part a delay is
+            approximated by a constant phase.
     """
 
     works_on = ("channel", "pulse", "range")
@@ -363,15 +386,23 @@ class EstimateBalance(Stage):
         self.radar, self.prior, self.bands, self.delays, self.blocks = radar, prior, bands, delays, blocks
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate the differences from data with the axes (channel, pulse, range)."""
+        """Estimate phase, gain and delay of each channel from stationary clutter.
+
+        Args:
+            signal: Range-compressed channels with the axes (channel, pulse, range), without the
+                transmit range.
+
+        Returns:
+            `phase_rad`, `gain_db` and `delay_s` of shape (..., channel), see `estimate_balance`.
+        """
         return estimate_balance(signal.data, self.radar, self.prior, self.bands, self.delays, self.blocks)
 
 
 class CorrectBalance(Stage):
-    """`correct_balance` with estimated or measured values.
+    """Stage that removes estimated or measured phases, gains and delays of the channels.
 
-    Connect it as `use(CorrectBalance(radar), phase_rad="balance", gain_db="balance",
-    delay_s="balance")`.
+    See `correct_balance`. After a stage "balance" that estimates the values, connect it as
+    `use(CorrectBalance(radar), phase_rad="balance", gain_db="balance", delay_s="balance")`.
 
     Args:
         radar: Instrument.
@@ -385,7 +416,18 @@ class CorrectBalance(Stage):
         self.radar = radar
 
     def forward(self, signal: Signal, phase_rad: Tensor, gain_db: Tensor, delay_s: Tensor | None = None) -> Signal:
-        """Balance channels (channel, pulse[, range]) with values (..., channel)."""
+        """Remove phase, gain and delay of each channel.
+
+        Args:
+            signal: Channels with the axes (channel, pulse[, range]).
+            phase_rad: Phases in radians, shape (..., channel).
+            gain_db: Gains in dB, shape (..., channel).
+            delay_s: Delays in seconds, shape (..., channel), or None. Without a range axis they
+                must be None or zero.
+
+        Returns:
+            Balanced channels on the same axes.
+        """
         return signal.with_data(
             correct_balance(signal.data, self.radar, phase_rad, gain_db, delay_s, "range" in signal.names)
         )

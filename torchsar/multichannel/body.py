@@ -1,12 +1,16 @@
 """Extended moving targets ("bodies"): one velocity for all scatterers, image, and echo to subtract.
 
-Range lines around the body are shifted by its range history and deramped channel by channel. Each
-scatterer then is one tone in all channels, even if aliased: the frequency F gives its
-along-track position y = y0 + F lambda R0 / v, and position and velocity give its phases across the
-channels. In short segments of slow time the sea at the frequency of a tone comes from as few look
-angles as there are Doppler bands; range lines beside the body give its covariance. The slant-range
-velocity is the most likely one for all tones and segments with free amplitudes, the along-track
-velocity is the one of the sharpest image, and the echo is the fit with both.
+Range lines around the body are shifted by the range history of its middle and deramped channel by
+channel. Each scatterer then is one tone in all channels, even if aliased. The frequency F of the
+tone gives the along-track position y = y0 + F lambda R0 / v of the scatterer, with the position y0
+and the closest range R0 of the middle and the along-track speed v of the receiver relative to the
+body. Position and velocity determine the phases of the tone across the channels.
+
+In a short segment of slow time, the sea clutter at the frequency of a tone comes from only a few
+look angles, one for each Doppler band. Its covariance across the channels is estimated from range
+lines beside the body. The slant-range velocity is the one of highest likelihood over all tones and
+segments, each with a free amplitude. The along-track velocity is the one of the sharpest image. The
+echo is the fit with both velocities.
 
 Reference:
     Remote Sens. 2020, 12, 1703, section 4.3 (extraction of moving targets, one velocity for
@@ -61,13 +65,14 @@ _NEAR_U_R_M_S, _NEAR_U_A_M_S, _LAST_U_R_M_S = 2.0, 1.0, 1.0
 
 @dataclass(frozen=True)
 class Extraction:
-    """Extent of a body in the data.
+    """Extent of the data that are extracted for one body, an extended moving target.
 
     Args:
-        along_m: Half width along track about the middle in metres.
-        range_m: Half width in range about the middle in metres.
-        integration_s: Time for which a scatterer is illuminated in seconds.
-        segment_s: Length of the segments of slow time in seconds.
+        along_m: Half width along track about the middle of the body in metres.
+        range_m: Half width in range about the middle of the body in metres.
+        integration_s: Time in seconds for which a scatterer is illuminated.
+        segment_s: Length in seconds of the segments of slow time in which the clutter is
+            suppressed.
 
     Raises:
         ValueError: If a value is not positive and finite.
@@ -91,7 +96,7 @@ class Segments:
     Args:
         n: Number of pulses.
         length: Number of pulses of a segment.
-        bins: FFT indices kept of each segment, shape (tone,).
+        bins: Indices of the FFT bins (tones) that are kept of each segment, shape (tone,).
         rows: Indices of the segments in which a body is illuminated, shape (segment,).
     """
 
@@ -102,15 +107,15 @@ class Segments:
 
     @property
     def hop(self) -> int:
-        """Number of pulses between segments."""
+        """Number of pulses from one segment to the next, half the length of a segment."""
         return self.length // 2
 
     def window(self) -> Tensor:
-        """Return the Hann window, float64 (length,)."""
+        """Return the Hann window of a segment, float64 (length,)."""
         return torch.hann_window(self.length, dtype=torch.float64, device=self.bins.device)
 
     def of(self, x: Tensor) -> Tensor:
-        """Transform data (..., pulse), complex128, to segments (..., segment, tone)."""
+        """Return the short-time spectra (..., segment, tone) of complex128 data (..., pulse)."""
         made = torch.stft(
             x.flatten(0, -2),
             self.length,
@@ -124,7 +129,10 @@ class Segments:
         return made[:, self.bins][..., self.rows].mT.unflatten(0, x.shape[:-1])
 
     def back(self, cells: Tensor) -> Tensor:
-        """Invert `of`; segments and bins that were left out are zero."""
+        """Transform short-time spectra (..., segment, tone) back to slow time (..., pulse).
+
+        This is the inverse of `of`; segments and FFT bins that were left out count as zero.
+        """
         full = torch.zeros(
             cells.shape[:-2].numel(), self.length, self.n // self.hop + 1, dtype=cells.dtype, device=cells.device
         )
@@ -144,17 +152,19 @@ class Segments:
 
 @dataclass(frozen=True)
 class Chip:
-    """Range lines around a body in segments, deramped by the motion of its middle.
+    """Short-time spectra of the range lines around a body, deramped by the motion of its middle.
 
     Args:
         radar: Instrument.
         motion: Motion of the middle of the body.
-        segments: Transform of slow time.
-        cells: Lines of the body, complex128 (line, channel, segment, tone).
-        beside: Lines beside the body, complex128 (line, channel, segment, tone).
-        tone_hz: Frequencies of the tones in Hz, shape (tone,).
-        range_m: Closest ranges of the lines of the body in metres, shape (line,).
-        inverse: Inverse covariance of sea and noise, complex128 (segment, tone, channel, channel).
+        segments: Short-time Fourier transform of slow time.
+        cells: Spectra of the range lines of the body, complex128 (line, channel, segment, tone).
+        beside: Spectra of the range lines beside the body, complex128 (line, channel, segment,
+            tone).
+        tone_hz: Doppler frequencies of the kept bins after deramping in Hz, shape (tone,).
+        range_m: Closest ranges of the range lines of the body in metres, shape (line,).
+        inverse: Inverse covariance of sea and noise across the channels, complex128 (segment, tone,
+            channel, channel).
         lit: True for pulses at which some part of the body is illuminated, bool (pulse,).
         time_s: Slow time in seconds, float64 (pulse,).
     """
@@ -171,14 +181,18 @@ class Chip:
     time_s: Tensor
 
     def steering(self, motion: PointMotion, tone_hz: Tensor) -> Tensor:
-        """Return the phases across the channels of scatterers at given tones.
+        """Return the phases across the channels of scatterers with given tones in deramped data.
+
+        A scatterer at along-track position y has the phasor exp(-j 2 pi (y - y0) dx_m / (lambda
+        R0)) in the channel at dx_m, with the along-track position y0 of the middle of the body and
+        the closest range R0.
 
         Args:
             motion: Motion of the scatterers, shape (...,).
             tone_hz: Frequencies of the tones in Hz, shape (tone,).
 
         Returns:
-            Phasors relative to the deramp, complex128 (..., tone, channel).
+            Phasors, complex128 (..., tone, channel).
         """
         position = self.position_m(motion, tone_hz) - self.motion.y0_m
         return unit_phasor(
@@ -189,14 +203,15 @@ class Chip:
         )
 
     def position_m(self, motion: PointMotion, tone_hz: Tensor) -> Tensor:
-        """Return the along-track positions at t = 0 of tones.
+        """Return the along-track positions of scatterers with given tones in deramped data.
 
         Args:
-            motion: Motion whose y0 is the position of tone zero, shape (...,).
+            motion: Motion of the scatterers, shape (...,); its along-track position is that of a
+                tone of frequency zero.
             tone_hz: Frequencies of the tones in Hz, shape (tone,).
 
         Returns:
-            Positions in metres, shape (..., tone).
+            Positions at t = 0 in metres, shape (..., tone).
         """
         per_hz = self.radar.wavelength_m * motion.range_m / motion.along_m_s
         return motion.y0_m[..., None] + per_hz[..., None] * tone_hz
@@ -208,15 +223,16 @@ class Chip:
         return weight, (steering[..., None, :, :].conj() * weight).sum(-1).real.clamp_min(_TINY)
 
     def energy(self, motions: PointMotion) -> Tensor:
-        """Return the energy of the data that cells of free amplitude explain.
+        """Return the energy of the data that scatterers with each candidate motion explain.
 
-        Up to constants this is the log-likelihood.
+        Each cell (range line, segment, tone) has a free complex amplitude. The energy is relative
+        to the covariance of sea and noise; up to constants it is the log-likelihood.
 
         Args:
             motions: Candidate motions, shape (candidate,).
 
         Returns:
-            Energy, shape (candidate,).
+            Energy summed over all cells, without unit, shape (candidate,).
         """
         weight, gain = self._weights(motions)
         return (torch.einsum("lmsf,csfm->clsf", self.cells, weight.conj()).abs().square() / gain[:, None]).sum(
@@ -224,22 +240,23 @@ class Chip:
         )
 
     def echo(self, cells: Tensor) -> Tensor:
-        """Return the most likely deramped echo of scatterers with the motion of the chip.
+        """Return the most likely deramped echo of scatterers that move as the middle of the body.
 
         Args:
-            cells: Segments, complex128 (line, channel, segment, tone).
+            cells: Short-time spectra of range lines, complex128 (line, channel, segment, tone).
 
         Returns:
-            Echo at the reference point of the track, complex128 (line, pulse), zero in pulses at
-            which nothing is illuminated.
+            Echo as received at the reference point of the track, complex128 (line, pulse), zero in
+            pulses in which no part of the body is illuminated.
         """
         weight, gain = self._weights(self.motion)
         return self.segments.back(torch.einsum("lmsf,sfm->lsf", cells, weight.conj()) / gain) * self.lit
 
     def picture(self) -> Picture:
-        """Image the body: spectra of its echo, and the mean intensity of residual sea and noise.
+        """Return the image of the body: the Doppler spectra of its deramped echo.
 
-        The residual intensity is measured in the lines beside the body.
+        The image includes the mean intensity of the residual sea and noise, which is measured in
+        the range lines beside the body.
         """
         n = self.segments.n
         hz = torch.fft.fftfreq(n, 1 / self.radar.prf_hz, dtype=torch.float64, device=self.lit.device)
@@ -250,11 +267,12 @@ class Chip:
 
 @dataclass(frozen=True)
 class Picture:
-    """Image of a body over range lines and tones.
+    """Image of a body over range lines and tones, the Doppler bins of its deramped echo.
 
     Args:
-        amplitude: Sum of the echo over illuminated pulses at each tone, complex128 (line, tone).
-        left: Mean intensity of the residual sea and noise, shape ().
+        amplitude: Spectrum of the echo, summed over the illuminated pulses, complex128 (line,
+            tone).
+        left: Mean intensity of the residual sea and noise in a pixel, shape ().
         tone_hz: Frequencies of the tones in Hz, shape (tone,).
         index: Index of each tone in an FFT over all pulses, shape (tone,).
     """
@@ -266,29 +284,34 @@ class Picture:
 
     @property
     def level(self) -> Tensor:
-        """Intensity relative to the residual sea and noise, shape (line, tone)."""
+        """Ratio of the intensity of each pixel to the mean residual sea and noise, (line, tone)."""
         return self.amplitude.abs().square() / self.left
 
     @property
     def bright(self) -> Tensor:
-        """True for pixels of the body, above 12 times the residual and 1 % of the maximum."""
+        """True for pixels of the body, shape (line, tone).
+
+        They exceed 12 times the mean intensity of the residual sea and noise, and 1 % of the
+        brightest pixel.
+        """
         level = self.level
         return level > torch.maximum(level.new_tensor(_BRIGHT), _BRIGHT_SHARE * level.max())
 
 
 @dataclass(frozen=True)
 class Body:
-    """Moving body that was found.
+    """Extended moving target (body) that was found in the data.
 
     Args:
         motion: Velocity of the body, and along-track position and closest range of its middle by
             intensity.
-        u_r_std_m_s: Predicted standard deviation of u_r in m/s.
+        u_r_std_m_s: Predicted standard deviation of the slant-range speed u_r in m/s.
         chip: Data of the body, deramped by its motion.
         picture: Image of the body.
-        level: Mean of the bright pixels relative to the residual sea and noise.
-        ok: False if `level` is below 40 (16 dB), u_r lies at the end of its search, or the body
-            left the frame during the search.
+        level: Ratio of the mean intensity of the bright pixels to that of the residual sea and
+            noise.
+        ok: False if `level` is below 40 (16 dB), u_r lies at an end of its search interval, or the
+            body left the frame during the search.
     """
 
     motion: PointMotion
@@ -300,7 +323,7 @@ class Body:
 
 
 def chip_about(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extraction) -> Chip:
-    """Extract the range cells of a body with a given motion, deramped and in segments of slow time.
+    """Extract the range cells of a body, deramped with its motion, as short-time spectra.
 
     Args:
         data: Range-compressed channels without the transmit range, shape (channel, pulse, range),
@@ -310,7 +333,7 @@ def chip_about(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extr
         extraction: Extent of the body.
 
     Returns:
-        Short-time spectra of the range cells, with the covariance of the sea.
+        Short-time spectra of the range cells, with the inverse covariance of sea and noise.
 
     Raises:
         ValueError: If the data have no range cell of the body, or fewer than 12 outside it.
@@ -320,11 +343,11 @@ def chip_about(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extr
     if not bool(body.any()) or int(beside.sum()) < _LEAST_LINES:
         counts = (
             f"{int(body.sum())} cells within {extraction.range_m:g} m of "
-            f"{float(motion.range_m):.0f} m and {int(beside.sum())} beside them"
+            f"its range of {float(motion.range_m):.0f} m and {int(beside.sum())} beside it"
         )
         raise ValueError(
-            f"a body needs range cells of its own and {_LEAST_LINES} beside it for the covariance of the sea, "
-            f"got {counts}; give more range cells or a smaller extraction"
+            f"the data must hold range cells of the body and at least {_LEAST_LINES} beside it for the covariance of "
+            f"the sea, got {counts}; give more range cells or a smaller extraction"
         )
     lit = (
         frame.time_s - motion.y0_m / motion.along_m_s
@@ -391,24 +414,27 @@ def find_body(
 ) -> Body:
     """Find velocity and position of a body that appears in an image of the stationary scene.
 
-    Each round shifts and deramps the data by the motion found so far.
+    Each round shifts and deramps the data by the motion found so far, and then estimates the
+    slant-range speed u_r, the along-track speed u_a and the middle of the body again.
 
     Args:
         data: Range-compressed channels without the transmit range, shape (channel, pulse, range),
-            complex, around the body as in `chip_about`.
+            complex, with the range cells of the body and at least 12 beside it.
         frame: Geometry of the data.
         image_s: Slow time in seconds at which the image shows the body.
         image_m: Range in metres at which the image shows the body.
         extraction: Extent of the body.
-        u_r_half_m_s: Half width of the search in u_r in m/s, by default half of lambda PRF.
+        u_r_half_m_s: Half width of the search in u_r in m/s, by default lambda PRF / 2, half the
+            ambiguity interval.
         u_a_half_m_s: Half width of the search in u_a in m/s.
         rounds: Number of rounds.
 
     Returns:
-        The body; see `Body` for `ok`.
+        The body. Its `ok` is False where it is too weak or was not found within the search, see
+        `Body`.
 
     Raises:
-        ValueError: As in `chip_about`.
+        ValueError: If the data have no range cell of the body, or fewer than 12 beside it.
     """
     half = frame.radar.ambiguous_velocity_m_s / 2 if u_r_half_m_s is None else u_r_half_m_s
     chip = chip_about(data, frame, _motion_imaged_at(frame.radar, data, 0.0, 0.0, image_s, image_m), extraction)
@@ -539,15 +565,16 @@ def _centred(chip: Chip, image_s: float, image_m: float) -> tuple[float, float, 
 
 
 def centred_motion(chip: Chip) -> PointMotion:
-    """Return the motion of a chip with the position and range of the middle of its bright pixels.
+    """Return the motion of a body with its position and range measured at its middle.
 
-    The middle is weighted by intensity. Without bright pixels the motion is unchanged.
+    The middle is the mean position of the bright pixels of its image, weighted by intensity.
+    Without bright pixels the motion is unchanged.
 
     Args:
-        chip: Cut of the data about one body.
+        chip: Short-time spectra of the range lines about one body.
 
     Returns:
-        Motion, shape () each.
+        Motion with tensors of shape (); the velocity is that of `chip.motion`.
     """
     picture = chip.picture()
     weight = picture.level * picture.bright
@@ -560,19 +587,20 @@ def centred_motion(chip: Chip) -> PointMotion:
 
 
 def known_body(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extraction) -> Body:
-    """Form the body of a known motion: its velocity is kept, its middle is measured.
+    """Extract a body of known velocity from the data and measure the position of its middle.
 
     Args:
-        data: Channels as in `chip_about`.
+        data: Range-compressed channels without the transmit range, shape (channel, pulse, range),
+            complex, with the range cells of the body and at least 12 beside it.
         frame: Geometry of the data.
         motion: Known motion of the body.
         extraction: Extent of the body.
 
     Returns:
-        Body without an uncertainty of its velocity.
+        Body; the standard deviation of its velocity is zero.
 
     Raises:
-        ValueError: As in `chip_about`.
+        ValueError: If the data have no range cell of the body, or fewer than 12 beside it.
     """
     chip = chip_about(data, frame, motion, extraction)
     chip = chip_about(data, frame, centred_motion(chip), extraction)
@@ -582,12 +610,13 @@ def known_body(data: Tensor, frame: Frame, motion: PointMotion, extraction: Extr
 def body_echo(body: Body, frame: Frame, everything: bool = False) -> Tensor:
     """Return the echo of a body, to subtract from the data of the frame in which it was found.
 
-    The echo consists of the pixels above the residual sea and noise.
+    The echo consists of the pixels of more than twice the intensity of the residual sea and noise.
 
     Args:
-        body: Body.
+        body: Body that was found in these data.
         frame: Geometry of the data.
-        everything: True for all data in its lines and tones, including the sea.
+        everything: True to return all data in the range lines and Doppler bins of the body instead,
+            including the sea.
 
     Returns:
         Echo, complex128 (channel, pulse, range).
@@ -622,7 +651,7 @@ def body_image(body: Body, position_m: Tensor, extraction: Extraction) -> Tensor
     """Return the complex image of a body at given along-track positions, with the sea suppressed.
 
     Args:
-        body: Body.
+        body: Body that was found in the data.
         position_m: Along-track positions at t = 0 in metres, float64 (position,).
         extraction: Extent of the body.
 

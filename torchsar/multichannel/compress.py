@@ -20,8 +20,8 @@ class CompressChannels(Stage):
     Args:
         radar: Instrument.
         reference: Reference spectrum "matched", "flat" or "phase", see `focus.RangeCompress`.
-            "flat" gives an exactly rectangular band, the response of data simulated as range
-            compressed.
+            "flat" gives an exactly rectangular band, the same response as in data that are
+            simulated range compressed.
 
     Raises:
         ValueError: If `reference` is unknown.
@@ -36,9 +36,9 @@ class CompressChannels(Stage):
         self.radar, self.reference = radar, reference
 
     def spectrum(self, n: int, device: torch.device | str | None = None) -> Tensor:
-        """Return the reference spectrum for range lines of n samples, complex128 (n,)."""
+        """Return the reference spectrum of compression for lines of n samples, complex128 (n,)."""
         return REFERENCES[self.reference](self.radar.pulse, n, self.radar.sampling_hz, device)
 
     def forward(self, signal: Signal) -> Signal:
-        """Compress data with the axes (channel, pulse, range) in range."""
+        """Compress full chirps with the axes (channel, pulse, range) in range, on the same axes."""
         return signal.with_data(range_compress(signal.data, self.spectrum(signal.data.shape[-1], signal.data.device)))

@@ -1,4 +1,4 @@
-"""Detection of targets in sea clutter by the mean intensity of image neighbourhoods."""
+"""Detection of targets in images of sea clutter by the mean intensity of small rectangles."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ class Detection:
     """Position of one detection in an image.
 
     Args:
-        azimuth_m: Azimuth x = V_R t of the intensity centre in metres.
+        azimuth_m: Azimuth x = V_R t of the intensity centre in metres, with the speed V_R of the
+            receiver.
         range_m: Range of the intensity centre in metres.
-        contrast_db: Mean intensity of the strongest neighbourhood over the median of the image in
-            dB.
+        contrast_db: Mean intensity of the brightest neighbourhood, a small rectangle of pixels,
+            relative to the median over all neighbourhoods of the image in dB.
     """
 
     azimuth_m: float
@@ -28,7 +29,9 @@ class Detection:
 
 
 def contrast(image: Signal, extent_m: tuple[float, float] = (60.0, 10.0)) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-    """Compute the mean intensity of half-overlapping neighbourhoods over the median of them all.
+    """Compute the mean intensity of small rectangles of pixels relative to the median of all.
+
+    The rectangles (neighbourhoods) overlap by half along both axes.
 
     Args:
         image: Image (azimuth, range), complex.
@@ -67,8 +70,11 @@ def detect(
 ) -> list[Detection]:
     """Detect bright targets in one image, strongest first.
 
-    Targets are separated by at least `apart_m` along one axis. The position is the intensity centre
-    of the neighbourhoods above a quarter of the peak within that distance.
+    The image is divided into rectangles of pixels (neighbourhoods) that overlap by half. Their
+    contrast is the mean intensity relative to the median over all of them. Any two detections are
+    at least `apart_m` apart along one of the axes. The position of a detection is the intensity
+    centre of the neighbourhoods within `apart_m` of its brightest one whose contrast exceeds a
+    quarter of the largest.
 
     Args:
         image: Image (azimuth, range) without trials, complex.
@@ -85,7 +91,8 @@ def detect(
     """
     if image.trials:
         raise ValueError(
-            f"detect works on one image at a time, got trials {tuple(image.trials)}; call it for each image separately"
+            "detect works on one image at a time, got images with the trial dimensions "
+            f"{tuple(image.trials)}; call it for each image separately"
         )
     level, (rows, columns) = contrast(image, extent_m)
     left, found = level.clone(), []

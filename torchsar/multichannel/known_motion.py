@@ -1,4 +1,4 @@
-"""The chain that focuses points of known velocity and position."""
+"""Chain of stages that focuses points of known velocity and position."""
 
 from __future__ import annotations
 
@@ -22,18 +22,23 @@ def known_motion_chain(
     full: bool = False,
     follow: bool = True,
 ) -> Chain:
-    """Build the chain from channels to the images of points, each of known motion.
+    """Build the chain of stages from channels to the images of points of known motion.
 
-    The chain takes `given.u_r_m_s`, `u_a_m_s`, `y0_m` and `range_m` alike, shape (row,).
+    When it is run, the chain needs the motion of each point by the names `given.u_r_m_s`,
+    `given.u_a_m_s`, `given.y0_m` and `given.range_m`, each of shape (trial,): slant-range and
+    along-track speed in m/s, along-track position and closest range in metres.
 
     Args:
         radar: Instrument.
         rebuild: Reconstruction of the Doppler bands.
-        bandwidth_hz: Doppler band that is focused; None for the whole one.
+        bandwidth_hz: Width of the Doppler band that is focused in Hz; None for the whole
+            reconstructed band.
         migration: Correction of range migration; None for azimuth-only data.
-        order: Orders of the transmit range that are removed; None for all.
-        full: Whether the data are chirps that must be compressed first.
-        follow: Whether the migration is corrected with the known motion.
+        order: Number of coefficients (orders in time) of the transmit range that are removed; None
+            for all.
+        full: Whether the data are full chirps, which are then compressed in range first.
+        follow: Whether the migration is corrected with the known motion, instead of that of a point
+            at rest.
 
     Returns:
         The chain.

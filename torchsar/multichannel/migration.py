@@ -1,11 +1,12 @@
 """Range migration correction of moving points in channels that are aliased in azimuth.
 
 A keystone transform removes the range walk of all targets at once, but it needs unaliased slow
-time, and each channel is aliased. The range history of a reference is therefore removed first from
-carrier and envelope, by the factor exp(+j 2 pi (fc + fr) / c (R_ref,m(t) - R_ref)), which reduces
-each target to a tone. Slow time is then rescaled, t -> t fc / (fc + fr), and the history is
-restored in the carrier alone. Azimuth phases are unchanged, and the envelope of each target stays
-at one range.
+time, and each channel is aliased. The range history of a reference point is therefore removed first
+from carrier and envelope, which reduces each target to a tone. The factor is exp(+j 2 pi (fc + fr)
+/ c (R_ref,m(t) - R_ref)), with the carrier frequency fc, the range frequency fr, the range
+R_ref,m(t) between the reference point and channel m, and its closest range R_ref. Slow time is then
+rescaled, t -> t fc / (fc + fr), and the history is restored in the carrier alone. Azimuth phases
+are unchanged, and the envelope of each target stays at one range.
 
 Reference:
     Remote Sens. 2020, 12, 1703, section 4.1, which names the keystone transform without the deramp
@@ -36,7 +37,7 @@ _EPS = {torch.complex64: 1e-5, torch.complex128: 1e-10}
 
 @dataclass(frozen=True)
 class Frame:
-    """Geometry of data (..., channel, pulse, range).
+    """Radar and axes of data (..., channel, pulse, range), from which range histories follow.
 
     Args:
         radar: Instrument.
@@ -55,10 +56,13 @@ class Frame:
         return Frame(radar, signal.axis("pulse").values(device), signal.axis("range").values(device))
 
     def path_m(self, reference: PointMotion) -> Tensor:
-        """Return the range history R_ref,m(t) - R_ref of a reference.
+        """Return the range history of a reference point, seen from each channel.
+
+        It is the range between the point and the channel at each pulse, minus the closest range of
+        the motion, `reference.range_m`.
 
         Args:
-            reference: Motion of the reference, shape (...,).
+            reference: Motion of the reference point, shape (...,).
 
         Returns:
             Change of range in metres, float64 (..., channel, pulse).
@@ -66,14 +70,14 @@ class Frame:
         return self._history(reference, reference.range_m[..., None, None, None]).path_m[..., 0]
 
     def residual_m(self, reference: PointMotion, walks: float) -> Tensor:
-        """Return the displacement of envelopes after the history of the reference is removed.
+        """Return the displacement of envelopes after the reference range history is removed.
 
-        With e(t) the history at the range of the cell minus that of the reference, the displacement
-        is e(t) - walks * t de/dt: a keystone transform (walks = 1) removes what is linear in t and
-        displaces the rest by -t de/dt.
+        Let e(t) be the range history of a point at the range of the cell minus that of the
+        reference point. The displacement is e(t) - walks * t de/dt: a keystone transform (walks =
+        1) removes what is linear in t and displaces the rest by -t de/dt.
 
         Args:
-            reference: Motion of the reference, shape (...,).
+            reference: Motion of the reference point, shape (...,).
             walks: 1 after a keystone transform, 0 without.
 
         Returns:
@@ -133,13 +137,14 @@ class Migration(Protocol):
     """Method of range migration correction."""
 
     def apply(self, data: Tensor, frame: Frame, reference: PointMotion, ambiguity: Tensor) -> Tensor:
-        """Correct the migration.
+        """Correct the range migration.
 
         Args:
             data: Range-compressed channels, shape (..., channel, pulse, range), complex.
             frame: Geometry of the data.
-            reference: Motion of the reference, shape (...,).
-            ambiguity: PRF ambiguity number, shape (...,).
+            reference: Motion of the reference point, whose range history is removed, shape (...,).
+            ambiguity: PRF ambiguity number of the targets relative to the reference, shape (...,),
+                see `ambiguity_number`.
 
         Returns:
             Corrected data, same shape.
@@ -147,15 +152,19 @@ class Migration(Protocol):
         ...
 
     def neglected_m(self, integration_s: float, motion: PointMotion, reference: PointMotion) -> Tensor:
-        """Return the envelope motion in metres that remains for a point with another motion.
+        """Return the range migration that remains for a point unlike the reference point.
 
-        The motion is the largest over an integration time about t = 0. Below a quarter of a range
-        cell, c / (4 B), the loss is negligible.
+        It is the largest displacement of the envelope within the integration time, which is centred
+        on t = 0. Below a quarter of a range cell, c / (4 B) with the bandwidth B, the loss is
+        negligible.
 
         Args:
             integration_s: Integration time in seconds.
             motion: Motion of the point, shape (...,).
-            reference: Motion of the reference, shape (...,).
+            reference: Motion of the reference point, shape (...,).
+
+        Returns:
+            Remaining migration in metres, shape (...,).
         """
         ...
 
@@ -169,31 +178,31 @@ class NoMigration:
         return data
 
     def neglected_m(self, integration_s: float, motion: PointMotion, reference: PointMotion) -> Tensor:
-        """Return the whole migration relative to t = 0 in metres, (...,)."""
+        """Return the largest range change of a point relative to t = 0, in metres, (...,)."""
         return _moved_m(integration_s, motion).abs().amax(0)
 
 
 @dataclass(frozen=True)
 class StaticBulk:
-    """Shift of every pulse along range by the history of the reference.
+    """Migration correction by a shift of every pulse along range by a reference range history.
 
     Exact for a point that moves as the reference does, whatever its Doppler ambiguity. The range
     walk of other points relative to the reference remains.
 
     Args:
-        whole_swath: True to follow the closest range along the range axis, False to use the shifts
-            of the reference for all ranges.
+        whole_swath: True to compute the shift for the closest range of every range cell, False to
+            use the shift of the reference for all cells.
     """
 
     whole_swath: bool = False
 
     def apply(self, data: Tensor, frame: Frame, reference: PointMotion, ambiguity: Tensor) -> Tensor:
-        """Shift the pulses by the history of the reference; arguments as in `Migration.apply`."""
+        """Shift pulses by the range history of the reference; arguments as in `Migration.apply`."""
         spectrum = torch.fft.fft(data) * _envelope_phasor(frame.path_m(reference), frame.radar, data)
         return _profiles(spectrum, frame, reference, 0.0) if self.whole_swath else torch.fft.ifft(spectrum)
 
     def neglected_m(self, integration_s: float, motion: PointMotion, reference: PointMotion) -> Tensor:
-        """Return the walk and curvature in metres that differ from the reference, (...,)."""
+        """Return the range migration of a point minus that of the reference in metres, (...,)."""
         return (
             (_moved_m(integration_s, motion) - _moved_m(integration_s, _followed(motion, reference, self.whole_swath)))
             .abs()
@@ -203,21 +212,29 @@ class StaticBulk:
 
 @dataclass(frozen=True)
 class Keystone:
-    """Deramp, keystone transform and reramp, which remove the range walk of all targets.
+    """Migration correction that removes the range walk of all targets by a keystone transform.
 
-    The ambiguity number must be that of the target: its tone (u_r + v y0 / R0) / lambda relative to
-    the reference must lie within half a PRF of the ambiguity number times the PRF.
+    The range history of the reference is removed before the transform (deramp) and restored in the
+    carrier phase after it (reramp). The ambiguity number must be that of the target: the frequency
+    (u_r + v y0 / R0) / lambda of the target, minus that of the reference, must lie within half a
+    PRF of the ambiguity number times the PRF. Here u_r is the slant-range speed, v the along-track
+    speed of the receiver relative to the point, y0 the along-track position and R0 the closest
+    range.
 
     Args:
-        whole_swath: True if the curvature follows the closest range along the range axis. False
-            uses the curvature of the reference, which suffices within 165 m of the reference range
-            in the geometry of the paper and takes a third of the time.
+        whole_swath: True to correct the curvature for the closest range of every range cell. False
+            uses the curvature of the reference for all cells, which takes a third of the time and
+            suffices within 165 m of the reference range in the geometry of Remote Sens. 2020, 12,
+            1703.
     """
 
     whole_swath: bool = True
 
     def apply(self, data: Tensor, frame: Frame, reference: PointMotion, ambiguity: Tensor) -> Tensor:
-        """Apply deramp, keystone transform and reramp; arguments as in `Migration.apply`."""
+        """Correct range migration by deramp, keystone transform and reramp.
+
+        Arguments as in `Migration.apply`.
+        """
         path = frame.path_m(reference)
         deramp = unit_phasor(path / frame.radar.wavelength_m, data.dtype)[..., None]
         spectrum = torch.fft.fft(data * deramp) * _envelope_phasor(path, frame.radar, data)
@@ -225,7 +242,7 @@ class Keystone:
         return _profiles(spectrum, frame, reference, 1.0) if self.whole_swath else torch.fft.ifft(spectrum)
 
     def neglected_m(self, integration_s: float, motion: PointMotion, reference: PointMotion) -> Tensor:
-        """Return the curvature in metres that differs from that of the reference, (...,)."""
+        """Return the range curvature of a point minus that of the reference in metres, (...,)."""
         e = _moved_m(integration_s, motion) - _moved_m(integration_s, _followed(motion, reference, self.whole_swath))
         return e.mean(0).abs()
 
@@ -246,14 +263,17 @@ def _followed(motion: PointMotion, reference: PointMotion, whole_swath: bool) ->
 
 
 def ambiguity_number(radar: BistaticRadar, motion: PointMotion, reference: PointMotion) -> Tensor:
-    """Return the PRF ambiguity number of the tone of a point after the deramp.
+    """Return the PRF ambiguity number of a point after the range history of a reference is removed.
 
-    The number is round((du_r + v y0 / R0) / (lambda PRF)), relative to the reference.
+    A point then is a tone of frequency F - F_ref, with F = (u_r + v y0 / R0) / lambda of the point
+    and F_ref that of the reference; the number is round((F - F_ref) / PRF). Here u_r is the
+    slant-range speed, v the along-track speed of the receiver relative to the point, y0 the
+    along-track position and R0 the closest range.
 
     Args:
         radar: Instrument.
         motion: Motion of the point, shape (...,).
-        reference: Motion of the reference, shape (...,).
+        reference: Motion of the reference point, shape (...,).
 
     Returns:
         Whole numbers, float64 (...,).
@@ -305,18 +325,20 @@ def correct_migration(
 ) -> Tensor:
     """Correct the range migration so that each envelope stays at one range.
 
-    An envelope stays at its range at t = 0, minus that of the reference, plus the closest range of
-    the reference; a point at y0 thus lies at sqrt(R0^2 + y0^2) with a reference at y0 = 0. Carrier
-    phases are unchanged. Range lines wrap around: leave as many free cells at both ends as the
-    envelopes move. Differentiable in the data and, with `whole_swath` False, in the reference.
+    The corrected envelope lies at the range of the point at t = 0, minus that of the reference at t
+    = 0, plus the closest range of the reference. With a reference at the along-track position 0, a
+    point at the along-track position y0 and the closest range R0 thus lies at sqrt(R0^2 + y0^2).
+    Carrier phases are unchanged. Shifts wrap around at the ends of the range line: leave as many
+    free range cells at both ends as the envelopes move. Differentiable in the data and, with
+    `whole_swath` False, in the reference.
 
     Args:
         data: Range-compressed channels without the transmit range, shape (..., channel, pulse,
             range), complex.
         frame: Geometry of the data.
-        reference: Motion whose history is removed, shape (...,).
+        reference: Motion of the reference point, whose range history is removed, shape (...,).
         migration: Method, `Keystone()` by default.
-        ambiguity: PRF ambiguity number of the tones relative to the reference, shape (...,) or a
+        ambiguity: PRF ambiguity number of the targets relative to the reference, shape (...,) or a
             number, see `ambiguity_number`.
 
     Returns:
@@ -328,21 +350,21 @@ def correct_migration(
     if data.ndim < 3 or data.shape[-3:] != (frame.radar.channels, frame.time_s.shape[0], frame.range_m.shape[0]):
         expected = (frame.radar.channels, frame.time_s.shape[0], frame.range_m.shape[0])
         raise ValueError(
-            f"correct_migration works on data (..., {', '.join(map(str, expected))}), the shape of radar "
-            f"and axes, got shape {tuple(data.shape)}; give the frame of the data"
+            f"correct_migration works on data (..., {', '.join(map(str, expected))}), the numbers of channels, pulses "
+            f"and range cells of its frame, got shape {tuple(data.shape)}; give the frame of these data"
         )
     return (Keystone() if migration is None else migration).apply(data, frame, reference, per_trial(ambiguity, 0, data))
 
 
 class CorrectMigration(Stage):
-    """Range migration correction of range-compressed channels (channel, pulse, range).
+    """Stage that corrects the range migration of range-compressed channels (channel, pulse, range).
 
     Azimuth-only data (channel, pulse), which do not migrate, pass unchanged.
 
     Args:
         radar: Instrument.
         migration: Method, `Keystone()` by default.
-        range_m: Closest range of the reference in metres, None for the reference range of the
+        range_m: Closest range of the reference point in metres, None for the reference range of the
             radar.
     """
 
@@ -358,7 +380,9 @@ class CorrectMigration(Stage):
     def forward(
         self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0, ambiguity: Number = 0
     ) -> Signal:
-        """Correct the migration with a reference per trial, by default at rest, broadside at t = 0.
+        """Correct the range migration with one reference point per trial.
+
+        By default the reference is at rest and broadside at t = 0.
 
         Args:
             signal: Channels with the axes (channel, pulse, range) or (channel, pulse).
@@ -366,7 +390,11 @@ class CorrectMigration(Stage):
                 number.
             u_a_m_s: Along-track speed of the reference in m/s, same shape.
             y0_m: Along-track position of the reference at t = 0 in metres, same shape.
-            ambiguity: PRF ambiguity number, same shape.
+            ambiguity: PRF ambiguity number of the targets relative to the reference, same shape,
+                see `ambiguity_number`.
+
+        Returns:
+            Corrected channels on the same axes; azimuth-only data are returned unchanged.
 
         Raises:
             ValueError: If slow time is not zero at pulse n // 2.

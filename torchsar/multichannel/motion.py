@@ -1,4 +1,4 @@
-"""Uniform motion of a point in front of an airborne receiver, and the quantities that follow."""
+"""Uniform motion of a point in front of an airborne receiver, and derived quantities."""
 
 from __future__ import annotations
 
@@ -57,6 +57,9 @@ class PointMotion:
             y0_m: Along-track position at t = 0 in metres.
             range_m: Closest range in metres, None for the reference range of the radar.
 
+        Returns:
+            Motion with float64 tensors.
+
         Raises:
             ValueError: If a value is not finite, the point is as fast along track as the receiver,
                 or the range is not positive.
@@ -73,47 +76,66 @@ class PointMotion:
         return motion
 
     def each(self, change: Callable[[Tensor], Tensor]) -> PointMotion:
-        """Return the motion with a function applied to all four tensors."""
+        """Return the motion with a function applied to u_r_m_s, u_a_m_s, y0_m and range_m."""
         return PointMotion(
             change(self.u_r_m_s), change(self.u_a_m_s), change(self.y0_m), change(self.range_m), self.speed_m_s
         )
 
     @property
     def along_m_s(self) -> Tensor:
-        """Along-track speed v = V_R - u_a of the receiver relative to the point in m/s."""
+        """Along-track speed of the receiver minus that of the point, v = V_R - u_a, in m/s."""
         return self.speed_m_s - self.u_a_m_s
 
     @property
     def square_m2_s2(self) -> Tensor:
-        """Squared relative speed V^2 = v^2 + u_r^2 in m^2/s^2."""
+        """Squared relative speed V^2 = v^2 + u_r^2 in m^2/s^2.
+
+        v is the along-track speed of the receiver relative to the point, u_r the slant-range speed.
+        """
         return self.along_m_s.square() + self.u_r_m_s.square()
 
     @property
     def effective_m_s(self) -> Tensor:
-        """Relative sensor velocity v_e = V^2 / v in m/s, Eq. (25)."""
+        """Relative sensor velocity v_e = V^2 / v in m/s, Eq. (25).
+
+        v is the along-track speed of the receiver relative to the point, and V^2 = v^2 + u_r^2 with
+        the slant-range speed u_r.
+        """
         return self.square_m2_s2 / self.along_m_s
 
     @property
     def trial_dims(self) -> int:
-        """Number of trial dimensions of quantities that depend on the velocities."""
+        """Number of trial dimensions of the velocities u_r_m_s and u_a_m_s after broadcasting."""
         return max(self.u_r_m_s.ndim, self.u_a_m_s.ndim)
 
     @property
     def image_s(self) -> Tensor:
-        """Slow time t0 = (u_r R0 + v y0) / V^2 of zero Doppler in s, where the point is imaged."""
+        """Slow time in seconds at which the point has zero Doppler and appears in an image.
+
+        It is t0 = (u_r R0 + v y0) / V^2, with the slant-range speed u_r, the along-track speed v of
+        the receiver relative to the point, V^2 = v^2 + u_r^2, the along-track position y0 at t = 0
+        and the closest range R0 of the point at rest.
+        """
         return (self.u_r_m_s * self.range_m + self.along_m_s * self.y0_m) / self.square_m2_s2
 
     @property
     def closest_m(self) -> Tensor:
-        """Least range of the path, sqrt(R0^2 + y0^2 - (u_r R0 + v y0)^2 / V^2), in metres."""
+        """Least range in metres between the receiver and the moving point.
+
+        It is sqrt(R0^2 + y0^2 - (u_r R0 + v y0)^2 / V^2), with the closest range R0 of the point at
+        rest, the along-track position y0 at t = 0, the slant-range speed u_r, the along-track speed
+        v of the receiver relative to the point, and V^2 = v^2 + u_r^2.
+        """
         cross = self.along_m_s * self.range_m - self.u_r_m_s * self.y0_m
         return cross / self.square_m2_s2.sqrt()
 
     def position_m(self, image_s: Tensor) -> Tensor:
         """Return the along-track position y0 at t = 0 of a point that appears at a given slow time.
 
-        This is the location correction. Eq. (30) is printed with the opposite sign: on x = V_R t a
-        closing target (u_r > 0) appears displaced by +V_R u_r R0 / V^2.
+        This corrects the azimuth displacement of a moving target: a closing target (slant-range
+        speed u_r > 0) appears displaced by +V_R u_r R0 / V^2 in azimuth x = V_R t, with the speed
+        V_R of the receiver, the closest range R0 and the relative speed V. Eq. (30) of the paper is
+        printed with the opposite sign.
 
         Args:
             image_s: Slow time in seconds at which the image shows the point, shape (...,).

@@ -3,8 +3,8 @@
 All that does not depend on the data is computed once, so that an image costs little more than its
 transforms. At each alias frequency the chain of `reconstruct` and `focus_azimuth` is one small
 matrix from channels to Doppler bands, with the exact filter included. Use a plan for Monte Carlo
-trials or range lines that share one motion; use the two stages where each trial has its own
-velocities.
+trials or range lines that share one motion; use the stages `Reconstruct` and `FocusAzimuth` where
+each trial has its own velocities.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from torchsar.radar import BistaticRadar
 class AzimuthPlan:
     """Plan that turns channels into focused images of points with one motion.
 
-    The image equals that of `focus_azimuth(reconstruct(data))` times the carrier exp(+j 2 pi f t)
-    of the Doppler centre, which is rounded to the nearest bin.
+    The image equals that of `focus_azimuth(reconstruct(data))` times the carrier exp(+j 2 pi f t),
+    where f is the Doppler centre, rounded to the nearest bin, and t slow time.
 
     Args:
         radar: Instrument.
-        motion: Motion of the points, without trials.
+        motion: Motion of the points; its tensors have the shape ().
         n_pulse: Number of pulses.
         rebuild: Reconstruction method, `LeastSquares()` by default.
         bandwidth_hz: Processed Doppler bandwidth about the centre in Hz, None for the whole
@@ -61,7 +61,7 @@ class AzimuthPlan:
         self.matrix = _matrix(radar, motion, n_pulse, rebuild, bandwidth_hz).to(dtype)
 
     def image(self, data: Tensor) -> Tensor:
-        """Focus channels; differentiable in the data.
+        """Focus channels to azimuth images. Differentiable in the data.
 
         Args:
             data: Channels, shape (..., channel, pulse), complex, of the dtype of the plan.
@@ -76,8 +76,8 @@ class AzimuthPlan:
         if data.dtype != self.matrix.dtype or data.shape[-2:] != self.matrix.shape[-2:]:
             expected = f"(..., {self.matrix.shape[-2]}, {self.matrix.shape[-1]}) of {self.matrix.dtype}"
             raise ValueError(
-                f"this plan works on channels and pulses {expected}, got {tuple(data.shape)} of {data.dtype}; "
-                "form a plan for these data"
+                f"this plan works on channels and pulses {expected}, got shape {tuple(data.shape)} of {data.dtype}; "
+                "build a plan for these data"
             )
         if torch.is_grad_enabled() and data.requires_grad:
             spectrum = torch.fft.fft(data)
@@ -132,11 +132,10 @@ def _matrix(radar: BistaticRadar, motion: PointMotion, n: int, rebuild: Rebuild,
 
 
 class FocusPlan(Stage):
-    """`AzimuthPlan` as a stage: channels (channel, pulse) to the image (azimuth,) of one motion.
+    """Stage that focuses channels to the azimuth image of points with one known motion.
 
-    The motion is known a priori. Azimuth is x = V_R t in metres. The plan is kept until the number
-    of pulses, the dtype or the device of the data changes. A warning is given where the
-    reconstruction is ill-conditioned.
+    It uses an `AzimuthPlan`, which is kept until the number of pulses, the dtype or the device of
+    the data changes. A warning is given where the reconstruction is ill-conditioned.
 
     Args:
         radar: Instrument.
@@ -170,7 +169,7 @@ class FocusPlan(Stage):
         self._plan: AzimuthPlan | None = None
 
     def plan(self, data: Tensor) -> AzimuthPlan:
-        """Return the plan for data of this shape, dtype and device.
+        """Return the focusing plan for data of this shape, dtype and device.
 
         Raises:
             ValueError: If the reconstruction is singular, or there are too few channels for the
@@ -184,10 +183,15 @@ class FocusPlan(Stage):
         return self._plan
 
     def forward(self, signal: Signal) -> Signal:
-        """Focus channels (channel, pulse).
+        """Focus channels (channel, pulse) to an image (azimuth,).
+
+        Returns:
+            Image with azimuth x = V_R t in metres, V_R being the speed of the receiver and t slow
+            time.
 
         Raises:
-            ValueError: If slow time is not zero at pulse n // 2, or as in `plan`.
+            ValueError: If slow time is not zero at pulse n // 2, the reconstruction is singular, or
+                there are too few channels for the bands.
         """
         pulse = signal.axis("pulse")
         refuse_shifted(self.radar, pulse)

@@ -1,7 +1,8 @@
 """Azimuth reconstruction: from the aliased spectra of several channels to the full Doppler band.
 
-Data are demodulated by the Doppler centre of the assumed motion. The reconstructed bands are then
-centred on it to a fraction of a bin, and the result is smooth in the velocities.
+Data are demodulated by the Doppler centre of the assumed motion. The reconstructed bands are
+therefore centred on it to a fraction of a bin, and the result is a smooth function of the
+velocities.
 
 Reference:
     Remote Sens. 2020, 12, 1703, Eqs. (34)-(36).
@@ -39,7 +40,7 @@ def reconstruct(
 
     Args:
         data: Channels with slow time zero at pulse n // 2, shape (..., channel, pulse), complex.
-            The transmit range is removed, or `left_k1_m_s` is its rate.
+            The transmit range has been removed, except for a linear term of rate `left_k1_m_s`.
         radar: Instrument.
         motion: Motion of the points, shape (...,).
         rebuild: Reconstruction method.
@@ -47,8 +48,8 @@ def reconstruct(
 
     Returns:
         Spectrum about the Doppler centre of the motion, shape (..., bands * pulse), complex. Bins
-        rise from `first_bin`, phases refer to slow time zero, and the scale is that of the FFT of
-        bands * pulse samples of a single channel.
+        rise in Doppler from `first_bin(pulse, bands)`, phases refer to slow time zero, and the
+        scale is that of the FFT of bands * pulse samples of a single channel.
 
     Raises:
         ValueError: If the data do not have the channels of the radar, or there are too few channels
@@ -60,22 +61,24 @@ def reconstruct(
 def reconstruct_lines(
     data: Tensor, radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, left_k1_m_s: float = 0.0
 ) -> Tensor:
-    """Reconstruct the spectra of range lines that share one motion.
+    """Reconstruct the full-band Doppler spectra of range lines that share one motion.
 
-    Arguments are as in `reconstruct`, except for the range axis.
+    As `reconstruct`, for data with a range axis.
 
     Args:
-        data: Channels, shape (..., channel, pulse, range), complex.
+        data: Channels with slow time zero at pulse n // 2, shape (..., channel, pulse, range),
+            complex.
         radar: Instrument.
         motion: Motion of the points, shape (...,).
         rebuild: Reconstruction method.
         left_k1_m_s: Rate k1 of the transmit range that remains in the data in m/s.
 
     Returns:
-        Spectra, shape (..., bands * pulse, range), complex.
+        Spectra about the Doppler centre of the motion, shape (..., bands * pulse, range), complex.
 
     Raises:
-        ValueError: As in `reconstruct`.
+        ValueError: If the data do not have the channels of the radar, or there are too few channels
+            for the bands.
     """
     _check_channels(data, radar, rebuild)
     n, dtype = data.shape[-2], data.dtype
@@ -115,10 +118,10 @@ def _check_channels(data: Tensor, radar: BistaticRadar, rebuild: Rebuild) -> Non
 
 
 class Reconstruct(Stage):
-    """Reconstruction of the full Doppler band of points with given velocities.
+    """Stage that reconstructs the full Doppler band of points with given velocities.
 
     The input has the axes (channel, pulse[, range]), the output the axes (doppler[, range]) with
-    Doppler in Hz relative to the Doppler centre.
+    Doppler in Hz relative to the Doppler centre of the points.
 
     Args:
         radar: Instrument.
@@ -143,7 +146,9 @@ class Reconstruct(Stage):
             raise ValueError(why)
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Signal:
-        """Reconstruct with velocities per trial, zero for a stationary scene.
+        """Reconstruct the full Doppler band with the velocities of each trial.
+
+        Velocities of zero suit a stationary scene.
 
         A warning is given where the reconstruction is ill-conditioned.
 
@@ -176,7 +181,7 @@ class Reconstruct(Stage):
 def refuse_shifted(radar: BistaticRadar, pulse: Axis) -> None:
     """Raise ValueError unless slow time is zero at pulse n // 2 and pulses come at the radar's PRF.
 
-    Phases are counted from slow time zero.
+    Reconstruction and focusing count phases from slow time zero.
 
     Args:
         radar: Instrument.
@@ -191,7 +196,7 @@ def refuse_shifted(radar: BistaticRadar, pulse: Axis) -> None:
             f"slow time must be zero at pulse {pulse.n // 2} of {pulse.n}, in steps of 1 / "
             f"{radar.prf_hz:g} s, got a first pulse at {pulse.start:g} s in steps of "
             f"{pulse.step:g} s; "
-            "crop the same number of pulses from both ends, and give the radar's prf_hz"
+            "crop the same number of pulses from both ends, and check prf_hz of the radar"
         )
 
 
@@ -230,7 +235,7 @@ def check_condition(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild,
 
     Raises:
         ValueError: If the condition number exceeds 1e6 (1e4 in complex64) in all trials. The
-            message names the pulse rate and the speed.
+            message states the pulse rate and the speed of the receiver past the target.
     """
     if not isinstance(rebuild, LeastSquares):
         return

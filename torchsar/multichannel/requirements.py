@@ -55,7 +55,7 @@ Estimator = Literal["sir", "ati", "ml", "whitened"]
 
 @dataclass(frozen=True)
 class MultichannelUse:
-    """Use of a radar: record, reconstruction, and bounds of the motion in the scene.
+    """Planned use of a radar: record, reconstruction, and bounds of the motion in the scene.
 
     Args:
         n_pulse: Number of pulses of the record.
@@ -105,11 +105,11 @@ class MultichannelUse:
         for name in ("u_r_m_s", "u_a_m_s"):
             low, high = getattr(self, name)
             if not (math.isfinite(low) and math.isfinite(high) and low <= high):
-                raise ValueError(f"{name} is (least, largest) velocity, finite and in order, got {(low, high)}")
+                raise ValueError(f"{name} must be (least, largest) velocity, finite and in order, got {(low, high)}")
         if self.n_pulse < 1 or not self.integration_s > 0:
             raise ValueError(
                 "a record needs n_pulse of 1 or more and a positive integration_s, got "
-                f"{self.n_pulse} and {self.integration_s}"
+                f"n_pulse={self.n_pulse} and integration_s={self.integration_s}"
             )
         least = {
             name: getattr(self, name)
@@ -118,13 +118,13 @@ class MultichannelUse:
         wrong = {name: value for name, value in least.items() if not (math.isfinite(value) and value >= 0)}
         if wrong:
             raise ValueError(
-                "these values must be finite and not negative, got "
+                f"{', '.join(wrong)} must be finite and not negative, got "
                 f"{', '.join(f'{name}={value}' for name, value in wrong.items())}"
             )
 
     @property
     def fastest_m_s(self) -> float:
-        """Largest |u_r| in m/s."""
+        """Largest magnitude of the slant-range speeds that are searched, in m/s."""
         return max(abs(u) for u in self.u_r_m_s)
 
 
@@ -142,7 +142,8 @@ def multichannel_limits(radar: BistaticRadar, use: MultichannelUse) -> tuple[Lim
 
     Returns:
         One row per limit. Rows that need an SNR, a pattern or an estimator that `use` does not have
-        are absent. If the fastest target is as fast as the receiver, that row alone is returned.
+        are absent. If the fastest target is as fast along track as the receiver, the row of this
+        limit is returned alone.
     """
     slowest = radar.speed_m_s - use.u_a_m_s[1]
     moves = Limit(
@@ -288,8 +289,9 @@ def _worst_condition(radar: BistaticRadar, use: MultichannelUse) -> tuple[float,
 def singular_speeds_m_s(radar: BistaticRadar, bands: int, u_a_m_s: tuple[float, float]) -> list[float]:
     """Return along-track speeds at which the reconstruction is singular.
 
-    At these speeds fewer than `bands` channels sample different positions: v = (m - m') d PRF / q
-    for a pair of channels and a whole number q, at u_r = 0.
+    At these speeds fewer than `bands` channels sample different positions. Two channels at a
+    distance D along track sample the same positions if the receiver passes the target at the speed
+    v = D PRF / q with a positive whole number q; targets without slant-range speed are assumed.
 
     Args:
         radar: Instrument.
@@ -297,7 +299,7 @@ def singular_speeds_m_s(radar: BistaticRadar, bands: int, u_a_m_s: tuple[float, 
         u_a_m_s: Bounds of the along-track speed in m/s.
 
     Returns:
-        Speeds u_a within the bounds in m/s, rising.
+        Along-track speeds of the target within the bounds in m/s, rising.
     """
     positions = radar.channel_m
     pairs = {round(abs(a - b), 9) for i, a in enumerate(positions) for b in positions[:i]}
@@ -403,19 +405,22 @@ def _estimator_limits(radar: BistaticRadar, use: MultichannelUse) -> Iterable[Li
 def multichannel_requirements(
     radar: BistaticRadar, use: MultichannelUse, tolerance_rad: float = math.pi / 4
 ) -> tuple[Requirement, ...]:
-    """Return the phase that each simplification neglects at worst, against its tolerance.
+    """Return the largest phase that each simplification neglects, with its tolerance.
 
-    Transmit and receive range and migration are judged by the relative error of the response; range
-    migration is expressed as the phase at the ends of the band, where a quarter of a resolution
-    cell c / B is pi / 4. y0 is compared with 0.3 rad. Errors of the
-    reconstruction are compared with the phase that makes a false target of `use.replica_db`.
-    Quadratic phases count at the ends of the aperture. Terms "absorbed by u_a" are focused by
-    another value of u_a.
+    A row with a predicted relative error of the response of a point is judged by that error:
+    transmit range, parabolic receive range and range migration. Any other row is judged by its
+    phase. Range migration is stated as the phase at the ends of the range band, where a shift of a
+    quarter of a resolution cell c / B is pi / 4. Quadratic phases are stated at the ends of the
+    aperture. Terms "absorbed by u_a" are focused by another value of the along-track speed u_a.
+
+    The tolerance is 0.3 rad for the transmit range and for an along-track position y0 that is left
+    out of the azimuth filter. For errors of the reconstruction it is the phase that makes a false
+    target of `use.replica_db`.
 
     Args:
         radar: Instrument.
         use: Record, reconstruction and bounds of the motion.
-        tolerance_rad: Tolerance of the other rows in radians.
+        tolerance_rad: Tolerance in radians of the rows that have none of their own.
 
     Returns:
         One row per simplification.

@@ -1,9 +1,10 @@
 """Response of channels along track to the Doppler bands of a point, and separating weights.
 
 One channel samples at the pulse rate, so that its spectrum at each alias frequency is a sum over
-Doppler bands one PRF apart. Up to a constant phase, channel m is the reference channel delayed by
-dx_m / v_e: its response to band b has the factor exp(-j 2 pi b PRF dx_m / v_e), which differs
-between channels and allows the bands to be separated.
+Doppler bands one PRF apart. Up to a constant phase, channel m at the along-track position dx_m is
+the reference channel delayed by dx_m / v_e, with the relative sensor velocity v_e of Eq. (25). Its
+response to band b has the factor exp(-j 2 pi b PRF dx_m / v_e), which differs between channels and
+allows the bands to be separated.
 
 Reference:
     Remote Sens. 2020, 12, 1703, Eqs. (25), (26), (34)-(36). The constant phase is that of Eq. (34);
@@ -66,7 +67,10 @@ def doppler_offsets(n_pulse: int, bands: int, prf_hz: float, device: torch.devic
 
 
 def band_matrix(radar: BistaticRadar, motion: PointMotion, bands: int) -> Tensor:
-    """Return the part of Eq. (34) that differs between bands, exp(-j 2 pi b PRF dx_m / v_e).
+    """Return the part of the channel response of Eq. (34) that differs between Doppler bands.
+
+    It is exp(-j 2 pi b PRF dx_m / v_e) in band b for the channel at the along-track position dx_m,
+    with the relative sensor velocity v_e of Eq. (25).
 
     Args:
         radar: Instrument.
@@ -86,9 +90,12 @@ def shared_response(
 ) -> Tensor:
     """Return the part of the channel response of Eq. (34) that all bands share.
 
-    It is exp(-j 2 pi (f dx_m / v_e + C_m / (2 R0 lambda))) in the lowest band, with f counted from
-    the Doppler centre, by which the data are demodulated first, and C_m = dx^2 - (v dx^2 + 2 R0 u_r
-    dx) / v_e + 2 y0 dx u_r^2 / V^2, Eq. (7) extended by y0.
+    It is exp(-j 2 pi (f dx / v_e + C / (2 R0 lambda))) for the channel at the along-track position
+    dx, with C = dx^2 - (v dx^2 + 2 R0 u_r dx) / v_e + 2 y0 dx u_r^2 / V^2, Eq. (7) extended by y0.
+    The Doppler f lies in the lowest band and is counted from the Doppler centre, by which the data
+    are demodulated first. v is the along-track speed of the receiver relative to the point, u_r the
+    slant-range speed, V^2 = v^2 + u_r^2, v_e = V^2 / v, y0 the along-track position at t = 0 and R0
+    the closest range.
 
     Args:
         radar: Instrument.
@@ -118,7 +125,9 @@ def shared_response(
 
 
 def doppler_centre_hz(radar: BistaticRadar, motion: PointMotion, left_k1_m_s: float = 0.0) -> Tensor:
-    """Return the Doppler centre (u_r - k1) / lambda of a point at broadside.
+    """Return the Doppler centre (u_r - k1) / lambda of a point with the slant-range speed u_r.
+
+    It is the Doppler frequency while the point is at broadside.
 
     Args:
         radar: Instrument.
@@ -133,7 +142,7 @@ def doppler_centre_hz(radar: BistaticRadar, motion: PointMotion, left_k1_m_s: fl
 
 
 class Prior(Protocol):
-    """Expected power over Doppler."""
+    """Expected power of the echoes over Doppler."""
 
     def power(self, offset_hz: Tensor, radar: BistaticRadar, motion: PointMotion) -> Tensor:
         """Return the expected power relative to its peak.
@@ -151,19 +160,22 @@ class Prior(Protocol):
 
 @dataclass(frozen=True)
 class ElementPattern:
-    """One-way power pattern of the aperture of a channel, sinc^2(element sin(look) / lambda).
+    """Expected power over Doppler by the one-way antenna pattern of a channel.
 
-    Over Doppler sin(look) = -lambda offset / v.
+    The pattern is sinc^2(L sin(look) / lambda) with the length L = `radar.element_m` of the
+    aperture of a channel. The look angle from broadside follows from sin(look) = -lambda offset /
+    v, with the Doppler offset from the centre and the along-track speed v of the receiver relative
+    to the point.
     """
 
     def power(self, offset_hz: Tensor, radar: BistaticRadar, motion: PointMotion) -> Tensor:
-        """Return the power pattern over Doppler offsets in Hz, see `Prior.power`."""
+        """Return the antenna pattern over Doppler as a power ratio, see `Prior.power`."""
         return torch.sinc(radar.element_m * offset_hz / motion.along_m_s[(...,) + (None,) * offset_hz.ndim]).square()
 
 
 @dataclass(frozen=True)
 class FlatBand:
-    """Equal power within a band about the Doppler centre, none outside.
+    """Expected power that is equal within a band about the Doppler centre and zero outside.
 
     Args:
         bandwidth_hz: Width of the band in Hz.
@@ -192,7 +204,7 @@ class Rebuild(Protocol):
         ...
 
     def weights(self, radar: BistaticRadar, motion: PointMotion, n_pulse: int) -> Tensor:
-        """Return the weights from channels to bands.
+        """Return the weights that combine the spectra of the channels to Doppler bands.
 
         Args:
             radar: Instrument.
@@ -206,7 +218,7 @@ class Rebuild(Protocol):
         ...
 
     def refusal(self, channels: int) -> str | None:
-        """Return why the method cannot work with so many channels, or None if it can."""
+        """Return why the method cannot work with this number of channels, or None if it can."""
         ...
 
 
@@ -218,12 +230,13 @@ def _check_bands(bands: int) -> None:
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """Pseudo-inverse of the band matrix, Eq. (36) for any number of channels.
+    """Reconstruction of Doppler bands by the pseudo-inverse of the channel responses.
 
-    It is the inverse where there are as many bands as channels. Singular values below 1e-6 of the
-    largest are damped, so that the weights stay finite where two channels sample the same
-    positions. Prefer two bands for three channels: three bands amplify noise strongly near PRFs at
-    which channels sample the same positions.
+    This is Eq. (36) for any number of channels. The pseudo-inverse is the inverse where there are
+    as many bands as channels. Singular values below 1e-6 of the largest are damped, so that the
+    weights stay finite where two channels sample the same positions. Prefer two bands for three
+    channels: three bands amplify noise strongly near PRFs at which channels sample the same
+    positions.
 
     Args:
         bands: Number of Doppler bands, at most the number of channels.
@@ -241,7 +254,10 @@ class LeastSquares:
         _check_bands(self.bands)
 
     def weights(self, radar: BistaticRadar, motion: PointMotion, n_pulse: int) -> Tensor:
-        """Return the pseudo-inverse, complex128 (..., band, channel); see `Rebuild`."""
+        """Return the weights from channels to Doppler bands, complex128 (..., band, channel).
+
+        They are the same for all Doppler bins of a band.
+        """
         matrix = band_matrix(radar, motion, self.bands)
         normal = matrix.mH @ matrix
         floor = _TINY * self.bands * radar.channels
@@ -250,7 +266,7 @@ class LeastSquares:
         )
 
     def refusal(self, channels: int) -> str | None:
-        """Return why the method cannot work with so many channels, or None if it can."""
+        """Return why the method cannot work with this number of channels, or None if it can."""
         few = (
             f"{self.bands} Doppler bands cannot be separated by {channels} "
             f"channel{'s' if channels > 1 else ''}; rebuild at most {channels}, or give a prior "
@@ -261,10 +277,11 @@ class LeastSquares:
 
 @dataclass(frozen=True)
 class MinimumMeanSquare:
-    """Linear estimate of least mean square error for bands of a given expected power.
+    """Reconstruction of Doppler bands with least mean square error, for an expected power.
 
-    With the response G and the expected power A the weights are A G^H (G A G^H + I / snr)^-1. There
-    may be more bands than channels.
+    The weights are A G^H (G A G^H + I / snr)^-1, with the channel responses G to the bands, the
+    diagonal matrix A of the expected powers of the bands relative to the peak, and the power ratio
+    snr of this peak to the noise. There may be more bands than channels.
 
     Args:
         bands: Number of Doppler bands.
@@ -288,7 +305,10 @@ class MinimumMeanSquare:
             )
 
     def weights(self, radar: BistaticRadar, motion: PointMotion, n_pulse: int) -> Tensor:
-        """Return weights per bin, complex128 (..., n_pulse, band, channel); see `Rebuild`."""
+        """Return the weights from channels to Doppler bands for each Doppler bin of a band.
+
+        The shape is (..., n_pulse, band, channel), complex128.
+        """
         offset = doppler_offsets(n_pulse, self.bands, radar.prf_hz, motion.u_r_m_s.device).view(self.bands, n_pulse).T
         matrix = band_matrix(radar, motion, self.bands)[..., None, :, :]
         weighted = matrix * self.prior.power(offset, radar, motion)[..., None, :].to(matrix.dtype)
@@ -296,7 +316,7 @@ class MinimumMeanSquare:
         return torch.linalg.solve(weighted @ matrix.mH + noise, weighted).mH
 
     def refusal(self, channels: int) -> str | None:
-        """Return None: with a prior any number of bands can be separated."""
+        """Return None, since a prior lets any number of channels separate the bands."""
         return None
 
 
@@ -325,10 +345,10 @@ def clutter_covariance(
 
 
 def condition_number(radar: BistaticRadar, motion: PointMotion, bands: int) -> Tensor:
-    """Return the condition number of the band matrix.
+    """Return the condition number of the matrix of channel responses to the Doppler bands.
 
-    It is the ratio of the largest to the least singular value, infinite where the matrix is
-    singular. Not differentiable.
+    It is the ratio of the largest to the least singular value of `band_matrix`, infinite where the
+    matrix is singular or has more bands than channels. Not differentiable.
 
     Args:
         radar: Instrument.
@@ -350,9 +370,10 @@ def condition_number(radar: BistaticRadar, motion: PointMotion, bands: int) -> T
 def noise_gain_db(radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, n_pulse: int = 64) -> Tensor:
     """Return the noise gain of a reconstruction relative to ideal uniform sampling.
 
-    The gain M / N trace(W W^H) is the noise power of a reconstructed bin over that of uniform
-    sampling with as many channels, as a mean over bins. It is infinite where a least-squares matrix
-    is singular: the damped weights are finite there, but they lose bands.
+    The gain is the noise power of a reconstructed bin over that of uniform sampling with as many
+    channels, as a mean over bins: M / N trace(W W^H) for the weights W from M channels to N bands.
+    It is infinite where a least-squares matrix is singular: the damped weights are finite there,
+    but they lose bands.
 
     Args:
         radar: Instrument.

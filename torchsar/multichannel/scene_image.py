@@ -1,10 +1,10 @@
 """Image of a stationary scene and of its moving targets at their true positions.
 
 The conventional image is formed and targets are detected in it. Then for each target, strongest
-first, its range lines are extracted, its velocity is estimated, its echo is removed from the data,
-it is imaged with its own velocity, and it is relocated. The false targets of a target are removed
-with its echo, so that they are not detected as targets. Weaker targets are detected in images with
-suppressed sea.
+first, the range lines around it are extracted, its velocity is estimated, its echo is removed from
+the data, and it is imaged with its own velocity at its true position. Removal of the echo also
+removes the false targets that it causes, so that these are not detected as targets. Weaker targets
+are then sought in an image in which the sea is suppressed.
 
 Reference:
     Remote Sens. 2020, 12, 1703, Fig. 13 and section 4.3.
@@ -48,15 +48,16 @@ _HALF_QUALITY_LEVEL = 100.0  # level (20 dB) at which the quality of a target is
 
 @dataclass(frozen=True)
 class Detector:
-    """Settings of the detection of targets.
+    """Settings of the detection of moving targets in images.
 
     Args:
-        threshold_db: Least mean intensity of a neighbourhood over the median of the image in dB.
+        threshold_db: Least contrast of a target in dB: the mean intensity of a small rectangle of
+            pixels (neighbourhood) relative to the median over all of them.
         extent_m: Extent of a neighbourhood in azimuth and range in metres.
         apart_m: Least separation of detections in azimuth and range in metres.
         most: Largest number of targets.
-        suppressed_m_s: Slant-range speeds in m/s of the images with suppressed sea, in which weaker
-            targets are detected; empty to omit these.
+        suppressed_m_s: Slant-range speeds in m/s for which an image with suppressed sea is matched,
+            to detect weaker targets in it; empty to omit this image.
 
     Raises:
         ValueError: If the threshold, an extent or a separation is not positive, or `most` is below
@@ -72,12 +73,12 @@ class Detector:
     def __post_init__(self) -> None:
         if not (self.threshold_db > 0 and all(x > 0 for x in (*self.extent_m, *self.apart_m)) and self.most >= 1):
             raise ValueError(
-                "a detector needs a threshold_db above 0, positive extents and distances, and most "
-                f"of 1 or more, got {self}"
+                "a detector needs threshold_db above 0, positive extent_m and apart_m, and at least 1 for most, "
+                f"the largest number of targets, got {self}"
             )
 
     def found(self, image: Signal) -> list[Detection]:
-        """Return the detections in an image (azimuth, range), strongest first."""
+        """Return the targets that are detected in an image (azimuth, range), strongest first."""
         return detect(image, self.threshold_db, self.extent_m, self.apart_m, self.most)
 
 
@@ -88,10 +89,10 @@ class SceneImage:
     Args:
         conventional: Image (azimuth, range) of all data as if the whole scene were stationary.
         rest: Image of the data without the moving targets.
-        fused: Image `rest` with every moving target at its position.
+        fused: Image `rest` with every moving target at its true position.
         bodies: All targets, strongest first.
-        estimate: `u_r_m_s`, `u_a_m_s`, `y0_m`, `range_m` of shape (target,), with the `most`
-            entries of the detector; entries without a target are zero and not `ok`.
+        estimate: `u_r_m_s`, `u_a_m_s`, `y0_m`, `range_m` of shape (target,), padded to the setting
+            `most` of the detector; entries without a target are zero, and `ok` is False there.
         data: Channels without the moving targets.
     """
 
@@ -104,7 +105,7 @@ class SceneImage:
 
 
 class ImageMovers(Stage):
-    """Imaging of a scene and its moving targets, from channels to a `SceneImage`.
+    """Stage that images a scene and its moving targets, from channels to a `SceneImage`.
 
     The channels (channel, pulse, range) are range compressed and without the transmit range. One
     frame is processed at a time, since the number of targets differs between frames.
@@ -116,9 +117,9 @@ class ImageMovers(Stage):
         rebuild: Reconstruction method for the stationary scene, `LeastSquares()` by default.
         removal: "subtract" removes the echo fitted to a moving target. "zero" removes all data in
             its lines and extent, including the sea, as in the paper.
-        slowest_m_s: Least |u_r| and |u_a| in m/s of a moving target; other targets remain in the
-            image.
-        u_a_half_m_s: Half width of the search in u_a in m/s.
+        slowest_m_s: Least slant-range and least along-track speed in m/s. A target that exceeds one
+            of them counts as moving; other targets stay in the image as stationary ones.
+        u_a_half_m_s: Half width of the search in the along-track speed u_a in m/s.
 
     Raises:
         ValueError: If `removal` is unknown, or there are too few channels for the bands.
@@ -144,14 +145,14 @@ class ImageMovers(Stage):
         self.slowest_m_s, self.u_a_half_m_s = slowest_m_s, u_a_half_m_s
 
     def forward(self, signal: Signal, known: Sequence[PointMotion] | None = None) -> SceneImage:
-        """Image one frame.
+        """Image one frame of data with its moving targets.
 
         A warning is given if the swath is too narrow for any target to be detected.
 
         Args:
             signal: Channels with the axes (channel, pulse, range), without trials.
             known: Motions of all targets by their middles, strongest first, if known a priori; no
-                targets are then detected. None to detect targets.
+                targets are then detected. None to detect the targets in the images.
 
         Returns:
             The images and the targets.
@@ -162,8 +163,8 @@ class ImageMovers(Stage):
         """
         if signal.trials:
             raise ValueError(
-                f"ImageMovers works on one frame at a time, got trials {tuple(signal.trials)}; "
-                "call it for each trial separately"
+                "ImageMovers works on one frame at a time, got data with the trial dimensions "
+                f"{tuple(signal.trials)}; call it for each trial separately"
             )
         conventional = self.image(signal)
         axis = signal.axis("range")
@@ -340,7 +341,10 @@ class ImageMovers(Stage):
 
 
 class MoversImage(Stage):
-    """`ImageMovers` as a stage of a chain: the fused image and the targets of every trial.
+    """Stage for chains that images the scene and the moving targets of every trial.
+
+    See `ImageMovers`; it gives the image with every target at its true position, and an estimate of
+    the motions.
 
     Args:
         radar: Instrument.
@@ -348,7 +352,7 @@ class MoversImage(Stage):
         removal: "subtract" or "zero", see `ImageMovers`.
         extraction: Extent of a target in the data.
         detector: Settings of the detection.
-        u_a_half_m_s: Half width of the search in u_a in m/s.
+        u_a_half_m_s: Half width of the search in the along-track speed u_a in m/s.
     """
 
     works_on = ("channel", "pulse", "range")
@@ -374,7 +378,7 @@ class MoversImage(Stage):
         y0_m: Tensor | None = None,
         range_m: Tensor | None = None,
     ) -> tuple[Signal, Estimate]:
-        """Image every trial.
+        """Image the scene and the moving targets of every trial.
 
         Args:
             signal: Channels (..., channel, pulse, range), without the transmit range.
@@ -382,9 +386,11 @@ class MoversImage(Stage):
                 first, if known a priori: all four, or none.
 
         Returns:
-            The fused images (..., azimuth, range), and the estimate with values of shape (...,
-            target), padded to the `most` of the detector. Its info holds `level`, 0 where there is
-            no target, and the images `rest` and `conventional`, see `SceneImage`.
+            The images with every moving target at its true position, (..., azimuth, range), and the
+            estimate of the motions with values of shape (..., target), padded to the setting `most`
+            of the detector. Its info holds `level`, the ratio of the mean intensity of each target
+            to the residual sea and noise (0 where there is no target), and the images `rest` and
+            `conventional`, see `SceneImage`.
 
         Raises:
             ValueError: If some of the four values are missing, or as in `ImageMovers`.
@@ -393,7 +399,8 @@ class MoversImage(Stage):
         known = [None if x is None else x.to(torch.float64).expand(*signal.trials, x.shape[-1]) for x in values]
         if any(x is None for x in known) != all(x is None for x in known):
             raise ValueError(
-                "targets are known by u_r_m_s, u_a_m_s, y0_m and range_m together; connect all four, or none"
+                "known targets need all of u_r_m_s, u_a_m_s, y0_m and range_m, got only some of them; "
+                "connect all four, or none to detect the targets"
             )
         frames = signal.data.reshape(-1, *signal.data.shape[-3:])
         rows = [None if x is None else x.reshape(len(frames), -1) for x in known]
@@ -426,21 +433,23 @@ class MoversImage(Stage):
 def suppressed_image(
     signal: Signal, radar: BistaticRadar, image: StationaryImage, speeds_m_s: Sequence[float]
 ) -> Signal:
-    """Image moving targets with suppressed sea, over several slant-range speeds.
+    """Image moving targets with suppressed sea, matched to several slant-range speeds.
 
-    In every Doppler bin the channels are weighted by the inverse covariance of all range lines,
-    then by the response of a point of each speed: the Doppler filter of the paper extended to the
-    channels. Each intensity image is divided by its median, and the maximum over the speeds is
-    taken.
+    In every Doppler bin the channels are weighted by the inverse of their covariance, which is
+    estimated from all range lines and neighbouring bins, and then by the channel response to a
+    point of each speed. This is the Doppler filter of the paper extended to several channels. The
+    intensity image of each speed is divided by its median, and the maximum over the speeds is taken
+    in each pixel.
 
     Args:
         signal: Channels with the axes (channel, pulse, range), without trials.
         radar: Instrument.
-        image: Stage of the conventional image.
+        image: Stage that forms the conventional image.
         speeds_m_s: Slant-range speeds in m/s, closing positive.
 
     Returns:
-        Real amplitudes with the dtype of the signal on the axes of `image`.
+        Amplitudes (real values with the complex dtype of the signal) on the axes (azimuth, range)
+        of the conventional image.
 
     Reference:
         Remote Sens. 2020, 12, 1703, section 4.3 (clutter suppression via Doppler filtering).
@@ -482,13 +491,14 @@ def _matched(data: Tensor, radar: BistaticRadar, motion: PointMotion, bands: int
 
 
 def placed(image: Signal, body: Body, extraction: Extraction) -> Signal:
-    """Add the image of a body to an image (azimuth, range) at its position at t = 0.
+    """Add a moving body, focused with its velocity, to an image at its true position.
 
-    The body is placed at its closest ranges and scaled as stationary points are.
+    This is the along-track position at t = 0 and the closest range of each of its range lines. The
+    amplitude is scaled as that of stationary points.
 
     Args:
         image: Image (azimuth, range).
-        body: Body.
+        body: Body to add.
         extraction: Extent of the body.
 
     Returns:

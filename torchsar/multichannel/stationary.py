@@ -1,7 +1,8 @@
 """Conventional imaging of the stationary scene from all channels over the whole swath.
 
-For a stationary point, channel m is the reference channel delayed by dx_m / V_R, exactly and at
-every range frequency. The bands can therefore be reconstructed with u = 0 before any migration is
+For a stationary point, the channel at the along-track position dx_m is the reference channel
+delayed by dx_m / V_R, exactly and at every range frequency, with the speed V_R of the receiver. The
+Doppler bands can therefore be reconstructed with zero target velocity before any migration is
 corrected. The rest is ordinary focusing of an unaliased stripmap: a path that is travelled once
 equals one that is travelled both ways by waves of twice the speed, so that the monostatic omega-K
 algorithm applies unchanged.
@@ -29,7 +30,7 @@ FORMS: dict[str, Callable[..., Tensor]] = {"bulk": omega_k, "stolt": omega_k_sto
 
 
 def two_way_radar(radar: BistaticRadar, bands: int, near_range_m: float) -> StripmapRadar:
-    """Return the monostatic stripmap radar whose phases equal those of the receive path.
+    """Return the monostatic stripmap radar whose two-way phases equal those of the receive path.
 
     Args:
         radar: Instrument.
@@ -59,12 +60,14 @@ def stationary_image(
     form: str = "stolt",
     band_hz: float | None = None,
 ) -> Tensor:
-    """Image the stationary scene.
+    """Image the stationary scene from range-compressed channels.
 
-    The image is as long as the record and wraps around in azimuth. A unit point illuminated for T
-    seconds has a peak of T sqrt(V_R^2 / (lambda R0)) and the phase -2 pi (R0 - R_ref) / lambda.
-    Moving points appear displaced by V_R u_r R0 / V^2, defocused and with false targets.
-    Differentiable in the data.
+    The image is as long as the record and wraps around in azimuth. A point of amplitude 1 and
+    closest range R0 that is illuminated for T seconds has a peak of T sqrt(V_R^2 / (lambda R0)) and
+    the phase -2 pi (R0 - R_ref) / lambda, with the speed V_R of the receiver and the reference
+    range R_ref of the radar. A moving point of slant-range speed u_r and relative speed V appears
+    displaced by V_R u_r R0 / V^2 in azimuth, defocused and with false targets. Differentiable in
+    the data.
 
     Args:
         data: Range-compressed channels without the transmit range, shape (..., channel, pulse,
@@ -74,10 +77,12 @@ def stationary_image(
         rebuild: Reconstruction method, `LeastSquares(2)` by default.
         form: "stolt", exact at every range, or "bulk", with the migration of mid-swath for all
             ranges.
-        band_hz: Processed Doppler bandwidth about zero in Hz, None for all bands * PRF.
+        band_hz: Processed Doppler bandwidth about zero in Hz, None for the whole reconstructed
+            band, bands * PRF.
 
     Returns:
-        Image (..., azimuth, range), complex, with azimuth x = V_R t and range the closest range R0.
+        Image (..., azimuth, range), complex, with azimuth x = V_R t; the range is the closest range
+        R0.
 
     Raises:
         ValueError: If `form` is unknown, the data do not have the channels of the radar, or there
@@ -96,7 +101,9 @@ def focus_stationary(
     form: str = "stolt",
     band_hz: float | None = None,
 ) -> Tensor:
-    """Focus reconstructed Doppler spectra to an image, the second half of `stationary_image`.
+    """Focus reconstructed Doppler spectra to an image of the stationary scene.
+
+    This is the second half of `stationary_image`.
 
     Args:
         spectrum: Spectra about zero Doppler, shape (..., bands * pulse, range), complex.
@@ -104,7 +111,8 @@ def focus_stationary(
         near_range_m: Range of the first sample in metres.
         bands: Number of bands.
         form: "stolt" or "bulk", see `stationary_image`.
-        band_hz: Processed Doppler bandwidth about zero in Hz, None for all.
+        band_hz: Processed Doppler bandwidth about zero in Hz, None for the whole reconstructed
+            band.
 
     Returns:
         Image (..., azimuth, range), complex.
@@ -120,7 +128,7 @@ def focus_stationary(
 
 
 class StationaryImage(Stage):
-    """Conventional image of range-compressed channels, see `stationary_image`.
+    """Stage that forms the conventional image of range-compressed channels; see `stationary_image`.
 
     The input has the axes (channel, pulse, range), the output the axes (azimuth, range) in metres.
 
@@ -129,7 +137,8 @@ class StationaryImage(Stage):
         rebuild: Reconstruction method, `LeastSquares()` by default.
         form: "stolt", exact at every range, or "bulk", with the migration of mid-swath for all
             ranges.
-        band_hz: Processed Doppler bandwidth about zero in Hz, None for all bands * PRF.
+        band_hz: Processed Doppler bandwidth about zero in Hz, None for the whole reconstructed
+            band, bands * PRF.
 
     Raises:
         ValueError: If there are too few channels for the bands.
@@ -147,7 +156,10 @@ class StationaryImage(Stage):
             raise ValueError(why)
 
     def forward(self, signal: Signal) -> Signal:
-        """Image the stationary scene.
+        """Image the stationary scene from channels with the axes (channel, pulse, range).
+
+        Returns:
+            Image with the axes (azimuth, range) in metres.
 
         Raises:
             ValueError: If slow time is not zero at pulse n // 2, the pulse rate makes the
@@ -161,11 +173,14 @@ class StationaryImage(Stage):
         )
 
     def focused(self, spectrum: Tensor, signal: Signal) -> Signal:
-        """Focus a spectrum that was reconstructed from `signal` by any method.
+        """Focus a Doppler spectrum that was reconstructed from `signal` by any method.
 
         Args:
             spectrum: Spectrum about zero Doppler, shape (..., doppler, range), complex.
-            signal: Channels from which it was reconstructed, for the axes.
+            signal: Channels from which it was reconstructed, which give the axes.
+
+        Returns:
+            Image with the axes (azimuth, range) in metres.
         """
         _, pulse, range_ = signal.axes
         image = focus_stationary(spectrum, self.radar, range_.start, self.rebuild.bands, self.form, self.band_hz)
@@ -173,7 +188,9 @@ class StationaryImage(Stage):
 
 
 def stationary_axis(radar: BistaticRadar, pulse: Axis, bands: int) -> Axis:
-    """Return the azimuth axis x = V_R t in metres of the image, zero at sample n // 2.
+    """Return the azimuth axis x = V_R t in metres of the image, zero at sample n // 2 of n.
+
+    V_R is the speed of the receiver and t the slow time.
 
     Args:
         radar: Instrument.
@@ -189,7 +206,9 @@ def stationary_axis(radar: BistaticRadar, pulse: Axis, bands: int) -> Axis:
 
 
 def bulk_error_db(radar: BistaticRadar, bands: int, half_swath_m: float, integration_s: float) -> float:
-    """Predict the error of the image of a point at rest at the edge of the swath by the bulk form.
+    """Predict the error at the edge of the swath if migration is corrected as in its middle.
+
+    The error is that of a point at rest in an image of the form "bulk", see `stationary_image`.
 
     Args:
         radar: Receiver.
@@ -198,7 +217,7 @@ def bulk_error_db(radar: BistaticRadar, bands: int, half_swath_m: float, integra
         integration_s: Integration time in seconds.
 
     Returns:
-        Relative error of the response in dB.
+        Relative error of the response of the point in dB.
     """
     middle = radar.reference_range_m
     two_way = two_way_radar(radar, bands, middle - half_swath_m)
@@ -213,7 +232,9 @@ def swath_limit(
     range_m: float,
     integration_s: float,
 ) -> Limit:
-    """Return the least half swath in which moving ships of any unambiguous velocity are found.
+    """Return the limit of the half swath for finding ships of any unambiguous velocity.
+
+    The swath must hold the extracted data of each ship, its curvature and its largest range walk.
 
     Args:
         radar: Receiver.
@@ -224,7 +245,7 @@ def swath_limit(
         integration_s: Integration time in seconds.
 
     Returns:
-        Half width of this scene and its least value.
+        Limit with the half width of this scene and its least value.
     """
     curve = (integration_s * radar.speed_m_s) ** 2 / (8 * radar.reference_range_m)
     walks = [

@@ -28,9 +28,10 @@ _LEAST_SNR = 10.0  # 10 dB after compression: below, the strongest sample is oft
 
 
 def estimate_synchronisation(direct: Tensor, radar: BistaticRadar) -> Estimate:
-    """Estimate the phase and delay of the direct path, pulse by pulse, by maximum likelihood.
+    """Estimate the clock phase and delay of each pulse from the direct path.
 
-    The data carry exp(j phase) and arrive later by the delay.
+    The estimator is that of maximum likelihood. The direct path carries the factor exp(j phase) and
+    arrives later by the delay.
 
     Args:
         direct: Direct path, range compressed at the sampling rate of the echoes, shape (..., pulse,
@@ -40,9 +41,9 @@ def estimate_synchronisation(direct: Tensor, radar: BistaticRadar) -> Estimate:
 
     Returns:
         `phase_rad` in -pi..pi and `delay_s` in seconds, shape (..., pulse) each, with their
-        standard deviations. `info` holds `snr_db` (..., pulse) of the compressed peak over the
-        noise in the band. `ok` is False in a trial where a pulse lies below 10 dB; such pulses have
-        zeros.
+        standard deviations. `info` holds `snr_db` (..., pulse), the SNR of the compressed peak
+        within the band. `ok` is False in a trial where the SNR of a pulse is below 10 dB; phase and
+        delay of such pulses are zero.
 
     Raises:
         ValueError: If the direct path is not complex, or has fewer than 8 samples.
@@ -108,8 +109,8 @@ def remove_synchronisation(
 ) -> Tensor:
     """Remove the phase and the delay of the clocks from every pulse of all channels.
 
-    Pulses are multiplied by exp(-j phase) and advanced by the delay, which moves envelopes only.
-    Differentiable.
+    Each pulse is multiplied by exp(-j phase), and its envelope is advanced in range time by the
+    delay; the delay does not change the carrier phase. Differentiable.
 
     Args:
         data: Channels, shape (..., channel, pulse, range), or (..., channel, pulse) if `with_range`
@@ -129,13 +130,15 @@ def remove_synchronisation(
     for name, value in (("phase_rad", phase_rad), ("delay_s", delay_s)):
         if value is not None and value.shape[-1:] != (pulses,):
             raise ValueError(
-                f"remove_synchronisation needs {name} (..., {pulses}), one value per pulse, got shape "
+                f"remove_synchronisation needs {name} of shape (..., {pulses}), one value per pulse, got shape "
                 f"{tuple(value.shape)}"
             )
     turn = unit_phasor(-phase_rad.to(torch.float64) / (2 * math.pi), data.dtype)[..., None, :]
     if not with_range:
         if delay_s is not None and bool((delay_s != 0).any()):
-            raise ValueError("data without a range axis cannot be shifted along it; leave delay_s out")
+            raise ValueError(
+                "delay_s must be None or zero for data without a range axis, along which delays act; leave delay_s out"
+            )
         return data * turn
     if delay_s is None:
         return data * turn[..., None]
@@ -147,10 +150,11 @@ def remove_synchronisation(
 
 
 class EstimateSynchronisation(Stage):
-    """`estimate_synchronisation` of a direct path that is recorded beside the channels.
+    """Stage that estimates the clock phase and delay of each pulse from a recorded direct path.
 
-    Connect it as `use(EstimateSynchronisation(radar), direct_path="aux.direct_path")`. The signal
-    is not changed.
+    See `estimate_synchronisation`. Where the direct path is side data of the recording, connect it
+    as `use(EstimateSynchronisation(radar), direct_path="aux.direct_path")`. The signal is not
+    changed.
 
     Args:
         radar: Instrument.
@@ -165,22 +169,31 @@ class EstimateSynchronisation(Stage):
         self.radar = radar
 
     def forward(self, signal: Signal, direct_path: Tensor) -> Estimate:
-        """Estimate phase and delay of the direct path (..., pulse, sample).
+        """Estimate the clock phase and delay of each pulse from the direct path.
+
+        Args:
+            signal: Channels, whose number of pulses the direct path must have.
+            direct_path: Range-compressed direct path, shape (..., pulse, sample), complex.
+
+        Returns:
+            `phase_rad` and `delay_s` of shape (..., pulse), see `estimate_synchronisation`.
 
         Raises:
-            ValueError: If the direct path does not have one line per pulse, or as in
-                `estimate_synchronisation`.
+            ValueError: If the direct path does not have one line per pulse, is not complex, or has
+                fewer than 8 samples.
         """
         if direct_path.shape[-2:-1] != (signal.axis("pulse").n,):
             raise ValueError(
-                f"the direct path needs a line for each of the {signal.axis('pulse').n} pulses, got "
+                f"direct_path (..., pulse, sample) needs a line for each of the {signal.axis('pulse').n} pulses, got "
                 f"shape {tuple(direct_path.shape)}"
             )
         return estimate_synchronisation(direct_path, self.radar)
 
 
 class RemoveSynchronisation(Stage):
-    """`remove_synchronisation` with estimated or known values.
+    """Stage that removes estimated or known clock phases and delays from every pulse.
+
+    See `remove_synchronisation`.
 
     Args:
         radar: Instrument.
@@ -194,7 +207,7 @@ class RemoveSynchronisation(Stage):
         self.radar = radar
 
     def forward(self, signal: Signal, phase_rad: Tensor, delay_s: Tensor | None = None) -> Signal:
-        """Remove phases and delays (..., pulse) from channels (channel, pulse[, range])."""
+        """Remove clock phases and delays (..., pulse) from channels (channel, pulse[, range])."""
         return signal.with_data(
             remove_synchronisation(signal.data, self.radar, phase_rad, delay_s, "range" in signal.names)
         )

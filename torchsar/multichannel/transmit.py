@@ -2,8 +2,8 @@
 
 Reference:
     Remote Sens. 2020, 12, 1703, Eqs. (8)-(14), (31). The transmit range does not depend on the
-    channel, so that its removal by the ephemeris is exact; Eq. (31) leaves the linear term in the
-    channel response.
+    channel, so that its removal by the ephemeris is exact; the scaling of Eq. (31) leaves the
+    linear term, which then belongs to the channel response.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ from torchsar.radar import BistaticRadar, polynomial_range
 def transmit_phasor(
     coefficients: Sequence[float | Tensor], time_s: Tensor, wavelength_m: float, dtype: torch.dtype
 ) -> Tensor:
-    """Return exp(+j 2 pi / lambda (k1 t + k2 t^2 + ...)), which removes the transmit range.
+    """Return the phasor exp(+j 2 pi / lambda (k1 t + k2 t^2 + ...)) that removes a transmit range.
 
     Args:
-        coefficients: k1, k2, ... in m/s, m/s^2, ...
+        coefficients: Coefficients k1, k2, ... of the transmit range over slow time t in m/s, m/s^2,
+            ...
         time_s: Slow time in seconds, float64.
         wavelength_m: Carrier wavelength in metres.
         dtype: Complex dtype of the result.
@@ -42,15 +43,16 @@ def remove_transmit_range(
 ) -> Tensor:
     """Remove the transmit range from the phase, so that the phase of the receive path remains.
 
-    Data are multiplied by exp(+j 2 pi / lambda (R_T(t) - R_T(0))) with R_T(t) - R_T(0) = k1 t + k2
-    t^2 + .... This is exact, since the transmit range is common to all channels. Envelopes stay,
-    since the receive window follows the transmit range. Differentiable in data and coefficients.
+    Data are multiplied by exp(+j 2 pi / lambda (R_T(t) - R_T(0))) where the change of the transmit
+    range is R_T(t) - R_T(0) = k1 t + k2 t^2 + .... This is exact, since the transmit range is
+    common to all channels. Envelopes stay, since the receive window follows the transmit range.
+    Differentiable in data and coefficients.
 
     Args:
         data: Channels, shape (..., channel, pulse, range), or (..., channel, pulse) if `with_range`
             is False, complex.
         time_s: Slow time in seconds, float64 (pulse,).
-        coefficients: k1, k2, ... in m/s, m/s^2, ...: numbers or tensors (...,).
+        coefficients: Coefficients k1, k2, ... in m/s, m/s^2, ...: numbers or tensors (...,).
         wavelength_m: Carrier wavelength in metres.
         with_range: Whether the data have a range axis.
 
@@ -73,20 +75,22 @@ def remove_transmit_range(
 def scale_azimuth(
     data: Tensor, radar: BistaticRadar, time_s: Tensor, motion: PointMotion, order: int = 4, with_range: bool = True
 ) -> Tensor:
-    """Apply azimuth nonlinear chirp scaling (ANLCS), Eq. (31).
+    """Remove the transmit range beyond k1 t by azimuth nonlinear chirp scaling, Eq. (31).
 
-    Data of channel m are multiplied by exp(j pi (q2 t'^2 + q3 t'^3 + q4 t'^4)) with t' = t - dx_m /
-    v_e and q_i = 2 k_i / lambda. The term k1 t remains; it centres the Doppler at (u_r - k1) /
-    lambda and belongs to the channel response, Eq. (34): use `reconstruct(..., left_k1_m_s=k1)`.
-    The phase 2 k2 t dx_m / v_e is neglected; it reaches 0.006 rad at the ends of an aperture of
-    4.5 s. The function is differentiable. `remove_transmit_range` is exact and should be preferred.
+    With the transmit range k1 t + k2 t^2 + ... over slow time t, data of channel m at the
+    along-track position dx_m are multiplied by exp(j pi (q2 t'^2 + q3 t'^3 + q4 t'^4)), where t' =
+    t - dx_m / v_e, v_e is the relative sensor velocity, and q_i = 2 k_i / lambda. The term k1 t
+    remains; it centres the Doppler at (u_r - k1) / lambda for the slant-range speed u_r and belongs
+    to the channel response, Eq. (34): use `reconstruct(..., left_k1_m_s=k1)`. The phase due to 2 k2
+    t dx_m / v_e is neglected; it reaches 0.006 rad at the ends of an aperture of 4.5 s. The
+    function is differentiable. `remove_transmit_range` is exact and should be preferred.
 
     Args:
         data: Channels as in `remove_transmit_range`.
         radar: Instrument.
         time_s: Slow time in seconds, float64 (pulse,).
         motion: Motion of the points, shape (...,).
-        order: Highest order of the transmit range that is removed.
+        order: Highest power of slow time in the transmit range that is removed.
         with_range: Whether the data have a range axis.
 
     Returns:
@@ -103,15 +107,18 @@ def scale_azimuth(
 
 
 def neglected_transmit_phase_rad(radar: BistaticRadar, order: int, integration_s: float) -> float:
-    """Bound the phase of the transmit range beyond a given order, in radians.
+    """Return a bound of the phase that higher orders of the transmit range contribute.
+
+    Orders are powers of slow time; those above `order` are counted, each at the ends of the
+    integration time.
 
     Args:
         radar: Instrument.
-        order: Highest order that is removed.
+        order: Highest order that is removed and does not count.
         integration_s: Integration time centred on t = 0 in seconds.
 
     Returns:
-        Upper bound of the phase in rad.
+        Upper bound of the magnitude of the phase in radians.
     """
     half = integration_s / 2
     return (
@@ -128,11 +135,12 @@ def _over_range(phasor: Tensor, with_range: bool) -> Tensor:
 
 
 class RemoveTransmitRange(Stage):
-    """`remove_transmit_range` with the ephemeris coefficients of the radar.
+    """Stage that removes the transmit range with the ephemeris coefficients of the radar.
 
-    A warning is given where the remaining orders exceed 0.3 rad at the ends of the data. Two orders
-    are enough for apertures below 20 s: in the geometry of the paper the third and higher orders
-    reach 2.7e-4 rad in 4.5 s.
+    See `remove_transmit_range`. A warning is given where the coefficients that are left out
+    contribute a phase above 0.3 rad at the ends of the data. Two coefficients (k1 t and k2 t^2) are
+    enough for apertures below 20 s: in the geometry of the paper all others contribute 2.7e-4 rad
+    in 4.5 s.
 
     Args:
         radar: Instrument.
@@ -148,11 +156,13 @@ class RemoveTransmitRange(Stage):
     def __init__(self, radar: BistaticRadar, order: int | None = None) -> None:
         super().__init__()
         if order is not None and order < 0:
-            raise ValueError(f"order must be a number of transmit-range coefficients, 0 for none, got {order}")
+            raise ValueError(
+                f"order must be 0 or more, the number of transmit-range coefficients to remove, got {order}"
+            )
         self.radar, self.order = radar, len(radar.transmit_range) if order is None else order
 
     def forward(self, signal: Signal) -> Signal:
-        """Remove the transmit range from channels (channel, pulse[, range])."""
+        """Remove the transmit range from the phase of channels (channel, pulse[, range])."""
         pulse = signal.axis("pulse")
         left = neglected_transmit_phase_rad(self.radar, max(self.order, 1), pulse.n * pulse.step)
         if left > 0.3:  # rad, well below the pi / 4 at which a quadratic phase broadens the response
@@ -174,11 +184,14 @@ class RemoveTransmitRange(Stage):
 
 
 class AzimuthScaling(Stage):
-    """`scale_azimuth` as a stage, the form of the paper; k1 is left to the reconstruction.
+    """Stage that removes the transmit range beyond its linear term, as in the paper.
+
+    See `scale_azimuth`. The linear term k1 t stays in the data; `RemoveTransmitRange` removes it as
+    well and is exact.
 
     Args:
         radar: Instrument.
-        order: Highest order of the transmit range that is removed, 2 to 4.
+        order: Highest power of slow time in the transmit range that is removed, 2 to 4.
 
     Raises:
         ValueError: If `order` lies outside 2 to 4.
@@ -190,17 +203,23 @@ class AzimuthScaling(Stage):
     def __init__(self, radar: BistaticRadar, order: int = 4) -> None:
         super().__init__()
         if not 2 <= order <= 4:
-            raise ValueError(f"azimuth scaling removes orders 2 to 4 of the transmit range (Eq. 31), got order={order}")
+            raise ValueError(
+                "order must be 2, 3 or 4, since azimuth scaling removes orders 2 to 4 of the transmit range (Eq. 31), "
+                f"got {order}"
+            )
         self.radar, self.order = radar, order
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0) -> Signal:
-        """Scale channels (channel, pulse[, range]) for a motion per trial.
+        """Remove the transmit range beyond its linear term for the motion of each trial.
 
         Args:
-            signal: Channels.
+            signal: Channels with the axes (channel, pulse[, range]).
             u_r_m_s: Slant-range speed in m/s, closing positive, shape (...,) or a number.
             u_a_m_s: Along-track speed in m/s, positive in the direction of the receiver, same
                 shape.
+
+        Returns:
+            Channels on the same axes.
         """
         motion = PointMotion.of(self.radar, signal.data, u_r_m_s, u_a_m_s)
         time = signal.axis("pulse").values(signal.data.device)

@@ -1,7 +1,8 @@
 """Along-track velocity of a moving point by the power of its deramped tone.
 
-This is azimuth autofocus with a known form of the phase history. It inverts no band matrix, so that
-it also works at speeds at which the channels sample the same positions.
+Data are deramped with the phase history of each candidate velocity; the right one leaves a tone of
+most power. This is azimuth autofocus with a known form of the phase history. The Doppler bands are
+not reconstructed, so that it also works at speeds at which the channels sample the same positions.
 
 Reference:
     Remote Sens. 2020, 12, 1703, section 4.2, which prescribes autofocus for this velocity
@@ -36,16 +37,18 @@ def along_track_velocity(
     step_m_s: float = 0.5,
     fine: int = 3,
 ) -> Estimate:
-    """Estimate the along-track speed u_a, with u_r and y0 as in the start.
+    """Estimate the along-track speed u_a of a point of known slant-range speed and position.
 
-    A grid of step_m_s is followed by `fine` grids of five points, each a fifth as wide, and by a
-    parabola. The curvature of the phase is what is measured: an acceleration along the line of
-    sight has the same effect (0.05 m/s^2 as 0.42 m/s in the geometry of the paper).
+    A grid of `step_m_s` is followed by `fine` grids of five points, whose step each time is 2/5 of
+    the previous one; a parabola through the maximum refines every grid. The curvature of the phase
+    is what is measured, so that an acceleration along the line of sight has the same effect as a
+    speed: 0.05 m/s^2 act as 0.42 m/s in the geometry of the paper.
 
     Args:
         data: Channels without the transmit range, shape (..., channel, pulse), complex.
         radar: Instrument.
-        start: Motion about which u_a is searched, shape (...,).
+        start: Motion about which u_a is searched, shape (...,). Its slant-range speed and
+            along-track position are kept.
         aperture: Expected amplitude over slow time.
         half_m_s: Half width of the search in m/s.
         step_m_s: Step of the first grid in m/s.
@@ -53,16 +56,16 @@ def along_track_velocity(
 
     Returns:
         `u_a_m_s` of shape (...,), positive in the direction of the receiver, with its standard
-        deviation from the curvature of the likelihood. `info` holds `snr_db` and `at_the_end`. `ok`
-        is False where the tone has less than 19 dB over all samples, or the maximum lies at an end
-        of the search.
+        deviation from the curvature of the likelihood. `info` holds `snr_db`, the SNR over all
+        samples, and `at_the_end`, True where the maximum lies at an end of the search. `ok` is
+        False where the tone has less than 19 dB over all samples, or where `at_the_end` is True.
 
     Raises:
         ValueError: If `half_m_s` is not positive, or the search reaches the speed of the receiver.
     """
     if not half_m_s > 0:
         raise ValueError(
-            f"half_m_s of a search along track must be positive, got {half_m_s}; omit the estimator where u_a is known"
+            f"half_m_s of a search along track must be positive, got {half_m_s}; omit the stage where u_a_m_s is known"
         )
     # raises ValueError for a search up to the speed of the receiver
     PointMotion.of(radar, data, 0.0, start.u_a_m_s + half_m_s)
@@ -113,9 +116,10 @@ def _best(
 
 
 def tone_power(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture) -> Tensor:
-    """Return the greatest energy of a tone in the deramped data, summed over channels.
+    """Return the energy of the strongest tone in the deramped data, summed over channels.
 
-    It equals the energy of the point where the curvature of the phase is right.
+    It equals the energy of the echo of the point if the motion gives the right curvature of the
+    phase.
 
     Args:
         data: Channels, shape (..., channel, pulse), complex.
@@ -160,7 +164,7 @@ def _estimate_at(
 def motion_from(
     radar: BistaticRadar, data: Tensor, u_r_m_s: Number, u_a_m_s: Number, y0_m: Number, range_m: Number | None
 ) -> PointMotion:
-    """Return the motion of each trial of the data from values given to a stage.
+    """Return the motion of the point in each trial of the data from velocities and positions.
 
     Args:
         radar: Instrument.

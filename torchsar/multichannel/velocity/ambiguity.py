@@ -30,11 +30,12 @@ _FASTEST = 0.9
 
 
 def better_pulse_rate(data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture) -> Tensor:
-    """Return the ambiguity number that explains clearly more of the data than a fitted motion.
+    """Return the Doppler ambiguity number that explains clearly more of the data than a fit.
 
-    One PRF corresponds to lambda PRF of slant-range velocity. Each alternative has the look angle
-    measured by the channels, and the best along-track speed within 22 m/s of the one that keeps the
-    curvature of the phase, since the along-track speed that an estimator assumed may be wrong.
+    The alternatives to the fitted motion are a slant-range velocity larger or smaller by lambda
+    PRF, which is one PRF of Doppler. For each, the along-track position is fitted again, and the
+    along-track speed is searched within 22 m/s of the one that keeps the curvature of the phase,
+    since the speed that an estimator assumed may be wrong.
 
     Args:
         data: Channels, shape (..., channel, pulse), complex.
@@ -43,8 +44,8 @@ def better_pulse_rate(data: Tensor, radar: BistaticRadar, motion: PointMotion, a
         aperture: Expected amplitude over slow time.
 
     Returns:
-        Number of PRFs to add to the Doppler, -1, 0 or 1, float64 (...,); 0 where the motion is
-        right.
+        Number of PRFs to add to the Doppler, -1, 0 or 1, float64 (...,); 0 where no alternative
+        explains at least 1.3 times the energy of the fitted motion.
     """
     begin = motion.each(lambda value: value.expand(data.shape[:-2])[..., None])
     offsets = torch.arange(
@@ -72,7 +73,9 @@ def better_pulse_rate(data: Tensor, radar: BistaticRadar, motion: PointMotion, a
 def warned_of_ambiguity(
     estimate: Estimate, data: Tensor, radar: BistaticRadar, motion: PointMotion, aperture: Aperture
 ) -> Estimate:
-    """Add the ambiguity number to an estimate and warn where it is not zero.
+    """Check an estimate for a Doppler ambiguity, and warn where one is found.
+
+    The number of PRFs by which the Doppler is wrong is that of `better_pulse_rate`.
 
     Args:
         estimate: Estimate of the velocity.
@@ -82,7 +85,8 @@ def warned_of_ambiguity(
         aperture: Expected amplitude over slow time.
 
     Returns:
-        The estimate with `pulse_rates` in its info; `ok` is False where it is not zero.
+        The estimate with this number as `pulse_rates` in its info; `ok` is False where it is not
+        zero.
     """
     off = better_pulse_rate(data, radar, motion, aperture)
     wrong = (off != 0) & estimate.ok

@@ -13,10 +13,13 @@ from torchsar.radar import BistaticRadar
 
 
 class Aperture(Protocol):
-    """Expected amplitude of a point over slow time, about the time at which it is at broadside."""
+    """Expected amplitude of the echo of a point over slow time.
+
+    It is centred on the time at which the point is at broadside.
+    """
 
     def weight(self, radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
-        """Return the expected amplitude.
+        """Return the expected amplitude of the echo of a point in each pulse.
 
         Args:
             radar: Instrument.
@@ -31,9 +34,9 @@ class Aperture(Protocol):
 
 @dataclass(frozen=True)
 class Dwell:
-    """Constant amplitude for a duration centred on the time at broadside, zero outside.
+    """Expected amplitude 1 for a duration centred on the time at broadside, 0 outside.
 
-    The edges depend on the position of the point, but estimators do not use them to find that
+    Begin and end follow from the position of a point, but estimators do not use them to find that
     position.
 
     Args:
@@ -48,7 +51,7 @@ class Dwell:
     def __post_init__(self) -> None:
         if not 0 < self.duration_s < float("inf"):
             raise ValueError(
-                f"an aperture needs a positive, finite duration_s, got {self.duration_s}; ElementBeam() is unlimited"
+                f"a dwell needs a positive, finite duration_s, got {self.duration_s}; use ElementBeam() for no limit"
             )
 
     def weight(self, radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
@@ -59,13 +62,17 @@ class Dwell:
 
 @dataclass(frozen=True)
 class ElementBeam:
-    """One-way pattern of the aperture of a channel, sinc(element sin(look) / lambda).
+    """Expected amplitude by the one-way antenna pattern of a channel.
 
-    Side lobes and their signs are included.
+    The pattern is sinc(L sin(look) / lambda) with the length L = `radar.element_m` of the aperture
+    of a channel and the look angle from broadside. Side lobes and their signs are included.
     """
 
     def weight(self, radar: BistaticRadar, motion: PointMotion, time_s: Tensor) -> Tensor:
-        """Return the amplitude pattern, see `Aperture.weight`; not differentiable in the motion."""
+        """Return the pattern over slow time, see `Aperture.weight`.
+
+        Not differentiable in the motion.
+        """
         along = motion.along_m_s.detach()[..., None] * time_s - motion.y0_m.detach()[..., None]
         across = motion.range_m.detach()[..., None] - motion.u_r_m_s.detach()[..., None] * time_s
         turns = radar.element_m * along / torch.sqrt(along.square() + across.square()) / radar.wavelength_m

@@ -27,14 +27,16 @@ _TINY = torch.finfo(torch.float32).tiny  # keeps divisions by zero finite
 
 @dataclass(frozen=True)
 class Search:
-    """Extent and steps of a velocity search about zero.
+    """Extent and steps of a search over the velocities and the position of a point.
 
     The default steps suit apertures of about 4.5 s at 300 m/s and 5 km.
 
     Args:
-        u_r_m_s: Half width of the slant-range speed in m/s.
-        u_a_m_s: Half width of the along-track speed in m/s, 0 where it is known a priori.
-        y0_m: Largest along-track distance of the point from the middle in metres.
+        u_r_m_s: Half width of the search in slant-range speed, about zero, in m/s.
+        u_a_m_s: Half width of the search in along-track speed in m/s, 0 where this speed is known a
+            priori.
+        y0_m: Largest along-track distance of the point from the expected position (by default 0) in
+            metres.
         u_r_step_m_s: Step of the slant-range speed in m/s.
         u_a_step_m_s: Step of the along-track speed in m/s.
 
@@ -54,7 +56,10 @@ class Search:
             if not 0 <= getattr(self, name) < float("inf"):
                 raise ValueError(f"search.{name} must be 0 or a positive half width, got {getattr(self, name)}")
         if not (self.u_r_step_m_s > 0 and self.u_a_step_m_s > 0):
-            raise ValueError(f"steps of a search must be positive, got {self.u_r_step_m_s} and {self.u_a_step_m_s} m/s")
+            raise ValueError(
+                "u_r_step_m_s and u_a_step_m_s of a search must be positive, got "
+                f"{self.u_r_step_m_s} and {self.u_a_step_m_s} m/s"
+            )
 
 
 def bank_search(
@@ -67,11 +72,11 @@ def bank_search(
     whitening: Whitening | None = None,
     image_s: Number | None = None,
 ) -> tuple[PointMotion, Tensor]:
-    """Find the hypothesis that explains most of the energy, per trial.
+    """Find the velocities and the position that explain most of the energy in each trial.
 
-    The along-track position is read from the residual tone, within +-search.y0_m of zero. Where a
-    detection gives the slow time `image_s` at which the point appears in an image, positions lie
-    about the one that each velocity implies for that time.
+    A grid of velocities is tried. For each, the along-track position is read from the residual
+    tone, within +-search.y0_m of zero. If the slow time `image_s` at which the point appears in an
+    image is given, the position is sought about the one that the velocities and `image_s` imply.
 
     Args:
         data: Channels, shape (..., channel, pulse), complex.
@@ -84,8 +89,8 @@ def bank_search(
         image_s: Slow time in seconds at which the point appears in an image, shape (...,), or None.
 
     Returns:
-        The motion, and the energy that it explains (...,) by normalised correlation. Trials of
-        zeros have zero velocity and energy.
+        The motion, and the energy that it explains by normalised correlation, shape (...,). Trials
+        of zeros have zero velocity and energy.
     """
     n = data.shape[-1]
     time_s = radar.pulse_axis(n).values(data.device)
@@ -117,17 +122,19 @@ def bank_search(
 
 
 def tone_energy(data: Tensor, radar: BistaticRadar, motions: PointMotion, aperture: Aperture, reach_m: float) -> Tensor:
-    """Return the greatest energy that any of several motions explains.
+    """Return the largest energy that one of several hypotheses of the motion explains.
+
+    The along-track position of each hypothesis may change by up to `reach_m`.
 
     Args:
         data: Channels, shape (..., channel, pulse), complex.
         radar: Instrument.
         motions: Hypotheses, shape (..., hypothesis).
         aperture: Expected amplitude over slow time.
-        reach_m: Largest along-track distance in metres from the position of a motion.
+        reach_m: Largest along-track distance in metres from the position of a hypothesis.
 
     Returns:
-        Energy, float64 (...,).
+        Energy by normalised correlation, float64 (...,).
     """
     time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
     motions, prepared = (

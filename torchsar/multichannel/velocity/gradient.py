@@ -48,22 +48,24 @@ def gradient_likelihood(
     unknowns: tuple[str, ...] = UNKNOWNS,
     steps: int = 60,
 ) -> Estimate:
-    """Maximise the likelihood near `start` by limited-memory BFGS on autograd gradients.
+    """Estimate the motion of highest likelihood by limited-memory BFGS with autograd gradients.
 
-    This checks `maximum_likelihood`, which is faster, and is the pattern for other objectives.
+    The function serves as a check of `maximum_likelihood`, which is faster, and as an example for
+    other objectives.
 
     Args:
         data: Channels without the transmit range, shape (..., channel, pulse), complex.
         radar: Instrument.
-        start: Starting motion, shape (...,), as close as for `maximum_likelihood`.
+        start: Starting motion, shape (...,). Its residual Doppler must lie within half a Doppler
+            cell, as for `maximum_likelihood`.
         aperture: Expected amplitude over slow time.
         unknowns: Names of the parameters to estimate among `u_r_m_s`, `u_a_m_s`, `y0_m`.
         steps: Largest number of steps.
 
     Returns:
         `u_r_m_s`, `u_a_m_s`, `y0_m` of shape (...,) with standard deviations of the unknowns.
-        `info` holds `snr_db`, `noise_power` and `converged`. `ok` is False where the search failed
-        or the point has less than 19 dB over all samples.
+        `info` holds `snr_db` (over all samples), `noise_power` (per sample) and `converged`. `ok`
+        is False where the search failed or the point has less than 19 dB over all samples.
 
     Raises:
         ValueError: If `unknowns` holds other names or a name twice.

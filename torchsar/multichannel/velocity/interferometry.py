@@ -1,8 +1,10 @@
 """Along-track interferometry: slant-range velocity from the Doppler of a deramped point.
 
-The Doppler is corrected by the look angle, which the phases across the channels measure. A residual
-tone F and a phase slope -2 pi dx dy / (lambda R0) over the channel positions give the update u_r <-
-u_r + lambda F - v dy / R0, y0 <- y0 + dy.
+The Doppler is corrected by the look angle, which the phases across the channels measure. After
+deramping with an assumed motion, a position error dy shows as the phase -2 pi dx dy / (lambda R0)
+in the channel at dx, and a residual tone F remains. The update is u_r <- u_r + lambda F - v dy / R0
+for the slant-range speed and y0 <- y0 + dy for the along-track position, with the closest range R0
+and the along-track speed v of the receiver relative to the point.
 """
 
 from __future__ import annotations
@@ -31,23 +33,24 @@ DETECTED_DB = 19.0
 def interferometry(
     data: Tensor, radar: BistaticRadar, start: PointMotion, aperture: Aperture, passes: int = 4
 ) -> Estimate:
-    """Estimate u_r and y0 of one point per trial by along-track interferometry.
+    """Estimate slant-range speed and position of one point per trial by along-track interferometry.
 
-    The first pass uses all pulses, later ones the aperture about the position found. u_r is
-    measured modulo lambda PRF and returned within half of that about the start. u_a is that of the
-    start.
+    The first pass uses all pulses, later passes the expected amplitude about the position found so
+    far. The slant-range speed u_r is measured modulo lambda PRF and returned within lambda PRF / 2
+    of the start. The along-track speed u_a keeps the value of the start.
 
     Args:
         data: Channels without the transmit range, shape (..., channel, pulse), complex.
         radar: Instrument with at least two channels.
         start: Starting motion, shape (...,).
         aperture: Expected amplitude over slow time.
-        passes: Number of passes.
+        passes: Number of passes, each of which starts from the result of the previous one.
 
     Returns:
         `u_r_m_s` (closing positive), `u_a_m_s` and `y0_m` of shape (...,). Standard deviations of
-        u_r and y0 follow from the residual noise. `info` holds `snr_db` and `noise_power`. `ok` is
-        False where the tone has less than 19 dB over all samples.
+        u_r and y0 follow from the residual noise. `info` holds `snr_db` (over all samples) and
+        `noise_power` (per sample). `ok` is False where the tone has less than 19 dB over all
+        samples.
 
     Raises:
         ValueError: If the radar has a single channel.
@@ -85,7 +88,7 @@ def _improved(data: Tensor, radar: BistaticRadar, motion: PointMotion, weight: T
 
 
 def tone_frequency(tones: Tensor, rate_hz: float) -> Tensor:
-    """Estimate the frequency of a tone whose power is summed over channels.
+    """Estimate the frequency of the tone of most power, summed over channels.
 
     A zero-padded FFT is followed by a parabola through its maximum.
 

@@ -1,7 +1,7 @@
 """Maximum likelihood of velocity and position of a moving point by Gauss-Newton steps.
 
-The complex amplitude is eliminated, and noise is white or clutter of known covariance. In white
-noise the estimate reaches the Cramer-Rao bound of `metrics.bistatic_bounds`.
+The complex amplitude is fitted for each motion in closed form. Noise is white or clutter of known
+covariance. In white noise the estimate reaches the Cramer-Rao bound of `metrics.bistatic_bounds`.
 """
 
 from __future__ import annotations
@@ -33,13 +33,14 @@ _HALVINGS = 4  # trials of a step: whole, half, quarter, eighth; then it is omit
 
 @dataclass(frozen=True)
 class PointFit:
-    """Fit of a point at a given motion, per trial.
+    """Least-squares fit of the amplitude of a point for a given motion, per trial.
 
     Args:
         amplitude: Complex amplitude, shape (...,).
-        energy: Explained energy, shape (...,).
-        gradient: Gradient of half the explained energy, shape (..., unknown).
-        normal: Normal matrix of half the explained energy, shape (..., unknown, unknown).
+        energy: Energy of the data that the point explains, shape (...,).
+        gradient: Gradient of half the explained energy by the unknowns, shape (..., unknown).
+        normal: Gauss-Newton normal matrix of half the explained energy, shape (..., unknown,
+            unknown).
     """
 
     amplitude: Tensor
@@ -57,12 +58,14 @@ def maximum_likelihood(
     whitening: Whitening | None = None,
     steps: int = 12,
 ) -> Found:
-    """Find the most likely motion near `start`.
+    """Find the motion of highest likelihood near a starting motion by Gauss-Newton steps.
 
-    The residual tone (du_r + v dy0 / R0) / lambda of the start must lie within half a Doppler cell,
-    0.03 m/s at 4.5 s; `interferometry` and `bank_search` give such starts. The expected amplitude
-    stays where the start places it, so that the ends of the aperture do not determine the position.
-    A step that does not explain more energy is halved or omitted, separately in each trial.
+    The start may be wrong by du_r in slant-range speed and by dy0 in along-track position as long
+    as the residual Doppler (du_r + v dy0 / R0) / lambda lies within half a Doppler cell (0.03 m/s
+    for 4.5 s), with the closest range R0 and the along-track speed v of the receiver relative to
+    the point. `interferometry` and `bank_search` give such starts. The expected amplitude stays
+    where the start places it, so that the ends of the aperture do not determine the position. A
+    step that does not explain more energy is halved or omitted, separately in each trial.
 
     Args:
         data: Channels with slow time zero at pulse n // 2 and without the transmit range, shape
@@ -93,7 +96,7 @@ def maximum_likelihood(
 
 @dataclass(frozen=True)
 class PointLikelihood:
-    """Likelihood of a point, with all that stays the same during a search.
+    """Likelihood of the motion of one point: data and settings that do not change in a search.
 
     Args:
         data: Channels, shape (..., channel, pulse), complex128, or their whitened spectra (...,
@@ -121,7 +124,7 @@ class PointLikelihood:
         unknowns: tuple[str, ...],
         whitening: Whitening | None,
     ) -> PointLikelihood:
-        """Prepare the likelihood of data; arguments as in `maximum_likelihood`."""
+        """Build the likelihood from channels; arguments as in `maximum_likelihood`."""
         refuse_unknowns(unknowns)
         time_s = radar.pulse_axis(data.shape[-1]).values(data.device)
         weight = aperture.weight(radar, start, time_s)[..., None, :]
@@ -131,7 +134,7 @@ class PointLikelihood:
         )
 
     def fit(self, motion: PointMotion) -> PointFit:
-        """Fit the amplitude at a motion by least squares, with derivatives by the unknowns."""
+        """Return the least-squares amplitude for a motion, with derivatives by the unknowns."""
         slopes = phase_slopes(self.radar, motion, self.time_s, self.unknowns)
         phasor = point_phasor(self.radar, motion, self.time_s, torch.complex128)
         if self.whitening is None:
@@ -142,12 +145,16 @@ class PointLikelihood:
         )
 
     def noise_power(self, fit: PointFit) -> Tensor:
-        """Return the residual power per sample where the point is illuminated.
+        """Return the residual power per sample in the pulses in which the point is illuminated.
 
-        With a covariance the power is relative to it.
+        With a clutter covariance it is the power per sample of the whitened residual, over all
+        samples.
 
         Args:
-            fit: Fit at a motion.
+            fit: Fit of the point for one motion.
+
+        Returns:
+            Power, shape (...,).
         """
         power = self.data.abs().square()
         illuminated = (

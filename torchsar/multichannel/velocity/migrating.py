@@ -1,4 +1,4 @@
-"""Velocity estimators on lines that still migrate."""
+"""Velocity estimation on range lines whose migration has not been corrected."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from torchsar.radar import BistaticRadar
 
 
 class MigratingLines(Stage):
-    """A velocity estimator for lines that still migrate.
+    """Stage that estimates a velocity from range lines whose migration has not been corrected.
 
-    It corrects the migration of a point at rest and the walk of the strongest point for the
-    estimator alone, and returns the signal unchanged: the migration that the estimated velocity
-    causes is for a later `CorrectMigration`. Azimuth-only data do not migrate.
+    For the estimator alone, the migration of a point at rest and the range walk of the strongest
+    point are corrected. The signal itself is not changed, so that a later `CorrectMigration` can
+    use the estimated velocity. Azimuth-only data do not migrate and go to the estimator directly.
 
     Args:
         radar: Instrument.
         estimator: Estimator of the velocity, a stage on (channel, pulse, range) or, with
             `one_line`, on (channel, pulse).
-        one_line: Whether the estimator gets the strongest range line only.
+        one_line: Whether the estimator gets only the strongest range line.
     """
 
     works_on = ("channel", "pulse", "range")
@@ -35,7 +35,12 @@ class MigratingLines(Stage):
         self.provides = estimator.provides
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate the velocity; `ok` is False also where the walk is not reliably known."""
+        """Estimate the velocity from channels with the axes (channel, pulse[, range]).
+
+        Returns:
+            Values of the estimator, with the ambiguity number of the range walk as `ambiguity` in
+            `info` if there is a range axis. `ok` is False also where this number is not reliable.
+        """
         if "range" not in signal.names:
             return self.estimator(signal)
         walk = self.walk(signal)

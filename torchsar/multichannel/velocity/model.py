@@ -18,7 +18,7 @@ UNKNOWNS = ("u_r_m_s", "u_a_m_s", "y0_m")
 def point_phasor(radar: BistaticRadar, motion: PointMotion, time_s: Tensor, dtype: torch.dtype) -> Tensor:
     """Return the phase history exp(-j 2 pi / lambda (R_m(t) - R_ref)) of a point.
 
-    R_ref is the reference range of the radar.
+    R_m(t) is the range between the point and channel m, and R_ref the reference range of the radar.
 
     Args:
         radar: Instrument.
@@ -50,7 +50,7 @@ def phase_slopes(
         unknowns: Names among `u_r_m_s`, `u_a_m_s`, `y0_m`.
 
     Returns:
-        Derivatives in radians per unit, float64 (..., unknown, channel, pulse).
+        Derivatives in radians per m/s or per metre, float64 (..., unknown, channel, pulse).
     """
     u_r, v, y0, near = (
         value[..., None, None] for value in (motion.u_r_m_s, motion.along_m_s, motion.y0_m, motion.range_m)
@@ -64,14 +64,14 @@ def phase_slopes(
 
 @dataclass(frozen=True)
 class Found:
-    """Fitted point per trial.
+    """Motion and amplitude fitted to the echo of one point, per trial.
 
     Args:
         motion: Motion, shape (...,).
         amplitude: Complex amplitude, shape (...,).
         noise_power: Residual power per sample, shape (...,).
         covariance: Covariance of the unknowns, shape (..., unknown, unknown).
-        energy: Explained energy, shape (...,).
+        energy: Energy of the data that the point explains, shape (...,).
         unknowns: Names of the estimated parameters.
     """
 
@@ -84,12 +84,14 @@ class Found:
 
     @property
     def snr_db(self) -> Tensor:
-        """SNR of the point over all its samples in dB, within +-300 dB; it decides on detection."""
+        """SNR of the point over all its samples in dB, within +-300 dB; it decides detection."""
         return energy_ratio_db(self.energy, self.noise_power)
 
 
 def energy_ratio_db(energy: Tensor, noise_power: Tensor) -> Tensor:
-    """Return an energy over a noise power in dB, within +-300 dB; -300 dB where both are zero.
+    """Return the ratio of an energy to a noise power in dB.
+
+    It is limited to +-300 dB, and -300 dB where both are zero.
 
     Args:
         energy: Energies, any shape, float64.
@@ -119,9 +121,11 @@ def covariance_of(normal: Tensor, noise_power: Tensor) -> Tensor:
 
 
 def solved(normal: Tensor, right: Tensor) -> Tensor:
-    """Solve normal x = right with a floor for unknowns that can hardly be separated.
+    """Solve the normal equations normal x = right of a least-squares fit.
 
-    Unknowns that the data do not determine return their right-hand side.
+    A small diagonal term keeps the solution finite where unknowns can hardly be separated. An
+    unknown with a zero diagonal, which the data do not determine, gets its right-hand side as
+    solution.
 
     Args:
         normal: Normal matrices, shape (..., n, n).
@@ -135,13 +139,15 @@ def solved(normal: Tensor, right: Tensor) -> Tensor:
 
 
 def round_units(normal: Tensor) -> Tensor:
-    """Return combinations of the unknowns in which the explained energy falls off equally.
+    """Return combinations of the unknowns along which the explained energy falls off equally.
+
+    A change x of the combinations changes the unknowns by the returned matrix times x.
 
     Args:
-        normal: Normal matrices, shape (..., n, n).
+        normal: Normal matrices of the fit, shape (..., n, n).
 
     Returns:
-        Combinations, shape (..., unknown, n).
+        Matrices with one combination in each column, shape (..., unknown, n).
     """
     unit, scale = _of_unit_diagonal(normal)
     units = scale[..., :, None] * torch.linalg.inv(torch.linalg.cholesky(unit)).mT
@@ -157,22 +163,22 @@ def _of_unit_diagonal(normal: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def refuse_unknowns(unknowns: tuple[str, ...]) -> None:
-    """Raise ValueError unless the names are among UNKNOWNS, each once.
+    """Raise ValueError unless the names are among `u_r_m_s`, `u_a_m_s` and `y0_m`, each once.
 
     Args:
-        unknowns: Names.
+        unknowns: Names of the parameters to estimate.
     """
     if not unknowns or len(set(unknowns)) != len(unknowns) or not set(unknowns) <= set(UNKNOWNS):
         raise ValueError(f"unknowns must be names among {UNKNOWNS}, each once, got {tuple(unknowns)}")
 
 
 def moved(motion: PointMotion, step: Tensor, unknowns: tuple[str, ...]) -> PointMotion:
-    """Return the motion with `step` (..., unknown) added to the unknowns.
+    """Return a motion with a step added to some of its parameters.
 
     Args:
         motion: Motion, shape (...,) each.
         step: Steps in the units of the unknowns, shape (..., unknown).
-        unknowns: Names of the unknowns, in the order of the steps.
+        unknowns: Names of these parameters, in the order of the steps.
 
     Returns:
         Motion after the step.
@@ -205,7 +211,7 @@ def estimate_of(found: Found, ok: Tensor, quality: Tensor, **info: Tensor) -> Es
         found: Fit of the point.
         ok: Whether each trial is reliable, bool (...,).
         quality: Quality of each trial in 0..1, shape (...,).
-        info: Further tensors for the info.
+        info: Further tensors by name, added to `info` of the estimate.
 
     Returns:
         The estimate, with standard deviations of the unknowns of the fit.

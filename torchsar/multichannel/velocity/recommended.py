@@ -1,7 +1,7 @@
 """Velocity and position of a moving point without prior knowledge.
 
-A bank of velocities is followed by maximum likelihood, in white noise or in clutter whose
-covariance is estimated from the data.
+A search over a grid of velocities is followed by maximum likelihood, in white noise or in clutter
+whose covariance is estimated from the data.
 """
 
 from __future__ import annotations
@@ -38,27 +38,28 @@ def moving_point_velocity(
     range_m: Number | None = None,
     whitening: Whitening | None = None,
 ) -> Estimate:
-    """Estimate u_r, u_a and y0 of the strongest moving point per trial, without a starting value.
+    """Estimate velocity and position of the strongest moving point per trial, without a start.
 
-    If no covariance is given, the point is sought in white noise and in the covariance of the data;
-    both fits are refined with the covariance of their residuals, and the more likely one is used,
-    per trial.
+    If no clutter covariance is given, the point is first sought in white noise. If the residual
+    then shows clutter, it is also sought with the covariance of the data. Each fit is refined with
+    the covariance of its residual, and in each trial the fit of higher likelihood is used.
 
     Args:
         data: Channels with slow time zero at pulse n // 2 and without the transmit range, shape
             (..., channel, pulse), complex.
         radar: Instrument.
         aperture: Expected amplitude over slow time.
-        search: Extent of the bank, by default three PRFs of u_r, whose ambiguity modulo lambda PRF
-            the cubic phase of the range history resolves.
+        search: Extent of the search, by default +-1.5 lambda PRF in slant-range speed. The
+            ambiguity modulo lambda PRF is resolved by the cubic phase of the range history.
         u_a_m_s: Along-track speed in m/s where it is known a priori, None to estimate it.
         range_m: Closest range in metres, None for the reference range of the radar.
         whitening: Clutter covariance, for example from neighbouring range lines; None to estimate
             it from the data.
 
     Returns:
-        `u_r_m_s` (closing positive), `u_a_m_s` and `y0_m` of shape (...,), with standard
-        deviations. `info` holds `snr_db`, `noise_power` and `coloured` (True where clutter was
+        Slant-range speed `u_r_m_s` (closing positive), along-track speed `u_a_m_s` and along-track
+        position at t = 0 `y0_m` of shape (...,), with standard deviations. `info` holds `snr_db`
+        (over all samples), `noise_power` (per sample) and `coloured` (True where clutter was
         found). `ok` is False where the point has less than 19 dB over all samples, the estimate
         lies outside the search, or the standard deviation of u_r exceeds the half width of the
         search, as with a single channel.
@@ -110,14 +111,17 @@ class _Job:
     unknowns: tuple[str, ...]
 
     def found(self, whitening: Whitening | None) -> Found:
-        """Search the bank on the middle of the aperture, then fit there and on all of it."""
+        """Find the point by a grid search over velocities, followed by maximum likelihood.
+
+        The search uses the middle of the aperture, the last fit all of it.
+        """
         coarse = self.aperture if isinstance(self.aperture, Dwell) else Dwell(_COARSE_S)
         start, _ = bank_search(self.data, self.radar, coarse, self.search, self.u_a_m_s, self.range_m, whitening)
         near = maximum_likelihood(self.data, self.radar, start, coarse, self.unknowns, whitening)
         return maximum_likelihood(self.data, self.radar, near.motion, self.aperture, self.unknowns, whitening)
 
     def centred(self, found: Found, whitening: Whitening) -> Found:
-        """Repeat the fit with the aperture about the position found.
+        """Repeat the fit four times, with the expected amplitude about the last position found.
 
         In clutter a displaced expected amplitude biases the position; each round reduces this bias
         to a third.
@@ -129,7 +133,10 @@ class _Job:
         return found
 
     def refined(self, found: Found) -> _Refined:
-        """Repeat the fit twice in the covariance of its residual, where that is not white."""
+        """Repeat the fit up to two times with the covariance of its residual.
+
+        Trials whose residual is white noise keep their fit.
+        """
         whitening = sample_whitening(self.left(found), self.radar)
         for _ in range(_ROUNDS):
             if not bool(whitening.coloured.any()):

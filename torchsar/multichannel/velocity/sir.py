@@ -55,11 +55,14 @@ class Intensity:
 
     @property
     def total(self) -> Intensity:
-        """Sum over the last dimension."""
+        """Energies and amplitudes summed over their last dimension."""
         return self._each(lambda x: x.sum(-1))
 
     def summed(self, weight: Tensor) -> Intensity:
-        """Sum over the last dimension with weights (last, group), to shape (..., group)."""
+        """Return weighted sums over the last dimension, with weights (last, group).
+
+        The energies and amplitudes of the result have the shape (..., group).
+        """
         return self._each(lambda x: x @ weight)
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> Intensity:
@@ -74,27 +77,31 @@ class Intensity:
 
     @property
     def power_ratio(self) -> Tensor:
-        """Power ratio Gamma 1, Eq. (37); 0 for zero data."""
+        """Ratio Gamma 1 of the energies inside and outside the band, Eq. (37); 0 for zero data."""
         return self.energy_in / self.energy_out.clamp_min(torch.finfo(self.energy_out.dtype).tiny)
 
     @property
     def amplitude_ratio(self) -> Tensor:
-        """Ratio Gamma 2 of the mean amplitudes inside and outside, Eq. (38); 0 for zero data."""
+        """Ratio Gamma 2 of mean amplitudes inside and outside the band, Eq. (38).
+
+        It is 0 for zero data.
+        """
         outside = self.amplitude_out.clamp_min(torch.finfo(self.amplitude_out.dtype).tiny)
         return self.bins_out / self.bins_in * self.amplitude_in / outside
 
     @property
     def ratio(self) -> Tensor:
-        """Product Gamma = Gamma 1 Gamma 2."""
+        """Signal intensity ratio Gamma, the product of the energy ratio and the amplitude ratio."""
         return self.power_ratio * self.amplitude_ratio
 
 
 def signal_intensity(
     data: Tensor, radar: BistaticRadar, motion: PointMotion, rebuild: Rebuild, bandwidth_hz: float
 ) -> Intensity:
-    """Return intensities inside and outside a band about the Doppler centre of a motion.
+    """Return energies and amplitudes inside and outside the Doppler band of a motion.
 
-    The spectrum is reconstructed with the same motion. Differentiable in data and motion.
+    The spectrum is reconstructed with this motion, and the band is centred on its Doppler centre.
+    Differentiable in data and motion.
 
     Args:
         data: Range lines of one target without the transmit range, shape (..., channel, pulse,
@@ -105,7 +112,7 @@ def signal_intensity(
         bandwidth_hz: Processed Doppler bandwidth in Hz.
 
     Returns:
-        Intensities of shape (...,).
+        Energies and summed amplitudes of shape (...,).
 
     Raises:
         ValueError: If the reconstructed band does not exceed `bandwidth_hz`, or there are too few
@@ -140,32 +147,35 @@ def refuse_full_band(radar: BistaticRadar, rebuild: Rebuild, bandwidth_hz: float
     if not 0 < bandwidth_hz < rebuild.bands * radar.prf_hz:
         band = f"{rebuild.bands} bands of {radar.prf_hz:g} Hz"
         raise ValueError(
-            "the intensity ratio compares the spectrum inside bandwidth_hz with the rest, "
-            f"but {band} leave nothing outside {bandwidth_hz:g} Hz; rebuild more bands, or "
-            "integrate less"
+            "bandwidth_hz must be above 0 and below the width of the rebuilt bands, since the intensity ratio compares "
+            f"the spectrum inside bandwidth_hz with the rest, but {band} leave nothing outside "
+            f"{bandwidth_hz:g} Hz; rebuild more bands, or integrate less"
         )
 
 
 class SignalIntensityRatio(Stage):
-    """Estimator of u_r that maximises the intensity ratio Gamma, per trial.
+    """Stage that estimates the slant-range speed u_r by the signal intensity ratio Gamma.
 
-    A grid search is refined by parabolic interpolation about its best point. Prefer
-    `Interferometry` or `MovingPointVelocity`: the ratio needs about 15 dB more SNR (its threshold
-    lies at 0 to +7 dB per sample), below its threshold it is biased by more than the standard
-    deviation indicates, and with stationary clutter beside the target its maximum lies at u_r = 0.
-    Without noise it errs by up to 0.06 m/s, since echoes beyond the reconstructed bands alias into
-    them. The record must contain the whole dwell of the target.
+    A spectrum that is reconstructed with the right speed concentrates in the processed Doppler
+    band. Gamma compares the energies and amplitudes inside and outside this band, and its maximum
+    is sought in each trial. A grid search is refined by parabolic interpolation about its best
+    point. Prefer `Interferometry` or `MovingPointVelocity`: the ratio needs about 15 dB more SNR
+    (its threshold lies at 0 to +7 dB per sample), below its threshold it is biased by more than the
+    standard deviation indicates, and with stationary clutter beside the target its maximum lies at
+    u_r = 0. Without noise it errs by up to 0.06 m/s, since echoes beyond the reconstructed bands
+    alias into them. The record must contain the whole dwell of the target.
 
     Args:
         radar: Instrument.
-        bandwidth_hz: Processed Doppler bandwidth V^2 T / (lambda R0) in Hz.
+        bandwidth_hz: Processed Doppler bandwidth in Hz, V^2 T / (lambda R0) for the relative speed
+            V, the integration time T and the closest range R0.
         rebuild: Reconstruction method, `LeastSquares(3)` by default, since two bands leave little
             outside the processed band.
         search_m_s: Least and largest velocity of the search in m/s, None for the unambiguous
             interval +-lambda PRF / 2.
         step_m_s: Step of the grid in m/s.
         range_m: Closest range in metres, None for the reference range of the radar.
-        least_quality: Least quality of a reliable estimate.
+        least_quality: Least quality (0 to 1) of an estimate that is `ok`, see `forward`.
 
     Raises:
         ValueError: If the search interval is shorter than two steps, the reconstructed band does
@@ -202,7 +212,7 @@ class SignalIntensityRatio(Stage):
         if not (low < high and 0 < step_m_s <= (high - low) / 2):
             raise ValueError(
                 "search_m_s must be (least, largest) velocity with at least two steps of step_m_s between, got "
-                f"{self.search_m_s} and {step_m_s}"
+                f"search_m_s={self.search_m_s} and step_m_s={step_m_s}"
             )
         why = self.rebuild.refusal(radar.channels)
         if why is not None:
@@ -210,7 +220,7 @@ class SignalIntensityRatio(Stage):
         refuse_full_band(radar, self.rebuild, bandwidth_hz)
 
     def forward(self, signal: Signal, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
-        """Estimate u_r from channels with the axes (channel, pulse[, range]).
+        """Estimate the slant-range speed from channels with the axes (channel, pulse[, range]).
 
         Args:
             signal: Channels without the transmit range.
@@ -219,10 +229,11 @@ class SignalIntensityRatio(Stage):
 
         Returns:
             `u_r_m_s` of shape (...,), closing positive, with a jackknife standard deviation. The
-            quality is 1 - median / largest Gamma over the grid. `info` holds `log_ratio` over the
-            grid and `pulse_rates`. `ok` is False if the data are zero (the value is then
-            the middle of the search interval), the maximum lies at an end of the interval, the
-            quality is below `least_quality`, or the velocity is wrong by a multiple of lambda PRF.
+            quality is 1 - median / maximum of the intensity ratio Gamma over the grid of speeds.
+            `info` holds `log_ratio`, log Gamma over the grid, and `pulse_rates`, the number of PRFs
+            by which the Doppler is wrong. `ok` is False if the data are zero (the value is then the
+            middle of the search interval), the maximum lies at an end of the interval, the quality
+            is below `least_quality`, or the velocity is wrong by a multiple of lambda PRF.
 
         Raises:
             ValueError: If the reconstruction is singular.

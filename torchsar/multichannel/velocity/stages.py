@@ -29,7 +29,7 @@ _LEAST_PULSES = 4  # convention: three pulses define a tone and its curvature, a
 
 
 def strongest_line(data: Tensor) -> tuple[Tensor, Tensor]:
-    """Select the range line of most energy of each trial.
+    """Select the range line of most energy in each trial.
 
     Args:
         data: Channels with corrected migration, shape (..., channel, pulse, range), complex.
@@ -53,7 +53,7 @@ class _Velocity(Stage):
         self.radar, self.aperture, self.range_m = radar, aperture, range_m
 
     def line(self, signal: Signal) -> tuple[Tensor, Tensor | float | None]:
-        """Return the data (..., channel, pulse) of the strongest line and their closest range.
+        """Return the data (..., channel, pulse) of the strongest range line and its closest range.
 
         Raises:
             ValueError: If the channels are not those of the radar, slow time is not zero at pulse n
@@ -64,8 +64,8 @@ class _Velocity(Stage):
         if channels != self.radar.channels or pulses < _LEAST_PULSES:
             raise ValueError(
                 f"{type(self).__name__} expects {self.radar.channels} channels as in the radar's "
-                f"channel_m and at least {_LEAST_PULSES} pulses, got {channels} and {pulses}; select "
-                "the same channels in radar and data"
+                f"channel_m and at least {_LEAST_PULSES} pulses, got {channels} channels and {pulses} pulses; "
+                "select the same channels in radar and data"
             )
         if "range" not in signal.names:
             return signal.data, self.range_m
@@ -76,18 +76,21 @@ class _Velocity(Stage):
     def begin(
         self, signal: Signal, u_r_m_s: Number, u_a_m_s: Number, y0_m: Number
     ) -> tuple[Tensor, BistaticRadar, PointMotion, Aperture]:
-        """Return data, radar, starting motion and aperture for an estimator near a start."""
+        """Return data, radar, starting motion and aperture for an estimator that needs a start."""
         data, range_m = self.line(signal)
         return data, self.radar, motion_from(self.radar, data, u_r_m_s, u_a_m_s, y0_m, range_m), self.aperture
 
 
 class Interferometry(_Velocity):
-    """Stage that estimates u_r by along-track interferometry for a given u_a; see `interferometry`.
+    """Stage that estimates the slant-range speed by along-track interferometry.
+
+    The along-track speed is given; see `interferometry`.
 
     Args:
         radar: Instrument.
         aperture: Expected amplitude over slow time.
-        range_m: Closest range in metres, None for that of the line or the reference range.
+        range_m: Closest range in metres, None for that of the strongest range line, or for the
+            reference range of the radar if there is no range axis.
         check_ambiguity: Whether to check for a velocity wrong by a multiple of lambda * PRF, in
             about 10 ms per trial. If one is found, a warning is given and `ok` is False.
     """
@@ -99,7 +102,7 @@ class Interferometry(_Velocity):
         self.check_ambiguity = check_ambiguity
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
-        """Estimate u_r and y0 near a start.
+        """Estimate slant-range speed and along-track position for a known along-track speed.
 
         Args:
             signal: Channels with the axes (channel, pulse[, range]).
@@ -107,9 +110,14 @@ class Interferometry(_Velocity):
             u_a_m_s: Along-track speed in m/s, shape (...,) or a number.
             y0_m: Starting along-track position at t = 0 in metres, shape (...,) or a number.
 
+        Returns:
+            `u_r_m_s`, `u_a_m_s` and `y0_m` of shape (...,), see `interferometry`. With
+            `check_ambiguity`, `info` also holds `pulse_rates`, the number of PRFs by which the
+            Doppler is wrong.
+
         Raises:
-            ValueError: As in `interferometry`, for other channels than the radar's, for slow time
-                that is not zero at pulse n // 2, and for fewer than 4 pulses.
+            ValueError: If the radar has one channel, the data have other channels than the radar or
+                fewer than 4 pulses, or slow time is not zero at pulse n // 2.
         """
         data, radar, start, aperture = self.begin(signal, u_r_m_s, u_a_m_s, y0_m)
         found = interferometry(data, radar, start, aperture)
@@ -118,13 +126,16 @@ class Interferometry(_Velocity):
 
 
 class AlongTrackAutofocus(_Velocity):
-    """Along-track velocity by the power of the deramped tone; see `along_track_velocity`.
+    """Stage that estimates the along-track speed by the power of the deramped tone.
+
+    See `along_track_velocity`.
 
     Args:
         radar: Instrument.
         aperture: Expected amplitude over slow time.
-        range_m: Closest range in metres, None for that of the line or the reference range.
-        half_m_s: Half width of the search about u_a = 0 in m/s.
+        range_m: Closest range in metres, None for that of the strongest range line, or for the
+            reference range of the radar if there is no range axis.
+        half_m_s: Half width of the search about an along-track speed of zero in m/s.
     """
 
     provides = ("u_a_m_s",)
@@ -136,26 +147,34 @@ class AlongTrackAutofocus(_Velocity):
         self.half_m_s = half_m_s
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
-        """Estimate u_a with u_r and y0 as given.
+        """Estimate the along-track speed for a given slant-range speed and along-track position.
 
         Args:
             signal: Channels with the axes (channel, pulse[, range]).
             u_r_m_s: Slant-range speed in m/s, shape (...,) or a number.
             y0_m: Along-track position at t = 0 in metres, shape (...,) or a number.
 
+        Returns:
+            `u_a_m_s` of shape (...,), see `along_track_velocity`.
+
         Raises:
-            ValueError: As in `along_track_velocity`, and as in `Interferometry.forward`.
+            ValueError: If the half width of the search is not positive, the search reaches the
+                speed of the receiver, the data have other channels than the radar or fewer than 4
+                pulses, or slow time is not zero at pulse n // 2.
         """
         return along_track_velocity(*self.begin(signal, u_r_m_s, 0.0, y0_m), self.half_m_s)
 
 
 class LikelihoodVelocity(_Velocity):
-    """Maximum likelihood near given values as a stage; see `maximum_likelihood`.
+    """Stage that estimates velocity and position by maximum likelihood near a start.
+
+    See `maximum_likelihood`.
 
     Args:
         radar: Instrument.
         aperture: Expected amplitude over slow time.
-        range_m: Closest range in metres, None for that of the line or the reference range.
+        range_m: Closest range in metres, None for that of the strongest range line, or for the
+            reference range of the radar if there is no range axis.
         unknowns: Names of the parameters to estimate among `u_r_m_s`, `u_a_m_s`, `y0_m`.
 
     Raises:
@@ -174,7 +193,7 @@ class LikelihoodVelocity(_Velocity):
         refuse_unknowns(self.unknowns)
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
-        """Estimate the unknowns near a start; `ok` is False below 19 dB over all samples.
+        """Estimate those parameters that are unknown, near a start.
 
         Args:
             signal: Channels with the axes (channel, pulse[, range]).
@@ -182,20 +201,28 @@ class LikelihoodVelocity(_Velocity):
             u_a_m_s: Starting along-track speed in m/s, shape (...,) or a number.
             y0_m: Starting along-track position at t = 0 in metres, shape (...,) or a number.
 
+        Returns:
+            `u_r_m_s`, `u_a_m_s` and `y0_m` of shape (...,), with standard deviations of those
+            estimated. `ok` is False where the point has less than 19 dB over all samples.
+
         Raises:
-            ValueError: As in `Interferometry.forward`.
+            ValueError: If the data have other channels than the radar or fewer than 4 pulses, or
+                slow time is not zero at pulse n // 2.
         """
         found = maximum_likelihood(*self.begin(signal, u_r_m_s, u_a_m_s, y0_m), self.unknowns)
         return estimate_of(found, found.snr_db >= DETECTED_DB, ((found.snr_db - DETECTED_DB) / 3).sigmoid())
 
 
 class GradientVelocity(_Velocity):
-    """Maximum likelihood by autograd gradients as a stage; see `gradient_likelihood`.
+    """Stage that estimates velocity and position by maximum likelihood with autograd gradients.
+
+    See `gradient_likelihood`.
 
     Args:
         radar: Instrument.
         aperture: Expected amplitude over slow time.
-        range_m: Closest range in metres, None for that of the line or the reference range.
+        range_m: Closest range in metres, None for that of the strongest range line, or for the
+            reference range of the radar if there is no range axis.
         unknowns: Names of the parameters to estimate among `u_r_m_s`, `u_a_m_s`, `y0_m`.
 
     Raises:
@@ -214,21 +241,36 @@ class GradientVelocity(_Velocity):
         refuse_unknowns(self.unknowns)
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
-        """Estimate the unknowns near a start; arguments as in `LikelihoodVelocity.forward`."""
+        """Estimate those parameters that are unknown, near a start.
+
+        Args:
+            signal: Channels with the axes (channel, pulse[, range]).
+            u_r_m_s: Starting slant-range speed in m/s, shape (...,) or a number.
+            u_a_m_s: Starting along-track speed in m/s, shape (...,) or a number.
+            y0_m: Starting along-track position at t = 0 in metres, shape (...,) or a number.
+
+        Returns:
+            `u_r_m_s`, `u_a_m_s` and `y0_m` of shape (...,), see `gradient_likelihood`.
+
+        Raises:
+            ValueError: If the data have other channels than the radar or fewer than 4 pulses, or
+                slow time is not zero at pulse n // 2.
+        """
         return gradient_likelihood(*self.begin(signal, u_r_m_s, u_a_m_s, y0_m), self.unknowns)
 
 
 class MovingPointVelocity(_Velocity):
-    """Recommended velocity estimator, without prior knowledge; see `moving_point_velocity`.
+    """Recommended stage for velocity and position of a moving point, without prior knowledge.
 
-    If the search covers less than one PRF of u_r, a warning is given where the velocity lies
-    beyond.
+    See `moving_point_velocity`. If the half width of the search in slant-range speed is below
+    lambda PRF, a warning is given where the velocity seems to lie beyond it.
 
     Args:
         radar: Instrument.
         aperture: Expected amplitude over slow time.
-        range_m: Closest range in metres, None for that of the line or the reference range.
-        search: Extent of the bank, by default three PRFs of u_r.
+        range_m: Closest range in metres, None for that of the strongest range line, or for the
+            reference range of the radar if there is no range axis.
+        search: Extent of the search, by default +-1.5 lambda PRF in slant-range speed.
         u_a_m_s: Along-track speed in m/s where it is known a priori, None to estimate it.
     """
 
@@ -244,10 +286,15 @@ class MovingPointVelocity(_Velocity):
         self.search, self.u_a_m_s = search, u_a_m_s
 
     def forward(self, signal: Signal) -> Estimate:
-        """Estimate u_r, u_a and y0 from channels with the axes (channel, pulse[, range]).
+        """Estimate velocity and position from channels with the axes (channel, pulse[, range]).
+
+        Returns:
+            `u_r_m_s`, `u_a_m_s` and `y0_m` of shape (...,), see `moving_point_velocity`.
 
         Raises:
-            ValueError: As in `moving_point_velocity` and `Interferometry.forward`.
+            ValueError: If the search reaches the speed of the receiver, the data have other
+                channels than the radar or fewer than 4 pulses, or slow time is not zero at pulse n
+                // 2.
         """
         data, range_m = self.line(signal)
         found = moving_point_velocity(data, self.radar, self.aperture, self.search, self.u_a_m_s, range_m)

@@ -21,22 +21,23 @@ _TINY = torch.finfo(torch.float64).tiny  # keeps divisions by zero finite
 def walk_ambiguity(
     data: Tensor, frame: Frame, reference: PointMotion, most: int = 2, migration: Migration | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Find the ambiguity number for which the strongest point stays in one range line.
+    """Find the PRF ambiguity number for which the strongest point stays in one range line.
 
-    The criterion is the energy of the strongest line, so that neither phase nor aliasing matter.
+    The range migration is corrected with each number in turn. The criterion is the energy of the
+    strongest range line, which depends neither on phases nor on aliasing in azimuth.
 
     Args:
         data: Range-compressed channels without the transmit range, shape (..., channel, pulse,
             range), complex.
         frame: Geometry of the data.
-        reference: Motion of the reference, shape (...,).
-        most: Largest ambiguity number tried, to either side.
+        reference: Motion of the reference point, whose range history is removed, shape (...,).
+        most: Largest magnitude of the ambiguity numbers that are tried.
         migration: Method of migration correction, `Keystone(whole_swath=False)` by default.
 
     Returns:
-        Three tensors (...,): the ambiguity number, float64; the excess of its strongest line over
-            that of the next best number, in standard deviations of the noise; and the index of its
-            line.
+        Three tensors (...,): the ambiguity number, float64; the energy of its strongest range line
+        minus that for the next best number, in standard deviations of the energy of a line of
+        noise; and the index of the strongest line.
     """
     numbers = torch.arange(-most, most + 1, dtype=torch.float64, device=data.device)
     energies = torch.stack(
@@ -66,12 +67,14 @@ def _noise_std(energy: Tensor) -> Tensor:
 
 
 class WalkAmbiguity(Stage):
-    """Estimator of the ambiguity number for `CorrectMigration`; see `walk_ambiguity`.
+    """Stage that estimates the PRF ambiguity number of the strongest point from its range walk.
+
+    The value connects to `CorrectMigration`; see `walk_ambiguity`.
 
     Args:
         radar: Instrument.
-        most: Largest ambiguity number tried, to either side.
-        range_m: Closest range of the reference in metres, None for the reference range of the
+        most: Largest magnitude of the ambiguity numbers that are tried.
+        range_m: Closest range of the reference point in metres, None for the reference range of the
             radar.
 
     Raises:
@@ -88,17 +91,18 @@ class WalkAmbiguity(Stage):
         self.radar, self.most, self.range_m = radar, most, range_m
 
     def forward(self, signal: Signal, u_r_m_s: Number = 0.0, u_a_m_s: Number = 0.0, y0_m: Number = 0.0) -> Estimate:
-        """Estimate the ambiguity number.
+        """Estimate the PRF ambiguity number of the strongest point from its range walk.
 
         Args:
             signal: Range-compressed channels with the axes (channel, pulse, range).
-            u_r_m_s: Slant-range speed of the reference in m/s, shape (...,) or a number.
+            u_r_m_s: Slant-range speed of the reference point in m/s, shape (...,) or a number.
             u_a_m_s: Along-track speed of the reference in m/s, same shape.
             y0_m: Along-track position of the reference at t = 0 in metres, same shape.
 
         Returns:
-            `ambiguity` of shape (...,). `info` holds `line` and `contrast`. `ok` is False where the
-            best number exceeds the next one by less than five standard deviations of the noise.
+            `ambiguity` of shape (...,). `info` holds `line`, the index of the range line of the
+            point, and `contrast`, the energy of this line minus that for the next best number, in
+            standard deviations of the noise. `ok` is False where the contrast is below 5.
         """
         reference = PointMotion.of(self.radar, signal.data, u_r_m_s, u_a_m_s, y0_m, self.range_m)
         number, contrast, line = walk_ambiguity(signal.data, Frame.of(self.radar, signal), reference, self.most)

@@ -1,9 +1,10 @@
 """Whitening of stationary clutter by the covariance of the channels in each Doppler bin.
 
-A stationary scene has the channel response at rest: in a Doppler bin its bands span few directions
-among the channels. After removal of the known phase ramp over Doppler the covariance changes slowly
-from bin to bin, so that neighbouring bins, and range lines where there are several, are samples of
-it.
+For a stationary scene the phases across the channels are known in each Doppler band. In a Doppler
+bin of one channel only few bands overlap, so that the clutter fills few dimensions of the space of
+the channels. After removal of the known phase ramp over Doppler, the covariance of the channels
+changes slowly from bin to bin, so that it can be averaged over neighbouring bins, and over range
+lines where there are several.
 
 Reference:
     Reed, Mallett and Brennan 1974 (sample covariance).
@@ -31,13 +32,13 @@ _EVIDENCE = 2.0
 
 @dataclass(frozen=True)
 class Whitening:
-    """Whitening matrices of the FFT over pulses, in unitary scale.
+    """Matrices that whiten the channels in each Doppler bin of the unitary FFT over pulses.
 
     Args:
-        factor: Matrices W with W R W^H = 1 for the covariance R, complex128 (..., bin, channel,
-            channel).
-        log_det: Log determinant of all R together, shape (...,).
-        coloured: True where R differs from that of white noise, bool (...,).
+        factor: Matrices W with W R W^H = I for the covariance R of the channels in each bin,
+            complex128 (..., bin, channel, channel).
+        log_det: Sum of the log determinants of R over all bins, shape (...,).
+        coloured: True in trials where R differs from the covariance of white noise, bool (...,).
     """
 
     factor: Tensor
@@ -45,13 +46,13 @@ class Whitening:
     coloured: Tensor
 
     def expanded(self, count: int) -> Whitening:
-        """Return the same covariance for `count` trials."""
+        """Return this whitening of a single trial repeated for `count` trials."""
         return Whitening(
             self.factor.expand(count, *self.factor.shape), self.log_det.expand(count), self.coloured.expand(count)
         )
 
     def applied(self, data: Tensor) -> Tensor:
-        """Whiten the spectra of data.
+        """Return the whitened Doppler spectra of the channels.
 
         Args:
             data: Channels, shape (..., channel, pulse), or (..., any, channel, pulse) with one more
@@ -64,7 +65,9 @@ class Whitening:
         return _mixed(self.factor if data.ndim == self.factor.ndim - 1 else self.factor[..., None, :, :, :], spectrum)
 
     def backed(self, data: Tensor) -> Tensor:
-        """Apply R^-1 to data and return to slow time, for correlation with a model in clutter.
+        """Return channels weighted by their inverse covariance in each Doppler bin.
+
+        The result over slow time serves for correlation with the model of an echo in clutter.
 
         Args:
             data: Channels, shape (..., channel, pulse), complex.
@@ -88,7 +91,9 @@ def _mixed(factor: Tensor, spectrum: Tensor) -> Tensor:
 
 
 def sample_whitening(data: Tensor, radar: BistaticRadar, samples: int = _SAMPLES) -> Whitening:
-    """Estimate the covariance from the data themselves; see `line_whitening`.
+    """Estimate the whitening of the channels in each Doppler bin from the data themselves.
+
+    The covariance of the channels is averaged over neighbouring bins; see `line_whitening`.
 
     Args:
         data: Channels, shape (..., channel, pulse), complex.
@@ -96,24 +101,26 @@ def sample_whitening(data: Tensor, radar: BistaticRadar, samples: int = _SAMPLES
         samples: Number of neighbouring bins averaged.
 
     Returns:
-        Whitening of each Doppler bin, as from `line_whitening`.
+        Whitening of each Doppler bin; that of white noise in trials without clear structure.
     """
     return line_whitening(data[..., None, :, :], radar, samples)
 
 
 def line_whitening(lines: Tensor, radar: BistaticRadar, samples: int = _SAMPLES) -> Whitening:
-    """Estimate the covariance from several independent range lines without the point to be found.
+    """Estimate the whitening of the channels in each Doppler bin from several range lines.
 
-    The covariance is that of white noise in trials where the data show no more structure than white
-    noise does by chance. A trial of zeros gets unit noise.
+    The covariance of the channels is averaged over the lines, which should be independent and not
+    contain the point to be found, and over neighbouring bins. In trials where it shows no more
+    structure than white noise does by chance, that of white noise is used. A trial of zeros gets a
+    noise power of 1.
 
     Args:
         lines: Range lines, shape (..., line, channel, pulse), complex.
         radar: Instrument.
-        samples: Number of samples averaged, lines times neighbouring bins.
+        samples: Number of samples averaged: range lines times neighbouring bins.
 
     Returns:
-        The whitening.
+        Whitening of each Doppler bin.
     """
     n, channels, count = lines.shape[-1], lines.shape[-2], lines.shape[-3]
     groups = max(1, n * count // max(samples, 4 * channels))
