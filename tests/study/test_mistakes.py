@@ -57,7 +57,7 @@ DENSE = points([0.0, 0.02], [1.5, 1.55])
 MISTAKES = [
     # of every system
     ("isal", {"metrics": {"reference": "sca"}}, "name a method with 'input: clean'"),
-    ("sal", {"beyond_limits": ["segmentd"]}, "beyond_limits names the method 'segmentd'"),
+    ("sal", {"beyond_limits": ["segmentd"]}, "beyond_limits names 'segmentd', which is no method"),
     ("stripmap", {"world": world("stripmap", squint_deg=1.0)}, "both give the direction of the beam"),
     ("stripmap", {"world": world("stripmap", doppler_hz=None, squint_deg=90.0)}, "between -90 and 90 degrees"),
     ("stripmap", {"world": world("stripmap", lines=1)}, "at least 2 lines of 2 samples"),
@@ -361,4 +361,4 @@ def test_an_unknown_system_is_named(tmp_path: Path) -> None:
 def test_a_sweep_has_no_cases(system: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = write(tmp_path, system, cases={"quiet": {"seed": 30}}, sweep={"precision": ["complex64"], "trials": 1})
     assert main(["sweep", config, "--out", str(tmp_path / "sweep")]) == 2
-    assert "cases belong to runs" in capsys.readouterr().err
+    assert "cases cannot be used in a sweep" in capsys.readouterr().err
