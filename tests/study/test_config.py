@@ -136,7 +136,7 @@ def test_unknown_config_names_what_there_is() -> None:
         (["processor.squint_ignored.rerun.method=other"], ["processor.squint_ignored.rerun.method", "'other'"]),
         (["processor.squint_ignored.rerun.start=fokus"], ["rerun.start", "did you mean 'focus'"]),
         (["processor.squint_ignored.rerun.given={doppler.x_hz: 1.0}"], ["rerun.given.doppler.x_hz"]),
-        (["processor.truth.stages.focus.stage=omega_k"], ["processor.truth", "choose another one"]),
+        (["processor.truth.stages.focus.stage=omega_k"], ["processor.truth", "choose another"]),
         (["metrics.reference=ideal"], ["metrics.reference", "'ideal'"]),
         (["seed=-1"], ["'seed' has the value -1"]),
         (["seed=1.5"], ["'seed' has the value 1.5", "integer"]),

@@ -225,7 +225,7 @@ class Catalogue:
         return entry[self.key] in self.sections and self.sections[entry[self.key]].takes_tensor(path, entry)
 
     def describe(self, value: Any) -> dict[str, Any] | None:
-        """Return the config entry that builds such an object, None if no constructor is its class."""
+        """Return the config entry that builds such an object, None if no entry has its class."""
         name = next((name for name, target in self.entries.items() if target is type(value)), None)
         return None if name is None else {self.key: name, **_described(value)}
 

@@ -35,7 +35,8 @@ class Shot:
     Args:
         image: Its image without noise.
         profile: Cut along azimuth through the peak.
-        along_m: Positions of the cut on the axis x = (V_R - u_a) t of the target in metres.
+        along_m: Positions of the cut in metres on the axis x = (V_R - u_a) t, with the speeds along
+            track V_R of the receiver and u_a of the target.
         spectrum: Rebuilt spectrum over Doppler frequency from its centre.
     """
 

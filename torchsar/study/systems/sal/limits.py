@@ -49,7 +49,11 @@ _MODELS = (
 
 
 def moved(bench: Bench) -> Moved:
-    """What the first trial of a run shows. Raises ValueError if nothing can be seen."""
+    """Return scatterers and motion in the first trial of a run, as far as the ladar observes them.
+
+    Raises:
+        ValueError: If the ladar observes no scatterer, or one is where no sweep can show it.
+    """
     world, radar, draws = bench.world(), bench.radar, Draws(bench.config.seed, "run", [0])
     motion = drawn_motion(world.motion, draws, world.periods * radar.pulse_step_s)
     return Moved.of(radar, world.of().scene.scatterers(draws), motion, world.periods, world.gate_m)
@@ -150,7 +154,9 @@ def _estimates(bench: Bench) -> Measured:
     chain = bench.chains["recommended"]
     found = [name for name, stage in chain.stages.items() if "velocity_m_s" in getattr(stage, "provides", ())]
     if not found:
-        raise ValueError("the recommended method estimates no velocity; there is nothing to compare")
+        raise ValueError(
+            "processor.recommended estimates no velocity, so that there is nothing to compare; add a stage that does"
+        )
     sweeps = chain.trace(trials.recording).inputs[found[0]]
     window, true = getattr(chain.stages[found[0]], "window_m", None), trials.truth["velocity_m_s"]
     pulse = sweeps.axis("pulse")
