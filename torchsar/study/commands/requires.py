@@ -95,7 +95,7 @@ def refuse_beyond_limits(bench: Bench, case: str) -> None:
     """Check the limits of the methods of a case, and log a warning for each limit that is exceeded.
 
     Args:
-        bench: Bench of the case.
+        bench: Bench of the case: its radar, world and chains.
         case: Name of the case.
 
     Raises:

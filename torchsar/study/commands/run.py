@@ -34,7 +34,7 @@ _LISTED = 16
 
 
 def run(loaded: Loaded, out: Path, command: str = "torchsar run", device: str = "cpu") -> Path:
-    """Run every method on every case and write the result into a folder.
+    """Run every method of a config on each of its cases, and write the result into a folder.
 
     Args:
         loaded: The config.

@@ -145,7 +145,7 @@ def sweep(
         raise Interrupted(f"finished trials are recorded in {out}; go on with --resume") from None
     except OSError as error:
         raise ConfigError(
-            f"{out}: the report cannot be written ({error.strerror or error}); the trials are recorded; make the "
+            f"{out}: the report cannot be written ({error.strerror or error}), but the trials are recorded; make the "
             "report with --resume"
         ) from error
     return out / "report.html"

@@ -285,9 +285,9 @@ class _Run:
         self.warned: set[str] = set()
 
     def all_levels(self, engine: Engine) -> None:
-        """Compute all trials in steps between the numbers of trials at which points are checked.
+        """Compute all trials in steps, after each of which points are checked for an early end.
 
-        A point that meets the criterion for an early end gets no further trials.
+        A point that meets the criterion of the plan gets no further trials.
         """
         stops = looks(self.plan.trials, self.plan.stop)
         known = (n for n in self.record.about.get("finished", []) if n < self.plan.trials)

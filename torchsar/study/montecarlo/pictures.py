@@ -130,7 +130,7 @@ class SweepPictures:
     def curves(self, quantity: Quantity) -> Drawn:
         """Yield curves over each parameter with at least two numeric values.
 
-        Without such a parameter they are over the parameter with the largest number of words.
+        Without such a parameter, the curves are over the parameter of words with the most values.
         """
         if not np.isfinite(self.values(quantity)).any():
             return

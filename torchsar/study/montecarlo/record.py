@@ -48,7 +48,9 @@ class Record:
         return ("algorithm", *self.labels, "trial")
 
     def blank(self, by_algorithm: bool = True) -> np.ndarray:
-        """Return an array of NaN with the dims of a metric, or with those of a bound."""
+        """Return an array of NaN with the shape of a metric, (algorithm, *parameters, trial), or of
+        a bound, (*parameters, trial).
+        """
         return np.full(self.ok.shape if by_algorithm else self.done.shape, np.nan)
 
     def index_of(self, labels: Mapping[str, float | str]) -> tuple[int, ...]:
@@ -118,7 +120,7 @@ class Record:
     def grown(self, labels: Labels, trials: int) -> Record:
         """Return the results in larger arrays, for more parameter values or more trials.
 
-        The labels must begin with those of this record.
+        For each parameter, the given labels must begin with those of this record.
         """
         return self._mapped(lambda x: _enlarged(x, (*map(len, labels.values()), trials)), labels)
 

@@ -26,7 +26,7 @@ def write_sweep_report(
     Args:
         path: Where to write it.
         tree: The content of summary.json.
-        pictures: In the order of reading.
+        pictures: Pictures in the order in which they are shown.
         figures: The folder that holds them.
         config_text: The resolved config.
         command: The command that made it.

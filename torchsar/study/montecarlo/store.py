@@ -258,8 +258,8 @@ def _writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise ConfigError(
-            f"{path} cannot be written ({error.strerror or error}); trials that are marked done are "
-            "safe; go on with --resume once the folder can be written"
+            f"{path} cannot be written ({error.strerror or error}), but finished trials are kept; go on with "
+            "--resume once the folder can be written"
         ) from error
 
 

@@ -99,7 +99,7 @@ def summary_of(record: Record, success: Mapping[str, float]) -> Summary:
 
     Args:
         record: The results; `record.about` holds the seed, also for the bootstrap of intervals.
-        success: By metric, its largest magnitude in a trial that counts as a success.
+        success: For each metric, the largest magnitude that counts as a success.
     """
     done = record.done[None]
     trials = {"trials": np.broadcast_to(done.sum(-1), record.ok.shape[:-1]), **_shares(record.ok, done, "ok")}

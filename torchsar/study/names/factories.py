@@ -77,13 +77,13 @@ def rotation_and_phase(
     rotation (`UnevenRotation`) of a target, each from the data after correction of the other.
 
     Args:
-        order: Order of the warp of slow time by the rotation.
+        order: Order of the rotation angle as a polynomial of slow time.
         yc_m: Range in metres from the centre of rotation to the zero of the range axis. It is not
             estimated, because the phase errors of the pulses absorb its whole effect.
         rounds: Number of times that both are estimated.
         scatterers: Largest number of scatterers that are used.
         search: Largest number of iterations of the entropy fixed point.
-        polish: Largest number of iterations against the Wiener estimate.
+        polish: Largest number of iterations against the Wiener estimate of the scene.
     """
     return Alternate(
         rounds,

@@ -95,7 +95,9 @@ class EarlyStop(Strict):
 
 
 class Save(Strict):
-    """Numbers of the trials whose images and outputs of the stages `taps` are kept in the store."""
+    """Numbers of the trials whose images are kept in the store, and names of stages (`taps`) whose
+    outputs are kept with them.
+    """
 
     trials: list[int] = []
     taps: list[str] = []

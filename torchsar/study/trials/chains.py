@@ -39,7 +39,7 @@ def build_chains(loaded: Loaded, **context: Any) -> dict[str, Chain]:
             unknown = next((value for value in method.rerun.given if value not in offered), None)
             if unknown is not None:
                 raise ConfigError(
-                    f"{where}.rerun.given names {unknown!r}, which is no estimate of {method.rerun.method!r}"
+                    f"{where}.rerun.given.{unknown} is no estimate of the method {method.rerun.method!r}"
                     f"{did_you_mean(unknown, offered)}"
                 )
     return chains

@@ -144,7 +144,7 @@ class Geo(System):
         targets = list((loaded.config.world or {})["targets"])
         if len(targets) > 1:
             raise ConfigError(
-                f"{loaded.file}: world.targets: a sweep follows one target, and there are {', '.join(targets)}; "
+                f"{loaded.file}: world.targets must have a single target in a sweep, got {', '.join(targets)}; "
                 "keep one of them"
             )
 

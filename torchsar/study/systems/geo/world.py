@@ -117,7 +117,7 @@ class Points(World):
         super().__post_init__()
         if self.pulses < 1 or not self.targets or (self.samples is not None and self.samples < 1):
             raise ValueError(
-                "world needs at least one target and one pulse, and samples of 1 or more or None, got "
+                "world needs at least one target, one pulse and one sample (or null for azimuth-only data), got "
                 f"{len(self.targets)} targets, {self.pulses} pulses and {self.samples} samples"
             )
         if self.noise.scr_db is not None and self.sea is None:

@@ -54,8 +54,8 @@ class Target(World):
         super().__post_init__()
         if self.pulses < 1 or self.samples < 1 or not self.scene:
             raise ValueError(
-                "world needs a scene and at least one pulse and one sample, got "
-                f"{self.pulses} pulses and {self.samples} samples"
+                "world needs at least one scene, one pulse and one sample, got "
+                f"{len(self.scene)} scenes, {self.pulses} pulses and {self.samples} samples"
             )
 
     def of(self, radar: InverseRadar) -> TurntableWorld:

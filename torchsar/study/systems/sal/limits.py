@@ -155,7 +155,7 @@ def _estimates(bench: Bench) -> Measured:
     found = [name for name, stage in chain.stages.items() if "velocity_m_s" in getattr(stage, "provides", ())]
     if not found:
         raise ValueError(
-            "processor.recommended estimates no velocity, so that there is nothing to compare; add a stage that does"
+            "processor.recommended estimates no velocity, so that nothing can be compared; add such a stage"
         )
     sweeps = chain.trace(trials.recording).inputs[found[0]]
     window, true = getattr(chain.stages[found[0]], "window_m", None), trials.truth["velocity_m_s"]

@@ -89,7 +89,9 @@ class Ground(World):
         super().__post_init__()
         snr_db = self.noise.snr_db
         if self.periods < 1 or not self.scene:
-            raise ValueError(f"world needs a scene and at least one period, got {self.periods} periods")
+            raise ValueError(
+                f"world needs at least one scene and one period, got {len(self.scene)} scenes, {self.periods} periods"
+            )
         if snr_db is not None and bool((torch.as_tensor(snr_db).abs() > 300).any()):
             raise ValueError(
                 f"noise.snr_db is {snr_db}, outside the numerical range; give -300 to 300 dB, or null for no noise"
