@@ -125,7 +125,7 @@ class _Tried:
     failed: str = ""
 
     def again(self) -> None:
-        """One more repeat; the first one measures the loss as well."""
+        """Run the alternative once more; the first run measures its loss as well."""
         try:
             with PeakMemory() as peak:
                 spent, result = _spent(lambda: self.measured.run(self.one), _LEAST_S if self.times else 0.0)
@@ -143,7 +143,7 @@ class _Tried:
             log.info("%s", self._line())
 
     def row(self, tolerance: Mapping[str, float]) -> Row:
-        """The alternative as it stands in trade.json."""
+        """Return the row of the alternative in trade.json."""
         cpu, wall = (statistics.median(part) for part in zip(*self.times)) if self.times else (None, None)
         row = {"name": self.one.name, "neglects": self.one.neglects, "cpu_s": cpu, "wall_s": wall}
         row |= {"peak_bytes": max(self.peaks, default=None), "loss": self.loss, "predicted": self.one.loss}

@@ -29,7 +29,7 @@ _UNGUARDED = (
 
 @dataclass(frozen=True)
 class InProcess:
-    """One chunk after the other in this process."""
+    """Engine that computes one chunk (batch of trials) after the other in this process."""
 
     threads: int = 1
     workers: int = 1

@@ -104,7 +104,7 @@ def address(parameters: Mapping[str, Any]) -> str:
 
 
 def canonical(tree: Any) -> str:
-    """One text for one content: keys sorted, 20 and 20.0 alike."""
+    """Return a text that is equal for equal content: keys are sorted, and 20 and 20.0 are alike."""
     return json.dumps(_plain(tree), sort_keys=True, separators=(",", ":"))
 
 

@@ -1,4 +1,4 @@
-"""Figures of a sweep, drawn from its summary alone."""
+"""Pictures of a sweep, drawn from its summary alone."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Quantity:
 
 
 def share(metric: str, name: str, title: str) -> Quantity:
-    """A share of trials, whose title needs no unit."""
+    """Return a share of trials as a quantity without a unit."""
     return Quantity(metric, f"{name}_share", f"{name}_interval", title, title)
 
 
@@ -148,7 +148,7 @@ class SweepPictures:
                 yield name + end, quantity.title + along + page, self.caption(quantity) + note, figure
 
     def values(self, quantity: Quantity) -> np.ndarray:
-        """What is drawn, (algorithm, *parameters)."""
+        """Return the values that are drawn, (algorithm, *parameters)."""
         return self.figures[quantity.metric][quantity.field]
 
     def part(self, quantity: Quantity, panel: Panel, over: str) -> dict[str, Any]:
@@ -259,7 +259,7 @@ class SweepPictures:
             yield name, f"{quantity.title} over {name_and_unit(x)[0]} and {name_and_unit(y)[0]}{page}", caption, figure
 
     def map_part(self, values: np.ndarray, panel: Panel, x: str, y: str, algorithm: str) -> dict[str, Any]:
-        """One panel of a heat map; values: (*parameters)."""
+        """Return one panel of a heat map, for the values (*parameters) of one algorithm."""
         names = list(self.labels)
         z = np.moveaxis(values, (names.index(y), names.index(x)), (0, 1))
         z = z[(slice(None), slice(None), *(panel.index[name] for name in names if name not in (x, y)))]

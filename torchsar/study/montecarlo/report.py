@@ -64,7 +64,7 @@ def facts(tree: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def metric_tables(tree: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """One table a metric: title, columns and rows of text."""
+    """Return a table for each metric, with title, columns and rows of text."""
     grouped: dict[str, list[Mapping[str, Any]]] = {}
     for point in tree["points"]:
         grouped.setdefault(point["metric"], []).append(point)

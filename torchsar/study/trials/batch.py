@@ -83,7 +83,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Batch:
-    """The trials of one batch, and the outcome of every method."""
+    """The trials of one batch, and the result of every method."""
 
     trials: Trials
     outcomes: Mapping[str, Outcome]

@@ -71,7 +71,7 @@ _DIMENSIONS = ("azimuth only", "range lines", "full chirps")
 
 
 def limits(bench: Bench) -> dict[Limit, list[str]]:
-    """Limits, each with the methods that it concerns."""
+    """Return the limits of methods in this scene, with the methods that each concerns."""
     found: dict[Limit, list[str]] = {}
     for name, chain in bench.chains.items():
         for limit in multichannel_limits(bench.radar, use_of(chain, bench)):

@@ -76,7 +76,7 @@ class Own(NamedTuple):
 
     @property
     def integration_s(self) -> Tensor | float | None:
-        """Time for which targets are lit; None for a pattern."""
+        """Time in s for which targets are illuminated; None for illumination by an antenna pattern."""
         return self.world.integration_s
 
 
@@ -140,7 +140,7 @@ class Points(World):
 
     @property
     def integration_s(self) -> Tensor | float | None:
-        """Time for which targets are lit; None for a pattern."""
+        """Time in s for which targets are illuminated; None for illumination by an antenna pattern."""
         return self.gate.duration_s if isinstance(self.gate, BandLimited) else None
 
     def snr_db(self, radar: BistaticRadar) -> Tensor | float | None:
@@ -184,7 +184,7 @@ class Points(World):
         return Trials(noisy, truth.clean, values, count, Own(alone, snr, own))
 
     def points(self, count: int) -> MovingPoints:
-        """The targets, one a row (trial, target), flattened."""
+        """Return the targets, one in each row; the rows of a trial follow each other."""
 
         def rows(name: str) -> Tensor:
             each = [

@@ -48,7 +48,7 @@ _NOT_HERE = (
 
 
 def limits(bench: Bench) -> dict[Limit, list[str]]:
-    """Limits, each with the methods that it concerns."""
+    """Return the limits of methods in this scene, with the methods that each concerns."""
     found: dict[Limit, list[str]] = {}
     for name in bench.chains:
         for limit in (*multichannel_limits(bench.radar, _use_of(bench, name)), *_swath_limits(bench, name)):

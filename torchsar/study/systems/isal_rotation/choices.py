@@ -46,7 +46,7 @@ _DESCENT, _GENETIC = "descent from 0.95 of the truth", "genetic 10 x 4, +-10 % a
 
 
 def limits(bench: Bench) -> tuple[Limit, ...]:
-    """Limits of the first trial of a run."""
+    """Return the limits of methods for the target in the first trial of a run."""
     world, radar = bench.world(), bench.radar
     x, y, amplitude = _scatterers(bench)
     omega, k, yc = _rotation(world)

@@ -84,7 +84,7 @@ class Rotating(Target):
 
 
 def k_of(rotation: PolynomialRotation) -> Tensor:
-    """k1, k2, ... of the first trial."""
+    """Return k1, k2, ... (relative derivatives of the rotation rate) in the first trial."""
     k = rotation.warp_k(torch.zeros(0, dtype=torch.float64))
     return k.reshape(-1, k.shape[-1])[0] if k.numel() else k.reshape(-1)[:0]
 

@@ -60,7 +60,7 @@ def moved(bench: Bench) -> Moved:
 
 
 def limits(bench: Bench, seen: Moved) -> dict[Limit, list[str]]:
-    """Limits, each with the methods that it stops."""
+    """Return the limits of methods in this scene, with the methods that each stops."""
     world, radar, e = bench.world(), bench.radar, seen.extremes
     apart = torch.diff(torch.unique(seen.range_m))
     snr_db = world.noise.snr_db
@@ -90,14 +90,14 @@ def _concerns(limit: Limit, name: str, bench: Bench) -> bool:
 
 
 def requirements(bench: Bench, seen: Moved) -> Sequence[Requirement]:
-    """What echo and compensation may leave out."""
+    """Return what simplified echo models and motion compensation neglect in this scene."""
     e, world = seen.extremes, bench.world()
     motion = (e.velocity_m_s, e.acceleration_m_s2, e.displacement_m)
     return ladar_requirements(bench.radar, world.periods, e.range_m, *motion)
 
 
 def choices(bench: Bench, seen: Moved) -> list[Choice]:
-    """Echo model, estimator of the velocity, and its settings."""
+    """Return the choices between alternatives: echo model, and estimator of the velocity."""
     estimators = {
         "segmented interference": segmented_interference,
         "correlation, upsampling 1": partial(spectrum_correlation, upsampling=1),

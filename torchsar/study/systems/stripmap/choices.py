@@ -57,7 +57,7 @@ class StripProbe:
 
     @property
     def dwell_s(self) -> float:
-        """Time for which targets are lit."""
+        """Time in s for which targets are illuminated."""
         radar = self.radar
         known = getattr(self.world.beam, "dwell_s", None) or radar.integration_s
         return float(known or radar.aperture_s(radar.near_range_m))

@@ -83,7 +83,7 @@ class Strip:
 
 
 def pictures(results: Mapping[str, Result], columns: Mapping[str, Any]) -> Iterator[Callable[[], Drawn]]:
-    """Functions that draw the pictures, in the order of the report."""
+    """Yield functions that draw the pictures, in the order of the report."""
     makers = (_images, _cuts, _squint, _doppler_spectrum, _increments, _corrections, _contaminated_line)
     for case, result in results.items():
         for make in (*makers, _response, _image_corrections, _velocity):
