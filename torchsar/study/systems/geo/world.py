@@ -76,7 +76,7 @@ class Own(NamedTuple):
 
     @property
     def integration_s(self) -> Tensor | float | None:
-        """Time in s for which targets are illuminated; None for illumination by an antenna pattern."""
+        """Time in s for which targets are illuminated; None for an antenna pattern."""
         return self.world.integration_s
 
 
@@ -140,7 +140,7 @@ class Points(World):
 
     @property
     def integration_s(self) -> Tensor | float | None:
-        """Time in s for which targets are illuminated; None for illumination by an antenna pattern."""
+        """Time in s for which targets are illuminated; None for an antenna pattern."""
         return self.gate.duration_s if isinstance(self.gate, BandLimited) else None
 
     def snr_db(self, radar: BistaticRadar) -> Tensor | float | None:
