@@ -258,7 +258,7 @@ def test_a_part_of_a_chain_runs_again(system: str, tmp_path: Path) -> None:
 
 CASE_MISTAKES = [
     ({"empty": {}}, "cases.empty changes nothing"),
-    ({"odd": {"world.nose.snr_db": 3.0}}, "leads nowhere at 'nose'"),
+    ({"odd": {"world.nose.snr_db": 3.0}}, "does not exist, because there is no part 'nose'"),
     ({"odd": {"world.noise.snr_db": "loud"}}, "cases.odd: key 'world.noise.snr_db'"),
     ({"odd": {"metrics.reference": "sca"}}, "cases.odd: the key 'metrics.reference' is common to all cases"),
     ({"odd": {"world.trials": 2}}, "the key 'world.trials' is common to all cases"),
@@ -282,7 +282,7 @@ def test_cases_that_would_mislead_are_refused(tmp_path: Path, cases: dict, said:
 def test_methods_cannot_take_the_names_of_groups_of_results(system: str, tmp_path: Path) -> None:
     processor = SCENES[system]["processor"]
     for name in ("truth", "estimate"):
-        with pytest.raises(ConfigError, match=f"processor.{name}: a group of the results has this name"):
+        with pytest.raises(ConfigError, match=f"processor.{name}: a method cannot have this name"):
             loaded_as(tmp_path, system, processor={**processor, name: processor["recommended"]})
 
 

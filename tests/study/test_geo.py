@@ -177,7 +177,7 @@ def test_theory_follows_its_formulas(tmp_path: Path) -> None:
 def test_a_sweep_follows_one_target(tmp_path: Path) -> None:
     grid = {"world.noise.raw_scnr_db": [0.0]}
     loaded = loaded_as(tmp_path, "geo", sweep=grid)
-    with pytest.raises(ConfigError, match="a sweep follows one target, and there are slow, fast"):
+    with pytest.raises(ConfigError, match="world.targets must have a single target in a sweep, got slow, fast"):
         sweep_grid(loaded, SweepTrial(loaded))
     both = {**grid, "world.noise.snr_db": [0.0]}
     loaded = loaded_as(tmp_path, "geo", sweep=both, world=world("geo", targets=ALONE, noise={}))

@@ -57,10 +57,10 @@ DENSE = points([0.0, 0.02], [1.5, 1.55])
 MISTAKES = [
     # of every system
     ("isal", {"metrics": {"reference": "sca"}}, "name a method with 'input: clean'"),
-    ("sal", {"beyond_limits": ["segmentd"]}, "beyond_limits names the method 'segmentd'"),
+    ("sal", {"beyond_limits": ["segmentd"]}, "beyond_limits names 'segmentd', which is no method"),
     ("stripmap", {"world": world("stripmap", squint_deg=1.0)}, "both give the direction of the beam"),
     ("stripmap", {"world": world("stripmap", doppler_hz=None, squint_deg=90.0)}, "between -90 and 90 degrees"),
-    ("stripmap", {"world": world("stripmap", lines=1)}, "at least 2 lines of 2 samples"),
+    ("stripmap", {"world": world("stripmap", lines=1)}, "at least one scene, 2 lines and 2 samples"),
     ("stripmap", alone({"stage": "omega_k", "doppler_hz": [1.0, 2.0]}), "doppler_hz' has the value [1.0, 2.0]"),
     ("stripmap", alone({"stage": "compress_dechirped"}), "needs radar.pulse_s"),
     # isal
@@ -219,8 +219,12 @@ MISTAKES = [
     ("geo", {"radar": radar("geo", prf_hz=0.0)}, "prf_hz"),
     ("geo", {"radar": radar("geo", reference_range_m=2000.0)}, "height_m must lie in 0..reference_range_m"),
     ("geo", {"world": world("geo", noise={"snr_db": 0.0, "raw_scnr_db": 0.0})}, "both set the level of the targets"),
-    ("geo", {"world": world("geo", noise={"scr_db": 0.0})}, "noise.scr_db is a signal-to-clutter ratio"),
-    ("geo", {"world": world("geo", sea={"kind": "k_sea"}, noise={})}, "the level of the sea is relative to the noise"),
+    ("geo", {"world": world("geo", noise={"scr_db": 0.0})}, "noise.scr_db, a signal-to-clutter ratio, needs world.sea"),
+    (
+        "geo",
+        {"world": world("geo", sea={"kind": "k_sea"}, noise={})},
+        "must be given with world.sea, whose level is relative to the noise",
+    ),
     ("geo", {"world": world("geo", targets={"p": {"range_m": 10.0}})}, "azimuth-only data (null) have a single range"),
     ("geo", {"world": world("geo", targets={"p": {"u_a_m_s": 300.0}})}, "speed past the fastest target is 0 m/s"),
     ("geo", {"world": world("geo", pulses=600)}, "record is 3.333 s, and must be at least 4.5 s"),
@@ -361,4 +365,4 @@ def test_an_unknown_system_is_named(tmp_path: Path) -> None:
 def test_a_sweep_has_no_cases(system: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = write(tmp_path, system, cases={"quiet": {"seed": 30}}, sweep={"precision": ["complex64"], "trials": 1})
     assert main(["sweep", config, "--out", str(tmp_path / "sweep")]) == 2
-    assert "cases belong to runs" in capsys.readouterr().err
+    assert "cases cannot be used in a sweep" in capsys.readouterr().err

@@ -65,7 +65,7 @@ def test_addresses_stay_when_the_grid_grows_or_is_reordered() -> None:
         ({"trial": [1]}, [], "names a dimension"),
         ({"a": ["x"]}, ["a"], "finite numbers"),
         ({"a": [float("nan")]}, [], "a holds the value nan"),
-        ({"a": [1]}, ["b"], "batched names 'b'"),
+        ({"a": [1]}, ["b"], "batched lists 'b'"),
     ],
 )
 def test_bad_grids_are_refused_by_name(grid: dict, batched: list, said: str) -> None:
@@ -202,7 +202,7 @@ def test_what_a_trial_does_wrong_is_named_with_its_position(result, said: str) -
 
 
 def test_other_algorithms_in_the_middle_are_refused() -> None:
-    with pytest.raises(ConfigError, match="algorithm 'b', those before it of a"):
+    with pytest.raises(ConfigError, match="algorithm 'b', but earlier trials of a;"):
         sweep(lambda p, d: {p["law"]: {"m": torch.zeros(len(d.trials))}}, {"law": ["a", "b"]}, trials=2)
 
 
@@ -298,8 +298,8 @@ def test_trials_and_values_can_be_added(tmp_path: Path) -> None:
     [
         ({"seed": 6}, "seed was 5 and is 6"),
         ({"config": {"world": {"lines": 65}}}, "config.world.lines was 64 and is 65"),
-        ({"grid": {"snr_db": [0.0]}}, "holds a sweep over snr_db, law, not over snr_db"),
-        ({"grid": {"snr_db": [0.0], "law": {"flat": "tilted"}}}, "where law 'flat' is"),
+        ({"grid": {"snr_db": [0.0]}}, "holds a sweep over the parameters snr_db, law, and this sweep is over snr_db;"),
+        ({"grid": {"snr_db": [0.0], "law": {"flat": "tilted"}}}, "in which 'flat' of the parameter law stands for"),
     ],
 )
 def test_resuming_another_sweep_is_refused_with_what_differs(tmp_path: Path, change: dict, said: str) -> None:
@@ -400,5 +400,5 @@ def test_trials_that_came_out_otherwise_are_named(reference: Record) -> None:
     ]
     assert found[0].values[1] - found[0].values[0] == pytest.approx(0.5)
     assert differences(reference, reference, 0.0) == []
-    with pytest.raises(ConfigError, match="different sweeps"):
+    with pytest.raises(ConfigError, match="must have the same algorithms and parameter values"):
         differences(reference, reference.select({"snr_db": (0.0,), "law": ("flat",)}), 0.0)

@@ -50,7 +50,7 @@ def run(out: Path | None = None, function: Any = trial, **options: Any):
     [
         ([1, 2], "must be a mapping of names"),
         ({"a": np.float64(3)}, "must be a list of values"),
-        ({"a": [10**400]}, "names nothing"),
+        ({"a": [10**400]}, "cannot be a label of results"),
         ({"a": {float("nan"): 3}}, "holds the value nan"),
         ({"a": {"x": object()}}, "differs between processes"),
         ({"done": [1]}, "cannot be called 'done'"),
@@ -131,7 +131,7 @@ def test_unusual_names_are_kept(name: str, tmp_path: Path) -> None:
 
 
 def test_an_algorithm_that_disappears_is_missed() -> None:
-    with pytest.raises(ConfigError, match="results of x alone, those before it of x, y"):
+    with pytest.raises(ConfigError, match="results of x alone, but earlier trials of x, y"):
         run(
             function=lambda p, d: {
                 "x": {"m": level(len(d.trials))},
@@ -153,7 +153,7 @@ def test_halves_of_a_batch_may_give_other_metrics_but_not_other_algorithms() -> 
     record = run(function=halved(lambda t: {"x": {"m": level(1), **({"late": level(1)} if t == 2 else {})}}), chunk=4)
     np.testing.assert_array_equal(np.isfinite(record.metrics["late"][0, 0]), [False, False, True, False])
     assert record.ok.all()
-    with pytest.raises(ConfigError, match="the algorithm 'y', those before it of x"):
+    with pytest.raises(ConfigError, match="the algorithm 'y', but earlier trials of x"):
         run(function=halved(lambda t: {"xy"[t > 1]: {"m": level(1)}}), chunk=4)
 
 
@@ -189,7 +189,7 @@ def test_half_precision_images_are_kept(tmp_path: Path) -> None:
         ({"workers": 0}, "workers must be a whole number of at least 1, got 0"),
         ({"threads": 0}, "threads must be a whole number"),
         ({"device": None}, "device None cannot be used"),
-        ({"stop": Stop("ok", 0.1)}, "stop.metric names 'ok', which no trial gives"),
+        ({"stop": Stop("ok", 0.1)}, "stop.metric names 'ok', which is no metric of the trials"),
     ],
 )
 def test_impossible_settings_are_refused(options: dict, said: str) -> None:
@@ -199,7 +199,7 @@ def test_impossible_settings_are_refused(options: dict, said: str) -> None:
 
 @pytest.mark.parametrize("numbers", [[99], [-1], "01", [True]])
 def test_trials_to_keep_are_trials_of_the_sweep(numbers: Any, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="a point has the trials 0 to 3"):
+    with pytest.raises(ConfigError, match="save must list numbers of trials, which are 0 to 3"):
         run(tmp_path / "s", save=numbers)
     assert not (tmp_path / "s").exists()
 
@@ -321,7 +321,7 @@ def test_what_cannot_be_sent_is_a_sentence() -> None:
     pytest.importorskip("cloudpickle")
     lock = threading.Lock()
     _refuse_unsendable(Work(lambda p, d: {}, make_grid({}), 1))
-    with pytest.raises(ConfigError, match="cannot be sent to other processes .*lock"):
+    with pytest.raises(ConfigError, match="cannot be sent to worker processes .*lock"):
         _refuse_unsendable(Work(lambda p, d: {"m": lock}, make_grid({}), 1))
 
 
@@ -352,10 +352,10 @@ def test_workers_that_do_not_start_are_a_sentence(monkeypatch: pytest.MonkeyPatc
 @pytest.mark.parametrize(
     "settings, said",
     [
-        ({"success": {"ok": 1.0}}, "sweep.success names 'ok', which no trial gives"),
-        ({"show": ["ok"]}, "sweep.show names 'ok', which no trial gives"),
+        ({"success": {"ok": 1.0}}, "sweep.success names 'ok', which is no metric of the trials"),
+        ({"show": ["ok"]}, "sweep.show names 'ok', which is no metric of the trials"),
         ({"success": {"entropy_nats": -1.0}}, "greater than or equal to 0"),
-        ({"save": {"trials": [2]}}, "a point has the trials 0 to 1"),
+        ({"save": {"trials": [2]}}, "save must list numbers of trials, which are 0 to 1"),
         ({"world.beam.dwell_s": [0.2, -0.1, 0.3]}, "got -0.1"),
         ({"trials": 10**13}, "do not fit into memory"),
     ],
@@ -383,7 +383,7 @@ def test_a_method_may_not_have_the_name_of_the_bounds(tmp_path: Path, capsys: py
         sweep={"world.noise.snr_db": [20.0], "trials": 1},
     )
     assert main(["sweep", str(config), "--out", str(tmp_path / "s")]) == 2
-    assert "processor.bounds: in a sweep this name is taken" in capsys.readouterr().err
+    assert "processor.bounds: a method of a sweep cannot have this name" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

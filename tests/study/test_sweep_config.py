@@ -161,7 +161,7 @@ def test_a_recording_cannot_be_swept(load_tree, tmp_path: Path) -> None:
     rest = {key: value for key, value in TINY.items() if key not in ("world", "radar")}
     (tmp_path / "raw.npz").touch()
     recorded = load_tree({**rest, "data": {"file": str(tmp_path / "raw.npz")}, "sweep": SWEEP})
-    with pytest.raises(ConfigError, match="a sweep simulates its trials"):
+    with pytest.raises(ConfigError, match="data.file cannot be used in a sweep"):
         sweep_grid(recorded, SweepTrial(recorded))
 
 

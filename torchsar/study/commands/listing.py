@@ -1,4 +1,6 @@
-"""`torchsar list`: systems, stages and parts of worlds with their keys, and the data files."""
+"""The command `torchsar list`: prints what a config may name (systems, stages, scenes and other
+parts of simulated worlds) with the keys of each, and the formats of data files.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ _ARGUMENT = re.compile(r"^ {4}((?:\w+, )*\w+): (.*(?:\n {5,}.*)*)", re.MULTILINE
 
 
 def listing(systems: Mapping[str, System]) -> str:
-    """Return the list of systems, stages, parts of worlds and data files as text."""
+    """Return what `torchsar list` prints: systems, stages and parts of simulated worlds, with their
+    keys, and the formats of data files.
+    """
     lines = ["", "SYSTEMS (the key `system` of a config; a number marked * may differ from trial to trial)"]
     for name, system in systems.items():
         lines.append(f"  {name:<26}{system.about}")

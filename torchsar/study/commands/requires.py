@@ -1,4 +1,6 @@
-"""`torchsar requires`: requirements of a scene on models and methods, without processing it."""
+"""The command `torchsar requires`: predicts for a scene, without processing it, which limits of
+methods it exceeds, what simplified models neglect, and which alternatives suffice.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,7 @@ FILES = ("config.yaml", "requires.json", "requires.txt")
 
 
 def requires(loaded: Loaded, out: Path, device: str = "cpu") -> str:
-    """Write limits, neglected phases and recommended choices of every case into a folder.
+    """Write the limits of methods, neglected phases and recommended choices of each case to files.
 
     Args:
         loaded: The config.
@@ -93,7 +95,7 @@ def refuse_beyond_limits(bench: Bench, case: str) -> None:
     """Check the limits of the methods of a case, and log a warning for each limit that is exceeded.
 
     Args:
-        bench: Bench of the case.
+        bench: Bench of the case: its radar, world and chains.
         case: Name of the case.
 
     Raises:
@@ -132,7 +134,7 @@ def _text(name: str, tree: Mapping[str, Any]) -> str:
 
 
 def aligned(rows: Sequence[Sequence[str]], right: Collection[int] = ()) -> list[str]:
-    """Return the lines of a table; the columns with the numbers in `right` are aligned right."""
+    """Return the lines of a table as text; `right` lists the indices of right-aligned columns."""
     wide = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [[x.rjust(w) if i in right else x.ljust(w) for i, (x, w) in enumerate(zip(row, wide))] for row in rows]
     return ["  ".join(line).rstrip() for line in lines]

@@ -1,4 +1,4 @@
-"""`torchsar run`: every method on every case, with its report."""
+"""The command `torchsar run`: runs every method of a config on every case and writes a report."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _LISTED = 16
 
 
 def run(loaded: Loaded, out: Path, command: str = "torchsar run", device: str = "cpu") -> Path:
-    """Run every method on every case and write the result into a folder.
+    """Run every method of a config on each of its cases, and write the result into a folder.
 
     Args:
         loaded: The config.
@@ -168,7 +168,7 @@ def metrics_tree(loaded: Loaded, results: Mapping[str, Result]) -> dict[str, Any
 
     Args:
         loaded: The config.
-        results: Results by case; `metrics` of a method are those of the first case.
+        results: Results by case. The entry `metrics` of a method is that of the first case.
     """
     first = next(iter(results.values()))
     methods = {name: _method_tree(method.title, name, results) for name, method in loaded.config.processor.items()}

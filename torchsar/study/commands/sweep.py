@@ -1,4 +1,4 @@
-"""`torchsar sweep`: a Monte Carlo sweep, from config to report."""
+"""The command `torchsar sweep`: runs the Monte Carlo sweep of a config and writes a report."""
 
 from __future__ import annotations
 
@@ -37,11 +37,12 @@ _FIXED = ("sweep", "seed", "data", "title", "trade", "system", "cases")
 
 
 class SweepTrial:
-    """The trial function of a config: simulates, runs and judges one batch of a sweep.
+    """Trial function of a config: it simulates a batch of trials, runs every method on them, and
+    returns their metrics.
 
     Args:
         loaded: The config.
-        device: Where batches are computed.
+        device: Device on which batches are computed.
     """
 
     def __init__(self, loaded: Loaded, device: str = "cpu") -> None:
@@ -58,14 +59,14 @@ class SweepTrial:
         return section == "world" and self.loaded.system.may_differ(rest, self.loaded.config.world)
 
     def bench(self, fixed: Mapping[str, Any]) -> Bench:
-        """The bench of a case of the grid, built once."""
+        """Return the bench (radar, world and chains) of a case of the grid; it is built once."""
         key = repr(fixed)
         if key not in self._benches:
             self._benches[key] = Bench(self.loaded.changed(fixed), self.device)
         return self._benches[key]
 
     def bytes_per_trial(self, fixed: Mapping[str, Any]) -> int:
-        """Bytes of the largest tensor of a trial, by which batches are cut."""
+        """Return the size in bytes of the largest tensor of a trial; batch sizes follow from it."""
         return self.bench(fixed).bytes_per_trial
 
     def __call__(self, parameters: Mapping[str, Any], draws: Draws) -> dict[str, Any]:
@@ -99,18 +100,18 @@ def sweep(
     device: str = "cpu",
     command: str = "torchsar sweep",
 ) -> Path:
-    """Run the sweep of a config.
+    """Run the sweep of a config, and write its results and report into a folder.
 
     Args:
         loaded: The config.
         out: The folder: results.zarr grows there while the sweep runs and is never replaced;
             config.yaml, summary.json, figures/ and report.html appear at the end.
         resume: Whether to continue a sweep that is in the folder.
-        workers: Processes of this machine; None computes in this one.
-        cluster: Address of a running dask scheduler instead.
-        threads: Threads of torch in each process.
-        device: Where batches are computed.
-        command: The command, for the report.
+        workers: Number of worker processes on this machine; None to compute in this process.
+        cluster: Address of a running dask scheduler, whose workers are used instead.
+        threads: Number of torch threads in each process.
+        device: Device on which batches are computed.
+        command: Command line that the report shows.
 
     Returns:
         The path of the report.
@@ -144,29 +145,33 @@ def sweep(
         raise Interrupted(f"finished trials are recorded in {out}; go on with --resume") from None
     except OSError as error:
         raise ConfigError(
-            f"{out}: the report cannot be written ({error.strerror or error}); the trials are recorded; make the "
+            f"{out}: the report cannot be written ({error.strerror or error}), but the trials are recorded; make the "
             "report with --resume"
         ) from error
     return out / "report.html"
 
 
 def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
-    """The grid of a config's sweep; every key and value is checked and every case built.
+    """Return the grid of the sweep in a config, after a check of its keys and values.
 
     Raises:
-        ConfigError: If the sweep is invalid.
+        ConfigError: If a key or value is not accepted, or a case of the grid cannot be built.
     """
     given, file = loaded.config.sweep.grid, loaded.file
     if loaded.config.data.file is not None:
-        raise ConfigError(f"{file}: a sweep simulates its trials; give 'radar' and 'world' and no data.file")
+        raise ConfigError(
+            f"{file}: data.file cannot be used in a sweep, which simulates its trials; give 'radar' and 'world' instead"
+        )
     if loaded.config.cases:
         raise ConfigError(
-            f"{file}: cases belong to runs; sweep over the keys that they change, and add cases={{}} to leave them out"
+            f"{file}: cases cannot be used in a sweep; sweep over the keys that they change, and add cases={{}} to "
+            "remove them"
         )
     taken = next((name for name in loaded.config.processor if name in (BOUNDS, SAVED)), None)
     if taken is not None:
         raise ConfigError(
-            f"{file}: processor.{taken}: in a sweep this name is taken by a part of the results; choose another"
+            f"{file}: processor.{taken}: a method of a sweep cannot have this name, which a part of the results has; "
+            "choose another name"
         )
     for key in given:
         if key.split(".")[0] in _FIXED or key == "world.trials":
@@ -193,13 +198,15 @@ def sweep_grid(loaded: Loaded, trial: SweepTrial) -> Grid:
 
 
 def identity(loaded: Loaded) -> dict[str, Any]:
-    """What the results depend on besides the grid: seed and resolved config."""
+    """Return what the results depend on besides the grid: the seed, and all other keys of the
+    config that change results.
+    """
     kept = {key: value for key, value in loaded.config.model_dump().items() if key not in _NOT_IDENTITY}
     return {"seed": loaded.config.seed, "config": kept}
 
 
 def report(record: Record, loaded: Loaded, out: Path, config_text: str, command: str) -> None:
-    """Write config.yaml, summary.json, figures/ and report.html of a record into a folder."""
+    """Write config.yaml, summary.json, figures/ and report.html of a sweep to a folder."""
     titles = {f"method {name}": method.title for name, method in loaded.config.processor.items() if method.title}
     summary = summary_of(record, loaded.config.sweep.success)
     tree = summary.tree(record.about, {"snr": loaded.system.definitions["snr"], **titles})

@@ -1,4 +1,6 @@
-"""`torchsar trade`: what each alternative costs and what it loses, beside an exact yardstick."""
+"""The command `torchsar trade`: measures the computing time of alternative stages, models and
+settings, and the accuracy that each loses relative to an exact one.
+"""
 
 from __future__ import annotations
 
@@ -41,16 +43,16 @@ Row = dict[str, Any]
 
 
 def trade(loaded: Loaded, out: Path, device: str = "cpu") -> str:
-    """Time and loss of the alternatives of the first case, as text.
+    """Measure time and loss of the alternatives for each choice in the first case of a config.
 
-    Every alternative is timed `trade.repeats` times, in turn with the others; its loss is measured
-    against the yardstick at the worst position of the scene. The cheapest alternative whose losses
-    are all within `trade.tolerance` is recommended.
+    Every alternative is timed `trade.repeats` times, in turn with the others. Its loss, by
+    metric, is measured against an exact result at the worst position of the scene. The alternative
+    with the least CPU time among those with all losses within `trade.tolerance` is recommended.
 
     Args:
         loaded: The config.
         out: The folder for config.yaml, trade.json, trade.txt and figures/.
-        device: Where the work is done.
+        device: Device on which the alternatives are run.
 
     Returns:
         The text of trade.txt.
@@ -83,7 +85,10 @@ def trade(loaded: Loaded, out: Path, device: str = "cpu") -> str:
 
 @torch.no_grad()
 def compared(choice: Choice, bench: Bench, tolerance: Mapping[str, float]) -> list[Row]:
-    """The alternatives of one choice, timed and judged, the cheapest acceptable one marked."""
+    """Return times and losses of the alternatives of one choice, one row each.
+
+    The row with the least CPU time among those with acceptable losses is marked as recommended.
+    """
     repeats = bench.config.trade.repeats
     order = [*choice.alternatives, *([] if choice.yardstick is None else [choice.yardstick])]
     names = [f"{choice.name}: {one.name}" for one in order]
@@ -120,7 +125,7 @@ class _Tried:
     failed: str = ""
 
     def again(self) -> None:
-        """One more repeat; the first one measures the loss as well."""
+        """Run the alternative once more; the first run measures its loss as well."""
         try:
             with PeakMemory() as peak:
                 spent, result = _spent(lambda: self.measured.run(self.one), _LEAST_S if self.times else 0.0)
@@ -138,7 +143,7 @@ class _Tried:
             log.info("%s", self._line())
 
     def row(self, tolerance: Mapping[str, float]) -> Row:
-        """The alternative as it stands in trade.json."""
+        """Return the row of the alternative in trade.json."""
         cpu, wall = (statistics.median(part) for part in zip(*self.times)) if self.times else (None, None)
         row = {"name": self.one.name, "neglects": self.one.neglects, "cpu_s": cpu, "wall_s": wall}
         row |= {"peak_bytes": max(self.peaks, default=None), "loss": self.loss, "predicted": self.one.loss}

@@ -1,4 +1,4 @@
-"""Where chunks are computed: in this process, or on workers of dask.distributed."""
+"""Engines of a sweep: they compute batches of trials in this process or in workers of dask."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _UNGUARDED = (
 
 @dataclass(frozen=True)
 class InProcess:
-    """One chunk after the other in this process."""
+    """Engine that computes one chunk (batch of trials) after the other in this process."""
 
     threads: int = 1
     workers: int = 1
@@ -85,8 +85,9 @@ def _on_own_gpu(work: Work, worker: Any) -> Work:
 
 @dataclass(frozen=True)
 class Distributed:
-    """Workers of a dask.distributed client. A chunk whose worker dies is run again on
-    another one.
+    """Engine that computes chunks (batches of trials) in the workers of a dask.distributed client.
+
+    A chunk whose worker process dies is run again by another worker.
     """
 
     client: Any
@@ -135,17 +136,20 @@ def _refuse_unsendable(work: Work) -> None:
         cloudpickle.dumps(work)
     except Exception as error:  # pickling may raise any exception
         raise ConfigError(
-            "the trial function and its grid cannot be sent to other processes "
-            f"({one_line(error)}); make such objects inside the function"
+            "the trial function and its grid cannot be sent to worker processes "
+            f"({one_line(error)}); create what cannot be pickled inside the trial function"
         ) from error
 
 
 def refuse_unguarded() -> None:
-    """Refuse to start workers from a process that is itself a starting worker.
+    """End this process if it is a new worker that would start workers of its own.
 
-    Such a process imports the user's script again; it starts workers only if the script lacks the
-    usual guard. SystemExit ends it with one sentence and without a traceback; the parent process
-    then reports that its workers did not start.
+    A new worker process imports the user's script again. It reaches this function only if the
+    script lacks the usual guard, `if __name__ == "__main__":`. The parent process then reports
+    that its workers did not start.
+
+    Raises:
+        SystemExit: In such a process; it ends with one sentence and without a traceback.
     """
     if getattr(multiprocessing.current_process(), "_inheriting", False):
         raise SystemExit(_UNGUARDED)
@@ -169,17 +173,18 @@ def _after_deaths(chunk: Chunk) -> Iterator[Chunk]:
 
 @contextmanager
 def engine(workers: int | None = None, cluster: str | None = None, threads: int = 1) -> Iterator[Engine]:
-    """Where chunks are computed.
+    """Start the engine that computes the batches of a sweep, and stop it at the end of the block.
 
     Args:
-        workers: Processes of this machine; None computes in this one.
-        cluster: Address of a running scheduler, whose workers are used instead.
-        threads: Threads of torch in each process. One is the default: batches that fit the cache
-            gain nothing from more (two took 1.4 times as long on two cores), and results then do
-            not depend on the number of cores.
+        workers: Number of worker processes on this machine; None to compute in this process.
+        cluster: Address of a running dask scheduler, whose workers are used instead.
+        threads: Number of torch threads in each process. The default is 1, because batches that fit
+            the cache do not gain from more (with 2 threads on 2 cores they took 1.4 times as long),
+            and because results then do not depend on the number of cores.
 
     Raises:
-        ConfigError: If dask.distributed is missing or the address does not answer.
+        ConfigError: If a number is not accepted, both `workers` and `cluster` are given,
+            dask.distributed is not installed, or no scheduler answers at the address.
     """
     for name, value in (("workers", workers), ("threads", threads)):
         if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
@@ -195,7 +200,7 @@ def engine(workers: int | None = None, cluster: str | None = None, threads: int 
         import distributed
     except ImportError:
         raise ConfigError(
-            "several processes need dask.distributed; install the extra: pip install 'torchsar-lab[cluster]'"
+            "workers and cluster need dask.distributed, which is not installed; run pip install 'torchsar-lab[cluster]'"
         ) from None
     local = _local(distributed, workers or 1, threads)
     with local if cluster is None else _remote(distributed, cluster, threads) as chosen:

@@ -1,5 +1,7 @@
-"""The grid of a sweep: named parameters and their values, the points they span, and the address of
-each.
+"""The grid of a sweep: named parameters with their values, and the points, which are the
+combinations of these values.
+
+Each point has an address, a hash of its parameters, from which its random numbers follow.
 """
 
 from __future__ import annotations
@@ -22,14 +24,15 @@ _LONGEST = 200  # bytes: file systems allow 255, and names of bounds and figures
 
 @dataclass(frozen=True)
 class Parameter:
-    """One dimension of a sweep.
+    """One parameter of a sweep with its values, which are one dimension of the grid.
 
     Args:
-        name: Its name.
+        name: Name of the parameter.
         labels: Numbers or words that name the values in results.
-        values: The values that are passed to the trial.
-        batched: Whether the trial gets the values as one tensor with an entry per row, so that one
-            batch may hold several of them; otherwise each value is a case of its own.
+        values: The values that are passed to the trial function.
+        batched: Whether the trial function gets the values as a tensor with one entry per trial of
+            a batch, so that a batch may hold several values; otherwise all trials of a batch have
+            the same value.
     """
 
     name: str
@@ -40,7 +43,9 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Point:
-    """One point of the grid: index along every parameter, and the address of its random numbers."""
+    """One point of the grid: its index along every parameter, and the hash of its parameters, from
+    which its random numbers follow.
+    """
 
     index: tuple[int, ...]
     address: str
@@ -48,7 +53,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Case:
-    """The points that may share a batch: they differ in batched parameters alone."""
+    """Points of the grid whose trials may share a batch: only their batched parameters differ."""
 
     fixed: Mapping[str, Any]
     points: tuple[Point, ...]
@@ -56,7 +61,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Grid:
-    """The product of its parameters, the last one running fastest."""
+    """All combinations of the values of the parameters; the last parameter runs fastest."""
 
     parameters: tuple[Parameter, ...]
 
@@ -69,14 +74,14 @@ class Grid:
         return {p.name: p.labels for p in self.parameters}
 
     def points(self) -> list[Point]:
-        """Every point; its address depends on its names and values alone."""
+        """Return every point. Its address depends only on names and values of its parameters."""
         return [
             Point(index, address({p.name: p.values[i] for p, i in zip(self.parameters, index)}))
             for index in itertools.product(*map(range, self.shape))
         ]
 
     def cases(self) -> list[Case]:
-        """The points in groups of equal fixed parameters, in the order of the grid."""
+        """Return the points in groups with equal values of all parameters that are not batched."""
         groups: dict[tuple[int, ...], list[Point]] = {}
         for point in self.points():
             groups.setdefault(tuple(i for p, i in zip(self.parameters, point.index) if not p.batched), []).append(point)
@@ -91,14 +96,15 @@ class Grid:
 
 
 def address(parameters: Mapping[str, Any]) -> str:
-    """A hash of parameters by name: equal parameters give equal random numbers in every grid, in
-    any order.
+    """Return a hash of the names and values of parameters, in whatever order they are given.
+
+    The random numbers of a point follow from it, so that they are the same in every grid.
     """
     return hashlib.blake2b(canonical(parameters).encode(), digest_size=12).hexdigest()
 
 
 def canonical(tree: Any) -> str:
-    """One text for one content: keys sorted, 20 and 20.0 alike."""
+    """Return a text that is equal for equal content: keys are sorted, and 20 and 20.0 are alike."""
     return json.dumps(_plain(tree), sort_keys=True, separators=(",", ":"))
 
 
@@ -118,16 +124,18 @@ def _plain(x: Any) -> Any:
 def make_grid(
     values: Mapping[str, Sequence[Any] | Mapping[str, Any]], batched: Sequence[str] = (), where: str = "grid"
 ) -> Grid:
-    """A grid from the values of every parameter.
+    """Return the grid of all combinations of the values of some parameters.
 
     Args:
-        values: {name: values}, or {name: {label: value}} if they are neither numbers nor words.
-        batched: Names whose values the trial gets as tensors with an entry per row.
+        values: {name: values}, or {name: {label: value}} for values that are neither numbers nor
+            words.
+        batched: Names of the parameters whose values the trial function gets as tensors with one
+            entry per trial of a batch.
         where: Beginning of error messages.
 
     Raises:
         ConfigError: If a parameter has no values, a value is given twice, a name is reserved, or a
-            batched parameter is not a number.
+            value of a batched parameter is not a number.
     """
     if not isinstance(values, Mapping):
         raise ConfigError(f"{where} must be a mapping of names to lists of values, got {values!r}")
@@ -135,13 +143,15 @@ def make_grid(
         raise ConfigError(f"{where}: batched must be a list of names, got {batched!r}; write [{batched!r}]")
     unknown = next((name for name in batched if name not in values), None)
     if unknown is not None:
-        known = ", ".join(values) or "it has none"
-        raise ConfigError(f"{where}: batched names {unknown!r}, which is not a parameter of the grid ({known})")
+        known = ", ".join(values) or "none"
+        raise ConfigError(
+            f"{where}: batched lists {unknown!r}, which is not a parameter of the grid (parameters: {known})"
+        )
     return Grid(tuple(_parameter(name, given, name in batched, f"{where}: {name}") for name, given in values.items()))
 
 
 def check_name(name: Any, taken: Sequence[str], where: str, kind: str) -> None:
-    """Refuse a name under which the store could not keep an array: each is a folder of its own.
+    """Check that an array of this name can be kept in the store, where each array is a folder.
 
     Args:
         name: The name.
@@ -184,17 +194,17 @@ def _parameter(name: str, given: Any, batched: bool, where: str) -> Parameter:
         (not values, "has no values; give at least one"),
         (
             nameless is not None,
-            f"holds {nameless!r}, whose text differs between processes, and random numbers depend on it; give numbers, "
-            "words, lists, mappings or dataclasses",
+            f"holds {nameless!r}, whose repr() differs between processes, so that random numbers would differ as well; "
+            "give numbers, words, lists, mappings or dataclasses",
         ),
         (twice is not None, f"holds {twice} twice; give each value once"),
         (
             len({isinstance(label, str) for label in labels}) > 1,
-            "mixes numbers and words; name all of its values: {label: value, ...}",
+            "mixes numbers and words; give every value a label of one kind: {label: value, ...}",
         ),
         (
             batched and not all(map(_is_number, values)),
-            f"becomes a tensor with an entry per trial, so its values must be finite numbers, got {list(values)}",
+            f"is passed as a tensor with one entry per trial, so its values must be finite numbers, got {list(values)}",
         ),
     ):
         if wrong:
@@ -214,4 +224,6 @@ def _label(value: Any, where: str) -> float | str:
         return value
     if value is None or isinstance(value, (bool, list, tuple)):
         return canonical(value)
-    raise ConfigError(f"{where} holds the value {value!r}, which names nothing; write {{label: value, ...}}")
+    raise ConfigError(
+        f"{where} holds the value {value!r}, which cannot be a label of results; write {{label: value, ...}}"
+    )

@@ -38,21 +38,24 @@ class Interrupted(KeyboardInterrupt):
 
 @dataclass(frozen=True)
 class Stop:
-    """Ends a point when half of the 95 % interval of a statistic is small against the statistic.
+    """Criterion that ends the trials of a grid point once a statistic is known precisely enough.
 
-    Points are checked after 50, 100, 200, 400, ... trials in the order of their numbers, and
-    never in between; every algorithm that has the metric must meet the criterion. An rmse that is
-    dominated by rare outliers may meet it before the first outlier: with one error in a hundred
-    100 times as large and relative = 0.19, four points of ten end at 50 trials without one. Below
-    a threshold SNR take the median, or a smaller relative (0.1 takes 100 trials or more).
+    It is met when half the width of the 95 % confidence interval of the statistic is less than
+    `relative` times the magnitude of the statistic, for every algorithm that has the metric. Points
+    are checked after their first 50, 100, 200, 400, ... trials, and never in between.
+
+    An rmse that is dominated by rare outliers may meet the criterion before the first outlier. For
+    example, if one error in 100 is 100 times as large as the others and `relative` is 0.19, four
+    points of ten end at 50 trials without an outlier. Below a threshold SNR choose the median, or a
+    smaller `relative` (0.1 takes 100 trials or more).
 
     Args:
-        metric: The metric.
-        relative: Largest half width over the statistic.
+        metric: Name of the metric.
+        relative: Ratio of half the width of the interval to the statistic, between 0 and 1.
         statistic: "rmse", "mean" or "median".
 
     Raises:
-        ConfigError: If one of them is impossible.
+        ConfigError: If `relative` or `statistic` is not one of the accepted values.
     """
 
     metric: str
@@ -66,34 +69,37 @@ class Stop:
             raise ConfigError(f"stop.relative must lie between 0 and 1, got {self.relative!r}")
 
     def reached(self, record: Record, point: tuple[int, ...], trials: int, seed: int) -> bool:
-        """Whether the first `trials` trials of a point meet the criterion."""
+        """Return whether the first `trials` trials of a point meet the criterion."""
         values = record.metrics[self.metric][(slice(None), *point, slice(0, trials))]
         values = values[np.isfinite(values).any(-1)]
         return bool(len(values)) and bool((half_width_ratio(values, self.statistic, seed) < self.relative).all())
 
 
 def looks(trials: int, stop: Stop | None) -> list[int]:
-    """Numbers of trials after which points are checked; the last is the limit."""
+    """Return the numbers of trials after which points are checked for an early end by `stop`.
+
+    The last is the largest number of trials; without `stop` it is the only one.
+    """
     levels = [FIRST_LOOK << i for i in range(trials.bit_length()) if stop is not None]
     return [*(level for level in levels if level < trials), trials]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The work of a sweep.
+    """What a sweep computes.
 
     Args:
-        grid: The points.
-        trials: Trials of each point.
-        seed: Of all random numbers.
-        chunk: Rows of a batch, None to choose by bytes.
-        stop: Criterion that ends points early.
-        save: Trials whose arrays are kept.
-        device: Where batches are computed.
-        needs: Metrics that the trial must give, each with the key that names it.
+        grid: The points, which are combinations of values of the parameters.
+        trials: Number of trials of each point; with `stop` the largest number.
+        seed: Seed of all random numbers.
+        chunk: Number of trials of a batch; None to choose it by the memory that a trial needs.
+        stop: Criterion that ends the trials of a point early; None for no early end.
+        save: Numbers of the trials whose arrays are kept.
+        device: Device on which batches are computed.
+        needs: (key of the config, metric) of each metric that the trial function must return.
 
     Raises:
-        ConfigError: If a number or the device is impossible.
+        ConfigError: If a number is out of range, or the device cannot be used.
     """
 
     grid: Grid
@@ -112,8 +118,7 @@ class Plan:
         absent = next((t for t in self.save if type(t) is not int or not 0 <= t < self.trials), None)
         if absent is not None:
             raise ConfigError(
-                f"sweep: save names trial {absent!r}, and a point has the trials 0 to {self.trials - 1}; name some of "
-                "these"
+                f"sweep: save must list numbers of trials, which are 0 to {self.trials - 1}, got {absent!r}"
             )
         try:
             torch.empty(0, device=torch.device(self.device))
@@ -126,16 +131,18 @@ class Plan:
         return Work(trial, self.grid, self.seed, self.device, self.save)
 
     def refuse_missing(self, trial: Trial) -> None:
-        """Refuse needed metrics that the first trial, computed here, does not give.
+        """Compute the first trial, and check that it returns every metric in `needs`.
 
         Raises:
-            ConfigError: If there is one; it names the first.
+            ConfigError: If a metric is missing; the message names the first one.
         """
         parts = self.work(trial).compute(Chunk(0, (0,), (0,))).parts if self.needs else []
         given = {metric for part in parts for metrics in part.values.values() for metric in metrics if metric != OK}
         for where, metric in self.needs:
             if metric not in given:
-                raise ConfigError(f"{where} names {metric!r}, which no trial gives{did_you_mean(metric, given)}")
+                raise ConfigError(
+                    f"{where} names {metric!r}, which is no metric of the trials{did_you_mean(metric, given)}"
+                )
 
 
 def sweep(
@@ -158,36 +165,41 @@ def sweep(
 ) -> Record:
     """Run a trial function over a grid of parameters, many trials at once.
 
-    Random numbers depend on (seed, purpose, parameters, trial) alone.
+    The random numbers of a trial depend only on the seed, their purpose, the parameters of the grid
+    point and the number of the trial; batches and processes do not change them.
 
     Args:
-        trial: Gets the parameters of a batch by name, and `Draws` whose trials are the rows of that
-            batch. Returns {metric: (rows,) tensor}, or {algorithm: {metric: tensor}} to compare
-            algorithms on the same noise; `ok` (bool) says whether the estimate is reliable. Two
-            further keys: "bounds" {metric: {name: (rows,) tensor}}, and "saved" {algorithm: {name:
-            (rows, ...) tensor}}, kept for the trials in `save`.
-        grid: {name: values}, or {name: {label: value}} if they are neither numbers nor words.
-        trials: Trials of each point; more of them on a finished sweep extend it.
-        seed: Of all random numbers.
-        batched: Names whose values come as one float64 tensor (rows,); any other value comes as it
-            is, one case after the other.
+        trial: Function of (parameters, draws), called for a batch of trials, one per row. It gets
+            the parameters by name, and `Draws` with the random numbers of the rows. It returns
+            {metric: (rows,) tensor}, or {algorithm: {metric: tensor}} to compare algorithms on the
+            same noise. The metric `ok` (bool) says whether an estimate is reliable. Two further
+            keys are optional: "bounds", {metric: {name: (rows,) tensor}}, and "saved",
+            {algorithm: {name: (rows, ...) tensor}}, arrays that are kept for the trials in `save`.
+        grid: {name: values} of each parameter, or {name: {label: value}} for values that are
+            neither numbers nor words.
+        trials: Number of trials of each point. With `resume`, a larger number extends a finished
+            sweep.
+        seed: Seed of all random numbers.
+        batched: Names of the parameters that `trial` gets as float64 tensors (rows,). A batch has
+            one value of any other parameter, which is passed unchanged.
         out: Folder for results.zarr; None keeps the results in memory only.
         resume: Whether to continue a sweep that is in the folder.
-        chunk: Rows of a batch; None to choose by bytes.
-        workers: Processes of this machine; None computes in this one.
-        cluster: Address of a running dask scheduler instead.
-        threads: Threads of torch in each process.
-        stop: Ends points early.
-        save: Trials whose arrays are kept.
-        device: Where batches are computed.
-        config: All else that the results depend on; a sweep is resumed only with the same one.
+        chunk: Number of trials of a batch; None to choose it by the memory that a trial needs.
+        workers: Number of worker processes on this machine; None to compute in this process.
+        cluster: Address of a running dask scheduler, whose workers are used instead.
+        threads: Number of torch threads in each process.
+        stop: Criterion that ends the trials of a point early; None for no early end.
+        save: Numbers of the trials whose arrays are kept.
+        device: Device on which batches are computed.
+        config: Everything else that the results depend on; a sweep is resumed only if it is
+            unchanged.
 
     Returns:
-        The labelled results.
+        The results, with the dims (algorithm, *parameters, trial).
 
     Raises:
         ConfigError: If an argument is invalid, or the trial function fails.
-        Interrupted: After Ctrl-C.
+        Interrupted: After Ctrl-C; finished trials are recorded in `out`, if that is given.
     """
     if workers is not None:
         refuse_unguarded()
@@ -200,7 +212,7 @@ def sweep(
         if not good:
             raise ConfigError(f"sweep: {name} must {expected}, got {given!r}")
     if out is None and set(save):
-        raise ConfigError("sweep: save keeps arrays in the folder of the sweep; give out as well")
+        raise ConfigError("sweep: save needs the folder out, in which the arrays are kept; give out as well")
     needs = () if stop is None else (("stop.metric", stop.metric),)
     plan = Plan(make_grid(grid, batched), trials, seed, chunk, stop, frozenset(save), device, needs)
     plan.refuse_missing(trial)
@@ -212,12 +224,13 @@ def sweep(
 
 
 def open_store(folder: ResultFolder, plan: Plan, identity: Mapping[str, Any], resume: bool) -> Store:
-    """The file results.zarr of a sweep: a new one, or with `resume` the one that is there.
+    """Open results.zarr in the folder of a sweep: with `resume` the existing store, else a new one.
 
-    A sweep that ended before its first mark holds nothing to lose and is begun anew.
+    A new store may replace an existing one in which no trial is marked as done.
 
     Raises:
-        ConfigError: If results would be lost, or the store that is there belongs to another sweep.
+        ConfigError: If a new store would replace results, or the existing one belongs to another
+            sweep.
     """
     path = folder.path / "results.zarr"
     there = path.exists() and not (folder.claimed and cut_off(path))
@@ -233,19 +246,19 @@ def open_store(folder: ResultFolder, plan: Plan, identity: Mapping[str, Any], re
 
 
 def run_plan(plan: Plan, trial: Trial, store: Store | None, engine: AbstractContextManager[Engine]) -> Record:
-    """Compute what is missing.
+    """Compute the trials of a plan that the store does not hold yet.
 
     Args:
         plan: What to compute.
-        trial: The trial function.
-        store: Where results are kept; None keeps them in memory only.
-        engine: Where chunks are computed.
+        trial: The trial function; see `sweep`.
+        store: Store in which results are kept; None keeps them in memory only.
+        engine: Context manager of the engine that computes batches.
 
     Returns:
-        The whole record, which may hold more labels than the plan's grid after a resume.
+        All results. After a resume they may include parameter values beyond the grid of the plan.
 
     Raises:
-        Interrupted: After Ctrl-C.
+        Interrupted: After Ctrl-C; finished trials are in the store, if there is one.
     """
     record = empty(plan.grid.labels, plan.trials) if store is None else store.record
     run = _Run(plan, plan.work(trial), record, store)
@@ -272,7 +285,10 @@ class _Run:
         self.warned: set[str] = set()
 
     def all_levels(self, engine: Engine) -> None:
-        """Compute all trials level by level; points may end early after each level."""
+        """Compute all trials in steps, after each of which points are checked for an early end.
+
+        A point that meets the criterion of the plan gets no further trials.
+        """
         stops = looks(self.plan.trials, self.plan.stop)
         known = (n for n in self.record.about.get("finished", []) if n < self.plan.trials)
         levels = sorted({*stops, *known})

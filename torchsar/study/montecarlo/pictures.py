@@ -1,4 +1,4 @@
-"""Figures of a sweep, drawn from its summary alone."""
+"""Pictures of a sweep, drawn from its summary alone."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ def _value_text(name: str, label: float | str) -> str:
 
 @dataclass(frozen=True)
 class Quantity:
-    """A figure of a metric that is drawn.
+    """A statistic of a metric that is drawn, such as its RMSE.
 
     Args:
-        metric: Its name.
-        field: The field of its figures.
-        interval: The field of the interval.
-        title: What is drawn, for titles.
-        label: The same with the unit, for axes.
-        log: Whether its axis is logarithmic.
+        metric: Name of the metric.
+        field: Key of the statistic in `Summary.figures[metric]`, such as "rmse".
+        interval: Key of the confidence interval of the statistic.
+        title: Name of the statistic in titles.
+        label: Name of the statistic with its unit, for axes.
+        log: Whether the axis is logarithmic.
     """
 
     metric: str
@@ -57,17 +57,17 @@ class Quantity:
 
 
 def share(metric: str, name: str, title: str) -> Quantity:
-    """A share of trials, whose title needs no unit."""
+    """Return a share of trials as a quantity without a unit."""
     return Quantity(metric, f"{name}_share", f"{name}_interval", title, title)
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One position along the parameters that are not axes of a figure.
+    """One panel of a figure: a choice of values of the parameters that are not its axes.
 
     Args:
-        title: The values of these parameters.
-        index: Index by parameter.
+        title: These values as text.
+        index: Index of the value of each parameter, by name.
     """
 
     title: str
@@ -75,10 +75,10 @@ class Panel:
 
 
 class SweepPictures:
-    """Draws the figures of a sweep.
+    """Draws the pictures of a sweep.
 
     Args:
-        summary: The figures of the sweep.
+        summary: Statistics and bounds of the metrics of the sweep.
     """
 
     def __init__(self, summary: Summary) -> None:
@@ -90,7 +90,7 @@ class SweepPictures:
         self.fixed = {name: 0 for name in self.labels if name not in several}
 
     def order(self, name: str) -> np.ndarray:
-        """Indices that sort a parameter's numbers; words stay as they are."""
+        """Return the indices that sort the values of a parameter; words keep their order."""
         labels = self.labels[name]
         return np.arange(len(labels)) if isinstance(labels[0], str) else np.argsort(np.asarray(labels, dtype=float))
 
@@ -99,19 +99,21 @@ class SweepPictures:
         return [self.labels[name][i] for i in self.order(name)]
 
     def cut(self, array: np.ndarray, panel: Panel, over: str, lead: int = 1) -> np.ndarray:
-        """The part of an array along one sorted parameter, the others at the panel's position.
+        """Return an array along one parameter, with the values of the others that a panel shows.
 
         Args:
-            array: (..., *parameters, ...).
-            panel: The position.
-            over: The parameter; none for an array at one position.
-            lead: Dims before the parameters.
+            array: Array of shape (..., *parameters, ...).
+            panel: The panel.
+            over: Name of the parameter, whose values are sorted; empty for a single point.
+            lead: Number of dims before those of the parameters.
         """
         index = tuple(self.order(name) if name == over else panel.index[name] for name in self.labels)
         return array[(slice(None),) * lead + index]
 
     def all(self, wanted: Sequence[str]) -> Drawn:
-        """Curves, success and heat maps of each metric; last the shares of trusted trials."""
+        """Yield the pictures of each metric (curves, share of successes, heat maps), and last the
+        share of trials that the algorithms call reliable.
+        """
         for metric in wanted:
             fields, (name, unit) = self.figures[metric], name_and_unit(metric)
             quantity = main_quantity(metric, bool(self.bounds.get(metric)))
@@ -126,7 +128,10 @@ class SweepPictures:
             yield from self.curves(share(next(iter(self.figures)), "ok", "share of trusted trials"))
 
     def curves(self, quantity: Quantity) -> Drawn:
-        """Over every parameter with two numbers or more; without any, over words."""
+        """Yield curves over each parameter with at least two numeric values.
+
+        Without such a parameter, the curves are over the parameter of words with the most values.
+        """
         if not np.isfinite(self.values(quantity)).any():
             return
         longest = max(self.worded, key=lambda name: len(self.labels[name]), default="")
@@ -143,11 +148,11 @@ class SweepPictures:
                 yield name + end, quantity.title + along + page, self.caption(quantity) + note, figure
 
     def values(self, quantity: Quantity) -> np.ndarray:
-        """What is drawn, (algorithm, *parameters)."""
+        """Return the values that are drawn, (algorithm, *parameters)."""
         return self.figures[quantity.metric][quantity.field]
 
     def part(self, quantity: Quantity, panel: Panel, over: str) -> dict[str, Any]:
-        """Every algorithm along one parameter, or side by side if there is none."""
+        """Return the data of a panel: each algorithm over one parameter, or all side by side."""
         fields = self.figures[quantity.metric]
         y, interval = (self.cut(fields[name], panel, over) for name in (quantity.field, quantity.interval))
         bounds = self.bounds.get(quantity.metric, {}) if quantity.log else {}
@@ -161,24 +166,30 @@ class SweepPictures:
         return {"title": panel.title, "x": x, "series": series, "bounds": bounds}
 
     def has_positive(self, quantity: Quantity) -> bool:
-        """Whether the axis is logarithmic and some value can be shown on it."""
+        """Return whether the axis is logarithmic and at least one value is positive."""
         return quantity.log and bool((self.values(quantity) > 0).any())
 
     def is_log(self, over: str) -> bool:
-        """Positive numbers over two decades and more, unless they are logarithms themselves."""
+        """Return whether the axis of a parameter is logarithmic.
+
+        It is, if the values are positive, span at least two decades and are not in dB.
+        """
         if over not in self.numeric or over.endswith("_db"):
             return False
         values = np.asarray(self.labels[over], dtype=float)
         return bool((values > 0).all() and values.max() >= 100 * values.min())
 
     def panels_beside(self, over: Collection[str]) -> tuple[list[Panel], str]:
-        """A panel for every position along the other parameters, words first.
+        """Return a panel for each combination of values of the parameters that are not axes.
 
-        Beyond six panels each other parameter of numbers shows its first, middle and last value,
-        then first and last, then the middle one.
+        If these are more than six panels, numeric parameters are reduced to their first, middle and
+        last values; if that is not enough, to the first and last, or to the middle one.
+
+        Args:
+            over: Names of the parameters that are axes.
 
         Returns:
-            The panels, and a sentence on what is left out or fixed.
+            The panels, and sentences about values that are left out and parameters with one value.
         """
         others = [name for name in (*self.worded, *self.numeric) if name not in over]
         chosen, positions = {}, []
@@ -201,7 +212,7 @@ class SweepPictures:
         return ", ".join(_value_text(name, self.labels[name][i]) for name, i in index.items())
 
     def caption(self, quantity: Quantity) -> str:
-        """What the picture shows, with the level of the interval and the number of trials."""
+        """Return a caption with what is drawn, the confidence level and the number of trials."""
         trials = self.trials(quantity.metric)
         if quantity.is_share:
             more = ", right or wrong" if quantity.field == "ok_share" else "; within: the error is at most the limit"
@@ -227,7 +238,10 @@ class SweepPictures:
         return f"{many} trials a point" if few == many else f"{few} to {many} trials a point"
 
     def heat_maps(self, quantity: Quantity, x: str, y: str) -> Drawn:
-        """One panel for each algorithm and position; all pages share one colour scale."""
+        """Yield heat maps of a statistic over the parameters `x` and `y`, on one colour scale.
+
+        There is a panel for each algorithm and each combination of the other parameters.
+        """
         values, log = self.values(quantity), self.has_positive(quantity)
         known = values[np.isfinite(values) & ((values > 0) | (not log))]
         if not known.size:
@@ -245,7 +259,7 @@ class SweepPictures:
             yield name, f"{quantity.title} over {name_and_unit(x)[0]} and {name_and_unit(y)[0]}{page}", caption, figure
 
     def map_part(self, values: np.ndarray, panel: Panel, x: str, y: str, algorithm: str) -> dict[str, Any]:
-        """One panel of a heat map; values: (*parameters)."""
+        """Return one panel of a heat map, for the values (*parameters) of one algorithm."""
         names = list(self.labels)
         z = np.moveaxis(values, (names.index(y), names.index(x)), (0, 1))
         z = z[(slice(None), slice(None), *(panel.index[name] for name in names if name not in (x, y)))]
@@ -255,11 +269,14 @@ class SweepPictures:
 
 
 def main_quantity(metric: str, bounded: bool = False) -> Quantity:
-    """RMSE on a logarithmic axis for errors about zero; the median of everything else.
+    """Return the statistic of a metric that is drawn, with its kind of axis.
+
+    It is the RMSE on a logarithmic axis for a metric with "error" in its name, unless that is a
+    ratio in dB, and the median for any other metric.
 
     Args:
-        metric: Its name; errors that are ratios in dB are no errors about zero.
-        bounded: Whether it has bounds, which make a logarithmic axis useful by themselves.
+        metric: Name of the metric.
+        bounded: Whether the metric has lower bounds; the axis of a median is then logarithmic.
     """
     name, label = name_and_unit(metric)[0], axis_label(metric)
     if "error" in metric and not metric.endswith("_db"):
@@ -279,13 +296,16 @@ def _paged(panels: Sequence[Panel], size: int) -> Iterator[tuple[str, Sequence[P
 
 
 def draw_sweep(summary: Summary, folder: Path, show: Sequence[str] = ()) -> list[Picture]:
-    """The pictures of a sweep as PNG files in a new folder, in the order of reading.
+    """Draw the pictures of a sweep, and write them as PNG files in a new folder.
 
     Args:
-        summary: The figures of the sweep.
-        folder: Where to write.
-        show: The metrics to draw, in this order; by default the errors, and where nothing is called
-            an error everything that was measured.
+        summary: Statistics and bounds of the metrics of the sweep.
+        folder: The folder.
+        show: Names of the metrics that are drawn, in this order. If empty, these are the metrics
+            with "error" in their names, or all metrics if there are none.
+
+    Returns:
+        The pictures, in the order of the report.
     """
     wanted = show or [metric for metric in summary.figures if "error" in metric] or list(summary.figures)
     return draw_all([lambda: SweepPictures(summary).all(wanted)], folder)

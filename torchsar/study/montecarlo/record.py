@@ -1,4 +1,4 @@
-"""Results of a sweep in memory, as labelled arrays with trials last, and how two of them differ."""
+"""Results of a sweep in memory, as labelled arrays with trials last, and their comparison."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ class Record:
     """Results of a sweep. A trial that has not run is NaN in every metric and False in `done`.
 
     Args:
-        algorithms: Names, along the first dim of metrics.
-        labels: Values of every parameter, numbers or words, in the order of the dims.
+        algorithms: Names of the algorithms, along the first dim of `ok` and of the metrics.
+        labels: Values of each parameter by name, numbers or words, in the order of the dims.
         done: Which trials have run, bool (*parameters, trial); points that ended early have fewer
             than others.
         ok: Whether each estimate is reliable, bool (algorithm, *parameters, trial).
-        metrics: By name, float64 of the same shape as `ok`.
-        bounds: By metric and name of the bound, float64 (*parameters, trial).
+        metrics: Metrics by name, float64 (algorithm, *parameters, trial).
+        bounds: Lower bounds by metric and name of the bound, float64 (*parameters, trial).
         about: Title, resolved config, hash, seed, versions, device and timings of the run.
     """
 
@@ -48,7 +48,9 @@ class Record:
         return ("algorithm", *self.labels, "trial")
 
     def blank(self, by_algorithm: bool = True) -> np.ndarray:
-        """An array of NaN with the dims of a metric, or those of a bound."""
+        """Return an array of NaN with the shape of a metric, (algorithm, *parameters, trial), or of
+        a bound, (*parameters, trial).
+        """
         return np.full(self.ok.shape if by_algorithm else self.done.shape, np.nan)
 
     def index_of(self, labels: Mapping[str, float | str]) -> tuple[int, ...]:
@@ -62,16 +64,18 @@ class Record:
         values: Mapping[str, Mapping[str, Sequence[float]]],
         bounds: Mapping[str, Mapping[str, Sequence[float]]],
     ) -> None:
-        """Enter rows.
+        """Enter the results of some trials, one per row, and mark these trials as done.
 
         Args:
-            points: Index of the point of each row.
+            points: Index of the grid point of each row.
             trials: Trial number of each row.
-            values: By algorithm and metric, (rows,); without `ok` every trial counts as reliable.
-            bounds: By metric and name, (rows,).
+            values: Metrics by algorithm and name, (rows,) each; without the metric `ok` every trial
+                counts as reliable.
+            bounds: Lower bounds by metric and name of the bound, (rows,) each.
 
         Raises:
-            ConfigError: If the algorithms are not those of the rows before, or a name is taken.
+            ConfigError: If the algorithms differ from those of earlier trials, or the name of a
+                metric or bound cannot be used.
         """
         if not self.algorithms:
             self.algorithms, self.ok = tuple(values), np.zeros((len(values), *self.done.shape), bool)
@@ -79,8 +83,8 @@ class Record:
             new = next((repr(a) for a in values if a not in self.algorithms), None)
             gave = f"{', '.join(values)} alone" if new is None else f"the algorithm {new}"
             raise ConfigError(
-                f"a trial gave results of {gave}, those before it of {', '.join(self.algorithms)}; return the same "
-                "algorithms in every trial"
+                f"a trial returned results of {gave}, but earlier trials of {', '.join(self.algorithms)}; return the "
+                "same algorithms in every trial"
             )
         indices = zip(*((*point, trial) for point, trial in zip(points, trials)))
         rows = np.ravel_multi_index(tuple(indices), self.done.shape)
@@ -104,7 +108,7 @@ class Record:
         return known[name]
 
     def variables(self) -> dict[str, tuple[np.ndarray, tuple[str, ...], dict[str, str]]]:
-        """Every array of results by its name in the store: data, dims, and what it is."""
+        """Return every array of results by its name in the store, as (data, dims, attributes)."""
         found = {OK: (self.ok, self.dims, {"kind": OK})}
         found |= {name: (x, self.dims, {"kind": "metric"}) for name, x in self.metrics.items()}
         for metric, named in self.bounds.items():
@@ -114,11 +118,14 @@ class Record:
         return found
 
     def grown(self, labels: Labels, trials: int) -> Record:
-        """The same results in larger arrays: labels begin with those of this record."""
+        """Return the results in larger arrays, for more parameter values or more trials.
+
+        For each parameter, the given labels must begin with those of this record.
+        """
         return self._mapped(lambda x: _enlarged(x, (*map(len, labels.values()), trials)), labels)
 
     def select(self, labels: Labels) -> Record:
-        """The part of these labels, in their order."""
+        """Return the results of the given parameter values, in the order given."""
         index = [[self.labels[name].index(label) for label in wanted] for name, wanted in labels.items()]
         every = range(self.trials)
         return self._mapped(lambda x: x[np.ix_(*map(range, x.shape[: x.ndim - self.done.ndim]), *index, every)], labels)
@@ -135,9 +142,9 @@ class Record:
         )
 
     def to_xarray(self) -> Any:
-        """An xarray.Dataset with the dims (algorithm, *parameters, trial).
+        """Return the results as an xarray.Dataset with the dims (algorithm, *parameters, trial).
 
-        Bounds have the attributes `bound_of` and `bound`.
+        The array of a bound has the attributes `bound_of`, its metric, and `bound`, its name.
 
         Raises:
             ImportError: If the extra `xarray` is not installed.
@@ -145,7 +152,9 @@ class Record:
         try:
             import xarray
         except ImportError:
-            raise ImportError("labelled reading needs xarray: pip install 'torchsar-lab[xarray]'") from None
+            raise ImportError(
+                "to_xarray needs xarray, which is not installed; run pip install 'torchsar-lab[xarray]'"
+            ) from None
         coordinates = {"algorithm": self.algorithms, **self.labels, "trial": range(self.trials)}
         return xarray.Dataset(
             {"done": (self.dims[1:], self.done), **{name: (d, x, a) for name, (x, d, a) in self.variables().items()}},
@@ -154,8 +163,8 @@ class Record:
 
 
 def bound_name(metric: str, bound: str) -> str:
-    """Name of a bound's array: 'doppler_error_hz' and 'Cramer-Rao bound' give
-    doppler_error_hz_bound_cramer_rao_bound.
+    """Return the name of the array of a bound: the metric 'doppler_error_hz' and the bound
+    'Cramer-Rao bound' give 'doppler_error_hz_bound_cramer_rao_bound'.
     """
     return f"{metric}_bound_{''.join(c if c.isalnum() else '_' for c in bound.lower())}"
 
@@ -168,7 +177,7 @@ def _enlarged(x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Difference:
-    """One trial of one algorithm that differs between two records."""
+    """A trial of one algorithm in which two records have different values of a metric."""
 
     metric: str
     algorithm: str
@@ -178,25 +187,26 @@ class Difference:
 
 
 def differences(a: Record, b: Record, tolerance: float) -> list[Difference]:
-    """Trials that both records hold and that differ.
+    """Return the trials that both records hold and in which a metric or `ok` differs.
 
-    Two runs in batches of other sizes or with other threads differ by rounding alone, except in
-    trials in which a choice (a peak, a candidate, an end of iterations) depends on less than that;
-    those are found here. Errors are compared on the scale of the largest error of their metric and
-    point, since an error is a small difference of two large numbers.
+    Two runs with different batch sizes or numbers of threads differ only by rounding, except in
+    trials in which rounding changes a decision (the choice of a peak or the end of an iteration).
+    This function finds such trials. An error is a small difference of two large numbers, so that
+    metrics with "error" in their names are compared relative to the largest error of the point.
 
     Args:
         a: The one record.
         b: The other record.
-        tolerance: Largest difference of a metric over the larger magnitude; `ok` must be equal.
+        tolerance: Largest accepted difference of a metric, relative to the larger of the two
+            magnitudes; `ok` must be equal.
 
     Raises:
-        ConfigError: If the records are not of one grid.
+        ConfigError: If the records differ in their algorithms or parameter values.
     """
     if a.labels != b.labels or a.algorithms != b.algorithms:
         raise ConfigError(
-            f"records of different sweeps cannot be compared: {a.algorithms} over {a.labels} and "
-            f"{b.algorithms} over {b.labels}"
+            f"the two records must have the same algorithms and parameter values, got {a.algorithms} over {a.labels} "
+            f"and {b.algorithms} over {b.labels}"
         )
     n = min(a.trials, b.trials)
     both = a.done[..., :n] & b.done[..., :n]

@@ -26,7 +26,7 @@ def write_sweep_report(
     Args:
         path: Where to write it.
         tree: The content of summary.json.
-        pictures: In the order of reading.
+        pictures: Pictures in the order in which they are shown.
         figures: The folder that holds them.
         config_text: The resolved config.
         command: The command that made it.
@@ -38,13 +38,17 @@ def write_sweep_report(
 
 
 def with_interval(value: float | None, interval: Sequence[float | None]) -> str:
-    """'1.234 [1.100, 1.400]', without brackets where there is no interval."""
+    """Return a value with its interval, as '1.234 [1.100, 1.400]'; without one, the value alone."""
     low, high = map(number, interval)
     return number(value) if MISSING in (low, high) else f"{number(value)} [{low}, {high}]"
 
 
 def facts(tree: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """(value, what it is): trials, points, algorithms, time and rate, over all sessions."""
+    """Return (value, name) of the numbers at the top of the report.
+
+    They are the numbers of trials, points and algorithms, and the computing time and the trials per
+    second over all sessions.
+    """
     done = {tuple(point["parameters"].values()): point["trials"] for point in tree["points"]}
     few, many = min(done.values(), default=0), max(done.values(), default=0)
     sessions = tree["about"].get("sessions", [])
@@ -60,7 +64,7 @@ def facts(tree: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def metric_tables(tree: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """One table a metric: title, columns and rows of text."""
+    """Return a table for each metric, with title, columns and rows of text."""
     grouped: dict[str, list[Mapping[str, Any]]] = {}
     for point in tree["points"]:
         grouped.setdefault(point["metric"], []).append(point)
@@ -98,7 +102,7 @@ def bound_tables(tree: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def origin(about: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Names and text of seed, hash, versions and device, and of every session."""
+    """Yield (name, text) of seed and hash of the sweep, and of device and versions by session."""
     sessions = about.get("sessions", [])
     trees = [(f"session {i}: " if len(sessions) > 1 else "", session) for i, session in enumerate(sessions, 1)]
     for before, tree in [("", about), *trees]:

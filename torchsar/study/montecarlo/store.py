@@ -1,9 +1,8 @@
-"""The store of a sweep: labelled arrays in zarr version 3, and markers of what is done, written
-last.
+"""The store of a sweep: labelled arrays in zarr version 3, and marks of the trials that are done.
 
-One process writes, and every file of a zarr store is replaced whole. A sweep that is killed at any
-moment therefore leaves arrays that may hold more than is marked done, never less; trials that are
-not marked are ignored and computed again.
+One process writes, every file of a zarr store is replaced as a whole, and the marks are written
+last. If a sweep is killed, its arrays may therefore hold more trials than are marked as done, but
+never fewer. Trials that are not marked are ignored and computed again.
 """
 
 from __future__ import annotations
@@ -38,13 +37,13 @@ class Store:
     """results.zarr of one sweep, open for writing; made by `create` or `resume`.
 
     Root attributes: format, identity and hash (what the results depend on), labels and values of
-    the parameters, algorithms, trials, about, sessions. Arrays: one a metric, `ok`, one a bound,
-    the coordinates. Group `done`: by index of the point, the ranges of trials that are recorded.
-    Group `saved`: images and taps of chosen trials.
+    the parameters, algorithms, trials, about, sessions. Arrays: one for each metric, `ok`, one for
+    each bound, and the coordinates. Group `done`: for each point, by its index, the ranges of
+    trials that are recorded. Group `saved`: images and outputs of stages for chosen trials.
 
     Args:
-        root: The group.
-        record: Its content.
+        root: The open zarr group.
+        record: The same results in memory.
     """
 
     def __init__(self, root: zarr.Group, record: Record) -> None:
@@ -58,7 +57,7 @@ class Store:
 
     @classmethod
     def create(cls, path: Path, grid: Grid, trials: int, identity: Mapping[str, Any]) -> Store:
-        """A new store.
+        """Create a new store for the results of a sweep, and return it.
 
         Raises:
             ConfigError: If the folder cannot be written.
@@ -71,10 +70,10 @@ class Store:
 
     @classmethod
     def resume(cls, path: Path, grid: Grid, trials: int, identity: Mapping[str, Any]) -> Store:
-        """The existing store, enlarged for new labels and trials.
+        """Open an existing store, and enlarge it for new values of parameters and more trials.
 
         Raises:
-            ConfigError: If it belongs to another config.
+            ConfigError: If the store has the results of another config, or is damaged.
         """
         root = _opened(path, "r+")
         _refuse_another(path, _attributes(root), _plain(identity), _values(grid))
@@ -104,29 +103,33 @@ class Store:
 
     @property
     def due(self) -> bool:
-        """Whether writing costs less than half a percent of the time since the last writing, or
-        too many arrays wait for it.
+        """Whether results should be written now.
+
+        This is so if writing takes less than 0.5 % of the time since the results were last written,
+        or if the saved arrays of 64 trials wait to be written.
         """
         waited = time.perf_counter() - self._last
         return waited > self._cost / _SHARE_FOR_WRITING or len(self._pending) >= _WAITING
 
     def entered(self, points: Iterable[tuple[int, ...]], trials: Iterable[int]) -> None:
-        """Rows have entered the record, to be written by the next `flush`.
+        """Note trials whose results are new in the record; the next `flush` writes them.
 
         Args:
-            points: Index of the point of each row.
-            trials: Trial number of each row.
+            points: Index of the grid point of each trial.
+            trials: Number of each trial at its point.
         """
         self._dirty.update(zip(points, trials))
 
     def save(self, labels: Mapping[str, float | str], trial: int, arrays: Mapping[str, np.ndarray]) -> None:
-        """Keep arrays of one trial, to be written before it is marked done."""
+        """Keep arrays of a trial until the next `flush`, which writes them and then marks the trial
+        as done.
+        """
         self._pending.append((f"{address(labels)}/{trial}", {"parameters": dict(labels), "trial": trial}, dict(arrays)))
 
     def flush(self) -> None:
-        """Write what has entered the record, then mark it done, in one file.
+        """Write the new results, and then mark their trials as done, by writing a single file.
 
-        The names of algorithms and arrays are written after the arrays and before the marks, so
+        The names of algorithms and arrays are written after the arrays and before these marks, so
         that a reader finds every array that is named.
         """
         if not self._dirty:
@@ -196,10 +199,10 @@ class Store:
 
 
 def empty(labels: Labels, trials: int) -> Record:
-    """A record in which nothing has run.
+    """Return a record without results, in which no trial is marked as done.
 
     Raises:
-        ConfigError: If it does not fit into memory.
+        ConfigError: If its arrays do not fit into memory.
     """
     shape = (*map(len, labels.values()), trials)
     try:
@@ -212,10 +215,16 @@ def empty(labels: Labels, trials: int) -> Record:
 
 
 def read_sweep(path: Path | str) -> Record:
-    """The record in a results.zarr, or in the folder of a sweep, finished or not.
+    """Read the results of a sweep, finished or not.
+
+    Args:
+        path: Path of results.zarr, or of the folder of the sweep that has this file.
+
+    Returns:
+        The results, with trials that have not run as NaN.
 
     Raises:
-        ConfigError: If there is none.
+        ConfigError: If there are no results, or they are damaged or of another version.
     """
     path = Path(path) / "results.zarr" if (Path(path) / "results.zarr").exists() else Path(path)
     return _loaded(_opened(path, "r"), path)
@@ -249,8 +258,8 @@ def _writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise ConfigError(
-            f"{path} cannot be written ({error.strerror or error}); trials that are marked done are "
-            "safe; go on with --resume once the folder can be written"
+            f"{path} cannot be written ({error.strerror or error}), but finished trials are kept; go on with "
+            "--resume once the folder can be written"
         ) from error
 
 
@@ -316,22 +325,23 @@ def _refuse_another(
     was = held["values"]
     if list(was) != list(values):
         raise ConfigError(
-            f"{path} holds a sweep over {', '.join(was) or 'nothing'}, not over "
-            f"{', '.join(values) or 'nothing'}; choose another folder for the other sweep"
+            f"{path} holds a sweep over the parameters {', '.join(was) or '(none)'}, and this sweep is over "
+            f"{', '.join(values) or '(none)'}; choose another folder for this sweep"
         )
     for name, named in values.items():
         for label, value in named.items():
             if was[name].get(label, value) != value:
                 raise ConfigError(
-                    f"{path} holds a sweep where {name} {label!r} is {_short(was[name][label])}, "
-                    f"and now it is {_short(value)}; give the new value a name of its own"
+                    f"{path} holds a sweep in which {label!r} of the parameter {name} stands for "
+                    f"{_short(was[name][label])}, and now it stands for {_short(value)}; give the new value "
+                    "another label"
                 )
     differing = list(_differences(held["identity"], identity))
     if differing:
         more = f", and {len(differing) - 3} more" if len(differing) > 3 else ""
         raise ConfigError(
-            f"{path} holds a sweep of another config ({address(held['identity'])}, now {address(identity)}): "
-            f"{'; '.join(differing[:3])}{more}; choose another folder, or set these back"
+            f"{path} holds a sweep of another config (hash {address(held['identity'])}, now {address(identity)}): "
+            f"{', '.join(differing[:3])}{more}; choose another folder, or give these keys their earlier values"
         )
 
 

@@ -1,4 +1,4 @@
-"""The summary of a sweep: every figure that is printed or drawn, as arrays and as summary.json."""
+"""The summary of a sweep: all statistics that reports show, as arrays and as summary.json."""
 
 from __future__ import annotations
 
@@ -43,11 +43,12 @@ class Summary:
     """Statistics of the metrics of a sweep, and their bounds.
 
     Args:
-        algorithms: Names, along the first dim of figures.
-        labels: Values of every parameter, in the order of the dims.
-        figures: Arrays of shape (algorithm, *parameters) for each metric and statistic; confidence
-            intervals have one more dimension of 2.
-        bounds: Root-mean-square value of each bound of each metric, shape (*parameters).
+        algorithms: Names of the algorithms, along the first dim of the arrays in `figures`.
+        labels: Values of each parameter by name, in the order of the dims.
+        figures: Statistics by metric and name, arrays (algorithm, *parameters); confidence
+            intervals have a last dim of 2 for their lower and upper end.
+        bounds: Lower bounds by metric and name of the bound, each as the root mean square over
+            trials, shape (*parameters).
     """
 
     algorithms: tuple[str, ...]
@@ -56,16 +57,16 @@ class Summary:
     bounds: Mapping[str, Mapping[str, np.ndarray]]
 
     def points(self) -> Iterator[tuple[tuple[int, ...], dict[str, float | str]]]:
-        """Index and labels of every point of the grid, the last parameter running fastest."""
+        """Yield index and labels of every point of the grid; the last parameter runs fastest."""
         for index in itertools.product(*(range(len(labels)) for labels in self.labels.values())):
             yield index, {name: labels[i] for (name, labels), i in zip(self.labels.items(), index)}
 
     def tree(self, about: Mapping[str, Any], definitions: Mapping[str, str]) -> dict[str, Any]:
-        """The content of summary.json; what is unknown is NaN (null in the file).
+        """Return the content of summary.json; unknown numbers are NaN, and null in the file.
 
         Args:
-            about: Title and description of the run.
-            definitions: Added to those made here.
+            about: Title and description of the sweep, as in `Record.about`.
+            definitions: Definitions of terms, in addition to those of the statistics.
         """
         points = [
             {"algorithm": algorithm, "parameters": parameters, "metric": metric}
@@ -94,11 +95,11 @@ class Summary:
 
 
 def summary_of(record: Record, success: Mapping[str, float]) -> Summary:
-    """The figures of a record.
+    """Return the statistics and bounds of the metrics of a sweep.
 
     Args:
-        record: The results; `record.about` holds the seed.
-        success: Metric -> largest magnitude that counts as success.
+        record: The results; `record.about` holds the seed, also for the bootstrap of intervals.
+        success: For each metric, the largest magnitude that counts as a success.
     """
     done = record.done[None]
     trials = {"trials": np.broadcast_to(done.sum(-1), record.ok.shape[:-1]), **_shares(record.ok, done, "ok")}

@@ -1,4 +1,4 @@
-"""Chunks of a sweep: how many trials run at once, and how a chunk is computed in any process."""
+"""Chunks of a sweep, which are batches of trials: their sizes, and how a process computes them."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ _GPU_SHARE, _LIVE_TENSORS = 0.5, 12
 
 @dataclass(frozen=True)
 class Chunk:
-    """Rows that run as one batch.
+    """Trials that run as one batch, one per row.
 
     Args:
-        case: Number of the case that all rows belong to.
+        case: Number of the case, the group of grid points that may share a batch.
         points: Number of the point of each row within the case.
         trials: Trial number of each row.
     """
@@ -50,7 +50,7 @@ class Chunk:
         return len(self.trials)
 
     def pieces(self, rows: int) -> Iterator[Chunk]:
-        """The same rows in as few and as equal pieces of at most `rows` as there can be."""
+        """Yield the rows in as few pieces of at most `rows` rows as possible, nearly equal."""
         count = -(-len(self) // rows)
         edges = [round(i * len(self) / count) for i in range(count + 1)]
         for first, last in pairwise(edges):
@@ -59,13 +59,13 @@ class Chunk:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Results of one batch.
+    """Results of one batch of trials.
 
     Args:
-        chunk: Its rows.
-        values: By algorithm and metric, (rows,).
-        bounds: By metric and name, (rows,).
-        saved: Arrays by row and "algorithm.name".
+        chunk: The trials, one per row.
+        values: Metrics by algorithm and name, (rows,) each.
+        bounds: Lower bounds by metric and name of the bound, (rows,) each.
+        saved: Arrays that are kept, by row and "algorithm.name".
     """
 
     chunk: Chunk
@@ -76,12 +76,12 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Computed:
-    """Results of a chunk.
+    """Results of a chunk of trials, which is run in smaller batches where memory is short.
 
     Args:
-        parts: Results of the batches that it was run in.
-        fits: The largest batch that fits into memory, None if no batch was too large.
-        warnings: What the trials logged as warnings.
+        parts: Results of each batch in which it was run.
+        fits: Largest number of trials that fit into memory, None if no batch was too large.
+        warnings: Warnings that the trials logged.
     """
 
     parts: list[Outcome]
@@ -104,7 +104,7 @@ class Work:
         return tuple(self.grid.cases())
 
     def compute(self, chunk: Chunk, fits: int | None = None) -> Computed:
-        """Run a chunk in batches of at most `fits` rows; one too large for the memory is halved.
+        """Run a chunk in batches of at most `fits` trials; halve batches that exceed the memory.
 
         Raises:
             ConfigError: If the trial function fails.
@@ -141,7 +141,7 @@ class Work:
             torch.cuda.empty_cache()
 
     def parameters(self, chunk: Chunk) -> dict[str, Any]:
-        """Parameters of the trial: fixed values as they are, batched ones as (rows,) float64."""
+        """Return the parameters of the trials: batched ones as float64 (rows,), others as given."""
         given, indices = dict[str, Any](), [self.cases[chunk.case].points[p].index for p in chunk.points]
         for dim, parameter in enumerate(self.grid.parameters):
             rows = [parameter.values[index[dim]] for index in indices]
@@ -269,9 +269,9 @@ class _Largest(TorchDispatchMode):
 
 
 def probed_bytes(work: Work, case: int) -> int:
-    """Bytes of the largest tensor of one trial, found by running it once.
+    """Return the size in bytes of the largest tensor of one trial, found by running one trial.
 
-    A trial function with a method `bytes_per_trial(fixed)` is asked instead.
+    If the trial function has a method `bytes_per_trial(fixed)`, the result of this is used instead.
     """
     known = getattr(work.trial, "bytes_per_trial", None)
     if known is not None:
@@ -282,12 +282,12 @@ def probed_bytes(work: Work, case: int) -> int:
 
 
 def rows_by_bytes(bytes_per_trial: int, device: str) -> int:
-    """Trials of a batch.
+    """Return the number of trials in a batch, chosen by the memory.
 
     Args:
-        bytes_per_trial: Bytes of the largest tensor of one trial.
-        device: On a CPU, that tensor of the whole batch fills CACHE_BYTES; on a GPU, about a dozen
-            of them fill half of the free memory.
+        bytes_per_trial: Size in bytes of the largest tensor of one trial.
+        device: Device of the batch. On a CPU, this tensor for the whole batch takes at most 12 MiB,
+            the size of a cache; on a GPU, 12 such tensors take at most half of the free memory.
     """
     if torch.device(device).type == "cuda":
         free, _ = torch.cuda.mem_get_info(device)
@@ -296,10 +296,10 @@ def rows_by_bytes(bytes_per_trial: int, device: str) -> int:
 
 
 def cut(case: int, whole: Case, active: set[int], first: int, last: int, rows: int) -> Iterator[Chunk]:
-    """Chunks of at most `rows` rows: trials first..last-1 of the active points, point by point.
+    """Yield chunks of at most `rows` trials: the trials `first` to `last` - 1 of each active point.
 
-    The cuts depend on these arguments alone, not on the trials already done, so that a resumed
-    sweep runs the same batches.
+    The division depends only on these arguments and not on the trials already done, so that a
+    resumed sweep runs the same batches.
     """
     order = [(p, t) for p in range(len(whole.points)) if p in active for t in range(first, last)]
     if order:

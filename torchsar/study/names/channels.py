@@ -1,4 +1,4 @@
-"""Factories for the stages of `torchsar.multichannel` from plain keys."""
+"""Factories that build the stages of `torchsar.multichannel` from plain keys of a config."""
 
 from __future__ import annotations
 
@@ -58,13 +58,14 @@ def migration_correct(
     whole_swath: bool = True,
     range_m: float | None = None,
 ) -> CorrectMigration:
-    """Correction of range migration by deramp, keystone and reramp, by a shift of each pulse, or no
-    correction.
+    """Correction of range migration in the data of several channels.
 
     Args:
-        kind: "keystone", "static_bulk", or "none" for no correction.
+        kind: "keystone" for deramp, keystone transform and reramp; "static_bulk" for a shift of
+            each pulse along range; "none" for no correction.
         whole_swath: Whether the correction varies with the range over the swath.
-        range_m: Closest range of data without a range axis in m; None for that of the radar.
+        range_m: Closest range of a target in m, for data without a range axis; None for the
+            reference range of the radar.
     """
     kinds = {"keystone": Keystone(whole_swath), "static_bulk": StaticBulk(whole_swath), "none": NoMigration()}
     return CorrectMigration(radar, kinds[kind], range_m)
@@ -78,15 +79,17 @@ def rebuild_bands(
     snr_db: float = 40.0,
     range_m: float | None = None,
 ) -> Reconstruct:
-    """Reconstruction of the full Doppler band from the channels, for the velocities given.
+    """Reconstruction of the full Doppler band of a target with given velocities from the channels.
 
     Args:
         bands: Number of Doppler bands, each as wide as the PRF, that are separated.
-        method: "least_squares", or "mmse" if the matrix of the channels may be singular.
-        band_hz: Doppler band of the flat spectrum that "mmse" assumes, in Hz; None for the spectrum
-            by the pattern of the elements.
+        method: Reconstruction of the bands: "least_squares", or "mmse" (minimum mean-square error),
+            which is also defined where the matrix of the channels is singular.
+        band_hz: Width in Hz of the flat Doppler spectrum that "mmse" assumes; None for the spectrum
+            by the antenna pattern of the channels.
         snr_db: Signal-to-noise ratio that "mmse" assumes, in dB.
-        range_m: Closest range of data without a range axis in m; None for that of the radar.
+        range_m: Closest range of a target in m, for data without a range axis; None for the
+            reference range of the radar.
     """
     return Reconstruct(radar, _rebuild(bands, method, band_hz, snr_db), range_m)
 
@@ -94,11 +97,11 @@ def rebuild_bands(
 def channel_balance(
     radar: BistaticRadar, band_hz: float | None = None, bands: int = 5, delays: bool = True
 ) -> EstimateBalance:
-    """Estimator of phase, gain and delay of the channels from clutter at rest.
+    """Estimator of phase, gain and delay errors of the channels from stationary clutter.
 
     Args:
-        band_hz: Doppler band of the flat spectrum of the clutter in Hz; None for the spectrum by
-            the pattern of the elements.
+        band_hz: Width in Hz of the flat Doppler spectrum of the clutter; None for the spectrum by
+            the antenna pattern of the channels.
         bands: Number of Doppler bands of the clutter, each as wide as the PRF.
         delays: Whether delays are estimated as well.
     """
@@ -106,12 +109,14 @@ def channel_balance(
 
 
 def interferometry(radar: BistaticRadar, dwell_s: float | None = None, range_m: float | None = None) -> Interferometry:
-    """Estimator of u_r by along-track interferometry, for the u_a given.
+    """Estimator of the slant-range speed u_r of a target, with a given along-track speed u_a, by
+    along-track interferometry.
 
     Args:
-        dwell_s: Time during which the beam illuminates a target, in s; None for the time within the
-            pattern of the elements.
-        range_m: Closest range of data without a range axis in m; None for that of the radar.
+        dwell_s: Time in s for which a target is illuminated; None for illumination by the antenna
+            pattern of the channels.
+        range_m: Closest range of a target in m, for data without a range axis; None for the
+            reference range of the radar.
     """
     return Interferometry(radar, _aperture(dwell_s), range_m)
 
@@ -119,13 +124,15 @@ def interferometry(radar: BistaticRadar, dwell_s: float | None = None, range_m: 
 def along_track_autofocus(
     radar: BistaticRadar, dwell_s: float | None = None, half_m_s: float = 20.0, range_m: float | None = None
 ) -> AlongTrackAutofocus:
-    """Estimator of u_a by the power of the deramped tone.
+    """Estimator of the along-track speed u_a of a target, whose deramped echo has most power as a
+    tone at the true speed.
 
     Args:
-        dwell_s: Time during which the beam illuminates a target, in s; None for the time within the
-            pattern of the elements.
-        half_m_s: Half width of the search interval of u_a in m/s.
-        range_m: Closest range of data without a range axis in m; None for that of the radar.
+        dwell_s: Time in s for which a target is illuminated; None for illumination by the antenna
+            pattern of the channels.
+        half_m_s: Half width of the search interval of u_a about 0, in m/s.
+        range_m: Closest range of a target in m, for data without a range axis; None for the
+            reference range of the radar.
     """
     return AlongTrackAutofocus(radar, _aperture(dwell_s), range_m, half_m_s)
 
@@ -136,13 +143,16 @@ def likelihood_velocity(
     unknowns: tuple[Unknown, ...] = ("u_r_m_s", "u_a_m_s", "y0_m"),
     range_m: float | None = None,
 ) -> LikelihoodVelocity:
-    """Maximum-likelihood estimator of the unknowns near the values given, by Gauss-Newton steps.
+    """Maximum-likelihood estimator of the motion of a target by Gauss-Newton steps from given
+    values.
 
     Args:
-        dwell_s: Time during which the beam illuminates a target, in s; None for the time within the
-            pattern of the elements.
-        unknowns: Quantities that are estimated; the others keep the values given.
-        range_m: Closest range of data without a range axis in m; None for that of the radar.
+        dwell_s: Time in s for which a target is illuminated; None for illumination by the antenna
+            pattern of the channels.
+        unknowns: Quantities that are estimated, of the speeds u_r_m_s (slant range) and u_a_m_s
+            (along track) and the along-track position y0_m; the others keep their given values.
+        range_m: Closest range of a target in m, for data without a range axis; None for the
+            reference range of the radar.
     """
     return LikelihoodVelocity(radar, _aperture(dwell_s), range_m, unknowns)
 
@@ -153,13 +163,15 @@ def gradient_velocity(
     unknowns: tuple[Unknown, ...] = ("u_r_m_s", "u_a_m_s", "y0_m"),
     range_m: float | None = None,
 ) -> GradientVelocity:
-    """Maximum-likelihood estimator of the unknowns near the values given, by gradient descent.
+    """Maximum-likelihood estimator of the motion of a target by gradient descent from given values.
 
     Args:
-        dwell_s: Time during which the beam illuminates a target, in s; None for the time within the
-            pattern of the elements.
-        unknowns: Quantities that are estimated; the others keep the values given.
-        range_m: Closest range of data without a range axis in m; None for that of the radar.
+        dwell_s: Time in s for which a target is illuminated; None for illumination by the antenna
+            pattern of the channels.
+        unknowns: Quantities that are estimated, of the speeds u_r_m_s (slant range) and u_a_m_s
+            (along track) and the along-track position y0_m; the others keep their given values.
+        range_m: Closest range of a target in m, for data without a range axis; None for the
+            reference range of the radar.
     """
     return GradientVelocity(radar, _aperture(dwell_s), range_m, unknowns)
 
@@ -173,17 +185,19 @@ def moving_point_velocity(
     u_a_m_s: float | None = None,
     range_m: float | None = None,
 ) -> MigratingLines:
-    """The recommended estimator of velocity and position. It needs no initial values, only the
-    limits of the search.
+    """Recommended estimator of velocity and position of a moving target. It needs no initial
+    values, only the limits of the search.
 
     Args:
-        dwell_s: Time during which the beam illuminates a target, in s; None for the time within the
-            pattern of the elements.
-        u_r_reach_m_s: Half width of the search in u_r in m/s; None for 1.5 ambiguous velocities.
-        u_a_reach_m_s: Half width of the search in u_a in m/s.
-        y0_reach_m: Half width of the search in the position in m.
-        u_a_m_s: u_a in m/s if it is known a priori.
-        range_m: Closest range of data without a range axis in m; None for that of the radar.
+        dwell_s: Time in s for which a target is illuminated; None for illumination by the antenna
+            pattern of the channels.
+        u_r_reach_m_s: Half width of the search in the slant-range speed in m/s; None for 1.5
+            ambiguous velocities.
+        u_a_reach_m_s: Half width of the search in the along-track speed in m/s.
+        y0_reach_m: Half width of the search in the along-track position in m.
+        u_a_m_s: Along-track speed in m/s if it is known a priori; None to estimate it.
+        range_m: Closest range of a target in m, for data without a range axis; None for the
+            reference range of the radar.
     """
     reach = 1.5 * radar.ambiguous_velocity_m_s if u_r_reach_m_s is None else u_r_reach_m_s
     return MigratingLines(
@@ -201,16 +215,19 @@ def intensity_ratio(
     step_m_s: float = 0.5,
     range_m: float | None = None,
 ) -> SignalIntensityRatio:
-    """Estimator of u_r by the signal intensity ratio.
+    """Estimator of the slant-range speed u_r of a target by the signal intensity ratio: the rebuilt
+    spectrum is most intense inside the processed Doppler band at the true speed.
 
     Args:
         bandwidth_hz: Doppler bandwidth of the target in Hz.
         bands: Number of Doppler bands, each as wide as the PRF, that are separated.
-        method: "least_squares", or "mmse" if the matrix of the channels may be singular.
+        method: Reconstruction of the bands: "least_squares", or "mmse" (minimum mean-square error),
+            which is also defined where the matrix of the channels is singular.
         search_m_s: Least and largest velocity of the search in m/s; None for all that are
             unambiguous.
         step_m_s: Step of the search in m/s.
-        range_m: Closest range of data without a range axis in m; None for that of the radar.
+        range_m: Closest range of a target in m, for data without a range axis; None for the
+            reference range of the radar.
     """
     rebuild = _rebuild(bands, method)
     return SignalIntensityRatio(radar, bandwidth_hz, rebuild, search_m_s, step_m_s, range_m)
@@ -226,17 +243,19 @@ def alternate_velocity(
     step_m_s: float = 0.5,
     half_m_s: float = 20.0,
 ) -> MigratingLines:
-    """Alternate estimation of u_r by the signal intensity ratio and of u_a by autofocus.
+    """Alternate estimation of the slant-range speed u_r of a target by the signal intensity ratio,
+    and of its along-track speed u_a by autofocus.
 
     Args:
         bandwidth_hz: Doppler bandwidth of the target in Hz.
-        dwell_s: Time during which the beam illuminates a target, in s; None for the time within the
-            pattern of the elements.
+        dwell_s: Time in s for which a target is illuminated; None for illumination by the antenna
+            pattern of the channels.
         bands: Number of Doppler bands, each as wide as the PRF, that are separated.
-        method: "least_squares", or "mmse" if the matrix of the channels may be singular.
+        method: Reconstruction of the bands: "least_squares", or "mmse" (minimum mean-square error),
+            which is also defined where the matrix of the channels is singular.
         rounds: Number of times that both are estimated.
         step_m_s: Step of the search for u_r in m/s.
-        half_m_s: Half width of the search interval of u_a in m/s.
+        half_m_s: Half width of the search interval of u_a about 0, in m/s.
 
     Reference:
         Remote Sens. 2020, 12, 1703, section 4.3.
@@ -256,13 +275,14 @@ def stationary_image(
     snr_db: float = 40.0,
     form: Literal["stolt", "bulk"] = "stolt",
 ) -> StationaryImage:
-    """The image of a scene at rest; moving targets are defocused in it.
+    """Image focused for a stationary scene; moving targets are defocused and displaced in it.
 
     Args:
         bands: Number of Doppler bands, each as wide as the PRF, that are separated.
-        method: "least_squares", or "mmse" if the matrix of the channels may be singular.
-        band_hz: Doppler band of the flat spectrum that "mmse" assumes, in Hz; None for the spectrum
-            by the pattern of the elements.
+        method: Reconstruction of the bands: "least_squares", or "mmse" (minimum mean-square error),
+            which is also defined where the matrix of the channels is singular.
+        band_hz: Width in Hz of the flat Doppler spectrum that "mmse" assumes; None for the spectrum
+            by the antenna pattern of the channels.
         snr_db: Signal-to-noise ratio that "mmse" assumes, in dB.
         form: "stolt", exact at every range, or "bulk", with the migration of mid-swath for all
             ranges.
@@ -286,23 +306,25 @@ def movers_image(
     u_a_reach_m_s: float = 20.0,
     suppressed_m_s: Sequence[float] = Detector().suppressed_m_s,
 ) -> MoversImage:
-    """The image of every frame with the moving targets focused at their true positions, and the
-    estimates of these targets.
+    """Image of a scene with its moving targets focused at their true positions, and estimates of
+    their motion.
 
     Args:
         bands: Number of Doppler bands, each as wide as the PRF, that are separated.
-        method: "least_squares", or "mmse" if the matrix of the channels may be singular.
-        band_hz: Doppler band of the flat spectrum that "mmse" assumes, in Hz; None for the spectrum
-            by the pattern of the elements.
+        method: Reconstruction of the bands: "least_squares", or "mmse" (minimum mean-square error),
+            which is also defined where the matrix of the channels is singular.
+        band_hz: Width in Hz of the flat Doppler spectrum that "mmse" assumes; None for the spectrum
+            by the antenna pattern of the channels.
         snr_db: Signal-to-noise ratio that "mmse" assumes, in dB.
         removal: "subtract" removes the echo fitted to a target, "zero" all data in its area.
-        integration_s: Time for which a scatterer is illuminated in s.
-        segment_s: Length of the segments of slow time in s.
+        integration_s: Time in s for which a scatterer is illuminated.
+        segment_s: Length in s of the segments of slow time into which the echo of a target is
+            divided.
         half_along_m: Half width of a target along track in m.
         half_range_m: Half width of a target in range in m.
-        threshold_db: Least mean intensity of a target over the median of the image in dB.
+        threshold_db: Least mean intensity of a target relative to the median of the image, in dB.
         most: Largest number of targets.
-        u_a_reach_m_s: Half width of the search in u_a in m/s.
+        u_a_reach_m_s: Half width of the search in the along-track speed in m/s.
         suppressed_m_s: Slant-range speeds in m/s of the images with suppressed sea, in which weaker
             targets are detected; empty to omit these.
 

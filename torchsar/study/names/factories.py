@@ -1,4 +1,6 @@
-"""Stages, scenes and impairments whose constructors take objects or functions, from plain keys."""
+"""Factories that build stages, scenes and impairments from plain keys of a config, where their
+constructors take objects or functions.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,7 @@ def effective_velocity(
     refine: Literal["gradient", "parabola"] = "gradient",
     tolerance_m_s: float = 0.01,
 ) -> EffectiveVelocity:
-    """Velocity of minimum image entropy.
+    """Estimator of the effective velocity, as the velocity that gives the least image entropy.
 
     Args:
         reference: Reference of the range compression; None if the lines are already compressed.
@@ -71,17 +73,17 @@ def rotation_and_phase(
     search: int = 60,
     polish: int = 20,
 ) -> Alternate:
-    """A phase per pulse and the rotation, estimated alternately by `RotationAutofocus` and
-    `UnevenRotation`, each from the recorded data after correction of the other.
+    """Alternate estimation of a phase error per pulse (`RotationAutofocus`) and of the non-uniform
+    rotation (`UnevenRotation`) of a target, each from the data after correction of the other.
 
     Args:
-        order: Order of the warp of slow time by the rotation.
-        yc_m: Deviation of the range centre in metres. It is held fixed, because an independent
-            phase of every pulse absorbs its whole effect.
+        order: Order of the rotation angle as a polynomial of slow time.
+        yc_m: Range in metres from the centre of rotation to the zero of the range axis. It is not
+            estimated, because the phase errors of the pulses absorb its whole effect.
         rounds: Number of times that both are estimated.
         scatterers: Largest number of scatterers that are used.
         search: Largest number of iterations of the entropy fixed point.
-        polish: Largest number of iterations against the Wiener estimate.
+        polish: Largest number of iterations against the Wiener estimate of the scene.
     """
     return Alternate(
         rounds,
@@ -91,7 +93,7 @@ def rotation_and_phase(
 
 
 def jitter_lagrange(points: int = 4, offset_samples: Tensor | None = None) -> CorrectJitter:
-    """Jitter correction by Lagrange interpolation.
+    """Correction of periodic sampling jitter by Lagrange interpolation.
 
     Args:
         points: Number of points of the interpolation.
@@ -101,11 +103,12 @@ def jitter_lagrange(points: int = 4, offset_samples: Tensor | None = None) -> Co
 
 
 def jitter_band_limited(points: int = 8, band: float = 0.95, offset_samples: Tensor | None = None) -> CorrectJitter:
-    """Jitter correction by the local weights of least error for a band-limited signal.
+    """Correction of periodic sampling jitter by interpolation with the weights of least error for a
+    band-limited signal.
 
     Args:
         points: Number of points of the interpolation.
-        band: Bandwidth of the signal over the sampling rate.
+        band: Ratio of the bandwidth of the signal to the sampling rate.
         offset_samples: Offsets of one period in samples, if they are known.
     """
     return CorrectJitter(offset_samples, BandLimited(points, band))
@@ -122,7 +125,7 @@ def drift(velocity_m_s: Tensor | float = 0.0, acceleration_m_s2: Tensor | float 
 
 
 def dechirped(track_m: Sequence[Tensor | float] | None = None) -> Dechirped:
-    """Dechirped pulses with the range evaluated at every sample.
+    """Echo model of dechirped pulses, with the range of a target computed at every sample.
 
     Args:
         track_m: Polynomial that the range window follows: velocity in m/s, half the acceleration in
@@ -214,7 +217,7 @@ def clock_errors(
 
 
 def with_wavelength(radar: type) -> Callable[..., Any]:
-    """The constructor of a radar with `wavelength_m` as an alternative to `carrier_hz`.
+    """Return the constructor of a radar with `wavelength_m` as an alternative to `carrier_hz`.
 
     Args:
         radar: Class of the radar, with the parameter `carrier_hz`.

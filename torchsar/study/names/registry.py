@@ -236,7 +236,11 @@ GROUPS = {"repair": REPAIR, "compensate": COMPENSATE, "focus": FOCUS}
 
 @cache
 def stages() -> Catalogue:
-    """All stages, the user's own among them. A name taken twice is refused."""
+    """Return the catalogue of all stages, including those of the user.
+
+    Raises:
+        ValueError: If a stage of the user has a name that is in use.
+    """
     entries = {name: target for group in GROUPS.values() for name, target in group.items()}
     for point in entry_points(group="torchsar.stages"):
         if point.name in entries:
@@ -248,5 +252,5 @@ def stages() -> Catalogue:
 
 
 def group_of(name: str) -> str:
-    """repair, compensate, focus, or `own` for a user's stage."""
+    """Return the group of a stage: repair, compensate, focus, or `own` for a stage of the user."""
     return next((group for group, members in GROUPS.items() if name in members), "own")

@@ -141,7 +141,10 @@ def opened(out: Path, kind: str, names: Sequence[str] = ()) -> Iterator[ResultFo
 
 @contextmanager
 def fresh_result(out: Path, kind: str, names: Sequence[str]) -> Iterator[Path]:
-    """Provide an empty folder for a new result; see `opened` and `ResultFolder.staged`."""
+    """Provide an empty folder, whose content becomes the result in `out` at the end of the block.
+
+    See `opened` and `ResultFolder.staged`.
+    """
     try:
         with opened(out, kind, names) as folder, folder.staged() as new:
             yield new

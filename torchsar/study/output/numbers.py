@@ -13,7 +13,9 @@ _PREFIXES = {-12: "p", -9: "n", -6: "u", -3: "m", 0: "", 3: "k", 6: "M", 9: "G",
 
 
 def scale_of(values: Sequence[float | None], unit: str) -> tuple[float, str]:
-    """Return the factor and the unit for which the median of the values is between 1 and 1000."""
+    """Return a factor and a unit with a prefix, for which the median magnitude of the values is
+    between 1 and 1000.
+    """
     there = sorted(abs(v) for v in values if v is not None and math.isfinite(v) and v)
     if not there or unit.split("/")[0].split("^")[0] not in _PREFIXED or "^" in unit.split("/")[0]:
         return 1.0, unit

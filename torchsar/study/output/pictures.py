@@ -33,7 +33,7 @@ def draw_all(makers: Iterable[Callable[[], Drawn]], folder: Path) -> list[Pictur
 
     Args:
         makers: Functions that yield pictures as (name, title, caption, figure); a list of figures
-            is one picture with several panels, an empty list none.
+            is one picture with several panels, and an empty list gives no picture.
         folder: Folder of the files; it is made if it does not exist.
 
     Returns:
@@ -87,6 +87,6 @@ def comparisons(results: Mapping[str, Any], columns: Mapping[str, Any], without:
 
 
 def first_named(images: Mapping[str, Signal], name: str = "ideal") -> dict[str, Signal]:
-    """Return the images with that of one method first, if there is one."""
+    """Return images by method, with that of the method `name` moved to the front if it exists."""
     front = {name: images[name]} if name in images else {}
     return {**front, **images}

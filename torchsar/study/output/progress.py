@@ -58,7 +58,7 @@ class Steps:
         self._began, self._spent = self._since, dict[str, float]()
 
     def begin(self, name: str) -> None:
-        """Note that a step begins; steps between the last one and this one were not needed."""
+        """Note that a step begins; earlier steps that did not begin were not needed."""
         now = time.perf_counter()
         if self._at >= 0:
             self._spent[self._names[self._at]] = now - self._since

@@ -30,6 +30,6 @@ def did_you_mean(word: str, accepted: Iterable[str]) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """Return the text of an error in one line, for a KeyError without its quotes."""
+    """Return the text of an error as one line; that of a KeyError has no quotes around it."""
     text = error.args[0] if isinstance(error, KeyError) and error.args else error
     return " ".join(str(text).split())

@@ -1,4 +1,4 @@
-"""Checks of the numbers of radar and world, which find most mistakes of units.
+"""Checks of the numbers in the sections radar and world of a config, which find most wrong units.
 
 Each number with a unit has a wide range of plausible magnitudes. Relations between numbers, which
 are products of powers, have limits as well.
@@ -85,11 +85,12 @@ _RANGES: Sequence[tuple[str, float, float, str]] = (
 
 @dataclass(frozen=True)
 class Relation:
-    """Limits of a product of powers of numbers.
+    """Limits of a product of powers of numbers in a config, such as pulse length times PRF.
 
     Args:
         what: Meaning of the product.
-        powers: Powers by dotted key; `world.scene` denotes the largest coordinate of the scene.
+        powers: Exponent of each number by its dotted key; `world.scene` denotes the largest
+            coordinate of the scene.
         low: Least value of the product.
         high: Largest value of the product.
         factor: Constant factor of the product.
@@ -182,8 +183,8 @@ def _check_relation(relation: Relation, powers: Mapping[str, int], numbers: Mapp
         for key, power in powers.items()
     ]
     raise ConfigError(
-        f"{file}: {relation.what} is {product:.3g} and should be {limit}; check the units, and change one of "
-        f"{', '.join(tries)} or beyond"
+        f"{file}: {relation.what} is {product:.3g} and should be {limit}; check the units, or change one number at "
+        f"least as far as follows: {', '.join(tries)}"
     )
 
 

@@ -28,7 +28,7 @@ class Data(Strict):
 
 
 class Rerun(Strict):
-    """A repetition of the last stages of another method with given values.
+    """A repetition of the last stages of another method, with given values for some estimates.
 
     Fields:
         method: The other method.
@@ -95,7 +95,9 @@ class EarlyStop(Strict):
 
 
 class Save(Strict):
-    """Trials whose images and outputs of the stages in `taps` are kept in the store."""
+    """Numbers of the trials whose images are kept in the store, and names of stages (`taps`) whose
+    outputs are kept with them.
+    """
 
     trials: list[int] = []
     taps: list[str] = []
@@ -162,12 +164,16 @@ class Config(Strict):
             raise ValueError("processor.recommended needs stages of its own")
         taken = next((name for name in RESERVED if name in self.processor), None)
         if taken is not None:
-            raise ValueError(f"processor.{taken}: a group of the results has this name; choose another one")
+            raise ValueError(
+                f"processor.{taken}: a method cannot have this name, which a part of the results has; choose another"
+            )
         reference = self.metrics.get("reference")
         named = [*(("beyond_limits", name) for name in self.beyond_limits), ("metrics.reference", reference)]
         for key, name in named:
             if name is not None and name not in self.processor:
-                raise ValueError(f"{key} names the method {name!r}; there is {', '.join(self.processor)}")
+                raise ValueError(
+                    f"{key} names {name!r}, which is no method of the processor ({', '.join(self.processor)})"
+                )
         return self
 
 
@@ -217,7 +223,8 @@ def _placed(tree: Any, path: list[str], value: Any, what: str) -> Any:
         return [*tree[:index], _placed(tree[index], rest, value, what) if rest else value, *tree[index + 1 :]]
     if not isinstance(tree, dict) or (rest and head not in tree):
         raise ConfigError(
-            f"{what} leads nowhere at {head!r}{did_you_mean(head, tree if isinstance(tree, dict) else ())}"
+            f"{what} does not exist, because there is no part "
+            f"{head!r}{did_you_mean(head, tree if isinstance(tree, dict) else ())}"
         )
     return {**tree, head: _placed(tree[head], rest, value, what) if rest else value}
 
@@ -258,7 +265,9 @@ def _method(method: Method, where: str, system: Any, file: str) -> Method:
     for name, entry in (method.stages or {}).items():
         uses = entry.get("uses", {})
         if not (isinstance(uses, dict) and all(isinstance(source, str) for source in uses.values())):
-            raise ConfigError(f"{file}: {where}.stages.{name}.uses must map values to 'stage.value', got {uses!r}")
+            raise ConfigError(
+                f"{file}: {where}.stages.{name}.uses must map keys of the stage to 'stage.value', got {uses!r}"
+            )
         old = next((source for source in uses.values() if source.startswith(_OLD_TRUTH)), None)
         if old is not None:
             new = f"truth.{old.removeprefix(_OLD_TRUTH)}"

@@ -163,7 +163,7 @@ class Section:
 
 
 class Catalogue:
-    """Constructors by name, one of which a config names.
+    """Constructors by name, of which a config chooses one.
 
     Args:
         what: Kind of the entries, for messages.
@@ -225,13 +225,13 @@ class Catalogue:
         return entry[self.key] in self.sections and self.sections[entry[self.key]].takes_tensor(path, entry)
 
     def describe(self, value: Any) -> dict[str, Any] | None:
-        """Return the entry that describes an object, None if no entry has its class."""
+        """Return the config entry that builds such an object, None if no entry has its class."""
         name = next((name for name, target in self.entries.items() if target is type(value)), None)
         return None if name is None else {self.key: name, **_described(value)}
 
 
 def below(given: Given, name: str) -> dict[str, Tensor]:
-    """Return the values whose dotted keys begin with a name, without this name."""
+    """Return the values whose dotted keys begin with a name, which is removed from the keys."""
     return {key.partition(".")[2]: value for key, value in given.items() if key.startswith(f"{name}.")}
 
 

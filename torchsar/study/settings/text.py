@@ -144,7 +144,7 @@ def read_tree(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: cannot be read as text ({error})") from None
     tree = parse(text, str(path))
     if not isinstance(tree, dict):
-        raise ConfigError(f"{path}: a config is a mapping of sections, got {type(tree).__name__}")
+        raise ConfigError(f"{path}: a config must be a mapping of sections, got {type(tree).__name__}")
     return tree
 
 
@@ -161,7 +161,8 @@ def override(
             `sweep.grid.world.noise.snr_db=[0, 10]` both set the key "world.noise.snr_db".
 
     Raises:
-        ConfigError: If an assignment is no override, or its key is below a plain value.
+        ConfigError: If an assignment is not of the form key=value, or its key is below a number or
+            another plain value.
     """
     for assignment in assignments:
         key, equals, value = assignment.partition("=")

@@ -1,1 +1,1 @@
-"""The systems: what is physics in an experiment."""
+"""The systems, which contain the physics of the experiments."""

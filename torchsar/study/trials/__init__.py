@@ -1,1 +1,3 @@
-"""Experiments: a system, its bench, batches of trials, and the outcome of every method."""
+"""Experiments: the physics of a system, the objects that a config builds (its bench), batches of
+trials, and the results of the methods.
+"""

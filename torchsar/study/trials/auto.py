@@ -1,4 +1,4 @@
-"""Keys with the value `auto`: the cheapest alternative with an acceptable predicted loss."""
+"""Keys with the value `auto` get the cheapest alternative with an acceptable predicted loss."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from torchsar.study.trials.choice import Alternative, Choice
 
 
 def tolerance_of(loaded: Loaded) -> dict[str, float]:
-    """Return the largest acceptable loss by metric, from the system and the config."""
+    """Return the largest acceptable loss by metric, of the config or by default of the system."""
     unknown = next((name for name in loaded.config.trade.tolerance if name not in loaded.system.tolerance), None)
     if unknown is not None:
         known = ", ".join(loaded.system.tolerance)
         raise ConfigError(
-            f"{loaded.file}: trade.tolerance names {unknown!r}, which is no loss of this system; there is {known}"
+            f"{loaded.file}: trade.tolerance names {unknown!r}, which is no loss of this system (losses: {known})"
         )
     return {**loaded.system.tolerance, **loaded.config.trade.tolerance}
 
 
 def within(loss: Mapping[str, float] | None, tolerance: Mapping[str, float]) -> bool:
-    """Return whether every loss is known and acceptable; NaN is not."""
+    """Return whether the losses are known and within their tolerances; NaN is not within any."""
     return loss is not None and all(value <= tolerance[name] for name, value in loss.items() if name in tolerance)
 
 
@@ -34,7 +34,11 @@ def cheapest(choice: Choice, tolerance: Mapping[str, float]) -> Alternative:
 
 
 def choices_of(bench: Any) -> Sequence[Choice]:
-    """Return the choices of a config. Raises ConfigError if their losses cannot be predicted."""
+    """Return the choices between alternatives that a config has.
+
+    Raises:
+        ConfigError: If the losses of the alternatives cannot be predicted.
+    """
     try:
         return bench.system.choices(bench)
     except ConfigError:
@@ -70,7 +74,7 @@ def resolved(loaded: Loaded, bench_of: Callable[[Loaded], Any]) -> tuple[Loaded,
     choices = {choice.at: choice for choice in choices_of(bench)}
     fixed = next((path for at, path, _ in found if at not in choices), None)
     if fixed is not None:
-        raise ConfigError(f"{loaded.file}: {fixed} is 'auto', but this config has no alternatives for it; give a name")
+        raise ConfigError(f"{loaded.file}: {fixed} is 'auto', but this config has no alternatives for it; give a value")
     tolerance, changes, reasons = tolerance_of(loaded), {}, []
     for at, path, entry in found:
         taken = cheapest(choices[at], tolerance)

@@ -27,7 +27,7 @@ class Trials:
             phase.
         truth: True values by name, (trial, ...); only oracles may use them.
         count: Number of trials.
-        own: Further data for the judge of the system.
+        own: Further data from which the system computes metrics.
     """
 
     recording: Recording
@@ -44,7 +44,7 @@ class Judged:
     Args:
         metrics: Metrics by name, (trial,) each.
         targets: Metrics of each named target.
-        outside: Named targets outside the image or the record.
+        outside: Names of the targets that lie outside the image or the record.
         view: Further data for the pictures of the system.
     """
 
@@ -83,7 +83,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Batch:
-    """The trials of one batch, and the outcome of every method."""
+    """The trials of one batch, and the result of every method."""
 
     trials: Trials
     outcomes: Mapping[str, Outcome]
@@ -152,7 +152,9 @@ def joined_found(parts: Sequence[Mapping[str, Found]]) -> dict[str, Found]:
 
 
 def summary(metrics: Metrics) -> dict[str, float]:
-    """Return the mean over the trials with a finite metric, and `<name>_sd` of several trials."""
+    """Return the mean of each metric over the trials in which it is finite, and its standard
+    deviation as `<name>_sd` if there are several such trials.
+    """
     row: dict[str, float] = {}
     for name, value in metrics.items():
         x = value.to(torch.float64)
@@ -164,7 +166,9 @@ def summary(metrics: Metrics) -> dict[str, float]:
 
 
 def verdict(estimates: Mapping[str, Estimate], count: int) -> dict[str, Tensor]:
-    """Return `ok`, (trial,) bool, whether all estimates are reliable; empty without estimates."""
+    """Return {"ok": whether all estimates of a trial are reliable, bool (trial,)}, or {} without
+    estimates.
+    """
     found = [_rows(estimate.ok, count).flatten(1).all(1) for estimate in estimates.values()]
     return {OK: torch.stack(found).all(0)} if found else {}
 

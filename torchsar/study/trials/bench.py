@@ -66,7 +66,7 @@ class Bench:
         self.system.check(self)
 
     def memo(self, name: str, make: Callable[[], Any]) -> Any:
-        """Return an object that is made once for this bench and kept by name."""
+        """Return the object that is kept under a name; `make` makes it when it is first needed."""
         if name not in self._memo:
             self._memo[name] = make()
         return self._memo[name]
@@ -207,7 +207,7 @@ class Bench:
         if method.rerun is not None:
             source = earlier[method.rerun.method].trace
             if source is None:
-                raise ValueError(f"the method {method.rerun.method!r}, part of which this method repeats, failed")
+                raise ValueError(f"the method {method.rerun.method!r} failed, and this method repeats a part of it")
             given = {k: torch.tensor(v, dtype=torch.float64, device=self.device) for k, v in method.rerun.given.items()}
             began = time.perf_counter()
             again = chain.retrace(source, method.rerun.start, given)

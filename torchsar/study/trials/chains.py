@@ -26,7 +26,7 @@ def build_chains(loaded: Loaded, **context: Any) -> dict[str, Chain]:
         Chains by method; a rerun has the chain of the method that it repeats.
 
     Raises:
-        ConfigError: If a key, a connection or a held value is not accepted.
+        ConfigError: If a key, a connection of stages or a value given to a rerun is not accepted.
     """
     chains: dict[str, Chain] = {}
     for name, method in loaded.config.processor.items():
@@ -39,7 +39,8 @@ def build_chains(loaded: Loaded, **context: Any) -> dict[str, Chain]:
             unknown = next((value for value in method.rerun.given if value not in offered), None)
             if unknown is not None:
                 raise ConfigError(
-                    f"{where}.rerun.given.{unknown} is no value of that chain{did_you_mean(unknown, offered)}"
+                    f"{where}.rerun.given.{unknown} is no estimate of the method {method.rerun.method!r}"
+                    f"{did_you_mean(unknown, offered)}"
                 )
     return chains
 

@@ -1,4 +1,4 @@
-"""Choices of a config, their alternatives, and the comparison of these."""
+"""Choices that a config makes, such as the form of the focusing, and their alternatives."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class Alternative:
         keys: Keys and values that select it in the mapping of the choice.
         loss: Predicted loss by metric; None if there is no prediction.
         neglects: The effects that it neglects.
-        effect: Name of the requirement about the same effect, whose verdict then follows from this
-            loss.
+        effect: Name of the `Requirement` about the same simplification, whose verdict then follows
+            from this loss.
     """
 
     name: str
@@ -38,9 +38,9 @@ class Measured:
     Args:
         run: Function of an alternative that computes its result, and whose time is measured.
         loss: Function of an alternative and its result that returns the loss by metric, relative to
-            the yardstick.
-        share: Function of an alternative that returns the share of its work that `run` does; times
-            are divided by it.
+            an exact result.
+        share: Function of an alternative that returns which part of the whole work `run` does,
+            between 0 and 1; measured times are divided by it.
     """
 
     run: Callable[[Alternative], Any]
@@ -57,8 +57,9 @@ class Choice:
         at: The key that may have the value `auto`: a dotted key of the world such as
             `world.fidelity`, `stage`, or `STAGE.key` for a key of all stages of that name.
         alternatives: The alternatives, the cheapest first and the exact one last.
-        measured: Function that prepares their measurement, which may take long.
-        yardstick: The reference of the measurement, if it is none of the alternatives.
+        measured: Function that prepares the measurement of the alternatives, which may take long;
+            None if they cannot be measured.
+        yardstick: Exact reference of the losses, if it is none of the alternatives.
     """
 
     name: str

@@ -97,7 +97,7 @@ class System(ABC):
         tolerance: Default of the largest acceptable loss, by metric.
         exact: Keys of the exact alternative, by the key that may be `auto` (see `Choice.at`).
         images: Axes of signals that are images.
-        address: Address of the random numbers of runs.
+        address: Name from which the random numbers of runs follow.
         peak: Measured ratio of the largest tensor of a trial and its raw data.
     """
 
@@ -135,7 +135,7 @@ class System(ABC):
 
     @abstractmethod
     def simulate(self, bench: Bench, world: Any, draws: Draws) -> Trials:
-        """Simulate the trials of the draws; numbers of the world may differ between trials."""
+        """Simulate the trials in `draws`; numbers of the world may differ between trials."""
 
     @abstractmethod
     def judge(self, bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
@@ -164,7 +164,7 @@ class System(ABC):
         raise NotImplementedError(f"system {self.name} reads no recordings")
 
     def context(self, recording: Recording) -> dict[str, Any]:
-        """Return parameters of stages from a recording, in addition to its radar."""
+        """Return what constructors of stages need from a recording, in addition to its radar."""
         return {}
 
     def check(self, bench: Bench) -> None:
@@ -174,7 +174,7 @@ class System(ABC):
         """Check that the axes of a grid are consistent. Raises ConfigError."""
 
     def compare(self, bench: Bench, outcome: Outcome, ideal: Outcome | None) -> Judged:
-        """Return the metrics of a method, with those relative to the method metrics.reference."""
+        """Return the metrics of a method, with those relative to the reference method."""
         judged, key = outcome.judged, "entropy_nats"
         if ideal is None or ideal is outcome or key not in judged.metrics or key not in ideal.metrics:
             return judged

@@ -1,5 +1,5 @@
-"""Azimuth-multichannel SAR with a far transmitter, and moving points one at a time
-(Remote Sens. 2020, 12, 1703).
+"""System `geo`: moving points, one at a time, seen by a SAR with several azimuth channels and a far
+transmitter (Remote Sens. 2020, 12, 1703).
 """
 
 from __future__ import annotations
@@ -45,8 +45,9 @@ class Judging:
     """Settings of the metrics.
 
     Args:
-        orders: Largest distance of a replica, in pulse rates, up to which it is measured.
-        published_targets: Published values by figure, target and method.
+        orders: Number of pulse rates to either side of a target up to which its replicas, which are
+            false targets, are measured.
+        published_targets: Published values by metric, target and method.
     """
 
     orders: int = 3
@@ -143,12 +144,15 @@ class Geo(System):
         targets = list((loaded.config.world or {})["targets"])
         if len(targets) > 1:
             raise ConfigError(
-                f"{loaded.file}: world.targets: a sweep follows one target, and there are {', '.join(targets)}; "
+                f"{loaded.file}: world.targets must have a single target in a sweep, got {', '.join(targets)}; "
                 "keep one of them"
             )
 
     def may_differ(self, path: str, world: Mapping[str, Any]) -> bool:
-        """A gate that illuminates a sea sets the number of its cells, and cannot vary."""
+        """Return whether a number of the world, by dotted key, may differ between trials.
+
+        The illumination of a sea may not, because it determines the number of cells of the sea.
+        """
         lights_sea = "gate." if world["sea_gate"] is None else "sea_gate."
         shapes = world["sea"] is not None and path.startswith(lights_sea)
         return not shapes and super().may_differ(path, world)
@@ -191,7 +195,9 @@ class Geo(System):
         return table
 
     def bounds(self, bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
-        """Lower bounds of the errors, for the unknowns of the methods; none without noise."""
+        """Return Cramer-Rao bounds of velocities and position, for the quantities that the methods
+        estimate; nothing for data without noise.
+        """
         truth, world, radar = batch.trials.truth, bench.world(), bench.radar
         metrics = [outcome.metrics for outcome in batch.outcomes.values()]
         kinds: dict[str, tuple[str, ...]] = {}
@@ -218,7 +224,9 @@ class Geo(System):
     choices = staticmethod(choices.choices)  # pyright: ignore[reportAssignmentType]
 
     def theory(self, result: Result) -> Mapping[str, Mapping[str, float]]:
-        """Ideal responses of the recommended method, if it makes an image."""
+        """Return the metrics of the ideal response of each target; empty if the recommended method
+        makes no image.
+        """
         focused, truth = result.first_of("recommended").judged.view.focused, result.first.trials.truth
         own, world = result.first.trials.own, result.bench.world()
         if focused is None:
@@ -246,7 +254,9 @@ class Geo(System):
         yield "Signal to noise", text
 
     def extra_definitions(self, bench: Bench) -> Mapping[str, Any]:
-        """SNR before and after compression, and coefficients of the range to the transmitter."""
+        """Return the SNR in dB before and after range compression, and the coefficients k1, k2, ...
+        of the range to the transmitter.
+        """
         snr, gain = bench.world().snr_db(bench.radar), compression_gain_db(bench.radar)
         transmit = {f"transmit_range_k{i}": k for i, k in enumerate(bench.radar.transmit_range, 1)}
         levels = (

@@ -1,4 +1,4 @@
-"""What moving points require of their processor, and the alternatives that it may choose."""
+"""Processing of moving points: its limits, what simplifications neglect, and its alternatives."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ _DIMENSIONS = ("azimuth only", "range lines", "full chirps")
 
 
 def limits(bench: Bench) -> dict[Limit, list[str]]:
-    """Limits, each with the methods that it concerns."""
+    """Return the limits of methods in this scene, with the methods that each concerns."""
     found: dict[Limit, list[str]] = {}
     for name, chain in bench.chains.items():
         for limit in multichannel_limits(bench.radar, use_of(chain, bench)):
@@ -80,13 +80,15 @@ def limits(bench: Bench) -> dict[Limit, list[str]]:
 
 
 def requirements(bench: Bench) -> Sequence[Requirement]:
-    """What simplifications neglect; nothing where no aperture forms."""
+    """Return what simplified processing neglects; nothing if a target is as fast along track as the
+    receiver, since no aperture forms then.
+    """
     use = use_of(bench.chains["recommended"], bench)
     return multichannel_requirements(bench.radar, use) if bench.radar.speed_m_s > use.u_a_m_s[1] else ()
 
 
 def use_of(chain: Chain, bench: Bench) -> MultichannelUse:
-    """How a chain uses the radar; the targets of the world bound the velocities."""
+    """Return how a chain uses the radar, with the range of velocities of the simulated targets."""
     world, stages = bench.world(), list(_stages(chain))
     rebuilds = [s for s in stages if isinstance(s, Reconstruct)]
     # without a reconstruction the intensity ratio tells bands apart
@@ -125,7 +127,9 @@ def _stages(chain: Chain) -> Iterable[Any]:
 
 
 def choices(bench: Bench) -> list[Choice]:
-    """The decisions of a config, on its targets without noise, with their true velocities."""
+    """Return the choices between alternatives, with losses for the targets of the config without
+    noise and with known velocities.
+    """
     world, radar, band = bench.world(), bench.radar, _bandwidth_hz(bench)
     movers = world.points(1).movers(radar, Draws(0))
     seen, focused = (LitPoints(movers, world.gate, radar, world.pulses, hz) for hz in (None, band))

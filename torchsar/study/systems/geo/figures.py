@@ -35,7 +35,8 @@ class Shot:
     Args:
         image: Its image without noise.
         profile: Cut along azimuth through the peak.
-        along_m: Positions of the cut on the axis x = (V_R - u_a) t of the target in metres.
+        along_m: Positions of the cut in metres on the axis x = (V_R - u_a) t, with the speeds along
+            track V_R of the receiver and u_a of the target.
         spectrum: Rebuilt spectrum over Doppler frequency from its centre.
     """
 
@@ -49,7 +50,7 @@ Shots = dict[str, dict[str, Shot]]
 
 
 def shots(result: Result) -> Shots:
-    """Every target, by every method that makes images."""
+    """Return the image of every target by every method that makes images."""
     targets, truth, radar = list(result.bench.world().targets), result.first.trials.truth, result.bench.radar
     found: Shots = {}
     for name, outcome in result.first.outcomes.items():
@@ -73,7 +74,7 @@ def shots(result: Result) -> Shots:
 
 
 def pictures(results: Mapping[str, Result], columns: Mapping[str, Any]) -> Iterator[Callable[[], Drawn]]:
-    """Makers of all pictures."""
+    """Yield functions that draw the pictures, in the order of the report."""
     yield partial(comparisons, by_target(results), columns)
     for case, result in results.items():
         for make in (_profiles, _main_lobes, _contours, _spectra):
@@ -81,7 +82,7 @@ def pictures(results: Mapping[str, Result], columns: Mapping[str, Any]) -> Itera
 
 
 def by_target(results: Mapping[str, Result]) -> dict[str, Any]:
-    """Figures of the methods, by case and target."""
+    """Return the metrics of the methods, by case and target."""
     names = {(case, t): None for case, r in results.items() for of in r.targets.values() for t in of}
     rows = {}
     for case, target in names:

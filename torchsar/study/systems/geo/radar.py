@@ -38,12 +38,12 @@ def bistatic_radar(
         element_m: Length of the aperture of each channel along the track in metres.
         transmit_range: Coefficients k1, k2, ... (m/s, m/s^2, ...) of the change of the range to the
             transmitter, k1 t + k2 t^2 + ...
-        orbit: Orbit of the transmitter, from which these coefficients follow; null if they are
-            given, or zero.
+        orbit: Orbit of the transmitter, from which these coefficients follow; null if
+            transmit_range is given, or the coefficients are zero.
         wave_speed_m_s: Propagation speed in m/s.
 
     Raises:
-        ValueError: If both transmit_range and orbit are given, or the radar is not possible.
+        ValueError: If both transmit_range and orbit are given, or a value is not accepted.
     """
     if orbit is not None and transmit_range:
         raise ValueError("radar: give one of transmit_range and orbit, and leave the other out")

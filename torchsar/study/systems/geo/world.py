@@ -47,7 +47,8 @@ class Level:
 
     Args:
         snr_db: Power of a target over noise in a sample of one channel after range compression.
-        raw_scnr_db: The same before range compression, which adds 10 log10(B tau_p).
+        raw_scnr_db: The same before range compression, which adds 10 log10(B tau_p) with the
+            bandwidth B and the length tau_p of a pulse.
         scr_db: Power of a target over that of the sea in a sample after range compression.
     """
 
@@ -75,7 +76,7 @@ class Own(NamedTuple):
 
     @property
     def integration_s(self) -> Tensor | float | None:
-        """Time for which targets are lit; None for a pattern."""
+        """Time in s for which targets are illuminated; None for an antenna pattern."""
         return self.world.integration_s
 
 
@@ -86,7 +87,7 @@ class Points(World):
 
     Args:
         pulses: Number of pulses of the record.
-        samples: Number of range samples; null for azimuth alone, the range line of the target.
+        samples: Number of range samples; null for azimuth-only data, the range line of a target.
         kind: compressed for range-compressed data, or full for chirps, which need more samples
             by two pulse lengths.
         targets: Point targets by name.
@@ -116,17 +117,20 @@ class Points(World):
         super().__post_init__()
         if self.pulses < 1 or not self.targets or (self.samples is not None and self.samples < 1):
             raise ValueError(
-                "world needs at least one target and one pulse, and samples of 1 or more or None, got "
+                "world needs at least one target, one pulse and one sample (or null for azimuth-only data), got "
                 f"{len(self.targets)} targets, {self.pulses} pulses and {self.samples} samples"
             )
         if self.noise.scr_db is not None and self.sea is None:
-            raise ValueError("world.noise.scr_db is a signal-to-clutter ratio; give world.sea, or use snr_db")
+            raise ValueError("world.noise.scr_db, a signal-to-clutter ratio, needs world.sea; give it, or use snr_db")
         if self.sea is not None and all(getattr(self.noise, one.name) is None for one in fields(Level)):
             raise ValueError(
-                "world.noise: the level of the sea is relative to the noise; give snr_db, raw_scnr_db or scr_db"
+                "world.noise must be given with world.sea, whose level is relative to the noise; give snr_db, "
+                "raw_scnr_db or scr_db"
             )
         if self.sea is not None and self.kind == "full":
-            raise ValueError("world.sea is added to range-compressed echoes; set kind: compressed")
+            raise ValueError(
+                "world.sea needs range-compressed echoes, to which it is added; set world.kind: compressed"
+            )
         beyond = any(bool((torch.as_tensor(target.range_m) != 0).any()) for target in self.targets.values())
         if self.samples is None and (self.kind == "full" or beyond):
             raise ValueError(
@@ -136,11 +140,13 @@ class Points(World):
 
     @property
     def integration_s(self) -> Tensor | float | None:
-        """Time for which targets are lit; None for a pattern."""
+        """Time in s for which targets are illuminated; None for an antenna pattern."""
         return self.gate.duration_s if isinstance(self.gate, BandLimited) else None
 
     def snr_db(self, radar: BistaticRadar) -> Tensor | float | None:
-        """SNR of a range-compressed sample of one channel; None for no noise."""
+        """Return the SNR in dB of a target in a range-compressed sample of one channel; None for no
+        noise.
+        """
         noise = self.noise
         if noise.raw_scnr_db is not None:
             return noise.raw_scnr_db + compression_gain_db(radar)
@@ -149,8 +155,9 @@ class Points(World):
         return noise.snr_db
 
     def trials_of(self, radar: BistaticRadar, draws: Draws, dtype: torch.dtype, device: str = "cpu") -> Trials:
-        """Simulate rows (trial, target), flattened, with and without noise and sea, and the true
-        values.
+        """Simulate recordings with and without noise and sea, and the true values.
+
+        A row is one target in one trial; the rows of a trial follow each other.
         """
         rows, count = _row_draws(draws, self.targets), len(draws.trials or (0,))
         own: Points = repeated(self, len(self.targets))  # each row has the numbers of its trial
@@ -177,7 +184,7 @@ class Points(World):
         return Trials(noisy, truth.clean, values, count, Own(alone, snr, own))
 
     def points(self, count: int) -> MovingPoints:
-        """The targets, one a row (trial, target), flattened."""
+        """Return the targets, one in each row; the rows of a trial follow each other."""
 
         def rows(name: str) -> Tensor:
             each = [
@@ -199,7 +206,7 @@ class Points(World):
 
 
 def compression_gain_db(radar: BistaticRadar) -> float:
-    """Gain of range compression in SNR, 10 log10(B tau_p), in dB."""
+    """Return the SNR gain of range compression in dB, 10 log10(bandwidth * pulse length)."""
     return 10 * math.log10(radar.pulse.bandwidth_hz * radar.pulse.duration_s)
 
 

@@ -33,9 +33,10 @@ class Judging:
     """Settings of the metrics.
 
     Args:
-        match_m: Largest distance in metres, along track and in range, of a detected target from the
-            position at which the image focused for a stationary scene shows a ship.
-        published_targets: Published values by figure, ship and method.
+        match_m: Largest distances in metres, along track and in range, at which a detected target
+            counts as a ship. They are measured from the position of the ship in the image that is
+            focused for a stationary scene.
+        published_targets: Published values by metric, ship and method.
     """
 
     match_m: Sequence[float] = (150.0, 40.0)
@@ -148,11 +149,14 @@ class GeoOcean(System):
                 if chain.uses[stage] or getattr(chain.stages[stage], "provides", ()):
                     raise ConfigError(
                         f"{bench.file}: processor.{name}.stages.{stage}: stages before {last!r} may neither "
-                        "estimate nor use values; leave it out"
+                        "estimate nor use values; leave this stage out"
                     )
 
     def may_differ(self, path: str, world: Mapping[str, Any]) -> bool:
-        """The gate sets the number of cells of the sea, and cannot vary."""
+        """Return whether a number of the world, by dotted key, may differ between trials.
+
+        The illumination (`gate`) may not, because it determines the number of cells of the sea.
+        """
         return not path.startswith("gate.") and super().may_differ(path, world)
 
     def simulate(self, bench: Bench, world: Ocean, draws: Draws) -> Trials:
@@ -180,7 +184,7 @@ class GeoOcean(System):
         return Judged(whole, ships, view=View(made, views))
 
     def found(self, bench: Bench, outcome: Outcome, trials: Trials) -> dict[str, Found]:
-        """Estimated motions of the ships; NaN where a ship was not found."""
+        """Return the estimated motion of every ship; NaN in trials in which it was not found."""
         if outcome.failed or outcome.judged.view.made[0].targets is None:
             return {}
         rows = outcome.judged.view.found

@@ -1,4 +1,4 @@
-"""What ships on a sea require of their processor, and the alternatives that it may choose."""
+"""Processing of ships on a sea: its limits, what simplifications neglect, and its alternatives."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _NOT_HERE = (
 
 
 def limits(bench: Bench) -> dict[Limit, list[str]]:
-    """Limits, each with the methods that it concerns."""
+    """Return the limits of methods in this scene, with the methods that each concerns."""
     found: dict[Limit, list[str]] = {}
     for name in bench.chains:
         for limit in (*multichannel_limits(bench.radar, _use_of(bench, name)), *_swath_limits(bench, name)):
@@ -58,7 +58,9 @@ def limits(bench: Bench) -> dict[Limit, list[str]]:
 
 
 def requirements(bench: Bench) -> Sequence[Requirement]:
-    """What simplifications neglect; nothing where no aperture forms."""
+    """Return what simplified processing neglects; nothing if a target is as fast along track as the
+    receiver, since no aperture forms then.
+    """
     use = _use_of(bench, "recommended")
     return multichannel_requirements(bench.radar, use) if bench.radar.speed_m_s > use.u_a_m_s[1] else ()
 
@@ -105,7 +107,9 @@ def _swath_limits(bench: Bench, name: str) -> list[Limit]:
 
 
 def choices(bench: Bench) -> list[Choice]:
-    """Settings of the recommended flow on its first scene, and the form of the image at rest."""
+    """Return the choices between alternatives: the form of the image of what is at rest, and the
+    settings by which the recommended method images moving ships.
+    """
     radar, world, lit = bench.radar, bench.world(), _integration_s(bench) or _PATTERN_S
     lost = bulk_error_db(radar, _rebuild(bench).bands, world.samples / 2 * radar.range_step_m, lit)
     forms = [
@@ -156,7 +160,10 @@ def _flows(bench: Bench) -> Measured:
     flow, world = _last(bench, "recommended").flow, bench.world()
     name, ship = max(world.targets.items(), key=lambda item: _speed_m_s(item[1]))
     if not _speed_m_s(ship):
-        raise ConfigError(f"{bench.file}: settings of the flow are compared on ships that move; let a ship move")
+        raise ConfigError(
+            f"{bench.file}: world.targets: alternative settings are compared on a moving ship, and no ship moves; give "
+            "a ship a speed u_r_m_s or u_a_m_s"
+        )
     radar = replace(bench.radar, reference_range_m=bench.radar.reference_range_m + float(ship.range_m))
     pulses, samples = min(_CROP[0], world.pulses), min(_CROP[1], world.samples)
     crop = replace(world, pulses=pulses, samples=samples, targets={name: replace(ship, range_m=0.0)})

@@ -24,7 +24,7 @@ _UP_DB, _DOWN_DB, _BLOCKS = 25.0, -10.0, 300
 
 
 def pictures(results: Mapping[str, Result], columns: Mapping[str, Any]) -> Iterator[Callable[[], Drawn]]:
-    """Makers of all pictures."""
+    """Yield functions that draw the pictures, in the order of the report."""
     for case, result in results.items():
         for make in (_flow, _methods, _ships):
             yield partial(make, case, result)

@@ -68,7 +68,7 @@ class Frame:
         ships: Ships by name.
         still: Recording without ships that move, shape (channel, pulse, range), with the range to
             the transmitter removed.
-        images: Images of it by reconstruction and form, added when they are first needed.
+        images: Images of `still` by reconstruction and form, added when they are first needed.
     """
 
     ships: Mapping[str, ShownShip]
@@ -76,7 +76,7 @@ class Frame:
     images: dict[tuple[Rebuild, str], Signal] = field(default_factory=dict)
 
     def still_image(self, stage: StationaryImage) -> Signal:
-        """Image of what does not move, by the reconstruction of a method."""
+        """Return the image of what does not move, made by the imaging stage of a method."""
         kind = (stage.rebuild, stage.form)
         if kind not in self.images:
             self.images[kind] = stage(self.still)

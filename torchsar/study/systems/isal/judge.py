@@ -17,7 +17,10 @@ _MOST_SCATTERERS, _MOST_PULSES = 1200, 800
 
 
 def judge(bench: Bench, name: str, trace: Trace, trials: Trials) -> Judged:
-    """Metrics of the residual phase and of the image; the view is the phase that is removed."""
+    """Return the metrics of the residual phase and of the image by one method.
+
+    The field `view` of the result is the phase in rad that the method removes, (trial, pulse).
+    """
     chain, clean = bench.chains[name], bench.config.processor[name].input == "clean"
     true, present = whole_phase(trials), received(trials)
     truth = torch.zeros_like(true) if clean else true
@@ -38,10 +41,11 @@ def judge(bench: Bench, name: str, trace: Trace, trials: Trials) -> Judged:
 
 
 def bounds(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
-    """Bounds of the residual phase for a known scene and for unknown amplitudes.
+    """Return lower bounds of the rms residual phase in rad, (trial,): one for a known scene, and
+    one for unknown amplitudes of its scatterers.
 
-    The ratio of the second to the first is computed for one scene of the case; it differs by about
-    one percent between scenes.
+    The ratio of the second bound to the first is computed for a single scene of the case; it
+    differs by about one percent between scenes.
     """
     std, data = batch.trials.truth["noise_std"], batch.trials.clean.signal.data
     if not bool((std > 0).all()):
@@ -54,7 +58,7 @@ def bounds(bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
 
 
 def whole_phase(trials: Trials) -> Tensor:
-    """Phase error of every pulse in rad, including that of impairments, (trial, pulse)."""
+    """Return the true phase error of every pulse in rad, with impairments, (trial, pulse)."""
     phases = [value for name, value in trials.truth.items() if name == "phase_rad" or name.endswith(".phase_rad")]
     pulses = trials.recording.signal.data.shape[:-1]
     whole = torch.zeros(pulses, dtype=torch.float64, device=trials.recording.signal.data.device)
@@ -68,10 +72,11 @@ def received(trials: Trials) -> Tensor | None:
 
 
 def estimated_phase(chain: Chain, trace: Trace, like: Tensor) -> Tensor:
-    """Phase in rad that a chain removes from each pulse, shaped as `like`: the sum over correctors.
+    """Return the phase in rad that a chain removes from each pulse, in the shape of `like`.
 
-    For a chain without a corrector it is the last estimate of a phase, and zero if there is none. A
-    phase that only initialises another estimator is left out.
+    It is the sum over all stages that correct a phase. If there is no such stage, it is the last
+    estimate of a phase, or zero if there is none. Phases that are only initial values of another
+    estimator do not count.
     """
     taken = [
         trace.values[uses["phase_rad"]]

@@ -54,8 +54,8 @@ class Target(World):
         super().__post_init__()
         if self.pulses < 1 or self.samples < 1 or not self.scene:
             raise ValueError(
-                "world needs a scene and at least one pulse and one sample, got "
-                f"{self.pulses} pulses and {self.samples} samples"
+                "world needs at least one scene, one pulse and one sample, got "
+                f"{len(self.scene)} scenes, {self.pulses} pulses and {self.samples} samples"
             )
 
     def of(self, radar: InverseRadar) -> TurntableWorld:
@@ -64,21 +64,23 @@ class Target(World):
         return TurntableWorld(scene, self.rotation_rad_s, self.motion, self.start_phase, noise, self.fidelity)
 
     def trials_of(self, radar: InverseRadar, draws: Draws, dtype: torch.dtype, device: str = "cpu") -> Trials:
-        """Recordings with and without phase errors and motion, and the truth."""
+        """Simulate recordings with and without phase errors and motion, and the true values."""
         world, size = self.of(radar), (self.pulses, self.samples)
         recording, truth = simulate_turntable(radar, world, *size, draws, self.impairments, dtype, device)
         assert truth.clean is not None
         return Trials(recording, truth.clean, truth.values, len(draws.trials or (0,)), world)
 
     def edge(self, draws: Draws) -> tuple[float, float]:
-        """Largest cross range and largest range (m) of the scatterers."""
+        """Return the largest magnitudes of cross range and range (m) of the scatterers."""
         scene = Together(self.scene).scatterers(draws)
         return tuple(float(x.abs().max()) for x in (scene.azimuth_m, scene.range_m))  # pyright: ignore[reportReturnType]
 
 
 def echo_choices(bench: Bench) -> list[Choice]:
-    """The echo model: phases of range-compressed pulses alone, or dechirped pulses with the motion
-    within each pulse, which needs the length of a pulse.
+    """Return the choice of the echo model; nothing if the radar has no pulse length.
+
+    The model `phase_only` changes the phases of range-compressed pulses; the model `dechirped`
+    simulates dechirped pulses with the motion within each pulse.
     """
     world, radar = bench.world(), bench.radar
     if radar.pulse_s is None:

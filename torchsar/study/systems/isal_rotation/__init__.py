@@ -34,14 +34,14 @@ _OF_ESTIMATORS = {"scatterers above the noise": "warp_k", "range term, pi lambda
 
 @dataclass(frozen=True)
 class Judging:
-    """How results are judged.
+    """Settings of the metrics.
 
     Args:
         reference: Name of the method whose image of the same scene is the ideal one.
         search_m: Largest distance in metres along cross range between the response of a point
             target and its true position.
-        published: Values of the source, by metric, case and method.
-        published_targets: Values of the source for point targets, by metric, target and method.
+        published: Published values by metric, case and method.
+        published_targets: Published values of point targets, by metric, target and method.
     """
 
     reference: str | None = None
@@ -206,7 +206,9 @@ class IsalRotation(System):
         return figures.pictures(results, self.columns)
 
     def notes(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        """Cases in which a wrong rotation gives an image of less entropy than the true one."""
+        """Yield notes for the report, as (title, text), about cases in which a wrong rotation gives
+        an image with less entropy than the true rotation.
+        """
         methods, reference = metrics["methods"], metrics["definitions"]["reference"]
         for case in methods[reference]["cases"] if reference else ():
             rows = {name: method["cases"][case] for name, method in methods.items()}

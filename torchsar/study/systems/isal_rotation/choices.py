@@ -1,4 +1,4 @@
-"""What a rotating target requires of its processor, and the alternatives that it may choose."""
+"""Processing of a rotating target: its limits, what simplifications neglect, its alternatives."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _DESCENT, _GENETIC = "descent from 0.95 of the truth", "genetic 10 x 4, +-10 % a
 
 
 def limits(bench: Bench) -> tuple[Limit, ...]:
-    """Limits of the first trial of a run."""
+    """Return the limits of methods for the target in the first trial of a run."""
     world, radar = bench.world(), bench.radar
     x, y, amplitude = _scatterers(bench)
     omega, k, yc = _rotation(world)
@@ -58,7 +58,7 @@ def limits(bench: Bench) -> tuple[Limit, ...]:
 
 
 def requirements(bench: Bench) -> Sequence[Requirement]:
-    """What each simplification neglects in the first trial of a run."""
+    """Return what each simplified processing neglects for the target in the first trial."""
     x, y, _ = _scatterers(bench)
     omega, k, yc = _rotation(bench.world())
     reach = (float(x.abs().max()), float((y + yc).abs().max()))
@@ -66,7 +66,9 @@ def requirements(bench: Bench) -> Sequence[Requirement]:
 
 
 def choices(bench: Bench) -> list[Choice]:
-    """Order of the rotation, range term, transform, estimator, and echo model."""
+    """Return the choices between alternatives: order of the rotation, range term of the phase,
+    transform along slow time, estimator of the rotation, and echo model.
+    """
     orders = [_order(order, bench) for order in range(1, max(_ORDERS, 1 + len(_rotation(bench.world())[1])) + 1)]
     kernels = {f"gridding, {taps} taps": Gridding(taps=taps) for taps in _TAPS}
     transforms = [

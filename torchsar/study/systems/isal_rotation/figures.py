@@ -29,7 +29,7 @@ _WIDTHS, _BESIDE = 25, 4
 
 
 def pictures(results: Mapping[str, Result], columns: Mapping[str, Any]) -> Iterator[Callable[[], Drawn]]:
-    """Functions that draw the pictures, in the order of the report."""
+    """Yield functions that draw the pictures, in the order of the report."""
     yield partial(target, next(iter(results.values())))
     yield partial(comparisons, results, columns)
     for case, result in results.items():

@@ -31,7 +31,7 @@ class Rotating(Target):
     """Section `world`: the simulated target and its true parameters.
 
     Args:
-        rotation: Rotation rate at the first pulse and its relative derivatives.
+        rotation: Rotation rate at the first pulse, and its time derivatives relative to that rate.
         centre_deviation_m: Range in metres from the centre of rotation to the zero of the range
             axis, yc.
         scene_seed: Seed of one scene for all trials, which then differ in noise alone; None for
@@ -45,7 +45,9 @@ class Rotating(Target):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.rotation_rad_s is not None:
-            raise ValueError("world.rotation_rad_s is the rate of a uniform rotation; give world.rotation alone")
+            raise ValueError(
+                "world.rotation_rad_s, the rate of a uniform rotation, is not accepted here; give world.rotation alone"
+            )
         if not bool((torch.as_tensor(self.rotation.omega_rad_s) > 0).all()):
             raise ValueError(
                 f"world.rotation.omega_rad_s must be positive, got {self.rotation.omega_rad_s}; the data "
@@ -71,7 +73,10 @@ class Rotating(Target):
         return names
 
     def noise_std(self, amplitude: Tensor) -> float:
-        """Noise of a sample, from the mean power of the scatterers over the range cells."""
+        """Return the standard deviation of the noise in a sample.
+
+        It follows from the SNR and the power of all scatterers, as the mean over range cells.
+        """
         snr_db = self.noise.snr_db
         if snr_db is None:
             return 0.0
@@ -79,7 +84,7 @@ class Rotating(Target):
 
 
 def k_of(rotation: PolynomialRotation) -> Tensor:
-    """k1, k2, ... of the first trial."""
+    """Return k1, k2, ... (relative derivatives of the rotation rate) in the first trial."""
     k = rotation.warp_k(torch.zeros(0, dtype=torch.float64))
     return k.reshape(-1, k.shape[-1])[0] if k.numel() else k.reshape(-1)[:0]
 

@@ -52,9 +52,10 @@ class Judging:
     Args:
         reference: Method whose image of the same scene is the ideal one; null for none.
         target: Point target whose impulse response is measured and drawn; null for none.
-        sidelobe_nulls: Extent of the side lobes of a response in null spacings.
-        search_m: Largest distance in metres of a response from its predicted position.
-        published: Published values by figure, case and method.
+        sidelobe_nulls: Extent of the measured side lobes in spacings of the nulls.
+        search_m: Largest distance in metres at which a response is sought from its predicted
+            position.
+        published: Published values by metric, case and method.
     """
 
     reference: str | None = None
@@ -137,7 +138,10 @@ class Sal(System):
         return world.periods * per_period
 
     def bytes_per_trial(self, bench: Bench) -> int:
-        """Memory of noise in double precision, or of spectra upsampled over the whole band."""
+        """Return the size in bytes of the largest tensor of a trial.
+
+        This is the noise in double precision, or spectra that are upsampled over the whole band.
+        """
         world, radar = bench.world(), bench.radar
         stages = [stage for chain in bench.chains.values() for stage in chain.stages.values()]
         wide = [s.upsampling for s in stages if isinstance(s, SpectrumCorrelation) and s.window_m is None]
@@ -196,7 +200,9 @@ class Sal(System):
         return _expanded(metrics, targets, [t for t in named if t not in targets], course, trials.count)
 
     def bounds(self, bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
-        """Lower bounds for scenes of one point, whose energy every estimator can use."""
+        """Return lower bounds of the errors of velocity (m/s) and range (m) for a scene of one
+        point; nothing for other scenes and without noise.
+        """
         truth, radar, std = batch.trials.truth, bench.radar, batch.trials.truth["noise_std"]
         points = all(isinstance(scene, Points) for scene in bench.world().scene.values())
         if truth["range_m"].shape[-1] != 1 or not points or not bool((std > 0).all()):
@@ -228,7 +234,9 @@ class Sal(System):
         return figures.pictures(results, self.columns)
 
     def notes(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        """Images with much residual phase, but less entropy than the ideal one."""
+        """Yield notes for the report, as (title, text), about images with a large residual phase
+        but less entropy than the ideal image.
+        """
         methods, reference = metrics["methods"], metrics["definitions"]["reference"]
         for case, ideal in (methods[reference]["cases"] if reference else {}).items():
             rows = {name: method["cases"][case] for name, method in methods.items() if name != reference}

@@ -29,7 +29,7 @@ Lines = Mapping[str, tuple[Axis, Tensor]]
 
 
 def pictures(results: Mapping[str, Result], columns: Mapping[str, Any]) -> Iterator[Callable[[], Drawn]]:
-    """Makers of all pictures."""
+    """Yield functions that draw the pictures, in the order of the report."""
     yield partial(_target, next(iter(results.values())))
     yield partial(comparisons, results, columns)
     for case, result in results.items():

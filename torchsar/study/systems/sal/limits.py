@@ -49,14 +49,18 @@ _MODELS = (
 
 
 def moved(bench: Bench) -> Moved:
-    """What the first trial of a run shows. Raises ValueError if nothing can be seen."""
+    """Return scatterers and motion in the first trial of a run, as far as the ladar observes them.
+
+    Raises:
+        ValueError: If the ladar observes no scatterer, or one is where no sweep can show it.
+    """
     world, radar, draws = bench.world(), bench.radar, Draws(bench.config.seed, "run", [0])
     motion = drawn_motion(world.motion, draws, world.periods * radar.pulse_step_s)
     return Moved.of(radar, world.of().scene.scatterers(draws), motion, world.periods, world.gate_m)
 
 
 def limits(bench: Bench, seen: Moved) -> dict[Limit, list[str]]:
-    """Limits, each with the methods that it stops."""
+    """Return the limits of methods in this scene, with the methods that each stops."""
     world, radar, e = bench.world(), bench.radar, seen.extremes
     apart = torch.diff(torch.unique(seen.range_m))
     snr_db = world.noise.snr_db
@@ -86,14 +90,14 @@ def _concerns(limit: Limit, name: str, bench: Bench) -> bool:
 
 
 def requirements(bench: Bench, seen: Moved) -> Sequence[Requirement]:
-    """What echo and compensation may leave out."""
+    """Return what simplified echo models and motion compensation neglect in this scene."""
     e, world = seen.extremes, bench.world()
     motion = (e.velocity_m_s, e.acceleration_m_s2, e.displacement_m)
     return ladar_requirements(bench.radar, world.periods, e.range_m, *motion)
 
 
 def choices(bench: Bench, seen: Moved) -> list[Choice]:
-    """Echo model, estimator of the velocity, and its settings."""
+    """Return the choices between alternatives: echo model, and estimator of the velocity."""
     estimators = {
         "segmented interference": segmented_interference,
         "correlation, upsampling 1": partial(spectrum_correlation, upsampling=1),
@@ -150,7 +154,9 @@ def _estimates(bench: Bench) -> Measured:
     chain = bench.chains["recommended"]
     found = [name for name, stage in chain.stages.items() if "velocity_m_s" in getattr(stage, "provides", ())]
     if not found:
-        raise ValueError("the recommended method estimates no velocity; there is nothing to compare")
+        raise ValueError(
+            "processor.recommended estimates no velocity, so that nothing can be compared; add such a stage"
+        )
     sweeps = chain.trace(trials.recording).inputs[found[0]]
     window, true = getattr(chain.stages[found[0]], "window_m", None), trials.truth["velocity_m_s"]
     pulse = sweeps.axis("pulse")

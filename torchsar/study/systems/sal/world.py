@@ -40,12 +40,12 @@ from torchsar.study.trials.system import Noise, World
 
 @dataclass(frozen=True)
 class Record:
-    """A continuous record instead of separated sweeps.
+    """A continuous record of the detector, cut into blocks, instead of separated sweeps.
 
     Args:
         trigger_s: Time from the start of a block to the start of an up sweep in seconds.
-        block_s: Length of a block in seconds; null for one period where every period is kept, else
-            two.
+        block_s: Length of a block in seconds; null for one period of the sweep if every period is
+            kept, and else for two periods.
         trigger_known: Whether the recording contains the time of the trigger.
     """
 
@@ -68,7 +68,8 @@ class Ground(World):
         sweep_error: Phase error of the laser's sweeps; null for none.
         calibration: Internal fibre by which the sweep error can be measured; null for none.
         record: Continuous record of the detector; null for sweeps that are separated ideally.
-        noise: Receiver noise per sample before any compression, against a scatterer of amplitude 1.
+        noise: Receiver noise; its snr_db is the power of a scatterer of amplitude 1 over that of
+            the noise in a sample before any compression.
         impairments: Impairments of the recording by name, applied in this order.
     """
 
@@ -88,7 +89,9 @@ class Ground(World):
         super().__post_init__()
         snr_db = self.noise.snr_db
         if self.periods < 1 or not self.scene:
-            raise ValueError(f"world needs a scene and at least one period, got {self.periods} periods")
+            raise ValueError(
+                f"world needs at least one scene and one period, got {len(self.scene)} scenes, {self.periods} periods"
+            )
         if snr_db is not None and bool((torch.as_tensor(snr_db).abs() > 300).any()):
             raise ValueError(
                 f"noise.snr_db is {snr_db}, outside the numerical range; give -300 to 300 dB, or null for no noise"

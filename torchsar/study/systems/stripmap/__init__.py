@@ -120,7 +120,9 @@ class Stripmap(System):
             )
 
     def bounds(self, bench: Bench, batch: Batch) -> dict[str, dict[str, Tensor]]:
-        """Bounds for scenes of points alone: the energy of other scenes is not known in advance."""
+        """Return lower bounds of the errors of Doppler centroid (Hz) and velocity (m/s) for scenes
+        of points; nothing for other scenes, whose energy is not known in advance.
+        """
         truth, world, radar = batch.trials.truth, batch.trials.own, bench.radar
         std = truth["noise_std"]
         if (
@@ -140,7 +142,10 @@ class Stripmap(System):
         return {**bounds, "velocity_error_m_s": {"Cramer-Rao bound": velocity}}
 
     def limits(self, bench: Bench) -> Mapping[Limit, Sequence[str]]:
-        """Of simulated data: the aperture of recorded ones is what the beam has made it."""
+        """Return the limits of focusing in a simulated scene, with the methods that each concerns.
+
+        There are none for a recording, whose aperture the antenna beam has already determined.
+        """
         if bench.recording is not None:
             return {}
         found = strip_limits(bench.radar, bench.world().samples, *probe_of(bench).motion)
@@ -153,7 +158,7 @@ class Stripmap(System):
         return choices(bench, {row.effect: row for row in self.requirements(bench)})
 
     def position_of(self, result: Result, target: str) -> tuple[float, float]:
-        """Expected azimuth and range (m) of a target in the image of the recommended method."""
+        """Return the expected azimuth and range (m) of a target in the recommended image."""
         trials, view = result.first.trials, result.first_of("recommended").judged.view
         azimuth, range_ = judge.positions(result.bench.chains["recommended"], view, result.bench, trials)
         index = list(result.bench.world().named_points).index(target)

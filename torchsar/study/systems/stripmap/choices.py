@@ -1,4 +1,4 @@
-"""What a strip may choose: form of the focusing, precision, range history, jitter correction."""
+"""Alternatives for a strip: form of the focusing, precision, range history, jitter correction."""
 
 from __future__ import annotations
 
@@ -36,8 +36,9 @@ class StripProbe:
     Args:
         radar: The instrument.
         world: The points, seen with the true Doppler and velocity.
-        size: Lines and samples.
-        edges_m: Ranges of the points from the middle of the fully compressed part of a line.
+        size: Number of lines and number of samples in a line.
+        edges_m: Ranges of the points in metres, relative to the middle of the fully compressed part
+            of a line.
     """
 
     radar: StripmapRadar
@@ -46,7 +47,7 @@ class StripProbe:
     edges_m: tuple[float, ...] = (0.0,)
 
     def between_edges(self) -> StripProbe:
-        """The probe with points at both edges and in the middle of the fully focused swath."""
+        """Return this probe with points at both edges and the middle of the focused swath."""
         radar, size = self.radar, self.size
         margin = (HALF + 1) * radar.range_step_m
         near, far = full_swath_m(radar, radar.raw_axes(*size), *self.motion, self.dwell_s)
@@ -56,7 +57,7 @@ class StripProbe:
 
     @property
     def dwell_s(self) -> float:
-        """Time for which targets are lit."""
+        """Time in s for which targets are illuminated."""
         radar = self.radar
         known = getattr(self.world.beam, "dwell_s", None) or radar.integration_s
         return float(known or radar.aperture_s(radar.near_range_m))
@@ -71,11 +72,13 @@ class StripProbe:
         return first[0], first[1]
 
     def recorded(self, dtype: torch.dtype, **changes: Any) -> tuple[Recording, Truth]:
-        """Simulate the recording, with changes of the world, and its truth."""
+        """Simulate the recording and its true values; `changes` replaces fields of the world."""
         return simulate(self.radar, replace(self.world, **changes), *self.size, Draws(0), dtype=dtype)
 
     def seen(self) -> tuple[Signal, PointPatches, tuple[Tensor, Tensor]]:
-        """Raw data in double precision, the patches about the points, Doppler and velocity."""
+        """Return raw data in double precision, the image patches about the points, and the pair of
+        Doppler (Hz) and velocity (m/s).
+        """
         recording, truth = self.recorded(torch.complex128)
         of = truth.values
         known = (of["doppler_hz"], of["velocity_m_s"])
@@ -83,15 +86,17 @@ class StripProbe:
         return recording.signal, PointPatches.about(self.radar, self.size, *at, *known), known
 
     def rows(self) -> tuple[Requirement, ...]:
-        """What each simplification neglects for this size, Doppler and velocity."""
+        """Return what each simplified focusing neglects for this size, Doppler and velocity."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an aliased aperture is one of the limits
             return requirements(self.radar, self.radar.raw_axes(*self.size), *self.motion)
 
 
 def probe_of(bench: Bench) -> StripProbe:
-    """Points seen with Doppler and velocity of the world, or of a recording as the recommended
-    method estimates them.
+    """Return point targets at the edges and in the middle of the swath of a config.
+
+    They have the Doppler and velocity of the simulated world, or for a recording those that the
+    recommended method estimates.
     """
     radar = bench.radar
     if bench.recording is None:
@@ -108,7 +113,12 @@ def probe_of(bench: Bench) -> StripProbe:
 
 
 def choices(bench: Bench, rows: Mapping[str, Requirement]) -> list[Choice]:
-    """The decisions of a config; rows: what simplifications neglect, by effect."""
+    """Return the choices between alternatives that a config has.
+
+    Args:
+        bench: Bench of the config.
+        rows: What simplified focusing neglects, by name of the effect.
+    """
     forms = [
         Alternative(
             name, {"stage": name}, {"image_error_db": rows[row].error_db} if row else {}, _neglects(rows, row), row

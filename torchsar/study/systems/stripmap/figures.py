@@ -47,8 +47,10 @@ class Strip:
 
     @property
     def scale(self) -> dict[str, Any]:
-        """Levels of images: 0 dB is the peak where all targets are known points, and else the level
-        that 0.1 % of the samples exceed.
+        """Level of 0 dB (as a percentile) and dynamic range of drawn images.
+
+        0 dB is the peak if the scene has point targets, and else the level that 0.1 % of the
+        samples exceed.
         """
         known = bool(self.result.targets)
         return {"percentile": 100.0 if known else 99.9, "dynamic_range_db": 60.0 if known else 50.0}
@@ -66,7 +68,9 @@ class Strip:
         return image_of((trace.outputs if output else trace.inputs)[name])
 
     def strongest(self) -> tuple[str, float, float]:
-        """Name, azimuth and range (m) of the strongest target; without targets, of the peak."""
+        """Return name, azimuth and range (m) of the strongest target, or of the brightest point of
+        the image if there are no targets.
+        """
         targets = self.result.first_of("recommended").judged.targets
         image = self.images()["recommended"]
         if targets:
@@ -79,7 +83,7 @@ class Strip:
 
 
 def pictures(results: Mapping[str, Result], columns: Mapping[str, Any]) -> Iterator[Callable[[], Drawn]]:
-    """Functions that draw the pictures, in the order of the report."""
+    """Yield functions that draw the pictures, in the order of the report."""
     makers = (_images, _cuts, _squint, _doppler_spectrum, _increments, _corrections, _contaminated_line)
     for case, result in results.items():
         for make in (*makers, _response, _image_corrections, _velocity):

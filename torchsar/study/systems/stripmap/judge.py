@@ -31,10 +31,10 @@ class Margin:
     """Edges of the image that the metrics leave out.
 
     Args:
-        first_lines: Lines at the start of the record.
-        last_lines: Lines at its end.
-        first_samples: Range samples at the near edge.
-        last_samples: Range samples at the far edge.
+        first_lines: Number of lines left out at the start of the record.
+        last_lines: Number of lines left out at the end of the record.
+        first_samples: Number of range samples left out at the near edge.
+        last_samples: Number of range samples left out at the far edge.
     """
 
     first_lines: int = 0
@@ -45,7 +45,7 @@ class Margin:
 
 @dataclass(frozen=True)
 class Judging:
-    """How images are judged.
+    """Settings of the metrics.
 
     Args:
         margin: Edges of the image that the metrics leave out; None for lines without a full
@@ -56,7 +56,7 @@ class Judging:
             target that counts as found.
         found_above_db: Lowest peak of a target that counts as found, in dB relative to the
             reference.
-        published: Values of the source, by metric, case and method.
+        published: Published values by metric, case and method.
     """
 
     margin: Margin | None = None
@@ -68,8 +68,10 @@ class Judging:
 
 
 def window(image: Signal, radar: StripmapRadar, margin: Margin | None) -> dict[str, tuple[int, int]]:
-    """Lines and samples that the metrics use: those with a full pulse and a full aperture, or what
-    the margin leaves. An axis of which fewer than 32 would be left is used as a whole.
+    """Return the part of an image that the metrics use, as (first, last) by axis.
+
+    It has the lines with a full aperture and the samples with a full pulse, or what a given margin
+    leaves. An axis of which fewer than 32 lines or samples would be left is used as a whole.
     """
     lines, samples = (axis.n for axis in image.axes)
     if margin is None:
@@ -111,7 +113,7 @@ class Used:
         return Used(doppler, value("velocity_m_s", radar.velocity_m_s), frame)
 
     def metrics(self, radar: StripmapRadar) -> dict[str, Tensor]:
-        """Doppler centroid, squint and velocity that the image was focused with."""
+        """Return Doppler centroid, squint and velocity with which the image was focused."""
         found = {"effective_velocity_m_s": self.velocity_m_s}
         if self.doppler_hz is not None:
             sine = radar.sin_squint(self.doppler_hz, self.velocity_m_s).clamp(-1, 1)
@@ -122,7 +124,11 @@ class Used:
 
 
 def focus_name(chain: Chain) -> str:
-    """Name of the stage that forms the image: the last one with a Doppler frame, else the last."""
+    """Return the name of the stage that forms the image.
+
+    It is the last stage with the attribute `frame_hz`, the Doppler frequency of the image
+    coordinates, or else the last stage.
+    """
     focusing = [name for name, stage in chain.stages.items() if hasattr(focuser_of(stage), "frame_hz")]
     return focusing[-1] if focusing else list(chain.stages)[-1]
 
@@ -133,7 +139,7 @@ def focuser_of(stage: nn.Module) -> nn.Module:
 
 
 def judge(bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -> Judged:
-    """Metrics of one method, with those of point targets if `detail` is true."""
+    """Return the metrics of one method, with those of point targets if `detail` is true."""
     chain, n = bench.chains[name], trials.count
     metrics = estimation_metrics(trace, trials, bench.radar.prf_hz)
     if trace.signal.names != IMAGE:
@@ -148,7 +154,10 @@ def judge(bench: Bench, name: str, trace: Trace, trials: Trials, detail: bool) -
 
 
 def estimation_metrics(trace: Trace, trials: Trials, prf_hz: float) -> dict[str, Tensor]:
-    """Scalar estimates by name, and their errors; of two stages with one name the later counts."""
+    """Return the scalar estimates of a chain by name, and their errors.
+
+    If two stages estimate values of the same name, the value of the later stage is used.
+    """
     n, truth = trials.count, trials.truth
     found = {key: v for estimate in trace.estimates.values() for key, v in estimate.value.items()}
     values = {key: v.double().expand(n) for key, v in found.items() if v.shape == trace.signal.trials}
@@ -168,7 +177,9 @@ def error_name(name: str) -> str:
 
 
 def compare(bench: Bench, outcome: Outcome, ideal: Outcome | None) -> Judged:
-    """Metrics of a method together with those relative to the reference and over its targets."""
+    """Return the metrics of a method, with image error and correlation relative to the reference
+    method, and with statistics over its point targets.
+    """
     judged = over_targets(bench, outcome.judged, None if ideal is None else ideal.judged)
     one, other = outcome.signal, None if ideal is None else ideal.signal
     if one is None or other is None or one is other or not one.names == other.names == IMAGE:
@@ -181,7 +192,9 @@ def compare(bench: Bench, outcome: Outcome, ideal: Outcome | None) -> Judged:
 
 
 def positions(chain: Chain, used: Used, bench: Bench, trials: Trials) -> tuple[Tensor, Tensor]:
-    """Expected azimuth and range (m), (trial, target), of the point targets in an image."""
+    """Return the expected azimuth and range (m) of the point targets in an image, each of shape
+    (trial, target).
+    """
     index = torch.tensor(list(bench.world().named_points.values()))
     zero, closest, velocity = (trials.truth[key] for key in ("zero_doppler_s", "closest_range_m", "velocity_m_s"))
     zero, closest = (x[..., index].expand(trials.count, -1) for x in (zero, closest))
@@ -216,8 +229,8 @@ def _targets(
 
 
 def over_targets(bench: Bench, judged: Judged, ideal: Judged | None) -> Judged:
-    """Metrics of a method with peaks relative to the reference, the number of targets found, and
-    medians over these.
+    """Return the metrics of a method over its point targets: peaks relative to the reference
+    method, the number of targets found, and medians over those found.
     """
     settings, targets = bench.judging, {}
     for name, row in judged.targets.items():

@@ -50,7 +50,8 @@ class Strip(World):
         super().__post_init__()
         if self.lines < 2 or self.samples < 2 or not self.scene:
             raise ValueError(
-                f"world needs a scene and at least 2 lines of 2 samples, got {self.lines} x {self.samples}"
+                f"world needs at least one scene, 2 lines and 2 samples, got {len(self.scene)} scenes, "
+                f"{self.lines} lines and {self.samples} samples"
             )
         if self.doppler_hz is not None and self.squint_deg is not None:
             raise ValueError("doppler_hz and squint_deg both give the direction of the beam; give one of them")
@@ -73,7 +74,7 @@ class Strip(World):
         return StripmapWorld(scene, self.beam, self.path, self.velocity_m_s, doppler, self.noise.snr_db)
 
     def trials_of(self, radar: StripmapRadar, draws: Draws, dtype: torch.dtype, device: str) -> Trials:
-        """Recordings with and without impairments, and the truth."""
+        """Simulate recordings with and without impairments, and the true values."""
         world, size = self.of(radar), (self.lines, self.samples)
         recording, truth = simulate(radar, world, *size, draws, self.impairments, dtype, device)
         assert truth.clean is not None
