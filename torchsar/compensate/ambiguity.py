@@ -169,7 +169,9 @@ def _phase_slope(products: Tensor, frequency_hz: Tensor) -> Tensor:
 def entropy_scores(
     group: RangeGroup, doppler_hz: Tensor, velocity_m_s: float, turns: Tensor, dwell_s: float
 ) -> tuple[Tensor, Tensor]:
-    """Compute the negative entropies of a group focused with every candidate ambiguity.
+    """Compute the negative image entropies of a group of range cells for each candidate ambiguity.
+
+    The group is focused once with each candidate for the absolute Doppler centroid.
 
     Args:
         group: Group of range cells.
@@ -255,8 +257,8 @@ class DopplerCentroid(Stage):
     The baseband centroid comes from the phase increment, and the ambiguity from range migration,
     without prior knowledge. If the dwell of the beam is known (`radar.integration_s`) and shorter
     than the record, the centroid is refined with targets whose whole dwell lies in the record (see
-    `complete_aperture_centroid`), because targets cut by the ends of the record would pull it. The
-    signal is left unchanged.
+    `complete_aperture_centroid`), because targets that the ends of the record cut would bias it.
+    The signal is left unchanged.
 
     Provides `doppler_hz` (absolute, positive when closing), `doppler_baseband_hz`, `ambiguity`
     (whole number of PRFs, as float64) and `squint_deg` (positive ahead, for the nominal velocity).

@@ -1,9 +1,10 @@
 """Doppler centroid from targets that are illuminated for their whole dwell within the record.
 
 The ends of a record cut the apertures of the targets near them. In a strip with a few bright points
-this pulls the centroid by a considerable part of the beam's band. In an image each target lies at
-the time when the beam centre crosses it, so lines of complete apertures can be separated from the
-others. The azimuth spectrum of these lines alone is that of the beam for any scene.
+this biases the centroid by a considerable part of the beam's Doppler band. In an image each target
+lies at the time when the beam centre crosses it, so image lines whose targets have complete
+apertures can be separated from the others. The azimuth spectrum of these lines alone has the shape
+of the beam, whatever the scene.
 """
 
 from __future__ import annotations

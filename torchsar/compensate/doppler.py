@@ -129,8 +129,8 @@ def block_spectra(x: Tensor, blocks: tuple[int, int] = (8, 8)) -> Tensor:
 def circular_centre(spectrum: Tensor) -> Tensor:
     """Compute the first Fourier coefficient of a power spectrum.
 
-    Its argument divided by 2 pi is the energy centre of the spectrum, as a fraction of the sampling
-    rate.
+    The phase of this coefficient divided by 2 pi is the circular energy centre of the spectrum, as
+    a fraction of the sampling rate.
 
     Args:
         spectrum: Power spectrum in FFT order, shape (..., n).
@@ -147,7 +147,8 @@ def circular_centre(spectrum: Tensor) -> Tensor:
 def plain_energy_centre(spectrum: Tensor, prf_hz: float) -> Tensor:
     """Compute the ordinary, non-circular centre of mass of a power spectrum.
 
-    A baseline for comparison: it is wrong wherever the spectrum wraps. Use `energy_centre` instead.
+    It serves for comparison only, because it is wrong wherever the spectrum wraps at half the PRF.
+    Use `energy_centre` instead.
 
     Args:
         spectrum: Power spectrum in FFT order, shape (..., n).
@@ -375,7 +376,8 @@ class PhaseIncrement(Stage):
     Args:
         radar: Radar parameters, of which the PRF is used.
         blocks: Number of blocks along pulses and along range.
-        over: "mean" or "median" over the blocks.
+        over: How the phase increments of the blocks are combined: "mean" (weighted by energy) or
+            "median" (robust against bright blocks).
 
     Raises:
         ValueError: If `over` is neither "mean" nor "median".

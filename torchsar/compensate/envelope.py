@@ -181,8 +181,8 @@ def align_envelopes(
         degree is None and tones
     ):
         raise ValueError(
-            "align_envelopes needs whole numbers: degree and tones must be 0 or more, passes and blocks 1 "
-            "or more; degree may be None only if tones is 0; "
+            "align_envelopes: degree and tones must be whole numbers of 0 or more (degree may be None if tones "
+            "is 0), and passes and blocks whole numbers of 1 or more, "
             f"got degree {degree!r}, tones {tones!r}, passes {passes!r} and blocks {blocks!r}"
         )
 

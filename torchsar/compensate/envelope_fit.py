@@ -93,7 +93,7 @@ class Envelopes:
         return Envelopes(torch.fft.rfft(self.on_grid(self.spectra).clamp_min(0).sqrt()), self.present, self.n)
 
     def on_grid(self, spectra: Tensor, per_cell: int = _HALF) -> Tensor:
-        """Compute samples of envelopes from their half spectra.
+        """Compute samples of envelopes over range from their half spectra.
 
         Args:
             spectra: Half spectra, shape (..., frequency).
@@ -382,9 +382,10 @@ def _residual_shifts(pulses: Envelopes, course: Tensor) -> Tensor:
 
 
 def log_likelihood(pulses: Envelopes, course: Tensor) -> Tensor:
-    """Compute the log-likelihood of a shift history, with the mean envelope T that is best for it.
+    """Compute the log-likelihood of a history of range shifts.
 
-    It is -(number of pulses) * sum over cells of ln T, up to a constant.
+    It is -(number of pulses) * sum over cells of ln T, up to a constant, where T is the mean power
+    envelope of the pulses with these shifts removed.
 
     Args:
         pulses: Envelopes.
@@ -459,7 +460,7 @@ def wrapped(cells: Tensor, n: int) -> Tensor:
 
 
 def unit_time(n: int, device: torch.device) -> Tensor:
-    """Compute the times of n pulses on the interval -1..1.
+    """Compute evenly spaced times of n pulses, scaled to the interval -1..1.
 
     Args:
         n: Number of pulses.

@@ -53,7 +53,9 @@ def central_lines(raw: Tensor, most: int) -> Tensor:
 
 
 def full_columns(n_range: int, pulse_samples: int) -> int:
-    """Count the columns of a compressed line that hold the whole pulse.
+    """Count the columns (range cells) whose echo lies completely in the recorded line.
+
+    Later columns are compressed from a part of the pulse only.
 
     Args:
         n_range: Number of range samples of the line.
@@ -66,7 +68,7 @@ def full_columns(n_range: int, pulse_samples: int) -> int:
 
 
 def compress(raw: Tensor, radar: StripmapRadar, spectrum: Tensor | None) -> Tensor:
-    """Compress lines in range and keep only the fully compressed columns.
+    """Compress lines in range and keep the columns (range cells) whose whole echo was recorded.
 
     Args:
         raw: Lines, shape (..., pulse, range), complex.
@@ -120,7 +122,9 @@ class BeamSpectrum:
     doppler_hz: Tensor
 
     def moved(self, by_hz: Tensor | float) -> BeamSpectrum:
-        """Interpret the same samples as lying higher in absolute Doppler.
+        """Reinterpret the spectrum at another absolute Doppler; the samples stay as they are.
+
+        This serves to try another Doppler ambiguity.
 
         Args:
             by_hz: Increase of the Doppler in Hz, shape (...,) or a number.
@@ -232,17 +236,17 @@ def column_signal(lines: Tensor) -> Tensor:
 
 
 def pick_group(lines: Tensor, radar: StripmapRadar, width: int) -> RangeGroup:
-    """Choose the group of columns with the most signal above the background.
+    """Choose the group of neighbouring range cells with the most signal above the background.
 
-    Among similar groups the one nearer to the middle of the swath is chosen.
+    Among groups with similar signal, the one nearest to the middle of the swath is chosen.
 
     Args:
         lines: Range-compressed lines, shape (..., pulse, range), complex.
         radar: Radar parameters.
-        width: Number of columns.
+        width: Number of range cells in the group.
 
     Returns:
-        The group, which may lie elsewhere in every trial.
+        The group, which may lie at another range in every trial.
     """
     count = lines.shape[-1]
     width = min(width, count)
@@ -256,9 +260,9 @@ def pick_group(lines: Tensor, radar: StripmapRadar, width: int) -> RangeGroup:
 
 
 def stays_inside(width: int, radar: StripmapRadar, doppler_hz: Tensor, dwell_s: float) -> Tensor:
-    """Mark the columns of a group whose targets stay in the group while they migrate.
+    """Mark the columns of a group of range cells whose targets stay in the group as they migrate.
 
-    The middle half is always marked.
+    The middle half of the columns is always marked.
 
     Args:
         width: Number of columns of the group.
@@ -277,10 +281,11 @@ def stays_inside(width: int, radar: StripmapRadar, doppler_hz: Tensor, dwell_s: 
 
 
 def block_weights(columns: Tensor, radar: StripmapRadar, doppler_hz: Tensor, dwell_s: float) -> Tensor:
-    """Compute the weights of the range blocks of a group in an objective function.
+    """Compute the weights with which the blocks of range cells of a group enter an objective.
 
-    A block is weighted with its signal (`column_signal`). Columns whose targets migrate out of the
-    group within the aperture do not contribute; those of the middle half always do.
+    A block is weighted with its signal above the background (`column_signal`). Range cells whose
+    targets migrate out of the group within the aperture do not contribute, except those of the
+    middle half of the group.
 
     Args:
         columns: Lines or an image of the group, shape (..., n, width), complex.

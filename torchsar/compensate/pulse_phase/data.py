@@ -190,9 +190,9 @@ def safe_angle(z: Tensor) -> Tensor:
 
 
 def without_line(phase_rad: Tensor, present: Tensor) -> Tensor:
-    """Subtract from phases their constant and their slope, by least squares.
+    """Subtract from the phases of pulses the straight line that fits them best (least squares).
 
-    Only pulses that are present enter the fit.
+    Only pulses with samples enter the fit; the line is subtracted from all.
 
     Args:
         phase_rad: Phases in rad, shape (..., pulse).

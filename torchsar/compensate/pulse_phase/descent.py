@@ -1,4 +1,7 @@
-"""The phase of every pulse as the minimum of a cost of the image, such as its entropy."""
+"""Autofocus by gradient descent: the phases of the pulses that minimise a cost of the image.
+
+Such a cost is, for example, the entropy of the image.
+"""
 
 from __future__ import annotations
 
@@ -213,8 +216,8 @@ def _space_of(basis: Tensor | None, pulses: Pulses) -> _Space:
     wide = _by_trial(basis.to(device=pulses.rows.device, dtype=torch.float64), pulses, "basis")
     if not torch.isfinite(wide).all() or bool((torch.linalg.matrix_rank(wide) < wide.shape[-2]).any()):
         raise ValueError(
-            f"sharpest_phase: the {wide.shape[-2]} functions of the basis must be finite and linearly "
-            "independent; orthogonal functions such as torchsar.core.legendre are"
+            f"sharpest_phase: the {wide.shape[-2]} functions of basis must be finite and linearly "
+            "independent; use orthogonal functions such as those of torchsar.core.legendre"
         )
     return _Spanned((torch.linalg.qr(wide.mT).Q.mT * math.sqrt(pulses.n)).to(pulses.rows.real.dtype).contiguous())
 
@@ -337,8 +340,8 @@ def _check_cost(cost: Any, phase: Tensor) -> None:
             else type(cost).__name__
         )
         raise ValueError(
-            f"sharpest_phase: the objective returned {got} for {len(phase)} images; return one "
-            "real cost per image, differentiable in its samples"
+            f"sharpest_phase: the objective returned {got} for {len(phase)} images; it must return one real "
+            "cost per image that is differentiable in the samples of the image"
         )
 
 

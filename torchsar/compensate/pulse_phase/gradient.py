@@ -42,13 +42,13 @@ class Windows(Protocol):
     """
 
     def width(self, iteration: int, n: int, profile: Callable[[], Tensor]) -> Tensor:
-        """Compute the width of the window at an iteration.
+        """Compute the width of the window that isolates the scatterers in an iteration of PGA.
 
         Args:
             iteration: Number of the iteration, from 0.
             n: Number of Doppler cells of the image.
-            profile: Function that returns the power of the rows about their peaks, shape (trial,
-                n), peak first.
+            profile: Function that returns the power along Doppler, summed over the range cells with
+                their peaks shifted to index 0, shape (trial, n).
 
         Returns:
             The width in Doppler cells, shape (trial,) or (1,).
@@ -83,7 +83,7 @@ class Shrinking:
             )
 
     def width(self, iteration: int, n: int, profile: Callable[[], Tensor]) -> Tensor:
-        """Compute the width of the window at an iteration, see `Windows.width`.
+        """Compute the width of the PGA window, which narrows by a constant factor per iteration.
 
         Args:
             iteration: Number of the iteration, from 0.
@@ -118,13 +118,13 @@ class Measured:
     floor: float = 5.0
 
     def width(self, iteration: int, n: int, profile: Callable[[], Tensor]) -> Tensor:
-        """Compute the width of the window at an iteration, see `Windows.width`.
+        """Compute the width of the PGA window from the width of the blur.
 
         Args:
             iteration: Not used.
             n: Number of Doppler cells of the image.
-            profile: Function that returns the power of the rows about their peaks, shape (trial,
-                n), peak first.
+            profile: Function that returns the power along Doppler, summed over the range cells with
+                their peaks shifted to index 0, shape (trial, n).
 
         Returns:
             The width in Doppler cells, shape (trial,).
@@ -154,7 +154,7 @@ class Listed:
             raise ValueError(f"Listed: cells must hold window widths of 1 Doppler cell or more, got {self.cells}")
 
     def width(self, iteration: int, n: int, profile: Callable[[], Tensor]) -> Tensor:
-        """Compute the width of the window at an iteration, see `Windows.width`.
+        """Look up the width of the PGA window of an iteration in the list.
 
         Args:
             iteration: Number of the iteration, from 0.
@@ -391,7 +391,7 @@ def _solver(kernel: Kernel) -> Solver:
     """The function of a kernel."""
     solvers: dict[str, Solver] = {"lumv": _lumv, "ml": _ml, "synchronised": _synchronised, "eigenvector": _eigenvector}
     if kernel not in solvers:
-        raise ValueError(f"kernel {kernel!r} is not known; choose one of {', '.join(solvers)}")
+        raise ValueError(f"PGA kernel {kernel!r} is not known; choose one of {', '.join(solvers)}")
     return solvers[kernel]
 
 

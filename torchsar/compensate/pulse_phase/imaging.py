@@ -1,4 +1,4 @@
-"""Linear image formation for autofocus: the forward operator and its adjoint."""
+"""Linear image formation for autofocus: operators from pulses to an image, and their adjoints."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Spatial correlation algorithm (SCA): the phase between adjacent pulses, summed over range."""
+"""Spatial correlation algorithm (SCA), an autofocus by the phases between adjacent pulses.
+
+The phase between two pulses is that of their product, summed over range.
+"""
 
 from __future__ import annotations
 

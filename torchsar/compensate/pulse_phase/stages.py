@@ -1,6 +1,6 @@
-"""Autofocus as stages: estimators of `phase_rad`, and the stage that removes it.
+"""Autofocus as stages of a chain: estimators of the phase error of every pulse, and its removal.
 
-The estimators leave the signal unchanged.
+The estimators provide the phase as `phase_rad` and leave the signal unchanged.
 """
 
 from __future__ import annotations
@@ -126,14 +126,14 @@ class Pga(Stage):
         self.windows, self.iterations, self.patience = windows_of(windows), iterations, patience
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
-        """Estimate `phase_rad` of a signal of axes (pulse, range).
+        """Estimate the phase error of every pulse of a signal of axes (pulse, range).
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
             start: Phase to start from in rad, shape (..., pulse); by default zero.
 
         Returns:
-            The estimate of `pga`.
+            The estimate of `pga`: `phase_rad` of shape (..., pulse), to be removed.
         """
         return pga(
             signal.data,
@@ -210,14 +210,14 @@ class EntropyFixedPoint(Stage):
         self.schedule, self.relaxation, self.imaging = tuple(zip(floors, iterations)), relaxation, imaging
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
-        """Estimate `phase_rad` of a signal of axes (pulse, range).
+        """Estimate the phase error of every pulse of a signal of axes (pulse, range).
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
             start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
 
         Returns:
-            The estimate of `entropy_fixed_point`.
+            The estimate of `entropy_fixed_point`: `phase_rad` of shape (..., pulse), to be removed.
         """
         return entropy_fixed_point(
             signal.data, start=start, floors=self.schedule, relaxation=self.relaxation, imaging=self.imaging
@@ -242,14 +242,14 @@ class Autofocus(Stage):
         self.search, self.polish, self.imaging = search, polish, imaging
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
-        """Estimate `phase_rad` of a signal of axes (pulse, range).
+        """Estimate the phase error of every pulse of a signal of axes (pulse, range).
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
             start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
 
         Returns:
-            The estimate of `autofocus`.
+            The estimate of `autofocus`: `phase_rad` of shape (..., pulse), to be removed.
         """
         return autofocus(signal.data, start=start, search=self.search, polish=self.polish, imaging=self.imaging)
 
@@ -275,14 +275,14 @@ class TargetAutofocus(Autofocus):
         self.target = None if geometry is None else TargetImage(radar, geometry)
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
-        """Estimate `phase_rad` of a signal of axes (pulse, range).
+        """Estimate the phase error of every pulse of a signal of axes (pulse, range).
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
             start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
 
         Returns:
-            The estimate of `autofocus`.
+            The estimate of `autofocus`: `phase_rad` of shape (..., pulse), to be removed.
         """
         imaging = None if self.target is None else self.target.operator(signal.data)
         return autofocus(signal.data, start=start, search=self.search, polish=self.polish, imaging=imaging)
@@ -311,13 +311,13 @@ class SharpestPhase(Stage):
         self.steps = steps
 
     def forward(self, signal: Signal, start: Tensor | None = None) -> Estimate:
-        """Estimate `phase_rad` of a signal of axes (pulse, range).
+        """Estimate the phase error of every pulse of a signal of axes (pulse, range).
 
         Args:
             signal: Range-compressed pulses, shape (..., pulse, range), complex.
             start: Phase to start from in rad, shape (..., pulse); by default that of `sca`.
 
         Returns:
-            The estimate of `sharpest_phase`.
+            The estimate of `sharpest_phase`: `phase_rad` of shape (..., pulse), to be removed.
         """
         return sharpest_phase(signal.data, objective=self.objective, method=self.method, steps=self.steps, start=start)

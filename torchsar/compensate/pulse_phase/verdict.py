@@ -81,7 +81,8 @@ def sharpness_of_noise(rows: Tensor) -> Tensor:
 def occupied_band(rows: Tensor) -> Tensor:
     """Compute the share of the range band that the data occupy.
 
-    In noise that is sampled four times too finely, for example, 1 / 4 of the rows are independent.
+    It is the share of the rows (range cells) that are independent: 1 / 4 in noise that is sampled
+    four times too finely, for example.
 
     Args:
         rows: Pulses, shape (trial, range, pulse), complex.

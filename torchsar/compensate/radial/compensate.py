@@ -1,4 +1,4 @@
-"""Exact compensation of a known radial motion in dechirped sweeps."""
+"""Exact compensation of a known radial motion in dechirped sweeps of a triangular-FMCW ladar."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Radial velocity by cross-correlation of up and down spectra, the paper's reference method."""
+"""Radial velocity by cross-correlation of the range spectra of up and down sweeps.
+
+It is the reference method of Remote Sens. 2024, 16, 793.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Amplitude of every pulse relative to steady scatterers, and its correction."""
+"""Estimation of the amplitude of every pulse from steady scatterers, and its equalisation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Newton steps that refine a peak after a coarse, detached search."""
+"""Newton steps that refine the position of a peak after a coarse search.
+
+Gradients pass through the steps, but not through the search.
+"""
 
 from __future__ import annotations
 

@@ -86,7 +86,10 @@ def radial_motion(
 
 
 def polished(bands: Bands, coarse: Estimate, pulse: Axis, iterations: int, tolerance_rad: float) -> Estimate:
-    """Add to estimated velocities the residual phases of the up sweeps.
+    """Complete an estimate of radial velocities by the residual phase of each up sweep.
+
+    The motion is compensated with the velocities first; `phase_polish` then estimates the phases
+    that remain.
 
     Args:
         bands: Filtered sweeps from which the velocities were estimated.

@@ -1,4 +1,4 @@
-"""Estimators and compensation of radial motion as stages.
+"""Estimation and compensation of the radial motion of a triangular-FMCW ladar, as chain stages.
 
 The estimators leave the sweeps unchanged.
 """

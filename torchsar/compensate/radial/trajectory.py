@@ -1,4 +1,4 @@
-"""Range error from radial velocities at the turning points, and the geometric velocity."""
+"""Range error by integration of radial velocities, and the velocity that straight flight causes."""
 
 from __future__ import annotations
 

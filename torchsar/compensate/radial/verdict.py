@@ -1,4 +1,4 @@
-"""Estimates of the radial velocity with their accuracy and reliability."""
+"""Accuracy and reliability of an estimated radial velocity, from the measured SNR."""
 
 from __future__ import annotations
 

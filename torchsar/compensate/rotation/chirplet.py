@@ -1,6 +1,7 @@
-"""Adaptive chirplet imaging in the manner of CLEAN, a baseline.
+"""Adaptive chirplet imaging in the manner of CLEAN, for comparison with other estimators.
 
-Every range cell is modelled as a sum of chirps, the strongest of which is removed first.
+Every range cell is modelled as a sum of chirps, which are found and removed one by one, the
+strongest first.
 """
 
 from __future__ import annotations

@@ -164,7 +164,7 @@ class ImageEntropy:
         return cost.reshape(x.shape[:-1]), gradient.reshape(x.shape)
 
     def turn(self, x: Tensor) -> RotationParameters:
-        """Convert unknowns to the rotation that they describe.
+        """Convert vectors of unknowns to the rotations that they describe.
 
         Args:
             x: Unknowns, shape (..., n), one vector per trial.

@@ -122,7 +122,10 @@ class Motion:
 
     @property
     def omega_rad_s(self) -> Tensor:
-        """Rotation rate at the first pulse in rad/s, shape (trial,); nearly 0 where w < 0."""
+        """Rotation rate at the first pulse in rad/s, shape (trial,).
+
+        It is nearly 0 where the estimate of its square is negative.
+        """
         return self.w.clamp_min(torch.finfo(torch.float64).tiny).sqrt()
 
     @property
@@ -135,7 +138,11 @@ class Motion:
 
     @property
     def yc_m(self) -> Tensor:
-        """Range centre deviation in metres, shape (trial,); `centre_m` where w <= 0."""
+        """Range centre deviation yc in metres, shape (trial,).
+
+        A cell at range y lies at y + yc from the rotation centre. Where the estimate of the squared
+        rotation rate is not positive, yc is the value known a priori.
+        """
         return self.centre_m + torch.where(self.w > 0, self.v / torch.where(self.w > 0, self.w, 1), 0)
 
     def possible(self, sampling: Sampling) -> Tensor:

@@ -1,4 +1,7 @@
-"""Bright scatterers of an image: local maxima above the noise and the side lobes about them."""
+"""Detection of bright scatterers in an image.
+
+They are local maxima above the noise and above the side lobes of their neighbours.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +37,7 @@ class Peaks:
             count: Number of peaks to keep, shape (trial,).
 
         Returns:
-            The peaks.
+            The kept peaks, brightest first; power 0 where a trial has fewer.
         """
         power = torch.where(torch.arange(self.power.shape[-1], device=count.device) < count[:, None], self.power, 0)
         width = max(1, int((power > 0).sum(-1).max()))

@@ -54,12 +54,12 @@ _SETTLED = 0.2  # steps of the motion below this share of its standard deviation
 
 @dataclass(frozen=True)
 class Scatterers:
-    """Scatterers of every trial.
+    """Amplitudes and positions of the scatterers of every trial.
 
     Args:
-        amplitude: Amplitude, shape (trial, scatterer), complex128; 0 for none.
-        cell: Doppler cell, shape (trial, scatterer), float64.
-        row: Range cell, shape (trial, scatterer), float64.
+        amplitude: Amplitude, shape (trial, scatterer), complex128; 0 where there is no scatterer.
+        cell: Doppler cell, fractional, 0 at zero Doppler, shape (trial, scatterer), float64.
+        row: Range cell, fractional, shape (trial, scatterer), float64.
     """
 
     amplitude: Tensor

@@ -1,4 +1,4 @@
-"""Estimators of non-uniform rotation as stages, and the autofocus of such a target."""
+"""Stages that estimate the non-uniform rotation of a target, and autofocus of such a target."""
 
 from __future__ import annotations
 
