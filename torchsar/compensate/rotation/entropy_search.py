@@ -48,10 +48,11 @@ def search_rotation(figure: ImageEntropy, axes: Sequence[Vector], *, limit: int 
         limit: Largest number of grid points per trial.
 
     Returns:
-        `warp_k` (relative derivatives of the rotation rate) and, with the range term, `omega_rad_s`
-        and `yc_m`, as in `genetic_rotation`. `ok` is False where the image is not sharper than
-        without compensation, or the best point lies at the end of an axis of several values.
-        info["entropy_grid_nats"], shape (..., m_1, m_2, ...), is the entropy on the grid.
+        `warp_k` (relative derivatives of the rotation rate) and, if `figure` compensates the
+        range-dependent phase, `omega_rad_s` and `yc_m`, as in `genetic_rotation`. `ok` is False
+        where the image is not sharper than without compensation, or the best point lies at the end
+        of an axis of several values. info["entropy_grid_nats"], shape (..., m_1, m_2, ...), is the
+        entropy on the grid.
 
     Raises:
         ValueError: If there is not one list of values per unknown, or the grid exceeds the limit.
@@ -78,11 +79,11 @@ def genetic_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: 
 
     Returns:
         `warp_k`, the relative derivatives of the rotation rate, shape (..., order - 1), and its
-        entries `k1_per_s`, `k2_per_s2`, ... With the range term also the rotation rate
-        `omega_rad_s` at the first pulse, shape (...,), made positive since its sign is not
-        observable (the image may be mirrored in cross range), and the range centre deviation
-        `yc_m`, shape (...,). There are no standard deviations, because an entropy is not a
-        likelihood. quality is the relative decrease of exp(entropy), the number of cells that the
+        entries `k1_per_s`, `k2_per_s2`, ... If `figure` compensates the range-dependent phase, also
+        the rotation rate `omega_rad_s` at the first pulse, shape (...,), made positive since its
+        sign is not observable (the image may be mirrored in cross range), and the range centre
+        deviation `yc_m`, shape (...,). There are no standard deviations, because an entropy is not
+        a likelihood. quality is the relative decrease of exp(entropy), the number of cells that the
         image fills, due to the compensation. `ok` is False where this number does not decrease, or
         the minimum lies on the edge of the box; with few image lines the result may be biased even
         where `ok` is True, see `EntropyObjective`. info: evaluations, entropy_nats,
@@ -111,8 +112,9 @@ def evolve_rotation(figure: ImageEntropy, low: Vector, high: Vector, *, draws: D
         options: Options of `torchsar.optim.differential_evolution`.
 
     Returns:
-        `warp_k` (relative derivatives of the rotation rate) and, with the range term, `omega_rad_s`
-        and `yc_m`; quality, `ok` and info are defined as for `genetic_rotation`.
+        `warp_k` (relative derivatives of the rotation rate) and, if `figure` compensates the
+        range-dependent phase, `omega_rad_s` and `yc_m`; quality, `ok` and info are defined as for
+        `genetic_rotation`.
 
     Raises:
         ValueError: If there is not one bound per unknown, or an option is invalid.
@@ -136,10 +138,11 @@ def newton_rotation(figure: ImageEntropy, start: Tensor, *, damped: bool = True,
         steps: Largest number of steps.
 
     Returns:
-        `warp_k` (relative derivatives of the rotation rate) and, with the range term, `omega_rad_s`
-        and `yc_m`, as in `genetic_rotation`. `ok` is False where the image is not sharper than
-        without compensation, where a trial diverges (it keeps its last finite point), or where it
-        has not converged after `steps` steps. info["iterations"] is the number of steps.
+        `warp_k` (relative derivatives of the rotation rate) and, if `figure` compensates the
+        range-dependent phase, `omega_rad_s` and `yc_m`, as in `genetic_rotation`. `ok` is False
+        where the image is not sharper than without compensation, where a trial diverges (it keeps
+        its last finite point), or where it has not converged after `steps` steps.
+        info["iterations"] is the number of steps.
 
     Raises:
         ValueError: If the start does not have one value per unknown.
@@ -157,9 +160,9 @@ def descend_rotation(figure: ImageEntropy, start: Tensor, *, steps: int = 60, to
     """Find a rotation of least image entropy near a start by L-BFGS with exact gradients.
 
     The descent converges best in the variables "shape", see `Unknowns`. With order 2 and without
-    range term this is the second-order method (SM) of Remote Sens. 2025, 17, 3447. For a target of
-    order 3, that method finds about k1 + k2 T / 2 in place of k1, where T is the length of the
-    aperture.
+    compensation of the range-dependent phase this is the second-order method (SM) of Remote Sens.
+    2025, 17, 3447. For a target of order 3, that method finds about k1 + k2 T / 2 in place of k1,
+    where T is the length of the aperture.
 
     Args:
         figure: Image entropy as a function of the unknowns of the rotation.
@@ -168,9 +171,10 @@ def descend_rotation(figure: ImageEntropy, start: Tensor, *, steps: int = 60, to
         tolerance: Norm of the gradient, relative to that at the start, at which a trial ends.
 
     Returns:
-        `warp_k` (relative derivatives of the rotation rate) and, with the range term, `omega_rad_s`
-        and `yc_m`, as in `genetic_rotation`. `ok` is False where the image is not sharper than
-        without compensation, or where a trial has not converged after `steps` steps.
+        `warp_k` (relative derivatives of the rotation rate) and, if `figure` compensates the
+        range-dependent phase, `omega_rad_s` and `yc_m`, as in `genetic_rotation`. `ok` is False
+        where the image is not sharper than without compensation, or where a trial has not converged
+        after `steps` steps.
 
     Raises:
         ValueError: If the start does not have one value per unknown.
@@ -512,8 +516,8 @@ class RotationNewton(_Descending):
 
     Args:
         radar: Radar parameters.
-        start: Values to start from, [omega (rad/s), k1, k2, ...], without omega if there is no
-            range term; None if the values are connected.
+        start: Values to start from, [omega (rad/s), k1, k2, ...], without omega if the
+            range-dependent phase is not compensated; None if the values are connected.
         objective: Settings of the entropy, by default with six taps. If yc is an unknown, the
             search starts from the connected `yc_m` or 0.
         damped: True damps the steps.
@@ -566,13 +570,13 @@ class RotationNewton(_Descending):
 class RotationDescent(_Descending):
     """Rotation of least image entropy near a start by L-BFGS; see `descend_rotation`.
 
-    With order 2 and without range term it is the second-order method (SM) of Remote Sens. 2025, 17,
-    3447.
+    With order 2 and without compensation of the range-dependent phase it is the second-order method
+    (SM) of Remote Sens. 2025, 17, 3447.
 
     Args:
         radar: Radar parameters.
-        start: Values to start from, [omega (rad/s), k1, k2, ...], without omega if there is no
-            range term; None if the values are connected.
+        start: Values to start from, [omega (rad/s), k1, k2, ...], without omega if the
+            range-dependent phase is not compensated; None if the values are connected.
         objective: Settings of the entropy, by default with the variables "shape". If yc is an
             unknown, the search starts from the connected `yc_m` or 0.
         steps: Largest number of steps.
